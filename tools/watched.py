@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.load import checked
 from softfinger.daemon.types import Event
+from softfinger.tools.processes.kernel_build import table_cache
 
 
 @dataclass(frozen=True)
@@ -39,19 +40,20 @@ class Watched:
     def __init__(self, sections: dict[str, dict[str, Any]]) -> None:
         settings = checked(sections | {"loop": {"clock": "virtual"}})
         self.events: list[Event] = []
-        self._daemon = Daemon(settings, on_event=self._note, wire=False)
-        self.control = self._daemon.loop._control
+        self._daemon = Daemon(settings, wire=False, table_cache=table_cache(), on_event=self._note)
+        self.loop, self.state = self._daemon.loop, self._daemon.loop.state
+        self.control = self.loop._control
         assert self._daemon.hand is not None
         self.plant = self._daemon.hand
-        self.contact_filter = self._daemon.loop.perception.filter
-        self.contacts = self._daemon.loop.state.contacts
+        self.contact_filter = self.loop.perception.filter
+        self.contacts = self.state.contacts
         self.settings = settings
 
     def _note(self, *event: str) -> None:
         level, kind, text = event
         self.events.append((level, kind, text))
 
-    def __enter__(self) -> Watched:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -64,28 +66,28 @@ class Watched:
 
     @property
     def mode(self) -> str:
-        return self._daemon.loop.state.mode
+        return self.state.mode
 
     def command(self, name: str, **numbers: float) -> dict[str, Any]:
-        return self._daemon.loop.command({"command": name, **numbers})
+        return self.loop.command({"command": name, **numbers})
 
     def grasp(self, force: float) -> None:
         """Arm and start to grasp."""
-        self._daemon.loop.advance(0.3)
+        self.loop.advance(0.3)
         self.command("arm")
-        self._daemon.loop.advance(0.2)
+        self.loop.advance(0.2)
         self.command("grasp", force=force)
 
     def run(self, seconds: float) -> None:
         """Go on for ``seconds`` without looking."""
-        self._daemon.loop.advance(seconds)
+        self.loop.advance(seconds)
 
     def watch(self, seconds: float) -> Seen:
         """Go on for ``seconds``; the truth at each tick."""
         return Seen(*(np.array(column) for column in zip(*self._ticks(seconds), strict=True)))
 
     def _ticks(self, seconds: float) -> Iterator[tuple[float, tuple[float, ...], float, float]]:
-        loop, plant = self._daemon.loop, self.plant
+        loop, plant = self.loop, self.plant
         for _ in range(max(round(seconds / loop.period), 1)):
             loop.advance(loop.period)
             normal = self.settings.simulation.tip_friction * np.maximum(plant.normal, 1e-9)

@@ -54,6 +54,7 @@ _YIELDS = 0.01  # rad/s that both joints give way faster than just before: half 
 _FAST = 0.1  # rad/s, likewise
 _SIGNS = 4.0  # standard deviations, of the angle and of the torques, more than that
 _BOTH = 0.5  # of the mean of both joints' torques: each must show so much of a sudden load
+_BALANCED = 0.6  # of both tips' mean force: each must feel so much, as of any object that is free
 _LEAST_LEVER = 0.2  # of the object's width: a load's lever is not taken for less
 _LEAST_SPARE = 0.3  # of the friction: where rolling takes more, a firmer grip hardly helps
 
@@ -178,8 +179,8 @@ def _average(
 ) -> bool:
     """Take in both joints' torques; whether a load has come at once that needs a firmer grip.
 
-    A jump of both that is no flicker, while the joints give way, is a load: no frame's error, which
-    moves no joint, and no current that was read wrongly.
+    A jump of both that is no flicker, while the joints give way, is a load: no current that was
+    read wrongly, and no frame's error, by which one tip alone seems to let go.
     """
     friction = s.law.joint_friction
     known = closing * friction
@@ -195,7 +196,9 @@ def _average(
     flicker += friction * max(1.0 - s.age / _LEARN, 0.0)  # joints may still come to rest
     yields = (s.speed - speed) * math.copysign(1.0, off) > _YIELDS
     s.speed += (speed - s.speed) * s.law.dt / _SMOOTH
-    if judged and alike and yields and abs(off) > flicker and abs(before + off) > abs(before):
+    balanced = min(grasp.normal[0], grasp.normal[1]) > _BALANCED * mean(grasp.normal)
+    felt = abs(off) > flicker and abs(before + off) > abs(before)
+    if judged and alike and balanced and yields and felt:
         load, slope = load_of(before + off, grasp.load_lever, grasp.load_bow)
         hidden = friction / max(slope, _LEAST_LEVER * s.law.width)
         sudden = abs(load) + 0.5 * hidden > _SUDDEN * max(spare, 0.0) * mean(grasp.normal)

@@ -313,7 +313,9 @@ class Control:
             if not contact.contact:
                 self._lose(dt, goal)
                 return
-        self._lost = 0.0
+        if self._lost > 0.0:
+            self._still = False  # the force is built up again: what moves joints is no load
+            self._waiting = self._lost = 0.0
         if self._pose.width < self._settings.object.width_min or self._empty > 0.0:
             self._is_empty(dt)
         self._pull(self._grip.torques(self._reading, self._pose, self._still), goal)

@@ -1,9 +1,11 @@
-"""A soak on the virtual clock: random commands, rare faults, and what must hold at every tick.
+"""A soak on the virtual clock: random sequences of commands, loads and faults, each from a seed.
 
-``python -m tests.soak.virtual`` runs ten million ticks, five and a half hours of the hand's time,
-in some minutes; tests run a short one. The daemon is whole but for its sockets. Faults come in by
-wrappers around its servos and sensors, and the same wrappers judge what reaches the servos, with
-arithmetic of their own. A broken invariant ends the soak with AssertionError.
+``python -m tests.soak.virtual`` runs a thousand sequences of 10 s; most of them grip, and are
+loaded, turned, lied to and stopped from there. ``--ticks 10000000 --sequences 1`` runs one for
+five and a half hours of the hand's time, and looks at the memory. The daemon is whole but for its
+sockets. What must hold is judged by the plant and by what reaches the servos, never by what the
+daemon says of itself, and it is counted how often each of it was judged: a soak that never came to
+one of them has failed. Tests run a few sequences.
 """
 
 from __future__ import annotations
@@ -16,6 +18,7 @@ import random
 import sys
 import time
 from collections import Counter
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -25,42 +28,98 @@ import numpy as np
 from softfinger.daemon.control.modes import COMMANDS, Mode
 from softfinger.daemon.errors import Refused, ServoError
 from softfinger.daemon.loop.build import Daemon
+from softfinger.daemon.perception import witnesses
+from softfinger.daemon.profile.load import checked
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.types import Frame, Goal, Reading
+from softfinger.daemon.types import FINGERS, GRIP_SHARE, Frame, Goal, Reading
+from softfinger.tools.processes.kernel_build import table_cache
 
-TICKS = 10_000_000
+SEQUENCES, TICKS = 1000, 5000
+HELD = 0.3  # of the sequences, at least, must come to hold
 _GRIPPING = ("grasping", "holding", "rotating")
-_EVERY = 1500  # ticks between two faults, in the mean
-_COMMAND_EVERY = 150  # ticks between two random commands, in the mean
-_WARM = 0.1  # share of the ticks after which memory counts
-_LOOKS = 50  # at the memory, altogether
+_COMMAND_EVERY = 150  # ticks between two commands, in the mean
+_DISTURBED_EVERY = 800  # ticks between two loads or faults, likewise
+_DISTURBED_FOR = 500
+_WILD = 0.1  # of the commands are of any kind, whatever the hand does
+_LOOKS = 50  # at the memory, in a long sequence
+_WARM = 5  # of them pass before it counts
 # deaf: all that is written gets lost, and readings come.
 # jumped: the angle is 0.2 rad off. numb: angle, velocity and current stand still.
 SERVO_FAULTS = (
     *("silent", "gone", "deaf", "alert", "hot", "low", "fast", "stuck", "strayed"),
     *("jumped", "numb"),
 )
+_ENCODER = ("fast", "strayed", "jumped", "numb")  # the frames disagree with the joint, too
 _UNHEARD = ("silent", "gone", "deaf")  # no servo hears that torque shall be off
 _WATCHDOG = 100  # ticks, 0.2 s, within which the servos' watchdogs then stop them
 _LOST = 20  # goals in a row that get lost and are noticed
 SENSOR_FAULTS = ("no frames", "frozen", "full", "zero", "noise", "invalid")
+# What a sensor or a servo's current reads wrongly: between which values, and what may be named.
+LIES = {
+    "gain": ((0.5, 1.6), "sensor"),
+    "shift-x": ((-4.0, 4.0), "sensor"),
+    "shift-y": ((-4.0, 4.0), "sensor"),
+    "mirror": ((1.0, 1.0), "sensor"),
+    "drift": ((-0.2, 0.2), "sensor"),
+    "replay": ((0.3, 1.0), "sensor"),
+    "current": ((0.4, 2.5), "current"),
+}
+LOADS = ("push", "twist")
+_TOO_LONG = 0.05  # s that a tip's force may be above its bound
+_TOO_MUCH = 1.3  # of the force asked for, where nothing called for more
+_UNSURE = 1.2  # of what a grip may be raised to, and tips that bear a load differ
+_REMEMBERED = 5.0  # s after a load in which a grip may still be raised
+_RETARGETED = 0.5  # s in which a force that was asked for before may still be there
+_UNCOVERED = 1.0  # s after which a tip that came to the object's edge no longer counts
+
+# What must hold, and is counted.
+STOPPED = {mode: f"no torque after a stop while {mode}" for mode in ("holding", "rotating")}
+OFF = "no torque after disarm or fault"
+WATCHDOG = "no torque 0.2 s after a stop that no servo hears"
+STAYS = "no goal, no torque until arm"
+GOAL = "goals within angles, currents, slew"
+READING, FRAME = "no old reading", "no old frame in a grip"
+STATE = "mode, fault and torque agree, contacts finite"
+CALM = "force ≤ 1.3 × asked: nothing calls for more"
+LIED = "force ≤ 1.3 × asked, with a false measurement"
+RAISED = "force ≤ what it may be raised to, loaded"
+MOST = "force ≤ safety.force_max, as well as it is known"
+HONEST = {mode: f"nothing named while {mode}, honest" for mode in _GRIPPING}
+LOADED = "nothing named while loaded, honest"
+NAMED = {kind: f"only what lies is named: {kind}" for kind in LIES}
+ASSERTIONS = (
+    *STOPPED.values(), OFF, WATCHDOG, STAYS, GOAL, READING, FRAME, STATE, CALM, LIED, RAISED,
+    MOST, *HONEST.values(), LOADED, *NAMED.values(),
+)  # fmt: skip
+
+
+class Judge:
+    """What must hold, and how often each of it was judged."""
+
+    def __init__(self, judged: Counter[str]) -> None:
+        self._judged = judged
+
+    def __call__(self, name: str, holds: bool, *found: object) -> None:
+        """Count ``name``. Raises AssertionError with what was found where it does not hold."""
+        self._judged[name] += 1
+        assert holds, f"{name}: {' '.join(map(str, found))}"
 
 
 class FaultyServos:
     """Servos that fail on demand, and a judge of all that is sent to them."""
 
-    def __init__(self, servos: Any, settings: Settings, clock: Any) -> None:
+    def __init__(self, servos: Any, settings: Settings, clock: Any, must: Judge) -> None:
         self._servos = servos
         self._settings = settings
         self._clock = clock
+        self._must = must
         self._rise = settings.safety.current_rate / settings.loop.rate
         self._current = [0.0, 0.0]
-        self._hardware = [0, 0]
         self.fault = ""
         self.finger = 0
         self.last_good = -math.inf
         self.torque = False
-        self.written = 0
+        self.armed = False  # it was, and nothing has ended that
         self._last = 0.0  # angle at which a numb joint stands [rad]
         self._unheard = 0
 
@@ -104,17 +163,20 @@ class FaultyServos:
 
     def write(self, goal: Goal) -> None:
         hand, safety = self._settings.hand, self._settings.safety
-        now = self._clock.now()
-        self.written += 1
-        assert self.torque, "a goal was sent with torque off"
-        age = now - self.last_good
-        assert age <= self._settings.servos.fault_after, f"goal on a reading {age:.3f} s old"
+        must = self._must
+        must(STAYS, self.torque and self.armed, "a goal was sent")
+        age = self._clock.now() - self.last_good
+        must(READING, age <= self._settings.servos.fault_after, f"goal on one {age:.3f} s old")
         for i in range(2):
             q, current = goal.q[i], goal.current[i]
-            assert hand.q_min[i] <= q <= hand.q_max[i], f"goal angle {q}"
-            assert 0.0 <= current <= safety.current_max, f"goal current {current}"
             rise = current - self._current[i]
-            assert rise <= self._rise + 1e-9, f"goal current rose by {rise} A in a tick"
+            must(
+                GOAL,
+                hand.q_min[i] <= q <= hand.q_max[i]
+                and 0.0 <= current <= safety.current_max
+                and rise <= self._rise + 1e-9,
+                f"{q} rad, {current} A, which rose by {rise} A in a tick",
+            )
             self._current[i] = current
         if self.fault == "gone":
             raise ServoError("the port is gone")
@@ -196,127 +258,144 @@ class FaultySensor:
 
 @dataclass
 class Account:
-    """What a soak went through."""
+    """What sequences went through."""
 
+    sequences: int = 0
+    held: int = 0  # of them
     ticks: int = 0
     seconds: float = 0.0  # that it took
-    written: int = 0  # goals that reached the servos
+    judged: Counter[str] = field(default_factory=Counter)
     modes: Counter[str] = field(default_factory=Counter)  # ticks in each
     faults: Counter[str] = field(default_factory=Counter)  # latched, by name
     injected: Counter[str] = field(default_factory=Counter)
+    named: Counter[str] = field(default_factory=Counter)  # what was wrong, and what was named then
     commands: Counter[str] = field(default_factory=Counter)  # carried out
     refused: int = 0
+    failures: list[str] = field(default_factory=list)
     memory: list[float] = field(default_factory=list)  # MB, resident, since warm
 
     @property
     def growth(self) -> float:
-        """Share by which the greatest memory is above that at the end of the warm-up."""
-        return max(self.memory) / self.memory[0] - 1.0 if self.memory else math.nan
+        """Ratio of the greatest memory to that at the end of the warm-up, less 1."""
+        return max(self.memory) / self.memory[0] - 1.0 if self.memory else 0.0
+
+    @property
+    def never(self) -> list[str]:
+        """What was never judged."""
+        return [name for name in ASSERTIONS if not self.judged[name]]
 
     def lines(self) -> list[str]:
         """For people."""
-        memory = "not looked at"
-        if self.memory:
-            memory = (
-                f"{self.memory[0]:.1f} MB warm, {max(self.memory):.1f} MB at most "
-                f"({100.0 * self.growth:+.2f} %)"
-            )
         return [
-            f"{self.ticks} ticks in {self.seconds:.0f} s, "
-            f"{1e6 * self.seconds / max(self.ticks, 1):.1f} µs a tick; {self.written} goals sent",
-            f"memory: {memory}",
+            *(f"{self.judged[name]:>10}  {name}" for name in ASSERTIONS),
+            f"{self.held} of {self.sequences} sequences came to hold; {self.ticks} ticks in "
+            f"{self.seconds:.0f} s",
+            f"memory grew by {100.0 * self.growth:.2f} % over {len(self.memory)} looks",
             *(
                 f"{name}: " + ", ".join(f"{key} {count}" for key, count in counted.most_common())
                 for name, counted in (
                     ("ticks", self.modes),
                     ("injected", self.injected),
                     ("latched", self.faults),
+                    ("named", self.named),
                     ("carried out", self.commands),
                 )
             ),
             f"refused: {self.refused}",
+            *(f"FAILED: {failure}" for failure in self.failures),
         ]
 
 
 class Soak:
-    """A daemon on the virtual clock, what is done to it, and what must hold."""
+    """One sequence: a daemon on the virtual clock, what is done to it, and what must hold."""
 
-    def __init__(self, seed: int = 1, cache: Path | None = None) -> None:
-        self.settings = Settings.model_validate({"loop": {"clock": "virtual"}})
-        self.daemon = Daemon(self.settings, wire=False, table_cache=cache)
-        self.account = Account()
-        self._random = random.Random(seed)
-        source = np.random.default_rng(seed)
-        loop = self.daemon.loop
-        self.servos = FaultyServos(loop.servos, self.settings, self.daemon.clock)
+    def __init__(self, seed: int = 1, account: Account | None = None) -> None:
+        chance = self._random = random.Random(seed)
+        mass = 0.1 * 2.0 ** chance.uniform(-1.0, 1.0)
+        simulation = {"seed": seed, "object_mass": mass}
+        self.settings = checked({"loop": {"clock": "virtual"}, "simulation": simulation})
+        self.account = account or Account()
+        self.account.sequences += 1
+        self.daemon = Daemon(
+            self.settings, wire=False, table_cache=table_cache(), on_event=self._hear
+        )
+        loop, clock = self.daemon.loop, self.daemon.clock
+        self.must = Judge(self.account.judged)
+        self.servos = FaultyServos(loop.servos, self.settings, clock, self.must)
         loop.servos = self.servos
+        source = np.random.default_rng(seed)
         self.sensors = [
             FaultySensor(each.sensor, self.settings, source) for each in loop.perception.fingers
         ]
         for perception, sensor in zip(loop.perception.fingers, self.sensors, strict=True):
             perception.sensor = sensor
-        self._well_at = math.inf  # tick at which the fault ends
+        assert self.daemon.hand is not None
+        self.hand = self.daemon.hand
+        self.hand.plant.parameters.torque_constant *= chance.uniform(0.9, 1.1)
+        self.count = 0  # ticks
+        self.held = False
+        self.off_by = math.inf  # tick by which torque must be off
+        self._off_name = OFF
         self._failed = ""
-        self._off_by = math.inf  # tick by which torque must be off
+        self._deadline = clock.now()
+        self._next_command = 1
+        self._next_disturbance = self._after(_DISTURBED_EVERY)
+        self._well_at = math.inf  # tick at which a disturbance ends
+        self._lie = ""  # kind of the measurement that is wrong now
+        self._false: set[str] = set()  # what was wrong, and may be named
+        self._loaded = 0.0  # N along the faces
+        self._loaded_t = self._uncovered_t = -math.inf  # s, when last so
+        self._asked: list[tuple[float, float]] = []  # when [s], force [N]; none without a grip
+        self._above = {MOST: math.inf, CALM: math.inf}  # since when [s]
 
     def close(self) -> None:
         self.daemon.close()
 
-    def run(self, ticks: int, seconds: float = math.inf, tell: Any = None) -> Account:
-        """So many ticks, or as many as ``seconds`` allow."""
-        loop, account, chance = self.daemon.loop, self.account, self._random
-        clock, period = self.daemon.clock, loop.period
-        begin = time.monotonic()
-        gc.freeze()  # what is there already need not be looked through again at each look
-        first = max(int(_WARM * ticks), 1)
-        every = max((ticks - first) // _LOOKS, 1)
-        deadline = clock.now()
-        next_fault = self._after(_EVERY)
-        next_command = 1
-        for count in range(1, ticks + 1):
-            clock.sleep_until(deadline)
+    def run(self, ticks: int) -> Account:
+        """Go on for so many ticks."""
+        loop, clock = self.daemon.loop, self.daemon.clock
+        for _ in range(ticks):
+            self.count += 1
+            clock.sleep_until(self._deadline)
             loop.tick(clock.now())
-            deadline += period
-            self._judge(count)
-            if count >= next_command:
-                next_command = count + self._after(_COMMAND_EVERY)
-                self._command(chance)
-            if count >= next_fault:
-                next_fault = count + self._after(_EVERY)
-                self._break(chance, count)
-            if count >= self._well_at:
+            self._deadline += loop.period
+            self._judge()
+            if self.count >= self._next_command:
+                self._next_command = self.count + self._after(_COMMAND_EVERY)
+                self._command()
+            if self.count >= self._next_disturbance and self._may_be_disturbed():
+                self._next_disturbance = self.count + self._after(_DISTURBED_EVERY)
+                self._disturb()
+            if self.count >= self._well_at:
                 self._mend()
-            if count >= first and (count - first) % every == 0:
-                account.seconds = time.monotonic() - begin
-                account.ticks, account.written = count, self.servos.written
-                account.memory.append(resident())
-                if tell is not None:
-                    tell(account)
-                if account.seconds > seconds:
-                    break
-        account.seconds = time.monotonic() - begin
-        account.ticks, account.written = count, self.servos.written
-        return account
+        self.account.ticks += ticks
+        return self.account
 
     def _after(self, mean: float) -> int:
         return 1 + int(self._random.expovariate(1.0 / mean))
 
+    def _may_be_disturbed(self) -> bool:
+        """While it holds; also at other times, but seldom."""
+        return self.daemon.loop.state.mode == "holding" or self._random.random() < 1e-3
+
     # What is done to it
 
-    def _command(self, chance: random.Random) -> None:
-        state = self.daemon.loop.state
+    def _command(self) -> None:
+        chance, state = self._random, self.daemon.loop.state
+        mode = state.mode
         usual = {
-            "disarmed": "arm",
-            "armed": chance.choice(("grasp", "grasp", "grasp", "move", "release")),
-            "moving": "grasp",
-            "holding": chance.choice(("rotate", "rotate", "grasp", "release")),
-            "fault": "clear",
-        }.get(state.mode, "status")
-        name = usual if chance.random() < 0.7 else chance.choice(sorted(COMMANDS))
+            "disarmed": ("arm",),
+            "armed": ("grasp", "grasp", "grasp", "grasp", "move", "release"),
+            "moving": ("grasp",),
+            "holding": (*["rotate"] * 4, *["grasp"] * 3, "release", "stop", "status", "status"),
+            "rotating": (*["status"] * 6, "grasp", "stop"),
+            "fault": ("clear",),
+        }.get(mode, ("status",))
+        name = chance.choice(usual if chance.random() > _WILD else sorted(COMMANDS))
         request: dict[str, Any] = {"command": name}
         for key, required in COMMANDS[name][1].items():
             if required or chance.random() < 0.8:
-                request[key] = self._number(chance, key)
+                request[key] = self._number(key)
         self._put_object_back()
         try:
             self.daemon.loop.command(request)
@@ -324,95 +403,236 @@ class Soak:
             self.account.refused += 1
         else:
             self.account.commands[name] += 1
+            self._carried_out(request, str(mode))
 
-    def _number(self, chance: random.Random, key: str) -> Any:
-        if chance.random() < 0.05:
+    def _carried_out(self, request: dict[str, Any], mode: str) -> None:
+        """Keep what follows of a command that was accepted."""
+        name = request["command"]
+        if name == "arm":
+            self.servos.armed, self.off_by = True, math.inf
+        elif name in ("stop", "disarm"):
+            self._must_end(STOPPED.get(mode, OFF) if name == "stop" else OFF)
+        if name == "grasp":
+            force = request.get("force", self.settings.control.force_default)
+            t = self.daemon.clock.now()
+            if not self._asked:  # a motion may have pressed more
+                self._asked.append((t, max(self.hand.force.tolist())))
+            self._asked.append((t, force))
+        elif name in ("arm", "move", "release", "stop", "disarm"):
+            self._asked.clear()
+
+    def _must_end(self, name: str) -> None:
+        """From now on no motor may be driven, and no goal sent."""
+        if not self.servos.armed:
+            return
+        self.servos.armed = False
+        unheard = self.servos.fault in _UNHEARD
+        self._off_name = WATCHDOG if unheard else name
+        self.off_by = self.count + (_WATCHDOG if unheard else 1)
+
+    def _number(self, key: str) -> Any:
+        chance = self._random
+        if chance.random() < 0.02:
             return chance.choice((math.nan, math.inf, -1e300, "12", True, None, 1 << 70))
         low, high = {
             "left": (-0.6, 1.1),
             "right": (-0.6, 1.1),
-            "force": (0.0, 30.0),
-            "angle": (-0.4, 0.4),
+            "force": (2.0, 28.0),
+            "angle": (-0.25, 0.25),
             "compliance": (0.0, 0.2),
         }[key]
         return chance.uniform(low, high)
 
-    def _break(self, chance: random.Random, count: int) -> None:
+    def _disturb(self) -> None:
+        """A load, a false measurement, a servo's or a sensor's fault."""
         self._mend()
-        self._well_at = count + self._after(200.0)
-        if chance.random() < 0.5:
-            self.servos.fault = chance.choice(SERVO_FAULTS)
-            self.servos.finger = chance.randrange(2)
-            name = self.servos.fault
+        chance, t = self._random, self.daemon.clock.now()
+        self._well_at = self.count + self._after(_DISTURBED_FOR)
+        finger = chance.randrange(2)
+        side = FINGERS[finger]
+        which = chance.random()
+        if which < 0.35:
+            kind = chance.choice(LOADS)
+            self._load(kind)
+        elif which < 0.75:
+            kind = self._lie = chance.choice(tuple(LIES))
+            (low, high), false = LIES[kind]
+            self._false.add(f"{side}_{false}")
+            over = chance.choice((0.0, 0.0, 1.0))
+            self.hand.measurement_faults[finger].begin(kind, chance.uniform(low, high), t, over)
+        elif which < 0.87:
+            kind = self.servos.fault = chance.choice(SERVO_FAULTS)
+            self.servos.finger = finger
+            self._false.add(f"{side}_current")
+            if kind in _ENCODER:
+                self._false.add(f"{side}_sensor")
         else:
-            sensor = chance.choice(self.sensors)
-            sensor.fault = name = chance.choice(SENSOR_FAULTS)
-        self.account.injected[name] += 1
+            kind = self.sensors[finger].fault = chance.choice(SENSOR_FAULTS)
+            self._false.add(f"{side}_sensor")
+        self.account.injected[kind] += 1
+
+    def _load(self, kind: str) -> None:
+        """Up to what the grip bears, and in some cases more."""
+        chance, friction = self._random, self.settings.simulation.tip_friction
+        force = self._asked[-1][1] if self._asked else 5.0
+        share = chance.uniform(-0.7, 0.7) if chance.random() < 0.8 else chance.uniform(-1.6, 1.6)
+        self._loaded = 2.0 * share * friction * force
+        arm = 1.0 if kind == "push" else 0.5 * self.settings.simulation.object_width
+        self.hand.load(**{kind: arm * self._loaded})
 
     def _mend(self) -> None:
         self._well_at = math.inf
-        self.servos.fault = ""
+        self.servos.fault = self._lie = ""
         for sensor in self.sensors:
             sensor.fault = ""
+        for each in self.hand.measurement_faults:
+            each.clear()
+        self._loaded = 0.0
+        self.hand.load()
 
     def _put_object_back(self) -> None:
-        """Where pushes have carried it off, and the fingers leave room for it at its place."""
-        hand, simulation = self.daemon.hand, self.settings.simulation
-        assert hand is not None
-        x, y = simulation.object_position
-        pose, velocity = hand.object_pose, hand.object_velocity
-        if max(abs(pose[0] - x), abs(pose[1] - y)) < 0.01 and abs(pose[2]) < 0.3:
+        """Where loads have carried it off, and the fingers leave room for it at its place."""
+        hand, (x, y) = self.hand, self.settings.simulation.object_position
+        pose = hand.object_pose.copy()
+        if hand.force.any() or (math.dist(pose[:2], (x, y)) < 0.003 and abs(pose[2]) < 0.03):
             return
-        before = pose.tolist(), velocity.tolist()
-        pose[:], velocity[:] = (x, y, simulation.object_angle), 0.0
-        hand.refresh()
+        hand.place_object()
         if max(hand.d) > 0.0:
-            pose[:], velocity[:] = before
+            hand.object_pose[:] = pose
             hand.refresh()
 
     # What must hold
 
-    def _driven(self) -> bool:
-        """Whether a motor has torque, by the plant's own account."""
-        hand = self.daemon.hand
-        assert hand is not None
-        hand.advance(self.daemon.clock.now())
-        return bool(hand.torque_on.any())
+    def _hear(self, level: str, kind: str, _: str) -> None:
+        if kind.startswith("witness.") and level != "info":
+            self._names(kind.removeprefix("witness."))
 
-    def _judge(self, count: int) -> None:
-        state, servos, account = self.daemon.loop.state, self.servos, self.account
+    def _judge(self) -> None:
+        state, servos, must = self.daemon.loop.state, self.servos, self.must
         mode = str(state.mode)
-        account.modes[mode] += 1
-        assert mode in set(Mode)
-        assert (mode == "fault") == bool(state.fault), f"{mode} with fault {state.fault!r}"
-        assert bool(state.fault) == bool(state.fault_name)
-        assert state.torque or not servos.torque, "torque is on and the state says off"
+        self.account.modes[mode] += 1
+        self.held = self.held or mode == "holding"
+        finite = all(
+            math.isfinite(each.d + each.theta + each.force + each.energy + each.gain)
+            for each in state.contacts
+        )
+        must(
+            STATE,
+            mode in set(Mode)
+            and (mode == "fault") == bool(state.fault) == bool(state.fault_name)
+            and (state.torque or not servos.torque)
+            and finite,
+            state,
+        )
         if state.fault and state.fault != self._failed:
-            account.faults[state.fault_name] += 1
+            self.account.faults[state.fault_name] += 1
+            self._must_end(OFF)
+            self._asked.clear()
         self._failed = state.fault
-        for contact in state.contacts:
-            total = contact.d + contact.theta + contact.force + contact.energy + contact.gain
-            assert math.isfinite(total), f"a contact is no number: {contact}"
-        self._judge_torque(state, mode, count)
+        self.hand.advance(state.t)
+        self._judge_torque()
+        if mode not in ("disarmed", "fault"):
+            self._judge_ages(mode)
+        self._judge_forces(state.t)
+        self._judge_witnesses(mode)
 
-    def _judge_torque(self, state: Any, mode: str, count: int) -> None:
-        servos = self.servos
-        safe = mode in ("disarmed", "fault")
-        if not safe or not self._driven():
-            self._off_by = math.inf
-        elif self._off_by == math.inf:
-            self._off_by = count + (_WATCHDOG if servos.fault in _UNHEARD else 1)
-        assert count <= self._off_by, f"a motor is driven while {mode}"
-        if safe:
+    def _judge_torque(self) -> None:
+        if self.servos.armed:
             return
-        settings, now = self.settings, state.t
-        reading = now - servos.last_good
-        assert reading <= settings.servos.fault_after, f"{mode} on a reading {reading:.3f} s old"
+        if self.count < self.off_by and self.hand.torque_on.any():
+            return
+        if self.off_by < math.inf:
+            self.must(self._off_name, not self.hand.torque_on.any(), "a motor is driven")
+            self.off_by = math.inf
+        self.must(STAYS, not self.hand.torque_on.any(), "a motor is driven")
+
+    def _judge_ages(self, mode: str) -> None:
+        now, settings = self.daemon.loop.state.t, self.settings
+        age = now - self.servos.last_good
+        self.must(READING, age <= settings.servos.fault_after, f"{mode} on one {age:.3f} s old")
         if mode in _GRIPPING:
-            limit = settings.safety.frame_age_fault / settings.tactile.rate
-            for sensor in self.sensors:
-                age = now - sensor.last_sent
-                assert age <= limit + 1e-9, f"{mode} on a frame {age:.3f} s old"
+            age = now - min(sensor.last_sent for sensor in self.sensors)
+            most = settings.safety.frame_age_fault / settings.tactile.rate
+            self.must(FRAME, age <= most + 1e-9, f"{mode} on one {age:.3f} s old")
+
+    def _judge_forces(self, t: float) -> None:
+        """By the plant's own forces: none above its bound for long."""
+        control, most = self.settings.control, self.settings.safety.force_max
+        if self._loaded:
+            self._loaded_t = t
+        force = max(self.hand.force.tolist())
+        # What is felt may be as far off as the torque constant, by which it is known.
+        self._must_end_soon(MOST, MOST, force, (1.0 + control.torque_error) * most, t)
+        while len(self._asked) > 1 and self._asked[1][0] < t - _RETARGETED:
+            del self._asked[0]
+        if not self._asked:
+            self._above[CALM] = math.inf
+            return
+        asked = max(each for _, each in self._asked)
+        raised = asked + min(control.grip_raise_max, control.grip_raise_share * asked)
+        loaded = t < self._loaded_t + _REMEMBERED
+        friction = control.joint_friction / self.settings.hand.finger_length
+        bound = _TOO_MUCH * asked + 2.0 * friction  # that is given, and that holds
+        if loaded:
+            bound = max(bound, _UNSURE * min(raised, GRIP_SHARE * most))
+        name = RAISED if loaded else LIED if self._lie else CALM
+        self._must_end_soon(CALM, name, force, bound, t)
+
+    def _must_end_soon(self, key: str, name: str, force: float, bound: float, t: float) -> None:
+        self._above[key] = min(self._above[key], t) if force > bound else math.inf
+        found = f"{force:.2f} N for {t - self._above[key]:.3f} s, bound {bound:.2f} N"
+        self.must(name, t - self._above[key] <= _TOO_LONG, found)
+
+    def _judge_witnesses(self, mode: str) -> None:
+        if not self._covered():
+            self._uncovered_t = self.daemon.loop.state.t
+        for name in self._doubts():
+            self._names(name)
+        if mode not in HONEST:
+            return
+        if self._lie:
+            self.must(NAMED[self._lie], True)
+        elif not self._false:
+            self.must(LOADED if self._loaded else HONEST[mode], True)
+
+    def _doubts(self) -> Iterator[str]:
+        """What the perception's own state holds for false."""
+        perception = self.daemon.loop.perception
+        found = perception.filter.grasp.witnesses
+        for sensor in perception.fingers:
+            side, finger = FINGERS[sensor.finger], sensor.finger
+            if (
+                found.jumps[finger] > witnesses.JUMPS_MAX
+                or found.drifted[finger] > witnesses.DRIFT_TIME
+                or sensor.repeats.long
+            ):
+                yield f"{side}_sensor"
+            if found.off_goal[finger] > witnesses.CURRENT_TIME:
+                yield f"{side}_current"
+
+    def _names(self, name: str) -> None:
+        """A witness is held for false: it must be one that is, or the object has slipped away."""
+        t = self.daemon.loop.state.t
+        wrong = self._lie or self.servos.fault or "".join(each.fault for each in self.sensors)
+        self.account.named[f"{name} ({wrong or ('load' if self._loaded else 'nothing')})"] += 1
+        if t > self._uncovered_t + _UNCOVERED:
+            judged = NAMED.get(self._lie, LOADED)
+            self.must(
+                judged, name in self._false, f"{name} named, wrong is {self._false or 'none'}"
+            )
+
+    def _covered(self) -> bool:
+        """Whether the object's faces lie under both tips' whole footprints, by the plant."""
+        hand, simulation = self.hand, self.settings.simulation
+        x, y, angle = hand.object_pose.tolist()
+        sine, cosine, radius = math.sin(angle), math.cos(angle), self.settings.tip.radius
+        for k, depth in enumerate(hand.d.tolist()):
+            tip = hand.plant.fingers[k]
+            along = abs((tip.y - y) * cosine - (tip.x - x) * sine)
+            footprint = math.sqrt(max(depth * (2.0 * radius - depth), 0.0))
+            if depth <= 0.0 or along + footprint > 0.5 * simulation.object_height:
+                return False
+        return not hand.on_other_tip.any()
 
 
 def resident() -> float:
@@ -422,31 +642,46 @@ def resident() -> float:
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
+def sequence(
+    seed: int, ticks: int, account: Account, look: Callable[[], None] | None = None
+) -> None:
+    """Run the sequence of ``seed``; what must not be is kept in the account.
+
+    ``look`` is called 50 times meanwhile.
+    """
+    soak = Soak(seed, account)
+    try:
+        for _ in range(_LOOKS if look else 1):
+            soak.run(ticks // (_LOOKS if look else 1))
+            if look:
+                look()
+    except AssertionError as error:
+        t, mode = soak.daemon.loop.state.t, soak.daemon.loop.state.mode
+        account.failures.append(f"seed {seed}, tick {soak.count} ({t:.3f} s, {mode}): {error}")
+    finally:
+        account.held += soak.held
+        soak.close()
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.soak.virtual", description=__doc__)
-    parser.add_argument("--ticks", type=int, default=TICKS, metavar="N")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--seconds", type=float, default=math.inf, help="end after so long")
+    parser.add_argument("--seed", type=int, default=1, help="of the first sequence")
+    parser.add_argument("--sequences", type=int, default=SEQUENCES, metavar="N")
+    parser.add_argument("--ticks", type=int, default=TICKS, metavar="N", help="of each")
     arguments = parser.parse_args()
-    soak = Soak(arguments.seed)
+    account, begin = Account(), time.monotonic()
 
-    def tell(account: Account) -> None:
-        print(
-            f"{account.ticks} ticks, {account.seconds:.0f} s, {account.memory[-1]:.1f} MB",
-            file=sys.stderr,
-            flush=True,
-        )
+    def look() -> None:
+        account.memory.append(resident())
 
-    try:
-        account = soak.run(arguments.ticks, arguments.seconds, tell)
-    except BaseException:
-        state = soak.daemon.loop.state
-        print(f"after {state.seq} ticks: {state}", file=sys.stderr)
-        raise
-    finally:
-        soak.close()
+    for seed in range(arguments.seed, arguments.seed + arguments.sequences):
+        sequence(seed, arguments.ticks, account, look if arguments.sequences == 1 else None)
+        gc.collect()  # each daemon refers to itself, with megabytes of frames
+    del account.memory[:_WARM]
+    account.seconds = time.monotonic() - begin
     print("\n".join(account.lines()))
-    return 0 if account.growth <= 0.01 else 1
+    few = account.held < HELD * account.sequences
+    return 1 if account.failures or account.never or few or account.growth > 0.01 else 0
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ import pytest
 
 from softfinger.daemon.errors import Refused
 from softfinger.tools import cli
-from softfinger.tools.benchmarks import accuracy, bench, measuring, startup, tick
+from softfinger.tools.benchmarks import bench, faults, measuring, startup, tick
 from softfinger.tools.benchmarks.measuring import (
     Report,
     Row,
@@ -149,10 +149,10 @@ def test_a_failed_campaign_is_no_success(
         asked.append((trials, only))
         return [Report("part", [{"name": "x"}], failed=trials == 7)]
 
-    monkeypatch.setattr(accuracy, "measure", measure)
-    assert cli.main(["bench", "campaign", "accuracy"]) == 0
-    assert cli.main(["bench", "campaign", "accuracy", "--trials", "7", "--only", "dead"]) == 1
-    assert asked == [(None, ""), (7, "dead")]
+    monkeypatch.setattr(faults, "measure", measure)
+    assert cli.main(["bench", "campaign", "faults"]) == 0
+    assert cli.main(["bench", "campaign", "faults", "--trials", "7", "--only", "board"]) == 1
+    assert asked == [(None, ""), (7, "board")]
     capsys.readouterr()
 
 
@@ -161,14 +161,13 @@ def test_a_failed_campaign_is_no_success(
     [
         (["contct"], "found 'contct', expected one of contact"),
         (["faults"], "it is a campaign, `bench campaign faults`"),
-        (["campaign"], "'campaign' alone, expected one of accuracy, faults, witnesses"),
+        (["campaign"], "'campaign' alone, expected one of faults, witnesses"),
         (
             ["campaign", "faults", "--only", "no such fault"],
             "no case of faults has this in its name",
         ),
         (["campaign", "faults", "--plot", "x.png"], "campaigns have no picture"),
-        (["campaign", "faults", "--emulate"], "--emulate: faults has no such cases"),
-        (["campaign", "witnesses", "--emulate", "--only", "push"], "no case of witnesses"),
+        (["tick", "--full"], "--full: only reflex has it"),
         (["tick", "--against", "/nowhere.json"], "no figures of `bench --json`"),
     ],
 )

@@ -47,6 +47,37 @@ def test_a_lie_is_named_and_never_obeyed(lie: str) -> None:
             assert any(kind == "tactile.silent" for _, kind, _ in hand.events)
 
 
+@pytest.mark.parametrize(
+    ("kind", "value", "force"),
+    [("drift", -0.06, 5.0), ("replay", 0.41, 5.0), ("replay", 0.41, 8.0)],
+)
+def test_a_tip_that_seems_to_let_go_is_no_sudden_load(
+    kind: str, value: float, force: float
+) -> None:
+    with Hand({}) as hand:
+        hand.grasp(force)
+        while hand.mode != "holding":
+            hand.run(0.002)
+        hand.plant.measurement_faults[1].begin(kind, value, hand.plant.t)
+        seen = hand.watch(0.5)
+        assert seen.force.max() < 1.4 * force
+        assert not [text for _, kind, text in hand.events if kind == "slip"]
+
+
+def test_a_sensor_that_was_blind_for_a_moment_raises_no_grip() -> None:
+    with Hand({}) as hand:
+        grasped(hand, FORCE)
+        blind = hand.plant.measurement_faults[0]
+        blind.begin("gain", 0.0, hand.plant.t)
+        hand.watch(0.036)
+        blind.clear()
+        seen = hand.watch(1.0)
+        assert hand.mode == "holding"
+        assert seen.force.max() < 1.1 * FORCE
+        assert seen.force[-1].mean() == pytest.approx(FORCE, rel=0.05)
+        assert not [text for _, kind, text in hand.events if kind == "slip"]
+
+
 def test_a_sensor_that_is_honest_again_is_believed_again() -> None:
     with Hand({}) as hand:
         grasped(hand, FORCE)

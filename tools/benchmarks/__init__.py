@@ -1,4 +1,5 @@
 """``softfinger bench``: one module for each thing it measures, and what they share.
 
-`measuring`, `picture` and `rigs` know no single measurement; `accuracy` and `faults` are campaigns.
+`measuring`, `picture`, `rigs` and `virtual_grip` know no single measurement; `faults` and
+`witnesses` are campaigns.
 """

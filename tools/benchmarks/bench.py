@@ -25,12 +25,11 @@ MEASUREMENTS = {
     "tick": "the tick back to back, in place and over ptys",
     "startup": "start to the first published state, memory",
     "control": "what each grip law leaves of an object's angle",
-    "reflex": "from a slip's onset to the servos' bytes",
-    "scenes": "what each thing that a scene skips saves, a tick and at the first start",
+    "reflex": "greater loads on a grip that bears one: held or lost, slid, answered",
+    "scenes": "what each thing that a scene skips saves a tick",
     "growth": "cost and error against cells, subscribers, sensors, rate",
 }
 CAMPAIGNS = {
-    "accuracy": "the estimator over its whole range against the Cramér-Rao bound, ten minutes",
     "faults": "faults on the emulated hand and what comes of them, an hour for 100 trials each",
     "witnesses": "false measurements, and the true force of a grip on them, a quarter of an hour",
 }
@@ -57,13 +56,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--only", default="", metavar="TEXT", help="cases of a campaign with this in their name"
     )
     parser.add_argument(
-        "--emulate",
-        action="store_true",
-        help="some cases of a campaign through `softfinger emulate`, in real time (witnesses)",
-    )
-    parser.add_argument(
         "--brief", action="store_true", help="fewer cases of each NAME, as for the page"
     )
+    parser.add_argument("--full", action="store_true", help="all loads of 'reflex', not a few")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures here too")
     parser.add_argument("--plot", type=Path, metavar="FILE", help="draw them (extra 'plot')")
     parser.add_argument(
@@ -127,11 +122,10 @@ def _measured(
     before, tables = yardsticks(), []
     try:
         if campaign:
-            module = _module(name)
-            measure = module.measure_emulated if arguments.emulate else module.measure
-            tables = measure(arguments.trials, arguments.only)
+            tables = _module(name).measure(arguments.trials, arguments.only)
         else:
-            tables = _module(name).measure(brief=arguments.brief or not arguments.names)
+            more = {"full": True} if arguments.full else {}
+            tables = _module(name).measure(brief=arguments.brief or not arguments.names, **more)
     except (RuntimeError, SoftfingerError) as error:  # on a busy machine a hand may let go
         print(f"bench: {name}: {error}", file=sys.stderr)
     for table in tables:
@@ -191,17 +185,14 @@ def _check(names: list[str], texts: dict[str, str], arguments: argparse.Namespac
     """What can be refused before anything is measured. Raises ValueError."""
     if not names:
         raise ValueError(f"'{_CAMPAIGN}' alone, expected one of {', '.join(texts)} after it")
+    if arguments.full and (texts is CAMPAIGNS or names != ["reflex"]):
+        raise ValueError("--full: only reflex has it")
     for name in names:
         if name not in texts:
             hint = f": it is a campaign, `bench {_CAMPAIGN} {name}`" if name in CAMPAIGNS else ""
             raise ValueError(f"found {name!r}, expected one of {', '.join(texts)}{hint}")
-        if texts is CAMPAIGNS:
-            module = _module(name)
-            cases = getattr(module, "EMULATED", ()) if arguments.emulate else module.NAMES
-            if not cases:
-                raise ValueError(f"--emulate: {name} has no such cases")
-            if not any(arguments.only in case for case in cases):
-                raise ValueError(f"--only {arguments.only}: no case of {name} has this in its name")
+        if texts is CAMPAIGNS and not any(arguments.only in case for case in _module(name).NAMES):
+            raise ValueError(f"--only {arguments.only}: no case of {name} has this in its name")
     if arguments.plot:
         from softfinger.tools.extras import MissingExtra
         from softfinger.tools.style import settings

@@ -2,8 +2,7 @@
 
 Judged by the plant's truth, not by the daemon's estimates, over plants that differ from the
 settings. On virtual time: nothing here depends on the machine's speed. Beside the daemon's laws
-stand three of the literature, made from them: equal torques, the law upright without its spring and
-dither; two-phased, energy with the force's arms as levers; and goal angles without any feedback.
+stands one of the literature, equal torques: the law upright without its spring and dither.
 """
 
 from __future__ import annotations
@@ -13,12 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from softfinger.daemon.types import Goal
 from softfinger.tools.benchmarks.measuring import Report, figure
-from softfinger.tools.benchmarks.rigs import merged
+from softfinger.tools.benchmarks.rigs import SOLID, Sections, merged
 from softfinger.tools.watched import Watched
-
-Sections = dict[str, dict[str, Any]]
 
 _FORCE = 10.0  # N
 _ASKEW = math.radians(5.0)
@@ -27,57 +23,17 @@ _FOUND = 5.0  # s from the command to grasp on, when the object's angle is read
 _STEERED = "energy, steered to 0"  # by its measured angle
 EQUAL_TORQUES = {"law": "upright", "dither_time": 0.0, "joint_stiffness": 1e-9}
 _RELAXING: Sections = {"simulation": {"tip_creep_time": 20.0, "tip_micro_slip": True}}
-_SOLID: Sections = {
-    "tip": {"physics": "solid"},
-    "material": {"law": "constant", "modulus": 0.15e6},
-    "estimator": {"free_gain": False},
-    "safety": {"d_max": 0.008},
-}
 # Settings of `control`, tips, aim for what is left [°].
 WAYS: dict[str, tuple[dict[str, Any], Sections, float | None]] = {
     "equal torques (blind)": (EQUAL_TORQUES, {}, None),
     "equal torques, tips that relax": (EQUAL_TORQUES, _RELAXING, None),
-    "equal torques, solid tips": (EQUAL_TORQUES, _SOLID, None),
-    "position alone": ({"grip_raise_max": 0.0}, {}, None),
-    "two-phased": ({}, {}, None),
+    "equal torques, solid tips": (EQUAL_TORQUES, SOLID, None),
     "energy": ({}, {}, None),
     _STEERED: ({}, {}, 0.2),
     "upright (blind)": ({"law": "upright"}, {}, 0.5),
     "upright, tips that relax": ({"law": "upright"}, _RELAXING, 0.5),
-    "upright, solid tips": ({"law": "upright"}, _SOLID, 0.5),
+    "upright, solid tips": ({"law": "upright"}, SOLID, 0.5),
 }
-
-
-def _by_arms(hand: Watched) -> None:
-    """Have the force's arms about the pivots for levers."""
-    grip: Any = hand.control._grip
-    torques = grip.torques
-
-    def by_arms(*arguments: Any) -> Any:
-        grip._grasp.lever = grip._grasp.arm
-        return torques(*arguments)
-
-    grip.torques = by_arms
-
-
-def _by_position(hand: Watched) -> None:
-    """Close the joints by what the wanted force's rise compresses the tips; feel nothing."""
-    control: Any = hand.control
-    grip, grasp, settings = control._grip, control._held, hand.settings
-    goals: list[float] = []
-
-    def pull(_: tuple[float, float], goal: Goal) -> None:
-        if not goals:
-            goals[:] = grasp.q
-        close = 2.0 * grip.force.speed / (0.5 * sum(grasp.stiffness) * sum(grasp.arm))
-        goals[:] = [q + close / settings.loop.rate for q in goals]
-        goal.q[:] = goals
-        goal.current[:] = [settings.safety.current_max] * 2
-
-    control._pull = pull
-
-
-_ALTERED = {"position alone": _by_position, "two-phased": _by_arms}
 
 
 def measure(brief: bool = False) -> list[Report]:
@@ -99,8 +55,6 @@ def measure(brief: bool = False) -> list[Report]:
         left = []
         for draw in drawn:
             with Watched(merged({"simulation": draw, "control": law}, tips)) as hand:
-                if name in _ALTERED:
-                    _ALTERED[name](hand)
                 hand.grasp(_FORCE)
                 hand.run(_FOUND - 2.0)
                 if name == _STEERED:

@@ -110,12 +110,9 @@ def jacobian(grid: SensorGrid, truth: tuple[float, float, float, float]) -> Floa
     return np.stack(columns, axis=1)
 
 
-def bound(
-    slopes: FloatArray, noise: float, free: bool = True, live: NDArray[np.bool_] | None = None
-) -> FloatArray:
-    """The Cramér-Rao covariance of (d, tilt_x, tilt_y[, gain]) from the ``live`` cells."""
-    used = slopes if live is None else slopes[live.ravel()]
-    used = used[:, : 4 if free else 3]
+def bound(slopes: FloatArray, noise: float, free: bool = True) -> FloatArray:
+    """The Cramér-Rao covariance of (d, tilt_x, tilt_y[, gain]) from all cells."""
+    used = slopes[:, : 4 if free else 3]
     return np.asarray(np.linalg.inv(used.T @ used) * noise**2)
 
 

@@ -1,104 +1,119 @@
-"""From a slip's onset to the servos' bytes: the emulated hand and a daemon, two real processes.
+"""What a grip does when its load becomes greater at once: held or lost, slid how far, how soon.
 
-Sudden pulls and twists that the grip's friction can't bear. When the tips slip and what comes over
-the servos' wire is read from the emulated hand's record, by its clock; the daemon is not asked.
+A grip of 10 N bears a standing load along the object's faces, away from the palm, and then a
+greater one that stays. On virtual time, and judged by the plant. *Lost*: the object is no longer
+between the tips. *Slid*: along the tips' faces, from the midpoint of both tips; that the fingers
+lean is no slide. *Answer*: from a slip's onset to goal currents a quarter higher. *Said*: from when
+the object has gone until the mode is no longer one of a grip.
 """
 
 from __future__ import annotations
 
+import gc
+import itertools
 import math
 import random
-import time
-from typing import Any
+from collections.abc import Sequence
+from statistics import fmean
+from typing import NamedTuple
 
-from softfinger.tools.benchmarks.measuring import Report, figure
-from softfinger.tools.benchmarks.rigs import Rig
+from softfinger.daemon.control.modes import GRIPPING
+from softfinger.tools.benchmarks.measuring import Report, Row, figure
+from softfinger.tools.benchmarks.rigs import SOLID, Sections, merged
+from softfinger.tools.benchmarks.virtual_grip import VirtualGrip
 
-_FORCE = 10.0  # N: the tips' friction bears 12 N along the faces
-_RAISED = 1.25  # of the goal currents before: a firmer grip, and not only damped joints
-_LOADS = {"push": (14.0, 18.0), "twist": (0.30, 0.45)}  # N away from the palm; N·m
-_SLIPS = 18  # of each
-_SETTLED = 1.3  # s in a grip, after which loads show fully
-_CALM = 0.1  # s looked at before the load
-_LOOK = 0.3  # and after it
-_LOST = 0.010  # m
-_AIM = 20.0  # ms
-_TRIES = 3
-_PATIENCE = 20.0  # s for a grip
-_STEPS = {"fault": "clear", "disarmed": "arm"}
-
-
-def measure(brief: bool = False) -> list[Report]:
-    """Onset to a raised grip on the wire [ms], over many slips. Raises RuntimeError."""
-    chance, rows = random.Random(1), []
-    with Rig() as rig:
-        rig.start()
-        before = rig.settings.simulation.object_position
-        for kind, (least, most) in _LOADS.items():
-            took: list[float] = []
-            waited: list[float] = []
-            lost = 0
-            for _ in range(1 if brief else _SLIPS):
-                _grip(rig)
-                rig.waited()
-                found = _slip(rig, kind, chance.uniform(least, most), chance.uniform(0.0, 0.02))
-                waited.append(1e3 * rig.waited())
-                took.append(1e3 * reaction(found))
-                lost += math.dist(found["object"]["pose"][:2], before) > _LOST
-            answered = [each for each in took if each < math.inf]
-            if answered:
-                row = figure(f"{kind}: slip to a firmer grip on the wire", "ms", answered, _AIM)
-                rows.append(row | {"greatest": max(answered)})
-            unanswered = len(took) - len(answered)
-            rows.append(figure(f"{kind}: slips without an answer", "1", [unanswered], 0.0))
-            rows.append(figure(f"{kind}: objects lost", "1", [lost]))
-            rows.append(figure(f"{kind}: a process waited for a processor meanwhile", "ms", waited))
-    return [Report("reflex, 100 Hz frames, by the emulated hand's clock", rows)]
+TIPS: dict[str, Sections] = {"springs": {}, "solid": SOLID}
+MASSES = (0.1, 0.5, 2.0)  # kg
+STANDING = (0.0, 3.0, 6.0, 8.0, 9.0)  # N
+OVERLOADS = (12.5, 13.0, 14.0, 15.0, 16.0, 18.0)  # N; the tips' friction bears 12 N of 10 N
+THIN = (0.0, 6.0, 9.0), (13.0, 15.0, 18.0)  # of these, unless all are wanted
+_FORCE = 10.0  # N
+_TRIALS = 3  # of each
+_ANSWER, _SAID = 22.0, 200.0  # ms, aims
+_GRIP = 2.5  # s until it holds, at most
+_RISES, _STANDS = 1.0, 1.5  # s in which the standing load comes, and stays
+_STEPS = 50  # in which it comes
+_LOOK = 1.0  # s of the greater one
+_GONE_LOOK = 1.0  # s after which a lost object's mode is no longer waited for
 
 
-def reaction(report: dict[str, Any]) -> float:
-    """Seconds from the slip's onset until both servos' goal currents together are raised.
+class Overload(NamedTuple):
+    """What came of one."""
 
-    Infinity when they are not.
-    """
-    pushed, slipped = report["object"]["pushed"], report["object"]["slipped"]
-    left, right = (servo["goal_currents"] for servo in report["servos"])
-    both = [(t, abs(a) + abs(b)) for (t, a), (_, b) in zip(left, right, strict=True)]
-    calm = [value for t, value in both if t <= pushed] or [math.inf]
-    most = _RAISED * sum(calm) / len(calm)
-    raised = [float(t) for t, value in both if t > pushed and value > most]
-    return min(raised, default=math.inf) - float(slipped)
+    answer: float  # s; NaN: nothing slipped, infinity: no answer
+    slid: float  # m, while it was between the tips
+    lost: bool
+    said: float = math.nan  # s
 
 
-def _grip(rig: Rig) -> None:
-    """Put the object back between open fingers and grip it. Raises RuntimeError."""
-    rig.ask({"command": "release"})
-    end, placed = time.monotonic() + _PATIENCE, False
-    while time.monotonic() < end:
-        mode = (rig.status(2.0) or {"mode": ""})["mode"]
-        if mode in _STEPS:
-            rig.ask({"command": _STEPS[mode]}, 5.0)
-        elif mode == "armed":
-            rig.send("place")
-            placed = True
-            rig.ask({"command": "grasp", "force": _FORCE})
-        elif mode == "holding" and placed:
-            time.sleep(_SETTLED)
-            return
-        time.sleep(0.02)
-    raise RuntimeError(f"the hand does not grip: {rig.status()}")
+def measure(brief: bool = False, full: bool = False) -> list[Report]:
+    """A table for each kind of tips and mass; ``brief``: one trial of the greatest loads each."""
+    loads = list(itertools.product(STANDING, OVERLOADS) if full else itertools.product(*THIN))
+    trials = _TRIALS
+    if brief:
+        loads, trials = loads[-1:], 1
+    tables = []
+    for (name, tips), mass in itertools.product(TIPS.items(), MASSES):
+        settings = merged({"simulation": {"object_mass": mass}}, tips)
+        tables.append(_table(f"{name}, {mass:g} kg", settings, loads, trials))
+    return tables
 
 
-def _slip(rig: Rig, kind: str, load: float, after: float) -> dict[str, Any]:
-    """Load the object ``after`` so many seconds; the hand's record a while later.
+def _table(
+    name: str, settings: Sections, loads: Sequence[tuple[float, float]], trials: int
+) -> Report:
+    rows = []
+    for standing, overload in loads:
+        found = [overloaded(settings, standing, overload, seed) for seed in range(1, trials + 1)]
+        rows.append(row(f"{standing:g} N, then {overload:g} N", found))
+        gc.collect()  # each trial's daemon refers to itself, with megabytes of frames
+    said = [each["said ms"] for each in rows if each["held %"] < 100.0]
+    note = f"  said that the object has gone: in {max(said, default=0.0):.0f} ms, aim ≤ {_SAID:g}"
+    return Report(f"{name}, answer", rows, notes=(note,) if said else ())
 
-    Raises RuntimeError when it does not slip.
-    """
-    for _ in range(_TRIES):
-        rig.send(f"forget {kind}={load:.3f}@{_CALM + after:.4f}")
-        time.sleep(_CALM + after + _LOOK)
-        found: dict[str, Any] = rig.report("goals")
-        if found["object"]["slipped"] is not None:
-            return found
-        _grip(rig)  # raised before, on a busy machine, it may bear the load
-    raise RuntimeError(f"{kind}={load:.3f}: the object did not slip")
+
+def row(name: str, found: Sequence[Overload]) -> Row:
+    """Held share and greatest slide of those held, beside the times."""
+    answers = [1e3 * each.answer for each in found if math.isfinite(each.answer)]
+    times: Row = figure(name, "ms", answers, _ANSWER) if answers else {"name": name}
+    held = [each for each in found if not each.lost]
+    return times | {
+        "greatest": max(answers, default=math.nan),
+        "unanswered": sum(each.answer == math.inf for each in found),
+        "held %": 100.0 * len(held) / len(found),
+        "slid mm": 1e3 * max((each.slid for each in held), default=math.nan),
+        "said ms": 1e3 * max((each.said for each in found if each.lost), default=math.nan),
+    }
+
+
+def overloaded(settings: Sections, standing: float, overload: float, seed: int) -> Overload:
+    """Grip, bear ``standing`` [N], then ``overload`` [N]. Raises RuntimeError without a grip."""
+    chance = random.Random(seed)
+    with VirtualGrip(seed, chance, settings) as grip:
+        loop, state = grip.loop, grip.state
+        grip.command("arm")
+        loop.advance(0.1)
+        grip.command("grasp", force=_FORCE)
+        if not grip.until("holding", _GRIP):
+            raise RuntimeError(f"the hand does not hold: {state.mode} {state.fault}")
+        loop.advance(1.0 + chance.uniform(0.0, 0.02))
+        for k in range(_STEPS):
+            grip.plant.load(push=standing * (k + 1) / _STEPS)
+            loop.advance(_RISES / _STEPS)
+        loop.advance(_STANDS)
+        begin, slid, gone, said = fmean(grip.along()), 0.0, math.inf, math.inf
+
+        def look() -> None:
+            nonlocal slid, gone, said
+            if gone == math.inf and grip.between():
+                slid = max(slid, abs(fmean(grip.along()) - begin))
+            else:
+                gone = min(gone, state.t)
+            if gone < math.inf and state.mode not in GRIPPING:
+                said = min(said, state.t)
+
+        grip.look = look
+        answer = grip.answer(f"push={overload}", _LOOK)
+        while gone < math.inf and said == math.inf and state.t < gone + _GONE_LOOK:
+            loop.advance(loop.period)
+        return Overload(answer, slid, gone < math.inf, said - gone if gone < math.inf else math.nan)

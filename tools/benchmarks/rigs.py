@@ -35,6 +35,11 @@ from softfinger.daemon.wire.schema import STATE
 Sections = Mapping[str, Mapping[str, Any]]
 
 HIL = Path(__file__).parents[2] / "config" / "hil.toml"
+SOLID: Sections = {  # tips of solid rubber
+    "tip": {"physics": "solid"},
+    "material": {"law": "constant", "modulus": 0.15e6},
+    "safety": {"d_max": 0.008},
+}
 SOFTFINGER = (sys.executable, "-m", "softfinger")
 _KEPT = 16  # frames that take turns
 _PATIENCE = 120.0  # s for a process to be ready: kernels may be new

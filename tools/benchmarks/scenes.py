@@ -3,19 +3,13 @@
 In µs a tick: all daemons stand side by side, on canned readings (or the simulated hand) and virtual
 time, and tick in turns. A step is switched off in a daemon of its own, from outside; what it saves
 is the median of the differences to the daemon that has it, round by round, with that median's own
-error. In seconds of the first start: `softfinger compile` with an empty cache, on all processors,
-and the processor time of that, which other load hardly changes; 0 where both need the same kernels.
+error.
 """
 
 from __future__ import annotations
 
 import contextlib
 import math
-import os
-import resource
-import subprocess
-import tempfile
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -28,7 +22,6 @@ from softfinger.daemon.wire.publisher import bit
 from softfinger.kinematics.estimation.estimator import ContactEstimator
 from softfinger.tools.benchmarks.measuring import Report, Row, Subject, figure, interleave
 from softfinger.tools.benchmarks.rigs import (
-    SOFTFINGER,
     RigError,
     Sections,
     can,
@@ -53,19 +46,6 @@ class TimedScene:
     topics: tuple[str, ...] = ()
     subscribers: int = 1  # to each of these
     alter: Callable[[Daemon], None] = can
-    start: tuple[str, ...] | None = None  # words that say its kernels, if not the sections
-
-    @property
-    def words(self) -> tuple[str, ...]:
-        """For `softfinger compile`."""
-        if self.start is not None:
-            return self.start
-        words = []
-        for part, values in self.sections.items():
-            for key, value in values.items():
-                text = repr(list(value) if isinstance(value, tuple) else value)
-                words += ["--set", f"{part}.{key}={text}"]
-        return tuple(words)
 
 
 def _always_fitted(daemon: Daemon) -> None:
@@ -107,13 +87,10 @@ STEPS: dict[str, tuple[TimedScene, TimedScene]] = {
     "topics without subscribers": (SCENES[HOLDING], TimedScene(alter=_always_packed)),
     "state at 100 Hz, not each tick": (
         TimedScene(topics=("hand/state",)),
-        TimedScene({"stream": {"state_rate": 500.0}}, topics=("hand/state",), start=()),
+        TimedScene({"stream": {"state_rate": 500.0}}, topics=("hand/state",)),
     ),
     "a finger": (SCENES[ONE_IDLE], SCENES[IDLE]),
-    "the simulated hand": (
-        TimedScene(start=("--config", "hil")),
-        TimedScene(alter=_as_it_is),
-    ),
+    "the simulated hand": (TimedScene(), TimedScene(alter=_as_it_is)),
     "the object's taper": (
         TimedScene(alter=_as_it_is),
         TimedScene({"simulation": {"object_shape": "wedge"}}, alter=_as_it_is),
@@ -121,12 +98,10 @@ STEPS: dict[str, tuple[TimedScene, TimedScene]] = {
     "sensors": (SCENES[NO_SENSORS], SCENES[IDLE]),
     "servos": (SCENES[NO_SERVOS], SCENES[HOLDING]),
 }
-# Of the first start alone.
-OTHERS = "kernels of other scenes", ((), ("--all",))
 
 
 def measure(brief: bool = False, rounds: int = 400) -> list[Report]:
-    """All scenes and steps in turns; unless ``brief`` the first starts, several minutes."""
+    """All scenes and steps in turns."""
     scenes = dict(SCENES)
     for name, (base, without) in STEPS.items():
         scenes |= {f"with {name}": base, f"without {name}": without}
@@ -139,16 +114,6 @@ def measure(brief: bool = False, rounds: int = 400) -> list[Report]:
     taken = {name: 1e-3 * times[same[id(scene)]] for name, scene in scenes.items()}
     costs = [figure(name, "µs", taken[name]) for name in SCENES]
     savings = [saving(name, taken[f"with {name}"], taken[f"without {name}"]) for name in STEPS]
-    if not brief:
-        pairs = {name: (base.words, without.words) for name, (base, without) in STEPS.items()}
-        savings.append({"name": OTHERS[0]})
-        starts: dict[tuple[str, ...], NDArray[np.float64]] = {}
-        for row, (some, more) in zip(savings, [*pairs.values(), OTHERS[1]], strict=True):
-            for words in (some, more) if some != more else ():
-                if words not in starts:
-                    starts[words] = np.array(first_start(*words))
-            wall, busy = starts[more] - starts[some] if some != more else (0.0, 0.0)
-            row |= {"first start s": wall, "of processor time s": busy}
     return [Report("mean tick", costs), Report("skipped, µs a tick", savings)]
 
 
@@ -198,21 +163,3 @@ def saving(name: str, with_it: NDArray[np.float64], without: NDArray[np.float64]
         "±": error,
         "measurable": middle > _SURE * error,
     }
-
-
-def first_start(*words: str) -> tuple[float, float]:
-    """Seconds that all kernels of a scene take to compile, by the clock and of processors.
-
-    Raises RigError.
-    """
-    with tempfile.TemporaryDirectory() as folder:
-        environment = os.environ | {"XDG_CACHE_HOME": folder}
-        environment.pop("NUMBA_CACHE_DIR", None)
-        spent, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
-        command = [*SOFTFINGER, "compile", *words]
-        done = subprocess.run(command, env=environment, capture_output=True, text=True)
-        if done.returncode:
-            raise RigError(f"{' '.join(command[1:])}: {done.stderr.splitlines()[-1:]}")
-        wall, total = time.monotonic() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
-    busy = total.ru_utime + total.ru_stime - spent.ru_utime - spent.ru_stime
-    return wall, busy

@@ -11,14 +11,13 @@ import math
 import random
 from collections.abc import Callable, Sequence
 from statistics import fmean
+from typing import Any
 
 from softfinger.daemon.errors import Refused
-from softfinger.daemon.loop.build import Daemon
-from softfinger.daemon.profile.load import checked
 from softfinger.daemon.simulation.faults import OBJECT, parse_faults
 from softfinger.daemon.types import FINGERS
 from softfinger.tools.benchmarks.rigs import Sections, merged
-from softfinger.tools.processes.kernel_build import table_cache
+from softfinger.tools.watched import Watched
 
 TOO_MUCH = 1.3  # of the force asked for
 GONE = 0.1  # m that an object has slid: beyond, it no longer matters how far
@@ -57,40 +56,30 @@ class Watch:
         return fmean(ratio for t, ratio in self._mean if t > end)
 
 
-class VirtualGrip:
-    """A simulated hand on virtual time and its events; ``look`` is called after each tick."""
+class VirtualGrip(Watched):
+    """A grip whose mass and torque constant are drawn; ``look`` is called after each tick."""
 
     def __init__(self, seed: int, chance: random.Random, sections: Sections) -> None:
         drawn = {"seed": seed, "object_mass": 0.1 * 2.0 ** chance.uniform(-1.0, 1.0)}
-        base = {"simulation": drawn, "loop": {"clock": "virtual"}}
-        self.settings = checked(merged(sections, base))
-        self.events: list[tuple[float, str]] = []  # warnings and errors: when [s], kind
-        self._daemon = Daemon(
-            self.settings, wire=False, table_cache=table_cache(), on_event=self._hear
-        )
-        self.loop, self.state = self._daemon.loop, self._daemon.loop.state
-        assert self._daemon.hand is not None
-        self.hand = self._daemon.hand
+        self.alarms: list[tuple[float, str]] = []  # warnings and errors: when [s], kind
+        super().__init__(merged(sections, {"simulation": drawn}))
         error = chance.uniform(-_TORQUE_ERROR, _TORQUE_ERROR)
-        self.hand.plant.parameters.torque_constant *= 1.0 + error
+        self.plant.plant.parameters.torque_constant *= 1.0 + error
         self.look: Callable[[], None] = lambda: None
         self.loop.heartbeat = lambda _: self.look()
         self.loop.advance(0.1)
 
-    def __enter__(self) -> VirtualGrip:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._daemon.close()
-
-    def _hear(self, level: str, kind: str, _text: str) -> None:
+    def _note(self, *event: str) -> None:
+        super()._note(*event)
+        level, kind, _ = event
         if level != "info":
-            self.events.append((self._daemon.clock.now(), kind))
+            self.alarms.append((self.now, kind))
 
-    def command(self, name: str, **numbers: float) -> None:
+    def command(self, name: str, **numbers: float) -> dict[str, Any]:
         """Give a command, which the hand may refuse."""
         with contextlib.suppress(Refused):
-            self.loop.command({"command": name, **numbers})
+            return super().command(name, **numbers)
+        return {}
 
     def until(self, mode: str, seconds: float) -> bool:
         """Go on until the hand is in that mode; False when it is not within ``seconds``."""
@@ -103,14 +92,14 @@ class VirtualGrip:
         """Let begin now what these words of `softfinger emulate --fault` say."""
         for after, part, kind, value, over in parse_faults(words.split(), ()):
             if part == OBJECT:
-                self.hand.load(**{kind: value})
+                self.plant.load(**{kind: value})
             else:
-                faults = self.hand.measurement_faults[FINGERS.index(part)]
+                faults = self.plant.measurement_faults[FINGERS.index(part)]
                 faults.begin(kind, value, self.state.t + after, over)
 
     def watched(self, asked: float) -> Watch:
         """A watch that sees each tick from now on."""
-        watch, hand, state = Watch(asked), self.hand, self.state
+        watch, hand, state = Watch(asked), self.plant, self.state
         self.look = lambda: watch.see(
             state.t, hand.force.tolist(), hand.object_pose[:2].tolist(), state.torque
         )
@@ -135,7 +124,18 @@ class VirtualGrip:
                 answered = min(answered, state.t)
         return answered - onset if onset < math.inf else math.nan
 
+    def along(self) -> list[float]:
+        """Each tip's place along the object's faces, from their middle [m]."""
+        x, y, angle = self.plant.object_pose.tolist()
+        sine, cosine = math.sin(angle), math.cos(angle)
+        tips = (self.plant.plant.fingers[k] for k in range(2))
+        return [(tip.y - y) * cosine - (tip.x - x) * sine for tip in tips]
+
+    def between(self) -> bool:
+        """Whether the object is between the tips: both press on it."""
+        return min(self.plant.force.tolist()) > 0.0 and not self.plant.on_other_tip.any()
+
     def _slips(self) -> bool:
         most = _SLIPS * self.settings.simulation.tip_friction
-        tips = zip(self.hand.tangential.tolist(), self.hand.normal.tolist(), strict=True)
+        tips = zip(self.plant.tangential.tolist(), self.plant.normal.tolist(), strict=True)
         return any(abs(along) >= most * normal for along, normal in tips)
