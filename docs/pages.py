@@ -233,7 +233,7 @@ def limits() -> str:
             when = f"{after}a tick ({tick:g} ms)"
         else:
             when = "where it is met"
-        keys = _values(settings, row.keys)
+        keys = ", ".join(_values(settings, row))
         rows.append(_row(f"`{row.name}`", row.judged, row.level, when, keys and f"`{keys}`"))
     return "".join(rows)
 

@@ -7,42 +7,58 @@ raises: a SettingsError (exit status 2), any other SoftfingerError or an OSError
 
 from __future__ import annotations
 
+import argparse
+import difflib
+import importlib
 import os
+import re
 import signal
 import sys
 from collections.abc import Collection, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any, NoReturn
 
 from softfinger import __version__
 from softfinger.daemon.errors import SettingsError, SoftfingerError
 
-if TYPE_CHECKING:
-    import argparse
+_OPTIONS = ("-h", "--help", "--version")
+_UNKNOWN = re.compile(r"invalid choice: '([^']*)'|unrecognized arguments: (\S+)")
 
-SUBCOMMANDS = {  # the room of tools/ that its module is in, and what it does
-    "run": ("processes", "run the daemon; without --config, on the built-in simulated hand"),
-    "emulate": ("processes", "emulate a hand: servos and tactile boards on ptys"),
-    "send": ("terminal", "send one command to the running daemon"),
-    "monitor": ("terminal", "live page of the running daemon in the terminal"),
-    "view": ("viewing", "show the running hand, or a recording, in Rerun's viewer"),
-    "record": ("recordings", "record the running daemon's stream into an MCAP file"),
-    "replay": ("recordings", "publish a recording again, or compare it with today's code"),
-    "analyse": ("analysis", "compute contact, force and energy over time from recorded frames"),
-    "plot": ("analysis", "draw a recording: over time, against the model, errors, timing"),
-    "export": ("recordings", "export a recording's topics as CSV or Parquet"),
-    "doctor": ("setup", "check ports, servos, boards and this machine, and say what mends them"),
-    "scan": ("setup", "find the servos on a port, at any rate"),
-    "calibrate": ("calibration", "calibrate joints, sensors and tips, step by step"),
-    "envelope": ("setup", "find out what a hand holds: shape, size, friction, mass"),
-    "limits": ("setup", "list every limit: condition, consequence, setting"),
-    "config": ("setup", "list and show the profiles, and every setting with its default"),
-    "compile": ("processes", "compile a hand's kernels ahead of its first start"),
-    "keys": ("setup", "make the keys that addresses outside this machine need"),
-    "install-service": ("setup", "print or write a systemd unit and udev rules"),
-    "completion": ("setup", "print what completes these words in bash, zsh or fish"),
-    "figures": ("paper", "draw the paper's figures from this model, as CSV and PNG"),
-    "bench": ("benchmarks", "measure run time, beside the usual alternatives"),
+GROUPS = {  # subcommands: the room of tools/ that its module is in, and what it does
+    "run": {
+        "run": ("processes", "run the daemon; without --config, on the built-in simulated hand"),
+        "emulate": ("processes", "emulate a hand: servos and tactile boards on ptys"),
+    },
+    "hand": {
+        "status": ("terminal", "say in one line what the running hand does"),
+        "send": ("terminal", "send one command to the running daemon"),
+        "monitor": ("terminal", "live page of the running daemon in the terminal"),
+        "view": ("viewing", "show the running hand, or a recording, in Rerun's viewer"),
+    },
+    "data": {
+        "record": ("recordings", "record the running daemon's stream into an MCAP file"),
+        "replay": ("recordings", "publish a recording again, or compare it with today's code"),
+        "analyse": ("analysis", "compute contact, force and energy over time from frames"),
+        "plot": ("analysis", "draw a recording: over time, against the model, errors, timing"),
+        "export": ("recordings", "export a recording's topics as CSV or Parquet"),
+    },
+    "machine": {
+        "doctor": ("setup", "check ports, servos, boards and this machine; say what mends them"),
+        "scan": ("setup", "find the servos on a port, at any rate"),
+        "calibrate": ("calibration", "calibrate joints, sensors and tips, step by step"),
+        "envelope": ("setup", "find out what a hand holds: shape, size, friction, mass"),
+        "limits": ("setup", "list every limit: condition, consequence, setting"),
+        "config": ("setup", "list and show the profiles, and every setting with its default"),
+        "compile": ("processes", "compile a hand's kernels ahead of its first start"),
+        "keys": ("setup", "make the keys that addresses outside this machine need"),
+        "install-service": ("setup", "print or write a systemd unit and udev rules"),
+        "completion": ("setup", "print what completes these words in bash, zsh or fish"),
+    },
+    "develop": {
+        "figures": ("paper", "draw the paper's figures from this model, as CSV and PNG"),
+        "bench": ("benchmarks", "measure run time, beside the usual alternatives"),
+    },
 }
+SUBCOMMANDS = {name: row for rows in GROUPS.values() for name, row in rows.items()}
 
 _FIRST_STEPS = """\
 softfinger {version}: two rotational fingers with soft tips. To begin:
@@ -66,23 +82,47 @@ def _open_standard_streams() -> None:
             setattr(sys, name, os.fdopen(descriptor, mode))
 
 
-def make_parser(imported: Collection[str]) -> tuple[argparse.ArgumentParser, dict[str, Any]]:
-    """The parser with all subcommands, and the modules of those ``imported``: they have arguments.
+class Parser(argparse.ArgumentParser):
+    """Names the nearest of what is known for a word that is not."""
 
-    Without its module a subcommand has none.
+    def error(self, message: str) -> NoReturn:
+        unknown = _UNKNOWN.search(message)
+        if unknown is not None:
+            known = [word for action in self._actions for word in action.option_strings]
+            known += [word for action in self._actions for word in action.choices or ()]
+            word = next(filter(None, unknown.groups()))
+            near = difflib.get_close_matches(word.partition("=")[0], known, n=1)
+            if near:
+                message = f"found {word!r}, expected a known word; nearest: {near[0]}"
+        super().error(message)
+
+
+class TopParser(Parser):
+    """Lists the subcommands in their groups."""
+
+    def format_help(self) -> str:
+        lines = [f"usage: {self.prog} SUBCOMMAND …\n\n{self.description}"]
+        for group, rows in GROUPS.items():
+            lines.append(f"\n{group}:")
+            lines += [f"    {name:17}{text}" for name, (_, text) in rows.items()]
+        return "\n".join([*lines, f"\n{self.epilog}\n"])
+
+
+def make_parser(imported: Collection[str]) -> tuple[Parser, dict[str, tuple[Any, Parser]]]:
+    """Make the parser with all subcommands; return it with module and parser of each ``imported``.
+
+    Without its module a subcommand has no arguments.
     """
-    import argparse
-    import importlib
-
-    parser = argparse.ArgumentParser(
+    parser = TopParser(
         prog="softfinger",
         description="Two rotational fingers with soft tips: daemon and tools.",
         epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"softfinger {__version__}")
-    subparsers = parser.add_subparsers(dest="subcommand", metavar="SUBCOMMAND", required=True)
-    modules = {}
+    subparsers = parser.add_subparsers(
+        dest="subcommand", metavar="SUBCOMMAND", required=True, parser_class=Parser
+    )
+    made = {}
     for name, (room, text) in SUBCOMMANDS.items():
         subparser = subparsers.add_parser(
             name,
@@ -93,8 +133,8 @@ def make_parser(imported: Collection[str]) -> tuple[argparse.ArgumentParser, dic
         if name in imported:
             module = importlib.import_module(f"softfinger.tools.{room}.{name.replace('-', '_')}")
             module.add_arguments(subparser)
-            modules[name] = module
-    return parser, modules
+            made[name] = module, subparser
+    return parser, made
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -110,15 +150,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         words = [*words[1:2], "--help"]
     # Only the subcommand that is called is imported, for its arguments and for its work.
     called = next((word for word in words if word in SUBCOMMANDS), "")
-    parser, modules = make_parser([called])
-    if not (called or words[0].startswith("-")):
-        import difflib
-
-        near = difflib.get_close_matches(words[0], SUBCOMMANDS, n=1)
+    parser, made = make_parser([called])
+    if not called and words[0] not in _OPTIONS:
+        near = difflib.get_close_matches(words[0], [*SUBCOMMANDS, *_OPTIONS], n=1)
         hint = f"nearest: {near[0]}" if near else "`softfinger help` lists them"
         parser.error(f"found {words[0]!r}, expected a subcommand; {hint}")
-    arguments = parser.parse_args(words)
-    module = modules[called]
+    arguments, unknown = parser.parse_known_args(words)
+    module, subparser = made[called]
+    if unknown:
+        subparser.error(f"unrecognized arguments: {' '.join(unknown)}")
     try:
         signal.signal(signal.SIGINT, signal.default_int_handler)
         status: int = module.run(arguments)

@@ -166,7 +166,7 @@ def check_servo(
         if first < least or last > greatest:
             wrong(
                 f"position limits are {least} … {greatest}, the joint needs {first} … {last}",
-                "widen the limits, or correct servos.zero, hand.q_min and hand.q_max",
+                "widen the limits, or `softfinger calibrate joints`, which finds zero and range",
             )
     elif model.senses_current and limit < current_max:
         wrong(
@@ -221,7 +221,12 @@ def check_angle(name: str, q: float, hand: GeometrySettings, finger: int) -> Fin
         return None
     found, least, most = (f"{math.degrees(angle):.0f}°" for angle in (q, low, high))
     problem = f"the joint is at {found}, not in {least} … {most}"
-    return Finding("FAIL", name, problem, "turn it there by hand, or correct servos.zero")
+    return Finding(
+        "FAIL",
+        name,
+        problem,
+        "turn it there by hand, or `softfinger calibrate joints`, which finds its zero",
+    )
 
 
 def latency_of(path: str) -> tuple[float, list[Finding]]:

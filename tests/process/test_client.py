@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import inspect
+import json
 import math
 import re
 import subprocess
@@ -36,7 +37,7 @@ from softfinger.daemon.client.records import read
 from softfinger.daemon.client.stream import Gaps
 from softfinger.daemon.errors import HandClosed, SettingsError
 from softfinger.daemon.types import COMMAND_ADDRESS, STREAM_ADDRESS
-from tests.conftest import until
+from tests.conftest import Inline, until
 from tests.harness import fake_daemon
 from tests.harness.daemon_process import Running, insist
 from tests.harness.fake_daemon import FakeDaemon
@@ -388,3 +389,23 @@ def test_an_address_in_the_environment_that_is_none(
     monkeypatch.setenv("SOFTFINGER_ADDRESS", named)
     with pytest.raises(SettingsError, match=r"SOFTFINGER_ADDRESS: found .*, expected tcp://HOST"):
         Hand()
+
+
+def test_status_is_a_line_for_people_and_a_state_for_programs(
+    fake: FakeDaemon, inline: Inline
+) -> None:
+    with Hand(fake.state_address, fake.command_address, timeout=60.0) as hand:
+        state = hand.state()  # the stand-in's numbers drift a little from state to state
+    told = inline("status", "--address", fake.state_address)
+    assert told.returncode == 0
+    line = re.fullmatch(r"(\w+) (\S+) N \(\S+ ± \S+, \S+ ± \S+\), (\S+)°, (\S+) mm\n", told.stdout)
+    assert line is not None, told.stdout
+    assert line[1] == state.mode
+    assert float(line[2]) == pytest.approx(0.5 * (state.left.force + state.right.force), abs=1.0)
+    assert float(line[3]) == pytest.approx(math.degrees(state.object.angle), abs=3.0)
+    assert float(line[4]) == pytest.approx(state.object.width * 1e3, abs=3.0)
+    whole = json.loads(inline("status", "--json", "--address", fake.state_address).stdout)
+    assert whole["left"]["force"] == pytest.approx(state.left.force, abs=1.0)
+    fake.changes = {"mode": "fault", "fault": "servo 1: overload"}
+    failed = inline("status", "--address", fake.state_address)
+    assert (failed.returncode, failed.stdout) == (1, "fault: servo 1: overload\n")

@@ -21,10 +21,35 @@ def test_no_words_name_the_first_steps_and_help_all_subcommands(inline: Inline) 
     assert shown.returncode == 0
     assert all(f"\n    {name}" in shown.stdout for name in SUBCOMMANDS)
     assert "Exit status: 0 " in shown.stdout
-    for word, hint in (("recrod", "nearest: record"), ("7", "`softfinger help` lists them")):
+    for word, hint in (
+        ("recrod", "nearest: record"),
+        ("versoin", "nearest: --version"),
+        ("--verison", "nearest: --version"),
+        ("7", "`softfinger help` lists them"),
+    ):
         wrong = inline(word, "run.mcap")
         assert wrong.returncode == 2
         assert f"found {word!r}, expected a subcommand; {hint}" in wrong.stderr
+
+
+def test_the_nearest_word_is_named_for_one_that_is_not_known(inline: Inline) -> None:
+    for words, word, near in (
+        (("run", "--cofnig", "hil"), "--cofnig", "--config"),
+        (("send", "grap", "force=3"), "grap", "grasp"),
+        (("calibrate", "tar", "left.json"), "tar", "tare"),
+    ):
+        wrong = inline(*words)
+        assert wrong.returncode == 2
+        assert f"found {word!r}, expected a known word; nearest: {near}" in wrong.stderr
+    assert "unrecognized arguments: --zzz" in inline("run", "--zzz").stderr
+
+
+def test_limits_fit_a_wide_terminal_and_tell_the_threshold(inline: Inline) -> None:
+    lines = inline("limits").stdout.splitlines()
+    assert max(map(len, lines)) <= 120
+    warn, fault = (line.split() for line in lines if line.startswith("tip.force "))
+    assert warn[-5:] == ["0.9", "×", "safety.force_max", "=", "30"]
+    assert fault[-4:] == ["tip", "safety.force_max", "=", "30"]
 
 
 @pytest.mark.parametrize(
@@ -35,7 +60,7 @@ def test_no_words_name_the_first_steps_and_help_all_subcommands(inline: Inline) 
         ("grasp force=5 mm", "found 'force=5 mm' in 'mm', expected N or mN"),
         ("grasp force=nan", "found 'force=nan', expected key=number"),
         ("grasp 5", "found '5', expected key=number"),
-        ("gasp", "argument COMMAND: invalid choice: 'gasp'"),
+        ("gasp", "found 'gasp', expected a known word; nearest: grasp"),
     ],
 )
 def test_what_is_no_number_of_its_kind_is_not_sent(inline: Inline, words: str, said: str) -> None:

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import argparse
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from softfinger.daemon.profile.settings import Settings
 from softfinger.tools.arguments import add_profile, profile
+
+if TYPE_CHECKING:
+    from softfinger.daemon.safety.limits import Limit
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -16,18 +19,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Print the table. Raises SettingsError."""
     settings = profile(arguments)
+    from rich.console import Console
+    from rich.table import Table
+
     from softfinger.daemon.safety.limits import LIMITS
 
-    lines = [(row.name, row.level, row.judged, _values(settings, row.keys)) for row in LIMITS]
-    widths = [max(len(line[column]) for line in lines) for column in range(3)]
-    for line in lines:
-        cells = [cell.ljust(width) for cell, width in zip(line, widths, strict=False)]
-        print("  ".join([*cells, line[3]]).rstrip())
+    table = Table(box=None, padding=(0, 2, 0, 0), show_header=False)
+    for wrapped in (False, False, True, True):
+        table.add_column(no_wrap=not wrapped, overflow="fold")
+    for row in LIMITS:
+        table.add_row(row.name, row.level, row.judged, "\n".join(_values(settings, row)))
+    console = Console(width=120, highlight=False, markup=False)
+    with console.capture() as printed:
+        console.print(table)
+    print("\n".join(line.rstrip() for line in printed.get().splitlines()))
     return 0
 
 
-def _values(settings: Settings, keys: tuple[str, ...]) -> str:
-    return ", ".join(f"{key} = {_shown(_value(settings, key))}" for key in keys)
+def _values(settings: Settings, row: Limit) -> list[str]:
+    """Return the settings of a limit, each with the share of it that is the threshold."""
+    share = "" if row.share == 1.0 else f"{row.share:g} × "
+    return [f"{share}{key} = {_shown(_value(settings, key))}" for key in row.keys]
 
 
 def _value(settings: Settings, key: str) -> Any:

@@ -1,0 +1,48 @@
+"""``softfinger status``: what the running hand does, in one line for people."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+from dataclasses import asdict
+
+from softfinger.daemon.client.hand import Hand
+from softfinger.daemon.errors import NoStream
+from softfinger.daemon.wire.schema import HandState
+from softfinger.tools.arguments import add_keys, no_stream, stream_address
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--address", type=stream_address, default="", help="the stream's socket")
+    add_keys(parser)
+    parser.add_argument("--json", action="store_true", help="the whole state, for programs")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Print the next state; 1 when the hand has a fault, 2 when no state comes."""
+    try:
+        with Hand(arguments.address, keys=arguments.keys) as hand:
+            state = hand.state()
+    except NoStream:
+        print(f"status: {no_stream(arguments.address, arguments.keys)}", file=sys.stderr)
+        return 2
+    print(json.dumps(asdict(state), ensure_ascii=False) if arguments.json else told(state))
+    return 1 if state.fault else 0
+
+
+def told(state: HandState) -> str:
+    """Return the line: mode, mean force, the object's angle and width; or the fault."""
+    if state.fault:
+        return f"{state.mode}: {state.fault}"
+    parts = [state.mode]
+    touching = [finger for finger in (state.left, state.right) if finger.contact]
+    if touching:
+        force = sum(finger.force for finger in touching) / len(touching)
+        tips = ", ".join(f"{finger.force:.1f} ± {finger.force_std:.1f}" for finger in touching)
+        parts.append(f"{force:.1f} N ({tips})")
+    if state.object.valid:
+        parts.append(f"{math.degrees(state.object.angle):.1f}°")
+        parts.append(f"{state.object.width * 1e3:.1f} mm")
+    return " ".join(parts[:1]) + (" " + ", ".join(parts[1:]) if parts[1:] else "")
