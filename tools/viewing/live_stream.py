@@ -1,4 +1,4 @@
-"""The stream as both viewers read it: drained in time, drawn so many times a second."""
+"""The stream as page and Foxglove server read it: drained in time, drawn so many times a second."""
 
 from __future__ import annotations
 
@@ -26,6 +26,7 @@ TOPICS = (
     schema.TRUTH,
     schema.TACTILE,
     schema.STATS,
+    schema.COMMAND,
 )
 NICE = 5  # everything real-time goes first
 _SILENCE = 2.0  # s without a message after which a line says so
