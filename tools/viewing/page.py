@@ -24,7 +24,6 @@ import uvicorn
 import zmq
 from fastapi import FastAPI, WebSocket, WebSocketDisconnect
 from nicegui import ui
-from nicegui.element import Element
 from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocketClose
@@ -119,7 +118,7 @@ class CommandBar:
     def __init__(self, pictures: Pictures, commander: Commander) -> None:
         self._pictures = pictures
         self._commander = commander
-        self._buttons: dict[str, list[Element]] = {}
+        self._buttons: dict[str, list[ui.button]] = {}
         self._shown: Any = None
         with ui.row().classes("items-center"):
             ui.button("STOP", on_click=self._stop, color="red").props("size=lg").classes("stop")

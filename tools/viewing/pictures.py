@@ -11,7 +11,7 @@ import base64
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from operator import attrgetter
 from typing import Any
 
@@ -25,7 +25,14 @@ from softfinger.daemon.wire import schema
 from softfinger.tools.terminal import heatmap
 from softfinger.tools.terminal.feed import Feed, number, printable, text
 from softfinger.tools.terminal.typeset import micro, short
-from softfinger.tools.viewing.known import HEIGHT, WIDTH, ShownHand, palette, read_settings
+from softfinger.tools.viewing.known import (
+    HEIGHT,
+    WIDTH,
+    Landscape,
+    ShownHand,
+    palette,
+    read_settings,
+)
 from softfinger.tools.viewing.live_stream import TOPICS
 from softfinger.tools.viewing.planar import (
     COLOURS,
@@ -58,23 +65,22 @@ _MODES = {
     "releasing": (190, 150, 90),
     "fault": (214, 54, 40),
 }
-# Title, factor, fields of each finger (the second is dashed; {}_std is its deviation, where the
-# stream has one), and other lines: name, field, colour.
-_PLOTS: tuple[tuple[str, float, str, tuple[tuple[str, str, Colour], ...]], ...] = (
-    ("Force [N]", 1.0, "force", (("goal", "goal_force", GOAL),)),
-    ("Displacement d [mm]", 1e3, "d", ()),
-    (
-        "Object's angle [°]",
-        _DEGREE,
-        "",
-        (("object", "object.angle", OBJECT), ("goal", "goal_angle", GOAL)),
-    ),
-    ("Tilt θ [°]", _DEGREE, "theta", ()),
-    ("Energy [mJ]", 1e3, "energy", (("goal", "goal_energy", GOAL),)),
-    ("Joints [°]", _DEGREE, "q goal_q", ()),
-    ("Currents [A]", 1.0, "current goal_current", ()),
-    ("Tick [µs]", 1e6, "", (("work", "compute_s", OBJECT), ("late", "wake_late_s", LATE))),
+_PLOTS = (  # title, factor, fields of `hand/state`; {}_std is a deviation, where there is one
+    ("Force [N]", 1.0, "left.force right.force goal_force"),
+    ("Displacement d [mm]", 1e3, "left.d right.d"),
+    ("Object's angle [°]", _DEGREE, "object.angle goal_angle"),
+    ("Tilt θ [°]", _DEGREE, "left.theta right.theta"),
+    ("Energy [mJ]", 1e3, "left.energy right.energy goal_energy"),
+    ("Joints [°]", _DEGREE, "left.q right.q left.goal_q right.goal_q"),
+    ("Currents [A]", 1.0, "left.current right.current left.goal_current right.goal_current"),
+    ("Tick [µs]", 1e6, "compute_s wake_late_s"),
 )
+_SERVOS = ("q", "goal_q", "current", "goal_current")  # what a hand without servos lacks
+_OTHERS = {  # names and colours of lines that are no finger's
+    "object.angle": ("object", OBJECT),
+    "compute_s": ("work", OBJECT),
+    "wake_late_s": ("late", LATE),
+}
 _BOUNDS = (  # field of a finger, setting in `safety`, factor, unit
     ("force", "force_max", 1.0, "N"),
     ("d", "d_max", 1e3, "mm"),
@@ -104,7 +110,6 @@ class Pictures:
         self._live = live
         self._same_schema = True
         self._known = ""  # the settings, as they came
-        self._scenes = 0
         self.unreadable = 0
         self.shown = 0
         self.hand = ShownHand()
@@ -147,6 +152,8 @@ class Pictures:
         if topic == schema.STATE:
             if number(message, "seq") < number(self._state, "seq"):  # another daemon's
                 self._columns.clear()
+                for trail in self._trails.values():
+                    trail.clear()
             self.time, self._state = when, message
             self.shown += 1
         self.feed.sort_in(topic, message, self._moment())
@@ -166,78 +173,76 @@ class Pictures:
             self._know(ShownHand(settings))
 
     def _know(self, hand: ShownHand) -> None:
-        """Lay out the scene of a hand: panels for what it has, and no others."""
+        """Lay out the scene of a hand: panels and plots of what it has, and no others."""
         self.hand = hand
         self._parts = HandScene(hand)
         self._landscape = hand.landscape()
         self._columns.clear()
-        self._scenes += 1
-        self._lines: list[tuple[str, float]] = []  # field and factor of each column
-        plots = []
-        for title, factor, fields, others in _PLOTS:
-            if ("goal_q" in fields or "current" in fields) and not hand.servos:
-                continue
-            if "Object" in title and len(hand.fingers) < 2:
-                continue
-            lines = [
-                (name + " goal" * dashed, f"{name}.{key}", COLOURS[name], dashed)
-                for dashed, key in enumerate(fields.split())
-                for name in hand.fingers
-            ] + [(name, key, colour, name == "goal") for name, key, colour in others]
-            plots.append({"title": title, "lines": [self._line(factor, *each) for each in lines]})
-        geometry = hand.geometry
-        a = geometry.tip_radius
-        half, top = geometry.half_separation + 1.3 * a, geometry.reach + 1.9 * a
-        panels = [_panel("hand", "Hand", (-half, half, top, -0.4 * a), scaled=True)]
+        self._fields: list[tuple[str, float]] = []  # what the plots' columns hold, and its factor
+        a = hand.geometry.tip_radius
+        half, top = hand.geometry.half_separation + 1.3 * a, hand.geometry.reach + 1.9 * a
+        panels = [_panel("hand", "Hand", -half, half, top, -0.4 * a, scaled=True)]
         if hand.sensors:
-            tactile = hand.settings.tactile
-            box = (0.0, tactile.cols, 0.0, tactile.rows)
-            maps = [_panel(name, f"Pressure, {name} tip", box) for name in hand.fingers]
+            rows, cols = hand.settings.tactile.rows, hand.settings.tactile.cols
+            maps = [
+                _panel(name, f"Pressure, {name} tip", 0, cols, 0, rows) for name in hand.fingers
+            ]
             panels = [*maps[:1], *panels, *maps[1:]]
         if self._landscape is not None:
-            box = (-30.0, WIDTH + 8.0, -6.0, HEIGHT + 14.0)
-            still = self._still()
-            panels.append(_panel("landscape", "Energy landscape U(d, θ)", box, still=still))
+            box = -30.0, WIDTH + 8.0, -6.0, HEIGHT + 14.0
+            still = self._still(self._landscape)
+            panels.append(_panel("landscape", "Energy landscape U(d, θ)", *box, still=still))
+        plots = [
+            {"title": title, "lines": self._lines(factor, fields)}
+            for title, factor, fields in _PLOTS
+        ]
         self._scene = orjson.dumps(
             {
-                "number": self._scenes,
                 "seconds": SECONDS,
                 "panels": panels,
-                "plots": plots,
+                "plots": [plot for plot in plots if plot["lines"]],
                 "modes": {name: _css(colour) for name, colour in _MODES.items()},
                 "levels": {name: _css(colour) for name, colour in LEVELS.items()},
                 "palettes": {"pressure": heatmap.colour_map(), "energy": palette().tolist()},
             }
         )
 
-    def _line(
-        self, factor: float, name: str, key: str, colour: Colour, dashed: bool
-    ) -> dict[str, Any]:
-        """One line of a plot: which column it is, and which its deviation."""
-        columns = [len(self._lines) + 2]  # after the time and the mode
-        self._lines.append((key, factor))
-        if key.rpartition(".")[2] in ("d", "theta", "force"):
-            columns.append(len(self._lines) + 2)
-            self._lines.append((f"{key}_std", factor))
-        return {"name": name, "colour": _css(colour), "dashed": dashed, "columns": columns}
+    def _lines(self, factor: float, fields: str) -> list[dict[str, Any]]:
+        """A plot's lines: name, colour, and the columns of values and of their deviations."""
+        lines = []
+        for path in fields.split():
+            finger, _, key = path.rpartition(".")
+            if finger in FINGERS and finger not in self.hand.fingers:
+                continue
+            if key in _SERVOS and not self.hand.servos:
+                continue
+            if path in ("object.angle", "goal_angle") and len(self.hand.fingers) < 2:
+                continue
+            goal = " goal" if key.startswith("goal") else ""
+            name, colour = _OTHERS.get(path, ((finger + goal).strip(), COLOURS.get(finger, GOAL)))
+            spread = [f"{path}_std"] if hasattr(self.feed.state.left, f"{key}_std") else []
+            first = len(self._fields) + 2  # after the time and the mode
+            self._fields += [(each, factor) for each in (path, *spread)]
+            columns = list(range(first, len(self._fields) + 2))
+            lines.append({"name": name, "colour": _css(colour), "goal": goal, "columns": columns})
+        return lines
 
-    def _still(self) -> dict[str, Any]:
-        assert self._landscape is not None
-        contours = [each for each in self._landscape.contours() if len(each.line) > 1]
+    def _still(self, landscape: Landscape) -> dict[str, Any]:
+        contours = [each for each in landscape.contours() if len(each.line) > 1]
         labels = [
             (each.line[len(each.line) // 8], f"{1e3 * each.energy:g} mJ") for each in contours
         ]
         return {
-            "image": _image(self._landscape.picture(), "energy"),
+            "image": _image(landscape.picture(), "energy"),
             "lines": [_line(each.line, "#ffffff90", 1.0) for each in contours],
             "texts": [_text(*each, _WHITE) for each in labels]
-            + [_text(*each, GOAL) for each in self._landscape.ticks()],
+            + [_text(*each, GOAL) for each in landscape.ticks()],
         }
 
     def _take_column(self, when: float) -> None:
-        """The newest state is the last column; a step later it begins another."""
+        """The newest state is the last column, and stays when the next step begins."""
         state, columns = self.feed.state, self._columns
-        if len(columns) > 1 and when - columns[-2][0] < _STEP:
+        if columns and when // _STEP == columns[-1][0] // _STEP:
             columns.pop()
         elif columns:
             for name, trail in self._trails.items():
@@ -247,15 +252,17 @@ class Pictures:
                 else:
                     trail.append((contact.d, contact.theta))
         row: list[Any] = [when, self.feed.mode]
-        for key, factor in self._lines:
-            if key == "goal_energy":
-                force = np.array([state.goal_force])
-                known = self._landscape is not None
-                value = float(self._landscape.energy_of(force)[0]) if known else math.nan
-            else:
-                value = attrgetter(key)(state)
-            if key == "object.angle" and not state.object.valid:
+        for path, factor in self._fields:
+            if path == "goal_energy":
+                value = (
+                    math.nan
+                    if self._landscape is None
+                    else self._landscape.energy_of(np.array(state.goal_force))
+                )
+            elif path == "object.angle" and not state.object.valid:
                 value = math.nan
+            else:
+                value = attrgetter(path)(state)
             row.append(float(f"{factor * value:.5g}"))
         columns.append(row)
 
@@ -264,11 +271,7 @@ class Pictures:
         if not self._watched():
             return
         now, feed = self._moment(), self.feed
-        panels = {"hand": self._hand(), **self._maps(now)}
-        if self._landscape is not None:
-            panels["landscape"] = self._contacts()
         picture = {
-            "scene": self._scenes,
             "time": self.time,
             "seq": feed.state.seq,
             "mode": feed.mode,
@@ -276,7 +279,7 @@ class Pictures:
             "fault": feed.fault,
             "limits": self._limits(),
             "facts": self._facts(now),
-            "panels": panels,
+            "panels": {"hand": self._hand(), "landscape": self._contacts(), **self._maps(now)},
             "columns": list(self._columns),
             "events": [
                 (each.clock(), each.level, each.kind, each.text) for each in feed.events[-_EVENTS:]
@@ -295,7 +298,7 @@ class Pictures:
         ]
         return {
             "lines": [*lines, *(_arrow(push) for push in pushes)],
-            "texts": [_text(push.at + 1.1 * push.way, push.text, push.colour) for push in pushes],
+            "texts": [_text(push.at - (0.0, 0.02), push.text, push.colour) for push in pushes],
         }
 
     def _maps(self, now: float) -> dict[str, Any]:
@@ -326,11 +329,10 @@ class Pictures:
 
     def _contacts(self) -> dict[str, Any]:
         """Each contact on the landscape, with its trail."""
-        assert self._landscape is not None
         lines, dots = [], []
         for name in self.hand.fingers:
             contact = touch(self._state, name)
-            if contact is None:
+            if contact is None or self._landscape is None:
                 continue
             trail = np.array([*self._trails[name], (contact.d, contact.theta)])
             places = self._landscape.place(trail[:, 0], trail[:, 1])
@@ -370,36 +372,27 @@ class Pictures:
         def each(key: str, factor: float, decimals: int) -> str:
             return " / ".join(short(factor * getattr(finger, key), decimals) for finger in fingers)
 
-        facts = [
-            f"tick {short(ticks.rate, 0)} Hz",
-            f"overruns {state.overruns}",
-            f"work {micro(ticks.compute)} µs",
-            f"late {micro(ticks.late)} µs",
-        ]
+        facts = [f"tick {short(ticks.rate, 0)} Hz", f"overruns {state.overruns}"]
+        rates = ""
         if times is not None:
-            spreads = (("work", times.compute), ("late", times.wake), ("bus", times.bus))
-            spreads += (("publish", times.publish),)
-            facts += [
-                f"{name} p50 {micro(each.p50)}, p99 {micro(each.p99)}, p99.9 {micro(each.p999)}, "
-                f"max {micro(each.max)} µs"
-                for name, each in spreads
-            ]
-            facts.append(f"frames {short(times.rates.left, 0)} / {short(times.rates.right, 0)} Hz")
+            rates = f", {short(times.rates.left, 0)} / {short(times.rates.right, 0)} Hz"
+        parts = {} if times is None else {"work": times.compute, "bus": times.bus}
+        parts |= {} if times is None else {"late": times.wake, "publish": times.publish}
+        for name, of in parts.items():
+            spread = ", ".join(micro(value) for value in (of.p50, of.p99, of.p999, of.max))
+            facts.append(f"{name} [µs] p50, 99, 99.9, max: {spread}")
         facts += [
-            f"frames {each('frame_age_s', 1e3, 0)} ms old",
+            f"frames {each('frame_age_s', 1e3, 0)} ms old{rates}",
             f"servos {each('temperature', 1.0, 0)} °C, {each('voltage', 1.0, 1)} V",
             f"object {short(1e3 * state.object.width, 1)} mm wide" if state.object.valid else "",
             f"{sum(gaps.lost for gaps in self._gaps.values())} lost, {feed.skipped} unreadable",
             f"{feed.commander(now)} commands" if feed.commander(now) else "",
         ]
-        waited = feed.waited(now)
-        if waited > 0.05:
-            facts.append(f"this machine is busy: the simulated hand runs {waited:.2f} s behind")
         return [fact for fact in facts if fact]
 
 
-def _panel(name: str, title: str, box: Sequence[float], **more: Any) -> dict[str, Any]:
-    """``box``: left, right, top, bottom; lines are ``scaled`` where widths have its unit."""
+def _panel(name: str, title: str, *box: float, **more: Any) -> dict[str, Any]:
+    """``box``: left, right, top, bottom; ``scaled``: lines' widths have its unit."""
     return {"name": name, "title": title, "box": box, **more}
 
 

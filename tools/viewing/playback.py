@@ -7,6 +7,7 @@ import time
 from softfinger.daemon.wire import schema
 from softfinger.tools.ending import Ending
 from softfinger.tools.recordings.reader import Recording
+from softfinger.tools.terminal.feed import number
 from softfinger.tools.viewing.live_stream import TOPICS
 from softfinger.tools.viewing.pictures import SECONDS, Pictures
 
@@ -43,7 +44,7 @@ class Playback:
         self._pictures.clear()
         self.position = target
         for topic, message in self._recording.messages(TOPICS, target - SECONDS):
-            at = message.get("timestamp", 0.0) - self._recording.start
+            at = min(number(message, "timestamp") - self._recording.start, self.duration)
             while at > self.position:
                 self._stand(ending)
                 if self._target is not None or ending.over:

@@ -1,0 +1,359 @@
+"""``softfinger view``: its pictures are the stream's, and who may have them; what can go wrong."""
+
+from __future__ import annotations
+
+import base64
+import http.client
+import math
+import signal
+import subprocess
+import threading
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import numpy as np
+import orjson
+import psutil
+import pytest
+from websockets.exceptions import InvalidStatus
+
+from softfinger.daemon.wire import schema
+from softfinger.tools.ending import Ending
+from softfinger.tools.recordings.reader import Recording
+from softfinger.tools.viewing.pictures import Pictures
+from softfinger.tools.viewing.playback import Playback
+from tests.conftest import until
+from tests.harness.daemon_process import SOFTFINGER
+from tests.harness.fake_daemon import FakeDaemon, event, finger, frame, state
+from tests.harness.recorded_hand import record_hand
+from tests.harness.viewed import Viewed, Watcher
+
+GRASP = {
+    30: {"command": "arm"},
+    60: {"command": "grasp", "force": 8.0},
+    800: {"command": "rotate", "angle": 0.1},
+    1100: {"command": "release"},
+}
+GOALS = {"goal_force": 9.0, "goal_angle": 0.1}
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The simulated hand at work for 2.6 s: grasps, turns, releases."""
+    path = tmp_path_factory.mktemp("recorded") / "hand.mcap"
+    record_hand(path, GRASP, 2.6)
+    return path
+
+
+class Kept:
+    """Pictures as they are published, in this process."""
+
+    def __init__(self, *, live: bool = False) -> None:
+        self.newest: dict[str, Any] = {}
+        self.scene: dict[str, Any] = {}
+        self.said: list[str] = []
+        self.pictures = Pictures(self._take, lambda: True, self.said.append, live=live)
+
+    def _take(self, scene: bytes, picture: bytes) -> None:
+        self.scene, self.newest = orjson.loads(scene), orjson.loads(picture)
+
+
+def view(fake: FakeDaemon, *words: str) -> Viewed:
+    where = ("--address", fake.state_address, "--commands", fake.command_address)
+    return Viewed(*where, *words)
+
+
+def got(host: str, path: str, **headers: str) -> tuple[int, str]:
+    connection = http.client.HTTPConnection(host, timeout=60)
+    connection.request("GET", path, headers=headers)
+    answer = connection.getresponse()
+    body = answer.read().decode()
+    connection.close()
+    return answer.status, body
+
+
+# What is shown
+
+
+def test_a_picture_has_the_streams_values() -> None:
+    left = {**finger(0.0, 0), "force": 7.5, "temperature": 66.0}
+    with FakeDaemon() as fake:
+        fake.changes = {"left": left, **GOALS}
+        with view(fake) as viewed, Watcher(viewed.host) as page:
+            pictures = [page.next() for _ in range(5)]
+            told = event(7, "slip", "the object slips", "warning")
+            fake.send(schema.EVENT, msgpack.packb(told))
+            until(lambda: page.next()["events"])
+            picture = page.next()
+            said = viewed.end()
+    seqs = [each["seq"] for each in pictures]
+    assert seqs == sorted(set(seqs))
+    shown = page.lines(picture)
+    assert shown["Force [N] left"] == [7.5, 0.05]
+    assert shown["Force [N] goal"] == [9.0]
+    assert shown["Displacement d [mm] right"] == pytest.approx([3.31, 0.02])
+    assert shown["Tilt θ [°] left"][1] == pytest.approx(0.1)
+    assert shown["Object's angle [°] object"] == pytest.approx([4.98])
+    assert shown["Object's angle [°] goal"] == pytest.approx([math.degrees(0.1)], rel=1e-4)
+    assert shown["Energy [mJ] right"] == pytest.approx([12.34])
+    assert shown["Joints [°] left goal"] == pytest.approx([math.degrees(0.44)], rel=1e-4)
+    assert shown["Currents [A] right"] == [0.213]
+    assert shown["Tick [µs] work"] == pytest.approx([11.0])
+    assert (picture["mode"], picture["status"], picture["fault"]) == ("holding", "live", "")
+    assert picture["events"][-1][1:] == ["warning", "slip", "the object slips"]
+    assert "the object slips · grip: goal 9.0 N" in picture["limits"]
+    assert picture["limits"].endswith("nearest limit: left temperature at 94 % of 70 °C")
+    assert "servos 66 / 41 °C, 12.1 / 12.1 V" in picture["facts"]
+    for name in ("left", "right"):
+        image = picture["panels"][name]["image"]
+        levels = np.frombuffer(base64.b64decode(image["data"]), np.uint8).reshape(44, 44)
+        counts = np.frombuffer(frame(0.0, 0)["data"], "<u2").reshape(44, 44)
+        assert levels[counts == counts.max()].min() > 20
+        assert levels[0, 0] < 4
+        assert len(picture["panels"][name]["lines"]) == 2  # the rim and the footprint
+    assert len(picture["panels"]["landscape"]["dots"]) == 2
+    assert picture["panels"]["hand"]["texts"][0][3] == "7.5 N"
+    assert "0 messages could not be read" in said
+
+
+def test_pages_share_one_subscription_and_a_slow_one_is_sent_nothing_that_it_did_not_ask_for() -> (
+    None
+):
+    with FakeDaemon() as fake, view(fake) as viewed:
+        with Watcher(viewed.host) as slow, ExitStack() as stack:
+            begun = slow.next()["seq"]
+            process = psutil.Process(viewed.process.pid)
+            port = int(fake.state_address.rpartition(":")[2])
+
+            def links() -> int:
+                return sum(
+                    bool(each.raddr) and each.raddr.port == port
+                    for each in process.net_connections()
+                )
+
+            one = links()
+            pages = [stack.enter_context(Watcher(viewed.host)) for _ in range(9)]
+            for _ in range(10):
+                seqs = [page.next()["seq"] for page in pages]
+            assert links() == one > 0
+            with pytest.raises(TimeoutError):
+                slow.socket.recv(timeout=0.0)
+            assert slow.next()["seq"] >= max(seqs) > begun
+        viewed.end()
+
+
+@pytest.mark.parametrize(
+    ("changes", "gone", "there"),
+    [
+        (
+            ('scene.fingers=["left"]', "scene.object_model=false"),
+            {"right", "Object's angle [°]"},
+            "left",
+        ),
+        (("servos.backend=none",), {"Joints [°]", "Currents [A]"}, "right"),
+        (("tactile.backend=none",), {"left", "right"}, "Joints [°]"),
+    ],
+)
+def test_what_the_scene_lacks_has_no_place(
+    tmp_path: Path, changes: tuple[str, ...], gone: set[str], there: str
+) -> None:
+    record_hand(tmp_path / "a.mcap", {}, 0.5, changes)
+    kept = Kept()
+    for topic, message in Recording(tmp_path / "a.mcap").messages():
+        kept.pictures.take(topic, message)
+    kept.pictures.draw(last=True)
+    names = {each["name"] for each in kept.scene["panels"]}
+    names |= {each["title"] for each in kept.scene["plots"]}
+    assert there in names
+    assert not gone & names
+    width = {len(row) for row in kept.newest["columns"]}
+    assert width == {
+        1
+        + max(k for plot in kept.scene["plots"] for line in plot["lines"] for k in line["columns"])
+    }
+
+
+# Who may look and command
+
+
+def test_other_hosts_and_origins_are_refused_and_nothing_else_listens() -> None:
+    with FakeDaemon() as fake, view(fake) as viewed:
+        port = viewed.host.rpartition(":")[2]
+        assert got(viewed.host, "/")[0] == 200
+        assert got(viewed.host, "/", Host=f"localhost:{port}")[0] == 200
+        for host in ("evil.example", f"evil.example:{port}", "127.0.0.1.evil.example", ""):
+            assert got(viewed.host, "/", Host=host)[0] == 403
+        for origin in (
+            "http://evil.example",
+            "null",
+            f"https://{viewed.host}",
+            "http://127.0.0.1:1",
+        ):
+            assert got(viewed.host, "/", Origin=origin)[0] == 403
+            for path in ("pictures", "_nicegui_ws/socket.io/?EIO=4&transport=websocket"):
+                with pytest.raises(InvalidStatus, match="403"), Watcher(viewed.host, origin=origin):
+                    pass
+                assert got(viewed.host, f"/{path}", Origin=origin)[0] == 403
+        with Watcher(viewed.host, origin=f"http://{viewed.host}") as page:
+            assert page.next()["mode"] == "holding"
+        for path in ("/docs", "/openapi.json", "/../etc/passwd"):
+            assert got(viewed.host, path)[0] == 404
+        listening = psutil.Process(viewed.process.pid).net_connections()
+        assert [each.laddr.ip for each in listening if each.status == "LISTEN"] == ["127.0.0.1"]
+
+
+def test_only_the_token_brings_what_commands() -> None:
+    with FakeDaemon() as fake, view(fake) as viewed:
+        assert "STOP" in got(viewed.host, viewed.commanding.removeprefix(viewed.address[:-1]))[1]
+        for path in ("/", "/?token=", "/?token=None", "/?token=%C3%A9", "/?token=abc"):
+            status, body = got(viewed.host, path)
+            assert status == 200
+            assert "STOP" not in body
+            assert "Watching" in body
+
+
+# A recording
+
+
+def test_a_recording_is_shown_from_any_place(recorded: Path) -> None:
+    recording = Recording(recorded)
+    states = [message for _, message in recording.messages([schema.STATE])]
+    kept = Kept()
+    playback = Playback(recording, kept.pictures, 0.01)
+    with Ending() as ending:
+        thread = threading.Thread(target=playback.run, args=(ending,))
+        thread.start()
+        try:
+            until(lambda: playback.position > 0.3)  # it plays
+            playback.playing = False
+            for place in (2.0, 0.5, 1.5):
+                playback.seek(place)
+                when = recording.start + place
+                until(lambda: abs(kept.newest["time"] - when) < 0.02)  # noqa: B023
+                picture = kept.newest
+                at = next(each for each in states if each["timestamp"] == picture["time"])
+                assert (picture["mode"], picture["status"]) == (at["mode"], "recording")
+                column = kept.scene["plots"][0]["lines"][0]["columns"][0]
+                past = {each["timestamp"]: each["left"]["force"] for each in states}
+                for row in picture["columns"]:
+                    force = past[row[0]]
+                    assert row[column] == (
+                        pytest.approx(force, rel=1e-4) if math.isfinite(force) else None
+                    )
+                assert len(picture["columns"]) == pytest.approx(10 * place, abs=2)
+            assert playback.position == 1.5
+            playback.playing = True
+            until(lambda: not playback.playing)  # at its end
+            assert playback.position == pytest.approx(recording.duration)
+            drawn = kept.newest
+            until(lambda: kept.newest is not drawn)  # and stays there
+        finally:
+            ending.end()
+            thread.join()
+
+
+def test_a_recording_that_was_cut_short_is_shown_as_far_as_it_goes(
+    recorded: Path, tmp_path: Path
+) -> None:
+    data = recorded.read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(data[: len(data) * 2 // 3])
+    with Viewed(str(tmp_path / "cut.mcap")) as viewed, Watcher(viewed.host) as page:
+        until(lambda: page.next()["mode"] == "holding")
+        body = got(viewed.host, "/")[1]
+        said = viewed.end()
+    assert "STOP" not in body
+    assert "cut short" in said
+
+
+# What can go wrong
+
+
+def test_messages_of_any_kind_are_survived() -> None:
+    odd: list[Any] = [None, 3, {}, {"timestamp": "now"}, {"timestamp": math.inf, "schema": 1}]
+    odd += [{"timestamp": 1e9, "schema": 1, "left": 3, "mode": 5, "seq": "a", "finger": "left"}]
+    odd += [{"timestamp": 1e9, "left": {"contact": True, "d": math.nan, "q": math.inf}}]
+    odd += [{"timestamp": 1e9, "left": {"contact": True, "d": 1.0, "theta": 9.0, "force": -1e300}}]
+    odd += [{**frame(0.0, 0), "data": b"abc"}, {**frame(0.0, 0), "pitch": -1.0}]
+    odd += [{"timestamp": 1e9, "settings": "{", "request": "{", "command": "grasp", "ok": True}]
+    odd += [{**state(0.0, 1), "mode": "\x1b[31m", "left": {**finger(0.0, 0), "q": 1e308}}]
+    kept = Kept(live=True)
+    for topic in (*kept.pictures._gaps, b"hand/news"):
+        for message in odd:
+            kept.pictures.take(topic, message)
+            kept.pictures.draw(last=True)
+    assert kept.pictures.unreadable > 10
+    kept.pictures.take(schema.STATE, {**state(0.0, 5), **GOALS})
+    kept.pictures.draw()
+    assert kept.newest["mode"] == "holding"
+
+
+def test_another_schema_is_told_once_and_what_is_known_is_shown() -> None:
+    with FakeDaemon() as fake:
+        fake.changes = {"schema": 2, "news": 1.5}
+        with view(fake) as viewed, Watcher(viewed.host) as page:
+            until(lambda: len(page.next()["columns"]) > 5)
+            assert 8.0 <= page.lines(page.next())["Force [N] left"][0] <= 12.0
+            said = viewed.end()
+    assert said.count("the stream is of schema 2, this viewer knows 1") == 1
+
+
+def test_waiting_is_told_and_a_signal_ends_it() -> None:
+    with FakeDaemon() as fake:
+        fake.silent.set()
+        with view(fake) as viewed, Watcher(viewed.host) as page:
+            assert viewed.process.stderr is not None
+            assert page.next()["status"] == "waiting"
+            waiting = f"waiting for a stream from {fake.state_address}"
+            assert any(waiting in line for line in viewed.process.stderr)
+            fake.silent.clear()
+            assert any("the stream has begun" in line for line in viewed.process.stderr)
+            until(lambda: page.next()["status"] == "live")
+            fake.silent.set()
+            until(lambda: page.next()["status"] == "lost")
+            viewed.process.send_signal(signal.SIGINT)
+            assert "states seen" in viewed.process.stderr.read()
+            assert viewed.process.wait(60) == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (("none.mcap",), "No such file"),
+        (("empty.mcap",), "empty"),
+        (("text.mcap",), "not an MCAP file"),
+        (("text.mcap", "--port", "-1"), "expected a port"),
+        (("--address", "tcp://nowhere"), "tcp://nowhere"),
+        (("--address", "tcp://127.0.0.1:9", "--duration", "0.1"), "nothing came"),
+        (("--address", "tcp://127.0.0.1:9", "--no-wait"), "no stream from tcp"),
+        (("--rate", "fast"), "expected 0.1 to 100 Hz"),
+    ],
+)
+def test_bad_input_is_one_clear_line(tmp_path: Path, words: tuple[str, ...], reason: str) -> None:
+    (tmp_path / "empty.mcap").touch()
+    (tmp_path / "text.mcap").write_text("no recording")
+    done = subprocess.run(
+        [*SOFTFINGER, "view", "--no-browser", *words],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode in (1, 2)
+    assert reason in done.stderr.splitlines()[-1]
+    assert "Traceback" not in done.stderr
+
+
+def test_pages_whose_port_nobody_chose_get_one_each() -> None:
+    from softfinger.tools.viewing.live_stream import ViewError
+    from softfinger.tools.viewing.page import listen
+
+    sockets = [listen(None) for _ in range(3)]  # the first one's is taken for the others
+    ports = [each.getsockname()[1] for each in sockets]
+    assert len(set(ports)) == 3
+    with pytest.raises(ViewError, match=f"port {ports[0]}"):
+        listen(ports[0])
+    for each in sockets:
+        each.close()
