@@ -65,9 +65,9 @@ def view(fake: FakeDaemon, *words: str) -> Viewed:
     return Viewed(*where, *words)
 
 
-def got(host: str, path: str, **headers: str) -> tuple[int, str]:
+def got(host: str, path: str, method: str = "GET", **headers: str) -> tuple[int, str]:
     connection = http.client.HTTPConnection(host, timeout=60)
-    connection.request("GET", path, headers=headers)
+    connection.request(method, path, headers=headers)
     answer = connection.getresponse()
     body = answer.read().decode()
     connection.close()
@@ -109,9 +109,9 @@ def test_a_picture_has_the_streams_values() -> None:
     for name in ("left", "right"):
         image = picture["panels"][name]["image"]
         levels = np.frombuffer(base64.b64decode(image["data"]), np.uint8).reshape(44, 44)
-        counts = np.frombuffer(frame(0.0, 0)["data"], "<u2").reshape(44, 44)
-        assert levels[counts == counts.max()].min() > 20
-        assert levels[0, 0] < 4
+        assert levels.max() > 20  # of 31: 45 kPa of 50
+        assert levels[20:24, 20:24].min() > 10
+        assert levels[:8].max() < 6  # noise
         assert len(picture["panels"][name]["lines"]) == 2  # the rim and the footprint
     assert len(picture["panels"]["landscape"]["dots"]) == 2
     assert picture["panels"]["hand"]["texts"][0][3] == "7.5 N"
@@ -212,6 +212,12 @@ def test_only_the_token_brings_what_commands() -> None:
             assert status == 200
             assert "STOP" not in body
             assert "Watching" in body
+            assert got(viewed.host, path.replace("/", "/stop"), "POST")[0] == 403
+        assert not fake.requests
+        query = viewed.commanding.removeprefix(viewed.address)
+        assert got(viewed.host, f"/stop{query}", "POST", Origin="http://evil.example")[0] == 403
+        assert got(viewed.host, f"/stop{query}", "POST") == (200, "✓ stop: ok")
+        assert fake.requests == [{"command": "stop"}]
 
 
 # A recording

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import json
 import math
 import os
 import secrets
@@ -28,7 +29,9 @@ from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocketClose
 
+from softfinger.daemon.client.command_client import NoAnswer, accepted, send
 from softfinger.daemon.control.modes import COMMANDS, GRIPPING
+from softfinger.daemon.errors import Refused
 from softfinger.daemon.loop.warm_up import LANDSCAPE
 from softfinger.daemon.profile.settings import Settings
 from softfinger.tools.arguments import client_keys, to_stderr
@@ -121,7 +124,8 @@ class CommandBar:
         self._buttons: dict[str, list[ui.button]] = {}
         self._shown: Any = None
         with ui.row().classes("items-center"):
-            ui.button("STOP", on_click=self._stop, color="red").props("size=lg").classes("stop")
+            stop = ui.button("STOP", color="red").props("size=lg").classes("stop")
+            stop.on("click", js_handler="() => stop()")
             for command, name in _SIMPLE.items():
                 self._button(name, command, lambda _, command=command: self._send(command))
         with ui.row().classes("items-center no-wrap slider"):
@@ -135,8 +139,7 @@ class CommandBar:
             self._angle.on("change", lambda _: self._rotate())
             self._button(f"+{_STEP:g}°", "rotate", lambda _: self._turn(_STEP))
             ui.label().bind_text_from(self._angle, "value", lambda angle: f"{angle:+.0f}°")
-        self._reply = ui.label().classes("reply")
-        ui.on("stop", self._stop)  # the space key
+        ui.label().classes("reply")  # the script's, which shows a stop's reply there, too
         ui.timer(_REFRESH, self._refresh)
 
     def _button(self, name: str, command: str, pressed: Callable[..., object]) -> None:
@@ -149,9 +152,6 @@ class CommandBar:
 
     def _send(self, command: str, label: str = "", **numbers: float) -> None:
         self._commander.send(time.monotonic(), label or command, command, **numbers)
-
-    def _stop(self) -> None:
-        self._send("stop")
 
     def _grasp(self) -> None:
         force = float(self._force.value)
@@ -178,7 +178,8 @@ class CommandBar:
             return
         self._shown = shown
         if reply is not None:
-            self._reply.text = f"{'✓' if reply.ok else '✗'} {reply.text}"
+            words = f"{'✓' if reply.ok else '✗'} {reply.text}"
+            ui.run_javascript(f"say({json.dumps(words)})")
         if math.isfinite(feed.force_most):
             self._force.props(f"max={feed.force_most:g}")
         for command, buttons in self._buttons.items():
@@ -247,13 +248,25 @@ async def _serve(
         playback = Playback(recording, pictures, 1.0 / arguments.rate)
         source = partial(playback.run, ending)
 
-    def page(token: str = "", *, expected: str | None = token) -> None:
+    def may_command(given: str) -> bool:
+        return token is not None and secrets.compare_digest(given.encode(), token.encode())
+
+    def stop(token: str = "") -> PlainTextResponse:
+        if not may_command(token):
+            return PlainTextResponse("✗ stop: needs the token that the terminal prints", 403)
+        try:
+            accepted(send(arguments.commands, {"command": "stop"}, keys=keys))
+        except (NoAnswer, Refused) as error:
+            return PlainTextResponse(f"✗ stop: {error}", 502)
+        return PlainTextResponse("✓ stop: ok")
+
+    def page(token: str = "") -> None:
         ui.add_head_html(_HEAD)
         ui.html('<div id="board"></div>', sanitize=False)
         with ui.footer():
             if playback is not None:
                 PlayBar(playback)
-            elif secrets.compare_digest(token.encode(), str(expected).encode()):
+            elif may_command(token):
                 name = f"page {secrets.token_hex(2)}"
                 CommandBar(pictures, Commander(context, arguments.commands, name))
             else:
@@ -261,7 +274,7 @@ async def _serve(
 
     server = uvicorn.Server(
         uvicorn.Config(
-            SameOrigin(_site(page, newest)),
+            SameOrigin(_site(page, stop, newest)),
             log_level="error",
             access_log=False,
             proxy_headers=False,
@@ -289,9 +302,15 @@ async def _serve(
     return pictures
 
 
-def _site(page: Callable[..., None], newest: Newest) -> FastAPI:
-    """The page at /, its pictures at /pictures, and NiceGUI's own files; nothing else."""
+def _site(
+    page: Callable[..., None], stop: Callable[..., PlainTextResponse], newest: Newest
+) -> FastAPI:
+    """The page at /, its pictures at /pictures, and NiceGUI's own files; nothing else.
+
+    A stop is a request of its own: a page that slept has lost its connection, and doesn't know yet.
+    """
     site = FastAPI(openapi_url=None)
+    site.post("/stop", response_class=PlainTextResponse)(stop)
     site.add_api_websocket_route("/pictures", newest.serve)
     ui.page("/", title="softfinger", dark=True)(page)
     ui.run_with(

@@ -1,0 +1,220 @@
+"""The page of ``softfinger view`` in a real browser: what it shows, and what its buttons do."""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from softfinger.daemon.client import Hand
+from softfinger.daemon.client.command_client import send
+from softfinger.tools.viewing.planar import COLOURS
+from tests.conftest import until
+from tests.harness.daemon_process import PATIENCE, Running
+from tests.harness.fake_daemon import FakeDaemon
+from tests.harness.headless_browser import Browser, browser_path
+from tests.harness.recorded_hand import record_hand
+from tests.harness.viewed import Viewed
+
+pytestmark = pytest.mark.skipif(browser_path() is None, reason="no Chromium on this machine")
+
+PATIENT = "\n".join(f"{key} = {value}" for key, value in PATIENCE.items())
+# The fraction of a canvas's pixels that nearly have a colour.
+FRACTION = """((name, colour) => {
+  const canvas = document.querySelector(`#board .${name} canvas`);
+  const data = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data;
+  let count = 0;
+  for (let k = 0; k < data.length; k += 4)
+    count += data[k + 3] > 200 && colour.every((value, c) => Math.abs(data[k + c] - value) < 30);
+  return 4 * count / data.length;
+})"""
+
+
+class Page:
+    """The browser's page, and what a test does there."""
+
+    def __init__(self, browser: Browser) -> None:
+        self.browser = browser
+
+    def open(self, url: str) -> float:
+        """Open, and return the seconds until the first picture was drawn."""
+        begun = time.monotonic()
+        self.browser.open(url)
+        until(lambda: self("document.body?.dataset.seq"))
+        return time.monotonic() - begun
+
+    def __call__(self, script: str) -> Any:
+        return self.browser.evaluate(script)
+
+    def text(self, selector: str) -> str:
+        return str(self(f"document.querySelector('{selector}')?.textContent"))
+
+    def click(self, selector: str) -> None:
+        """Once it may be pressed."""
+        button = f"document.querySelector('.q-footer {selector}')"
+        until(lambda: self(f"!!{button} && !{button}.disabled"))
+        self(f"{button}.click()")
+
+    def space(self) -> None:
+        for kind in ("keyDown", "keyUp"):
+            self.browser.ask("Input.dispatchKeyEvent", type=kind, code="Space", key=" ", text=" ")
+
+    def fraction(self, panel: str, colour: tuple[int, int, int]) -> float:
+        return float(self(f"{FRACTION}('{panel}', {list(colour)})"))
+
+    def lag(self) -> float:
+        """How far the page is behind the stream [s]."""
+        return float(self("Date.now() / 1000 - window.picture.time"))
+
+
+@pytest.fixture
+def page(tmp_path: Path) -> Iterator[Page]:
+    path = browser_path()
+    assert path is not None
+    browser = Browser(path, tmp_path / "profile", 1400, 900)
+    yield Page(browser)
+    browser.close()
+
+
+def test_every_button_brings_its_mode_and_a_lost_page_gives_the_hand_back(
+    start: Callable[..., Running],
+    profile: Callable[[str], Path],
+    addresses: tuple[str, str],
+    page: Page,
+) -> None:
+    start("--config", str(profile(PATIENT)))
+    stream, commands = addresses
+    with (
+        Viewed("--address", stream, "--commands", commands) as viewed,
+        Hand(*addresses, timeout=60.0) as hand,
+    ):
+        page.open(viewed.commanding)
+
+        def press(button: str, mode: str) -> None:
+            page.click(button)
+            hand.wait_for(lambda state: state.mode == mode, 60.0)
+            until(lambda: page.text(".mode") == mode)
+
+        press(".arm", "armed")
+        refused = send(commands, {"command": "release", "client": "another"})
+        assert "page" in refused["error"]  # it commands the hand
+        press(".grasp", "holding")
+        assert hand.state().goal_force == pytest.approx(5.0)
+        until(lambda: page.fraction("hand", COLOURS["left"]) > 0.002)
+        for name, colour in COLOURS.items():
+            assert page.fraction("hand", colour) > 0.002, name
+            assert page.fraction("plot", colour) > 0.0005, name
+            assert page.fraction(name, (255, 255, 255)) > 0.001, name  # the footprint
+            assert page.fraction(name, (132, 198, 74)) > 0.0005, name  # high pressure
+            assert page.fraction("landscape", colour) > 0.0003, name
+        assert page.fraction("hand", (0, 158, 115)) > 0.001  # the object
+        page.click(".rotate:last-of-type")
+        goal = hand.wait_for(lambda state: math.isfinite(state.goal_angle)).goal_angle
+        assert goal == pytest.approx(math.radians(5.0), abs=math.radians(1.0))
+        hand.wait_for(lambda state: state.mode == "holding", 60.0)
+        press(".release", "armed")
+        page("document.querySelector('.grasp').focus()")
+        page.space()
+        hand.wait_for(lambda state: state.mode == "disarmed", 60.0)
+        until(lambda: page.text(".reply") == "✓ stop: ok")  # and grasp was not pressed
+        page.click(".tare")
+        until(lambda: page.text(".reply") == "✓ tare: ok")
+        press(".arm", "armed")
+        press(".disarm", "disarmed")
+        press(".arm", "armed")
+        press(".stop", "disarmed")
+        press(".arm", "armed")
+        page.browser.open("about:blank")
+        until(lambda: send(commands, {"command": "release", "client": "another"})["ok"])
+        viewed.end()
+
+
+def test_the_page_is_quick_survives_sleep_and_reload_and_asks_nobody_else(page: Page) -> None:
+    with FakeDaemon() as fake:
+        where = ("--address", fake.state_address, "--commands", fake.command_address)
+        fake.changes = {"mode": "fault", "fault": "<b>tip.force</b>: 31 N"}
+        with Viewed(*where) as viewed:
+            page.open(viewed.address)  # fills the browser's cache, as a second visit finds it
+            assert "Watching" in page.text(".q-footer")
+            assert page.text(".fault") == "<b>tip.force</b>: 31 N"
+            page.space()
+            page("stop()")
+            assert page.open(viewed.commanding) < 10.0  # 2 s where nothing else runs
+            page.click(".clear")
+            until(lambda: page.text(".reply") == "✓ clear: ok")
+            assert [each["command"] for each in fake.requests] == ["clear"]  # no stop without it
+            until(lambda: page.lag() < 0.5)
+
+            os.killpg(page.browser.process.pid, signal.SIGSTOP)
+            asleep = fake.published
+            until(lambda: fake.published > asleep + 1000)  # 10 s of the stream
+            os.killpg(page.browser.process.pid, signal.SIGCONT)
+            until(lambda: page.lag() < 0.5, 10.0)
+            page.click(".stop")  # heard although the page's connection was given up meanwhile
+            until(lambda: fake.requests[-1]["command"] == "stop")
+
+            page("location.reload()")
+            until(lambda: page("performance.getEntriesByType('navigation')[0].type") == "reload")
+            until(lambda: page("document.body?.dataset.seq"))
+            page.click(".clear")
+            until(lambda: fake.requests[-1]["command"] == "clear")
+            assert fake.requests[0]["client"] != fake.requests[-1]["client"]
+
+            page.browser.ask(
+                "Emulation.setDeviceMetricsOverride",
+                width=390,
+                height=844,
+                deviceScaleFactor=2,
+                mobile=True,
+            )
+            until(lambda: page("document.documentElement.scrollWidth") <= 390)
+            edges = page(
+                "(({left, right, bottom}) => [left, right, bottom])"
+                "(document.querySelector('.stop').getBoundingClientRect())"
+            )
+            assert 0 <= edges[0] < edges[1] <= 390
+            assert edges[2] <= 844
+            foreign = [
+                url
+                for url in page.browser.requests
+                if not url.startswith((f"http://{viewed.host}/", f"ws://{viewed.host}/", "data:"))
+            ]
+            assert not foreign
+
+            page.browser.open("data:text/html,another page")  # of an origin of its own
+            until(lambda: page("location.protocol") == "data:")
+            page(f"(window.tried = new WebSocket('ws://{viewed.host}/pictures')).readyState")
+            page("tried.onopen = tried.onerror = event => window.came = event.type")
+            until(lambda: page("window.came"))
+            assert page("window.came") == "error"
+            viewed.end()
+
+
+def test_a_recordings_slider_goes_to_its_place(page: Page, tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    record_hand(path, {30: {"command": "arm"}, 60: {"command": "grasp", "force": 8.0}}, 2.0)
+    with Viewed(str(path)) as viewed:
+        page.open(viewed.address)
+        until(lambda: page.text(".place").startswith("2.0 of 2.0"))
+        assert page.text(".mode") == "holding"
+        box = page(
+            "(({left, top, height}) => [left, top + height / 2])"
+            "(document.querySelector('.q-slider').getBoundingClientRect())"
+        )
+        for kind in ("mousePressed", "mouseReleased"):
+            page.browser.ask(
+                "Input.dispatchMouseEvent",
+                type=kind,
+                x=box[0] + 2,
+                y=box[1],
+                button="left",
+                clickCount=1,
+            )
+        until(lambda: page.text(".mode") == "disarmed")
+        viewed.end()
