@@ -24,7 +24,7 @@ SUBCOMMANDS = {  # the room of tools/ that its module is in, and what it does
     "emulate": ("processes", "emulate a hand: servos and tactile boards on ptys"),
     "send": ("terminal", "send one command to the running daemon"),
     "monitor": ("terminal", "live page of the running daemon in the terminal"),
-    "view": ("viewing", "show the running hand, or a recording, in Rerun's viewer"),
+    "view": ("viewing", "a web page to see and command the hand, or to see a recording"),
     "record": ("recordings", "record the running daemon's stream into an MCAP file"),
     "replay": ("recordings", "publish a recording again, or compare it with today's code"),
     "analyse": ("analysis", "compute contact, force and energy over time from recorded frames"),
