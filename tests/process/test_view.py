@@ -104,7 +104,9 @@ def test_a_picture_has_the_streams_values() -> None:
     assert (picture["mode"], picture["status"], picture["fault"]) == ("holding", "live", "")
     assert picture["events"][-1][1:] == ["warning", "slip", "the object slips"]
     assert "the object slips · grip: goal 9.0 N" in picture["limits"]
-    assert picture["limits"].endswith("nearest limit: left temperature at 94 % of 70 °C")
+    assert picture["limits"].endswith(
+        "nearest limit: left temperature at 94% of safety.temperature_max"
+    )
     assert "servos 66 / 41 °C, 12.1 / 12.1 V" in picture["facts"]
     for name in ("left", "right"):
         image = picture["panels"][name]["image"]

@@ -59,7 +59,6 @@ def follow(
     bridge: Taker,
     ending: Ending,
     say: Callable[[str], None],
-    is_open: Callable[[], bool] = lambda: True,
 ) -> None:
     """Show the stream that ``arguments`` name until the end. Raises ViewError."""
     period = 1.0 / arguments.rate
@@ -88,8 +87,6 @@ def follow(
             after = time.monotonic()
             # Never busy for more than half of its time, however slow the machine is.
             due = after + max(period - (after - now), min(after - now, _REST))
-            if not is_open():
-                return
         stream.drain(bridge, 0.0)
         bridge.draw(last=True)
 

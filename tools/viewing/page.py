@@ -297,8 +297,8 @@ async def _serve(
     server.should_exit = True
     ending.end()
     await serving
-    await reading
     context.destroy(linger=0)
+    await reading  # and raise what ended it
     return pictures
 
 

@@ -81,12 +81,12 @@ _OTHERS = {  # names and colours of lines that are no finger's
     "compute_s": ("work", OBJECT),
     "wake_late_s": ("late", LATE),
 }
-_BOUNDS = (  # field of a finger, setting in `safety`, factor, unit
-    ("force", "force_max", 1.0, "N"),
-    ("d", "d_max", 1e3, "mm"),
-    ("current", "current_max", 1.0, "A"),
-    ("temperature", "temperature_max", 1.0, "°C"),
-)
+_BOUNDS = {  # fields of a finger, and what bounds them in the section `safety`
+    "force": "force_max",
+    "d": "d_max",
+    "current": "current_max",
+    "temperature": "temperature_max",
+}
 
 
 class Pictures:
@@ -210,13 +210,14 @@ class Pictures:
     def _lines(self, factor: float, fields: str) -> list[dict[str, Any]]:
         """A plot's lines: name, colour, and the columns of values and of their deviations."""
         lines = []
+        hand = self.hand
         for path in fields.split():
             finger, _, key = path.rpartition(".")
-            if finger in FINGERS and finger not in self.hand.fingers:
-                continue
-            if key in _SERVOS and not self.hand.servos:
-                continue
-            if path in ("object.angle", "goal_angle") and len(self.hand.fingers) < 2:
+            if (
+                (finger in FINGERS and finger not in hand.fingers)
+                or (key in _SERVOS and not hand.servos)
+                or (path in ("object.angle", "goal_angle") and len(hand.fingers) < 2)
+            ):
                 continue
             goal = " goal" if key.startswith("goal") else ""
             name, colour = _OTHERS.get(path, ((finger + goal).strip(), COLOURS.get(finger, GOAL)))
@@ -253,15 +254,10 @@ class Pictures:
                     trail.append((contact.d, contact.theta))
         row: list[Any] = [when, self.feed.mode]
         for path, factor in self._fields:
-            if path == "goal_energy":
-                value = (
-                    math.nan
-                    if self._landscape is None
-                    else self._landscape.energy_of(np.array(state.goal_force))
-                )
-            elif path == "object.angle" and not state.object.valid:
-                value = math.nan
-            else:
+            value: Any = math.nan
+            if path == "goal_energy" and self._landscape is not None:
+                value = self._landscape.energy_of(np.array(state.goal_force))
+            elif path != "goal_energy" and (path != "object.angle" or state.object.valid):
                 value = attrgetter(path)(state)
             row.append(float(f"{factor * value:.5g}"))
         columns.append(row)
@@ -352,16 +348,16 @@ class Pictures:
             asked = self.feed.asked
             raised = f", raised from {asked:.1f} N" if state.goal_force > 1.01 * asked else ""
             parts.append(f"grip: goal {state.goal_force:.1f} N{raised}")
-        near = []
-        for name in self.hand.fingers:
-            for key, setting, factor, unit in _BOUNDS:
-                value, bound = abs(getattr(getattr(state, name), key)), getattr(safety, setting)
-                words = (
-                    f"{name} {key} at {100.0 * value / bound:.0f} % of {factor * bound:g} {unit}"
-                )
-                near.append((value / bound, words))
-        known = [each for each in near if math.isfinite(each[0])]
-        return " · ".join([*parts, *(f"nearest limit: {max(known)[1]}" for _ in known[:1])])
+        used = {
+            f"{name} {key} at {{:.0%}} of safety.{bound}": value / getattr(safety, bound)
+            for name in self.hand.fingers
+            for key, bound in _BOUNDS.items()
+            if math.isfinite(value := abs(getattr(getattr(state, name), key)))
+        }
+        if used:
+            nearest = max(used, key=lambda words: used[words])
+            parts.append("nearest limit: " + nearest.format(used[nearest]))
+        return " · ".join(parts)
 
     def _facts(self, now: float) -> list[str]:
         """Small facts, one cell each: tick and its times, frames, servos, losses, commander."""
@@ -373,22 +369,21 @@ class Pictures:
             return " / ".join(short(factor * getattr(finger, key), decimals) for finger in fingers)
 
         facts = [f"tick {short(ticks.rate, 0)} Hz", f"overruns {state.overruns}"]
-        rates = ""
         if times is not None:
-            rates = f", {short(times.rates.left, 0)} / {short(times.rates.right, 0)} Hz"
-        parts = {} if times is None else {"work": times.compute, "bus": times.bus}
-        parts |= {} if times is None else {"late": times.wake, "publish": times.publish}
-        for name, of in parts.items():
-            spread = ", ".join(micro(value) for value in (of.p50, of.p99, of.p999, of.max))
-            facts.append(f"{name} [µs] p50, 99, 99.9, max: {spread}")
+            spreads = (times.compute, times.wake, times.bus, times.publish)
+            for name, of in zip(("work", "late", "bus", "publish"), spreads, strict=True):
+                spread = ", ".join(micro(value) for value in (of.p50, of.p99, of.p999, of.max))
+                facts.append(f"{name} [µs] p50, 99, 99.9, max: {spread}")
+            rates = short(times.rates.left, 0), short(times.rates.right, 0)
+            facts.append(f"frames {' / '.join(rates)} Hz")
         facts += [
-            f"frames {each('frame_age_s', 1e3, 0)} ms old{rates}",
+            f"frames {each('frame_age_s', 1e3, 0)} ms old",
             f"servos {each('temperature', 1.0, 0)} °C, {each('voltage', 1.0, 1)} V",
-            f"object {short(1e3 * state.object.width, 1)} mm wide" if state.object.valid else "",
+            f"object {short(1e3 * state.object.width, 1)} mm wide",
             f"{sum(gaps.lost for gaps in self._gaps.values())} lost, {feed.skipped} unreadable",
-            f"{feed.commander(now)} commands" if feed.commander(now) else "",
         ]
-        return [fact for fact in facts if fact]
+        who = feed.commander(now)
+        return [*facts, f"{who} commands"] if who else facts
 
 
 def _panel(name: str, title: str, *box: float, **more: Any) -> dict[str, Any]:
