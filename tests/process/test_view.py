@@ -257,6 +257,8 @@ def test_a_recording_is_shown_from_any_place(recorded: Path) -> None:
             assert playback.position == pytest.approx(recording.duration)
             drawn = kept.newest
             until(lambda: kept.newest is not drawn)  # and stays there
+            playback.playing = True
+            until(lambda: 0.0 < playback.position < 1.0)  # and plays again
         finally:
             ending.end()
             thread.join()

@@ -19,7 +19,7 @@ class Playback:
         self._recording = recording
         self._pictures = pictures
         self._period = period  # s between two pictures
-        self._target: float | None = 0.0
+        self._target: float | None = None  # where to go, from another thread
         self.playing = True
         self.position = 0.0  # s from the first message on
         self.duration = recording.duration
@@ -33,10 +33,10 @@ class Playback:
         if self._recording.count(schema.SETTINGS):  # which may come once, at the beginning
             self._pictures.take(*next(self._recording.messages([schema.SETTINGS])))
         while not ending.over:
-            if self._target is None:
+            if self._target is None and not self.playing:
                 self._stand(ending)
-            else:
-                target, self._target = self._target, None
+            else:  # without a place, again from the beginning
+                target, self._target = self._target or 0.0, None
                 self._play_from(target, ending)
 
     def _play_from(self, target: float, ending: Ending) -> None:
