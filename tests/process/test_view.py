@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import http.client
 import math
+import select
 import signal
 import subprocess
 import threading
@@ -17,11 +18,14 @@ import numpy as np
 import orjson
 import psutil
 import pytest
+import zmq
 from websockets.exceptions import InvalidStatus
 
 from softfinger.daemon.wire import schema
+from softfinger.daemon.wire.packer import pack
 from softfinger.tools.ending import Ending
 from softfinger.tools.recordings.reader import Recording
+from softfinger.tools.viewing.live_stream import TOPICS, LiveStream
 from softfinger.tools.viewing.pictures import Pictures
 from softfinger.tools.viewing.playback import Playback
 from tests.conftest import until
@@ -297,6 +301,26 @@ def test_messages_of_any_kind_are_survived() -> None:
     kept.pictures.take(schema.STATE, {**state(0.0, 5), **GOALS})
     kept.pictures.draw()
     assert kept.newest["mode"] == "holding"
+
+
+def test_while_nothing_is_read_states_wait(
+    context: zmq.Context[Any], addresses: tuple[str, str]
+) -> None:
+    """As while a busy machine draws for seconds."""
+    publisher = context.socket(zmq.XPUB)
+    publisher.setsockopt(zmq.SNDHWM, 2000)  # as the daemon's
+    publisher.bind(addresses[0])
+    kept = Kept(live=True)
+    with LiveStream(addresses[0]) as stream:
+        until(lambda: {publisher.recv()[1:] for _ in TOPICS} == set(TOPICS))
+        for k in range(1, 10_001):
+            publisher.send_multipart([schema.STATE, pack({**state(0.0, k), "seq_step": 1})])
+            if k % 100 == 0:
+                select.select([], [], [], 0.005)  # as fast as libzmq's own thread takes them
+        until(lambda: stream.drain(kept.pictures, 0.0) == 0)
+    kept.pictures.draw()
+    assert kept.pictures.shown == 10_000
+    assert "0 lost, 0 unreadable" in kept.newest["facts"]
 
 
 def test_another_schema_is_told_once_and_what_is_known_is_shown() -> None:
