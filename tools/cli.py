@@ -32,7 +32,7 @@ GROUPS = {  # subcommands: the room of tools/ that its module is in, and what it
         "status": ("terminal", "say in one line what the running hand does"),
         "send": ("terminal", "send one command to the running daemon"),
         "monitor": ("terminal", "live page of the running daemon in the terminal"),
-        "view": ("viewing", "show the running hand, or a recording, in Rerun's viewer"),
+        "view": ("viewing", "show and command the running hand, or show a recording, in a page"),
     },
     "data": {
         "record": ("recordings", "record the running daemon's stream into an MCAP file"),

@@ -12,7 +12,7 @@ from softfinger.daemon.errors import SoftfingerError
 _EXTRAS = {  # what the message says, and the modules
     "plot": ("pictures need matplotlib", ("matplotlib",)),
     "record": ("recordings need mcap, orjson and zstandard", ("mcap", "orjson", "zstandard")),
-    "view": ("the viewer needs rerun-sdk from 0.32 on", ("rerun", "rerun_cli")),
+    "view": ("the page needs nicegui and orjson", ("nicegui", "orjson")),
     "foxglove": ("Foxglove's server needs foxglove-sdk and orjson", ("foxglove", "orjson")),
     "parquet": ("Parquet files need pyarrow", ("pyarrow",)),
     "gym": ("the environments need gymnasium", ("gymnasium",)),
@@ -29,8 +29,6 @@ def require(extra: str) -> None:
     try:
         for module in modules:
             importlib.import_module(module)
-        if extra == "view":
-            importlib.import_module("rerun.archetypes.state_change")  # what older ones lack
     except ImportError:
         raise MissingExtra(f"{needs}: {_install()} 'softfinger[{extra}]'") from None
 

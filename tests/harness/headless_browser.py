@@ -32,9 +32,7 @@ _FLAGS = (
     "--disable-extensions",
     "--disable-dev-shm-usage",
     "--hide-scrollbars",
-    "--use-gl=angle",
-    "--use-angle=swiftshader",  # draws on the processor: a test machine has no graphics card
-    "--enable-unsafe-swiftshader",
+    "--disable-gpu",  # a test machine has no graphics card
     "--remote-debugging-pipe",
 )
 

@@ -187,9 +187,6 @@ def check_events(client: Client, early: dict[str, Any]) -> None:
     assert fields(line[1][0])[1] == [int(early["timestamp"])]
 
 
-@pytest.mark.parametrize("words", [("run.mcap",), ("--web",), ("--save", "a.rrd")])
-def test_foxglove_is_for_the_stream_alone(
-    words: tuple[str, ...], capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert cli.main(["view", *words, "--foxglove"]) == 2
+def test_foxglove_is_for_the_stream_alone(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["view", "run.mcap", "--foxglove"]) == 2
     assert "--foxglove serves the stream alone" in capsys.readouterr().err

@@ -28,6 +28,7 @@ from tests.harness.daemon_process import (
     softfinger,
     until_it_says,
 )
+from tests.harness.viewed import Viewed, Watcher
 from tests.process.test_record import written
 from tests.unit.test_schema import sample
 
@@ -72,12 +73,10 @@ def test_tools_with_keys_see_and_command_the_hand(guarded: Guarded, tmp_path: Pa
     folder, addresses, _ = guarded
     stream, commands = addresses
     alice = ("--keys", str(folder / "alice"))
-    path, shown = tmp_path / "a.mcap", tmp_path / "a.rrd"
-    record(path, "--address", stream, *alice)
-    view = subprocess.Popen([*SOFTFINGER, "view", "--save", shown, "--address", stream, *alice])
-    until(lambda: shown.exists() and shown.stat().st_size > 100_000)
-    view.terminate()
-    assert view.wait(120.0) == 0
+    record(tmp_path / "a.mcap", "--address", stream, *alice)
+    with Viewed("--address", stream, *alice) as viewed, Watcher(viewed.host) as page:
+        until(lambda: page.next()["mode"] == "disarmed")
+        viewed.end()
     with Hand(*addresses, keys=folder / "alice", timeout=60.0) as hand:
         insist(hand.arm)
         assert hand.wait_for(lambda state: state.torque, 60.0).mode == "armed"
@@ -105,7 +104,7 @@ def test_tools_without_keys_see_nothing_and_say_what_may_be_missing(
         subprocess.Popen([*SOFTFINGER, *words], stderr=subprocess.PIPE, text=True)
         for words in (
             ("record", str(path), "--address", stream, "--no-wait"),
-            ("view", "--save", str(tmp_path / "b.rrd"), "--address", stream, "--no-wait"),
+            ("view", "--no-browser", "--port", "0", "--address", stream, "--no-wait"),
             ("monitor", "--plain", "--state", stream, "--commands", commands, "--no-wait"),
             ("send", "status", "--address", commands, "--timeout", "0.5"),
         )

@@ -1,144 +1,222 @@
-"""``softfinger view --web`` in a real browser: the picture has the hand in every panel."""
+"""The page of ``softfinger view`` in a real browser: what it shows, and what its buttons do."""
 
 from __future__ import annotations
 
-import re
-import select
-import subprocess
+import math
+import os
+import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
-import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from softfinger.daemon.client import Hand
+from softfinger.daemon.client.command_client import send
 from softfinger.tools.viewing.planar import COLOURS
 from tests.conftest import until
-from tests.harness.daemon_process import SOFTFINGER, Running, ask
+from tests.harness.daemon_process import PATIENCE, Running
+from tests.harness.fake_daemon import FakeDaemon
 from tests.harness.headless_browser import Browser, browser_path
+from tests.harness.recorded_hand import record_hand
+from tests.harness.viewed import Viewed
 
-Picture = NDArray[np.uint8]
-Region = tuple[float, float, float, float]  # left, right, top, bottom, as shares of the picture
+pytestmark = pytest.mark.skipif(browser_path() is None, reason="no Chromium on this machine")
 
-WIDTH, HEIGHT = 1400, 900
-LEFT_MAP: Region = (0.0, 0.25, 0.06, 0.46)
-HAND: Region = (0.27, 0.73, 0.06, 0.46)
-RIGHT_MAP: Region = (0.75, 1.0, 0.06, 0.46)
-LANDSCAPE: Region = (0.0, 0.31, 0.5, 0.96)
-FORCE: Region = (0.32, 0.66, 0.52, 0.73)
-ENERGY: Region = (0.32, 0.66, 0.76, 0.96)
-TICK: Region = (0.67, 1.0, 0.5, 0.68)
-MODE: Region = (0.67, 1.0, 0.69, 0.8)
-EVENTS: Region = (0.67, 1.0, 0.84, 0.96)
-GREEN = (0, 158, 115)  # the tick's work
-
-# A hand that sits out a test machine's stalls: what is looked at is its picture.
-PATIENT = """
-servos.watchdog = 0.0
-safety.frame_age_hold = 100.0
-safety.frame_age_fault = 300.0
-loop.rate = 100.0
-"""
+PATIENT = "\n".join(f"{key} = {value}" for key, value in PATIENCE.items())
+# The fraction of a canvas's pixels that nearly have a colour.
+FRACTION = """((name, colour) => {
+  const canvas = document.querySelector(`#board .${name} canvas`);
+  const data = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data;
+  let count = 0;
+  for (let k = 0; k < data.length; k += 4)
+    count += data[k + 3] > 200 && colour.every((value, c) => Math.abs(data[k + c] - value) < 30);
+  return 4 * count / data.length;
+})"""
 
 
-def part(picture: Picture, region: Region) -> Picture:
-    left, right, top, bottom = region
-    height, width = picture.shape[:2]
-    return picture[int(top * height) : int(bottom * height), int(left * width) : int(right * width)]
+class Page:
+    """The browser's page, and what a test does there."""
+
+    def __init__(self, browser: Browser) -> None:
+        self.browser = browser
+
+    def open(self, url: str) -> float:
+        """Open, and return the seconds until the first picture was drawn."""
+        begun = time.monotonic()
+        self.browser.open(url)
+        until(lambda: self("document.body?.dataset.seq"))
+        return time.monotonic() - begun
+
+    def __call__(self, script: str) -> Any:
+        return self.browser.evaluate(script)
+
+    def text(self, selector: str) -> str:
+        return str(self(f"document.querySelector('{selector}')?.textContent"))
+
+    def click(self, selector: str) -> None:
+        """Once it may be pressed."""
+        button = f"document.querySelector('.q-footer {selector}')"
+        until(lambda: self(f"!!{button} && !{button}.disabled"))
+        self(f"{button}.click()")
+
+    def space(self) -> None:
+        for kind in ("keyDown", "keyUp"):
+            self.browser.ask("Input.dispatchKeyEvent", type=kind, code="Space", key=" ", text=" ")
+
+    def fraction(self, panel: str, colour: tuple[int, int, int]) -> float:
+        return float(self(f"{FRACTION}('{panel}', {list(colour)})"))
+
+    def lag(self) -> float:
+        """How far the page is behind the stream [s]."""
+        return float(self("Date.now() / 1000 - window.picture.time"))
 
 
-def share(picture: Picture, region: Region, colour: tuple[int, int, int], apart: int = 40) -> float:
-    """Share of a region's pixels that have nearly this colour."""
-    distance = np.abs(part(picture, region).astype(int) - colour).max(axis=-1)
-    return float((distance <= apart).mean())
+@pytest.fixture
+def page(tmp_path: Path) -> Iterator[Page]:
+    path = browser_path()
+    assert path is not None
+    browser = Browser(path, tmp_path / "profile", 1400, 900)
+    yield Page(browser)
+    browser.close()
 
 
-def missing(picture: Picture) -> list[str]:
-    """What should be in the picture of a hand that turns its object, and is not."""
-    found = {}
-    for name, region in (("left", LEFT_MAP), ("right", RIGHT_MAP)):
-        pixels = part(picture, region).astype(int)
-        hot = (pixels[..., 0] > 200) & (pixels[..., 1] > 90) & (pixels[..., 2] < 120)
-        found[f"{name} tip's pressure"] = hot.mean() > 0.01
-        found[f"{name} tip's footprint"] = share(picture, region, (255, 255, 255)) > 0.002
-        found[f"{name} tip's rim"] = share(picture, region, COLOURS[name], 80) > 0.0015
-        found[f"{name} finger"] = share(picture, HAND, COLOURS[name]) > 0.01
-        found[f"{name} force"] = share(picture, FORCE, COLOURS[name]) > 0.001
-        found[f"{name} energy"] = share(picture, ENERGY, COLOURS[name]) > 0.001
-        found[f"{name} trail"] = share(picture, LANDSCAPE, COLOURS[name]) > 0.0003
-    found["object"] = share(picture, HAND, GREEN) > 0.002
-    found["wanted force"] = share(picture, FORCE, (140, 140, 140), 12) > 0.0005
-    ramp = {"shallow": (42, 55, 110), "middle": (38, 130, 140), "deep": (150, 202, 102)}
-    for name, colour in ramp.items():
-        found[f"{name} energies"] = share(picture, LANDSCAPE, colour, 25) > 0.01
-    found["tick"] = share(picture, TICK, GREEN) > 0.001
-    strip = part(picture, MODE).astype(int)
-    found["mode"] = (strip.max(axis=-1) - strip.min(axis=-1) > 60).mean() > 0.02
-    ground = np.median(part(picture, EVENTS).reshape(-1, 3), axis=0)
-    text = np.abs(part(picture, EVENTS) - ground).max(axis=-1) > 60
-    found["events"] = text.any(axis=1).mean() > 0.2  # lines of text
-    return [name for name, there in found.items() if not there]
-
-
-@pytest.mark.parametrize("ground", [(0, 0, 0), (20, 22, 30), (255, 255, 255)])
-def test_an_empty_page_has_nothing_of_it(ground: tuple[int, int, int]) -> None:
-    empty = np.full((HEIGHT, WIDTH, 3), ground, dtype=np.uint8)
-    absent = missing(empty)
-    assert len(absent) >= 18
-    assert {"left finger", "right force", "object", "middle energies", "events"} <= set(absent)
-
-
-@pytest.mark.skipif(browser_path() is None, reason="no Chromium on this machine")
-def test_every_panel_shows_the_hand(
+def test_every_button_brings_its_mode_and_a_lost_page_gives_the_hand_back(
     start: Callable[..., Running],
     profile: Callable[[str], Path],
     addresses: tuple[str, str],
-    tmp_path: Path,
+    page: Page,
 ) -> None:
-    daemon = start("--config", str(profile(PATIENT)))
-    words = ["view", "--web", "--no-browser", "--rate", "5", "--address", addresses[0]]
-    view = subprocess.Popen(
-        [*SOFTFINGER, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
-    path = browser_path()
-    assert path is not None
-    assert view.stdout is not None
-    browser = None
-    try:
-        found = re.search(r"http://127\.0\.0\.1:\d+/", view.stdout.readline())
-        assert found is not None
-        # A browser that draws on the processor takes all of it: it comes when there is all to see.
-        assert ask(addresses[1], "arm")["ok"]
-        assert ask(addresses[1], "grasp", force=10.0)["ok"]
-        until(lambda: ask(addresses[1], "status")["mode"] == "holding")
-        browser = Browser(path, tmp_path / "profile", WIDTH, HEIGHT)
-        browser.open(found[0])
-        angle = 0.1
-        deadline = time.monotonic() + 300.0
-        absent = missing(np.zeros((HEIGHT, WIDTH, 3), dtype=np.uint8))  # not seen so far
-        while True:
-            picture = browser.picture()
-            absent = [each for each in missing(picture) if each in absent]
-            if not absent or time.monotonic() > deadline:
-                break
-            angle = -angle
-            ask(addresses[1], "rotate", angle=angle)  # refused while it still turns
-            select.select([], [], [], 0.5)
-        if absent:
-            from PIL import Image
+    start("--config", str(profile(PATIENT)))
+    stream, commands = addresses
+    with (
+        Viewed("--address", stream, "--commands", commands) as viewed,
+        Hand(*addresses, timeout=60.0) as hand,
+    ):
+        page.open(viewed.commanding)
 
-            Image.fromarray(picture).save(tmp_path / "seen.png")
-        assert not absent, f"{absent} not in {tmp_path / 'seen.png'}"
-        # Nothing was asked of another machine, but for what the page's policy kept back.
-        foreign = [url for url in browser.requests if not url.startswith("http://127.0.0.1:")]
-        assert len(foreign) <= browser.blocked.count("csp")
-        assert any(url.endswith("re_viewer_bg.wasm") for url in browser.requests)
-    finally:
-        if browser is not None:
-            browser.close()
-        view.terminate()
-        _, error = view.communicate(timeout=120)
-    assert view.returncode == 0, error
-    assert "states shown" in error
-    assert daemon.end() == 0
+        def press(button: str, mode: str) -> None:
+            page.click(button)
+            hand.wait_for(lambda state: state.mode == mode, 60.0)
+            until(lambda: page.text(".mode") == mode)
+
+        press(".arm", "armed")
+        refused = send(commands, {"command": "release", "client": "another"})
+        assert "page" in refused["error"]  # it commands the hand
+        press(".grasp", "holding")
+        assert hand.state().goal_force == pytest.approx(5.0)
+        for name, colour in COLOURS.items():
+            for panel, seen, least in (
+                ("hand", colour, 0.002),
+                ("plot", colour, 0.0005),
+                ("landscape", colour, 0.0003),
+                (name, (255, 255, 255), 0.001),  # the footprint
+                (name, (132, 198, 74), 0.0005),  # high pressure
+            ):
+                until(lambda: page.fraction(panel, seen) > least)  # noqa: B023
+        until(lambda: page.fraction("hand", (0, 158, 115)) > 0.001)  # the object
+        page.click(".rotate:last-of-type")
+        hand.wait_for(lambda state: abs(state.goal_angle - math.radians(5.0)) < 0.02, 60.0)
+        hand.wait_for(lambda state: state.mode == "holding", 60.0)
+        press(".release", "armed")
+        page("document.querySelector('.grasp').focus()")
+        page.space()
+        hand.wait_for(lambda state: state.mode == "disarmed", 60.0)
+        until(lambda: page.text(".reply") == "✓ stop: ok")  # and grasp was not pressed
+        page.click(".tare")
+        until(lambda: page.text(".reply") == "✓ tare: ok")
+        press(".arm", "armed")
+        press(".disarm", "disarmed")
+        press(".arm", "armed")
+        press(".stop", "disarmed")
+        press(".arm", "armed")
+        page.browser.open("about:blank")
+        until(lambda: send(commands, {"command": "release", "client": "another"})["ok"])
+        viewed.end()
+
+
+def test_the_page_is_quick_survives_sleep_and_reload_and_asks_nobody_else(page: Page) -> None:
+    with FakeDaemon() as fake:
+        where = ("--address", fake.state_address, "--commands", fake.command_address)
+        fake.changes = {"mode": "fault", "fault": "<b>tip.force</b>: 31 N"}
+        with Viewed(*where) as viewed:
+            page.open(viewed.address)  # fills the browser's cache, as a second visit finds it
+            assert "Watching" in page.text(".q-footer")
+            assert page.text(".fault") == "<b>tip.force</b>: 31 N"
+            page.space()
+            page("stop()")
+            assert page.open(viewed.commanding) < 10.0  # 2 s where nothing else runs
+            page.click(".clear")
+            until(lambda: page.text(".reply") == "✓ clear: ok")
+            assert [each["command"] for each in fake.requests] == ["clear"]  # no stop without it
+            until(lambda: page.lag() < 0.5)
+
+            os.killpg(page.browser.process.pid, signal.SIGSTOP)
+            asleep = fake.published
+            until(lambda: fake.published > asleep + 1000)  # 10 s of the stream
+            os.killpg(page.browser.process.pid, signal.SIGCONT)
+            until(lambda: page.lag() < 0.5, 10.0)
+            page.click(".stop")  # heard although the page's connection was given up meanwhile
+            until(lambda: fake.requests[-1]["command"] == "stop")
+
+            page("location.reload()")
+            until(lambda: page("performance.getEntriesByType('navigation')[0].type") == "reload")
+            until(lambda: page("document.body?.dataset.seq"))
+            page.click(".clear")
+            until(lambda: fake.requests[-1]["command"] == "clear")
+            assert fake.requests[0]["client"] != fake.requests[-1]["client"]
+
+            page.browser.ask(
+                "Emulation.setDeviceMetricsOverride",
+                width=390,
+                height=844,
+                deviceScaleFactor=2,
+                mobile=True,
+            )
+            until(lambda: page("document.documentElement.scrollWidth") <= 390)
+            edges = page(
+                "(({left, right, bottom}) => [left, right, bottom])"
+                "(document.querySelector('.stop').getBoundingClientRect())"
+            )
+            assert 0 <= edges[0] < edges[1] <= 390
+            assert edges[2] <= 844
+            foreign = [
+                url
+                for url in page.browser.requests
+                if not url.startswith((f"http://{viewed.host}/", f"ws://{viewed.host}/", "data:"))
+            ]
+            assert not foreign
+
+            page.browser.open("data:text/html,another page")  # of an origin of its own
+            until(lambda: page("location.protocol") == "data:")
+            socket = f"new WebSocket('ws://{viewed.host}/pictures')"
+            page(f"({socket}).onopen = event => window.came = event.type")
+            page(f"({socket}).onerror = event => window.came = event.type")
+            until(lambda: page("window.came"))
+            assert page("window.came") == "error"
+            viewed.end()
+
+
+def test_a_recordings_slider_goes_to_its_place(page: Page, tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    record_hand(path, {30: {"command": "arm"}, 60: {"command": "grasp", "force": 8.0}}, 2.0)
+    with Viewed(str(path)) as viewed:
+        page.open(viewed.address)
+        until(lambda: page.text(".place").startswith("2.0 of 2.0"))
+        assert page.text(".mode") == "holding"
+        box = page(
+            "(({left, top, height}) => [left, top + height / 2])"
+            "(document.querySelector('.q-slider').getBoundingClientRect())"
+        )
+        for kind in ("mousePressed", "mouseReleased"):
+            page.browser.ask(
+                "Input.dispatchMouseEvent",
+                type=kind,
+                x=box[0] + 2,
+                y=box[1],
+                button="left",
+                clickCount=1,
+            )
+        until(lambda: page.text(".mode") == "disarmed")
+        viewed.end()

@@ -14,8 +14,14 @@ from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.table import ContactTable
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
-from softfinger.tools.viewing.bridge import statistics_table
-from softfinger.tools.viewing.known import HEIGHT, THETA_END, WIDTH, Landscape, read_settings
+from softfinger.tools.viewing.known import (
+    HEIGHT,
+    THETA_END,
+    WIDTH,
+    Landscape,
+    palette,
+    read_settings,
+)
 from softfinger.tools.viewing.planar import (
     HeldObject,
     Touch,
@@ -197,12 +203,13 @@ def test_contours_are_lines_of_equal_energy(landscape: Landscape) -> None:
 
 
 def test_colours_grow_lighter_with_the_energy(landscape: Landscape) -> None:
-    picture = landscape.picture().astype(float) @ [0.2126, 0.7152, 0.0722]
+    colours = palette()[landscape.picture()]
+    picture = colours.astype(float) @ [0.2126, 0.7152, 0.0722]
     assert picture.shape == (HEIGHT, WIDTH)
     upright = picture[::-1, WIDTH // 2]  # with growing d
     assert (np.diff(upright) >= -1.0).all()
     assert upright[-1] > 150.0 > 60.0 > upright[0]
-    corner = landscape.picture()[0, 0]
+    corner = colours[0, 0]
     assert np.ptp(corner.astype(int)) < 8  # grey: 12 mm deep, no tip tilts by 45°
 
 
@@ -234,11 +241,3 @@ def test_settings_of_another_version_keep_what_is_known() -> None:
     assert settings.servos == Settings().servos
     for text in ("", "{", "[]", "null", 3, None):
         assert read_settings({"settings": text})[0] == Settings()
-
-
-def test_statistics_as_a_table() -> None:
-    page = statistics_table(
-        {"ticks": 1000, "overruns": 2, "period_s": 0.002, "compute": {"p50": 1.234e-5}}
-    )
-    assert "**1000 ticks** of 2.000 ms, **2 overruns**" in page
-    assert "| work | 12.3 | — | — | — |" in page

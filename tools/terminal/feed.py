@@ -143,7 +143,13 @@ class Feed:
     def take(self, message: list[bytes], now: float) -> None:
         """Read one message off the wire, of any content."""
         try:
-            topic, record = unpack(message)
+            self.sort_in(*unpack(message), now)
+        except ValueError:
+            self.skipped += 1
+
+    def sort_in(self, topic: bytes, record: dict[str, Any], now: float) -> None:
+        """As `take`, of a message that is unpacked already."""
+        try:
             if topic in self.topics:
                 self.topics[topic](read(schema.TOPICS[topic].record, record), now)
         except (ValueError, TypeError, RecursionError):

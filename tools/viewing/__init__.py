@@ -1,1 +1,1 @@
-"""`view`: the stream, or a recording, turned into Rerun's entities."""
+"""`view`: the stream, or a recording, on a web page; the stream for Foxglove."""

@@ -51,7 +51,7 @@ class FoxgloveServer:
             name: RawImageChannel(f"{schema.TACTILE.decode()}/{name}", context=context)
             for name in FINGERS
         }
-        self._gaps = {topic: Gaps() for topic in TOPICS}
+        self._gaps = {topic: Gaps() for topic in TOPICS if topic != schema.COMMAND}
         self._events: deque[dict[str, Any]] = deque(maxlen=_EVENTS)
         self._frames: dict[str, dict[str, Any]] = {}
         self._newest: dict[bytes, dict[str, Any]] = {}  # state and truth, for the scene

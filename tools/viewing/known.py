@@ -29,14 +29,14 @@ from softfinger.kinematics.hand.geometry import HandGeometry
 
 FloatArray = NDArray[np.float64]
 
-WIDTH, HEIGHT = 480, 400  # pixels
+WIDTH, HEIGHT = 240, 200  # pixels
 THETA_END = math.radians(45.0)  # the picture's, to both sides
 # Dark to light in even steps, from blue over green to yellow: in order in grey, too.
 _RAMP = np.array(
     [(38, 32, 84), (45, 70, 130), (38, 110, 142), (38, 148, 136), (84, 184, 112), (236, 226, 88)]
 )
 _APART = 0.1  # of the picture's height, from one contour line to the next
-_OUTSIDE = (112, 112, 116)
+_OUTSIDE = (112, 112, 116)  # where no such contact can be
 _LEVELS = 1e-3 * np.array([1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000])  # J
 
 
@@ -74,18 +74,13 @@ class Landscape:
         return energy
 
     def picture(self) -> NDArray[np.uint8]:
-        """Colours [HEIGHT, WIDTH, 3]; grey where no such contact can be."""
+        """Indices [HEIGHT, WIDTH] into `palette`, the last where no such contact can be."""
         theta = (2.0 * (np.arange(WIDTH) + 0.5) / WIDTH - 1.0) * THETA_END
         d = (1.0 - (np.arange(HEIGHT) + 0.5) / HEIGHT) * self.d_end
         depth, angle = np.meshgrid(d, theta, indexing="ij")
         contact = self._table(depth, angle, edge=True)
-        share = np.cbrt(np.asarray(contact.energy) / self._energy[-1])
-        share = np.clip(share, 0.0, 1.0) * (len(_RAMP) - 1)
-        stops = np.arange(len(_RAMP))
-        colours = [np.interp(share, stops, _RAMP[:, channel]) for channel in range(3)]
-        picture = np.stack(colours, axis=-1)
-        picture[~contact.inside] = _OUTSIDE
-        return picture.astype(np.uint8)
+        share = np.clip(np.cbrt(np.asarray(contact.energy) / self._energy[-1]), 0.0, 1.0)
+        return np.where(contact.inside, share * 254.0, 255.0).astype(np.uint8)
 
     def contours(self) -> list[Contour]:
         """Lines of equal energy at round values, as far as the contact's domain goes."""
@@ -110,13 +105,20 @@ class Landscape:
         ticks = []
         for degrees in (-40, -20, 0, 20, 40):
             x, y = self.place(0.0, math.radians(degrees))
-            ticks.append((np.array([x, y + 14.0]), f"{degrees:+d}°" if degrees else "θ = 0°"))
+            ticks.append((np.array([x, y + 9.0]), f"{degrees:+d}°" if degrees else "θ = 0°"))
         step = next((step for step in (1, 2, 5) if self.d_end <= 0.0065 * step), 10)
         for millimetres in range(0, int(1e3 * self.d_end) + 1, step):
             x, y = self.place(1e-3 * millimetres, -THETA_END)
             name = f"{millimetres} mm" if millimetres else "d = 0"
-            ticks.append((np.array([x - 22.0, y]), name))
+            ticks.append((np.array([x - 14.0, y]), name))
         return ticks
+
+
+def palette() -> NDArray[np.uint8]:
+    """Colours [256, 3] of the landscape's picture."""
+    at = np.linspace(0.0, len(_RAMP) - 1.0, 255)
+    ramp = [np.interp(at, range(len(_RAMP)), channel) for channel in _RAMP.T]
+    return np.vstack((np.transpose(ramp), _OUTSIDE)).astype(np.uint8)
 
 
 _TOLERANCE = 1e-6  # relative error of a table for a picture
@@ -147,14 +149,6 @@ class ShownHand:
         except (SettingsError, TableError):
             return None
         return Landscape(table, tip.radius, self.settings.safety.d_max)
-
-
-def warm_up() -> None:
-    """Do what takes long the first time, before messages wait for it."""
-    landscape = ShownHand().landscape()
-    if landscape is not None:
-        landscape.picture()
-        landscape.contours()
 
 
 def read_settings(message: dict[str, Any]) -> tuple[Settings, list[str]]:

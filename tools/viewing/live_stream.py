@@ -1,4 +1,4 @@
-"""The stream as both viewers read it: drained in time, drawn so many times a second."""
+"""The stream as page and Foxglove server read it: drained in time, drawn so many times a second."""
 
 from __future__ import annotations
 
@@ -26,6 +26,7 @@ TOPICS = (
     schema.TRUTH,
     schema.TACTILE,
     schema.STATS,
+    schema.COMMAND,
 )
 NICE = 5  # everything real-time goes first
 _SILENCE = 2.0  # s without a message after which a line says so
@@ -58,7 +59,6 @@ def follow(
     bridge: Taker,
     ending: Ending,
     say: Callable[[str], None],
-    is_open: Callable[[], bool] = lambda: True,
 ) -> None:
     """Show the stream that ``arguments`` name until the end. Raises ViewError."""
     period = 1.0 / arguments.rate
@@ -87,8 +87,6 @@ def follow(
             after = time.monotonic()
             # Never busy for more than half of its time, however slow the machine is.
             due = after + max(period - (after - now), min(after - now, _REST))
-            if not is_open():
-                return
         stream.drain(bridge, 0.0)
         bridge.draw(last=True)
 

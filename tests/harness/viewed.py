@@ -1,0 +1,80 @@
+"""``softfinger view`` in a process of its own, and its pictures as a page gets them."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from typing import Any, Self
+
+from websockets.sync.client import connect
+
+from tests.harness.daemon_process import SOFTFINGER
+
+WAIT = 60.0  # s for one picture
+
+
+class Viewed:
+    """Serving when constructed. ``address`` is the page's, ``commanding`` that with the token."""
+
+    def __init__(self, *words: str) -> None:
+        self.process = subprocess.Popen(
+            [*SOFTFINGER, "view", *words, "--no-browser", "--port", "0"],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        assert self.process.stdout is not None
+        self.address = self.commanding = ""
+        for line in self.process.stdout:
+            self.commanding = self.commanding or line.split()[1]
+            self.address = line.split()[1]
+            if line.rstrip().endswith("to see it"):
+                break
+        self.host = self.address.removeprefix("http://").rstrip("/")
+
+    def end(self) -> str:
+        """End it as a signal does, and return what it said."""
+        self.process.terminate()
+        said = self.process.communicate(timeout=120)[1]
+        assert self.process.returncode == 0, said
+        return said
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.process.returncode is None:
+            self.process.kill()
+            self.process.communicate()
+
+
+class Watcher:
+    """A page's connection: asks for pictures. ``scene`` is the newest that came before one."""
+
+    def __init__(self, host: str, **more: Any) -> None:
+        self._connection = connect(f"ws://{host}/pictures", proxy=None, max_size=None, **more)
+        self.scene: dict[str, Any] = {}
+
+    def next(self) -> dict[str, Any]:
+        """The next picture."""
+        self.socket.send("")
+        while True:
+            message = json.loads(self.socket.recv(timeout=WAIT))
+            if isinstance(message["panels"], dict):
+                return dict(message)
+            self.scene = message
+
+    def lines(self, picture: dict[str, Any]) -> dict[str, list[Any]]:
+        """The newest column by plot's title and line's name: value, and its deviation if any."""
+        return {
+            f"{plot['title']} {line['name']}": [picture["columns"][-1][k] for k in line["columns"]]
+            for plot in self.scene["plots"]
+            for line in plot["lines"]
+        }
+
+    def __enter__(self) -> Self:
+        self.socket = self._connection.__enter__()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.socket.close()
