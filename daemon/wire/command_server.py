@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import msgpack
 
 from softfinger.daemon.errors import Refused
-from softfinger.daemon.wire.loop_link import Link
+from softfinger.daemon.wire.loop_link import ALWAYS, Link
 
 if TYPE_CHECKING:  # the gateway has no use for it
     from softfinger.daemon.wire.local_stop import LocalStop
@@ -62,7 +62,7 @@ class CommandServer:
         self._link = link
         self._local = local
         self._pauses = Pauses(longest_pause)
-        self._worked = False  # at the last tick
+        self._worked = False  # a command that changes something was carried out at the last tick
         self._stopped: bytes | None = None  # answer to a local stop, until the gateway knows it
         self._answer_by = 0.0
         if local is not None:
@@ -103,7 +103,7 @@ class CommandServer:
             ask = link.asked.popleft()
             reply = _carry_out(msgpack.unpackb(ask.packed), handler)
             self._pauses.look()  # to reconnect the servos may take long, and is no pause
-            self._worked = True
+            self._worked |= ask.came < ALWAYS
             link.reply(ask.number, reply)
 
     def start(self) -> None:
