@@ -68,7 +68,7 @@ LOADS = ("push", "twist")
 _TOO_LONG = 0.05  # s that a tip's force may be above its bound
 _TOO_MUCH = 1.3  # of the force asked for, where nothing called for more
 _UNSURE = 1.2  # of what a grip may be raised to, and tips that bear a load differ
-_REMEMBERED = 5.0  # s after a load in which a grip may still be raised
+_REMEMBERED = 5.0  # s after a load in which a grip may still be raised, or has been by a lie
 _RETARGETED = 0.5  # s in which a force that was asked for before may still be there
 _UNCOVERED = 1.0  # s after which a tip that came to the object's edge no longer counts
 
@@ -81,7 +81,7 @@ GOAL = "goals within angles, currents, slew"
 READING, FRAME = "no old reading", "no old frame in a grip"
 STATE = "mode, fault and torque agree, contacts finite"
 CALM = "force ≤ 1.3 × asked: nothing calls for more"
-LIED = "force ≤ 1.3 × asked, with a false measurement"
+LIED = "force ≤ 1.3 × asked, with or after a false measurement"
 RAISED = "force ≤ what it may be raised to, loaded"
 MOST = "force ≤ safety.force_max, as well as it is known"
 HONEST = {mode: f"nothing named while {mode}, honest" for mode in _GRIPPING}
@@ -344,7 +344,7 @@ class Soak:
         self._lie = ""  # kind of the measurement that is wrong now
         self._false: set[str] = set()  # what was wrong, and may be named
         self._loaded = 0.0  # N along the faces
-        self._loaded_t = self._uncovered_t = -math.inf  # s, when last so
+        self._loaded_t = self._lied_t = self._uncovered_t = -math.inf  # s, when last so
         self._asked: list[tuple[float, float]] = []  # when [s], force [N]; none without a grip
         self._above = {MOST: math.inf, CALM: math.inf}  # since when [s]
 
@@ -560,6 +560,8 @@ class Soak:
         control, most = self.settings.control, self.settings.safety.force_max
         if self._loaded:
             self._loaded_t = t
+        if self._lie or any(sensor.fault for sensor in self.sensors):
+            self._lied_t = t
         force = max(self.hand.force.tolist())
         # What is felt may be as far off as the torque constant, by which it is known.
         self._must_end_soon(MOST, MOST, force, (1.0 + control.torque_error) * most, t)
@@ -575,7 +577,8 @@ class Soak:
         bound = _TOO_MUCH * asked + 2.0 * friction  # that is given, and that holds
         if loaded:
             bound = max(bound, _UNSURE * min(raised, GRIP_SHARE * most))
-        name = RAISED if loaded else LIED if self._lie else CALM
+        lied = t < self._lied_t + _REMEMBERED
+        name = RAISED if loaded else LIED if lied else CALM
         self._must_end_soon(CALM, name, force, bound, t)
 
     def _must_end_soon(self, key: str, name: str, force: float, bound: float, t: float) -> None:
