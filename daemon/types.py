@@ -18,7 +18,7 @@ if TYPE_CHECKING:  # a command's client needs no NumPy
 FINGERS = ("left", "right")
 STREAM_ADDRESS = "tcp://127.0.0.1:9872"  # unless settings or a client say otherwise
 COMMAND_ADDRESS = "tcp://127.0.0.1:9873"
-GRIP_SHARE = 0.9  # of `safety.force_max` that a grip may be asked for, or raised to by itself
+GRIP_FRACTION = 0.9  # of `safety.force_max` that a grip may be asked for, or raised to by itself
 Event = tuple[str, str, str]  # level, kind, text
 
 
@@ -62,7 +62,7 @@ class Contact:
     seq: int = 0  # of the frame
     t: float = 0.0  # when that frame was sampled [s]
     t_arrival: float = 0.0  # and when it was complete here [s]
-    t_sound: float = 0.0  # arrival of the last frame whose estimate was sound [s]
+    t_valid: float = 0.0  # arrival of the last frame whose estimate was valid [s]
     valid: bool = False  # a frame has come, its estimate is sound and it is not too old
     contact: bool = False  # something touches the tip
     d: float = 0.0  # maximum displacement [m]

@@ -60,7 +60,7 @@ class Perception:
             if frame is not None:
                 if each.repeats.long:
                     frame = replace(frame, valid=False)
-                self.filter.correct(each.finger, frame, each.estimate, state.contacts[each.finger])
+                self.filter.update(each.finger, frame, each.estimate, state.contacts[each.finger])
         self.filter.write_contacts(state.t, state.contacts, state.object, state.mode)
 
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from softfinger.daemon.backends import backend
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.types import FINGERS, GRIP_SHARE
+from softfinger.daemon.types import FINGERS, GRIP_FRACTION
 
 _LONGEST = 60  # characters of a value that are shown
 _DITHER_TICKS = 8  # a period of the dither, at least: with fewer it is no oscillation of its own
@@ -232,10 +232,10 @@ def _limits(settings: Settings) -> Iterator[str]:
 
 
 def _forces(settings: Settings) -> Iterator[str]:
-    low, high = settings.control.contact_force, GRIP_SHARE * settings.safety.force_max
+    low, high = settings.control.contact_force, GRIP_FRACTION * settings.safety.force_max
     if low >= high:
         yield (
-            f"control.contact_force: found {low:g} N, expected below {GRIP_SHARE:g} "
+            f"control.contact_force: found {low:g} N, expected below {GRIP_FRACTION:g} "
             f"safety.force_max, {high:g}"
         )
         return

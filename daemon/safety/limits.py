@@ -425,9 +425,9 @@ def _tactile_silent(view: View, state: State, _: float) -> str:
     bound = view.limits.frame_age_fault / view.settings.tactile.rate
     for i in view.fingers:
         contact = state.contacts[i]
-        age = state.t - contact.t_sound
+        age = state.t - contact.t_valid
         if not age <= bound:
-            what = "frame" if contact.t_arrival == contact.t_sound else "sound estimate"
+            what = "frame" if contact.t_arrival == contact.t_valid else "sound estimate"
             doubt = _doubt(view, i)
             return doubt or f"tactile: no {what} of the {FINGERS[i]} sensor for {age:.3f} s"
     return ""
@@ -437,7 +437,7 @@ def _doubt(view: View, finger: int) -> str:
     """Return why a sensor's frames are refused, or an empty text."""
     side, found = FINGERS[finger], view.grasp.witnesses
     if found.jumps[finger] > witnesses.JUMPS_MAX:
-        jumped = math.degrees(abs(found.miss[finger]))
+        jumped = math.degrees(abs(found.innovation[finger]))
         return (
             f"{side} sensor shows the object turned by {jumped:.0f}° at once, which neither the "
             "joints nor the other tip explain: its image has moved, or the object ends under it"

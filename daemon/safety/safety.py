@@ -132,7 +132,7 @@ class Safety:
         if gripping and self._has_sensors:
             oldest, contacts = state.t - self._hold_age, state.contacts
             for i in view.fingers:
-                if contacts[i].t_sound < oldest:
+                if contacts[i].t_valid < oldest:
                     self.must_hold = True
             if self.must_hold:
                 self._count("tactile.late")

@@ -54,7 +54,7 @@ def _by_arms(hand: Watched) -> None:
     torques = grip.torques
 
     def by_arms(*arguments: Any) -> Any:
-        grip._grasp.lever = grip._grasp.arm
+        grip._grasp.energy_arm = grip._grasp.moment_arm
         return torques(*arguments)
 
     grip.torques = by_arms
@@ -69,7 +69,7 @@ def _by_position(hand: Watched) -> None:
     def pull(_: tuple[float, float], goal: Goal) -> None:
         if not goals:
             goals[:] = grasp.q
-        close = 2.0 * grip.force.speed / (0.5 * sum(grasp.stiffness) * sum(grasp.arm))
+        close = 2.0 * grip.force.speed / (0.5 * sum(grasp.stiffness) * sum(grasp.moment_arm))
         goals[:] = [q + close / settings.loop.rate for q in goals]
         goal.q[:] = goals
         goal.current[:] = [settings.safety.current_max] * 2

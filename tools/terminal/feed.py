@@ -25,7 +25,7 @@ from softfinger.daemon.client.command_client import LOCALLY, UNCONFIRMED
 from softfinger.daemon.client.connection import PATIENCE, SILENCE, drain, subscribe, unpack
 from softfinger.daemon.client.records import read
 from softfinger.daemon.control.modes import UNLEASED
-from softfinger.daemon.types import FINGERS, GRIP_SHARE
+from softfinger.daemon.types import FINGERS, GRIP_FRACTION
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.local_stop import stop_locally
 
@@ -227,7 +227,7 @@ class Feed:
         warm = number(settings, "safety", "temperature_warn")
         self.force_default = number(settings, "control", "force_default")
         most = number(settings, "safety", "force_max")
-        self.force_most = math.inf if math.isnan(most) else GRIP_SHARE * most
+        self.force_most = math.inf if math.isnan(most) else GRIP_FRACTION * most
         self.warm = math.inf if math.isnan(warm) else warm
 
     def news(self) -> list[ShownEvent]:
