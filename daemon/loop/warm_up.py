@@ -151,7 +151,7 @@ def _sensor(scene: WantedScene) -> None:
     counts = np.empty((settings.tactile.rows, settings.tactile.cols), np.uint16)
     model.frame(depth, 0.1, 0.0, counts)
     if settings.simulation.object_shape == "disc":
-        model.frame(depth, 0.1, 0.0, counts, bend=1.0 / settings.simulation.object_radius)
+        model.frame(depth, 0.1, 0.0, counts, curvature=1.0 / settings.simulation.object_radius)
 
 
 def _filter(scene: WantedScene) -> None:

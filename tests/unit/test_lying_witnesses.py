@@ -84,7 +84,7 @@ def test_a_real_load_and_a_real_turn_are_no_lie(load: tuple[float, float, float]
     with Hand({}) as hand:
         grasped(hand, 10.0)
         for sign in (1.0, -1.0, 0.0):
-            hand.plant.push(*(sign * each for each in load))
+            hand.plant.apply_load(*(sign * each for each in load))
             hand.watch(0.8)
         hand.command("rotate", angle=0.12)
         hand.watch(1.0)

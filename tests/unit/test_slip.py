@@ -47,7 +47,7 @@ def test_the_grip_comes_back_when_the_load_has_gone() -> None:
         grasped(hand)
         push_along(hand, BORNE, rate=9.0)
         assert hand.plant.force.mean() > 1.2 * FORCE
-        hand.plant.push(0.0, 0.0)
+        hand.plant.apply_load(0.0, 0.0)
         hand.watch(4.0)
         assert hand.mode == "holding"
         assert hand.plant.force.mean() == pytest.approx(FORCE, rel=KNOWN)
@@ -70,7 +70,7 @@ def test_an_object_that_turns_in_the_grip_is_gripped_more_firmly() -> None:
             start = hand.plant.object_pose[2]
             # Both tips' friction bears about 0.25 N·m over the object's width.
             for k in range(1, 76):
-                hand.plant.push(0.0, 0.0, 0.4 * k / 75)
+                hand.plant.apply_load(0.0, 0.0, 0.4 * k / 75)
                 hand.watch(0.02)
             turned = abs(hand.plant.object_pose[2] - start)
             assert (turned < math.radians(5.0)) == held

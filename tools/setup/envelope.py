@@ -145,7 +145,7 @@ def grasped(
         pull = weight * (1.0 + settings.simulation.table_friction)  # which the table would hold
         for k in range(_STEPS):
             load, phi = pull * (k + 1) / _STEPS, float(hand.plant.object_pose[2])
-            hand.plant.push(-load * math.sin(phi), load * math.cos(phi))
+            hand.plant.apply_load(-load * math.sin(phi), load * math.cos(phi))
             hand.run(_LIFT / _STEPS)
         hand.run(_AFTER)
         moved = math.dist(hand.plant.object_pose[:2], before[:2])

@@ -276,9 +276,9 @@ class Emulator:
             if press := plate.reached(t):
                 self._tell(f"plate: {finger} {press}")
         if self._slipped is None:
-            most = _SLIPS * self._simulation.tip_friction
+            limit = _SLIPS * self._simulation.tip_friction
             tips = zip(self.hand.tangential.tolist(), self.hand.normal.tolist(), strict=True)
-            if any(normal > 0.0 and abs(along) >= most * normal for along, normal in tips):
+            if any(normal > 0.0 and abs(along) >= limit * normal for along, normal in tips):
                 self._slipped = self._stuck
             self._stuck = t
 
@@ -368,8 +368,8 @@ class Emulator:
         """
         servos = self._servos.bus.report(t) if self._servos is not None else []
         if goals and self._servos is not None:
-            for told, servo in zip(servos, self._servos.bus.servos, strict=True):
-                told["goal_currents"] = servo.goal_currents()
+            for report_of, servo in zip(servos, self._servos.bus.servos, strict=True):
+                report_of["goal_currents"] = servo.goal_currents()
         pose = self.hand.object_pose.tolist()
         held = {"pose": pose, "pushed": self._pushed, "slipped": self._slipped}
         hand = {"servos": servos, "object": held, "force": self.hand.force.tolist()}
