@@ -19,8 +19,13 @@ from softfinger.daemon.simulation.sensor.curved_face import CurvedContact, rende
 from softfinger.kinematics.compiled.kernel import kernel
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
-from softfinger.kinematics.sensing.blur import average, pieces
-from softfinger.kinematics.sensing.pressure_grid import Rendering, SensorGrid, render
+from softfinger.kinematics.sensing.pressure_grid import (
+    Rendering,
+    SensorGrid,
+    average,
+    blur_pieces,
+    render,
+)
 from softfinger.kinematics.sensing.solid_pressure import SolidPressure
 
 FloatArray = NDArray[np.float64]
@@ -131,7 +136,7 @@ class SensorModel:
         self._pressure = self._rendered = np.zeros(shape)
         cells = grid
         if flaws.blur > 0.0:
-            n_x, n_y = (min(pieces(flaws.blur / pitch), _PIECES_MAX) for pitch in grid.pitches)
+            n_x, n_y = (min(blur_pieces(flaws.blur / pitch), _PIECES_MAX) for pitch in grid.pitches)
             self._pieces = n_x, n_y
             self._stencils, cells = replace(grid, blur=flaws.blur).finer(self._pieces)
             self._rendered = np.zeros(cells.shape)
