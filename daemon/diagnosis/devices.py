@@ -48,7 +48,7 @@ def check_servos(settings: Settings, wait: float = SEARCH_TIME) -> list[Finding]
         with open_line(servos.port, servos.baud, low_latency=False) as line:
             found = examine(line, settings, model)
         results = [line for each in found for line in _judge(each, settings, model)]
-        if not all(each.answers for each in found):
+        if not all(each.replies for each in found):
             results += _search(settings, model, wait) or _blame_power(found)
     except ServoError as error:
         return [Finding("FAIL", "servos", str(error))]
@@ -57,14 +57,14 @@ def check_servos(settings: Settings, wait: float = SEARCH_TIME) -> list[Finding]
 
 def _judge(servo: Examined, settings: Settings, model: ServoModel) -> list[Finding]:
     name = servo.name
-    if not servo.answers:
+    if not servo.replies:
         problem = f"no answer at {settings.servos.baud} baud"
         fix = "check its power and cable, then see what was found below"
         return [Finding("FAIL", name, problem, fix)]
     results = [*servo.errors, *servo.notices]
     if servo.table and not servo.errors:
         described = Finding("pass", name, _described(servo, model))
-        results.append(servo.stray or described)
+        results.append(servo.misplaced or described)
     return results
 
 

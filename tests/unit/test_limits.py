@@ -428,7 +428,7 @@ def test_a_fault_begins_at_its_bound_and_nan_is_past_it(
     PUSHES[name](state, finger, share)
     (row,) = (row for row in LIMITS if row.name == name and row.level == "fault")
     assert row.check is not None
-    assert bool(row.check(View(SETTINGS), state, row.share)) != (share < 1.0)
+    assert bool(row.check(View(SETTINGS), state, row.fraction)) != (share < 1.0)
 
 
 def test_every_row_is_named_once_a_level_and_its_settings_exist() -> None:

@@ -18,7 +18,7 @@ def run(arguments: argparse.Namespace) -> int:
     settings = profile(arguments)
     from softfinger.daemon.safety.limits import LIMITS
 
-    lines = [(row.name, row.level, row.judged, _values(settings, row.keys)) for row in LIMITS]
+    lines = [(row.name, row.level, row.quantity, _values(settings, row.keys)) for row in LIMITS]
     widths = [max(len(line[column]) for line in lines) for column in range(3)]
     for line in lines:
         cells = [cell.ljust(width) for cell, width in zip(line, widths, strict=False)]
