@@ -57,7 +57,7 @@ class Frame:
 
 @dataclass(slots=True)
 class Contact:
-    """What one fingertip feels: the newest frame's estimate, carried on by the joints."""
+    """Contact of one fingertip: the newest frame's estimate, predicted by the joints since."""
 
     seq: int = 0  # of the frame
     t: float = 0.0  # when that frame was sampled [s]
@@ -147,7 +147,7 @@ class State:
 
 
 class Parts(NamedTuple):
-    """What the scene has: which fingers, and whether they have servos and sensors."""
+    """Parts of the scene: its fingers, and their servos and sensors."""
 
     fingers: tuple[bool, bool]
     servos: bool
@@ -164,7 +164,7 @@ class TimeSpread(NamedTuple):
 
 
 class SensorFacts(NamedTuple):
-    """What subscribers learn of a tactile sensor with each frame; see ``hand/tactile``."""
+    """Facts of a tactile sensor that are published with each frame; see ``hand/tactile``."""
 
     pitch: float  # from column to column [m]
     pitch_y: float  # from row to row [m]
@@ -178,7 +178,7 @@ class SensorFacts(NamedTuple):
 
 
 class HandFacts(NamedTuple):
-    """What doesn't change while a daemon runs; texts of JSON, empty where there is nothing."""
+    """Facts that don't change while a daemon runs; texts of JSON, empty where there is nothing."""
 
     version: str
     settings: str
@@ -189,7 +189,7 @@ class HandFacts(NamedTuple):
 
 
 class Truth(Protocol):
-    """What a simulated hand knows: arrays of both tips, and the object's x, y, φ."""
+    """True state of a simulated hand: arrays of both tips, and the object's x, y, φ."""
 
     d: NDArray[np.float64]
     theta: NDArray[np.float64]
