@@ -31,7 +31,7 @@ from softfinger.daemon.servos.provisioning import (
 from softfinger.daemon.tactile.base import make_sensor
 from softfinger.daemon.types import FINGERS
 
-_PATIENCE = 5.0  # s for a board: one that its adapter resets when the port is opened starts anew
+_PATIENCE = 5.0  # s for a board: one that its adapter resets when the port is opened starts again
 _LISTEN = 0.5  # s of a board's frames
 _OFF_RATE = 0.1  # share of the rate by which a board may be off
 

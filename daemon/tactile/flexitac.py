@@ -37,7 +37,7 @@ class FlexiTacDecoder(Decoder):
     Else it waits for the next marker, or for ``settle``.
 
     *Loss.* A marker that isn't where it must be drops the frame before it and starts the search
-    anew.
+    again.
     """
 
     def __init__(self, rows: int, cols: int, byte_time: float = 5e-6) -> None:

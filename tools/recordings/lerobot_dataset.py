@@ -54,7 +54,7 @@ def samples(
 ) -> Iterator[Sample]:
     """Yield the newest state and frames at each 1/fps [s], from the first state with frames on.
 
-    Raises RecordingError when the daemon was started anew on the way.
+    Raises RecordingError when the daemon was restarted on the way.
     """
     newest: dict[str, TactileFrame] = {}
     last: Sample | None = None

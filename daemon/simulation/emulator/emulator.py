@@ -289,7 +289,7 @@ class Emulator:
 
         A time behind a word counts from now. With ``report`` among them the answer is
         :meth:`report` as JSON, and with ``goals`` each servo's newest goal currents are in it;
-        ``forget`` begins the record anew; ``place`` puts the object back where it was at the
+        ``forget`` begins the record again; ``place`` puts the object back where it was at the
         start, at rest and with no load on it. ``press …`` is for :meth:`press`, ``turn …`` for
         :meth:`turn`.
         """
@@ -376,7 +376,7 @@ class Emulator:
         return {"t": t, "monotonic": time.monotonic(), **hand}
 
     def _forget(self, t: float) -> None:
-        """Begin the record anew."""
+        """Begin the record again."""
         self._pushed = self._slipped = None
         self._stuck = t
         if self._servos is not None:

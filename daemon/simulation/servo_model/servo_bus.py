@@ -186,7 +186,7 @@ class ServoBus:
         return [servo.report(t) for servo in self.servos]
 
     def forget(self, t: float) -> None:
-        """Begin the record anew."""
+        """Begin the record again."""
         for servo in self.servos:
             servo.recorder = BusRecorder(t)
 
