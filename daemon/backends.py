@@ -88,7 +88,7 @@ def backend(kind: Kind, name: str) -> Backend:
 
 
 def needs_hand(servos: str, tactile: str) -> bool:
-    """Whether servos or sensors of those names are parts of the simulated hand."""
+    """Return whether servos or sensors of those names are parts of the simulated hand."""
     return backend("servos", servos).hand or backend("tactile", tactile).hand
 
 

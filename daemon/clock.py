@@ -22,7 +22,7 @@ class Clock(Protocol):
 
 
 class LoopClock(Clock, Protocol):
-    """What the loop asks beside: how much of the machine's own time things take."""
+    """Clock of the loop, which also tells the machine's own time that things take."""
 
     behind: float  # s that `now` has been kept back since the clock was made
 

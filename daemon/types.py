@@ -18,7 +18,7 @@ if TYPE_CHECKING:  # a command's client needs no NumPy
 FINGERS = ("left", "right")
 STREAM_ADDRESS = "tcp://127.0.0.1:9872"  # unless settings or a client say otherwise
 COMMAND_ADDRESS = "tcp://127.0.0.1:9873"
-GRIP_SHARE = 0.9  # of `safety.force_max` that a grip may be asked for, or raised to by itself
+GRIP_FRACTION = 0.9  # of `safety.force_max` that a grip may be asked for, or raised to by itself
 Event = tuple[str, str, str]  # level, kind, text
 
 
@@ -57,12 +57,12 @@ class Frame:
 
 @dataclass(slots=True)
 class Contact:
-    """What one fingertip feels: the newest frame's estimate, carried on by the joints."""
+    """Contact of one fingertip: the newest frame's estimate, predicted by the joints since."""
 
     seq: int = 0  # of the frame
     t: float = 0.0  # when that frame was sampled [s]
     t_arrival: float = 0.0  # and when it was complete here [s]
-    t_sound: float = 0.0  # arrival of the last frame whose estimate was sound [s]
+    t_valid: float = 0.0  # arrival of the last frame whose estimate was valid [s]
     valid: bool = False  # a frame has come, its estimate is sound and it is not too old
     contact: bool = False  # something touches the tip
     d: float = 0.0  # maximum displacement [m]
@@ -148,7 +148,7 @@ class State:
 
 
 class Parts(NamedTuple):
-    """What the scene has: which fingers, and whether they have servos and sensors."""
+    """Parts of the scene: its fingers, and their servos and sensors."""
 
     fingers: tuple[bool, bool]
     servos: bool
@@ -165,7 +165,7 @@ class TimeSpread(NamedTuple):
 
 
 class SensorFacts(NamedTuple):
-    """What subscribers learn of a tactile sensor with each frame; see ``hand/tactile``."""
+    """Facts of a tactile sensor that are published with each frame; see ``hand/tactile``."""
 
     pitch: float  # from column to column [m]
     pitch_y: float  # from row to row [m]
@@ -179,7 +179,7 @@ class SensorFacts(NamedTuple):
 
 
 class HandFacts(NamedTuple):
-    """What doesn't change while a daemon runs; texts of JSON, empty where there is nothing."""
+    """Facts that don't change while a daemon runs; texts of JSON, empty where there is nothing."""
 
     version: str
     settings: str
@@ -190,7 +190,7 @@ class HandFacts(NamedTuple):
 
 
 class Truth(Protocol):
-    """What a simulated hand knows: arrays of both tips, and the object's x, y, φ."""
+    """True state of a simulated hand: arrays of both tips, and the object's x, y, φ."""
 
     d: NDArray[np.float64]
     theta: NDArray[np.float64]

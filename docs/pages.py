@@ -234,7 +234,7 @@ def limits() -> str:
         else:
             when = "where it is met"
         keys = ", ".join(_values(settings, row))
-        rows.append(_row(f"`{row.name}`", row.judged, row.level, when, keys and f"`{keys}`"))
+        rows.append(_row(f"`{row.name}`", row.quantity, row.level, when, keys and f"`{keys}`"))
     return "".join(rows)
 
 

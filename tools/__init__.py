@@ -1,1 +1,1 @@
-"""What people use: the command line `cli`, and its subcommands, each in the room of its subject."""
+"""Tools for people: the command line `cli` and its subcommands, each in the room of its subject."""

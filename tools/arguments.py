@@ -58,7 +58,7 @@ def profile(arguments: argparse.Namespace) -> Settings:
 
 
 def own_runtime_folder() -> Path:
-    """Where an emulated hand links its ports without ``--dir``.
+    """Return the folder where an emulated hand links its ports without ``--dir``.
 
     Raises SettingsError when another user has made that folder.
     """

@@ -1,4 +1,4 @@
-"""When a subcommand ends: by a signal, after a duration, or with the process that started it."""
+"""End of a subcommand: by a signal, after a duration, or with the process that started it."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ class Ending:
 
 
 class Endable(Protocol):
-    """What runs until its end is asked for, at any moment: a loop, an emulator."""
+    """Loop or emulator that runs until it is ended, at any moment."""
 
     def end(self) -> None:
         """End soon."""
@@ -110,7 +110,7 @@ class Signals:
             signal.signal(number, self._end)
 
     def hand_over(self, running: Endable) -> None:
-        """From now on signals end ``running``. Raises Interrupted when one came before."""
+        """Let signals end ``running`` from now on. Raises Interrupted when one came before."""
         self._running = running
         if self._ended:
             raise Interrupted

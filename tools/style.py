@@ -1,4 +1,4 @@
-"""How all pictures look: sizes for print, and lines told apart without their colour.
+"""Style of all pictures: sizes for print, and lines that differ without their colour.
 
 Families that are ordered (by displacement, by angle) take colours of falling lightness, which stay
 in order in grey and for colour-blind readers, each with a dash of its own. Things of different

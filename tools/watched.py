@@ -25,7 +25,7 @@ class Seen:
     slip: NDArray[np.float64]  # |T|/μN, the greater of both tips
 
     def since(self, index: int) -> Seen:
-        """From this tick on."""
+        """Return the record from this tick on."""
         return Seen(self.t[index:], self.force[index:], self.angle[index:], self.slip[index:])
 
     def settled(self, off: NDArray[np.bool_]) -> float:

@@ -13,7 +13,7 @@ from typing import Any
 
 from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.types import GRIP_SHARE
+from softfinger.daemon.types import GRIP_FRACTION
 
 KEPT = Path(__file__).with_name("envelope.toml")
 HELD, TURNED, LOST, REFUSED = "htlr"
@@ -35,7 +35,7 @@ def identity(settings: Settings) -> dict[str, Any]:
 
 def raised(settings: Settings, force: float) -> float:
     """Return the force [N] to which a grip of ``force`` [N] may be raised."""
-    most = GRIP_SHARE * settings.safety.force_max
+    most = GRIP_FRACTION * settings.safety.force_max
     return max(min(force + settings.control.grip_raise_max, most), force)
 
 

@@ -47,10 +47,10 @@ class Grip:
         self.force = Setpoint(dt, control.smooth_time, state.force)  # mean of the tips [N]
         self.angle = Setpoint(dt, control.smooth_time, state.angle)  # of the object [rad]
         self.slip = state.slip
-        self.asked = 0.0  # force of the command [N]
-        self.given = 0.0  # target force, more where the tips would slip [N]
+        self.commanded = 0.0  # force of the command [N]
+        self.target = 0.0  # target force, more where the tips would slip [N]
         self.slipped = False  # the object has turned in the grip, at this tick
-        self.kept_angle = math.nan  # target of the object's angle [rad]; NaN: it is not steered
+        self.target_angle = math.nan  # target of the object's angle [rad]; NaN: it is not steered
         set_law(state.slip.law, settings)
         law = state.law
         law.dt = dt
@@ -63,7 +63,7 @@ class Grip:
         law.torque_error = control.torque_error
         law.friction_speed = control.friction_speed
         law.torque_max = settings.safety.current_max * control.torque_constant
-        law.rest = math.exp(-2.0 * dt / control.smooth_time)
+        law.decay = math.exp(-2.0 * dt / control.smooth_time)
         law.upright = control.law == "upright"
         hand = settings.hand
         law.half_separation = 0.5 * hand.pivot_separation
@@ -83,7 +83,7 @@ class Grip:
         """True while the fingers are still to bring the object upright."""
         state = self._state
         awaited = state.law.upright and self._alone is None and not state.steering
-        return awaited and state.shaken < state.law.dither_time
+        return awaited and state.dither_elapsed < state.law.dither_time
 
     @property
     def turning_on(self) -> float:
@@ -96,31 +96,31 @@ class Grip:
     @property
     def turning(self) -> bool:
         """True while the setpoint of the object's angle is on its way."""
-        return self._state.steering and self.angle.value != self.kept_angle
+        return self._state.steering and self.angle.value != self.target_angle
 
     def start(self, felt: float, force: float) -> None:
         """Take over from the approach with ``felt`` N on the tips, and go to ``force`` [N]."""
         kernels.start(self._state.array, self._grasp.array, self.force.windows, felt)
-        self.kept_angle = math.nan
+        self.target_angle = math.nan
         self.retarget(force)
 
     def retarget(self, force: float) -> None:
         """Go to another grip force [N]."""
-        self.asked = self._state.asked = force
-        self._state.shaken = 0.0
-        self.given = self.force.target = max(force, min(self.slip.needed, self.slip.most))
-        least = max(0.1 * force, 0.5 * self._control.grip_raise_max)
-        way = max(abs(force - self.force.value), least)
-        self._state.force_rate = way / self._control.force_time
+        self.commanded = self._state.commanded = force
+        self._state.dither_elapsed = 0.0
+        self.target = self.force.target = max(force, min(self.slip.needed, self.slip.force_limit))
+        change_min = max(0.1 * force, 0.5 * self._control.grip_raise_max)
+        change = max(abs(force - self.force.value), change_min)
+        self._state.force_rate = change / self._control.force_time
 
     def steer(self, present: float, angle: float) -> None:
         """Turn the object from its ``present`` angle to ``angle`` [rad], and keep it there."""
-        if math.isnan(self.kept_angle):
+        if math.isnan(self.target_angle):
             self.angle.reset(present)
-        self.kept_angle = self.angle.target = angle
+        self.target_angle = self.angle.target = angle
         self._state.steering = True
 
-    def soften(self, joint_stiffness: float) -> None:
+    def set_joint_stiffness(self, joint_stiffness: float) -> None:
         """Keep the joints to their lean with so many N·m/rad."""
         self._state.joint_stiffness = joint_stiffness
 
@@ -135,10 +135,12 @@ class Grip:
         """
         grip, grasp, finger = self._state.array, self._grasp.array, self._alone
         if finger is not None:
-            torque = kernels.press(grip, grasp, self.force.windows, finger, reading.dq[finger])
+            torque = kernels.single_torque(
+                grip, grasp, self.force.windows, finger, reading.dq[finger]
+            )
             return (torque, 0.0) if finger == 0 else (0.0, torque)
         dq1, dq2 = reading.dq
-        torque1, torque2, self.given, self.slipped = kernels.squeeze(
+        torque1, torque2, self.target, self.slipped = kernels.grip_torques(
             grip,
             grasp,
             self.force.windows,
@@ -149,7 +151,7 @@ class Grip:
         )
         return torque1, torque2
 
-    def coast(self, reading: Reading) -> tuple[float, float]:
+    def hold_goal(self, reading: Reading) -> tuple[float, float]:
         """Return joint torques [N·m] while frames are late: the force stays, turning ends.
 
         Joints are read all the same. Torques that stayed as they are would turn the object on, to
@@ -157,9 +159,9 @@ class Grip:
         """
         finger = self._alone
         if finger is not None:
-            torque = kernels.coast_alone(
+            torque = kernels.hold_goal_single(
                 self._state.array, self._grasp.array, finger, reading.dq[finger]
             )
             return (torque, 0.0) if finger == 0 else (0.0, torque)
         dq1, dq2 = reading.dq
-        return kernels.coast(self._state.array, self._grasp.array, (dq1, dq2))
+        return kernels.hold_goal(self._state.array, self._grasp.array, (dq1, dq2))

@@ -23,13 +23,13 @@ FloatArray = NDArray[np.float64]
 
 _SURE = 2.0  # standard deviations of the torque constants that a grip may need
 _ARM_MIN = 0.1  # of the finger's length
-_INTEGRAL_SHARE = 0.3  # the integral's bound, as a share of the force wanted
-_SHARE_BANDWIDTH = 2.0  # Hz of the integral of the tips' difference
-_SHARE_ANGLE = 3e-3  # rad that the object may turn by that
+_INTEGRAL_RATIO = 0.3  # the integral's bound, as a share of the force wanted
+_DISTRIBUTE_BANDWIDTH = 2.0  # Hz of the integral of the tips' difference
+_DISTRIBUTE_ANGLE = 3e-3  # rad that the object may turn by that
 _QUIET = 3.0  # standard deviations of the angle that the joints at rest don't follow
 _LONGEST_PAUSE = 0.05  # s of the dither's time that passes at once after ticks without
 _STIFFNESS_MIN = 100.0  # N/m, below which a contact is too light to scale by
-_TURN_MIN = 0.1  # of the object over a joint's lean, likewise
+_ROTATION_MIN = 0.1  # of the object over the antisymmetric angle, likewise
 
 
 class GripLaw(Record):
@@ -45,7 +45,7 @@ class GripLaw(Record):
     friction_speed: float  # from which on all of it is given [rad/s]
     torque_max: float  # [N·m]
     torque_error: float  # relative, of the joints' torque constants
-    rest: float  # what is left of a turning a tick later without frames
+    decay: float  # what is left of a turning a tick later without frames
     upright: bool  # the fingers' shaking brings the object upright, its angle is not looked at
     half_separation: float  # of the hand, in m as its other lengths
     length: float
@@ -63,15 +63,15 @@ class GripState(Record):
     force: SetpointState  # mean of the tips [N]
     angle: SetpointState  # of the object [rad]
     slip: SlipState
-    asked: float  # force [N]
+    commanded: float  # force [N]
     force_rate: float  # [N/s]
     joint_stiffness: float  # [N·m/rad]
     steering: bool  # the object's angle has a target
     integral: float  # [N]
-    push: float  # that the joints give, both laws' parts together [N]
-    lean: float  # speed of the offset that turns the object [rad/s]
+    grip_force: float  # that the joints give, both laws' parts together [N]
+    offset_rate: float  # speed of the offset that turns the object [rad/s]
     offset: float  # goal of (q1 − q2)/2 [rad]
-    shaken: float  # since the dither began [s]
+    dither_elapsed: float  # since the dither began [s]
     seen: float  # when the joints were last read while both pushed alike [s]
     shift: float  # of the offset, to share the force out between the tips [rad]
     closing_friction: float  # share of the joints' friction that is given for closing
@@ -90,7 +90,7 @@ def start(
     q = grasps[0].q
     slip_monitor.forget(g.slip)
     setpoint.reset(g.force, force_windows, felt)
-    g.integral = g.shift = g.closing_friction = g.shaken = 0.0
+    g.integral = g.shift = g.closing_friction = g.dither_elapsed = 0.0
     g.offset = 0.5 * (q[0] - q[1])
     g.steering = False
     g.seen = grasps[0].t
@@ -103,58 +103,60 @@ def begin_holding(grips: Records[GripState], grasps: Records[GraspState]) -> Non
 
 
 @kernel
-def squeeze(
+def grip_torques(
     grips: Records[GripState],
     grasps: Records[GraspState],
     force_windows: FloatArray,
     angle_windows: FloatArray,
-    turned: float,
+    angle: float,
     dq: tuple[float, float],
     holding: bool,
 ) -> tuple[float, float, float, bool]:
     """Return torques of both joints [N·m], the target force [N], and whether the object slipped.
 
-    ``turned`` is the object's angle [rad], NaN where it is not known. ``dq``: joint velocities
+    ``angle`` is the object's angle [rad], NaN where it is not known. ``dq``: joint velocities
     [rad/s]. ``holding``: nothing but loads moves the joints.
     """
     g = grips[0]
     grasp = grasps[0]
     speed = 0.5 * (dq[0] + dq[1])
-    g.force.target = slip_monitor.look(g.slip, grasp, g.asked, holding, g.closing_friction, speed)
+    g.force.target = slip_monitor.update(
+        g.slip, grasp, g.commanded, holding, g.closing_friction, speed
+    )
     if g.slip.reflex and g.force.target > g.force.value:
         setpoint.reset(g.force, force_windows, g.force.target)
-    wanted = setpoint.advance(g.force, force_windows, g.force_rate)
-    push = wanted + _correction(g, wanted, mean(grasp.force))
-    load = grasp.load_lever * g.slip.load
-    g.push = min(push, _most(g, load, mean(grasp.arm)))
+    target = setpoint.advance(g.force, force_windows, g.force_rate)
+    grip_force = target + _correction(g, target, mean(grasp.force))
+    load = grasp.load_arm * g.slip.load
+    g.grip_force = min(grip_force, _force_limit(g, load, mean(grasp.moment_arm)))
     if g.law.upright and not g.steering:
-        torque1, torque2 = _equal_torques(g, grasp, wanted, dq)
+        torque1, torque2 = _equal_torques(g, grasp, target, dq)
         return torque1, torque2, g.force.target, g.slip.turned
-    lean = 0.0
+    offset_rate = 0.0
     if g.steering:
-        lean = _steer(g, angle_windows, grasp, turned)
-    g.lean = lean
+        offset_rate = _steer(g, angle_windows, grasp, angle)
+    g.offset_rate = offset_rate
     if setpoint.arrived(g.force) and not (g.steering and not setpoint.arrived(g.angle)):
-        _share_out(g, grasp)
-    close = _closing(grasp, g.force.speed, lean)
+        _distribute(g, grasp)
+    close = _closing(grasp, g.force.speed, offset_rate)
     g.closing_friction = min(max(close / g.law.friction_speed, -1.0), 1.0)
-    torque1, torque2 = _torques(g, grasp, close, lean, dq)
+    torque1, torque2 = _torques(g, grasp, close, offset_rate, dq)
     return torque1, torque2, g.force.target, g.slip.turned
 
 
 @kernel
-def coast(
+def hold_goal(
     grips: Records[GripState], grasps: Records[GraspState], dq: tuple[float, float]
 ) -> tuple[float, float]:
-    """Replace :func:`squeeze` while frames are late: the force stays, turning comes to rest."""
+    """Replace :func:`grip_torques` while frames are late: the force stays, turning ends."""
     g = grips[0]
-    g.lean *= g.law.rest
-    g.offset += g.lean * g.law.dt
-    return _torques(g, grasps[0], _closing(grasps[0], 0.0, g.lean), g.lean, dq)
+    g.offset_rate *= g.law.decay
+    g.offset += g.offset_rate * g.law.dt
+    return _torques(g, grasps[0], _closing(grasps[0], 0.0, g.offset_rate), g.offset_rate, dq)
 
 
 @kernel
-def press(
+def single_torque(
     grips: Records[GripState],
     grasps: Records[GraspState],
     force_windows: FloatArray,
@@ -163,17 +165,17 @@ def press(
 ) -> float:
     """Return torque [N·m] of one ``finger`` on an object that stands by itself."""
     g = grips[0]
-    wanted = setpoint.advance(g.force, force_windows, g.force_rate)
-    push = wanted + _correction(g, wanted, grasps[0].force[finger])
-    g.push = min(push, _most(g, 0.0, grasps[0].arm[finger]))
+    target = setpoint.advance(g.force, force_windows, g.force_rate)
+    grip_force = target + _correction(g, target, grasps[0].force[finger])
+    g.grip_force = min(grip_force, _force_limit(g, 0.0, grasps[0].moment_arm[finger]))
     return _torque_alone(g, grasps[0], finger, g.force.speed, dq)
 
 
 @kernel
-def coast_alone(
+def hold_goal_single(
     grips: Records[GripState], grasps: Records[GraspState], finger: int, dq: float
 ) -> float:
-    """Replace :func:`press` while frames are late."""
+    """Replace :func:`single_torque` while frames are late."""
     return _torque_alone(grips[0], grasps[0], finger, 0.0, dq)
 
 
@@ -184,28 +186,28 @@ def _mean_stiffness(grasp: GraspState) -> float:
 
 @inner_kernel
 def _turning(grasp: GraspState) -> float:
-    """Return how far the object turns when one joint leans forward and the other back."""
-    both: float = grasp.turn[0] + grasp.turn[1]
-    return max(both, _TURN_MIN)
+    """Return ∂φ of the object by the antisymmetric joint angle."""
+    both: float = grasp.jacobian_rotation[0] + grasp.jacobian_rotation[1]
+    return max(both, _ROTATION_MIN)
 
 
 @inner_kernel
-def _correction(g: GripState, wanted: float, felt: float) -> float:
+def _correction(g: GripState, target: float, felt: float) -> float:
     """Return the force [N] that feedback adds to the feed-forward."""
     law = g.law
-    error = wanted - felt
+    error = target - felt
     # Beyond what the servos may give, more error must not be stored.
     full = abs(g.torque[0]) >= law.torque_max or abs(g.torque[1]) >= law.torque_max
     if not full or error < 0.0:
         integral = g.integral + law.force_bandwidth * error * law.dt
-        bound = _INTEGRAL_SHARE * g.force.target
+        bound = _INTEGRAL_RATIO * g.force.target
         g.integral = min(max(integral, -bound), bound)
     return law.force_gain * error + g.integral
 
 
 @inner_kernel
-def _most(g: GripState, load: float, arm: float) -> float:
-    """The push [N] that the target force may take, whatever the sensors feel.
+def _force_limit(g: GripState, load: float, arm: float) -> float:
+    """Upper limit [N] of the grip force for the target force, independent of the sensors.
 
     Beside what the torque constants may be off, friction and the torque [N·m] of the ``load`` that
     is believed may take some; ``arm`` [m]: the force's lever.
@@ -216,116 +218,120 @@ def _most(g: GripState, load: float, arm: float) -> float:
 
 
 @inner_kernel
-def _steer(g: GripState, windows: FloatArray, grasp: GraspState, turned: float) -> float:
+def _steer(g: GripState, windows: FloatArray, grasp: GraspState, angle: float) -> float:
     """Move the antisymmetric goal; returns its rate [rad/s]."""
-    wanted = setpoint.advance(g.angle, windows, g.law.rotate_speed)
-    turn = _turning(grasp)
-    lean = g.angle.speed / turn
-    if not math.isnan(turned):
-        error = wanted - turned
+    target = setpoint.advance(g.angle, windows, g.law.rotate_speed)
+    rotation = _turning(grasp)
+    offset_rate = g.angle.speed / rotation
+    if not math.isnan(angle):
+        error = target - angle
         if setpoint.arrived(g.angle):  # what is no more than noise, joints at rest shall not follow
             noise = _QUIET * grasp.angle_std
             error -= min(max(error, -noise), noise)
-        g.offset += g.law.rotate_bandwidth * error / turn * g.law.dt
-    g.offset += lean * g.law.dt
-    return lean
+        g.offset += g.law.rotate_bandwidth * error / rotation * g.law.dt
+    g.offset += offset_rate * g.law.dt
+    return offset_rate
 
 
 @inner_kernel
-def _share_out(g: GripState, grasp: GraspState) -> None:
-    """Take out what the object's rubbing on the table has put between the tips.
+def _distribute(g: GripState, grasp: GraspState) -> None:
+    """Balance the tips' forces, which the object's friction on the table keeps apart.
 
     The force law holds their mean; friction may keep the object where one tip is pressed more.
     Both fingers then shift sideways by a little, less than the object's angle is held to.
     """
-    off = 0.5 * (grasp.normal[0] - grasp.normal[1]) / (_mean_stiffness(grasp) * mean(grasp.arm))
-    most = _SHARE_ANGLE / _turning(grasp)
-    shift = g.shift - 2.0 * math.pi * _SHARE_BANDWIDTH * off * g.law.dt
-    shift = min(max(shift, -most), most)
+    off = (
+        0.5
+        * (grasp.normal[0] - grasp.normal[1])
+        / (_mean_stiffness(grasp) * mean(grasp.moment_arm))
+    )
+    limit = _DISTRIBUTE_ANGLE / _turning(grasp)
+    shift = g.shift - 2.0 * math.pi * _DISTRIBUTE_BANDWIDTH * off * g.law.dt
+    shift = min(max(shift, -limit), limit)
     g.offset += shift - g.shift
     g.shift = shift
 
 
 @inner_kernel
-def _closing(grasp: GraspState, rate: float, lean: float) -> float:
+def _closing(grasp: GraspState, rate: float, offset_rate: float) -> float:
     """Closing [rad/s] for a ``rate`` [N/s] of the force, what turning takes counted in."""
-    arm = grasp.arm
-    turn = grasp.turn
-    way = 2.0 * rate / _mean_stiffness(grasp)
-    way -= (arm[0] - arm[1] + grasp.slide * (turn[0] + turn[1])) * lean
-    closing: float = way / (arm[0] + arm[1])
+    arm = grasp.moment_arm
+    rotation = grasp.jacobian_rotation
+    d_rate = 2.0 * rate / _mean_stiffness(grasp)
+    d_rate -= (arm[0] - arm[1] + grasp.jacobian_slide * (rotation[0] + rotation[1])) * offset_rate
+    closing: float = d_rate / (arm[0] + arm[1])
     return closing
 
 
 @inner_kernel
 def _torques(
-    g: GripState, grasp: GraspState, close: float, lean: float, dq: tuple[float, float]
+    g: GripState, grasp: GraspState, close: float, offset_rate: float, dq: tuple[float, float]
 ) -> tuple[float, float]:
-    """Torques of two fingers at rates [rad/s] of closing and leaning that are wanted."""
+    """Torques of two fingers at commanded rates [rad/s] of closing and of the offset."""
     law = g.law
-    arm = mean(grasp.arm)
-    calm = law.damping * math.sqrt(_mean_stiffness(grasp) * arm * arm)
-    calm *= close - 0.5 * (dq[0] + dq[1])
+    arm = mean(grasp.moment_arm)
+    damping = law.damping * math.sqrt(_mean_stiffness(grasp) * arm * arm)
+    damping *= close - 0.5 * (dq[0] + dq[1])
     error = g.offset - 0.5 * (grasp.q[0] - grasp.q[1])
-    turn = g.joint_stiffness * error
-    turn += law.damping * math.sqrt(g.joint_stiffness) * (lean - 0.5 * (dq[0] - dq[1]))
-    lever = grasp.arm if law.upright else grasp.lever
-    g.torque[0] = lever[0] * g.push + calm + turn + _friction(law, close + lean)
-    g.torque[1] = lever[1] * g.push + calm - turn + _friction(law, close - lean)
+    steering = g.joint_stiffness * error
+    steering += law.damping * math.sqrt(g.joint_stiffness) * (offset_rate - 0.5 * (dq[0] - dq[1]))
+    lever = grasp.moment_arm if law.upright else grasp.energy_arm
+    g.torque[0] = lever[0] * g.grip_force + damping + steering + _friction(law, close + offset_rate)
+    g.torque[1] = lever[1] * g.grip_force + damping - steering + _friction(law, close - offset_rate)
     return g.torque[0], g.torque[1]
 
 
 @inner_kernel
 def _equal_torques(
-    g: GripState, grasp: GraspState, wanted: float, dq: tuple[float, float]
+    g: GripState, grasp: GraspState, target: float, dq: tuple[float, float]
 ) -> tuple[float, float]:
-    """Torques of two fingers that push alike, whatever the object's angle.
+    """Torques of two fingers of the same force, whatever the object's angle.
 
     With the spring of `hand.upright` between the fingers, and a dither that fades and so leaves the
-    joints' friction without a bias. Then the joints keep to their lean.
+    joints' friction without a bias. Then the joints keep their antisymmetric angle.
     """
     law, q = g.law, grasp.q
     close = _closing(grasp, g.force.speed, 0.0)
-    g.lean = 0.0
+    g.offset_rate = 0.0
     g.closing_friction = min(max(close / law.friction_speed, -1.0), 1.0)
     closed = mean(q)
     arm = law.length * math.cos(closed) - law.offset * math.sin(closed)
-    calm = law.damping * math.sqrt(_mean_stiffness(grasp) * arm * arm)
-    push = arm * g.push + calm * (close - 0.5 * (dq[0] + dq[1])) + _friction(law, close)
-    lean = 0.5 * (q[0] - q[1])
-    turn = -0.5 * calm * (dq[0] - dq[1])
-    if g.shaken < law.dither_time:
+    damping = law.damping * math.sqrt(_mean_stiffness(grasp) * arm * arm)
+    common = arm * g.grip_force + damping * (close - 0.5 * (dq[0] + dq[1])) + _friction(law, close)
+    antisymmetric = 0.5 * (q[0] - q[1])
+    steering = -0.5 * damping * (dq[0] - dq[1])
+    if g.dither_elapsed < law.dither_time:
         lengths = (law.half_separation, law.length, law.offset, law.radius)
         depth = mean(grasp.d)
         spring = min(
-            upright_spring(closed, depth, wanted, grasp.turning, lengths), g.joint_stiffness
+            upright_spring(closed, depth, target, grasp.turning, lengths), g.joint_stiffness
         )
         # What then holds the fingers begins with the torque that the spring has come to.
-        g.offset = lean * (1.0 - spring / g.joint_stiffness)
+        g.offset = antisymmetric * (1.0 - spring / g.joint_stiffness)
         # Within its first period it grows, from then on it fades.
-        phase = law.dither_rate * g.shaken
-        size = min(phase / (2.0 * math.pi), 1.0) * (1.0 - g.shaken / law.dither_time)
-        turn = size * law.dither_torque * math.sin(phase) - spring * lean
-        if g.shaken > 0.0 or setpoint.arrived(g.force):
+        phase = law.dither_rate * g.dither_elapsed
+        size = min(phase / (2.0 * math.pi), 1.0) * (1.0 - g.dither_elapsed / law.dither_time)
+        steering = size * law.dither_torque * math.sin(phase) - spring * antisymmetric
+        if g.dither_elapsed > 0.0 or setpoint.arrived(g.force):
             # By the clock and not by ticks: where these come late the dither must not become slow,
             # for the fingers on the tips swing by themselves at one to two hertz.
-            g.shaken += min(max(grasp.t - g.seen, 0.0), _LONGEST_PAUSE)
+            g.dither_elapsed += min(max(grasp.t - g.seen, 0.0), _LONGEST_PAUSE)
     else:
-        turn += g.joint_stiffness * (g.offset - lean)
+        steering += g.joint_stiffness * (g.offset - antisymmetric)
     g.seen = grasp.t
-    g.torque[0] = push + turn
-    g.torque[1] = push - turn
+    g.torque[0] = common + steering
+    g.torque[1] = common - steering
     return g.torque[0], g.torque[1]
 
 
 @inner_kernel
 def _torque_alone(g: GripState, grasp: GraspState, finger: int, rate: float, dq: float) -> float:
     """Torque [N·m] of one finger whose force is to change by ``rate`` [N/s]."""
-    arm = grasp.arm[finger]
+    arm = grasp.moment_arm[finger]
     stiffness = max(grasp.stiffness[finger], _STIFFNESS_MIN)
     close = rate / (stiffness * arm)
-    calm = g.law.damping * math.sqrt(stiffness * arm * arm) * (close - dq)
-    torque: float = arm * g.push + calm + _friction(g.law, close)
+    damping = g.law.damping * math.sqrt(stiffness * arm * arm) * (close - dq)
+    torque: float = arm * g.grip_force + damping + _friction(g.law, close)
     g.torque[finger] = torque
     return torque
 

@@ -18,7 +18,7 @@ class RunningMean(Record):
     """The mean of the last ``length`` values, which are kept beside it."""
 
     length: int
-    place: int  # of the oldest value
+    index: int  # of the oldest value
     sum: float
 
 
@@ -41,8 +41,8 @@ def reset(s: SetpointState, windows: FloatArray, value: float) -> None:
     s.target = s.ramp = s.value = value
     s.speed = 0.0
     s.idle = s.first.length + s.second.length
-    s.first.place = 0
-    s.second.place = 0
+    s.first.index = 0
+    s.second.index = 0
     s.first.sum = value * s.first.length
     s.second.sum = value * s.second.length
     windows[:] = value
@@ -58,10 +58,10 @@ def arrived(s: SetpointState) -> bool:
 @inner_kernel
 def _add(mean: RunningMean, windows: FloatArray, start: int, value: float) -> float:
     """Take ``value`` into a mean whose window begins at ``start``."""
-    place = mean.place
-    mean.sum += value - windows[start + place]
-    windows[start + place] = value
-    mean.place = place + 1 if place + 1 < mean.length else 0
+    index = mean.index
+    mean.sum += value - windows[start + index]
+    windows[start + index] = value
+    mean.index = index + 1 if index + 1 < mean.length else 0
     result: float = mean.sum / mean.length
     return result
 
@@ -80,12 +80,12 @@ def advance(s: SetpointState, windows: FloatArray, rate: float) -> float:
             reset(s, windows, s.target)  # the running sums' rounding ends here
             return s.target
     else:
-        most = rate * s.dt
+        step_max = rate * s.dt
         s.idle = 0
-        if abs(left) <= most:
+        if abs(left) <= step_max:
             s.ramp = s.target
         else:
-            s.ramp += most if left > 0.0 else -most
+            s.ramp += step_max if left > 0.0 else -step_max
     smooth = _add(s.first, windows, 0, s.ramp)
     s.value = _add(s.second, windows, s.first.length, smooth)
     s.speed = (s.value - last) / s.dt

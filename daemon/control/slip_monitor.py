@@ -1,4 +1,18 @@
-"""How near a held object is to slipping, and the grip force that keeps the margin.
+"""Slip margin of a held object, and the grip force that keeps it.
+
+With the names of `SlipLaw`, `SlipState` and `GraspState`, at each tick:
+
+    standing torque    mean(torque_residual) − closing · joint_friction, averaged: smooth
+    load L of a tip    smooth − still = load_arm L + load_curvature L²        (`load_of`)
+    sure               |L| − (1/2 … 3/2) joint_friction/load_arm
+    s.load             min(max(4 sure, 0), |L| + joint_friction/slope)
+    spare              friction (1 − margin) − shear         of the normal force, for a load
+    needed             max(s.load, felt, object_load/2)/spare
+    force              min(max(commanded, needed), force_limit)
+    force_limit        min(commanded + min(raise_max, raise_ratio · commanded), force_max)
+
+`needed` stays for _HOLD_TIME and then falls by raise_max in _BACK. A load that comes at once, or a
+turn of the object beyond μ (d1 + d2)/2W · _WELL, raises the force at once.
 
 What these sensors show, and what they don't:
 
@@ -35,7 +49,7 @@ import math
 
 from softfinger.daemon.perception.contact_filter_kernels import GraspState
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.types import GRIP_SHARE
+from softfinger.daemon.types import GRIP_FRACTION
 from softfinger.kinematics.compiled.kernel import inner_kernel
 from softfinger.kinematics.compiled.layout import Pair, Record
 from softfinger.kinematics.hand.grasp_state import load_of
@@ -43,20 +57,20 @@ from softfinger.kinematics.hand.grasp_state import load_of
 _SMOOTH = 0.1  # s over which the load is averaged: joint velocities flicker by a count
 _SUDDEN = 0.7  # of what friction bears with its margin: a load that comes at once, and may go on
 _LEARN = 1.0  # s in which the friction at rest is learnt
-_KEPT = 1.0  # s that a raised grip is kept after the need for it has gone
+_HOLD_TIME = 1.0  # s that a raised grip is kept after the need for it has gone
 _BACK = 2.0  # s in which it then comes back by all of `grip_raise_max`
-_TURNED_MORE = 0.5  # share that the grip is raised by when the object turns in it
+_TURNED_MORE = 0.5  # fraction that the grip is raised by when the object turns in it
 _WELL = 1.5  # times what the tips' shear explains: the object turns in the grip
 _FORGET = 2.0  # s in which turning that no joint explains is forgotten: warmth, creep
-_LEAST_JUMP = 0.01  # N·m of a jump, besides
+_JUMP_MIN = 0.01  # N·m of a jump, besides
 _SHEAR_JUMP = 0.6  # N: frames scatter by 0.1
 _YIELDS = 0.01  # rad/s that both joints give way faster than just before: half a count of one
 _FAST = 0.1  # rad/s, likewise
 _SIGNS = 4.0  # standard deviations, of the angle and of the torques, more than that
 _BOTH = 0.5  # of the mean of both joints' torques: each must show so much of a sudden load
 _BALANCED = 0.6  # of both tips' mean force: each must feel so much, as of any object that is free
-_LEAST_LEVER = 0.2  # of the object's width: a load's lever is not taken for less
-_LEAST_SPARE = 0.3  # of the friction: where rolling takes more, a firmer grip hardly helps
+_ARM_MIN = 0.2  # of the object's width: a load's lever is not taken for less
+_SPARE_MIN = 0.3  # of the friction: where rolling takes more, a firmer grip hardly helps
 
 
 class SlipLaw(Record):
@@ -66,11 +80,11 @@ class SlipLaw(Record):
     width: float  # of the object [m]
     force_max: float  # [N]
     friction: float  # Coulomb, tip on object
-    margin: float  # share of it that is kept unused
+    margin: float  # fraction of it that is kept unused
     joint_friction: float  # [N·m]
     object_load: float  # [N]
     raise_max: float  # [N]
-    raise_share: float  # of the force asked for
+    raise_ratio: float  # of the force asked for
 
 
 class SlipState(Record):
@@ -87,10 +101,10 @@ class SlipState(Record):
     speed: float  # of the joints' closing, averaged [rad/s]
     felt: float  # the load that solid tips feel, averaged [N]
     age: float  # since holding began, up to `_LEARN` [s]
-    stray: float  # sum of unexplained turning that has been looked at [rad]
+    unexplained_rotation: float  # sum of unexplained turning that has been looked at [rad]
     away: float  # unexplained turning that is not forgotten yet [rad]
     needed: float  # force for the margin, kept for a while [N]
-    most: float  # that the grip may be raised to [N]
+    force_limit: float  # that the grip may be raised to [N]
     idle: float  # since that was needed [s]
 
 
@@ -99,11 +113,11 @@ def set_law(law: SlipLaw, settings: Settings) -> None:
     control = settings.control
     law.dt = 1.0 / settings.loop.rate
     law.width = settings.object.width
-    law.force_max = GRIP_SHARE * settings.safety.force_max
+    law.force_max = GRIP_FRACTION * settings.safety.force_max
     law.friction, law.margin = control.tip_friction, control.slip_margin
     law.joint_friction = control.joint_friction
     law.object_load = control.object_load
-    law.raise_max, law.raise_share = control.grip_raise_max, control.grip_raise_share
+    law.raise_max, law.raise_ratio = control.grip_raise_max, control.grip_raise_share
 
 
 @inner_kernel
@@ -112,70 +126,70 @@ def forget(s: SlipState) -> None:
     s.turned = s.known = s.reflex = False
     s.load = s.felt = s.still = s.variance = s.age = 0.0
     s.smooth[0] = s.smooth[1] = s.speed = 0.0
-    s.stray = s.away = s.needed = s.most = s.idle = 0.0
+    s.unexplained_rotation = s.away = s.needed = s.force_limit = s.idle = 0.0
 
 
 @inner_kernel
 def begin(s: SlipState, grasp: GraspState) -> None:
     """Begin holding, or begin again after a command: learn the torques that are no load."""
-    s.known = grasp.load_lever > 0.0
+    s.known = grasp.load_arm > 0.0
     if not s.known:
         return
     friction = s.law.joint_friction
     s.still = min(max(mean(s.smooth), -friction), friction)
-    s.stray = grasp.stray
+    s.unexplained_rotation = grasp.unexplained_rotation
     s.away = 0.0
     s.age = _SMOOTH
 
 
 @inner_kernel
-def look(
-    s: SlipState, grasp: GraspState, asked: float, holding: bool, closing: float, speed: float
+def update(
+    s: SlipState, grasp: GraspState, commanded: float, holding: bool, closing: float, speed: float
 ) -> float:
-    """Return the grip force [N] to go to: ``asked``, or more where the margin needs it.
+    """Return the grip force [N] to go to: ``commanded``, or more where the margin needs it.
 
     ``holding``: nothing but loads moves the joints. ``closing``, -1 to 1: how much of the joints'
     friction is given at present for closing. ``speed`` [rad/s]: of the joints' closing.
     """
     law = s.law
     s.turned = False
-    raised = min(law.raise_max, law.raise_share * asked)
-    s.most = max(min(asked + raised, law.force_max), asked)
-    judged = holding and s.known and grasp.load_lever > 0.0
+    raised = min(law.raise_max, law.raise_ratio * commanded)
+    s.force_limit = max(min(commanded + raised, law.force_max), commanded)
+    monitored = holding and s.known and grasp.load_arm > 0.0
     # Of the shear one part grows with the grip, the rolling's; the load is borne by both tips.
     spare = law.friction * (1.0 - law.margin) - grasp.shear
-    sudden = _average(s, grasp, closing, speed, judged, spare)
-    if judged:
-        _weigh(s, grasp)
+    sudden = _average(s, grasp, closing, speed, monitored, spare)
+    if monitored:
+        _estimate_load(s, grasp)
         _watch_turning(s, grasp)
     else:
-        s.stray = grasp.stray
+        s.unexplained_rotation = grasp.unexplained_rotation
     # A grip that bears less than the joints' friction hides is not judged by their torques.
-    seen = s.load if law.friction * asked * grasp.load_lever > law.joint_friction else 0.0
+    seen = s.load if law.friction * commanded * grasp.load_arm > law.joint_friction else 0.0
     felt = max(abs(grasp.sheared) - grasp.shear * mean(grasp.normal), 0.0)
-    sudden = _shear_jumps(s, felt, spare * mean(grasp.normal), judged) or sudden
+    sudden = _shear_jumps(s, felt, spare * mean(grasp.normal), monitored) or sudden
     load = max(seen, felt, 0.5 * law.object_load)
     needed = 0.0
     if load > 0.0:
-        needed = load / max(spare, _LEAST_SPARE * law.friction)
+        needed = load / max(spare, _SPARE_MIN * law.friction)
     if s.turned:
-        needed = max(needed, (1.0 + _TURNED_MORE) * max(asked, s.needed))
+        needed = max(needed, (1.0 + _TURNED_MORE) * max(commanded, s.needed))
     s.reflex = s.turned or sudden
     if sudden:
-        needed = s.most  # how much more is to come is not known
+        needed = s.force_limit  # how much more is to come is not known
     if needed >= s.needed:
-        s.needed = min(needed, s.most)
+        s.needed = min(needed, s.force_limit)
         s.idle = 0.0
     else:
         s.idle += law.dt
-        if s.idle > _KEPT:
+        if s.idle > _HOLD_TIME:
             s.needed = max(s.needed - law.raise_max / _BACK * law.dt, needed)
-    return min(max(asked, s.needed), s.most)
+    return min(max(commanded, s.needed), s.force_limit)
 
 
 @inner_kernel
 def _average(
-    s: SlipState, grasp: GraspState, closing: float, speed: float, judged: bool, spare: float
+    s: SlipState, grasp: GraspState, closing: float, speed: float, monitored: bool, spare: float
 ) -> bool:
     """Take in both joints' torques; whether a load has come at once that needs a firmer grip.
 
@@ -184,24 +198,24 @@ def _average(
     """
     friction = s.law.joint_friction
     known = closing * friction
-    found1 = grasp.unexplained[0] - known
-    found2 = grasp.unexplained[1] - known
+    found1 = grasp.torque_residual[0] - known
+    found2 = grasp.torque_residual[1] - known
     off1 = found1 - s.smooth[0]
     off2 = found2 - s.smooth[1]
     off = 0.5 * (off1 + off2)
     before = mean(s.smooth) - s.still
     sudden = False
     alike = min(off1 * off, off2 * off) > _BOTH * off * off
-    flicker = _SIGNS * math.sqrt(s.variance) + _LEAST_JUMP
+    flicker = _SIGNS * math.sqrt(s.variance) + _JUMP_MIN
     flicker += friction * max(1.0 - s.age / _LEARN, 0.0)  # joints may still come to rest
     yields = (s.speed - speed) * math.copysign(1.0, off) > _YIELDS
     s.speed += (speed - s.speed) * s.law.dt / _SMOOTH
     balanced = min(grasp.normal[0], grasp.normal[1]) > _BALANCED * mean(grasp.normal)
     felt = abs(off) > flicker and abs(before + off) > abs(before)
-    if judged and alike and balanced and yields and felt:
-        load, slope = load_of(before + off, grasp.load_lever, grasp.load_bow)
-        hidden = friction / max(slope, _LEAST_LEVER * s.law.width)
-        sudden = abs(load) + 0.5 * hidden > _SUDDEN * max(spare, 0.0) * mean(grasp.normal)
+    if monitored and alike and balanced and yields and felt:
+        load, slope = load_of(before + off, grasp.load_arm, grasp.load_curvature)
+        undetected = friction / max(slope, _ARM_MIN * s.law.width)
+        sudden = abs(load) + 0.5 * undetected > _SUDDEN * max(spare, 0.0) * mean(grasp.normal)
     if sudden:
         s.smooth[0] += off1
         s.smooth[1] += off2
@@ -213,24 +227,24 @@ def _average(
 
 
 @inner_kernel
-def _shear_jumps(s: SlipState, felt: float, bears: float, judged: bool) -> bool:
+def _shear_jumps(s: SlipState, felt: float, bears: float, monitored: bool) -> bool:
     """Take in the load that solid tips feel [N]; whether one has come at once, as with torques.
 
     ``bears`` [N]: what friction does with its margin.
     """
     jump = felt - s.felt
     s.felt += jump * s.law.dt / _SMOOTH
-    return judged and jump > _SHEAR_JUMP and felt > _SUDDEN * bears
+    return monitored and jump > _SHEAR_JUMP and felt > _SUDDEN * bears
 
 
 @inner_kernel
-def _weigh(s: SlipState, grasp: GraspState) -> None:
+def _estimate_load(s: SlipState, grasp: GraspState) -> None:
     """Tell the load from the joints' friction."""
     law = s.law
     off = _alike(s) - s.still
-    load, slope = load_of(off, grasp.load_lever, grasp.load_bow)
+    load, slope = load_of(off, grasp.load_arm, grasp.load_curvature)
     load = abs(load)
-    friction = law.joint_friction / grasp.load_lever
+    friction = law.joint_friction / grasp.load_arm
     s.age = min(s.age + law.dt, _LEARN)
     if load < friction:
         # So little may as well be friction that gives way; what comes slower stays hidden.
@@ -239,26 +253,26 @@ def _weigh(s: SlipState, grasp: GraspState) -> None:
     # Half the friction is no sign yet, and after a motion it may turn round; from all of it on
     # as much may be hidden.
     sure = load - (0.5 + max(1.0 - s.age / _LEARN, 0.0)) * friction
-    hidden = law.joint_friction / max(slope, _LEAST_LEVER * law.width)
-    s.load = min(max(4.0 * sure, 0.0), load + hidden)
+    undetected = law.joint_friction / max(slope, _ARM_MIN * law.width)
+    s.load = min(max(4.0 * sure, 0.0), load + undetected)
 
 
 @inner_kernel
 def _alike(s: SlipState) -> float:
     """The torque [N·m] that both joints show of a load: one alone doesn't speak for both."""
     both = mean(s.smooth)
-    least = 0.0
+    smaller = 0.0
     if s.smooth[0] * s.smooth[1] > 0.0:
-        least = min(abs(s.smooth[0]), abs(s.smooth[1]))
-    most = least / _BOTH + s.law.joint_friction
-    return min(max(both, -most), most)
+        smaller = min(abs(s.smooth[0]), abs(s.smooth[1]))
+    force_limit = smaller / _BOTH + s.law.joint_friction
+    return min(max(both, -force_limit), force_limit)
 
 
 @inner_kernel
 def _watch_turning(s: SlipState, grasp: GraspState) -> None:
     """Look for turning beyond what the tips' shear explains."""
-    s.away += grasp.stray - s.stray - s.away * s.law.dt / _FORGET
-    s.stray = grasp.stray
+    s.away += grasp.unexplained_rotation - s.unexplained_rotation - s.away * s.law.dt / _FORGET
+    s.unexplained_rotation = grasp.unexplained_rotation
     depth = grasp.d[0] + grasp.d[1]
     sheared = 0.5 * s.law.friction * depth / s.law.width
     if abs(s.away) > _WELL * sheared + _SIGNS * grasp.angle_std:

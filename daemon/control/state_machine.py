@@ -16,7 +16,9 @@ from softfinger.daemon.perception.contact_filter_kernels import HOLDING, OTHER, 
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS, Event, Goal, State
 
-_REACH = 0.35  # rad beyond the present angle: far enough that the servo's current bound decides
+_GOAL_OFFSET = (
+    0.35  # rad beyond the present angle: far enough that the servo's current bound decides
+)
 _ARRIVED = 0.03  # rad from the goal
 _GRACE = 1.0  # s after the ramp's end in which a joint that friction holds may still arrive
 _SETTLED_FORCE = 0.03  # share of the force target
@@ -25,7 +27,7 @@ _SETTLED_FOR = 0.2  # s
 _FOLLOWED = 0.25  # share of a stream's force, within which a grip follows it
 _STEADY_FORCE = 0.02  # share, and …
 _STEADY_ANGLE = 2e-3  # … rad, within which setpoints may flicker without counting as new ones
-_TURN_RESERVE = 0.1  # rad of tilt kept from the limit that is a fault
+_TILT_RESERVE = 0.1  # rad of tilt kept from the limit that is a fault
 _RAISED = 1.02  # of the force asked for, above which the grip is reported as raised
 _LOST_AFTER = 0.1  # s without contact in a grip
 _EMPTY_AFTER = 0.05  # s in which a grip is too narrow to hold anything
@@ -61,7 +63,7 @@ class Control:
         self._raised = False  # the grip is firmer than was asked for
         self._touching = [False, False]
         self._gripping = False
-        self._rest_current = settings.safety.current_move  # A, with which the joints hold a goal
+        self._hold_current = settings.safety.current_move  # A, with which the joints hold a goal
         self._waiting = 0.0  # s since the ramps ended, or the grip has been settled
         self._lost = 0.0  # s without contact in a grip
         self._empty = 0.0  # s in which a grip has been too narrow to hold anything
@@ -132,7 +134,7 @@ class Control:
         `control.rotate_speed` and in `control.force_time`, smoothly whatever the stream. Return the
         angle that is turned to, bounded by what this grip reaches; None where none is known yet.
         """
-        if force is not None and not (self._gripping and force == self._grip.asked):
+        if force is not None and not (self._gripping and force == self._grip.commanded):
             self.grasp(force)
             self._streamed = True
         if angle is None:
@@ -152,8 +154,8 @@ class Control:
         force, angle = self._still_at
         grip = self._grip
         if self._still and not (
-            abs(grip.asked - force) < _STEADY_FORCE * force
-            and (math.isnan(grip.kept_angle) or abs(grip.kept_angle - angle) < _STEADY_ANGLE)
+            abs(grip.commanded - force) < _STEADY_FORCE * force
+            and (math.isnan(grip.target_angle) or abs(grip.target_angle - angle) < _STEADY_ANGLE)
         ):
             self._still = False
             self._waiting = 0.0
@@ -168,7 +170,7 @@ class Control:
 
     def set(self, compliance: float) -> None:
         """Set the angle by which the grip gives way to a torque [rad/(N·m)]."""
-        self._grip.soften(1.0 / compliance)
+        self._grip.set_joint_stiffness(1.0 / compliance)
 
     def why_not_turn(self, angle: float) -> str:
         """Return why the held object can't be turned to ``angle`` [rad] now; empty where it can."""
@@ -186,12 +188,12 @@ class Control:
         tilt changes by both.
         """
         settings, present = self._settings, self._pose.angle
-        lean = 1.0 / max(self._held.turn[0] + self._held.turn[1], 0.1)
+        lean = 1.0 / max(self._held.jacobian_rotation[0] + self._held.jacobian_rotation[1], 0.1)
         low, high = -math.inf, math.inf
         for index, sense in ((0, 1.0), (1, -1.0)):
             contact, q = self._contacts[index], self._reading.q[index]
             depth = 1.0 - contact.d / settings.tip.radius
-            reach = math.asin(max(depth, 0.0)) - settings.safety.theta_margin - _TURN_RESERVE
+            reach = math.asin(max(depth, 0.0)) - settings.safety.theta_margin - _TILT_RESERVE
             low = max(low, (-reach - contact.theta) / (1.0 + lean))
             high = min(high, (reach - contact.theta) / (1.0 + lean))
             down, up = settings.hand.q_min[index] - q, settings.hand.q_max[index] - q
@@ -215,7 +217,7 @@ class Control:
             self._next_angle = None
             text = f"rotate: dropped, since the grasp ended in {mode.value}"
             self.events.append(("warning", "rotate", text))
-        self._rest_current = self._settings.safety.current_move
+        self._hold_current = self._settings.safety.current_move
         self._waiting = self._lost = self._empty = 0.0
         self._still = False
         if mode in (Mode.DISARMED, Mode.ARMED, Mode.FAULT):
@@ -242,20 +244,20 @@ class Control:
             self._hold(dt, goal)
         else:
             self._rest(
-                goal, self._approach_current() if mode is Mode.GRASPING else self._rest_current
+                goal, self._approach_current() if mode is Mode.GRASPING else self._hold_current
             )
         if self._gripping:
-            goal.force, goal.angle = self._grip.given, self._grip.kept_angle
+            goal.force, goal.angle = self._grip.target, self._grip.target_angle
         elif self.mode is Mode.GRASPING:
             goal.force = self._force
 
-    def coast(self, goal: Goal) -> None:
+    def hold_goal(self, goal: Goal) -> None:
         """Replace :meth:`step` while frames are late: goals stay as they are.
 
         A grip's goals are torques: its joints are damped, and a turn comes to rest.
         """
         if goal.valid and self._gripping and self._lost == 0.0:
-            self._pull(self._grip.coast(self._reading), goal)
+            self._pull(self._grip.hold_goal(self._reading), goal)
 
     def _rest(self, goal: Goal, current: float) -> None:
         """Joints follow their setpoints, with at most ``current`` [A]."""
@@ -319,7 +321,7 @@ class Control:
         if self._pose.width < self._settings.object.width_min or self._empty > 0.0:
             self._is_empty(dt)
         self._pull(self._grip.torques(self._reading, self._pose, self._still), goal)
-        if self._grip.slipped or self._raised or self._grip.given != self._grip.asked:
+        if self._grip.slipped or self._raised or self._grip.target != self._grip.commanded:
             self._watch_slip()
         if not self._still:
             if self.mode is not Mode.GRASPING:
@@ -329,7 +331,7 @@ class Control:
     def _pull(self, torques: tuple[float, float], goal: Goal) -> None:
         for index in self._fingers:
             current = torques[index] / self._settings.control.torque_constant
-            goal.q[index] = self._reading.q[index] + math.copysign(_REACH, current)
+            goal.q[index] = self._reading.q[index] + math.copysign(_GOAL_OFFSET, current)
             goal.current[index] = abs(current)
 
     def _lose(self, dt: float, goal: Goal) -> None:
@@ -338,14 +340,14 @@ class Control:
             self._hold_here()
             # A board that went blind must not make the joints press harder than they did.
             pressed = max(goal.current[index] for index in self._fingers)
-            self._rest_current = min(pressed, self._settings.safety.current_move)
-        self._rest(goal, self._rest_current)
+            self._hold_current = min(pressed, self._settings.safety.current_move)
+        self._rest(goal, self._hold_current)
         self._lost += dt
         if self._lost > _LOST_AFTER:
             self.events.append(("warning", "lost", "contact lost; the joints hold where they are"))
-            rest = self._rest_current
+            rest = self._hold_current
             self._enter(Mode.ARMED)
-            self._rest_current = rest
+            self._hold_current = rest
 
     def _is_empty(self, dt: float) -> bool:
         """Return whether there seems to be nothing between the tips; if that lasts, the hand opens.
@@ -353,15 +355,15 @@ class Control:
         Tips that press each other would roll off to one side. Their contacts are one, so that the
         object's width by joints and sensors is 0 up to their errors.
         """
-        least = self._settings.object.width_min
-        if not self._pose.valid or self._pose.width >= least:
+        width_min = self._settings.object.width_min
+        if not self._pose.valid or self._pose.width >= width_min:
             self._empty = 0.0
             return False
         self._empty += dt
         if self._empty > _EMPTY_AFTER:
             text = (
                 f"nothing between the tips: {self._pose.width * 1e3:.1f} mm, "
-                f"less than object.width_min {least * 1e3:g} mm; opening"
+                f"less than object.width_min {width_min * 1e3:g} mm; opening"
             )
             self.events.append(("warning", "grasp", text))
             self.release()
@@ -372,18 +374,19 @@ class Control:
         grip = self._grip
         if grip.slipped:
             self.events.append(("warning", "slip", "the object turns in the grip"))
-        if grip.given <= grip.asked:
+        if grip.target <= grip.commanded:
             self._raised = False
-        elif grip.given > _RAISED * grip.asked and not self._raised:
+        elif grip.target > _RAISED * grip.commanded and not self._raised:
             self._raised = True
-            text = f"grip raised above {grip.asked:.1f} N: each tip may bear {grip.slip.load:.1f} N"
-            self.events.append(("warning", "slip", f"{text} along its face"))
+            load = f"each tip may bear {grip.slip.load:.1f} N along its face"
+            text = f"grip raised above {grip.commanded:.1f} N: {load}"
+            self.events.append(("warning", "slip", text))
 
     def _watch_turning(self) -> None:
         """Turning ends where the tips would slip."""
         grip, law, angle = self._grip, self._settings.control, self._pose.angle
-        most = law.tip_friction * (1.0 - law.slip_margin)
-        if not self._held.shear * grip.turning_on > most:
+        shear_max = law.tip_friction * (1.0 - law.slip_margin)
+        if not self._held.shear * grip.turning_on > shear_max:
             return
         if not self._turn_ended:
             text = f"turning ended at {math.degrees(angle):.1f}°: the tips would slip"
@@ -395,25 +398,25 @@ class Control:
         """Pass into holding once the force, or the angle while turning, has stayed at its goal."""
         grip, pose = self._grip, self._pose
         settled = self.mode is Mode.GRASPING or not (
-            abs(pose.angle - grip.kept_angle) >= _SETTLED_ANGLE
+            abs(pose.angle - grip.target_angle) >= _SETTLED_ANGLE
         )
         if self.mode is not Mode.ROTATING:
             # The mean, since what the object rubs on may take some force between the tips.
-            wanted = grip.given
+            wanted = grip.target
             if self._streamed and self.mode is Mode.GRASPING:  # it may never rest
                 wanted = grip.force.value
-                settled = abs(wanted - grip.given) < _FOLLOWED * grip.given
-            settled = settled and abs(self._felt() - wanted) < _SETTLED_FORCE * grip.given
+                settled = abs(wanted - grip.target) < _FOLLOWED * grip.target
+            settled = settled and abs(self._felt() - wanted) < _SETTLED_FORCE * grip.target
             settled = settled and not grip.shaking
         self._waiting = self._waiting + dt if settled else 0.0
         if self._waiting <= _SETTLED_FOR:
             return
-        if pose.valid and math.isnan(grip.kept_angle) and not grip.upright:
+        if pose.valid and math.isnan(grip.target_angle) and not grip.upright:
             grip.steer(pose.angle, pose.angle)
         grip.begin_holding()
         self._enter(Mode.HOLDING)
         self._still = True
-        self._still_at = grip.asked, grip.kept_angle
+        self._still_at = grip.commanded, grip.target_angle
         if self._next_angle is None:
             return
         angle, self._next_angle = self._next_angle, None  # a turn that waited for the grip

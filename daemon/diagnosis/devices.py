@@ -31,7 +31,7 @@ from softfinger.daemon.servos.provisioning import (
 from softfinger.daemon.tactile.base import make_sensor
 from softfinger.daemon.types import FINGERS
 
-_PATIENCE = 5.0  # s for a board: one that its adapter resets when the port is opened starts anew
+_PATIENCE = 5.0  # s for a board: one that its adapter resets when the port is opened starts again
 _LISTEN = 0.5  # s of a board's frames
 _OFF_RATE = 0.1  # share of the rate by which a board may be off
 
@@ -48,7 +48,7 @@ def check_servos(settings: Settings, wait: float = SEARCH_TIME) -> list[Finding]
         with open_line(servos.port, servos.baud, low_latency=False) as line:
             found = examine(line, settings, model)
         results = [line for each in found for line in _judge(each, settings, model)]
-        if not all(each.answers for each in found):
+        if not all(each.replies for each in found):
             results += _search(settings, model, wait) or _blame_power(found)
     except ServoError as error:
         return [Finding("FAIL", "servos", str(error))]
@@ -57,14 +57,14 @@ def check_servos(settings: Settings, wait: float = SEARCH_TIME) -> list[Finding]
 
 def _judge(servo: Examined, settings: Settings, model: ServoModel) -> list[Finding]:
     name = servo.name
-    if not servo.answers:
+    if not servo.replies:
         problem = f"no answer at {settings.servos.baud} baud"
         fix = "check its power and cable, then see what was found below"
         return [Finding("FAIL", name, problem, fix)]
     results = [*servo.errors, *servo.notices]
     if servo.table and not servo.errors:
         described = Finding("pass", name, _described(servo, model))
-        results.append(servo.stray or described)
+        results.append(servo.misplaced or described)
     return results
 
 

@@ -223,7 +223,7 @@ class Loop:
             self._fail(str(error))
         if reading.valid and self.perception.fingers:
             gripping = state.mode in GRIPPING and state.goal.valid
-            self.perception.filter.advance(reading, state.goal if gripping else None)
+            self.perception.filter.predict(reading, state.goal if gripping else None)
 
     def _decide(self) -> None:
         state, control = self.state, self._control
@@ -245,7 +245,7 @@ class Loop:
         if breach is not None or self._safety.warnings or self._after_opening is not None:
             self._react(breach)
         if self._safety.must_hold and state.mode in GRIPPING:
-            control.coast(state.goal)
+            control.hold_goal(state.goal)
         else:
             control.step(self.period, state.goal)
         if control.events or self.perception.events or self._reports:

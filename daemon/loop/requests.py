@@ -19,7 +19,7 @@ from softfinger.daemon.perception.perception import Perception
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.safety.safety import Safety
 from softfinger.daemon.safety.torque_state import TorqueState
-from softfinger.daemon.types import FINGERS, GRIP_SHARE, State
+from softfinger.daemon.types import FINGERS, GRIP_FRACTION, State
 
 _COMPLIANCE = (0.01, 1.0)  # rad/(N·m)
 _ENVELOPE = frozenset({"command", "client"})
@@ -218,7 +218,7 @@ class Requests:
             numbers.setdefault("force", settings.control.force_default)
         if "force" in numbers:
             force = numbers["force"]
-            low, high = settings.control.contact_force, GRIP_SHARE * settings.safety.force_max
+            low, high = settings.control.contact_force, GRIP_FRACTION * settings.safety.force_max
             if not low < force <= high:
                 return f"force: found {force:g} N, expected above {low:g} to {high:g}"
         if "angle" in numbers:

@@ -151,7 +151,7 @@ def _sensor(scene: WantedScene) -> None:
     counts = np.empty((settings.tactile.rows, settings.tactile.cols), np.uint16)
     model.frame(depth, 0.1, 0.0, counts)
     if settings.simulation.object_shape == "disc":
-        model.frame(depth, 0.1, 0.0, counts, bend=1.0 / settings.simulation.object_radius)
+        model.frame(depth, 0.1, 0.0, counts, curvature=1.0 / settings.simulation.object_radius)
 
 
 def _filter(scene: WantedScene) -> None:
@@ -164,9 +164,9 @@ def _filter(scene: WantedScene) -> None:
     frame = Frame(1, 0.0, 0.0, True, np.zeros((1, 1), np.uint16))
     touch = ContactEstimate(contact=True, valid=True, d=1e-3)
     for k in (1, 2):
-        contact_filter.advance(Reading(t=0.01 * k))
+        contact_filter.predict(Reading(t=0.01 * k))
         for finger in fingers:
-            contact_filter.correct(finger, frame, touch, contacts[finger])
+            contact_filter.update(finger, frame, touch, contacts[finger])
         contact_filter.write_contacts(0.01 * k, contacts, pose)
 
 
@@ -182,7 +182,7 @@ def _grip(scene: WantedScene) -> None:
     grip.steer(0.0, 0.1)
     grip.begin_holding()
     grip.torques(reading, pose, True)
-    grip.coast(reading)
+    grip.hold_goal(reading)
 
 
 def _joints(scene: WantedScene) -> None:

@@ -347,9 +347,9 @@ def _usb_serial(settings: Settings, finger: int) -> str:
         return ""
     from serial.tools.list_ports import comports
 
-    wanted = os.path.realpath(tactile.port[finger])
+    target = os.path.realpath(tactile.port[finger])
     for port in comports():
-        if os.path.realpath(port.device) == wanted:
+        if os.path.realpath(port.device) == target:
             return port.serial_number or ""
     return ""
 

@@ -1,9 +1,9 @@
-"""Contacts between the tactile frames: predicted from the joints each tick, corrected by frames.
+"""Contacts between the tactile frames: a Kalman filter, predicted by joints, updated by frames.
 
 A frame is exact but late and rare; joints are fresh but coarse. While an object is held, joint
 motion carries d and the object's angle φ on by the rolling constraints (`hand.grasp_state`). A
-frame is compared with what was predicted for the instant at which it was sampled, and the
-difference, weighed by both variances, corrects the present.
+frame is compared with the prediction for the instant at which it was sampled, and this innovation,
+weighed by both variances, updates the present.
 
 An encoder reads whole counts: the tracked angle runs on with the measured velocity and is held
 inside the count that was read, so that it is exact at each count's edge.
@@ -81,9 +81,9 @@ class ContactFilter:
         state.taper = state.assumed_taper = settings.object.taper
         state.alone = len(self._fingers) == 1
         state.t = -math.inf
-        shares = np.linspace(1e-3, 1.0, kernels.LAW_POINTS)
+        ratios = np.linspace(1e-3, 1.0, kernels.LAW_POINTS)
         for finger, table in enumerate(tables):
-            law = 0.0 if materials is None else materials[finger].force_error(shares)
+            law = 0.0 if materials is None else materials[finger].force_error(ratios)
             state.tip[finger].law[:] = np.hypot(law, table.max_error)
         control = settings.control
         set_prior(state.grasp.scales, priors, control.joint_friction, control.joint_inertia)
@@ -95,12 +95,12 @@ class ContactFilter:
         self.grasp = state.grasp
         self.grasp.turning = 0.5 * sum(_turning(table, state.radius) for table in tables)
         self._read = False  # the joints are known
-        self._live = [False, False]  # tips that touch and are carried on by the joints
+        self._in_contact = [False, False]  # tips that touch and are carried on by the joints
         self._news = True  # the scales may have changed
-        self._sound = [False, False]  # the newest frame's estimate can be used
+        self._valid = [False, False]  # the newest frame's estimate can be used
 
-    def advance(self, reading: Reading, goal: Goal | None = None) -> None:
-        """Carry the estimates on to the instant of a good reading.
+    def predict(self, reading: Reading, goal: Goal | None = None) -> None:
+        """Predict the estimates at the instant of a good reading.
 
         ``goal``: what it was to be, where a grip set its currents.
         """
@@ -108,27 +108,29 @@ class ContactFilter:
         q1, q2 = reading.q
         dq1, dq2 = reading.dq
         current1, current2 = reading.current
-        kernels.advance(
+        kernels.predict(
             self._state.array,
             self._history,
             reading.t,
             (q1, q2),
             (dq1, dq2),
             (current1, current2),
-            (0.0, 0.0) if goal is None else (_pull(goal, 0, q1), _pull(goal, 1, q2)),
+            (0.0, 0.0)
+            if goal is None
+            else (_commanded_current(goal, 0, q1), _commanded_current(goal, 1, q2)),
         )
 
-    def correct(
+    def update(
         self, finger: int, frame: Frame, estimate: ContactEstimate, contact: Contact
     ) -> None:
-        """Take in one finger's new ``frame`` and its ``estimate``; they show in ``contact``."""
+        """Update by a finger's new ``frame`` and its ``estimate``; write both into ``contact``."""
         contact.seq, contact.t, contact.t_arrival = frame.seq, frame.t_sample, frame.t_arrival
-        sound = self._sound[finger] = frame.valid and estimate.valid
-        if not sound:
+        valid = self._valid[finger] = frame.valid and estimate.valid
+        if not valid:
             return  # nothing is learnt: the contact is carried on, and grows older
         # Before a first reading nothing is known of the joints: the frame stands for itself.
-        live = estimate.contact and self._read
-        if live and not kernels.correct(
+        in_contact = estimate.contact and self._read
+        if in_contact and not kernels.update(
             self._state.array,
             self._history,
             finger,
@@ -143,17 +145,17 @@ class ContactFilter:
             estimate.covariance,
             estimate.systematic,
         ):
-            self._sound[finger] = False
+            self._valid[finger] = False
             return
-        self._live[finger] = live
+        self._in_contact[finger] = in_contact
         self._news = True
-        contact.t_sound = frame.t_arrival
+        contact.t_valid = frame.t_arrival
         contact.contact, contact.gain = estimate.contact, estimate.gain
         contact.tilt_y, contact.misfit = estimate.tilt_y, estimate.misfit
         contact.shear_x, contact.shear_y = estimate.shear_x, estimate.shear_y
-        if not live:
+        if not in_contact:
             tip = self._state.tip[finger]
-            tip.live, tip.d.mean = False, 0.0
+            tip.in_contact, tip.d.mean = False, 0.0
             _fill_from_frame(
                 contact,
                 estimate,
@@ -170,10 +172,10 @@ class ContactFilter:
 
         By the ``phase`` of a grip torques are taken for what they tell.
         """
-        live = self._live
-        pose.valid = live[0] and live[1] and self._with_object
+        in_contact = self._in_contact
+        pose.valid = in_contact[0] and in_contact[1] and self._with_object
         pose.angle = pose.width = 0.0
-        if live[0] or live[1]:
+        if in_contact[0] or in_contact[1]:
             left, right, angle, width = kernels.write_grasp(self._state.array, *self._tables, phase)
             tips = left, right
             if pose.valid:
@@ -185,7 +187,7 @@ class ContactFilter:
         oldest = t - self._age_max
         for finger in self._fingers:
             contact = contacts[finger]
-            if live[finger]:
+            if in_contact[finger]:
                 (
                     contact.d,
                     contact.theta,
@@ -196,12 +198,12 @@ class ContactFilter:
                     contact.force_std,
                     contact.inside,
                 ) = tips[finger]
-            contact.valid = self._sound[finger]
-            if not contact.t_sound >= oldest:
+            contact.valid = self._valid[finger]
+            if not contact.t_valid >= oldest:
                 contact.valid = pose.valid = False
 
 
-def _pull(goal: Goal, finger: int, q: float) -> float:
+def _commanded_current(goal: Goal, finger: int, q: float) -> float:
     """The current [A] of a goal that is so far from ``q`` that nothing but its bound counts."""
     return goal.current[finger] if goal.q[finger] - q > _FAR else 0.0
 
@@ -252,7 +254,7 @@ def _fill_from_frame(
         along = contact.theta / tilt if tilt > 0.0 else 0.0
         across = contact.tilt_y / tilt if tilt > 0.0 else 0.0
         slopes = modulus * np.array([by_d, by_tilt * along, by_tilt * across])
-        share = np.interp(contact.d / radius, np.linspace(0.0, 1.0, kernels.LAW_POINTS), law)
-        relative = share**2 + stiff * gain / (stiff + gain)
+        law_error = np.interp(contact.d / radius, np.linspace(0.0, 1.0, kernels.LAW_POINTS), law)
+        relative = law_error**2 + stiff * gain / (stiff + gain)
         variance = slopes @ estimate.covariance[:3, :3] @ slopes + relative * contact.force**2
         contact.force_std = math.sqrt(variance)

@@ -1,6 +1,24 @@
-"""The contact filter's state and kernels; `perception.contact_filter` explains the filter.
+"""State and kernels of the contact filter: a Kalman filter with delayed, gated measurements.
 
-Pairs are (left, right). SI units.
+Prediction by the joints, at each tick, with a, r, s the rows ``moment_arm``, ``jacobian_rotation``
+and ``jacobian_slide`` of the grasp Jacobian (`hand.grasp_state.held_motion`):
+
+    Δφ = r1 Δq1 − r2 Δq2        Δd1 = Δd2 = (a1 Δq1 + a2 Δq2 + s Δφ)/2
+    variance += drift² dt       displacement += Δ       path_length += |Δ|
+
+A prediction's variance is P = variance + (0.05 path_length)² + min(path_length², step²/12), `step`
+being what a count of the encoder moves it by. Update by a frame that was sampled at t, with d_since
+and angle_since the displacements from t on, out of the history, and R the frame's covariance less
+its systematic part (upper signs: left tip):
+
+    innovation = d_frame − (d − d_since)                         state (d, gain), H = 1
+    innovation = (θ ∓ q) − (φ ∓ α/2 − angle_since)               state (φ, α), H = (1, ∓1/2)
+    K = P Hᵀ (H P Hᵀ + R)⁻¹       state += K innovation       P = (1 − K H) P
+
+The gate: beyond innovation² = _GATE · (H P Hᵀ + R) the prediction was wrong, not the frame, and
+innovation² is put into P first. A frame of an angle beyond `witnesses.JUMP` is refused instead. The
+force is F = e^ε F_table(d, θ), its variance (∂F/∂d σ_d)² + (∂F/∂θ σ_θ)² + (σ_ε² + law²) F², with
+the modulus' logarithm ε of `perception.scales`. Pairs are (left, right). SI units.
 """
 
 from __future__ import annotations
@@ -31,14 +49,14 @@ Tip = tuple[float, float, float, float, float, float, float, bool]  # of `write_
 Noise = tuple[float, float, float]  # of a frame: variance of d, covariance, variance of the gain
 
 OTHER, RAMPING, HOLDING = 0, 1, 2  # phases of a grip: its force is on its way, nothing moves it
-HISTORY = 0.5  # s of joint motion that are kept: an older frame is taken as so old
+HISTORY = 0.5  # s of joint motion stored: an older frame is taken as so old
 _DRIFT_D = 1e-4  # m/√s, what d does by itself: the object shifts, the tip creeps
 _DRIFT_GAIN = 0.1  # 1/√s, what the frames' height over the model's does
 _DRIFT_ANGLE = 4e-3  # rad/√s, likewise
 _DRIFT_TAPER = 1e-3  # rad/√s, what the taper does: tips come to other parts of the faces
 _TAPER_ERROR = 0.1  # rad that `object.taper` may be off
-_SHARE = 0.05  # error of a predicted motion, as a share of it
-_OUTLIER = 9.0  # variances off: the prediction was wrong, not the frame
+_MOTION_ERROR = 0.05  # of a predicted motion, relative
+_GATE = 9.0  # squared Mahalanobis distance
 _BY_TURNING = 0.8  # of such an angle's variance: the object turned, rather than tapers otherwise
 _FIRM = 1.0  # N of both tips, from which on an object does not rock between them
 _STEP_VARIANCE = 1.0 / 12.0  # of a count
@@ -50,8 +68,8 @@ class Quantity(Record):
 
     mean: float
     variance: float  # just after the last frame, drift added
-    way: float  # sum of predicted motion
-    since: float  # its length since the last frame's instant
+    displacement: float  # sum of predicted motion
+    path_length: float  # of it since the last frame's instant
 
 
 class TrackedTip(Record):
@@ -71,7 +89,7 @@ class TrackedTip(Record):
     speed: float  # of the joint [rad/s]
     shared: Pair  # the variances of d and θ that all frames share
     law: Annotated[FloatArray, LAW_POINTS]  # relative error of F by table and law, over d
-    live: bool  # touches, and is carried on
+    in_contact: bool  # touches, and is carried on
 
 
 class GraspState(Record):
@@ -82,20 +100,20 @@ class GraspState(Record):
     force: Pair  # of the tips, their moduli's scale times their tables' [N]
     angle_std: float  # standard deviation of the object's angle [rad]
     taper: float  # α between the object's faces, as both tips feel them [rad]
-    stray: float  # turning of the object that no joint explains, summed [rad]
+    unexplained_rotation: float  # of the object, by no joint, summed [rad]
     turning: float  # ∂U/∂θ over F θ d of the tips, upright: set once
     q: Pair  # tracked joints [rad]
-    arm: Pair  # ∂(d1 + d2)/∂q, the force's lever [m]
-    turn: Pair  # φ̇ = turn1 q̇1 − turn2 q̇2
-    slide: float  # ∂(d1 + d2)/∂φ [m/rad]
-    lever: Pair  # torque over force by the energy [m]
+    moment_arm: Pair  # ∂(d1 + d2)/∂q [m]
+    jacobian_rotation: Pair  # r of φ̇ = r1 q̇1 − r2 q̇2
+    jacobian_slide: float  # ∂(d1 + d2)/∂φ [m/rad]
+    energy_arm: Pair  # torque over force by the energy [m]
     stiffness: Pair  # ∂F/∂d [N/m]
     normal: Pair  # normal forces [N]
     shear: float  # shear over normal force, by the object's balance, unloaded
     sheared: float  # along the faces, as solid tips' newest frames show it [N]
-    unexplained: Pair  # what only a load along the faces explains of the joints' torques [N·m]
-    load_lever: float  # a load L makes them lever L + bow L²; 0: it shows nothing [m]
-    load_bow: float  # [m/N]
+    torque_residual: Pair  # what only a load along the faces explains of the joints' torques [N·m]
+    load_arm: float  # a load L makes them arm L + curvature L²; 0: none shows [m]
+    load_curvature: float  # [m/N]
     scales: Scales  # of what feels the tips' forces
     witnesses: WitnessState  # and what speaks against it
 
@@ -122,7 +140,7 @@ class FilterState(Record):
     assumed_taper: float  # `object.taper` [rad]
     alone: bool  # one finger
     t: float  # of the last reading [s]
-    weighed: float  # when witnesses were weighed last [s]
+    checked: float  # when witnesses were checked last [s]
     newest: int  # row of the history
     phase: int  # of the grip at the last tick
     tip: Annotated[Records[TrackedTip], 2]
@@ -130,18 +148,18 @@ class FilterState(Record):
     taper: float  # α as found [rad]
     taper_variance: float
     taper_covariance: float  # with φ
-    stray: float  # sum of what frames have corrected of φ [rad]
+    unexplained_rotation: float  # sum of what frames have corrected of φ [rad]
     grasp: GraspState
 
 
 @inner_kernel
 def _variance(quantity: Quantity, step: float) -> float:
     """Return the last frame's variance and that of joints read since in steps of ``step``."""
-    since = quantity.since
-    missed = _SHARE * since
+    path_length = quantity.path_length
+    missed = _MOTION_ERROR * path_length
     variance: float = quantity.variance + missed * missed
-    if since > 0.0:
-        variance += min(since * since, _STEP_VARIANCE * step * step)
+    if path_length > 0.0:
+        variance += min(path_length * path_length, _STEP_VARIANCE * step * step)
     return variance
 
 
@@ -164,28 +182,30 @@ def _assume_taper(f: FilterState, sense: float, angle: float, variance: float) -
 
 
 @inner_kernel
-def _credited(tip: TrackedTip, slow: float, way: float, shown: float, dt: float) -> float:
+def _new_displacement(
+    tip: TrackedTip, slow: float, displacement: float, measured: float, dt: float
+) -> float:
     """Return the displacement of a tracked joint that the estimates have not accounted for yet.
 
     A joint that creeps through its count comes up by a whole one at the edge; frames have seen most
-    of that before. Beyond the displacement ``shown`` by the velocity only so much is new as may
+    of that before. Beyond the displacement ``measured`` by the velocity only so much is new as may
     have stayed below half a count of velocity since the last frame.
     """
     unseen = tip.unseen + slow * dt
-    more = min(max(way - shown, -unseen), unseen)
+    more = min(max(displacement - measured, -unseen), unseen)
     tip.unseen = unseen - abs(more)
-    return shown + more
+    return measured + more
 
 
 @inner_kernel
-def _move(quantity: Quantity, way: float) -> None:
-    quantity.mean += way
-    quantity.way += way
-    quantity.since += abs(way)
+def _move(quantity: Quantity, displacement: float) -> None:
+    quantity.mean += displacement
+    quantity.displacement += displacement
+    quantity.path_length += abs(displacement)
 
 
 @kernel
-def advance(
+def predict(
     filters: Records[FilterState],
     history: Records[Past],
     t: float,
@@ -194,7 +214,7 @@ def advance(
     current: Two,
     goal: Two,
 ) -> None:
-    """Carry the estimates on to time ``t`` by the joints' reading [rad, rad/s, A].
+    """Predict the estimates at time ``t`` by the joints' reading [rad, rad/s, A].
 
     ``goal`` [A]: what a grip has the currents be, 0 without one.
     """
@@ -215,25 +235,25 @@ def advance(
         left.q = q[0]
         right.q = q[1]
     half = 0.5 * f.count
-    way1 = min(max(left.q + dq[0] * dt, q[0] - half), q[0] + half) - left.q
-    way2 = min(max(right.q + dq[1] * dt, q[1] - half), q[1] + half) - right.q
-    seen1 = _credited(left, f.slow, way1, dq[0] * dt, dt)
-    seen2 = _credited(right, f.slow, way2, dq[1] * dt, dt)
-    both = left.live and right.live
+    displacement1 = min(max(left.q + dq[0] * dt, q[0] - half), q[0] + half) - left.q
+    displacement2 = min(max(right.q + dq[1] * dt, q[1] - half), q[1] + half) - right.q
+    seen1 = _new_displacement(left, f.slow, displacement1, dq[0] * dt, dt)
+    seen2 = _new_displacement(right, f.slow, displacement2, dq[1] * dt, dt)
+    both = left.in_contact and right.in_contact
     if both or f.alone:
-        arm1, arm2, turn1, turn2, slide, _, _ = _motion(f)
+        arm1, arm2, turn1, turn2, jacobian_slide, _, _ = _motion(f)
         if both:
             turn = turn1 * seen1 - turn2 * seen2
-            deeper1 = deeper2 = 0.5 * (arm1 * seen1 + arm2 * seen2 + slide * turn)
+            deeper1 = deeper2 = 0.5 * (arm1 * seen1 + arm2 * seen2 + jacobian_slide * turn)
         else:
             turn = 0.0
-            deeper1 = arm1 * seen1 if left.live else 0.0
-            deeper2 = arm2 * seen2 if right.live else 0.0
+            deeper1 = arm1 * seen1 if left.in_contact else 0.0
+            deeper2 = arm2 * seen2 if right.in_contact else 0.0
         _move(left.d, deeper1)
         _move(right.d, deeper2)
         _move(f.angle, turn)
-    left.q += way1
-    right.q += way2
+    left.q += displacement1
+    right.q += displacement2
     left.d.variance += _DRIFT_D * _DRIFT_D * dt
     right.d.variance += _DRIFT_D * _DRIFT_D * dt
     left.gain_variance += _DRIFT_GAIN * _DRIFT_GAIN * dt
@@ -245,9 +265,9 @@ def advance(
     f.newest = (f.newest + 1) % len(history)
     row = history[f.newest]
     row.t = t
-    row.angle = f.angle.way
+    row.angle = f.angle.displacement
     for k in range(2):
-        row.d[k] = f.tip[k].d.way
+        row.d[k] = f.tip[k].d.displacement
         row.q[k] = f.tip[k].q
 
 
@@ -261,7 +281,7 @@ def _motion(f: FilterState) -> Motion:
 
 @inner_kernel
 def _rows_at(history: Records[Past], newest: int, t: float) -> tuple[int, int, float]:
-    """Rows before and after time ``t``, and the later one's share; the ends for a time beyond."""
+    """Rows before and after time ``t``, and the later one's weight; the ends for a time beyond."""
     size = len(history)
     later = newest
     for back in range(size):
@@ -270,17 +290,17 @@ def _rows_at(history: Records[Past], newest: int, t: float) -> tuple[int, int, f
             break  # nothing was read before: a frame may be older than the first reading
         if history[row].t <= t:
             span = history[later].t - history[row].t
-            share = (t - history[row].t) / span if span > 0.0 else 0.0
-            return row, later, share
+            fraction = (t - history[row].t) / span if span > 0.0 else 0.0
+            return row, later, fraction
         later = row
     return later, later, 0.0
 
 
 @inner_kernel
 def _update_tip(
-    tip: TrackedTip, step: float, moved: float, d: float, gain: float, noise: Noise
+    tip: TrackedTip, step: float, d_since: float, d: float, gain: float, noise: Noise
 ) -> None:
-    """Correct d and gain by a frame's, which came ``moved`` ago by the joints.
+    """Update d and gain by a frame, since which the joints moved d by ``d_since``.
 
     Its errors in both make up for each other, so the gain, which is slow, makes d the better.
     """
@@ -288,13 +308,13 @@ def _update_tip(
     slow = tip.gain_variance
     joint = tip.d_gain
     by_d, by_both, by_gain = noise
-    miss = d - (tip.d.mean - moved)
-    higher = gain - tip.gain
-    if miss * miss > _OUTLIER * (own + by_d):
-        own = miss * miss
+    innovation = d - (tip.d.mean - d_since)
+    gain_innovation = gain - tip.gain
+    if innovation * innovation > _GATE * (own + by_d):
+        own = innovation * innovation
         joint = 0.0
-    if higher * higher > _OUTLIER * (slow + by_gain):
-        slow = higher * higher
+    if gain_innovation * gain_innovation > _GATE * (slow + by_gain):
+        slow = gain_innovation * gain_innovation
         joint = 0.0
     total = own + by_d
     both = joint + by_both
@@ -304,39 +324,39 @@ def _update_tip(
     d_by_gain = (joint * total - own * both) * inverse
     gain_by_d = (joint * height - slow * both) * inverse
     gain_by_gain = (slow * total - joint * both) * inverse
-    tip.d.mean += d_by_d * miss + d_by_gain * higher
-    tip.gain += gain_by_d * miss + gain_by_gain * higher
+    tip.d.mean += d_by_d * innovation + d_by_gain * gain_innovation
+    tip.gain += gain_by_d * innovation + gain_by_gain * gain_innovation
     tip.d.variance = (1.0 - d_by_d) * own - d_by_gain * joint
     tip.d_gain = (1.0 - d_by_d) * joint - d_by_gain * slow
     tip.gain_variance = (1.0 - gain_by_gain) * slow - gain_by_d * joint
-    tip.d.since = abs(moved)
+    tip.d.path_length = abs(d_since)
 
 
 @inner_kernel
-def _weigh_angle(
-    f: FilterState, sense: float, turned: float, found: float, variance: float
+def _update_angle(
+    f: FilterState, sense: float, angle_since: float, found: float, variance: float
 ) -> None:
-    """Correct φ and α by the angle of one face that a frame ``found``, ``turned`` ago."""
+    """Update φ and α by the angle of one face that a frame ``found``, ``angle_since`` ago."""
     own = _variance(f.angle, f.count)
     joint = f.taper_covariance
     spread = f.taper_variance
-    miss = found - (f.angle.mean + 0.5 * sense * f.taper - turned)
-    if miss * miss > _OUTLIER * (_face_variance(f, sense) + variance):
-        own += _BY_TURNING * miss * miss
-        spread += 4.0 * (1.0 - _BY_TURNING) * miss * miss
+    innovation = found - (f.angle.mean + 0.5 * sense * f.taper - angle_since)
+    if innovation * innovation > _GATE * (_face_variance(f, sense) + variance):
+        own += _BY_TURNING * innovation * innovation
+        spread += 4.0 * (1.0 - _BY_TURNING) * innovation * innovation
     by_angle = own + 0.5 * sense * joint
     by_taper = joint + 0.5 * sense * spread
     inverse = 1.0 / (by_angle + 0.5 * sense * by_taper + variance)
-    f.angle.mean += by_angle * inverse * miss
-    f.taper += by_taper * inverse * miss
+    f.angle.mean += by_angle * inverse * innovation
+    f.taper += by_taper * inverse * innovation
     f.angle.variance = own - by_angle * by_angle * inverse
     f.taper_covariance = joint - by_angle * by_taper * inverse
     f.taper_variance = spread - by_taper * by_taper * inverse
-    f.angle.since = abs(turned)
+    f.angle.path_length = abs(angle_since)
 
 
 @kernel
-def correct(
+def update(
     filters: Records[FilterState],
     history: Records[Past],
     finger: int,
@@ -345,7 +365,7 @@ def correct(
     covariance: FloatArray,
     systematic: FloatArray,
 ) -> bool:
-    """Take in one finger's frame of time ``t``: d, θ, tilt_y, gain, shear and their covariance.
+    """Update by one finger's frame of time ``t``: d, θ, tilt_y, gain, shear and their covariance.
 
     ``systematic`` is the part of it that all frames share: it is no reason to wait for more.
     Returns False for a frame that is refused, since what it shows can't be.
@@ -360,23 +380,23 @@ def correct(
         covariance[0, 3] - systematic[0, 3],
         covariance[3, 3] - systematic[3, 3],
     )
-    row, later, share = _rows_at(history, f.newest, t)
+    row, later, fraction = _rows_at(history, f.newest, t)
     before = history[row]
     after = history[later]
-    moved = tip.d.way - _between(before.d[finger], after.d[finger], share)
-    turned = f.angle.way - _between(before.angle, after.angle, share)
-    q = _between(before.q[finger], after.q[finger], share)
+    d_since = tip.d.displacement - _between(before.d[finger], after.d[finger], fraction)
+    angle_since = f.angle.displacement - _between(before.angle, after.angle, fraction)
+    q = _between(before.q[finger], after.q[finger], fraction)
     angle = theta - q if finger == 0 else theta + q
     sense = -1.0 if finger == 0 else 1.0
     angle_variance = theta_variance + _STEP_VARIANCE * f.count * f.count
-    both = tip.live and other.live
+    both = tip.in_contact and other.in_contact
     if both and f.grasp.witnesses.drifted[finger] > witnesses.DRIFT_TIME:
         return False
     if both and min(f.grasp.normal[0], f.grasp.normal[1]) > _FIRM:
-        miss = angle - (f.angle.mean + 0.5 * sense * f.taper - turned)
-        unsure = _face_variance(f, sense) + angle_variance
+        innovation = angle - (f.angle.mean + 0.5 * sense * f.taper - angle_since)
+        innovation_variance = _face_variance(f, sense) + angle_variance
         speed = abs(tip.speed) + abs(other.speed)
-        if witnesses.refuses(f.grasp.witnesses, finger, miss, unsure, speed):
+        if witnesses.refuses(f.grasp.witnesses, finger, innovation, innovation_variance, speed):
             return False
     tip.unseen = min(tip.unseen, f.slow * max(f.t - t, 0.0))
     tip.tilt_y = tilt_y
@@ -385,43 +405,43 @@ def correct(
     tip.shared[1] = systematic[1, 1]
     tip.free = covariance[3, 3] > 0.0
     tip.fresh = True
-    if not tip.live:
-        tip.live = True
-        tip.d.mean = d + moved
+    if not tip.in_contact:
+        tip.in_contact = True
+        tip.d.mean = d + d_since
         tip.d.variance, tip.d_gain, tip.gain_variance = noise
-        tip.d.since = abs(moved)
+        tip.d.path_length = abs(d_since)
         tip.gain = gain
         f.grasp.scales.gripping = False
         witnesses.forget(f.grasp.witnesses)
-        if not other.live:
-            _assume_taper(f, sense, angle + turned, angle_variance)
-            f.angle.since = abs(turned)
+        if not other.in_contact:
+            _assume_taper(f, sense, angle + angle_since, angle_variance)
+            f.angle.path_length = abs(angle_since)
         else:
             face = f.angle.mean - 0.5 * sense * f.taper
             _assume_taper(f, -sense, face, _face_variance(f, -sense))
-            _weigh_angle(f, sense, turned, angle, angle_variance)
+            _update_angle(f, sense, angle_since, angle, angle_variance)
         return True
     before_it = tip.d.mean
-    _update_tip(tip, f.count * f.length, moved, d, gain, noise)
+    _update_tip(tip, f.count * f.length, d_since, d, gain, noise)
     f.grasp.witnesses.corrected[finger] += tip.d.mean - before_it
     predicted = f.angle.mean
-    _weigh_angle(f, sense, turned, angle, angle_variance)
-    f.stray += f.angle.mean - predicted
+    _update_angle(f, sense, angle_since, angle, angle_variance)
+    f.unexplained_rotation += f.angle.mean - predicted
     return True
 
 
 @inner_kernel
-def _law_error(tip: TrackedTip, share: float) -> float:
-    """Relative error of F by table and law; ``share`` is d over the tip's radius."""
-    t = min(max(share, 0.0), 1.0) * (LAW_POINTS - 1.001)
+def _law_error(tip: TrackedTip, fraction: float) -> float:
+    """Relative error of F by table and law; ``fraction`` is d over the tip's radius."""
+    t = min(max(fraction, 0.0), 1.0) * (LAW_POINTS - 1.001)
     k = int(t)
     error: float = tip.law[k] + (t - k) * (tip.law[k + 1] - tip.law[k])
     return error
 
 
 @inner_kernel
-def _between(first: float, last: float, share: float) -> float:
-    return first + share * (last - first)
+def _between(first: float, last: float, fraction: float) -> float:
+    return first + fraction * (last - first)
 
 
 @inner_kernel
@@ -463,26 +483,26 @@ def _learn_scales(f: FilterState, ramping: bool) -> None:
     """Take in what this tick's frames and joints say of the scales."""
     s = f.grasp.scales
     grasp = f.grasp
-    both = f.tip[0].live and f.tip[1].live
+    both = f.tip[0].in_contact and f.tip[1].in_contact
     if both and not s.gripping:
         scales.begin_grip(s)
     news = False
     for k in range(2):
         tip = f.tip[k]
-        if not (tip.fresh and tip.live):
+        if not (tip.fresh and tip.in_contact):
             continue
         tip.fresh = False
         news = True
         if tip.free:
-            scales.take_height(s, k, tip.gain, tip.gain_variance / (tip.gain * tip.gain))
+            scales.update_height(s, k, tip.gain, tip.gain_variance / (tip.gain * tip.gain))
     if not news:
         return
-    if both and ramping and grasp.load_lever > 0.0:
+    if both and ramping and grasp.load_arm > 0.0:
         for k in range(2):
             s.torque[k] = f.tip[k].torque
-            s.moment[k] = s.torque[k] / (1.0 + s.mean[scales.TORQUE + k]) - grasp.unexplained[k]
-        scales.take_torque(s, s.torque, s.moment, 0.5 * (f.tip[0].speed + f.tip[1].speed), f.t)
-        scales.take_balance(s, grasp.normal[0], grasp.normal[1])
+            s.moment[k] = s.torque[k] / (1.0 + s.mean[scales.TORQUE + k]) - grasp.torque_residual[k]
+        scales.update_torque(s, s.torque, s.moment, 0.5 * (f.tip[0].speed + f.tip[1].speed), f.t)
+        scales.update_balance(s, grasp.normal[0], grasp.normal[1])
     scales.settle(s)
 
 
@@ -509,20 +529,20 @@ def write_grasp(
     grasp.t = f.t
     grasp.angle_std = math.sqrt(_variance(f.angle, f.count))
     grasp.taper = taper
-    grasp.stray = f.stray
-    arm1, arm2, turn1, turn2, grasp.slide, width, _ = motion
-    grasp.arm[0] = arm1
-    grasp.arm[1] = arm2
-    grasp.turn[0] = turn1
-    grasp.turn[1] = turn2
+    grasp.unexplained_rotation = f.unexplained_rotation
+    arm1, arm2, turn1, turn2, grasp.jacobian_slide, width, _ = motion
+    grasp.moment_arm[0] = arm1
+    grasp.moment_arm[1] = arm2
+    grasp.jacobian_rotation[0] = turn1
+    grasp.jacobian_rotation[1] = turn2
     d = left.d.mean, right.d.mean
     theta = theta1, theta2
     lever1, lever2, shear, normal1, normal2 = holding_levers(
         table1, table2, d, theta, taper, motion
     )
     out_of_grip = 0.5 * math.tan(0.5 * taper) * (normal1 + normal2)
-    grasp.lever[0] = lever1
-    grasp.lever[1] = lever2
+    grasp.energy_arm[0] = lever1
+    grasp.energy_arm[1] = lever2
     grasp.shear = 0.0
     if normal1 + normal2 > 0.0:
         grasp.shear = 2.0 * (abs(shear) + abs(out_of_grip)) / (normal1 + normal2)
@@ -535,32 +555,32 @@ def write_grasp(
     torque1 = left.torque / (1.0 + means[scales.TORQUE])
     torque2 = right.torque / (1.0 + means[scales.TORQUE + 1])
     torques = torque1 / modulus1, torque2 / modulus2
-    left1, left2, grasp.load_lever, bow = load_torques(
+    remaining1, remaining2, grasp.load_arm, curvature = load_torques(
         table1, table2, d, theta, taper, motion, rolled, torques
     )
     # Forces on the two faces are opposite; only what both show alike bears a load.
     grasp.sheared = 0.0
     if left.shear * right.shear < 0.0:
         grasp.sheared = math.copysign(min(abs(left.shear), abs(right.shear)), left.shear)
-    grasp.unexplained[0] = modulus1 * left1
-    grasp.unexplained[1] = modulus2 * left2
-    grasp.load_bow = 2.0 * bow / (modulus1 + modulus2)
+    grasp.torque_residual[0] = modulus1 * remaining1
+    grasp.torque_residual[1] = modulus2 * remaining2
+    grasp.load_curvature = 2.0 * curvature / (modulus1 + modulus2)
     _learn_scales(f, phase == RAMPING)
-    if grasp.load_lever > 0.0:
-        dt = f.t - f.weighed
+    if grasp.load_arm > 0.0:
+        dt = f.t - f.checked
         if phase == HOLDING and f.phase != HOLDING:
-            witnesses.begin_holding(grasp.witnesses, grasp.unexplained)
+            witnesses.begin_holding(grasp.witnesses, grasp.torque_residual)
         for k in range(2):
-            grasp.unexplained[k] = witnesses.weigh_drift(
+            grasp.torque_residual[k] = witnesses.check_drift(
                 f.grasp.witnesses,
                 k,
-                grasp.unexplained[k],
-                f.tip[k].torque - grasp.unexplained[k],
-                grasp.arm[k] * grasp.stiffness[k],
+                grasp.torque_residual[k],
+                f.tip[k].torque - grasp.torque_residual[k],
+                grasp.moment_arm[k] * grasp.stiffness[k],
                 abs(f.tip[k].speed) < witnesses.QUIET,
                 phase == HOLDING,
                 min(dt, HISTORY),
             )
     f.phase = phase
-    f.weighed = f.t
+    f.checked = f.t
     return seen1, seen2, angle, width

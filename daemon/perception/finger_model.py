@@ -144,16 +144,16 @@ def make_estimator(
     settings: Settings,
     material: Material,
     finger: int = 0,
-    live: NDArray[np.bool_] | None = None,
+    active: NDArray[np.bool_] | None = None,
     calibration: Calibration | None = None,
 ) -> ContactEstimator | MeasuredEstimator:
     """Return an estimator of its own for each finger, since it starts from its last estimate.
 
-    ``live``: cells that exist, less the settings' dead ones. With a ``calibration``
+    ``active``: cells that exist, less the settings' dead ones. With a ``calibration``
     its frames are the pressures [Pa] of a `Converter`, without one they are counts.
     """
     tactile = settings.tactile
-    alive = np.ones((tactile.rows, tactile.cols), np.bool_) if live is None else live.copy()
+    alive = np.ones((tactile.rows, tactile.cols), np.bool_) if active is None else active.copy()
     for row, col in tactile.dead[finger]:
         alive[row, col] = False
     saturation, threshold, quantum = float(tactile.full_count), float(tactile.threshold), 0.0

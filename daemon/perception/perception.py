@@ -60,7 +60,7 @@ class Perception:
             if frame is not None:
                 if each.repeats.long:
                     frame = replace(frame, valid=False)
-                self.filter.correct(each.finger, frame, each.estimate, state.contacts[each.finger])
+                self.filter.update(each.finger, frame, each.estimate, state.contacts[each.finger])
         self.filter.write_contacts(state.t, state.contacts, state.object, state.phase)
 
 
@@ -71,31 +71,31 @@ class Repeats:
     is no repetition, and judged as a frozen sensor.
     """
 
-    def __init__(self, rate: float, judged: bool = True) -> None:
-        """``rate``: of the frames [Hz]; ``judged``: to repeat them is wrong."""
-        self._judged = judged
+    def __init__(self, rate: float, enabled: bool = True) -> None:
+        """``rate``: of the frames [Hz]; ``enabled``: to repeat them is wrong."""
+        self._enabled = enabled
         self.lag = 0  # frames after which they come again, 0: they don't
         self._run = 0  # frames in a row that did so
         self._enough = max(round(_REPEATED * rate), _DISTINCT)
-        self._kept: deque[int] = deque(maxlen=round(_REMEMBERED * rate))
+        self._digests: deque[int] = deque(maxlen=round(_REMEMBERED * rate))
         self._seen: dict[int, int] = {}  # digest → number of the last such frame
         self._number = 0
 
     @property
     def long(self) -> bool:
         """True if the frames have repeated for long enough to be sure."""
-        return self._judged and self._run >= self._enough
+        return self._enabled and self._run >= self._enough
 
-    def look(self, data: NDArray[np.uint16]) -> bool:
+    def seen_before(self, data: NDArray[np.uint16]) -> bool:
         """Take in a frame; whether it differs from the last."""
         digest = hash(data.tobytes())
-        number, kept = self._number + 1, self._kept
+        number, digests = self._number + 1, self._digests
         before = self._seen.get(digest)
-        if before == self._number and kept:
+        if before == self._number and digests:
             return False
-        if len(kept) == kept.maxlen and self._seen[kept[0]] == number - len(kept):
-            del self._seen[kept[0]]
-        kept.append(digest)
+        if len(digests) == digests.maxlen and self._seen[digests[0]] == number - len(digests):
+            del self._seen[digests[0]]
+        digests.append(digest)
         self._number = self._seen[digest] = number
         lag = 0 if before is None else number - before
         self._run = self._run + 1 if lag and lag == self.lag else min(lag, 1)
@@ -119,8 +119,10 @@ class FingerPerception:
         # A recording that plays from its start again repeats itself.
         self.repeats = Repeats(settings.tactile.rate, tactile.backend != "replay")
         self.estimate = ContactEstimate()  # of the last valid frame
-        live = getattr(sensor, "live", None)  # of a recording that lacks cells
-        self._estimator = make_estimator(settings, model.material, model.finger, live, calibration)
+        active = getattr(sensor, "live", None)  # of a recording that lacks cells
+        self._estimator = make_estimator(
+            settings, model.material, model.finger, active, calibration
+        )
         self._full = float(tactile.full_count)
         self._scale = tactile.pascal_per_count  # of the readings
         self._converter: Converter | None = None
@@ -150,7 +152,7 @@ class FingerPerception:
         frame, last = self.sensor.latest(), self.frame
         if frame is None or frame is last:
             return None
-        if self.repeats.look(frame.data):
+        if self.repeats.seen_before(frame.data):
             self.changed = frame.t_arrival
         self.frame = frame
         self.frames += 1

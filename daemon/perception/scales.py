@@ -1,4 +1,4 @@
-"""Tells a stiffer tip from a sensor that reads too much: the scales of what feels a force.
+"""Kalman filter of the force witnesses' scales: tells a stiffer tip from a sensor's gain.
 
 A tip's normal force F is known in several ways, each off by a scale of its own:
 
@@ -31,7 +31,7 @@ from softfinger.kinematics.compiled.layout import Pair, Record
 FloatArray = NDArray[np.float64]
 
 STATES = 8
-MODULUS, GAIN, TORQUE, OFFSET = 0, 2, 4, 6  # places of the left finger's; the right one's follow
+MODULUS, GAIN, TORQUE, OFFSET = 0, 2, 4, 6  # indices of the left finger's; the right one's follow
 
 MODULUS_ERROR = 0.2  # of a tip whose modulus nobody measured
 GAIN_DOUBTED = 1.5  # prior standard deviations off, a sensor's gain is reported
@@ -39,12 +39,12 @@ CALIBRATED_ERROR = 0.05  # of one that `softfinger calibrate modulus` found
 _LOAD_ERROR = 0.05  # N·m, standard deviation of what stands in a joint beside its friction
 _GAIN_WALK = 0.05  # 1/√s, what a sensor's gain does in a grip: warmth, creep
 _OFFSET_WALK = 0.05  # N·m/√s, what friction does while the force ramps
-_FORGOTTEN = 0.1  # of what was learnt, with each new grip
+_FORGET = 0.1  # fraction of what was learnt, with each new grip
 _HEIGHT_ERROR = 0.02  # of a frame's height, by all that the model leaves out
 _TORQUE_NOISE = 0.02  # N·m of a joint that stands
 _MOVING_NOISE = 0.05  # N·m of one that moves: inertia, damping
 _MOVING = 0.05  # rad/s
-_LATELY = 0.1  # s
+_INTERVAL_MAX = 0.1  # s
 _BALANCE_ERROR = 0.05  # of the tips' forces, and …
 _RUBBED = 0.4  # … N that a table may take off one of them
 _GATE = 3.0  # standard deviations: what is further off counts as no more than so much
@@ -76,7 +76,7 @@ class Scales(Record):
     torque: Pair  # of the joints, and …
     moment: Pair  # … of the tips' forces about them, when torques were taken in last [N·m]
     slopes: Annotated[FloatArray, STATES]  # scratch: of a measurement by the states
-    across: Annotated[FloatArray, STATES]  # scratch
+    cross: Annotated[FloatArray, STATES]  # scratch
     gripping: bool  # both tips touch, and have since `begin_grip`
 
 
@@ -105,8 +105,8 @@ def begin_grip(s: Scales) -> None:
             if i >= OFFSET or j >= OFFSET:
                 s.covariance[i, j] = 0.0
             else:
-                s.covariance[i, j] *= 1.0 - _FORGOTTEN
-        s.covariance[i, i] += s.prior[i] * (1.0 if i >= OFFSET else _FORGOTTEN)
+                s.covariance[i, j] *= 1.0 - _FORGET
+        s.covariance[i, i] += s.prior[i] * (1.0 if i >= OFFSET else _FORGET)
     s.mean[OFFSET] = s.mean[OFFSET + 1] = 0.0
 
 
@@ -119,42 +119,42 @@ def drift(s: Scales, dt: float) -> None:
 
 
 @inner_kernel
-def _update(s: Scales, miss: float, variance: float, gate: float) -> None:
-    """Kalman's update by one measurement that is ``miss`` off, with `slopes` by the states.
+def _update(s: Scales, innovation: float, variance: float, gate: float) -> None:
+    """Update by one measurement's ``innovation``, with `slopes` by the states.
 
     Beyond a ``gate`` [standard deviations] it weighs as if it were that far off: nobody is believed
     alone. Leaves the slopes 0.
     """
     slopes = s.slopes
-    across = s.across
+    cross = s.cross
     expected = 0.0
     for i in range(STATES):
         total = 0.0
         for j in range(STATES):
             total += s.covariance[i, j] * slopes[j]
-        across[i] = total
+        cross[i] = total
         expected += slopes[i] * total
-    variance = max(variance, miss * miss / (gate * gate) - expected)
+    variance = max(variance, innovation * innovation / (gate * gate) - expected)
     inverse = 1.0 / (expected + variance)
     for i in range(STATES):
-        s.mean[i] += across[i] * inverse * miss
+        s.mean[i] += cross[i] * inverse * innovation
         for j in range(STATES):
-            s.covariance[i, j] -= across[i] * across[j] * inverse
+            s.covariance[i, j] -= cross[i] * cross[j] * inverse
     slopes[:] = 0.0
 
 
 @inner_kernel
-def take_height(s: Scales, finger: int, height: float, variance: float) -> None:
-    """Take in the filtered ``height`` of a finger's frames over the model's."""
+def update_height(s: Scales, finger: int, height: float, variance: float) -> None:
+    """Update by the filtered ``height`` of a finger's frames over the model's."""
     slopes = s.slopes
     slopes[MODULUS + finger] = slopes[GAIN + finger] = 1.0
-    miss = math.log(max(height, 1e-3)) - s.mean[MODULUS + finger] - s.mean[GAIN + finger]
-    _update(s, miss, variance + _HEIGHT_ERROR * _HEIGHT_ERROR, math.inf)
+    innovation = math.log(max(height, 1e-3)) - s.mean[MODULUS + finger] - s.mean[GAIN + finger]
+    _update(s, innovation, variance + _HEIGHT_ERROR * _HEIGHT_ERROR, math.inf)
 
 
 @inner_kernel
-def take_torque(s: Scales, torque: Pair, moment: Pair, speed: float, t: float) -> None:
-    """Take in the joints' ``torque`` [N·m] where the tips' forces make a ``moment`` [N·m].
+def update_torque(s: Scales, torque: Pair, moment: Pair, speed: float, t: float) -> None:
+    """Update by the joints' ``torque`` [N·m] where the tips' forces make a ``moment`` [N·m].
 
     The mean of both: what turns the object, shakes it or leans on it is in one as much as it lacks
     in the other. ``speed`` [rad/s]: of their closing; ``t``: the time [s].
@@ -163,26 +163,26 @@ def take_torque(s: Scales, torque: Pair, moment: Pair, speed: float, t: float) -
     since = t - s.t
     s.speed = speed
     s.t = t
-    if not 0.0 < since < _LATELY:
+    if not 0.0 < since < _INTERVAL_MAX:
         return
-    miss = 0.0
+    innovation = 0.0
     slopes = s.slopes
     for k in range(2):
         scaled = 0.5 * (1.0 + s.mean[TORQUE + k]) * moment[k]
-        miss += 0.5 * torque[k] - scaled - 0.5 * s.mean[OFFSET + k]
+        innovation += 0.5 * torque[k] - scaled - 0.5 * s.mean[OFFSET + k]
         slopes[MODULUS + k] = scaled
         slopes[TORQUE + k] = 0.5 * moment[k]
         slopes[OFFSET + k] = 0.5
-    miss -= s.friction * min(max(speed / _MOVING, -1.0), 1.0) + s.inertia * faster / since
+    innovation -= s.friction * min(max(speed / _MOVING, -1.0), 1.0) + s.inertia * faster / since
     noise = _TORQUE_NOISE
     if abs(speed) > _MOVING:
         noise = _MOVING_NOISE
-    _update(s, miss, noise * noise, _GATE)
+    _update(s, innovation, noise * noise, _GATE)
 
 
 @inner_kernel
-def take_balance(s: Scales, force1: float, force2: float) -> None:
-    """Take in that both tips press an object with about the same force."""
+def update_balance(s: Scales, force1: float, force2: float) -> None:
+    """Update by the balance: both tips press an object with about the same force."""
     slopes = s.slopes
     slopes[MODULUS] = 1.0
     slopes[MODULUS + 1] = -1.0

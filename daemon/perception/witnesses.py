@@ -1,4 +1,4 @@
-"""Finds out which witness of a grip's force lies, by what the others say.
+"""Faults of the witnesses of a grip's force, each found by the others.
 
 Frames, encoders and torques each tell how hard a tip is pressed. A scale that is off is found in
 `perception.scales`; here stands what no scale explains:
@@ -26,20 +26,20 @@ from softfinger.kinematics.compiled.layout import Pair, Record
 
 JUMP = 0.12  # rad beyond the joints' prediction in one frame: honest ones stay below 0.04
 _SURE = 5.0  # standard deviations, likewise
-_ALIKE = 0.5  # share of it that the other tip shows of a turn that is real
+_ALIKE = 0.5  # fraction of it that the other tip shows of a turn that is real
 _TURNING = 0.1  # rad/s of both joints together, or …
 _GOES_ON = 0.06  # … rad from frame to frame, likewise
 JUMPS_MAX = 2  # frames that are refused before it is reported
 _GIVE_UP = 50  # frames after which the contact is taken as they show it
-_LATELY = 2.0  # s within which a drift shows
+_RECENT = 2.0  # s within which a drift shows
 _DRIFT = 0.08  # N·m that frames and closing must be apart
-_DRIFT_SHARE = 0.15  # of the joint's moment, likewise
-_LEAST, _MOST = 0.6, 1.5  # times as much the torque changes then, …
+_DRIFT_RATIO = 0.15  # of the joint's moment, likewise
+_RATIO_MIN, _RATIO_MAX = 0.6, 1.5  # times as much the torque changes then, …
 _FRICTION = 0.06  # … and N·m by which a joint's friction adds to it
 DRIFT_TIME = 0.05  # s for which that must stand
 QUIET = 0.1  # rad/s of a joint; beyond, torques move it
 _NOISE = 0.02  # N·m by which they are apart when nothing is wrong
-_CURRENT = 0.25  # share of its goal that a current may be off …
+_CURRENT = 0.25  # fraction of its goal that a current may be off …
 _CURRENT_NOISE = 0.02  # … and A besides
 CURRENT_TIME = 0.1  # s for which that must stand
 
@@ -47,10 +47,10 @@ CURRENT_TIME = 0.1  # s for which that must stand
 class WitnessState(Record):
     """Evidence against each finger's witnesses."""
 
-    miss: Pair  # of the newest frame's angle, before it was taken in or refused [rad]
+    innovation: Pair  # of the newest frame's angle, before it was taken in or refused [rad]
     jumps: Pair  # frames that were refused in a row
     corrected: Pair  # d that frames have added lately to what the joints did [m]
-    stood: Pair  # the torque that nothing explains, averaged [N·m]
+    standing: Pair  # the torque that nothing explains, averaged [N·m]
     drifted: Pair  # for how long frames contradict closing and torque [s]
     off_goal: Pair  # for how long the current is not its goal's [s]
 
@@ -58,29 +58,29 @@ class WitnessState(Record):
 @inner_kernel
 def forget(w: WitnessState) -> None:
     """Forget the evidence: nothing is held any more, or something else."""
-    w.miss[:] = 0.0
+    w.innovation[:] = 0.0
     w.jumps[:] = 0.0
     w.corrected[:] = 0.0
-    w.stood[:] = 0.0
+    w.standing[:] = 0.0
     w.drifted[:] = 0.0
 
 
 @inner_kernel
-def refuses(w: WitnessState, finger: int, miss: float, variance: float, speed: float) -> bool:
-    """Return whether a frame's angle, ``miss`` [rad] off its prediction, is to be refused.
+def refuses(w: WitnessState, finger: int, innovation: float, variance: float, speed: float) -> bool:
+    """Return whether a frame's angle, ``innovation`` [rad] off its prediction, is to be refused.
 
     ``variance`` [rad²] of that; ``speed`` [rad/s]: of both joints together. The first frame of a
     real turn is refused as well: what the other tip shows is not known yet.
     """
-    other = w.miss[1 - finger]
-    before = w.miss[finger]
-    w.miss[finger] = miss
-    if abs(miss) <= max(JUMP, _SURE * math.sqrt(variance)) or w.jumps[finger] >= _GIVE_UP:
+    other = w.innovation[1 - finger]
+    before = w.innovation[finger]
+    w.innovation[finger] = innovation
+    if abs(innovation) <= max(JUMP, _SURE * math.sqrt(variance)) or w.jumps[finger] >= _GIVE_UP:
         w.jumps[finger] = 0.0
         return False
-    alike = miss * other > _ALIKE * miss * miss
+    alike = innovation * other > _ALIKE * innovation * innovation
     again = w.jumps[finger] > 0.0
-    goes_on = speed > _TURNING or (again and abs(miss - before) > _GOES_ON)
+    goes_on = speed > _TURNING or (again and abs(innovation - before) > _GOES_ON)
     if alike and goes_on and (again or w.jumps[1 - finger] > 0.0):
         w.jumps[finger] = 0.0
         return False
@@ -89,18 +89,18 @@ def refuses(w: WitnessState, finger: int, miss: float, variance: float, speed: f
 
 
 @inner_kernel
-def begin_holding(w: WitnessState, unexplained: Pair) -> None:
+def begin_holding(w: WitnessState, residual: Pair) -> None:
     """Mark the grip as held: from now on only loads and faulty witnesses change what is felt."""
     for k in range(2):
         w.corrected[k] = 0.0
-        w.stood[k] = unexplained[k]
+        w.standing[k] = residual[k]
 
 
 @inner_kernel
-def weigh_drift(
+def check_drift(
     w: WitnessState,
     finger: int,
-    unexplained: float,
+    residual: float,
     moment: float,
     by_depth: float,
     quiet: bool,
@@ -109,31 +109,31 @@ def weigh_drift(
 ) -> float:
     """Return the torque [N·m] that a load remains to explain: less that of the joint's closing.
 
-    ``unexplained``: torque beyond the frames' force; ``moment`` [N·m]: torque of that force;
+    ``residual``: torque beyond the frames' force; ``moment`` [N·m]: torque of that force;
     ``by_depth`` [N]: the moment's slope by d; ``quiet``: the joint hardly moves. Unless the grip is
     ``holding`` still, only a tip that is pressed more than its frames say is looked for.
     """
-    w.corrected[finger] -= w.corrected[finger] * dt / _LATELY
-    w.stood[finger] += (unexplained - w.stood[finger]) * dt / _LATELY
+    w.corrected[finger] -= w.corrected[finger] * dt / _RECENT
+    w.standing[finger] += (residual - w.standing[finger]) * dt / _RECENT
     # What one tip gains and the other loses, the object does that is pushed towards one.
     corrected = w.corrected[finger]
     other = w.corrected[1 - finger]
     if corrected * other < 0.0:
         corrected += math.copysign(min(abs(corrected), abs(other)), other)
     closing = -by_depth * corrected
-    lately = unexplained - w.stood[finger]
-    share = lately / closing if closing != 0.0 else 0.0
-    apart = max(_DRIFT, _DRIFT_SHARE * moment)
+    recent = residual - w.standing[finger]
+    ratio = recent / closing if closing != 0.0 else 0.0
+    apart = max(_DRIFT, _DRIFT_RATIO * moment)
     beyond = max(abs(closing) - _NOISE, 0.0)
-    most = _MOST * beyond + min(2.0 * beyond, _FRICTION)
-    agrees = share > _LEAST and abs(lately) < most + _NOISE
+    limit = _RATIO_MAX * beyond + min(2.0 * beyond, _FRICTION)
+    agrees = ratio > _RATIO_MIN and abs(recent) < limit + _NOISE
     if quiet and abs(closing) > apart and (holding or closing > 0.0) and agrees:
         w.drifted[finger] += dt
     else:
         w.drifted[finger] = 0.0
-    if share <= 0.0:
-        return unexplained
-    return unexplained - math.copysign(min(abs(lately), most), lately)
+    if ratio <= 0.0:
+        return residual
+    return residual - math.copysign(min(abs(recent), limit), recent)
 
 
 @inner_kernel

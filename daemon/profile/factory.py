@@ -41,14 +41,14 @@ def worst_force_error(material: Material) -> float:
     return float(material.force_error(np.linspace(SHALLOWEST, 1.0, 20)).max())
 
 
-def law_problem(material: Material, most: float) -> str:
-    """Return why a law off its points by over ``most`` of F can't be used; empty if it can."""
+def law_problem(material: Material, limit: float) -> str:
+    """Return why a law off its points by over ``limit`` of F can't be used; empty if it can."""
     found = worst_force_error(material)
-    if found <= most:
+    if found <= limit:
         return ""
     return (
         f"the smooth law misses its points by up to {material.fit_error:.4g} Pa, which makes "
-        f"{found:.1%} of F; expected {most:.1%} at most (material.force_error_max)"
+        f"{found:.1%} of F; expected {limit:.1%} at most (material.force_error_max)"
     )
 
 

@@ -54,7 +54,7 @@ def checked(
     try:
         settings = Settings.model_validate(data)
     except ValidationError as error:
-        settings, wrong = _sound_sections(data)
+        settings, wrong = _valid_sections(data)
         found = [_line(details) for details in error.errors()]
     if directory is not None:
         settings = _with_directory(settings, directory)
@@ -136,16 +136,16 @@ def _tuples(value: Any, depth: int = 0) -> Any:
     return value
 
 
-def _sound_sections(data: dict[str, Any]) -> tuple[Settings, list[str]]:
+def _valid_sections(data: dict[str, Any]) -> tuple[Settings, list[str]]:
     """Return the settings of the sections without errors, and the names of the others."""
-    sound: dict[str, Any] = {}
+    valid: dict[str, Any] = {}
     wrong = []
     for name, field in Settings.model_fields.items():
         try:
-            sound[name] = type(field.default).model_validate(data.get(name, {}))
+            valid[name] = type(field.default).model_validate(data.get(name, {}))
         except ValidationError:
             wrong.append(name)
-    return Settings(**sound), wrong
+    return Settings(**valid), wrong
 
 
 def _plugin_problems(settings: Settings) -> Iterator[str]:

@@ -13,7 +13,7 @@ from typing import Any
 
 from softfinger.daemon.backends import backend
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.types import FINGERS, GRIP_SHARE
+from softfinger.daemon.types import FINGERS, GRIP_FRACTION
 
 _LONGEST = 60  # characters of a value that are shown
 _DITHER_TICKS = 8  # a period of the dither, at least: with fewer it is no oscillation of its own
@@ -107,9 +107,9 @@ def _lacking(settings: Settings, key: str, expected: str) -> Iterator[str]:
             yield f'tactile.{key}: found "" for {name}, expected {expected}'
 
 
-def _above(key: str, found: float, unit: str, most: float, why: str) -> Iterator[str]:
-    if found > most:
-        yield f"{key}: found {found:g} {unit}, expected at most {most:g} {unit}, {why}"
+def _above(key: str, found: float, unit: str, limit: float, why: str) -> Iterator[str]:
+    if found > limit:
+        yield f"{key}: found {found:g} {unit}, expected at most {limit:g} {unit}, {why}"
 
 
 def _solid_tip(settings: Settings) -> Iterator[str]:
@@ -174,11 +174,11 @@ def _wedge(settings: Settings) -> Iterator[str]:
     if simulation.object_shape != "wedge":
         return
     height, width = simulation.object_height, simulation.object_width
-    most = 2.0 * math.atan(width / height)
-    if abs(simulation.object_taper) >= most:
+    limit = 2.0 * math.atan(width / height)
+    if abs(simulation.object_taper) >= limit:
         yield (
             f"simulation.object_taper: found {simulation.object_taper:g} rad, expected less than "
-            f"{most:.3g}, at which this width and height make the faces meet"
+            f"{limit:.3g}, at which this width and height make the faces meet"
         )
 
 
@@ -186,11 +186,11 @@ def _dither(settings: Settings) -> Iterator[str]:
     control = settings.control
     if control.law != "upright":
         return
-    most = settings.safety.current_max * control.torque_constant
+    limit = settings.safety.current_max * control.torque_constant
     why = "what safety.current_max gives"
-    yield from _above("control.dither_torque", control.dither_torque, "N·m", most, why)
-    most, why = settings.loop.rate / _DITHER_TICKS, f"{_DITHER_TICKS} ticks a period"
-    yield from _above("control.dither_frequency", control.dither_frequency, "Hz", most, why)
+    yield from _above("control.dither_torque", control.dither_torque, "N·m", limit, why)
+    limit, why = settings.loop.rate / _DITHER_TICKS, f"{_DITHER_TICKS} ticks a period"
+    yield from _above("control.dither_frequency", control.dither_frequency, "Hz", limit, why)
 
 
 def _cells(settings: Settings) -> Iterator[str]:
@@ -207,8 +207,8 @@ def _cells(settings: Settings) -> Iterator[str]:
 def _blur(settings: Settings) -> Iterator[str]:
     tactile = settings.tactile
     height = tactile.rows * (tactile.pitch_y or tactile.pitch)
-    most = 0.5 * min(height, tactile.cols * tactile.pitch)
-    yield from _above("tactile.blur", tactile.blur, "m", most, "half the sensor")
+    limit = 0.5 * min(height, tactile.cols * tactile.pitch)
+    yield from _above("tactile.blur", tactile.blur, "m", limit, "half the sensor")
 
 
 def _recordings(settings: Settings) -> Iterator[str]:
@@ -232,17 +232,17 @@ def _limits(settings: Settings) -> Iterator[str]:
 
 
 def _forces(settings: Settings) -> Iterator[str]:
-    low, high = settings.control.contact_force, GRIP_SHARE * settings.safety.force_max
+    low, high = settings.control.contact_force, GRIP_FRACTION * settings.safety.force_max
     if low >= high:
         yield (
-            f"control.contact_force: found {low:g} N, expected below {GRIP_SHARE:g} "
+            f"control.contact_force: found {low:g} N, expected below {GRIP_FRACTION:g} "
             f"safety.force_max, {high:g}"
         )
         return
-    wanted = [("control.force_default", settings.control.force_default)]
+    forces = [("control.force_default", settings.control.force_default)]
     if settings.task.name != "none":
-        wanted.append(("task.force", settings.task.force))
-    for key, force in wanted:
+        forces.append(("task.force", settings.task.force))
+    for key, force in forces:
         if not low < force <= high:
             yield f"{key}: found {force:g} N, expected above {low:g} to {high:g}"
 

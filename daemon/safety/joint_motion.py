@@ -28,31 +28,31 @@ class JointMotion:
         self._velocity_max = velocity_max
         self._late = max(_LATE, 3.0 * period)
         self._gap = max(_GAP, self._late)
-        self._asked = -math.inf  # when the last good reading was asked for [s]
+        self._requested = -math.inf  # when the last good reading was asked for [s]
         self._t = -math.inf  # and had come
         self._q = [0.0, 0.0]
         self._apart = [0.0, 0.0]  # rad
 
-    def follow(self, asked: float, reading: Reading) -> None:
-        """Take a reading in that was asked for at the time ``asked``."""
+    def follow(self, requested: float, reading: Reading) -> None:
+        """Take a reading in that was asked for at the time ``requested``."""
         self.jumped = 0
         t = reading.t
         if not reading.valid or t == self._t:
             return
         # Each was taken somewhere between question and answer.
-        longest, dt = t - self._asked, t - self._t
+        longest, dt = t - self._requested, t - self._t
         q, before, apart = reading.q, self._q, self._apart
         if longest < self._gap:
-            most = self._velocity_max * longest + _AT_ONCE
+            limit = self._velocity_max * longest + _AT_ONCE
             keep = 1.0 - dt / _MEMORY if longest < self._late else 0.0
             for i in self._fingers:
                 step = q[i] - before[i]
                 before[i] = q[i]
                 off = apart[i] = keep * (apart[i] + step - reading.dq[i] * dt)
-                if not (-most <= step <= most and -_APART <= off <= _APART):
+                if not (-limit <= step <= limit and -_APART <= off <= _APART):
                     self.jumped |= 1 << i
                     apart[i] = 0.0
         else:
             before[:] = q
             apart[:] = 0.0, 0.0
-        self._t, self._asked = t, asked
+        self._t, self._requested = t, requested

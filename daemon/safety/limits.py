@@ -112,13 +112,13 @@ class Limit:
     """
 
     name: str
-    judged: str
+    quantity: str
     level: Literal["warn", "limit", "fault"]
     keys: tuple[str, ...] = ()  # the settings that it depends on
     needs: Literal["", "servos", "sensors"] = ""
     check: Check | None = None
     lasts: float | str = 0.0  # s that it must stand, or the setting that says so
-    share: float = 1.0  # of the bound
+    fraction: float = 1.0  # of the bound
     in_turn: bool = False  # one such row is checked a tick; the others at each
     gripping: bool = False  # stands only while the hand grips
 
@@ -175,14 +175,14 @@ def _servos_alert(view: View, state: State, _: float) -> str:
 
 @Limit("servos.temperature", "temperature of a servo", "warn", ("safety.temperature_warn",),
     "servos", in_turn=True)  # fmt: skip
-def _servos_warm(view: View, state: State, share: float) -> str:
-    return _hotter(view, state, share * view.limits.temperature_warn)
+def _servos_warm(view: View, state: State, fraction: float) -> str:
+    return _hotter(view, state, fraction * view.limits.temperature_warn)
 
 
 @Limit("servos.temperature", "temperature of a servo", "fault", ("safety.temperature_max",),
     "servos", in_turn=True)  # fmt: skip
-def _servos_hot(view: View, state: State, share: float) -> str:
-    return _hotter(view, state, share * view.limits.temperature_max)
+def _servos_hot(view: View, state: State, fraction: float) -> str:
+    return _hotter(view, state, fraction * view.limits.temperature_max)
 
 
 def _hotter(view: View, state: State, bound: float) -> str:
@@ -315,13 +315,13 @@ _ALL = 0.95  # of the greatest current there may be: a grip that takes more can'
 
 @Limit("joint.strained", "grip that takes all the current there may be", "warn",
     ("safety.current_max",), "servos", in_turn=True, lasts=1.0)  # fmt: skip
-def _joint_strained(view: View, state: State, share: float) -> str:
+def _joint_strained(view: View, state: State, fraction: float) -> str:
     if not state.torque or state.mode not in GRIPPING:
         return ""
-    most = view.limits.current_max
+    limit = view.limits.current_max
     for i in view.fingers:
-        if not abs(state.reading.current[i]) < _ALL * share * most:
-            return f"{FINGERS[i]} joint grips with all of its {most:g} A"
+        if not abs(state.reading.current[i]) < _ALL * fraction * limit:
+            return f"{FINGERS[i]} joint grips with all of its {limit:g} A"
     return ""
 
 
@@ -360,9 +360,11 @@ LIMITS += [
 
 
 @Limit("tip.force", "normal force of a tip", "fault", ("safety.force_max",), "sensors")
-@Limit("tip.force", "normal force of a tip", "warn", ("safety.force_max",), "sensors", share=_NEAR)
-def _tip_force(view: View, state: State, share: float) -> str:
-    bound = share * view.limits.force_max
+@Limit(
+    "tip.force", "normal force of a tip", "warn", ("safety.force_max",), "sensors", fraction=_NEAR
+)
+def _tip_force(view: View, state: State, fraction: float) -> str:
+    bound = fraction * view.limits.force_max
     for i in view.fingers:
         contact = state.contacts[i]
         if _touches(contact) and not contact.force <= bound:
@@ -372,9 +374,9 @@ def _tip_force(view: View, state: State, share: float) -> str:
 
 @Limit("tip.displacement", "displacement of a tip", "fault", ("safety.d_max",), "sensors")
 @Limit("tip.displacement", "displacement of a tip", "warn", ("safety.d_max",), "sensors",
-    share=_NEAR)  # fmt: skip
-def _tip_displacement(view: View, state: State, share: float) -> str:
-    bound = share * view.limits.d_max
+    fraction=_NEAR)  # fmt: skip
+def _tip_displacement(view: View, state: State, fraction: float) -> str:
+    bound = fraction * view.limits.d_max
     for i in view.fingers:
         contact = state.contacts[i]
         if _touches(contact) and not contact.d <= bound:
@@ -386,9 +388,9 @@ _TILT = "|θ| against asin(1 − d/a) less a margin"
 
 
 @Limit("tip.tilt", _TILT, "fault", ("safety.theta_margin",), "sensors")
-@Limit("tip.tilt", _TILT, "warn", ("safety.theta_margin",), "sensors", share=_NEAR)
-def _tip_tilt(view: View, state: State, share: float) -> str:
-    """|θ| ≤ share·(asin(1 − d/a) − margin).
+@Limit("tip.tilt", _TILT, "warn", ("safety.theta_margin",), "sensors", fraction=_NEAR)
+def _tip_tilt(view: View, state: State, fraction: float) -> str:
+    """|θ| ≤ fraction·(asin(1 − d/a) − margin).
 
     At asin(1 − d/a) the object's plane reaches the rim of the tip's backing plate. Checked with
     sin, which is defined for every finite angle.
@@ -398,14 +400,14 @@ def _tip_tilt(view: View, state: State, share: float) -> str:
         contact = state.contacts[i]
         if not _touches(contact):
             continue
-        lean = abs(contact.theta) / share + margin
-        if contact.inside and lean <= 1.57 and math.sin(lean) <= 1.0 - contact.d / radius:
+        tilt = abs(contact.theta) / fraction + margin
+        if contact.inside and tilt <= 1.57 and math.sin(tilt) <= 1.0 - contact.d / radius:
             continue
         if not contact.inside and view.settings.tip.physics != "springs":
             tilt = math.degrees(math.hypot(contact.theta, contact.tilt_y))
             deep = f"{FINGERS[i]} tip {contact.d * 1e3:.2f} mm deep at {tilt:.1f}°"
             return f"{deep}: its law ends before"
-        limit = share * (math.asin(min(max(1.0 - contact.d / radius, 0.0), 1.0)) - margin)
+        limit = fraction * (math.asin(min(max(1.0 - contact.d / radius, 0.0), 1.0)) - margin)
         return (
             f"{FINGERS[i]} tip at {math.degrees(contact.theta):.1f}°, "
             f"past {math.degrees(limit):.1f}° at this depth"
@@ -425,9 +427,9 @@ def _tactile_silent(view: View, state: State, _: float) -> str:
     bound = view.limits.frame_age_fault / view.settings.tactile.rate
     for i in view.fingers:
         contact = state.contacts[i]
-        age = state.t - contact.t_sound
+        age = state.t - contact.t_valid
         if not age <= bound:
-            what = "frame" if contact.t_arrival == contact.t_sound else "sound estimate"
+            what = "frame" if contact.t_arrival == contact.t_valid else "sound estimate"
             doubt = _doubt(view, i)
             return doubt or f"tactile: no {what} of the {FINGERS[i]} sensor for {age:.3f} s"
     return ""
@@ -437,7 +439,7 @@ def _doubt(view: View, finger: int) -> str:
     """Return why a sensor's frames are refused, or an empty text."""
     side, found = FINGERS[finger], view.grasp.witnesses
     if found.jumps[finger] > witnesses.JUMPS_MAX:
-        jumped = math.degrees(abs(found.miss[finger]))
+        jumped = math.degrees(abs(found.innovation[finger]))
         return (
             f"{side} sensor shows the object turned by {jumped:.0f}° at once, which neither the "
             "joints nor the other tip explain: its image has moved, or the object ends under it"
@@ -515,15 +517,17 @@ def _tactile_frozen(view: View, state: State, _: float) -> str:
 
 @Limit("tactile.saturated", "share of full cells", "warn", ("safety.saturated",), "sensors",
     in_turn=True, lasts=0.1)  # fmt: skip
-def _tactile_saturated(view: View, _: State, share: float) -> str:
-    full, most = view.settings.tactile.full_count, share * view.limits.saturated
+def _tactile_saturated(view: View, _: State, fraction: float) -> str:
+    full, limit = view.settings.tactile.full_count, fraction * view.limits.saturated
     for sensor in view.sensors:
         if sensor.frame is None:
             continue
         data = sensor.frame.data
-        part = np.count_nonzero(data >= full) / data.size
-        if part > most:
-            return f"tactile: {part:.0%} of the {FINGERS[sensor.finger]} sensor's cells are full"
+        saturated = np.count_nonzero(data >= full) / data.size
+        if saturated > limit:
+            return (
+                f"tactile: {saturated:.0%} of the {FINGERS[sensor.finger]} sensor's cells are full"
+            )
     return ""
 
 
@@ -547,15 +551,15 @@ _ANGLE_KEYS = ("safety.residual_angle", "object.taper")
 
 
 @Limit("hand.angle", _ANGLE, "fault", _ANGLE_KEYS, "sensors", in_turn=True, lasts=0.2)
-@Limit("hand.angle", _ANGLE, "warn", _ANGLE_KEYS, "sensors", in_turn=True, lasts=0.2, share=0.5)
-def _hand_angle(view: View, state: State, share: float) -> str:
+@Limit("hand.angle", _ANGLE, "warn", _ANGLE_KEYS, "sensors", in_turn=True, lasts=0.2, fraction=0.5)
+def _hand_angle(view: View, state: State, fraction: float) -> str:
     if not view.touched(state) or len(view.sensors) < 2:
         return ""
     left, right = (sensor.estimate for sensor in view.sensors)  # of the newest frames alone
     if not (left.contact and right.contact):
         return ""
     unsure = _SURE * (left.tilt_x_std + right.tilt_x_std)
-    bound = max(share * view.limits.residual_angle, unsure)
+    bound = max(fraction * view.limits.residual_angle, unsure)
     q = state.reading.q
     apart = (left.tilt_x - q[0]) - (right.tilt_x + q[1]) + view.settings.object.taper
     if abs(apart) <= bound:
@@ -570,9 +574,9 @@ def _hand_angle(view: View, state: State, share: float) -> str:
 @Limit("hand.width", "held object's width by joints and sensors, since it was gripped", "fault",
     ("safety.residual_width",), "sensors", in_turn=True,
     lasts=0.2)  # fmt: skip
-def _hand_width(view: View, state: State, share: float) -> str:
+def _hand_width(view: View, state: State, fraction: float) -> str:
     changed = state.object.width - view.grip_width
-    if not (view.holds(state) and abs(changed) > share * view.limits.residual_width):
+    if not (view.holds(state) and abs(changed) > fraction * view.limits.residual_width):
         return ""
     return (
         f"the held object's width changed by {changed * 1e3:+.1f} mm since it was gripped: "
@@ -582,9 +586,9 @@ def _hand_width(view: View, state: State, share: float) -> str:
 
 @Limit("hand.force", "one tip's force against the other's", "warn", ("safety.residual_force",),
     "sensors", in_turn=True, lasts=0.3)  # fmt: skip
-def _hand_force(view: View, state: State, share: float) -> str:
+def _hand_force(view: View, state: State, fraction: float) -> str:
     left, right = (contact.force for contact in state.contacts)
-    bound = share * view.limits.residual_force * max(left, right)
+    bound = fraction * view.limits.residual_force * max(left, right)
     if not view.holds(state) or abs(left - right) <= bound:
         return ""
     return f"the tips feel {left:.1f} N and {right:.1f} N of one grip"
@@ -593,10 +597,10 @@ def _hand_force(view: View, state: State, share: float) -> str:
 @Limit("grip.slip", "shear against friction less a margin", "warn",
     ("control.tip_friction", "control.slip_margin"), "sensors", in_turn=True,
     lasts=0.1)  # fmt: skip
-def _grip_slip(view: View, state: State, share: float) -> str:
+def _grip_slip(view: View, state: State, fraction: float) -> str:
     control, shear = view.settings.control, view.grasp.shear
     usable = control.tip_friction * (1.0 - control.slip_margin)
-    if not view.holds(state) or shear <= share * usable:
+    if not view.holds(state) or shear <= fraction * usable:
         return ""
     return f"shear is {shear:.2f} of the grip's force, above {usable:.2f}: may slip"
 

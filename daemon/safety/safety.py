@@ -46,12 +46,12 @@ class _Watch:
         self.reported = False
         self._ended = -math.inf
 
-    def look(
+    def check_limit(
         self, view: View, state: State, faults: dict[_Watch, str], warnings: list[Breach]
     ) -> None:
         """Enter what stands at this tick and has for long enough; keeps count of how long."""
         limit = self.limit
-        found = self.check(view, state, limit.share * (_EASE if self.reported else 1.0))
+        found = self.check(view, state, limit.fraction * (_EASE if self.reported else 1.0))
         if not found:
             if self.since < math.inf:
                 self.since = math.inf
@@ -105,7 +105,7 @@ class Safety:
         dt = 1.0 / settings.loop.rate
         self._step = limits.goal_speed * dt
         # In position mode no current bounds what a jump does.
-        self._reach = 0.0 if settings.servos.mode == "position" else limits.goal_reach
+        self._travel = 0.0 if settings.servos.mode == "position" else limits.goal_reach
         self._rise = limits.current_rate * dt
         self._ends = [(i, hand.q_min[i], hand.q_max[i]) for i in view.fingers]
         self._sent_q = [0.0, 0.0]
@@ -122,17 +122,17 @@ class Safety:
         view, found = self._view, self._found
         view.follow(state)
         for watch in self._each_tick:
-            watch.look(view, state, found, self.warnings)
+            watch.check_limit(view, state, found, self.warnings)
         view.bad_goal = False
         if self._in_turn:
             self._turn = (self._turn + 1) % len(self._in_turn)
-            self._in_turn[self._turn].look(view, state, found, self.warnings)
+            self._in_turn[self._turn].check_limit(view, state, found, self.warnings)
         gripping = state.mode in GRIPPING
         self.must_hold = False
         if gripping and self._has_sensors:
             oldest, contacts = state.t - self._hold_age, state.contacts
             for i in view.fingers:
-                if contacts[i].t_sound < oldest:
+                if contacts[i].t_valid < oldest:
                     self.must_hold = True
             if self.must_hold:
                 self._count("tactile.late")
@@ -153,14 +153,14 @@ class Safety:
             if watch.limit.gripping and not gripping:
                 continue
             lasted = state.t - min(watch.since, state.t) >= watch.lasts
-            if lasted and (found := watch.check(view, state, watch.limit.share)):
+            if lasted and (found := watch.check(view, state, watch.limit.fraction)):
                 return found
         return ""
 
     def opens_first(self, breach: Breach, mode: Mode | str) -> bool:
         """Return whether the hand opens before this fault takes its torque."""
-        wanted = self._limits.frame_age_action == "open"
-        return wanted and breach.name == "tactile.silent" and mode in GRIPPING
+        commanded = self._limits.frame_age_action == "open"
+        return commanded and breach.name == "tactile.silent" and mode in GRIPPING
 
     # Goals
 
@@ -176,13 +176,13 @@ class Safety:
             self._sent_q[:] = present
             self._sent_current[:] = (0.0, 0.0)
         self._sent_seq = state.seq
-        sent, reach, most = self._sent_current, self._reach, self._limits.current_max
+        sent, travel, limit = self._sent_current, self._travel, self._limits.current_max
         for i, low, high in self._ends:
-            wanted = current[i]
+            commanded = current[i]
             if (
-                not (low <= q[i] <= high and -reach <= q[i] - present[i] <= reach)
-                or not 0.0 <= wanted <= most
-                or wanted > sent[i] + self._rise
+                not (low <= q[i] <= high and -travel <= q[i] - present[i] <= travel)
+                or not 0.0 <= commanded <= limit
+                or commanded > sent[i] + self._rise
             ):
                 self._bound_one(goal, i, low, high, present[i])
                 if not goal.valid:
@@ -202,18 +202,18 @@ class Safety:
         if inside != q:
             self._count("goal.angle")
         sent = self._sent_q[i]
-        lowest = min(sent, present - self._reach) - self._step
-        highest = max(sent, present + self._reach) + self._step
+        lowest = min(sent, present - self._travel) - self._step
+        highest = max(sent, present + self._travel) + self._step
         near = min(max(inside, lowest), highest)
         if near != inside:
             self._count("goal.step")
         # The joint's limits have the last word.
         goal.q[i] = min(max(near, low), high)
-        most = min(max(current, 0.0), self._limits.current_max)
-        if most != current:
+        limit = min(max(current, 0.0), self._limits.current_max)
+        if limit != current:
             self._count("goal.current")
-        slow = min(most, self._sent_current[i] + self._rise)
-        if slow != most:
+        slow = min(limit, self._sent_current[i] + self._rise)
+        if slow != limit:
             self._count("goal.slew")
         goal.current[i] = slow
 

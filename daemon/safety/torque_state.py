@@ -71,12 +71,12 @@ class TorqueState:
         else:
             self._try(servos, reading)
 
-    def write(self, wanted: bool, now: float) -> None:
-        """Bring torque to what is ``wanted`` at this tick, and the goal to the servos."""
+    def write(self, requested: bool, now: float) -> None:
+        """Bring torque to what is ``requested`` at this tick, and the goal to the servos."""
         state, servos = self._state, self.servos
         if servos is None:
             return
-        if not wanted:
+        if not requested:
             if state.torque and not self.pending:
                 self.off()
         elif not state.torque:

@@ -51,11 +51,11 @@ class Examined:
 
     finger: int
     id: int
-    answers: bool  # to a ping
+    replies: bool  # to a ping
     table: Registers = field(default_factory=Registers)
     errors: tuple[Finding, ...] = ()
     notices: tuple[Finding, ...] = ()
-    stray: Finding | None = None  # its joint's angle can't be right
+    misplaced: Finding | None = None  # its joint's angle can't be right
 
     @property
     def name(self) -> str:
@@ -71,11 +71,11 @@ def examine(line: ServoLine, settings: Settings, model: ServoModel) -> list[Exam
         if line.ping(servo_id) is None:
             found.append(Examined(finger, servo_id, False))
             continue
-        name, stray = servo_name(servo_id, finger), None
+        name, misplaced = servo_name(servo_id, finger), None
         table = Registers(line.read(servo_id, 0, CHECKED) or b"")
         if table:
             scale = JointScale.of(settings.servos, finger, model)
-            stray = check_angle(
+            misplaced = check_angle(
                 name, scale.angle(table.long(reg.PRESENT_POSITION)), settings.hand, finger
             )
             errors = check_servo(name, model, table, settings, finger)
@@ -86,7 +86,9 @@ def examine(line: ServoLine, settings: Settings, model: ServoModel) -> list[Exam
                 "bad line)"
             )
             errors, notices = [Finding("FAIL", name, why, FIX)], []
-        found.append(Examined(finger, servo_id, True, table, tuple(errors), tuple(notices), stray))
+        found.append(
+            Examined(finger, servo_id, True, table, tuple(errors), tuple(notices), misplaced)
+        )
     return found
 
 
@@ -121,14 +123,14 @@ def check_servo(
     if number != model.number:
         wrong(f"is an {reg.name_of(number)}, not an {model.name}", "set servos.model")
         return found
-    wanted, mode = reg.MODE_NUMBERS[settings.servos.mode], table[reg.OPERATING_MODE]
-    unfit = check_model(name, model, wanted)
+    required, mode = reg.MODE_NUMBERS[settings.servos.mode], table[reg.OPERATING_MODE]
+    unfit = check_model(name, model, required)
     if unfit is not None:
         found.append(unfit)
-    elif mode != wanted:
+    elif mode != required:
         wrong(
             f"operating mode is {reg.MODE_NAMES.get(mode, str(mode))} ({mode}), not "
-            f"{reg.MODE_NAMES[wanted]} ({wanted})"
+            f"{reg.MODE_NAMES[required]} ({required})"
         )
     drive = table[reg.DRIVE_MODE]
     if drive & DRIVE_UNFIT:
@@ -157,15 +159,15 @@ def check_servo(
         )
     limit = table.word(reg.CURRENT_LIMIT) * model.current_unit
     current_max = settings.safety.current_max
-    if wanted == reg.POSITION_MODE:
+    if required == reg.POSITION_MODE:
         # A goal beyond the servo's position limits is refused without a word.
         scale = JointScale.of(settings.servos, finger, model)
         ends = (settings.hand.q_min[finger], settings.hand.q_max[finger])
         first, last = sorted(scale.position_counts(q) for q in ends)
-        least, greatest = table.long(reg.MIN_POSITION_LIMIT), table.long(reg.MAX_POSITION_LIMIT)
-        if first < least or last > greatest:
+        lowest, greatest = table.long(reg.MIN_POSITION_LIMIT), table.long(reg.MAX_POSITION_LIMIT)
+        if first < lowest or last > greatest:
             wrong(
-                f"position limits are {least} … {greatest}, the joint needs {first} … {last}",
+                f"position limits are {lowest} … {greatest}, the joint needs {first} … {last}",
                 "widen the limits, or `softfinger calibrate joints`, which finds zero and range",
             )
     elif model.senses_current and limit < current_max:
@@ -219,14 +221,10 @@ def check_angle(name: str, q: float, hand: GeometrySettings, finger: int) -> Fin
     low, high = hand.q_min[finger], hand.q_max[finger]
     if low - ANGLE_MARGIN <= q <= high + ANGLE_MARGIN:
         return None
-    found, least, most = (f"{math.degrees(angle):.0f}°" for angle in (q, low, high))
-    problem = f"the joint is at {found}, not in {least} … {most}"
-    return Finding(
-        "FAIL",
-        name,
-        problem,
-        "turn it there by hand, or `softfinger calibrate joints`, which finds its zero",
-    )
+    found, lowest, highest = (f"{math.degrees(angle):.0f}°" for angle in (q, low, high))
+    problem = f"the joint is at {found}, not in {lowest} … {highest}"
+    cure = "turn it there by hand, or `softfinger calibrate joints`, which finds its zero"
+    return Finding("FAIL", name, problem, cure)
 
 
 def latency_of(path: str) -> tuple[float, list[Finding]]:

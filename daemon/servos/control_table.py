@@ -178,8 +178,8 @@ class ServoModel:
 
     def settled_temperature(self, current: float) -> float:
         """Return the temperature [°C] that a simulated motor settles at with this current [A]."""
-        share = current / self.stall_current
-        return AMBIENT + _THERMAL_RISE * share * share
+        ratio = current / self.stall_current
+        return AMBIENT + _THERMAL_RISE * ratio * ratio
 
     def indirect_blocks(self, firmware: int) -> tuple[tuple[int, int, int], ...]:
         """Return (first address register, first data register, entries) of each indirect block."""

@@ -46,7 +46,7 @@ _HEALTH = (reg.PRESENT_CURRENT, reg.PRESENT_TEMPERATURE)
 _ENABLED = (reg.TORQUE_ENABLE, reg.PRESENT_POSITION + 3)
 _HEALTH_EVERY = 0.25  # s
 _CHECK_EVERY = 0.01  # s
-_CHECK_SHARE = 0.05  # of the line's time that checks may take
+_CHECK_FRACTION = 0.05  # of the line's time that checks may take
 _SENT_LATELY = 0.035  # s for which a goal counts as sent lately
 _FROZEN = 0.1  # s in which a servo's own clock, of 1 ms, must advance
 # A reply may come after its deadline, and be taken for the next request's. So after a request
@@ -93,9 +93,9 @@ class DynamixelServos:
         self.close()
         servos, profile = self._settings, self._profile
         model = by_name(servos.model)
-        kept = max(2, round(_SENT_LATELY * profile.loop.rate))
+        stored = max(2, round(_SENT_LATELY * profile.loop.rate))
         self._joints = [
-            Joint(f, servos.ids[f], JointScale.of(servos, f, model), sent=deque(maxlen=kept))
+            Joint(f, servos.ids[f], JointScale.of(servos, f, model), sent=deque(maxlen=stored))
             for f in map(FINGERS.index, profile.scene.fingers)
         ]
         port = SerialPort(servos.port, servos.baud, servos.reply_timeout)
@@ -117,7 +117,7 @@ class DynamixelServos:
             ]
         self._errors = read(port, self._handler, reg.HARDWARE_ERROR_STATUS, 1, ids)
         more = len(ids) * (_PRESENT[0] - _CHECK[0]) * BITS_PER_BYTE / servos.baud
-        self._check_every = max(_CHECK_EVERY, more / _CHECK_SHARE)
+        self._check_every = max(_CHECK_EVERY, more / _CHECK_FRACTION)
         self._doubtful = 0
         self._next_health = self._next_check = -math.inf
         self._line, self._torque = line, torque
@@ -130,7 +130,7 @@ class DynamixelServos:
             found = examine(line, self._profile, model)
         finally:
             port.reply_timeout = allowed
-        if not any(each.answers for each in found):
+        if not any(each.replies for each in found):
             raise ServoError(
                 f"{port.port_name}: no servo answers at {port.baudrate} baud (IDs "
                 f"{', '.join(str(each.id) for each in found)}): check power and wiring; "
@@ -141,7 +141,7 @@ class DynamixelServos:
         for each in found:
             errors += each.errors
             notices += each.notices
-            if not each.answers:
+            if not each.replies:
                 fix = "check its cable and ID; `softfinger doctor` looks for it at every rate"
                 errors.append(Finding("FAIL", each.name, f"no answer at {port.baudrate} baud", fix))
         if errors:
@@ -153,9 +153,9 @@ class DynamixelServos:
                 each.table.long(reg.MIN_POSITION_LIMIT),
                 each.table.long(reg.MAX_POSITION_LIMIT),
             )
-            if each.stray is not None:
-                fix = f"{each.stray.fix}; torque is refused there"
-                notices.append(replace(each.stray, fix=fix))
+            if each.misplaced is not None:
+                fix = f"{each.misplaced.fix}; torque is refused there"
+                notices.append(replace(each.misplaced, fix=fix))
         self.notices = tuple(notices)
         for notice in notices:
             _log.warning(notice)

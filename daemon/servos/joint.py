@@ -130,8 +130,8 @@ class Joint:
         bound = min(scale.bound_counts(current), self.bound)
         if mode == reg.CURRENT_BASED_POSITION_MODE:
             return _CURRENT_AND_POSITION.pack(bound, scale.position_counts(q))
-        wanted = scale.current_counts(current_toward(servos, q, current, self.q, self.dq))
-        return _CURRENT.pack(min(max(wanted, -bound), bound))
+        counts = scale.current_counts(current_toward(servos, q, current, self.q, self.dq))
+        return _CURRENT.pack(min(max(counts, -bound), bound))
 
 
 def pack_goal(mode: int, current: int, position: int) -> bytes:

@@ -88,13 +88,13 @@ class SerialPort(PortHandler):  # type: ignore[misc]
         With ``reply`` bytes to come, older input is dropped first, so that it isn't taken for the
         answer, and their deadline starts, not later than ``until`` [s, time.monotonic()].
         """
-        rest = packet
+        remaining = packet
         try:
             if reply:
                 self.received.clear()
                 termios.tcflush(self._descriptor, termios.TCIFLUSH)
-            while rest:
-                rest = rest[os.write(self._descriptor, rest) :]
+            while remaining:
+                remaining = remaining[os.write(self._descriptor, remaining) :]
         except BlockingIOError:
             return False
         except (termios.error, OSError, ValueError) as error:
@@ -115,8 +115,8 @@ class SerialPort(PortHandler):  # type: ignore[misc]
     def fill(self) -> bool:
         """Wait for bytes into ``received``; False when the deadline came first."""
         try:
-            rest = max(0.0, self.deadline - time.monotonic())
-            if not select.select((self._descriptor,), (), (), rest)[0]:
+            remaining = max(0.0, self.deadline - time.monotonic())
+            if not select.select((self._descriptor,), (), (), remaining)[0]:
                 return False
             data = os.read(self._descriptor, _READ_SIZE)
         except (OSError, ValueError) as error:

@@ -101,10 +101,10 @@ def search(
                 refusal = refusal or error
                 continue
             opened = True
-            answers = line.ping_all(wait)
-            asked = {*answers, *(ids if line.handler.damaged else ())}
-            found += [FoundServo(each, baud, *what) for each, what in answers.items()]
-            garbled += [Garbled(i, baud) for i in sorted(asked) if is_garbled(line, i)]
+            replies = line.ping_all(wait)
+            ids_asked = {*replies, *(ids if line.handler.damaged else ())}
+            found += [FoundServo(each, baud, *what) for each, what in replies.items()]
+            garbled += [Garbled(i, baud) for i in sorted(ids_asked) if is_garbled(line, i)]
     if refusal is not None and not opened:
         raise refusal
     return Found(tuple(found), tuple(garbled))
@@ -317,12 +317,12 @@ def _set_up(
     now, drive, delay = (
         table[at] for at in (reg.OPERATING_MODE, reg.DRIVE_MODE, reg.RETURN_DELAY_TIME)
     )
-    wanted = [
+    required = [
         (reg.OPERATING_MODE, now if mode is None else mode, f"operating mode {now}"),
         (reg.DRIVE_MODE, drive & ~DRIVE_UNFIT, f"drive mode {drive}"),
         (reg.RETURN_DELAY_TIME, 0 if delay > RETURN_DELAY_MAX else delay, f"return delay {delay}"),
     ]
-    for address, value, text in wanted:
+    for address, value, text in required:
         if value == table[address]:
             continue
         if line.store(address, {servo_id: bytes((value,))}):

@@ -37,7 +37,7 @@ class FlexiTacDecoder(Decoder):
     Else it waits for the next marker, or for ``settle``.
 
     *Loss.* A marker that isn't where it must be drops the frame before it and starts the search
-    anew.
+    again.
     """
 
     def __init__(self, rows: int, cols: int, byte_time: float = 5e-6) -> None:
@@ -78,17 +78,17 @@ class FlexiTacDecoder(Decoder):
     def found_cells(self) -> int:
         """Cells of a frame by the markers' spacing while there is no lock; 0 if it doesn't tell."""
         ordered = list(self._markers)
-        places = set(ordered)
+        markers = set(ordered)
         spans: dict[int, int] = {}  # spacing → bytes covered by its longest chain up to the end
-        for i, place in enumerate(ordered):
+        for i, marker in enumerate(ordered):
             for earlier in ordered[:i]:
-                spacing = place - earlier
-                if spacing < _SMALLEST_GRID + len(MARKER) or ordered[-1] - place >= spacing:
+                spacing = marker - earlier
+                if spacing < _SMALLEST_GRID + len(MARKER) or ordered[-1] - marker >= spacing:
                     continue
-                while earlier - spacing in places:
+                while earlier - spacing in markers:
                     earlier -= spacing
-                if place - earlier >= 2 * spacing:
-                    spans[spacing] = max(spans.get(spacing, 0), place - earlier)
+                if marker - earlier >= 2 * spacing:
+                    spans[spacing] = max(spans.get(spacing, 0), marker - earlier)
         # A pattern within an image breaks off where the image ends, the frames' markers never do.
         spacing = max(spans, key=lambda m: (spans[m], -m), default=0)
         return spacing - len(MARKER) if spacing not in (0, self.frame_bytes) else 0
@@ -114,11 +114,11 @@ class FlexiTacDecoder(Decoder):
         """Bring the buffer's start to a marker that is one for sure; False when more is needed."""
         buffer, stride = self._buffer, self.frame_bytes
         while True:
-            place = buffer.find(MARKER)
-            if place < 0:
+            marker = buffer.find(MARKER)
+            if marker < 0:
                 self._skip(len(buffer) - buffer.endswith(MARKER[:1]))
                 return False
-            self._skip(place)
+            self._skip(marker)
             self._note(0)
             verdict = self._only_place()
             if verdict == "undecided":
@@ -158,16 +158,16 @@ class FlexiTacDecoder(Decoder):
 
     def _between(self) -> list[int]:
         """Places of ``AA 55`` between the marker at the buffer's start and the next one."""
-        places = []
-        place = self._buffer.find(MARKER, len(MARKER), self.frame_bytes)
-        while place >= 0:
-            places.append(place)
-            place = self._buffer.find(MARKER, place + len(MARKER), self.frame_bytes)
-        return places
+        markers = []
+        marker = self._buffer.find(MARKER, len(MARKER), self.frame_bytes)
+        while marker >= 0:
+            markers.append(marker)
+            marker = self._buffer.find(MARKER, marker + len(MARKER), self.frame_bytes)
+        return markers
 
-    def _misplaced(self, place: int) -> bool:
-        """The buffer's bytes at ``place``, as far as they came, are not a marker's."""
-        return not MARKER.startswith(self._buffer[place : place + len(MARKER)])
+    def _misplaced(self, marker: int) -> bool:
+        """The buffer's bytes at ``marker``, as far as they came, are not a marker's."""
+        return not MARKER.startswith(self._buffer[marker : marker + len(MARKER)])
 
     def _may_be_spliced(self) -> bool:
         """The whole frame at the buffer's start shows the marker of another one inside."""
@@ -210,10 +210,10 @@ class FlexiTacDecoder(Decoder):
         while self._pieces and self._pieces[0][0] <= self._start:
             self._pieces.popleft()
 
-    def _note(self, place: int) -> None:
-        place += self._start
-        if not self._markers or place > self._markers[-1]:
-            self._markers.append(place)
+    def _note(self, marker: int) -> None:
+        marker += self._start
+        if not self._markers or marker > self._markers[-1]:
+            self._markers.append(marker)
 
 
 class FlexiTac(SerialReader):

@@ -56,8 +56,8 @@ def load_recording(path: Path, pascal_per_count: float, rate: float) -> FrameRec
             return _folder(path, pascal_per_count, rate)
         if path.suffix == ".npz":
             with np.load(path, allow_pickle=False) as archive:
-                held = {name: archive[name] for name in archive.files}
-            return _checked(held, pascal_per_count, rate)
+                arrays = {name: archive[name] for name in archive.files}
+            return _checked(arrays, pascal_per_count, rate)
         if path.suffix == ".npy":
             return _checked({"frames": _frames(path)}, pascal_per_count, rate)
         return _export(path, pascal_per_count, rate)
@@ -72,17 +72,17 @@ def _folder(path: Path, scale: float, rate: float) -> FrameRecording:
         return [(int(part), "") if part.isdigit() else (-1, part) for part in parts]
 
     parts = []
-    held: dict[str, NDArray[Any]] = {}
+    arrays: dict[str, NDArray[Any]] = {}
     for file in sorted(path.glob("*.npy"), key=order):
         if file.stem in ("t", "live", *TRUTHS):
-            held[file.stem] = np.load(file, allow_pickle=False)
+            arrays[file.stem] = np.load(file, allow_pickle=False)
         else:
             parts.append(_frames(file))
     if not parts:
         raise ValueError("no .npy file with a frame in this folder")
     if len({part.shape[1:] for part in parts}) > 1:
         raise ValueError("frames of different shapes in this folder")
-    return _checked({"frames": np.concatenate(parts), **held}, scale, rate)
+    return _checked({"frames": np.concatenate(parts), **arrays}, scale, rate)
 
 
 def _frames(path: Path) -> NDArray[Any]:
@@ -95,15 +95,15 @@ def _frames(path: Path) -> NDArray[Any]:
 
 def _export(path: Path, scale: float, rate: float) -> FrameRecording:
     export = tekscan.parse(path.read_text(encoding="latin-1"), 1.0 / rate)
-    held: dict[str, NDArray[Any]] = {"frames": export.values, "t": export.t, "live": export.live}
-    recording = _checked(held, 1.0 if export.raw else scale, rate)
+    arrays: dict[str, NDArray[Any]] = {"frames": export.values, "t": export.t, "live": export.live}
+    recording = _checked(arrays, 1.0 if export.raw else scale, rate)
     return recording if math.isnan(sum(export.pitch)) else replace(recording, pitch=export.pitch)
 
 
-def _checked(held: dict[str, NDArray[Any]], scale: float, rate: float) -> FrameRecording:
-    if "frames" not in held:
+def _checked(arrays: dict[str, NDArray[Any]], scale: float, rate: float) -> FrameRecording:
+    if "frames" not in arrays:
         raise ValueError("no array 'frames' in it")
-    frames = held["frames"]
+    frames = arrays["frames"]
     if frames.ndim != 3 or frames.size == 0:
         raise ValueError(f"frames: found shape {frames.shape}, expected [n, rows, cols]")
     if frames.dtype.kind not in "uif":
@@ -114,20 +114,20 @@ def _checked(held: dict[str, NDArray[Any]], scale: float, rate: float) -> FrameR
     if not (frames >= 0).all() or (frames > _FULL).any():
         raise ValueError(f"frames: found readings outside 0 to {_FULL} counts")
     count = len(frames)
-    t = _row(held, "t", count) if "t" in held else np.arange(count) / rate
+    t = _row(arrays, "t", count) if "t" in arrays else np.arange(count) / rate
     if (np.diff(t) <= 0.0).any():
         raise ValueError("t: the times must rise")
     live = np.ones(frames.shape[1:], np.bool_)
-    if "live" in held:
-        live = held["live"].astype(np.bool_)
+    if "live" in arrays:
+        live = arrays["live"].astype(np.bool_)
         if live.shape != frames.shape[1:]:
             raise ValueError(f"live: found shape {live.shape}, expected {frames.shape[1:]}")
-    truths = {name: _row(held, name, count) for name in TRUTHS if name in held}
+    truths = {name: _row(arrays, name, count) for name in TRUTHS if name in arrays}
     return FrameRecording(np.ascontiguousarray(frames, np.uint16), t - t[0], live, truths)
 
 
-def _row(held: dict[str, NDArray[Any]], name: str, count: int) -> FloatArray:
-    array = held[name]
+def _row(arrays: dict[str, NDArray[Any]], name: str, count: int) -> FloatArray:
+    array = arrays[name]
     if array.shape != (count,) or array.dtype.kind not in "uif":
         raise ValueError(f"{name}: found shape {array.shape}, expected {count} numbers")
     values = array.astype(np.float64)

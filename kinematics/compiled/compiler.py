@@ -152,7 +152,7 @@ class BitcodeKernel(plain.InnerKernel):
             no_cfunc_wrapper=True,
             **options,
         )(self.py_func)
-        # Numba would compile it anew for each literal among the arguments; LLVM folds them anyway.
+        # Numba would compile it again for each literal among the arguments; LLVM folds them anyway.
         resolve = self.dispatcher.get_call_template
         self.dispatcher.get_call_template = lambda args, kws: resolve(
             tuple(types.unliteral(each) for each in args), kws

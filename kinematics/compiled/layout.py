@@ -16,7 +16,7 @@
         deeper(tip, more)     # inner kernels take the record itself
 
 Fields are `float`, `int` (64 bit), `bool`, another record, or an array of fixed shape by
-:data:`Annotated`. What depends on a grid's size is no field: each size would be compiled anew.
+:data:`Annotated`. What depends on a grid's size is no field: each size would be compiled again.
 """
 
 from __future__ import annotations

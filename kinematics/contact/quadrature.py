@@ -77,6 +77,17 @@ def ratios(
 ) -> tuple[float, float, float, float, float]:
     """Return ratios to the closed forms of modulus E₀: of F, U, ∂F/∂d, ∂F/∂θ and ∂U/∂θ.
 
+    With v = (t − h)/δ, q = t − h, r² = 1 − t², p² = t² − s², ``middle`` = r² c/(t c + p), ⟨·⟩ the
+    mean over χ at the strain ε = ``mean`` + ``amplitude`` cos χ = q (t + s r cos χ/c)/p², and the
+    law's expansions S_1, W_1, T_1, S_2, T_2 of `Material.expansions`:
+
+        F      1 + 2δ ∫ v² ⟨S_1⟩ dv/(c p)          ∂F/∂d   1 + δ ∫ v ⟨T_1⟩ dv/(c p)
+        U      1 + 3δ ∫ v³ ⟨W_1⟩ dv/(c p)
+        ∂F/∂θ  1 + 2 ∫ v (q ⟨T_1⟩ + T_1(0) middle + q r²/p² ⟨T_2 + k T_2′⟩) dv/(c p)
+        ∂U/∂θ  1 + 3 ∫ v² (q ⟨S_1⟩ + S_1(0) middle + q r²/p² ⟨S_2 + k S_2′⟩) dv/(c p)
+
+    over v from 0 to 1, with k = ``curvature`` = sin² χ t q/p². In y, t = sin θ + y².
+
     gauss: [2, n] points and weights on [0, 1]. circle: [2, m] cos χ and sin² χ of the equidistant
     angles. polynomials: the law's expansions. delta = d/a in (0, 1], h = 1 − delta given beside it
     so that both keep their digits; s = |sin θ| ≤ h, c = cos θ.

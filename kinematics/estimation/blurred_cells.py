@@ -1,6 +1,6 @@
 """The footprint's cells under a blur: the packed pieces of cells blurred and averaged, as kernels.
 
-The fit models a blurred grid on half cells, or on whole ones if that will do; see sensing/blur.py.
+The fit models a blurred grid on half cells, or on whole ones if that will do; see pressure_grid.py.
 """
 
 from __future__ import annotations

@@ -1,11 +1,19 @@
 """Errors that one frame doesn't show as noise from cell to cell, carried into its covariance.
 
-Noise that neighbouring cells share is measured by `calibrate` as its correlation by lag. What that
-makes of the covariance depends on the footprint's size beside the correlation's: it is tabulated
-over d, in the coordinates in which white noise makes the identity. A shift of all cells, the tip's
-place on the sensor, the pitch and the modulus are the same in every frame: each has a pattern of
-pressure, and moves the estimate as the fit answers that pattern. So does a misfit that is smooth
-over the footprint; how much of it there is shows in how alike the residuals of neighbours are.
+With J the Jacobian by (gain, u, v, w), JᵀJ = L Lᵀ, white noise of σ² leaves σ² (JᵀJ)⁻¹. Besides:
+
+    correlated noise   σ² L⁻ᵀ K L⁻¹,   K(d) = L⁻¹ Jᵀ C J L⁻ᵀ                     (`correlate`)
+    shared error q     m mᵀ,   m = size (JᵀJ)⁻¹ Jᵀq                              (`systematic`)
+      of second order  (0.7 d Δ²)² + (0.8 d ω²)² + (1.6 ω² d²/a)² in d, … (`add_second_order`)
+      it leaves        Σ size² qᵀq − m·(size Jᵀq)
+    smooth misfit      Σ r_k r_(k−1) − n ρ₁ σ² − decrement             (`undetected_misfit`)
+
+C is the noise's correlation by lag, as `calibrate` measures it: K, the ``variance_factor``, depends
+on the footprint's size beside the correlation's and is tabulated over d. The q are images of what
+is the same in every frame: a shift of all cells, the tip's centre in x and y, the pitch, and the
+modulus, ``size`` their standard deviations; Δ is m's part in depth over d, ω² = ``rotated`` its
+rotation squared. r_k are the residuals of the packed cells: single cells' noise adds nothing to
+the product of neighbours on average, a misfit that is smooth over the footprint all of it.
 
 Kernels that take ``solid`` first depend on the tip: those here are of springs, and `solid_budget`
 has a solid tip's, of which a scene compiles the ones it needs.

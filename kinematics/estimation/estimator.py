@@ -212,7 +212,7 @@ class ContactEstimator:
     def saturation(self) -> float | None:
         """The reading at which a cell is full; None for an integer type's largest value.
 
-        Set it anew where another zero is taken off the readings. Raises ValueError for one that is
+        Set it again where another zero is taken off the readings. Raises ValueError for one that is
         not positive.
         """
         return self._saturation

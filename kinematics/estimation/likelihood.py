@@ -4,7 +4,7 @@ The model of a cell is ``γ · mean(σ(ε)) = γ A (σ(ε̄) + ½ σ''(ε̄) V)`
 the footprint, ε̄ and V the strain's mean and variance over that fraction; it is exact for a
 constant modulus, and to the strain's third moment for any other law. The strain is linear in (u, v,
 w) (see footprint.py), so its means are sums of fixed means of g, x g, y g for whole cells; cut
-cells are integrated (cut_cells.py). The outline adds no derivative of its own, as σ is 0 there.
+cells are integrated (packing.py). The outline adds no derivative of its own, as σ is 0 there.
 """
 
 from __future__ import annotations

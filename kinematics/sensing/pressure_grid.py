@@ -2,6 +2,11 @@
 
 Holds the sensor's geometry (`SensorGrid`) and the rendering of a contact on it. Every cell reads
 the pressure averaged over its area; sensor imperfections (noise, counts, dead cells) are not here.
+
+The elastomer over a sensor spreads a point's pressure, a Gaussian blur: a cell reads
+c(x) = (p ∗ box)(x), a blurred one ∫ G(t) c(x − t) dt with G of standard deviation w both ways. c is
+smooth on the scale of a cell, so the integral is a weighted sum of neighbouring cells' c, along one
+axis and then along the other: of finer cells here, of half or whole ones in the fit.
 """
 
 from __future__ import annotations
@@ -17,7 +22,6 @@ from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 from softfinger.kinematics.compiled.layout import Record, Records
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
-from softfinger.kinematics.sensing.blur import average, pieces, stencil
 from softfinger.kinematics.sensing.cell_integrals import (
     NODES,
     NODES_A_CELL,
@@ -41,6 +45,9 @@ from softfinger.kinematics.sensing.solid_pressure import SolidPressure, images
 
 _PITCH_MAX = 0.1  # m; a greater one is in millimetres
 OWNERS = 256  # cells whose nodes are evaluated at once
+_MATCHED = 0.75  # cells: below it weights that match moments, above it samples of the Gaussian
+_CUTOFF = 4.5  # standard deviations of the blur
+_PIECES_MAX = 8
 
 
 class Rendering(Record):
@@ -224,7 +231,7 @@ class SensorGrid:
             render(work, material.law, np.empty((self.cols + 1, 2)), out)
             return out
         pitch_x, pitch_y = self.pitches
-        n = pieces(self.blur / pitch_x), pieces(self.blur / pitch_y)
+        n = blur_pieces(self.blur / pitch_x), blur_pieces(self.blur / pitch_y)
         stencils, finer = self.finer(n)
         fine = np.empty(finer.shape)
         work["grid"] = finer.on(tip).array
@@ -257,7 +264,7 @@ class SensorGrid:
 def _images(grid: SensorGrid, tip: Fingertip) -> FloatArray:
     if grid.blur == 0.0:
         return images(tip, grid.on(tip))
-    n = pieces(grid.blur / grid.pitches[0]), pieces(grid.blur / grid.pitches[1])
+    n = blur_pieces(grid.blur / grid.pitches[0]), blur_pieces(grid.blur / grid.pitches[1])
     stencils, finer = grid.finer(n)
     fine = images(tip, finer.on(tip)).reshape(-1, *finer.shape)
     return np.stack([average(each, *stencils, n).ravel() for each in fine])
@@ -273,3 +280,46 @@ def normal(d: float, tilt_x: float, tilt_y: float, radius: float) -> tuple[float
     if abs(tilt_x) >= 0.5 * math.pi or abs(tilt_y) >= 0.5 * math.pi or n_x**2 + n_y**2 >= 1.0:
         raise ValueError(f"tilts {tilt_x}, {tilt_y} rad don't make a normal out of the tip")
     return n_x, n_y
+
+
+def stencil(width: float) -> FloatArray:
+    """Return the blur's weights over neighbouring cells, float64 [2 n + 1]; ``width`` in cells.
+
+    Samples of the Gaussian: the trapezoid rule, whose error falls like exp(−2π² w²). Below
+    three quarters of a cell five weights of the Gaussian's moments up to the fifth, which are exact
+    for polynomials of that degree. One weight of 1 without a blur.
+    """
+    if width == 0.0:
+        return np.ones(1)
+    if width < _MATCHED:
+        square = width * width
+        far = (3.0 * square * square - square) / 24.0
+        near = 0.5 * square - 4.0 * far
+        return np.array([far, near, 1.0 - 2.0 * (near + far), near, far])
+    n = math.ceil(_CUTOFF * width)
+    weights = np.exp(-0.5 * (np.arange(-n, n + 1) / width) ** 2)
+    return np.asarray(weights / weights.sum())
+
+
+def blur_pieces(width: float) -> int:
+    """Return the pieces of a cell's side in the forward model; ``width`` in cells."""
+    return min(max(math.ceil(1.0 / width), 2), _PIECES_MAX)
+
+
+def average(
+    fine: FloatArray, across: FloatArray, along: FloatArray, n: tuple[int, int]
+) -> FloatArray:
+    """Blur ``fine`` by the stencils along x and y and average it over cells of n = (x, y) pieces.
+
+    ``fine`` has the stencils' half lengths more on each side than there are pieces.
+    """
+    cols = (fine.shape[1] - len(across) + 1) // n[0]
+    rows = (fine.shape[0] - len(along) + 1) // n[1]
+    # The mean over a cell's pieces goes into the weights, so that only cells are summed.
+    half = np.zeros((fine.shape[0], cols))
+    for k, weight in enumerate(np.convolve(across, np.full(n[0], 1.0 / n[0]))):
+        half += weight * fine[:, k : k + cols * n[0] : n[0]]
+    whole = np.zeros((rows, cols))
+    for k, weight in enumerate(np.convolve(along, np.full(n[1], 1.0 / n[1]))):
+        whole += weight * half[k : k + rows * n[1] : n[1]]
+    return whole

@@ -167,7 +167,7 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._act(np.clip(np.asarray(action, np.float64), -1.0, 1.0))
         if self._push:
             on = self._push_at <= self._loop.state.t < self._push_until
-            self._hand.push(0.0, self._push if on else 0.0)
+            self._hand.apply_load(0.0, self._push if on else 0.0)
         self._loop.advance(STEP)
         away = math.hypot(*(self._hand.object_pose[:2] - self._first[:2]))
         ended = bool(self._loop.state.mode == Mode.FAULT or away > LOST)

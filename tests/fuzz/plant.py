@@ -34,13 +34,13 @@ WRONG = (
 
 
 @kernel
-def past_limit(radius, d, theta, bend):
+def past_limit(radius, d, theta, curvature):
     """How far the rim must be pressed in by the tip's d and θ alone [m]."""
-    if bend == 0.0:
+    if curvature == 0.0:
         return d - radius * (1.0 - abs(math.sin(theta)))
-    away = radius - d + 1.0 / bend
+    away = radius - d + 1.0 / curvature
     beyond = max(abs(away * math.sin(theta)) - radius, 0.0)
-    return 1.0 / bend - math.hypot(away * math.cos(theta), beyond)
+    return 1.0 / curvature - math.hypot(away * math.cos(theta), beyond)
 
 
 @kernel
@@ -71,7 +71,7 @@ def carry_out(plants, data, ring, commands):
         goals.q[joint] = commands[k, 3]
         goals.current[joint] = commands[k, 4]
         if commands[k, 8] > 0.0:
-            goals.push[:] = commands[k, 5:8]
+            goals.load[:] = commands[k, 5:8]
         if commands[k, 9] > 0.0:  # open, the object back between the fingers
             state.position[:] = 0.0
             state.velocity[:] = 0.0
@@ -79,7 +79,7 @@ def carry_out(plants, data, ring, commands):
         if commands[k, 11] > 0.0:  # no input for a while: from then on the energy may only fall
             goals.torque_on[:] = 0
             state.current[:] = 0.0
-            goals.push[:] = 0.0
+            goals.load[:] = 0.0
         most = math.inf
         for _ in range(int(commands[k, 10] / plant.parameters.step) + 1):
             step(plants, data, ring, 1)
@@ -91,7 +91,7 @@ def carry_out(plants, data, ring, commands):
             return NOT_FINITE, k
         for finger in range(2):
             each = felt[finger]
-            least = past_limit(plant.parameters.radius, each.d, each.theta, each.bend)
+            least = past_limit(plant.parameters.radius, each.d, each.theta, each.curvature)
             if each.force > 0.0 and least > 1e-9 and not each.rim > 0.0:
                 return UNTOLD, k
             if abs(state.position[finger]) > 1.6:

@@ -65,6 +65,6 @@ def push_along(hand: Watched, force: float, rate: float, start: float = 0.0) -> 
     for k in range(1, count + 1):
         now = start + (force - start) * k / count
         angle = float(hand.plant.object_pose[2])
-        hand.plant.push(-now * math.sin(angle), now * math.cos(angle))
+        hand.plant.apply_load(-now * math.sin(angle), now * math.cos(angle))
         used = max(used, float(hand.watch(dt).slip.max()))
     return used

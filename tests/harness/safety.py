@@ -52,7 +52,7 @@ def sound(mode: Mode = Mode.HOLDING) -> State:
             seq=1,
             t=4.99,
             t_arrival=5.0,
-            t_sound=5.0,
+            t_valid=5.0,
             valid=True,
             contact=True,
             d=0.004,
@@ -90,13 +90,13 @@ def later(state: State, dt: float) -> None:
     state.reading.t += dt
     state.seq += 1
     for contact in state.contacts:
-        contact.t_sound += dt
+        contact.t_valid += dt
         contact.t_arrival += dt
 
 
 def levers(lever: float) -> GraspState:
     held = GraspState()
-    held.lever = [lever, lever]
+    held.energy_arm = [lever, lever]
     return held
 
 

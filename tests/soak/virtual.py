@@ -31,7 +31,7 @@ from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.perception import witnesses
 from softfinger.daemon.profile.load import checked
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.types import FINGERS, GRIP_SHARE, Frame, Goal, Reading
+from softfinger.daemon.types import FINGERS, GRIP_FRACTION, Frame, Goal, Reading
 from softfinger.tools.processes.kernel_build import table_cache
 
 SEQUENCES, TICKS = 1000, 5000
@@ -576,7 +576,7 @@ class Soak:
         friction = control.joint_friction / self.settings.hand.finger_length
         bound = _TOO_MUCH * asked + 2.0 * friction  # that is given, and that holds
         if loaded:
-            bound = max(bound, _UNSURE * min(raised, GRIP_SHARE * most))
+            bound = max(bound, _UNSURE * min(raised, GRIP_FRACTION * most))
         lied = t < self._lied_t + _REMEMBERED
         name = RAISED if loaded else LIED if lied else CALM
         self._must_end_soon(CALM, name, force, bound, t)

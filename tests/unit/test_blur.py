@@ -21,9 +21,8 @@ from softfinger.kinematics.estimation.blurred_cells import PLANES, weights
 from softfinger.kinematics.estimation.estimator import ContactEstimator
 from softfinger.kinematics.estimation.packing import INDEX_BITS
 from softfinger.kinematics.estimation.state import READING, WEIGHT, EstimatorState
-from softfinger.kinematics.sensing.blur import stencil
 from softfinger.kinematics.sensing.cell_integrals import ACTIVE, CELL_PLANES
-from softfinger.kinematics.sensing.pressure_grid import SensorGrid
+from softfinger.kinematics.sensing.pressure_grid import SensorGrid, stencil
 from tests.harness.estimator_kernels import blur_cells
 
 A = 0.020

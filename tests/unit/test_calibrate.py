@@ -164,7 +164,7 @@ def test_the_daemon_applies_the_file(bench, tmp_path):
         daemon.loop.advance(0.05)
         contact = daemon.loop.state.contacts[0]
         assert contact.valid
-        assert contact.t_sound == contact.t_arrival > 0.0
+        assert contact.t_valid == contact.t_arrival > 0.0
         assert contact.d == pytest.approx(0.003, rel=0.02)
         assert contact.theta == pytest.approx(0.15, abs=0.01)
         assert contact.tilt_y == pytest.approx(0.0, abs=0.01)

@@ -39,8 +39,8 @@ def test_what_frames_share_stays_however_many_come(contact_filter: ContactFilter
     estimate = replace(ESTIMATE, covariance=ESTIMATE.covariance + shared, systematic=shared)
     for k in range(100):
         t = 5.0 + 0.01 * k
-        contact_filter.advance(Reading(t=t, q=[0.15, 0.15], valid=True))
-        contact_filter.correct(0, frame(t), estimate, contacts[0])
+        contact_filter.predict(Reading(t=t, q=[0.15, 0.15], valid=True))
+        contact_filter.update(0, frame(t), estimate, contacts[0])
         contact_filter.write_contacts(t, contacts, pose)
         if k == 0:
             first = replace(contacts[0])
@@ -66,8 +66,8 @@ def test_the_law_misfit_is_in_the_force(contact_filter: ContactFilter) -> None:
     for each in (known, unknown):
         for read in (False, True):
             if read:
-                each.advance(Reading(t=5.0, q=[0.15, 0.15], valid=True))
-            each.correct(0, frame(5.0), ESTIMATE, contacts[0])
+                each.predict(Reading(t=5.0, q=[0.15, 0.15], valid=True))
+            each.update(0, frame(5.0), ESTIMATE, contacts[0])
             each.write_contacts(5.0, contacts, pose)
             found.append(contacts[0].force_std / contacts[0].force)
     by_law = law.force_error(0.003 / SETTINGS.tip.radius)
@@ -84,19 +84,19 @@ def test_a_tip_that_touches_at_the_start_is_felt_at_once_and_from_then_on(
 ) -> None:
     contacts, pose = [Contact(), Contact()], ObjectPose()
     if read_first:
-        contact_filter.advance(Reading(t=5.0, q=[0.15, 0.15], valid=True))
+        contact_filter.predict(Reading(t=5.0, q=[0.15, 0.15], valid=True))
     # Both frames were sampled before the first reading was taken.
     for k in range(2):
-        contact_filter.correct(0, frame(4.98 + 0.01 * k), ESTIMATE, contacts[0])
+        contact_filter.update(0, frame(4.98 + 0.01 * k), ESTIMATE, contacts[0])
         contact_filter.write_contacts(5.0, contacts, pose)
         assert contacts[0].valid
         assert contacts[0].d == pytest.approx(0.003)
         assert contacts[0].theta == pytest.approx(0.1)
     for k in range(1, 30):
         t = 5.0 + 0.002 * k
-        contact_filter.advance(Reading(t=t, q=[0.15, 0.15], valid=True))
+        contact_filter.predict(Reading(t=t, q=[0.15, 0.15], valid=True))
         if k % 5 == 0:
-            contact_filter.correct(0, frame(t - 0.01), ESTIMATE, contacts[0])
+            contact_filter.update(0, frame(t - 0.01), ESTIMATE, contacts[0])
         contact_filter.write_contacts(t, contacts, pose)
     contact = contacts[0]
     assert contact.d == pytest.approx(0.003, rel=0.02)

@@ -88,11 +88,11 @@ def test_a_held_object_withstands_pushes_of_a_fifth_of_the_grip(
         start = hand.plant.object_pose.copy()
         for _ in range(20):
             way = rng.uniform(-math.pi, math.pi)
-            hand.plant.push(2.0 * math.cos(way), 2.0 * math.sin(way))
+            hand.plant.apply_load(2.0 * math.cos(way), 2.0 * math.sin(way))
             seen = hand.watch(0.25)
             assert hand.mode == "holding"
             assert np.abs(seen.force.mean(axis=1) / 10.0 - 1.0).max() < 0.10 + KNOWN
-        hand.plant.push(0.0, 0.0)
+        hand.plant.apply_load(0.0, 0.0)
         hand.watch(2.0)
         moved = hand.plant.object_pose - start
         assert abs(moved[2]) < math.radians(0.2)
@@ -245,7 +245,7 @@ def test_compliance_lets_the_object_yield_and_is_bounded() -> None:
             grasped(hand)
             hand.command("set", compliance=compliance)
             before = hand.plant.object_pose[2]
-            hand.plant.push(0.0, 0.0, 0.1)
+            hand.plant.apply_load(0.0, 0.0, 0.1)
             hand.watch(1.0)
             yielded.append(abs(hand.plant.object_pose[2] - before))
             with pytest.raises(Refused, match=r"set: compliance: found 5 rad/\(N·m\), expected"):
@@ -375,7 +375,7 @@ def test_a_stream_of_setpoints_is_followed_in_force_and_angle(rate: float) -> No
             hand.command("hold", force=10.0 + 0.05 * (k % 2), angle=1e-3 * (k % 2))
             hand.run(1.0 / rate)
         assert not [event for event in hand.events if event[0] != "info"]
-        hand.plant.push(0.0, 13.0)
+        hand.plant.apply_load(0.0, 13.0)
         hand.watch(0.5)
         assert hand.mode == "holding"
         assert hand.plant.force.mean() > 15.0, "a sudden load is answered as ever"

@@ -19,10 +19,10 @@ PITCH = 0.058 / 44
 COUNT = 2.5  # Pa
 
 
-def frame(grid: SensorGrid, d: float, tilt: float, bend: float) -> np.ndarray:
+def frame(grid: SensorGrid, d: float, tilt: float, curvature: float) -> np.ndarray:
     sensor = SensorModel(grid, TIP, MATERIAL, Board(COUNT))
     out = np.zeros(grid.shape, np.uint16)
-    sensor.frame(d, tilt, 0.0, out, bend=bend)
+    sensor.frame(d, tilt, 0.0, out, curvature=curvature)
     return out * COUNT
 
 

@@ -61,10 +61,10 @@ class Twin:
         self, held: GraspState, felt: float, turned: float, dq: tuple[float, float]
     ) -> tuple[float, float]:
         law = self.settings.control
-        arm1, arm2 = held.arm
+        arm1, arm2 = held.moment_arm
         arm = 0.5 * (arm1 + arm2)
         stiffness = float(np.mean(held.stiffness))
-        turn = sum(held.turn)
+        turn = sum(held.jacobian_rotation)
         self.force.step(self.rate)
         error = self.force.value - felt
         most = self.settings.safety.current_max * law.torque_constant
@@ -88,12 +88,12 @@ class Twin:
             self.offset += shift - self.shift
             self.shift = shift
         close = 2.0 * self.force.speed / stiffness
-        close = (close - (arm1 - arm2 + held.slide * turn) * lean) / (arm1 + arm2)
+        close = (close - (arm1 - arm2 + held.jacobian_slide * turn) * lean) / (arm1 + arm2)
         damping = 2.0 * law.damping_ratio * math.sqrt(law.joint_inertia)
         calm = damping * math.sqrt(stiffness * arm**2) * (close - 0.5 * sum(dq))
         steer = law.joint_stiffness * (self.offset - 0.5 * (held.q[0] - held.q[1]))
         steer += damping * math.sqrt(law.joint_stiffness) * (lean - 0.5 * (dq[0] - dq[1]))
-        levers = held.lever if law.law == "energy" else held.arm
+        levers = held.energy_arm if law.law == "energy" else held.moment_arm
         rub = [
             law.joint_friction * between(w / law.friction_speed, 1.0)
             for w in (close + lean, close - lean)
@@ -108,12 +108,12 @@ class Twin:
 def change(held: GraspState, generator: np.random.Generator) -> None:
     """Another object, but for the forces of the tips."""
     held.q = list(generator.uniform(-0.2, 0.2, 2))
-    held.arm = list(generator.uniform(0.06, 0.09, 2))
-    held.turn = list(generator.uniform(0.5, 1.0, 2))
-    held.lever = list(generator.uniform(0.06, 0.09, 2))
+    held.moment_arm = list(generator.uniform(0.06, 0.09, 2))
+    held.jacobian_rotation = list(generator.uniform(0.5, 1.0, 2))
+    held.energy_arm = list(generator.uniform(0.06, 0.09, 2))
     held.stiffness = list(generator.uniform(2e3, 9e3, 2))
     held.normal = list(generator.uniform(5.0, 9.0, 2))
-    held.slide = generator.uniform(-0.02, 0.02)
+    held.jacobian_slide = generator.uniform(-0.02, 0.02)
     held.angle_std = generator.uniform(0.0, 0.02)
 
 
@@ -161,7 +161,7 @@ def test_late_frames_leave_the_push_and_let_a_turn_come_to_rest() -> None:
     generator = np.random.default_rng(6)
     held = some_held(generator, 8.0)
     grip = Grip(Settings(), [0, 1], held)
-    held.slide, held.arm = 0.0, [0.08, 0.08]
+    held.jacobian_slide, held.moment_arm = 0.0, [0.08, 0.08]
     reading = Reading()
     grip.start(8.0, 8.0)
     grip.steer(0.0, 0.3)
@@ -169,8 +169,8 @@ def test_late_frames_leave_the_push_and_let_a_turn_come_to_rest() -> None:
         grip.torques(reading, ObjectPose(True, 0.0, 0.03), False)
     pushes, leans = [], []
     for _ in range(400):
-        left, right = grip.coast(reading)
-        pushes.append(left / held.arm[0] + right / held.arm[1])
+        left, right = grip.hold_goal(reading)
+        pushes.append(left / held.moment_arm[0] + right / held.moment_arm[1])
         leans.append(left - right)
     assert np.ptp(pushes) < 1e-6 * pushes[0]
     assert abs(leans[-1] - leans[-2]) < 1e-6 < abs(leans[1] - leans[0])
@@ -184,8 +184,8 @@ def test_one_finger_presses_and_the_other_gets_nothing(finger: int) -> None:
     grip.start(5.0, 5.0)
     reading.dq[finger] = 0.1
     law = settings.control
-    arm, stiffness = held.arm[finger], held.stiffness[finger]
+    arm, stiffness = held.moment_arm[finger], held.stiffness[finger]
     damping = 2.0 * law.damping_ratio * math.sqrt(law.joint_inertia * stiffness) * arm
-    for torques in (grip.torques(reading, ObjectPose(), False), grip.coast(reading)):
+    for torques in (grip.torques(reading, ObjectPose(), False), grip.hold_goal(reading)):
         assert torques[finger] == pytest.approx(arm * 5.0 - damping * 0.1)
         assert torques[1 - finger] == 0.0

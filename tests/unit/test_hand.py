@@ -98,7 +98,7 @@ def test_a_held_object_slips_when_the_push_exceeds_friction(friction):
     push = 0.0
     while hand.object_pose[1] < place_held + 0.006:
         push += 0.01
-        hand.push(0.0, push)
+        hand.apply_load(0.0, push)
         run(hand, 0.005)
         ratio = np.abs(hand.tangential) / hand.normal
         assert (ratio <= friction * (1 + 1e-9)).all()
@@ -130,7 +130,7 @@ def test_a_dropped_object_comes_to_rest_on_the_palm():
 
 def test_a_push_onto_the_palm_is_borne_by_it():
     hand = make(palm=0.045, object_mass=0.02)
-    hand.push(0.0, -20.0)
+    hand.apply_load(0.0, -20.0)
     run(hand, 0.5)
     assert hand.object_pose[1] == pytest.approx(0.045 + 0.03 - 20.0 / 2e5, rel=1e-6)
     assert hand.object_pose[2] == pytest.approx(0.0, abs=1e-9)
@@ -269,7 +269,7 @@ def test_without_servos_and_script_the_joints_stay():
         {"servos": {"backend": "none"}, "simulation": {"compression_speed": 0.0}}
     )
     hand = SimulatedHand(settings, table=PAPER)
-    hand.push(0.5, 0.0)
+    hand.apply_load(0.5, 0.0)
     run(hand, 1.0)
     np.testing.assert_array_equal(hand.q, settings.hand.open_angle)
     # Friction's rest is viscous, so that it creeps to where the tip bears the whole push.

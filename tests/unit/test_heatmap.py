@@ -83,7 +83,7 @@ def test_round_up() -> None:
 
 
 def test_scale_grows_at_once_and_shrinks_late() -> None:
-    scale = FullScale(least=5.0, patience=3.0)
+    scale = FullScale(smallest=5.0, patience=3.0)
     assert scale.follow(0.0, 0.0) == 5.0
     assert scale.follow(41.0, 1.0) == 50.0
     assert scale.follow(8.0, 2.0) == 50.0

@@ -1,4 +1,4 @@
-"""Imports run one way, without circles; classes have names of their own, exceptions one root."""
+"""Imports run one way, without circles; names and docstrings of modules, classes and exceptions."""
 
 from __future__ import annotations
 
@@ -14,6 +14,9 @@ import softfinger
 ROOT = Path(softfinger.__file__).parents[1]
 ORDER = ("kinematics", "daemon", "tools")  # each imports itself and those before it
 PAGE = ROOT / "docs" / "architecture.md"
+QUESTION = re.compile(r"(What|Whether|Of|As|By|How|Where|When|Who|From|To|With|For|At)\b")
+# Rooms whose docstrings still begin so.
+EXEMPT = re.compile(r"daemon\.(client|gateway|loop|wire)|tools\.(benchmarks|calibration|viewing)")
 BUILT_IN = {"Exception", "ValueError", "RuntimeError", "OSError", "TimeoutError"}
 
 
@@ -159,3 +162,15 @@ def test_every_exception_derives_from_the_root() -> None:
         and all(isinstance(base, ast.Name) for base in node.bases)
     ]
     assert alone == []
+
+
+def test_a_docstring_begins_with_a_verb_or_a_noun() -> None:
+    begun = [
+        f"{name}: {text.splitlines()[0]}"
+        for name, file in modules().items()
+        if not EXEMPT.match(name)
+        for node in ast.walk(parsed(file))
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)
+        if QUESTION.match(text := ast.get_docstring(node) or "")
+    ]
+    assert begun == []

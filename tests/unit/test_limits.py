@@ -89,11 +89,11 @@ def brown_out(state: State) -> None:
 
 
 def silent_frames(state: State) -> None:
-    state.contacts[0].t_arrival = state.contacts[0].t_sound = 5.0 - 11.0 / SETTINGS.tactile.rate
+    state.contacts[0].t_arrival = state.contacts[0].t_valid = 5.0 - 11.0 / SETTINGS.tactile.rate
 
 
 def unsound_estimates(state: State) -> None:
-    state.contacts[0].t_sound = 5.0 - 11.0 / SETTINGS.tactile.rate
+    state.contacts[0].t_valid = 5.0 - 11.0 / SETTINGS.tactile.rate
 
 
 def never_read(state: State) -> None:
@@ -194,7 +194,7 @@ def test_asking_for_a_cause_changes_nothing(name: str) -> None:
 
 def test_late_frames_hold_the_goals_before_they_are_a_fault() -> None:
     state = sound()
-    state.contacts[0].t_sound = 5.0 - 4.0 / SETTINGS.tactile.rate
+    state.contacts[0].t_valid = 5.0 - 4.0 / SETTINGS.tactile.rate
     judge = safety()
     assert judge.judge(state) is None
     assert judge.must_hold
@@ -290,7 +290,7 @@ def test_a_warning_is_told_once_until_it_has_been_over(
         well = sound()
         well.t = well.reading.t = state.t
         for contact in well.contacts:
-            contact.t_sound = state.t
+            contact.t_valid = state.t
         judged(judge, well, wait)
         state = well
         spoil(state)
@@ -318,7 +318,7 @@ def test_each_witness_that_is_doubted_is_named() -> None:
     judged(judge, state, 0.5)
     assert judge.warnings == [], "that is not known well"
     grasp.scales.covariance[GAIN + 1, GAIN + 1] = 0.1**2
-    grasp.witnesses.jumps[0], grasp.witnesses.miss[0] = 3.0, -0.2
+    grasp.witnesses.jumps[0], grasp.witnesses.innovation[0] = 3.0, -0.2
     grasp.witnesses.off_goal[1] = 0.2
     state.reading.current[1], state.goal.current[1] = 0.1, 0.2
     judged(judge, state, 0.5)
@@ -412,7 +412,7 @@ PUSHES: dict[str, Callable[[State, int, float], None]] = {
     ),
     "tactile.silent": lambda state, i, share: setattr(
         state.contacts[i],
-        "t_sound",
+        "t_valid",
         state.t - share * BOUNDS.frame_age_fault / SETTINGS.tactile.rate,
     ),
 }
@@ -428,7 +428,7 @@ def test_a_fault_begins_at_its_bound_and_nan_is_past_it(
     PUSHES[name](state, finger, share)
     (row,) = (row for row in LIMITS if row.name == name and row.level == "fault")
     assert row.check is not None
-    assert bool(row.check(View(SETTINGS), state, row.share)) != (share < 1.0)
+    assert bool(row.check(View(SETTINGS), state, row.fraction)) != (share < 1.0)
 
 
 def test_every_row_is_named_once_a_level_and_its_settings_exist() -> None:

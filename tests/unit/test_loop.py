@@ -280,7 +280,7 @@ def test_the_state_tells_what_the_grip_goes_to(make: Make) -> None:
     # More than was asked for, since a load would make the tips slip.
     assert daemon.hand is not None
     for k in range(1, 101):
-        daemon.hand.push(0.0, 0.12 * k, 0.0)
+        daemon.hand.apply_load(0.0, 0.12 * k, 0.0)
         daemon.loop.advance(0.02)
     assert 9.0 < goal.force <= 18.0
     daemon.loop.advance(1.0)

@@ -115,7 +115,7 @@ def test_a_real_load_and_a_real_turn_are_no_lie(load: tuple[float, float, float]
     with Hand({}) as hand:
         grasped(hand, 10.0)
         for sign in (1.0, -1.0, 0.0):
-            hand.plant.push(*(sign * each for each in load))
+            hand.plant.apply_load(*(sign * each for each in load))
             hand.watch(0.8)
         hand.command("rotate", angle=0.12)
         hand.watch(1.0)
@@ -125,7 +125,7 @@ def test_a_real_load_and_a_real_turn_are_no_lie(load: tuple[float, float, float]
 
 def given(repeats: Repeats, frames: list[int]) -> bool:
     for number in frames:
-        repeats.look(np.full((2, 2), number, np.uint16))
+        repeats.seen_before(np.full((2, 2), number, np.uint16))
     return repeats.long
 
 
@@ -145,4 +145,4 @@ SEQUENCES: dict[str, tuple[Callable[[], list[int]], bool]] = {
 def test_only_an_order_that_comes_again_is_a_repetition(name: str) -> None:
     frames, expected = SEQUENCES[name]
     assert given(Repeats(100.0), frames()) is expected
-    assert not given(Repeats(100.0, judged=False), frames())
+    assert not given(Repeats(100.0, enabled=False), frames())

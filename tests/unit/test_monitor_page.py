@@ -30,7 +30,7 @@ def fed(now: float = 0.0) -> Feed:
 
 
 def give(feed: Feed, topic: bytes, record: object, now: float = 0.0) -> None:
-    feed.take([topic, msgpack.packb(record)], now)
+    feed.read([topic, msgpack.packb(record)], now)
 
 
 def shown(feed: Feed, now: float = 0.0, width: int = 80, height: int = 24, **more: Any) -> str:
@@ -140,7 +140,7 @@ def test_statistics_of_the_last_second() -> None:
     tick = feed.statistics(2.995)
     assert tick.rate == pytest.approx(400.0)
     assert tick.messages == pytest.approx(100.0, abs=1.0)
-    assert (tick.late, tick.late_max) == (3e-6, 900e-6)
+    assert (tick.lateness, tick.lateness_max) == (3e-6, 900e-6)
 
 
 def test_a_busy_machine_is_told_while_a_simulated_hand_waits_for_it() -> None:
@@ -302,7 +302,7 @@ def test_no_stream_breaks_the_page(
     for topic, record in records:
         give(feed, topic, record)
     for message in garbage:
-        feed.take(message, 0.0)
+        feed.read(message, 0.0)
     shown(feed)
     give(feed, b"hand/state", fake_daemon.state(1.0, 2**63))
     assert "HOLDING" in shown(feed)

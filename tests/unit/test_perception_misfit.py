@@ -49,8 +49,8 @@ def test_unequal_cells_are_a_misfit_that_is_warned_of_and_published() -> None:
     for tick in range(1000):
         state.t = 0.02 + 0.002 * tick
         state.seq += 1
-        contact.t_sound = state.t
-        state.contacts[1] = Contact(valid=True, t_sound=state.t)
+        contact.t_valid = state.t
+        state.contacts[1] = Contact(valid=True, t_valid=state.t)
         safety.judge(state)
         told += safety.warnings
         safety.warnings.clear()

@@ -42,9 +42,9 @@ def test_gyration_and_lever_of_the_shapes():
     square = shape(object_width=0.04, object_height=0.04)
     assert square.gyration == pytest.approx(0.04 / math.sqrt(6))
     # (√2 + asinh 1)/6 of the side.
-    assert square.lever == pytest.approx(0.04 * (math.sqrt(2) + math.asinh(1)) / 6, rel=1e-4)
+    assert square.mean_radius == pytest.approx(0.04 * (math.sqrt(2) + math.asinh(1)) / 6, rel=1e-4)
     disc = shape(object_shape="disc", object_radius=0.03)
-    assert (disc.gyration, disc.lever) == pytest.approx((0.03 / math.sqrt(2), 0.02))
+    assert (disc.gyration, disc.mean_radius) == pytest.approx((0.03 / math.sqrt(2), 0.02))
     flat = shape(object_shape="wedge", object_taper=0.0)
     np.testing.assert_allclose(flat.corners, shape().corners)
     assert flat.gyration == pytest.approx(shape().gyration)
@@ -66,7 +66,7 @@ def test_a_wedge_stands_about_its_centre_of_mass():
         points = points[(points - edge[:2]) @ edge[2:4] < 0]
     np.testing.assert_allclose(points.mean(axis=0), 0.0, atol=1e-4)
     distances = np.hypot(*points.T)
-    assert wedge.lever == pytest.approx(distances.mean(), rel=3e-3)
+    assert wedge.mean_radius == pytest.approx(distances.mean(), rel=3e-3)
     assert wedge.gyration == pytest.approx(math.sqrt((distances**2).mean()), rel=3e-3)
     assert wedge.half_width == pytest.approx(0.02 - sides[0][1] * -math.tan(0.3), rel=1e-9)
 
@@ -135,7 +135,7 @@ def springs_on_a_cylinder(d, theta, curved):
     ("curved", "upright", "tilted"), [(1.0, 1.5e-3, 1e-3), (0.04, 0.02, 0.023), (0.02, 0.01, 0.045)]
 )
 def test_curvature_softens_the_contact_as_the_springs_themselves_say(curved, upright, tilted):
-    share = make(object_shape="disc", object_radius=curved).plant.parameters.share
+    share = make(object_shape="disc", object_radius=curved).plant.parameters.factor
     for d in (0.001, 0.004, 0.008):
         assert springs_on_a_cylinder(d, 0.0, curved) == pytest.approx((share,) * 2, rel=upright)
         assert springs_on_a_cylinder(d, math.radians(30), curved) == pytest.approx(
@@ -330,7 +330,7 @@ def test_an_object_sticks_to_the_palm_below_friction_and_slides_above():
         hand = make(palm=0.05, palm_friction=0.5, gravity=(0.0, -GRAVITY), object_height=0.02)
         place(hand, (-0.5, -0.5), (0.0, 0.06, 0.0))
         run(hand, 0.3)
-        hand.push(push * 0.5 * 0.1 * GRAVITY, 0.0)
+        hand.apply_load(push * 0.5 * 0.1 * GRAVITY, 0.0)
         run(hand, 0.1)
         at = hand.object_pose[0]
         run(hand, 0.15)

@@ -24,17 +24,17 @@ def begin(records: Records[Scales]) -> None:
 
 @kernel
 def height(records: Records[Scales], finger: int, value: float, variance: float) -> None:
-    scales.take_height(records[0], finger, value, variance)
+    scales.update_height(records[0], finger, value, variance)
 
 
 @kernel
 def torques(records: Records[Scales], torque: Pair, moment: Pair, speed: float, t: float) -> None:
-    scales.take_torque(records[0], torque, moment, speed, t)
+    scales.update_torque(records[0], torque, moment, speed, t)
 
 
 @kernel
 def balance(records: Records[Scales], force1: float, force2: float) -> None:
-    scales.take_balance(records[0], force1, force2)
+    scales.update_balance(records[0], force1, force2)
 
 
 class Reference:

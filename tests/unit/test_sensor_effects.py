@@ -192,7 +192,7 @@ def test_dead_cells_nobody_is_told_of_are_a_share_and_the_seeds():
     grid = SensorGrid(100, 100, PITCH)
     flaws = Imperfections(dead=0.05)
     first, again, other = (
-        SensorModel(grid, TIP, LINEAR, Board(1.0), flaws, seed=seed).live for seed in (1, 1, 2)
+        SensorModel(grid, TIP, LINEAR, Board(1.0), flaws, seed=seed).active for seed in (1, 1, 2)
     )
     np.testing.assert_array_equal(first, again)
     assert (first != other).any()

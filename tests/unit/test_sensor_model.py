@@ -74,10 +74,10 @@ def test_gain_spread_is_fixed_per_cell_and_dead_cells_read_zero():
     first, second = frame(sensor), frame(sensor)
     np.testing.assert_array_equal(first, second)
     assert first[22, 24] == 0
-    assert not sensor.live[22, 24]
-    assert sensor.live.sum() == 44 * 44 - 2
+    assert not sensor.active[22, 24]
+    assert sensor.active.sum() == 44 * 44 - 2
     clean = GRID.pressure(TIP, MATERIAL, 0.004, 0.2, -0.1)
-    strong = (clean > 4000.0) & sensor.live
+    strong = (clean > 4000.0) & sensor.active
     assert (first[strong] * 4.0 / clean[strong]).std() == pytest.approx(0.05, rel=0.25)
 
 

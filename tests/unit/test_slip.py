@@ -47,7 +47,7 @@ def test_the_grip_comes_back_when_the_load_has_gone() -> None:
         grasped(hand)
         push_along(hand, BORNE, rate=9.0)
         assert hand.plant.force.mean() > 1.2 * FORCE
-        hand.plant.push(0.0, 0.0)
+        hand.plant.apply_load(0.0, 0.0)
         hand.watch(4.0)
         assert hand.mode == "holding"
         assert hand.plant.force.mean() == pytest.approx(FORCE, rel=KNOWN)
@@ -70,7 +70,7 @@ def test_an_object_that_turns_in_the_grip_is_gripped_more_firmly() -> None:
             start = hand.plant.object_pose[2]
             # Both tips' friction bears about 0.25 N·m over the object's width.
             for k in range(1, 76):
-                hand.plant.push(0.0, 0.0, 0.4 * k / 75)
+                hand.plant.apply_load(0.0, 0.0, 0.4 * k / 75)
                 hand.watch(0.02)
             turned = abs(hand.plant.object_pose[2] - start)
             assert (turned < math.radians(5.0)) == held
@@ -82,8 +82,12 @@ class Watched:
 
     def __init__(self, asked: float = FORCE, **control: float) -> None:
         self.held = held = GraspState()
-        held.load_lever = 0.03
-        held.arm, held.turn, held.stiffness = [0.079, 0.079], [0.75, 0.75], [6e3, 6e3]
+        held.load_arm = 0.03
+        held.moment_arm, held.jacobian_rotation, held.stiffness = (
+            [0.079, 0.079],
+            [0.75, 0.75],
+            [6e3, 6e3],
+        )
         held.d, held.force = [4e-3, 4e-3], [asked, asked]
         self.grip = Grip(Settings.model_validate({"control": control}), [0, 1], held)
         self.grip.start(asked, asked)
@@ -97,11 +101,11 @@ class Watched:
         speed: float = 0.0,
     ) -> float:
         """So many ticks under a load, joints closing with ``speed``; the force [N] gone to."""
-        self.held.unexplained = [self.held.load_lever * load] * 2
+        self.held.torque_residual = [self.held.load_arm * load] * 2
         self.held.normal = [normal, normal]
         for _ in range(ticks):
             self.grip.torques(Reading(dq=[speed, speed]), ObjectPose(), holding)
-        return self.grip.given
+        return self.grip.target
 
 
 def test_what_friction_may_be_is_not_a_load_and_what_it_can_not_is() -> None:
@@ -141,14 +145,14 @@ def test_a_load_that_comes_at_once_raises_the_grip_at_once_by_all_it_may() -> No
     watched = at_rest()
     assert watched.run(2.0 * friction, 1, speed=GIVES_WAY) == FORCE + 10.0
     state = watched.grip._state
-    assert state.push > 1.15 * (FORCE + 10.0), "at the same tick"
+    assert state.grip_force > 1.15 * (FORCE + 10.0), "at the same tick"
     # As much as the torque constants' error, friction and the load may take, and no more.
     most = (FORCE + 10.0) * 1.2 + (0.05 + 0.03 * state.slip.load) / 0.079
-    assert state.push <= most + 1e-9
+    assert state.grip_force <= most + 1e-9
     # The force felt comes up: the controller holds what the reflex gave.
     watched.held.force = [FORCE + 10.0] * 2
     watched.run(2.0 * friction, 1)
-    assert state.push == pytest.approx(FORCE + 10.0, rel=0.03)
+    assert state.grip_force == pytest.approx(FORCE + 10.0, rel=0.03)
 
 
 def test_a_load_that_stands_leaves_less_to_come() -> None:
@@ -179,7 +183,7 @@ def test_what_one_joint_alone_shows_is_no_sudden_load() -> None:
     """A current that is read wrongly, or a joint that is dead."""
     watched = at_rest()
     for torque in (0.3, -0.3, 0.3):
-        watched.held.unexplained = [0.0, torque]
+        watched.held.torque_residual = [0.0, torque]
         for _ in range(5):
             watched.grip.torques(Reading(), ObjectPose(), True)
             assert not watched.grip.slip.reflex
@@ -190,13 +194,13 @@ def test_noise_of_the_currents_is_no_load_and_a_load_in_it_is(force: float) -> N
     """30 mA on each, for a minute; a load towards the palm is the hardest to see."""
     rng = np.random.default_rng(1)
     watched = at_rest(force)
-    watched.held.load_lever, watched.held.load_bow = 0.025, 0.02 / force
+    watched.held.load_arm, watched.held.load_curvature = 0.025, 0.02 / force
     noise = 0.030 * 1.78 * rng.standard_normal((30_000, 2))
     for tick, pair in enumerate(noise.tolist()):
-        watched.held.unexplained = pair
+        watched.held.torque_residual = pair
         watched.grip.torques(Reading(), ObjectPose(), tick > 500)  # it was there before the grip
-        assert watched.grip.given == force
-    watched.held.unexplained = [0.35, 0.35]
+        assert watched.grip.target == force
+    watched.held.torque_residual = [0.35, 0.35]
     watched.grip.torques(Reading(dq=[GIVES_WAY, GIVES_WAY]), ObjectPose(), True)
     assert watched.grip.slip.reflex
 

@@ -126,7 +126,7 @@ def test_a_raised_grip_that_comes_back_does_not_hold_the_dither_at_one_side() ->
         push_along(hand, 13.0, 11.0)
         goal = hand._daemon.loop.state.goal
         assert goal.force > 1.1 * FORCE
-        hand.plant.push(0.0, 0.0)
+        hand.plant.apply_load(0.0, 0.0)
         hand.run(0.1)
         hand.command("grasp", force=FORCE)  # a second later, while it shakes, the grip comes back
         turned = np.abs(hand.watch(3.5).angle).max()

@@ -165,7 +165,7 @@ class _Pass:
         self._contact = self._state.contacts[finger]
         self._rows: list[tuple[float, ...]] = []
 
-    def take(self, t: float, counts: NDArray[np.uint16]) -> None:
+    def add(self, t: float, counts: NDArray[np.uint16]) -> None:
         self._sensor.frame = Frame(len(self._rows) + 1, t, t, True, counts)
         self._state.t = t
         self._perception.update(self._state)
@@ -183,7 +183,7 @@ def analyse(source: Source, progress: Progress) -> list[Contacts]:
     """Return the contacts of each sensor. Raises what the source's frames raise."""
     passes = {finger: _Pass(source, finger) for finger in source.fingers}
     for finger, t, counts in source.frames(progress):
-        passes[finger].take(t, counts)
+        passes[finger].add(t, counts)
     return [each.contacts(finger, source.truths) for finger, each in passes.items()]
 
 
@@ -222,8 +222,8 @@ def draw(contacts: list[Contacts], title: str, path: Path) -> None:
         axes = figure.subplots(len(_PANELS), 1, sharex=True)
         for panel, (name, value, spread, factor, unit) in zip(axes, _PANELS, strict=True):
             for k, each in enumerate(contacts):
-                sound = each.valid & each.contact
-                shown = np.where(sound, each.values[value] * factor, np.nan)
+                valid = each.valid & each.contact
+                shown = np.where(valid, each.values[value] * factor, np.nan)
                 colour = style.KINDS[k]
                 line = "-" if k == 0 else (0, (5, 1.5))
                 panel.plot(

@@ -71,8 +71,8 @@ class RecordedRun:
 
     def touching(self, finger: str) -> BoolArray:
         """Return where the finger's state is valid and in contact."""
-        sound = (self.states[f"{finger}.valid"] > 0.0) & (self.states[f"{finger}.contact"] > 0.0)
-        return sound & np.isfinite(self.states[f"{finger}.d"])
+        valid = (self.states[f"{finger}.valid"] > 0.0) & (self.states[f"{finger}.contact"] > 0.0)
+        return valid & np.isfinite(self.states[f"{finger}.d"])
 
     def gapped(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return t and ``values`` with a NaN in each gap of the stream, which breaks the line."""
@@ -121,7 +121,7 @@ def load_run(
     true_fingers = {f"true_{name}": _TRUE for name in FINGERS}
     truth = _Columns(("mono_ns",), {**true_fingers, "true_object": _TRUE_OBJECT})
     for topic, message in recording.messages({schema.STATE, schema.TRUTH}, start, end, progress):
-        (states if topic == schema.STATE else truth).take(message)
+        (states if topic == schema.STATE else truth).add(message)
     models, why = _model(recording, cache)
     return RecordedRun(
         recording.path.name,
@@ -158,7 +158,7 @@ class _Columns:
         self._values = array("d")
         self.count = 0
 
-    def take(self, message: dict[str, Any]) -> None:
+    def add(self, message: dict[str, Any]) -> None:
         """Add a row, unless the map lacks a field."""
         try:
             row = [float(message[name]) for name in self._own]

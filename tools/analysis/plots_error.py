@@ -41,15 +41,15 @@ def draw_error(run: RecordedRun) -> Figure:
     t = run.t[at]
     for panels, (title, field, factor, unit) in zip(axes, _ROWS, strict=False):
         entries = []
-        for name, sound in both.items():
+        for name, valid in both.items():
             key = f"{name}.{field}"
             error = (run.states[key][at] - run.truth[f"true_{key}"][true]) * factor
-            entries.append((name, error, run.states[f"{key}_std"][at] * factor, sound))
+            entries.append((name, error, run.states[f"{key}_std"][at] * factor, valid))
         _row(panels, t, entries)
         panels[0].set_ylabel(f"error of {title} [{unit}]")
     error = (run.states["object.angle"][at] - run.truth["true_object.angle"][true]) * DEGREES
-    sound = (run.states["object.valid"][at] > 0.0) & np.all(list(both.values()), axis=0)
-    _row(axes[3], t, [("object", error, np.full(t.size, np.nan), sound)])
+    valid = (run.states["object.valid"][at] > 0.0) & np.all(list(both.values()), axis=0)
+    _row(axes[3], t, [("object", error, np.full(t.size, np.nan), valid)])
     axes[3, 0].set_ylabel("error of φ [°]")
     axes[3, 1].set_xlabel("share [%]")
     handles, labels = axes[0, 0].get_legend_handles_labels()
@@ -68,34 +68,34 @@ def _row(
 ) -> None:
     """One quantity: name, error, reported σ and where both are valid, of each finger."""
     panel, side = panels
-    known = [error[sound & np.isfinite(error)] for _, error, _, sound in entries]
+    known = [error[valid & np.isfinite(error)] for _, error, _, valid in entries]
     together = np.concatenate(known)
     if not together.size:
         return
-    reach = 1.3 * float(np.quantile(np.abs(together), 0.995)) or 1e-12
-    for k, (name, error, spread, sound) in enumerate(entries):
+    limit = 1.3 * float(np.quantile(np.abs(together), 0.995)) or 1e-12
+    for k, (name, error, std, valid) in enumerate(entries):
         if not known[k].size:
             continue
         look = LINES.get(name, {"color": style.KINDS[2], "linestyle": "-"})
         colour = look["color"]
-        panel.plot(t, np.where(sound, error, np.nan), label=name, linewidth=0.7, **look)
-        said = f"{name}: mean {known[k].mean():.2g}, std {known[k].std():.2g}"
-        if np.isfinite(spread[sound]).any():
-            times, band = _envelope(t, np.where(sound, 2.0 * spread, np.nan))
+        panel.plot(t, np.where(valid, error, np.nan), label=name, linewidth=0.7, **look)
+        text = f"{name}: mean {known[k].mean():.2g}, std {known[k].std():.2g}"
+        if np.isfinite(std[valid]).any():
+            times, band = _envelope(t, np.where(valid, 2.0 * std, np.nan))
             panel.fill_between(times, -band, band, color=colour, alpha=0.10, lw=0)
             for sign in (-1.0, 1.0):
                 panel.plot(times, sign * band, color=colour, linewidth=0.6, alpha=0.8)
-            inside = np.abs(error[sound]) <= 2.0 * spread[sound]
-            said += f", {100.0 * inside.mean():.1f} % within 2σ"
-            reach = max(reach, 1.15 * float(np.nanquantile(2.0 * spread[sound], 0.97)))
-        panel.text(0.52 * k, 1.02, said, transform=panel.transAxes, fontsize=6.8, color=colour)
+            inside = np.abs(error[valid]) <= 2.0 * std[valid]
+            text += f", {100.0 * inside.mean():.1f} % within 2σ"
+            limit = max(limit, 1.15 * float(np.nanquantile(2.0 * std[valid], 0.97)))
+        panel.text(0.52 * k, 1.02, text, transform=panel.transAxes, fontsize=6.8, color=colour)
     for (name, *_), each in zip(entries, known, strict=True):
         if each.size:
-            shares, edges = np.histogram(each, _BINS, (-reach, reach))
+            counts, edges = np.histogram(each, _BINS, (-limit, limit))
             look = LINES.get(name, {"color": style.KINDS[2]})
-            side.stairs(100.0 * shares / each.size, edges, orientation="horizontal", **look)
-    panel.set_ylim(-reach, reach)
-    beyond = float((np.abs(together) > reach).mean())
+            side.stairs(100.0 * counts / each.size, edges, orientation="horizontal", **look)
+    panel.set_ylim(-limit, limit)
+    beyond = float((np.abs(together) > limit).mean())
     if beyond > 0.0:
         side.text(
             1.0,

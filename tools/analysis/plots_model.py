@@ -154,9 +154,9 @@ def _against_angle(
     panel.set_ylim(top=panel.get_ylim()[1] * 1.12)
     panel.margins(x=0.02)
     labels = [f"{depth * 1e3:g} mm" for depth in depths]
-    room, last = 0.045 * panel.get_ylim()[1], 0.0
+    gap, last = 0.045 * panel.get_ylim()[1], 0.0
     for (x, y), text in zip(ends, labels, strict=True):
-        if y - last < room:
+        if y - last < gap:
             continue
         last = y
         panel.annotate(
@@ -168,11 +168,11 @@ def _against_angle(
 
 def _depths(d: FloatArray) -> FloatArray:
     """A few round displacements [m] that span the measured ones, at least one."""
-    most = max(float(np.quantile(d, 0.995)), 2e-4) * 1e3
-    rough = most / _CURVES
+    largest = max(float(np.quantile(d, 0.995)), 2e-4) * 1e3
+    rough = largest / _CURVES
     decade = 10.0 ** np.floor(np.log10(rough))
     step = next(each * decade for each in (1.0, 2.0, 2.5, 5.0, 10.0) if each * decade >= rough)
-    depths: FloatArray = np.arange(1, int(np.ceil(most / step)) + 1) * step * 1e-3
+    depths: FloatArray = np.arange(1, int(np.ceil(largest / step)) + 1) * step * 1e-3
     return depths
 
 
@@ -220,27 +220,27 @@ def draw_map(panel: Axes, table: ContactTable, deepest: float, widest: float) ->
     limit = table.tip.theta_limit(d)
     contact = table(d[:, None], theta[None, :], edge=True)
     energy = np.ma.masked_where(~contact.inside, contact.energy * 1e3)
-    most = float(energy.max())
-    round_ones = {float(f"{most * (k / 8.0) ** 2:.2g}") for k in range(8)}
-    levels = np.array([*sorted(round_ones), most])
+    largest = float(energy.max())
+    round_ones = {float(f"{largest * (k / 8.0) ** 2:.2g}") for k in range(8)}
+    levels = np.array([*sorted(round_ones), largest])
     panel.contourf(
         theta * DEGREES,
         d * 1e3,
         energy,
         levels,
         cmap="Greys",
-        norm=PowerNorm(0.5, 0.0, 2.2 * most),
+        norm=PowerNorm(0.5, 0.0, 2.2 * largest),
     )
     lines = panel.contour(
         theta * DEGREES, d * 1e3, energy, levels[1:-1], colors=style.GREY, linewidths=0.5
     )
-    low = [level for level in levels[1:-1] if level < 0.65 * most]  # others run out of the frame
+    low = [level for level in levels[1:-1] if level < 0.65 * largest]  # others run out of the frame
     panel.clabel(lines, low, fmt=lambda level: f"{level:.3g} mJ", fontsize=6.5)
-    least = theta[np.argmin(energy, axis=1)]
-    local = np.abs(least) < 0.99 * widest  # a bonded solid tip's energy falls to the sides
+    minima = theta[np.argmin(energy, axis=1)]
+    local = np.abs(minima) < 0.99 * widest  # a bonded solid tip's energy falls to the sides
     if local.any():
         panel.plot(
-            np.where(local, least, np.nan) * DEGREES,
+            np.where(local, minima, np.nan) * DEGREES,
             d * 1e3,
             color=style.INK,
             linestyle=(0, (1, 1.2)),
@@ -269,8 +269,8 @@ def draw_path(panel: Axes, d: FloatArray, theta: FloatArray, finger: str) -> Non
     """Draw a finger's path over the map, with its start and end."""
     colour = LINES[finger]["color"]
     panel.plot(theta * DEGREES, d * 1e3, label=f"{finger} finger", **LINES[finger])
-    sound = np.flatnonzero(np.isfinite(d))
-    for at, marker in ((sound[0], "^"), (sound[-1], "s")):
+    valid = np.flatnonzero(np.isfinite(d))
+    for at, marker in ((valid[0], "^"), (valid[-1], "s")):
         panel.plot(
             theta[at] * DEGREES,
             d[at] * 1e3,

@@ -37,10 +37,10 @@ class Terms(NamedTuple):
 
     def energy(self, radius: float, modulus: float, d: FloatArray) -> FloatArray:
         """Return U(d, 0) by eq. 12 [J]."""
-        first, second, third = self.parts(radius, modulus, d)
+        first, second, third = self.terms(radius, modulus, d)
         return first + second + third
 
-    def parts(self, radius: float, modulus: float, d: FloatArray) -> tuple[FloatArray, ...]:
+    def terms(self, radius: float, modulus: float, d: FloatArray) -> tuple[FloatArray, ...]:
         """Return each term's contribution to eq. 12's energy [J]."""
         h = radius - d
         factor = 0.5 * modulus * h**2
@@ -84,8 +84,8 @@ def _appendix() -> tuple[Sheet, ...]:
         ("as printed", printed_terms(TIP.radius, metres)),
         ("integrated", integrated_terms(TIP.radius, metres)),
     ):
-        for name, part in zip(_TERMS, terms.parts(TIP.radius, MODULUS, metres), strict=True):
-            columns.append((f"{name} term {how}", "mJ", 1e3 * part))
+        for name, term in zip(_TERMS, terms.terms(TIP.radius, MODULUS, metres), strict=True):
+            columns.append((f"{name} term {how}", "mJ", 1e3 * term))
         columns.append((f"U {how}", "mJ", 1e3 * terms.energy(TIP.radius, MODULUS, metres)))
     theta_max, p = limits(TIP.radius, metres)
     columns += [("theta_max", "deg", np.degrees(theta_max)), ("p", "deg", np.degrees(p))]

@@ -96,9 +96,9 @@ def basin() -> tuple[Sheet, ...]:
 def _laws(laws: Sheet, *_: Sheet) -> Iterator[DrawnCurve]:
     starts = laws["put at"]
     for spring, text in ((0.0, "equal torques, no friction"), (1e9, "fingers locked")):
-        share = resting_ratio(_DEPTH, _WIDTH, spring, _FORCE, _LENGTHS)
+        ratio = resting_ratio(_DEPTH, _WIDTH, spring, _FORCE, _LENGTHS)
         line = {"color": GREY, "ls": "--" if spring else ":", "lw": 1.0}
-        yield DrawnCurve(starts, share * starts, line, f"closed form: {text}")
+        yield DrawnCurve(starts, ratio * starts, line, f"closed form: {text}")
     for law, color, marker in zip(LAWS, KINDS, MARKERS, strict=False):
         text = LAWS[law][1]
         yield DrawnCurve(starts, laws[f"left by {law}"], {"color": color, "marker": marker}, text)

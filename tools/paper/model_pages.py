@@ -169,7 +169,7 @@ class Plotted:
         """Return the paper's continuous line: πEd² or πEd³/3, in the figure's unit; d in mm."""
         return self.straight * MODULUS * np.asarray(d * MILLI) ** self.exponent * self.scale
 
-    def most(self, tilt: float) -> float:
+    def largest(self, tilt: float) -> float:
         """Return the value at 8 mm and this tilt [degrees], in the figure's unit."""
         cosine = np.cos(np.radians(tilt)) ** (self.exponent - 1)
         return float(self.at_zero_tilt(np.float64(8.0)) / cosine)
@@ -237,8 +237,8 @@ def _tilt_curves(quantity: Plotted, numbers: Sheet) -> Iterator[DrawnCurve]:
         yield DrawnCurve(theta, closed, style, end=f"d = {d} mm")
         look = CIRCLE | {"ms": 4, "mec": style["color"], "clip_on": False}
         yield DrawnCurve(theta[::10], integral[::10], look)
-        least = {"marker": "v", "ms": 6, "color": style["color"]}
-        yield DrawnCurve(0.0, closed[theta == 0.0], least)
+        marker = {"marker": "v", "ms": 6, "color": style["color"]}
+        yield DrawnCurve(0.0, closed[theta == 0.0], marker)
     yield from _key(quantity)
     look = {"marker": "v", "ms": 6, "color": INK, "linestyle": "none"}
     yield DrawnCurve([], [], look, "minimum")
@@ -258,7 +258,7 @@ def _straight(quantity: Plotted, axes: Axes, numbers: Sheet, _: Sheet) -> None:
     axes.annotate(
         f"continuous line:\n{quantity.symbol}(d, 0) = {quantity.power}",
         (6.0, float(numbers[f"{quantity.symbol} at 0 deg"][60])),
-        (5.4, 0.1 * quantity.most(30.0)),
+        (5.4, 0.1 * quantity.largest(30.0)),
         fontsize=7.5,
         color=INK,
         arrowprops={"arrowstyle": "->", "lw": 0.6, "color": GREY},
@@ -282,7 +282,7 @@ def _tilt_page(name: str, title: str, height: float, quantity: Plotted, **more: 
         partial(_tilt_curves, quantity),
         "θ [deg]",
         quantity.axis,
-        more={"xlim": (-25, 25), "ylim": (0, 1.16 * quantity.most(25.0))},
+        more={"xlim": (-25, 25), "ylim": (0, 1.16 * quantity.largest(25.0))},
         legend={"loc": "upper center", "ncols": 3},
     )
     return FigurePage(title, (5.2, height), partial(over_tilt, name, quantity), (panel,), **more)
@@ -293,7 +293,7 @@ def _depth_page(name: str, title: str, quantity: Plotted, **more: Any) -> Figure
         partial(_depth_curves, quantity),
         "displacement d [mm]",
         quantity.axis,
-        more={"xlim": (0, 8), "ylim": (0, 1.12 * quantity.most(30.0))},
+        more={"xlim": (0, 8), "ylim": (0, 1.12 * quantity.largest(30.0))},
         legend={"loc": "upper left"},
         annotate=partial(_straight, quantity),
     )

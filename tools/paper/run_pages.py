@@ -115,8 +115,8 @@ def _zero(axes: Axes, *_: Sheet) -> None:
     axes.axhline(0.0, color=GREY, linewidth=0.7)
 
 
-def _error_panel(symbol: str, title: str, label: str, most: float) -> Panel:
-    more = {"xlim": (0, 8), "ylim": (-1.3 * most, most)}
+def _error_panel(symbol: str, title: str, label: str, limit: float) -> Panel:
+    more = {"xlim": (0, 8), "ylim": (-1.3 * limit, limit)}
     legend = {"loc": "lower right", "ncols": 4, "title": "tilt"}
     curves = partial(_errors, symbol)
     return Panel(curves, "displacement d [mm]", label, title, more, legend, annotate=_zero)
@@ -125,12 +125,12 @@ def _error_panel(symbol: str, title: str, label: str, most: float) -> Panel:
 @cache
 def tilt_and_roll() -> tuple[Sheet, ...]:
     """Return rotation, the rolling at each displacement, and where force and energy are least."""
-    columns, least = [], []
+    columns, minima = [], []
     for depth in DEPTHS:
         run = runs.rolling(depth * MILLI)
         columns += _columns(run, f" at {depth} mm", -1.0)
         theta = -np.degrees(run.theta)
-        least.append(
+        minima.append(
             (
                 depth,
                 *_minimum(theta, run.force_found),
@@ -153,7 +153,7 @@ def tilt_and_roll() -> tuple[Sheet, ...]:
     return (
         sheet("fig10_run_rotation", *_columns(runs.rotation(), "", -1.0)),
         sheet("fig10_run_rolling", *columns),
-        summary("fig10_run_minimum", heads, least),
+        summary("fig10_run_minimum", heads, minima),
     )
 
 
@@ -170,16 +170,16 @@ def _minimum(theta: FloatArray, values: FloatArray) -> tuple[float, float]:
 
 def _along(symbol: str, rotation: Sheet, rolling: Sheet, _: Sheet) -> Iterator[DrawnCurve]:
     """Tabulate along the path: the rotation, then the rolling at 4 mm."""
-    for part, at, color, name in (
+    for piece, at, color, name in (
         (rotation, "", KINDS[1], "the finger rotates"),
         (rolling, f" at {_ROLLED_AT} mm", KINDS[0], "then the object rolls"),
     ):
-        yield DrawnCurve(part[f"theta{at}"], part[f"{symbol}{at}"], {"color": color}, name)
-        theta, found = part[f"theta estimated{at}"], part[f"{symbol} estimated{at}"]
+        yield DrawnCurve(piece[f"theta{at}"], piece[f"{symbol}{at}"], {"color": color}, name)
+        theta, found = piece[f"theta estimated{at}"], piece[f"{symbol} estimated{at}"]
         yield DrawnCurve(theta[::4], found[::4], _DOT, "estimated" if at else "")
 
 
-def _over_upright(_: Sheet, rolling: Sheet, least: Sheet) -> Iterator[DrawnCurve]:
+def _over_upright(_: Sheet, rolling: Sheet, minima: Sheet) -> Iterator[DrawnCurve]:
     for depth, style in zip(DEPTHS, ordered(len(DEPTHS)), strict=True):
         theta, model = rolling[f"theta at {depth} mm"], rolling[f"U at {depth} mm"]
         level = float(np.interp(0.0, theta, model))
@@ -188,9 +188,9 @@ def _over_upright(_: Sheet, rolling: Sheet, least: Sheet) -> Iterator[DrawnCurve
         yield DrawnCurve(theta, model / level, {"color": GREY, "linewidth": 0.7})
 
 
-def _least(axes: Axes, _: Sheet, rolling: Sheet, least: Sheet) -> None:
+def _show_minima(axes: Axes, _: Sheet, rolling: Sheet, minima: Sheet) -> None:
     """The least angles with their standard errors, enlarged, one line a displacement."""
-    found, error = least["angle of the least U estimated"], least["its standard error, U"]
+    found, error = minima["angle of the least U estimated"], minima["its standard error, U"]
     inset = axes.inset_axes((0.33, 0.14, 0.4, 0.28))
     for k, style in enumerate(ordered(len(DEPTHS))):
         inset.errorbar(found[k], -k, xerr=error[k], fmt="o", ms=3, color=style["color"], capsize=2)
@@ -202,7 +202,7 @@ def _least(axes: Axes, _: Sheet, rolling: Sheet, least: Sheet) -> None:
     inset.tick_params(labelsize=7, pad=1)
 
 
-def _angle_errors(_: Sheet, rolling: Sheet, least: Sheet) -> Iterator[DrawnCurve]:
+def _angle_errors(_: Sheet, rolling: Sheet, minima: Sheet) -> Iterator[DrawnCurve]:
     for depth, style in zip(DEPTHS, ordered(len(DEPTHS)), strict=True):
         theta = rolling[f"theta at {depth} mm"]
         off = rolling[f"theta estimated at {depth} mm"] - theta
@@ -262,7 +262,7 @@ PAGES = {
                 "U(θ)/U(0)",
                 "(c) energy while rolling, over U(0)",
                 _PATH | {"ylim": (0.86, 1.085)},
-                annotate=_least,
+                annotate=_show_minima,
             ),
             Panel(
                 _angle_errors,

@@ -127,8 +127,8 @@ def rolling(d: float, tip: Sections | None = None) -> SimulatedRun:
         "simulation": {"object_height": 0.2, "compression_speed": 0.0},
     }
 
-    def place(hand: SimulatedHand, share: float) -> None:
-        _roll(hand, d, -ROLLED * share)
+    def place(hand: SimulatedHand, fraction: float) -> None:
+        _roll(hand, d, -ROLLED * fraction)
 
     with _daemon(sections, tip) as daemon:
         return _collect(_frames(daemon, _ROLL_STEPS, place), daemon)

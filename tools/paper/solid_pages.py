@@ -49,7 +49,7 @@ _ROLLED: dict[str, tuple[str, str, Any]] = {
 _DOT: dict[str, Any] = CIRCLE | {"ms": 3, "mec": INK, "mew": 0.6}
 
 
-class Way(NamedTuple):
+class RollingPath(NamedTuple):
     """Columns of `research.solid_tip.ways`: mm, the paper's degrees; N and J for E = 1 Pa."""
 
     d: FloatArray
@@ -58,11 +58,11 @@ class Way(NamedTuple):
     energy: FloatArray
 
 
-def _way(name: str) -> Way:
+def _path(name: str) -> RollingPath:
     with np.load(_WAYS) as file:
         d, theta, _, _, force, energy = file[name].T
     size = runs.RADIUS**2
-    return Way(d * 20.0, -np.degrees(theta), force * size, energy * size * runs.RADIUS)
+    return RollingPath(d * 20.0, -np.degrees(theta), force * size, energy * size * runs.RADIUS)
 
 
 def _springs(d: FloatArray, tilt: float) -> FloatArray:
@@ -75,7 +75,7 @@ def offsets() -> tuple[Sheet, ...]:
 
     That is by least squares, F_springs = E F_solid − offset, upright, from 2 to 8 mm.
     """
-    pressed = _way("pressed_down")
+    pressed = _path("pressed_down")
     d = pressed.d.reshape(len(TILTS), -1)[0]
     force = {
         _FREE: np.array([_SOLID(d * MILLI, np.radians(tilt) + 0.0 * d).force for tilt in TILTS]),
@@ -128,28 +128,28 @@ def solid_runs() -> tuple[Sheet, ...]:
         ("F estimated", "N", run.force_found),
     )
     stuck = 1e6 * float(made[2]["modulus"][0])
-    columns, least = [], []
+    columns, minima = [], []
     for name in _ROLLED:
-        way = _way(name)
-        for d in np.unique(way.d):
-            at = way.d == d
-            theta, force, energy = way.theta[at], stuck * way.force[at], stuck * way.energy[at]
+        path = _path(name)
+        for d in np.unique(path.d):
+            at = path.d == d
+            theta, force, energy = path.theta[at], stuck * path.force[at], stuck * path.energy[at]
             columns += [
                 (f"theta, {name}, {d:.0f} mm", "deg", theta),
                 (f"F, {name}, {d:.0f} mm", "N", force),
                 (f"U, {name}, {d:.0f} mm", "mJ", 1e3 * energy),
             ]
-            least.append((d, _least(theta, force), _least(theta, energy)))
+            minima.append((d, _minimum(theta, force), _minimum(theta, energy)))
     heads = (("d", "mm"), ("angle of the least F", "deg"), ("angle of the least U", "deg"))
     return (
         *made,
         rolled,
         sheet("solid_run_ways", *columns),
-        summary("solid_run_minimum", heads, least),
+        summary("solid_run_minimum", heads, minima),
     )
 
 
-def _least(theta: FloatArray, values: FloatArray) -> float:
+def _minimum(theta: FloatArray, values: FloatArray) -> float:
     """Return where a cubic through all values is least; NaN if it still falls at the end."""
     tried = np.linspace(theta[0], theta[-1], 2001)
     place = int(np.argmin(np.polyval(np.polyfit(theta, values, 3), tried)))
@@ -181,7 +181,7 @@ def _over_springs(forces: Sheet, *_: Sheet) -> Iterator[DrawnCurve]:
 
 
 def _rolling(*sheets: Sheet) -> Iterator[DrawnCurve]:
-    run, ways = sheets[-3], sheets[-2]
+    run, paths = sheets[-3], sheets[-2]
     theta = run["theta"]
     upright = float(np.interp(0.0, theta, run["F"]))
     yield DrawnCurve(theta, 1.0 / np.cos(np.radians(theta)), {"color": INK}, "springs")
@@ -189,7 +189,7 @@ def _rolling(*sheets: Sheet) -> Iterator[DrawnCurve]:
     found = run["theta estimated"][::5], run["F estimated"][::5] / upright
     yield DrawnCurve(*found, _DOT, "estimated from frames")
     for name, (words, color, dash) in _ROLLED.items():
-        theta, force = (ways[f"{x}, {name}, {_ROLLED_AT} mm"] for x in ("theta", "F"))
+        theta, force = (paths[f"{x}, {name}, {_ROLLED_AT} mm"] for x in ("theta", "F"))
         over = force / float(np.interp(0.0, theta, force))
         yield DrawnCurve(theta, over, {"color": color, "linestyle": dash}, f"sticking: {words}")
 
@@ -214,12 +214,12 @@ def _zero(axes: Axes, *_: Sheet) -> None:
 
 def _least_angles(axes: Axes, *sheets: Sheet) -> None:
     axes.axvline(0.0, color=GREY, linewidth=0.7)
-    least, ways = sheets[-1], sheets[-2]
+    minima, paths = sheets[-1], sheets[-2]
     for name, (_, color, _) in _ROLLED.items():
         k = 2 * list(_ROLLED).index(name)
-        angle = float(least["angle of the least F"][k])
+        angle = float(minima["angle of the least F"][k])
         if np.isfinite(angle):
-            theta, force = (ways[f"{x}, {name}, {_ROLLED_AT} mm"] for x in ("theta", "F"))
+            theta, force = (paths[f"{x}, {name}, {_ROLLED_AT} mm"] for x in ("theta", "F"))
             value = float(np.interp(angle, theta, force) / np.interp(0.0, theta, force))
             axes.plot(angle, value, "v", color=color, ms=6)
 

@@ -148,8 +148,8 @@ class RecorderBeside:
         while not subscribed():
             if self._process.poll() is not None or time.monotonic() > deadline:
                 self._process.kill()
-                said = " ".join(part.strip() for part in self._process.communicate())
-                raise NoRecorder(said.strip() or "the recorder did not start")
+                output = " ".join(text.strip() for text in self._process.communicate())
+                raise NoRecorder(output.strip() or "the recorder did not start")
             time.sleep(0.01)
         self._watch = threading.Thread(target=self._wait, name="recorder", daemon=True)
         self._watch.start()

@@ -47,7 +47,7 @@ a plate on a stage, which presses a tip instead of the object, so that `calibrat
     tilt=10deg     of the plate (0)
     speed=2mm/s    of the way there (5)
     hold=1s        then it lifts off; a last press without it stays, others rest for 1 s. Where the
-                   last one ends, all begin anew
+                   last one ends, all begin again
     tip=left       or right (both)
   The log says what a tip feels where a plate has come to rest. The joints don't feel it.
 
@@ -57,7 +57,7 @@ a person's hand, which turns joints without torque, so that `calibrate joints` c
 the object, where it slipped away: --send place puts it back, at rest and without a load.
 
 what was on the servos' wire, for tests of a daemon: --send report prints it as JSON, --send forget
-begins the record anew, --send "report forget" does both without a gap:
+begins the record again, --send "report forget" does both without a gap:
   t, monotonic     the hand's time now [s], and time.monotonic() then
   servos           left first, of each:
     id, torque, mode, q, hardware_error, watchdog (time armed for [s], 0 when it is not, null after

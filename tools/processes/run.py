@@ -87,11 +87,11 @@ def _serve(
     build_kernels(settings, log.line, bar=arguments.log == "plain" and not arguments.log_file)
     daemon = None
 
-    def told(level: str, kind: str, text: str) -> None:
+    def on_event(level: str, kind: str, text: str) -> None:
         log.line(level, kind, text, **({} if daemon is None else _numbers(daemon.loop.state)))
 
     try:
-        daemon = Daemon(settings, on_event=told, table_cache=table_cache())
+        daemon = Daemon(settings, on_event=on_event, table_cache=table_cache())
     except (SoftfingerError, ValueError) as error:
         log.plain(f"softfinger: {error}", "error")
         return 2 if isinstance(error, SettingsError) else 1  # 2: a service is not started again

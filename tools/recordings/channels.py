@@ -34,7 +34,7 @@ _FOXGLOVE: dict[bytes, tuple[str, dict[str, Any]]] = {
         | {"file": _WORD, "line": _NUMBER},
     ),
 }
-_KEPT_AS = {"timestamp": "unix", "level": "severity"}
+_STORED_AS = {"timestamp": "unix", "level": "severity"}
 _LEVELS = {"info": 2, "warning": 3, "error": 4}  # Foxglove's; 0 is one that it doesn't know
 
 _MOST_CELLS = 4096  # in a row or column
@@ -81,7 +81,7 @@ def from_json(topic: bytes) -> Converter:
 
 
 def _kept_as(name: str, fields: dict[str, Any]) -> str:
-    return _KEPT_AS[name] if name in fields else name
+    return _STORED_AS[name] if name in fields else name
 
 
 def _as_it_is(message: dict[str, Any]) -> dict[str, Any]:
@@ -156,12 +156,12 @@ class _Restored:
         )
 
     def __call__(self, message: dict[str, Any]) -> dict[str, Any]:
-        if self._foxglove and _KEPT_AS["timestamp"] in message:
+        if self._foxglove and _STORED_AS["timestamp"] in message:
             for name in self._foxglove:
                 message.pop(name, None)
-            for name, kept in _KEPT_AS.items():
-                if kept in message:
-                    message[name] = message.pop(kept)
+            for name, stored in _STORED_AS.items():
+                if stored in message:
+                    message[name] = message.pop(stored)
             message = {name: message[name] for name in self._names if name in message} | message
         if self._image:
             message["data"] = base64.b64decode(message.get("data") or "")

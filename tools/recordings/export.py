@@ -89,12 +89,12 @@ def _rate(text: str) -> int:
 def _topics(words: list[str] | None, recorded: list[bytes]) -> list[bytes]:
     if words is None:
         return recorded
-    wanted = [(word if word.startswith("hand/") else f"hand/{word}").encode() for word in words]
-    for topic, word in zip(wanted, words, strict=True):
+    selected = [(word if word.startswith("hand/") else f"hand/{word}").encode() for word in words]
+    for topic, word in zip(selected, words, strict=True):
         if topic not in recorded:
             known = ", ".join(each.decode() for each in recorded) or "none"
             raise RecordingError(f"found topic {word!r}, the recording has {known}")
-    return wanted
+    return selected
 
 
 BLOCK = 2000  # rows

@@ -54,7 +54,7 @@ def samples(
 ) -> Iterator[Sample]:
     """Yield the newest state and frames at each 1/fps [s], from the first state with frames on.
 
-    Raises RecordingError when the daemon was started anew on the way.
+    Raises RecordingError when the daemon was restarted on the way.
     """
     newest: dict[str, TactileFrame] = {}
     last: Sample | None = None
@@ -150,8 +150,8 @@ def _info(fps: int, count: int, shape: dict[str, tuple[int, int, int]]) -> dict[
     }
     for name in FINGERS:
         names = ["height", "width", "channels"]
-        told = {"dtype": "image", "shape": [*shape[name]], "names": names}
-        features[f"observation.images.{IMAGES[name]}"] = told
+        feature = {"dtype": "image", "shape": [*shape[name]], "names": names}
+        features[f"observation.images.{IMAGES[name]}"] = feature
     features["timestamp"] = {"dtype": "float32", "shape": [1], "names": None}
     features |= {name: {"dtype": "int64", "shape": [1], "names": None} for name in _WHOLE}
     return {

@@ -115,20 +115,20 @@ class Recording:
         loads = orjson.loads
         begin = self._first + int(start * 1e9) if math.isfinite(start) else 0
         finish = self._first + int(end * 1e9) if math.isfinite(end) else 2**63
-        wanted: dict[int, tuple[bytes, Converter]] = {}
+        selected: dict[int, tuple[bytes, Converter]] = {}
         for number, name in self._names.items():
             topic = topic_of(name)
             if topics is None or topic in topics:
-                wanted[number] = topic, from_json(topic)
+                selected[number] = topic, from_json(topic)
         for chunk in self._chunks(progress):
             if chunk.message_end_time < begin or chunk.message_start_time > finish:
                 continue
             for record in self._records(chunk):
-                if not isinstance(record, Message) or record.channel_id not in wanted:
+                if not isinstance(record, Message) or record.channel_id not in selected:
                     continue
                 if not begin <= record.log_time <= finish:
                     continue
-                topic, convert = wanted[record.channel_id]
+                topic, convert = selected[record.channel_id]
                 try:
                     message = convert(loads(record.data))
                 except (ValueError, TypeError, AttributeError) as error:

@@ -144,7 +144,7 @@ class _Recorder:
                 self._show(now - began, now - last)
                 shown = now
         # What was sent before a signal may still be on its way: a daemon's last words among it.
-        self._take_rest(socket, _QUIET if ending.asked or not ending.over else 0.0)
+        self._read_remaining(socket, _QUIET if ending.asked or not ending.over else 0.0)
         return failure
 
     def _take_batch(self, socket: zmq.Socket[bytes]) -> int:
@@ -157,7 +157,7 @@ class _Recorder:
                 break
         return count
 
-    def _take_rest(self, socket: zmq.Socket[bytes], quiet: float) -> None:
+    def _read_remaining(self, socket: zmq.Socket[bytes], quiet: float) -> None:
         """Take the messages that wait, and those that arrive within ``quiet`` s."""
         began = time.monotonic()
         while not self._complete:

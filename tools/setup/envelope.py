@@ -121,7 +121,7 @@ def grasped(
     from softfinger.tools.watched import Watched
 
     weight = mass * _GRAVITY
-    told: dict[str, dict[str, Any]] = settings.model_dump(exclude_unset=True)
+    changed: dict[str, dict[str, Any]] = settings.model_dump(exclude_unset=True)
     changes: dict[str, dict[str, Any]] = {
         "simulation": {
             "object_shape": shape,
@@ -134,8 +134,8 @@ def grasped(
         "control": {"tip_friction": friction, "object_load": weight},
     }
     for name, values in changes.items():
-        told[name] = told.get(name, {}) | values
-    with Watched(told) as hand:
+        changed[name] = changed.get(name, {}) | values
+    with Watched(changed) as hand:
         hand.grasp(force)
         angle = float(hand.plant.object_pose[2])
         hand.run(_SETTLE)
@@ -145,11 +145,11 @@ def grasped(
         pull = weight * (1.0 + settings.simulation.table_friction)  # which the table would hold
         for k in range(_STEPS):
             load, phi = pull * (k + 1) / _STEPS, float(hand.plant.object_pose[2])
-            hand.plant.push(-load * math.sin(phi), load * math.cos(phi))
+            hand.plant.apply_load(-load * math.sin(phi), load * math.cos(phi))
             hand.run(_LIFT / _STEPS)
         hand.run(_AFTER)
-        moved = math.dist(hand.plant.object_pose[:2], before[:2])
-        if hand.mode != "holding" or moved > _AWAY:
+        shifted = math.dist(hand.plant.object_pose[:2], before[:2])
+        if hand.mode != "holding" or shifted > _AWAY:
             return Cell(LOST, math.nan)
         turned = abs(float(hand.plant.object_pose[2]) - angle)
         return Cell(TURNED if turned > _TURNED else HELD, turned)

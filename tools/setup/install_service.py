@@ -167,8 +167,8 @@ def rules(names: list[str]) -> str:
     lines = [_RULES]
     for pair in names:
         name, separator, serial = pair.partition("=")
-        sound = re.fullmatch(r"[A-Za-z0-9_./-]+", name) and ".." not in name and name[0] != "/"
-        if not (separator and sound and re.fullmatch(r"[A-Za-z0-9_.:-]+", serial)):
+        valid = re.fullmatch(r"[A-Za-z0-9_./-]+", name) and ".." not in name and name[0] != "/"
+        if not (separator and valid and re.fullmatch(r"[A-Za-z0-9_.:-]+", serial)):
             raise ValueError(f"found {pair!r}, expected NAME=SERIAL, as softfinger/servos=FT4THVRN")
         lines.append(
             f'SUBSYSTEM=="tty", ATTRS{{serial}}=="{serial}", SYMLINK+="{name}", TAG+="systemd"\n'

@@ -28,7 +28,7 @@ def run(arguments: argparse.Namespace) -> int:
     for wrapped in (False, False, True, True):
         table.add_column(no_wrap=not wrapped, overflow="fold")
     for row in LIMITS:
-        table.add_row(row.name, row.level, row.judged, "\n".join(_values(settings, row)))
+        table.add_row(row.name, row.level, row.quantity, "\n".join(_values(settings, row)))
     console = Console(width=120, highlight=False, markup=False)
     with console.capture() as printed:
         console.print(table)
@@ -38,7 +38,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _values(settings: Settings, row: Limit) -> list[str]:
     """Return the settings of a limit, each with the share of it that is the threshold."""
-    share = "" if row.share == 1.0 else f"{row.share:g} × "
+    share = "" if row.fraction == 1.0 else f"{row.fraction:g} × "
     return [f"{share}{key} = {_shown(_value(settings, key))}" for key in row.keys]
 
 

@@ -25,7 +25,7 @@ from softfinger.daemon.client.command_client import LOCALLY, UNCONFIRMED
 from softfinger.daemon.client.connection import PATIENCE, SILENCE, drain, subscribe, unpack
 from softfinger.daemon.client.records import read
 from softfinger.daemon.control.modes import UNLEASED
-from softfinger.daemon.types import FINGERS, GRIP_SHARE
+from softfinger.daemon.types import FINGERS, GRIP_FRACTION
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.local_stop import stop_locally
 
@@ -98,8 +98,8 @@ class RecentTicks(NamedTuple):
     rate: float = math.nan  # ticks a second
     compute: float = math.nan
     compute_max: float = math.nan
-    late: float = math.nan
-    late_max: float = math.nan
+    lateness: float = math.nan
+    lateness_max: float = math.nan
 
 
 class Feed:
@@ -121,9 +121,9 @@ class Feed:
         self.warm = math.inf  # °C from which a servo's temperature is warned about
         self._commanding = "", -math.inf  # who has the commander's lease, until when
         self._lease = math.nan  # s
-        self.asked = math.nan  # N of the last grasp command, of any client
+        self.commanded = math.nan  # N of the last grasp command, of any client
         self.force_default = math.nan  # N of a grasp without a force
-        self.force_most = math.inf  # N that a grip may be asked for
+        self.force_limit = math.inf  # N that a grip may be asked for
         self.skipped = 0
         self.history: deque[tuple[float, float]] = deque(maxlen=HISTORY_LENGTH)  # N, left, right
         self._bin: list[tuple[float, float]] = []
@@ -132,15 +132,15 @@ class Feed:
         self._waits: deque[tuple[float, float]] = deque(maxlen=10_000)
         self._period = 0.0  # s between states, smoothed
         self.topics: dict[bytes, Callable[[Any, float], None]] = {
-            schema.STATE: self._take_state,
-            schema.TACTILE: self._take_frame,
-            schema.EVENT: self._take_event,
-            schema.STATS: self._take_stats,
-            schema.COMMAND: self._take_command,
-            schema.SETTINGS: self._take_settings,
+            schema.STATE: self._read_state,
+            schema.TACTILE: self._read_frame,
+            schema.EVENT: self._read_event,
+            schema.STATS: self._read_stats,
+            schema.COMMAND: self._read_command,
+            schema.SETTINGS: self._read_settings,
         }
 
-    def take(self, message: list[bytes], now: float) -> None:
+    def read(self, message: list[bytes], now: float) -> None:
         """Read one message off the wire, of any content."""
         try:
             self.sort_in(*unpack(message), now)
@@ -155,14 +155,14 @@ class Feed:
         except (ValueError, TypeError, RecursionError):
             self.skipped += 1
 
-    def _take_state(self, state: schema.HandState, now: float) -> None:
+    def _read_state(self, state: schema.HandState, now: float) -> None:
         before = self.state
         if state.seq < before.seq:  # another daemon: a new story
             for each in (self._ticks, self._waits, self.history, self.frames, self._bin):
                 each.clear()
             self._period = 0.0
             self.times, self._commanding = None, ("", -math.inf)
-            self.asked = math.nan
+            self.commanded = math.nan
         elif before.mono_ns and 0.0 < (step := 1e-9 * (state.mono_ns - before.mono_ns)) < 60.0:
             self._period = step if self._period == 0.0 else 0.9 * self._period + 0.1 * step
             if (waited := state.behind_s - before.behind_s) > 0.0:
@@ -178,7 +178,7 @@ class Feed:
             self._bin_end = now + HISTORY_STEP
         self._bin.append((state.left.force, state.right.force))
 
-    def _take_frame(self, frame: schema.TactileFrame, now: float) -> None:
+    def _read_frame(self, frame: schema.TactileFrame, now: float) -> None:
         if frame.finger not in FINGERS:
             raise ValueError("not a frame of one of the fingers")
         known = 0.0 < frame.scale < math.inf
@@ -191,7 +191,7 @@ class Feed:
             aspect if 0.01 < aspect < 100.0 else 1.0,
         )
 
-    def _take_event(self, event: schema.Event, _: float) -> None:
+    def _read_event(self, event: schema.Event, _: float) -> None:
         # Told again for somebody who came later, it has its first seq and times; another daemon's
         # has other times.
         name = event.seq, event.timestamp
@@ -209,10 +209,10 @@ class Feed:
             insort(self.events, event, key=lambda each: each.timestamp)
         del self.events[:-EVENTS]
 
-    def _take_stats(self, times: schema.LoopStatistics, _: float) -> None:
+    def _read_stats(self, times: schema.LoopStatistics, _: float) -> None:
         self.times = times
 
-    def _take_command(self, answered: schema.AnsweredCommand, now: float) -> None:
+    def _read_command(self, answered: schema.AnsweredCommand, now: float) -> None:
         """Note who commands; show a refusal as an event, unless this page sent the command."""
         client = printable(answered.client)
         if answered.again:
@@ -223,17 +223,17 @@ class Feed:
             return
         if answered.command == "grasp":
             force = number(json.loads(answered.request or "{}"), "force")
-            self.asked = self.force_default if math.isnan(force) else force
+            self.commanded = self.force_default if math.isnan(force) else force
         if answered.command not in UNLEASED and self._lease > 0.0:
             self._commanding = client, now + self._lease
 
-    def _take_settings(self, message: schema.HandSettings, _: float) -> None:
+    def _read_settings(self, message: schema.HandSettings, _: float) -> None:
         settings = json.loads(message.settings or "{}")
         self._lease = number(settings, "commands", "lease")
         warm = number(settings, "safety", "temperature_warn")
         self.force_default = number(settings, "control", "force_default")
-        most = number(settings, "safety", "force_max")
-        self.force_most = math.inf if math.isnan(most) else GRIP_SHARE * most
+        limit = number(settings, "safety", "force_max")
+        self.force_limit = math.inf if math.isnan(limit) else GRIP_FRACTION * limit
         self.warm = math.inf if math.isnan(warm) else warm
 
     def news(self) -> list[ShownEvent]:
@@ -273,12 +273,12 @@ class Feed:
         if not self._ticks:
             return RecentTicks()
         _, *columns = zip(*self._ticks, strict=True)
-        (tick, _), compute, late = map(_spread, columns)
+        (tick, _), compute, lateness = map(_summary, columns)
         rate = 1.0 / tick if tick > 0.0 else math.nan
-        return RecentTicks(len(self._ticks) / WINDOW, rate, *compute, *late)
+        return RecentTicks(len(self._ticks) / WINDOW, rate, *compute, *lateness)
 
 
-def _spread(values: Iterable[float]) -> tuple[float, float]:
+def _summary(values: Iterable[float]) -> tuple[float, float]:
     """Median and largest of the finite ones, NaN without any."""
     finite = [value for value in values if math.isfinite(value)] or [math.nan]
     return statistics.median(finite), max(finite)
@@ -293,7 +293,7 @@ class FeedSubscriber:
 
     def drain(self, now: float) -> None:
         for message in drain(self._socket, _DRAIN_LIMIT):
-            self.feed.take(message, now)
+            self.feed.read(message, now)
 
 
 class ShownReply(NamedTuple):

@@ -66,8 +66,8 @@ def _overlaps(cells: int, pixels: int) -> FloatArray:
     edges = np.arange(pixels + 1) * (cells / pixels)
     low, high = edges[:-1, None], edges[1:, None]
     cell = np.arange(cells)[None, :]
-    share = np.clip(np.minimum(high, cell + 1.0) - np.maximum(low, cell), 0.0, None)
-    result: FloatArray = share / share.sum(axis=1, keepdims=True)
+    overlap = np.clip(np.minimum(high, cell + 1.0) - np.maximum(low, cell), 0.0, None)
+    result: FloatArray = overlap / overlap.sum(axis=1, keepdims=True)
     return result
 
 
@@ -140,21 +140,21 @@ def round_up(value: float) -> float:
 class FullScale:
     """End of a scale that follows a signal's peak: up at once, down only after a while."""
 
-    def __init__(self, least: float, patience: float = 3.0) -> None:
-        self._least = least
+    def __init__(self, smallest: float, patience: float = 3.0) -> None:
+        self._smallest = smallest
         self._patience = patience  # s below the next smaller scale before it shrinks
         self._since: float | None = None
-        self.value = least
+        self.value = smallest
 
     def follow(self, peak: float, now: float) -> float:
         """Return the scale's end for a signal that peaks at ``peak`` at time ``now`` [s]."""
-        wanted = max(self._least, round_up(peak)) if peak > 0.0 else self._least
-        if wanted >= self.value:
-            self.value = wanted
+        end = max(self._smallest, round_up(peak)) if peak > 0.0 else self._smallest
+        if end >= self.value:
+            self.value = end
             self._since = None
         elif self._since is None:
             self._since = now
         elif now - self._since > self._patience:
-            self.value = wanted
+            self.value = end
             self._since = None
         return self.value

@@ -70,7 +70,7 @@ class HandKeys:
         if not self._gripping or self._adding(now):
             return feed.force_default if math.isnan(self._chosen) else self._chosen
         # A grip's goal may be older than this page.
-        known = (feed.asked, feed.state.goal_force, self._chosen)
+        known = (feed.commanded, feed.state.goal_force, self._chosen)
         return next((force for force in known if not math.isnan(force)), math.nan)
 
     @property
@@ -83,16 +83,16 @@ class HandKeys:
         refused = reply is not None and not reply.ok and reply.at >= self._pressed
         return now - self._pressed < _BETWEEN and not refused
 
-    def _change_force(self, way: float, now: float) -> None:
+    def _change_force(self, sign: float, now: float) -> None:
         """Raise or lower the force to the next step; a grip follows at once."""
         present = self.force(now)
         if not math.isfinite(present):
             self._commander.refuse(now, "grasp: the hand's settings are not known yet")
             return
-        step = next(step for most, step in _STEPS if present + 0.01 * way <= most)
-        wanted = round(step * (round(present / step) + way), 3)
+        step = next(step for limit, step in _STEPS if present + 0.01 * sign <= limit)
+        target = round(step * (round(present / step) + sign), 3)
         # The daemon checks it.
-        self._chosen = min(max(wanted, step), self._feed.force_most)
+        self._chosen = min(max(target, step), self._feed.force_limit)
         self._pressed = now
         if self._gripping:
             self._grasp(now)
@@ -320,22 +320,22 @@ def _run_plain(address: str, subscriber: FeedSubscriber, ending: _Ending) -> Non
 def plain_line(feed: Feed, now: float) -> str:
     """Return the hand in one short line."""
     state = feed.state
-    parts = [_clock(), feed.mode or "—"]
+    texts = [_clock(), feed.mode or "—"]
     if feed.fault:
-        parts.append(f"FAULT {feed.fault}")
+        texts.append(f"FAULT {feed.fault}")
     for name in FINGERS:
         tip = getattr(state, name)
         force, d, theta = short(tip.force, 2), short(1e3 * tip.d, 2), _degrees(tip.theta)
-        parts.append(f"{name} {force} N {d} mm {theta}")
+        texts.append(f"{name} {force} N {d} mm {theta}")
     if math.isfinite(state.goal_force):
-        parts.append(f"goal {state.goal_force:.1f} N")
-    parts.append(f"object {_degrees(state.object.angle)}")
+        texts.append(f"goal {state.goal_force:.1f} N")
+    texts.append(f"object {_degrees(state.object.angle)}")
     tick = feed.statistics(now)
     rate, compute = short(tick.rate, 0), short(1e6 * tick.compute, 0)
-    parts.append(f"tick {rate} Hz {compute} µs overruns {state.overruns}")
+    texts.append(f"tick {rate} Hz {compute} µs overruns {state.overruns}")
     if feed.skipped:
-        parts.append(f"unreadable {feed.skipped}")
-    return "  ".join(parts)
+        texts.append(f"unreadable {feed.skipped}")
+    return "  ".join(texts)
 
 
 def _degrees(angle: float) -> str:

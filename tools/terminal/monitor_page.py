@@ -110,7 +110,7 @@ class MonitorPage:
             self._statistics = self.feed.statistics(now)
             self._statistics_at = now
         status = self.feed.status(now)
-        maps, trend, events = _shares(width, height)
+        maps, trend, events = _heights(width, height)
         numbers = [
             *self._body(width, maps, now),
             rule(width, Text(self._goal())),
@@ -142,8 +142,8 @@ class MonitorPage:
             sign, style = ("◐ stale", WARN) if status == "stale" else ("○ lost", BAD)
             right = Text(f"{sign} {short(feed.age(now), 1)} s ", style)
         unreadable = f"{feed.skipped} unreadable  " if feed.skipped else ""
-        room = width - left.cell_len - right.cell_len - 2
-        address = f"{self.address}  " if len(self.address + unreadable) <= room else ""
+        width_left = width - left.cell_len - right.cell_len - 2
+        address = f"{self.address}  " if len(self.address + unreadable) <= width_left else ""
         return apart(left, Text.assemble((unreadable, WARN), (address, DIM), right), width)
 
     def _notice(self, width: int, now: float, status: str) -> Text:
@@ -179,8 +179,8 @@ class MonitorPage:
         margin = " " * max(0, (width - 2 * box - 2 * gap - CENTRE) // 2)
         page = []
         for parts in zip(left, self._numbers(lines + 2), right, strict=True):
-            for part, room in zip(parts, (box, CENTRE, box), strict=True):
-                part.truncate(room, overflow="crop", pad=True)
+            for part, width_left in zip(parts, (box, CENTRE, box), strict=True):
+                part.truncate(width_left, overflow="crop", pad=True)
             page.append(Text.assemble(margin, parts[0], " " * gap, parts[1], " " * gap, parts[2]))
         return page
 
@@ -196,11 +196,11 @@ class MonitorPage:
             return [title, *picture, Text()]
         unit, factor, decimals = ("counts", 1.0, 0) if counts else ("kPa", 1e-3, 1)
         touch = getattr(self.feed.state, name).contact
-        said, style = ("contact", GOOD) if touch else ("free", DIM)
+        text, style = ("contact", GOOD) if touch else ("free", DIM)
         if now - frame.arrived > OLD:
-            said, style = "old", WARN
+            text, style = "old", WARN
         peak = Text(f"{frame.grid.max() * factor:.{decimals}f} {unit}")
-        title = apart(Text.assemble(title, (f" {said}", style)), peak, box)
+        title = apart(Text.assemble(title, (f" {text}", style)), peak, box)
         rows, cols = frame.grid.shape
         height, columns = heatmap.fit(rows, cols, lines, box, frame.aspect)
         above = (lines - height) // 2
@@ -259,11 +259,11 @@ class MonitorPage:
         angle = math.degrees(self.feed.state.goal_angle)
         if not math.isfinite(force):
             return ""
-        said = f"grip: goal {force:.1f} N"
-        asked = self.feed.asked
-        if force > _RAISED * asked:
-            said += f", raised from {asked:.1f} N"
-        return said + (f", object to {angle:.1f}°" if math.isfinite(angle) else "")
+        text = f"grip: goal {force:.1f} N"
+        commanded = self.feed.commanded
+        if force > _RAISED * commanded:
+            text += f", raised from {commanded:.1f} N"
+        return text + (f", object to {angle:.1f}°" if math.isfinite(angle) else "")
 
     def _trends(self, width: int, lines: int) -> list[Text]:
         """The recent history of both forces, ``lines`` of bars each."""
@@ -294,7 +294,10 @@ class MonitorPage:
         times: dict[str, tuple[float, ...]]
         if of_all is None:
             words = ("µs", "max")
-            times = {"compute": (now.compute, now.compute_max), "late": (now.late, now.late_max)}
+            times = {
+                "compute": (now.compute, now.compute_max),
+                "late": (now.lateness, now.lateness_max),
+            }
         else:
             spreads = {"compute": of_all.compute, "late": of_all.wake}
             times = {name: (each.p50, each.p99, each.max) for name, each in spreads.items()}
@@ -303,12 +306,12 @@ class MonitorPage:
         head.append(known, WARN if overruns > 0 else "default")
         full, slim = head.copy(), Text()
         for label, values in times.items():
-            said = [micro(value) for value in values]
+            text = [micro(value) for value in values]
             tail = "".join(
-                f" {word} {value}" for word, value in zip(words[1:], said[1:], strict=True)
+                f" {word} {value}" for word, value in zip(words[1:], text[1:], strict=True)
             )
-            full.append(f"  {label} ", DIM).append(f"{said[0]} µs").append(tail, DIM)
-            slim.append(f"  {label} ", DIM).append("/".join(said))
+            full.append(f"  {label} ", DIM).append(f"{text[0]} µs").append(tail, DIM)
+            slim.append(f"  {label} ", DIM).append("/".join(text))
         slim.append(" µs", DIM)
         named = Text.assemble(head, (f"  p50/{'/'.join(words[1:])}", DIM), slim)
         fitting = (line for line in (full, named) if line.cell_len <= width)
@@ -321,14 +324,14 @@ class MonitorPage:
         full: list[Text] = []
         if Text(self.feed.fault).cell_len > width - len(self._way_out) - 8:
             full = wrapped(Text(self.feed.fault, BAD), width - 2)
-        said = Text()
+        text = Text()
         if reply is not None and now - reply.at <= REPLY_TIME:
-            said = Text(f"{'✓' if reply.ok else '✗'} {reply.text}", GOOD if reply.ok else BAD)
-        if said.cell_len > width - len(title) - 9:
-            full += wrapped(said, width - 2)
-            said = Text()
+            text = Text(f"{'✓' if reply.ok else '✗'} {reply.text}", GOOD if reply.ok else BAD)
+        if text.cell_len > width - len(title) - 9:
+            full += wrapped(text, width - 2)
+            text = Text()
         full = full[:count]
-        return [rule(width, title, said), *full, *self._events(width, count - len(full))]
+        return [rule(width, title, text), *full, *self._events(width, count - len(full))]
 
     @property
     def _way_out(self) -> str:
@@ -366,7 +369,7 @@ def _named(keys: dict[str, str]) -> Text:
     return line
 
 
-def _shares(width: int, height: int) -> tuple[int, int, int]:
+def _heights(width: int, height: int) -> tuple[int, int, int]:
     """Lines of (each map, each trend, the events) on a page of this size."""
     spare = height - HEIGHT
     widest = (width - CENTRE - 2) // 4  # the maps' width is twice their height
@@ -378,12 +381,12 @@ def _shares(width: int, height: int) -> tuple[int, int, int]:
 
 
 def _too_small(width: int, height: int) -> list[Text]:
-    said = [
+    text = [
         "softfinger monitor",
         f"needs {WIDTH} × {HEIGHT},",
         f"this is {width} × {height}",
         "q quits, space stops",
     ]
-    lines = [Text() for _ in range(max(0, (height - len(said)) // 2))]
-    lines += [centred(cut(Text(line, WARN), width), width) for line in said]
+    lines = [Text() for _ in range(max(0, (height - len(text)) // 2))]
+    lines += [centred(cut(Text(line, WARN), width), width) for line in text]
     return (lines + [Text() for _ in range(height)])[:height]

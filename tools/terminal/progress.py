@@ -24,10 +24,10 @@ class Progress:
         if not self.on or time.monotonic() - self._shown < _STEP:
             return
         self._shown = time.monotonic()
-        share = min(done / self._total, 1.0)
-        full = round(share * _WIDTH)
+        fraction = min(done / self._total, 1.0)
+        full = round(fraction * _WIDTH)
         bar = "█" * full + "·" * (_WIDTH - full)
-        line = f"{self._what} {bar} {note or f'{share:4.0%}'}"
+        line = f"{self._what} {bar} {note or f'{fraction:4.0%}'}"
         columns = shutil.get_terminal_size().columns
         print(f"\r{line[: columns - 1]}\x1b[K", end="", file=sys.stderr, flush=True)
 

@@ -123,17 +123,17 @@ class Terminal:
 
     def draw(self, lines: Sequence[Text]) -> None:
         """Show ``lines``, each exactly as wide as the terminal."""
-        parts = []
+        output = []
         if (size := self.size()) != self._size:
             self._size = size
             self._shown = []
-            parts.append("\x1b[0m\x1b[2J")
+            output.append("\x1b[0m\x1b[2J")
         new = ["".join(map(self._render, self._segments(line))) for line in lines]
         for row, line in enumerate(new):
             if row >= len(self._shown) or line != self._shown[row]:
-                parts.append(f"\x1b[{row + 1};1H{line}")
-        if parts:
-            self._write(_HOLD + "".join(parts) + _SHOW)
+                output.append(f"\x1b[{row + 1};1H{line}")
+        if output:
+            self._write(_HOLD + "".join(output) + _SHOW)
         self._shown = new
 
     def _segments(self, line: Text) -> Iterable[Segment]:

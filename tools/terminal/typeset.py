@@ -15,15 +15,15 @@ DIM = "#8b929c"
 BARS = " ▁▂▃▄▅▆▇█"
 
 
-def cut(line: Text, room: int) -> Text:
-    """Return ``line`` in at most ``room`` columns, with an ellipsis where it was cut."""
-    line.truncate(max(room, 0), overflow="ellipsis")
+def cut(line: Text, columns: int) -> Text:
+    """Return ``line`` in at most ``columns`` columns, with an ellipsis where it was cut."""
+    line.truncate(max(columns, 0), overflow="ellipsis")
     return line
 
 
-def wrapped(line: Text, room: int) -> list[Text]:
-    """Return the first two lines of ``room`` columns, one in from the left."""
-    lines = line.wrap(Console(), room)[:2]
+def wrapped(line: Text, columns: int) -> list[Text]:
+    """Return the first two lines of ``columns`` columns, one in from the left."""
+    lines = line.wrap(Console(), columns)[:2]
     for each in lines:
         each.pad_left(1)
     return list(lines)

@@ -173,15 +173,15 @@ class CommandBar:
         """Show the newest reply; offer what the mode allows, but for stop, which always is."""
         self._commander.collect(time.monotonic())
         feed, reply = self._pictures.feed, self._commander.reply
-        shown = feed.mode, feed.force_most, reply
+        shown = feed.mode, feed.force_limit, reply
         if shown == self._shown:
             return
         self._shown = shown
         if reply is not None:
             words = f"{'✓' if reply.ok else '✗'} {reply.text}"
             ui.run_javascript(f"say({json.dumps(words)})")
-        if math.isfinite(feed.force_most):
-            self._force.props(f"max={feed.force_most:g}")
+        if math.isfinite(feed.force_limit):
+            self._force.props(f"max={feed.force_limit:g}")
         for command, buttons in self._buttons.items():
             for button in buttons:
                 button.set_enabled(feed.mode in COMMANDS[command][0])

@@ -345,7 +345,7 @@ class Pictures:
             if each.level == "warning" and self.time - each.timestamp < _LATELY
         ]
         if math.isfinite(state.goal_force):
-            asked = self.feed.asked
+            asked = self.feed.commanded
             raised = f", raised from {asked:.1f} N" if state.goal_force > 1.01 * asked else ""
             parts.append(f"grip: goal {state.goal_force:.1f} N{raised}")
         used = {

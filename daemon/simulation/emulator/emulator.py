@@ -276,9 +276,9 @@ class Emulator:
             if press := plate.reached(t):
                 self._tell(f"plate: {finger} {press}")
         if self._slipped is None:
-            most = _SLIPS * self._simulation.tip_friction
+            limit = _SLIPS * self._simulation.tip_friction
             tips = zip(self.hand.tangential.tolist(), self.hand.normal.tolist(), strict=True)
-            if any(normal > 0.0 and abs(along) >= most * normal for along, normal in tips):
+            if any(normal > 0.0 and abs(along) >= limit * normal for along, normal in tips):
                 self._slipped = self._stuck
             self._stuck = t
 
@@ -289,7 +289,7 @@ class Emulator:
 
         A time behind a word counts from now. With ``report`` among them the answer is
         :meth:`report` as JSON, and with ``goals`` each servo's newest goal currents are in it;
-        ``forget`` begins the record anew; ``place`` puts the object back where it was at the
+        ``forget`` begins the record again; ``place`` puts the object back where it was at the
         start, at rest and with no load on it. ``press …`` is for :meth:`press`, ``turn …`` for
         :meth:`turn`.
         """
@@ -368,15 +368,15 @@ class Emulator:
         """
         servos = self._servos.bus.report(t) if self._servos is not None else []
         if goals and self._servos is not None:
-            for told, servo in zip(servos, self._servos.bus.servos, strict=True):
-                told["goal_currents"] = servo.goal_currents()
+            for report_of, servo in zip(servos, self._servos.bus.servos, strict=True):
+                report_of["goal_currents"] = servo.goal_currents()
         pose = self.hand.object_pose.tolist()
         held = {"pose": pose, "pushed": self._pushed, "slipped": self._slipped}
         hand = {"servos": servos, "object": held, "force": self.hand.force.tolist()}
         return {"t": t, "monotonic": time.monotonic(), **hand}
 
     def _forget(self, t: float) -> None:
-        """Begin the record anew."""
+        """Begin the record again."""
         self._pushed = self._slipped = None
         self._stuck = t
         if self._servos is not None:

@@ -48,10 +48,10 @@ class LinkFolder:
         except OSError as error:
             raise FolderError(f"{path}: can't be used as --dir: {error.strerror}") from None
         for name in LINKS:
-            place = path / name
-            if place.exists() and not place.is_symlink():
+            link = path / name
+            if link.exists() and not link.is_symlink():
                 self.close()
-                raise FolderError(f"{place}: is in the way and is no link; move it elsewhere")
+                raise FolderError(f"{link}: is in the way and is no link; move it elsewhere")
 
     def _take(self, path: Path) -> int:
         while True:
@@ -75,12 +75,12 @@ class LinkFolder:
 
     def link(self, name: str, target: str) -> None:
         """Put the link ``name`` to ``target`` in place, whole at any instant."""
-        place = self.path / name
+        link = self.path / name
         fresh = self.path / f".{name}.{os.getpid()}"
         fresh.unlink(missing_ok=True)
         fresh.symlink_to(target)
-        fresh.replace(place)
-        self._links[place] = target
+        fresh.replace(link)
+        self._links[link] = target
 
     def unlink(self, name: str) -> None:
         """Remove the link ``name``, unless it leads elsewhere by now."""
@@ -91,8 +91,8 @@ class LinkFolder:
 
     def close(self) -> None:
         """Remove what is ours: the links, unless they lead elsewhere by now, and the lock."""
-        for place in list(self._links):
-            self.unlink(place.name)
+        for link in list(self._links):
+            self.unlink(link.name)
         with contextlib.suppress(OSError):
             (self.path / _LOCK).unlink()
         with contextlib.suppress(OSError):

@@ -109,14 +109,14 @@ def _value(name: str, text: str) -> float:
 def _press(values: dict[str, float], table: ContactTable, scale: float) -> PlatePress:
     d, theta, pressure = values.get("depth", 0.0), values["tilt"], values.get("pressure", 0.0)
     # As far as the tip's law goes at that tilt.
-    most = 0.75 * table.tip.radius * (1.0 - abs(math.sin(theta)))
-    known = [(float(x), lookup(table.data, x, theta)) for x in np.linspace(0.0, most, 1001)]
+    d_max = 0.75 * table.tip.radius * (1.0 - abs(math.sin(theta)))
+    known = [(float(x), lookup(table.data, x, theta)) for x in np.linspace(0.0, d_max, 1001)]
     depths = [x for x, (*_, inside) in known if inside]
     forces = [scale * float(force) for _, (force, *_, inside) in known if inside]
     if "force" in values:
         d = float(np.interp(values["force"], forces, depths, right=math.inf))
     force, *_, inside = lookup(table.data, d, theta)
-    if d > most or not inside:
+    if d > d_max or not inside:
         raise PlateError(
             f"press: at {math.degrees(theta):g}° this tip takes {depths[-1] * 1e3:.2f} mm or "
             f"{forces[-1]:.1f} N at most"
@@ -134,13 +134,13 @@ class Plate:
             (None, False)
         ]  # from a knot on; if at rest
         self._round = math.inf, 1.0  # where rounds begin, and their length
-        self._told = -1
+        self._reported = -1
         self.arrives = 0.0  # when a sequence's last press is reached for the first time
 
     def go(self, presses: Sequence[PlatePress], t: float) -> None:
         """Lift off and do ``presses`` from ``t`` on: round after round if the last one ends."""
         d, (press, _) = max(self(t).d, -_CLEAR), self._doing[self._leg(t)]
-        self._t, self._d, self._doing, self._told = [t], [d], [], -1
+        self._t, self._d, self._doing, self._reported = [t], [d], [], -1
         self._add((d + _CLEAR) / _LIFT, -_CLEAR, press)
         begin = self._t[-1]
         for press in presses:
@@ -175,8 +175,8 @@ class Plate:
         """Return the press that has come to rest since the last call; None: none has."""
         leg = self._leg(t)
         press, rests = self._doing[leg]
-        fresh = rests and leg != self._told
-        self._told = leg if rests else -1
+        fresh = rests and leg != self._reported
+        self._reported = leg if rests else -1
         return press if fresh else None
 
     def _within(self, t: float) -> float:

@@ -47,7 +47,7 @@ class FrameWriter:
     def __init__(self) -> None:
         self._master, self._slave, self.path = open_pty()
         self.dropped = 0  # frames
-        self._rest = b""  # of a frame that the pty took only a part of
+        self._remaining = b""  # of a frame that the pty took only a part of
         self._unread = array.array("i", [0])
 
     def fileno(self) -> int:
@@ -59,16 +59,16 @@ class FrameWriter:
         if not self.flush() or self._unread_bytes() > min(len(frame), _TTY_ROOM):
             self.dropped += 1
             return False
-        self._rest = frame
+        self._remaining = frame
         self.flush()
         return True
 
     def flush(self) -> bool:
         """Write on with what is left of a frame; True when nothing is left."""
-        if self._rest:
+        if self._remaining:
             with contextlib.suppress(BlockingIOError):
-                self._rest = self._rest[os.write(self._master, self._rest) :]
-        return not self._rest
+                self._remaining = self._remaining[os.write(self._master, self._remaining) :]
+        return not self._remaining
 
     def drain(self) -> bytes:
         """Return the bytes that the client has written."""
@@ -115,14 +115,14 @@ class TactileBoard:
         """Frames are due at k/rate + delay [Hz, s]; ``seed`` drives the faults' chance."""
         self._source = source
         self._encoder = encoder
-        self._asked = not encoder.request
+        self._requested = not encoder.request
         self._rate = rate
         self._delay = delay
         self.faults: dict[str, float] = {}
         self._random = np.random.default_rng(seed)
         self.plug()
         self._seq = -1
-        self._kept: NDArray[np.uint16] | None = None  # the image that a frozen board repeats
+        self._frozen: NDArray[np.uint16] | None = None  # the image that a frozen board repeats
         self._due = -math.inf
         self.sent = 0  # frames
 
@@ -151,7 +151,7 @@ class TactileBoard:
         """Take what the client wrote: requests, where the board waits for them."""
         written = self._writer.drain() if self.plugged else b""
         if self._encoder.request and self._encoder.request in written:
-            self._asked = True
+            self._requested = True
 
     def next_event(self) -> float:
         """Return when :meth:`service` next has something to do [s]."""
@@ -169,11 +169,11 @@ class TactileBoard:
             self._due = min(self._due, t + _RETRY)
             return
         self._seq = frame.seq
-        if not self._asked or not self.plugged:
+        if not self._requested or not self.plugged:
             return
         data = self._spoil(frame)
         if data:
-            self._asked = not self._encoder.request
+            self._requested = not self._encoder.request
             self.sent += self._writer.send(data)
 
     def close(self) -> None:
@@ -184,8 +184,8 @@ class TactileBoard:
         if "silent" in faults:
             return b""
         if "frozen" in faults:
-            counts = counts if self._kept is None else self._kept
-        self._kept = counts
+            counts = counts if self._frozen is None else self._frozen
+        self._frozen = counts
         if "saturated" in faults:
             counts = np.full_like(counts, np.iinfo(counts.dtype).max)  # framings clip it
         elif "zero" in faults:

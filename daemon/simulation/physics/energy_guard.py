@@ -77,12 +77,12 @@ def work_done(plant: Plant) -> float:
     before, now = plant.earlier, plant.state
     work = 0.0
     for j in range(5):
-        way = now.position[j] - before.position[j]
+        displacement = now.position[j] - before.position[j]
         if j < 2:
-            most = max(before.current[j] * way, now.current[j] * way)
-            work += plant.parameters.torque_constant * most
+            largest = max(before.current[j] * displacement, now.current[j] * displacement)
+            work += plant.parameters.torque_constant * largest
         else:
-            work += plant.goals.push[j - 2] * way
+            work += plant.goals.load[j - 2] * displacement
     return work
 
 
@@ -100,32 +100,32 @@ def guard_step(plant: Plant, was_on_rim: bool) -> int:
     work = work_done(plant)
     limit = plant.allowed + work
     if was_on_rim or on_rim(plant):
-        most = min(limit, plant.energy + work)
+        allowed = min(limit, plant.energy + work)
     else:
-        most = limit + plant.parameters.tolerance * max(limit - weight, 0.0)
-    if energy <= most + _ROUNDING * (moving + abs(energy) + abs(weight)):
+        allowed = limit + plant.parameters.tolerance * max(limit - weight, 0.0)
+    if energy <= allowed + _ROUNDING * (moving + abs(energy) + abs(weight)):
         plant.energy = energy
         plant.allowed = min(energy, limit)
         return 0
     plant.guarded += 1
-    kept = moving - (energy - most)
-    share = math.sqrt(kept / moving) if kept > 0.0 else 0.0
+    remaining = moving - (energy - allowed)
+    scale = math.sqrt(remaining / moving) if remaining > 0.0 else 0.0
     for j in range(5):
-        plant.state.velocity[j] *= share
-    return 1 if kept >= 0.0 else 2
+        plant.state.velocity[j] *= scale
+    return 1 if remaining >= 0.0 else 2
 
 
 @inner_kernel
-def shorten(plant: Plant, share: float) -> None:
-    """Leave only ``share`` of the way and of the shears that the step brought."""
+def shorten(plant: Plant, scale: float) -> None:
+    """Leave only ``scale`` of the displacement and of the shears that the step brought."""
     before, now = plant.earlier, plant.state
     for j in range(5):
-        now.position[j] = before.position[j] + share * (now.position[j] - before.position[j])
+        now.position[j] = before.position[j] + scale * (now.position[j] - before.position[j])
     for j in range(2):
-        now.shear[j] = before.shear[j] + share * (now.shear[j] - before.shear[j])
+        now.shear[j] = before.shear[j] + scale * (now.shear[j] - before.shear[j])
     for j in range(SHEARS):
-        way = now.extra_shear[j] - before.extra_shear[j]
-        now.extra_shear[j] = before.extra_shear[j] + share * way
+        displacement = now.extra_shear[j] - before.extra_shear[j]
+        now.extra_shear[j] = before.extra_shear[j] + scale * displacement
 
 
 @inner_kernel

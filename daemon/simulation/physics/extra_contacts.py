@@ -36,8 +36,8 @@ from softfinger.daemon.simulation.physics.plant_state import (
 from softfinger.daemon.simulation.physics.tip import (
     D_MIN,
     clear_contact,
+    contact_forces,
     fade,
-    press,
     stiffen_by_rim,
 )
 from softfinger.kinematics.compiled.kernel import inner_kernel
@@ -91,25 +91,25 @@ def touch_palm(
             lever_y = u * ny + v * nx
         depth = -(height + lever_y)
         rate = -(y_rate + lever_x * turn_rate)
-        slide = x_rate - lever_y * turn_rate
+        slip_rate = x_rate - lever_y * turn_rate
         coming = max(depth, depth + p.step * rate) > 0.0
-        push = 0.0
+        normal = 0.0
         drag = 0.0
         loss = LOSS * STIFFNESS
         along = 0.0
         if depth > 0.0:
-            push = max(STIFFNESS * (depth + LOSS * rate), 0.0)
-            most = p.palm_friction * push
-            along = min(max(STIFFNESS * now.extra_shear[corner], -most), most)
+            normal = max(STIFFNESS * (depth + LOSS * rate), 0.0)
+            along_max = p.palm_friction * normal
+            along = min(max(STIFFNESS * now.extra_shear[corner], -along_max), along_max)
             energy += 0.5 * (STIFFNESS * depth * depth + along * along / STIFFNESS)
-            if slide != 0.0:
-                opposed = along if slide > 0.0 else -along
-                loss = min(loss, (most - opposed) / abs(slide))
-            drag = along + loss * slide
+            if slip_rate != 0.0:
+                opposed = along if slip_rate > 0.0 else -along
+                loss = min(loss, (along_max - opposed) / abs(slip_rate))
+            drag = along + loss * slip_rate
             plant.forces[2] -= drag
-            plant.forces[3] += push
-            plant.forces[4] += push * lever_x + drag * lever_y
-        stage.extra_rate[corner] = slide if depth > 0.0 else 0.0
+            plant.forces[3] += normal
+            plant.forces[4] += normal * lever_x + drag * lever_y
+        stage.extra_rate[corner] = slip_rate if depth > 0.0 else 0.0
         if is_first:
             now.extra_shear[corner] = along / STIFFNESS
             up = plant.extra[2 * corner]
@@ -132,24 +132,24 @@ def touch_palm(
 def tips_are_far(plant: Plant) -> bool:
     """Return whether both tips are too far from each other to be evaluated."""
     left, right = plant.fingers[0], plant.fingers[1]
-    way_x = right.x - left.x
-    way_y = right.y - left.y
+    apart_x = right.x - left.x
+    apart_y = right.y - left.y
     far = 2.0 * _FAR * plant.parameters.radius
-    return bool(way_x * way_x + way_y * way_y > far * far)
+    return bool(apart_x * apart_x + apart_y * apart_y > far * far)
 
 
 @inner_kernel
-def press_on_each_other(plant: Plant, table: Pointer, now: Motion, stage: Stage) -> bool:
+def tip_on_tip(plant: Plant, table: Pointer, now: Motion, stage: Stage) -> bool:
     """Evaluate both tips on each other and add their torques to the forces; may they touch?"""
     p = plant.parameters
     left, right = plant.fingers[0], plant.fingers[1]
-    way_x = right.x - left.x
-    way_y = right.y - left.y
-    apart = math.sqrt(way_x * way_x + way_y * way_y)
+    apart_x = right.x - left.x
+    apart_y = right.y - left.y
+    apart = math.sqrt(apart_x * apart_x + apart_y * apart_y)
     half = 0.5 * apart
     d = p.radius - half
-    ex = way_x / apart
-    ey = way_y / apart
+    ex = apart_x / apart
+    ey = apart_y / apart
     # v·e and v along e turned by a right angle.
     m1 = left.x_q * ex + left.y_q * ey
     m2 = right.x_q * ex + right.y_q * ey
@@ -158,8 +158,8 @@ def press_on_each_other(plant: Plant, table: Pointer, now: Motion, stage: Stage)
     q1_rate = now.velocity[0]
     q2_rate = now.velocity[1]
     rate_d = 0.5 * (m1 * q1_rate - m2 * q2_rate)
-    reach = max(p.step * rate_d, 0.0)
-    touching = bool(d + reach > D_MIN)
+    travel = max(p.step * rate_d, 0.0)
+    touching = bool(d + travel > D_MIN)
     slide1 = 0.5 * (half - t1)
     slide2 = 0.5 * (t2 - half)
     for finger in range(2):
@@ -183,14 +183,14 @@ def press_on_each_other(plant: Plant, table: Pointer, now: Motion, stage: Stage)
             by_q2 -= 1.0
         rim = rim_on_plane(p, tip)
         tip.rim = max(rim, 0.0)
-        tip.bend = 0.0
-        tip.reach = reach
+        tip.curvature = 0.0
+        tip.travel = travel
         tip.rate_d = rate_d
         tip.rate_theta = by_q1 * q1_rate + by_q2 * q2_rate
-        tip.slide = slide1 * q1_rate + slide2 * q2_rate
+        tip.slip_rate = slide1 * q1_rate + slide2 * q2_rate
         tip.shear = now.extra_shear[CORNERS + finger]
-        press(p, table, tip, 1.0)
-        if rim + reach > 0.0:
+        contact_forces(p, table, tip, 1.0)
+        if rim + travel > 0.0:
             stiffen_by_rim(p, tip)
         tangent = tip.tangent
         tip.rows[ALONG_D, 0] = 0.5 * m1
@@ -217,7 +217,7 @@ def touch_each_other(
     The first stage also hands their rows to the full matrix.
     """
     near = not tips_are_far(plant) or plant.parameters.shape == NO_OBJECT
-    touching = near and press_on_each_other(plant, table, now, stage)
+    touching = near and tip_on_tip(plant, table, now, stage)
     for finger in range(2):
         tip = stage.on_tip[finger]
         stage.extra_rate[CORNERS + finger] = tip.shear_rate if touching else 0.0

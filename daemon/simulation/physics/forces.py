@@ -83,15 +83,15 @@ def stop_stiffness(plant: Plant, joint: int) -> float:
 @inner_kernel
 def free_object(plant: Plant, now: Motion) -> None:
     """Add weight, loads and the table's friction to the object."""
-    p, push = plant.parameters, plant.goals.push
+    p, load = plant.parameters, plant.goals.load
     vx = now.velocity[2]
     vy = now.velocity[3]
     spin = now.velocity[4]
     drag = p.table_force / math.sqrt(vx * vx + vy * vy + p.table_speed**2)
     spin_drag = p.table_torque / math.sqrt(spin**2 + p.table_spin**2)
-    plant.forces[2] = p.mass * p.gravity[0] + push[0] - drag * vx
-    plant.forces[3] = p.mass * p.gravity[1] + push[1] - drag * vy
-    plant.forces[4] = push[2] - spin_drag * spin
+    plant.forces[2] = p.mass * p.gravity[0] + load[0] - drag * vx
+    plant.forces[3] = p.mass * p.gravity[1] + load[1] - drag * vy
+    plant.forces[4] = load[2] - spin_drag * spin
     plant.drag[2] = drag
     plant.drag[3] = drag
     plant.drag[4] = spin_drag
@@ -171,12 +171,12 @@ def script_x(plant: Plant, t: float) -> float:
     """Return x [m] of a scripted object at ``t``: from its start to the left tip, back, right."""
     p = plant.parameters
     x: float = p.script_x
-    left = p.script_reach[0]
-    right = p.script_reach[1]
+    left = p.script_travel[0]
+    right = p.script_travel[1]
     if p.script_speed > 0.0 and left + right > 0.0:
-        way = (p.script_speed * t) % (2.0 * (left + right))
-        if way <= 2.0 * left:
-            x += abs(left - way) - left
+        path = (p.script_speed * t) % (2.0 * (left + right))
+        if path <= 2.0 * left:
+            x += abs(left - path) - left
         else:
-            x += right - abs(right - (way - 2.0 * left))
+            x += right - abs(right - (path - 2.0 * left))
     return x

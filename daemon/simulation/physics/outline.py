@@ -68,13 +68,13 @@ def nearest_on_polygon(p: Parameters, u: float, v: float) -> tuple[float, float,
             to_u = 0.0
             to_v = 0.0
             for k in range(p.corners):
-                way_u = p.outline[k].x - u
-                way_v = p.outline[k].y - v
-                way = math.sqrt(way_u * way_u + way_v * way_v)
-                if way < distance:
-                    distance = way
-                    to_u = way_u / way
-                    to_v = way_v / way
+                to_corner_u = p.outline[k].x - u
+                to_corner_v = p.outline[k].y - v
+                length = math.sqrt(to_corner_u * to_corner_u + to_corner_v * to_corner_v)
+                if length < distance:
+                    distance = length
+                    to_u = to_corner_u / length
+                    to_v = to_corner_v / length
             return to_u, to_v, distance, 0.0
     return -p.outline[face].normal_x, -p.outline[face].normal_y, best, FACE
 

@@ -105,18 +105,18 @@ def _object(p: Parameters, settings: Settings) -> None:
         edge.x, edge.y, edge.normal_x, edge.normal_y, edge.length = values
     # κ of a face with that radius, see tip.py.
     curved = shape.roundness
-    p.share = math.sqrt(curved / (curved + settings.tip.radius)) if curved else 1.0
+    p.factor = math.sqrt(curved / (curved + settings.tip.radius)) if curved else 1.0
     if settings.tip.physics == "solid":
-        p.share = math.sqrt(p.share)
+        p.factor = math.sqrt(p.factor)
     p.mass = mass
     p.inertia = mass * shape.gyration**2
     p.gravity[:] = simulation.gravity
     # What gravity doesn't pull along the plane presses the object on the table.
     pressing = math.sqrt(max(STANDARD_GRAVITY**2 - math.hypot(*simulation.gravity) ** 2, 0.0))
     p.table_force = simulation.table_friction * mass * pressing
-    p.table_torque = p.table_force * shape.lever
+    p.table_torque = p.table_force * shape.mean_radius
     p.table_speed = TABLE_SPEED
-    p.table_spin = TABLE_SPEED / shape.lever
+    p.table_spin = TABLE_SPEED / shape.mean_radius
     # One finger alone can't hold anything: the object is then fixed to the bench.
     p.object_held = (
         shape.kind == NO_OBJECT
@@ -158,4 +158,4 @@ def _script(p: Parameters, settings: Settings) -> None:
     contacts = geometry_of(settings).contacts(settings.hand.open_angle, pose, width)
     ways = COMPRESSION_DEPTH * settings.tip.radius - contacts.d
     ways = np.maximum(ways / max(math.cos(simulation.object_angle), 0.1), 0.0)
-    p.script_reach[:] = ways * p.present
+    p.script_travel[:] = ways * p.present

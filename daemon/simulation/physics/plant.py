@@ -64,9 +64,9 @@ _GAMMA = 1.0 - math.sqrt(0.5)
 
 
 @inner_kernel
-def bounded(value: float, most: float) -> float:
-    """Return ``value`` within ± ``most``."""
-    return min(max(value, -most), most)
+def bounded(value: float, limit: float) -> float:
+    """Return ``value`` within ± ``limit``."""
+    return min(max(value, -limit), limit)
 
 
 @inner_kernel
@@ -81,12 +81,12 @@ def load_motors(plant: Plant, now: Motion, k: Motion, g: float) -> None:
     constant = p.torque_constant
     for j in range(2):
         reference = current_reference(plant, j, now.position[j], now.velocity[j])
-        way = k.position[j]
-        fall = g * plant.motor_by_q[j] * way / constant
+        displacement = k.position[j]
+        fall = g * plant.motor_by_q[j] * displacement / constant
         change = (reference - now.current[j] - 2.0 * lag * k.current[j]) / (lag + g) - fall
         k.current[j] = change
         torque = constant * (now.current[j] + g * change)
-        plant.load[j] += torque - g * stop_stiffness(plant, j) * way
+        plant.load[j] += torque - g * stop_stiffness(plant, j) * displacement
 
 
 @inner_kernel
@@ -177,17 +177,17 @@ def go_on(plant: Plant, h: float) -> None:
     for j in range(5):
         if p.joints_held if j < 2 else p.object_held:
             continue
-        way = h * (1.5 * first.position[j] + 0.5 * second.position[j])
+        displacement = h * (1.5 * first.position[j] + 0.5 * second.position[j])
         change = h * (1.5 * first.velocity[j] + 0.5 * second.velocity[j])
         # A step that would carry a tip past a quarter of its radius is far too long for what it
         # is asked: it goes that far, and what it loses by that is energy.
-        most = 0.25 * p.radius
+        limit = 0.25 * p.radius
         if j < 2:
-            most /= p.length + abs(p.offset)
+            limit /= p.length + abs(p.offset)
         elif j == 4:
-            most /= p.extent
-        state.position[j] += bounded(way, most)
-        state.velocity[j] = bounded(state.velocity[j] + change, most / h)
+            limit /= p.extent
+        state.position[j] += bounded(displacement, limit)
+        state.velocity[j] = bounded(state.velocity[j] + change, limit / h)
 
 
 @inner_kernel
@@ -236,12 +236,12 @@ def take_sample(plant: Plant, ring: Records[Sample]) -> None:
         now, before = felt_contact(plant, finger), plant.felt[finger]
         # Between what is touched before and after there is nothing to interpolate.
         same = feels_tip(plant, finger) == (plant.on_other_tip[finger] != 0)
-        share = back if same else 0.0
-        row.d[finger] = now.d - share * (now.d - before.d)
-        row.theta[finger] = now.theta - share * (now.theta - before.theta)
-        row.gain[finger] = now.gain - share * (now.gain - before.gain)
-        row.bend[finger] = now.bend
-        row.tangential[finger] = now.tangential - share * (now.tangential - before.tangential)
+        fraction = back if same else 0.0
+        row.d[finger] = now.d - fraction * (now.d - before.d)
+        row.theta[finger] = now.theta - fraction * (now.theta - before.theta)
+        row.gain[finger] = now.gain - fraction * (now.gain - before.gain)
+        row.curvature[finger] = now.curvature
+        row.tangential[finger] = now.tangential - fraction * (now.tangential - before.tangential)
     plant.samples += 1
 
 

@@ -61,7 +61,7 @@ class Sample(Record):
     d: Pair
     theta: Pair
     gain: Pair
-    bend: Pair
+    curvature: Pair
     tangential: Pair
 
 
@@ -99,7 +99,7 @@ class Parameters(Record):
     half_width: float  # [m]
     half_height: float  # [m]
     roundness: float  # radius of a disc [m]
-    share: float  # stiffness of a tip on the object over that on a plane
+    factor: float  # stiffness of a tip on the object over that on a plane
     extent: float  # farthest point from the object's centre [m]
     corners: int  # that it has
     outline: Annotated[Records[Edge], CORNERS]  # counter-clockwise
@@ -129,7 +129,7 @@ class Parameters(Record):
     joints_held: bool
     object_held: bool
     script_speed: float  # of a held object's to and fro; 0 leaves it still [m/s]
-    script_reach: Pair  # how far it goes to the left and to the right [m]
+    script_travel: Pair  # how far it goes to the left and to the right [m]
     script_x: float  # where it starts [m]
 
 
@@ -140,7 +140,7 @@ class Goals(Record):
     torque_on: Flags
     q: Pair  # [rad]
     current: Pair  # [A]
-    push: Three  # external force x, y [N] and torque [N·m] on the object
+    load: Three  # external force x, y [N] and torque [N·m] on the object
 
 
 class Finger(Record):
@@ -166,13 +166,13 @@ class TipContact(Record):
     cosine: float
     tangent: float  # tan θ, 0 where nothing soft is left
     gain: float  # of the force against a plane: w(θ) and the face's curvature
-    bend: float  # curvature of what is touched [1/m]
-    reach: float  # how much deeper the step may lead [m]
+    curvature: float  # curvature of what is touched [1/m]
+    travel: float  # how much deeper the step may lead [m]
     rate_d: float  # [m/s]
     rate_theta: float  # [rad/s]
-    slide: float  # velocity of what is touched less the tip's, along t [m/s]
+    slip_rate: float  # velocity of what is touched less the tip's, along t [m/s]
     shear: float  # d_t within its limits [m]
-    spread: float  # variance of its layers' shears [m²]
+    shear_variance: float  # variance of its layers' shears [m²]
     shear_rate: float  # stick rate of d_t [m/s]
     force: float  # total force on the tip's base, what a pressure grid sums to [N]
     energy: float  # elastic [J]
@@ -249,7 +249,7 @@ class Plant(Record):
     motor_by_q: Pair  # slopes of the motors' torques for the matrix
     motor_by_rate: Pair
     layers: Annotated[FloatArray, 2, LAYERS]  # shear of each tip's layers [m]
-    spread: Pair  # their variance [m²]
+    shear_variance: Pair  # their variance [m²]
     palm_energy: float  # [J]
     tips_near: bool  # the tips on each other were evaluated
     coupled: bool  # an extra row may act in this step

@@ -29,7 +29,9 @@ class Shape:
     corners: FloatArray  # [n, 2], counter-clockwise; of a disc: those of the square round it
     roundness: float  # radius of a disc, else 0
     gyration: float  # radius of gyration
-    lever: float  # mean distance of its points from the centre: what spinning friction acts on
+    mean_radius: (
+        float  # mean distance of its points from the centre: what spinning friction acts on
+    )
 
     @property
     def extent(self) -> float:
@@ -49,9 +51,9 @@ class Shape:
 
     def edges(self) -> FloatArray:
         """Return the edges, float64 [n, 5]: start x, y, outward normal x, y, length."""
-        way = np.roll(self.corners, -1, axis=0) - self.corners
-        length = np.hypot(*way.T)
-        normal = np.stack((way[:, 1], -way[:, 0]), axis=1) / length[:, None]
+        edge = np.roll(self.corners, -1, axis=0) - self.corners
+        length = np.hypot(*edge.T)
+        normal = np.stack((edge[:, 1], -edge[:, 0]), axis=1) / length[:, None]
         return np.column_stack((self.corners, normal, length))
 
 

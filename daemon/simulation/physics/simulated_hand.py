@@ -74,10 +74,10 @@ class SimulatedHand:
         goals.mode[:] = CURRENT_BASED_POSITION_MODE
         # As many as may be on their way to a sensor's reader.
         latest = simulation.tactile_delay + simulation.tactile_jitter
-        kept = math.ceil(latest * settings.tactile.rate) + SPARE_SAMPLES
-        self._ring = np.zeros(kept, Sample.dtype)
+        stored = math.ceil(latest * settings.tactile.rate) + SPARE_SAMPLES
+        self._ring = np.zeros(stored, Sample.dtype)
         self._ring["number"] = -1
-        self._rows = [Sample(self._ring[k : k + 1]) for k in range(kept)]
+        self._rows = [Sample(self._ring[k : k + 1]) for k in range(stored)]
         self._done = 0
         self._torque_until = math.inf
         self._per_step = 1.0 / self.step
@@ -117,12 +117,12 @@ class SimulatedHand:
 
     def _advance(self, t: float) -> None:
         # The small addend keeps ticks that are multiples of the sub-step on their sub-step.
-        behind = int((t - self.start) * self._per_step + 1e-6) - self._done
-        most = int(LONGEST_ADVANCE * self._per_step)
-        while behind > 0:
-            count = min(behind, most)
+        remaining = int((t - self.start) * self._per_step + 1e-6) - self._done
+        steps_max = int(LONGEST_ADVANCE * self._per_step)
+        while remaining > 0:
+            count = min(remaining, steps_max)
             self._run(count)
-            behind -= count
+            remaining -= count
 
     def refresh(self) -> None:
         """Evaluate the contacts of a state that was written from outside; time stays."""
@@ -160,9 +160,9 @@ class SimulatedHand:
         """End both servos' torque at ``t`` [s]; infinity: don't."""
         self._torque_until = t
 
-    def push(self, force_x: float, force_y: float, torque: float = 0.0) -> None:
+    def apply_load(self, force_x: float, force_y: float, torque: float = 0.0) -> None:
         """Push the object with this force [N] and torque [N·m] from now on; zeros end it."""
-        self.plant.goals.push[:] = force_x, force_y, torque
+        self.plant.goals.load[:] = force_x, force_y, torque
 
     def load(self, push: float = 0.0, twist: float = 0.0) -> None:
         """Load the object from now on: along its faces, away from the palm [N], and round [N·m].
@@ -170,7 +170,7 @@ class SimulatedHand:
         The force keeps its direction when the object turns; zeros end it.
         """
         angle = self.object_pose.item(2)
-        self.push(-push * math.sin(angle), push * math.cos(angle), twist)
+        self.apply_load(-push * math.sin(angle), push * math.cos(angle), twist)
 
     @property
     def samples(self) -> int:
@@ -178,7 +178,7 @@ class SimulatedHand:
         return self.plant.samples
 
     @property
-    def kept_samples(self) -> int:
+    def stored_samples(self) -> int:
         """Number of newest samples that are stored."""
         return len(self._rows)
 

@@ -74,11 +74,11 @@ def factorise(plant: Plant, g: float) -> None:
     factors.l10 = b * first
     factors.l20 = d * first
     second = 1.0 / (c - factors.l10 * b)
-    rest = e - factors.l10 * d
-    factors.l21 = rest * second
+    remainder = e - factors.l10 * d
+    factors.l21 = remainder * second
     factors.pivot[0] = free * first
     factors.pivot[1] = free * second
-    factors.pivot[2] = free / (f - factors.l20 * d - factors.l21 * rest)
+    factors.pivot[2] = free / (f - factors.l20 * d - factors.l21 * remainder)
 
 
 @inner_kernel
@@ -177,10 +177,10 @@ def factorise_full(plant: Plant, g: float) -> None:
         pivot = full[k, k]
         inverse[k] = 1.0 / pivot
         for i in range(k + 1, 5):
-            share = full[i, k] / pivot
+            ratio = full[i, k] / pivot
             for j in range(k + 1, 5):
-                full[i, j] -= share * full[k, j]
-            full[i, k] = share
+                full[i, j] -= ratio * full[k, j]
+            full[i, k] = ratio
 
 
 @inner_kernel

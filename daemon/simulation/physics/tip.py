@@ -22,7 +22,7 @@ springs, for a constant modulus, a = 20 mm and d up to 8 mm, are within 1.6 % of
 within 4.5 % at 30° for R = 20 and 40 mm, within 3 % and 9 % for R = 10 mm. The sensor's frame is
 rendered from those springs (`sensor.curved_face`), so its sum differs by as much. A solid tip's
 force goes with d^(3/2) and by √κ, as Hertz's does between a sphere and a cylinder in the limit of
-small d; its frame is the plane's with that share.
+small d; its frame is the plane's times that.
 
 Friction is Coulomb's: d_t stays within the two shears at which |T| = μN. Where the model's own
 ratio |T|/N can't reach μ (with a constant E and s = 1 it can't exceed 1 at θ = 0), the tip slips at
@@ -90,9 +90,9 @@ def shear_limit(t1: float, n0: float, n1: float, n2: float, friction: float) -> 
     if friction <= 0.0 or n0 <= 0.0:
         return 0.0
     b = t1 - friction * n1
-    rest = b * b - 4.0 * friction * friction * n0 * n2
-    if b > 0.0 and rest >= 0.0:
-        return 2.0 * friction * n0 / (b + math.sqrt(rest))
+    root = b * b - 4.0 * friction * friction * n0 * n2
+    if b > 0.0 and root >= 0.0:
+        return 2.0 * friction * n0 / (b + math.sqrt(root))
     return math.sqrt(n0 / n2)
 
 
@@ -106,7 +106,7 @@ def clear_contact(tip: TipContact) -> None:
     tip.tangential = 0.0
     tip.shear = 0.0
     tip.shear_rate = 0.0
-    tip.bend = 0.0
+    tip.curvature = 0.0
     for r in range(3):
         tip.stiffness[r] = 0.0
         tip.damping[r] = 0.0
@@ -117,20 +117,30 @@ def clear_contact(tip: TipContact) -> None:
 
 
 @inner_kernel
-def press(p: Parameters, table: Pointer, tip: TipContact, share: float) -> None:
+def contact_forces(p: Parameters, table: Pointer, tip: TipContact, factor: float) -> None:
     """Compute forces, stiffness and losses of a ``tip`` along d, θ and d_t.
 
-    ``share`` is κ. Takes from the tip d, θ, reach, rates, slide, shear, spread and the rim; writes
-    the rest but what is over the coordinates.
+    With ζ the shear d_t, v its variance, γ = ``gain`` = w(θ) κ, ρ = ``ratio`` = s cos θ/d, within
+    the soft range:
+
+        T = t0 + t1 ζ             t0 = γ F sin θ,  t1 = 2 γ F ρ
+        N = n0 + n1 ζ + n2 ζ²     n0 = γ ∂U₀/∂d − t0 tan θ + ∂U_rim/∂d
+                                  n1 = γ ∂F/∂d sin θ − t1 tan θ,  n2 = γ ρ (∂F/∂d − F/d)
+        U = γ (U₀ + F sheared) + U_rim     sheared = ζ sin θ + ρ (ζ² + v)
+        |T| ≤ μ N bounds ζ on both sides of ``neutral`` = −d tan θ/2s, where T = 0
+        losses: loss · stiffness · rate    stiffness = γ/cos θ (∂F/∂d, 2d/3 ∂U₀/∂d) and t1
+
+    ``factor`` is κ. Takes from the tip d, θ, travel, rates, slip rate, shear, its variance and the
+    rim; writes the rest but what is over the coordinates.
     """
     d = tip.d
     sine = tip.sine
     cosine = tip.cosine
     shear = tip.shear
-    spread = tip.spread
+    shear_variance = tip.shear_variance
     gain, gain_theta = fade(tip.theta)
-    gain *= share
-    gain_theta *= share
+    gain *= factor
+    gain_theta *= factor
     along_d = 0.0
     along_theta = 0.0
     energy = 0.0
@@ -145,12 +155,12 @@ def press(p: Parameters, table: Pointer, tip: TipContact, share: float) -> None:
     stiffness_d = 0.0
     stiffness_theta = 0.0
     stiffness_t = 0.0
-    coming = 0.0  # stiffness of the soft part that the step may add
+    ahead = 0.0  # stiffness of the soft part that the step may add
     if gain > 0.0:
         inverse_cosine = 1.0 / cosine
         tangent = sine * inverse_cosine
-        coming = stiffness_ahead(table, 2.0 * math.pi * p.modulus * gain, tip.reach)
-        coming *= inverse_cosine
+        ahead = stiffness_ahead(table, 2.0 * math.pi * p.modulus * gain, tip.travel)
+        ahead *= inverse_cosine
     if gain > 0.0 and d > D_MIN:
         # The soft part within its range; d_soft_d, d_soft_theta are d_soft's derivatives.
         radius = p.radius
@@ -193,7 +203,7 @@ def press(p: Parameters, table: Pointer, tip: TipContact, share: float) -> None:
         n0 = gain * slope - t0 * tangent + along_d
         n1 = gain * d_soft_d * force_d * sine - t1 * tangent
         n2 = gain * d_soft_d * ratio * (force_d - force * inverse_d)
-        bend = max(n2, 0.25 * gain * force * ratio * inverse_d)
+        curvature = max(n2, 0.25 * gain * force * ratio * inverse_d)
         neutral = -0.5 * tangent * d_soft / firm  # where T = 0
         at_neutral = n0 + neutral * (n1 + neutral * n2)
         # Most steps are far from slip, which two comparisons tell.
@@ -201,24 +211,24 @@ def press(p: Parameters, table: Pointer, tip: TipContact, share: float) -> None:
         tangential = t0 + t1 * shear
         friction = p.friction
         # What was brought within the limits just now is within them.
-        most = friction * normal * (1.0 + _WITHIN)
-        if abs(tangential) > most or bend * (shear - neutral) ** 2 > at_neutral:
+        stuck = friction * normal * (1.0 + _WITHIN)
+        if abs(tangential) > stuck or curvature * (shear - neutral) ** 2 > at_neutral:
             slope_there = n1 + 2.0 * n2 * neutral
-            highest = neutral + shear_limit(t1, at_neutral, slope_there, bend, friction)
-            lowest = neutral - shear_limit(t1, at_neutral, -slope_there, bend, friction)
+            highest = neutral + shear_limit(t1, at_neutral, slope_there, curvature, friction)
+            lowest = neutral - shear_limit(t1, at_neutral, -slope_there, curvature, friction)
             shear = min(max(shear, lowest), highest)
             normal = n0 + shear * (n1 + shear * n2)
             tangential = t0 + t1 * shear
-        normal += n2 * spread
+        normal += n2 * shear_variance
 
         # U's second term and its derivatives.
         bent = firm * sine * inverse_d
-        stretch = sine * shear + ratio * shear * shear + ratio * spread
-        by_soft = force_d * stretch - force * ratio * inverse_d * shear * shear
-        by_soft -= force * ratio * inverse_d * spread
-        by_theta = force_theta * stretch + force * shear * (cosine - bent * shear)
-        by_theta -= force * bent * spread
-        soft += force * stretch
+        sheared = sine * shear + ratio * shear * shear + ratio * shear_variance
+        by_soft = force_d * sheared - force * ratio * inverse_d * shear * shear
+        by_soft -= force * ratio * inverse_d * shear_variance
+        by_theta = force_theta * sheared + force * shear * (cosine - bent * shear)
+        by_theta -= force * bent * shear_variance
+        soft += force * sheared
         energy += gain * soft
         along_d += gain * (slope + d_soft_d * by_soft)
         along_theta += gain * (soft_theta + by_theta + d_soft_theta * by_soft) + gain_theta * soft
@@ -231,7 +241,7 @@ def press(p: Parameters, table: Pointer, tip: TipContact, share: float) -> None:
     # Losses: a tip that leaves doesn't pull, and shear's loss stays within friction. Stick is
     # without slide, but for the tan θ ḋ that keeps the virtual work consistent.
     rate_d = tip.rate_d
-    rate_t = tip.slide - tangent * rate_d
+    rate_t = tip.slip_rate - tangent * rate_d
     loss = p.loss
     loss_d = loss * stiffness_d
     if rate_d < 0.0:
@@ -240,8 +250,8 @@ def press(p: Parameters, table: Pointer, tip: TipContact, share: float) -> None:
     loss_t = loss * stiffness_t
     if rate_t != 0.0:
         opposed = tangential if rate_t > 0.0 else -tangential
-        least = max(p.friction * normal - opposed, 0.0)
-        loss_t = min(loss_t, least / abs(rate_t))
+        loss_max = max(p.friction * normal - opposed, 0.0)
+        loss_t = min(loss_t, loss_max / abs(rate_t))
     tip.gain = gain
     tip.tangent = tangent
     tip.force = gain * force
@@ -250,10 +260,10 @@ def press(p: Parameters, table: Pointer, tip: TipContact, share: float) -> None:
     tip.tangential = tangential
     tip.shear = shear
     tip.shear_rate = rate_t if d > D_MIN else 0.0
-    tip.stiffness[ALONG_D] = stiffness_d + coming
+    tip.stiffness[ALONG_D] = stiffness_d + ahead
     tip.stiffness[ALONG_THETA] = stiffness_theta
     tip.stiffness[ALONG_SHEAR] = stiffness_t
-    tip.damping[ALONG_D] = loss_d + loss * coming
+    tip.damping[ALONG_D] = loss_d + loss * ahead
     tip.damping[ALONG_THETA] = loss_theta
     tip.damping[ALONG_SHEAR] = loss_t
     tip.along[ALONG_D] = along_d + loss_d * rate_d
@@ -262,12 +272,12 @@ def press(p: Parameters, table: Pointer, tip: TipContact, share: float) -> None:
 
 
 @inner_kernel
-def set_row(tip: TipContact, r: int, q: float, x: float, y: float, turn: float) -> None:
+def set_row(tip: TipContact, r: int, q: float, x: float, y: float, rotation: float) -> None:
     """Set a row over (q, x, y, φ)."""
     tip.rows[r, 0] = q
     tip.rows[r, 1] = x
     tip.rows[r, 2] = y
-    tip.rows[r, 3] = turn
+    tip.rows[r, 3] = rotation
 
 
 @inner_kernel
@@ -311,26 +321,26 @@ def touch_object(
     # Rows over (q, x, y, φ); the contact point is at ``distance`` m from the tip's centre.
     px = rx + distance * mx
     py = ry + distance * my
-    turn_m = my * px - mx * py
-    turn_t = mx * px + my * py
+    rotation_m = my * px - mx * py
+    rotation_t = mx * px + my * py
     v_m = its.x_q * mx + its.y_q * my
     v_t = its.y_q * mx - its.x_q * my
     q_rate = now.velocity[finger]
     x_rate = now.velocity[2]
     y_rate = now.velocity[3]
-    turn_rate = now.velocity[4]
-    rate_d = v_m * q_rate - mx * x_rate - my * y_rate - turn_m * turn_rate
+    rotation_rate = now.velocity[4]
+    rate_d = v_m * q_rate - mx * x_rate - my * y_rate - rotation_m * rotation_rate
     # The integrator's matrix takes the stiffness of where the step leads, so that an impact meets
     # it at once; losses take that of here.
-    reach = max(p.step * rate_d, 0.0)
-    if d + reach <= D_MIN:
-        tip.gain = fade(theta)[0] * p.share
+    travel = max(p.step * rate_d, 0.0)
+    if d + travel <= D_MIN:
+        tip.gain = fade(theta)[0] * p.factor
         clear_contact(tip)
         return
     theta_q = side
     theta_x = 0.0
     theta_y = 0.0
-    theta_turn = 1.0
+    theta_rotation = 1.0
     if curved >= 0.0:
         # m turns with the way from the tip's centre to the centre of curvature, which is fixed in
         # the object: the corner itself, or the disc's centre.
@@ -338,40 +348,42 @@ def touch_object(
         theta_q -= v_t * inverse
         theta_x = -my * inverse
         theta_y = mx * inverse
-        theta_turn = (turn_t + curved) * inverse
+        theta_rotation = (rotation_t + curved) * inverse
     if curved > 0.0:
-        tip.bend = 1.0 / curved
+        tip.curvature = 1.0 / curved
         rim = rim_on_disc(p, tip, distance + curved)
     else:
-        tip.bend = 0.0
+        tip.curvature = 0.0
         rim = rim_on_plane(p, tip)
     tip.rim = max(rim, 0.0)
-    tip.reach = reach
+    tip.travel = travel
     tip.rate_d = rate_d
-    tip.rate_theta = theta_q * q_rate + theta_x * x_rate + theta_y * y_rate + theta_turn * turn_rate
+    tip.rate_theta = (
+        theta_q * q_rate + theta_x * x_rate + theta_y * y_rate + theta_rotation * rotation_rate
+    )
     # The object's velocity at the contact less the tip's, along t.
     t_q = side * distance - v_t
-    tip.slide = t_q * q_rate - my * x_rate + mx * y_rate + turn_t * turn_rate
+    tip.slip_rate = t_q * q_rate - my * x_rate + mx * y_rate + rotation_t * rotation_rate
     tip.shear = now.shear[finger]
-    tip.spread = plant.spread[finger]
-    press(p, table, tip, p.share)
-    if rim + reach > 0.0:
+    tip.shear_variance = plant.shear_variance[finger]
+    contact_forces(p, table, tip, p.factor)
+    if rim + travel > 0.0:
         stiffen_by_rim(p, tip)
     tangent = tip.tangent
     t_q -= tangent * v_m
     t_x = -my + tangent * mx
     t_y = mx + tangent * my
-    t_turn = turn_t + tangent * turn_m
-    set_row(tip, ALONG_D, v_m, -mx, -my, -turn_m)
-    set_row(tip, ALONG_THETA, theta_q, theta_x, theta_y, theta_turn)
-    set_row(tip, ALONG_SHEAR, t_q, t_x, t_y, t_turn)
+    t_rotation = rotation_t + tangent * rotation_m
+    set_row(tip, ALONG_D, v_m, -mx, -my, -rotation_m)
+    set_row(tip, ALONG_THETA, theta_q, theta_x, theta_y, theta_rotation)
+    set_row(tip, ALONG_SHEAR, t_q, t_x, t_y, t_rotation)
     along_d = tip.along[ALONG_D]
     along_theta = tip.along[ALONG_THETA]
     along_t = tip.along[ALONG_SHEAR]
     tip.forces[0] = -(along_d * v_m + along_theta * theta_q + along_t * t_q)
     tip.forces[1] = along_d * mx - along_theta * theta_x - along_t * t_x
     tip.forces[2] = along_d * my - along_theta * theta_y - along_t * t_y
-    tip.forces[3] = along_d * turn_m - along_theta * theta_turn - along_t * t_turn
+    tip.forces[3] = along_d * rotation_m - along_theta * theta_rotation - along_t * t_rotation
 
 
 @inner_kernel
@@ -384,7 +396,7 @@ def relax_shears(plant: Plant) -> None:
         if stiffness <= 0.0:
             for k in range(LAYERS):
                 layers[k] = 0.0
-            plant.spread[finger] = 0.0
+            plant.shear_variance[finger] = 0.0
             continue
         neutral = tip.shear - tip.tangential / stiffness
         shear = state.shear[finger]
@@ -397,11 +409,13 @@ def relax_shears(plant: Plant) -> None:
             brought = shear - mean
             shear = 0.0
             for k in range(LAYERS):
-                most = limit * (k + 0.5) / LAYERS
-                layers[k] = neutral + min(max(layers[k] + brought - neutral, -most), most)
+                layer_limit = limit * (k + 0.5) / LAYERS
+                layers[k] = neutral + min(
+                    max(layers[k] + brought - neutral, -layer_limit), layer_limit
+                )
                 shear += layers[k] / LAYERS
             square = 0.0
             for k in range(LAYERS):
                 square += (layers[k] - shear) ** 2
-            plant.spread[finger] = square / LAYERS
+            plant.shear_variance[finger] = square / LAYERS
         state.shear[finger] = shear

@@ -40,7 +40,7 @@ class CurvedContact(Record):
     n_y: float
     across_x: float  # unit vector at right angles to the axis in the base's plane
     across_y: float
-    bend: float  # curvature 1/R [1/m]
+    curvature: float  # curvature 1/R [1/m]
     grid: Grid
     face: Face
 
@@ -62,13 +62,13 @@ def render_curved(contacts: Records[CurvedContact], law: FloatArray, out: FloatA
     d = contact.d
     n_x = contact.n_x
     n_y = contact.n_y
-    bend = contact.bend
+    curvature = contact.curvature
     across_x = contact.across_x
     across_y = contact.across_y
     pitch_x = grid.pitch_x
     pitch_y = grid.pitch_y
     out[:] = 0.0
-    if not (d > 0.0 and bend > 0.0 and n_x * n_x + n_y * n_y < 1.0):
+    if not (d > 0.0 and curvature > 0.0 and n_x * n_x + n_y * n_y < 1.0):
         return
     # The cylinder lies behind its tangent plane, so it presses on no more cells than that.
     set_face(face, a, min(d, a), n_x, n_y)
@@ -77,11 +77,11 @@ def render_curved(contacts: Records[CurvedContact], law: FloatArray, out: FloatA
         return
     first_row, last_row = rows_touched(face, grid)
     first_col, last_col = cols_touched(face, grid)
-    roundness = 1.0 / bend
+    roundness = 1.0 / curvature
     away = a - d + roundness
     c_p = away * (n_x * across_x + n_y * across_y)
     c_z = away * math.sqrt(1.0 - n_x * n_x - n_y * n_y)
-    share = 1.0 / (_POINTS * _POINTS)
+    weight = 1.0 / (_POINTS * _POINTS)
     step_x = pitch_x / _POINTS
     step_y = pitch_y / _POINTS
     for i in range(first_row, last_row):
@@ -104,4 +104,4 @@ def render_curved(contacts: Records[CurvedContact], law: FloatArray, out: FloatA
                     z = max(c_z - math.sqrt(under), 0.0)
                     if z * z < square:
                         total += stress_at(law, 1.0 - z / math.sqrt(square))
-            out[i, j] = share * total
+            out[i, j] = weight * total

@@ -19,14 +19,19 @@ from softfinger.daemon.simulation.sensor.curved_face import CurvedContact, rende
 from softfinger.kinematics.compiled.kernel import kernel
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
-from softfinger.kinematics.sensing.blur import average, pieces
-from softfinger.kinematics.sensing.pressure_grid import Rendering, SensorGrid, render
+from softfinger.kinematics.sensing.pressure_grid import (
+    Rendering,
+    SensorGrid,
+    average,
+    blur_pieces,
+    render,
+)
 from softfinger.kinematics.sensing.solid_pressure import SolidPressure
 
 FloatArray = NDArray[np.float64]
 
 PLAYS = 4
-_MOST_PARTS = 3  # of a cell's side for the blur: within 2.5e-4 of the modulus
+_PIECES_MAX = 3  # of a cell's side for the blur: within 2.5e-4 of the modulus
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,8 +126,8 @@ class SensorModel:
         self._ends = (board.threshold, board.full_count)
         self._generator = np.random.Generator(np.random.SFC64(seed))
         shape = grid.shape
-        spread = self._generator.standard_normal(shape)
-        sensitivity = gain * np.maximum(1.0 + flaws.gain_spread * spread, 0.0) / self._per_count
+        deviations = self._generator.standard_normal(shape)
+        sensitivity = gain * np.maximum(1.0 + flaws.gain_spread * deviations, 0.0) / self._per_count
         for row, col in dead:
             sensitivity[row, col] = 0.0
         if flaws.dead > 0.0:
@@ -131,9 +136,9 @@ class SensorModel:
         self._pressure = self._rendered = np.zeros(shape)
         cells = grid
         if flaws.blur > 0.0:
-            n_x, n_y = (min(pieces(flaws.blur / pitch), _MOST_PARTS) for pitch in grid.pitches)
-            self._parts = n_x, n_y
-            self._stencils, cells = replace(grid, blur=flaws.blur).finer(self._parts)
+            n_x, n_y = (min(blur_pieces(flaws.blur / pitch), _PIECES_MAX) for pitch in grid.pitches)
+            self._pieces = n_x, n_y
+            self._stencils, cells = replace(grid, blur=flaws.blur).finer(self._pieces)
             self._rendered = np.zeros(cells.shape)
         self._columns = np.empty((cells.cols + 1, 2))
         self._solid: SolidPressure | None = None
@@ -155,7 +160,7 @@ class SensorModel:
         self._t: float | None = None
 
     @property
-    def live(self) -> NDArray[np.bool_]:
+    def active(self) -> NDArray[np.bool_]:
         """Cells that read anything, bool [rows, cols]."""
         return self._sensitivity > 0.0
 
@@ -171,14 +176,14 @@ class SensorModel:
         tilt_y: float,
         out: NDArray[np.uint16],
         t: float = 0.0,
-        bend: float = 0.0,
+        curvature: float = 0.0,
     ) -> None:
         """Write the next frame's counts into ``out``, uint16 [rows, cols] contiguous.
 
         ``d`` [m] ≤ 0 is no contact; tilts [rad] as for :meth:`SensorGrid.pressure`; ``t`` [s], for
-        creep and drift, is the frame's time; ``bend`` as for :meth:`press`.
+        creep and drift, is the frame's time; ``curvature`` as for :meth:`press`.
         """
-        self.press(d, tilt_x, tilt_y, t, bend)
+        self.press(d, tilt_x, tilt_y, t, curvature)
         self.read(out)
 
     def press(
@@ -187,15 +192,16 @@ class SensorModel:
         tilt_x: float,
         tilt_y: float,
         t: float = 0.0,
-        bend: float = 0.0,
-        share: float = 1.0,
+        curvature: float = 0.0,
+        fraction: float = 1.0,
         shear: float = 0.0,
     ) -> None:
         """Let the cells feel the contact of time ``t`` without reading them.
 
-        ``bend`` [1/m] is the face's curvature in the plane of ``tilt_x``, 0 for a plane face: that
-        of a cylinder whose axis is along the finger's y. A solid tip shows it as a ``share`` of the
-        plane's pressure alone, and it shows the ``shear`` [N] along x, as at the height a.
+        ``curvature`` [1/m] is the face's curvature in the plane of ``tilt_x``, 0 for a plane face:
+        that of a cylinder whose axis is along the finger's y. A solid tip shows it as a
+        ``fraction`` of the plane's pressure alone, and it shows the ``shear`` [N] along x, as at
+        the height a.
         """
         n_x, n_y = self.grid.to_sensor(math.sin(tilt_x), math.sin(tilt_y))
         flaws, pressure = self._flaws, self._pressure
@@ -203,17 +209,17 @@ class SensorModel:
         self._t = t
         if self._solid is not None:
             along = self.grid.to_sensor(shear, 0.0)
-            self._solid((d, n_x, n_y), share, pressure, along)
+            self._solid((d, n_x, n_y), fraction, pressure, along)
         else:
-            contact = self._curved if bend > 0.0 else self._plane
+            contact = self._curved if curvature > 0.0 else self._plane
             contact.d, contact.n_x, contact.n_y = d, n_x, n_y
-            if bend > 0.0:
-                self._curved.bend = bend
+            if curvature > 0.0:
+                self._curved.curvature = curvature
                 render_curved(self._curved.array, self._law, self._rendered)
             else:
                 render(self._plane.array, self._law, self._columns, self._rendered)
             if flaws.blur > 0.0:
-                pressure[:] = average(self._rendered, *self._stencils, self._parts)
+                pressure[:] = average(self._rendered, *self._stencils, self._pieces)
         if flaws.hysteresis > 0.0:
             hysteresis(pressure, flaws.hysteresis, self._plays)
         if flaws.creep > 0.0:
@@ -255,24 +261,24 @@ class SensorModel:
 # --- what a soft, resistive sensor does to the pressure: in place, on arrays [rows, cols] --------
 
 
-def hysteresis(pressure: FloatArray, excess: float, plays: FloatArray) -> None:
+def hysteresis(pressure: FloatArray, excess: float, memory: FloatArray) -> None:
     """Let each cell read more while it is unloaded than while it was loaded.
 
     A Prandtl-Ishlinskii sum of PLAYS generalised play operators: a cell's output is the mean of
-    their states ``plays`` [PLAYS, rows, cols]. Each follows the pressure p upwards at once and
+    their states ``memory`` [PLAYS, rows, cols]. Each follows the pressure p upwards at once and
     downwards only once it is above (1 + h_k) p, with h_k spread evenly over 0 … 2·excess. So the
     loading curve is the pressure itself, the unloading one ends at (1 + excess) p, loops close,
     inner loops lie within, and no pressure reads 0 whatever came before.
     """
     widths = 2.0 * excess * (np.arange(PLAYS) + 0.5) / PLAYS
-    np.minimum(plays, (1.0 + widths)[:, None, None] * pressure, out=plays)
-    np.maximum(plays, pressure, out=plays)
-    plays.mean(axis=0, out=pressure)
+    np.minimum(memory, (1.0 + widths)[:, None, None] * pressure, out=memory)
+    np.maximum(memory, pressure, out=memory)
+    memory.mean(axis=0, out=pressure)
 
 
 def creep(
     pressure: FloatArray,
-    share: float,
+    fraction: float,
     time: float,
     elapsed: float,
     before: FloatArray,
@@ -291,7 +297,7 @@ def creep(
     crept *= decay
     crept += (mean - decay) * before + (1.0 - mean) * pressure
     before[:] = pressure
-    pressure += share * crept
+    pressure += fraction * crept
 
 
 def drift(
@@ -302,19 +308,19 @@ def drift(
     ``offset`` starts at 0 with a fresh tare and ends up with the standard ``deviation``, forgetting
     over ``time`` [s]; ``normals`` are standard normal numbers.
     """
-    kept = math.exp(-elapsed / time)
-    offset *= kept
-    offset += deviation * math.sqrt(1.0 - kept * kept) * normals
+    decay = math.exp(-elapsed / time)
+    offset *= decay
+    offset += deviation * math.sqrt(1.0 - decay * decay) * normals
 
 
-def crosstalk(signal: FloatArray, share: float, rows: FloatArray, cols: FloatArray) -> None:
-    """Add crosstalk to every cell of each line: ``share`` of its line's mean signal.
+def crosstalk(signal: FloatArray, fraction: float, rows: FloatArray, cols: FloatArray) -> None:
+    """Add crosstalk to every cell of each line: ``fraction`` of its line's mean signal.
 
     Cells of a resistive matrix share their drive and sense lines, and current leaks along them.
     ``rows`` [rows] and ``cols`` [cols] take the lines' parts.
     """
-    np.multiply(share, signal.mean(axis=1), out=rows)
-    np.multiply(share, signal.mean(axis=0), out=cols)
+    np.multiply(fraction, signal.mean(axis=1), out=rows)
+    np.multiply(fraction, signal.mean(axis=0), out=cols)
 
 
 @kernel
@@ -322,7 +328,7 @@ def count(
     signal: FloatArray,
     offset: FloatArray,
     lines: tuple[FloatArray, FloatArray],
-    live: FloatArray,
+    active: FloatArray,
     noise: float,
     normals: FloatArray,
     ends: tuple[int, int],
@@ -330,15 +336,15 @@ def count(
 ) -> None:
     """Round signal + offset + both ``lines``' crosstalk + noise to counts, into ``out``.
 
-    All in counts. Cells of ``live`` 0 read 0; ``ends`` are the smallest count that is sent, below
+    All in counts. Cells of ``active`` 0 read 0; ``ends`` are the smallest count that is sent, below
     which goes 0, and the largest there is.
     """
     rows, cols = lines
-    least, full = ends
+    lowest, full = ends
     height, width = out.shape
     for i in range(height):
         for j in range(width):
             value = signal[i, j] + offset[i, j] + rows[i] + cols[j] + noise * normals[i, j] + 0.5
             value = min(max(value, 0.0), full + 0.5)
-            value = value if live[i, j] > 0.0 and value >= least else 0.0
+            value = value if active[i, j] > 0.0 and value >= lowest else 0.0
             out[i, j] = np.uint16(value)

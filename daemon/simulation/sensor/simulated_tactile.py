@@ -149,22 +149,22 @@ class SimulatedTactile:
             if touch.pressure > 0.0:
                 self._model.press_evenly(touch.pressure)
             return True
-        if number < self._hand.samples - self._hand.kept_samples:
+        if number < self._hand.samples - self._hand.stored_samples:
             return False
         sample = self._hand.sample(number)
         finger = self._finger
         d, theta = float(sample.d[finger]), float(sample.theta[finger])
-        share, bend = float(sample.gain[finger]), float(sample.bend[finger])
+        factor, curvature = float(sample.gain[finger]), float(sample.curvature[finger])
         if abs(theta) >= 0.5 * math.pi:
             d = 0.0
         if self._solid:
             shear = float(sample.tangential[finger]) * (1.0 - d / self._radius)
-            self._model.press(d, theta, 0.0, number * self._period, bend, share, shear)
+            self._model.press(d, theta, 0.0, number * self._period, curvature, factor, shear)
             return True
         # What is left without the curvature's own share, which the cells are to show themselves.
-        share *= math.sqrt(1.0 + bend * self._radius)
+        factor *= math.sqrt(1.0 + curvature * self._radius)
         # Force goes with d²: half a tip on the face's edge presses with half the force.
-        self._model.press(d * math.sqrt(share), theta, 0.0, number * self._period, bend)
+        self._model.press(d * math.sqrt(factor), theta, 0.0, number * self._period, curvature)
         return True
 
 

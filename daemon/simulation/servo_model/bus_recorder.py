@@ -13,7 +13,7 @@ from softfinger.daemon.simulation.servo_model.servo_joint import POSITION_MODES,
 
 FAR = 0.05  # rad between goal and present angle at torque on that count as far
 _WATCHED = frozenset((reg.GOAL_CURRENT, reg.GOAL_POSITION))
-_KEPT = 1000  # goal currents
+_CURRENTS_MAX = 1000  # goal currents
 
 
 class BusRecorder:
@@ -21,7 +21,7 @@ class BusRecorder:
 
     def __init__(self, t: float) -> None:
         self._goals: dict[int, tuple[int, int]] = {}  # register → least and greatest, counts
-        self._currents: deque[tuple[float, int]] = deque(maxlen=_KEPT)  # when, counts
+        self._currents: deque[tuple[float, int]] = deque(maxlen=_CURRENTS_MAX)  # when, counts
         self._refused = 0
         self._torque_on = 0  # how often
         self._torque_t: float | None = None

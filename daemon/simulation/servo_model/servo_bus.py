@@ -186,7 +186,7 @@ class ServoBus:
         return [servo.report(t) for servo in self.servos]
 
     def forget(self, t: float) -> None:
-        """Begin the record anew."""
+        """Begin the record again."""
         for servo in self.servos:
             servo.recorder = BusRecorder(t)
 
@@ -236,12 +236,12 @@ class ServoBus:
     def _group_read(
         self, instruction: int, data: bytes, servos: list[EmulatedServo], t: float
     ) -> list[TimedReply]:
-        wanted, piece = _wanted(instruction, data)
+        requested, piece = _requested(instruction, data)
         fast = instruction in _FAST_READS
         replies: list[TimedReply] = []
         block = b""
         crc, delay = 0, 0.0
-        for servo_id, address, length in wanted:
+        for servo_id, address, length in requested:
             same = [servo for servo in servos if servo.answers_reads(servo_id, fast)]
             if not same or (fast and len(same) > 1):
                 break
@@ -267,21 +267,21 @@ class ServoBus:
 
 
 @lru_cache(maxsize=32)
-def _wanted(instruction: int, data: bytes) -> tuple[list[tuple[int, int, int]], bytes]:
+def _requested(instruction: int, data: bytes) -> tuple[list[tuple[int, int, int]], bytes]:
     """ID, address and length of each span that a group read asks for, and how a fast reply begins.
 
     There are none where it is cut, or an ID stands in it twice.
     """
-    wanted: list[tuple[int, int, int]] = []
+    requested: list[tuple[int, int, int]] = []
     if instruction not in _SYNC_READS:
         if len(data) % _ITEM.size == 0:
-            wanted = list(_ITEM.iter_unpack(data))
+            requested = list(_ITEM.iter_unpack(data))
     elif len(data) >= 5:
         address, length = _SPAN.unpack_from(data)
-        wanted = [(servo_id, address, length) for servo_id in data[4:]]
-    if len({servo_id for servo_id, _, _ in wanted}) < len(wanted):
+        requested = [(servo_id, address, length) for servo_id in data[4:]]
+    if len({servo_id for servo_id, _, _ in requested}) < len(requested):
         return [], b""
-    return wanted, framing.fast_head(1 + sum(length + 4 for _, _, length in wanted))
+    return requested, framing.fast_head(1 + sum(length + 4 for _, _, length in requested))
 
 
 def _write_each(

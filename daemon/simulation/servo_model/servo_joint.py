@@ -277,8 +277,8 @@ class Profile:
             # The speed from which it can still stop at the target, over the coming step too.
             a = self.acceleration
             stop = math.sqrt(2.0 * a * abs(distance) + (a * dt / 2.0) ** 2) - a * dt / 2.0
-            wanted = math.copysign(min(limit, stop), distance)
-            change = max(-a * dt, min(a * dt, wanted - self.velocity))
+            speed = math.copysign(min(limit, stop), distance)
+            change = max(-a * dt, min(a * dt, speed - self.velocity))
             velocity = self.velocity + change
         else:
             velocity = math.copysign(min(limit, abs(distance) / dt), distance)
