@@ -221,9 +221,12 @@ class Feed:
             by = f" (to {client})" if client else ""
             self._happened(answered.timestamp, "warning", "refused", f"{answered.error}{by}")
             return
-        if answered.command == "grasp":
+        if answered.command in ("grasp", "hold"):
             force = number(json.loads(answered.request or "{}"), "force")
-            self.commanded = self.force_default if math.isnan(force) else force
+            if not math.isnan(force):
+                self.commanded = force
+            elif answered.command == "grasp":
+                self.commanded = self.force_default
         if answered.command not in UNLEASED and self._lease > 0.0:
             self._commanding = client, now + self._lease
 
