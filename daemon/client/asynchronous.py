@@ -21,7 +21,7 @@ _Record = TypeVar("_Record")
 
 
 class AsyncSubscription(Subscriber[_Record]):
-    """As `client.hand.Subscription`: ``async for record in hand.stream(): …``."""
+    """`client.hand.Subscription` for asyncio: ``async for record in hand.stream(): …``."""
 
     def __aiter__(self) -> AsyncIterator[_Record]:
         return self
@@ -30,7 +30,7 @@ class AsyncSubscription(Subscriber[_Record]):
         return await self.next(self._timeout)
 
     async def next(self, timeout: float | None) -> _Record:
-        """The next record. Raises NoStream when none comes within ``timeout`` s."""
+        """Return the next record. Raises NoStream when none comes within ``timeout`` s."""
         deadline = math.inf if timeout is None else time.monotonic() + timeout
         while True:
             left = max(deadline - time.monotonic(), 0.0)
@@ -61,7 +61,7 @@ class AsyncSubscription(Subscriber[_Record]):
 
 
 class AsyncHand(HandClient[Coroutine[Any, Any, None]]):
-    """As `client.hand.Hand`, in one event loop: ``async with AsyncHand() as hand: …``."""
+    """`client.hand.Hand` in one event loop: ``async with AsyncHand() as hand: …``."""
 
     _CONTEXT = zmq.asyncio.Context
     _states: AsyncSubscription[HandState] | None = None
@@ -73,7 +73,7 @@ class AsyncHand(HandClient[Coroutine[Any, Any, None]]):
         self.close()
 
     async def state(self, timeout: float | None = None) -> HandState:
-        """The next state to come, never one that has been waiting. Raises NoStream."""
+        """Return the next state to come, never one that has been waiting. Raises NoStream."""
         if self._states is None:
             self._states = self.stream()
         else:
@@ -81,7 +81,7 @@ class AsyncHand(HandClient[Coroutine[Any, Any, None]]):
         return await self._states.next(self.timeout if timeout is None else timeout)
 
     def stream(self, timeout: float | None = None) -> AsyncSubscription[HandState]:
-        """States one after the other, every one that is published."""
+        """Return states one after the other, every one that is published."""
         return self._subscription(STATE, timeout)
 
     def frames(self, timeout: float | None = None) -> AsyncSubscription[TactileFrame]:
@@ -89,7 +89,7 @@ class AsyncHand(HandClient[Coroutine[Any, Any, None]]):
         return self._subscription(TACTILE, timeout)
 
     def events(self, timeout: float | None = None) -> AsyncSubscription[Event]:
-        """The daemon's events: modes, faults, warnings."""
+        """Return the daemon's events: modes, faults, warnings."""
         return self._subscription(EVENT, timeout)
 
     def _subscription(self, topic: bytes, timeout: float | None) -> AsyncSubscription[Any]:
@@ -97,7 +97,7 @@ class AsyncHand(HandClient[Coroutine[Any, Any, None]]):
         return AsyncSubscription(self._context, self.stream_address, topic, timeout)
 
     async def collect(self, seconds: float) -> list[HandState]:
-        """All states of the next ``seconds`` s, by the daemon's clock. Raises NoStream."""
+        """Return all states of the next ``seconds`` s, by the daemon's clock. Raises NoStream."""
         async with self.stream(self.timeout) as states:
             collected = [await anext(states)]
             end = collected[0].mono_ns + round(seconds * 1e9)
@@ -110,7 +110,7 @@ class AsyncHand(HandClient[Coroutine[Any, Any, None]]):
     async def wait_for(
         self, condition: Callable[[HandState], object], timeout: float = 10.0
     ) -> HandState:
-        """The first state from now on for which ``condition`` holds.
+        """Return the first state from now on for which ``condition`` holds.
 
         Raises as `client.hand.Hand.wait_for` does.
         """
@@ -140,5 +140,5 @@ class AsyncHand(HandClient[Coroutine[Any, Any, None]]):
                 raise
 
     async def status(self) -> dict[str, Any]:
-        """The daemon's mode, fault, torque, and counters of servos and sensors."""
+        """Return the daemon's mode, fault, torque, and counters of servos and sensors."""
         return await self.command("status")

@@ -72,7 +72,7 @@ def send(
 
 
 def accepted(reply: dict[str, Any]) -> dict[str, Any]:
-    """The reply without ``ok``. Raises Refused with the reason when it is not ok.
+    """Return the reply without ``ok``. Raises Refused with the reason when it is not ok.
 
     A warning is logged when the servos have not confirmed that torque is off.
     """
@@ -84,7 +84,7 @@ def accepted(reply: dict[str, Any]) -> dict[str, Any]:
 
 
 def is_done(command: str, status: dict[str, Any]) -> bool:
-    """Whether a refused command asks for what is so already, by the daemon's status."""
+    """Return whether a refused command asks for what is so already, by the daemon's status."""
     mode = status.get("mode", "fault")
     if command == "arm":
         return mode not in ("disarmed", "fault")
@@ -94,7 +94,7 @@ def is_done(command: str, status: dict[str, Any]) -> bool:
 
 
 class HandClient(Generic[_Done]):
-    """What `Hand` and `AsyncHand` have in common: the addresses, and the commands by name.
+    """Shared by `Hand` and `AsyncHand`: the addresses, and the commands by name.
 
     Commands raise Refused with the daemon's reason, and NoAnswer. ``arm``, ``disarm``, ``clear``
     and ``release`` may be repeated: a hand that is armed stays armed.
@@ -150,7 +150,7 @@ class HandClient(Generic[_Done]):
         return self._carry_out("tare")
 
     def move(self, left: float | None = None, right: float | None = None) -> _Done:
-        """Joints to angles [rad]."""
+        """Move joints to angles [rad]."""
         angles = {"left": left, "right": right}
         return self._carry_out(
             "move", **{finger: angle for finger, angle in angles.items() if angle is not None}

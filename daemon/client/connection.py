@@ -1,4 +1,4 @@
-"""What all clients share: the daemon's addresses, the subscriber's socket, time-outs."""
+"""Shared by all clients: the daemon's addresses, the subscriber's socket, time-outs."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _MESSAGE_LIMIT = 4_000_000  # bytes; the largest grid is 131 kB
 
 
 def default_addresses() -> tuple[str, str]:
-    """Where the stream and the commands are, from SOFTFINGER_ADDRESS or this machine's.
+    """Return where stream and commands are, by SOFTFINGER_ADDRESS or on this machine.
 
     It is ``tcp://HOST``, with the usual ports, or both addresses with a comma between them.
     Raises SettingsError when it is neither.
@@ -45,7 +45,7 @@ def default_addresses() -> tuple[str, str]:
 def subscribe(
     context: zmq.Context[Any], address: str, *topics: bytes, queue: int = _QUEUE
 ) -> zmq.Socket[Any]:
-    """A socket subscribed to topics; ``queue`` messages wait in it for a slow program.
+    """Return a socket subscribed to topics; ``queue`` messages wait in it for a slow program.
 
     Raises zmq.ZMQError when the address can't be read.
     """
@@ -65,7 +65,7 @@ def subscribe(
 
 
 def drain(socket: zmq.Socket[Any], limit: int) -> Iterator[list[bytes]]:
-    """The messages that wait in a socket, at most ``limit``; never waits for one."""
+    """Yield the messages that wait in a socket, at most ``limit``; never wait for one."""
     for _ in range(limit):
         try:
             yield socket.recv_multipart(zmq.NOBLOCK)
@@ -86,5 +86,5 @@ def unpack(frames: list[bytes]) -> tuple[bytes, dict[str, Any]]:
 
 
 def still_waiting(what: str, timeout: float) -> str:
-    """The warning about something that has not come yet."""
+    """Return the warning about something that has not come yet."""
     return f"no {what} yet, waiting up to {timeout:g} s"

@@ -29,7 +29,7 @@ class Subscription(Subscriber[_Record]):
         return self.next(self._timeout)
 
     def next(self, timeout: float | None) -> _Record:
-        """The next record. Raises NoStream when none comes within ``timeout`` s.
+        """Return the next record. Raises NoStream when none comes within ``timeout`` s.
 
         A warning is logged when that takes long; without a timeout, silence may be as it should.
         """
@@ -81,7 +81,7 @@ class Hand(HandClient[None]):
         self.close()
 
     def state(self, timeout: float | None = None) -> HandState:
-        """The next state to come, never one that has been waiting. Raises NoStream."""
+        """Return the next state to come, never one that has been waiting. Raises NoStream."""
         if self._states is None:
             self._states = self.stream()
         else:
@@ -89,7 +89,7 @@ class Hand(HandClient[None]):
         return self._states.next(self.timeout if timeout is None else timeout)
 
     def stream(self, timeout: float | None = None) -> Subscription[HandState]:
-        """States one after the other, every one that is published."""
+        """Return states one after the other, every one that is published."""
         return self._subscription(STATE, timeout)
 
     def frames(self, timeout: float | None = None) -> Subscription[TactileFrame]:
@@ -97,7 +97,7 @@ class Hand(HandClient[None]):
         return self._subscription(TACTILE, timeout)
 
     def events(self, timeout: float | None = None) -> Subscription[Event]:
-        """The daemon's events: modes, faults, warnings."""
+        """Return the daemon's events: modes, faults, warnings."""
         return self._subscription(EVENT, timeout)
 
     def _subscription(self, topic: bytes, timeout: float | None) -> Subscription[Any]:
@@ -105,7 +105,7 @@ class Hand(HandClient[None]):
         return Subscription(self._context, self.stream_address, topic, timeout)
 
     def collect(self, seconds: float) -> list[HandState]:
-        """All states of the next ``seconds`` s, by the daemon's clock. Raises NoStream."""
+        """Return all states of the next ``seconds`` s, by the daemon's clock. Raises NoStream."""
         with self.stream(self.timeout) as states:
             collected = [next(states)]
             end = collected[0].mono_ns + round(seconds * 1e9)
@@ -118,7 +118,7 @@ class Hand(HandClient[None]):
     def wait_for(
         self, condition: Callable[[HandState], object], timeout: float = 10.0
     ) -> HandState:
-        """The first state from now on for which ``condition`` holds.
+        """Return the first state from now on for which ``condition`` holds.
 
         Raises NotInTime after ``timeout`` s, HandFault as soon as the hand has a fault (unless the
         condition holds then), and NoStream when nothing comes at all.
@@ -146,5 +146,5 @@ class Hand(HandClient[None]):
                 raise
 
     def status(self) -> dict[str, Any]:
-        """The daemon's mode, fault, torque, and counters of servos and sensors."""
+        """Return the daemon's mode, fault, torque, and counters of servos and sensors."""
         return self.command("status")

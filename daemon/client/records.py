@@ -23,7 +23,7 @@ _Record = TypeVar("_Record")
 
 
 def read(record: type[_Record], message: object) -> _Record:
-    """A topic's map as its record of `wire.schema`.
+    """Return a topic's map as its record of `wire.schema`.
 
     Raises ValueError for a tactile frame that is no grid.
     """
@@ -53,7 +53,7 @@ _CONVERTERS: dict[Any, Callable[[object], Any]] = {
 
 
 def to_columns(states: Iterable[HandState]) -> dict[str, NDArray[Any]]:
-    """States as one array a field, nested ones with a dot (``left.force``), in their order.
+    """Return states as one array a field, nested ones with a dot (``left.force``), in their order.
 
     ``pandas.DataFrame(to_columns(states))`` takes it as it is.
     """

@@ -75,7 +75,7 @@ class Unpacker(Generic[_Record]):
         self.unreadable = 0
 
     def take(self, frames: list[bytes]) -> _Record | None:
-        """The record of one message, None when it can't be read or was received before."""
+        """Return the record of one message, None when it can't be read or was received before."""
         try:
             _, message = unpack(frames)
             record = read(self._record, message)
@@ -99,7 +99,7 @@ class Unpacker(Generic[_Record]):
         _log.warning(still_waiting(f"{self._topic.decode()} from {self._address}", timeout))
 
     def no_stream(self, timeout: float) -> NoStream:
-        """The exception when nothing has come at all."""
+        """Return the exception when nothing has come at all."""
         return NoStream(
             f"no {self._topic.decode()} from {self._address} within {timeout:g} s; "
             "is softfinger running?"
@@ -144,14 +144,14 @@ class Wait:
         self._last: HandState | None = None
 
     def left(self) -> float:
-        """How long the next state may take [s]. Raises NotInTime after the end."""
+        """Return how long the next state may take [s]. Raises NotInTime after the end."""
         left = self._end - time.monotonic()
         if left <= 0.0 and self._last is not None:
             raise self.over("")
         return max(left, 0.0)
 
     def ends_with(self, state: HandState) -> bool:
-        """Whether the condition holds. Raises HandFault when the hand has a fault instead."""
+        """Return whether the condition holds. Raises HandFault for a hand in fault."""
         self._last = state
         if self._condition(state):
             return True
@@ -160,7 +160,7 @@ class Wait:
         return False
 
     def over(self, address: str) -> NotInTime | NoStream:
-        """The exception when no further state came."""
+        """Return the exception when no further state came."""
         if self._last is None:
             return Unpacker[HandState](address, STATE).no_stream(self._timeout)
         return NotInTime(

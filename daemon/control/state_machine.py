@@ -150,7 +150,7 @@ class Control:
         return angle
 
     def _unsettle(self) -> None:
-        """What is asked for has changed: the grip is still again once it is there."""
+        """Take that what is asked for has changed: the grip is still again once it is there."""
         force, angle = self._still_at
         grip = self._grip
         if self._still and not (

@@ -1,4 +1,4 @@
-"""Who is let in: pyzmq's authenticator, by the folder of keys where there is one.
+"""Admission of clients: pyzmq's authenticator, by the folder of keys where there is one.
 
 Without keys it lets in everybody, but libzmq then hangs up on all who don't greet it as ZMTP 3
 does: web pages among them, whose POST older versions take for messages.
@@ -47,16 +47,16 @@ class Admission(ThreadAuthenticator):
         socket.setsockopt(zmq.HANDSHAKE_IVL, int(1e3 * bounds.HANDSHAKE))
 
     def callback(self, domain: str, key: bytes) -> bool:
-        """Whether a client with this key is let in; asked by the authenticator."""
+        """Return whether a client with this key is let in; asked by the authenticator."""
         return self._keys is not None and domain == _DOMAIN and key in self._keys.clients
 
     def curve_user_id(self, client_public_key: bytes) -> str:
-        """The key's name."""
+        """Return the key's name."""
         assert self._keys is not None
         return self._keys.clients.get(zmq.utils.z85.encode(client_public_key), "")
 
     def name(self, part: zmq.Frame) -> str:
-        """Who sent this, by the key; empty without keys."""
+        """Return who sent this, by the key; empty without keys."""
         return "" if self._keys is None else str(part.get("User-Id"))
 
     def look(self, now: float) -> None:

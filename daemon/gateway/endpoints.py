@@ -67,7 +67,7 @@ class Endpoint:
 
 
 class CommandEndpoint(Endpoint):
-    """Where requests come in, and answers go out.
+    """The socket by which requests come in and answers go out.
 
     After a fence it reads what may have come before; `past` is the time from when on all that
     comes came after it.
@@ -153,7 +153,7 @@ class CommandEndpoint(Endpoint):
 
 
 class StreamEndpoint(Endpoint):
-    """Where subscribers come in."""
+    """The socket of the subscribers."""
 
     def __init__(self, admission: Admission, config: Config, late: Late) -> None:
         """``late`` gives what late subscribers to these topics (as bits) are told.

@@ -1,4 +1,4 @@
-"""Which request goes to the loop next, and which is refused: pace, fairness, and what a stop ends.
+"""Requests on their way to the loop, and refusals: pace, fairness, and the end by a stop.
 
 A ``stop`` goes first, whoever else sends, and one stop to the loop answers all that wait. Of all
 else few are on their way to the loop at a time; the rest waits here, where every client has a place
@@ -119,7 +119,7 @@ class RequestQueue:
             self._queue(client, _Request(route, came, msgpack.packb(request)))
 
     def _shared(self, client: Client, now: float) -> float:
-        """What each client may send in a second: less when many send."""
+        """Return what each client may send in a second: less when many send."""
         if now > self._share_until:
             self._share_until = now + 1.0
             self._active.clear()
@@ -193,7 +193,7 @@ class RequestQueue:
             del self._late[next(iter(self._late))]
 
     def reply(self, number: int, reply: bytes) -> None:
-        """The loop's answer to request ``number``."""
+        """Take the loop's answer to request ``number``."""
         if number in self._asked:
             self._give_way(number)
         for route in self._late.pop(number, ()):

@@ -1,4 +1,4 @@
-"""What the gateway does: one thread that waits for the loop and for clients, and serves both."""
+"""The gateway at work: one thread that waits for the loop and for clients, and serves both."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from softfinger.daemon.wire.loop_link import Topics
 
 
 class Repeated:
-    """What late subscribers get: the settings and the last events, marked as sent again."""
+    """Keep settings and last events for late subscribers, marked as sent again."""
 
     def __init__(self, topics: Topics) -> None:
         self._topics = topics
@@ -43,7 +43,7 @@ class Repeated:
         return again
 
     def late(self, wanted: int) -> list[tuple[int, bytes]]:
-        """For a subscriber to the topics ``wanted``, as bits: each message with its topic."""
+        """Yield each message with its topic for a subscriber to ``wanted``, topics as bits."""
         settings, events = self._topics.settings, self._topics.events
         found = []
         if self._settings is not None and wanted >> settings & 1:

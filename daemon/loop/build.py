@@ -1,4 +1,4 @@
-"""From settings to a running daemon: builds, connects and warms up everything, in the safe order.
+"""Settings become a running daemon: everything is built, connected and warmed up, in safe order.
 
 Sockets are bound before any hardware is touched, so that a second daemon ends without. Kernels
 are compiled and warm before the loop exists, and so before torque can be on.

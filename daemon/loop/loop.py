@@ -32,7 +32,7 @@ EventSink = Callable[[str, str, str], None]
 
 
 class Commands(Protocol):
-    """Where commands come from: `wire.command_server.CommandServer`, or a recording."""
+    """A source of commands: `wire.command_server.CommandServer`, or a recording."""
 
     @property
     def refused_by_pace(self) -> int:

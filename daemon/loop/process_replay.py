@@ -63,7 +63,7 @@ class ProcessReplay:
         frames: Mapping[int, Frame],
         commands: Sequence[dict[str, Any]],
     ) -> State:
-        """The state after one tick: its ``hand/input``, new frames by finger, its commands.
+        """Return the state after one tick: its ``hand/input``, new frames by finger, its commands.
 
         The state is the loop's own, and changes with the next call.
         """
@@ -83,7 +83,7 @@ class ProcessReplay:
 
 
 def with_calibrations(settings: Settings, calibrations: Sequence[str], folder: Path) -> Settings:
-    """Settings whose calibrations are files in ``folder``, made of these texts of JSON."""
+    """Return settings whose calibrations are files in ``folder``, made of these texts of JSON."""
     files = ["", ""]
     for finger, text in enumerate(calibrations):
         if text:
@@ -100,7 +100,7 @@ class _Clock(VirtualClock):
     unix = 0.0
 
     def wall(self) -> float:
-        """The recorded Unix time [s]."""
+        """Return the recorded Unix time [s]."""
         return self.unix
 
 

@@ -1,4 +1,4 @@
-"""What goes out to subscribers on which tick, and at what rates that really was.
+"""Publishing: a topic's ticks, and the rates that really came of it.
 
 A topic goes out on exactly every n-th tick, counted by ``seq``, with the n whose rate is nearest to
 the wanted one; statistics on ticks of their own where n allows it, so that no tick carries all. Of
@@ -25,12 +25,12 @@ _STATS_PHASE = 3  # ticks after those of the state
 
 
 def every(rate: float, wanted: float) -> int:
-    """Of how many at ``rate`` one comes nearest to the ``wanted`` rate."""
+    """Return of how many at ``rate`` one comes nearest to the ``wanted`` rate."""
     return max(round(rate / wanted), 1)
 
 
 def plan(settings: Settings) -> str:
-    """What is done how often, in one line for people."""
+    """Return a line for people: what is done how often."""
     rate, frames, stream = settings.loop.rate, settings.tactile.rate, settings.stream
     parts = [f"every tick ({rate:g} Hz) read, feel, decide, bound, write"]
     if settings.tactile.backend != "none":
@@ -58,7 +58,7 @@ class _Counts:
 
 
 def parts(settings: Settings) -> Parts:
-    """What the scene of these settings has."""
+    """Return what the scene of these settings has."""
     return Parts(
         fingers=("left" in settings.scene.fingers, "right" in settings.scene.fingers),
         servos=settings.servos.backend != "none",

@@ -1,4 +1,4 @@
-"""What the loop asks of the system: scheduling, memory and timers for a steady tick, and systemd.
+"""Requests to the system: scheduling, memory and timers for a steady tick, and systemd.
 
 The measures of the section ``[realtime]`` are taken once, after warm-up. None is needed: one that
 the system refuses is reported, with what is lost and the command that grants it. The spin before a
@@ -58,7 +58,7 @@ def hold_collector() -> None:
 
 
 class Measure(NamedTuple):
-    """What became of one measure."""
+    """The outcome of one measure."""
 
     granted: bool
     text: str  # what was granted; or what was refused and what is lost by it
@@ -98,7 +98,7 @@ class RealTime:
             self._granted(f"spin of {wanted.spin * 1e6:g} µs before each tick")
 
     def events(self) -> list[tuple[str, str, str]]:
-        """For the loop's events: one with all that was granted, one for each refusal."""
+        """Return the loop's events: one with all that was granted, one for each refusal."""
         granted = ", ".join(outcome.text for outcome in self.outcomes if outcome.granted)
         refused = [str(outcome) for outcome in self.outcomes if not outcome.granted]
         events = [("info", "realtime", granted)] if granted else []
@@ -213,7 +213,7 @@ class RealTime:
             self._granted("memory locked", libc.munlockall)
 
     def _hold_latency(self) -> None:
-        """As long as the file is open, no processor goes into a state that takes time to leave."""
+        """Keep processors out of states that take time to leave, as long as the file is open."""
         try:
             descriptor = os.open(_LATENCY, os.O_WRONLY | os.O_CLOEXEC)
         except OSError as error:
@@ -245,7 +245,7 @@ def _threads() -> list[int]:
 
 
 def _set_slice(calls: tuple[int, int], thread: int, nanoseconds: int) -> bool:
-    """Whether the thread has slices of that length afterwards; 0 stands for the system's."""
+    """Return whether the thread has slices of that length afterwards; 0 stands for the system's."""
     set_call, get_call = calls
     libc = ctypes.CDLL(None, use_errno=True)
     size = _ATTRIBUTES.size
@@ -278,7 +278,7 @@ class Service:
 
     @classmethod
     def of_environment(cls, environment: Mapping[str, str] = os.environ) -> Service | None:
-        """The service that this process is, None when it is none."""
+        """Return the service that this process is, None when it is none."""
         address = environment.get("NOTIFY_SOCKET", "")
         if address[:1] not in ("/", "@") or len(address) < 2:
             return None
@@ -288,7 +288,7 @@ class Service:
         return cls(address, watchdog)
 
     def alive(self, t: float) -> None:
-        """A sign of life at time ``t`` [s], sent when one is due; the first one says ready."""
+        """Send a sign of life at time ``t`` [s] when one is due; the first one says ready."""
         if t < self._due:
             return
         self._due = t + self._every
@@ -297,7 +297,7 @@ class Service:
         self._send(message)
 
     def stopping(self) -> None:
-        """The end has begun."""
+        """Say that the end has begun."""
         self._send(b"STOPPING=1")
 
     def close(self) -> None:

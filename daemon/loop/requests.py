@@ -79,7 +79,7 @@ class Lease:
         self._until = -math.inf
 
     def check(self, command: Command, now: float) -> None:
-        """Raises Refused while somebody else has the lease."""
+        """Raise Refused while somebody else has the lease."""
         if command.name in UNLEASED:
             return
         if now < self._until and command.client != self._owner:
@@ -185,7 +185,7 @@ class Requests:
         self._emit("warning", "silence", text)
 
     def _against(self, name: str, numbers: dict[str, float]) -> str:
-        """What the state, the scene or the limits have against a command that is heard."""
+        """Return what the state, the scene or the limits have against a command that is heard."""
         state, settings = self._state, self._settings
         if name in ("arm", "clear") and state.torque and not self._control.torque:
             return "the servos have not confirmed torque off yet: check their cable and their power"

@@ -102,17 +102,17 @@ class Statistics:
 
     @property
     def ticks(self) -> int:
-        """How many were counted."""
+        """The number of ticks that were counted."""
         return int(self.counts[0].sum())
 
     def spreads(self) -> dict[str, TimeSpread]:
-        """What was counted, by the names in `TIMES`; all 0 before the first tick."""
+        """Return what was counted, by the names in `TIMES`; all 0 before the first tick."""
         _quantiles(self.counts, self.largest, self._shares, self._out)
         rows = zip(TIMES, self._out.tolist(), self.largest.tolist(), strict=True)
         return {name: TimeSpread(row[0], row[1], row[2], largest) for name, row, largest in rows}
 
     def table(self) -> list[str]:
-        """The same for people, in µs."""
+        """Return the same for people, in µs."""
         lines = [f"{'':8} {'p50':>9} {'p99':>9} {'p99.9':>9} {'max':>9}  µs"]
         for name, spread in self.spreads().items():
             cells = " ".join(f"{1e6 * value:9.1f}" for value in spread)
@@ -183,7 +183,7 @@ class Lateness:
         )
 
     def with_cause(self, name: str, text: str, at_work: float) -> str:
-        """A finding's text, after "this machine was busy" where it was so a moment ago.
+        """Return a finding's text, after "this machine was busy" where it was so a moment ago.
 
         ``name`` is the broken limit's; ``at_work`` [s] how long the present tick has taken so far.
         """

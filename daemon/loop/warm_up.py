@@ -65,7 +65,7 @@ class Part(NamedTuple):
 
 
 def parts(settings: Settings) -> list[Part]:
-    """What ``settings`` has kernels for, in the order in which two processes best share them.
+    """Return what ``settings`` has kernels for, in the order that suits two processes.
 
     One has the estimator and then the simulated sensor, whose kernels it has compiled in part by
     then; the other the contact table, then the simulated hand and the filter, which look up in it;
@@ -86,18 +86,18 @@ def parts(settings: Settings) -> list[Part]:
 
 
 def named(name: str) -> Part:
-    """A part by its name. Raises KeyError when there is none."""
+    """Return a part by its name. Raises KeyError when there is none."""
     return {each.name: each for each in ALL}[name]
 
 
 def is_built(part: Part, settings: Settings) -> bool:
-    """Whether ``part`` was compiled from the present sources, for such tips, and is kept."""
+    """Return whether ``part`` was compiled from the present sources, for such tips, and is kept."""
     folder = kernel_folder()
     return folder is not None and _mark(folder, part, settings).exists()
 
 
 def mark_built(part: Part, settings: Settings) -> None:
-    """``part`` was compiled and is kept, where anything can be."""
+    """Note that ``part`` was compiled and is kept, where anything can be."""
     folder = kernel_folder()
     if folder is not None:
         _mark(folder, part, settings).touch()

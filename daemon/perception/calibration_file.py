@@ -116,7 +116,7 @@ class ModulusStep(_StepModel):
 
 
 class ScalesStep(_StepModel):
-    """What grips told of the finger's scales: (mean, relative standard deviation) of each.
+    """Scales of the finger by its grips: (mean, relative standard deviation) of each.
 
     Of the modulus over this file's or the settings', the sensor's gain, the joint's torque.
     """

@@ -39,7 +39,7 @@ class Pauses:
         self._looked = -math.inf
 
     def look(self, own_work: float = 0.0) -> bool:
-        """Whether there was one since the last look, or this is the first.
+        """Return whether there was one since the last look, or this is the first.
 
         ``own_work`` [s] may have been spent at work meanwhile.
         """

@@ -1,4 +1,4 @@
-"""How a record of fields is declared, and a topic of the stream: the mechanism of `wire.schema`."""
+"""Declarations of records of fields and of the stream's topics: the mechanism of `wire.schema`."""
 
 import dataclasses
 from collections.abc import Callable, Iterator

@@ -48,7 +48,7 @@ class ServerKeys:
     clients: dict[bytes, str]  # public key → name
 
     def left(self, folder: Path) -> ServerKeys:
-        """Without the clients whose files are gone. It opens nothing. Raises KeyFileError."""
+        """Return them without clients whose files are gone. Opens nothing. Raises KeyFileError."""
         clients = _place(folder) / "clients"
         _check_above(clients / "any")
         kept = {
@@ -79,7 +79,7 @@ class ClientKeys:
 
 
 def check_curve() -> None:
-    """Raises KeyFileError when this machine's libzmq can't do it."""
+    """Raise KeyFileError when this machine's libzmq can't do it."""
     if not zmq.has("curve"):
         raise KeyFileError(
             f"libzmq {zmq.zmq_version()} of this Python was built without CURVE: install a pyzmq "
@@ -132,7 +132,7 @@ def _write_keys(folder: Path, server: Path, names: list[str], new: bool) -> list
 
 
 def load_server(folder: Path) -> ServerKeys:
-    """The daemon's keys, from the folder of `make_keys` or its ``server``. Raises KeyFileError."""
+    """Return the daemon's keys: `make_keys`'s folder or its ``server``. Raises KeyFileError."""
     check_curve()
     place = _place(folder)
     public, secret = _pair(place / "server.key_secret")
@@ -148,7 +148,7 @@ def load_server(folder: Path) -> ServerKeys:
 
 
 def load_client(folder: Path) -> ClientKeys:
-    """A client's keys, from its own folder or the one of `make_keys`. Raises KeyFileError."""
+    """Return a client's keys, from its own folder or `make_keys`'s. Raises KeyFileError."""
     check_curve()
     place = folder if (folder / "client.key_secret").exists() else folder / LOCAL
     public, secret = _pair(place / "client.key_secret")

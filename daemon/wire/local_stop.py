@@ -52,7 +52,7 @@ class LocalStop:
         self._askers: deque[Any] = deque(maxlen=_ASKERS)
 
     def take(self) -> bool:
-        """Whether a stop has come."""
+        """Return whether a stop has come."""
         came = False
         for _ in range(_A_TICK):
             try:
@@ -65,7 +65,7 @@ class LocalStop:
         return came
 
     def fileno(self) -> int:
-        """The descriptor at which it comes."""
+        """Return the descriptor at which it comes."""
         return self._socket.fileno()
 
     def answer(self, reply: bytes) -> None:
@@ -108,7 +108,7 @@ def stop_locally(address: str, seconds: float) -> dict[str, Any] | None:
 
 
 def _name(address: str) -> str:
-    """What the socket is called. Raises ValueError for an address of another machine."""
+    """Return what the socket is called. Raises ValueError for an address of another machine."""
     kind, _, place = address.partition("://")
     if kind == "ipc":
         return f"stop-{hashlib.sha256(os.path.realpath(place).encode()).hexdigest()[:16]}"
@@ -120,7 +120,7 @@ def _name(address: str) -> str:
 
 
 def _folders() -> Iterator[Path]:
-    """Where it may be: of a service of the system, of this session, or of no session at all."""
+    """Return where it may be: of a system service, of this session, of no session at all."""
     for name in ("RUNTIME_DIRECTORY", "XDG_RUNTIME_DIR"):
         if place := os.environ.get(name):
             yield Path(place.split(":")[0]) / "softfinger"
@@ -146,7 +146,7 @@ def _own_folder() -> Path:
 
 
 def _is_ours(folder: Path) -> bool:
-    """Whether it is this user's, no link, and nobody else may even look into it."""
+    """Return whether it is this user's, no link, and nobody else may even look into it."""
     try:
         require_own(folder)
     except OSError:

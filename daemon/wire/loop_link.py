@@ -71,7 +71,7 @@ class Topics:
     events: int  # and of which the last few
 
     def matching(self, *prefixes: bytes) -> int:
-        """The topics that begin with any of these, as bits."""
+        """Return the topics that begin with any of these, as bits."""
         names = enumerate(self.names)
         return sum(1 << k for k, name in names if name.encode().startswith(prefixes))
 
@@ -85,7 +85,7 @@ class Ask(NamedTuple):
 
 
 def pair() -> tuple[socket.socket, socket.socket]:
-    """Both ends: the loop's and the gateway's."""
+    """Return both ends: the loop's and the gateway's."""
     ends = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     for end in ends:
         end.setblocking(False)
@@ -102,7 +102,7 @@ def send_all(end: socket.socket, packets: list[bytes]) -> None:
 
 
 def pieces(topic: int, message: bytes) -> list[bytes]:
-    """The packets that carry one message of the stream."""
+    """Return the packets that carry one message of the stream."""
     head = PUBLISH + bytes((topic,))
     count = max((len(message) + _PIECE - 1) // _PIECE, 1)
     return [
@@ -212,7 +212,7 @@ class Link:
         self._waiting.clear()
 
     def raise_fence(self) -> None:
-        """From now on requests that came before are not to be carried out."""
+        """Refuse from now on the requests that came before."""
         self._fence = (self._fence + 1) % _FENCES
         self.past = math.inf
         self._waiting.append(FENCE + NUMBER.pack(self._fence))

@@ -21,7 +21,7 @@ GATEWAY_TOPICS = Topics(
 
 
 def bit(topic: bytes) -> int:
-    """A topic's bit in `Publisher.wanted`."""
+    """Return a topic's bit in `Publisher.wanted`."""
     return 1 << _INDEX[topic]
 
 

@@ -66,7 +66,7 @@ _news = FieldSource["EventSource"]()
 
 @record
 class _TickMessage:
-    """What is sent every so many ticks."""
+    """A message of every so many ticks."""
 
     schema: int = _state(*_SCHEMA, lambda _: SCHEMA)
     seq: int = _state(*_SEQ)
@@ -77,7 +77,7 @@ class _TickMessage:
 
 @record
 class _Announcement:
-    """What is sent when it happens."""
+    """A message that is sent when it happens."""
 
     schema: int = _news(*_SCHEMA, lambda _: SCHEMA)
     seq: int = _news(*_SEQ)
@@ -211,7 +211,7 @@ class HandState(_TickMessage):
     object: ObjectState = _state.part("", lambda s: s.object)
 
     def finger(self, name: str) -> FingerState:
-        """``left`` or ``right`` by its name. Raises ValueError for another."""
+        """Return ``left`` or ``right`` by its name. Raises ValueError for another."""
         if name not in FINGERS:
             raise ValueError(f"found finger {name!r}, expected one of {', '.join(FINGERS)}")
         return self.left if name == FINGERS[0] else self.right
@@ -285,7 +285,7 @@ class TactileFrame:
         return np.frombuffer(self.data, dtype="<u2").reshape(self.rows, self.cols)
 
     def pressure(self) -> NDArray[np.float64]:
-        """Counts times the scale [Pa], [rows, cols]."""
+        """Return counts times the scale [Pa], [rows, cols]."""
         return self.counts.astype(np.float64) * self.scale
 
 
@@ -333,7 +333,7 @@ class Spread:
 
 @record
 class Rates:
-    """How often things have happened over the last second, in ``hand/stats``."""
+    """Rates of what happened over the last second, in ``hand/stats``."""
 
     tick: float = _rates("Hz", "ticks")
     left: float = _rates("Hz", "tactile frames that came from the left sensor")

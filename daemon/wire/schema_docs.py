@@ -37,7 +37,7 @@ in the machine's time.
 
 
 def json_schema(topic: bytes) -> dict[str, Any]:
-    """The topic's map as JSON Schema. Bytes are base64, a float that is no number is null."""
+    """Return a topic's map as JSON Schema. Bytes are base64, a float that is no number null."""
     schema: dict[str, Any] = {
         "title": topic.decode(),
         "description": TOPICS[topic].summary,
@@ -55,7 +55,7 @@ def json_schema(topic: bytes) -> dict[str, Any]:
 
 
 def page() -> str:
-    """The page for people, in Markdown."""
+    """Return the page for people, in Markdown."""
     parts = [_INTRODUCTION]
     for name, topic in TOPICS.items():
         rows = [f"| `{f.name}` | {f.kind} | {f.unit} | {f.meaning} |" for f in topic.fields]

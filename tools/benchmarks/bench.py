@@ -182,7 +182,7 @@ def _processor() -> str:
 
 
 def _check(names: list[str], texts: dict[str, str], arguments: argparse.Namespace) -> None:
-    """What can be refused before anything is measured. Raises ValueError."""
+    """Return what can be refused before anything is measured. Raises ValueError."""
     if not names:
         raise ValueError(f"'{_CAMPAIGN}' alone, expected one of {', '.join(texts)} after it")
     if arguments.full and (texts is CAMPAIGNS or names != ["reflex"]):

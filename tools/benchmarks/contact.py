@@ -40,7 +40,7 @@ _SINGLE = 16  # points that calls with floats go round
 
 
 def measure(brief: bool = False, rounds: int = 25, count: int = 512) -> list[Report]:
-    """Times by compiled code and from Python, with errors; ``count`` points, a power of two."""
+    """Return times by compiled code and from Python, with errors; ``count``: a power of two."""
     d, theta = points(count)
     expected = np.stack(integrate(TIP, LAW, d, theta, 40))
     tables = {f"table to {each:g}": ContactTable.build(TIP, LAW, each) for each in (1e-9, 1e-12)}
@@ -79,7 +79,7 @@ def measure(brief: bool = False, rounds: int = 25, count: int = 512) -> list[Rep
 
 
 def points(count: int) -> tuple[FloatArray, FloatArray]:
-    """The points d [m] and θ [rad] of all times and errors, the same in every run."""
+    """Return the points d [m] and θ [rad] of all times and errors, the same in every run."""
     rng = np.random.default_rng(3)
     even = rng.uniform(0.0, DEEPEST, count)
     spread = 10.0 ** rng.uniform(-6.0, np.log10(DEEPEST), count)
@@ -129,7 +129,7 @@ def _scipy() -> dict[str, Callable[..., Any]]:
 
 
 def loop(table: ContactTable | None, d: FloatArray, theta: FloatArray, repeat: int) -> FloatArray:
-    """``repeat`` times all points by compiled code, of the closed form without a table: [n, 6]."""
+    """Look up all points ``repeat`` times by compiled code, by the closed form without a table."""
     out = np.empty((d.size, 6))
     if table is None:
         closed_loop(repeat, MODULUS, d, theta, out)

@@ -1,4 +1,4 @@
-"""What each grip law leaves of the angle at which an object was put between the fingers.
+"""The error that each grip law leaves of the angle at which an object was put between the fingers.
 
 Judged by the plant's truth, not by the daemon's estimates, over plants that differ from the
 settings. On virtual time: nothing here depends on the machine's speed. Beside the daemon's laws
@@ -37,7 +37,7 @@ WAYS: dict[str, tuple[dict[str, Any], Sections, float | None]] = {
 
 
 def measure(brief: bool = False) -> list[Report]:
-    """The angles that are left [°]; p99 of a few draws is about the worst of them."""
+    """Return the angles that are left [°]; p99 of a few draws is about the worst of them."""
     rng = np.random.default_rng(16)
     drawn = [
         {

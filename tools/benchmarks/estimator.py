@@ -43,7 +43,7 @@ _STEPS = (1e-7, 1e-5, 1e-5, 1e-4)
 
 @dataclass
 class Timed:
-    """What is timed, and the array for what it finds in the frames [n, 3]."""
+    """A function to time, and the array for what it finds in the frames [n, 3]."""
 
     subject: Subject
     aim_us: float | None = None
@@ -60,7 +60,7 @@ class Timed:
 
 
 def tilts(theta: float, azimuth: float) -> tuple[float, float]:
-    """(tilt_x, tilt_y) of a total tilt towards ``azimuth`` [rad]."""
+    """Return (tilt_x, tilt_y) of a total tilt towards ``azimuth`` [rad]."""
     s = math.sin(theta)
     return math.asin(s * math.cos(azimuth)), math.asin(s * math.sin(azimuth))
 
@@ -71,7 +71,7 @@ _CORNER: Truth = (0.008, *tilts(math.radians(30.0), 0.7))
 
 
 def measure(brief: bool = False, rounds: int = 25) -> list[Report]:
-    """Times with errors, and the bound."""
+    """Return times with errors, and the bound."""
     noise = np.random.default_rng(4).standard_normal((_FRAMES, SIZE, SIZE))
     frames = GRID.pressure(TIP, LINEAR, *TRUTH) + NOISE * noise
     empty, deep = NOISE * noise, GRID.pressure(TIP, LINEAR, *_CORNER) + NOISE * noise
@@ -98,7 +98,7 @@ def measure(brief: bool = False, rounds: int = 25) -> list[Report]:
 
 
 def jacobian(grid: SensorGrid, truth: tuple[float, float, float, float]) -> FloatArray:
-    """∂ pressure/∂(d, tilt_x, tilt_y, gain) [cells, 4], by central differences."""
+    """Return ∂ pressure/∂(d, tilt_x, tilt_y, gain) [cells, 4], by central differences."""
     columns = []
     for k, step in enumerate(_STEPS):
         ends = []
@@ -111,7 +111,7 @@ def jacobian(grid: SensorGrid, truth: tuple[float, float, float, float]) -> Floa
 
 
 def bound(slopes: FloatArray, noise: float, free: bool = True) -> FloatArray:
-    """The Cramér-Rao covariance of (d, tilt_x, tilt_y[, gain]) from all cells."""
+    """Return the Cramér-Rao covariance of (d, tilt_x, tilt_y[, gain]) from all cells."""
     used = slopes[:, : 4 if free else 3]
     return np.asarray(np.linalg.inv(used.T @ used) * noise**2)
 
@@ -146,7 +146,7 @@ def kernel_case(
     grid: SensorGrid = GRID,
     **options: Any,
 ) -> Timed:
-    """The compiled entry, from the last estimate or from each frame alone."""
+    """Return the compiled entry, from the last estimate or from each frame alone."""
     estimator = ContactEstimator(TIP, LINEAR, grid, NOISE, **options)
     out = np.zeros((len(frames), 3))
 
@@ -157,7 +157,7 @@ def kernel_case(
 
 
 def decode(frames: FloatArray) -> Subject:
-    """A cobs board's bytes to counts."""
+    """Return a cobs board's bytes to counts."""
     counts = np.maximum(frames / _PASCAL_PER_COUNT, 0.0).astype(np.uint16)
     packets = [ENCODERS["cobs"].encode(frame, k, 0.01 * k) for k, frame in enumerate(counts)]
     return each(CobsDecoder(*frames.shape[1:]).feed, [(packet, 0.0) for packet in packets])

@@ -199,7 +199,7 @@ NAMES = tuple(case.name for case in CASES)
 
 @dataclass
 class Trial:
-    """What came of one injection."""
+    """The outcome of one injection."""
 
     seed: int
     phase: str = ""
@@ -217,7 +217,7 @@ class Trial:
 
     @property
     def failure(self) -> str:
-        """What was not as it must be, with the phase."""
+        """The first thing that was not as it must be, with the phase."""
         text = self.wrong or self.missed
         return f"{self.phase}: {text}" if text else ""
 
@@ -240,7 +240,7 @@ def measure(trials: int | None = None, only: str = "") -> list[Report]:
 
 
 def run_trials(trials: int, one: Callable[[int], Trial]) -> tuple[list[Trial], int]:
-    """``trials`` of ``one(seed)`` that count, and how many were disturbed and made again.
+    """Return ``trials`` of ``one(seed)`` that count, and how many were disturbed and made again.
 
     That many may be made again at most. A RigError is a failed trial; three in a row end the case.
     """
@@ -260,7 +260,7 @@ def run_trials(trials: int, one: Callable[[int], Trial]) -> tuple[list[Trial], i
 
 
 def summary(case: FaultCase, found: list[Trial], disturbed: int) -> Row:
-    """Counts, and times [ms] of those trials that have them: median and greatest."""
+    """Return counts, and times [ms] of those trials that have them: median and greatest."""
     passed, count = sum(not each.failure for each in found), len(found)
     row: Row = {
         "name": case.name,
@@ -360,7 +360,7 @@ def _ready(rig: Rig, chance: random.Random) -> bool:
 
 
 def _upright(rig: Rig) -> bool:
-    """Whether both tips feel opposite faces: a grip on an edge would end in a fault of its own."""
+    """Return whether both tips feel opposite faces: a grip on an edge ends in another fault."""
     states = rig.states(0.1)
     if not states:
         return False
@@ -451,7 +451,7 @@ def judge_wire(rig: Rig, found: Trial) -> None:
 
 
 def judge(case: FaultCase, found: Trial) -> None:
-    """What was expected, and in time."""
+    """Return what was expected, and in time."""
     safe = not math.isnan(found.safe_s)
     if case.expect in ("works", "lets go"):
         if found.fault:

@@ -1,4 +1,4 @@
-"""How cost and error grow: with cells, subscribers, sensors, rate.
+"""Growth of cost and error: with cells, subscribers, sensors, rate.
 
 Each table is of one run in turns, and ends with the fitted slopes: the exponent of a power law over
 all points, and between the last two, which shows where it bends.
@@ -36,7 +36,7 @@ _IN_TURN = 20  # ticks: whole periods of frames and state
 
 
 def measure(brief: bool = False) -> list[Report]:
-    """All of them; ``brief`` takes every other point."""
+    """Return all of them; ``brief`` takes every other point."""
     step, rounds = (2, 5) if brief else (1, 25)
     return [
         *cells(_SIDES[::step], rounds),
@@ -78,7 +78,7 @@ def cells(sides: tuple[int, ...], rounds: int) -> list[Report]:
 
 
 def ticks(step: int, rounds: int) -> list[Report]:
-    """The mean tick in place of a hand that holds, but without sensors idle; canned readings."""
+    """Return the mean tick of a hand that holds, idle without sensors; canned readings."""
     scenes: dict[str, dict[float, TimedScene]] = {
         "subscribers": {
             n: TimedScene(topics=("hand",), subscribers=n) for n in _SUBSCRIBERS[::step]

@@ -1,4 +1,4 @@
-"""What all measurements share: times in turns, tables of rows, slopes, and what became slower."""
+"""Shared by all measurements: times in turns, tables of rows, slopes, and what became slower."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def _cell(value: Any) -> str:
 
 
 def figure(name: str, unit: str, samples: ArrayLike, aim: float | None = None, **more: Any) -> Row:
-    """Median, interquartile range and 99th percentile of samples that are already in ``unit``."""
+    """Return median, interquartile range and 99th percentile of samples in ``unit``."""
     values = np.asarray(samples, dtype=np.float64)
     low, median, high, p99 = np.percentile(values, [25.0, 50.0, 75.0, 99.0]).tolist()
     spread = {"median": median, "IQR": high - low, "p99": p99}
@@ -79,7 +79,7 @@ class Subject:
 
 
 def each(call: Callable[..., object], arguments: Sequence[tuple[Any, ...]]) -> Subject:
-    """Calls from Python with each of these arguments."""
+    """Return calls from Python with each of these arguments."""
 
     def run(repeat: int) -> None:
         for _ in range(repeat):
@@ -90,7 +90,7 @@ def each(call: Callable[..., object], arguments: Sequence[tuple[Any, ...]]) -> S
 
 
 def interleave(subjects: dict[str, Subject], rounds: int) -> dict[str, NDArray[np.float64]]:
-    """Nanoseconds a call of each subject in each round, float64 [rounds].
+    """Return nanoseconds a call of each subject in each round, float64 [rounds].
 
     They take turns, so that a slow minute slows all of them. Each is called once before, which
     compiles it, and then repeated often enough to fill a slice.
@@ -130,7 +130,7 @@ def timed(call: Callable[[], object], count: int = 1) -> list[float]:
 
 
 def yardsticks() -> dict[str, list[float]]:
-    """Times [µs] of fixed pieces of work: how fast this machine is just now.
+    """Return times [µs] of fixed pieces of work: how fast this machine is just now.
 
     A short one, and one so long that on a busy machine others have their turn meanwhile.
     """
@@ -144,7 +144,7 @@ def _work(steps: int) -> int:
 
 
 def slopes(rows: list[Row], x: str) -> tuple[str, ...]:
-    """How the median of each kind of row grows with its ``x``: a note for each.
+    """Return how the median of each kind of row grows with its ``x``: a note for each.
 
     The exponent of a power law, over all points and between the last two, which shows where it
     bends; where ``x`` begins at 0, the cost of the first and then of each more.
@@ -170,7 +170,7 @@ def slopes(rows: list[Row], x: str) -> tuple[str, ...]:
 
 
 def by_kind(rows: list[Row]) -> dict[str, list[Row]]:
-    """Rows with a median by their kind, which is their name up to the first comma or colon."""
+    """Return rows with a median by their kind: their name up to the first comma or colon."""
     kinds: dict[str, list[Row]] = {}
     for row in rows:
         if "median" in row:
@@ -179,7 +179,7 @@ def by_kind(rows: list[Row]) -> dict[str, list[Row]]:
 
 
 def slower(old: list[Row], new: list[Row]) -> Report:
-    """The times and ratios of ``new`` that rose beyond the noise of both runs.
+    """Return the times and ratios of ``new`` that rose beyond the noise of both runs.
 
     Rows are matched by measurement, table and name. Times are taken over the yardstick of their
     runs that has become slower: neither a slower nor a busier machine makes anything slower.

@@ -16,7 +16,7 @@ _LONGEST = 46  # characters of a bar's name
 
 
 def draw(reports: list[Report], path: Path) -> None:
-    """A panel for each of ``reports``. Raises MissingExtra without matplotlib."""
+    """Draw a panel for each of ``reports``. Raises MissingExtra without matplotlib."""
     columns = min(len(reports), 3)
     heights = [
         max(3.5 if each.x else 1.1 + 0.24 * len(each.rows) for each in reports[k : k + columns])

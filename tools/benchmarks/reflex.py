@@ -1,4 +1,4 @@
-"""What a grip does when its load becomes greater at once: held or lost, slid how far, how soon.
+"""A grip whose load becomes greater at once: held or lost, slid how far, how soon.
 
 A grip of 10 N bears a standing load along the object's faces, away from the palm, and then a
 greater one that stays. On virtual time, and judged by the plant. *Lost*: the object is no longer
@@ -38,7 +38,7 @@ _GONE_LOOK = 1.0  # s after which a lost object's mode is no longer waited for
 
 
 class Overload(NamedTuple):
-    """What came of one."""
+    """The outcome of one."""
 
     answer: float  # s; NaN: nothing slipped, infinity: no answer
     slid: float  # m, while it was between the tips
@@ -47,7 +47,7 @@ class Overload(NamedTuple):
 
 
 def measure(brief: bool = False, full: bool = False) -> list[Report]:
-    """A table for each kind of tips and mass; ``brief``: one trial of the greatest loads each."""
+    """Return a table for each kind of tips and mass; ``brief``: one trial of the greatest loads."""
     loads = list(itertools.product(STANDING, OVERLOADS) if full else itertools.product(*THIN))
     trials = _TRIALS
     if brief:

@@ -1,4 +1,4 @@
-"""What several benchmarks run on: daemons that hold, canned backends, a hand and its daemon.
+"""Shared by several benchmarks: daemons that hold, canned backends, a hand and its daemon.
 
 The emulated hand runs as users run it, in a process of its own; so does the daemon of `Rig`.
 """
@@ -53,7 +53,7 @@ class RigError(SoftfingerError):
 
 @contextlib.contextmanager
 def emulator(folder: Path, config: Path, *words: str) -> Iterator[subprocess.Popen[str]]:
-    """The simulated hand behind ptys in ``folder``, in a process of its own, once it answers."""
+    """Yield the simulated hand behind ptys in ``folder``, in its own process, once it answers."""
     command = [*SOFTFINGER, "emulate", "--dir", str(folder), "--config", str(config), *words]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         try:
@@ -66,7 +66,7 @@ def emulator(folder: Path, config: Path, *words: str) -> Iterator[subprocess.Pop
 
 
 def merged(sections: Sections, base: Sections) -> dict[str, dict[str, Any]]:
-    """``base`` with what ``sections`` have instead or besides."""
+    """Return ``base`` with what ``sections`` have instead or besides."""
     names = dict.fromkeys((*base, *sections))
     return {name: {**base.get(name, {}), **sections.get(name, {})} for name in names}
 
@@ -75,7 +75,7 @@ def merged(sections: Sections, base: Sections) -> dict[str, dict[str, Any]]:
 def virtual_daemon(
     sections: Sections, *topics: str | bytes, subscribers: int = 1
 ) -> Iterator[Daemon]:
-    """A daemon on virtual time with its own addresses, ``topics`` of which are subscribed to."""
+    """Yield a daemon on virtual time at its own addresses, with ``topics`` subscribed to."""
     with tempfile.TemporaryDirectory() as folder, zmq.Context() as context:
         base = {
             "loop": {"clock": "virtual"},
@@ -108,14 +108,14 @@ def hold(daemon: Daemon, force: float = 8.0) -> None:
 
 
 def must_hold(daemon: Daemon) -> None:
-    """RigError unless the hand holds."""
+    """Raise RigError unless the hand holds."""
     state = daemon.loop.state
     if state.mode != "holding":
         raise RigError(f"the hand does not hold: {state.mode} {state.fault}")
 
 
 class _Canned:
-    """What a backend has nothing to do for."""
+    """The part of a backend in which there is nothing to do."""
 
     def close(self) -> None:
         """Nothing to do."""
@@ -123,7 +123,7 @@ class _Canned:
     connect = open = torque_on = close
 
     def counters(self) -> dict[str, int]:
-        """None."""
+        """Return no counters."""
         return {}
 
 
@@ -136,7 +136,7 @@ class CannedServos(_Canned):
         self._current = reading.current.copy()
 
     def read(self, reading: Reading) -> None:
-        """The same again, taken now."""
+        """Return the same again, taken now."""
         reading.seq += 1
         reading.valid = True
         reading.t = self._clock.now()
@@ -163,7 +163,7 @@ class CannedSensor(_Canned):
         self._frame = Frame(1, clock.now(), clock.now(), True, counts[0])
 
     def latest(self) -> Frame:
-        """The newest frame."""
+        """Return the newest frame."""
         now = self._clock.now()
         if now - self._frame.t_arrival >= self._period:
             seq = self._frame.seq + 1
@@ -293,7 +293,7 @@ class Rig:
         return self.daemon is not None and self.daemon.poll() is None
 
     def send(self, words: str) -> str:
-        """Words for the emulated hand's control socket; its reply. Raises RigError."""
+        """Send words to the emulated hand's control socket; return its reply. Raises RigError."""
         try:
             reply = send_words(self.ports, words)
         except NoEmulator as error:
@@ -303,7 +303,7 @@ class Rig:
         return reply
 
     def report(self, more: str = "") -> dict[str, Any]:
-        """What was on the servos' wire; ``more``: ``forget`` begins the record anew, ``goals``."""
+        """Return what was on the servos' wire; ``more``: ``forget`` begins again, ``goals``."""
         report: dict[str, Any] = json.loads(self.send(f"report {more}"))
         return report
 
@@ -319,7 +319,7 @@ class Rig:
         return reply
 
     def status(self, timeout: float = 0.5) -> dict[str, Any] | None:
-        """The daemon's status, None when it does not answer."""
+        """Return the daemon's status, None when it does not answer."""
         try:
             status = self.ask({"command": "status"}, timeout)
         except NoAnswer:
@@ -327,7 +327,7 @@ class Rig:
         return status if status["ok"] else None
 
     def states(self, wait: float = _LOOK) -> list[dict[str, Any]]:
-        """States that came since the last call, none after ``wait`` s without one."""
+        """Return states that came since the last call, none after ``wait`` s without one."""
         socket = self._states
         found: list[dict[str, Any]] = []
         if socket is None:
@@ -338,7 +338,7 @@ class Rig:
         return found
 
     def waited(self) -> float:
-        """Seconds that others held the processor that either process wanted, since last asked."""
+        """Return seconds that others held the processor that either process wanted."""
         most = 0.0
         for process in (self.daemon, self.hand):
             if process is not None:
@@ -349,7 +349,7 @@ class Rig:
 
 
 def _waited_seconds(process: int) -> float:
-    """How long a process's threads have been ready to run and did not, altogether [s].
+    """Return how long a process's threads have been ready to run and did not, altogether [s].
 
     All of them: while one waits with the interpreter's lock, the others can't go on.
     """
@@ -361,5 +361,5 @@ def _waited_seconds(process: int) -> float:
 
 
 def stopped(report: dict[str, Any]) -> bool:
-    """Whether no motor is driven: torque off, or stopped by the servo's own watchdog."""
+    """Return whether no motor is driven: torque off, or stopped by the servo's own watchdog."""
     return all(not servo["torque"] or servo["stopped_by_watchdog"] for servo in report["servos"])

@@ -1,4 +1,4 @@
-"""What a scene doesn't need costs nothing: what each skipped thing saves, by measurement.
+"""A scene pays for nothing that it doesn't need: the time that each skipped thing saves.
 
 In µs a tick: all daemons stand side by side, on canned readings (or the simulated hand) and virtual
 time, and tick in turns. A step is switched off in a daemon of its own, from outside; what it saves
@@ -101,7 +101,7 @@ STEPS: dict[str, tuple[TimedScene, TimedScene]] = {
 
 
 def measure(brief: bool = False, rounds: int = 400) -> list[Report]:
-    """All scenes and steps in turns."""
+    """Return all scenes and steps in turns."""
     scenes = dict(SCENES)
     for name, (base, without) in STEPS.items():
         scenes |= {f"with {name}": base, f"without {name}": without}
@@ -118,7 +118,7 @@ def measure(brief: bool = False, rounds: int = 400) -> list[Report]:
 
 
 def standing(scene: TimedScene, stack: contextlib.ExitStack) -> Daemon:
-    """A daemon of this scene until ``stack`` is closed. Raises RigError."""
+    """Return a daemon of this scene until ``stack`` is closed. Raises RigError."""
     daemon = stack.enter_context(
         virtual_daemon(scene.sections, *scene.topics, subscribers=scene.subscribers)
     )
@@ -136,7 +136,7 @@ def standing(scene: TimedScene, stack: contextlib.ExitStack) -> Daemon:
 
 
 def ticking(daemon: Daemon) -> Subject:
-    """A daemon's ticks back to back, as long as its mode stays. They raise RigError."""
+    """Return a daemon's ticks back to back, as long as its mode stays. They raise RigError."""
     loop, clock, mode = daemon.loop, daemon.clock, daemon.loop.state.mode
 
     def run(repeat: int) -> None:
@@ -150,7 +150,7 @@ def ticking(daemon: Daemon) -> Subject:
 
 
 def saving(name: str, with_it: NDArray[np.float64], without: NDArray[np.float64]) -> Row:
-    """What a step saves, from the times [µs] of the same rounds with and without it."""
+    """Return what a step saves, from the times [µs] of the same rounds with and without it."""
     saved = without - with_it
     # A median's error is 1.25 times a mean's; the spread is from quartiles, which no hiccup moves.
     low, middle, high = np.percentile(saved, [25, 50, 75]).tolist()

@@ -19,7 +19,7 @@ from softfinger.tools.benchmarks.rigs import SOFTFINGER
 
 
 def measure(brief: bool = False) -> list[Report]:
-    """Seconds to the first ``hand/state`` of the built-in simulated hand, and what it takes."""
+    """Return seconds to the simulated hand's first ``hand/state``, and what it takes."""
     with tempfile.TemporaryDirectory() as name:
         cold = start(Path(name))
         warm = [start(Path(name)) for _ in range(2 if brief else 5)]
@@ -35,7 +35,7 @@ def measure(brief: bool = False) -> list[Report]:
 
 
 def start(folder: Path) -> tuple[float, float]:
-    """Seconds and MB of one start with this folder for kernels and tables."""
+    """Return seconds and MB of one start with this folder for kernels and tables."""
     stream = f"ipc://{folder}/stream"
     addresses = {"stream.address": stream, "commands.address": f"ipc://{folder}/commands"}
     words = [word for key, value in addresses.items() for word in ("--set", f"{key}={value}")]

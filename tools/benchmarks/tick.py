@@ -37,7 +37,7 @@ _IN_TURN = 20  # cycles
 
 
 def measure(brief: bool = False) -> list[Report]:
-    """Ticks of a hand that holds an object [µs], a second on virtual time [ms]."""
+    """Return ticks of a hand that holds an object [µs], a second on virtual time [ms]."""
     rows = _in_turns(10 if brief else 40)
     with virtual_daemon({}) as daemon:
         hold(daemon)
@@ -99,7 +99,7 @@ def _own_processor() -> Settings:
 
 
 def ticks(daemon: Daemon, count: int) -> list[float]:
-    """Times of so many ticks on virtual time, one after the other [µs]."""
+    """Return times of so many ticks on virtual time, one after the other [µs]."""
     loop, clock = daemon.loop, daemon.clock
     samples = []
     for _ in range(count):
@@ -109,7 +109,7 @@ def ticks(daemon: Daemon, count: int) -> list[float]:
 
 
 def in_place(daemon: Daemon, rate: float, count: int = 0) -> list[float]:
-    """Times of ticks [µs] that each wake at a deadline of the machine's time; of 0.15 s."""
+    """Return times of ticks [µs] that each wake at a deadline of the machine's time; of 0.15 s."""
     machine = RealClock(daemon.settings.realtime.spin)
     deadline, samples = machine.now(), []
     for _ in range(count or round(0.15 * rate)):
@@ -120,14 +120,14 @@ def in_place(daemon: Daemon, rate: float, count: int = 0) -> list[float]:
 
 
 def may_be_real_time() -> bool:
-    """Whether SCHED_FIFO is allowed here."""
+    """Return whether SCHED_FIFO is allowed here."""
     settings = Settings.model_validate({"realtime": {"priority": _PRIORITY}})
     with RealTime(settings) as measures:
         return any(each.granted and "FIFO" in each.text for each in measures.outcomes)
 
 
 def in_the_loop(turns: int, baud: int, changes: Sequence[str] = ()) -> Report:
-    """Ticks over ptys of a hand that holds, and what its servos' exchanges take, in turns.
+    """Return ticks over ptys of a hand that holds, and what its servos' exchanges take, in turns.
 
     ``baud`` 0 is unpaced; ``changes`` go over the profile. A failed Report where the hand lets go,
     as on a machine that is busy.

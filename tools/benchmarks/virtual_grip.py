@@ -51,7 +51,7 @@ class Watch:
             self.slid = min(max(self.slid, math.dist(place, self._place)), GONE)
 
     def settled(self) -> float:
-        """The mean force over what is asked for, in the end."""
+        """Return the mean force over what is asked for, in the end."""
         end = self._mean[-1][0] - _LAST
         return fmean(ratio for t, ratio in self._mean if t > end)
 
@@ -98,7 +98,7 @@ class VirtualGrip(Watched):
                 faults.begin(kind, value, self.state.t + after, over)
 
     def watched(self, asked: float) -> Watch:
-        """A watch that sees each tick from now on."""
+        """Return a watch that sees each tick from now on."""
         watch, hand, state = Watch(asked), self.plant, self.state
         self.look = lambda: watch.see(
             state.t, hand.force.tolist(), hand.object_pose[:2].tolist(), state.torque
@@ -106,7 +106,7 @@ class VirtualGrip(Watched):
         return watch
 
     def answer(self, words: str, seconds: float) -> float:
-        """From the onset of the slip that ``words`` cause to raised goal currents [s].
+        """Return the time from the onset of the slip that ``words`` cause to raised goal currents [s].
 
         NaN where nothing slips in so many ``seconds``, infinity without an answer.
         """
@@ -125,14 +125,14 @@ class VirtualGrip(Watched):
         return answered - onset if onset < math.inf else math.nan
 
     def along(self) -> list[float]:
-        """Each tip's place along the object's faces, from their middle [m]."""
+        """Return each tip's place along the object's faces, from their middle [m]."""
         x, y, angle = self.plant.object_pose.tolist()
         sine, cosine = math.sin(angle), math.cos(angle)
         tips = (self.plant.plant.fingers[k] for k in range(2))
         return [(tip.y - y) * cosine - (tip.x - x) * sine for tip in tips]
 
     def between(self) -> bool:
-        """Whether the object is between the tips: both press on it."""
+        """Return whether the object is between the tips: both press on it."""
         return min(self.plant.force.tolist()) > 0.0 and not self.plant.on_other_tip.any()
 
     def _slips(self) -> bool:

@@ -113,7 +113,7 @@ NAMES = tuple(case.name for case in CASES)
 
 @dataclass
 class GripTrial:
-    """What came of a trial: forces over what was asked for, times since it began [s]."""
+    """The outcome of a trial: forces over what was asked for, times since it began [s]."""
 
     false: tuple[str, ...]  # what may be named
     held: bool = True  # before anything went wrong
@@ -131,12 +131,12 @@ class GripTrial:
         self.end, self.events = fault or mode, events
 
     def named(self, rightly: bool) -> list[tuple[float, str]]:
-        """What was named and when: what is false, or what is not."""
+        """Return what was named and when: what is false, or what is not."""
         names = [(t, k.removeprefix(_WITNESS)) for t, k in self.events if k.startswith(_WITNESS)]
         return [(t, name) for t, name in names if (name in self.false) == rightly]
 
     def missed(self, case: WitnessCase) -> list[str]:
-        """The parts of the aim that were missed."""
+        """Return the parts of the aim that were missed."""
         low, high = _SETTLED
         named = min((t for t, _ in self.named(True)), default=math.inf) - 0.5 * case.comes
         wrong = {
@@ -151,7 +151,7 @@ class GripTrial:
 
 
 def measure(trials: int | None = None, only: str = "") -> list[Report]:
-    """A table for each aim, of the cases whose name ``only`` is found in."""
+    """Return a table for each aim, of the cases whose name ``only`` is found in."""
     trials, reports = trials or _TRIALS, []
     for aim in (SETTLES, BOUNDED):
         rows = []
@@ -200,7 +200,7 @@ def trial(case: WitnessCase, seed: int) -> GripTrial:
 
 
 def summary(case: WitnessCase, found: Sequence[GripTrial]) -> Row:
-    """A case's row: median and extremes of its trials, what was missed, and when events came."""
+    """Return a case's row: median and extremes of its trials, what was missed, when events came."""
     settled = [each.settled for each in found if not math.isnan(each.settled)]
     missed = [each.missed(case) for each in found]
     return {
@@ -227,7 +227,7 @@ def _counts(words: Iterator[str]) -> str:
 
 
 def _firsts(trials: Sequence[Sequence[tuple[float, str]]]) -> str:
-    """Of each kind in how many trials it came, and the median of when it first did [s]."""
+    """Return for each kind in how many trials it came, and the median first time [s]."""
     first: dict[str, list[float]] = {}
     for events in trials:
         for kind in dict.fromkeys(kind for _, kind in events):

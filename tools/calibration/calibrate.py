@@ -140,7 +140,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _draws(arguments: argparse.Namespace) -> bool:
-    """Whether a picture is drawn, known before anything is measured.
+    """Return whether a picture is drawn, known before anything is measured.
 
     Raises MissingExtra for ``--plot`` without matplotlib.
     """

@@ -48,7 +48,7 @@ class Loads:
 
 
 def gather(arguments: argparse.Namespace, settings: Settings, calibration: Calibration) -> Loads:
-    """The step's loads. Raises TactileError, RecordingError or CalibrationError.
+    """Return the step's loads. Raises TactileError, RecordingError or CalibrationError.
 
     ``calibration`` has the sensor's facts and, live, its zero.
     """
@@ -209,7 +209,7 @@ def _live_run(
 
 
 def rising(totals: list[float]) -> int:
-    """How many frames came while the press went down: what rests at its depth is none of them."""
+    """Return how many frames came while the press went down, none that rest at its depth."""
     return int(np.argmax(np.array(totals) > _BACK * max(totals))) if totals else 0
 
 

@@ -141,7 +141,7 @@ def _write(arguments: argparse.Namespace, new: dict[str, dict[str, list[Any]]]) 
 
 
 def put(text: str, section: str, values: dict[str, list[Any]]) -> str:
-    """A profile's text with these arrays in its ``[section]``, where they stand or as new lines.
+    """Return a profile's text with these arrays in its ``[section]``, in place or as new lines.
 
     Without that header they are ``section.key`` where the text has such keys.
     """

@@ -59,7 +59,7 @@ Done = tuple[Calibration, str, dict[str, Any]]  # with the line to print and the
 
 
 def begin(arguments: argparse.Namespace, settings: Settings) -> Calibration:
-    """The file's calibration, or a new one. Raises CalibrationFileError for another sensor's."""
+    """Return the file's calibration, or a new one. Raises CalibrationFileError."""
     sensor = sensor_of(settings, FINGERS.index(arguments.finger))
     if not arguments.file.exists():
         return Calibration(sensor=sensor, date=now())
@@ -83,7 +83,7 @@ class Step:
 
     @cached_property
     def converter(self) -> Converter:
-        """From counts to pressure, by the steps done so far."""
+        """The conversion of counts to pressure, by the steps done so far."""
         return Converter(self.calibration, self.settings.tactile.pascal_per_count)
 
     @property
@@ -133,7 +133,7 @@ class Step:
         return SensorGrid(sensor.rows, sensor.cols, sensor.pitch)
 
     def result(self, **steps: Any) -> Calibration:
-        """The calibration with these steps."""
+        """Return the calibration with these steps."""
         return self.calibration.model_copy(update={"date": now(), **steps})
 
 

@@ -148,7 +148,7 @@ class Feed:
             self.skipped += 1
 
     def sort_in(self, topic: bytes, record: dict[str, Any], now: float) -> None:
-        """As `take`, of a message that is unpacked already."""
+        """Take a message that is unpacked already, as `take` does."""
         try:
             if topic in self.topics:
                 self.topics[topic](read(schema.TOPICS[topic].record, record), now)
