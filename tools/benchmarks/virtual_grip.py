@@ -106,7 +106,7 @@ class VirtualGrip(Watched):
         return watch
 
     def answer(self, words: str, seconds: float) -> float:
-        """Return the time from the onset of the slip that ``words`` cause to raised goal currents [s].
+        """Return the time from the slip that ``words`` cause to raised goal currents [s].
 
         NaN where nothing slips in so many ``seconds``, infinity without an answer.
         """
