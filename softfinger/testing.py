@@ -123,6 +123,6 @@ def check_shape(settings: Settings) -> None:
     sound = polygon(shape.corners)
     away = float(np.abs(sound.corners - shape.corners).max())
     assert away <= 1e-9, f"found a centre of mass {away:.3g} m off the origin"
-    for name in ("gyration", "lever"):
+    for name in ("gyration", "mean_radius"):
         found, expected = getattr(shape, name), getattr(sound, name)
         assert abs(found - expected) <= 1e-6 * expected, f"{name}: {found:g}, not {expected:g} m"

@@ -9,7 +9,9 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import math
 import os
+import re
 import shlex
 import socket
 import subprocess
@@ -17,14 +19,18 @@ import sys
 from pathlib import Path
 from unittest import mock
 
+from softfinger import SoftfingerError
+from softfinger.daemon.client import Hand, HandState
 from softfinger.daemon.errors import SettingsError
 from softfinger.tools.arguments import profile
 from softfinger.tools.cli import main, make_parser
-from tests.harness.daemon_process import SOFTFINGER
+from softfinger.tools.terminal.status import told
+from tests.harness.daemon_process import PATIENT, SOFTFINGER, Running
 
 _BUSY = "DOCUMENTED_BUSY"  # set for what a command starts: that runs on its own
 _ENDLESS = {"run", "monitor", "view", "replay", "envelope", "bench"}
 _ENDS = {"--record", "--recompute"}  # with these they are run
+_SHOWN = re.compile(r"# (?P<mode>\w+)(?: (?P<force>[\d.]+) N)?(?:.*?(?P<angle>-?[\d.]+)°)?")
 _CLIENT = """\
 import json, socket, sys
 with socket.socket(socket.AF_UNIX) as server:
@@ -61,6 +67,7 @@ class Softfinger:
         self.socket.bind(str(address))
         self.socket.listen()
         self._emulator: subprocess.Popen[str] | None = None
+        self._daemon: Running | None = None
 
     def serve(self) -> None:
         client = self.socket.accept()[0]
@@ -85,9 +92,13 @@ class Softfinger:
 
     def _carry_out(self, words: list[str]) -> int:
         name = words[0]
+        if name == "run" and self._emulator is not None and not _ENDS & {*words}:
+            return self._run(words)
         if name in _ENDLESS and not _ENDS & {*words}:
             parse(words)
             return 0
+        if name == "status" and words[1:]:
+            return _await(words[1])
         if name == "emulate" and "--send" not in words:
             return self._emulate(words)
         if name == "run":  # for a recording; the usual addresses are taken
@@ -100,6 +111,22 @@ class Softfinger:
             with _patient_doctor():
                 return main(words)
 
+    def _run(self, words: list[str]) -> int:
+        """Run the daemon of an emulated hand; later commands go there."""
+        self._end_daemon()
+        stream, commands = (f"ipc://{Path.cwd()}/{each}" for each in ("stream", "commands"))
+        own = ("--set", f"stream.address={stream}", "--set", f"commands.address={commands}")
+        self._daemon = Running(*words[1:], *own, *PATIENT)
+        self._usual = os.environ["SOFTFINGER_ADDRESS"]
+        os.environ["SOFTFINGER_ADDRESS"] = f"{stream},{commands}"
+        return 0
+
+    def _end_daemon(self) -> None:
+        if self._daemon is not None:
+            self._daemon.kill()
+            self._daemon = None
+            os.environ["SOFTFINGER_ADDRESS"] = self._usual
+
     def _emulate(self, words: list[str]) -> int:
         self.end()
         self._emulator = subprocess.Popen([*SOFTFINGER, *words], stdout=subprocess.PIPE, text=True)
@@ -107,11 +134,36 @@ class Softfinger:
         return 0 if self._emulator.stdout.readline() == "ready\n" else 1
 
     def end(self) -> None:
-        """End the emulated hand."""
+        """End the emulated hand and its daemon."""
+        self._end_daemon()
         if self._emulator is not None:
             self._emulator.terminate()
             self._emulator.communicate(timeout=60.0)
             self._emulator = None
+
+
+def _await(shown: str) -> int:
+    """Wait until `status` says what a page shows: its mode, force and angle."""
+    wanted = _SHOWN.match(shown)
+    assert wanted is not None, shown
+    force, angle = (float(wanted[each] or "nan") for each in ("force", "angle"))
+
+    def as_shown(state: HandState) -> bool:
+        felt = 0.5 * (state.left.force + state.right.force)
+        turned = math.degrees(state.object.angle)
+        return (
+            state.mode == wanted["mode"]
+            and not abs(felt - force) > 0.1 * force
+            and not abs(turned - angle) > 1.0
+        )
+
+    with Hand(timeout=120.0) as hand:
+        try:
+            hand.wait_for(as_shown, 120.0)
+        except SoftfingerError as error:
+            print(f"status: the page shows {shown[2:]!r}: {error}; the hand: {told(hand.state())}")
+            return 1
+    return 0
 
 
 def _patient_doctor() -> contextlib.ExitStack:

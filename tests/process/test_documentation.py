@@ -6,6 +6,9 @@ is its `softfinger`, and says what is only parsed. Above a block may stand what 
     <!-- not run: why -->                  it can't be, and why
     <!-- not run without gymnasium -->     it needs a package that isn't installed here
     <!-- exits 1: why -->                  its last command has to fail
+
+Behind `softfinger status` stands what it shows: the test waits until the hand's mode, force and
+angle are so.
 """
 
 from __future__ import annotations
@@ -39,6 +42,7 @@ USUAL = ("tcp://127.0.0.1:9872", "tcp://127.0.0.1:9873")
 MARK = re.compile(r"^ *<!-- (?:not run|exits)\b.*-->$", re.M)
 REASON = re.compile(r"not run: \S.*|not run without \w+|exits 1: \S.*")
 FENCE = re.compile(r"(?ms)^(?P<indent> *)```(?P<language>\w*)[^\n]*\n(?P<text>.*?)^(?P=indent)```$")
+STATUS = re.compile(r"(?m)^(softfinger status) +(# .*)$")  # with what the hand has to say then
 PRINTS = 20  # of a program without an end
 PATIENCE = 300.0  # s for a block
 
@@ -183,7 +187,7 @@ def test_blocks(
             ):
                 parse_only(block, at)
             elif block.language in ("sh", "bash"):
-                failed = shell.run(block.text)
+                failed = shell.run(STATUS.sub(lambda line: f"{line[1]} '{line[2]}'", block.text))
                 status = 1 if block.mark else 0
                 assert int(failed.split()[0] if failed else 0) == status, (
                     f"{at}: {failed}\n{shell.log.read_text()}"

@@ -387,7 +387,14 @@ class Soak:
             "disarmed": ("arm",),
             "armed": ("grasp", "grasp", "grasp", "grasp", "move", "release"),
             "moving": ("grasp",),
-            "holding": (*["rotate"] * 4, *["grasp"] * 3, "release", "stop", "status", "status"),
+            "holding": (
+                *["rotate"] * 4,
+                *["grasp"] * 3,
+                *["hold"] * 3,
+                "release",
+                "stop",
+                "status",
+            ),
             "rotating": (*["status"] * 6, "grasp", "stop"),
             "fault": ("clear",),
         }.get(mode, ("status",))
@@ -412,7 +419,7 @@ class Soak:
             self.servos.armed, self.off_by = True, math.inf
         elif name in ("stop", "disarm"):
             self._must_end(STOPPED.get(mode, OFF) if name == "stop" else OFF)
-        if name == "grasp":
+        if name == "grasp" or (name == "hold" and ("force" in request or mode not in _GRIPPING)):
             force = request.get("force", self.settings.control.force_default)
             t = self.daemon.clock.now()
             if not self._asked:  # a motion may have pressed more

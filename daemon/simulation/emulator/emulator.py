@@ -272,9 +272,11 @@ class Emulator:
         else:
             self.hand.advance(t)
         self._advance_due = t + _STEP
-        for finger, plate in self._plates.items():
+        for finger, plate in list(self._plates.items()):
             if press := plate.reached(t):
                 self._tell(f"plate: {finger} {press}")
+                if press.is_clear:
+                    self._take_away(finger)
         if self._slipped is None:
             limit = _SLIPS * self._simulation.tip_friction
             tips = zip(self.hand.tangential.tolist(), self.hand.normal.tolist(), strict=True)
@@ -290,8 +292,8 @@ class Emulator:
         A time behind a word counts from now. With ``report`` among them the answer is
         :meth:`report` as JSON, and with ``goals`` each servo's newest goal currents are in it;
         ``forget`` begins the record again; ``place`` puts the object back where it was at the
-        start, at rest and with no load on it. ``press …`` is for :meth:`press`, ``turn …`` for
-        :meth:`turn`.
+        start, at rest and with no load on it, and takes plates away. ``press …`` is for
+        :meth:`press`, ``turn …`` for :meth:`turn`.
         """
         words = text.split()
         if words[:1] == ["turn"]:
@@ -309,6 +311,8 @@ class Emulator:
             self._forget(now)
         if "place" in words:
             self.hand.place_object()
+            for finger in list(self._plates):
+                self._take_away(finger)
         self._events += [event._replace(after=now + event.after) for event in fresh]
         self._events.sort(key=lambda event: event.after)
         self._advance_due = now  # so that what starts now does
@@ -334,6 +338,11 @@ class Emulator:
                 self._sources[finger].stage = plate
         ends = [plate.arrives - now for plate in self._plates.values()]
         return json.dumps({"wait": max(0.0, *ends) if ends else 0.0})
+
+    def _take_away(self, finger: str) -> None:
+        """Take a tip's plate away: its sensor feels the object again."""
+        del self._plates[finger]
+        self._sources[finger].stage = None
 
     def turn(self, words: Sequence[str]) -> str:
         """Let a person's hand turn joints: ``left=closed``, to its stop; ``open``; ``zero``.

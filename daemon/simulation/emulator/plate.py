@@ -54,6 +54,11 @@ class PlatePress:
     speed: float
     hold: float
 
+    @property
+    def is_clear(self) -> bool:
+        """True for a plate that is lifted off, and stays so."""
+        return self.d <= 0.0 and self.pressure == 0.0 and self.hold == math.inf
+
     def __str__(self) -> str:
         if self.pressure > 0.0:
             return f"{self.pressure / 1e3:g} kPa on all cells"

@@ -29,9 +29,7 @@ class Shape:
     corners: FloatArray  # [n, 2], counter-clockwise; of a disc: those of the square round it
     roundness: float  # radius of a disc, else 0
     gyration: float  # radius of gyration
-    mean_radius: (
-        float  # mean distance of its points from the centre: what spinning friction acts on
-    )
+    mean_radius: float  # of its points from the centre: what spinning friction acts on
 
     @property
     def extent(self) -> float:
