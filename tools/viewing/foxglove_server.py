@@ -98,7 +98,7 @@ class FoxgloveServer:
             except TypeError:  # orjson's error, too: JSON can't hold it
                 self.unreadable += 1
 
-    def draw(self, last: bool = False) -> None:
+    def draw(self) -> None:
         """Send the newest frames, the scene, and events if somebody looks at them."""
         for message in self._frames.values():
             try:

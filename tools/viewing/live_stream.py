@@ -49,8 +49,8 @@ class Taker(Protocol):
     def take(self, topic: bytes, message: Any) -> None:
         """One message, whatever it holds."""
 
-    def draw(self, last: bool = False) -> None:
-        """Show what came since the last drawing; nothing more will come after the ``last``."""
+    def draw(self) -> None:
+        """Show what came since the last drawing."""
 
 
 def follow(
@@ -88,7 +88,7 @@ def follow(
             # Never busy for more than half of its time, however slow the machine is.
             due = after + max(period - (after - now), min(after - now, _REST))
         stream.drain(bridge, 0.0)
-        bridge.draw(last=True)
+        bridge.draw()
 
 
 class LiveStream:

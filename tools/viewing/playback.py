@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import math
 import time
 
 from softfinger.daemon.wire import schema
@@ -27,6 +29,14 @@ class Playback:
     def seek(self, position: float) -> None:
         """Go to ``position`` [s], from any thread."""
         self._target = min(max(position, 0.0), self.duration)
+
+    def ask(self, wish: str) -> None:
+        """Carry out a page's wish: ``play``, ``pause`` or a position; others are ignored."""
+        with contextlib.suppress(ValueError):
+            if wish in ("play", "pause"):
+                self.playing = wish == "play"
+            elif math.isfinite(place := float(wish)):
+                self.seek(place)
 
     def run(self, ending: Ending) -> None:
         """Play until the end is asked for."""
@@ -56,7 +66,7 @@ class Playback:
     def _stand(self, ending: Ending) -> None:
         """Show this place for one picture; the next is later where it plays."""
         begun = time.monotonic()
-        self._pictures.draw()
+        self._pictures.draw((self.position, self.duration, self.playing))
         ending.wait(self._period)
         if self.playing:
             self.position = min(self.position + time.monotonic() - begun, self.duration)
