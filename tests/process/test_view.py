@@ -292,7 +292,7 @@ def test_messages_of_any_kind_are_survived() -> None:
     odd += [{"timestamp": 1e9, "settings": "{", "request": "{", "command": "grasp", "ok": True}]
     odd += [{**state(0.0, 1), "mode": "\x1b[31m", "left": {**finger(0.0, 0), "q": 1e308}}]
     kept = Kept(live=True)
-    for topic in (*kept.pictures._gaps, b"hand/news"):
+    for topic in (*TOPICS, b"hand/news"):
         for message in odd:
             kept.pictures.take(topic, message)
             kept.pictures.draw()
@@ -318,7 +318,7 @@ def test_while_nothing_is_read_states_wait(
                 select.select([], [], [], 0.005)  # as fast as libzmq's own thread takes them
         until(lambda: stream.drain(kept.pictures, 0.0) == 0)
     kept.pictures.draw()
-    assert kept.pictures.shown == 10_000
+    assert kept.pictures.states == 10_000
     assert "0 lost, 0 unreadable" in kept.newest["facts"]
 
 

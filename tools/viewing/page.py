@@ -70,22 +70,21 @@ class SameOrigin:
 
 
 class Newest:
-    """The newest scene and picture, for the ``waiting`` pages, which ``loop`` serves."""
+    """The next scene and picture, for the pages that are ``waiting`` for them in ``loop``."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
-        self.waiting = 0
+        self.waiting: list[asyncio.Future[tuple[str, str]]] = []
         self._loop = loop
-        self._pair = "", ""
-        self._come = asyncio.Event()
 
     def publish(self, scene: bytes, picture: bytes) -> None:
         """Give both to the pages, from another thread."""
-        self._loop.call_soon_threadsafe(self._take, scene.decode(), picture.decode())
+        self._loop.call_soon_threadsafe(self._give, (scene.decode(), picture.decode()))
 
-    def _take(self, scene: str, picture: str) -> None:
-        self._pair = scene, picture
-        self._come.set()
-        self._come = asyncio.Event()
+    def _give(self, pair: tuple[str, str]) -> None:
+        for each in self.waiting:
+            if not each.done():  # the page has gone
+                each.set_result(pair)
+        self.waiting = []
 
     async def serve(self, playback: Playback | None, page: WebSocket) -> None:
         """Send a page the next picture each time it asks, and the scene where it is another."""
@@ -96,15 +95,11 @@ class Newest:
                 wish = await page.receive_text()
                 if playback is not None:
                     playback.ask(wish)
-                self.waiting += 1
-                try:
-                    await self._come.wait()
-                finally:
-                    self.waiting -= 1
-                scene, picture = self._pair
-                if scene is not known:
-                    known = scene
+                self.waiting.append(self._loop.create_future())
+                scene, picture = await self.waiting[-1]
+                if scene != known:
                     await page.send_text(scene)
+                known = scene
                 await page.send_text(picture)
 
 
@@ -166,7 +161,7 @@ def show(arguments: argparse.Namespace, ending: Ending) -> None:
     keys = client_keys(arguments.keys)
     loop = asyncio.new_event_loop()
     newest = Newest(loop)
-    pictures = Pictures(newest.publish, lambda: newest.waiting > 0, _say, live=recording is None)
+    pictures = Pictures(newest.publish, lambda: bool(newest.waiting), _say, live=recording is None)
     token = playback = None
     if recording is None:
         token, role = secrets.token_urlsafe(16), "command"
@@ -225,7 +220,7 @@ def show(arguments: argparse.Namespace, ending: Ending) -> None:
         finally:
             server.should_exit = True
             serving.join()
-    _say(f"{pictures.shown} states seen, {pictures.unreadable} messages could not be read")
-    if pictures.shown == 0:
+    _say(f"{pictures.states} states seen, {pictures.unreadable} messages could not be read")
+    if pictures.states == 0:
         where = arguments.address if recording is None else arguments.file
         raise ViewError(f"{where}: nothing came that can be shown")

@@ -19,16 +19,15 @@ import numpy as np
 import orjson
 from numpy.typing import NDArray
 
-from softfinger.daemon.client.stream import Gaps
 from softfinger.daemon.control.modes import COMMANDS
 from softfinger.daemon.types import FINGERS
 from softfinger.daemon.wire import schema
 from softfinger.tools.terminal import heatmap
-from softfinger.tools.terminal.feed import Feed, number, printable, text
+from softfinger.tools.terminal.feed import Feed, number
 from softfinger.tools.terminal.typeset import micro, short
 from softfinger.tools.viewing import planar
-from softfinger.tools.viewing.known import HEIGHT, WIDTH, ShownHand, palette, read_settings
-from softfinger.tools.viewing.live_stream import TOPICS
+from softfinger.tools.viewing.known import HEIGHT, WIDTH, ShownHand, palette
+from softfinger.tools.viewing.live_stream import Viewer
 from softfinger.tools.viewing.planar import COLOURS, GOAL, LATE, LEVELS, OBJECT, touch
 
 SECONDS = 12.0  # of the past in the plots
@@ -71,10 +70,9 @@ _BOUNDS = {  # fields of a finger, and what bounds them in the section `safety`
 }
 
 
-class Pictures:
-    """Takes messages (`live_stream.Taker`), and gives ``publish`` the scene and each picture.
+class Pictures(Viewer):
+    """Gives ``publish`` the scene and each picture, where it is ``watched``.
 
-    ``watched`` tells whether anybody looks: without, nothing is drawn. ``shown`` counts states.
     Times are the machine's of a ``live`` stream, the messages' of a recording.
     """
 
@@ -82,79 +80,47 @@ class Pictures:
         self,
         publish: Callable[[bytes, bytes], None],
         watched: Callable[[], bool],
-        say: Callable[[str], None] = lambda _: None,
+        say: Callable[[str], None],
         *,
         live: bool = True,
     ) -> None:
         self._publish = publish
         self._watched = watched
-        self._say = say
         self._live = live
-        self._same_schema = True
-        self._known = ""  # the settings, as they came
-        self.shown = self.unreadable = 0
-        self.hand = ShownHand()
-        self.clear()
-        self._know(self.hand)
+        super().__init__(say)
 
     def clear(self) -> None:
         """Forget all but the hand: what comes next is of another time."""
         self.feed = Feed()
-        self.time = math.nan
-        self._parts = planar.HandScene(self.hand)
-        self._state: dict[str, Any] = {}
-        self._truth: dict[str, Any] | None = None
-        self._frames: dict[str, dict[str, Any]] = {}
         self._columns: deque[list[Any]] = deque(maxlen=round(SECONDS / _STEP))
         self._trails = {name: deque[tuple[float, float]](maxlen=60) for name in FINGERS}
         self._pressure = heatmap.FullScale(5e3)
-        self._gaps = {topic: Gaps() for topic in TOPICS}
+        super().clear()
+
+    @property
+    def _state(self) -> dict[str, Any]:
+        return self.newest.get(schema.STATE, {})
 
     def _moment(self) -> float:
         return time.monotonic() if self._live else self.time
 
-    def take(self, topic: bytes, message: Any) -> None:
+    def take(self, topic: bytes, message: Any) -> bool:
         """One message, whatever it holds."""
-        if topic not in self._gaps:
-            return
-        when = number(message, "timestamp")
-        if not 0.0 <= when < 2.0**33:
-            self.unreadable += 1
-            return
-        self._gaps[topic].take(message)
-        if message.get("schema") != schema.SCHEMA and self._same_schema:
-            self._same_schema = False
-            self._say(
-                f"the stream is of schema {message.get('schema')!r:.20}, this viewer knows "
-                f"{schema.SCHEMA}; it keeps to the fields it knows"
-            )
+        before = number(self._state, "seq")
+        if not super().take(topic, message):
+            return False
+        self.feed.sort_in(topic, message, self._moment())
         if topic == schema.STATE:
-            if number(message, "seq") < number(self._state, "seq"):  # another daemon's
+            if number(message, "seq") < before:  # another daemon's
                 self._columns.clear()
                 for trail in self._trails.values():
                     trail.clear()
-            self.time, self._state = when, message
-            self.shown += 1
-        self.feed.sort_in(topic, message, self._moment())
-        if topic == schema.STATE:
-            self._take_column(when)
-        elif topic == schema.TACTILE:
-            self._frames[text(message, "finger")] = message
-        elif topic == schema.TRUTH:
-            self._truth = message
-        elif topic == schema.SETTINGS and text(message, "settings") != self._known:
-            self._known = text(message, "settings")
-            settings, unknown = read_settings(message)
-            if unknown:
-                version = text(message, "version") or "another version"
-                keys = printable(", ".join(unknown))
-                self._say(f"settings of {version} that are not known here: {keys}")
-            self._know(ShownHand(settings))
+            self._take_column(self.time)
+        return True
 
-    def _know(self, hand: ShownHand) -> None:
+    def know(self, hand: ShownHand) -> None:
         """Lay out the scene of a hand: panels and plots of what it has, and no others."""
-        self.hand = hand
-        self._parts = planar.HandScene(hand)
+        super().know(hand)
         self._columns.clear()
         self._fields: list[tuple[str, float]] = []  # what the plots' columns hold, and its factor
         a = hand.geometry.tip_radius
@@ -261,8 +227,8 @@ class Pictures:
         self._publish(self._scene, orjson.dumps(picture))
 
     def _hand(self) -> dict[str, Any]:
-        parts = self._parts.parts(self._state)
-        every = [*parts.values(), self._parts.simulated(self._truth)]
+        parts = self.parts.parts(self._state)
+        every = [*parts.values(), self.parts.simulated(self.newest.get(schema.TRUTH))]
         strips = [strip for part in every for strip in part.strips]
         lines = [(strip.colour, 1e-3 * strip.width, _flat(strip.points)) for strip in strips]
         texts = []
@@ -276,14 +242,14 @@ class Pictures:
 
     def _maps(self, now: float) -> dict[str, Any]:
         """Each tip's frame with its rim, and footprint and centroid of the contact."""
-        frames = {name: each for name, each in self.feed.frames.items() if name in self._frames}
+        frames = {name: each for name, each in self.feed.frames.items() if name in self.frames}
         peak = max((float(frame.grid.max()) for frame in frames.values()), default=0.0)
         full = self._pressure.follow(peak, now)
         maps = {}
         for name, frame in frames.items():
             unit, factor = ("counts", 1.0) if math.isnan(frame.scale) else ("kPa", 1e-3)
             lines, dots = [], []
-            grid, radius = planar.grid_of(self._frames[name]), self.hand.settings.tip.radius
+            grid, radius = planar.grid_of(self.frames[name]), self.hand.settings.tip.radius
             if grid is not None:
                 lines.append((COLOURS[name], 1.0, _flat(planar.tip_circle(grid, radius))))
             contact = touch(self._state, name)
@@ -360,7 +326,7 @@ class Pictures:
             f"frames {each('frame_age_s', 1e3, 0)} ms old",
             f"servos {each('temperature', 1.0, 0)} °C, {each('voltage', 1.0, 1)} V",
             f"object {short(1e3 * state.object.width, 1)} mm wide",
-            f"{sum(gaps.lost for gaps in self._gaps.values())} lost, {feed.skipped} unreadable",
+            f"{sum(gaps.lost for gaps in self.gaps.values())} lost, {feed.skipped} unreadable",
             *([f"{who} commands"] if who else []),
         ]
 
@@ -372,7 +338,8 @@ def _panel(name: str, title: str, *box: float, **more: Any) -> dict[str, Any]:
 
 def _flat(points: NDArray[np.float64]) -> list[float]:
     """x and y in turn; four decimals are a tenth of a pixel or less, in metres, too."""
-    return [round(value, 4) for value in np.ravel(points).tolist()]
+    flat: list[float] = np.clip(points, -1e6, 1e6).round(4).ravel().tolist()
+    return flat
 
 
 def _image(levels: NDArray[np.uint8], colours: str) -> dict[str, Any]:
