@@ -55,7 +55,7 @@ class Playback:
         self.position = target
         for topic, message in self._recording.messages(TOPICS, target - SECONDS):
             at = min(number(message, "timestamp") - self._recording.start, self.duration)
-            while at > self.position:
+            while at > self.position and self._pictures.newest.get(schema.STATE):
                 self._stand(ending)
                 if self._target is not None or ending.over:
                     return
