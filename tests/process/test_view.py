@@ -69,9 +69,11 @@ def view(fake: FakeDaemon, *words: str) -> Viewed:
     return Viewed(*where, *words)
 
 
-def got(host: str, path: str, method: str = "GET", **headers: str) -> tuple[int, str]:
+def got(
+    host: str, path: str, method: str = "GET", body: Any = None, **headers: str
+) -> tuple[int, str]:
     connection = http.client.HTTPConnection(host, timeout=60)
-    connection.request(method, path, headers=headers)
+    connection.request(method, path, body and orjson.dumps(body), headers)
     answer = connection.getresponse()
     body = answer.read().decode()
     connection.close()
@@ -217,12 +219,41 @@ def test_only_the_token_brings_what_commands() -> None:
             assert status == 200
             assert "STOP" not in body
             assert "Watching" in body
-            assert got(viewed.host, path.replace("/", "/stop"), "POST")[0] == 403
+            for action in ("/stop", "/command"):
+                answer = got(viewed.host, path.replace("/", action), "POST")
+                assert answer == (403, "✗ needs the token that the terminal prints")
         assert not fake.requests
-        query = viewed.commanding.removeprefix(viewed.address)
-        assert got(viewed.host, f"/stop{query}", "POST", Origin="http://evil.example")[0] == 403
-        assert got(viewed.host, f"/stop{query}", "POST") == (200, "✓ stop: ok")
+        stop = "/stop" + viewed.commanding.removeprefix(viewed.address)
+        assert got(viewed.host, stop, "POST", Origin="http://evil.example")[0] == 403
+        assert got(viewed.host, stop, "POST") == (200, "✓ stop: ok")
         assert fake.requests == [{"command": "stop"}]
+        fake.replies["stop"] = {"ok": True, "torque_off": "unconfirmed"}
+        status, said = got(viewed.host, stop, "POST")
+        assert (status, said[:7]) == (409, "✗ stop:")
+
+
+def test_a_command_is_sent_once_and_not_long_after_its_picture() -> None:
+    grasp = {"command": "grasp", "force": 5.0, "client": "page 1"}
+    with FakeDaemon() as fake, view(fake) as viewed, Watcher(viewed.host) as page:
+        path = "/command" + viewed.commanding.removeprefix(viewed.address)
+        seen = page.next()["now"]
+        assert got(viewed.host, path, "POST", {**grasp, "seen": seen}) == (200, "✓ grasp: ok")
+        fake.replies["grasp"] = {"ok": False, "error": "grasp: not while disarmed; arm first"}
+        seen = page.next()["now"]
+        refused = got(viewed.host, path, "POST", {**grasp, "seen": seen})
+        assert refused == (409, "✗ grasp: not while disarmed; arm first")
+        assert fake.requests == [grasp, grasp]
+        for late in (seen - 3.0, math.nan):  # which JSON has as null
+            answer = got(viewed.host, path, "POST", {**grasp, "seen": late})
+            assert answer[0] in (400, 409)
+        for odd in (None, "grasp", [], {"command": "grasp"}, {"seen": seen}):
+            assert got(viewed.host, path, "POST", odd)[0] == 400
+        fake.close()
+        seen = page.next()["now"]
+        status, said = got(viewed.host, path, "POST", {**grasp, "seen": seen})
+        assert status == 504
+        assert "✗ grasp: no answer" in said
+        assert len(fake.requests) == 2
 
 
 # A recording

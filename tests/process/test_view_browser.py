@@ -203,7 +203,7 @@ def test_a_recordings_slider_goes_to_its_place(page: Page, tmp_path: Path) -> No
     record_hand(path, {30: {"command": "arm"}, 60: {"command": "grasp", "force": 8.0}}, 2.0)
     with Viewed(str(path)) as viewed:
         page.open(viewed.address)
-        until(lambda: page.text("output.place").startswith("2.0 of 2.0"))
+        until(lambda: page.text(".reply").startswith("2.0 of 2.0"))
         assert page.text(".mode") == "holding"
         box = page(
             "(({left, top, height}) => [left, top + height / 2])"

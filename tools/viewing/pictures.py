@@ -106,16 +106,21 @@ class Pictures(Viewer):
 
     def take(self, topic: bytes, message: Any) -> bool:
         """One message, whatever it holds."""
-        before = number(self._state, "seq")
+        state, when = self._state, self.time
         if not super().take(topic, message):
             return False
-        self.feed.sort_in(topic, message, self._moment())
-        if topic == schema.STATE:
-            if number(message, "seq") < before:  # another daemon's
-                self._columns.clear()
-                for trail in self._trails.values():
+        if topic == schema.STATE and number(message, "seq") < number(state, "seq"):
+            self._columns.clear()  # they are another daemon's
+            for trail in self._trails.values():
+                trail.clear()
+        elif topic == schema.STATE and 0.0 <= when // _STEP != self.time // _STEP:
+            self._columns.append(self._column(when))  # the last state of a step stays
+            for name, trail in self._trails.items():
+                if (contact := touch(state, name)) is None:
                     trail.clear()
-            self._take_column(self.time)
+                else:
+                    trail.append((contact.d, contact.theta))
+        self.feed.sort_in(topic, message, self._moment())
         return True
 
     def know(self, hand: ShownHand) -> None:
@@ -143,17 +148,16 @@ class Pictures(Viewer):
             box = -30, WIDTH + 8, -6, HEIGHT + 14
             panels.append(_panel("landscape", "Energy landscape U(d, θ)", *box, still=still))
         plots = [{"title": name, "lines": self._lines(*of)} for name, of in _PLOTS.items()]
-        self._scene = orjson.dumps(
-            {
-                "seconds": SECONDS,
-                "panels": panels,
-                "plots": [plot for plot in plots if plot["lines"]],
-                "modes": _MODES,
-                "levels": LEVELS,
-                "palettes": {"pressure": heatmap.colour_map(), "energy": palette().tolist()},
-                "commands": {name: list(modes) for name, (modes, _) in COMMANDS.items()},
-            }
-        )
+        scene = {
+            "seconds": SECONDS,
+            "panels": panels,
+            "plots": [plot for plot in plots if plot["lines"]],
+            "modes": _MODES,
+            "levels": LEVELS,
+            "palettes": {"pressure": heatmap.colour_map(), "energy": palette().tolist()},
+            "commands": {name: list(modes) for name, (modes, _) in COMMANDS.items()},
+        }
+        self._scene = orjson.dumps(scene)
 
     def _lines(self, factor: float, fields: str) -> list[dict[str, Any]]:
         """A plot's lines: name, colour, and the columns of values and of their deviations."""
@@ -175,18 +179,8 @@ class Pictures(Viewer):
             lines.append({"name": name, "colour": colour, "goal": goal, "columns": columns})
         return lines
 
-    def _take_column(self, when: float) -> None:
-        """The newest state is the last column, and stays when the next step begins."""
-        state, columns = self.feed.state, self._columns
-        if columns and when // _STEP == columns[-1][0] // _STEP:
-            columns.pop()
-        elif columns:
-            for name, trail in self._trails.items():
-                contact = touch(self._state, name)
-                if contact is None:
-                    trail.clear()
-                else:
-                    trail.append((contact.d, contact.theta))
+    def _column(self, when: float) -> list[Any]:
+        state = self.feed.state
         row: list[Any] = [when, self.feed.mode]
         for path, factor in self._fields:
             value: Any = math.nan
@@ -195,7 +189,7 @@ class Pictures(Viewer):
             elif path != "goal_energy" and (path != "object.angle" or state.object.valid):
                 value = attrgetter(path)(state)
             row.append(float(f"{factor * value:.5g}"))
-        columns.append(row)
+        return row
 
     def draw(self, place: tuple[float, float, bool] | None = None) -> None:
         """Publish a picture of what has come so far, where anybody looks.
@@ -219,10 +213,8 @@ class Pictures(Viewer):
             "limits": self._limits(),
             "facts": self._facts(now),
             "panels": {"hand": self._hand(), "landscape": self._contacts(), **self._maps(now)},
-            "columns": list(self._columns),
-            "events": [
-                (each.clock(), each.level, each.kind, each.text) for each in feed.events[-_EVENTS:]
-            ],
+            "columns": [*self._columns, self._column(self.time)],
+            "events": [(each.clock(), *each[1:]) for each in feed.events[-_EVENTS:]],
         }
         self._publish(self._scene, orjson.dumps(picture))
 
@@ -284,11 +276,8 @@ class Pictures(Viewer):
     def _limits(self) -> str:
         """What holds the hand back: a recent warning, the grip's goal, and the nearest limit."""
         state, safety = self.feed.state, self.hand.settings.safety
-        parts = [
-            each.text
-            for each in self.feed.events[-1:]
-            if each.level == "warning" and self.time - each.timestamp < _LATELY
-        ]
+        last = [each for each in self.feed.events[-1:] if each.level == "warning"]
+        parts = [each.text for each in last if self.time - each.timestamp < _LATELY]
         if math.isfinite(state.goal_force):
             asked = self.feed.asked
             raised = f", raised from {asked:.1f} N" if state.goal_force > 1.01 * asked else ""
