@@ -138,9 +138,8 @@ class Commands:
         except NoAnswer as error:
             return PlainTextResponse(f"✗ {asked['command']}: {error}", 504)
         reply = judge(time.monotonic(), str(asked["command"]), record)
-        return PlainTextResponse(
-            f"{'✓' if reply.ok else '✗'} {reply.text}", 200 if reply.ok else 409
-        )
+        sign, status = ("✓", 200) if reply.ok else ("✗", 409)
+        return PlainTextResponse(f"{sign} {reply.text}", status)
 
 
 def listen(port: int | None) -> socket.socket:
@@ -174,29 +173,24 @@ def show(arguments: argparse.Namespace, ending: Ending) -> None:
 
     def page(request: Request) -> HTMLResponse:
         shown = role if token is None or commands.allows(request) else "watch"
-        return HTMLResponse(
-            re.sub(rf'<section class="(?!{shown}).*?</section>', "", _PAGE, flags=re.S)
-        )
+        others = rf'<section class="(?!{shown}).*?</section>'
+        return HTMLResponse(re.sub(others, "", _PAGE, flags=re.S))
 
-    site = Starlette(
-        routes=[
-            Route("/", page),
-            Route("/stop", commands.carry_out, methods=["POST"]),
-            Route("/command", commands.carry_out, methods=["POST"]),
-            WebSocketRoute("/pictures", partial(newest.serve, playback)),
-        ]
+    posts = [
+        Route(f"/{path}", commands.carry_out, methods=["POST"]) for path in ("stop", "command")
+    ]
+    pages = WebSocketRoute("/pictures", partial(newest.serve, playback))
+    site = Starlette(routes=[Route("/", page), *posts, pages])
+    config = uvicorn.Config(
+        SameOrigin(site),
+        lifespan="off",
+        log_level="error",
+        access_log=False,
+        proxy_headers=False,
+        ws_per_message_deflate=False,  # nothing is gained on this machine
+        timeout_graceful_shutdown=1,
     )
-    server = uvicorn.Server(
-        uvicorn.Config(
-            SameOrigin(site),
-            lifespan="off",
-            log_level="error",
-            access_log=False,
-            proxy_headers=False,
-            ws_per_message_deflate=False,  # nothing is gained on this machine
-            timeout_graceful_shutdown=1,
-        )
-    )
+    server = uvicorn.Server(config)
 
     def serve() -> None:
         try:
@@ -208,14 +202,14 @@ def show(arguments: argparse.Namespace, ending: Ending) -> None:
         serving = threading.Thread(target=serve)
         serving.start()
         address = f"http://{LOOPBACK}:{listener.getsockname()[1]}/"
-        if token is not None:
-            print(f"view: {address}?token={token} to see and command the hand", flush=True)
-        print(f"view: {address} to see it", flush=True)
-        if not arguments.no_browser:
-            # Without the token: other users of this machine may read a browser's command line.
-            webbrowser.open(address)
-        ending.begin()
         try:
+            if token is not None:
+                print(f"view: {address}?token={token} to see and command the hand", flush=True)
+            print(f"view: {address} to see it", flush=True)
+            if not arguments.no_browser:
+                # Without the token: other users of this machine may read a browser's command line.
+                webbrowser.open(address)
+            ending.begin()
             source()
         finally:
             server.should_exit = True

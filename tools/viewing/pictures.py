@@ -62,12 +62,7 @@ _OTHERS = {  # names and colours of lines that are no finger's
     "compute_s": ("work", OBJECT),
     "wake_late_s": ("late", LATE),
 }
-_BOUNDS = {  # fields of a finger, and what bounds them in the section `safety`
-    "force": "force_max",
-    "d": "d_max",
-    "current": "current_max",
-    "temperature": "temperature_max",
-}
+_BOUNDED = ("force", "d", "current", "temperature")  # of a finger, each by `safety.…_max`
 
 
 class Pictures(Viewer):
@@ -265,12 +260,11 @@ class Pictures(Viewer):
         lines, dots = [], []
         for name in self.hand.fingers:
             contact = touch(self._state, name)
-            if contact is None or self._landscape is None:
-                continue
-            trail = np.array([*self._trails[name], (contact.d, contact.theta)])
-            places = self._landscape.place(*trail.T)
-            lines.append((COLOURS[name], 2.0, _flat(places)))
-            dots.append((COLOURS[name], *_flat(places[-1])))
+            if contact is not None and self._landscape is not None:
+                trail = np.array([*self._trails[name], (contact.d, contact.theta)])
+                places = self._landscape.place(*trail.T)
+                lines.append((COLOURS[name], 2.0, _flat(places)))
+                dots.append((COLOURS[name], *_flat(places[-1])))
         return {"lines": lines, "dots": dots}
 
     def _limits(self) -> str:
@@ -283,14 +277,13 @@ class Pictures(Viewer):
             raised = f", raised from {asked:.1f} N" if state.goal_force > 1.01 * asked else ""
             parts.append(f"grip: goal {state.goal_force:.1f} N{raised}")
         used = [
-            (value / getattr(safety, bound), f"{name} {key}", bound)
+            (value / getattr(safety, f"{key}_max"), name, key)
             for name in self.hand.fingers
-            for key, bound in _BOUNDS.items()
+            for key in _BOUNDED
             if math.isfinite(value := abs(getattr(getattr(state, name), key)))
         ]
-        if used:
-            ratio, what, bound = max(used)
-            parts.append(f"nearest limit: {what} at {ratio:.0%} of safety.{bound}")
+        for ratio, name, key in sorted(used)[-1:]:
+            parts.append(f"nearest limit: {name} {key} at {ratio:.0%} of safety.{key}_max")
         return " · ".join(parts)
 
     def _facts(self, now: float) -> list[str]:
