@@ -12,7 +12,10 @@ from softfinger.daemon.errors import SoftfingerError
 _EXTRAS = {  # what the message says, and the modules
     "plot": ("pictures need matplotlib", ("matplotlib",)),
     "record": ("recordings need mcap, orjson and zstandard", ("mcap", "orjson", "zstandard")),
-    "view": ("the page needs nicegui and orjson", ("nicegui", "orjson")),
+    "view": (
+        "the page needs starlette, uvicorn, websockets and orjson",
+        ("starlette", "uvicorn", "websockets", "orjson"),
+    ),
     "foxglove": ("Foxglove's server needs foxglove-sdk and orjson", ("foxglove", "orjson")),
     "parquet": ("Parquet files need pyarrow", ("pyarrow",)),
     "gym": ("the environments need gymnasium", ("gymnasium",)),

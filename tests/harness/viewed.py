@@ -60,7 +60,7 @@ class Watcher:
         self.socket.send("")
         while True:
             message = json.loads(self.socket.recv(timeout=WAIT))
-            if isinstance(message["panels"], dict):
+            if "columns" in message:
                 return dict(message)
             self.scene = message
 

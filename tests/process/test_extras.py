@@ -18,7 +18,7 @@ from tests.process.test_record import written
         ("mcap", "record new.mcap", "record"),
         ("orjson", "record new.mcap", "record"),
         ("zstandard", "record new.mcap", "record"),
-        ("nicegui", "view", "view"),
+        ("starlette", "view", "view"),
         ("foxglove", "view --foxglove", "foxglove"),
         ("pyarrow", "export run.mcap --format parquet", "parquet"),
     ],

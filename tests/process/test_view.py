@@ -69,9 +69,11 @@ def view(fake: FakeDaemon, *words: str) -> Viewed:
     return Viewed(*where, *words)
 
 
-def got(host: str, path: str, method: str = "GET", **headers: str) -> tuple[int, str]:
+def got(
+    host: str, path: str, method: str = "GET", body: Any = None, **headers: str
+) -> tuple[int, str]:
     connection = http.client.HTTPConnection(host, timeout=60)
-    connection.request(method, path, headers=headers)
+    connection.request(method, path, body and orjson.dumps(body), headers)
     answer = connection.getresponse()
     body = answer.read().decode()
     connection.close()
@@ -169,7 +171,7 @@ def test_what_the_scene_lacks_has_no_place(
     kept = Kept()
     for topic, message in Recording(tmp_path / "a.mcap").messages():
         kept.pictures.take(topic, message)
-    kept.pictures.draw(last=True)
+    kept.pictures.draw()
     names = {each["name"] for each in kept.scene["panels"]}
     names |= {each["title"] for each in kept.scene["plots"]}
     assert there in names
@@ -198,10 +200,9 @@ def test_other_hosts_and_origins_are_refused_and_nothing_else_listens() -> None:
             "http://127.0.0.1:1",
         ):
             assert got(viewed.host, "/", Origin=origin)[0] == 403
-            for path in ("pictures", "_nicegui_ws/socket.io/?EIO=4&transport=websocket"):
-                with pytest.raises(InvalidStatus, match="403"), Watcher(viewed.host, origin=origin):
-                    pass
-                assert got(viewed.host, f"/{path}", Origin=origin)[0] == 403
+            assert got(viewed.host, "/pictures", Origin=origin)[0] == 403
+            with pytest.raises(InvalidStatus, match="403"), Watcher(viewed.host, origin=origin):
+                pass
         with Watcher(viewed.host, origin=f"http://{viewed.host}") as page:
             assert page.next()["mode"] == "holding"
         for path in ("/docs", "/openapi.json", "/../etc/passwd"):
@@ -218,12 +219,41 @@ def test_only_the_token_brings_what_commands() -> None:
             assert status == 200
             assert "STOP" not in body
             assert "Watching" in body
-            assert got(viewed.host, path.replace("/", "/stop"), "POST")[0] == 403
+            for action in ("/stop", "/command"):
+                answer = got(viewed.host, path.replace("/", action), "POST")
+                assert answer == (403, "✗ needs the token that the terminal prints")
         assert not fake.requests
-        query = viewed.commanding.removeprefix(viewed.address)
-        assert got(viewed.host, f"/stop{query}", "POST", Origin="http://evil.example")[0] == 403
-        assert got(viewed.host, f"/stop{query}", "POST") == (200, "✓ stop: ok")
+        stop = "/stop" + viewed.commanding.removeprefix(viewed.address)
+        assert got(viewed.host, stop, "POST", Origin="http://evil.example")[0] == 403
+        assert got(viewed.host, stop, "POST") == (200, "✓ stop: ok")
         assert fake.requests == [{"command": "stop"}]
+        fake.replies["stop"] = {"ok": True, "torque_off": "unconfirmed"}
+        status, said = got(viewed.host, stop, "POST")
+        assert (status, said[:7]) == (409, "✗ stop:")
+
+
+def test_a_command_is_sent_once_and_not_long_after_its_picture() -> None:
+    grasp = {"command": "grasp", "force": 5.0, "client": "page 1"}
+    with FakeDaemon() as fake, view(fake) as viewed, Watcher(viewed.host) as page:
+        path = "/command" + viewed.commanding.removeprefix(viewed.address)
+        seen = page.next()["now"]
+        assert got(viewed.host, path, "POST", {**grasp, "seen": seen}) == (200, "✓ grasp: ok")
+        fake.replies["grasp"] = {"ok": False, "error": "grasp: not while disarmed; arm first"}
+        seen = page.next()["now"]
+        refused = got(viewed.host, path, "POST", {**grasp, "seen": seen})
+        assert refused == (409, "✗ grasp: not while disarmed; arm first")
+        assert fake.requests == [grasp, grasp]
+        for late in (seen - 3.0, math.nan):  # which JSON has as null
+            answer = got(viewed.host, path, "POST", {**grasp, "seen": late})
+            assert answer[0] in (400, 409)
+        for odd in (None, "grasp", [], {"command": "grasp"}, {"seen": seen}):
+            assert got(viewed.host, path, "POST", odd)[0] == 400
+        fake.close()
+        seen = page.next()["now"]
+        status, said = got(viewed.host, path, "POST", {**grasp, "seen": seen})
+        assert status == 504
+        assert "✗ grasp: no answer" in said
+        assert len(fake.requests) == 2
 
 
 # A recording
@@ -293,10 +323,10 @@ def test_messages_of_any_kind_are_survived() -> None:
     odd += [{"timestamp": 1e9, "settings": "{", "request": "{", "command": "grasp", "ok": True}]
     odd += [{**state(0.0, 1), "mode": "\x1b[31m", "left": {**finger(0.0, 0), "q": 1e308}}]
     kept = Kept(live=True)
-    for topic in (*kept.pictures._gaps, b"hand/news"):
+    for topic in (*TOPICS, b"hand/news"):
         for message in odd:
             kept.pictures.take(topic, message)
-            kept.pictures.draw(last=True)
+            kept.pictures.draw()
     assert kept.pictures.unreadable > 10
     kept.pictures.take(schema.STATE, {**state(0.0, 5), **GOALS})
     kept.pictures.draw()
@@ -319,7 +349,7 @@ def test_while_nothing_is_read_states_wait(
                 select.select([], [], [], 0.005)  # as fast as libzmq's own thread takes them
         until(lambda: stream.drain(kept.pictures, 0.0) == 0)
     kept.pictures.draw()
-    assert kept.pictures.shown == 10_000
+    assert kept.pictures.states == 10_000
     assert "0 lost, 0 unreadable" in kept.newest["facts"]
 
 

@@ -27,7 +27,7 @@ pytestmark = pytest.mark.skipif(browser_path() is None, reason="no Chromium on t
 PATIENT = "\n".join(f"{key} = {value}" for key, value in PATIENCE.items())
 # The fraction of a canvas's pixels that nearly have a colour.
 FRACTION = """((name, colour) => {
-  const canvas = document.querySelector(`#board .${name} canvas`);
+  const canvas = document.querySelector(`.${name} canvas`);
   const data = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data;
   let count = 0;
   for (let k = 0; k < data.length; k += 4)
@@ -57,7 +57,7 @@ class Page:
 
     def click(self, selector: str) -> None:
         """Once it may be pressed."""
-        button = f"document.querySelector('.q-footer {selector}')"
+        button = f"document.querySelector('footer {selector}')"
         until(lambda: self(f"!!{button} && !{button}.disabled"))
         self(f"{button}.click()")
 
@@ -70,7 +70,7 @@ class Page:
 
     def lag(self) -> float:
         """How far the page is behind the stream [s]."""
-        return float(self("Date.now() / 1000 - window.picture.time"))
+        return float(self("Date.now() / 1000 - picture.time"))
 
 
 @pytest.fixture
@@ -101,10 +101,10 @@ def test_every_button_brings_its_mode_and_a_lost_page_gives_the_hand_back(
             hand.wait_for(lambda state: state.mode == mode, 60.0)
             until(lambda: page.text(".mode") == mode)
 
-        press(".arm", "armed")
+        press("[name=arm]", "armed")
         refused = send(commands, {"command": "release", "client": "another"})
         assert "page" in refused["error"]  # it commands the hand
-        press(".grasp", "holding")
+        press("[name=grasp]", "holding")
         assert hand.state().goal_force == pytest.approx(5.0)
         for name, colour in COLOURS.items():
             for panel, seen, least in (
@@ -116,21 +116,21 @@ def test_every_button_brings_its_mode_and_a_lost_page_gives_the_hand_back(
             ):
                 until(lambda: page.fraction(panel, seen) > least)  # noqa: B023
         until(lambda: page.fraction("hand", (0, 158, 115)) > 0.001)  # the object
-        page.click(".rotate:last-of-type")
+        page.click("[name=rotate]:last-of-type")
         hand.wait_for(lambda state: abs(state.goal_angle - math.radians(5.0)) < 0.02, 60.0)
         hand.wait_for(lambda state: state.mode == "holding", 60.0)
-        press(".release", "armed")
-        page("document.querySelector('.grasp').focus()")
+        press("[name=release]", "armed")
+        page("document.querySelector('[name=grasp]').focus()")
         page.space()
         hand.wait_for(lambda state: state.mode == "disarmed", 60.0)
         until(lambda: page.text(".reply") == "✓ stop: ok")  # and grasp was not pressed
-        page.click(".tare")
+        page.click("[name=tare]")
         until(lambda: page.text(".reply") == "✓ tare: ok")
-        press(".arm", "armed")
-        press(".disarm", "disarmed")
-        press(".arm", "armed")
-        press(".stop", "disarmed")
-        press(".arm", "armed")
+        press("[name=arm]", "armed")
+        press("[name=disarm]", "disarmed")
+        press("[name=arm]", "armed")
+        press("[name=stop]", "disarmed")
+        press("[name=arm]", "armed")
         page.browser.open("about:blank")
         until(lambda: send(commands, {"command": "release", "client": "another"})["ok"])
         viewed.end()
@@ -142,12 +142,12 @@ def test_the_page_is_quick_survives_sleep_and_reload_and_asks_nobody_else(page: 
         fake.changes = {"mode": "fault", "fault": "<b>tip.force</b>: 31 N"}
         with Viewed(*where) as viewed:
             page.open(viewed.address)  # fills the browser's cache, as a second visit finds it
-            assert "Watching" in page.text(".q-footer")
+            assert "Watching" in page.text("footer")
             assert page.text(".fault") == "<b>tip.force</b>: 31 N"
             page.space()
             page("stop()")
             assert page.open(viewed.commanding) < 10.0  # 2 s where nothing else runs
-            page.click(".clear")
+            page.click("[name=clear]")
             until(lambda: page.text(".reply") == "✓ clear: ok")
             assert [each["command"] for each in fake.requests] == ["clear"]  # no stop without it
             until(lambda: page.lag() < 0.5)
@@ -157,13 +157,13 @@ def test_the_page_is_quick_survives_sleep_and_reload_and_asks_nobody_else(page: 
             until(lambda: fake.published > asleep + 1000)  # 10 s of the stream
             os.killpg(page.browser.process.pid, signal.SIGCONT)
             until(lambda: page.lag() < 0.5, 10.0)
-            page.click(".stop")  # heard although the page's connection was given up meanwhile
+            page.click("[name=stop]")  # heard although the page's connection was given up meanwhile
             until(lambda: fake.requests[-1]["command"] == "stop")
 
             page("location.reload()")
             until(lambda: page("performance.getEntriesByType('navigation')[0].type") == "reload")
             until(lambda: page("document.body?.dataset.seq"))
-            page.click(".clear")
+            page.click("[name=clear]")
             until(lambda: fake.requests[-1]["command"] == "clear")
             assert fake.requests[0]["client"] != fake.requests[-1]["client"]
 
@@ -177,7 +177,7 @@ def test_the_page_is_quick_survives_sleep_and_reload_and_asks_nobody_else(page: 
             until(lambda: page("document.documentElement.scrollWidth") <= 390)
             edges = page(
                 "(({left, right, bottom}) => [left, right, bottom])"
-                "(document.querySelector('.stop').getBoundingClientRect())"
+                "(document.querySelector('[name=stop]').getBoundingClientRect())"
             )
             assert 0 <= edges[0] < edges[1] <= 390
             assert edges[2] <= 844
@@ -203,11 +203,11 @@ def test_a_recordings_slider_goes_to_its_place(page: Page, tmp_path: Path) -> No
     record_hand(path, {30: {"command": "arm"}, 60: {"command": "grasp", "force": 8.0}}, 2.0)
     with Viewed(str(path)) as viewed:
         page.open(viewed.address)
-        until(lambda: page.text(".place").startswith("2.0 of 2.0"))
+        until(lambda: page.text(".reply").startswith("2.0 of 2.0"))
         assert page.text(".mode") == "holding"
         box = page(
             "(({left, top, height}) => [left, top + height / 2])"
-            "(document.querySelector('.q-slider').getBoundingClientRect())"
+            "(document.querySelector('#place').getBoundingClientRect())"
         )
         for kind in ("mousePressed", "mouseReleased"):
             page.browser.ask(

@@ -340,7 +340,7 @@ class Commander:
             self.refuse(now, f"{label}: dropped, the daemon doesn't answer")
             return
         if command == "stop" and (stopped := stop_locally(self._address, LOCALLY)) is not None:
-            self.reply = _judge(now, label, stopped)
+            self.reply = judge(now, label, stopped)
             return
         request = self._context.socket(zmq.REQ)
         request.setsockopt(zmq.LINGER, 0)
@@ -371,12 +371,13 @@ class Commander:
                     record = msgpack.unpackb(payload)
                 except (ValueError, RecursionError, msgpack.UnpackException):
                     record = None
-                self.reply = _judge(now, each.label, record)
+                self.reply = judge(now, each.label, record)
             each.socket.close()
             self._pending.remove(each)
 
 
-def _judge(now: float, label: str, record: Any) -> ShownReply:
+def judge(now: float, label: str, record: Any) -> ShownReply:
+    """Return what a daemon's answer says of the command that is shown as ``label``."""
     if field(record, "ok") is True:
         if text(record, "torque_off") == "unconfirmed":
             return ShownReply(now, False, f"{label}: {UNCONFIRMED}")

@@ -10,6 +10,7 @@ import argparse
 import math
 import os
 from collections import deque
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,6 @@ import orjson
 from foxglove.channels import LogChannel, RawImageChannel, SceneUpdateChannel
 
 from softfinger.daemon.client.records import read
-from softfinger.daemon.client.stream import Gaps
 from softfinger.daemon.types import FINGERS
 from softfinger.daemon.wire import schema
 from softfinger.tools.arguments import client_keys, to_stderr
@@ -27,8 +27,7 @@ from softfinger.tools.ending import Ending
 from softfinger.tools.recordings.channels import schema_of
 from softfinger.tools.terminal.feed import number, text
 from softfinger.tools.viewing import planar
-from softfinger.tools.viewing.known import ShownHand, read_settings
-from softfinger.tools.viewing.live_stream import LOOPBACK, NICE, TOPICS, ViewError, follow
+from softfinger.tools.viewing.live_stream import LOOPBACK, NICE, Viewer, ViewError, follow
 from softfinger.tools.viewing.planar import Colour
 
 LAYOUT = Path(__file__).with_name("foxglove_layout.json")
@@ -39,10 +38,11 @@ _EVENTS = 50  # kept for the first who looks at them, as many as the daemon repe
 _LEVELS = {"info": fm.LogLevel.Info, "warning": fm.LogLevel.Warning, "error": fm.LogLevel.Error}
 
 
-class FoxgloveServer:
+class FoxgloveServer(Viewer):
     """Takes messages and serves them on ``port``, 0 for a free one. Raises ViewError."""
 
-    def __init__(self, port: int) -> None:
+    def __init__(self, port: int, say: Callable[[str], None]) -> None:
+        super().__init__(say)
         context = self._context = foxglove.Context()  # its end closes the channels
         self._numbers = {topic: _channel(topic, context) for topic in _NUMBERS}
         self._log = LogChannel(schema.EVENT.decode(), context=context)
@@ -51,14 +51,7 @@ class FoxgloveServer:
             name: RawImageChannel(f"{schema.TACTILE.decode()}/{name}", context=context)
             for name in FINGERS
         }
-        self._gaps = {topic: Gaps() for topic in TOPICS if topic != schema.COMMAND}
         self._events: deque[dict[str, Any]] = deque(maxlen=_EVENTS)
-        self._frames: dict[str, dict[str, Any]] = {}
-        self._newest: dict[bytes, dict[str, Any]] = {}  # state and truth, for the scene
-        self._know(ShownHand())
-        self.time = math.nan
-        self.unreadable = 0
-        self.states = 0
         try:
             self._server = foxglove.start_server(
                 name="softfinger", host=LOOPBACK, port=port, context=context
@@ -70,54 +63,36 @@ class FoxgloveServer:
     def close(self) -> None:
         self._server.stop()
 
-    def take(self, topic: bytes, message: Any) -> None:
+    def take(self, topic: bytes, message: Any) -> bool:
         """One message, whatever it holds."""
-        stamp = number(message, "timestamp")
-        if topic not in self._gaps or not self._gaps[topic].take(message):
-            return  # unknown, or repeated for a later subscriber
-        if not 0.0 <= stamp < 2.0**32:
-            self.unreadable += 1
-        elif topic == schema.EVENT:
+        if not super().take(topic, message):
+            return False
+        if topic == schema.EVENT:
             self._events.append(message)
-        elif topic == schema.TACTILE:
-            self._frames[text(message, "finger")] = message
-        elif topic == schema.SETTINGS:
-            settings, _ = read_settings(message)
-            if settings != self._hand.settings:
-                self._know(ShownHand(settings))
-        else:
-            self._newest[topic] = message
-            if topic == schema.STATE:
-                self.time = stamp
-                self.states += 1
-            channel = self._numbers[topic]
-            if not channel.has_sinks():
-                return
+        elif topic in self._numbers and self._numbers[topic].has_sinks():
             try:
-                channel.log(orjson.dumps(message), log_time=_ns(stamp))  # null for NaN
+                data = orjson.dumps(message)  # null for NaN
+                self._numbers[topic].log(data, log_time=_ns(number(message, "timestamp")))
             except TypeError:  # orjson's error, too: JSON can't hold it
                 self.unreadable += 1
+        return True
 
-    def draw(self, last: bool = False) -> None:
+    def draw(self) -> None:
         """Send the newest frames, the scene, and events if somebody looks at them."""
-        for message in self._frames.values():
+        for message in self.frames.values():
             try:
                 self._image(read(schema.TactileFrame, message))
             except (ValueError, KeyError):
                 self.unreadable += 1
-        self._frames.clear()
-        state = self._newest.pop(schema.STATE, None)
+        self.frames.clear()
+        state = self.newest.pop(schema.STATE, None)
         if state is not None and self._scene.has_sinks():
-            simulated = self._parts.simulated(self._newest.get(schema.TRUTH))
-            parts = self._parts.parts(state) | {"simulated": simulated}
+            simulated = self.parts.simulated(self.newest.get(schema.TRUTH))
+            parts = self.parts.parts(state) | {"simulated": simulated}
             entities = [_entity(name, part) for name, part in parts.items()]
             self._scene.log(fm.SceneUpdate(entities=entities), log_time=_ns(self.time))
         while self._log.has_sinks() and self._events:
             self._event(self._events.popleft())
-
-    def _know(self, hand: ShownHand) -> None:
-        self._hand = hand
-        self._parts = planar.HandScene(hand)
 
     def _image(self, frame: schema.TactileFrame) -> None:
         self._images[frame.finger].log(
@@ -207,12 +182,13 @@ def _time(stamp: float) -> fm.Timestamp:
 def serve(arguments: argparse.Namespace, ending: Ending) -> None:
     """Serve the stream until the end. Raises SoftfingerError."""
     keys = client_keys(arguments.keys)
-    server = FoxgloveServer(arguments.foxglove)
+    say = to_stderr("view")
+    server = FoxgloveServer(arguments.foxglove, say)
     os.nice(NICE)
     try:
         print(f"view: {server.address} for Foxglove; layout: {LAYOUT}", flush=True)
         ending.begin()
-        follow(arguments, keys, server, ending, to_stderr("view"))
+        follow(arguments, keys, server, ending, say)
     finally:
         server.close()
     if server.states == 0:

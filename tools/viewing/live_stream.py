@@ -6,17 +6,21 @@ import argparse
 import math
 import time
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 import zmq
 
 from softfinger.daemon.client.connection import drain, subscribe, unpack
+from softfinger.daemon.client.stream import Gaps
 from softfinger.daemon.errors import SoftfingerError
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.keys import ClientKeys
 from softfinger.daemon.wire.schema import TACTILE
 from softfinger.tools.arguments import PATIENCE, no_stream, waiting
 from softfinger.tools.ending import Ending
+from softfinger.tools.terminal.feed import number, printable, text
+from softfinger.tools.viewing.known import ShownHand, read_settings
+from softfinger.tools.viewing.planar import HandScene
 
 LOOPBACK = "127.0.0.1"
 TOPICS = (
@@ -40,23 +44,74 @@ class ViewError(SoftfingerError):
     """Nothing can be shown. The message says why, and what to do."""
 
 
-class Taker(Protocol):
-    """What messages are given to. ``time``: Unix time of the newest state [s], NaN before it."""
+class Viewer:
+    """Takes messages of any content: the newest of each topic, and the hand by its settings.
 
-    time: float
-    unreadable: int
+    ``time`` is that of the newest state [Unix s], NaN before it. ``say`` is told what is unknown.
+    """
 
-    def take(self, topic: bytes, message: Any) -> None:
-        """One message, whatever it holds."""
+    def __init__(self, say: Callable[[str], None]) -> None:
+        self._say = say
+        self._same_schema = True
+        self._settings = ""  # as they came
+        self.states = self.unreadable = 0
+        self.hand = ShownHand()
+        self.clear()
+        self.know(self.hand)
 
-    def draw(self, last: bool = False) -> None:
-        """Show what came since the last drawing; nothing more will come after the ``last``."""
+    def clear(self) -> None:
+        """Forget all but the hand: what comes next is of another time."""
+        self.time = math.nan
+        self.newest: dict[bytes, dict[str, Any]] = {}
+        self.frames: dict[str, dict[str, Any]] = {}  # by finger
+        self.gaps = {topic: Gaps() for topic in TOPICS}
+        self.parts = HandScene(self.hand)
+
+    def know(self, hand: ShownHand) -> None:
+        """Show this hand from now on."""
+        self.hand = hand
+        self.parts = HandScene(hand)
+
+    def take(self, topic: bytes, message: Any) -> bool:
+        """Keep one message; False where it can't be read, or came before."""
+        if topic not in self.gaps:
+            return False
+        stamp = number(message, "timestamp")
+        if not 0.0 <= stamp < 2.0**32:
+            self.unreadable += 1
+            return False
+        if not self.gaps[topic].take(message):
+            return False
+        if message.get("schema") != schema.SCHEMA and self._same_schema:
+            self._same_schema = False
+            self._say(
+                f"the stream is of schema {message.get('schema')!r:.20}, this viewer knows "
+                f"{schema.SCHEMA}; it keeps to the fields it knows"
+            )
+        if topic == TACTILE:
+            self.frames[text(message, "finger")] = message
+        self.newest[topic] = message
+        if topic == schema.STATE:
+            self.time = stamp
+            self.states += 1
+        elif topic == schema.SETTINGS and text(message, "settings") != self._settings:
+            self._settings = text(message, "settings")
+            settings, unknown = read_settings(message)
+            if unknown:
+                version = text(message, "version") or "another version"
+                keys = printable(", ".join(unknown))
+                self._say(f"settings of {version} that are not known here: {keys}")
+            self.know(ShownHand(settings))
+        return True
+
+    def draw(self) -> None:
+        """Show what came since the last drawing."""
 
 
 def follow(
     arguments: argparse.Namespace,
     keys: ClientKeys | None,
-    bridge: Taker,
+    viewer: Viewer,
     ending: Ending,
     say: Callable[[str], None],
 ) -> None:
@@ -66,7 +121,7 @@ def follow(
     with LiveStream(arguments.address, keys) as stream:
         due = last = time.monotonic()
         while not ending.over:
-            count = stream.drain(bridge, due)
+            count = stream.drain(viewer, due)
             now = time.monotonic()
             if count:
                 last = now
@@ -76,19 +131,19 @@ def follow(
             elif arguments.no_wait and now - last > PATIENCE:
                 raise ViewError(no_stream(arguments.address, arguments.keys))
             elif not silent and now - last > _SILENCE:
-                never = math.isnan(bridge.time)
+                never = math.isnan(viewer.time)
                 say(
                     waiting(arguments.address, arguments.keys)
                     if never
                     else f"silent: {arguments.address}"
                 )
                 silent = True
-            bridge.draw()
+            viewer.draw()
             after = time.monotonic()
             # Never busy for more than half of its time, however slow the machine is.
             due = after + max(period - (after - now), min(after - now, _REST))
-        stream.drain(bridge, 0.0)
-        bridge.draw(last=True)
+        stream.drain(viewer, 0.0)
+        viewer.draw()
 
 
 class LiveStream:
@@ -117,8 +172,8 @@ class LiveStream:
         for socket in self._sockets:
             self._poller.register(socket, zmq.POLLIN)
 
-    def drain(self, bridge: Taker, until: float) -> int:
-        """Give ``bridge`` the messages until the monotonic time ``until`` [s]; their number."""
+    def drain(self, viewer: Viewer, until: float) -> int:
+        """Give ``viewer`` the messages until the monotonic time ``until`` [s]; their number."""
         count = 0
         while True:
             left = until - time.monotonic()
@@ -130,9 +185,9 @@ class LiveStream:
                 for message in drain(socket, _AT_ONCE):
                     count += 1
                     try:
-                        bridge.take(*unpack(message))
+                        viewer.take(*unpack(message))
                     except ValueError:
-                        bridge.unreadable += 1
+                        viewer.unreadable += 1
             if left <= 0.0:
                 return count
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import math
 import time
 
 from softfinger.daemon.wire import schema
@@ -28,6 +30,14 @@ class Playback:
         """Go to ``position`` [s], from any thread."""
         self._target = min(max(position, 0.0), self.duration)
 
+    def ask(self, wish: str) -> None:
+        """Carry out a page's wish: ``play``, ``pause`` or a position; others are ignored."""
+        with contextlib.suppress(ValueError):
+            if wish in ("play", "pause"):
+                self.playing = wish == "play"
+            elif math.isfinite(place := float(wish)):
+                self.seek(place)
+
     def run(self, ending: Ending) -> None:
         """Play until the end is asked for."""
         if self._recording.count(schema.SETTINGS):  # which may come once, at the beginning
@@ -45,7 +55,7 @@ class Playback:
         self.position = target
         for topic, message in self._recording.messages(TOPICS, target - SECONDS):
             at = min(number(message, "timestamp") - self._recording.start, self.duration)
-            while at > self.position:
+            while at > self.position and self._pictures.newest.get(schema.STATE):
                 self._stand(ending)
                 if self._target is not None or ending.over:
                     return
@@ -56,7 +66,7 @@ class Playback:
     def _stand(self, ending: Ending) -> None:
         """Show this place for one picture; the next is later where it plays."""
         begun = time.monotonic()
-        self._pictures.draw()
+        self._pictures.draw((self.position, self.duration, self.playing))
         ending.wait(self._period)
         if self.playing:
             self.position = min(self.position + time.monotonic() - begun, self.duration)
