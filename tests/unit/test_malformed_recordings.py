@@ -97,6 +97,20 @@ def test_settings_without_their_text_are_told(tmp_path: Path, name: str) -> None
         recorded_settings(Recording(path))
 
 
+def test_recorded_settings_name_no_files(tmp_path: Path) -> None:
+    named = Settings().model_dump()
+    files = ("calibration", "recording", "envelope", "keys")
+    for section in named.values():
+        for key in section.keys() & set(files):
+            section[key] = "/dev/zero" if section[key] == "" else ("/dev/zero", "/dev/zero")
+    text = Settings.model_validate(named).model_dump_json()
+    assert text.count("/dev/zero") == 6
+    writer = RecordingWriter(tmp_path / "a.mcap")
+    writer.add(schema.SETTINGS, {**settings_message(), "settings": text})
+    writer.close()
+    assert recorded_settings(Recording(tmp_path / "a.mcap"))[0] == Settings()
+
+
 def test_a_file_cut_anywhere_is_told_in_plain_words(tmp_path: Path) -> None:
     whole = recording(tmp_path / "a.mcap", None).read_bytes()
     chance = random.Random(1)

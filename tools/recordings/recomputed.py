@@ -15,6 +15,7 @@ import numpy as np
 from softfinger.daemon.errors import RecordingError
 from softfinger.daemon.loop.process_replay import ProcessReplay
 from softfinger.daemon.loop.publishing import parts
+from softfinger.daemon.profile.load import without_files
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS, Frame
 from softfinger.daemon.wire import schema
@@ -53,7 +54,10 @@ class Comparison:
 
 
 def recorded_settings(recording: Recording) -> tuple[Settings, list[str]]:
-    """Return the recording's settings and calibrations (JSON). Raises RecordingError."""
+    """Return the recording's settings and calibrations (JSON). Raises RecordingError.
+
+    The settings name no files: a recording may come from anywhere.
+    """
     message = next((each for _, each in recording.messages([schema.SETTINGS])), None)
     if message is None:
         raise RecordingError(f"{recording.path}: no hand/settings in it")
@@ -66,7 +70,7 @@ def recorded_settings(recording: Recording) -> tuple[Settings, list[str]]:
         raise RecordingError(
             f"{recording.path}: its settings are not of this version: {error}"
         ) from None
-    return settings, [str(each) for each in calibrations]
+    return without_files(settings), [str(each) for each in calibrations]
 
 
 def recompute(
