@@ -14,6 +14,8 @@ import tempfile
 from pathlib import Path
 from typing import BinaryIO, Literal, TextIO
 
+from softfinger.kinematics.compiled.own_folder import check_above
+
 MOST = 16 << 20  # bytes of a file that is read at once, or of what a part of one unpacks to
 
 _SHARED = stat.S_IWOTH
@@ -73,6 +75,10 @@ def require_own(folder: Path) -> None:
     group = stat.S_IWGRP if found.st_gid != os.getegid() else 0
     if found.st_mode & (_SHARED | group):
         raise PermissionError(errno.EPERM, "others may write in it; `chmod go-w` it")
+    try:
+        check_above(folder)
+    except PermissionError as error:
+        raise PermissionError(errno.EPERM, str(error)) from None
 
 
 def write_text(path: Path, append: bool = False, newline: str | None = None) -> TextIO:
