@@ -1,7 +1,8 @@
-"""Files and folders that only this user has a hand in, wherever they lie.
+"""Files that a person or another file names, read within bounds; and files that only we write.
 
-In a folder such as /tmp anybody may have put a link or a file where one of ours is to be: what is
-written would go into whatever that leads to.
+A name may lead to a device, to a pipe that nobody fills, to more than memory holds. In a folder
+such as /tmp anybody may have put a link or a file where one of ours is to be: what is written would
+go into whatever that leads to.
 """
 
 from __future__ import annotations
@@ -13,7 +14,37 @@ import tempfile
 from pathlib import Path
 from typing import BinaryIO, Literal, TextIO
 
+from softfinger.kinematics.compiled.own_folder import check_above
+
+MOST = 16 << 20  # bytes of a file that is read at once, or of what a part of one unpacks to
+
 _SHARED = stat.S_IWOTH
+
+
+def open_regular(path: Path) -> BinaryIO:
+    """Open a file to be read. Raises OSError as `open`, and for a device or a pipe."""
+    mode = path.stat().st_mode  # opening alone may act on a device
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+        raise OSError(errno.EINVAL, "a device or a pipe, expected a file", str(path))
+    return open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))
+
+
+def read_file(path: Path, most: int = MOST) -> bytes:
+    """Return a file's bytes. Raises OSError as `open_regular`, and for more than ``most`` bytes."""
+    with open_regular(path) as file:
+        data = file.read(most + 1)
+    if len(data) > most:
+        raise OSError(errno.EFBIG, f"more than {most >> 10} kB", str(path))
+    return data
+
+
+def unpacked_most(file: BinaryIO) -> int:
+    """Return how many bytes a file may unpack to: 32 times the room that it takes on its disk.
+
+    Recordings take a third to a tenth of what they hold; holes in a file take no room.
+    """
+    found = os.fstat(file.fileno())
+    return max(MOST // 2, 32 * min(found.st_size, 512 * found.st_blocks))
 
 
 def runtime_folder() -> Path:
@@ -44,6 +75,10 @@ def require_own(folder: Path) -> None:
     group = stat.S_IWGRP if found.st_gid != os.getegid() else 0
     if found.st_mode & (_SHARED | group):
         raise PermissionError(errno.EPERM, "others may write in it; `chmod go-w` it")
+    try:
+        check_above(folder)
+    except PermissionError as error:
+        raise PermissionError(errno.EPERM, str(error)) from None
 
 
 def write_text(path: Path, append: bool = False, newline: str | None = None) -> TextIO:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from softfinger.daemon.errors import SettingsError
+from softfinger.daemon.profile.load import profile_text
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import GRIP_FRACTION
 
@@ -62,7 +63,7 @@ class Envelope:
         """
         own, control = settings.control.envelope, settings.control
         try:
-            found = tomllib.loads(Path(own or KEPT).read_text(encoding="utf-8"))
+            found = tomllib.loads(profile_text(Path(own or KEPT)))
             other = _difference(found["identity"], identity(settings))
             frictions, self._masses, sizes = found["friction"], found["mass"], found["size"]
             width, count = settings.object.width, len(self._masses)
@@ -72,7 +73,7 @@ class Envelope:
             rows = zip(*(found[shape][row : row + count] for shape in found["shapes"]), strict=True)
             self._outcomes = ["".join(cells[column] for cells in shapes) for shapes in rows]
             self._raised = found["raised"]
-        except (OSError, ValueError, LookupError, TypeError) as error:
+        except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
             raise SettingsError(
                 f"control.envelope: {own}: no map of `softfinger envelope --keep`: {error!r}"
             ) from None

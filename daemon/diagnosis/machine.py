@@ -15,7 +15,7 @@ from softfinger.daemon.loop.realtime import GRANT_LATENCY, GRANT_MEMORY_LOCK, GR
 from softfinger.daemon.loop.warm_up import is_built, parts
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.base import Finding
-from softfinger.kinematics.compiled.kernel_folder import find_folder
+from softfinger.kinematics.compiled.kernel_folder import damaged, find_folder
 
 _MEMORY = 1 << 30  # bytes: what the daemon has mapped, with room
 _WAKE_UPS = 100
@@ -125,13 +125,17 @@ def check_wake_ups(late: list[float]) -> Finding:
 def check_kernels(settings: Settings) -> list[Finding]:
     """Check that compiled kernels can be stored, and those of this scene are there."""
     try:
-        folder = find_folder()
+        with find_folder() as folder:
+            place, spoilt = folder.path, len(damaged(folder))
     except (OSError, RuntimeError) as error:
         problem = f"can't be used, so every start compiles: {error}"
         fix = "export NUMBA_CACHE_DIR=FOLDER, one that is yours alone"
         return [Finding("warn", "kernel cache", problem, fix)]
+    if spoilt:
+        problem = f"{spoilt} damaged files in {place}: the next start compiles them anew"
+        return [Finding("warn", "kernels", problem, "softfinger compile, or just start it")]
     cold = [part.name for part in parts(settings) if not is_built(part, settings)]
     if not cold:
-        return [Finding("pass", "kernels", f"compiled, in {folder}")]
+        return [Finding("pass", "kernels", f"compiled, in {place}")]
     problem = f"{', '.join(cold)} not compiled yet: the next start takes longer"
     return [Finding("warn", "kernels", problem, "softfinger compile, or just start it")]

@@ -21,7 +21,7 @@ from softfinger.daemon.perception.finger_model import FingerModel, make_estimato
 from softfinger.daemon.profile.factory import make_material
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS, Contact, Frame, ObjectPose, Reading
-from softfinger.kinematics.compiled.kernel_folder import kernel_folder
+from softfinger.kinematics.compiled.kernel_folder import is_marked, kernel_folder, mark
 from softfinger.kinematics.estimation.estimator import ContactEstimate
 from softfinger.kinematics.hand.grasp_state import total_tilt
 
@@ -93,18 +93,18 @@ def named(name: str) -> Part:
 def is_built(part: Part, settings: Settings) -> bool:
     """Return whether ``part`` was compiled from the present sources, for such tips, and is kept."""
     folder = kernel_folder()
-    return folder is not None and _mark(folder, part, settings).exists()
+    return folder is not None and is_marked(folder, _kind(part, settings))
 
 
 def mark_built(part: Part, settings: Settings) -> None:
     """Note that ``part`` was compiled and is kept, where anything can be."""
     folder = kernel_folder()
     if folder is not None:
-        _mark(folder, part, settings).touch()
+        mark(folder, _kind(part, settings))
 
 
-def _mark(folder: Path, part: Part, settings: Settings) -> Path:
-    return folder / f"{part.name.replace(' ', '-')}-{settings.tip.physics}.built"
+def _kind(part: Part, settings: Settings) -> str:
+    return f"{part.name.replace(' ', '-')}-{settings.tip.physics}"
 
 
 def warm_up(scene: WantedScene) -> None:

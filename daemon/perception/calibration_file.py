@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from softfinger.daemon.errors import TactileError
-from softfinger.daemon.own_files import write_whole
+from softfinger.daemon.own_files import read_file, write_whole
 from softfinger.daemon.profile.settings import Finite, NonNegative, Positive, Settings
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.tip_curves import TipCurves
@@ -173,7 +173,7 @@ def sensor_of(settings: Settings, finger: int) -> Sensor:
 def load_calibration(path: Path) -> Calibration:
     """Read and check a file. Raises CalibrationFileError."""
     try:
-        calibration = Calibration.model_validate_json(path.read_text(encoding="utf-8"))
+        calibration = Calibration.model_validate_json(read_file(path).decode())
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
         raise CalibrationFileError(f"{path}: can't be read: {reason}") from None

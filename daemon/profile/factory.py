@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from softfinger.daemon.errors import SettingsError
-from softfinger.daemon.own_files import write_whole
 from softfinger.daemon.profile.settings import MaterialSettings, Settings
+from softfinger.kinematics.compiled.own_folder import OwnFolder
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.lookup import TableError
 from softfinger.kinematics.contact.material import Material
@@ -120,14 +120,16 @@ def table_file(folder: Path, tip: Fingertip, material: Material, tolerance: floa
 
 def save_table(file: Path, table: ContactTable, tip: Fingertip, material: Material) -> None:
     """Write ``file``, making its folder. Raises OSError where that is not possible."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(file, table.to_bytes(tip, material))
+    with OwnFolder(file.parent) as folder:
+        folder.write(file.name, table.to_bytes(tip, material))
 
 
 def load_table(file: Path, tip: Fingertip, material: Material, tolerance: float) -> ContactTable:
     """Read ``file``. Raises OSError, or TableError when it holds no sound table of this kind."""
+    with OwnFolder(file.parent) as folder:
+        data = folder.read(file.name)
     try:
-        return ContactTable.from_bytes(file.read_bytes(), tip, material, tolerance)
+        return ContactTable.from_bytes(data, tip, material, tolerance)
     except TableError as error:
         raise TableError(f"{file}: {error}") from None
 

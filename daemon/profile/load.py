@@ -19,11 +19,16 @@ from pydantic_core import ErrorDetails
 import softfinger
 from softfinger.daemon.backends import BUILT_IN, backend, known
 from softfinger.daemon.errors import SettingsError
+from softfinger.daemon.own_files import read_file
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.profile.validation import problems, shown
 
 _PROFILES = Path(softfinger.__file__).parent / "config"
+_MOST = 256 << 10  # bytes; the reference, which names every key, has 12 kB
 _DEEPEST = 8  # tables and arrays in each other
+_TOLD = 20  # errors of one profile
+# A key of so many parts: one of thousands takes tomllib minutes.
+_DEEP_KEY = re.compile(r"""(?<![\w-])(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*){16}""")
 _LEAD = re.compile(r"\w+ should (be |have )?")  # of pydantic's messages
 
 
@@ -55,17 +60,19 @@ def checked(
         settings = Settings.model_validate(data)
     except ValidationError as error:
         settings, wrong = _valid_sections(data)
-        found = [_line(details) for details in error.errors()]
+        told = error.errors(include_url=False)
+        found = [_line(details) for details in told[:_TOLD]] + [""] * len(told[_TOLD:])
     if directory is not None:
         settings = _with_directory(settings, directory)
     found += [*problems(settings, wrong), *_plugin_problems(settings)]
     if found:
-        raise SettingsError(
-            "\n".join(
-                f"{'--set' if problem.split(':')[0] in changed else name}: {problem}"
-                for problem in found
-            )
-        )
+        lines = [
+            f"{'--set' if problem.split(':')[0] in changed else name}: {problem}"
+            for problem in found[:_TOLD]
+        ]
+        if len(found) > _TOLD:
+            lines.append(f"{name}: and {len(found) - _TOLD} more errors")
+        raise SettingsError("\n".join(lines))
     return settings
 
 
@@ -90,9 +97,33 @@ def find(path: Path) -> Path:
     return file
 
 
+def profile_text(path: Path) -> str:
+    """Return a profile's text. Raises OSError as `read_file`, UnicodeDecodeError; RecursionError
+    for keys of too many parts.
+    """
+    text = read_file(path, _MOST).decode("utf-8-sig")
+    if _DEEP_KEY.search(text):
+        raise RecursionError
+    return text
+
+
+def without_files(settings: Settings) -> Settings:
+    """Return settings that another's file tells, without the files that they name."""
+    changes = {
+        "tactile": {"calibration": ("", ""), "recording": ("", "")},
+        "control": {"envelope": ""},
+        "access": {"keys": ""},
+    }
+    return settings.model_copy(
+        update={
+            name: getattr(settings, name).model_copy(update=each) for name, each in changes.items()
+        }
+    )
+
+
 def _read(path: Path, name: str) -> dict[str, Any]:
     try:
-        raw = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        raw = tomllib.loads(profile_text(path))
         return {key: _tuples(item) for key, item in raw.items()}
     except OSError as error:
         hint = f"; {path.stem} alone names the packaged one" if path.stem in names() else ""
@@ -126,13 +157,18 @@ def _change(data: dict[str, Any], change: str) -> str:
 
 
 def _tuples(value: Any, depth: int = 0) -> Any:
-    """Lists as tuples, tables as they are. Raises RecursionError beyond any profile's depth."""
+    """Lists as tuples, tables as they are.
+
+    Raises RecursionError beyond any profile's depth, ValueError for integers beyond TOML's.
+    """
     if depth > _DEEPEST:
         raise RecursionError
     if isinstance(value, dict):
         return {key: _tuples(item, depth + 1) for key, item in value.items()}
     if isinstance(value, list):
         return tuple(_tuples(item, depth + 1) for item in value)
+    if isinstance(value, int) and value.bit_length() > 63:  # one of 5000 digits can't be printed
+        raise ValueError("an integer beyond 64 bits")
     return value
 
 

@@ -17,15 +17,17 @@ import bisect
 import math
 import re
 import zipfile
+import zlib
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from softfinger.daemon.clock import Clock
 from softfinger.daemon.errors import RecordingError, TactileError
+from softfinger.daemon.own_files import open_regular, read_file, unpacked_most
 from softfinger.daemon.profile.settings import TactileSettings
 from softfinger.daemon.tactile import tekscan
 from softfinger.daemon.types import FINGERS, Frame
@@ -55,13 +57,11 @@ def load_recording(path: Path, pascal_per_count: float, rate: float) -> FrameRec
         if path.is_dir():
             return _folder(path, pascal_per_count, rate)
         if path.suffix == ".npz":
-            with np.load(path, allow_pickle=False) as archive:
-                arrays = {name: archive[name] for name in archive.files}
-            return _checked(arrays, pascal_per_count, rate)
+            return _checked(_archive(path), pascal_per_count, rate)
         if path.suffix == ".npy":
             return _checked({"frames": _frames(path)}, pascal_per_count, rate)
         return _export(path, pascal_per_count, rate)
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else error
         raise RecordingError(f"{path}: {reason}") from None
 
@@ -75,7 +75,7 @@ def _folder(path: Path, scale: float, rate: float) -> FrameRecording:
     arrays: dict[str, NDArray[Any]] = {}
     for file in sorted(path.glob("*.npy"), key=order):
         if file.stem in ("t", "live", *TRUTHS):
-            arrays[file.stem] = np.load(file, allow_pickle=False)
+            arrays[file.stem] = _array(file)
         else:
             parts.append(_frames(file))
     if not parts:
@@ -87,14 +87,52 @@ def _folder(path: Path, scale: float, rate: float) -> FrameRecording:
 
 def _frames(path: Path) -> NDArray[Any]:
     """The frames of one .npy file, [n, rows, cols]."""
-    array: NDArray[Any] = np.load(path, allow_pickle=False)
+    array = _array(path)
     if array.ndim not in (2, 3):
         raise ValueError(f"{path.name}: found shape {array.shape}, expected [n, rows, cols]")
     return array.reshape(-1, *array.shape[-2:])
 
 
+def _archive(path: Path) -> dict[str, NDArray[Any]]:
+    """The arrays of an .npz file that are ours."""
+    held = {}
+    with open_regular(path) as file, zipfile.ZipFile(file) as archive:
+        left = unpacked_most(file)
+        for name in ("frames", "t", "live", *TRUTHS):
+            if f"{name}.npy" in archive.namelist():
+                part = archive.getinfo(f"{name}.npy")
+                # As NumPy packs them: others unpack beyond what they claim.
+                if part.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                    raise ValueError(f"{name}: found another compression than deflate")
+                left -= part.file_size
+                if left < 0:
+                    raise ValueError(f"{name}: unpacks to more than a recording of this size does")
+                with archive.open(part) as unpacked:
+                    held[name] = _read_array(unpacked, part.file_size)
+    return held
+
+
+def _array(path: Path) -> NDArray[Any]:
+    with open_regular(path) as file:
+        return _read_array(file, min(path.stat().st_size, unpacked_most(file)))
+
+
+def _read_array(file: IO[bytes], size: int) -> NDArray[Any]:
+    """The array of a .npy file of so many bytes. Raises ValueError where it claims to be larger."""
+    lib = np.lib.format
+    header = {(1, 0): lib.read_array_header_1_0, (2, 0): lib.read_array_header_2_0}
+    version = lib.read_magic(file)
+    if version not in header:
+        raise ValueError(f"found version {version} of .npy, expected 1.0 or 2.0")
+    shape, _, kind = header[version](file)
+    if math.prod(shape) * kind.itemsize > size:
+        raise ValueError(f"claims to hold {shape} of {kind}, more than the file has")
+    file.seek(0)
+    return np.asarray(lib.read_array(file, allow_pickle=False))
+
+
 def _export(path: Path, scale: float, rate: float) -> FrameRecording:
-    export = tekscan.parse(path.read_text(encoding="latin-1"), 1.0 / rate)
+    export = tekscan.parse(read_file(path).decode("latin-1"), 1.0 / rate)
     arrays: dict[str, NDArray[Any]] = {"frames": export.values, "t": export.t, "live": export.live}
     recording = _checked(arrays, 1.0 if export.raw else scale, rate)
     return recording if math.isnan(sum(export.pitch)) else replace(recording, pitch=export.pitch)

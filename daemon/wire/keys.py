@@ -32,6 +32,7 @@ import zmq.auth
 import zmq.utils.z85
 
 from softfinger.daemon.errors import KeyFileError, NoDescriptor
+from softfinger.kinematics.compiled.own_folder import check_above, fault
 
 LOCAL = "local"  # the client that every folder of keys has
 
@@ -189,21 +190,18 @@ def _keys(path: Path, secret: bool = False) -> tuple[bytes, bytes | None]:
 
 def _check(path: Path, status: os.stat_result, secret: bool = False) -> None:
     """Raises KeyFileError when somebody else owns or may write it, or may read a secret."""
-    if status.st_uid not in (0, os.geteuid()):
-        raise KeyFileError(f"{path}: belongs to user {status.st_uid}: chown it, or make new keys")
     mode = stat.S_IMODE(status.st_mode)
     if secret and mode & 0o077:
         raise KeyFileError(f"{path}: may be read by others ({mode:04o}): chmod 600 {path}")
-    # In a folder with the sticky bit, as /tmp, nobody can replace what isn't his.
-    if mode & 0o022 and not (mode & stat.S_ISVTX and stat.S_ISDIR(status.st_mode)):
-        raise KeyFileError(f"{path}: may be written by others ({mode:04o}): chmod go-w {path}")
+    if wrong := fault(path, status):
+        raise KeyFileError(wrong)
 
 
 def _check_above(path: Path) -> None:
     """All folders above a file. Raises KeyFileError."""
-    for folder in path.resolve().parents:
-        try:
-            status = folder.stat()
-        except OSError as error:
-            raise _unreadable(folder, error) from None
-        _check(folder, status)
+    try:
+        check_above(path)
+    except PermissionError as error:
+        raise KeyFileError(str(error)) from None
+    except OSError as error:
+        raise _unreadable(path, error) from None

@@ -21,6 +21,7 @@ of a second, 50 MB; this cache does not.
 from __future__ import annotations
 
 import hashlib
+import pickle
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
@@ -36,6 +37,7 @@ from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompilerBase, _LowerResult
 from numba.core.compiler_machinery import PassManager, register_pass
 from numba.core.runtime import nrt
+from numba.core.serialize import dumps
 from numba.core.typed_passes import (
     IRLegalization,
     NativeLowering,
@@ -55,7 +57,8 @@ from numba.core.untyped_passes import (
 )
 
 from softfinger.kinematics.compiled import plain
-from softfinger.kinematics.compiled.kernel_folder import ROOT, kernel_folder, text
+from softfinger.kinematics.compiled.kernel_folder import ROOT, keep, kept, kernel_folder, text
+from softfinger.kinematics.compiled.own_folder import OwnFolder
 
 _operation: Any = types.Function
 _resolve = _operation.get_call_type
@@ -239,7 +242,9 @@ class KernelFolder:
 
     def get_cache_path(self) -> str:
         """Return the one folder."""
-        return str(kernel_folder())
+        folder = kernel_folder()
+        assert folder is not None
+        return str(folder.path)
 
     def ensure_cache_path(self) -> None:
         """Do nothing: `kernel_folder` has made and checked it."""
@@ -271,10 +276,34 @@ class _MachineCode(CompileResultCacheImpl):
         return ((name, kind, (code, names_alone)), *rest)
 
 
+class _Files:
+    """Files of a kernel's overloads, one each, in the place of Numba's index and data files."""
+
+    def __init__(self, folder: OwnFolder, name: str, stamp: str) -> None:
+        self._folder, self._name, self._stamp = folder, name, stamp
+
+    def _file(self, key: Any) -> str:
+        return f"{self._name}-{hashlib.sha256(repr((self._stamp, key)).encode()).hexdigest()[:16]}"
+
+    def save(self, key: Any, data: Any) -> None:
+        keep(self._folder, self._file(key), dumps(data))
+
+    def load(self, key: Any) -> Any:
+        data = kept(self._folder, self._file(key))
+        return None if data is None else pickle.loads(data)
+
+
 class KernelCache(FunctionCache):
     """Numba's cache with machine code alone. Raises RuntimeError where there is no folder."""
 
     _impl_class = _MachineCode
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__(function)
+        folder = kernel_folder()
+        assert folder is not None
+        stamp = self._impl.locator.get_source_stamp()
+        self._cache_file: Any = _Files(folder, self._impl.filename_base, stamp)
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Load an overload without importing first all that Numba can compile."""

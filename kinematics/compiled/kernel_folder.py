@@ -2,8 +2,9 @@
 
 The folder's name is a digest of every source that a kernel of this package may depend on, of
 Python, Numba, llvmlite and NumPy, and of the processor, so nothing compiled from something else is
-ever loaded. Numba unpickles what it finds there, and so runs it: the folder is the user's own, or
-it is not used.
+ever loaded. What is found there is unpickled and run: the folder is the user's own, or it is not
+used. Each kernel's file begins with a digest of the rest: a file that is torn or has rotted is
+compiled anew.
 """
 
 from __future__ import annotations
@@ -13,7 +14,6 @@ import os
 import platform
 import re
 import shutil
-import stat
 import sys
 import warnings
 from collections.abc import Iterator
@@ -24,6 +24,8 @@ import llvmlite
 import llvmlite.binding
 import numba
 import numpy as np
+
+from softfinger.kinematics.compiled.own_folder import OwnFolder
 
 ROOT = Path(__file__).resolve().parents[2]  # what `softfinger.` stands for in a name
 _PACKAGES = ("kinematics", "daemon")
@@ -38,8 +40,12 @@ _IMPORT = re.compile(
 )
 
 
+_DIGEST = 32  # bytes
+_KERNEL, _MARK = ".kernel", ".built"
+
+
 @cache
-def kernel_folder() -> Path | None:
+def kernel_folder() -> OwnFolder | None:
     """Return this state's folder, made when absent; warn and return None if that fails."""
     try:
         return find_folder()
@@ -53,52 +59,84 @@ def kernel_folder() -> Path | None:
         return None
 
 
-def find_folder() -> Path:
+def find_folder() -> OwnFolder:
     """Return this state's folder in NUMBA_CACHE_DIR if set, else in the user's cache directory.
 
-    Raises as :func:`own_folder`, and RuntimeError where there is no home.
+    Raises as :class:`OwnFolder`, and RuntimeError where there is no home.
     """
     given = os.environ.get("NUMBA_CACHE_DIR")
     base = Path(given) if given else user_cache()
     if not given:
-        own_folder(base)
-    folder = base / f"kernels-{digest()}"
-    fresh = not folder.exists()
-    own_folder(folder)
-    os.utime(folder)  # by which pruning knows what is in use
+        OwnFolder(base).close()
+    path = base / f"kernels-{digest()}"
+    fresh = not path.exists()
+    folder = OwnFolder(path)
+    os.utime(folder.descriptor)  # by which pruning knows what is in use
     if fresh:
-        _prune(base, folder)
+        _prune(base, path)
     return folder
+
+
+def keep(folder: OwnFolder, name: str, content: bytes) -> None:
+    """Keep a kernel; where that fails, warn: it is compiled anew at the next start."""
+    try:
+        folder.write(name + _KERNEL, hashlib.sha256(content).digest() + content)
+    except OSError as error:
+        warnings.warn(f"{folder.path}: a kernel can't be kept: {error}", RuntimeWarning, 2)
+
+
+def kept(folder: OwnFolder, name: str) -> bytes | None:
+    """Return a kernel that was kept, None where there is none or, with a warning, no sound one."""
+    try:
+        return _sound(folder.read(name + _KERNEL))
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError) as error:
+        warnings.warn(f"{folder.path}: compiled anew: {error}", RuntimeWarning, stacklevel=2)
+        return None
+
+
+def _sound(data: bytes) -> bytes:
+    content = data[_DIGEST:]
+    if hashlib.sha256(content).digest() != data[:_DIGEST]:
+        raise ValueError("kernels are damaged")
+    return content
+
+
+def damaged(folder: OwnFolder) -> list[str]:
+    """Return the names of files that hold no sound kernel, or can't be read: some ms for all."""
+    found = []
+    for name in folder.names():
+        if name.endswith(_KERNEL):
+            try:
+                _sound(folder.read(name))
+            except (OSError, ValueError):
+                found.append(name)
+    return found
+
+
+def remove_damaged(folder: OwnFolder) -> int:
+    """Remove such files, and what says which parts are built; their number. Raises OSError."""
+    names = damaged(folder)
+    for name in [*names, *(each for each in folder.names() if names and each.endswith(_MARK))]:
+        folder.remove(name)
+    return len(names)
+
+
+def is_marked(folder: OwnFolder, part: str) -> bool:
+    """Return whether the kernels of ``part`` were marked as compiled."""
+    return part + _MARK in folder.names()
+
+
+def mark(folder: OwnFolder, part: str) -> None:
+    """Mark the kernels of ``part`` as compiled. Raises OSError."""
+    folder.write(part + _MARK, b"")
 
 
 def user_cache() -> Path:
     """Return this program's cache directory of the user. Raises RuntimeError without a home."""
     base = os.environ.get("XDG_CACHE_HOME")
     return Path(base) / "softfinger" if base else Path.home() / ".cache" / "softfinger"
-
-
-def own_folder(folder: Path) -> None:
-    """Make ``folder`` for this user alone (0700) if absent; else see that it is no one else's.
-
-    Raises PermissionError where another user owns it or may write to it, NotADirectoryError where
-    it is something else, OSError where it can't be made or written.
-    """
-    if not folder.is_symlink() and not folder.exists():
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        folder.mkdir(mode=0o700, exist_ok=True)
-    found = folder.lstat()
-    if not stat.S_ISDIR(found.st_mode):
-        raise NotADirectoryError(f"{folder}: found a link or a file, expected a folder")
-    if found.st_uid != os.geteuid():
-        raise PermissionError(
-            f"{folder}: belongs to user {found.st_uid}, expected {os.geteuid()}, who runs this"
-        )
-    if found.st_mode & 0o022:
-        raise PermissionError(
-            f"{folder}: others may write to it (mode {found.st_mode & 0o777:o}); chmod 700 {folder}"
-        )
-    if not os.access(folder, os.W_OK | os.X_OK):
-        raise PermissionError(f"{folder}: may not be written to")
 
 
 def _prune(base: Path, current: Path) -> None:

@@ -1,7 +1,8 @@
 """Kernels compiled by Numba's public interface alone: what `compiler` does, with any Numba.
 
 Results are the same; a first start takes twice as long, and later ones import all that Numba can
-compile. Kernels are kept in the same folder, which names their sources and Numba's version.
+compile. Kernels are kept in the same folder, which names their sources and Numba's version, but by
+Numba, without a digest.
 """
 
 from __future__ import annotations
@@ -59,7 +60,9 @@ inner = InnerKernel
 def compiled(function: Callable[..., Any], options: dict[str, Any]) -> Any:
     """Return ``function`` as one that Numba compiles and keeps, where there is a folder."""
     folder = kernel_folder()
-    before, _config.CACHE_DIR = _config.CACHE_DIR, str(folder or "")
+    # Through the folder as it was opened and judged, whatever its path leads to by now.
+    place = f"/proc/self/fd/{folder.descriptor}" if folder else ""
+    before, _config.CACHE_DIR = _config.CACHE_DIR, place
     try:
         return _njit(cache=folder is not None, **options)(function)
     finally:

@@ -22,6 +22,7 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.base import Finding
 from softfinger.daemon.simulation.emulator.emulator import EmulatedServos
+from softfinger.kinematics.compiled.kernel_folder import find_folder
 from softfinger.tools.cli import main
 from softfinger.tools.setup import doctor
 from tests.harness.descendants import ending
@@ -330,7 +331,7 @@ def test_memory_idle_states_and_clocks(tmp_path, monkeypatch):
 def test_kernels_are_told_where_they_are_or_are_not(tmp_path, monkeypatch):
     scene = Settings.model_validate({"servos": {"backend": "none"}, "tactile": {"backend": "none"}})
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    monkeypatch.setattr(warm_up, "kernel_folder", lambda: tmp_path)
+    monkeypatch.setattr(warm_up, "kernel_folder", find_folder)
     (found,) = kernels.check_kernels(scene)
     assert found.status == "warn"
     assert "contact table, joints and timing not compiled yet" in found.text
@@ -339,10 +340,13 @@ def test_kernels_are_told_where_they_are_or_are_not(tmp_path, monkeypatch):
     (found,) = kernels.check_kernels(scene)
     assert found.status == "pass"
     (folder,) = tmp_path.glob("kernels-*")
+    (folder / "grip.kernel").write_bytes(b"torn")
+    (found,) = kernels.check_kernels(scene)
+    assert (found.status, found.text[:15]) == ("warn", "1 damaged files")
     folder.chmod(0o777)
     (found,) = kernels.check_kernels(scene)
     assert found.status == "warn"
-    assert "others may write to it" in found.text
+    assert "may be written by others" in found.text
     assert "NUMBA_CACHE_DIR" in found.fix
 
 

@@ -77,6 +77,18 @@ def test_numbers_that_are_none_are_empty_cells(tmp_path: Path) -> None:
     assert (row["left.force"], row["news"]) == ("", "3.5")
 
 
+def test_files_have_plain_names_whatever_the_topics_are_called(tmp_path: Path) -> None:
+    writer = RecordingWriter(tmp_path / "a.mcap")
+    for topic in (b".hidden", b"\x1b[2Jhand/../../x", b"nul\0", b"/"):
+        writer.add(topic, {"timestamp": 1e9, "a": 1})
+    writer.close()
+    recording = Recording(tmp_path / "a.mcap")
+    files = export(recording, tmp_path, CsvTable, recording.topics)
+    names = {file.name for file in files}
+    assert names == {"hidden.csv", "-[2Jhand-..-..-x.csv".replace("[", "-"), "nul-.csv", "-.csv"}
+    assert {file.name for file in tmp_path.iterdir()} == names | {"a.mcap"}
+
+
 def test_from_the_command_line(path: Path, tmp_path: Path, inline: Inline) -> None:
     out = tmp_path / "out"
     words = ("--out", str(out), "--topics", "state", "--from", "100", "--to", "200")

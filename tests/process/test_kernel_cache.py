@@ -9,11 +9,13 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from softfinger.kinematics.compiled import kernel_folder
+from softfinger.kinematics.compiled import kernel_folder, own_folder
+from softfinger.kinematics.compiled.own_folder import OwnFolder
 
 FILES = {
     "softfinger/__init__.py": "",
@@ -129,16 +131,18 @@ def test_a_kept_kernel_runs_without_what_compiles_and_is_compiled_into_others(
 def test_own_folder_refuses_links_files_and_other_users(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    kernel_folder.own_folder(tmp_path / "new")
-    kernel_folder.own_folder(tmp_path / "new")
+    OwnFolder(tmp_path / "new").close()
+    OwnFolder(tmp_path / "new").close()
     (tmp_path / "link").symlink_to(tmp_path / "new")
     (tmp_path / "file").touch()
     for name in ("link", "file"):
         with pytest.raises(NotADirectoryError, match="found a link or a file"):
-            kernel_folder.own_folder(tmp_path / name)
-    monkeypatch.setattr(kernel_folder.os, "geteuid", lambda: 12345)
+            OwnFolder(tmp_path / name)
+    if os.geteuid() == 0:
+        os.chown(tmp_path / "new", 54321, 54321)
+    monkeypatch.setattr(own_folder.os, "geteuid", lambda: 12345)
     with pytest.raises(PermissionError, match="expected 12345"):
-        kernel_folder.own_folder(tmp_path / "new")
+        OwnFolder(tmp_path / "new")
 
 
 def test_the_folder_is_the_users_own_and_those_not_used_for_longest_go(package: Package) -> None:
@@ -160,4 +164,70 @@ def test_the_folder_is_the_users_own_and_those_not_used_for_longest_go(package: 
     (base / new).chmod(0o777)
     found, told = package.run()
     assert found == ["3.0", "0"], "compiled, but not taken from it"
-    assert "others may write to it (mode 777); chmod 700" in told
+    assert "may be written by others (0777): chmod go-w" in told
+
+
+def flipped(file: Path) -> None:
+    data = bytearray(file.read_bytes())
+    data[len(data) // 2] ^= 1
+    file.write_bytes(data)
+
+
+SPOILT: dict[str, Callable[[Path], object]] = {
+    "a flipped bit": flipped,
+    "torn": lambda file: os.truncate(file, 100),
+    "empty": lambda file: os.truncate(file, 0),
+    "another pickle": lambda file: file.write_bytes(b"\x80\x04N."),
+    "another's": lambda file: os.chown(file, 54321, 54321),
+}
+
+
+@pytest.mark.parametrize("spoil", SPOILT.values(), ids=SPOILT)
+def test_a_damaged_kernel_is_compiled_anew_with_a_warning(
+    package: Package, spoil: Callable[[Path], object]
+) -> None:
+    if spoil is SPOILT["another's"] and os.geteuid() != 0:
+        pytest.skip("only root gives files away")
+    package.run()
+    (file,) = package.cache.rglob("*.kernel")
+    spoil(file)
+    found, told = package.run()
+    assert found == ["3.0", "0"]
+    assert told.count("compiled anew") == 1
+    assert package.run() == (["3.0", "1"], "")
+
+
+def test_damaged_kernels_are_found_and_removed_with_their_marks(tmp_path: Path) -> None:
+    with OwnFolder(tmp_path / "kept") as folder:
+        for name in ("one", "two"):
+            kernel_folder.keep(folder, name, b"machine code")
+        kernel_folder.mark(folder, "grip")
+        assert kernel_folder.remove_damaged(folder) == 0
+        assert kernel_folder.is_marked(folder, "grip")
+        flipped(folder.path / "one.kernel")
+        assert kernel_folder.damaged(folder) == ["one.kernel"]
+        assert kernel_folder.remove_damaged(folder) == 1
+        assert folder.names() == ["two.kernel"]
+
+
+def test_a_folder_above_in_which_others_may_write_is_refused(package: Package) -> None:
+    package.cache.mkdir()
+    package.cache.chmod(0o777)
+    found, told = package.run()
+    assert found == ["3.0", "0"]
+    assert f"{package.cache}: may be written by others (0777): chmod go-w" in told
+    assert not list(package.cache.rglob("*.kernel"))
+
+
+def test_a_folder_that_is_renamed_is_read_as_it_was_opened(tmp_path: Path) -> None:
+    path, theirs = tmp_path / "kept", tmp_path / "theirs"
+    theirs.mkdir()
+    (theirs / "one.kernel").write_bytes(b"theirs")
+    with OwnFolder(path) as folder:
+        kernel_folder.keep(folder, "one", b"ours")
+        path.rename(tmp_path / "away")
+        theirs.rename(path)
+        assert kernel_folder.kept(folder, "one") == b"ours"
+        (tmp_path / "away" / "two.kernel").symlink_to(path / "one.kernel")
+        with pytest.warns(RuntimeWarning, match="compiled anew"):
+            assert kernel_folder.kept(folder, "two") is None

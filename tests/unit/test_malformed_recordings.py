@@ -16,10 +16,11 @@ from softfinger.daemon.wire import schema
 from softfinger.tools.analysis.contacts import analyse, open_source
 from softfinger.tools.analysis.plots_data import load_run
 from softfinger.tools.recordings.reader import Recording
-from softfinger.tools.recordings.recomputed import recorded_settings
+from softfinger.tools.recordings.recomputed import recompute, recorded_settings
 from softfinger.tools.recordings.writer import RecordingWriter
 from tests.harness.golden_wire import sample
 
+GOLDEN = Path(__file__).parents[1] / "golden" / "grasp_and_turn.mcap"
 SPOILT: dict[str, Any] = {
     "no finger": ("finger", None),
     "another finger": ("finger", "thumb"),
@@ -95,6 +96,34 @@ def test_settings_without_their_text_are_told(tmp_path: Path, name: str) -> None
     writer.close()
     with pytest.raises(RecordingError, match="its hand/settings lacks"):
         recorded_settings(Recording(path))
+
+
+def test_recorded_settings_name_no_files(tmp_path: Path) -> None:
+    named = Settings().model_dump()
+    files = ("calibration", "recording", "envelope", "keys")
+    for section in named.values():
+        for key in section.keys() & set(files):
+            section[key] = "/dev/zero" if section[key] == "" else ("/dev/zero", "/dev/zero")
+    text = Settings.model_validate(named).model_dump_json()
+    assert text.count("/dev/zero") == 6
+    writer = RecordingWriter(tmp_path / "a.mcap")
+    writer.add(schema.SETTINGS, {**settings_message(), "settings": text})
+    writer.close()
+    assert recorded_settings(Recording(tmp_path / "a.mcap"))[0] == Settings()
+
+
+@pytest.mark.parametrize("spoilt", ["seq", "t", "reading", "left", "timestamp"])
+def test_inputs_that_are_none_are_told(tmp_path: Path, spoilt: str) -> None:
+    writer = RecordingWriter(tmp_path / "a.mcap")
+    for topic, message in Recording(GOLDEN).messages(end=0.1):
+        if topic == schema.INPUT:
+            message[spoilt] = "none"
+        elif topic == schema.COMMAND:
+            message.pop("ok")
+        writer.add(topic, message)
+    writer.close()
+    with pytest.raises(RecordingError, match="not those of a loop"):
+        recompute(Recording(tmp_path / "a.mcap"))
 
 
 def test_a_file_cut_anywhere_is_told_in_plain_words(tmp_path: Path) -> None:

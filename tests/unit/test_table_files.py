@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from softfinger import ContactTable, Fingertip, Material
-from softfinger.daemon import own_files
 from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.profile import factory
 from softfinger.daemon.profile.factory import (
@@ -21,6 +18,7 @@ from softfinger.daemon.profile.factory import (
     table_file,
 )
 from softfinger.daemon.profile.settings import Settings
+from softfinger.kinematics.compiled import own_folder
 from softfinger.kinematics.contact.lookup import TableError
 
 TIP = Fingertip(0.020)
@@ -58,12 +56,10 @@ def test_a_file_appears_whole_or_not_at_all(
     save_table(file, table, TIP, CONSTANT)
     before = file.read_bytes()
 
-    class Full(io.FileIO):
-        def write(self, content: Any) -> int:
-            super().write(content[:50])
-            raise OSError(28, "No space left on device")
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(own_files, "write_bytes", lambda path: Full(path, "w"))
+    monkeypatch.setattr(own_folder.os, "fsync", full)
     with pytest.raises(OSError, match="No space left"):
         save_table(file, ContactTable.build(TIP, CONSTANT, 1e-3), TIP, CONSTANT)
     assert [path.name for path in tmp_path.iterdir()] == ["tip.table"]

@@ -14,7 +14,7 @@ from typing import Any
 
 from softfinger.daemon.errors import ServoError, SettingsError
 from softfinger.daemon.own_files import write_whole
-from softfinger.daemon.profile.load import find, load
+from softfinger.daemon.profile.load import find, load, profile_text
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.checks import CHECKED, DRIVE_REVERSE, Registers
@@ -125,7 +125,7 @@ def _write(arguments: argparse.Namespace, new: dict[str, dict[str, list[Any]]]) 
     changes = [f"{s}.{key} = {value}" for s, values in new.items() for key, value in values.items()]
     source = arguments.file if arguments.file.exists() else arguments.config
     load(source, arguments.dir or own_runtime_folder(), [*arguments.set, *changes])
-    before = text = find(source).read_text(encoding="utf-8-sig")
+    before = text = profile_text(find(source))
     for section, values in new.items():
         text = put(text, section, values)
     wanted = tomllib.loads(before)

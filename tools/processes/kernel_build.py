@@ -20,7 +20,7 @@ from typing import IO, Any, NamedTuple
 from softfinger.daemon.loop.warm_up import Part, WantedScene, is_built, mark_built, named, parts
 from softfinger.daemon.profile.settings import Settings
 from softfinger.kinematics.compiled.kernel import why_plain
-from softfinger.kinematics.compiled.kernel_folder import kernel_folder, user_cache
+from softfinger.kinematics.compiled.kernel_folder import kernel_folder, remove_damaged, user_cache
 from softfinger.tools.terminal.progress import Progress
 
 Tell = Callable[[str, str, str], None]
@@ -59,10 +59,14 @@ def build_kernels(
     terminal and ``bar`` allows it, else a call of ``tell`` for each part, as (level, kind, text);
     failures go to ``tell``, too. When interrupted it ends every process.
     """
+    folder = kernel_folder()
+    if folder is not None and (count := remove_damaged(folder)):
+        text = f"{folder.path}: {count} damaged files are compiled anew"
+        tell("warning", "compile", text)
     missing = [part for part in wanted or parts(settings) if not is_built(part, settings)]
     if not missing:
         return Built(0, False)
-    if kernel_folder() is None:
+    if folder is None:
         tell("warning", "compile", "kernels are compiled in this process, for half a minute")
         return Built(0, False)
     if why_plain:

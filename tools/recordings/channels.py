@@ -37,8 +37,6 @@ _FOXGLOVE: dict[bytes, tuple[str, dict[str, Any]]] = {
 _STORED_AS = {"timestamp": "unix", "level": "severity"}
 _LEVELS = {"info": 2, "warning": 3, "error": 4}  # Foxglove's; 0 is one that it doesn't know
 
-_MOST_CELLS = 4096  # in a row or column
-
 Converter = Callable[[dict[str, Any]], dict[str, Any]]
 
 
@@ -135,8 +133,7 @@ def _is_frame(message: dict[str, Any]) -> bool:
         and isinstance(stamp, float)
         and math.isfinite(stamp)
         and type(rows) is type(cols) is int
-        and 0 < rows <= _MOST_CELLS
-        and 0 < cols <= _MOST_CELLS
+        and min(rows, cols) > 0
         and len(message["data"]) == 2 * rows * cols
     )
 

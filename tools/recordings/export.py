@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import csv
 import math
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -178,7 +179,10 @@ def export(
         for topic, message in recording.messages(topics, start, end, progress):
             row = _flat(message)
             if topic not in tables:
-                files.append(folder / f"{topic.decode().replace('/', '-')}{kind.suffix}")
+                name = _file_name(topic)
+                if any(each.stem == name for each in files):
+                    raise RecordingError(f"{recording.path}: two topics would be {name}")
+                files.append(folder / f"{name}{kind.suffix}")
                 tables[topic] = kind(files[-1], topic, row), []
             if topic == schema.TACTILE:
                 times, frames = grids.setdefault(message["finger"], ([], []))
@@ -201,6 +205,11 @@ def export(
             t = np.array(times)
             np.savez_compressed(file, frames=np.stack(frames), t=t - t[0])
     return files
+
+
+def _file_name(topic: bytes) -> str:
+    """A topic's name as a file's, whatever a recording calls it: neither hidden nor elsewhere."""
+    return re.sub(r"[^A-Za-z0-9._-]", "-", topic.decode()).lstrip(".")[:100] or "topic"
 
 
 def _flat(message: Row, outer: str = "") -> Row:

@@ -1,25 +1,38 @@
 """`Recording`: an MCAP file's summary, and its messages in the order in which they came.
 
+A recording may come from anywhere, and what it claims is not believed: memory and time go with the
+room that it takes on the disk.
 `read_recording` gives its states as NumPy columns.
 """
 
 from __future__ import annotations
 
+import io
 import math
+import os
+import struct
+import zlib
 from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any, BinaryIO
 
 from softfinger.daemon.errors import RecordingError
+from softfinger.daemon.own_files import MOST, open_regular, unpacked_most
+from softfinger.daemon.wire import schema
 from softfinger.tools.extras import require
 from softfinger.tools.recordings.channels import ENCODING, PROFILE, Converter, from_json, topic_of
 
 if TYPE_CHECKING:
-    from mcap.records import Chunk, McapRecord
-    from mcap.summary import Summary
+    from mcap.records import Chunk, Statistics
     from numpy.typing import NDArray
 
-_RECORD_LIMIT = 256 * 1024 * 1024  # bytes; our own chunks are a thousandth of it
+_MESSAGE_MOST = 1 << 20  # bytes; the largest grid's frame has 0.2 MB, settings more
+_MESSAGE_LEAST = 512  # bytes that a message counts for: each takes time
+_HEADER, _FOOTER, _CHANNEL, _MESSAGE, _CHUNK, _STATISTICS, _DATA_END = 1, 2, 4, 5, 6, 11, 15
+_RECORD = struct.Struct("<BQ")  # what each begins with: its kind, the bytes of its content
+_BEFORE_DATA = struct.Struct("<HIQQ")  # channel, number, log time and publish time of a message
+_MAGIC = b"\x89MCAP0\r\n"
+_END = struct.Struct("<BQQQI8s")  # footer and magic
 
 
 def read_recording(path: str | Path) -> dict[str, NDArray[Any]]:
@@ -60,21 +73,21 @@ class Recording:
         self.end = math.nan
         self.chunks = 0
         self._first = 0  # log time of the earliest message [ns]
+        self._left = 0  # bytes that may yet be unpacked
         self._names: dict[int, str] = {}  # of the channels, by number
         try:
-            self.size = path.stat().st_size
-            if self.size == 0:
-                raise RecordingError(f"{path}: empty")
-            summary = self._summary()
+            with open_regular(path) as file:
+                self.size = os.fstat(file.fileno()).st_size
+                if self.size == 0:
+                    raise RecordingError(f"{path}: empty")
+                whole = self._summary(file)
         except OSError as error:
             raise RecordingError(f"{path}: {error.strerror}") from None
-        if summary is None:
+        if not whole:
             self.truncated = True
             self._scan()
             if not self.damage:
                 self._damaged(None)
-        else:
-            self._take(summary)
 
     @property
     def duration(self) -> float:
@@ -110,7 +123,6 @@ class Recording:
         don't fit their topic are left out.
         """
         import orjson
-        from mcap.records import Message
 
         loads = orjson.loads
         begin = self._first + int(start * 1e9) if math.isfinite(start) else 0
@@ -123,50 +135,74 @@ class Recording:
         for chunk in self._chunks(progress):
             if chunk.message_end_time < begin or chunk.message_start_time > finish:
                 continue
-            for record in self._records(chunk):
-                if not isinstance(record, Message) or record.channel_id not in selected:
+            for channel, log_time, data in self._messages_in(chunk):
+                if channel not in selected or not begin <= log_time <= finish:
                     continue
-                if not begin <= record.log_time <= finish:
-                    continue
-                topic, convert = selected[record.channel_id]
+                topic, convert = selected[channel]
                 try:
-                    message = convert(loads(record.data))
+                    if len(data) > _MESSAGE_MOST and topic != schema.SETTINGS:
+                        raise ValueError(f"a message of {len(data) >> 20} MB")
+                    message = convert(loads(data))
                 except (ValueError, TypeError, AttributeError) as error:
                     self._damaged(error)
                     continue
                 yield topic, message
 
     def _chunks(self, progress: Callable[[int], None] | None = None) -> Iterator[Chunk]:
-        from mcap.records import Chunk, DataEnd
-        from mcap.stream_reader import StreamReader
+        from mcap.data_stream import ReadDataStream
+        from mcap.records import Chunk
 
-        with self.path.open("rb") as file:
-            reader = StreamReader(file, emit_chunks=True, record_size_limit=_RECORD_LIMIT)
+        with open_regular(self.path) as file:
+            file.seek(len(_MAGIC))
+            self._left = unpacked_most(file)
             try:
-                for record in reader.records:
-                    if isinstance(record, Chunk):
-                        if progress is not None:
-                            progress(file.tell())
-                        yield record
-                    elif isinstance(record, DataEnd):
+                for kind, content in _records(file, (_CHUNK, _DATA_END)):
+                    if kind == _DATA_END:
                         return
+                    chunk = Chunk.read(ReadDataStream(io.BytesIO(content)))
+                    self._count(chunk.uncompressed_size)
+                    if progress is not None:
+                        progress(file.tell())
+                    yield chunk
             except Exception as error:
                 self._damaged(error)
+            else:
+                self._damaged(None)
 
-    def _records(self, chunk: Chunk) -> list[McapRecord]:
-        """A chunk's records; none where it is damaged."""
-        from mcap.stream_reader import breakup_chunk
+    def _messages_in(self, chunk: Chunk, learn: bool = False) -> Iterator[tuple[int, int, bytes]]:
+        """Yield a chunk's messages: number of the channel, log time [ns], data.
 
+        ``learn``: take over its channels, too. Where it is damaged nothing comes.
+        """
         try:
-            return breakup_chunk(chunk, validate_crc=True)
+            for kind, content in _records(io.BytesIO(_unpacked(chunk)), (_CHANNEL, _MESSAGE)):
+                if kind == _MESSAGE:
+                    self._count(max(0, _MESSAGE_LEAST - len(content)))
+                    channel, _, log_time, _ = _BEFORE_DATA.unpack_from(content)
+                    yield channel, log_time, content[_BEFORE_DATA.size :]
+                elif learn:
+                    self._learn(content)
         except Exception as error:  # the format's, the compression's and more kinds
             self._damaged(error)
-            return []
+
+    def _count(self, unpacked: int) -> None:
+        self._left -= unpacked
+        if self._left < 0:
+            raise ValueError("it unpacks to more than recordings of its size do")
+
+    def _learn(self, content: bytes) -> None:
+        from mcap.data_stream import ReadDataStream
+        from mcap.records import Channel
+
+        channel = Channel.read(ReadDataStream(io.BytesIO(content)))
+        if channel.message_encoding == ENCODING:
+            self._names[channel.id] = channel.topic
 
     def check(self) -> bool:
         """Read every chunk; whether the file is whole and sound."""
         for chunk in self._chunks():
-            self._records(chunk)
+            for _ in self._messages_in(chunk):
+                pass
         return not self.truncated and not self.damage
 
     def _damaged(self, error: Exception | None) -> None:
@@ -178,42 +214,50 @@ class Recording:
             what = "cut short" if self.truncated else "damaged"
             self._say(f"{self.path}: {what} ({self.damage}); what is sound in it is read")
 
-    def _summary(self) -> Summary | None:
-        from mcap.exceptions import EndOfFile, InvalidMagic
-        from mcap.reader import SeekingReader
+    def _summary(self, file: BinaryIO) -> bool:
+        """Take the summary at the file's end; False where it has none."""
+        from mcap.data_stream import ReadDataStream
+        from mcap.records import Header, Statistics
 
-        with self.path.open("rb") as file:
-            magic = file.read(8)
-            if magic[:1] != b"\x89" or magic[1:5] != b"MCAP":
-                raise RecordingError(f"{self.path}: not an MCAP file")
-            file.seek(0)
-            try:
-                reader = SeekingReader(file, record_size_limit=_RECORD_LIMIT)
-                header = reader.get_header()
-                if header.profile != PROFILE:
-                    raise RecordingError(
-                        f"{self.path}: profile {header.profile!r}, expected {PROFILE!r}: "
-                        "not a recording of this stream"
-                    )
-                summary = reader.get_summary()
-                if summary is not None and summary.statistics is not None:
-                    return summary
-            except (InvalidMagic, EndOfFile):
-                pass  # cut short: no summary
-            except RecordingError:
-                raise
-            except Exception as error:
-                self.truncated = True
-                self._damaged(error)
-        return None
+        if file.read(5) != _MAGIC[:5]:
+            raise RecordingError(f"{self.path}: not an MCAP file")
+        file.seek(len(_MAGIC))
+        try:
+            _, content = next(_records(file, (_HEADER,)))
+            profile = Header.read(ReadDataStream(io.BytesIO(content))).profile
+            if profile != PROFILE:
+                raise RecordingError(
+                    f"{self.path}: profile {profile!r}, expected {PROFILE!r}: "
+                    "not a recording of this stream"
+                )
+            file.seek(max(0, self.size - _END.size))
+            kind, _, start, _, _, magic = _END.unpack(file.read(_END.size))
+            if (kind, magic) != (_FOOTER, _MAGIC) or start == 0:
+                return False  # cut short
+            file.seek(start)
+            statistics: Statistics | None = None
+            for kind, content in _records(file, (_CHANNEL, _STATISTICS, _FOOTER)):
+                if kind == _CHANNEL:
+                    self._learn(content)
+                elif kind == _STATISTICS:
+                    statistics = Statistics.read(ReadDataStream(io.BytesIO(content)))
+                else:
+                    break
+        except (EOFError, StopIteration, struct.error):
+            return False
+        except RecordingError:
+            raise
+        except Exception as error:
+            self.truncated = True
+            self._damaged(error)
+            return False
+        if statistics is not None:
+            self._take(statistics)
+        return statistics is not None
 
-    def _take(self, summary: Summary) -> None:
-        statistics = summary.statistics
-        assert statistics is not None
-        for number, channel in summary.channels.items():
-            if channel.message_encoding == ENCODING:
-                self._names[number] = channel.topic
-                self.counts[channel.topic] = statistics.channel_message_counts.get(number, 0)
+    def _take(self, statistics: Statistics) -> None:
+        for number, name in self._names.items():
+            self.counts[name] = statistics.channel_message_counts.get(number, 0)
         self.chunks = statistics.chunk_count
         if statistics.message_count:
             self._first = statistics.message_start_time
@@ -221,19 +265,57 @@ class Recording:
             self.end = statistics.message_end_time * 1e-9
 
     def _scan(self) -> None:
-        from mcap.records import Channel, Message
-
         names = self._names
         start, end = 2**63, 0
         for chunk in self._chunks():
             self.chunks += 1
-            for record in self._records(chunk):
-                if isinstance(record, Message) and record.channel_id in names:
-                    name = names[record.channel_id]
+            for channel, log_time, _ in self._messages_in(chunk, learn=True):
+                if channel in names:
+                    name = names[channel]
                     self.counts[name] = self.counts.get(name, 0) + 1
-                    start, end = min(start, record.log_time), max(end, record.log_time)
-                elif isinstance(record, Channel) and record.message_encoding == ENCODING:
-                    names[record.id] = record.topic
+                    start, end = min(start, log_time), max(end, log_time)
         if end:
             self._first = start
             self.start, self.end = start * 1e-9, end * 1e-9
+
+
+def _records(file: IO[bytes], wanted: Collection[int]) -> Iterator[tuple[int, bytes]]:
+    """Yield kind and content of the records that are ``wanted``, until the end.
+
+    Raises EOFError for one that is cut short, ValueError for what is none or is too long.
+    """
+    while head := file.read(_RECORD.size):
+        if len(head) < _RECORD.size:
+            raise EOFError
+        kind, length = _RECORD.unpack(head)
+        if kind == 0:
+            raise ValueError("a record of no kind")
+        if kind not in wanted:
+            file.seek(length, os.SEEK_CUR)
+            continue
+        if length > MOST:
+            raise ValueError(f"a record of {length >> 20} MB")
+        content = file.read(length)
+        if len(content) < length:
+            raise EOFError
+        yield kind, content
+
+
+def _unpacked(chunk: Chunk) -> bytes:
+    """A chunk's records. Raises ValueError where it claims too much, or isn't what it claims."""
+    data, size = chunk.data, chunk.uncompressed_size
+    if size > MOST:
+        raise ValueError(f"a chunk of {size >> 20} MB")
+    if chunk.compression == "zstd":
+        import zstandard
+
+        if zstandard.frame_content_size(data) not in (-1, size):
+            raise ValueError("a chunk that is larger than it claims")
+        data = zstandard.ZstdDecompressor().decompress(data, max_output_size=size)
+    elif chunk.compression == "lz4":
+        import lz4.frame
+
+        data = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1)
+    if len(data) != size or chunk.uncompressed_crc not in (0, zlib.crc32(data)):
+        raise ValueError("a chunk that is not what it claims")
+    return data

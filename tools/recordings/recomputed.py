@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,9 +13,11 @@ from typing import Any
 import msgpack
 import numpy as np
 
+from softfinger.daemon.client.records import read
 from softfinger.daemon.errors import RecordingError
 from softfinger.daemon.loop.process_replay import ProcessReplay
 from softfinger.daemon.loop.publishing import parts
+from softfinger.daemon.profile.load import without_files
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS, Frame
 from softfinger.daemon.wire import schema
@@ -53,7 +56,10 @@ class Comparison:
 
 
 def recorded_settings(recording: Recording) -> tuple[Settings, list[str]]:
-    """Return the recording's settings and calibrations (JSON). Raises RecordingError."""
+    """Return the recording's settings and calibrations (JSON). Raises RecordingError.
+
+    The settings name no files: a recording may come from anywhere.
+    """
     message = next((each for _, each in recording.messages([schema.SETTINGS])), None)
     if message is None:
         raise RecordingError(f"{recording.path}: no hand/settings in it")
@@ -66,7 +72,7 @@ def recorded_settings(recording: Recording) -> tuple[Settings, list[str]]:
         raise RecordingError(
             f"{recording.path}: its settings are not of this version: {error}"
         ) from None
-    return settings, [str(each) for each in calibrations]
+    return without_files(settings), [str(each) for each in calibrations]
 
 
 def recompute(
@@ -86,11 +92,27 @@ def recompute(
             f"{recording.path}: no hand/input in it, each tick's inputs: record with --topics all, "
             "or by `softfinger run --record FILE`"
         )
-    used = settings or own
+    result = Comparison()
+    try:
+        _run(result, recording, settings or own, calibrations, cache, progress)
+    except (LookupError, TypeError, ValueError, ArithmeticError, struct.error) as error:
+        raise RecordingError(
+            f"{recording.path}: its messages are not those of a loop: {error!r}"
+        ) from error
+    return result
+
+
+def _run(
+    result: Comparison,
+    recording: Recording,
+    used: Settings,
+    calibrations: list[str],
+    cache: Path | None,
+    progress: Callable[[int], None] | None,
+) -> None:
     machine = ProcessReplay(used, calibrations, cache)
     scene = parts(used)
     pack_state = packer(schema.STATE)
-    result = Comparison()
     newest = [0, 0]
     last = 0
     for tick, frames, commands, state in _ticks(recording, progress):
@@ -129,7 +151,6 @@ def recompute(
             # Through the packer, as the recorded one: the same types and roundings.
             again = msgpack.unpackb(pack_state(now, scene, step))
             _compare(result, state, again)
-    return result
 
 
 # A tick's input, the counts of recent frames by (finger, seq), its commands, and its state if any.
@@ -161,8 +182,10 @@ def _ticks(recording: Recording, progress: Callable[[int], None] | None) -> Iter
             frames[finger, message["seq"]] = counts
             frames.pop((finger, message["seq"] - 2), None)
         elif topic == schema.COMMAND:
-            if message["ok"]:
-                commands.setdefault(message["tick"], []).append(json.loads(message["request"]))
+            command = read(schema.AnsweredCommand, message)
+            request = _request(command.request) if command.ok else None
+            if request is not None:
+                commands.setdefault(command.tick, []).append(request)
         elif topic == schema.INPUT:
             if waiting is not None:
                 yield waiting, frames, commands.pop(waiting["seq"], []), None
@@ -172,6 +195,15 @@ def _ticks(recording: Recording, progress: Callable[[int], None] | None) -> Iter
             waiting = None
     if waiting is not None:
         yield waiting, frames, commands.pop(waiting["seq"], []), None
+
+
+def _request(text: str) -> dict[str, Any] | None:
+    """A command's map, None where there is none."""
+    try:
+        found = json.loads(text)
+    except (ValueError, RecursionError):
+        return None
+    return found if isinstance(found, dict) else None
 
 
 def _compare(result: Comparison, recorded: dict[str, Any], recomputed: dict[str, Any]) -> None:

@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 
 from softfinger.daemon.errors import SettingsError
-from softfinger.daemon.profile.load import find, names
+from softfinger.daemon.profile.load import find, names, profile_text
 
 _REFERENCE = Path("sim")  # it has every key, with default, unit and meaning
 _EPILOG = """\
@@ -39,7 +39,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _text(profile: Path) -> str:
-    return find(profile).read_text(encoding="utf-8-sig")
+    return profile_text(find(profile))
 
 
 def subject(profile: Path) -> str:

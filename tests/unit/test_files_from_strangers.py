@@ -1,0 +1,134 @@
+"""Files that somebody else has made end in one line, soon, and without much memory."""
+
+from __future__ import annotations
+
+import os
+import resource
+import zipfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from softfinger.daemon.control.envelope import Envelope
+from softfinger.daemon.errors import RecordingError, SettingsError, SoftfingerError
+from softfinger.daemon.perception.calibration_file import load_calibration
+from softfinger.daemon.profile.load import load
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.tactile.replay import load_recording
+
+ROOM = 200e6  # bytes beyond what the tests have mapped
+
+
+@pytest.fixture(autouse=True)
+def little_memory() -> Iterator[None]:
+    """More than so much can't be had."""
+    mapped = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (int(mapped + ROOM), before[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_AS, before)
+
+
+def envelope(path: Path) -> object:
+    control = Settings().control.model_copy(update={"envelope": str(path)})
+    return Envelope(Settings().model_copy(update={"control": control}))
+
+
+READERS: dict[str, Callable[[Path], object]] = {
+    "profile": load,
+    "map": envelope,
+    "calibration": load_calibration,
+    "frames": lambda path: load_recording(path, 1.0, 100.0),
+}
+
+
+def fifo(path: Path) -> None:
+    os.mkfifo(path)
+
+
+def zeros(path: Path) -> None:
+    path.symlink_to("/dev/zero")
+
+
+def comments(path: Path) -> None:
+    path.write_text("# nothing\n" * 3_000_000)
+
+
+@pytest.mark.timeout(20)
+@pytest.mark.parametrize("make", [fifo, zeros, comments])
+@pytest.mark.parametrize("read", READERS.values(), ids=READERS)
+def test_a_name_that_leads_elsewhere_is_told(
+    tmp_path: Path, make: Callable[[Path], None], read: Callable[[Path], object]
+) -> None:
+    path = tmp_path / "named"
+    make(path)
+    with pytest.raises(SoftfingerError) as caught:
+        read(path)
+    assert str(path) in str(caught.value)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+PROFILES = {
+    "a hex integer": "loop.rate = 0x" + "f" * 200_000,
+    "a key of 50,000 parts": ".".join(["a"] * 50_000) + " = 1",
+    "a table of 50,000 parts": "[" + " . ".join(['"a"'] * 50_000) + "]",
+    "20,000 keys": "\n".join(f"x{k} = 1" for k in range(20_000)),
+    "50,000 wrong values": f"scene.fingers = [{'1,' * 50_000}]",
+    "arrays in arrays": f"a = {'[' * 100_000}",
+}
+
+
+@pytest.mark.timeout(10)
+@pytest.mark.parametrize("text", PROFILES.values(), ids=PROFILES)
+def test_a_profile_without_sense_is_told_soon_and_briefly(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "my.toml"
+    path.write_text(text)
+    with pytest.raises(SettingsError) as caught:
+        load(path)
+    assert len(str(caught.value)) < 4000
+
+
+def claiming(path: Path) -> None:
+    """An array of 3.5 TiB by its header."""
+    with path.open("wb") as file:
+        shape = {"descr": "<u2", "fortran_order": False, "shape": (10**9, 44, 44)}
+        np.lib.format.write_array_header_1_0(file, shape)
+        file.write(bytes(100))
+
+
+def holes(path: Path) -> None:
+    with path.open("wb") as file:
+        shape = {"descr": "<u2", "fortran_order": False, "shape": (10**6, 44, 44)}
+        np.lib.format.write_array_header_1_0(file, shape)
+        file.truncate(file.tell() + 2 * 44 * 44 * 10**6)
+
+
+def packed(path: Path, method: int = zipfile.ZIP_DEFLATED, *, honest: bool = True) -> None:
+    """20 MB of zeros in an archive, or an array that claims more than is there."""
+    with zipfile.ZipFile(path, "w", method) as archive, archive.open("frames.npy", "w") as file:
+        frames = 5_000 if honest else 10**9
+        shape = {"descr": "<u2", "fortran_order": False, "shape": (frames, 44, 44)}
+        np.lib.format.write_array_header_1_0(file, shape)
+        for _ in range(20 if honest else 1):
+            file.write(bytes(1 << 20))
+
+
+FRAMES: dict[str, tuple[str, Callable[[Path], None]]] = {
+    "a header of 3.5 TiB": ("a.npy", claiming),
+    "4 GB of holes": ("a.npy", holes),
+    "an archive of zeros": ("a.npz", packed),
+    "an archive that claims": ("a.npz", lambda path: packed(path, honest=False)),
+    "by another compression": ("a.npz", lambda path: packed(path, zipfile.ZIP_BZIP2, honest=False)),
+}
+
+
+@pytest.mark.timeout(20)
+@pytest.mark.parametrize(("name", "make"), FRAMES.values(), ids=FRAMES)
+def test_frames_beyond_their_file_are_told(
+    tmp_path: Path, name: str, make: Callable[[Path], None]
+) -> None:
+    make(tmp_path / name)
+    with pytest.raises(RecordingError, match=r"more than|another compression"):
+        load_recording(tmp_path / name, 1.0, 100.0)
