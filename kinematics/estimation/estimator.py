@@ -21,6 +21,7 @@ from softfinger.kinematics.estimation.blurred_cells import pieces_to_fit, weight
 from softfinger.kinematics.estimation.cell_centres import HEIGHT, cell_centres
 from softfinger.kinematics.estimation.error_budget import Uncertainty, set_budget
 from softfinger.kinematics.estimation.frame_pipeline import estimate_frame
+from softfinger.kinematics.estimation.invalid import REASONS, Invalid
 from softfinger.kinematics.estimation.likelihood import set_law
 from softfinger.kinematics.estimation.moments import moment_ratios
 from softfinger.kinematics.estimation.solid_budget import set_solid_budget
@@ -35,7 +36,8 @@ from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 class ContactEstimate:
     """Estimate of the contact in one frame; SI units, angles in rad.
 
-    ``contact``: something presses. ``valid`` promises one contact that the model describes: the
+    ``contact``: something presses. ``invalid`` says why the estimate can't be used; without a
+    reason it is ``valid``, which promises one contact that the model describes: the
     fit settled at d below 3/4 of the radius and a gain of 1/20 to 20, it accounts for 80 % of the
     frame's squared pressure, nothing else presses, and what it leaves smoothly over the footprint
     could hide no more than 60 % of d (one standard deviation), or 3 % with a gain beyond 1/2 to 2,
@@ -54,7 +56,7 @@ class ContactEstimate:
     """
 
     contact: bool = False
-    valid: bool = False
+    invalid: Invalid = Invalid.NO_FRAME
     d: float = 0.0
     tilt_x: float = 0.0
     tilt_y: float = 0.0
@@ -72,6 +74,11 @@ class ContactEstimate:
     cells_per_sample: float = 1.0  # cells for each whose noise is independent
     covariance: FloatArray = field(default_factory=lambda: np.zeros((4, 4)))
     systematic: FloatArray = field(default_factory=lambda: np.zeros((4, 4)))
+
+    @property
+    def valid(self) -> bool:
+        """The estimate can be used; see the class."""
+        return not self.invalid
 
     @property
     def d_std(self) -> float:
@@ -287,13 +294,14 @@ class ContactEstimator:
             result.iterations,
             result.rejected,
             result.contact,
-            result.valid,
+            invalid,
             result.second,
             _,
             result.shear_x,
             result.shear_y,
             *_,
         ) = self._estimate.item()
+        result.invalid = REASONS[invalid]
         # By Wilson-Hilferty, 5 σ.
         variance = 2.0 / (9.0 * max(result.cells / result.cells_per_sample - 4, 1))
         result.misfit = result.chi2 > (1.0 - variance + 5.0 * math.sqrt(variance)) ** 3

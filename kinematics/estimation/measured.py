@@ -17,6 +17,8 @@ from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.tip_curves import POWERS, SQUARES
 from softfinger.kinematics.estimation.error_budget import Uncertainty
 from softfinger.kinematics.estimation.estimator import ContactEstimate
+from softfinger.kinematics.estimation.frame_pipeline import ABOVE_MOST, ABOVE_PEAK
+from softfinger.kinematics.estimation.invalid import REASONS, Invalid
 from softfinger.kinematics.sensing.footprint import FloatArray
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
@@ -62,7 +64,7 @@ class MeasuredFit(Record):
     half: Matrix
     along: Annotated[FloatArray, 3]
     contact: bool
-    valid: bool
+    invalid: int  # an `Invalid`
 
 
 def sum_weights(
@@ -132,16 +134,32 @@ def fit_measured_frame(
     fit.covariance[:] = 0.0
     fit.systematic[:] = 0.0
     force = fit.sums[0]
-    fit.valid = math.isfinite(force) and math.isfinite(fit.peak)
+    finite = math.isfinite(force) and math.isfinite(fit.peak)
     std = math.sqrt(fit.noise[0, 0] + fit.shift[0] ** 2)
-    fit.contact = fit.valid and force > _TOUCHED * std
+    fit.contact = finite and force > _TOUCHED * std
+    reason = Invalid.NONE if finite else Invalid.NOT_FINITE
     if fit.contact:
-        fit.valid = _contact(fit)
+        reason = _contact(fit)
+        if reason != Invalid.NONE and _all_above(fit, frame, weights, scale):
+            reason = Invalid.ABOVE_ZERO
+    fit.invalid = reason
 
 
 @inner_kernel
-def _contact(fit: MeasuredFit) -> bool:
-    """The contact that the sums say; whether the curves hold there and its extent agrees."""
+def _all_above(fit: MeasuredFit, frame: FloatArray, weights: FloatArray, scale: float) -> bool:
+    """Return whether about all cells under the tip read as they do where nothing was tared."""
+    above = number = 0
+    for i in range(frame.shape[0]):
+        for j in range(frame.shape[1]):
+            if weights[0, i * frame.shape[1] + j] > 0.0:
+                number += 1
+                above += frame[i, j] * scale > ABOVE_PEAK * fit.peak
+    return above > ABOVE_MOST * number
+
+
+@inner_kernel
+def _contact(fit: MeasuredFit) -> Invalid:
+    """Set the contact that the sums say; check that the curves hold and its extent agrees."""
     force = fit.sums[0]
     moment = math.hypot(fit.sums[1], fit.sums[2])
     s_max = _BEYOND * fit.slope
@@ -172,7 +190,9 @@ def _contact(fit: MeasuredFit) -> bool:
     off = abs(fit.sums[3] - force * extent)
     agrees = off < _EXTENT * force * extent + _TOUCHED * math.sqrt(fit.noise[3, 3])
     within = t < _BEYOND * fit.root * (1.0 - 1e-9) and target < s_max + 3.0 * std
-    return bool(agrees and within)
+    if not within:
+        return Invalid.BEYOND
+    return Invalid.NONE if agrees else Invalid.MODEL
 
 
 @inner_kernel
@@ -309,7 +329,7 @@ class MeasuredEstimator:
             raise ValueError(f"a frame must have shape {self._frame.shape}, got {frame.shape}")
         np.copyto(self._frame, frame)
         fit_measured_frame(fit.array, self._frame, self._weights, float(pascal_per_count))
-        result.contact, result.valid = fit.contact, fit.valid
+        result.contact, result.invalid = fit.contact, REASONS[fit.invalid]
         result.peak, result.d = fit.peak, fit.d
         result.tilt_x, result.tilt_y = math.asin(fit.n_x), math.asin(fit.n_y)
         per_tilt = np.array([1.0, 1.0 / math.cos(result.tilt_x), 1.0 / math.cos(result.tilt_y)])

@@ -99,7 +99,7 @@ class Estimate(Record):
     iterations: int
     rejected: int
     contact: bool
-    valid: bool
+    invalid: int  # an `Invalid`
     second: bool
     warm: bool
     shear_x: float  # force on the face [N], of a solid tip

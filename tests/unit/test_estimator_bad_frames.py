@@ -10,6 +10,7 @@ import pytest
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.estimation.estimator import ContactEstimator, Readings
+from softfinger.kinematics.estimation.invalid import Invalid
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
 A = 0.020
@@ -101,11 +102,19 @@ class TestBadFrames:
         ):
             e = estimator(frame, scale)
             assert e.contact
-            assert not e.valid
+            assert e.invalid == (Invalid.SATURATED if frame.dtype != float else Invalid.ABOVE_ZERO)
+
+    def test_a_sensor_without_a_tare_is_named(self, method, free_gain):
+        estimator = self.estimator(method, free_gain)
+        rng = np.random.default_rng(8)
+        for _ in range(20):
+            zero = 20e3 + 3e3 * rng.standard_normal((44, 44))
+            e = estimator(zero + rng.normal(0.0, 600.0, (44, 44)))
+            assert (e.valid, e.invalid) == (False, Invalid.ABOVE_ZERO)
 
     def test_a_baseline_far_below_zero_is_not_valid(self, method, free_gain):
         estimator = self.estimator(method, free_gain)
-        assert not estimator(EMPTY - 5000.0).valid
+        assert estimator(EMPTY - 5000.0).invalid == Invalid.BELOW_ZERO
         assert not estimator(-GRID.pressure(TIP, MEASURED, 0.004) - 2000.0).valid
 
     def test_one_hot_cell_is_no_contact(self, method, free_gain):

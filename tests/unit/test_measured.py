@@ -27,6 +27,7 @@ from softfinger.kinematics.calibration.measured_fit import (
     fit_measured,
 )
 from softfinger.kinematics.contact.tip_curves import TipCurves
+from softfinger.kinematics.estimation.invalid import Invalid
 from softfinger.kinematics.estimation.measured import MeasuredEstimator
 
 A = 0.020
@@ -107,11 +108,12 @@ def test_a_frame_is_read_by_them_and_its_errors_are_known(
         squares.append(off**2 / found.covariance.diagonal()[:3])
     assert (np.mean(squares, axis=0) < 2.0).all()
     assert not estimator(NOISE * rng.standard_normal((32, 32))).contact
-    assert not estimator(weird(0.008, 0.0)).valid  # deeper than any press
+    assert estimator(weird(0.008, 0.0)).invalid == Invalid.BEYOND
     two = weird(d, 0.0) + np.roll(weird(d, 0.0), 8, axis=0)
     assert not estimator(two).valid
+    assert estimator(np.full((32, 32), 20e3)).invalid == Invalid.ABOVE_ZERO
     frame[3, 3] = np.nan
-    assert not estimator(frame).valid
+    assert estimator(frame).invalid == Invalid.NOT_FINITE
 
 
 def test_presses_that_make_no_law_are_refused() -> None:
