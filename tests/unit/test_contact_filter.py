@@ -55,6 +55,7 @@ def test_what_frames_share_stays_however_many_come(contact_filter: ContactFilter
     assert contact.force_std == pytest.approx(math.hypot(by_d, by_theta, by_modulus), rel=0.02)
 
 
+@pytest.mark.filterwarnings("ignore:the smooth law misses")
 def test_the_law_misfit_is_in_the_force(contact_filter: ContactFilter) -> None:
     contacts, pose = [Contact(), Contact()], ObjectPose()
     strain = np.linspace(0.025, 1.0, 40)
