@@ -70,7 +70,7 @@ class Contact:
     d: float = 0.0  # maximum displacement [m]
     theta: float = 0.0  # the object's angle in the tip's frame, in the hand's plane [rad]
     tilt_y: float = 0.0  # and across it [rad]
-    d_std: float = 0.0  # standard deviations of d [m] and theta [rad]
+    d_std: float = 0.0  # standard deviations of d [m], see `ContactEstimate`, and theta [rad]
     theta_std: float = 0.0
     gain: float = 1.0  # measured pressure over modelled pressure
     modulus_scale: float = 1.0  # of the tip's modulus over the settings' …

@@ -245,7 +245,9 @@ def _fill_from_frame(
     contact.d_std, contact.theta_std = estimate.d_std, estimate.tilt_x_std
     contact.force = contact.energy = contact.force_std = 0.0
     contact.inside = True
-    if estimate.contact:
+    if not estimate.contact:
+        contact.force_std = lookup(table, contact.d_std, 0.0)[0]  # of what could hide
+    else:
         tilt = total_tilt(contact.theta, contact.tilt_y)
         force, energy, by_d, by_tilt, _, _, contact.inside = lookup(table, contact.d, tilt)
         stiff, gain = prior.modulus[1] ** 2, prior.gain[1] ** 2

@@ -150,7 +150,9 @@ class FingerState:
         "N", "elastic force, modulus_scale · F(d, total tilt of theta and tilt_y) by the table"
     )
     energy: float = _contact("J", "elastic potential energy, modulus_scale · U(d, total tilt)")
-    d_std: float = _contact("m", "standard deviation of d")
+    d_std: float = _contact(
+        "m", "standard deviation of d; without contact the d that could hide from the sensor"
+    )
     theta_std: float = _contact("rad", "standard deviation of theta")
     force_std: float = _contact("N", "standard deviation of force, with that of the tip's law")
     shear_x: float = _contact(

@@ -44,7 +44,8 @@ from softfinger.kinematics.sensing.footprint import FloatArray
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
 _DEEPEST = 0.75  # of the radius: the end of the table over d
-_NEIGHBOURS = np.outer((1.0, 2.0, 2.0, 2.0, 1.0), (1.0, 2.0, 2.0, 2.0, 1.0))  # see `detection`
+NEIGHBOURS = np.outer((1.0, 2.0, 2.0, 2.0, 1.0), (1.0, 2.0, 2.0, 2.0, 1.0))  # see `detection`
+NEIGHBOURS[2, 2] = 0.0
 _PEAK = 4.5  # standard deviations of the cell that noise alone makes the largest
 _FEW = 48.0  # cells within which nothing is smooth or rough
 # What the fit makes of a motion besides its straight answer, as fractions of d and of the gain by
@@ -109,8 +110,7 @@ def set_budget(
     set_errors(state, known, law)
     budget, options = state.budget, state.options
     level = options.patch_level
-    weights = _NEIGHBOURS.copy()
-    weights[2, 2] = 0.0
+    weights = NEIGHBOURS
     norm = float(np.sqrt((weights**2).sum()))
     if budget.correlated:
         rho = both_ways(known.correlation)

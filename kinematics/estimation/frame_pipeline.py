@@ -322,6 +322,8 @@ def estimate_frame(
         estimate.n_x = 0.0
         estimate.n_y = 0.0
         estimate.gain = 1.0
+        estimate.covariance[0, 0] = state.options.undetected**2
+        estimate.systematic[0, 0] = state.options.undetected**2
     estimate.warm = signal.contact and reason == Invalid.NONE
     if not signal.finite:
         reason = Invalid.NOT_FINITE

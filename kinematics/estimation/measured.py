@@ -138,7 +138,11 @@ def fit_measured_frame(
     std = math.sqrt(fit.noise[0, 0] + fit.shift[0] ** 2)
     fit.contact = finite and force > _TOUCHED * std
     reason = Invalid.NONE if finite else Invalid.NOT_FINITE
-    if fit.contact:
+    if not fit.contact:
+        # What could hide: the d whose force is only just felt.
+        t = _root_of(fit, _TOUCHED * std, 0.0, fit.root)
+        fit.covariance[0, 0] = fit.systematic[0, 0] = (fit.radius * t * t) ** 2
+    else:
         reason = _contact(fit)
         if reason != Invalid.NONE and _all_above(fit, frame, weights, scale):
             reason = Invalid.ABOVE_ZERO

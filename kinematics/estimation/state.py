@@ -34,6 +34,7 @@ class Options(Record):
     """Constants of one estimator; see `ContactEstimator`."""
 
     noise: float  # of a cell [Pa]
+    undetected: float  # d [m] of a contact that is only just felt
     saturation: float  # [counts]
     floor: float  # least count sent, less a half
     tolerance: float
