@@ -43,6 +43,7 @@ GAIN_FAR = 2.0
 # zero. A solid tip's contact, that presses all of them, has 5 % of them below 0.32 of its peak.
 ABOVE_MOST, ABOVE_NOISE, ABOVE_PEAK = 0.95, 3.0, 0.4
 FULL_MOST = 0.5  # full cells of those above half of the peak, which leave no shape to fit
+ZERO_MAX = 0.2  # known error of the cells' zeros over the peak: beyond, none of it is straight
 SHARED_MAX = 0.5  # standard deviation of d by known uncertainties, over d: beyond, it's anything
 
 
@@ -112,7 +113,8 @@ def _likelihood(
 def _tip_problem(state: EstimatorState) -> Invalid:
     """Check that the misfit allows the model to be the tip's, and d to be known at all."""
     estimate = state.estimate
-    if estimate.shared > SHARED_MAX:
+    zero = math.hypot(state.budget.baseline, state.budget.slope)
+    if estimate.shared > SHARED_MAX or zero > ZERO_MAX * estimate.peak:
         return Invalid.UNCERTAIN
     near = 1.0 / GAIN_FAR < estimate.gain < GAIN_FAR
     if estimate.undetected > (UNDETECTED_MAX if near else UNDETECTED_MAX_FAR):

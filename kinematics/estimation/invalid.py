@@ -29,7 +29,7 @@ class Invalid(IntEnum):
     UNSETTLED = 7, "the fit does not settle"
     MODEL = 8, "not this tip"
     BEYOND = 9, "deeper or steeper than the model holds"
-    UNCERTAIN = 10, "d is uncertain by more than half of it"
+    UNCERTAIN = 10, "too uncertain: press more, or calibrate"
     # Of the daemon, which carries estimates on from frame to frame.
     NO_FRAME = 11, "no frame yet"
     FRAME = 12, "the board is gone, or its frames repeat"

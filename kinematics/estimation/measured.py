@@ -47,6 +47,9 @@ class MeasuredFit(Record):
     rest: Sums
     noise: Covariance  # of the sums
     shift: Sums  # the sums of all cells' common error, one standard deviation
+    gain: float  # relative, of all cells alike, one standard deviation
+    rotation_error: float  # of the sensor since the curves were measured [rad], likewise
+    place: float  # of the tip's place since then [m], likewise
     force_error: float
     lever_error: float
     sums: Sums
@@ -231,10 +234,12 @@ def _set_covariance(fit: MeasuredFit, t: float, s: float, c_x: float, c_y: float
     for i in range(3):
         shift = fit.rotation[i, 0] * fit.shift[0] + fit.rotation[i, 1] * fit.shift[1]
         fit.along[i] = shift + fit.rotation[i, 2] * fit.shift[2]
-    missed = fit.force_error, fit.lever_error, fit.lever_error
+    placed = math.hypot(fit.lever_error, fit.place)
+    missed = fit.force_error, placed, math.hypot(placed, fit.rotation_error * lever * s)
+    grown = fit.gain * shown, fit.gain * shown * lever * s, 0.0
     for i in range(3):
         for j in range(3):
-            fit.shared[i, j] = fit.along[i] * fit.along[j]
+            fit.shared[i, j] = fit.along[i] * fit.along[j] + grown[i] * grown[j]
         fit.shared[i, i] += (missed[i] * shown) ** 2
     fit.errors[:] = fit.random + fit.shared
     _between(fit, fit.jacobian, fit.errors, fit.covariance)
@@ -280,7 +285,8 @@ class MeasuredEstimator:
     """`ContactEstimator` for a tip whose ``physics`` is "measured". Each frame stands alone.
 
     ``grid`` has the tip where the law found it. ``active`` [rows, cols] bool masks dead cells;
-    ``known`` are the sensor's other uncertainties. An estimate is ``valid`` where the curves were
+    ``known`` are the sensor's other uncertainties: the baseline, and gain, centre and rotation
+    since the curves were measured. An estimate is ``valid`` where the curves were
     measured, and where the frame's extent is within 8 % of what its force says. Raises ValueError
     for arguments out of their range.
     """
@@ -307,6 +313,7 @@ class MeasuredEstimator:
             setattr(fit, name, np.array(getattr(law, name)))
         if known is not None:
             fit.shift = known.baseline * self._weights.sum(axis=1)
+            fit.gain, fit.rotation_error, fit.place = known.gain, known.rotation, known.centre
         self._frame = np.zeros(grid.shape)
         self._seq: int | None = None
         self._last = ContactEstimate()
