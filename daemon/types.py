@@ -11,6 +11,8 @@ import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
+from softfinger.kinematics.estimation.invalid import Invalid
+
 if TYPE_CHECKING:  # a command's client needs no NumPy
     import numpy as np
     from numpy.typing import NDArray
@@ -63,12 +65,12 @@ class Contact:
     t: float = 0.0  # when that frame was sampled [s]
     t_arrival: float = 0.0  # and when it was complete here [s]
     t_valid: float = 0.0  # arrival of the last frame whose estimate was valid [s]
-    valid: bool = False  # a frame has come, its estimate is sound and it is not too old
+    invalid: Invalid = Invalid.NO_FRAME  # why the estimate can't be used
     contact: bool = False  # something touches the tip
     d: float = 0.0  # maximum displacement [m]
     theta: float = 0.0  # the object's angle in the tip's frame, in the hand's plane [rad]
     tilt_y: float = 0.0  # and across it [rad]
-    d_std: float = 0.0  # standard deviations of d [m] and theta [rad]
+    d_std: float = 0.0  # standard deviations of d [m], see `ContactEstimate`, and theta [rad]
     theta_std: float = 0.0
     gain: float = 1.0  # measured pressure over modelled pressure
     modulus_scale: float = 1.0  # of the tip's modulus over the settings' …
@@ -84,6 +86,11 @@ class Contact:
     shear_x: float = 0.0  # force on the tip's face [N] along x and y, of a solid tip's newest frame
     shear_y: float = 0.0
     inside: bool = True  # (d, θ) lies inside the model's domain
+
+    @property
+    def valid(self) -> bool:
+        """A frame has come, its estimate is sound and it is not too old."""
+        return not self.invalid
 
 
 @dataclass(slots=True)

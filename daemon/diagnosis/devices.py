@@ -10,9 +10,12 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from softfinger.daemon.clock import RealClock
 from softfinger.daemon.diagnosis.ports import check_latency_timer
 from softfinger.daemon.errors import ServoError, TactileError
+from softfinger.daemon.perception.calibration_file import Converter, calibration_for
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.base import Finding
@@ -29,10 +32,11 @@ from softfinger.daemon.servos.provisioning import (
     search,
 )
 from softfinger.daemon.tactile.base import make_sensor
-from softfinger.daemon.types import FINGERS
+from softfinger.daemon.types import FINGERS, Frame
 
 _PATIENCE = 5.0  # s for a board: one that its adapter resets when the port is opened starts again
 _LISTEN = 0.5  # s of a board's frames
+_REST_NOISE = 3.0  # of a cell's noise, that a tared board's median cell does not reach at rest
 _OFF_RATE = 0.1  # share of the rate by which a board may be off
 
 
@@ -126,7 +130,7 @@ def check_board(settings: Settings, finger: int, listen: float = _LISTEN) -> Fin
     try:
         before, start = sensor.counters(), time.monotonic()
         time.sleep(listen)
-        sensor.latest()  # a plugin's board may read only when it is asked
+        frame = sensor.latest()  # a plugin's board may read only when it is asked
         after, spent = sensor.counters(), time.monotonic() - start
     finally:
         sensor.close()
@@ -141,7 +145,22 @@ def check_board(settings: Settings, finger: int, listen: float = _LISTEN) -> Fin
     if abs(frames - tactile.rate * spent) > max(_OFF_RATE * tactile.rate * spent, 1.5):
         text = f"{found}, not {tactile.rate:g}"
         return Finding("warn", name, text, f"set tactile.rate = {rate:.0f}")
+    rest = 0.0 if frame is None else _rest(settings, finger, frame)
+    if rest > _REST_NOISE * tactile.noise:
+        text = f"{found}, but half of them read {rest / 1e3:.1f} kPa or more, expected 0 at rest"
+        fix = "`softfinger calibrate tare`, or `softfinger send tare` at each start"
+        return Finding("warn", name, text, fix)
     return Finding("pass", name, found)
+
+
+def _rest(settings: Settings, finger: int, frame: Frame) -> float:
+    """Return the pressure [Pa] that half of the cells reach; no contact presses so many."""
+    calibration = calibration_for(settings, finger)
+    scale = settings.tactile.pascal_per_count
+    if calibration is None:
+        return scale * float(np.median(frame.data))
+    converter = Converter(calibration, scale)
+    return float(np.median(converter(frame.data)[converter.live]))
 
 
 def repair_latency_timer(path: str, *sysfs: Path) -> Finding | None:

@@ -23,6 +23,7 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS, Contact, Frame, ObjectPose, Reading
 from softfinger.kinematics.compiled.kernel_folder import is_marked, kernel_folder, mark
 from softfinger.kinematics.estimation.estimator import ContactEstimate
+from softfinger.kinematics.estimation.invalid import Invalid
 from softfinger.kinematics.hand.grasp_state import total_tilt
 
 
@@ -162,7 +163,7 @@ def _filter(scene: WantedScene) -> None:
     contact_filter = ContactFilter(settings, (left.table, right.table))
     contacts, pose = [Contact(), Contact()], ObjectPose()
     frame = Frame(1, 0.0, 0.0, True, np.zeros((1, 1), np.uint16))
-    touch = ContactEstimate(contact=True, valid=True, d=1e-3)
+    touch = ContactEstimate(contact=True, invalid=Invalid.NONE, d=1e-3)
     for k in (1, 2):
         contact_filter.predict(Reading(t=0.01 * k))
         for finger in fingers:

@@ -47,6 +47,7 @@ from softfinger.kinematics.contact.lookup import lookup
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.table import ContactTable
 from softfinger.kinematics.estimation.estimator import ContactEstimate
+from softfinger.kinematics.estimation.invalid import Invalid
 from softfinger.kinematics.hand.grasp_state import total_tilt
 
 FloatArray = NDArray[np.float64]
@@ -97,7 +98,7 @@ class ContactFilter:
         self._read = False  # the joints are known
         self._in_contact = [False, False]  # tips that touch and are carried on by the joints
         self._news = True  # the scales may have changed
-        self._valid = [False, False]  # the newest frame's estimate can be used
+        self._invalid = [Invalid.NO_FRAME] * 2  # why the newest frame's estimate can't be used
 
     def predict(self, reading: Reading, goal: Goal | None = None) -> None:
         """Predict the estimates at the instant of a good reading.
@@ -125,8 +126,8 @@ class ContactFilter:
     ) -> None:
         """Update by a finger's new ``frame`` and its ``estimate``; write both into ``contact``."""
         contact.seq, contact.t, contact.t_arrival = frame.seq, frame.t_sample, frame.t_arrival
-        valid = self._valid[finger] = frame.valid and estimate.valid
-        if not valid:
+        self._invalid[finger] = estimate.invalid if frame.valid else Invalid.FRAME
+        if self._invalid[finger]:
             return  # nothing is learnt: the contact is carried on, and grows older
         # Before a first reading nothing is known of the joints: the frame stands for itself.
         in_contact = estimate.contact and self._read
@@ -145,7 +146,7 @@ class ContactFilter:
             estimate.covariance,
             estimate.systematic,
         ):
-            self._valid[finger] = False
+            self._invalid[finger] = Invalid.JOINTS
             return
         self._in_contact[finger] = in_contact
         self._news = True
@@ -198,9 +199,9 @@ class ContactFilter:
                     contact.force_std,
                     contact.inside,
                 ) = tips[finger]
-            contact.valid = self._valid[finger]
+            contact.invalid = self._invalid[finger]
             if not contact.t_valid >= oldest:
-                contact.valid = pose.valid = False
+                contact.invalid, pose.valid = contact.invalid or Invalid.STALE, False
 
 
 def _commanded_current(goal: Goal, finger: int, q: float) -> float:
@@ -244,7 +245,9 @@ def _fill_from_frame(
     contact.d_std, contact.theta_std = estimate.d_std, estimate.tilt_x_std
     contact.force = contact.energy = contact.force_std = 0.0
     contact.inside = True
-    if estimate.contact:
+    if not estimate.contact:
+        contact.force_std = lookup(table, contact.d_std, 0.0)[0]  # of what could hide
+    else:
         tilt = total_tilt(contact.theta, contact.tilt_y)
         force, energy, by_d, by_tilt, _, _, contact.inside = lookup(table, contact.d, tilt)
         stiff, gain = prior.modulus[1] ** 2, prior.gain[1] ** 2

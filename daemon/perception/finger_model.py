@@ -19,7 +19,6 @@ from softfinger.daemon.profile.factory import (
     make_material,
     make_table,
     make_tip,
-    worst_force_error,
 )
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS
@@ -88,7 +87,7 @@ def make_models(
         if material.misfits is not None and on_event is not None:
             text = (
                 f"{name}: the law is within {material.fit_error:.0f} Pa of its points, which is "
-                f"{worst_force_error(material):.1%} of F at most"
+                f"{material.worst_force_error:.1%} of F at most"
             )
             on_event("info", "material", text)
     left, right = (made.get(k) or replace(made[1 - k], finger=k) for k in range(len(FINGERS)))

@@ -33,17 +33,9 @@ def make_tip(settings: Settings) -> Fingertip:
     return Fingertip(tip.radius, tip.physics, tip.poisson, tip.base, tip.face)
 
 
-SHALLOWEST = 0.05  # d over the radius from which a law's misfit of its points is judged
-
-
-def worst_force_error(material: Material) -> float:
-    """Return largest relative error of F by the law's misfit of its points, from SHALLOWEST on."""
-    return float(material.force_error(np.linspace(SHALLOWEST, 1.0, 20)).max())
-
-
 def law_problem(material: Material, limit: float) -> str:
     """Return why a law off its points by over ``limit`` of F can't be used; empty if it can."""
-    found = worst_force_error(material)
+    found = material.worst_force_error
     if found <= limit:
         return ""
     return (

@@ -30,6 +30,7 @@ from softfinger.daemon.types import (
 from softfinger.daemon.wire.fields import TOPICS as TOPICS
 from softfinger.daemon.wire.fields import FieldSource, record, topic
 from softfinger.daemon.wire.fields import fields_of as fields_of
+from softfinger.kinematics.estimation.invalid import Invalid
 
 SCHEMA = 1
 STATE = b"hand/state"
@@ -108,10 +109,13 @@ _pose = FieldSource[ObjectPose]()
 _goal = _state.of(lambda s: s.goal)
 
 
-def _valid(f: _Finger) -> bool:
+def _invalid(f: _Finger) -> Invalid:
     scene, state = f.scene, f.state
-    read = state.reading.valid or not scene.servos
-    return scene.fingers[f.i] and read and (state.contacts[f.i].valid or not scene.sensors)
+    if not scene.fingers[f.i]:
+        return Invalid.ABSENT
+    if scene.servos and not state.reading.valid:
+        return Invalid.SERVO
+    return state.contacts[f.i].invalid if scene.sensors else Invalid.NONE
 
 
 def _frame_age(f: _Finger) -> float:
@@ -124,7 +128,9 @@ class FingerState:
     """One finger in ``hand/state``."""
 
     valid: bool = _finger(
-        "", "in the scene, with fresh and sound data from its servo and sensor", _valid
+        "",
+        "in the scene, with fresh and sound data from its servo and sensor",
+        lambda f: not _invalid(f),
     )
     q: float = _finger("rad", "joint angle, positive closes", lambda f: f.state.reading.q[f.i])
     dq: float = _finger("rad/s", "joint velocity", lambda f: f.state.reading.dq[f.i])
@@ -144,7 +150,9 @@ class FingerState:
         "N", "elastic force, modulus_scale · F(d, total tilt of theta and tilt_y) by the table"
     )
     energy: float = _contact("J", "elastic potential energy, modulus_scale · U(d, total tilt)")
-    d_std: float = _contact("m", "standard deviation of d")
+    d_std: float = _contact(
+        "m", "standard deviation of d; without contact the d that could hide from the sensor"
+    )
     theta_std: float = _contact("rad", "standard deviation of theta")
     force_std: float = _contact("N", "standard deviation of force, with that of the tip's law")
     shear_x: float = _contact(
@@ -165,6 +173,7 @@ class FingerState:
         "", "the estimate's tactile frame, 0 before the first", lambda c: c.seq
     )
     frame_age_s: float = _finger("s", "age of that frame's sample", _frame_age)
+    invalid: str = _finger("", "why it is not valid, empty when it is", lambda f: _invalid(f).text)
 
 
 @record

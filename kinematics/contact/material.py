@@ -153,6 +153,11 @@ class Material:
         return np.asarray(missed / (self.stress(strain) * weight).sum(axis=-1))
 
     @property
+    def worst_force_error(self) -> float:
+        """F's largest relative error by the law's misfit, from a twentieth of the radius on."""
+        return float(self.force_error(np.linspace(0.05, 1.0, 20)).max())
+
+    @property
     def is_linear(self) -> bool:
         """True for Hooke's law, where the closed forms are exact."""
         return len(self.coefficients) == 1

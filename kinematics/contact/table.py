@@ -69,6 +69,7 @@ _numbers: Any = tuple.__new__
 
 _EDGE = 1.0 - 1e-12  # of d and θ: what is outside by rounding alone is inside with it
 
+_LAW_ERROR = 0.05  # of F, by a law's misfit of its points
 _MAGIC = b"SFTIPTAB"
 _CHECK = 32  # bytes of a SHA-256
 _SOURCES = (
@@ -105,12 +106,20 @@ class ContactTable:
         ∂F/∂θ, which passes through zero for some laws, counts relative to F tan θ if that is more.
 
         The tolerance is that of the arithmetic alone: a modulus that is 1 % off makes F 1 % off.
+        Warns where the law misses the points that it was made from by more than 5 % of F.
         Raises TableError, with the best that was reached, when the highest degree can't meet it.
         For a solid tip it says nothing; a solid tip raises MaterialError unless the modulus is
         constant. A measured tip has its own curves: neither tolerance nor material count.
         """
         if tip.physics != "springs":
             return cls(solid_table(tip, material).array)
+        if material.worst_force_error > _LAW_ERROR:
+            warnings.warn(
+                f"the smooth law misses its points by up to {material.fit_error:.4g} Pa, which "
+                f"makes {material.worst_force_error:.1%} of F; expected {_LAW_ERROR:.0%} at most",
+                RuntimeWarning,
+                stacklevel=2,
+            )
         return cls(build(tip, material, tolerance))
 
     def to_bytes(self, tip: Fingertip, material: Material) -> bytes:

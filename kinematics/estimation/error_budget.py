@@ -22,29 +22,38 @@ has a solid tip's, of which a scene compiles the ones it needs.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
 from softfinger.kinematics.compiled.kernel import fast_inner_kernel, inner_kernel
-from softfinger.kinematics.compiled.simd import Pointer, address
+from softfinger.kinematics.compiled.simd import Pointer, address, further
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.estimation.likelihood import BY_U, BY_V, BY_W, STRESS
 from softfinger.kinematics.estimation.solid_projection import SolidFit
 from softfinger.kinematics.estimation.state import (
     DEPTHS,
+    PLACE_X,
+    PLACE_Y,
     READING,
+    SCALING,
+    SHIFT,
+    SLOPE_X,
+    SLOPE_Y,
+    SOURCES,
     WEIGHT,
     Budget,
     EstimatorState,
+    Four,
     Matrix,
 )
 from softfinger.kinematics.sensing.footprint import FloatArray
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
 _DEEPEST = 0.75  # of the radius: the end of the table over d
-_NEIGHBOURS = np.outer((1.0, 2.0, 2.0, 2.0, 1.0), (1.0, 2.0, 2.0, 2.0, 1.0))  # see `detection`
+NEIGHBOURS = np.outer((1.0, 2.0, 2.0, 2.0, 1.0), (1.0, 2.0, 2.0, 2.0, 1.0))  # see `detection`
+NEIGHBOURS[2, 2] = 0.0
 _PEAK = 4.5  # standard deviations of the cell that noise alone makes the largest
 _FEW = 48.0  # cells within which nothing is smooth or rough
 # What the fit makes of a motion besides its straight answer, as fractions of d and of the gain by
@@ -53,6 +62,8 @@ _FEW = 48.0  # cells within which nothing is smooth or rough
 # % of the modulus.
 _D_BY_DEPTH, _GAIN_BY_DEPTH = 0.7, 0.6
 _D_BY_ROTATION, _GAIN_BY_ROTATION, _BY_ROTATION_AT_DEPTH = 0.8, 2.0, 1.6
+# Of an error's squares, spread over all that is smooth over a footprint: what one direction has.
+_SMOOTH = 0.2
 _SURE = 6.0  # standard deviations that noise alone hardly makes of neighbours' products
 
 
@@ -60,8 +71,12 @@ _SURE = 6.0  # standard deviations that noise alone hardly makes of neighbours' 
 class Uncertainty:
     """Standard deviations of what a sensor's frames have in common, and how its noise correlates.
 
-    ``baseline``: of a shift of all cells [Pa]; ``centre``: of the tip's place on the sensor, in x
-    and in y [m]; ``pitch`` and ``modulus``: relative. ``correlation`` [rows, cols] is that of two
+    ``baseline``: of a shift of all cells [Pa], ``slope``: of the same from the tip's middle to its
+    rim, in x and in y [Pa]; ``centre``: of the tip's place on the sensor, in x and in y [m];
+    ``rotation``: of the sensor [rad]; ``pitch``, ``radius``, ``modulus`` and ``gain`` (of all cells
+    alike): relative; ``smooth``: of a cell's pressure, relative, where neighbours share it, by
+    another curve, hysteresis or crosstalk; ``skew``: of the way [m] that the face goes during one
+    scan of the rows. ``correlation`` [rows, cols] is that of two
     cells' noise by their distance in rows and columns, 1 at [0, 0] and 0 beyond; None for white
     noise.
     """
@@ -71,9 +86,15 @@ class Uncertainty:
     pitch: float = 0.0
     modulus: float = 0.0
     correlation: FloatArray | None = None
+    slope: float = 0.0
+    gain: float = 0.0
+    smooth: float = 0.0
+    rotation: float = 0.0
+    radius: float = 0.0
+    skew: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("baseline", "centre", "pitch", "modulus"):
+        for name in (each.name for each in fields(self) if each.name != "correlation"):
             if not 0.0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
         if self.correlation is not None:
@@ -83,7 +104,7 @@ class Uncertainty:
             object.__setattr__(self, "correlation", rho)
 
 
-def set_errors(state: EstimatorState, known: Uncertainty, law: float) -> None:
+def set_errors(state: EstimatorState, known: Uncertainty, grid: SensorGrid, law: float) -> None:
     """Fill in what depends on no tip.
 
     ``law`` [Pa] is how far the material's law is off the points that it was made from: to the
@@ -91,9 +112,13 @@ def set_errors(state: EstimatorState, known: Uncertainty, law: float) -> None:
     """
     budget = state.budget
     budget.shift = math.hypot(known.baseline, law)
-    budget.baseline, budget.centre, budget.pitch = known.baseline, known.centre, known.pitch
-    budget.modulus = 0.0 if state.options.free_gain else known.modulus
-    budget.systematic = max(budget.shift, known.centre, known.pitch, budget.modulus) > 0.0
+    budget.baseline, budget.slope = known.baseline, known.slope
+    budget.centre, budget.pitch, budget.radius = known.centre, known.pitch, known.radius
+    budget.modulus = 0.0 if state.options.free_gain else math.hypot(known.modulus, known.gain)
+    budget.smooth, budget.rotation = known.smooth, known.rotation
+    budget.skew = known.skew / (grid.rows * grid.pitches[1])
+    sizes = budget.shift, budget.slope, budget.centre, budget.pitch, budget.radius, budget.modulus
+    budget.systematic = max(*sizes, budget.smooth, budget.rotation, budget.skew) > 0.0
     budget.cells_per_sample = 1.0
     if known.correlation is not None and known.correlation.size > 1:
         rho = both_ways(known.correlation)
@@ -106,11 +131,10 @@ def set_budget(
     state: EstimatorState, known: Uncertainty, grid: SensorGrid, tip: Fingertip, law: float
 ) -> None:
     """Fill in the budget, and raise the activity test's level to what the errors alone may make."""
-    set_errors(state, known, law)
+    set_errors(state, known, grid, law)
     budget, options = state.budget, state.options
     level = options.patch_level
-    weights = _NEIGHBOURS.copy()
-    weights[2, 2] = 0.0
+    weights = NEIGHBOURS
     norm = float(np.sqrt((weights**2).sum()))
     if budget.correlated:
         rho = both_ways(known.correlation)
@@ -269,12 +293,13 @@ def undetected_misfit(
 
 @fast_inner_kernel
 def project_shared_errors(solid: SolidFit | None, state: EstimatorState, packed: Pointer) -> None:
-    """Set Jᵀq and qᵀq of shared errors q: a shift of all cells, the tip's x and y, the pitch."""
+    """Set Jᵀq and qᵀq of the shared errors q."""
     face = state.fit.face
     u = face.u
     v = face.v
     w = face.w
     a2 = state.model.radius * state.model.radius
+    per_radius = 1.0 / state.model.radius
     # Variances of x and of y in a cell, times 4.
     xx_cell = state.model.pitch_x * state.model.pitch_x / 3.0
     yy_cell = state.model.pitch_y * state.model.pitch_y / 3.0
@@ -283,8 +308,8 @@ def project_shared_errors(solid: SolidFit | None, state: EstimatorState, packed:
     squares = address(state.budget.squares)
     for column in range(4):
         plane = column * size  # STRESS, BY_U, BY_V, BY_W stand first
-        shift = along_x = along_y = scaling = 0.0
-        n = xx = yy = ss = 0.0
+        shift = slope_x = slope_y = along_x = along_y = scaling = 0.0
+        n = nx = ny = xx = yy = ss = 0.0
         for k in range(state.fit.count):
             g = packed[BY_U * size + k]
             per_g = 1.0 / g if g > 0.0 else 0.0
@@ -301,21 +326,30 @@ def project_shared_errors(solid: SolidFit | None, state: EstimatorState, packed:
             whole = 1.0 if g > 0.0 else 0.0
             by_pitch = x * by_x + y * by_y
             shift += own * whole
+            slope_x += own * x
+            slope_y += own * y
             along_x += own * by_x
             along_y += own * by_y
             scaling += own * by_pitch
             n += whole
+            nx += x * x
+            ny += y * y
             xx += by_x * by_x
             yy += by_y * by_y
             ss += by_pitch * by_pitch
-        responses[4 * column] = shift
-        responses[4 * column + 1] = along_x
-        responses[4 * column + 2] = along_y
-        responses[4 * column + 3] = scaling
-        squares[0] = n
-        squares[1] = xx
-        squares[2] = yy
-        squares[3] = ss
+        out = further(responses, SOURCES * column)
+        out[SHIFT] = shift
+        out[SLOPE_X] = per_radius * slope_x
+        out[SLOPE_Y] = per_radius * slope_y
+        out[PLACE_X] = along_x
+        out[PLACE_Y] = along_y
+        out[SCALING] = scaling
+        squares[SHIFT] = n
+        squares[SLOPE_X] = nx / a2
+        squares[SLOPE_Y] = ny / a2
+        squares[PLACE_X] = xx
+        squares[PLACE_Y] = yy
+        squares[SCALING] = ss
 
 
 @inner_kernel
@@ -347,6 +381,46 @@ def add_second_order(solid: SolidFit | None, state: EstimatorState, d: float, ou
 
 
 @inner_kernel
+def deepen(solid: SolidFit | None, state: EstimatorState, change: float) -> None:
+    """Add a ``change`` of d [m] to the shift ``budget.displacement``."""
+    v = state.fit.face.v
+    w = state.fit.face.w
+    state.budget.displacement[1] -= change * math.sqrt(1.0 + v * v + w * w)
+
+
+@inner_kernel
+def turn(
+    solid: SolidFit | None, state: EstimatorState, rotation: float, skew: float, out: Matrix
+) -> None:
+    """Add what a rotated grid and a face that goes on during a scan do to the covariance ``out``.
+
+    The first turns the tilt with it. The second's change, y ∂p/∂u, is that of w to springs.
+    """
+    v = state.fit.face.v
+    w = state.fit.face.w
+    add_turned(v, w, rotation, out)
+    out[3, 3] += skew * skew * (1.0 + v * v + w * w)
+
+
+@inner_kernel
+def add_turned(x: float, y: float, rotation: float, out: Matrix) -> None:
+    """Add the covariance of a vector (x, y), the last two of ``out``, by its ``rotation``."""
+    square = rotation * rotation
+    out[2, 2] += square * y * y
+    out[2, 3] -= square * x * y
+    out[3, 2] -= square * x * y
+    out[3, 3] += square * x * x
+
+
+@inner_kernel
+def add_square(displacement: Four, out: Matrix) -> None:
+    """Add the covariance of a shift by ``displacement``."""
+    for i in range(4):
+        for j in range(4):
+            out[i, j] += displacement[i] * displacement[j]
+
+
+@inner_kernel
 def systematic(
     solid: SolidFit | None, state: EstimatorState, packed: Pointer, d: float, out: Matrix
 ) -> float:
@@ -360,27 +434,45 @@ def systematic(
     gain = fit.gain
     project_shared_errors(solid, state, packed)
     factor = (1.0, -gain, gain, gain)
-    sizes = (budget.shift, gain * budget.centre, gain * budget.centre, gain * budget.pitch)
+    # The pattern of the modulus is the pressure itself, that of the radius the pitch's.
+    sizes = (
+        budget.shift,
+        budget.slope,
+        budget.slope,
+        gain * budget.centre,
+        gain * budget.centre,
+        gain * budget.pitch,
+        gain * budget.radius,
+        gain * budget.modulus,
+    )
     displacement = budget.displacement
-    out[:] = 0.0
+    pressure = fit.sums.normal[0]
+    for i in range(4):
+        for j in range(4):
+            out[i, j] = budget.smooth * budget.smooth * _SMOOTH * gain * gain * pressure
+            out[i, j] *= fit.inverse[i, j]
     remaining = 0.0
-    for source in range(5):
-        # The pattern of the modulus is the pressure itself.
-        size = sizes[source] if source < 4 else gain * budget.modulus
-        square = budget.squares[source] if source < 4 else fit.sums.normal[0]
-        remaining += size * size * square
+    for source in range(SOURCES + 2):
+        size = sizes[source]
+        if size == 0.0:
+            continue
+        image = min(source, SCALING)
+        own = source <= SOURCES
+        remaining += size * size * (budget.squares[image] if own else pressure)
         for i in range(4):
             displacement[i] = 0.0
         for j in range(4):
-            response = budget.responses[j, source] if source < 4 else fit.sums.normal[j]
+            response = budget.responses[j, image] if own else fit.sums.normal[j]
             response *= factor[j] * size
             for i in range(4):
                 displacement[i] += fit.inverse[i, j] * response
         for j in range(4):
-            response = budget.responses[j, source] if source < 4 else fit.sums.normal[j]
+            response = budget.responses[j, image] if own else fit.sums.normal[j]
             remaining -= displacement[j] * response * factor[j] * size
-        for i in range(4):
-            for j in range(4):
-                out[i, j] += displacement[i] * displacement[j]
         add_second_order(solid, state, d, out)
+        if source == SOURCES:
+            # A wider tip looks like finer cells, and then its d is as much more.
+            deepen(solid, state, d * budget.radius)
+        add_square(displacement, out)
+    turn(solid, state, budget.rotation, budget.skew, out)
     return 4.0 * max(remaining, 0.0)

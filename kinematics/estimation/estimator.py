@@ -19,8 +19,9 @@ from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.estimation.blurred_cells import pieces_to_fit, weights
 from softfinger.kinematics.estimation.cell_centres import HEIGHT, cell_centres
-from softfinger.kinematics.estimation.error_budget import Uncertainty, set_budget
-from softfinger.kinematics.estimation.frame_pipeline import estimate_frame
+from softfinger.kinematics.estimation.error_budget import NEIGHBOURS, Uncertainty, set_budget
+from softfinger.kinematics.estimation.frame_pipeline import D_MAX, estimate_frame
+from softfinger.kinematics.estimation.invalid import REASONS, Invalid
 from softfinger.kinematics.estimation.likelihood import set_law
 from softfinger.kinematics.estimation.moments import moment_ratios
 from softfinger.kinematics.estimation.solid_budget import set_solid_budget
@@ -35,26 +36,28 @@ from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 class ContactEstimate:
     """Estimate of the contact in one frame; SI units, angles in rad.
 
-    ``contact``: something presses. ``valid`` promises one contact that the model describes: the
+    ``contact``: something presses. ``invalid`` says why the estimate can't be used; without a
+    reason it is ``valid``, which promises one contact that the model describes: the
     fit settled at d below 3/4 of the radius and a gain of 1/20 to 20, it accounts for 80 % of the
     frame's squared pressure, nothing else presses, and what it leaves smoothly over the footprint
     could hide no more than 60 % of d (one standard deviation), or 3 % with a gain beyond 1/2 to 2,
     where both say that this is another tip. Such a misfit, as of a curved face, and the known
     uncertainties are in the covariance; where together they leave more than half of d uncertain
     (one standard deviation), that is not valid either. Without contact d and the tilts are 0 and
-    that is valid. It can't promise what no frame shows: a wrong modulus with a fixed gain, a tip
+    that is valid; d_std is then the d of a contact that is only just felt, since a smaller one
+    could hide. It can't promise what no frame shows: a wrong modulus with a fixed gain, a tip
     that stands elsewhere on the sensor.
 
     ``covariance`` is of (d, tilt_x, tilt_y, gain), ``systematic`` the part of it that all frames
-    share and averaging does not lessen; a fixed gain has a zero row, and without contact all is
-    zero. ``chi2`` is the misfit's square a cell over the noise's, ``r_squared`` the fraction of the
-    frame's squared pressure that the model accounts for; both are 0 where nothing was fitted.
+    share and averaging does not lessen; a fixed gain has a zero row. ``chi2`` is the misfit's
+    square a cell over the noise's, ``r_squared`` the fraction of the frame's squared pressure that
+    the model accounts for; both are 0 where nothing was fitted.
     ``misfit``: χ² is beyond what the noise makes once in 3.5 million frames, so that the model does
     not describe the contact well, or the noise is larger than given.
     """
 
     contact: bool = False
-    valid: bool = False
+    invalid: Invalid = Invalid.NO_FRAME
     d: float = 0.0
     tilt_x: float = 0.0
     tilt_y: float = 0.0
@@ -72,6 +75,11 @@ class ContactEstimate:
     cells_per_sample: float = 1.0  # cells for each whose noise is independent
     covariance: FloatArray = field(default_factory=lambda: np.zeros((4, 4)))
     systematic: FloatArray = field(default_factory=lambda: np.zeros((4, 4)))
+
+    @property
+    def valid(self) -> bool:
+        """The estimate can be used; see the class."""
+        return not self.invalid
 
     @property
     def d_std(self) -> float:
@@ -158,6 +166,11 @@ class ContactEstimator:
     ) -> None:
         if not (math.isfinite(noise) and noise > 0.0):
             raise ValueError(f"noise must be a positive number of Pa, got {noise}")
+        if tip.physics == "measured":
+            raise ValueError(
+                "a measured tip has no model of its frames: expected a tip of springs or solid; "
+                "softfinger.kinematics.estimation.measured.MeasuredEstimator is for a measured one"
+            )
         if method not in ("ml", "moments"):
             raise ValueError(f"method must be 'ml' or 'moments', got {method!r}")
         if tip.physics == "solid" and method == "moments":
@@ -194,11 +207,18 @@ class ContactEstimator:
             scratch, indices, solid = lay_out_solid(state, grid, tip, alive, material)
             set_solid_budget(state, solid, known, grid, tip, indices, material.fit_error)
             self.scratch = scratch, indices, solid.array
+            pattern = np.zeros(grid.shape)
+            image = grid.images(tip)[0].ravel()[indices]
+            pattern.ravel()[indices] = image - image.mean()
+            options.undetected = self._undetected(
+                tip, material, pattern, solid.weights.table.deepest
+            )
         else:
             set_law(state.law, material.law)
             state.moments.ratios = moment_ratios(tip, material)
             set_budget(state, known, grid, tip, material.fit_error)
             self.scratch = *_lay_out(state, grid, tip, alive), None
+            options.undetected = self._undetected(tip, material, NEIGHBOURS, D_MAX * tip.radius)
         self._estimate: Any = state.estimate.array
         self._frame = np.zeros(grid.shape)
         self._seq: int | None = None
@@ -207,6 +227,30 @@ class ContactEstimator:
             covariance=state.estimate.covariance,
             systematic=state.estimate.systematic,
         )
+
+    def _undetected(
+        self, tip: Fingertip, material: Material, pattern: FloatArray, deepest: float
+    ) -> float:
+        """Return the d [m] of an upright contact that the activity test only just feels.
+
+        By the ``pattern`` that it compares with a frame: whole, or the cells round the largest.
+        """
+        options = self._options
+        noise = math.hypot(options.noise, self._quantum / math.sqrt(12.0))
+        level = options.patch_level * noise * math.sqrt((pattern**2).sum())
+        rows, cols = pattern.shape
+        low, high = 1e-6 * deepest, deepest
+        for _ in range(14):
+            d = math.sqrt(low * high)
+            frame = self.grid.pressure(tip, material, d)
+            felt = True
+            if pattern.shape != frame.shape:
+                felt = frame.max() > options.peak_level * noise
+                row, col = np.unravel_index(frame.argmax(), frame.shape)
+                frame = np.pad(frame, (rows // 2, cols // 2))[row : row + rows, col : col + cols]
+            felt = felt and (pattern * frame).sum() > level
+            low, high = (low, d) if felt else (d, high)
+        return high
 
     @property
     def saturation(self) -> float | None:
@@ -287,13 +331,14 @@ class ContactEstimator:
             result.iterations,
             result.rejected,
             result.contact,
-            result.valid,
+            invalid,
             result.second,
             _,
             result.shear_x,
             result.shear_y,
             *_,
         ) = self._estimate.item()
+        result.invalid = REASONS[invalid]
         # By Wilson-Hilferty, 5 σ.
         variance = 2.0 / (9.0 * max(result.cells / result.cells_per_sample - 4, 1))
         result.misfit = result.chi2 > (1.0 - variance + 5.0 * math.sqrt(variance)) ** 3

@@ -23,6 +23,7 @@ from softfinger.kinematics.estimation.gauss_newton import (
     linearise,
     solve,
 )
+from softfinger.kinematics.estimation.invalid import Invalid
 from softfinger.kinematics.estimation.moments import start, track
 from softfinger.kinematics.estimation.solid_projection import SolidFit, presses, solid_kernel
 from softfinger.kinematics.estimation.state import OUTLIERS_MAX, EstimatorState, Matrix
@@ -38,6 +39,11 @@ D_MAX = 0.75  # of the radius
 UNDETECTED_MAX = 0.6
 UNDETECTED_MAX_FAR = 0.03
 GAIN_FAR = 2.0
+# Of the cells under the tip, above noise and above this fraction of the peak: a sensor that has no
+# zero. A solid tip's contact, that presses all of them, has 5 % of them below 0.32 of its peak.
+ABOVE_MOST, ABOVE_NOISE, ABOVE_PEAK = 0.95, 3.0, 0.4
+FULL_MOST = 0.5  # full cells of those above half of the peak, which leave no shape to fit
+ZERO_MAX = 0.2  # known error of the cells' zeros over the peak: beyond, none of it is straight
 SHARED_MAX = 0.5  # standard deviation of d by known uncertainties, over d: beyond, it's anything
 
 
@@ -48,7 +54,7 @@ def _by_moments(
     frame: Pointer,
     scratch: Pointer,
     indices: IntArray | None,
-) -> bool:
+) -> Invalid:
     """Moments from the last estimate, or from the frame alone if that fails."""
     if not (state.estimate.warm and track(state, frame, further(scratch, state.at.centres))):
         start(solid, state, frame, scratch, indices)
@@ -58,8 +64,8 @@ def _by_moments(
 @solid_kernel(_by_moments)
 def _without_moments(
     solid: SolidFit, state: EstimatorState, frame: Pointer, scratch: Pointer, indices: IntArray
-) -> bool:
-    return False
+) -> Invalid:
+    return Invalid.UNSETTLED
 
 
 @inner_kernel
@@ -69,12 +75,13 @@ def _likelihood(
     frame: Pointer,
     scratch: Pointer,
     indices: IntArray | None,
-) -> bool:
+) -> Invalid:
     """Maximum likelihood from the last estimate, or from the frame alone if that fails."""
     estimate = state.estimate
     options = state.options
     signal = state.signal
     energy = energy_of(state)
+    reason = Invalid.UNSETTLED
     for attempt in range(2):
         if attempt == 0 and not estimate.warm:
             continue
@@ -87,6 +94,7 @@ def _likelihood(
         if fit(solid, state, frame, scratch, indices, tolerance):
             misfit, scatter = _set_r_squared(state)
             if estimate.r_squared < options.r_squared_min:
+                reason = Invalid.MODEL
                 continue
             # Only pressure beyond the footprint beyond noise and a small fraction calls for a
             # search.
@@ -96,18 +104,22 @@ def _likelihood(
                 height = further(scratch, state.at.centres)
                 estimate.second = presses_outside(solid, state, frame, height, level)
             if not estimate.second:
-                return _is_this_tip(state)
-    return False
+                return _tip_problem(state)
+            reason = Invalid.SECOND
+    return reason
 
 
 @inner_kernel
-def _is_this_tip(state: EstimatorState) -> bool:
-    """Return whether the misfit allows the model to be the tip's, and d to be known at all."""
+def _tip_problem(state: EstimatorState) -> Invalid:
+    """Check that the misfit allows the model to be the tip's, and d to be known at all."""
     estimate = state.estimate
-    if estimate.shared > SHARED_MAX:
-        return False
+    zero = math.hypot(state.budget.baseline, state.budget.slope)
+    if estimate.shared > SHARED_MAX or zero > ZERO_MAX * estimate.peak:
+        return Invalid.UNCERTAIN
     near = 1.0 / GAIN_FAR < estimate.gain < GAIN_FAR
-    return bool(estimate.undetected <= (UNDETECTED_MAX if near else UNDETECTED_MAX_FAR))
+    if estimate.undetected > (UNDETECTED_MAX if near else UNDETECTED_MAX_FAR):
+        return Invalid.MODEL
+    return Invalid.NONE
 
 
 @inner_kernel
@@ -134,8 +146,8 @@ def _set_r_squared(state: EstimatorState) -> tuple[float, float]:
 @inner_kernel
 def _check_moments(
     state: EstimatorState, frame: Pointer, scratch: Pointer, indices: IntArray | None
-) -> bool:
-    """Return whether the model accounts for the frame at the moments' contact, as for the fit.
+) -> Invalid:
+    """Check that the model accounts for the frame at the moments' contact, as for the fit.
 
     By one step of the likelihood's, which takes off what the moments' own small errors leave.
     """
@@ -145,10 +157,10 @@ def _check_moments(
     fit.gain = estimate.gain
     linearise(state, frame, scratch, indices)
     if not solve(fit, state.options.free_gain):
-        return False
+        return Invalid.UNSETTLED
     variance = check_fit(None, state, further(scratch, state.at.packed))
     if not variance > 0.0:
-        return False
+        return Invalid.UNSETTLED
     _set_r_squared(state)
     wider = variance / state.signal.variance
     if state.budget.correlated:
@@ -159,7 +171,9 @@ def _check_moments(
     for i in range(4):
         for j in range(4):
             fit.covariance[i, j] *= wider
-    return estimate.r_squared >= state.options.r_squared_min and _is_this_tip(state)
+    if estimate.r_squared < state.options.r_squared_min:
+        return Invalid.MODEL
+    return _tip_problem(state)
 
 
 @inner_kernel
@@ -193,27 +207,48 @@ def _to_tilts(state: EstimatorState, covariance: Matrix, rotated: Matrix) -> Non
 
 
 @inner_kernel
+def _cause(state: EstimatorState, frame: Pointer, height: Pointer, reason: Invalid) -> Invalid:
+    """Return what in the readings keeps a frame from being estimated; ``reason`` for nothing."""
+    signal = state.signal
+    level = max(ABOVE_NOISE * signal.noise, ABOVE_PEAK * signal.peak)
+    above = pressed = full = 0
+    for k in range(state.region.first, state.region.last):
+        if height[k] >= 0.0:
+            above += frame[k] > level
+            pressed += frame[k] > 0.5 * signal.peak
+            full += frame[k] * signal.scale >= signal.saturation
+    if full > FULL_MOST * pressed:
+        return Invalid.SATURATED
+    return Invalid.ABOVE_ZERO if above > ABOVE_MOST * state.region.number else reason
+
+
+@inner_kernel
 def _estimate(
     solid: SolidFit | None,
     state: EstimatorState,
     frame: Pointer,
     scratch: Pointer,
     indices: IntArray | None,
-) -> bool:
-    """The estimate of a frame with a contact; whether it can be used."""
+) -> Invalid:
+    """Estimate a frame with a contact; returns why that can't be used."""
     estimate = state.estimate
     if state.options.moments_only:
-        done = _by_moments(solid, state, frame, scratch, indices)
+        reason = _by_moments(solid, state, frame, scratch, indices)
     else:
-        done = _likelihood(solid, state, frame, scratch, indices)
-    in_range = GAIN_MIN < estimate.gain < GAIN_MAX and estimate.d < D_MAX * state.grid.radius
+        reason = _likelihood(solid, state, frame, scratch, indices)
+    if reason == Invalid.NONE and not GAIN_MIN < estimate.gain < GAIN_MAX:
+        reason = Invalid.MODEL
+    if reason == Invalid.NONE and not estimate.d < D_MAX * state.grid.radius:
+        reason = Invalid.BEYOND
+    if reason != Invalid.NONE:
+        reason = _cause(state, frame, further(scratch, state.at.centres), reason)
     _to_tilts(state, state.fit.covariance, estimate.covariance)
     if state.budget.systematic or estimate.undetected > 0.0:
         _to_tilts(state, state.budget.covariance, estimate.systematic)
         for i in range(4):
             for j in range(4):
                 estimate.covariance[i, j] += estimate.systematic[i, j]
-    return done and in_range
+    return reason
 
 
 @inner_kernel
@@ -281,17 +316,24 @@ def estimate_frame(
     estimate.peak = signal.peak * scale
     estimate.rejected = rejected
     estimate.contact = signal.contact
-    done = False
+    reason = Invalid.NONE
     if signal.contact:
-        done = _estimate(solid, state, readings, whole, indices)
+        reason = _estimate(solid, state, readings, whole, indices)
     else:
         estimate.d = 0.0
         estimate.n_x = 0.0
         estimate.n_y = 0.0
         estimate.gain = 1.0
-    # A baseline far below zero is a sensor to tare, not a tip in the air.
-    readable = signal.finite and signal.mean > -3.0 * signal.noise and rejected < OUTLIERS_MAX
-    estimate.valid = readable and (done or not signal.contact)
-    estimate.warm = done
+        estimate.covariance[0, 0] = state.options.undetected**2
+        estimate.systematic[0, 0] = state.options.undetected**2
+    estimate.warm = signal.contact and reason == Invalid.NONE
+    if not signal.finite:
+        reason = Invalid.NOT_FINITE
+    elif not signal.mean > -3.0 * signal.noise:
+        # A baseline far below zero is a sensor to tare, not a tip in the air.
+        reason = Invalid.BELOW_ZERO
+    elif rejected == OUTLIERS_MAX:
+        reason = Invalid.OUTLIERS
+    estimate.invalid = reason
     if rejected > 0:
         restore_outliers(state, rejected, cells, centres)

@@ -17,6 +17,8 @@ from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.tip_curves import POWERS, SQUARES
 from softfinger.kinematics.estimation.error_budget import Uncertainty
 from softfinger.kinematics.estimation.estimator import ContactEstimate
+from softfinger.kinematics.estimation.frame_pipeline import ABOVE_MOST, ABOVE_PEAK
+from softfinger.kinematics.estimation.invalid import REASONS, Invalid
 from softfinger.kinematics.sensing.footprint import FloatArray
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
@@ -45,6 +47,9 @@ class MeasuredFit(Record):
     rest: Sums
     noise: Covariance  # of the sums
     shift: Sums  # the sums of all cells' common error, one standard deviation
+    gain: float  # relative, of all cells alike, one standard deviation
+    rotation_error: float  # of the sensor since the curves were measured [rad], likewise
+    place: float  # of the tip's place since then [m], likewise
     force_error: float
     lever_error: float
     sums: Sums
@@ -62,7 +67,7 @@ class MeasuredFit(Record):
     half: Matrix
     along: Annotated[FloatArray, 3]
     contact: bool
-    valid: bool
+    invalid: int  # an `Invalid`
 
 
 def sum_weights(
@@ -132,16 +137,36 @@ def fit_measured_frame(
     fit.covariance[:] = 0.0
     fit.systematic[:] = 0.0
     force = fit.sums[0]
-    fit.valid = math.isfinite(force) and math.isfinite(fit.peak)
+    finite = math.isfinite(force) and math.isfinite(fit.peak)
     std = math.sqrt(fit.noise[0, 0] + fit.shift[0] ** 2)
-    fit.contact = fit.valid and force > _TOUCHED * std
-    if fit.contact:
-        fit.valid = _contact(fit)
+    fit.contact = finite and force > _TOUCHED * std
+    reason = Invalid.NONE if finite else Invalid.NOT_FINITE
+    if not fit.contact:
+        # What could hide: the d whose force is only just felt.
+        t = _root_of(fit, _TOUCHED * std, 0.0, fit.root)
+        fit.covariance[0, 0] = fit.systematic[0, 0] = (fit.radius * t * t) ** 2
+    else:
+        reason = _contact(fit)
+        if reason != Invalid.NONE and _all_above(fit, frame, weights, scale):
+            reason = Invalid.ABOVE_ZERO
+    fit.invalid = reason
 
 
 @inner_kernel
-def _contact(fit: MeasuredFit) -> bool:
-    """The contact that the sums say; whether the curves hold there and its extent agrees."""
+def _all_above(fit: MeasuredFit, frame: FloatArray, weights: FloatArray, scale: float) -> bool:
+    """Return whether about all cells under the tip read as they do where nothing was tared."""
+    above = number = 0
+    for i in range(frame.shape[0]):
+        for j in range(frame.shape[1]):
+            if weights[0, i * frame.shape[1] + j] > 0.0:
+                number += 1
+                above += frame[i, j] * scale > ABOVE_PEAK * fit.peak
+    return above > ABOVE_MOST * number
+
+
+@inner_kernel
+def _contact(fit: MeasuredFit) -> Invalid:
+    """Set the contact that the sums say; check that the curves hold and its extent agrees."""
     force = fit.sums[0]
     moment = math.hypot(fit.sums[1], fit.sums[2])
     s_max = _BEYOND * fit.slope
@@ -172,7 +197,9 @@ def _contact(fit: MeasuredFit) -> bool:
     off = abs(fit.sums[3] - force * extent)
     agrees = off < _EXTENT * force * extent + _TOUCHED * math.sqrt(fit.noise[3, 3])
     within = t < _BEYOND * fit.root * (1.0 - 1e-9) and target < s_max + 3.0 * std
-    return bool(agrees and within)
+    if not within:
+        return Invalid.BEYOND
+    return Invalid.NONE if agrees else Invalid.MODEL
 
 
 @inner_kernel
@@ -207,10 +234,12 @@ def _set_covariance(fit: MeasuredFit, t: float, s: float, c_x: float, c_y: float
     for i in range(3):
         shift = fit.rotation[i, 0] * fit.shift[0] + fit.rotation[i, 1] * fit.shift[1]
         fit.along[i] = shift + fit.rotation[i, 2] * fit.shift[2]
-    missed = fit.force_error, fit.lever_error, fit.lever_error
+    placed = math.hypot(fit.lever_error, fit.place)
+    missed = fit.force_error, placed, math.hypot(placed, fit.rotation_error * lever * s)
+    grown = fit.gain * shown, fit.gain * shown * lever * s, 0.0
     for i in range(3):
         for j in range(3):
-            fit.shared[i, j] = fit.along[i] * fit.along[j]
+            fit.shared[i, j] = fit.along[i] * fit.along[j] + grown[i] * grown[j]
         fit.shared[i, i] += (missed[i] * shown) ** 2
     fit.errors[:] = fit.random + fit.shared
     _between(fit, fit.jacobian, fit.errors, fit.covariance)
@@ -256,7 +285,8 @@ class MeasuredEstimator:
     """`ContactEstimator` for a tip whose ``physics`` is "measured". Each frame stands alone.
 
     ``grid`` has the tip where the law found it. ``active`` [rows, cols] bool masks dead cells;
-    ``known`` are the sensor's other uncertainties. An estimate is ``valid`` where the curves were
+    ``known`` are the sensor's other uncertainties: the baseline, and gain, centre and rotation
+    since the curves were measured. An estimate is ``valid`` where the curves were
     measured, and where the frame's extent is within 8 % of what its force says. Raises ValueError
     for arguments out of their range.
     """
@@ -283,6 +313,7 @@ class MeasuredEstimator:
             setattr(fit, name, np.array(getattr(law, name)))
         if known is not None:
             fit.shift = known.baseline * self._weights.sum(axis=1)
+            fit.gain, fit.rotation_error, fit.place = known.gain, known.rotation, known.centre
         self._frame = np.zeros(grid.shape)
         self._seq: int | None = None
         self._last = ContactEstimate()
@@ -309,7 +340,7 @@ class MeasuredEstimator:
             raise ValueError(f"a frame must have shape {self._frame.shape}, got {frame.shape}")
         np.copyto(self._frame, frame)
         fit_measured_frame(fit.array, self._frame, self._weights, float(pascal_per_count))
-        result.contact, result.valid = fit.contact, fit.valid
+        result.contact, result.invalid = fit.contact, REASONS[fit.invalid]
         result.peak, result.d = fit.peak, fit.d
         result.tilt_x, result.tilt_y = math.asin(fit.n_x), math.asin(fit.n_y)
         per_tilt = np.array([1.0, 1.0 / math.cos(result.tilt_x), 1.0 / math.cos(result.tilt_y)])

@@ -46,8 +46,8 @@ Overlap = Annotated[FloatArray, IMAGES, 2]  # how much of each shear image is in
 class SolidBudget(Record):
     """Sums over the cells for `solid_budget`, less what is like shear."""
 
-    shift: Sums  # Σ image
-    cells: float
+    shift: Annotated[FloatArray, 3, IMAGES]  # Σ image, and times x and y over the radius
+    shifts: Annotated[FloatArray, 3]  # the same of 1, x and y themselves
     displacement: Annotated[FloatArray, 3, IMAGES, IMAGES]  # Σ change of one · other image
     squares: Annotated[FloatArray, 3, IMAGES, IMAGES]  # Σ change · change
     correlated_sums: Products  # Σ over pairs of cells of image · their correlation · image

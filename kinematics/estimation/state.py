@@ -23,6 +23,10 @@ OUTLIERS_MAX = 6  # left out of one frame
 RATIO_POINTS = 33
 LAW_PIECES = 128
 LAW_TERMS = 8  # of a law that is one polynomial
+# Images of shared errors: a shift of all cells, its slopes in x and y, the tip's place in x and y,
+# and the pitch.
+SHIFT, SLOPE_X, SLOPE_Y, PLACE_X, PLACE_Y, SCALING = range(6)
+SOURCES = 6
 DEPTHS = 12  # at which the covariance under correlated noise is tabulated
 
 Four: TypeAlias = Annotated[FloatArray, 4]
@@ -34,6 +38,7 @@ class Options(Record):
     """Constants of one estimator; see `ContactEstimator`."""
 
     noise: float  # of a cell [Pa]
+    undetected: float  # d [m] of a contact that is only just felt
     saturation: float  # [counts]
     floor: float  # least count sent, less a half
     tolerance: float
@@ -99,7 +104,7 @@ class Estimate(Record):
     iterations: int
     rejected: int
     contact: bool
-    valid: bool
+    invalid: int  # an `Invalid`
     second: bool
     warm: bool
     shear_x: float  # force on the face [N], of a solid tip
@@ -163,17 +168,22 @@ class Budget(Record):
 
     baseline: float  # standard deviations: of a shift of all cells [Pa]
     shift: float  # the same, and of the pressed ones by the law's misfit
+    slope: float  # of the zero, at the radius [Pa]
     centre: float  # of the tip's place [m]
     pitch: float  # relative
-    modulus: float  # relative; 0 with a free gain
+    modulus: float  # of modulus and gain, relative; 0 with a free gain
+    smooth: float  # of pressure, relative
+    rotation: float  # of the sensor [rad]
+    radius: float  # relative
+    skew: float  # of the face over a scan of all rows, in w [–]
     along: float  # correlation of neighbours in a row
     cells_per_sample: float  # Σρ²: cells for each that is independent
     systematic: bool  # any of those but the correlation
     correlated: bool
     variance_factor: Annotated[FloatArray, DEPTHS, 4, 4]
     work: Matrix
-    responses: Matrix  # Jᵀq, columns by source
-    squares: Four  # qᵀq
+    responses: Annotated[FloatArray, 4, SOURCES]  # Jᵀq
+    squares: Annotated[FloatArray, SOURCES]  # qᵀq
     displacement: Four
     shared: Matrix  # covariance by what all frames share, of (gain, u, v, w)
     covariance: Matrix  # the same of (d, n_x, n_y, gain)

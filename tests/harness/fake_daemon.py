@@ -47,6 +47,7 @@ def finger(t: float, side: int) -> dict[str, Any]:
         "contact": True,
         "frame_seq": 7,
         "frame_age_s": 0.012,
+        "invalid": "",
     }
 
 

@@ -14,6 +14,7 @@ from softfinger.daemon.loop.timing import Statistics, record
 from softfinger.daemon.types import Frame, HandFacts, Parts, SensorFacts, State
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.packer import message_maker, packer
+from softfinger.kinematics.estimation.invalid import Invalid
 
 
 def golden_file(topic: bytes) -> Path:
@@ -43,7 +44,8 @@ def sample_state() -> State:
         state.reading.current[finger] = 0.5 + finger
         state.goal.q[finger] = 0.375 + 0.0625 * finger
         state.goal.current[finger] = 0.75 + finger
-        contact.seq, contact.t, contact.valid, contact.contact = 77 + finger, 12.48, True, True
+        contact.seq, contact.t, contact.contact = 77 + finger, 12.48, True
+        contact.invalid = Invalid.NONE
         contact.d, contact.theta, contact.tilt_y = 0.004, 0.1 * sign, 0.01 * sign
         contact.d_std, contact.theta_std, contact.gain = 2e-5, 1e-3, 1.01
         contact.force_std = 0.03

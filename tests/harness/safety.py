@@ -15,6 +15,7 @@ from softfinger.daemon.safety.safety import Safety
 from softfinger.daemon.servos.base import Servos
 from softfinger.daemon.types import Contact, Frame, Goal, State
 from softfinger.kinematics.estimation.estimator import ContactEstimate
+from softfinger.kinematics.estimation.invalid import Invalid
 
 SETTINGS = Settings()
 BOUNDS = SETTINGS.safety
@@ -53,7 +54,7 @@ def sound(mode: Mode = Mode.HOLDING) -> State:
             t=4.99,
             t_arrival=5.0,
             t_valid=5.0,
-            valid=True,
+            invalid=Invalid.NONE,
             contact=True,
             d=0.004,
             theta=0.1,

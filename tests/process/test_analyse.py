@@ -63,6 +63,17 @@ def save_stream(path: Path, counts: np.ndarray, settings: Settings) -> None:
     writer.close()
 
 
+def test_frames_that_can_not_be_used_are_counted_by_their_reason(
+    counts: np.ndarray, tmp_path: Path
+) -> None:
+    np.save(tmp_path / "untared.npy", np.full_like(counts, 5000))
+    made = Settings.model_validate({"tactile": {"pascal_per_count": SCALE, "pitch": PITCH}})
+    (contacts,) = analyse(open_source(tmp_path / "untared.npy", made, None, False), print)
+    assert contacts.reasons() == {"all cells read above zero: tare": len(counts)}
+    write_csv(tmp_path / "out.csv", [contacts])
+    assert rows_of(tmp_path / "out.csv")[0]["invalid"] == "all cells read above zero: tare"
+
+
 def test_every_kind_of_file_gives_the_same_contacts(counts: np.ndarray, tmp_path: Path) -> None:
     np.savez(tmp_path / "press.npz", frames=counts, t=np.arange(len(counts)) / 100, d=DEPTHS)
     folder = tmp_path / "frames"

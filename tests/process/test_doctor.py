@@ -117,6 +117,11 @@ def test_boards_are_listened_to(hands, capsys):
     for side in ("left", "right"):
         # On a busy machine they may be told as slow, which is no failure.
         assert [line for line in lines if f" tactile {side}: 32 × 32 cells, " in line]
+    hand.emulator.request("left:drift=0.1")
+    status, lines = hand.doctor(capsys)
+    assert status == 0
+    untared = next(line for line in lines if line.startswith("warn   tactile left"))
+    assert "expected 0 at rest" in untared
     hand.emulator.request("left:wrong-size")
     status, lines = hand.doctor(capsys)
     assert status == 1

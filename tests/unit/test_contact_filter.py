@@ -14,6 +14,7 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import Contact, Frame, ObjectPose, Reading
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.estimation.estimator import ContactEstimate
+from softfinger.kinematics.estimation.invalid import Invalid
 
 SETTINGS = Settings()
 
@@ -26,7 +27,7 @@ def contact_filter() -> ContactFilter:
 
 ESTIMATE = ContactEstimate(
     contact=True,
-    valid=True,
+    invalid=Invalid.NONE,
     d=0.003,
     tilt_x=0.1,
     covariance=np.diag([5e-5**2, 5e-3**2, 0.0, 0.0]),
@@ -54,6 +55,7 @@ def test_what_frames_share_stays_however_many_come(contact_filter: ContactFilter
     assert contact.force_std == pytest.approx(math.hypot(by_d, by_theta, by_modulus), rel=0.02)
 
 
+@pytest.mark.filterwarnings("ignore:the smooth law misses")
 def test_the_law_misfit_is_in_the_force(contact_filter: ContactFilter) -> None:
     contacts, pose = [Contact(), Contact()], ObjectPose()
     strain = np.linspace(0.025, 1.0, 40)

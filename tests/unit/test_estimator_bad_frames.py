@@ -9,7 +9,9 @@ import pytest
 
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.estimation.error_budget import Uncertainty
 from softfinger.kinematics.estimation.estimator import ContactEstimator, Readings
+from softfinger.kinematics.estimation.invalid import Invalid
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
 A = 0.020
@@ -64,6 +66,21 @@ def test_dead_cells_are_masked_whatever_they_hold():
 EMPTY = np.zeros((44, 44))
 
 
+@pytest.mark.parametrize("physics", ["springs", "solid"])
+@pytest.mark.parametrize("baseline", [0.0, 1000.0])
+def test_without_contact_d_std_is_the_d_that_is_just_felt(physics, baseline):
+    tip, material = Fingertip(A, physics), Material.constant(0.3e6)
+    known = Uncertainty(baseline=baseline)
+    estimator = ContactEstimator(tip, material, GRID, 600.0, known=known)
+    hidden = estimator(EMPTY).d_std
+    assert 1e-4 < hidden < 6e-4
+    rng = np.random.default_rng(4)
+    for fraction, least, most in ((0.6, 0.0, 0.1), (1.5, 0.9, 1.0)):
+        frame = GRID.pressure(tip, material, fraction * hidden, 0.05)
+        felt = [estimator(frame + rng.normal(0.0, 600.0, (44, 44))).contact for _ in range(50)]
+        assert least <= np.mean(felt) <= most
+
+
 @pytest.mark.parametrize("method", ["ml", "moments"])
 @pytest.mark.parametrize("free_gain", [True, False])
 class TestBadFrames:
@@ -73,7 +90,7 @@ class TestBadFrames:
     def test_all_zero_is_no_contact_and_valid(self, method, free_gain):
         for kind in (np.uint8, np.uint16, np.float32, np.float64):
             e = self.estimator(method, free_gain)(EMPTY.astype(kind))
-            assert (e.contact, e.valid, e.d, e.d_std) == (False, True, 0.0, 0.0)
+            assert (e.contact, e.valid, e.d) == (False, True, 0.0)
 
     @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
     def test_one_cell_that_is_no_number_invalidates(self, method, free_gain, bad):
@@ -101,11 +118,19 @@ class TestBadFrames:
         ):
             e = estimator(frame, scale)
             assert e.contact
-            assert not e.valid
+            assert e.invalid == (Invalid.SATURATED if frame.dtype != float else Invalid.ABOVE_ZERO)
+
+    def test_a_sensor_without_a_tare_is_named(self, method, free_gain):
+        estimator = self.estimator(method, free_gain)
+        rng = np.random.default_rng(8)
+        for _ in range(20):
+            zero = 20e3 + 3e3 * rng.standard_normal((44, 44))
+            e = estimator(zero + rng.normal(0.0, 600.0, (44, 44)))
+            assert (e.valid, e.invalid) == (False, Invalid.ABOVE_ZERO)
 
     def test_a_baseline_far_below_zero_is_not_valid(self, method, free_gain):
         estimator = self.estimator(method, free_gain)
-        assert not estimator(EMPTY - 5000.0).valid
+        assert estimator(EMPTY - 5000.0).invalid == Invalid.BELOW_ZERO
         assert not estimator(-GRID.pressure(TIP, MEASURED, 0.004) - 2000.0).valid
 
     def test_one_hot_cell_is_no_contact(self, method, free_gain):

@@ -16,6 +16,7 @@ from softfinger.daemon.profile.settings import SafetySettings as Limits
 from softfinger.daemon.safety.limits import LIMITS, View
 from softfinger.daemon.types import State
 from softfinger.kinematics.estimation.estimator import ContactEstimate
+from softfinger.kinematics.estimation.invalid import Invalid
 from tests.harness.safety import (
     BOUNDS,
     SETTINGS,
@@ -213,7 +214,7 @@ def test_overruns_in_a_row_are_a_cause() -> None:
 
 def felt(finger: int, theta: float) -> Sensor:
     sensor = Sensor(finger)
-    sensor.estimate = ContactEstimate(contact=True, valid=True, tilt_x=theta)
+    sensor.estimate = ContactEstimate(contact=True, invalid=Invalid.NONE, tilt_x=theta)
     sensor.estimate.covariance[1, 1] = 1e-3**2
     return sensor
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from softfinger import ContactTable, Fingertip, Material, SensorGrid
+from softfinger import ContactEstimator, ContactTable, Fingertip, Material, SensorGrid
 from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.perception.calibration_file import (
     Calibration,
@@ -27,6 +27,8 @@ from softfinger.kinematics.calibration.measured_fit import (
     fit_measured,
 )
 from softfinger.kinematics.contact.tip_curves import TipCurves
+from softfinger.kinematics.estimation.error_budget import Uncertainty
+from softfinger.kinematics.estimation.invalid import Invalid
 from softfinger.kinematics.estimation.measured import MeasuredEstimator
 
 A = 0.020
@@ -65,6 +67,22 @@ def presses(seed: int = 1, count: int = len(D)) -> PressSums:
 @pytest.fixture(scope="module")
 def law() -> TipCurves:
     return fit_measured(presses(), A, GRID)
+
+
+@pytest.mark.parametrize("push", [0.5, 2.0, 5.0])
+def test_a_contact_that_is_not_felt_is_within_what_could_hide(law: TipCurves, push: float) -> None:
+    placed = replace(GRID, centre=law.centre, rotation=law.rotation)
+    known = Uncertainty(baseline=1e3)
+    estimator = MeasuredEstimator(Fingertip(A, "measured", law=law), placed, known=known)
+    d = (push / (WEIRD * A**0.2)) ** (1 / 1.8)
+    found = estimator(weird(d, 0.0))
+    assert found.valid
+    assert found.contact or d < found.d_std < 1.5 * d * (5.0 / push) ** 0.6
+
+
+def test_the_estimator_of_a_model_names_that_of_a_measured_tip(law: TipCurves) -> None:
+    with pytest.raises(ValueError, match="MeasuredEstimator"):
+        ContactEstimator(Fingertip(A, "measured", law=law), Material.constant(1.0), GRID, NOISE)
 
 
 def test_the_curves_are_those_of_the_tip(law: TipCurves) -> None:
@@ -107,11 +125,12 @@ def test_a_frame_is_read_by_them_and_its_errors_are_known(
         squares.append(off**2 / found.covariance.diagonal()[:3])
     assert (np.mean(squares, axis=0) < 2.0).all()
     assert not estimator(NOISE * rng.standard_normal((32, 32))).contact
-    assert not estimator(weird(0.008, 0.0)).valid  # deeper than any press
+    assert estimator(weird(0.008, 0.0)).invalid == Invalid.BEYOND
     two = weird(d, 0.0) + np.roll(weird(d, 0.0), 8, axis=0)
     assert not estimator(two).valid
+    assert estimator(np.full((32, 32), 20e3)).invalid == Invalid.ABOVE_ZERO
     frame[3, 3] = np.nan
-    assert not estimator(frame).valid
+    assert estimator(frame).invalid == Invalid.NOT_FINITE
 
 
 def test_presses_that_make_no_law_are_refused() -> None:

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 from rich.text import Text
 
+from softfinger.kinematics.estimation.invalid import Invalid
 from softfinger.tools.terminal.feed import HISTORY_STEP, Feed, ShownReply
 from softfinger.tools.terminal.monitor_page import MonitorPage
 from softfinger.tools.terminal.terminal import KeyDecoder
@@ -81,9 +82,10 @@ def test_nothing_known_shows_dashes() -> None:
 def test_a_missing_finger_is_marked() -> None:
     feed = fed()
     state = fake_daemon.state(1.0, 100)
-    state["right"]["valid"] = False
+    state["right"] |= {"valid": False, "invalid": Invalid.ABOVE_ZERO.text}
     give(feed, b"hand/state", state)
     text = shown(feed)
+    assert "right not valid: all cells read above zero: tare" in text
     assert "right —" in text
     assert "left —" not in text
 

@@ -13,6 +13,7 @@ import pytest
 from softfinger.daemon.types import Frame, Parts, State
 from softfinger.daemon.wire.packer import message_maker, packer
 from softfinger.daemon.wire.schema import INPUT, STATE
+from softfinger.kinematics.estimation.invalid import Invalid
 
 input_message = message_maker(INPUT)
 state_message = message_maker(STATE)
@@ -21,6 +22,7 @@ ENDS: dict[type, tuple[Any, ...]] = {
     int: (0, 1, 127, 128, 2**31, 2**40),
     float: (0.0, -0.0, 1.5, -2.5e-300, 1e300, math.pi),
     bool: (False, True),
+    Invalid: tuple(Invalid),
     str: ("", "left joint at 2.5 rad, outside its limits — ß"),
 }
 

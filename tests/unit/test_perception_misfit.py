@@ -13,6 +13,7 @@ from softfinger.daemon.tactile.replay import GivenFrames
 from softfinger.daemon.types import Contact, Frame, Parts, State
 from softfinger.daemon.wire.packer import message_maker
 from softfinger.daemon.wire.schema import STATE
+from softfinger.kinematics.estimation.invalid import Invalid
 
 state_message = message_maker(STATE)
 
@@ -50,7 +51,7 @@ def test_unequal_cells_are_a_misfit_that_is_warned_of_and_published() -> None:
         state.t = 0.02 + 0.002 * tick
         state.seq += 1
         contact.t_valid = state.t
-        state.contacts[1] = Contact(valid=True, t_valid=state.t)
+        state.contacts[1] = Contact(invalid=Invalid.NONE, t_valid=state.t)
         safety.judge(state)
         told += safety.warnings
         safety.warnings.clear()

@@ -41,6 +41,9 @@ HARD = {
 OUTPUTS = ("force", "energy", "force_d", "force_theta", "energy_d", "energy_theta")
 
 
+pytestmark = pytest.mark.filterwarnings("ignore:the smooth law misses")
+
+
 @pytest.fixture(scope="module")
 def table() -> ContactTable:
     return ContactTable.build(TIP, TABLE_I, 1e-9)
@@ -353,6 +356,11 @@ def test_numbers_are_answered_as_arrays_are(forms: list[ContactTable]) -> None:
 
 def test_a_table_built_anew_is_the_same(table: ContactTable) -> None:
     np.testing.assert_array_equal(ContactTable.build(TIP, TABLE_I, 1e-9).data, table.data)
+
+
+def test_a_law_off_its_points_is_warned_of() -> None:
+    with pytest.warns(RuntimeWarning, match=r"makes 11\.0% of F; expected 5% at most"):
+        ContactTable.build(Fingertip(0.02), HARD["root"], 1e-6)
 
 
 def test_refusals() -> None:

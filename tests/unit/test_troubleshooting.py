@@ -13,7 +13,11 @@ ROW = re.compile(r"(?m)^\| ([^|]*) \|.*\|.*\|$")
 def texts() -> set[str]:
     """Every text in the sources, with … for the values in it."""
     found = set()
-    for path in [*ROOT.glob("daemon/**/*.py"), *ROOT.glob("tools/**/*.py")]:
+    for path in [
+        *ROOT.glob("daemon/**/*.py"),
+        *ROOT.glob("tools/**/*.py"),
+        *ROOT.glob("kinematics/**/*.py"),
+    ]:
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Constant) and isinstance(node.value, str):
                 found.add(node.value)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from collections import Counter
 from pathlib import Path
 
 from softfinger.tools.arguments import add_profile, profile
@@ -48,11 +49,13 @@ def run(arguments: argparse.Namespace) -> int:
     write_csv(table, contacts)
     frames = sum(each.t.size for each in contacts)
     touching = sum(int((each.contact & each.valid).sum()) for each in contacts)
-    unusable = sum(int((~each.valid).sum()) for each in contacts)
+    reasons = sum((each.reasons() for each in contacts), Counter[str]())
     print(
         f"{frames} frames in {elapsed:.2f} s ({frames / max(elapsed, 1e-9):.0f} a second): "
-        f"{touching} with contact, {unusable} not usable; {table}"
+        f"{touching} with contact, {reasons.total()} not usable; {table}"
     )
+    for reason, count in reasons.most_common():
+        print(f"  {count} not usable: {reason}")
     if arguments.no_plot:
         return 0
     picture = arguments.plot or path.with_name(path.name + ".contacts.png")

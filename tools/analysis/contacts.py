@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import csv
 import tempfile
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +25,7 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.tactile.replay import GivenFrames, load_recording
 from softfinger.daemon.types import FINGERS, Frame, State
 from softfinger.daemon.wire import schema
+from softfinger.kinematics.estimation.invalid import REASONS, Invalid
 from softfinger.tools import style
 from softfinger.tools.arguments import to_stderr
 from softfinger.tools.recordings.reader import Recording
@@ -149,10 +151,19 @@ class Contacts:
 
     finger: str
     t: FloatArray
-    valid: NDArray[np.bool_]
+    invalid: NDArray[np.int64]  # an `Invalid` each
     contact: NDArray[np.bool_]
     values: dict[str, FloatArray]
     truths: dict[str, FloatArray]
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """Frames whose estimate can be used."""
+        return np.equal(self.invalid, Invalid.NONE)
+
+    def reasons(self) -> Counter[str]:
+        """Count the reasons for which frames can't be used."""
+        return Counter(REASONS[k].text for k in self.invalid[~self.valid])
 
 
 class _Pass:
@@ -171,12 +182,14 @@ class _Pass:
         self._perception.update(self._state)
         contact = self._contact
         values = [getattr(contact, name) for name, _ in COLUMNS]
-        self._rows.append((t, contact.valid, contact.contact, *values))
+        self._rows.append((t, contact.invalid, contact.contact, *values))
 
     def contacts(self, finger: int, truths: dict[str, FloatArray]) -> Contacts:
         table = np.array(self._rows, np.float64).reshape(-1, 3 + len(COLUMNS)).T
         values = {name: table[3 + k] for k, (name, _) in enumerate(COLUMNS)}
-        return Contacts(FINGERS[finger], table[0], table[1] > 0.0, table[2] > 0.0, values, truths)
+        return Contacts(
+            FINGERS[finger], table[0], table[1].astype(int), table[2] > 0.0, values, truths
+        )
 
 
 def analyse(source: Source, progress: Progress) -> list[Contacts]:
@@ -195,15 +208,16 @@ def write_csv(path: Path, contacts: list[Contacts]) -> None:
     with write_text(path, newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         known = [f"{name}_true_{units[name]}" for name in truths]
-        writer.writerow(["t_s", "finger", "valid", "contact", *names, *known])
+        writer.writerow(["t_s", "finger", "valid", "contact", *names, *known, "invalid"])
         for each in contacts:
             columns = [each.values[name] for name, _ in COLUMNS]
             columns += [each.truths[name] for name in truths]
             numbers = zip(*(column.tolist() for column in columns), strict=True)
-            for t, valid, touches, row in zip(
-                each.t.tolist(), each.valid.tolist(), each.contact.tolist(), numbers, strict=True
+            for t, invalid, touches, row in zip(
+                each.t.tolist(), each.invalid.tolist(), each.contact.tolist(), numbers, strict=True
             ):
-                writer.writerow([f"{t:.6f}", each.finger, int(valid), int(touches), *row])
+                start = f"{t:.6f}", each.finger, int(not invalid), int(touches)
+                writer.writerow([*start, *row, REASONS[invalid].text])
 
 
 # Title, value, its standard deviation, factor to what is shown, unit shown.

@@ -17,6 +17,7 @@ from softfinger.daemon.types import FINGERS
 from softfinger.daemon.wire.schema import SCHEMA
 from softfinger.tools.terminal import heatmap
 from softfinger.tools.terminal.feed import Feed, RecentTicks, ShownReply
+from softfinger.tools.terminal.status import why_invalid
 from softfinger.tools.terminal.typeset import (
     DIM,
     aligned,
@@ -165,7 +166,7 @@ class MonitorPage:
         if lately > LATE:
             what = f" this machine is busy: the simulated hand runs {lately:.2f} s behind"
             return cut(Text(f"{what} ({short(feed.state.behind_s, 2)} s in all)", WARN), width)
-        return Text()
+        return cut(Text(f" {why_invalid(feed.state)}", WARN), width)
 
     def _body(self, width: int, lines: int, now: float) -> list[Text]:
         """Titles, maps with the numbers between them, and the maps' scale with the object."""

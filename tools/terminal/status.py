@@ -10,7 +10,9 @@ from dataclasses import asdict
 
 from softfinger.daemon.client.hand import Hand
 from softfinger.daemon.errors import NoStream
+from softfinger.daemon.types import FINGERS
 from softfinger.daemon.wire.schema import HandState
+from softfinger.kinematics.estimation.invalid import Invalid
 from softfinger.tools.arguments import add_keys, no_stream, stream_address
 
 
@@ -45,4 +47,15 @@ def told(state: HandState) -> str:
     if state.object.valid:
         parts.append(f"{math.degrees(state.object.angle):.1f}°")
         parts.append(f"{state.object.width * 1e3:.1f} mm")
+    parts += [why_invalid(state)] if why_invalid(state) else []
     return " ".join(parts[:1]) + (" " + ", ".join(parts[1:]) if parts[1:] else "")
+
+
+def why_invalid(state: HandState) -> str:
+    """Return why the scene's fingers are not valid, empty where they are."""
+    reasons = {name: state.finger(name).invalid for name in FINGERS}
+    return "; ".join(
+        f"{name} not valid: {reason}"
+        for name, reason in reasons.items()
+        if reason not in ("", Invalid.ABSENT.text)
+    )
