@@ -171,6 +171,7 @@ class TactileSettings(Section):
     pitch_error: Annotated[float, Field(ge=0, le=0.1)] = 0.0  # relative
     gain_error: Annotated[float, Field(gt=0, le=1)] = 0.25  # relative, likewise of all cells alike
     latency: Delay = 0.005  # s from the middle of a scan to the first byte on the wire
+    response: Delay = 0.0  # s, first-order lag of the cells, made up for by the joints
     open_timeout: Seconds = 2.0  # s to wait for a first good frame
     sensor: tuple[str, str] = ("", "")  # identifies the sensors, as a serial number
     calibration: tuple[str, str] = ("", "")  # files of `softfinger calibrate`; replace what's above
