@@ -1,7 +1,7 @@
 """The simulated pressure sensor: from a contact to the counts that a board would send.
 
-Delay and lost frames are in `simulated_tactile`. The flaws have the usual forms; the numbers in the
-profiles are our own choice.
+Delay and lost frames are in `simulated_tactile`. The flaws have the usual forms; ``velostat`` and
+``capacitive`` are profiles that have them.
 """
 
 from __future__ import annotations
@@ -309,7 +309,8 @@ def lag(pressure: FloatArray, time: float, elapsed: float, memory: FloatArray) -
     that went straight to now in ``elapsed`` [s]; ``memory`` [2, rows, cols] has what p and z were,
     and takes what they are.
     """
-    before, lagged = memory
+    before = memory[0]
+    lagged: FloatArray = memory[1]
     ratio = elapsed / time
     decay = math.exp(-ratio)
     # Mean of the decay over the interval, 1 − r/2 + … where the interval is short.
