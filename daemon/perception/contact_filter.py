@@ -78,6 +78,7 @@ class ContactFilter:
         state.radius = settings.tip.radius
         state.count = 2.0 * math.pi / (COUNTS_PER_TURN * gear)
         state.slow = 0.5 * VELOCITY_UNIT / gear
+        state.response = settings.tactile.response
         state.torque_constant = settings.control.torque_constant
         state.taper = state.assumed_taper = settings.object.taper
         state.alone = len(self._fingers) == 1

@@ -9,7 +9,8 @@ and ``jacobian_slide`` of the grasp Jacobian (`hand.grasp_state.held_motion`):
 A prediction's variance is P = variance + (0.05 path_length)² + min(path_length², step²/12), `step`
 being what a count of the encoder moves it by. Update by a frame that was sampled at t, with d_since
 and angle_since the displacements from t on, out of the history, and R the frame's covariance less
-its systematic part (upper signs: left tip):
+its systematic part (upper signs: left tip; cells that respond slowly show displacements s(t) with
+ds/dt = (displacement − s)/response, so the history keeps these):
 
     innovation = d_frame − (d − d_since)                         state (d, gain), H = 1
     innovation = (θ ∓ q) − (φ ∓ α/2 − angle_since)               state (φ, α), H = (1, ∓1/2)
@@ -119,7 +120,7 @@ class GraspState(Record):
 
 
 class Past(Record):
-    """Predicted motion until one instant: a row of the history."""
+    """Predicted motion until one instant, as cells show it: a row of the history."""
 
     t: float
     d: Pair
@@ -136,6 +137,7 @@ class FilterState(Record):
     radius: float
     count: float  # of a joint's encoder [rad]
     slow: float  # half a count of velocity [rad/s]
+    response: float  # of the cells [s]
     torque_constant: float  # [N·m/A]
     assumed_taper: float  # `object.taper` [rad]
     alone: bool  # one finger
@@ -198,6 +200,11 @@ def _new_displacement(
 
 
 @inner_kernel
+def _between(first: float, last: float, fraction: float) -> float:
+    return first + fraction * (last - first)
+
+
+@inner_kernel
 def _move(quantity: Quantity, displacement: float) -> None:
     quantity.mean += displacement
     quantity.displacement += displacement
@@ -230,6 +237,7 @@ def predict(
         trusted = witnesses.trusted_current(f.grasp.witnesses, k, current[k], goal[k], dt)
         f.tip[k].torque = f.torque_constant * trusted
     f.t = t
+    kept = math.exp(-dt / f.response) if f.response > 0.0 else 0.0
     if dt > HISTORY:
         dt = 0.0
         left.q = q[0]
@@ -262,13 +270,14 @@ def predict(
         scales.drift(f.grasp.scales, dt)
     f.angle.variance += _DRIFT_ANGLE * _DRIFT_ANGLE * dt
     f.taper_variance += _DRIFT_TAPER * _DRIFT_TAPER * dt
+    last = history[f.newest]
     f.newest = (f.newest + 1) % len(history)
     row = history[f.newest]
     row.t = t
-    row.angle = f.angle.displacement
+    row.angle = _between(f.angle.displacement, last.angle, kept)
     for k in range(2):
-        row.d[k] = f.tip[k].d.displacement
-        row.q[k] = f.tip[k].q
+        row.d[k] = _between(f.tip[k].d.displacement, last.d[k], kept)
+        row.q[k] = _between(f.tip[k].q, last.q[k], kept)
 
 
 @inner_kernel
@@ -398,7 +407,7 @@ def update(
         speed = abs(tip.speed) + abs(other.speed)
         if witnesses.refuses(f.grasp.witnesses, finger, innovation, innovation_variance, speed):
             return False
-    tip.unseen = min(tip.unseen, f.slow * max(f.t - t, 0.0))
+    tip.unseen = min(tip.unseen, f.slow * (max(f.t - t, 0.0) + f.response))
     tip.tilt_y = tilt_y
     tip.shear = shear
     tip.shared[0] = systematic[0, 0]
@@ -437,11 +446,6 @@ def _law_error(tip: TrackedTip, fraction: float) -> float:
     k = int(t)
     error: float = tip.law[k] + (t - k) * (tip.law[k + 1] - tip.law[k])
     return error
-
-
-@inner_kernel
-def _between(first: float, last: float, fraction: float) -> float:
-    return first + fraction * (last - first)
 
 
 @inner_kernel

@@ -171,6 +171,7 @@ class TactileSettings(Section):
     pitch_error: Annotated[float, Field(ge=0, le=0.1)] = 0.0  # relative
     gain_error: Annotated[float, Field(gt=0, le=1)] = 0.25  # relative, likewise of all cells alike
     latency: Delay = 0.005  # s from the middle of a scan to the first byte on the wire
+    response: Delay = 0.0  # s, first-order lag of the cells, made up for by the joints
     open_timeout: Seconds = 2.0  # s to wait for a first good frame
     sensor: tuple[str, str] = ("", "")  # identifies the sensors, as a serial number
     calibration: tuple[str, str] = ("", "")  # files of `softfinger calibrate`; replace what's above
@@ -345,8 +346,13 @@ class SimulationSettings(Section):
     tactile_hysteresis: Fraction = 0.0  # reads up to so much more while a cell is unloaded
     tactile_creep: Fraction = 0.0  # rise of the reading under a lasting pressure
     tactile_creep_time: Positive = 10.0  # s in which it comes about
+    tactile_response: Delay = 0.0  # s, first-order lag of the reading
+    tactile_exponent: Factor = 1.0  # of the pressure that a cell's reading goes with
+    tactile_fold: NonNegative = 0.0  # Pa above which a cell reads less again; 0: never
     tactile_crosstalk: Fraction = 0.0  # share of a line's mean that its cells read too much
+    tactile_row_noise: NonNegative = 0.0  # Pa, what all cells of a row share
     tactile_drift: NonNegative = 0.0  # Pa, how far the cells' zeros wander
+    tactile_gain_drift: Fraction = 0.0  # relative, likewise the gain of all, as by warmth
     tactile_drift_time: Positive = 60.0  # s in which they do
     tactile_delay: Delay = 0.010  # s from the middle of a scan to its arrival
     tactile_jitter: Delay = 0.0  # s that a frame may come later still

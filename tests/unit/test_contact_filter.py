@@ -105,3 +105,29 @@ def test_a_tip_that_touches_at_the_start_is_felt_at_once_and_from_then_on(
     assert contact.theta == pytest.approx(0.1, rel=0.02)
     assert contact.force > 1.0
     assert math.isfinite(contact.energy + contact.d_std + contact.theta_std)
+
+
+@pytest.mark.parametrize("response", [0.04, 0.08])
+def test_what_slow_cells_show_late_the_joints_make_up_for(response: float) -> None:
+    settings = Settings.model_validate({"tactile": {"response": response}})
+    table = make_table(settings, make_material(settings.material), None)
+    contact_filter = ContactFilter(settings, (table, table))
+    contacts, pose = [Contact(), Contact()], ObjectPose()
+    d, q = 0.003, 0.15
+    shown = np.array([d, q])
+    off = []
+    for k in range(300):
+        t = 1.0 + 0.002 * k
+        dq = 0.2 if 100 <= k < 200 else 0.0
+        d += 0.002 * dq * float(np.mean(contact_filter.grasp.moment_arm))
+        q += 0.002 * dq
+        shown += (np.array([d, q]) - shown) * -math.expm1(-0.002 / response)
+        contact_filter.predict(Reading(t=t, q=[q] * 2, dq=[dq] * 2, valid=True))
+        if k % 5 == 0:
+            for finger, sense in enumerate((1.0, -1.0)):
+                estimate = replace(ESTIMATE, d=shown[0], tilt_x=sense * shown[1])
+                contact_filter.update(finger, frame(t), estimate, contacts[finger])
+        contact_filter.write_contacts(t, contacts, pose)
+        off.append(contacts[0].d - d)
+    assert d > 5e-3
+    assert np.abs(off).max() < 5e-5

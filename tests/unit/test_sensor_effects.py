@@ -117,9 +117,9 @@ def test_loading_is_unchanged_unloading_reads_more_and_loops_close():
     assert not counts(model, (0.0, 0.0, 0.0)).any()
 
 
-def test_creep_is_the_exact_response_to_straight_pieces():
-    share, time = 0.2, 3.0
-    before, crept = np.zeros((2, 2)), np.zeros((2, 2))
+def test_a_lag_is_the_exact_response_to_straight_pieces():
+    time = 3.0
+    memory = np.zeros((2, 2, 2))
     shape = np.array([[1.0, 2.0], [0.5, 0.0]])
     times = [0.0, 0.7, 0.7, 5.0, 5.001, 30.0]
     values = [0.0, 100.0, 40.0, 40.0, 0.0, 10.0]
@@ -131,9 +131,8 @@ def test_creep_is_the_exact_response_to_straight_pieces():
         for m in range(steps):
             p = values[k - 1] + (values[k] - values[k - 1]) * (m + 0.5) / steps
             z += elapsed / steps * (p - z) / (time + 0.5 * elapsed / steps)
-        out = values[k] * shape
-        sensor_model.creep(out, share, time, elapsed, before, crept)
-        np.testing.assert_allclose(out, (values[k] + share * z) * shape, rtol=1e-6, atol=1e-6)
+        lagged = sensor_model.lag(values[k] * shape, time, elapsed, memory)
+        np.testing.assert_allclose(lagged, z * shape, rtol=1e-6, atol=1e-6)
 
 
 def test_a_lasting_contact_creeps_up_and_its_mark_fades():
@@ -150,6 +149,77 @@ def test_a_lasting_contact_creeps_up_and_its_mark_fades():
     assert counts(model, (0.0, 0.0, 0.0), 110.01).sum() / first == pytest.approx(
         0.05 * math.exp(-1), rel=0.02
     )
+
+
+def test_a_slow_cell_follows_a_step_to_63_per_cent_in_its_response_time():
+    model = sensor(response=0.06)
+    assert model.remembers
+    final = counts(sensor(), CONTACTS[1]).sum()
+    counts(model, (0.0, 0.0, 0.0), 0.0)
+    begin = counts(model, CONTACTS[1], 1e-9).sum()
+    assert begin == pytest.approx(0.0, abs=1.0)
+    risen = counts(model, CONTACTS[1], 0.06).sum() / final
+    assert risen == pytest.approx(1.0 - math.exp(-1.0), rel=1e-3)
+    assert counts(model, CONTACTS[1], 2.0).sum() == pytest.approx(final, rel=1e-3)
+    counts(model, (0.0, 0.0, 0.0), 2.0 + 1e-9)
+    left = counts(model, (0.0, 0.0, 0.0), 2.06).sum() / final
+    assert left == pytest.approx(math.exp(-1.0), rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("exponent", "fold", "read"),
+    [
+        (0.5, 0.0, {0.0: 0.0, 100.0: 1000.0, 2500.0: 5000.0, 10000.0: 10000.0}),
+        (1.0, 4000.0, {0.0: 0.0, 2000.0: 2000.0, 4000.0: 4000.0, 8000.0: 2000.0, 16000.0: 1000.0}),
+        (0.5, 4000.0, {1600.0: 4000.0, 10000.0: 4000.0}),
+    ],
+)
+def test_a_curve_is_a_power_right_at_full_scale_and_a_hard_pressed_cell_reads_less(
+    exponent, fold, read
+):
+    flaws = Imperfections(exponent=exponent, fold=fold)
+    model = SensorModel(SensorGrid(4, 5, PITCH), TIP, LINEAR, Board(1.0, 10000), flaws)
+    out = np.zeros(model.grid.shape, np.uint16)
+    for pressure, expected in read.items():
+        model.press_evenly(pressure)
+        model.read(out)
+        np.testing.assert_allclose(out, expected, atol=0.5)
+
+
+def test_a_rows_noise_is_its_cells_alike_and_new_with_each_frame():
+    grid = SensorGrid(200, 6, PITCH)
+    flaws = Imperfections(row_noise=30.0)
+    model = SensorModel(grid, TIP, LINEAR, Board(1.0), flaws)
+    model.press_evenly(1000.0)
+    seen = np.empty((50, *grid.shape), np.uint16)
+    for out in seen:
+        model.read(out)
+    np.testing.assert_array_equal(seen, seen[:, :, :1].repeat(6, axis=2))
+    rows = seen[:, :, 0] - 1000.0
+    assert rows.std() == pytest.approx(30.0, rel=0.03)
+    assert abs(np.mean(rows[1:] * rows[:-1])) < 0.05 * 30.0**2
+    assert abs(np.mean(rows[:, 1:] * rows[:, :-1])) < 0.05 * 30.0**2
+
+
+def test_a_gain_drifts_for_all_cells_alike_to_its_deviation():
+    grid = SensorGrid(4, 5, PITCH)
+    ends = []
+    for seed in range(400):
+        flaws = Imperfections(gain_drift=0.02, drift_time=60.0)
+        model = SensorModel(grid, TIP, LINEAR, Board(1.0), flaws, seed=seed)
+        out = np.zeros(grid.shape, np.uint16)
+        gains = []
+        for t in (0.0, 0.6, 600.0):
+            model.press(0.0, 0.0, 0.0, t)
+            model.press_evenly(50000.0)
+            model.read(out)
+            assert (out == out[0, 0]).all()
+            gains.append(out[0, 0] / 50000.0 - 1.0)
+        ends.append(gains)
+    begin, soon, late = np.std(ends, axis=0)
+    assert begin == 0.0
+    assert soon == pytest.approx(0.02 * math.sqrt(2 * 0.6 / 60.0), rel=0.15)
+    assert late == pytest.approx(0.02, rel=0.15)
 
 
 def test_zeros_drift_to_their_deviation_and_forget_in_their_time():
@@ -217,8 +287,13 @@ def test_all_at_once_is_the_same_for_a_seed():
         "blur": 5e-4,
         "hysteresis": 0.05,
         "creep": 0.03,
+        "response": 0.05,
+        "exponent": 0.9,
+        "fold": 60e3,
         "crosstalk": 0.02,
+        "row_noise": 100.0,
         "drift": 200.0,
+        "gain_drift": 0.01,
     }
     first, again = sensor(**flaws), sensor(**flaws)
     assert first.remembers

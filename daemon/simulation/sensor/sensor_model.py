@@ -1,7 +1,7 @@
 """The simulated pressure sensor: from a contact to the counts that a board would send.
 
-Delay and lost frames are in `simulated_tactile`. The flaws have the usual forms; the numbers in the
-profiles are our own choice.
+Delay and lost frames are in `simulated_tactile`. The flaws have the usual forms; ``velostat`` and
+``capacitive`` are profiles that have them.
 """
 
 from __future__ import annotations
@@ -44,8 +44,13 @@ class Imperfections:
     - ``blur`` [m]: the elastomer spreads a point's pressure, standard deviation.
     - ``hysteresis``: a cell being unloaded reads up to this share more than when it was loaded.
     - ``creep``, ``creep_time`` [s]: a cell's reading rises by this share under a lasting pressure.
+    - ``response`` [s]: a cell's reading follows the pressure with a first-order lag.
+    - ``exponent``: a cell reads p^exponent, right at the board's full scale.
+    - ``fold`` [Pa]: above it a cell reads fold²/p, the less the harder it is pressed; 0: never.
     - ``crosstalk``: each cell reads this share of its row's and of its column's mean too much.
-    - ``drift`` [Pa], ``drift_time`` [s]: the cells' zeros drift so far over such a time.
+    - ``row_noise`` [Pa]: standard deviation from frame to frame of what a row's cells share.
+    - ``drift`` [Pa], ``gain_drift``, ``drift_time`` [s]: how far each cell's zero, and the gain of
+      all cells together, drift over such a time, as with the room's temperature.
 
     Raises ValueError for values out of their range.
     """
@@ -57,8 +62,13 @@ class Imperfections:
     hysteresis: float = 0.0
     creep: float = 0.0
     creep_time: float = 10.0
+    response: float = 0.0
+    exponent: float = 1.0
+    fold: float = 0.0
     crosstalk: float = 0.0
+    row_noise: float = 0.0
     drift: float = 0.0
+    gain_drift: float = 0.0
     drift_time: float = 60.0
 
     def __post_init__(self) -> None:
@@ -68,7 +78,7 @@ class Imperfections:
                 raise ValueError(f"{field.name} must not be negative, got {value}")
         if self.dead > 1.0:
             raise ValueError(f"dead must be a share of the cells, got {self.dead}")
-        for name in ("creep_time", "drift_time"):
+        for name in ("creep_time", "exponent", "drift_time"):
             if not getattr(self, name) > 0.0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
 
@@ -151,9 +161,10 @@ class SensorModel:
         self._plane.gain = 1.0
         self._curved.across_x, self._curved.across_y = grid.to_sensor(1.0, 0.0)
         self._plays = np.zeros((PLAYS if flaws.hysteresis > 0.0 else 0, *shape))
-        self._before = np.zeros(shape)
-        self._crept = np.zeros(shape)
+        self._creep_lag, self._response_lag = np.zeros((2, 2, *shape))
         self._offset = np.zeros(shape)  # counts
+        self._warmer = np.zeros(1)  # the gain's excess
+        self._full_scale = board.full_count * board.pascal_per_count
         self._signal = np.zeros(shape)  # counts
         self._normals = np.zeros(shape)
         self._lines = (np.zeros(shape[0]), np.zeros(shape[1]))
@@ -167,7 +178,8 @@ class SensorModel:
     @property
     def remembers(self) -> bool:
         """True if readings depend on earlier contacts, not on the present one alone."""
-        return self._flaws.hysteresis > 0.0 or self._flaws.creep > 0.0
+        flaws = self._flaws
+        return flaws.hysteresis > 0.0 or flaws.creep > 0.0 or flaws.response > 0.0
 
     def frame(
         self,
@@ -181,7 +193,7 @@ class SensorModel:
         """Write the next frame's counts into ``out``, uint16 [rows, cols] contiguous.
 
         ``d`` [m] ≤ 0 is no contact; tilts [rad] as for :meth:`SensorGrid.pressure`; ``t`` [s], for
-        creep and drift, is the frame's time; ``curvature`` as for :meth:`press`.
+        creep, response and drift, is the frame's time; ``curvature`` as for :meth:`press`.
         """
         self.press(d, tilt_x, tilt_y, t, curvature)
         self.read(out)
@@ -223,12 +235,16 @@ class SensorModel:
         if flaws.hysteresis > 0.0:
             hysteresis(pressure, flaws.hysteresis, self._plays)
         if flaws.creep > 0.0:
-            memory = (self._before, self._crept)
-            creep(pressure, flaws.creep, flaws.creep_time, elapsed, *memory)
+            pressure += flaws.creep * lag(pressure, flaws.creep_time, elapsed, self._creep_lag)
+        if flaws.response > 0.0:
+            pressure[:] = lag(pressure, flaws.response, elapsed, self._response_lag)
         if flaws.drift > 0.0:
             self._generator.standard_normal(out=self._normals)
             deviation = flaws.drift / self._per_count
             drift(self._offset, deviation, flaws.drift_time, elapsed, self._normals)
+        if flaws.gain_drift > 0.0:
+            normal = self._generator.standard_normal(1)
+            drift(self._warmer, flaws.gain_drift, flaws.drift_time, elapsed, normal)
 
     def press_evenly(self, pressure: float) -> None:
         """Let all cells feel this pressure [Pa], as under a bladder, in the last press' place."""
@@ -239,11 +255,21 @@ class SensorModel:
     ) -> None:
         """Write the counts of what the cells feel into ``out``, with ``faults`` as at ``t`` [s]."""
         flaws = self._flaws
-        np.multiply(self._pressure, self._sensitivity, out=self._signal)
+        felt = self._pressure
+        if flaws.exponent != 1.0 or flaws.fold > 0.0:
+            felt = curve(felt, flaws.exponent, self._full_scale, flaws.fold)
+        np.multiply(felt, self._sensitivity, out=self._signal)
+        if flaws.gain_drift > 0.0:
+            self._signal *= np.maximum(1.0 + self._warmer, 0.0)
         if faults is not None:
             faults.apply(self._signal, self._ends[1], t)
         if flaws.crosstalk > 0.0:
             crosstalk(self._signal, flaws.crosstalk, *self._lines)
+        if flaws.row_noise > 0.0:
+            rows = self._lines[0]
+            if not flaws.crosstalk > 0.0:
+                rows[:] = 0.0
+            rows += self._generator.normal(0.0, flaws.row_noise / self._per_count, rows.shape)
         if flaws.noise > 0.0:
             self._generator.standard_normal(out=self._normals)
         count(
@@ -276,41 +302,49 @@ def hysteresis(pressure: FloatArray, excess: float, memory: FloatArray) -> None:
     memory.mean(axis=0, out=pressure)
 
 
-def creep(
-    pressure: FloatArray,
-    fraction: float,
-    time: float,
-    elapsed: float,
-    before: FloatArray,
-    crept: FloatArray,
-) -> None:
-    """Let each cell's reading creep up under a lasting pressure, and back after it.
+def lag(pressure: FloatArray, time: float, elapsed: float, memory: FloatArray) -> FloatArray:
+    """Return z of dz/dt = (p − z)/time: each cell's pressure with a first-order lag.
 
-    A standard linear solid: reading = p + share · z with dz/dt = (p − z)/time. Solved exactly for a
-    pressure that went straight from ``before`` to now in ``elapsed`` [s]; ``before`` and ``crept``
-    (z) are the cells' memory.
+    With p + share · z it is the creep of a standard linear solid. Solved exactly for a pressure
+    that went straight to now in ``elapsed`` [s]; ``memory`` [2, rows, cols] has what p and z were,
+    and takes what they are.
     """
+    before = memory[0]
+    lagged: FloatArray = memory[1]
     ratio = elapsed / time
     decay = math.exp(-ratio)
     # Mean of the decay over the interval, 1 − r/2 + … where the interval is short.
     mean = -math.expm1(-ratio) / ratio if ratio > 0.0 else 1.0
-    crept *= decay
-    crept += (mean - decay) * before + (1.0 - mean) * pressure
+    lagged *= decay
+    lagged += (mean - decay) * before + (1.0 - mean) * pressure
     before[:] = pressure
-    pressure += fraction * crept
+    return lagged
+
+
+def curve(pressure: FloatArray, exponent: float, full_scale: float, fold: float) -> FloatArray:
+    """Return what cells read of the pressure p: (p/full_scale)^exponent · full_scale.
+
+    Above ``fold`` [Pa], where that isn't 0, they read it of fold²/p: a cell that is pressed harder
+    than its contact resistance goes by reads less again.
+    """
+    if fold > 0.0:
+        pressure = np.minimum(pressure, fold * fold / np.maximum(pressure, fold))
+    if exponent != 1.0:
+        pressure = full_scale * (pressure / full_scale) ** exponent
+    return pressure
 
 
 def drift(
-    offset: FloatArray, deviation: float, time: float, elapsed: float, normals: FloatArray
+    value: FloatArray, deviation: float, time: float, elapsed: float, normals: FloatArray
 ) -> None:
-    """Let each cell's zero drift: an Ornstein-Uhlenbeck process.
+    """Let each cell's zero drift, or the gain: an Ornstein-Uhlenbeck process.
 
-    ``offset`` starts at 0 with a fresh tare and ends up with the standard ``deviation``, forgetting
+    ``value`` starts at 0 with a fresh tare and ends up with the standard ``deviation``, forgetting
     over ``time`` [s]; ``normals`` are standard normal numbers.
     """
     decay = math.exp(-elapsed / time)
-    offset *= decay
-    offset += deviation * math.sqrt(1.0 - decay * decay) * normals
+    value *= decay
+    value += deviation * math.sqrt(1.0 - decay * decay) * normals
 
 
 def crosstalk(signal: FloatArray, fraction: float, rows: FloatArray, cols: FloatArray) -> None:
