@@ -57,18 +57,15 @@ def profile(arguments: argparse.Namespace) -> Settings:
     return load(arguments.config, arguments.dir or own_runtime_folder(), arguments.set)
 
 
-def own_runtime_folder() -> Path:
-    """Where an emulated hand links its ports without ``--dir``.
-
-    Raises SettingsError when another user has made that folder.
-    """
-    folder = runtime_folder()
+def own_runtime_folder() -> Path | None:
+    """Where an emulated hand links its ports without ``--dir``; None where nothing is one's own."""
     try:
+        folder = runtime_folder()
         require_own(folder)
     except FileNotFoundError:
-        pass
-    except OSError as error:
-        raise SettingsError(f"{folder}: {error.strerror}, or choose another by --dir") from None
+        return folder
+    except (OSError, RuntimeError):
+        return None
     return folder
 
 
