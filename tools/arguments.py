@@ -180,6 +180,16 @@ def add_stream(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_split(parser: argparse.ArgumentParser) -> None:
+    """``--split-size`` and ``--split-time``: a recorder's memory grows with its file."""
+    parser.add_argument(
+        "--split-size", type=megabytes, metavar="MB", help="begin a new file after so many MB"
+    )
+    parser.add_argument(
+        "--split-time", type=seconds, metavar="S", help="begin a new file after S seconds"
+    )
+
+
 ALL = b"all"
 
 
