@@ -14,7 +14,7 @@ import tempfile
 from pathlib import Path
 from typing import BinaryIO, Literal, TextIO
 
-from softfinger.kinematics.compiled.own_folder import check_above
+from softfinger.kinematics.compiled.own_folder import check_above, user_cache
 
 MOST = 16 << 20  # bytes of a file that is read at once, or of what a part of one unpacks to
 
@@ -51,13 +51,30 @@ def runtime_folder() -> Path:
     """The user's own runtime folder, where an emulated hand links its ports by default.
 
     Without one (XDG_RUNTIME_DIR, /run/user), a folder named after the user where temporary files
-    are; whether that is this user's has to be looked at: `require_own`.
+    are, or at home where another user has made that. Raises RuntimeError without a home, too.
     """
     named = os.environ.get("XDG_RUNTIME_DIR", "")
     for folder in (Path(named), Path(f"/run/user/{os.geteuid()}")):
         if folder.is_absolute() and os.access(folder, os.W_OK | os.X_OK):
             return folder / "softfinger"
+    shared = shared_folder()
+    try:
+        require_own(shared)
+    except FileNotFoundError:
+        return shared
+    except OSError:
+        return home_folder()
+    return shared
+
+
+def shared_folder() -> Path:
+    """The folder where temporary files are, which another user may have made before."""
     return Path(tempfile.gettempdir()) / f"softfinger-{os.geteuid()}"
+
+
+def home_folder() -> Path:
+    """The folder at home for want of another. Raises RuntimeError without a home."""
+    return user_cache() / "run"
 
 
 def require_own(folder: Path) -> None:

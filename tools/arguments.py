@@ -57,18 +57,15 @@ def profile(arguments: argparse.Namespace) -> Settings:
     return load(arguments.config, arguments.dir or own_runtime_folder(), arguments.set)
 
 
-def own_runtime_folder() -> Path:
-    """Return the folder where an emulated hand links its ports without ``--dir``.
-
-    Raises SettingsError when another user has made that folder.
-    """
-    folder = runtime_folder()
+def own_runtime_folder() -> Path | None:
+    """Return where an emulated hand links its ports without ``--dir``; None: nowhere of our own."""
     try:
+        folder = runtime_folder()
         require_own(folder)
     except FileNotFoundError:
-        pass
-    except OSError as error:
-        raise SettingsError(f"{folder}: {error.strerror}, or choose another by --dir") from None
+        return folder
+    except (OSError, RuntimeError):
+        return None
     return folder
 
 
@@ -180,6 +177,16 @@ def add_stream(parser: argparse.ArgumentParser) -> None:
         "--no-wait",
         action="store_true",
         help=f"end with an error when nothing arrives within {PATIENCE:g} s",
+    )
+
+
+def add_split(parser: argparse.ArgumentParser) -> None:
+    """``--split-size`` and ``--split-time``: a recorder's memory grows with its file."""
+    parser.add_argument(
+        "--split-size", type=megabytes, metavar="MB", help="begin a new file after so many MB"
+    )
+    parser.add_argument(
+        "--split-time", type=seconds, metavar="S", help="begin a new file after S seconds"
     )
 
 

@@ -19,6 +19,7 @@ from softfinger.daemon.wire import loop_link
 _ROOT = Path(__file__).parents[3]  # where the package is found
 _PATIENCE = 60.0  # s for a gateway to bind its sockets; one that ended is not waited for
 _LASTED = 10.0  # s after which a death counts as the first
+_LOOK, _LOOKS = 1.0, 2  # s between looks at a process, and how many see it stopped
 _AGAIN = 0.1, 2.0  # s between a death and the next start, at first and after many
 
 
@@ -84,7 +85,7 @@ class Gateway:
         wait, longest = _AGAIN
         while True:
             began = time.monotonic()
-            status = self._process.wait()
+            status = self._wait()
             if self._closing.is_set():
                 return
             if status != loop_link.ANEW:
@@ -111,6 +112,23 @@ class Gateway:
             if self._closing.is_set():  # while it was started
                 self._end.close()
 
+    def _wait(self) -> int:
+        """Wait for its end; one that is stopped is ended: its own timers don't run then."""
+        process, stopped = self._process, 0
+        try:
+            ended = os.pidfd_open(process.pid)
+        except OSError:  # it has ended and was waited for, or this kernel is older than 5.3
+            return process.wait()
+        try:
+            while not select.select([ended], [], [], _LOOK)[0]:
+                stopped = stopped + 1 if _is_stopped(process.pid) else 0
+                if stopped == _LOOKS:
+                    self.link.notices.append("the process that serves clients was stopped")
+                    process.kill()
+        finally:
+            os.close(ended)
+        return process.wait()
+
     def close(self) -> None:
         """Disconnect, and wait until all has been sent."""
         self._closing.set()
@@ -123,6 +141,14 @@ class Gateway:
             self._process.wait()
         if self._thread is not None:
             self._thread.join(2.0)
+
+
+def _is_stopped(process: int) -> bool:
+    try:
+        state = Path(f"/proc/{process}/stat").read_text(encoding="latin-1").rpartition(")")[2]
+    except OSError:  # it has ended
+        return False
+    return state.split()[0] in "Tt"
 
 
 def _cause(status: int) -> str:

@@ -103,6 +103,8 @@ class Daemon:
         self._closers.append(gateway.close)
         local = LocalStop(commands.address)
         self._closers.append(local.close)
+        if local.notice:
+            gateway.link.notices.append(local.notice)
         # Servos that their own watchdog has stopped are another hand than the one commanded.
         watchdog = 0.0 if self.settings.simulated else self.settings.servos.watchdog
         server = CommandServer(gateway.link, local, min(_PAUSE, watchdog or _PAUSE))

@@ -11,7 +11,6 @@ import hashlib
 import ipaddress
 import os
 import socket
-import tempfile
 from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,7 +19,7 @@ from typing import Any
 import msgpack
 
 from softfinger.daemon.errors import AddressError
-from softfinger.daemon.own_files import require_own
+from softfinger.daemon.own_files import home_folder, require_own, shared_folder
 
 _ANY = ("localhost", "*", "0.0.0.0", "[::]")  # and addresses that mean this machine, too
 _LONGEST = 4096  # bytes
@@ -29,14 +28,18 @@ _A_TICK = 4  # taken at one; the system keeps few more
 
 
 class LocalStop:
-    """The daemon's end. The socket is named after ``address``, where it takes commands."""
+    """The daemon's end. The socket is named after ``address``, where it takes commands.
+
+    ``notice`` says where it is, if not where it should be.
+    """
 
     def __init__(self, address: str) -> None:
         """Raises AddressError."""
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
         try:
-            self._path = _own_folder() / _name(address)
+            folder, self.notice = _own_folder()
+            self._path = folder / _name(address)
             _remove_dead(self._path, address)
             before = os.umask(0o177)
             try:
@@ -126,12 +129,18 @@ def _folders() -> Iterator[Path]:
             yield Path(place.split(":")[0]) / "softfinger"
     yield Path("/run/softfinger/softfinger")
     yield Path(f"/run/user/{os.geteuid()}/softfinger")
-    yield Path(tempfile.gettempdir()) / f"softfinger-{os.geteuid()}"
+    yield shared_folder()
+    with contextlib.suppress(RuntimeError):  # no home
+        folder = home_folder()
+        with contextlib.suppress(OSError):
+            folder.parent.mkdir(parents=True, exist_ok=True)
+        yield folder
 
 
-def _own_folder() -> Path:
-    """The first that can be had, made if need be. Raises OSError."""
+def _own_folder() -> tuple[Path, str]:
+    """The first that can be had, made if need be, and why none before it. Raises OSError."""
     refused: OSError | None = None
+    notice = ""
     for folder in _folders():
         try:
             folder.mkdir(mode=0o700, exist_ok=True)
@@ -139,8 +148,9 @@ def _own_folder() -> Path:
             refused = error
             continue
         if _is_ours(folder):
-            return folder
+            return folder, notice and f"{notice}; the local stop is in {folder}"
         refused = PermissionError(1, "is not this user's alone", str(folder))
+        notice = f"{folder} is not this user's alone"
     assert refused is not None
     raise refused
 

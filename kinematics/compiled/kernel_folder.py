@@ -25,7 +25,7 @@ import llvmlite.binding
 import numba
 import numpy as np
 
-from softfinger.kinematics.compiled.own_folder import OwnFolder
+from softfinger.kinematics.compiled.own_folder import OwnFolder, user_cache
 
 ROOT = Path(__file__).resolve().parents[2]  # what `softfinger.` stands for in a name
 _PACKAGES = ("kinematics", "daemon")
@@ -131,12 +131,6 @@ def is_marked(folder: OwnFolder, part: str) -> bool:
 def mark(folder: OwnFolder, part: str) -> None:
     """Mark the kernels of ``part`` as compiled. Raises OSError."""
     folder.write(part + _MARK, b"")
-
-
-def user_cache() -> Path:
-    """Return this program's cache directory of the user. Raises RuntimeError without a home."""
-    base = os.environ.get("XDG_CACHE_HOME")
-    return Path(base) / "softfinger" if base else Path.home() / ".cache" / "softfinger"
 
 
 def _prune(base: Path, current: Path) -> None:

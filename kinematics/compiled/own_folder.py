@@ -15,6 +15,12 @@ from functools import cache
 from pathlib import Path
 
 
+def user_cache() -> Path:
+    """Return this program's cache directory of the user. Raises RuntimeError without a home."""
+    base = os.environ.get("XDG_CACHE_HOME")
+    return Path(base) / "softfinger" if base else Path.home() / ".cache" / "softfinger"
+
+
 def fault(path: Path, found: os.stat_result) -> str:
     """Return why others may change what is at ``path``, of status ``found``; empty if they may not.
 

@@ -185,6 +185,17 @@ def test_a_gateway_that_hangs_ends_itself_and_a_busy_machine_ends_none(
     assert ended.returncode == status
 
 
+def test_a_gateway_that_is_stopped_is_started_anew(addresses: tuple[str, str]) -> None:
+    gateway = Gateway(Config(*addresses, GATEWAY_TOPICS, 100)).wait()
+    try:
+        stopped = gateway.process
+        os.kill(stopped, signal.SIGSTOP)
+        until(lambda: gateway.process != stopped)
+        assert "the process that serves clients was stopped" in gateway.link.notices
+    finally:
+        gateway.close()
+
+
 def test_its_memory_has_a_bound_and_it_yields_to_the_loop(addresses: tuple[str, str]) -> None:
     gateway = Gateway(Config(*addresses, GATEWAY_TOPICS, 100)).wait()
     try:

@@ -10,6 +10,7 @@ import re
 import resource
 import signal
 import subprocess
+import tracemalloc
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -450,3 +451,18 @@ def test_a_damaged_chunk_is_told_and_left_out_and_recovered(
         assert "damaged (" in inline(words[0], path, *words[1:]).stderr, words
     assert recover(path)[0] == len(read)
     assert Recording(path).check()
+
+
+def test_a_file_that_is_closed_leaves_no_memory(tmp_path: Path) -> None:
+    tracemalloc.start()
+    try:
+        before = tracemalloc.get_traced_memory()[0]
+        writer = RecordingWriter(tmp_path / "a.mcap")
+        for _ in range(2000):
+            writer.add(schema.STATS, {"timestamp": 1e9})
+            writer.flush()
+        grown = tracemalloc.get_traced_memory()[0] - before
+        writer.close()
+        assert tracemalloc.get_traced_memory()[0] - before < 0.3 * grown
+    finally:
+        tracemalloc.stop()

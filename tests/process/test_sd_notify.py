@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import select
@@ -322,3 +323,18 @@ def test_the_daemon_runs_with_every_standard_stream_closed(profile: Callable[...
     )
     done = subprocess.run(["sh", "-c", f"exec {command} <&- >&- 2>&-"], timeout=200, check=False)
     assert done.returncode == 0
+
+
+@pytest.mark.parametrize("clock", [1e30, -1e30, math.inf, math.nan])
+def test_the_log_goes_on_whatever_the_clock_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, clock: float
+) -> None:
+    log = EventLog("plain", tmp_path / "log")
+    with monkeypatch.context() as patched:
+        patched.setattr("softfinger.tools.processes.event_log.time.time", lambda: clock)
+        log.line("info", "tick", "on no day")
+    log.line("info", "tick", "on this one")
+    log.close(60.0)
+    first, second = (tmp_path / "log").read_text().splitlines()
+    assert first.endswith("tick     on no day")
+    assert second.endswith("tick     on this one")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
 
@@ -12,6 +13,8 @@ from softfinger.daemon import own_files
 from softfinger.daemon.own_files import require_own, runtime_folder, write_bytes, write_text
 from softfinger.daemon.profile.factory import save_table
 from softfinger.daemon.simulation.emulator.folder import FolderError, LinkFolder
+from softfinger.daemon.wire import local_stop
+from softfinger.daemon.wire.local_stop import LocalStop
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.table import ContactTable
@@ -146,3 +149,27 @@ def test_the_runtime_folder_is_the_users_own(
     LinkFolder(folder).close()
     require_own(folder)
     assert folder.stat().st_mode & 0o777 == 0o700
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    folder.chmod(0o777)
+    assert runtime_folder() == tmp_path / "cache" / "softfinger" / "run"
+
+
+def test_the_local_stop_goes_on_at_home_and_says_so(
+    shared: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
+) -> None:
+    home = TemporaryDirectory(prefix="softfinger-")  # short enough for a socket's address
+    request.addfinalizer(home.cleanup)
+    for name in ("XDG_RUNTIME_DIR", "RUNTIME_DIRECTORY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", home.name)
+    theirs = shared / "theirs"
+    theirs.mkdir()
+    theirs.chmod(0o777)
+    found = [theirs, *list(local_stop._folders())[-1:]]
+    monkeypatch.setattr(local_stop, "_folders", lambda: iter(found))
+    local = LocalStop("tcp://127.0.0.1:9873")
+    try:
+        assert local.notice.startswith(f"{theirs} is not this user's alone; the local stop is in ")
+        assert list(found[1].iterdir())
+    finally:
+        local.close()

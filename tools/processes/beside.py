@@ -15,7 +15,6 @@ import termios
 import threading
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 from softfinger.daemon.errors import SoftfingerError
@@ -112,15 +111,14 @@ class MonitorBeside:
 
 
 class RecorderBeside:
-    """A recording of everything that ``address`` publishes, from the first message on.
+    """A recording by ``record`` with these ``words``, the first of which is its file.
 
     ``failed`` once it is known to be incomplete.
     """
 
     def __init__(
         self,
-        path: Path,
-        address: str,
+        words: list[str],
         subscribed: Callable[[], bool],
         on_end: Callable[[str], None],
         keys: str = "",
@@ -130,14 +128,14 @@ class RecorderBeside:
         ``on_end`` is called from a thread, with the reason, when the recorder ends before `close`.
         """
         self.failed = False
-        self._path = path
+        self._path = words[0]
         self._on_end = on_end
         self._closing = False
         self._said = ""
         self._lifeline = _Lifeline()
         # A session of its own: Ctrl-C is for the daemon, whose last messages are recorded too.
         self._process = self._lifeline.start(
-            ["record", str(path), "--topics", "all", "--address", address],
+            ["record", *words],
             keys,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,

@@ -160,6 +160,8 @@ def _ids(text: str) -> tuple[int, ...]:
 def run(arguments: argparse.Namespace) -> int:
     """Emulate until SIGINT, SIGTERM or SIGHUP; 1 with one line when it can't be set up."""
     arguments.dir = arguments.dir or own_runtime_folder()
+    if arguments.dir is None:
+        raise SettingsError("no folder of this user's own for the ports: name one by --dir")
     if arguments.send is not None:
         return _send(arguments.dir, arguments.send)
     if arguments.model is not None:

@@ -94,12 +94,20 @@ class EventLog:
             shown = f"{level:7} {kind:8} {text}"
             if not self._journal:  # which has the time of each line by itself
                 date = "%H:%M:%S" if self._file is None else "%Y-%m-%d %H:%M:%S"
-                clock = time.strftime(date, time.localtime(timestamp))
-                shown = f"{clock}.{int(timestamp % 1.0 * 1e3):03} {shown}"
+                shown = f"{_clock(date, timestamp)} {shown}"
         if self._journal:
             priority = _PRIORITIES[level]
             shown = priority + shown.replace("\n", f"\n{priority}")
         return shown
+
+
+def _clock(date: str, timestamp: float) -> str:
+    """The time of day, or the seconds of a clock that is none."""
+    try:
+        clock = time.strftime(date, time.localtime(timestamp))
+    except (OverflowError, OSError, ValueError):
+        return f"{timestamp:g}"
+    return f"{clock}.{int(timestamp % 1.0 * 1e3):03}"
 
 
 def _is_journal() -> bool:

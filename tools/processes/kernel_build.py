@@ -20,7 +20,8 @@ from typing import IO, Any, NamedTuple
 from softfinger.daemon.loop.warm_up import Part, WantedScene, is_built, mark_built, named, parts
 from softfinger.daemon.profile.settings import Settings
 from softfinger.kinematics.compiled.kernel import why_plain
-from softfinger.kinematics.compiled.kernel_folder import kernel_folder, remove_damaged, user_cache
+from softfinger.kinematics.compiled.kernel_folder import kernel_folder, remove_damaged
+from softfinger.kinematics.compiled.own_folder import user_cache
 from softfinger.tools.terminal.progress import Progress
 
 Tell = Callable[[str, str, str], None]

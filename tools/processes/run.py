@@ -16,7 +16,7 @@ from softfinger.daemon.errors import SettingsError, SoftfingerError
 from softfinger.daemon.loop.realtime import Service
 from softfinger.daemon.profile.settings import Settings, TaskSettings
 from softfinger.daemon.types import State
-from softfinger.tools.arguments import add_profile, profile, seconds
+from softfinger.tools.arguments import add_profile, add_split, profile, seconds
 from softfinger.tools.ending import Interrupted, Signals
 from softfinger.tools.processes.beside import MonitorBeside, NoRecorder, RecorderBeside
 from softfinger.tools.processes.event_log import EventLog
@@ -45,6 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE.mcap",
         help="record everything from the first tick on (extra 'record')",
     )
+    add_split(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -112,7 +113,7 @@ def _serve(
         recording: Any = nullcontext()
         if arguments.record is not None:
             try:
-                recording = _record(arguments.record, settings, daemon)
+                recording = _record(arguments, settings, daemon)
             except NoRecorder as error:
                 log.plain(f"softfinger: {error}")
                 return 1
@@ -156,7 +157,7 @@ def _service(loop: Any) -> Iterator[None]:
         service.close()
 
 
-def _record(path: Path, settings: Settings, daemon: Any) -> Any:
+def _record(arguments: argparse.Namespace, settings: Settings, daemon: Any) -> Any:
     """A recorder that has subscribed to everything. Raises NoRecorder."""
     from softfinger.daemon.wire import schema
     from softfinger.daemon.wire.publisher import bit
@@ -168,7 +169,11 @@ def _record(path: Path, settings: Settings, daemon: Any) -> Any:
     def ended(why: str) -> None:
         daemon.loop.report("error", "record", why)
 
-    return RecorderBeside(path, settings.stream.address, subscribed, ended, settings.access.keys)
+    words = [str(arguments.record), "--topics", "all", "--address", settings.stream.address]
+    for name in ("split_size", "split_time"):
+        if (value := getattr(arguments, name)) is not None:
+            words += [f"--{name.replace('_', '-')}", str(value)]
+    return RecorderBeside(words, subscribed, ended, settings.access.keys)
 
 
 def _page(settings: Settings, loop: Any) -> AbstractContextManager[Any]:

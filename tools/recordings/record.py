@@ -18,9 +18,9 @@ from softfinger.tools.arguments import (
     ALL,
     PATIENCE,
     add_range,
+    add_split,
     add_stream,
     client_keys,
-    megabytes,
     no_stream,
     seconds,
     to_stderr,
@@ -60,12 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="TOPIC",
         help="as state or hand/state, or all (default: all but input, each tick's inputs)",
     )
-    parser.add_argument(
-        "--split-size", type=megabytes, metavar="MB", help="begin a new file after so many MB"
-    )
-    parser.add_argument(
-        "--split-time", type=seconds, metavar="S", help="begin a new file after S seconds"
-    )
+    add_split(parser)
     parser.add_argument("--lifeline", type=int, help=argparse.SUPPRESS)  # ends when it closes
     parser.add_argument(
         "--recover", action="store_true", help="repair a FILE that was cut short; record nothing"

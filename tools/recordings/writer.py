@@ -103,6 +103,7 @@ class RecordingWriter:
             self._mcap.finish()  # type: ignore[no-untyped-call]
             self._wrote()
             self._file.close()
+            del self._mcap  # with the index of all its chunks, by far the most of its memory
         except OSError as error:
             raise self._failed(error) from None
 

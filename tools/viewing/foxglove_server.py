@@ -1,4 +1,4 @@
-"""The stream for Foxglove: its WebSocket server, by the ``foxglove-sdk``, on the loopback.
+"""The stream for Foxglove: its WebSocket server, by the ``foxglove-sdk``, behind a `Door`.
 
 Channels have the names and fields of recordings (`tools.recordings.channels`), so that one layout
 shows both; ``hand/scene``, the moving hand, is made here. What nobody subscribes to isn't packed.
@@ -27,6 +27,7 @@ from softfinger.tools.ending import Ending
 from softfinger.tools.recordings.channels import schema_of
 from softfinger.tools.terminal.feed import number, text
 from softfinger.tools.viewing import planar
+from softfinger.tools.viewing.door import Door, hidden_host
 from softfinger.tools.viewing.live_stream import LOOPBACK, NICE, Viewer, ViewError, follow
 from softfinger.tools.viewing.planar import Colour
 
@@ -52,15 +53,22 @@ class FoxgloveServer(Viewer):
             for name in FINGERS
         }
         self._events: deque[dict[str, Any]] = deque(maxlen=_EVENTS)
+        host = hidden_host()
         try:
             self._server = foxglove.start_server(
-                name="softfinger", host=LOOPBACK, port=port, context=context
+                name="softfinger", host=host, port=0, context=context
             )
         except RuntimeError as error:
-            raise ViewError(f"port {port}: {error}") from None
-        self.address = f"ws://{LOOPBACK}:{self._server.port}"
+            raise ViewError(f"Foxglove's server: {error}") from None
+        try:
+            self._door = Door(port, (host, self._server.port))
+        except OSError as error:
+            self._server.stop()
+            raise ViewError(f"port {port}: {error.strerror}") from None
+        self.address = f"ws://{LOOPBACK}:{self._door.port}"
 
     def close(self) -> None:
+        self._door.close()
         self._server.stop()
 
     def take(self, topic: bytes, message: Any) -> bool:
