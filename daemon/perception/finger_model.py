@@ -187,7 +187,7 @@ def uncertainty(settings: Settings, calibration: Calibration | None) -> Uncertai
     """Return the uncertainties that frames don't show, by settings or calibration."""
     tactile = settings.tactile
     baseline, centre, pitch = tactile.baseline_error, tactile.centre_error, tactile.pitch_error
-    modulus, correlation = settings.material.modulus_error, None
+    modulus, correlation, gain = settings.material.modulus_error, None, tactile.gain_error
     if calibration is not None:
         tare, place = calibration.tare, calibration.centre
         if tare is not None and tare.correlation:
@@ -200,4 +200,18 @@ def uncertainty(settings: Settings, calibration: Calibration | None) -> Uncertai
             pitch = max(pitch, abs(place.scale - 1.0))
         if calibration.modulus is not None:
             modulus = max(modulus, calibration.modulus.residual)
-    return Uncertainty(baseline, centre, pitch, modulus, correlation)
+        if calibration.scales is not None:
+            gain = calibration.scales.gain[1]
+    return Uncertainty(
+        baseline,
+        centre,
+        pitch,
+        modulus,
+        correlation,
+        slope=tactile.slope_error,
+        gain=gain,
+        smooth=tactile.smooth_error,
+        rotation=tactile.rotation_error,
+        radius=settings.tip.radius_error,
+        skew=tactile.skew_error,
+    )

@@ -103,6 +103,7 @@ class TipSettings(Section):
     """
 
     radius: Length = 0.020  # m
+    radius_error: Annotated[float, Field(ge=0, le=0.1)] = 0.0  # relative, standard deviation
     physics: Literal["springs", "solid", "measured"] = "springs"  # the contact model
     poisson: Annotated[float, Field(ge=0.45, le=0.4995)] = 0.49  # of a solid tip
     base: Literal["bonded", "lying"] = "bonded"  # a solid tip on its sensor
@@ -167,8 +168,14 @@ class TactileSettings(Section):
     rate: Rate = 100.0  # frames a second that are expected
     noise: Positive = 1520.0  # Pa a cell, standard deviation (0.5 % of 0.304 MPa)
     baseline_error: NonNegative = 0.0  # Pa, likewise of a shift of all cells since the tare
+    slope_error: NonNegative = 0.0  # Pa, of the same from the tip's middle to its rim, x and y
     centre_error: Annotated[float, Field(ge=0, le=0.01)] = 0.0  # m, of the tip's centre, x and y
     pitch_error: Annotated[float, Field(ge=0, le=0.1)] = 0.0  # relative
+    rotation_error: Annotated[float, Field(ge=0, le=0.5)] = 0.0  # rad, of the sensor about the tip
+    skew_error: Annotated[float, Field(ge=0, le=0.01)] = 0.0  # m that a face goes during a scan
+    # What neighbours share, of the pressure: crosstalk is below 3.3 % with a good read-out (arXiv
+    # 2508.20959), linearity ± 3 % (FlexiForce's manual).
+    smooth_error: Annotated[float, Field(ge=0, le=1)] = 0.03
     gain_error: Annotated[float, Field(gt=0, le=1)] = 0.25  # relative, likewise of all cells alike
     latency: Delay = 0.005  # s from the middle of a scan to the first byte on the wire
     response: Delay = 0.0  # s, first-order lag of the cells, made up for by the joints

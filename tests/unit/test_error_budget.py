@@ -205,3 +205,95 @@ def test_a_law_off_its_points_widens_what_it_says() -> None:
 def test_refusals(wrong: dict[str, float]) -> None:
     with pytest.raises(ValueError, match="must"):
         Uncertainty(**wrong)
+
+
+Imperfection = Callable[[Fingertip, float, float, float, float], np.ndarray]
+X, Y = np.meshgrid(*2 * (PITCH * (np.arange(44) - 21.5),))
+FLAT = SensorGrid(44, 44, PITCH)
+
+
+def pressed(
+    tip: Fingertip, d: float, x: float, y: float, grid: SensorGrid = FLAT, radius: float = 0.020
+) -> np.ndarray:
+    return grid.pressure(replace(tip, radius=radius), LINEAR, d, x, y)
+
+
+def unloading(tip: Fingertip, d: float, x: float, y: float, sign: float) -> np.ndarray:
+    """Off by up to 10 % of what each cell read at a depth of 1.3 d."""
+    loaded = np.maximum(pressed(tip, 1.3 * d, x, y), 1e-9)
+    strain = np.clip(pressed(tip, d, x, y) / loaded, 0.0, 1.0)
+    return pressed(tip, d, x, y) + sign * 0.4 * loaded * strain * (1.0 - strain)
+
+
+def crosstalk(tip: Fingertip, d: float, x: float, y: float, sign: float) -> np.ndarray:
+    frame = pressed(tip, d, x, y)
+    return frame + sign * 0.03 * (frame.mean(axis=0) + frame.mean(axis=1)[:, None])
+
+
+def power(tip: Fingertip, d: float, x: float, y: float, sign: float) -> np.ndarray:
+    frame = pressed(tip, d, x, y) / 50e3
+    return 50e3 * np.sign(frame) * np.abs(frame) ** (1.0 + 0.08 * sign)
+
+
+def scanned(tip: Fingertip, d: float, x: float, y: float, sign: float) -> np.ndarray:
+    """Rows one after the other, while the face goes 0.2 mm."""
+    rows = [pressed(tip, d + sign * 2e-4 * (k - 21.5) / 44, x, y)[k] for k in range(44)]
+    return np.stack(rows)
+
+
+# What real cells have and a sensor's model lacks, and what has to be known for it.
+IMPERFECTIONS: dict[str, tuple[Uncertainty, Imperfection]] = {
+    "unloading": (Uncertainty(gain=0.1, smooth=0.04), unloading),
+    "crosstalk": (Uncertainty(gain=0.02, smooth=0.01), crosstalk),
+    "power": (Uncertainty(gain=0.2, smooth=0.03), power),
+    "rotation": (
+        Uncertainty(rotation=math.radians(2.0)),
+        lambda tip, d, x, y, sign: pressed(
+            tip, d, x, y, replace(FLAT, rotation=sign * math.radians(2.0))
+        ),
+    ),
+    "slope": (
+        Uncertainty(slope=1000.0),
+        lambda tip, d, x, y, sign: pressed(tip, d, x, y) + sign * 5e4 * (X + Y),
+    ),
+    "scan": (Uncertainty(skew=2e-4), scanned),
+    "radius": (
+        Uncertainty(radius=0.02),
+        lambda tip, d, x, y, sign: pressed(tip, d, x, y, radius=0.020 * (1.0 + 0.02 * sign)),
+    ),
+    "gain": (
+        Uncertainty(gain=0.12),
+        lambda tip, d, x, y, sign: pressed(tip, d, x, y) * (1.0 + 0.12 * sign),
+    ),
+}
+
+
+def worst_nees(known: Uncertainty, tip: Fingertip, imperfect: Imperfection) -> float:
+    """Return the largest mean NEES of (d, tilts) at 0.5 to 7 mm, where no misfit is flagged."""
+    estimator = ContactEstimator(tip, LINEAR, FLAT, NOISE, known=known)
+    rng, worst = np.random.default_rng(3), 0.0
+    for d in (0.5e-3, 1e-3, 2e-3, 4e-3, 6e-3):
+        squares = []
+        for azimuth in (0.3, 1.9, 3.6, 5.2):
+            n = math.sin(0.26) * np.array([math.cos(azimuth), math.sin(azimuth)])
+            truth = np.array([d, *np.arcsin(n)])
+            for sign in (-1.0, 1.0):
+                frame = imperfect(tip, *truth, sign)
+                for _ in range(4):
+                    e = estimator(frame + rng.normal(0.0, NOISE, frame.shape))
+                    if e.valid and not e.misfit:
+                        error = np.array([e.d, e.tilt_x, e.tilt_y]) - truth
+                        squares.append(error @ np.linalg.solve(e.covariance[:3, :3], error) / 3.0)
+        if len(squares) > 16:  # else flagged
+            worst = max(worst, float(np.mean(squares)))
+    return worst
+
+
+@pytest.mark.parametrize("physics", ["springs", "solid"])
+@pytest.mark.parametrize("name", IMPERFECTIONS)
+def test_imperfections_of_real_cells_are_covered_or_flagged(name: str, physics: str) -> None:
+    known, imperfect = IMPERFECTIONS[name]
+    tip = Fingertip(0.020, physics)  # type: ignore[arg-type]
+    assert 0.7 < worst_nees(known, tip, imperfect) < 1.5
+    if (name, physics) not in (("gain", "springs"), ("slope", "solid")):  # which take no harm
+        assert worst_nees(Uncertainty(), tip, imperfect) > 5.0
