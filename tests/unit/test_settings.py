@@ -58,7 +58,7 @@ def test_an_unknown_name_is_told_with_the_known_ones() -> None:
         load(Path("hill"))
     assert str(caught.value) == (
         "hill: found no such profile, expected the path of a file or one of "
-        "demo, hil, paper, sim, small, solid"
+        "capacitive, demo, hil, paper, sim, small, solid, velostat"
     )
 
 
