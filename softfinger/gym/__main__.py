@@ -1,4 +1,7 @@
-"""``python -m softfinger.gym``: what a random agent and the built-in law get in each task."""
+"""What a random agent and the built-in law get in each task.
+
+``python -m softfinger.gym [EPISODES [PROFILE]]``
+"""
 
 from __future__ import annotations
 
@@ -17,13 +20,13 @@ from softfinger.gym.environment import ANGLE, FORCE, FORCES, Observation
 Policy = Callable[[Observation], NDArray[np.float32]]
 
 
-def main(episodes: int) -> None:
+def main(episodes: int = 20, profile: str = "sim") -> None:
     """Print a line for each task and agent; the seeds are 0 to ``episodes`` - 1."""
     print(f"{'task':8}{'agent':8}return of {SECONDS / STEP:.0f} steps      x real time")
     for task in TASKS:
         name = f"SoftFinger-{task.capitalize()}-v0"
         for agent, control in (("random", "joints"), ("law", "law")):
-            env = gymnasium.make(name, control=control)
+            env = gymnasium.make(name, control=control, profile=profile)
             policy = by_law if agent == "law" else at_random(env)
             began = time.perf_counter()
             returns = [episode(env, policy, seed) for seed in range(episodes)]
@@ -59,4 +62,4 @@ def by_law(observation: Observation) -> NDArray[np.float32]:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 20)
+    main(*(convert(word) for convert, word in zip((int, str), sys.argv[1:], strict=False)))

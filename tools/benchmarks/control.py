@@ -1,8 +1,9 @@
 """The error that each grip law leaves of the angle at which an object was put between the fingers.
 
 Judged by the plant's truth, not by the daemon's estimates, over plants that differ from the
-settings. On virtual time: nothing here depends on the machine's speed. Beside the daemon's laws
-stands one of the literature, equal torques: the law upright without its spring and dither.
+settings. The sensor is the ideal one, or one of those with flaws. On virtual time: nothing here
+depends on the machine's speed. Beside the daemon's laws stands one of the literature, equal
+torques: the law upright without its spring and dither.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from softfinger.tools.benchmarks.measuring import Report, figure
-from softfinger.tools.benchmarks.rigs import SOLID, Sections, merged
+from softfinger.tools.benchmarks.rigs import SENSORS, SOLID, Sections, merged
 from softfinger.tools.watched import Watched
 
 _FORCE = 10.0  # N
@@ -33,6 +34,7 @@ WAYS: dict[str, tuple[dict[str, Any], Sections, float | None]] = {
     "upright (blind)": ({"law": "upright"}, {}, 0.5),
     "upright, tips that relax": ({"law": "upright"}, _RELAXING, 0.5),
     "upright, solid tips": ({"law": "upright"}, SOLID, 0.5),
+    **{f"{_STEERED}, {sensor}": ({}, flaws, 1.0) for sensor, flaws in SENSORS.items()},
 }
 
 
@@ -57,7 +59,7 @@ def measure(brief: bool = False) -> list[Report]:
             with Watched(merged({"simulation": draw, "control": law}, tips)) as hand:
                 hand.grasp(_FORCE)
                 hand.run(_FOUND - 2.0)
-                if name == _STEERED:
+                if name.startswith(_STEERED):
                     hand.command("rotate", angle=0.0)
                 hand.run(2.0)
                 left.append(math.degrees(abs(float(hand.plant.object_pose[2]))))

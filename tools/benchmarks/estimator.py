@@ -2,7 +2,8 @@
 
 All of one run, in turns, over the same frames: 44 × 44 cells on 58 mm, d = 4 mm, a tilt of 15°,
 0.2 % of the modulus as noise. "kernel" is the compiled entry called by compiled code, "call" the
-Python call of the control loop. Errors are RMS over these frames.
+Python call of the control loop. Errors are RMS over these frames; "sensor" rows have those of a
+profile's own cells, pressed so for a second.
 """
 
 from __future__ import annotations
@@ -14,7 +15,11 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from softfinger.daemon.perception.finger_model import make_estimator
+from softfinger.daemon.profile.factory import make_material
+from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.emulator.tactile_board import ENCODERS
+from softfinger.daemon.simulation.sensor.simulated_tactile import make_sensor_model
 from softfinger.daemon.tactile.cobs import CobsDecoder
 from softfinger.kinematics.compiled.kernel import kernel
 from softfinger.kinematics.compiled.layout import Records
@@ -26,6 +31,7 @@ from softfinger.kinematics.estimation.solid_projection import SolidFit
 from softfinger.kinematics.estimation.state import EstimatorState
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from softfinger.tools.benchmarks.measuring import Report, Subject, each, figure, interleave
+from softfinger.tools.benchmarks.rigs import SENSORS
 
 FloatArray = NDArray[np.float64]
 Truth: TypeAlias = tuple[float, float, float]  # d [m], tilt_x, tilt_y [rad]
@@ -53,10 +59,12 @@ class Timed:
     @property
     def errors(self) -> dict[str, float]:
         """RMS of d and of the tilts."""
-        if self.found is None:
-            return {}
-        rms = np.sqrt(np.mean((self.found - np.array(self.truth)) ** 2, axis=0))
-        return {ERROR: 1e6 * float(rms[0]), "of tilts [°]": math.degrees(math.hypot(*rms[1:]))}
+        return {} if self.found is None else _errors(self.found, self.truth)
+
+
+def _errors(found: FloatArray, truth: Truth) -> dict[str, float]:
+    rms = np.sqrt(np.mean((found - np.array(truth)) ** 2, axis=0))
+    return {ERROR: 1e6 * float(rms[0]), "of tilts [°]": math.degrees(math.hypot(*rms[1:]))}
 
 
 def tilts(theta: float, azimuth: float) -> tuple[float, float]:
@@ -94,7 +102,23 @@ def measure(brief: bool = False, rounds: int = 25) -> list[Report]:
     ]
     sigma = np.sqrt(np.diag(bound(jacobian(GRID, (*TRUTH, 1.0)), NOISE)))
     rows.append({"name": "Cramér-Rao bound", ERROR: 1e6 * float(sigma[0])})
+    for sensor, flaws in {"ideal": {}, **SENSORS}.items():
+        errors = _errors_of(Settings.model_validate(flaws))
+        rows.append({"name": f"ml: sensor {sensor}", **errors})
     return [Report("frame to contact", rows, ERROR)]
+
+
+def _errors_of(settings: Settings) -> dict[str, float]:
+    """Errors on the frames of a profile's sensor."""
+    model = make_sensor_model(settings, 0)
+    estimator = make_estimator(settings, make_material(settings.material))
+    counts = np.zeros(model.grid.shape, np.uint16)
+    found = []
+    for k in range(round(settings.tactile.rate) + _FRAMES):
+        model.frame(*TRUTH, counts, k / settings.tactile.rate)
+        estimate = estimator.update(counts, settings.tactile.pascal_per_count)
+        found.append((estimate.d, estimate.tilt_x, estimate.tilt_y))
+    return _errors(np.array(found[-_FRAMES:]), TRUTH)
 
 
 def jacobian(grid: SensorGrid, truth: tuple[float, float, float, float]) -> FloatArray:

@@ -19,10 +19,10 @@ from typing import NamedTuple
 
 from softfinger.daemon.control.modes import GRIPPING
 from softfinger.tools.benchmarks.measuring import Report, Row, figure
-from softfinger.tools.benchmarks.rigs import SOLID, Sections, merged
+from softfinger.tools.benchmarks.rigs import SENSORS, SOLID, Sections, merged
 from softfinger.tools.benchmarks.virtual_grip import VirtualGrip
 
-TIPS: dict[str, Sections] = {"springs": {}, "solid": SOLID}
+TIPS: dict[str, Sections] = {"springs": {}, "solid": SOLID, **SENSORS}  # sensors: on springs
 MASSES = (0.1, 0.5, 2.0)  # kg
 STANDING = (0.0, 3.0, 6.0, 8.0, 9.0)  # N
 OVERLOADS = (12.5, 13.0, 14.0, 15.0, 16.0, 18.0)  # N; the tips' friction bears 12 N of 10 N
@@ -30,7 +30,7 @@ THIN = (0.0, 6.0, 9.0), (13.0, 15.0, 18.0)  # of these, unless all are wanted
 _FORCE = 10.0  # N
 _TRIALS = 3  # of each
 _ANSWER, _SAID = 22.0, 200.0  # ms, aims
-_GRIP = 2.5  # s until it holds, at most
+_GRIP = 5.0  # s until it holds, at most
 _RISES, _STANDS = 1.0, 1.5  # s in which the standing load comes, and stays
 _STEPS = 50  # in which it comes
 _LOOK = 1.0  # s of the greater one
@@ -47,7 +47,7 @@ class Overload(NamedTuple):
 
 
 def measure(brief: bool = False, full: bool = False) -> list[Report]:
-    """Return a table for each kind of tips and mass; ``brief``: one trial of the greatest loads."""
+    """Return a table for each kind of tips, or sensor, and mass; ``brief``: greatest loads alone."""
     loads = list(itertools.product(STANDING, OVERLOADS) if full else itertools.product(*THIN))
     trials = _TRIALS
     if brief:

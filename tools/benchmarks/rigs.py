@@ -40,6 +40,9 @@ SOLID: Sections = {  # tips of solid rubber
     "material": {"law": "constant", "modulus": 0.15e6},
     "safety": {"d_max": 0.008},
 }
+SENSORS: dict[str, Sections] = {  # with flaws; the ideal one has noise alone
+    name: load(Path(name)).model_dump(exclude_unset=True) for name in ("velostat", "capacitive")
+}
 SOFTFINGER = (sys.executable, "-m", "softfinger")
 _KEPT = 16  # frames that take turns
 _PATIENCE = 120.0  # s for a process to be ready: kernels may be new
