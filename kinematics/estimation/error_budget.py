@@ -6,14 +6,19 @@ With J the Jacobian by (gain, u, v, w), JᵀJ = L Lᵀ, white noise of σ² leav
     shared error q     m mᵀ,   m = size (JᵀJ)⁻¹ Jᵀq                              (`systematic`)
       of second order  (0.7 d Δ²)² + (0.8 d ω²)² + (1.6 ω² d²/a)² in d, … (`add_second_order`)
       it leaves        Σ size² qᵀq − m·(size Jᵀq)
+    smooth error       (JᵀJ)⁻¹ smooth² Σ p²/5, p the model's pressures       (`systematic`)
+    radius             m of the pitch, and d size in depth                       (`deepen`)
+    rotation, scan     (n × z) rotation, and in w the way over the rows' length    (`turn`)
     smooth misfit      Σ r_k r_(k−1) − n ρ₁ σ² − decrement             (`undetected_misfit`)
 
 C is the noise's correlation by lag, as `calibrate` measures it: K, the ``variance_factor``, depends
 on the footprint's size beside the correlation's and is tabulated over d. The q are images of what
-is the same in every frame: a shift of all cells, the tip's centre in x and y, the pitch, and the
-modulus, ``size`` their standard deviations; Δ is m's part in depth over d, ω² = ``rotated`` its
-rotation squared. r_k are the residuals of the packed cells: single cells' noise adds nothing to
-the product of neighbours on average, a misfit that is smooth over the footprint all of it.
+is the same in every frame: a shift of all cells, its slopes in x and y, the tip's centre in x and
+y, the pitch, and the modulus or gain, ``size`` their standard deviations; Δ is m's part in depth
+over d, ω² = ``rotated`` its rotation squared. An error that is smooth over the footprint, of any
+shape, has about five directions, of which J's are four. r_k are the residuals of the packed cells:
+single cells' noise adds nothing to the product of neighbours on average, a misfit that is smooth
+over the footprint all of it.
 
 Kernels that take ``solid`` first depend on the tip: those here are of springs, and `solid_budget`
 has a solid tip's, of which a scene compiles the ones it needs.

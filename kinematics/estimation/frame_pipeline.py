@@ -43,7 +43,7 @@ GAIN_FAR = 2.0
 # zero. A solid tip's contact, that presses all of them, has 5 % of them below 0.32 of its peak.
 ABOVE_MOST, ABOVE_NOISE, ABOVE_PEAK = 0.95, 3.0, 0.4
 FULL_MOST = 0.5  # full cells of those above half of the peak, which leave no shape to fit
-ZERO_MAX = 0.2  # known error of the cells' zeros over the peak: beyond, none of it is straight
+ZERO_MAX = 0.22  # known error of the cells' zeros over the peak: beyond, none of it is straight
 SHARED_MAX = 0.5  # standard deviation of d by known uncertainties, over d: beyond, it's anything
 
 

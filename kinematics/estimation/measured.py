@@ -47,6 +47,7 @@ class MeasuredFit(Record):
     rest: Sums
     noise: Covariance  # of the sums
     shift: Sums  # the sums of all cells' common error, one standard deviation
+    zero_moment: float  # of a slope of the cells' zeros [N·m], likewise
     gain: float  # relative, of all cells alike, one standard deviation
     rotation_error: float  # of the sensor since the curves were measured [rad], likewise
     place: float  # of the tip's place since then [m], likewise
@@ -240,7 +241,7 @@ def _set_covariance(fit: MeasuredFit, t: float, s: float, c_x: float, c_y: float
     for i in range(3):
         for j in range(3):
             fit.shared[i, j] = fit.along[i] * fit.along[j] + grown[i] * grown[j]
-        fit.shared[i, i] += (missed[i] * shown) ** 2
+        fit.shared[i, i] += (missed[i] * shown) ** 2 + (fit.zero_moment**2 if i > 0 else 0.0)
     fit.errors[:] = fit.random + fit.shared
     _between(fit, fit.jacobian, fit.errors, fit.covariance)
     variance = fit.covariance[1, 1]
@@ -285,7 +286,7 @@ class MeasuredEstimator:
     """`ContactEstimator` for a tip whose ``physics`` is "measured". Each frame stands alone.
 
     ``grid`` has the tip where the law found it. ``active`` [rows, cols] bool masks dead cells;
-    ``known`` are the sensor's other uncertainties: the baseline, and gain, centre and rotation
+    ``known`` are the sensor's other uncertainties: baseline, slope, and gain, centre and rotation
     since the curves were measured. An estimate is ``valid`` where the curves were
     measured, and where the frame's extent is within 8 % of what its force says. Raises ValueError
     for arguments out of their range.
@@ -313,6 +314,7 @@ class MeasuredEstimator:
             setattr(fit, name, np.array(getattr(law, name)))
         if known is not None:
             fit.shift = known.baseline * self._weights.sum(axis=1)
+            fit.zero_moment = known.slope / tip.radius * 0.5 * self._weights[3].sum()
             fit.gain, fit.rotation_error, fit.place = known.gain, known.rotation, known.centre
         self._frame = np.zeros(grid.shape)
         self._seq: int | None = None

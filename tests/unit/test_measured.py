@@ -80,6 +80,24 @@ def test_a_contact_that_is_not_felt_is_within_what_could_hide(law: TipCurves, pu
     assert found.contact or d < found.d_std < 1.5 * d * (5.0 / push) ** 0.6
 
 
+@pytest.mark.parametrize("name", ["gain", "slope"])
+@pytest.mark.parametrize("d", [1.5e-3, 4e-3])
+def test_what_is_known_of_the_cells_is_in_the_errors(law: TipCurves, name: str, d: float) -> None:
+    placed = replace(GRID, centre=law.centre, rotation=law.rotation)
+    known = {"gain": Uncertainty(gain=0.12), "slope": Uncertainty(slope=500.0)}[name]
+    estimator = MeasuredEstimator(Fingertip(A, "measured", law=law), placed, known=known)
+    off_by, theta = [], math.radians(10.0)
+    x = GRID.pitches[0] * (np.arange(32) - 15.5)
+    for sign in (-1.0, 1.0):
+        frame = weird(d, theta)
+        frame = frame * (1.0 + 0.12 * sign) if name == "gain" else frame + 500.0 * sign * x / A
+        found = estimator(frame)
+        assert found.valid
+        off = np.array([found.d - d, found.tilt_x - theta, found.tilt_y])
+        off_by.append(np.abs(off) / np.sqrt(found.covariance.diagonal()[:3]))
+    assert 0.5 < np.max(off_by) < 1.5
+
+
 def test_the_estimator_of_a_model_names_that_of_a_measured_tip(law: TipCurves) -> None:
     with pytest.raises(ValueError, match="MeasuredEstimator"):
         ContactEstimator(Fingertip(A, "measured", law=law), Material.constant(1.0), GRID, NOISE)
