@@ -57,8 +57,7 @@ def test_an_unknown_name_is_told_with_the_known_ones() -> None:
     with pytest.raises(SettingsError) as caught:
         load(Path("hill"))
     assert str(caught.value) == (
-        "hill: found no such profile, expected the path of a file or one of "
-        "capacitive, demo, hil, paper, sim, small, solid, velostat"
+        f"hill: found no such profile, expected the path of a file or one of {', '.join(names())}"
     )
 
 
