@@ -1,4 +1,4 @@
-"""What a random agent and the built-in law get in each task.
+"""Returns of a random agent and of the built-in law in each task.
 
 ``python -m softfinger.gym [EPISODES [PROFILE]]``
 """
