@@ -295,7 +295,8 @@ def test_clients_load_nothing_of_the_daemon(code: str, absent: set[str]) -> None
     )
     loaded = set(done.stdout.split())
     assert "softfinger.daemon.client.command_client" in loaded
-    assert not loaded & {"numba", "softfinger.kinematics", "softfinger.daemon.loop", *absent}
+    kernels = "softfinger.kinematics.compiled.kernel"
+    assert not loaded & {"numba", kernels, "softfinger.daemon.loop", *absent}
 
 
 def _face(cls: type) -> dict[str, object]:
