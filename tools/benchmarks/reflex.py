@@ -47,7 +47,7 @@ class Overload(NamedTuple):
 
 
 def measure(brief: bool = False, full: bool = False) -> list[Report]:
-    """Return a table for each kind of tips, or sensor, and mass; ``brief``: greatest loads alone."""
+    """Return a table for each kind of tips, or sensor, and mass; ``brief``: a few of them."""
     loads = list(itertools.product(STANDING, OVERLOADS) if full else itertools.product(*THIN))
     trials = _TRIALS
     if brief:

@@ -103,7 +103,7 @@ class Newest:
                 await page.send_text(picture)
 
 
-class Commands:
+class PageCommands:
     """Hands on, once, what pages with the ``token`` ask of the daemon. None: nobody may."""
 
     def __init__(self, address: str, keys: ClientKeys | None, token: str | None) -> None:
@@ -169,7 +169,7 @@ def show(arguments: argparse.Namespace, ending: Ending) -> None:
         role = "play"
         playback = Playback(recording, pictures, 1.0 / arguments.rate)
         source = partial(playback.run, ending)
-    commands = Commands(arguments.commands, keys, token)
+    commands = PageCommands(arguments.commands, keys, token)
 
     def page(request: Request) -> HTMLResponse:
         shown = role if token is None or commands.allows(request) else "watch"
