@@ -42,7 +42,7 @@ def _written_by_others(path: Path, found: os.stat_result) -> str:
 
 @cache
 def _alone_in(group: int) -> bool:
-    """Return whether a group is this user's private one: of its name, and with nobody else in it."""
+    """Return whether a group is this user's private one: of its name, with nobody else in it."""
     try:
         found, user = grp.getgrgid(group), pwd.getpwuid(os.geteuid()).pw_name
     except KeyError:

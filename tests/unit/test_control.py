@@ -276,7 +276,8 @@ def test_a_known_load_raises_the_grip_within_its_bound() -> None:
 def test_prediction_is_within_its_own_uncertainty_in_motion(
     sections: dict[str, dict[str, Any]],
 ) -> None:
-    with daemon(sections) as built:
+    tactile = sections.get("tactile", {}) | {"smooth_error": 0.0}  # of an ideal sensor
+    with daemon(sections | {"tactile": tactile}) as built:
         loop, hand = built.loop, built.hand
         assert hand is not None
         loop.advance(0.3)

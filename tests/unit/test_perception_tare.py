@@ -47,7 +47,12 @@ class Given:
 def settings(**tactile: object) -> Settings:
     made = Settings.model_validate(
         {
-            "tactile": {"full_count": FULL, "pascal_per_count": PASCAL_PER_COUNT, **tactile},
+            "tactile": {
+                "full_count": FULL,
+                "pascal_per_count": PASCAL_PER_COUNT,
+                "smooth_error": 0.0,
+                **tactile,
+            },
             "stream": {"tactile_unit": "Pa"},
         }
     )
