@@ -1,4 +1,4 @@
-"""What a backend of one's own has to do, as checks that its author runs.
+"""Checks of a backend of one's own, for its author to run.
 
 Each takes a profile's settings that name the backend, as
 ``check_tactile(load(Path("profile.toml")))``, makes it as the daemon would, and raises

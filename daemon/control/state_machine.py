@@ -115,6 +115,7 @@ class Control:
         if self.mode is not Mode.GRASPING:
             self._hold_here()
             self._touching = [False, False]
+        self._turn_ended = False
         self._force = force
         self._enter(Mode.GRASPING)
 
@@ -145,7 +146,6 @@ class Control:
         low, high = self._turns()
         angle = min(max(angle, low), high)
         self._grip.steer(self._pose.angle, angle)
-        self._turn_ended = False
         self._unsettle()
         return angle
 

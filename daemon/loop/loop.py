@@ -345,7 +345,7 @@ class Loop:
             self._latch(reason, name)
             self._control.fail(reason, name)
             self._emit_events()
-            self.state.mode = self._control.mode
+            self.state.mode, self.state.phase = self._control.mode, self._control.phase
 
     def _latch(self, reason: str, name: str) -> None:
         """The one place that writes the state's fault; empty texts clear it."""

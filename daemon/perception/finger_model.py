@@ -98,14 +98,16 @@ def _known_scales(settings: Settings, calibration: Calibration | None) -> Prior:
     """Return what is known of a finger's scales: by earlier grips, or else by the settings."""
     if calibration is not None and calibration.scales is not None:
         found = calibration.scales
-        return Prior(found.modulus, found.gain, found.torque)
+        # A gain changes again, by warmth or with the next load, however well a grip showed it.
+        gain = found.gain[0], max(found.gain[1], settings.tactile.gain_error)
+        return Prior(found.modulus, gain, found.torque)
     error = settings.material.modulus_error or MODULUS_ERROR
     if settings.tip.physics == "measured":
         error = CALIBRATED_ERROR
     elif calibration is not None and calibration.modulus is not None:
         error = max(CALIBRATED_ERROR, calibration.modulus.residual)
-    gain, torque = settings.tactile.gain_error, settings.control.torque_error
-    return Prior((1.0, error), (1.0, gain), (1.0, torque))
+    torque = settings.control.torque_error
+    return Prior((1.0, error), (1.0, settings.tactile.gain_error), (1.0, torque))
 
 
 def _measured_tip(settings: Settings, finger: int, calibration: Calibration | None) -> Fingertip:
@@ -187,7 +189,7 @@ def uncertainty(settings: Settings, calibration: Calibration | None) -> Uncertai
     """Return the uncertainties that frames don't show, by settings or calibration."""
     tactile = settings.tactile
     baseline, centre, pitch = tactile.baseline_error, tactile.centre_error, tactile.pitch_error
-    modulus, correlation, gain = settings.material.modulus_error, None, tactile.gain_error
+    modulus, correlation = settings.material.modulus_error, None
     if calibration is not None:
         tare, place = calibration.tare, calibration.centre
         if tare is not None and tare.correlation:
@@ -200,8 +202,6 @@ def uncertainty(settings: Settings, calibration: Calibration | None) -> Uncertai
             pitch = max(pitch, abs(place.scale - 1.0))
         if calibration.modulus is not None:
             modulus = max(modulus, calibration.modulus.residual)
-        if calibration.scales is not None:
-            gain = calibration.scales.gain[1]
     return Uncertainty(
         baseline,
         centre,
@@ -209,7 +209,7 @@ def uncertainty(settings: Settings, calibration: Calibration | None) -> Uncertai
         modulus,
         correlation,
         slope=tactile.slope_error,
-        gain=gain,
+        gain=tactile.gain_error,
         smooth=tactile.smooth_error,
         rotation=tactile.rotation_error,
         radius=settings.tip.radius_error,

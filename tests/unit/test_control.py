@@ -424,3 +424,15 @@ def test_a_commander_that_falls_silent_leaves_the_hand_as_the_settings_say(
         assert told == (
             [] if action == "hold" else [f"the commander has been silent for 0.5 s: {action}"]
         )
+
+
+def test_a_stream_beyond_what_the_tips_bear_is_told_once() -> None:
+    with watched({"control": {"tip_friction": 0.25}}) as hand:
+        hand.run(0.3)
+        hand.command("arm")
+        for k in range(200):
+            hand.command("hold", force=10.0, angle=0.002 * k)
+            hand.run(0.02)
+        assert hand.mode == "holding"
+        told = [text for _, _, text in hand.events if text.startswith("turning ended at")]
+        assert len(told) == 1

@@ -15,8 +15,6 @@ ROOT = Path(softfinger.__file__).parents[1]
 ORDER = ("kinematics", "daemon", "tools")  # each imports itself and those before it
 PAGE = ROOT / "docs" / "architecture.md"
 QUESTION = re.compile(r"(What|Whether|Of|As|By|How|Where|When|Who|From|To|With|For|At)\b")
-# Rooms whose docstrings still begin so.
-EXEMPT = re.compile(r"tools\.viewing")
 BUILT_IN = {"Exception", "ValueError", "RuntimeError", "OSError", "TimeoutError"}
 
 
@@ -168,7 +166,6 @@ def test_a_docstring_begins_with_a_verb_or_a_noun() -> None:
     begun = [
         f"{name}: {text.splitlines()[0]}"
         for name, file in modules().items()
-        if not EXEMPT.match(name)
         for node in ast.walk(parsed(file))
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)
         if QUESTION.match(text := ast.get_docstring(node) or "")

@@ -114,7 +114,7 @@ async def _pass_on(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -
 
 
 def _is_welcome(head: bytes) -> bool:
-    """Whether a request names this machine, and is no web page's but Foxglove's own."""
+    """Return whether a request names this machine, and is of no web page but Foxglove's own."""
     lines = head.decode("latin-1").split("\r\n")[1:]
     told = [line.partition(":") for line in lines]
     fields = {name.strip().lower(): value.strip() for name, _, value in told}

@@ -101,7 +101,7 @@ class Landscape:
         return contours
 
     def ticks(self) -> list[tuple[FloatArray, str]]:
-        """Where the axes' numbers stand [2], and what they say."""
+        """Return where the axes' numbers stand [2], and what they say."""
         ticks = []
         for degrees in (-40, -20, 0, 20, 40):
             x, y = self.place(0.0, math.radians(degrees))

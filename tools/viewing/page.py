@@ -112,7 +112,7 @@ class PageCommands:
         self._token = token
 
     def allows(self, request: Request) -> bool:
-        """Whether it has the token."""
+        """Return whether it has the token."""
         given = request.query_params.get("token", "").encode()
         return self._token is not None and secrets.compare_digest(given, self._token.encode())
 

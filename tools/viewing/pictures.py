@@ -1,4 +1,4 @@
-"""From the stream's messages to what a page draws: one picture for all pages, whole each time.
+"""The stream's messages as what a page draws: one picture for all pages, whole each time.
 
 A picture is JSON: lines, dots, texts and images of each panel, and the last seconds of the plots.
 Nothing in it refers to an earlier one, so that a page may miss as many as it likes. What stands
@@ -268,7 +268,7 @@ class Pictures(Viewer):
         return {"lines": lines, "dots": dots}
 
     def _limits(self) -> str:
-        """What holds the hand back: a recent warning, the grip's goal, and the nearest limit."""
+        """Return what holds the hand back: a recent warning, the grip's goal, the nearest limit."""
         state, safety = self.feed.state, self.hand.settings.safety
         last = [each for each in self.feed.events[-1:] if each.level == "warning"]
         parts = [each.text for each in last if self.time - each.timestamp < _LATELY]

@@ -15,7 +15,7 @@ from softfinger.tools.viewing.pictures import SECONDS, Pictures
 
 
 class Playback:
-    """Where a recording is, and whether it is ``playing``. ``run`` is for a thread of its own."""
+    """A recording's place, and that it is ``playing``. ``run`` is for a thread of its own."""
 
     def __init__(self, recording: Recording, pictures: Pictures, period: float) -> None:
         self._recording = recording
