@@ -5,7 +5,8 @@ Built-in ones are entries of a dict; others are entry points of installed packag
 function for a shape) that is called as the built-in ones are. It may have
 
 - ``metal``: it is real hardware (True unless it says otherwise),
-- ``hand``: it needs the simulated hand, which it then is given as the built-in ones are,
+- ``hand``: it needs the simulated hand, which it then is given as the built-in ones are; servos
+  may name the class that is made in the place of `SimulatedHand`, with its arguments,
 - ``Settings``: a pydantic model, best derived from `profile.settings.Section`, of the profile's
   table ``[plugins.NAME]``; the validated settings are its last argument.
 """
@@ -32,7 +33,7 @@ class Backend(NamedTuple):
 
     load: Callable[[], Any]
     metal: bool = True  # it drives or reads real hardware
-    hand: bool = False  # it needs the simulated hand
+    hand: Any = False  # it needs the simulated hand; of servos also the hand's class
     source: str = ""  # of a plugin: its name, package and version
     section: type[BaseModel] | None = None  # of a plugin: its own settings
 
@@ -89,7 +90,7 @@ def backend(kind: Kind, name: str) -> Backend:
 
 def needs_hand(servos: str, tactile: str) -> bool:
     """Return whether servos or sensors of those names are parts of the simulated hand."""
-    return backend("servos", servos).hand or backend("tactile", tactile).hand
+    return bool(backend("servos", servos).hand or backend("tactile", tactile).hand)
 
 
 def known(kind: Kind) -> list[str]:

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import time
+from pathlib import Path
 from typing import Protocol
 
+from softfinger.daemon.backends import backend
 from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.types import FINGERS
 
 
 class Clock(Protocol):
     """Time for the pipeline, in seconds."""
+
+    waits: bool  # the hand's time stands still while this machine is late
 
     def now(self) -> float:
         """Monotonic time [s]."""
@@ -34,11 +39,22 @@ def make_clock(settings: Settings) -> LoopClock:
     """The clock that ``loop.clock`` names."""
     name = settings.loop.clock
     if name == "auto":
-        name = "hand" if settings.simulated else "real"
+        name = "hand" if settings.simulated or emulated(settings) else "real"
     if name == "virtual":
         return VirtualClock()
     real = RealClock(settings.realtime.spin)
     return HandClock(real) if name == "hand" else real
+
+
+def emulated(settings: Settings) -> bool:
+    """Return whether all ports are those of a `softfinger emulate` that runs."""
+    ports = []
+    if backend("servos", settings.servos.backend).metal:
+        ports.append(settings.servos.port)
+    if backend("tactile", settings.tactile.backend).metal:
+        ports += [settings.tactile.port[FINGERS.index(name)] for name in settings.scene.fingers]
+    # Its links and its control socket share a folder.
+    return bool(ports) and all(Path(port).with_name("control").is_socket() for port in ports)
 
 
 class RealClock:
@@ -52,6 +68,7 @@ class RealClock:
     host = staticmethod(time.monotonic)
     wall = staticmethod(time.time)
     behind = 0.0
+    waits = False
 
     def __init__(self, spin: float = 0.0) -> None:
         self._spin = spin
@@ -68,12 +85,14 @@ class RealClock:
 
 
 class HandClock:
-    """Time of a hand that is simulated in this process: the machine's, but it waits for it.
+    """Time of a simulated or emulated hand: the machine's, but it waits for it.
 
     Time stands between two sleeps, and a sleep ends at its deadline to the bit however late the
     machine wakes up. What that takes from the time to the next deadline is made up for; what goes
     beyond never happens for the hand, and adds to ``behind``.
     """
+
+    waits = True
 
     def __init__(self, machine: LoopClock) -> None:
         self._machine = machine
@@ -110,6 +129,7 @@ class VirtualClock:
     """
 
     behind = 0.0
+    waits = True
 
     def __init__(self, start: float = 0.0) -> None:
         self._now = start

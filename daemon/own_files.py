@@ -14,7 +14,12 @@ import tempfile
 from pathlib import Path
 from typing import BinaryIO, Literal, TextIO
 
-from softfinger.kinematics.compiled.own_folder import check_above, user_cache
+from softfinger.kinematics.compiled.own_folder import (
+    JUDGED,
+    NO_FOLLOW,
+    require_own,
+    user_cache,
+)
 
 MOST = 16 << 20  # bytes of a file that is read at once, or of what a part of one unpacks to
 
@@ -26,7 +31,8 @@ def open_regular(path: Path) -> BinaryIO:
     mode = path.stat().st_mode  # opening alone may act on a device
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
         raise OSError(errno.EINVAL, "a device or a pipe, expected a file", str(path))
-    return open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))
+    no_wait = getattr(os, "O_NONBLOCK", 0)
+    return open(path, "rb", opener=lambda name, flags: os.open(name, flags | no_wait))
 
 
 def read_file(path: Path, most: int = MOST) -> bytes:
@@ -44,7 +50,8 @@ def unpacked_most(file: BinaryIO) -> int:
     Recordings take a third to a tenth of what they hold; holes in a file take no room.
     """
     found = os.fstat(file.fileno())
-    return max(MOST // 2, 32 * min(found.st_size, 512 * found.st_blocks))
+    room = 512 * found.st_blocks if JUDGED else found.st_size
+    return max(MOST // 2, 32 * min(found.st_size, room))
 
 
 def runtime_folder() -> Path:
@@ -67,6 +74,17 @@ def runtime_folder() -> Path:
     return shared
 
 
+def runtime_fault() -> str:
+    """Return why the runtime folder can't be used and what mends it; empty where it can."""
+    try:
+        require_own(runtime_folder())
+    except FileNotFoundError:
+        return ""
+    except (OSError, RuntimeError) as error:
+        return str(error)
+    return ""
+
+
 def shared_folder() -> Path:
     """The folder where temporary files are, which another user may have made before."""
     return Path(tempfile.gettempdir()) / f"softfinger-{os.geteuid()}"
@@ -77,52 +95,14 @@ def home_folder() -> Path:
     return user_cache() / "run"
 
 
-def require_own(folder: Path) -> None:
-    """Raises PermissionError unless this folder, no link, is this user's and nobody else's to fill.
-
-    Raises FileNotFoundError and NotADirectoryError, too.
-    """
-    found = folder.lstat()
-    if stat.S_ISLNK(found.st_mode):
-        raise PermissionError(errno.EPERM, "is a link; name the folder itself")
-    if not stat.S_ISDIR(found.st_mode):
-        raise NotADirectoryError(errno.ENOTDIR, "is no folder")
-    if found.st_uid != os.geteuid():
-        raise PermissionError(errno.EPERM, "belongs to another user")
-    group = stat.S_IWGRP if found.st_gid != os.getegid() else 0
-    if found.st_mode & (_SHARED | group):
-        raise PermissionError(errno.EPERM, "others may write in it; `chmod go-w` it")
-    try:
-        check_above(folder)
-    except PermissionError as error:
-        raise PermissionError(errno.EPERM, str(error)) from None
-
-
 def write_text(path: Path, append: bool = False, newline: str | None = None) -> TextIO:
-    """Open a file of text, UTF-8, that a person named, to be written anew or on at its end.
+    """Open a file of text, UTF-8, that a person named, to be overwritten or appended to.
 
     Raises OSError as `open` does, and PermissionError for what another user has put there: a link,
     or in a folder that all may write in any file.
     """
     mode: Literal["a", "w"] = "a" if append else "w"
     return open(path, mode, encoding="utf-8", newline=newline, opener=_open)
-
-
-def write_whole(path: Path, data: bytes) -> None:
-    """Write a file beside its place and move it there: it appears whole, or not at all.
-
-    Raises OSError as :func:`write_bytes`.
-    """
-    part = path.with_name(f"{path.name}.{os.getpid()}.part")
-    try:
-        with write_bytes(part) as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
-    except OSError:
-        part.unlink(missing_ok=True)
-        raise
 
 
 def write_bytes(path: Path) -> BinaryIO:
@@ -138,7 +118,7 @@ def _open(path: str, flags: int) -> int:
         follow = stat.S_ISLNK(there.st_mode)
     except FileNotFoundError:
         follow = False
-    flags = flags & ~os.O_TRUNC | (0 if follow else os.O_NOFOLLOW)
+    flags = flags & ~os.O_TRUNC | (0 if follow else NO_FOLLOW)
     descriptor = os.open(path, flags, 0o666)
     try:
         found = os.fstat(descriptor)
@@ -152,7 +132,7 @@ def _open(path: str, flags: int) -> int:
 
 
 def _refuse_strange(path: str, found: os.stat_result) -> None:
-    strange = found.st_uid not in (os.geteuid(), 0)
+    strange = JUDGED and found.st_uid not in (os.geteuid(), 0)
     link = stat.S_ISLNK(found.st_mode)
     if strange and (link or Path(path).parent.stat().st_mode & _SHARED):
         what = "a link" if link else "a file in a folder that all may write in"

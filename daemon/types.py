@@ -116,6 +116,18 @@ class Goal:
 
 
 @dataclass(slots=True)
+class Warmth:
+    """A servo's heat as `safety.heat` follows it; 0 while no temperature is known."""
+
+    winding: float = 0.0  # [°C]
+    winding_std: float = 0.0  # standard deviation [°C]
+    case: float = 0.0  # what its thermometer shows, without its steps [°C]
+    case_std: float = 0.0
+    ambient: float = 0.0  # [°C]
+    time_to_limit: float = 3600.0  # to `safety.temperature_max` with this current, at most [s]
+
+
+@dataclass(slots=True)
 class Timing:
     """The loop's own times [s], by this machine's clock."""
 
@@ -130,6 +142,10 @@ class Timing:
 
 def _contacts() -> list[Contact]:
     return [Contact(), Contact()]
+
+
+def _warmth() -> list[Warmth]:
+    return [Warmth(), Warmth()]
 
 
 @dataclass(slots=True)
@@ -151,6 +167,7 @@ class State:
     contacts: list[Contact] = field(default_factory=_contacts)
     object: ObjectPose = field(default_factory=ObjectPose)
     goal: Goal = field(default_factory=Goal)
+    heat: list[Warmth] = field(default_factory=_warmth)
     timing: Timing = field(default_factory=Timing)
 
 

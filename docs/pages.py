@@ -280,6 +280,26 @@ def errata() -> str:
     return _head("place", "printed", "holds") + "".join(rows)
 
 
+def servos() -> str:
+    """The known models, what they press at the tip, and the bounds to set for them."""
+    from softfinger.daemon.servos.control_table import MODELS
+
+    columns = ("V", "stall [N·m at A]", "N·m/A", "force [N]", "current_max [A]", "force_max [N]")
+    rows = [_head("`servos.model`", *columns)]
+    for name, model in MODELS.items():
+        torque, current, volts = model.stall
+        low, high = (each / 10 for each in (model.voltage_min, model.voltage_max))
+        supply = f"{volts:g} ({low:g} to {high:g})"
+        force = f"{torque / 0.06:.3g}, {torque / 0.08:.3g}"
+        cells = [supply, f"{torque:g} at {current:g}", "", force, "", ""]
+        if model.senses_current:
+            bound = 0.4 * torque
+            cells[2] = f"{model.torque_constant:.3g}"
+            cells[4:] = [f"{0.4 * current:.2g}", f"{bound / 0.06:.2g}, {bound / 0.08:.2g}"]
+        rows.append(_row(f"`{name}`", *cells))
+    return "".join(rows)
+
+
 def measured() -> str:
     """The figures that docs/benchmarks.json keeps, of a `softfinger bench` without names."""
     content = json.loads((ROOT / "docs" / "benchmarks.json").read_text(encoding="utf-8"))
@@ -298,7 +318,24 @@ def measured() -> str:
     return "".join(parts)
 
 
-TABLES = {"checkpoints": checkpoints, "errata": errata, "measured": measured}
+def published() -> str:
+    """The rows of `softfinger validate`, computed anew."""
+    from softfinger.tools.paper.validate import FIGURES, comparisons
+
+    rows = [_head("", "quantity", "published", "here", "source", "what stands between")]
+    for each in comparisons():
+        cells = each.quantity, each.published, each.ours, each.source, each.why
+        rows.append(_row(FIGURES[each.verdict], *cells))
+    return "".join(rows)
+
+
+TABLES = {
+    "published": published,
+    "checkpoints": checkpoints,
+    "errata": errata,
+    "servos": servos,
+    "measured": measured,
+}
 
 PAGES: dict[str, Callable[[], str]] = {
     "index.md": _from("README.md"),
@@ -320,6 +357,7 @@ _LINKS = {
     "daemon/wire/STREAM.md": "stream.md",
     "config/sim.toml": "configuration.md",
     "daemon/control/modes.py": "commands.md",
+    "daemon/safety/limits.py": "limits.md",
     "softfinger/__init__.py": "api.md",
     "tools/examples/grasp_and_turn.py": "example.md",
     "daemon/tactile/cobs.py": "contributing.md#a-tactile-board",

@@ -13,6 +13,8 @@ import select
 import signal
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -35,6 +37,7 @@ hypothesis.settings.load_profile("same")
 pytest_plugins = ["pytester"]  # for the test of this file
 
 _PORTS = itertools.count(9872)
+_OUR_OWN: set[int] = set()  # processes that no test started
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
 
 
@@ -42,6 +45,8 @@ def pytest_configure(config: pytest.Config) -> None:
     """End as on Ctrl-C when asked to; orphans of what tests started come to this process."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     descendants.adopt_orphans()
+    resource_tracker.ensure_running()  # not by a test: with its end the semaphores' names were lost
+    _OUR_OWN.update(descendants.running())
     if not hasattr(config, "workerinput"):
         descendants.end_with_this_process()
 
@@ -59,7 +64,7 @@ def pytest_collection_finish() -> None:
 
 def pytest_unconfigure() -> None:
     """A test process that crashed leaves what it started to the one that started it."""
-    descendants.end(descendants.running())
+    descendants.end(descendants.running() - _OUR_OWN)
 
 
 @pytest.fixture(autouse=True)
@@ -180,3 +185,14 @@ def make() -> Iterator[Make]:
     yield build
     for daemon in daemons:
         daemon.close()
+
+
+@pytest.fixture
+def exact_solid_data(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A solid tip's data have no error of their own, as for frames that are made of them."""
+    from softfinger.kinematics.estimation import solid_budget
+
+    data = solid_budget.solid_data
+    monkeypatch.setattr(
+        solid_budget, "solid_data", lambda tip: replace(data(tip), error=0.0, pressure_error=0.0)
+    )

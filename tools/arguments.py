@@ -10,15 +10,16 @@ import math
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from softfinger.daemon.errors import SettingsError
-from softfinger.daemon.own_files import require_own, runtime_folder
+from softfinger.daemon.own_files import runtime_fault, runtime_folder
 
 if TYPE_CHECKING:
     from softfinger.daemon.profile.settings import Settings
     from softfinger.daemon.wire.keys import ClientKeys
 
+ADDRESS_HELP = "where the daemon is: tcp://HOST, STREAM,COMMANDS, or one socket"
 PATIENCE = 5.0  # s that `--no-wait` gives a stream to arrive
 
 
@@ -54,19 +55,18 @@ def profile(arguments: argparse.Namespace) -> Settings:
     """The settings that `add_profile`'s arguments name. Raises SettingsError with the report."""
     from softfinger.daemon.profile.load import load
 
-    return load(arguments.config, arguments.dir or own_runtime_folder(), arguments.set)
+    folder = arguments.dir or own_runtime_folder()
+    try:
+        return load(arguments.config, folder, arguments.set)
+    except SettingsError as error:
+        if folder is None and "{dir}" in str(error):
+            raise SettingsError(f"{error}\n{runtime_fault()}") from None
+        raise
 
 
 def own_runtime_folder() -> Path | None:
     """Return where an emulated hand links its ports without ``--dir``; None: nowhere of our own."""
-    try:
-        folder = runtime_folder()
-        require_own(folder)
-    except FileNotFoundError:
-        return folder
-    except (OSError, RuntimeError):
-        return None
-    return folder
+    return None if runtime_fault() else runtime_folder()
 
 
 def add_keys(parser: argparse.ArgumentParser) -> None:
@@ -89,20 +89,26 @@ def client_keys(folder: Path | None) -> ClientKeys | None:
 
 
 def stream_address(text: str) -> str:
-    """The stream's address; when empty that of SOFTFINGER_ADDRESS, or else this machine's."""
-    return text or _default_addresses()[0]
+    """The stream's address: its own, or of ``tcp://HOST`` or ``STREAM,COMMANDS``.
+
+    When empty that of SOFTFINGER_ADDRESS, or else this machine's. Raises ArgumentTypeError.
+    """
+    return addresses(text)[0]
 
 
 def command_address(text: str) -> str:
     """The commands' address, likewise."""
-    return text or _default_addresses()[1]
+    return addresses(text)[1]
 
 
-def _default_addresses() -> tuple[str, str]:
-    from softfinger.daemon.client.connection import default_addresses
+def addresses(text: str) -> tuple[str, str]:
+    """Return the stream's and the commands' address; one that stands alone is both."""
+    from softfinger.daemon.client.connection import both_addresses, default_addresses, is_host
 
     try:
-        return default_addresses()
+        if not text:
+            return default_addresses()
+        return both_addresses(text, "address") if "," in text or is_host(text) else (text, text)
     except SettingsError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
 
@@ -169,9 +175,11 @@ def add_range(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_stream(parser: argparse.ArgumentParser) -> None:
-    """``--address``, ``--keys`` and ``--no-wait`` of a subscriber."""
-    parser.add_argument("--address", type=stream_address, default="", help="the stream's socket")
+def add_stream(
+    parser: argparse.ArgumentParser, kind: Callable[[str], Any] = stream_address
+) -> None:
+    """``--address``, ``--keys`` and ``--no-wait`` of a subscriber; ``addresses`` takes both."""
+    parser.add_argument("--address", type=kind, default="", help=ADDRESS_HELP)
     add_keys(parser)
     parser.add_argument(
         "--no-wait",

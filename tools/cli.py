@@ -38,7 +38,7 @@ GROUPS = {  # subcommands: the room of tools/ that its module is in, and what it
         "record": ("recordings", "record the running daemon's stream into an MCAP file"),
         "replay": ("recordings", "publish a recording again, or compare it with today's code"),
         "analyse": ("analysis", "compute contact, force and energy over time from frames"),
-        "plot": ("analysis", "draw a recording: over time, against the model, errors, timing"),
+        "plot": ("analysis", "draw a recording beside the model: forces, energy landscape, errors"),
         "export": ("recordings", "export a recording's topics as CSV or Parquet"),
     },
     "machine": {
@@ -55,11 +55,13 @@ GROUPS = {  # subcommands: the room of tools/ that its module is in, and what it
     },
     "develop": {
         "figures": ("paper", "draw the paper's figures from this model, as CSV and PNG"),
-        "bench": ("benchmarks", "measure run time, beside the usual alternatives"),
+        "validate": ("paper", "compare this model with published figures"),
+        "bench": ("benchmarks", "measure run time, and what the hand does in simulation"),
     },
 }
 SUBCOMMANDS = {name: row for rows in GROUPS.values() for name, row in rows.items()}
 
+_LINUX = (*GROUPS["run"], "doctor", "scan", "calibrate", "compile", "install-service", "bench")
 _FIRST_STEPS = """\
 softfinger {version}: two rotational fingers with soft tips. To begin:
   softfinger run --monitor          a simulated hand and its live page; q ends both
@@ -150,6 +152,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         words = [*words[1:2], "--help"]
     # Only the subcommand that is called is imported, for its arguments and for its work.
     called = next((word for word in words if word in SUBCOMMANDS), "")
+    if called in _LINUX and sys.platform != "linux":
+        print(
+            f"{called}: found {sys.platform}, expected Linux, whose scheduler and serial ports the "
+            "daemon needs; here the client, gym, recordings and `softfinger view` work",
+            file=sys.stderr,
+        )
+        return 1
     parser, made = make_parser([called])
     if not called and words[0] not in _OPTIONS:
         near = difflib.get_close_matches(words[0], [*SUBCOMMANDS, *_OPTIONS], n=1)

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import math
-import os
 import select
 import signal
+import socket
 import time
 from collections.abc import Iterator
 from typing import Any, Protocol, Self
+
+
+def known(*names: str) -> tuple[signal.Signals, ...]:
+    """Return those signals that this system has."""
+    return tuple(each for each in signal.Signals if each.name in names)
 
 
 class Ending:
@@ -51,10 +56,10 @@ class Ending:
         A signal that asks for no end ends the wait once.
         """
         left = min(seconds, self._deadline - time.monotonic())
-        watched = [self._wakes, *self._lifeline, *others]
+        watched = [self._wakes.fileno(), *self._lifeline, *others]
         ready = select.select(watched, [], [], max(0.0, left))[0]
-        if self._wakes in ready and not self._asked:
-            os.read(self._wakes, 4096)
+        if self._wakes.fileno() in ready and not self._asked:
+            self._wakes.recv(4096)
         self._asked |= bool(set(self._lifeline).intersection(ready))
         return [each for each in ready if each in others]
 
@@ -67,19 +72,19 @@ class Ending:
         """End a wait."""
         # No lock, as an Event has: the signal may come while this very thread holds it.
         with contextlib.suppress(BlockingIOError):  # it is full: that wakes, too
-            os.write(self._wake, b"!")
+            self._wake.send(b"!")
 
     def __enter__(self) -> Self:
-        self._wakes, self._wake = os.pipe()
-        os.set_blocking(self._wake, False)
+        self._wakes, self._wake = socket.socketpair()  # Windows can't wait for a pipe
+        self._wake.setblocking(False)
         self._before = {number: signal.signal(number, self.end) for number in self.signals}
         return self
 
     def __exit__(self, *_: object) -> None:
         for number, handler in self._before.items():
             signal.signal(number, handler)
-        os.close(self._wakes)
-        os.close(self._wake)
+        self._wakes.close()
+        self._wake.close()
 
 
 class Endable(Protocol):
@@ -94,10 +99,8 @@ class Interrupted(BaseException):
 
 
 # A signal whose default ends the process without a word would leave torque to the watchdog.
-_ENDING = (
-    *(signal.SIGINT, signal.SIGTERM, signal.SIGHUP),  # SIGHUP: the terminal is gone
-    *(signal.SIGQUIT, signal.SIGUSR2, signal.SIGALRM),
-)
+# SIGHUP: the terminal is gone.
+_ENDING = known("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGUSR2", "SIGALRM")
 
 
 class Signals:

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.load import checked
 from softfinger.daemon.types import Event
-from softfinger.tools.processes.kernel_build import table_cache
 
 
 @dataclass(frozen=True)
@@ -40,7 +39,7 @@ class Watched:
     def __init__(self, sections: dict[str, dict[str, Any]]) -> None:
         settings = checked(sections | {"loop": {"clock": "virtual"}})
         self.events: list[Event] = []
-        self._daemon = Daemon(settings, wire=False, table_cache=table_cache(), on_event=self._note)
+        self._daemon = Daemon(settings, wire=False, on_event=self._note)
         self.loop, self.state = self._daemon.loop, self._daemon.loop.state
         self.control = self.loop._control
         assert self._daemon.hand is not None

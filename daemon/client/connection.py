@@ -22,24 +22,38 @@ _MESSAGE_LIMIT = 4_000_000  # bytes; the largest grid is 131 kB
 def default_addresses() -> tuple[str, str]:
     """Return where stream and commands are, by SOFTFINGER_ADDRESS or on this machine.
 
-    It is ``tcp://HOST``, with the usual ports, or both addresses with a comma between them.
-    Raises SettingsError when it is neither.
+    Raises SettingsError as :func:`both_addresses`.
     """
     named = os.environ.get("SOFTFINGER_ADDRESS", "").strip()
     if not named:
         return STREAM_ADDRESS, COMMAND_ADDRESS
+    return both_addresses(named, "SOFTFINGER_ADDRESS")
+
+
+def both_addresses(named: str, where: str) -> tuple[str, str]:
+    """Return the stream's and the commands' address that one text names.
+
+    It is ``tcp://HOST``, with the usual ports, or both addresses with a comma between them.
+    Raises SettingsError, with ``where`` it stands, when it is neither.
+    """
     addresses = [part.strip() for part in named.split(",")]
-    if len(addresses) == 1 and named.startswith("tcp://") and ":" not in named[6:].split("]")[-1]:
+    if is_host(named):
         stream, commands = (
             f"{named}:{usual.rpartition(':')[2]}" for usual in (STREAM_ADDRESS, COMMAND_ADDRESS)
         )
         return stream, commands
     if len(addresses) != 2 or not all("://" in address for address in addresses):
         raise SettingsError(
-            f"SOFTFINGER_ADDRESS: found {named!r}, expected tcp://HOST, or STREAM,COMMANDS as in "
+            f"{where}: found {named!r}, expected tcp://HOST, or STREAM,COMMANDS as in "
             f"{STREAM_ADDRESS},{COMMAND_ADDRESS}"
         )
     return addresses[0], addresses[1]
+
+
+def is_host(named: str) -> bool:
+    """Return whether an address is ``tcp://HOST``, without a port."""
+    alone = named.startswith("tcp://") and "," not in named
+    return alone and ":" not in named[6:].split("]")[-1]
 
 
 def subscribe(

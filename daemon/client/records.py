@@ -52,11 +52,11 @@ _CONVERTERS: dict[Any, Callable[[object], Any]] = {
 }
 
 
-def to_columns(states: Iterable[HandState]) -> dict[str, NDArray[Any]]:
+def to_columns(states: Iterable[Any]) -> dict[str, NDArray[Any]]:
     """Return states as one array a field, nested ones with a dot (``left.force``), in their order.
 
-    ``pandas.DataFrame(to_columns(states))`` takes it as it is.
+    ``pandas.DataFrame(to_columns(states))`` takes it as it is. Records of another topic, too.
     """
     rows = list(states)
-    names = [field.name for field in fields_of(HandState)]
+    names = [field.name for field in fields_of(type(rows[0]) if rows else HandState)]
     return {name: np.array([attrgetter(name)(row) for row in rows]) for name in names}

@@ -48,6 +48,7 @@ class Grip:
         self.angle = Setpoint(dt, control.smooth_time, state.angle)  # of the object [rad]
         self.slip = state.slip
         self.commanded = 0.0  # force of the command [N]
+        self.most = math.inf  # that it is eased to, whatever is commanded [N]
         self.target = 0.0  # target force, more where the tips would slip [N]
         self.slipped = False  # the object has turned in the grip, at this tick
         self.target_angle = math.nan  # target of the object's angle [rad]; NaN: it is not steered
@@ -105,13 +106,31 @@ class Grip:
         self.retarget(force)
 
     def retarget(self, force: float) -> None:
-        """Go to another grip force [N]."""
+        """Go to another grip force [N]; what a firmer one needed more is less of a weaker one."""
+        force = min(force, self.most)
+        if force < self.commanded:
+            self.slip.needed *= force / self.commanded
         self.commanded = self._state.commanded = force
         self._state.dither_elapsed = 0.0
         self.target = self.force.target = max(force, min(self.slip.needed, self.slip.force_limit))
         change_min = max(0.1 * force, 0.5 * self._control.grip_raise_max)
         change = max(abs(force - self.force.value), change_min)
         self._state.force_rate = change / self._control.force_time
+
+    def ease(self, most: float, seconds: float) -> None:
+        """Press with ``most`` [N] at most from now on, come to within ``seconds``."""
+        self.most = most
+        self.retarget(most)
+        self._state.force_rate = abs(self.force.value - most) / seconds
+
+    def load_needs(self) -> float:
+        """Return the force [N] that the load needs with its margin, what may be hidden included."""
+        law, grasp = self.slip.law, self._grasp
+        load = max(self.slip.load, self.slip.felt, 0.5 * law.object_load)
+        if not law.shear_shows and law.object_load == 0.0:  # nothing says that there is none
+            load = max(load, law.joint_friction / max(grasp.load_arm, 0.5 * law.width))
+        spare = law.friction * (1.0 - law.margin) - grasp.shear
+        return max(load / max(spare, 0.3 * law.friction), self.slip.needed)
 
     def steer(self, present: float, angle: float) -> None:
         """Turn the object from its ``present`` angle to ``angle`` [rad], and keep it there."""

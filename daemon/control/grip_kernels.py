@@ -119,9 +119,8 @@ def grip_torques(
     """
     g = grips[0]
     grasp = grasps[0]
-    speed = 0.5 * (dq[0] + dq[1])
     g.force.target = slip_monitor.update(
-        g.slip, grasp, g.commanded, holding, g.closing_friction, speed
+        g.slip, grasp, g.commanded, holding, g.closing_friction, dq
     )
     if g.slip.reflex and g.force.target > g.force.value:
         setpoint.reset(g.force, force_windows, g.force.target)

@@ -41,6 +41,7 @@ COMMANDS: dict[str, tuple[frozenset[Mode], dict[str, bool]]] = {
     ),
     "release": (_ON, {}),
     "set": (_ON, {"compliance": True}),
+    "demo": (frozenset({Mode.DISARMED}), {}),  # begins the profile's task again
     "stop": (_ANY, {}),
     "clear": (frozenset({Mode.FAULT}), {}),
     "status": (_ANY, {}),

@@ -37,8 +37,9 @@ What these sensors show, and what they don't:
 - One that comes at once makes the joints give way, and their damping shows it before the sensors
   do: where both joints' torques jump by more than they flicker while the encoders say that the
   joints give way, and what stands and comes leaves too little of the friction, it is believed at
-  the same tick. A sliding tip shows no more than friction bears, so how much is to come is not
-  known: the grip is raised by all it may, as fast as ``safety.current_rate`` lets it. Of a load
+  the same tick; so is a twist, of which they show the contrary. A sliding tip shows no more than
+  friction bears, so how much is to come is not known: the grip is raised by all it may, as fast as
+  ``safety.current_rate`` lets it. Of a load
   towards the palm the torques show less the greater it is, never more than lever²/4 bow, or
   0.07 N·m at 10 N: a sudden one is hardly seen.
 """
@@ -52,7 +53,7 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import GRIP_FRACTION
 from softfinger.kinematics.compiled.kernel import inner_kernel
 from softfinger.kinematics.compiled.layout import Pair, Record
-from softfinger.kinematics.hand.grasp_state import load_of
+from softfinger.kinematics.hand.grasp_state import Two, load_of
 
 _SMOOTH = 0.1  # s over which the load is averaged: joint velocities flicker by a count
 _SUDDEN = 0.7  # of what friction bears with its margin: a load that comes at once, and may go on
@@ -83,6 +84,7 @@ class SlipLaw(Record):
     margin: float  # fraction of it that is kept unused
     joint_friction: float  # [N·m]
     object_load: float  # [N]
+    shear_shows: bool  # in the tips' frames
     raise_max: float  # [N]
     raise_ratio: float  # of the force asked for
 
@@ -97,8 +99,8 @@ class SlipState(Record):
     known: bool  # what stood of the joints' torques when holding began:
     still: float  # friction, as a rule [N·m]
     smooth: Pair  # what nothing else explains of them, averaged [N·m]
-    variance: float  # of both joints' mean about that [N²·m²]
-    speed: float  # of the joints' closing, averaged [rad/s]
+    variance: Pair  # of both joints' mean about that, and of half their difference [N²·m²]
+    speed: Pair  # of the joints, averaged [rad/s]
     felt: float  # the load that solid tips feel, averaged [N]
     age: float  # since holding began, up to `_LEARN` [s]
     unexplained_rotation: float  # sum of unexplained turning that has been looked at [rad]
@@ -117,6 +119,7 @@ def set_law(law: SlipLaw, settings: Settings) -> None:
     law.friction, law.margin = control.tip_friction, control.slip_margin
     law.joint_friction = control.joint_friction
     law.object_load = control.object_load
+    law.shear_shows = settings.tip.physics == "solid"
     law.raise_max, law.raise_ratio = control.grip_raise_max, control.grip_raise_share
 
 
@@ -124,8 +127,8 @@ def set_law(law: SlipLaw, settings: Settings) -> None:
 def forget(s: SlipState) -> None:
     """Forget the object: nothing is held any more, or something else."""
     s.turned = s.known = s.reflex = False
-    s.load = s.felt = s.still = s.variance = s.age = 0.0
-    s.smooth[0] = s.smooth[1] = s.speed = 0.0
+    s.load = s.felt = s.still = s.age = 0.0
+    s.smooth[:] = s.variance[:] = s.speed[:] = 0.0
     s.unexplained_rotation = s.away = s.needed = s.force_limit = s.idle = 0.0
 
 
@@ -144,12 +147,12 @@ def begin(s: SlipState, grasp: GraspState) -> None:
 
 @inner_kernel
 def update(
-    s: SlipState, grasp: GraspState, commanded: float, holding: bool, closing: float, speed: float
+    s: SlipState, grasp: GraspState, commanded: float, holding: bool, closing: float, dq: Two
 ) -> float:
     """Return the grip force [N] to go to: ``commanded``, or more where the margin needs it.
 
     ``holding``: nothing but loads moves the joints. ``closing``, -1 to 1: how much of the joints'
-    friction is given at present for closing. ``speed`` [rad/s]: of the joints' closing.
+    friction is given at present for closing. ``dq`` [rad/s]: of the joints.
     """
     law = s.law
     s.turned = False
@@ -158,7 +161,7 @@ def update(
     monitored = holding and s.known and grasp.load_arm > 0.0
     # Of the shear one part grows with the grip, the rolling's; the load is borne by both tips.
     spare = law.friction * (1.0 - law.margin) - grasp.shear
-    sudden = _average(s, grasp, closing, speed, monitored, spare)
+    sudden = _average(s, grasp, closing, dq, monitored, spare)
     if monitored:
         _estimate_load(s, grasp)
         _watch_turning(s, grasp)
@@ -167,6 +170,8 @@ def update(
     # A grip that bears less than the joints' friction hides is not judged by their torques.
     seen = s.load if law.friction * commanded * grasp.load_arm > law.joint_friction else 0.0
     felt = max(abs(grasp.sheared) - grasp.shear * mean(grasp.normal), 0.0)
+    if law.shear_shows:  # what torques say beyond that is a force that is not known well
+        seen = min(seen, felt + _SHEAR_JUMP)
     sudden = _shear_jumps(s, felt, spare * mean(grasp.normal), monitored) or sudden
     load = max(seen, felt, 0.5 * law.object_load)
     needed = 0.0
@@ -189,40 +194,47 @@ def update(
 
 @inner_kernel
 def _average(
-    s: SlipState, grasp: GraspState, closing: float, speed: float, monitored: bool, spare: float
+    s: SlipState, grasp: GraspState, closing: float, dq: Two, monitored: bool, spare: float
 ) -> bool:
     """Take in both joints' torques; whether a load has come at once that needs a firmer grip.
 
     A jump of both that is no flicker, while the joints give way, is a load: no current that was
-    read wrongly, and no frame's error, by which one tip alone seems to let go.
+    read wrongly, and no frame's error, by which one tip alone seems to let go. A twist makes
+    joints show the contrary of each other.
     """
     friction = s.law.joint_friction
     known = closing * friction
-    found1 = grasp.torque_residual[0] - known
-    found2 = grasp.torque_residual[1] - known
-    off1 = found1 - s.smooth[0]
-    off2 = found2 - s.smooth[1]
-    off = 0.5 * (off1 + off2)
-    before = mean(s.smooth) - s.still
-    sudden = False
-    alike = min(off1 * off, off2 * off) > _BOTH * off * off
-    flicker = _SIGNS * math.sqrt(s.variance) + _JUMP_MIN
-    flicker += friction * max(1.0 - s.age / _LEARN, 0.0)  # joints may still come to rest
-    yields = (s.speed - speed) * math.copysign(1.0, off) > _YIELDS
-    s.speed += (speed - s.speed) * s.law.dt / _SMOOTH
+    off1 = grasp.torque_residual[0] - known - s.smooth[0]
+    off2 = grasp.torque_residual[1] - known - s.smooth[1]
+    unsettled = _JUMP_MIN + friction * max(1.0 - s.age / _LEARN, 0.0)  # they may come to rest
     balanced = min(grasp.normal[0], grasp.normal[1]) > _BALANCED * mean(grasp.normal)
-    felt = abs(off) > flicker and abs(before + off) > abs(before)
-    if monitored and alike and balanced and yields and felt:
-        load, slope = load_of(before + off, grasp.load_arm, grasp.load_curvature)
-        undetected = friction / max(slope, _ARM_MIN * s.law.width)
-        sudden = abs(load) + 0.5 * undetected > _SUDDEN * max(spare, 0.0) * mean(grasp.normal)
-    if sudden:
-        s.smooth[0] += off1
-        s.smooth[1] += off2
-    elif abs(speed) < _FAST:  # beyond, torques also move the joints
-        s.variance += (off * off - s.variance) * s.law.dt / _LEARN
-        s.smooth[0] += off1 * s.law.dt / _SMOOTH
-        s.smooth[1] += off2 * s.law.dt / _SMOOTH
+    sudden = False
+    for k in range(2):
+        sense = 1.0 - 2.0 * k
+        off = 0.5 * (off1 + sense * off2)
+        before = 0.5 * (s.smooth[0] + sense * s.smooth[1])
+        before -= s.still if k == 0 else min(max(before, -friction), friction)
+        alike = min(off1 * off, sense * off2 * off) > _BOTH * off * off
+        gives = 0.5 * (s.speed[0] - dq[0] + sense * (s.speed[1] - dq[1]))
+        yields = gives * math.copysign(1.0, off) > _YIELDS
+        flicker = _SIGNS * math.sqrt(s.variance[k]) + unsettled
+        felt = abs(off) > flicker and abs(before + off) > abs(before)
+        if monitored and alike and balanced and yields and felt:
+            curvature = grasp.load_curvature if k == 0 else 0.0
+            load, slope = load_of(before + off, grasp.load_arm, curvature)
+            undetected = friction / max(slope, _ARM_MIN * s.law.width)
+            needs = abs(load) + 0.5 * undetected > _SUDDEN * max(spare, 0.0) * mean(grasp.normal)
+            sudden = sudden or needs
+    settles = abs(dq[0] + dq[1]) < 2.0 * _FAST  # beyond, torques also move the joints
+    kept = 1.0 if sudden else s.law.dt / _SMOOTH if settles else 0.0
+    if settles and not sudden:
+        for k in range(2):
+            off = 0.5 * (off1 + (1.0 - 2.0 * k) * off2)
+            s.variance[k] += (off * off - s.variance[k]) * s.law.dt / _LEARN
+    s.smooth[0] += off1 * kept
+    s.smooth[1] += off2 * kept
+    for k in range(2):
+        s.speed[k] += (dq[k] - s.speed[k]) * s.law.dt / _SMOOTH
     return sudden
 
 

@@ -29,6 +29,7 @@ _STEADY_FORCE = 0.02  # share, and …
 _STEADY_ANGLE = 2e-3  # … rad, within which setpoints may flicker without counting as new ones
 _TILT_RESERVE = 0.1  # rad of tilt kept from the limit that is a fault
 _RAISED = 1.02  # of the force asked for, above which the grip is reported as raised
+_EASING = 3.0  # s in which a grip is eased
 _LOST_AFTER = 0.1  # s without contact in a grip
 _EMPTY_AFTER = 0.05  # s in which a grip is too narrow to hold anything
 
@@ -119,6 +120,15 @@ class Control:
         self._force = force
         self._enter(Mode.GRASPING)
 
+    def ease(self, most: float) -> None:
+        """Let the present grip press with ``most`` [N] at most, whatever is asked for."""
+        self._grip.ease(most, _EASING)
+        self._unsettle()
+
+    def load_needs(self) -> float:
+        """Return the force [N] that the load of the grip needs with its margin."""
+        return self._grip.load_needs()
+
     def rotate(self, angle: float) -> None:
         """Turn the object to ``angle`` [rad]; while grasping, once the grip holds."""
         if self.mode is Mode.GRASPING:
@@ -165,8 +175,9 @@ class Control:
         """The grip's phase, by which perception takes torques for what they tell."""
         if self._still:
             return HOLDING
-        turning = self.mode is Mode.ROTATING or self._grip.turning
-        return RAMPING if self.mode in GRIPPING and not turning else OTHER
+        # A force that a turn began with has shown what torques tell of it.
+        known = self.mode is Mode.ROTATING and self._grip.commanded == self._still_at[0]
+        return OTHER if self.mode not in GRIPPING or self._grip.turning or known else RAMPING
 
     def set(self, compliance: float) -> None:
         """Set the angle by which the grip gives way to a torque [rad/(N·m)]."""
@@ -291,6 +302,7 @@ class Control:
         if not awaited:
             if not self._is_empty(dt):
                 self._gripping = True
+                self._grip.most = math.inf
                 self._grip.start(self._felt(), self._force)
         elif self._joints.step(law.approach_speed):
             self._waiting += dt

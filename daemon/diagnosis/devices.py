@@ -40,11 +40,8 @@ _REST_NOISE = 3.0  # of a cell's noise, that a tared board's median cell does no
 _OFF_RATE = 0.1  # share of the rate by which a board may be off
 
 
-def check_servos(settings: Settings, wait: float = SEARCH_TIME) -> list[Finding]:
-    """Check each servo of the scene; where one does not answer, search every rate for what answers.
-
-    ``wait`` [s] is given to each rate that is searched.
-    """
+def check_servos(settings: Settings) -> list[Finding]:
+    """Check each servo of the scene; where one does not answer, search every rate for one."""
     servos = settings.servos
     model = by_name(servos.model)
     try:
@@ -53,7 +50,7 @@ def check_servos(settings: Settings, wait: float = SEARCH_TIME) -> list[Finding]
             found = examine(line, settings, model)
         results = [line for each in found for line in _judge(each, settings, model)]
         if not all(each.replies for each in found):
-            results += _search(settings, model, wait) or _blame_power(found)
+            results += _search(settings, model) or _blame_power(found)
     except ServoError as error:
         return [Finding("FAIL", "servos", str(error))]
     return results
@@ -81,10 +78,10 @@ def _described(servo: Examined, model: ServoModel) -> str:
     )
 
 
-def _search(settings: Settings, model: ServoModel, wait: float) -> list[Finding]:
+def _search(settings: Settings, model: ServoModel) -> list[Finding]:
     """Search the port at every rate of the model and say how to reach what answers."""
     servos = settings.servos
-    found = search(servos.port, model.baud_rates, wait, {FACTORY_ID, *servos.ids})
+    found = search(servos.port, model.baud_rates, SEARCH_TIME, {FACTORY_ID, *servos.ids})
     if not found.servos and not found.garbled:
         problem = f"nothing answers on {servos.port} at any rate"
         return [Finding("FAIL", "servos", problem, "check the bus's power and cable")]
@@ -112,8 +109,8 @@ def _blame_power(examined: list[Examined]) -> list[Finding]:
     return [Finding("note", "found", f"{problem}; {min(volts):.1f} V at those that do", fix)]
 
 
-def check_board(settings: Settings, finger: int, listen: float = _LISTEN) -> Finding:
-    """Check that a board sends frames of the settings' grid at their rate, for ``listen`` [s]."""
+def check_board(settings: Settings, finger: int) -> Finding:
+    """Check that a board sends frames of the settings' grid at their rate."""
     tactile = settings.tactile
     name = f"tactile {FINGERS[finger]}"
     patient = tactile.model_copy(update={"open_timeout": max(tactile.open_timeout, _PATIENCE)})
@@ -129,7 +126,7 @@ def check_board(settings: Settings, finger: int, listen: float = _LISTEN) -> Fin
         return Finding("FAIL", name, str(error), "check tactile.port, its baud and its cable")
     try:
         before, start = sensor.counters(), time.monotonic()
-        time.sleep(listen)
+        time.sleep(_LISTEN)
         frame = sensor.latest()  # a plugin's board may read only when it is asked
         after, spent = sensor.counters(), time.monotonic() - start
     finally:
@@ -141,15 +138,15 @@ def check_board(settings: Settings, finger: int, listen: float = _LISTEN) -> Fin
     if lost:
         fix = "check its cable and what else loads the USB hub"
         return Finding("warn", name, f"{found}, but {lost} bytes were damaged or lost", fix)
-    # One frame more or less falls into the time that was listened for.
-    if abs(frames - tactile.rate * spent) > max(_OFF_RATE * tactile.rate * spent, 1.5):
-        text = f"{found}, not {tactile.rate:g}"
-        return Finding("warn", name, text, f"set tactile.rate = {rate:.0f}")
     rest = 0.0 if frame is None else _rest(settings, finger, frame)
     if rest > _REST_NOISE * tactile.noise:
         text = f"{found}, but half of them read {rest / 1e3:.1f} kPa or more, expected 0 at rest"
         fix = "`softfinger calibrate tare`, or `softfinger send tare` at each start"
         return Finding("warn", name, text, fix)
+    # One frame more or less falls into the time that was listened for.
+    if abs(frames - tactile.rate * spent) > max(_OFF_RATE * tactile.rate * spent, 1.5):
+        text = f"{found}, not {tactile.rate:g}"
+        return Finding("warn", name, text, f"set tactile.rate = {rate:.0f}")
     return Finding("pass", name, found)
 
 

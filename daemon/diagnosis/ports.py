@@ -15,6 +15,7 @@ from serial.tools import list_ports
 
 from softfinger.daemon.client.command_client import NoAnswer, send
 from softfinger.daemon.errors import KeyFileError
+from softfinger.daemon.own_files import runtime_fault, runtime_folder
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.base import Finding, Status
 from softfinger.daemon.servos.port import bring_it, latency_file
@@ -34,6 +35,14 @@ def note_ports() -> Finding:
         f"{path} ({text})" if text not in ("", "n/a") else path for path, text in serial_ports()
     ]
     return Finding("note", "serial ports", ", ".join(found) or "none on this machine")
+
+
+def check_runtime_folder() -> Finding:
+    """Check the folder of emulated hands' ports and of the local stop: nobody else may fill it."""
+    what, _, fix = runtime_fault().partition(": chmod ")
+    if not what:
+        return Finding("pass", "runtime folder", str(runtime_folder()))
+    return Finding("warn", "runtime folder", what, fix and f"chmod {fix}")
 
 
 def check_port(path: str, key: str, mode_of_daemon: str = "") -> Finding:

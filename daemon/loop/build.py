@@ -9,11 +9,10 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Callable
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from softfinger import __version__
-from softfinger.daemon.backends import needs_hand
+from softfinger.daemon.backends import backend, needs_hand
 from softfinger.daemon.clock import LoopClock, make_clock
 from softfinger.daemon.gateway.bounds import Config
 from softfinger.daemon.gateway.supervisor import Gateway
@@ -50,26 +49,25 @@ class Daemon:
         *,
         on_event: EventSink | None = None,
         wire: bool = True,
-        table_cache: Path | None = None,
     ) -> None:
         self.settings = settings
         self.clock: LoopClock = make_clock(settings)
         self._closers: list[Callable[[], None]] = []
         self.gateway: Gateway | None = None  # the process that serves clients
         try:
-            self._build(on_event, wire, table_cache)
+            self._build(on_event, wire)
         except BaseException:
             self.close()
             raise
 
-    def _build(self, on_event: EventSink | None, wire: bool, cache: Path | None) -> None:
+    def _build(self, on_event: EventSink | None, wire: bool) -> None:
         settings = self.settings
         publisher, server = self._bind() if wire else (None, None)
         self.publisher = publisher
-        scene = WantedScene(settings, cache, on_event)
+        scene = WantedScene(settings, on_event)
         self.models = scene.models
         warm_up(scene)
-        self.hand = self._make_hand(cache, on_event)
+        self.hand = self._make_hand()
         self.servos = make_servos(settings, self.clock, self.hand)
         perception = Perception(settings, self._make_sensors(), self.models)
         if self.gateway is not None:
@@ -106,11 +104,12 @@ class Daemon:
         if local.notice:
             gateway.link.notices.append(local.notice)
         # Servos that their own watchdog has stopped are another hand than the one commanded.
-        watchdog = 0.0 if self.settings.simulated else self.settings.servos.watchdog
+        own_time = self.settings.simulated or self.clock.waits
+        watchdog = 0.0 if own_time else self.settings.servos.watchdog
         server = CommandServer(gateway.link, local, min(_PAUSE, watchdog or _PAUSE))
         return Publisher(gateway.link), server
 
-    def _make_hand(self, cache: Path | None, on_event: EventSink | None) -> SimulatedHand | None:
+    def _make_hand(self) -> SimulatedHand | None:
         """The simulated hand, where a backend wants one.
 
         Its tips are of the settings' material, whatever a calibration says of them.
@@ -122,8 +121,12 @@ class Daemon:
 
         table = next((each.table for each in self.models if not each.own_material), None)
         if table is None:
-            table = make_table(settings, make_material(settings.material), cache, on_event)
-        return SimulatedHand(settings, self.clock.now(), table)
+            table = make_table(settings, make_material(settings.material))
+        own = backend("servos", settings.servos.backend).hand
+        made: SimulatedHand = (own if callable(own) else SimulatedHand)(
+            settings, self.clock.now(), table
+        )
+        return made
 
     def _make_sensors(self) -> dict[int, TactileSensor]:
         made = {}

@@ -21,6 +21,7 @@ from softfinger.daemon.loop.requests import Requests
 from softfinger.daemon.loop.timing import Lateness, Statistics, record
 from softfinger.daemon.perception.perception import Perception
 from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.safety.heat import HeatWatch
 from softfinger.daemon.safety.safety import BUS, Breach, Safety
 from softfinger.daemon.safety.torque_state import TorqueState
 from softfinger.daemon.servos.base import Servos
@@ -77,6 +78,7 @@ class Loop:
         self._control = Control(settings, self.state, grasp)
         self._task = Task.named(settings)
         self._safety = Safety(settings, servos is not None, bool(sensors), grasp, sensors)
+        self._heat = HeatWatch(settings, self.state)
         self._torque = TorqueState(
             servos, settings.servos, self.state, self._safety, self._fail, self.emit
         )
@@ -85,7 +87,7 @@ class Loop:
         )
         self._after_opening: Breach | None = None  # a fault for when the hand is open
         self.statistics = Statistics()
-        self._lateness = Lateness(settings, self.state.timing)
+        self._lateness = Lateness(settings, self.state.timing, clock.waits)
         self._publishing = None
         if publisher is not None:
             self._publishing = Publishing(settings, publisher, sensors, self.statistics)
@@ -221,6 +223,7 @@ class Loop:
             reading.valid = False
             state.read_error = str(error)
             self._fail(str(error))
+        self._heat.follow()
         if reading.valid and self.perception.fingers:
             gripping = state.mode in GRIPPING and state.goal.valid
             self.perception.filter.predict(reading, state.goal if gripping else None)
@@ -244,6 +247,8 @@ class Loop:
         breach = self._safety.judge(state)
         if breach is not None or self._safety.warnings or self._after_opening is not None:
             self._react(breach)
+        if self._heat.due and (action := self._heat.act(control, control.events)):
+            self._requests.end_grip(action)
         if self._safety.must_hold and state.mode in GRIPPING:
             control.hold_goal(state.goal)
         else:
@@ -303,6 +308,8 @@ class Loop:
             self._latch("", "")
         if self._task is not None and not by_task:
             self._end_task(f"ended by the command {name}")
+        if name == "demo":
+            self._task = Task.named(self._settings)
         return reply
 
     def _publish_command(self, request: dict[str, Any], error: str) -> None:

@@ -28,13 +28,11 @@ from softfinger.daemon.wire.command_server import Handler
 class ProcessReplay:
     """A loop on recorded inputs; ``calibrations`` as JSON, empty where there was none."""
 
-    def __init__(
-        self, settings: Settings, calibrations: Sequence[str], cache: Path | None = None
-    ) -> None:
+    def __init__(self, settings: Settings, calibrations: Sequence[str]) -> None:
         """Raises SettingsError or TactileError when settings and calibrations don't fit."""
         with tempfile.TemporaryDirectory() as folder:
             settings = with_calibrations(settings, calibrations, Path(folder))
-            models = make_models(settings, cache)
+            models = make_models(settings)
         settings = settings.model_copy(update={"task": TaskSettings()})  # its commands are recorded
         self._clock = _Clock()
         self._commands = _Commands()

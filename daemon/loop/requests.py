@@ -132,6 +132,7 @@ class Requests:
             "release": control.release,
             "set": control.set,
             "clear": control.disarm,
+            "demo": lambda: None,  # the loop begins its task
             "status": lambda: None,
         }
         self._lease = Lease(settings.commands.lease)
@@ -171,18 +172,24 @@ class Requests:
 
     def watch_silence(self) -> None:
         """Release or stop the hand, as the settings say, when its commander has fallen silent."""
-        action, control = self._settings.commands.on_silence, self._control
+        action = self._settings.commands.on_silence
         if action == "hold" or not (silent := self._lease.lapses(self._state.t)):
             return
+        if self.end_grip(action):
+            text = f"{silent} has been silent for {self._lease.seconds:g} s: {action}"
+            self._emit("warning", "silence", text)
+
+    def end_grip(self, action: str) -> bool:
+        """Do ``stop`` or ``release``; return whether there was anything to do."""
+        control = self._control
         if action == "stop" and control.torque:
             control.stop()
             self._torque.off()
         elif action == "release" and control.mode in GRIPPING | {Mode.MOVING}:
             control.release()
         else:
-            return
-        text = f"{silent} has been silent for {self._lease.seconds:g} s: {action}"
-        self._emit("warning", "silence", text)
+            return False
+        return True
 
     def _against(self, name: str, numbers: dict[str, float]) -> str:
         """Return what the state, the scene or the limits have against a command that is heard."""
@@ -205,6 +212,8 @@ class Requests:
                 return "something touches a tip"
         elif name == "move":
             return self._against_move(numbers)
+        elif name == "demo" and settings.task.name == "none":
+            return "the profile names no task; softfinger run --config demo has one"
         elif name == "hold" and not numbers:
             return "force or angle is missing"
         if name == "grasp" or begins:

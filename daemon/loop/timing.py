@@ -29,7 +29,7 @@ _PARTS = 32  # bins an octave
 _BINS = _OCTAVES * _PARTS
 
 LATE = 0.05  # s of lateness that is reported
-EVERY = 5.0  # s between two reports
+EVERY = 5.0  # s between two reports, of which each is of twice as much
 RECENT = 0.25  # s after a late tick in which it may be a fault's cause
 FIRST = 1.0  # s of ticks after which their steadiness is reported
 _STEADY = 0.2  # share of the servos' watchdog time that a pause may take without a warning
@@ -123,12 +123,15 @@ class Statistics:
 class Lateness:
     """Follows one loop's ticks."""
 
-    def __init__(self, settings: Settings, timing: Timing) -> None:
-        """``timing`` is the loop's own; what is written there is ``busy_s`` alone."""
+    def __init__(self, settings: Settings, timing: Timing, waits: bool) -> None:
+        """``timing`` is the loop's own; what is written there is ``busy_s`` alone.
+
+        ``waits``: the hand's time stands still while the machine is late.
+        """
         self._timing = timing
         self._period = 1.0 / settings.loop.rate
-        self._waits = settings.simulated and settings.loop.clock != "real"
-        self._watchdog = 0.0 if settings.simulated else settings.servos.watchdog
+        self._waits = waits
+        self._watchdog = 0.0 if settings.simulated or waits else settings.servos.watchdog
         self._begin = math.nan
         self._worst = 0.0  # s by which a pause of the first second was longer than the period
         self._sum = 0.0  # s that ticks came late in all, or that the hand has waited
@@ -151,7 +154,7 @@ class Lateness:
         elif gap > LATE:
             self._sum += gap
         new = self._sum - self._reported[0]
-        if new > LATE and t - self._reported[1] > EVERY:
+        if new > max(LATE, self._reported[0]) and t - self._reported[1] > EVERY:
             self._reported = (self._sum, t)
             return "warning", "late", self._text(new)
         return self._steadiness(t, gap) if self._watchdog else None

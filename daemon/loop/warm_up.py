@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -25,28 +24,28 @@ from softfinger.kinematics.compiled.kernel_folder import is_marked, kernel_folde
 from softfinger.kinematics.estimation.estimator import ContactEstimate
 from softfinger.kinematics.estimation.invalid import Invalid
 from softfinger.kinematics.hand.grasp_state import total_tilt
+from softfinger.kinematics.hand.servo_heat import (
+    HeatState,
+    follow,
+    lasting_square,
+    time_to_limit,
+    winding_std,
+)
 
 
 class WantedScene:
-    """A scene whose kernels are wanted; ``cache`` is where contact tables are kept.
-
-    ``on_event`` takes a warning where a kept table can't be used.
-    """
+    """A scene whose kernels are wanted; ``on_event`` takes what is to be said of its models."""
 
     def __init__(
-        self,
-        settings: Settings,
-        cache: Path | None,
-        on_event: Callable[[str, str, str], None] | None = None,
+        self, settings: Settings, on_event: Callable[[str, str, str], None] | None = None
     ) -> None:
         self.settings = settings
-        self._cache = cache
         self._on_event = on_event
 
     @cached_property
     def models(self) -> tuple[FingerModel, FingerModel]:
-        """Both fingers' models, their contact tables built or loaded."""
-        return make_models(self.settings, self._cache, self._on_event)
+        """Both fingers' models."""
+        return make_models(self.settings, self._on_event)
 
     @property
     def sensing(self) -> list[int]:
@@ -189,7 +188,15 @@ def _grip(scene: WantedScene) -> None:
 def _joints(scene: WantedScene) -> None:
     from softfinger.daemon.control.setpoint import JointSetpoints
     from softfinger.daemon.loop.timing import Statistics
+    from softfinger.daemon.safety.heat import set_law
 
+    heat = HeatState()
+    set_law(heat.law, scene.settings)
+    for _ in range(2):
+        follow(heat.array, 1.0, 0.5, 25.0)
+    winding_std(heat.array)
+    time_to_limit(heat.array, 1.0, 70.0)
+    lasting_square(heat.array, 70.0)
     JointSetpoints(1.0 / scene.settings.loop.rate, scene.settings.control.smooth_time)
     Statistics()
 
@@ -204,7 +211,7 @@ _HAND = Part("simulated hand", 64, _hand, after=_TABLE.name)
 _SENSOR = Part("simulated sensor", 14, _sensor)
 _FILTER = Part("contact filter", 25, _filter, after=_TABLE.name)
 _GRIP = Part("grip", 26, _grip)
-_JOINTS = Part("joints and timing", 7, _joints)
+_JOINTS = Part("joints and timing", 13, _joints)
 _MANY = Part("lookup of many points", 3, _many, after=_TABLE.name)
 ALL = (_TABLE, _ESTIMATOR, _HAND, _SENSOR, _FILTER, _GRIP, _JOINTS, _MANY)
 EMULATED = (_TABLE, _HAND, _SENSOR)  # what `softfinger emulate` needs

@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from softfinger.daemon.errors import TactileError
-from softfinger.daemon.own_files import read_file, write_whole
+from softfinger.daemon.own_files import read_file
 from softfinger.daemon.profile.settings import Finite, NonNegative, Positive, Settings
+from softfinger.kinematics.compiled.own_folder import write_whole
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.tip_curves import TipCurves
 from softfinger.kinematics.sensing.counts import look_up_pressure, to_pressure

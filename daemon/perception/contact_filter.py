@@ -79,14 +79,18 @@ class ContactFilter:
         state.count = 2.0 * math.pi / (COUNTS_PER_TURN * gear)
         state.slow = 0.5 * VELOCITY_UNIT / gear
         state.response = settings.tactile.response
+        state.relaxation[:] = settings.tip.relaxation
+        state.relaxation_time[:] = settings.tip.relaxation_times
         state.torque_constant = settings.control.torque_constant
         state.taper = state.assumed_taper = settings.object.taper
         state.alone = len(self._fingers) == 1
+        state.gain_known = settings.estimator.free_gain is False
         state.t = -math.inf
         ratios = np.linspace(1e-3, 1.0, kernels.LAW_POINTS)
         for finger, table in enumerate(tables):
             law = 0.0 if materials is None else materials[finger].force_error(ratios)
             state.tip[finger].law[:] = np.hypot(law, table.max_error)
+            state.tip[finger].firmness = 1.0 + sum(settings.tip.relaxation)
         control = settings.control
         set_prior(state.grasp.scales, priors, control.joint_friction, control.joint_inertia)
         self._priors = priors
@@ -94,6 +98,7 @@ class ContactFilter:
             round(kernels.HISTORY * settings.loop.rate) + 2, dtype=Past.dtype
         )
         self._history["t"] = -math.inf
+        self._history["firmness"] = 1.0 + sum(settings.tip.relaxation)
         self.grasp = state.grasp
         self.grasp.turning = 0.5 * sum(_turning(table, state.radius) for table in tables)
         self._read = False  # the joints are known
@@ -146,6 +151,7 @@ class ContactFilter:
             ),
             estimate.covariance,
             estimate.systematic,
+            self._tables[finger],
         ):
             self._invalid[finger] = Invalid.JOINTS
             return

@@ -16,9 +16,19 @@ ds/dt = (displacement − s)/response, so the history keeps these):
     innovation = (θ ∓ q) − (φ ∓ α/2 − angle_since)               state (φ, α), H = (1, ∓1/2)
     K = P Hᵀ (H P Hᵀ + R)⁻¹       state += K innovation       P = (1 − K H) P
 
+A frame that was fitted with a fixed gain, as of a solid tip, shows d A^(1/n), where F ∝ dⁿ and A is
+the gain; ln d and ln A are the state then, H = (1, 1/n), and A stays what it is but for the sensor:
+
+    closing     innovation = ln d_frame − ln (d − d_since) − ln A/n
+    turning     the same for d alone: rolling is no closing
+    holding     the same for d alone, within a count of the joints; A takes what is beyond
+
+A tip of rubber relaxes: with r_i, τ_i of ``tip.relaxation`` its firmness is
+ρ = 1 + Σ r_i (1 − h_i/F), ḣ_i = (F − h_i)/τ_i, where F is the force that lasts; frames show A ρ.
+
 The gate: beyond innovation² = _GATE · (H P Hᵀ + R) the prediction was wrong, not the frame, and
 innovation² is put into P first. A frame of an angle beyond `witnesses.JUMP` is refused instead. The
-force is F = e^ε F_table(d, θ), its variance (∂F/∂d σ_d)² + (∂F/∂θ σ_θ)² + (σ_ε² + law²) F², with
+force is ρ e^ε F_table(d, θ), its variance (∂F/∂d σ_d)² + (∂F/∂θ σ_θ)² + (σ_ε² + law²) F², with
 the modulus' logarithm ε of `perception.scales`. Pairs are (left, right). SI units.
 """
 
@@ -53,6 +63,8 @@ OTHER, RAMPING, HOLDING = 0, 1, 2  # phases of a grip: its force is on its way, 
 HISTORY = 0.5  # s of joint motion stored: an older frame is taken as so old
 _DRIFT_D = 1e-4  # m/√s, what d does by itself: the object shifts, the tip creeps
 _DRIFT_GAIN = 0.1  # 1/√s, what the frames' height over the model's does
+_D_MIN = 1e-5  # m that touches
+_LIMP = 0.02  # least firmness, of a tip that comes back late
 _DRIFT_ANGLE = 4e-3  # rad/√s, likewise
 _DRIFT_TAPER = 1e-3  # rad/√s, what the taper does: tips come to other parts of the faces
 _TAPER_ERROR = 0.1  # rad that `object.taper` may be off
@@ -80,7 +92,8 @@ class TrackedTip(Record):
     gain: float  # measured over modelled pressure: the frames' height
     gain_variance: float
     d_gain: float  # covariance of d and gain [m]
-    free: bool  # frames tell the gain
+    before: float  # 1/variance of the gain's logarithm by the scales; 0: frames tell it, ∞: known
+    power: float  # of d by F, where a frame has one amplitude for d and gain
     fresh: bool  # a frame has come that the scales have not taken in yet
     tilt_y: float
     shear: float  # along the face in the hand's plane, by a solid tip's newest frame [N]
@@ -90,6 +103,8 @@ class TrackedTip(Record):
     speed: float  # of the joint [rad/s]
     shared: Pair  # the variances of d and θ that all frames share
     law: Annotated[FloatArray, LAW_POINTS]  # relative error of F by table and law, over d
+    memory: Annotated[FloatArray, 3]  # the lasting force, followed by each Prony term [N]
+    firmness: float  # of a tip that relaxes, over its lasting one
     in_contact: bool  # touches, and is carried on
 
 
@@ -126,6 +141,7 @@ class Past(Record):
     d: Pair
     angle: float
     q: Pair
+    firmness: Pair
 
 
 class FilterState(Record):
@@ -138,9 +154,12 @@ class FilterState(Record):
     count: float  # of a joint's encoder [rad]
     slow: float  # half a count of velocity [rad/s]
     response: float  # of the cells [s]
+    relaxation: Annotated[FloatArray, 3]  # of the tips: `tip.relaxation`, and …
+    relaxation_time: Annotated[FloatArray, 3]  # … its times [s]
     torque_constant: float  # [N·m/A]
     assumed_taper: float  # `object.taper` [rad]
     alone: bool  # one finger
+    gain_known: bool  # by the settings, where frames don't tell it
     t: float  # of the last reading [s]
     checked: float  # when witnesses were checked last [s]
     newest: int  # row of the history
@@ -260,12 +279,21 @@ def predict(
         _move(left.d, deeper1)
         _move(right.d, deeper2)
         _move(f.angle, turn)
+        if both:  # what frames have shown before its count came
+            shown1 = displacement1 - seen1
+            shown2 = displacement2 - seen2
+            turn = turn1 * shown1 - turn2 * shown2
+            shown = 0.5 * (arm1 * shown1 + arm2 * shown2 + jacobian_slide * turn)
+            f.grasp.witnesses.corrected[0] -= shown
+            f.grasp.witnesses.corrected[1] -= shown
     left.q += displacement1
     right.q += displacement2
     left.d.variance += _DRIFT_D * _DRIFT_D * dt
     right.d.variance += _DRIFT_D * _DRIFT_D * dt
-    left.gain_variance += _DRIFT_GAIN * _DRIFT_GAIN * dt
-    right.gain_variance += _DRIFT_GAIN * _DRIFT_GAIN * dt
+    for k in range(2):
+        if f.gain_known or f.tip[k].before == 0.0:
+            f.tip[k].gain_variance += _DRIFT_GAIN * _DRIFT_GAIN * dt
+        _relax(f, k, dt)
     if both:
         scales.drift(f.grasp.scales, dt)
     f.angle.variance += _DRIFT_ANGLE * _DRIFT_ANGLE * dt
@@ -278,6 +306,22 @@ def predict(
     for k in range(2):
         row.d[k] = _between(f.tip[k].d.displacement, last.d[k], kept)
         row.q[k] = _between(f.tip[k].q, last.q[k], kept)
+        row.firmness[k] = _between(f.tip[k].firmness, last.firmness[k], kept)
+
+
+@inner_kernel
+def _relax(f: FilterState, finger: int, dt: float) -> None:
+    """Let ``dt`` s pass in a tip that relaxes; set its firmness."""
+    tip = f.tip[finger]
+    lasting = f.grasp.force[finger] / tip.firmness if tip.in_contact else 0.0
+    firmness = 1.0
+    for k in range(3):
+        strength = f.relaxation[k]
+        if strength == 0.0:
+            continue
+        tip.memory[k] += (lasting - tip.memory[k]) * -math.expm1(-dt / f.relaxation_time[k])
+        firmness += strength * (1.0 - tip.memory[k] / lasting if lasting > 0.0 else 1.0)
+    tip.firmness = max(firmness, _LIMP)
 
 
 @inner_kernel
@@ -342,6 +386,60 @@ def _update_tip(
 
 
 @inner_kernel
+def _update_product(
+    tip: TrackedTip,
+    step: float,
+    d_since: float,
+    d: float,
+    power: float,
+    by_d: float,
+    turning: bool,
+    holding: bool,
+    corrected: float,
+) -> None:
+    """Update d and gain by a frame whose fit had a fixed gain: it shows d gain^(1/n), as F ∝ dⁿ.
+
+    ``power``: 1/n. What joints and closing don't explain is d's, and when ``turning`` all is, as
+    rolling is no closing; when ``holding``, no more of it than a count of the joints hides, of
+    which frames have ``corrected`` some lately: all else is the sensor's.
+    """
+    before = max(tip.d.mean - d_since, _D_MIN)
+    gain = tip.gain
+    # All of the logarithms, in which the frame's is straight.
+    own = _variance(tip.d, step) / (before * before)
+    joint = tip.d_gain / (before * gain)
+    slow = tip.gain_variance / (gain * gain)
+    noise = by_d / (d * d)
+    innovation = math.log(d / before) - power * math.log(gain)
+    total = own + power * (2.0 * joint + power * slow) + noise
+    jumped = innovation * innovation > _GATE * total
+    if holding:
+        jumped = jumped and abs(innovation) * before > 2.0 * step
+    if jumped and holding:
+        slow += innovation * innovation / (power * power)
+    elif jumped:
+        own += innovation * innovation
+    total = own + power * (2.0 * joint + power * slow) + noise
+    d_weight = (own + power * joint) / total
+    gain_weight = (joint + power * slow) / total
+    if turning or (holding and not jumped):
+        gain_weight = 0.0  # no closing tells it
+    after = before * math.exp(d_weight * innovation)
+    kept = after
+    if holding:
+        deepest = before - corrected + step
+        kept = min(max(after, deepest - 2.0 * step), deepest)
+    gain *= math.exp(gain_weight * innovation) * (after / kept) ** (1.0 / power)
+    tip.d.mean = kept + d_since
+    tip.gain = gain
+    tip.d.variance = kept * kept * (own - d_weight * (own + power * joint))
+    tip.d_gain = kept * gain * (joint - d_weight * (joint + power * slow))
+    slow -= gain_weight * gain_weight * total
+    tip.gain_variance = gain * gain * slow
+    tip.d.path_length = abs(d_since)
+
+
+@inner_kernel
 def _update_angle(
     f: FilterState, sense: float, angle_since: float, found: float, variance: float
 ) -> None:
@@ -373,6 +471,7 @@ def update(
     found: tuple[float, float, float, float, float],
     covariance: FloatArray,
     systematic: FloatArray,
+    table: FloatArray,
 ) -> bool:
     """Update by one finger's frame of time ``t``: d, θ, tilt_y, gain, shear and their covariance.
 
@@ -399,27 +498,56 @@ def update(
     sense = -1.0 if finger == 0 else 1.0
     angle_variance = theta_variance + _STEP_VARIANCE * f.count * f.count
     both = tip.in_contact and other.in_contact
+    firmness = _between(before.firmness[finger], after.firmness[finger], fraction)
+    free = covariance[3, 3] > 0.0 or f.gain_known
+    power = 0.0  # of d by F, where the frame has one amplitude for d and gain
+    if covariance[3, 3] > 0.0:
+        gain /= firmness
+    else:
+        force, _, stiffness, _, _, _, _ = lookup(table, d, total_tilt(theta, tilt_y))
+        power = force / (stiffness * d)
+        d *= firmness**-power
     if both and f.grasp.witnesses.drifted[finger] > witnesses.DRIFT_TIME:
         return False
     if both and min(f.grasp.normal[0], f.grasp.normal[1]) > _FIRM:
         innovation = angle - (f.angle.mean + 0.5 * sense * f.taper - angle_since)
-        innovation_variance = _face_variance(f, sense) + angle_variance
-        speed = abs(tip.speed) + abs(other.speed)
-        if witnesses.refuses(f.grasp.witnesses, finger, innovation, innovation_variance, speed):
+        if witnesses.refuses(
+            f.grasp.witnesses,
+            finger,
+            innovation,
+            _face_variance(f, sense) + angle_variance,
+            d - (tip.d.mean - d_since) if covariance[3, 3] > 0.0 else 0.0,
+            _variance(tip.d, f.count * f.length) + noise[0],
+            abs(tip.speed) + abs(other.speed),
+        ):
             return False
     tip.unseen = min(tip.unseen, f.slow * (max(f.t - t, 0.0) + f.response))
     tip.tilt_y = tilt_y
     tip.shear = shear
+    tip.power = power
     tip.shared[0] = systematic[0, 0]
     tip.shared[1] = systematic[1, 1]
-    tip.free = covariance[3, 3] > 0.0
+    if not free:  # the gain's part is the filter's own
+        of_gain = power * d * f.grasp.scales.prior[scales.GAIN + finger] ** 0.5
+        tip.shared[0] = max(systematic[0, 0] - of_gain * of_gain, 0.0)
     tip.fresh = True
     if not tip.in_contact:
         tip.in_contact = True
-        tip.d.mean = d + d_since
-        tip.d.variance, tip.d_gain, tip.gain_variance = noise
+        tip.before = math.inf if covariance[3, 3] == 0.0 else 0.0
+        if free:
+            tip.gain = gain
+            tip.d.mean = d + d_since
+            tip.d.variance, tip.d_gain, tip.gain_variance = noise
+        else:
+            tip.gain, relative = scales.height(f.grasp.scales, finger)
+            tip.gain_variance = relative * tip.gain * tip.gain
+            tip.before = 1.0 / relative
+            alone = d / tip.gain**power
+            slope = -power * alone / tip.gain
+            tip.d.mean = alone + d_since
+            tip.d.variance = noise[0] + slope * slope * tip.gain_variance
+            tip.d_gain = slope * tip.gain_variance
         tip.d.path_length = abs(d_since)
-        tip.gain = gain
         f.grasp.scales.gripping = False
         witnesses.forget(f.grasp.witnesses)
         if not other.in_contact:
@@ -431,7 +559,20 @@ def update(
             _update_angle(f, sense, angle_since, angle, angle_variance)
         return True
     before_it = tip.d.mean
-    _update_tip(tip, f.count * f.length, d_since, d, gain, noise)
+    if free:
+        _update_tip(tip, f.count * f.length, d_since, d, gain, noise)
+    else:
+        _update_product(
+            tip,
+            f.count * f.length,
+            d_since,
+            d,
+            power,
+            noise[0],
+            both and f.phase == OTHER,
+            both and f.phase == HOLDING,
+            f.grasp.witnesses.corrected[finger],
+        )
     f.grasp.witnesses.corrected[finger] += tip.d.mean - before_it
     predicted = f.angle.mean
     _update_angle(f, sense, angle_since, angle, angle_variance)
@@ -456,7 +597,7 @@ def _write_tip(f: FilterState, finger: int, theta: float, table: FloatArray) -> 
     force, energy, stiffness, by_tilt, _, _, inside = lookup(table, tip.d.mean, tilt)
     grasp.q[finger] = tip.q
     grasp.d[finger] = max(tip.d.mean, 0.0)
-    modulus = f.grasp.scales.modulus[finger]
+    modulus = f.grasp.scales.modulus[finger] * tip.firmness
     grasp.force[finger] = modulus * force
     grasp.stiffness[finger] = modulus * stiffness
     d_variance = _variance(tip.d, f.count * f.length) + tip.shared[0]
@@ -497,8 +638,11 @@ def _learn_scales(f: FilterState, ramping: bool) -> None:
             continue
         tip.fresh = False
         news = True
-        if tip.free:
-            scales.update_height(s, k, tip.gain, tip.gain_variance / (tip.gain * tip.gain))
+        s.product[k] = 1.0 if 0.0 < tip.before < math.inf else 0.0
+        if tip.before < math.inf:
+            relative = max(tip.gain_variance / (tip.gain * tip.gain), 1e-12)
+            known = tip.before if ramping else 0.0
+            scales.update_height(s, k, tip.gain, relative, known)
     if not news:
         return
     if both and ramping and grasp.load_arm > 0.0:
@@ -507,7 +651,24 @@ def _learn_scales(f: FilterState, ramping: bool) -> None:
             s.moment[k] = s.torque[k] / (1.0 + s.mean[scales.TORQUE + k]) - grasp.torque_residual[k]
         scales.update_torque(s, s.torque, s.moment, 0.5 * (f.tip[0].speed + f.tip[1].speed), f.t)
         scales.update_balance(s, grasp.normal[0], grasp.normal[1])
+    for k in range(2):
+        if ramping and f.tip[k].in_contact and s.product[k] > 0.0:
+            _take_height(f.tip[k], s, k)
     scales.settle(s)
+
+
+@inner_kernel
+def _take_height(tip: TrackedTip, s: Scales, finger: int) -> None:
+    """Take the gain that torques have told of, too; d is what the frames' amplitude leaves."""
+    alone = tip.d.variance - tip.d_gain * tip.d_gain / tip.gain_variance
+    gain, relative = scales.height(s, finger)
+    tip.d.mean *= (tip.gain / gain) ** tip.power
+    slope = tip.power * tip.d.mean
+    tip.d.variance = max(alone, 0.0) + slope * slope * relative
+    tip.d_gain = -slope * gain * relative
+    tip.gain = gain
+    tip.gain_variance = gain * gain * relative
+    tip.before = 1.0 / relative
 
 
 @kernel
@@ -550,8 +711,8 @@ def write_grasp(
     grasp.shear = 0.0
     if normal1 + normal2 > 0.0:
         grasp.shear = 2.0 * (abs(shear) + abs(out_of_grip)) / (normal1 + normal2)
-    modulus1 = f.grasp.scales.modulus[0]
-    modulus2 = f.grasp.scales.modulus[1]
+    modulus1 = f.grasp.scales.modulus[0] * left.firmness
+    modulus2 = f.grasp.scales.modulus[1] * right.firmness
     grasp.normal[0] = modulus1 * normal1
     grasp.normal[1] = modulus2 * normal2
     rolled = (shear - out_of_grip, shear + out_of_grip)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,7 +48,7 @@ class FingerModel:
 
 
 def make_models(
-    settings: Settings, cache: Path | None, on_event: Callable[[str, str, str], None] | None = None
+    settings: Settings, on_event: Callable[[str, str, str], None] | None = None
 ) -> tuple[FingerModel, FingerModel]:
     """Make both fingers' models, by the settings' law where a tip's modulus is not calibrated.
 
@@ -67,17 +66,17 @@ def make_models(
             if name not in settings.scene.fingers:
                 continue  # it has the other's
             material, tip = Material.constant(1.0), _measured_tip(settings, finger, calibration)
-            table = make_table(settings, material, None, tip=tip)
+            table = make_table(settings, material, tip)
         elif calibration is not None and calibration.modulus is not None:
             material = calibration.modulus.material()
             problem = law_problem(material, settings.material.force_error_max)
             if problem:
                 raise SettingsError(f"{settings.tactile.calibration[finger]}: modulus: {problem}")
-            table = make_table(settings, material, cache, on_event)
+            table = make_table(settings, material)
         else:
             if common is None:
                 law = make_material(settings.material)
-                common = law, make_table(settings, law, cache, on_event)
+                common = law, make_table(settings, law)
             material, table = common
         grid = calibrated_grid(settings, finger, calibration)
         scales = _known_scales(settings, calibration)

@@ -9,12 +9,14 @@ A tip's normal force F is known in several ways, each off by a scale of its own:
   the error of the torque constant, and o an offset: friction, or a load that stood before the grip;
 - what both tips press is equal up to what the object rubs on.
 
-One frame can't tell ε from γ. A Kalman filter holds (ε, γ, κ, o) of both fingers, with priors: a
-modulus is known to some 20 % before it was calibrated, a sensor's gain changes by 5-32 % when it is
-mounted again (DTIC ADP011007), a torque constant is good to 10 %. Torques are taken in only while a
-grip's force ramps: a wrong scale grows with the force, a load along the faces doesn't. The height
-is taken in with each frame; what changes of it in a lasting grip is the sensor's, for a modulus
-doesn't jump. What was found stays for later grips; `softfinger calibrate scales` keeps it.
+Frames that were fitted with a fixed gain, as of a solid tip, show F e^γ: there the joints' closing
+tells A, and what tells F tells γ. One frame can't tell ε from γ. A Kalman filter holds (ε, γ, κ, o)
+of both fingers, with priors: a modulus is known to some 20 % before it was calibrated, a sensor's
+gain changes by 5-32 % when it is mounted again (DTIC ADP011007), a torque constant is good to 10 %.
+Torques are taken in only while a grip's force ramps: a wrong scale grows with the force, a load
+along the faces doesn't. The height is taken in with each frame; what changes of it in a lasting
+grip is the sensor's, for a modulus doesn't jump. What was found stays for later grips; `softfinger
+calibrate scales` keeps it.
 """
 
 from __future__ import annotations
@@ -75,6 +77,7 @@ class Scales(Record):
     modulus: Pair  # e^ε: force over the table's
     torque: Pair  # of the joints, and …
     moment: Pair  # … of the tips' forces about them, when torques were taken in last [N·m]
+    product: Pair  # 1 where frames show but e^γ times the force, d and modulus in one; 0: d
     slopes: Annotated[FloatArray, STATES]  # scratch: of a measurement by the states
     cross: Annotated[FloatArray, STATES]  # scratch
     gripping: bool  # both tips touch, and have since `begin_grip`
@@ -144,12 +147,35 @@ def _update(s: Scales, innovation: float, variance: float, gate: float) -> None:
 
 
 @inner_kernel
-def update_height(s: Scales, finger: int, height: float, variance: float) -> None:
-    """Update by the filtered ``height`` of a finger's frames over the model's."""
+def height(s: Scales, finger: int) -> tuple[float, float]:
+    """Return a finger's height over the model's that is expected, and its relative variance."""
+    i = MODULUS + finger
+    j = GAIN + finger
+    variance = s.covariance[i, i] + s.covariance[j, j] + 2.0 * s.covariance[i, j]
+    return math.exp(s.mean[i] + s.mean[j]), max(variance, _HEIGHT_ERROR * _HEIGHT_ERROR)
+
+
+@inner_kernel
+def update_height(s: Scales, finger: int, height: float, variance: float, known: float) -> None:
+    """Update by the filtered ``height`` of a finger's frames over the model's.
+
+    Of its inverse ``variance`` so much was ``known`` here before, and went into it.
+    """
     slopes = s.slopes
     slopes[MODULUS + finger] = slopes[GAIN + finger] = 1.0
     innovation = math.log(max(height, 1e-3)) - s.mean[MODULUS + finger] - s.mean[GAIN + finger]
-    _update(s, innovation, variance + _HEIGHT_ERROR * _HEIGHT_ERROR, math.inf)
+    new = 1.0 - known * variance
+    if new > 0.0:
+        noise = variance / new + _HEIGHT_ERROR * _HEIGHT_ERROR
+        _update(s, innovation / new, noise, math.inf)
+    slopes[:] = 0.0
+
+
+@inner_kernel
+def _by_force(s: Scales, finger: int, slope: float) -> None:
+    """Set a measurement's slopes by what scales a tip's force, of which its ``slope`` is known."""
+    s.slopes[MODULUS + finger] = (1.0 - s.product[finger]) * slope
+    s.slopes[GAIN + finger] = -s.product[finger] * slope
 
 
 @inner_kernel
@@ -170,7 +196,7 @@ def update_torque(s: Scales, torque: Pair, moment: Pair, speed: float, t: float)
     for k in range(2):
         scaled = 0.5 * (1.0 + s.mean[TORQUE + k]) * moment[k]
         innovation += 0.5 * torque[k] - scaled - 0.5 * s.mean[OFFSET + k]
-        slopes[MODULUS + k] = scaled
+        _by_force(s, k, scaled)
         slopes[TORQUE + k] = 0.5 * moment[k]
         slopes[OFFSET + k] = 0.5
     innovation -= s.friction * min(max(speed / _MOVING, -1.0), 1.0) + s.inertia * faster / since
@@ -183,9 +209,8 @@ def update_torque(s: Scales, torque: Pair, moment: Pair, speed: float, t: float)
 @inner_kernel
 def update_balance(s: Scales, force1: float, force2: float) -> None:
     """Update by the balance: both tips press an object with about the same force."""
-    slopes = s.slopes
-    slopes[MODULUS] = 1.0
-    slopes[MODULUS + 1] = -1.0
+    _by_force(s, 0, 1.0)
+    _by_force(s, 1, -1.0)
     error = _BALANCE_ERROR + _RUBBED / min(force1, force2)
     _update(s, math.log(force2 / force1), error * error, _GATE)
 

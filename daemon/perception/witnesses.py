@@ -5,7 +5,8 @@ Frames, encoders and torques each tell how hard a tip is pressed. A scale that i
 
 - *jump*: what a frame shows of the object's angle, beyond what the joints' rolling predicts, comes
   in one frame of one tip alone, or of both while the joints stand still. A turn that is real shows
-  in both tips, and turns the joints.
+  in both tips, and turns the joints. So does d, where the joints stand still: an object that is
+  struck is pressed into one tip as it leaves the other.
 - *drift*: frames say that a tip is pressed less than the joints' closing makes it, and the joint's
   torque agrees with its closing. A load changes the torque alone; an object that has another width
   elsewhere changes the frames, and the torque agrees with them.
@@ -25,8 +26,9 @@ from softfinger.kinematics.compiled.kernel import inner_kernel
 from softfinger.kinematics.compiled.layout import Pair, Record
 
 JUMP = 0.12  # rad beyond the joints' prediction in one frame: honest ones stay below 0.04
+DEEPER = 1e-3  # m, likewise
 _SURE = 5.0  # standard deviations, likewise
-_ALIKE = 0.5  # fraction of it that the other tip shows of a turn that is real
+_ALIKE = 0.5  # fraction of it that the other tip shows of what is real
 _TURNING = 0.1  # rad/s of both joints together, or …
 _GOES_ON = 0.06  # … rad from frame to frame, likewise
 JUMPS_MAX = 2  # frames that are refused before it is reported
@@ -48,6 +50,7 @@ class WitnessState(Record):
     """Evidence against each finger's witnesses."""
 
     innovation: Pair  # of the newest frame's angle, before it was taken in or refused [rad]
+    deeper: Pair  # of its d, where it tells the gain, too [m]
     jumps: Pair  # frames that were refused in a row
     corrected: Pair  # d that frames have added lately to what the joints did [m]
     standing: Pair  # the torque that nothing explains, averaged [N·m]
@@ -59,6 +62,7 @@ class WitnessState(Record):
 def forget(w: WitnessState) -> None:
     """Forget the evidence: nothing is held any more, or something else."""
     w.innovation[:] = 0.0
+    w.deeper[:] = 0.0
     w.jumps[:] = 0.0
     w.corrected[:] = 0.0
     w.standing[:] = 0.0
@@ -66,22 +70,35 @@ def forget(w: WitnessState) -> None:
 
 
 @inner_kernel
-def refuses(w: WitnessState, finger: int, innovation: float, variance: float, speed: float) -> bool:
-    """Return whether a frame's angle, ``innovation`` [rad] off its prediction, is to be refused.
+def refuses(
+    w: WitnessState,
+    finger: int,
+    innovation: float,
+    variance: float,
+    deeper: float,
+    deeper_variance: float,
+    speed: float,
+) -> bool:
+    """Return whether a frame is to be refused for what it is off its prediction.
 
-    ``variance`` [rad²] of that; ``speed`` [rad/s]: of both joints together. The first frame of a
-    real turn is refused as well: what the other tip shows is not known yet.
+    ``innovation`` [rad] and ``deeper`` [m]: its angle and d, with their variances; ``speed``
+    [rad/s]: of both joints together. The first frame of what is real is refused as well: what the
+    other tip shows is not known yet.
     """
     other = w.innovation[1 - finger]
     before = w.innovation[finger]
     w.innovation[finger] = innovation
-    if abs(innovation) <= max(JUMP, _SURE * math.sqrt(variance)) or w.jumps[finger] >= _GIVE_UP:
-        w.jumps[finger] = 0.0
-        return False
-    alike = innovation * other > _ALIKE * innovation * innovation
-    again = w.jumps[finger] > 0.0
-    goes_on = speed > _TURNING or (again and abs(innovation - before) > _GOES_ON)
-    if alike and goes_on and (again or w.jumps[1 - finger] > 0.0):
+    w.deeper[finger] = deeper
+    turned = abs(innovation) > max(JUMP, _SURE * math.sqrt(variance))
+    moved = abs(deeper) > max(DEEPER, _SURE * math.sqrt(deeper_variance))
+    if moved:
+        moved = speed < _TURNING and abs(w.deeper[1 - finger]) < _ALIKE * abs(deeper)
+    if turned:
+        again = w.jumps[finger] > 0.0
+        goes_on = speed > _TURNING or (again and abs(innovation - before) > _GOES_ON)
+        alike = innovation * other > _ALIKE * innovation * innovation
+        turned = not (alike and goes_on and (again or w.jumps[1 - finger] > 0.0))
+    if w.jumps[finger] >= _GIVE_UP or not (turned or moved):
         w.jumps[finger] = 0.0
         return False
     w.jumps[finger] += 1.0
@@ -115,11 +132,16 @@ def check_drift(
     """
     w.corrected[finger] -= w.corrected[finger] * dt / _RECENT
     w.standing[finger] += (residual - w.standing[finger]) * dt / _RECENT
-    # What one tip gains and the other loses, the object does that is pushed towards one.
+    # What one tip gains and the other loses, the object does that is pushed towards one. What both
+    # show alike while joints move may be their rolling: it explains torque, and tells no drift.
     corrected = w.corrected[finger]
     other = w.corrected[1 - finger]
+    shared = math.copysign(min(abs(corrected), abs(other)), corrected)
+    own = corrected - shared
     if corrected * other < 0.0:
-        corrected += math.copysign(min(abs(corrected), abs(other)), other)
+        corrected = own
+    elif holding:
+        own = corrected
     closing = -by_depth * corrected
     recent = residual - w.standing[finger]
     ratio = recent / closing if closing != 0.0 else 0.0
@@ -127,7 +149,7 @@ def check_drift(
     beyond = max(abs(closing) - _NOISE, 0.0)
     limit = _RATIO_MAX * beyond + min(2.0 * beyond, _FRICTION)
     agrees = ratio > _RATIO_MIN and abs(recent) < limit + _NOISE
-    if quiet and abs(closing) > apart and (holding or closing > 0.0) and agrees:
+    if quiet and by_depth * abs(own) > apart and (holding or closing > 0.0) and agrees:
         w.drifted[finger] += dt
     else:
         w.drifted[finger] = 0.0

@@ -1,25 +1,17 @@
-"""Makes what settings describe: tip, material, contact table, sensor grid.
-
-Contact tables are kept in files, so that a start does not build them again. One that is damaged or
-can't be read is replaced; where no file can be kept, the table is built anyway.
-"""
+"""Makes what settings describe: tip, material, contact table, sensor grid."""
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Callable
-from functools import lru_cache, partial
-from pathlib import Path
+from functools import lru_cache
 
 import numpy as np
 
 from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.profile.settings import MaterialSettings, Settings
-from softfinger.kinematics.compiled.own_folder import OwnFolder
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.lookup import TableError
 from softfinger.kinematics.contact.material import Material
-from softfinger.kinematics.contact.table import ContactTable, table_key
+from softfinger.kinematics.contact.table import ContactTable
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
 
@@ -57,33 +49,24 @@ def make_material(law: MaterialSettings) -> Material:
 
 
 def make_table(
-    settings: Settings,
-    material: Material,
-    cache: Path | None,
-    on_event: Callable[[str, str, str], None] | None = None,
-    tip: Fingertip | None = None,
+    settings: Settings, material: Material, tip: Fingertip | None = None
 ) -> ContactTable:
-    """Return contact table, from its file in ``cache`` where one fits; ``tip``: not the settings'.
+    """Make the contact table; ``tip``: another than the settings'.
 
-    ``on_event`` takes a warning where that file can't be used. Raises SettingsError when no table
-    of this material reaches the tolerance.
+    Raises SettingsError when no table of this material reaches the tolerance.
     """
     tip = tip or make_tip(settings)
-    tolerance = settings.table.tolerance
-    warn = warnings.warn if on_event is None else partial(on_event, "warning", "table")
     try:
         if tip.physics != "springs":  # which takes no time to make
             return ContactTable.build(tip, material)
-        if cache is None:
-            return _built(tip, material, tolerance)
-        return load_or_build(cache, tip, material, tolerance, warn)
+        return _built(tip, material, settings.table.tolerance)
     except TableError as error:
         raise SettingsError(f"table.tolerance: {error}") from None
 
 
 @lru_cache(maxsize=8)
 def _built(tip: Fingertip, material: Material, tolerance: float) -> ContactTable:
-    """The table without a file: 0.16 s of work that hands of one process share."""
+    """0.16 s of work that hands of one process share."""
     return ContactTable.build(tip, material, tolerance)
 
 
@@ -103,51 +86,3 @@ def make_grid(
         rotation=tactile.rotation[finger] if rotation is None else rotation,
         blur=tactile.blur,
     )
-
-
-def table_file(folder: Path, tip: Fingertip, material: Material, tolerance: float) -> Path:
-    """Return where in ``folder`` the table of this tip, material, tolerance and version is kept."""
-    return folder / f"contact-{table_key(tip, material, tolerance).hex()[:16]}.table"
-
-
-def save_table(file: Path, table: ContactTable, tip: Fingertip, material: Material) -> None:
-    """Write ``file``, making its folder. Raises OSError where that is not possible."""
-    with OwnFolder(file.parent) as folder:
-        folder.write(file.name, table.to_bytes(tip, material))
-
-
-def load_table(file: Path, tip: Fingertip, material: Material, tolerance: float) -> ContactTable:
-    """Read ``file``. Raises OSError, or TableError when it holds no sound table of this kind."""
-    with OwnFolder(file.parent) as folder:
-        data = folder.read(file.name)
-    try:
-        return ContactTable.from_bytes(data, tip, material, tolerance)
-    except TableError as error:
-        raise TableError(f"{file}: {error}") from None
-
-
-def load_or_build(
-    folder: Path,
-    tip: Fingertip,
-    material: Material,
-    tolerance: float,
-    warn: Callable[[str], None],
-) -> ContactTable:
-    """Return the table kept in ``folder``, or built and kept there.
-
-    ``warn`` takes what is wrong with a file or the folder. Raises TableError when the tolerance
-    can't be met.
-    """
-    file = table_file(folder, tip, material, tolerance)
-    try:
-        return load_table(file, tip, material, tolerance)
-    except (FileNotFoundError, NotADirectoryError):
-        pass
-    except (OSError, TableError) as error:
-        warn(f"the contact table is built again: {error}")
-    table = ContactTable.build(tip, material, tolerance)
-    try:
-        save_table(file, table, tip, material)
-    except OSError as error:
-        warn(f"the contact table can't be kept, each start builds it again: {error}")
-    return table

@@ -108,6 +108,10 @@ class TipSettings(Section):
     poisson: Annotated[float, Field(ge=0.45, le=0.4995)] = 0.49  # of a solid tip
     base: Literal["bonded", "lying"] = "bonded"  # a solid tip on its sensor
     face: Literal["frictionless", "sticking"] = "frictionless"  # a solid tip on the object
+    # how much firmer it is at once than in the end, by each of three Prony terms
+    relaxation: tuple[Fraction, Fraction, Fraction] = (0.0, 0.0, 0.0)
+    # s, of each: a human fingerpad's (Pawluk & Howe, 1999)
+    relaxation_times: tuple[Positive, Positive, Positive] = (0.004, 0.07, 1.4)
 
 
 class MaterialSettings(Section):
@@ -146,6 +150,8 @@ class ServoSettings(Section):
     reply_timeout: Annotated[float, Field(gt=0, le=1)] = 0.004  # s, a missing reply costs no more
     fault_after: Seconds = 0.05  # s without a good reading → fault
     watchdog: Annotated[float, Field(ge=0, le=2.54)] = 0.1  # s, the servo's own; 0 leaves it off
+    heat_rise: NonNegative = 0.0  # K/A² that its case warms by in the end; 0: the model's own
+    heat_time: NonNegative = 0.0  # s in which it does, likewise
 
 
 class TactileSettings(Section):
@@ -202,7 +208,7 @@ class LoopSettings(Section):
 
     ``real`` is this machine's time; ``hand`` a simulated hand's own, which waits while the machine
     is busy; ``virtual`` runs as fast as the machine can. The latter two need simulated backends;
-    ``auto`` is ``hand`` with these and ``real`` with others.
+    ``auto`` is ``hand`` with these and on the ports of `softfinger emulate`, else ``real``.
     """
 
     rate: Annotated[float, Field(ge=10, le=5000)] = 500.0  # Hz, ticks
@@ -304,8 +310,9 @@ class SafetySettings(Section):
     current_fault: Positive = 1.8  # A measured for 0.1 s → fault
     stall_error: Positive = 0.1  # rad off its goal, with all the current it may take …
     stall_time: Seconds = 2.0  # … for so many s: a joint has stalled → fault
-    temperature_warn: Positive = 60.0  # °C of a servo
-    temperature_max: Positive = 70.0  # °C → fault
+    temperature_max: Positive = 70.0  # °C of a servo → fault
+    heat_warn: Positive = 60.0  # s before that: warned, and a grip eased to what lasts
+    heat_action: Literal["hold", "release", "stop"] = "hold"  # where the load needs more
     voltage_min: NonNegative = 0.0  # V of a servo's supply → fault; 0: the model's own limit
     voltage_max: NonNegative = 0.0  # V, likewise
     residual_angle: Positive = 0.2  # rad between the object's angles by the two fingers → fault
@@ -370,9 +377,15 @@ class SimulationSettings(Section):
     tip_shear_stiffness: Ratio = 1.0  # of its springs along the face over that across it
     tip_creep_time: NonNegative = 0.0  # s in which a stuck shear relaxes to 1/e; 0: it stays
     tip_micro_slip: bool = False  # the footprint's edge slips before all of it does
+    # how much firmer a tip is at once than in the end, by each of three Prony terms; 0: elastic
+    tip_relaxation: tuple[Fraction, Fraction, Fraction] = (0.0, 0.0, 0.0)
+    # s, of each: a human fingerpad's (Pawluk & Howe, 1999)
+    tip_relaxation_times: tuple[Positive, Positive, Positive] = (0.004, 0.07, 1.4)
     joint_inertia: Factor = 0.010  # kg·m² at the joint: finger and reflected rotor
     joint_damping: NonNegative = 0.02  # N·m·s/rad
     joint_friction: NonNegative = 0.05  # N·m, Coulomb
+    servo_heat: tuple[Factor, Factor, Factor] = (1.0, 1.0, 1.0)  # of heating, cooling, capacity
+    ambient: Annotated[float, Field(ge=-40, le=80)] = 25.0  # °C around the servos
     compression_speed: NonNegative = 0.004  # m/s, presses the object on the tips; no servos only
 
 

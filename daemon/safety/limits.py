@@ -173,22 +173,22 @@ def _servos_alert(view: View, state: State, _: float) -> str:
     return f"servos: hardware error reported by {' and '.join(parts)}"
 
 
-@Limit("servos.temperature", "temperature of a servo", "warn", ("safety.temperature_warn",),
-    "servos", in_turn=True)  # fmt: skip
+@Limit("servos.heat", "time until a servo is at its limit of temperature, by its thermal model",
+    "warn", ("safety.heat_warn", "safety.heat_action"), "servos", in_turn=True)  # fmt: skip
 def _servos_warm(view: View, state: State, fraction: float) -> str:
-    return _hotter(view, state, fraction * view.limits.temperature_warn)
+    for i in view.fingers:
+        left = state.heat[i].time_to_limit
+        if not left >= view.limits.heat_warn / fraction:
+            return f"{FINGERS[i]} servo at {view.limits.temperature_max:g} °C in {left:.0f} s"
+    return ""
 
 
 @Limit("servos.temperature", "temperature of a servo", "fault", ("safety.temperature_max",),
     "servos", in_turn=True)  # fmt: skip
 def _servos_hot(view: View, state: State, fraction: float) -> str:
-    return _hotter(view, state, fraction * view.limits.temperature_max)
-
-
-def _hotter(view: View, state: State, bound: float) -> str:
     for i in view.fingers:
         temperature = state.reading.temperature[i]
-        if not temperature < bound:
+        if not temperature < fraction * view.limits.temperature_max:
             return f"{FINGERS[i]} servo at {temperature:.0f} °C"
     return ""
 
@@ -439,10 +439,13 @@ def _doubt(view: View, finger: int) -> str:
     """Return why a sensor's frames are refused, or an empty text."""
     side, found = FINGERS[finger], view.grasp.witnesses
     if found.jumps[finger] > witnesses.JUMPS_MAX:
-        jumped = math.degrees(abs(found.innovation[finger]))
+        turned, deeper = found.innovation[finger], 1e3 * found.deeper[finger]
+        what = f"the object turned by {math.degrees(abs(turned)):.0f}°"
+        if abs(turned) <= witnesses.JUMP:
+            what = f"the tip {abs(deeper):.1f} mm {'deeper' if deeper > 0.0 else 'less deep'}"
         return (
-            f"{side} sensor shows the object turned by {jumped:.0f}° at once, which neither the "
-            "joints nor the other tip explain: its image has moved, or the object ends under it"
+            f"{side} sensor shows {what} at once, which neither the joints nor the other tip "
+            "explain: its image has moved or is old, or the object ends under it"
         )
     if found.drifted[finger] > witnesses.DRIFT_TIME:
         off = 1e3 * found.corrected[finger]
@@ -591,7 +594,7 @@ def _hand_force(view: View, state: State, fraction: float) -> str:
     bound = fraction * view.limits.residual_force * max(left, right)
     if not view.holds(state) or abs(left - right) <= bound:
         return ""
-    return f"the tips feel {left:.1f} N and {right:.1f} N of one grip"
+    return f"the left tip feels {left:.1f} N and the right one {right:.1f} N of one grip"
 
 
 @Limit("grip.slip", "shear against friction less a margin", "warn",

@@ -15,7 +15,7 @@ from softfinger.daemon.servos.control_table import ServoModel
 from softfinger.daemon.servos.joint import JointScale, servo_name
 from softfinger.daemon.servos.port import latency_file
 from softfinger.daemon.servos.protocol import ServoLine
-from softfinger.daemon.types import FINGERS
+from softfinger.daemon.types import FINGERS, GRIP_FRACTION
 
 CHECKED = reg.BACKUP_READY  # registers 0 … 146 are read
 # Return delays of both servos pass within one read; above 50 µs each they eat a 500 Hz tick.
@@ -27,6 +27,7 @@ FIX = "`softfinger doctor --fix`"
 REBOOT_FIX = "remove the cause, then `softfinger doctor --fix` reboots it"
 _WATCHDOG_FIRMWARE = 38
 _LONG = 0.5  # s without an answer, from which on servos.fault_after is worth a notice
+_CONSTANT_OFF = 1.3  # factor by which a torque constant may differ from the data sheet's
 _NEAR_LIMIT = 10  # °C below the temperature limit
 # rad beyond the hand's limits at which a joint's angle is not believed: a wrong zero, or a servo
 # that forgot its turns when it was switched off.
@@ -210,7 +211,24 @@ def notice_servo(
         ),
         (present >= limit - _NEAR_LIMIT, f"{present} °C, near its limit of {limit} °C"),
     )
-    return [Finding("warn", name, text) for true, text in notices if true]
+    found = [Finding("warn", name, text) for true, text in notices if true]
+    return found + notice_strength(name, model, settings)
+
+
+def notice_strength(name: str, model: ServoModel, settings: Settings) -> list[Finding]:
+    """Return the findings on forces and a torque constant that a model can't have."""
+    gear, lever = settings.servos.gear_ratio, settings.hand.finger_length
+    force = GRIP_FRACTION * settings.safety.force_max
+    bound, constant = gear * model.stall[0] / lever, gear * model.torque_constant
+    found = []
+    if force > bound:
+        text = f"{force:.3g} N may be asked for, and it stalls at {bound:.2g} N on this finger"
+        found.append(Finding("warn", name, text, "lower safety.force_max and safety.current_max"))
+    given = settings.control.torque_constant
+    if constant and not 1.0 / _CONSTANT_OFF < given / constant < _CONSTANT_OFF:
+        text = f"control.torque_constant is {given:g} N·m/A, its data sheet's {constant:.3g}"
+        found.append(Finding("warn", name, text, f"control.torque_constant = {constant:.3g}"))
+    return found
 
 
 def check_angle(name: str, q: float, hand: GeometrySettings, finger: int) -> Finding | None:

@@ -104,12 +104,14 @@ MODE_NUMBERS: Final = {name: number for number, name in MODE_NAMES.items()}
 
 # --- hardware errors, registers 70 and 63 --------------------------------------------------------
 
+OVERHEATING: Final = 2
+OVERLOAD: Final = 5
 HARDWARE_ERRORS: Final = {
     0: "input voltage out of limits",
-    2: "overheating",
+    OVERHEATING: "overheating",
     3: "motor encoder",
     4: "electrical shock",
-    5: "overload",
+    OVERLOAD: "overload",
 }
 
 
@@ -121,10 +123,9 @@ def hardware_error_names(status: int) -> str:
 
 # --- models --------------------------------------------------------------------------------------
 
-# Our own choice for the simulated servos, where the manuals say nothing: one thermal time constant.
-AMBIENT: Final = 25.0  # °C
-THERMAL_TIME: Final = 120.0  # s
-_THERMAL_RISE = 90.0  # °C over ambient at stall current, in the long run
+_SPECIFIC_HEAT = 0.9  # J/(g K), of plastic, aluminium and steel alike
+_CONVECTION = 10.0  # W/(m² K), of a body this small in still air
+SAG: Final = 0.35  # Ω of a simulated supply and its cable
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,6 +148,9 @@ class ServoModel:
     shutdown: int
     drive_mode_max: int
     fast_read_firmware: int  # first version that answers fast sync and fast bulk read
+    stall: tuple[float, float, float]  # N·m and A at a stall, at V
+    mass: float  # g
+    size: tuple[float, float, float]  # mm
     modes: tuple[int, ...] = tuple(MODE_NAMES)
     pwm_slope: int | None = None  # default of register 62, where the model has it
     small: bool = False  # X330 frame: its indirect map moved with firmware 53
@@ -167,6 +171,12 @@ class ServoModel:
         return self.current_limit * self.current_unit if self.senses_current else 1.0
 
     @property
+    def torque_constant(self) -> float:
+        """N·m per A at the shaft; 0 without a current sensor."""
+        torque, current, _ = self.stall
+        return torque / current if self.senses_current else 0.0
+
+    @property
     def no_load_speed(self) -> float:
         """rad/s at the shaft with full PWM and no load; the default velocity limit is about it."""
         return self.velocity_limit * VELOCITY_UNIT
@@ -176,10 +186,21 @@ class ServoModel:
         """V: the middle of the supply's range."""
         return (self.voltage_min + self.voltage_max) / 2.0 * VOLTAGE_UNIT
 
-    def settled_temperature(self, current: float) -> float:
-        """Return the temperature [°C] that a simulated motor settles at with this current [A]."""
-        ratio = current / self.stall_current
-        return AMBIENT + _THERMAL_RISE * ratio * ratio
+    @property
+    def resistance(self) -> float:
+        """Ω that the stall's current meets, the driver's included."""
+        return self.stall[2] / self.stall[1]
+
+    @property
+    def heat_capacity(self) -> float:
+        """J/K: of its mass."""
+        return _SPECIFIC_HEAT * self.mass
+
+    @property
+    def case_resistance(self) -> float:
+        """K/W between case and still air: of its surface."""
+        a, b, c = (1e-3 * side for side in self.size)
+        return 1.0 / (_CONVECTION * 2.0 * (a * b + b * c + c * a))
 
     def indirect_blocks(self, firmware: int) -> tuple[tuple[int, int, int], ...]:
         """Return (first address register, first data register, entries) of each indirect block."""
@@ -204,21 +225,29 @@ _WITHOUT_CURRENT = (VELOCITY_MODE, POSITION_MODE, EXTENDED_POSITION_MODE, PWM_MO
 # count, current limit, velocity limit and its bound, °C, 0.1 V; then gains, shutdown and the rest.
 _MODELS: tuple[tuple[Any, ...], ...] = (
     ("XM430-W350", 1020, 48, 7, 2.69e-3, 1193, 200, 1023, 80, 95, 160,
-     (1920, 100), (0, 0, 800), 52, 5, 45),
+     (1920, 100), (0, 0, 800), 52, 5, 45, (4.1, 2.3, 12.0),
+     82, (28.5, 46.5, 34.0)),
     ("XM430-W210", 1030, 48, 7, 2.69e-3, 1193, 330, 1023, 80, 95, 160,
-     (1920, 100), (0, 0, 800), 52, 5, 45),
+     (1920, 100), (0, 0, 800), 52, 5, 45, (3.0, 2.3, 12.0),
+     82, (28.5, 46.5, 34.0)),
     ("XM540-W270", 1120, 48, 7, 2.69e-3, 2047, 128, 1023, 80, 95, 160,
-     (1920, 100), (0, 0, 800), 52, 5, 45),
+     (1920, 100), (0, 0, 800), 52, 5, 45, (10.6, 4.4, 12.0),
+     165, (33.5, 58.5, 44.0)),
     ("XL330-M288", 1200, 53, 6, 1e-3, 1750, 445, 2047, 70, 35, 70,
-     (1600, 180), (0, 0, 400), 53, 5, 46, _ALL, 140, True),
+     (1600, 180), (0, 0, 400), 53, 5, 46, (0.52, 1.47, 5.0),
+     18, (20.0, 34.0, 26.0), _ALL, 140, True),
     ("XL330-M077", 1190, 53, 6, 1e-3, 1750, 1620, 2047, 70, 35, 70,
-     (400, 40), (0, 400, 400), 53, 5, 46, _ALL, 140, True),
+     (400, 40), (0, 400, 400), 53, 5, 46, (0.215, 1.47, 5.0),
+     18, (20.0, 34.0, 26.0), _ALL, 140, True),
     ("XC330-T288", 1220, 53, 6, 1e-3, 910, 320, 2047, 70, 55, 140,
-     (1200, 40), (0, 0, 900), 52, 13, 46, _ALL, 255, True),
+     (1200, 40), (0, 0, 900), 52, 13, 46, (0.92, 0.80, 11.1),
+     23, (20.0, 34.0, 26.0), _ALL, 255, True),
     ("XC330-M288", 1240, 53, 6, 1e-3, 2352, 350, 2047, 70, 35, 70,
-     (1600, 50), (500, 0, 1100), 52, 13, 46, _ALL, 140, True),
+     (1600, 50), (500, 0, 1100), 52, 13, 46, (0.93, 1.80, 5.0),
+     23, (20.0, 34.0, 26.0), _ALL, 140, True),
     ("XL430-W250", 1060, 48, 7, 0.0, 0, 265, 1023, 72, 60, 140,
-     (1000, 100), (4000, 0, 640), 52, 13, 45, _WITHOUT_CURRENT),
+     (1000, 100), (4000, 0, 640), 52, 13, 45, (1.5, 1.4, 12.0),
+     57.2, (28.5, 46.5, 34.0), _WITHOUT_CURRENT),
 )  # fmt: skip
 MODELS: Final = {row[0]: ServoModel(*row) for row in _MODELS}
 

@@ -54,6 +54,8 @@ _FROZEN = 0.1  # s in which a servo's own clock, of 1 ms, must advance
 _LENGTHS = 11  # of each span: the shortest, and up to ten registers before it
 _DOUBTFUL = 32  # requests
 _PATIENCE = 0.2  # s for a reply while the servos are checked; `clear` holds the loop up for it
+# s for a reply of an emulated hand, which the machine may hold up while the hand's time stands.
+_BUSY = 0.04
 _LAST_TRIES = 10  # of torque off, at the end
 
 
@@ -98,7 +100,8 @@ class DynamixelServos:
             Joint(f, servos.ids[f], JointScale.of(servos, f, model), sent=deque(maxlen=stored))
             for f in map(FINGERS.index, profile.scene.fingers)
         ]
-        port = SerialPort(servos.port, servos.baud, servos.reply_timeout)
+        patience = _BUSY if self._clock.waits else 0.0
+        port = SerialPort(servos.port, servos.baud, max(servos.reply_timeout, patience))
         port.openPort()
         line = ServoLine(port, self._handler)
         torque = Torque(line, model, servos, profile.hand, self._joints)

@@ -5,11 +5,11 @@ Why the SDK's own port is not used is listed in :mod:`servos.protocol`.
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import math
 import os
 import select
-import termios
 import time
 from pathlib import Path
 
@@ -17,6 +17,9 @@ import serial
 from dynamixel_sdk.port_handler import PortHandler
 
 from softfinger.daemon.errors import ServoError
+
+with contextlib.suppress(ModuleNotFoundError):  # Windows: simulated servos alone
+    import termios
 
 BITS_PER_BYTE = 10
 # s for a reply where nothing hurries (setting up, calibrating): a factory-new servo with its return

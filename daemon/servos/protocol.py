@@ -323,11 +323,9 @@ class ServoLine:
 
 
 @contextlib.contextmanager
-def open_line(
-    path: str, baud: int, reply_timeout: float = UNHURRIED, low_latency: bool = True
-) -> Iterator[ServoLine]:
+def open_line(path: str, baud: int, low_latency: bool = True) -> Iterator[ServoLine]:
     """Yield a line on its own port, closed at the end. Raises ServoError if it can't be opened."""
-    port = SerialPort(path, baud, reply_timeout, low_latency)
+    port = SerialPort(path, baud, UNHURRIED, low_latency)
     port.openPort()
     try:
         yield ServoLine(port)

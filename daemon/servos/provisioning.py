@@ -49,8 +49,12 @@ class FoundServo:
     firmware: int
 
     def __str__(self) -> str:
+        return self.told(str(self.baud))
+
+    def told(self, rates: str) -> str:
+        """Return the line of a servo that answers at these rates [baud]."""
         name = reg.name_of(self.number)
-        return f"ID {self.id} at {self.baud} baud: {name}, firmware {self.firmware}"
+        return f"ID {self.id} at {rates} baud: {name}, firmware {self.firmware}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,11 +211,10 @@ def plan(found: Found, settings: Settings, model: ServoModel, rates: Sequence[in
 # --- setting them up -----------------------------------------------------------------------------
 
 
-def provision(settings: Settings, search_time: float = SEARCH_TIME) -> list[Finding]:
+def provision(settings: Settings) -> list[Finding]:
     """Set each servo of the scene up: ID, rate, mode, no return delay, reads answered, no errors.
 
     Returns what was ``fixed``, and as ``warn`` what could not be.
-    ``search_time`` [s] is given to each rate where a servo has to be searched for.
 
     Raises:
         ServoError: the port can't be opened.
@@ -226,7 +229,7 @@ def provision(settings: Settings, search_time: float = SEARCH_TIME) -> list[Find
     with open_line(servos.port, servos.baud) as line:
         complete = all(line.ping(servo_id) is not None for servo_id in names)
     if not complete:
-        found = search(servos.port, model.baud_rates, search_time, {FACTORY_ID, *servos.ids})
+        found = search(servos.port, model.baud_rates, SEARCH_TIME, {FACTORY_ID, *servos.ids})
         what = plan(found, settings, model, model.baud_rates)
         for change in what.changes:
             _identify(servos.port, change, model, result)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Protocol
 
 from softfinger.daemon.clock import Clock
@@ -16,10 +17,24 @@ from softfinger.daemon.servos.joint import JointScale, current_toward
 from softfinger.daemon.types import FINGERS, Goal, Reading
 
 _HEALTH_EVERY = 0.25  # s between two readings of temperature and supply
+_OVERLOAD = 2.0  # s of all the current allowed
+
+
+class MotorHeat(Protocol):
+    """Heat of one motor."""
+
+    sensed: float  # what its thermometer shows [°C]
+
+    def step(self, current: float, seconds: float) -> None:
+        """Go on by ``seconds`` with this ``current`` [A]."""
 
 
 class HandPlant(JointPlant, Protocol):
-    """The joints of the simulated hand, which knows of the servos' watchdog."""
+    """The joints of the simulated hand, which knows of the servos' watchdog and their heat."""
+
+    @property
+    def servo_heat(self) -> Sequence[MotorHeat]:
+        """Heat of each joint's motor."""
 
     def hold_torque_until(self, t: float) -> None:
         """Hold torque until time t [s], when it ends by itself."""
@@ -51,7 +66,8 @@ class SimulatedServos:
         self._q = [0.0, 0.0]  # of the last reading [rad, rad/s]
         self._dq = [0.0, 0.0]
         self._seq = 0
-        self._temperature = [reg.AMBIENT, reg.AMBIENT]  # °C
+        self._errors = [0, 0]  # hardware error bits
+        self._pressed = [0.0, 0.0]  # s of all the current that is allowed
         self._health_read = -math.inf
 
     def connect(self) -> None:
@@ -81,18 +97,32 @@ class SimulatedServos:
             self._read_health(reading)
         self._seq += 1
         reading.seq = self._seq
-        reading.alert = reading.lost = reading.frozen = 0
+        reading.lost = reading.frozen = 0
         reading.valid = True
 
     def _read_health(self, reading: Reading) -> None:
         passed = min(reading.t - self._health_read, _HEALTH_EVERY * 2.0)
         self._health_read = reading.t
+        currents = [abs(each) for each in self._hand.current.tolist()]
+        voltage = self._model.supply - reg.SAG * sum(currents)
+        reading.alert = 0
         for joint in self._joints:
-            settled = self._model.settled_temperature(self._hand.current.item(joint))
-            warmer = settled - self._temperature[joint]
-            self._temperature[joint] += warmer * passed / reg.THERMAL_TIME
-            reading.temperature[joint] = float(round(self._temperature[joint]))
-            reading.voltage[joint] = self._model.supply
+            heat, current = self._hand.servo_heat[joint], currents[joint]
+            heat.step(current, passed)
+            reading.temperature[joint] = float(round(heat.sensed))
+            reading.voltage[joint] = round(voltage / reg.VOLTAGE_UNIT) * reg.VOLTAGE_UNIT
+            limit = min(self._settings.current_limit[joint], self._model.stall_current)
+            pressed = self._torque and current >= 0.99 * limit
+            self._pressed[joint] = self._pressed[joint] + passed if pressed else 0.0
+            hot, over = (
+                heat.sensed > self._model.temperature_limit,
+                self._pressed[joint] > _OVERLOAD,
+            )
+            errors = self._errors[joint] = hot << reg.OVERHEATING | over << reg.OVERLOAD
+            reading.hardware[joint] = errors
+            reading.alert |= bool(errors) << joint
+        if reading.alert and self._torque:
+            self._drive()
 
     def torque_on(self) -> None:
         """Switch torque on, the goal at the present count, no current until a goal is written."""
@@ -171,4 +201,5 @@ class SimulatedServos:
     def _drive(self) -> None:
         for joint in self._joints:
             goal_q, goal_current = self._goal_q[joint], self._goal_current[joint]
-            self._hand.drive(joint, self._mode, self._torque, goal_q, goal_current)
+            torque = self._torque and not self._errors[joint]  # as after a shutdown
+            self._hand.drive(joint, self._mode, torque, goal_q, goal_current)

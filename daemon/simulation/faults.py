@@ -43,6 +43,7 @@ BOARD_FAULTS = {  # kind → probability if none is given
     "saturated": 1.0,
     "zero": 1.0,
 }
+_UNVALUED = ("unplug", "plug", "well")
 
 
 class FaultSource:
@@ -95,6 +96,10 @@ class FaultEvent(NamedTuple):
     value: float = 1.0  # a probability, a servo's ID, a load, or a measurement's error
     over: float = 0.0  # s in which it comes
 
+    def __str__(self) -> str:
+        value = "" if self.kind in _UNVALUED else f"={self.value:g}"
+        return f"{self.part}: {self.kind}{value}" + f" within {self.over:g} s" * bool(self.over)
+
 
 class _Form(NamedTuple):
     """Kinds of faults that are written alike."""
@@ -128,8 +133,8 @@ _FORMS = (
     _Form(LINE_FAULTS, "=PROBABILITY", (SERVOS,)),
     _Form(MEASUREMENT_FAULTS, "=NUMBER", FINGERS, sided=True),
     _Form(("push", "twist"), "=NUMBER", (OBJECT,)),  # N along its faces, away from the palm; N·m
-    _Form(("unplug", "plug"), "", (SERVOS,), sided=True),
-    _Form(("well",), "", (SERVOS, *FINGERS), sided=True),
+    _Form(_UNVALUED[:2], "", (SERVOS,), sided=True),
+    _Form(_UNVALUED[2:], "", (SERVOS, *FINGERS), sided=True),
 )
 _WORD = re.compile(r"(?:([^:]*):)?([a-z-]+)(?:=([^@]*))?(?:@(.*?)(?:\.\.(.*))?)?")
 

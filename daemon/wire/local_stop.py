@@ -19,7 +19,8 @@ from typing import Any
 import msgpack
 
 from softfinger.daemon.errors import AddressError
-from softfinger.daemon.own_files import home_folder, require_own, shared_folder
+from softfinger.daemon.own_files import home_folder, shared_folder
+from softfinger.kinematics.compiled.own_folder import require_own
 
 _ANY = ("localhost", "*", "0.0.0.0", "[::]")  # and addresses that mean this machine, too
 _LONGEST = 4096  # bytes
@@ -93,6 +94,8 @@ def stop_locally(address: str, seconds: float) -> dict[str, Any] | None:
         name = _name(address)
     except ValueError:
         return None
+    if not hasattr(socket, "AF_UNIX"):
+        return None
     for folder in _folders():
         if not _is_ours(folder):
             continue
@@ -161,7 +164,8 @@ def _is_ours(folder: Path) -> bool:
         require_own(folder)
     except OSError:
         return False
-    return not folder.stat().st_mode & 0o077
+    found = folder.stat()
+    return found.st_uid == os.geteuid() and not found.st_mode & 0o077
 
 
 def _remove_dead(path: Path, address: str) -> None:

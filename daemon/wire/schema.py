@@ -105,6 +105,7 @@ class _Finger(NamedTuple):
 
 _finger = FieldSource[_Finger]()
 _contact = _finger.of(lambda f: f.state.contacts[f.i])
+_heat = _finger.of(lambda f: f.state.heat[f.i])
 _pose = FieldSource[ObjectPose]()
 _goal = _state.of(lambda s: s.goal)
 
@@ -174,6 +175,13 @@ class FingerState:
     )
     frame_age_s: float = _finger("s", "age of that frame's sample", _frame_age)
     invalid: str = _finger("", "why it is not valid, empty when it is", lambda f: _invalid(f).text)
+    winding: float = _heat("°C", "temperature of the motor's winding, by the thermal model")
+    winding_std: float = _heat("°C", "its standard deviation")
+    case: float = _heat("°C", "temperature without the reading's steps, by the thermal model")
+    case_std: float = _heat("°C", "its standard deviation")
+    time_to_limit: float = _heat(
+        "s", "until the servo is at safety.temperature_max with this current; 3600: an hour or more"
+    )
 
 
 @record

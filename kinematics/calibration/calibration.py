@@ -18,9 +18,11 @@ from numpy.typing import ArrayLike, NDArray
 from softfinger import SoftfingerError
 from softfinger.kinematics.calibration.press_fit import (
     Presses,
+    Trend,
     depth_of_force,
     fit_place,
     modulus_by_force,
+    trend,
 )
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
@@ -355,12 +357,16 @@ def fit_centre(
 
 @dataclass(frozen=True)
 class Modulus:
-    """E [Pa] of F = πE(d − d₀)²/cos θ; ``offset`` d₀ [m]; ``errors`` [n] relative, of the force."""
+    """E [Pa] of F = πE(d − d₀)²/cos θ; ``offset`` d₀ [m]; ``errors`` [n] relative, of the force.
+
+    ``trend``: E of each load alone.
+    """
 
     modulus: float
     offset: float
     errors: FloatArray
     residual: float
+    trend: Trend
 
 
 def fit_modulus(
@@ -387,7 +393,9 @@ def fit_modulus(
         modulus, offset, fitted = modulus_by_force(depth, tilt, load, tip, free_offset)
         if not modulus > 0.0:
             raise CalibrationError("modulus: the force does not rise with d")
-        return Modulus(modulus, offset, fitted / load - 1.0, _rms(fitted / load - 1.0))
+        errors = fitted / load - 1.0
+        alone = trend(depth, modulus / (1.0 + errors), load)
+        return Modulus(modulus, offset, errors, _rms(errors), alone)
     root = np.sqrt(load * np.cos(tilt) / math.pi)
     rows = np.stack([depth, np.ones(len(depth))], axis=1) if free_offset else depth[:, None]
     solution = np.linalg.lstsq(rows, root, rcond=None)[0]
@@ -396,7 +404,9 @@ def fit_modulus(
     fitted = rows @ solution
     offset = -float(solution[1] / solution[0]) if free_offset else 0.0
     errors = (fitted / root) ** 2 - 1.0
-    return Modulus(float(solution[0]) ** 2, offset, errors, _rms(errors))
+    modulus = float(solution[0]) ** 2
+    alone = trend(depth, modulus / (1.0 + errors), load)
+    return Modulus(modulus, offset, errors, _rms(errors), alone)
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,8 @@ _ROTATION_STEP = 1e-4  # rad
 _TURNS = 8  # rotations that are tried first
 _GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
 _NARROW = 4e-3  # of ν
+_SAME_D, _SAME_THETA = 5e-5, 0.009  # m, rad: presses that differ by less are one repeated
+_DRIFT_MIN = 0.02  # of E, that a fit may hide: presses and tables are no better
 
 
 @dataclass(frozen=True)
@@ -55,6 +57,57 @@ class Presses:
 
 
 @dataclass(frozen=True)
+class Trend:
+    """E [n] Pa of each press alone, over its d [n] m: what one E for all of them may hide.
+
+    ``drift`` is what a line through them gains from the least d to the largest, relative, and
+    ``std`` its standard deviation by the scatter round the line.
+    """
+
+    d: FloatArray
+    modulus: FloatArray
+    drift: float
+    std: float
+
+    @property
+    def drifts(self) -> bool:
+        """E drifts by more than scatter makes of it: this is not the tip's law."""
+        return abs(self.drift) > max(2.0 * self.std, _DRIFT_MIN)
+
+    @property
+    def cause(self) -> str:
+        """Return what makes E drift that way."""
+        if self.drift > 0.0:
+            return "the tip stiffens more than this law: another base or face, or springs"
+        return "the tip stiffens less than this law: another base or face, or solid, or it softens"
+
+
+def trend(d: FloatArray, modulus: FloatArray, force: FloatArray) -> Trend:
+    """Lay a line through ``modulus`` [n] Pa over ``d`` [n] m, each as sure as its ``force`` [n]."""
+    weight = force / force.max()
+    span = np.ptp(d)
+    rows = weight[:, None] * np.stack([np.ones(len(d)), (d - d.min()) / span], axis=1)
+    (start, gain), *_ = np.linalg.lstsq(rows, weight * modulus, rcond=None)
+    left = weight * modulus - rows @ (start, gain)
+    variance = float(left @ left) / max(len(d) - 2, 1) * np.linalg.inv(rows.T @ rows)[1, 1]
+    middle = start + 0.5 * gain
+    return Trend(d, modulus, float(gain / middle), math.sqrt(variance) / abs(middle))
+
+
+def first_cycle(d: FloatArray, theta: FloatArray, force: FloatArray) -> float | None:
+    """Return by how much the first press [n] is firmer than later ones of its d and θ, relative.
+
+    Filled rubber softens over its first cycles (Mullins, 1948), and what is fitted to both is
+    neither's. The mean over all d [m] and θ [rad] that are pressed again; None without any.
+    """
+    poses = np.round(np.stack([d / _SAME_D, theta / _SAME_THETA], axis=1))
+    _, which = np.unique(poses, axis=0, return_inverse=True)
+    again = [force[which == pose] for pose in range(which.max() + 1)]
+    more = [float(each[0] / each[1:].mean()) for each in again if len(each) > 1]
+    return float(np.mean(more)) - 1.0 if more else None
+
+
+@dataclass(frozen=True)
 class TipFit:
     """Fit of one kind of tip to the presses.
 
@@ -62,7 +115,7 @@ class TipFit:
     zero of d ``offset`` [m] are fitted, and a solid tip's ν; ``chi2`` is the squared misfit a cell
     over the noise's. What is left when the estimator takes this tip: rms errors of d [m], θ [rad]
     and of the force against the sensor's sum, over the rms force; ``valid`` is the fraction of
-    frames whose estimate can be used, and they are over those.
+    frames whose estimate can be used, and they are over those. ``trend``: E of each press alone.
     """
 
     tip: Fingertip
@@ -72,6 +125,7 @@ class TipFit:
     d_error: float = math.nan
     theta_error: float = math.nan
     force_error: float = math.nan
+    trend: Trend | None = None
     valid: float = 0.0
     law: Material = _UNIT
 
@@ -153,6 +207,13 @@ def _with_errors(
     table = ContactTable.build(fit.tip, fit.material)
     estimator = ContactEstimator(fit.tip, fit.material, grid, presses.noise, active=active)
     area = math.prod(grid.pitches)
+    shapes = np.zeros(presses.frames.shape)
+    shapes[presses.used] = presses.of(fit.tip, grid, presses.d - fit.offset, fit.law)
+    pressed = shapes.any(axis=(1, 2))
+    d, shown, seen = presses.d[pressed], shapes[pressed], presses.frames[pressed]
+    if np.ptp(d) > 0.0:
+        alone = (shown * seen).sum(axis=(1, 2)) / (shown**2).sum(axis=(1, 2))
+        fit = replace(fit, trend=trend(d, alone, shown.sum(axis=(1, 2))))
     errors = []
     for frame, used, d, theta in zip(
         presses.frames, presses.used, presses.d - fit.offset, presses.theta, strict=True

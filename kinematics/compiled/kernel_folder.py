@@ -71,7 +71,7 @@ def find_folder() -> OwnFolder:
     path = base / f"kernels-{digest()}"
     fresh = not path.exists()
     folder = OwnFolder(path)
-    os.utime(folder.descriptor)  # by which pruning knows what is in use
+    os.utime(folder.path)  # by which pruning knows what is in use
     if fresh:
         _prune(base, path)
     return folder

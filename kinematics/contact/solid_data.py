@@ -1,5 +1,7 @@
 """A tip of solid rubber, computed once by finite elements: elasticity and base pressure, scaled.
 
+The rubber is neo-Hookean, of strain energy W = μ/2 (J^(−2/3) tr FᵀF − 3) + κ/2 (J − 1)² with the
+μ = E/(2 + 2ν) and κ = E/(3 − 6ν) of small strains, and contact is made in the deformed state.
 The file has them as polynomials in t = √(d/a), sin² θ and Poisson's ratio ν, with Young's modulus E
 and the radius a taken out; its ``notes`` say how it was made and how far off it is. Here ν is put
 in. The energy is U = E a³ t⁵ g(t, sin² θ), whose partials are the push along the face's normal
@@ -50,7 +52,8 @@ class SolidData:
     edges: FloatArray  # of the rings in r/a [rings + 1]
     modes: FloatArray  # B [k, rings], means over the rings
     shear: FloatArray  # B_T [rings]
-    error: float  # of N, relative, against finer meshes
+    error: float  # of N, relative, against other meshes
+    pressure_error: float  # of the base pressure, likewise: rms over its rms
 
 
 @lru_cache(maxsize=8)
@@ -92,6 +95,7 @@ def solid_data(tip: Fingertip) -> SolidData:
         stored["basis"],
         by_poisson(stored["shear"]),
         float(stored["force_error"]),
+        float(stored["pressure_error"]),
     )
 
 

@@ -1,19 +1,14 @@
 """Contact tables: force, energy and their partials by lookup, within a tolerance.
 
-Holds the table as an object and as bytes. A table is one flat float64 array, header and
-coefficients, which is the kernel's argument and the bytes' content alike. How one is built is in
-`table_build`, with the bound of a table's error; the lookup itself and the array's layout are in
-`lookup`.
+A table is one flat float64 array, header and coefficients, which is the kernel's argument. How one
+is built is in `table_build`, with the bound of a table's error; the lookup itself and the array's
+layout are in `lookup`.
 """
 
 from __future__ import annotations
 
-import hashlib
 import math
-import struct
 import warnings
-from functools import cache
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,9 +18,6 @@ from softfinger.kinematics.compiled.simd import SHAPES
 from softfinger.kinematics.contact.closed_form import Fingertip, flatten
 from softfinger.kinematics.contact.lookup import (
     CLOSED,
-    VERSION,
-    TableError,
-    aligned,
     header_of,
     lookup,
     lookups,
@@ -70,17 +62,6 @@ _numbers: Any = tuple.__new__
 _EDGE = 1.0 - 1e-12  # of d and θ: what is outside by rounding alone is inside with it
 
 _LAW_ERROR = 0.05  # of F, by a law's misfit of its points
-_MAGIC = b"SFTIPTAB"
-_CHECK = 32  # bytes of a SHA-256
-_SOURCES = (
-    "closed_form.py",
-    "lookup.py",
-    "material.py",
-    "material_fit.py",
-    "quadrature.py",
-    "table_build.py",
-    "../compiled/simd.py",
-)
 
 
 class ContactTable:
@@ -121,33 +102,6 @@ class ContactTable:
                 stacklevel=2,
             )
         return cls(build(tip, material, tolerance))
-
-    def to_bytes(self, tip: Fingertip, material: Material) -> bytes:
-        """Return the table with its key and checksum, for :meth:`from_bytes` to read again."""
-        key = table_key(tip, material, self.tolerance)
-        body: bytes = key + struct.pack("<Q", self.data.size) + self.data.astype("<f8").tobytes()
-        return _MAGIC + hashlib.sha256(body).digest() + body
-
-    @classmethod
-    def from_bytes(
-        cls, content: bytes, tip: Fingertip, material: Material, tolerance: float = 1e-9
-    ) -> ContactTable:
-        """Read the table of this tip, material and tolerance that this version made ``content`` of.
-
-        Raises TableError when it is damaged, belongs to another table or is none.
-        """
-        start = len(_MAGIC) + _CHECK
-        body = content[start:]
-        if content[: len(_MAGIC)] != _MAGIC:
-            raise TableError("it holds no contact table")
-        if hashlib.sha256(body).digest() != content[len(_MAGIC) : start]:
-            raise TableError("it is damaged: its checksum does not match")
-        if body[:_CHECK] != table_key(tip, material, tolerance):
-            raise TableError("it belongs to another tip, material, tolerance or version")
-        (size,) = struct.unpack_from("<Q", body, _CHECK)
-        data = aligned(size)
-        data[:] = np.frombuffer(body, dtype="<f8", offset=_CHECK + 8, count=size)
-        return cls(data)
 
     @property
     def tolerance(self) -> float:
@@ -215,19 +169,3 @@ class ContactTable:
                 RuntimeWarning,
                 stacklevel=3,
             )
-
-
-def table_key(tip: Fingertip, material: Material, tolerance: float) -> bytes:
-    """Return SHA-256 of a saved table's tip, material and tolerance and the code's version."""
-    law = [str(value) for value in material.coefficients]
-    text = repr((VERSION, _sources(), tip.radius.hex(), law, float(tolerance).hex()))
-    return hashlib.sha256(text.encode()).digest()
-
-
-@cache
-def _sources() -> str:
-    """SHA-256 of the modules that decide what is in a table."""
-    here, state = Path(__file__).parent, hashlib.sha256()
-    for name in _SOURCES:
-        state.update(here.joinpath(name).read_bytes())
-    return state.hexdigest()

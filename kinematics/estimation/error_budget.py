@@ -418,6 +418,12 @@ def add_turned(x: float, y: float, rotation: float, out: Matrix) -> None:
 
 
 @inner_kernel
+def smooth_square(solid: SolidFit | None, state: EstimatorState) -> float:
+    """Return the square of the relative error of a cell's pressure that neighbours share."""
+    return state.budget.smooth * state.budget.smooth
+
+
+@inner_kernel
 def add_square(displacement: Four, out: Matrix) -> None:
     """Add the covariance of a shift by ``displacement``."""
     for i in range(4):
@@ -452,10 +458,10 @@ def systematic(
     )
     displacement = budget.displacement
     pressure = fit.sums.normal[0]
+    smooth = smooth_square(solid, state) * _SMOOTH * gain * gain * pressure
     for i in range(4):
         for j in range(4):
-            out[i, j] = budget.smooth * budget.smooth * _SMOOTH * gain * gain * pressure
-            out[i, j] *= fit.inverse[i, j]
+            out[i, j] = smooth * fit.inverse[i, j]
     remaining = 0.0
     for source in range(SOURCES + 2):
         size = sizes[source]

@@ -15,6 +15,7 @@ import numpy as np
 from softfinger.kinematics.compiled.kernel import fast_inner_kernel
 from softfinger.kinematics.compiled.simd import Pointer, address, further
 from softfinger.kinematics.contact.closed_form import Fingertip
+from softfinger.kinematics.contact.solid_data import solid_data
 from softfinger.kinematics.estimation.error_budget import (
     Uncertainty,
     add_second_order,
@@ -27,6 +28,7 @@ from softfinger.kinematics.estimation.error_budget import (
     quadratic,
     set_errors,
     smooth_misfit,
+    smooth_square,
     turn,
 )
 from softfinger.kinematics.estimation.gauss_newton import set_covariance
@@ -49,6 +51,7 @@ from softfinger.kinematics.sensing.solid_pressure import IMAGES
 # … and of a face that goes on during a scan, of the radius: with 0.2 mm over 58 mm, 0.5 to 7 mm.
 _D_BY_SKEW, _TILT_BY_SKEW = 0.5, 0.19
 _D_BY_DEPTH, _TILT_BY_DEPTH, _D_BY_ROTATION = 0.4, 1.2, 1.6
+_TILTED = math.radians(15.0)  # where the data's error of the pressure was measured
 
 
 def set_solid_budget(
@@ -63,9 +66,16 @@ def set_solid_budget(
     """Set the budget as `error_budget.set_budget` does, for the cells ``indices`` of ``grid``.
 
     A shift is no contact to a solid tip whatever its size: the activity test takes the mean off.
+    What the data are off by counts, too: the force, and the pressure as far as the tip is tilted.
+    Upright an error of theirs is as symmetric as they are, and with a known gain hardly moves d.
     """
+    data, budget = solid_data(tip), solid.budget
+    known = replace(known, modulus=math.hypot(known.modulus, data.error))
+    if state.options.free_gain:
+        known = replace(known, smooth=math.hypot(known.smooth, data.pressure_error))
+    else:
+        budget.tilted = data.pressure_error / math.sin(_TILTED)
     set_errors(state, known, grid, law)
-    budget = solid.budget
     active = np.ascontiguousarray(grid.images(tip)[:, indices])
     shear = active[-2:]
     across = np.linalg.inv(shear @ shear.T)
@@ -183,6 +193,13 @@ def _add_second_order(solid: SolidFit, state: EstimatorState, d: float, out: Mat
     out[2, 3] += along_x * along_y
     out[3, 2] += along_x * along_y
     out[3, 3] += along_y * along_y
+
+
+@solid_kernel(smooth_square)
+def _smooth_square(solid: SolidFit, state: EstimatorState) -> float:
+    tilted = solid.budget.tilted * solid.budget.tilted
+    square = solid.n_x * solid.n_x + solid.n_y * solid.n_y
+    return state.budget.smooth * state.budget.smooth + tilted * square
 
 
 @solid_kernel(deepen)

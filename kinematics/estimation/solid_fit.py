@@ -43,6 +43,7 @@ _RIM = {"bonded": 0.03, "lying": 0.05}  # of the radius: nearer to a solid tip's
 CELLS_MIN = 9  # that a solid tip's contact and shear can be told from
 _PASSES = 24  # projections of a frame
 _LIMITED = 4  # of them that may end where the data do, one after the other
+_OVER = 1.01  # of the data's ends, in d and sin θ: so far noise may take a fit at them
 _SETTLED = 0.1  # squared step, in units of the noise floor, at which readings by the model stay
 _HALVINGS_MAX = 5
 _STARTS = 8  # depths from which a frame alone is fitted
@@ -136,12 +137,13 @@ def _go_on(state: EstimatorState, solid: SolidFit) -> None:
     n_x = solid.n_x + fit.step[2]
     n_y = solid.n_y + fit.step[3]
     tilt = math.hypot(n_x, n_y)
-    sine_max = math.sin(table.tilt)
-    solid.limited = d > table.deepest or tilt > sine_max
+    sine_max = _OVER * math.sin(table.tilt)
+    deepest = _OVER * table.deepest
+    solid.limited = d > deepest or tilt > sine_max
     if tilt > sine_max:
         n_x *= sine_max / tilt
         n_y *= sine_max / tilt
-    solid.d = min(max(d, 0.3 * solid.d, 1e-4 * table.radius), table.deepest)
+    solid.d = min(max(d, 0.3 * solid.d, 1e-4 * table.radius), deepest)
     solid.n_x = n_x
     solid.n_y = n_y
 
@@ -197,23 +199,24 @@ def _start(
     project(state, solid, frame, scratch, address(indices))
     best = math.inf
     tilt = 0.5 * math.sin(solid.weights.table.tilt)
-    for k in range(_STARTS):
-        solid.d = deepest * ((k + 0.5) / _STARTS) ** 2
-        for m in range(5):
-            solid.n_x = tilt if m == 1 else -tilt if m == 2 else 0.0
-            solid.n_y = tilt if m == 3 else -tilt if m == 4 else 0.0
-            fit.gain = 1.0
-            cost = _set_sums(state, solid)
-            if state.options.free_gain:
-                gain = fit.gain + fit.sums.right[0] / fit.sums.normal[0]
-                cost = -gain * gain * fit.sums.normal[0]
-                fit.gain = gain
-            if cost < best and fit.gain > 0.0:
-                best = cost
-                estimate.d = solid.d
-                estimate.n_x = solid.n_x
-                estimate.n_y = solid.n_y
-                estimate.gain = fit.gain
+    # Straight at each depth, then tilted at the best of them: the tilt hardly changes the force.
+    for k in range(_STARTS + 4):
+        m = k - _STARTS
+        solid.d = deepest * ((k + 0.5) / _STARTS) ** 2 if m < 0 else estimate.d
+        solid.n_x = tilt if m == 0 else -tilt if m == 1 else 0.0
+        solid.n_y = tilt if m == 2 else -tilt if m == 3 else 0.0
+        fit.gain = 1.0
+        cost = _set_sums(state, solid)
+        if state.options.free_gain:
+            gain = fit.gain + fit.sums.right[0] / fit.sums.normal[0]
+            cost = -gain * gain * fit.sums.normal[0]
+            fit.gain = gain
+        if cost < best and fit.gain > 0.0:
+            best = cost
+            estimate.d = solid.d
+            estimate.n_x = solid.n_x
+            estimate.n_y = solid.n_y
+            estimate.gain = fit.gain
     solid.shear[:] = 0.0
 
 
@@ -282,9 +285,12 @@ def _finish(state: EstimatorState, solid: SolidFit, scratch: Pointer, iterations
     y = solid.shear[1] + own * solid.n_y
     estimate.shear_x = along * x - across * y
     estimate.shear_y = across * x + along * y
-    estimate.d = solid.d
-    estimate.n_x = solid.n_x
-    estimate.n_y = solid.n_y
+    # Noise's own share beyond the data's ends is none of the contact.
+    sine_max = math.sin(solid.weights.table.tilt)
+    within = min(1.0, sine_max / max(math.sqrt(square), 1e-9))
+    estimate.d = min(solid.d, solid.weights.table.deepest)
+    estimate.n_x = within * solid.n_x
+    estimate.n_y = within * solid.n_y
     fit.sums.readings = solid.raw
     fit.sums.weight = solid.counted - 2.0  # shear's
     return conclude(solid, state, scratch, iterations)

@@ -52,6 +52,7 @@ class SolidBudget(Record):
     squares: Annotated[FloatArray, 3, IMAGES, IMAGES]  # Σ change · change
     correlated_sums: Products  # Σ over pairs of cells of image · their correlation · image
     shear: float  # the same of both of shear's alone, scaled to 1
+    tilted: float  # the data's error of the pressure, relative, over the sine of the tilt
     whole: Sums  # scratch: what each image counts, with shear's
     sums: Sums  # scratch
     work: Matrix  # scratch

@@ -78,7 +78,8 @@ def images(tip: Fingertip, cells: Grid) -> FloatArray:
     width, height = cells.pitch_x / cells.radius, cells.pitch_y / cells.radius
     near = np.hypot(*np.meshgrid(_nearest(x, width), _nearest(y, height)))
     far = np.hypot(*np.meshgrid(np.maximum(-x, x + width), np.maximum(-y, y + height)))
-    for points, chosen in ((_INSIDE, far <= 1.0), (_CUT, (near < 1.0) & (far > 1.0))):
+    cut = (near < 1.0) & (far > 1.0)
+    for points, chosen in ((_INSIDE, (near < data.edges[-1]) & ~cut), (_CUT, cut)):
         rows, cols = np.nonzero(chosen)
         offset = (np.arange(points) + 0.5) / points
         at_x = x[cols, None, None] + width * offset[None, None, :]
@@ -93,19 +94,18 @@ def _nearest(low: NDArray[Any], width: float) -> NDArray[Any]:
 
 
 def _means(tip: Fingertip, z: NDArray[np.complex128]) -> FloatArray:
-    """Means of all images over the points x + i y [cells, points], 0 beyond the rim."""
+    """Means of all images over the points x + i y [cells, points], 0 beyond the data's rings."""
     data = solid_data(tip)
     middle = 0.5 * (data.edges[1:] + data.edges[:-1])
     r = np.abs(z)
-    inside = (r < 1.0) / z.shape[1]
+    inside = (r < data.edges[-1]) / z.shape[1]
     phase = z / np.maximum(r, 1e-12)
     found: list[FloatArray] = []
     modes = zip([*data.harmonics.tolist(), 1], [*data.modes, data.shear], strict=True)
     for m, mode in modes:
         # Where m > 0 a mode goes to 0 at the middle.
         start = 0.0 if m else 1.5 * mode[0] - 0.5 * mode[1]
-        end = 1.5 * mode[-1] - 0.5 * mode[-2]
-        value = np.interp(r, [0.0, *middle, 1.0], [start, *mode, end]) * inside
+        value = np.interp(r, [0.0, *middle], [start, *mode]) * inside
         found.append((value * (phase**m).real).sum(axis=1))
         if m:
             found.append((value * (phase**m).imag).sum(axis=1))

@@ -17,7 +17,8 @@ class SoftfingerConfig(RobotConfig):
     the object's angle.
     """
 
-    stream: str | None = None  # addresses; SOFTFINGER_ADDRESS or this machine's when None
+    address: str | None = None  # tcp://HOST or STREAM,COMMANDS; SOFTFINGER_ADDRESS when None
+    stream: str | None = None  # either socket, where it is elsewhere
     commands: str | None = None
     keys: Path | None = None  # folder of this client's keys, where the daemon wants some
     control: str = "joints"
@@ -26,6 +27,7 @@ class SoftfingerConfig(RobotConfig):
     full_scale: float = FULL_SCALE  # Pa at which a grid's image is white
     least_force: float = 0.5  # N; an action `grip.force` below it opens the hand
     timeout: float = 5.0  # s for an answer, a state or a frame
+    start_timeout: float = 120.0  # s for a first state: the daemon may still compile
     disarm_on_disconnect: bool = True  # torque off; the hand drops what it holds
 
     def __post_init__(self) -> None:

@@ -1,4 +1,7 @@
-"""``python -m research.solid_tip``: compute the solid tip's data anew."""
+"""``python -m research.solid_tip``: the linear law of a solid tip, from which `strain` goes on.
+
+A file of its own, of the form that `strain`'s notes tell.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,7 @@ from numpy.typing import NDArray
 from research.solid_tip import fit
 from research.solid_tip.contact import TiltedPlane
 from research.solid_tip.fit import SolidTip, rms_difference
-from research.solid_tip.green import green, shear_response
+from research.solid_tip.green import RING_EDGES, green, shear_response
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -22,23 +25,6 @@ BASES = ("bonded", "lying")
 STICKING = "-sticking"
 BLOCKS = tuple(base + face for face in ("", STICKING) for base in BASES)
 HELD_OUT = (0.458, 0.49, 0.4995)  # values of ν that are not fitted
-
-NOTES = """Hemisphere of linear elastic rubber pressed by a rigid plane, by finite elements:
-python -m research.solid_tip, {rings} elements along the arc ({sticking} where the face
-sticks), {nodes} values of ν. The plane is without friction, or (…-sticking) holds each point where
-it touched, coming straight along its normal from first touch on: T = N sin θ cos θ P[coef_0] is
-the force along (cos θ, 0, −sin θ) against the tip. It is negative.
-Lengths in a, stresses in E; d ≤ 0.4 a, θ ≤ 36°, ν 0.45 … 0.4995. s = √(d/a), P a product of
-Chebyshev series in 2 s/s_max − 1, 2 (sin θ/sin theta_max)² − 1, and ν on nu_range:
-N = 4/(3 (1 − ν²)) s³ (1 + s P[push]), U = 8/(15 (1 − ν²)) s⁵ (1 + s P[energy]);
-p = F B_0(r) + N Σ P[coef_k] sin^m_k θ B_k(r) cos m_k φ; basis: means of B_k over rings;
-F = N cos θ (1 − sin² θ P[coef_0]), with coef_0 = 0 unless the face sticks.
-A shear force T on the face adds T B_T(r) cos(φ − φ_T); shear holds B_T's means over the rings
-(for a force at the pole), as Chebyshev coefficients in ν.
-Base bonded: u = 0. Lying: u_z = 0 (held down: it may pull), free to slide but for a uniform shear
-that carries the tip's own. force_error, pressure_error: largest differences in N and in a sensor's
-frame from a coarser mesh. Largest and rms differences between file and presses:
-{errors}"""
 
 
 def presses(which: tuple[str, int, float], folder: Path) -> fit.Samples:
@@ -128,7 +114,7 @@ def main() -> None:
         "s_max": np.array(fit.S_MAX),
         "theta_max": np.array(fit.THETA_MAX),
         "nu_range": np.array(fit.NU),
-        "ring_edges": fit.RING_EDGES,
+        "ring_edges": RING_EDGES,
     }
     arrays: Arrays = {}
     rows = []
@@ -145,15 +131,8 @@ def main() -> None:
                 rows.append(
                     f"{block}, {rings} elements, ν {poisson:.4f}{told}: {differences(tip, each)}"
                 )
-    notes = NOTES.format(
-        rings=arguments.rings,
-        sticking=arguments.sticking,
-        nodes=arguments.nodes,
-        errors="\n".join(rows),
-    )
-    arrays["notes"] = np.array(notes)
     np.savez_compressed(arguments.out, **arrays)  # type: ignore[arg-type]
-    print(notes)
+    print("\n".join(rows))
 
 
 if __name__ == "__main__":

@@ -18,16 +18,14 @@ from numpy.polynomial import chebyshev
 from numpy.typing import ArrayLike, NDArray
 
 from research.solid_tip.contact import Press
-from research.solid_tip.green import GAUSS, FloatArray, quadratic
+from research.solid_tip.green import GAUSS, RING_EDGES, FloatArray, quadratic
 
 D_MAX, THETA_MAX = 0.4, np.radians(36.0)  # sin 36° < 1 − D_MAX: the plane stays above the base
 NU = (0.45, 0.4995)
 S_MAX = np.sqrt(D_MAX)
-RING_EDGES = np.sin(
-    np.linspace(0, np.pi / 2, 97)
-)  # fine at the rim, where a bonded base is singular
-ORDERS = (8, 6)  # coefficients in s and sin²θ
+ORDERS = (11, 6)  # coefficients in s and sin²θ
 HARMONICS = 9
+RIM = 0.95  # from there on a bonded base is singular and a lying one ends: no cells count there
 
 
 def chebyshev_nodes(low: float, high: float, count: int) -> FloatArray:
@@ -62,6 +60,7 @@ def ring_means(base_radius: FloatArray) -> FloatArray:
     points, gauss = GAUSS
     ends = base_radius[::2]
     cuts = np.unique(np.concatenate([RING_EDGES, ends]))
+    cuts = cuts[cuts <= ends[-1]]
     out = np.zeros((RING_EDGES.size - 1, base_radius.size))
     for low, high in pairwise(cuts):
         r = (low + high) / 2 + (high - low) / 2 * points
@@ -141,17 +140,21 @@ def fit(
     patterns[:, :, 0] -= force[..., None] * first
     scale = np.sqrt(areas @ first**2)
     ms, basis, coef = [0], [first], [over_nu(stick.reshape(-1, *ORDERS))]
+    levers = np.pi * np.diff(RING_EDGES**3) / 3
     for m in range(HARMONICS):
-        weight = np.sqrt(areas * (1.0 if m == 0 else 0.5))
-        flat = patterns[:, :, m].reshape(-1, areas.size) * weight
-        _, size, rows = np.linalg.svd(flat, full_matrices=False)
-        left = np.sqrt(np.cumsum(size[::-1] ** 2)[::-1] / len(flat)) / scale  # rms of what is cut
+        weight = np.sqrt(areas * (1.0 if m == 0 else 0.5)) * np.where(RING_EDGES[1:] > RIM, 0.05, 1)
+        flat = patterns[:, :, m] * weight
+        # The moment on the base, too, so that the modes have it although the rim counts little.
+        moment = (m == 1) * 2.0 * patterns[:, :, m] @ levers
+        flat = np.concatenate([flat, moment[..., None]], axis=-1)
+        _, size, rows = np.linalg.svd(flat.reshape(-1, areas.size + 1), full_matrices=False)
+        # Root mean squares of what is cut.
+        left = np.sqrt(np.cumsum(size[::-1] ** 2)[::-1] / flat[..., 0].size) / scale
         turned = design * np.sin(theta)[:, None] ** m
         for row in rows[: int(np.sum(left > tolerance))]:
             ms.append(m)
-            basis.append(row / weight)
-            amplitude = (patterns[:, :, m] * weight) @ row
-            each = np.linalg.lstsq(turned, amplitude.T, rcond=None)[0].T.reshape(-1, *ORDERS)
+            basis.append(row[:-1] / weight)
+            each = np.linalg.lstsq(turned, (flat @ row).T, rcond=None)[0].T.reshape(-1, *ORDERS)
             coef.append(over_nu(each))
     return {
         "push": over_nu(push),
@@ -195,6 +198,13 @@ class SolidTip:
         pressure = np.zeros((self.m.max() + 1, self.edges.size - 1))
         np.add.at(pressure, self.m, push * amplitude[:, None] * self.basis)
         return push, energy, pressure
+
+    def shear(self, d: float, theta: float) -> float:
+        """T over N, along (cos θ, 0, −sin θ) against the tip, of a sticking face."""
+        x = 2 * np.sqrt(d) / self.s_max - 1
+        w = 2 * (np.sin(theta) / np.sin(self.theta_max)) ** 2 - 1
+        stick = float(chebyshev.chebval2d(x, w, self.coef[0]))
+        return stick * float(np.sin(theta) * np.cos(theta))
 
     def frame(self, pressure: FloatArray, pitch: float, cells: int) -> FloatArray:
         """Means over a square grid of cells centred under the tip, rows along y."""

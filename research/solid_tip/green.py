@@ -22,6 +22,12 @@ from scipy.sparse.linalg import splu
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
+# Rings of the base: fine at the rim, where a bonded base is singular, and mirrored to where a lying
+# one spreads.
+RING_EDGES = np.sin(np.linspace(0, np.pi / 2, 97))
+RING_EDGES = np.concatenate([RING_EDGES, 2 - RING_EDGES[RING_EDGES > 0.8][-2::-1]])
+MIDDLES = (RING_EDGES[1:] + RING_EDGES[:-1]) / 2
+
 GAUSS = np.polynomial.legendre.leggauss(3)
 
 
@@ -43,11 +49,11 @@ def graded(last: float, widest: float, growth: float, length: float) -> FloatArr
 class Meridian:
     """Mesh of the quarter disc: ``rings`` elements along the arc where contact may be."""
 
-    def __init__(self, rings: int) -> None:
+    def __init__(self, rings: int, finer: float = 8.0, widest: float = 0.08) -> None:
         step = np.pi / 2 / rings
         # Towards the rim both directions get finer: a bonded base has singular stress there.
-        radii = graded(step / 8, min(2.5 * step, 0.08), 1.6, 1.0)
-        angles = graded(step / 8, step, 2.0, np.pi / 2)
+        radii = graded(step / finer, min(2.5 * step, widest), 1.6, 1.0)
+        angles = graded(step / finer, step, 2.0, np.pi / 2)
         self.layers, self.arcs = len(radii) - 1, len(angles) - 1
         radius, angle = (
             np.sort(np.concatenate([ends, (ends[1:] + ends[:-1]) / 2])) for ends in (radii, angles)

@@ -1,13 +1,15 @@
 """Returns of a random agent and of the built-in law in each task.
 
-``python -m softfinger.gym [EPISODES [PROFILE]]``
+``python -m softfinger.gym [EPISODES [PROFILE]]``; ``--processes`` and ``--scheduler`` say where.
 """
 
 from __future__ import annotations
 
-import sys
+import argparse
+import itertools
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import gymnasium
@@ -16,24 +18,38 @@ from numpy.typing import NDArray
 
 from softfinger.gym import SECONDS, STEP, TASKS
 from softfinger.gym.environment import ANGLE, FORCE, FORCES, Observation
+from softfinger.tools.sweep import Sweep, add_sweep
 
+AGENTS = {"random": "joints", "law": "law"}  # what each controls
 Policy = Callable[[Observation], NDArray[np.float32]]
 
 
-def main(episodes: int = 20, profile: str = "sim") -> None:
+def main(
+    episodes: int, profile: str, processes: int | None = None, scheduler: str | None = None
+) -> None:
     """Print a line for each task and agent; the seeds are 0 to ``episodes`` - 1."""
     print(f"{'task':8}{'agent':8}return of {SECONDS / STEP:.0f} steps      x real time")
-    for task in TASKS:
-        name = f"SoftFinger-{task.capitalize()}-v0"
-        for agent, control in (("random", "joints"), ("law", "law")):
-            env = gymnasium.make(name, control=control, profile=profile)
-            policy = by_law if agent == "law" else at_random(env)
-            began = time.perf_counter()
-            returns = [episode(env, policy, seed) for seed in range(episodes)]
-            speed = SECONDS * episodes / (time.perf_counter() - began)
-            env.close()
-            told = f"{np.mean(returns):6.1f} ± {np.std(returns):<12.1f}{speed:6.0f}"
-            print(f"{task:8}{agent:8}{told}")
+    rows = list(itertools.product(TASKS, AGENTS))
+    cases = [(task, agent, seed) for task, agent in rows for seed in range(episodes)]
+    found = Sweep("gym", partial(_tried, profile), cases).run(processes, scheduler)
+    for task, agent in rows:
+        returns, spent = np.array([next(found) for _ in range(episodes)]).T
+        speed = SECONDS * episodes / spent.sum()
+        told = f"{np.mean(returns):6.1f} ± {np.std(returns):<12.1f}{speed:6.0f}"
+        print(f"{task:8}{agent:8}{told}")
+
+
+def _tried(profile: str, case: tuple[str, str, int]) -> tuple[float, float]:
+    """An episode's return, and how long it took [s]."""
+    task, agent, seed = case
+    name = f"SoftFinger-{task.capitalize()}-v0"
+    env = gymnasium.make(name, control=AGENTS[agent], profile=profile)
+    began = time.perf_counter()
+    try:
+        found = episode(env, by_law if agent == "law" else at_random(env), seed)
+        return found, time.perf_counter() - began
+    finally:
+        env.close()
 
 
 def episode(env: gymnasium.Env[Any, Any], policy: Policy, seed: int) -> float:
@@ -62,4 +78,8 @@ def by_law(observation: Observation) -> NDArray[np.float32]:
 
 
 if __name__ == "__main__":
-    main(*(convert(word) for convert, word in zip((int, str), sys.argv[1:], strict=False)))
+    parser = argparse.ArgumentParser(description="Returns of a random agent and of the law.")
+    parser.add_argument("episodes", type=int, nargs="?", default=20)
+    parser.add_argument("profile", nargs="?", default="sim")
+    add_sweep(parser)
+    main(**vars(parser.parse_args()))

@@ -22,7 +22,7 @@ from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
 from softfinger.gym import STEP, TASKS
-from softfinger.tools.processes.kernel_build import build_kernels, print_event, table_cache
+from softfinger.tools.processes.kernel_build import build_kernels, print_event
 
 Observation = dict[str, NDArray[Any]]
 
@@ -30,6 +30,7 @@ FORCE = 6.0  # N, of the grip that is wanted
 REACH = 0.02  # rad that a joint's goal moves in a step at most
 FORCES = 1.0, 12.0  # N, what an action of -1 and of 1 asks the grip for, …
 ANGLE = 0.25  # rad, … and to what angle it turns the object
+WHITE = 50e3  # Pa, at which an image is white
 LOST = 0.03  # m off its first place: the object is lost
 _DEEP = 0.004  # m, to which the joints alone press into the object when an episode begins with it
 _PATIENCE = 3.0  # s
@@ -56,6 +57,10 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     currents, left before right; ``contacts`` [6], d, θ and force of each tip; ``pressure`` [2,
     rows, cols], uint16, the newest frames; ``goal`` [1], N or rad.
 
+    ``shaped`` adds to each reward of ``grasp`` by how much a potential has grown: 10 for fingers
+    that have closed as far as they go, 10 for both forces. What is best to do stays the same (Ng,
+    Harada & Russell, 1999), and there is something to learn from before the first touch.
+
     An episode ends when the object is lost or the hand is in fault. ``profile`` is a profile of
     the simulated hand, ``changes`` are settings as ``--set`` takes them. ``info`` has ``truth``:
     the object's x, y [m] and angle [rad]; ``fault``; and ``refused``, why a command was.
@@ -69,6 +74,7 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         control: str = "joints",
         profile: Path | str | None = None,
         changes: Sequence[str] = (),
+        shaped: bool = False,
     ) -> None:
         if task not in TASKS:
             raise ValueError(f"task: found {task!r}, expected one of {', '.join(TASKS)}")
@@ -80,8 +86,10 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._settings = load(file, changes=(*ours, *changes))
         build_kernels(self._settings, print_event)
         self._task, self._by_law = task, control == "law"
+        self._shaped = shaped and task == "grasp"
         self._daemon: Daemon | None = None
         tactile = self._settings.tactile
+        self.pascal_per_count = tactile.pascal_per_count
         cells = (2, tactile.rows, tactile.cols)
         self._empty = np.zeros(cells[1:], np.uint16)
         self.observation_space: Any = spaces.Dict(
@@ -100,7 +108,7 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         """A new object, before the open hand or held by it. ``options`` has ``goal`` if wanted."""
         super().reset(seed=seed)
         self.close()
-        daemon = Daemon(self._drawn(), wire=False, table_cache=table_cache())
+        daemon = Daemon(self._drawn(), wire=False)
         assert daemon.hand is not None
         self._daemon, self._hand, self._loop = daemon, daemon.hand, daemon.loop
         self._refused = ""
@@ -116,6 +124,7 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             self._take_hold()
         self._joints = list(self._loop.state.reading.q)
         self._first = self._hand.object_pose.copy()
+        self._potential = self._closed()
         if self._task == "push":
             self._push = float(self.np_random.choice((-1.0, 1.0)) * self.np_random.uniform(1, 3))
             self._push_at = self._loop.state.t + float(self.np_random.uniform(0.2, 1.0))
@@ -171,7 +180,11 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._loop.advance(STEP)
         away = math.hypot(*(self._hand.object_pose[:2] - self._first[:2]))
         ended = bool(self._loop.state.mode == Mode.FAULT or away > LOST)
-        return self._observation(), self._reward(), ended, False, self._info()
+        reward, before = self._reward(), self._potential
+        if self._shaped:
+            self._potential = self._closed()
+            reward += self._potential - before
+        return self._observation(), reward, ended, False, self._info()
 
     def _act(self, action: NDArray[np.float64]) -> None:
         first, second = action.tolist()
@@ -200,6 +213,12 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         off = max(abs(float(force) - self._goal) for force in self._hand.force)
         return math.exp(-off)
 
+    def _closed(self) -> float:
+        """Return the potential: how far both fingers have closed, and what they press with."""
+        q, most = self._loop.state.reading.q, self._settings.hand.q_max
+        force = sum(min(float(each) / FORCE, 1.0) for each in self._hand.force)
+        return 5.0 * (q[0] / most[0] + q[1] / most[1] + force)
+
     def _observation(self) -> Observation:
         state = self._loop.state
         reading = state.reading
@@ -224,3 +243,20 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         if self._daemon is not None:
             self._daemon.close()
             self._daemon = None
+
+
+class Images(gymnasium.ObservationWrapper[Observation, NDArray[np.float32], Observation]):
+    """``pressure`` as Stable-Baselines3 takes images: uint8 [2, rows, cols], 255 from 50 kPa on."""
+
+    def __init__(self, env: gymnasium.Env[Observation, NDArray[np.float32]]) -> None:
+        super().__init__(env)
+        inner: Any = env.unwrapped
+        self._full = WHITE / inner.pascal_per_count
+        known = inner.observation_space
+        image = spaces.Box(0, 255, known["pressure"].shape, np.uint8)
+        self.observation_space: Any = spaces.Dict({**known.spaces, "pressure": image})
+
+    def observation(self, observation: Observation) -> Observation:
+        """Return it with the grids of 8 bits."""
+        grey = np.minimum(observation["pressure"] * (255.0 / self._full), 255.0)
+        return observation | {"pressure": grey.astype(np.uint8)}

@@ -26,7 +26,7 @@ PATIENCE = {
 PATIENT = [word for key, value in PATIENCE.items() for word in ("--set", f"{key}={value}")]
 
 
-def softfinger(*words: str, timeout: float = 120.0) -> subprocess.CompletedProcess[str]:
+def softfinger(*words: str, timeout: float = 300.0) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [*SOFTFINGER, *words], capture_output=True, text=True, timeout=timeout, check=False
     )
@@ -46,7 +46,7 @@ def until_it_says(words: Sequence[str | Path], text: str) -> None:
     assert process.stdout is not None
     assert any(text in line for line in process.stdout), f"{text!r} never came"
     process.terminate()
-    process.communicate(timeout=120.0)
+    process.communicate(timeout=300)
     assert process.returncode == 0
 
 
@@ -82,7 +82,7 @@ class Running:
         self.process.send_signal(number)
         assert self.process.stderr is not None
         self.lines += self.process.stderr.readlines()
-        return self.process.wait(timeout=60)
+        return self.process.wait(timeout=300)
 
     def kill(self) -> None:
         """End it however it stands, if it has not ended yet."""

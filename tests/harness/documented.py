@@ -138,7 +138,7 @@ class Softfinger:
         self._end_daemon()
         if self._emulator is not None:
             self._emulator.terminate()
-            self._emulator.communicate(timeout=60.0)
+            self._emulator.communicate(timeout=300)
             self._emulator = None
 
 
@@ -168,14 +168,12 @@ def _await(shown: str) -> int:
 
 def _patient_doctor() -> contextlib.ExitStack:
     """On a busy machine, on which others have the sockets."""
-    from softfinger.daemon.diagnosis import devices, machine
+    from softfinger.daemon.diagnosis import machine
     from softfinger.tools.setup import doctor
 
     stack = contextlib.ExitStack()
-    whole = devices.check_servos
     for module, name, value in (
         (doctor, "check_addresses", lambda _: []),
-        (doctor, "check_servos", lambda settings: whole(settings, 0.5)),
         (machine, "_WAKE_UPS", 5),
     ):
         stack.enter_context(mock.patch.object(module, name, value))

@@ -48,6 +48,11 @@ def finger(t: float, side: int) -> dict[str, Any]:
         "frame_seq": 7,
         "frame_age_s": 0.012,
         "invalid": "",
+        "winding": 44.0,
+        "winding_std": 1.5,
+        "case": 41.2,
+        "case_std": 0.2,
+        "time_to_limit": 3600.0,
     }
 
 

@@ -64,6 +64,8 @@ class Served:
         for _ in range(times):
             self.service.step(0.0)
             self.link.look()
+        while self.service._unsent:  # on a busy machine one turn isn't enough
+            self.service.step(0.0)
 
     def serve(self, handler: Handler) -> None:
         """One look of the gateway, one tick of the loop's, one look for its answers."""

@@ -54,6 +54,10 @@ def sample_state() -> State:
         contact.torque_scale, contact.torque_scale_std = 1.03125, 0.046875 + finger
         contact.shear_x, contact.shear_y = 0.75 * sign, 0.03125 * sign
         contact.force, contact.energy = 10.5 + finger, 0.0125 + finger
+        heat = state.heat[finger]
+        heat.winding, heat.winding_std = 61.5 + finger, 2.25 + finger
+        heat.case, heat.case_std = 48.25 + finger, 0.28125 + finger
+        heat.time_to_limit = 1800.5 + finger
     state.goal.force, state.goal.angle = 11.25, 0.0625
     state.object.valid, state.object.angle, state.object.width = True, 0.05, 0.04
     return state

@@ -150,8 +150,6 @@ class Grasp:
         weight: tuple[float, float] = (0.0, 0.0),
     ) -> None:
         """``weight`` is gravity's force on the object in the hand's plane (x, y) [N]."""
-        if not (width > 0.0 and math.isfinite(width)):
-            raise ValueError(f"the object's width must be positive, not {width!r}")
         self.hand = hand
         self.table = table
         self.width = width
@@ -177,10 +175,6 @@ class Grasp:
         state = GraspState(q, np.array([0.0, self.hand.tips(q)[0, 1], 0.0]), shear)
         self._check(self._evaluate(state.coordinates, state)[3])
         return state
-
-    def energy(self, state: GraspState) -> float:
-        """Elastic energy of both tips and the object's potential energy [J]."""
-        return self._evaluate(state.coordinates, state)[0]
 
     def gradient(self, state: GraspState) -> FloatArray:
         """Derivative (5,) of the energy by (q1, q2, x, y, φ) along the rolling increments.
@@ -254,14 +248,6 @@ class Grasp:
         2(a − d + L sin q + e cos q)/W for each radian.
         """
         return self.move(state, state.q + np.array([delta, -delta]), steps)
-
-    def stiffness(self, state: GraspState) -> FloatArray:
-        """Derivative (5, 5) of the gradient by (q1, q2, x, y, φ), the shears rolling along.
-
-        Its last three rows and columns are the grasp's stiffness felt by the object. Rolling is not
-        integrable, so it is symmetric only where the shear forces vanish.
-        """
-        return self._hessian(state.coordinates, state)
 
     def _evaluate(
         self, coordinates: FloatArray, start: GraspState

@@ -144,7 +144,7 @@ class Browser:
         """End the browser and the processes it started."""
         os.close(self._write)
         try:
-            self.process.wait(60.0)
+            self.process.wait(300.0)
         except subprocess.TimeoutExpired:
             os.killpg(self.process.pid, signal.SIGKILL)
             self.process.wait()

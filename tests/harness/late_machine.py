@@ -8,6 +8,8 @@ from softfinger.daemon.clock import VirtualClock
 class LateMachine(VirtualClock):
     """In the place of the real clock. ``late_by`` [s]: of the next wake-ups, one after another."""
 
+    waits = False
+
     def __init__(self, start: float = 0.0) -> None:
         super().__init__(start)
         self.late_by: list[float] = []

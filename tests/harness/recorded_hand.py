@@ -15,7 +15,7 @@ from softfinger.daemon.profile.load import load
 from softfinger.daemon.wire.command_server import Handler
 from softfinger.daemon.wire.loop_link import Link
 from softfinger.daemon.wire.publisher import GATEWAY_TOPICS
-from softfinger.tools.recordings.writer import RecordingWriter
+from softfinger.tools.recordings.record import RecordingWriter
 
 Messages = list[tuple[bytes, dict[str, Any]]]
 

@@ -35,7 +35,7 @@ class Viewed:
     def end(self) -> str:
         """End it as a signal does, and return what it said."""
         self.process.terminate()
-        said = self.process.communicate(timeout=120)[1]
+        said = self.process.communicate(timeout=300)[1]
         assert self.process.returncode == 0, said
         return said
 
@@ -52,7 +52,9 @@ class Watcher:
     """A page's connection: asks for pictures. ``scene`` is the newest that came before one."""
 
     def __init__(self, host: str, **more: Any) -> None:
-        self._connection = connect(f"ws://{host}/pictures", proxy=None, max_size=None, **more)
+        waits: Any = {"open_timeout": WAIT, "ping_timeout": None}
+        url = f"ws://{host}/pictures"
+        self._connection = connect(url, proxy=None, max_size=None, **waits, **more)
         self.scene: dict[str, Any] = {}
 
     def next(self) -> dict[str, Any]:

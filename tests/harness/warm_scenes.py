@@ -86,7 +86,7 @@ def run(settings: Settings) -> dict[str, Any]:
     watch = Watch()
     modes, faults = [], []
     with event.install_listener("numba:compiler_lock", watch):
-        warm_up(WantedScene(settings, None))
+        warm_up(WantedScene(settings))
         parts = len(watch.heard)
         hand = Daemon(settings, wire=False)
         before = len(watch.heard)

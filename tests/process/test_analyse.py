@@ -16,9 +16,8 @@ from softfinger.daemon.types import Frame, HandFacts, SensorFacts
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.packer import message_maker
 from softfinger.tools.analysis.contacts import analyse, open_source, write_csv
-from softfinger.tools.recordings.writer import RecordingWriter
+from softfinger.tools.recordings.record import RecordingWriter
 from tests.conftest import Inline
-from tests.harness.daemon_process import softfinger
 
 TIP, PITCH, SCALE = Fingertip(0.020), 0.058 / 44, 4.0
 DEPTHS = np.linspace(0.0, 0.005, 26)
@@ -68,7 +67,7 @@ def test_frames_that_can_not_be_used_are_counted_by_their_reason(
 ) -> None:
     np.save(tmp_path / "untared.npy", np.full_like(counts, 5000))
     made = Settings.model_validate({"tactile": {"pascal_per_count": SCALE, "pitch": PITCH}})
-    (contacts,) = analyse(open_source(tmp_path / "untared.npy", made, None, False), print)
+    (contacts,) = analyse(open_source(tmp_path / "untared.npy", made, False), print)
     assert contacts.reasons() == {"all cells read above zero: tare": len(counts)}
     write_csv(tmp_path / "out.csv", [contacts])
     assert rows_of(tmp_path / "out.csv")[0]["invalid"] == "all cells read above zero: tare"
@@ -92,17 +91,19 @@ def test_every_kind_of_file_gives_the_same_contacts(counts: np.ndarray, tmp_path
         wrong = {"rows": 10, "cols": 10, "pitch": 0.002} if name == "export.asf" else {}
         tactile = Settings().tactile.model_copy(update=wrong)
         settings = Settings().model_copy(update={"tactile": tactile})
-        source = open_source(tmp_path / name, settings, None, own=name == "run.mcap")
+        source = open_source(tmp_path / name, settings, own=name == "run.mcap")
         output = tmp_path / f"{name}.csv"
         write_csv(output, analyse(source, lambda done: None))
         check(output)
     assert float(rows_of(tmp_path / "press.npz.csv")[10]["d_true_m"]) == DEPTHS[10]
 
 
-def test_from_the_command_line_with_picture(counts: np.ndarray, tmp_path: Path) -> None:
+def test_from_the_command_line_with_picture(
+    inline: Inline, counts: np.ndarray, tmp_path: Path
+) -> None:
     path = tmp_path / "press.npz"
     np.savez(path, frames=counts)
-    done = softfinger("analyse", str(path), "--set", "tactile.noise=20.0")
+    done = inline("analyse", path, "--set", "tactile.noise=20.0")
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.startswith("26 frames in ")
     check(tmp_path / "press.npz.contacts.csv")
@@ -116,8 +117,8 @@ def test_a_recorded_hand_of_another_material_needs_no_settings(
 ) -> None:
     law = Settings().material.model_copy(update={"law": "constant", "modulus": 1e6})
     save_stream(tmp_path / "a.mcap", counts, Settings().model_copy(update={"material": law}))
-    own = analyse(open_source(tmp_path / "a.mcap", Settings(), None, own=True), lambda n: None)
-    mine = analyse(open_source(tmp_path / "a.mcap", Settings(), None, own=False), lambda n: None)
+    own = analyse(open_source(tmp_path / "a.mcap", Settings(), own=True), lambda n: None)
+    mine = analyse(open_source(tmp_path / "a.mcap", Settings(), own=False), lambda n: None)
     assert own[0].values["gain"][20] < 0.5 * mine[0].values["gain"][20]
 
 
@@ -149,7 +150,7 @@ def test_a_frame_of_another_size_is_told(counts: np.ndarray, tmp_path: Path) -> 
     path = tmp_path / "a.mcap"
     save_stream(path, counts[:, :40], Settings())
     with pytest.raises(RecordingError, match="40 × 44 cells, expected 44 × 44"):
-        analyse(open_source(path, Settings(), None, own=True), lambda n: None)
+        analyse(open_source(path, Settings(), own=True), lambda n: None)
 
 
 def test_frames_alone_need_settings_that_fit(

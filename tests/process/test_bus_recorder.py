@@ -65,16 +65,6 @@ def test_extremes_of_goals_refused_ones_too() -> None:
     assert hand.report(1)["goals_refused"] == 0
 
 
-def test_the_newest_goal_currents_with_their_times() -> None:
-    hand = Hand()
-    for current in (10, -20):
-        hand.later(0.5)
-        hand.write(2, reg.GOAL_CURRENT, "h", current)
-    first, last = hand.bus.servos[1].goal_currents()
-    assert (first[0], last[0]) == (hand.t - 0.5, hand.t)
-    assert (first[1], last[1]) == pytest.approx((-10 * UNIT, 20 * UNIT))  # the right one's sense
-
-
 def test_goals_through_group_writes_and_indirect_addresses() -> None:
     hand = Hand()
     places = (reg.GOAL_CURRENT, reg.GOAL_CURRENT + 1, *range(116, 120))

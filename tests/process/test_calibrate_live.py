@@ -12,14 +12,13 @@ import threading
 import numpy as np
 import pytest
 
-from softfinger.daemon.clock import RealClock
+from softfinger.daemon.clock import RealClock, VirtualClock
 from softfinger.daemon.perception.calibration_file import load_calibration
 from softfinger.daemon.simulation.emulator.tactile_board import ENCODERS, TactileBoard
 from softfinger.daemon.types import Frame
 from softfinger.kinematics.contact.material import Material
 from softfinger.tools.calibration import calibration_frames
 from softfinger.tools.cli import main
-from tests.harness.daemon_process import softfinger
 from tests.unit.test_calibrate import CENTRE, EXPONENT, NOISE, PROFILE, ROTATION, TIP, E, MadeUp, N
 
 MATERIAL = Material.constant(E)
@@ -122,8 +121,14 @@ def test_load_by_load_from_a_board(live):
 
 
 @pytest.fixture
-def pressed(tmp_path):
-    """The words for a press at known speed after its tare, of a simulated sensor in real time."""
+def virtual(monkeypatch):
+    """No machine is too busy for a press of the simulated sensor."""
+    monkeypatch.setattr(calibration_frames, "RealClock", VirtualClock)
+
+
+@pytest.fixture
+def pressed(tmp_path, virtual):
+    """The words for a press at known speed after its tare, of a simulated sensor."""
     profile = tmp_path / "press.toml"
     text = PROFILE.replace('clock = "virtual"', 'clock = "real"') + "rate = 200.0\n"
     profile.write_text(text + "[simulation]\ncompression_speed = 0.05\ntactile_noise = 300.0\n")
@@ -134,12 +139,7 @@ def pressed(tmp_path):
 
 @pytest.mark.parametrize("dropped", [0.0, 0.2])
 def test_a_press_at_known_speed_gives_the_modulus(tmp_path, capsys, pressed, dropped):
-    words = [*pressed, "--set", f"simulation.tactile_dropped={dropped}"]
-    for seed in range(20):
-        if main([*words, "--set", f"simulation.seed={seed}"]) == 0:
-            break
-        told = capsys.readouterr().err  # frames were missed, on a busy machine or on purpose
-        assert "press again" in told or "press slower" in told
+    assert main([*pressed, "--set", f"simulation.tactile_dropped={dropped}"]) == 0
     found = load_calibration(tmp_path / "a.json").modulus
     assert found.modulus == pytest.approx(E, rel=0.03)
     assert found.material().stress(0.2) == pytest.approx(0.2 * E, rel=0.05)
@@ -174,7 +174,7 @@ def test_a_press_of_which_the_most_was_not_seen_is_wanted_again(
         (["centre", "--theta", "0", "5"], "ended before all loads were on"),
     ],
 )
-def test_what_cannot_be_done_live(tmp_path, capsys, monkeypatch, words, told):
+def test_what_cannot_be_done_live(tmp_path, capsys, monkeypatch, virtual, words, told):
     profile = tmp_path / "press.toml"
     text = PROFILE.replace('clock = "virtual"', 'clock = "real"')
     profile.write_text(text + "[simulation]\ncompression_speed = 0.4\ntactile_noise = 300.0\n")
@@ -205,14 +205,3 @@ def test_without_matplotlib_the_step_is_done_and_the_missing_picture_told(
     assert main(["calibrate", "tare", str(tmp_path / "b.json"), *words, *picture]) == 1
     assert "pip install 'softfinger[plot]'" in capsys.readouterr().err
     assert not (tmp_path / "b.json").exists()
-
-
-def test_the_daemon_refuses_another_sensors_file_in_one_line(live, profile):
-    there = PROFILE.replace("A17", "B2") + f'calibration = ["{live / "sensor.json"}", ""]\n'
-    done = softfinger("run", "--config", str(profile(there)), "--duration", "0.1")
-    assert done.returncode == 1
-    assert "this is the calibration of another sensor: sensor A17, here B2" in done.stderr
-    assert "Traceback" not in done.stderr
-    told = [line for line in done.stderr.splitlines() if "sensor.json" in line]
-    assert len([line for line in told if "not compiled ahead" not in line]) == 1
-    assert len(told) <= 2  # where kernels are to be compiled first, they tell it once

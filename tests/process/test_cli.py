@@ -128,8 +128,8 @@ def test_bad_settings_end_it_with_the_whole_report(profile: Profile, inline: Inl
         ),
     ],
 )
-def test_a_missing_port_is_named(profile: Profile, text: str, error: str) -> None:
-    done = softfinger("run", "--config", str(profile(text)))
+def test_a_missing_port_is_named(profile: Profile, inline: Inline, text: str, error: str) -> None:
+    done = inline("run", "--config", profile(text))
     assert done.returncode == 1
     (line,) = [line for line in done.stderr.splitlines() if line.startswith("softfinger: ")][-1:]
     assert error in line
@@ -148,18 +148,6 @@ def test_send_without_a_daemon_or_with_nonsense(addresses: tuple[str, str], inli
     assert "found 'force:5', expected key=number" in done.stderr
 
 
-def test_garbage_on_the_command_socket_changes_nothing(
-    hand: Shared, context: zmq.Context[Any]
-) -> None:
-    socket = context.socket(zmq.DEALER)
-    socket.connect(hand.commands)
-    for payload in (b"\xc1" * 10, b"x" * 10_000, b"", msgpack.packb({"command": 3})):
-        socket.send_multipart([b"", payload])
-        assert socket.poll(60_000)
-        assert msgpack.unpackb(socket.recv_multipart()[-1])["ok"] is False
-    assert ask(hand.commands, "arm")["ok"]
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_during_start_up_ends_it_without_a_trace(profile: Profile, number: int) -> None:
     process = subprocess.Popen(
@@ -168,7 +156,7 @@ def test_a_signal_during_start_up_ends_it_without_a_trace(profile: Profile, numb
     assert process.stderr is not None
     first = process.stderr.readline()  # said once the handlers are there, before the kernels
     process.send_signal(number)
-    said = first + process.communicate(timeout=120)[1]
+    said = first + process.communicate(timeout=300)[1]
     assert process.returncode == 0
     assert "Traceback" not in said
     assert "ended" in said.splitlines()[-1]
@@ -183,7 +171,7 @@ def test_signals_that_would_end_a_process_at_once_turn_torque_off_first(
     )
     assert ask(addresses[1], "arm")["ok"]
     process.send_signal(number)
-    said = process.communicate(timeout=120)[1]
+    said = process.communicate(timeout=300)[1]
     assert process.returncode == 0
     assert "ended, torque off" in said
 
@@ -199,16 +187,19 @@ def test_a_reader_of_the_log_that_stops_reading_stops_nothing(
     assert ask(addresses[1], "arm")["ok"]
     assert ask(addresses[1], "status")["mode"] == "armed"
     process.terminate()
-    assert process.wait(60.0) == 0
+    assert process.wait(300) == 0
 
 
 def test_commands_that_waited_through_a_stall_are_refused_but_stop_stops(
     hand: Shared, context: zmq.Context[Any]
 ) -> None:
     assert ask(hand.commands, "arm")["ok"]
-    hand.running.process.send_signal(signal.SIGSTOP)
     socket = context.socket(zmq.DEALER)
     socket.connect(hand.commands)
+    socket.send_multipart([b"", msgpack.packb({"command": "status"})])
+    assert socket.poll(60_000)  # it is connected
+    socket.recv_multipart()
+    hand.running.process.send_signal(signal.SIGSTOP)
     for request in ({"command": "move", "left": 0.1}, {"command": "stop"}):
         socket.send_multipart([b"", msgpack.packb(request)])
     select.select([], [], [], 0.5)  # the stall itself
@@ -264,11 +255,13 @@ while True:
 """
 
 
-def test_an_ipc_address_never_replaces_a_file(tmp_path: Path, profile: Profile) -> None:
+def test_an_ipc_address_never_replaces_a_file(
+    tmp_path: Path, profile: Profile, inline: Inline
+) -> None:
     file = tmp_path / "precious"
     file.write_text("kept", encoding="utf-8")
     words = ("--set", f"stream.address=ipc://{file}", "--duration", "0.2")
-    done = softfinger("run", "--config", str(profile("")), *words)
+    done = inline("run", "--config", profile(""), *words)
     assert done.returncode == 1
     assert "is there already and is no socket" in done.stderr
     assert file.read_text(encoding="utf-8") == "kept"

@@ -19,29 +19,18 @@ echo "${COMPREPLY[@]}"
 """
 
 
-@pytest.mark.parametrize(
-    ("words", "completed"),
-    [
+def test_a_tab_completes(inline: Inline, tmp_path: Path) -> None:
+    script = tmp_path / "script"
+    script.write_text(inline("completion", "bash").stdout, encoding="utf-8")
+    (tmp_path / "my.toml").touch()
+    for words, completed in (
         (("re",), "record replay"),
         (("send", "ro"), "rotate"),
         (("run", "--log-"), "--log-file"),
         (("run", "--log", ""), "plain json"),
         (("calibrate", "cu"), "curve"),
         (("run", "--config", "my"), "my.toml"),
-    ],
-)
-def test_a_tab_completes(
-    inline: Inline, tmp_path: Path, words: tuple[str, ...], completed: str
-) -> None:
-    script = tmp_path / "script"
-    script.write_text(inline("completion", "bash").stdout, encoding="utf-8")
-    (tmp_path / "my.toml").touch()
-    done = subprocess.run(
-        ["bash", "--norc", "-c", _TAB, "bash", script, "softfinger", *words],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
-    assert done.stdout.strip() == completed
+    ):
+        call = ["bash", "--norc", "-c", _TAB, "bash", script, "softfinger", *words]
+        done = subprocess.run(call, cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert done.stdout.strip() == completed

@@ -32,7 +32,7 @@ sys.exit(cli.main(sys.argv[2:]))
 )
 def test_it_ends_the_process_as_any_other(module: str, words: list[str]) -> None:
     done = subprocess.run(
-        [sys.executable, "-c", _AT, module, *words], capture_output=True, text=True, timeout=60
+        [sys.executable, "-c", _AT, module, *words], capture_output=True, text=True, timeout=300
     )
     assert (done.returncode, done.stderr) == (-signal.SIGINT, "")
 
@@ -42,6 +42,6 @@ def test_later_it_is_a_keyboard_interrupt_again() -> None:
         [sys.executable, "-c", _AT, "softfinger.daemon.safety.limits", "limits"],
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=300,
     )
     assert (done.returncode, done.stderr) == (130, "")

@@ -80,8 +80,7 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
     """Listen for less than on metal, and leave the sockets of this machine alone."""
     monkeypatch.setattr(doctor, "check_addresses", lambda _: [])
     monkeypatch.setattr(machine, "_WAKE_UPS", 5)
-    whole = devices.check_servos
-    monkeypatch.setattr(doctor, "check_servos", lambda settings: whole(settings, 0.5))
+    monkeypatch.setattr(devices, "SEARCH_TIME", 0.5)
 
 
 def with_status(lines: list[str], status: str) -> list[str]:
@@ -166,6 +165,15 @@ def test_servos_at_another_rate_are_found(hands, capsys):
 
 
 @pytest.mark.waits
+def test_a_servo_that_answers_at_several_rates_is_one_line(hands, capsys):
+    path = str(hands().folder / "servos")
+    assert main(["scan", path, "--baud", "2000000", "--baud", "1000000", "--wait", "1"]) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        f"{path}: ID {servo} at 2000000, 1000000 baud: XM430-W350, firmware 48" for servo in (1, 2)
+    ]
+
+
+@pytest.mark.waits
 def test_a_servo_with_another_id_is_found_and_changed_only_when_asked(hands, capsys):
     hand = hands(ids=(1, 7), baud=2_000_000)
     servo = hand.emulator._servos.bus.servos[1]
@@ -190,13 +198,6 @@ def test_the_built_in_hand_has_nothing_to_ask(capsys):
     assert "note   servos: simulated: no servo to ask" in lines
     assert [line for line in lines if line.startswith("note   serial ports: ")]
     assert lines[-1].endswith(" 0 failed")
-
-
-def test_wrong_settings_are_told(tmp_path, capsys):
-    path = tmp_path / "bad.toml"
-    path.write_text("servos.speed = 3\n")
-    assert main(["doctor", "--config", str(path)]) == 2
-    assert "unknown key" in capsys.readouterr().err
 
 
 # Ports.
@@ -248,7 +249,7 @@ def test_who_has_a_port_is_named(terminal, locked):
         found = ports.check_port(path, "servos.port")
         well = ports.check_port(path, "servos.port", "holding")
         other.stdin.close()
-        other.wait(60)
+        other.wait(300.0)
     assert found.status == "FAIL"
     assert f"in use by process {other.pid} (python" in found.text
     assert found.fix == f"kill {other.pid}"

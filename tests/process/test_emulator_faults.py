@@ -18,7 +18,6 @@ from softfinger.daemon.tactile.base import make_sensor
 from softfinger.daemon.tactile.flexitac import FlexiTac
 from tests.conftest import until
 from tests.harness.emulated import SdkServos, board, emulated, send
-from tests.harness.tactile import why_not_open
 
 
 def test_a_scene_has_only_the_ports_it_needs(tmp_path):
@@ -67,33 +66,6 @@ full_count = {full}
         sensor.close()
 
 
-def test_board_faults_reach_the_daemons_backend(tmp_path):
-    with emulated(tmp_path, "left:wrong-size", "right:torn=0.5"):
-        until(lambda: "256 cells" in why_not_open(board(tmp_path, 0, timeout=0.1)))
-        sensor = board(tmp_path, 1)
-        sensor.open()
-        until(lambda: sensor.counters()["resyncs"] >= 3)
-        assert sensor.latest().data.mean() < 10
-        sensor.close()
-
-
-def test_silent_frozen_and_noisy_boards(tmp_path):
-    with emulated(tmp_path, "left:frozen", "right:noisy=0.3"):
-        left, right = board(tmp_path, 0), board(tmp_path, 1)
-        right.open()
-        left.open()
-        kept = left.latest().data
-        seq = left.latest().seq
-        until(lambda: left.latest().seq > seq + 10)
-        assert np.array_equal(left.latest().data, kept)
-        until(lambda: right.counters()["resyncs"] > 0)
-        left.close()
-        right.close()
-        assert send(tmp_path, "right:silent") == 0
-        # What it had sent before may still be read.
-        until(lambda: "no byte came" in why_not_open(board(tmp_path, 1, timeout=0.1)))
-
-
 def test_servo_faults_reach_the_sdk(tmp_path):
     with emulated(tmp_path, "silent=2"):
         servos = SdkServos(tmp_path)
@@ -124,9 +96,11 @@ def test_a_board_that_nobody_reads_disturbs_nothing(tmp_path):
 
 
 def test_faults_while_it_runs(tmp_path, capsys):
-    with emulated(tmp_path):
+    log: list[str] = []
+    with emulated(tmp_path, tell=log.append):
         servos = SdkServos(tmp_path)
         assert send(tmp_path, "silent=1 drop=1") == 0
+        assert log == ["fault: servos: silent=1", "fault: servos: drop=1"]
         assert servos.silent(1)
         assert servos.silent(2)
         assert send(tmp_path, "well") == 0
@@ -202,13 +176,16 @@ def test_the_control_socket_survives_rude_clients_and_is_taken_away(tmp_path, mo
 
 
 def test_measurements_are_wrong_and_the_hand_is_not(tmp_path: Path) -> None:
-    with emulated(tmp_path, "right:drift=0.2@0.5..1", "left:current=3@0.5") as made:
+    log: list[str] = []
+    faults = "right:drift=0.2@0.5..1", "left:current=3@0.5"
+    with emulated(tmp_path, *faults, tell=log.append) as made:
         until(lambda: board_mean(tmp_path, 1) > 48)  # of 255
         assert board_mean(tmp_path, 0) < 10
         left, right = made.hand.measurement_faults
         assert (left("current", 9.0), right("current", 9.0)) == (3.0, 1.0)
         assert send(tmp_path, "right:well left:gain=0@0.1..0.2") == 0
         until(lambda: board_mean(tmp_path, 1) < 10)
+        until(lambda: log[-2:] == ["fault: right: well", "fault: left: gain=0 within 0.1 s"])
         until(lambda: left("gain", made.clock.now()) == 0.0)
         assert left("current", 9.0) == 3.0
         assert send(tmp_path, "well") == 0
@@ -231,15 +208,10 @@ def test_an_object_that_slipped_away_is_put_back(tmp_path: Path) -> None:
         until(lambda: np.allclose(made.hand.object_pose, (0.0, 0.08, 0.0), atol=1e-3))
 
 
-def test_a_load_on_the_object_and_when_the_tips_slipped(tmp_path: Path) -> None:
+def test_a_load_moves_the_object(tmp_path: Path) -> None:
     with emulated(tmp_path) as made:
         made.request("push=5")
         until(lambda: made.hand.object_pose[1] > 0.082)  # off along its faces, away from the palm
-        held = made.report(made.clock.now())["object"]
-        assert held["pushed"] is not None
-        assert held["slipped"] is None, "no tip touches it"
         assert made.report(made.clock.now())["force"] == [0.0, 0.0]
         made.request("place twist=0.02")
         until(lambda: made.hand.object_pose[2] > 0.05)
-        made.request("place forget")
-        assert made.report(made.clock.now())["object"]["pushed"] is None

@@ -12,7 +12,7 @@ import pytest
 from matplotlib.image import imread
 
 from softfinger import Hand
-from tests.harness.daemon_process import Running
+from tests.harness.daemon_process import Running, insist
 
 Start = Callable[..., Running]
 Profile = Callable[[str], Path]
@@ -23,7 +23,7 @@ def example(*words: str) -> subprocess.CompletedProcess[str]:
         [sys.executable, "-m", "softfinger.tools.examples.grasp_and_turn", *words],
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=300,
         check=False,
     )
 
@@ -34,8 +34,8 @@ def test_grasp_and_turn(
     daemon = start("--config", str(profile("")))
     stream, commands = addresses
     picture = tmp_path / "picture.png"
-    with Hand(stream, commands) as hand:  # a program before it, as the README's, left it armed
-        hand.arm()
+    with Hand(stream, commands, timeout=60.0) as hand:  # a program before it left it armed
+        insist(hand.arm)
     done = example("--stream", stream, "--commands", commands, "--picture", str(picture))
     assert done.returncode == 0, done.stderr
     assert re.sub(r"no hand/state from .* yet, waiting up to .* s\n", "", done.stderr) == ""

@@ -12,9 +12,8 @@ import pytest
 from softfinger.daemon.wire import schema
 from softfinger.tools.recordings.export import BLOCK, CsvTable, ParquetTable, export
 from softfinger.tools.recordings.reader import Recording
-from softfinger.tools.recordings.writer import RecordingWriter
+from softfinger.tools.recordings.record import RecordingWriter
 from tests.conftest import Inline
-from tests.harness.daemon_process import softfinger
 from tests.harness.golden_wire import flat, sample
 from tests.process.test_record import written
 
@@ -32,7 +31,7 @@ def test_csv_has_every_field_with_all_its_digits(path: Path, tmp_path: Path) -> 
         rows = list(csv.DictReader(file))
     assert len(rows) == BLOCK + 50
     expected = flat(sample(schema.STATE))
-    assert list(rows[0]) == list(expected)
+    assert list(rows[0]) == [*expected, "t"]
     for name, value in expected.items():
         if name not in ("seq", "timestamp"):
             told = rows[-1][name]
@@ -92,11 +91,13 @@ def test_files_have_plain_names_whatever_the_topics_are_called(tmp_path: Path) -
 def test_from_the_command_line(path: Path, tmp_path: Path, inline: Inline) -> None:
     out = tmp_path / "out"
     words = ("--out", str(out), "--topics", "state", "--from", "100", "--to", "200")
-    done = softfinger("export", str(path), *words)
+    done = inline("export", path, *words)
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.strip() == str(out / "hand-state.csv")
     with (out / "hand-state.csv").open(encoding="utf-8") as file:
-        assert 100 <= len(file.readlines()) - 1 <= 101
+        rows = list(csv.DictReader(file))
+    assert 100 <= len(rows) <= 101
+    assert float(rows[0]["t"]) == pytest.approx(100.0, abs=1.01)
     done = inline("export", path, "--topics", "dreams")
     assert done.returncode == 1
     assert "found topic 'dreams', the recording has hand/state, hand/tactile" in done.stderr

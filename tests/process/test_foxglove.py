@@ -103,7 +103,8 @@ def test_a_client_reads_every_channel_of_the_running_hand() -> None:
             assert "127.0.0.1" in hosts
             assert all(host.startswith("127.") for host in hosts)
             fake.changes = {"goal_force": float("nan")}
-            with connect(address, subprotocols=["foxglove.sdk.v1"], proxy=None) as socket:
+            waits: Any = {"open_timeout": WAIT, "ping_timeout": None}
+            with connect(address, subprotocols=["foxglove.sdk.v1"], proxy=None, **waits) as socket:
                 client = Client(socket)
                 client.subscribe(*(topic for topic in TOPICS if topic != "hand/event"))
                 check_numbers(client)
@@ -118,7 +119,7 @@ def test_a_client_reads_every_channel_of_the_running_hand() -> None:
                 check_events(client, early)
         finally:
             process.terminate()
-            process.communicate(timeout=120)
+            process.communicate(timeout=300)
     assert process.returncode == 0
 
 

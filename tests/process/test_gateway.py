@@ -180,7 +180,7 @@ def test_a_gateway_that_hangs_ends_itself_and_a_busy_machine_ends_none(
                 config,
             ],
             pass_fds=(theirs.fileno(),),
-            timeout=300.0,
+            timeout=300,
         )
     assert ended.returncode == status
 

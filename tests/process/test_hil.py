@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import select
 import signal
 import subprocess
 from collections.abc import Iterator
@@ -32,7 +34,7 @@ class Emulated:
 
     def end(self) -> None:
         self.process.terminate()
-        self.process.wait(timeout=60)
+        self.process.wait(timeout=300)
         assert self.process.stdout is not None
         self.process.stdout.close()
 
@@ -138,6 +140,43 @@ def test_arm_grasp_10_n_hold_release_and_stop_over_bytes(
     until(lambda: not stream.newest()["torque"])
 
 
+@pytest.mark.waits
+def test_daemon_and_emulated_hand_wait_for_each_other(
+    tmp_path: Path, context: zmq.Context[Any]
+) -> None:
+    hand = Emulated(tmp_path / "hand")
+    config, (stream_address, commands) = profile(tmp_path / "hil.toml")
+    daemon = Running("--config", str(config), "--dir", str(hand.folder))
+    try:
+        stream = Stream(context, stream_address)
+        assert ask(commands, "arm")["ok"]
+        assert ask(commands, "grasp", force=8.0)["ok"]
+        # Older states of an armed hand may still be in the queue.
+        until(lambda: (mode := stream.next()["mode"]) == "holding" or mode == "fault")
+        for process in (daemon.process, hand.process):
+            stood = stream.newest()["behind_s"] + 0.4
+            process.send_signal(signal.SIGSTOP)
+            select.select([], [], [], 0.5)  # five times what the servos' watchdog allows
+            process.send_signal(signal.SIGCONT)
+            until(lambda at=stood: stream.next()["behind_s"] > at)
+        state = stream.newest()
+        assert (state["mode"], state["fault"]) == ("holding", "")
+        report = json.loads(send_words(hand.folder, "report"))
+        assert not any(servo["watchdog_fired"]["count"] for servo in report["servos"])
+        # A daemon that is gone is waited for no longer.
+        daemon.kill()
+        until(lambda: stopped(hand.folder))
+    finally:
+        daemon.kill()
+        hand.end()
+
+
+def stopped(folder: Path) -> bool:
+    """Whether the servos' watchdogs have stopped them."""
+    servos = json.loads(send_words(folder, "report"))["servos"]
+    return all(servo["stopped_by_watchdog"] for servo in servos)
+
+
 def test_a_second_daemon_on_the_same_ports_says_so_before_torque_is_on(
     pair: Pair, tmp_path: Path
 ) -> None:
@@ -146,6 +185,7 @@ def test_a_second_daemon_on_the_same_ports_says_so_before_torque_is_on(
     assert second.returncode == 1
     assert f"{pair.folder}/servos" in second.stderr.splitlines()[-1]
     assert "Traceback" not in second.stderr
+    ask(pair.commands, "disarm")
     reply = ask(pair.commands, "arm")
     assert reply["ok"], f"the first one must live on: {reply}"
     assert ask(pair.commands, "disarm")["ok"]

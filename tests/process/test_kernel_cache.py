@@ -182,18 +182,16 @@ SPOILT: dict[str, Callable[[Path], object]] = {
 }
 
 
-@pytest.mark.parametrize("spoil", SPOILT.values(), ids=SPOILT)
-def test_a_damaged_kernel_is_compiled_anew_with_a_warning(
-    package: Package, spoil: Callable[[Path], object]
-) -> None:
-    if spoil is SPOILT["another's"] and os.geteuid() != 0:
-        pytest.skip("only root gives files away")
+def test_a_damaged_kernel_is_compiled_anew_with_a_warning(package: Package) -> None:
     package.run()
     (file,) = package.cache.rglob("*.kernel")
-    spoil(file)
-    found, told = package.run()
-    assert found == ["3.0", "0"]
-    assert told.count("compiled anew") == 1
+    for name, spoil in SPOILT.items():
+        if name == "another's" and os.geteuid() != 0:
+            continue  # only root gives files away
+        spoil(file)
+        found, told = package.run()
+        assert found == ["3.0", "0"], name
+        assert told.count("compiled anew") == 1, name
     assert package.run() == (["3.0", "1"], "")
 
 

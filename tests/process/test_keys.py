@@ -251,30 +251,6 @@ def test_a_client_is_who_its_key_says_whatever_it_says(
     assert guarded.heard == [{"command": "arm", "client": "alice"}]
 
 
-def test_what_waits_with_keys_dies_with_a_stop_and_the_stops_own_client_goes_on(
-    guarded: Guarded, others: zmq.Context[Any], addresses: tuple[str, str], folder: Path
-) -> None:
-    flood, stopper = others.socket(zmq.DEALER), others.socket(zmq.REQ)
-    for socket in (flood, stopper):
-        socket.setsockopt(zmq.LINGER, 0)
-        load_client(folder / "alice").guard(socket)
-        socket.connect(addresses[1])
-    stopper.send(msgpack.packb({"command": "status"}))
-    until(lambda: [guarded.step(), stopper.poll(0)][1])
-    stopper.recv()
-    for _ in range(100):
-        flood.send(msgpack.packb({"command": "arm"}))
-    until(lambda: [guarded.step(), len(guarded.heard) > 3][1])
-    stopper.send(msgpack.packb({"command": "stop"}))
-    until(lambda: [guarded.step(), stopper.poll(0)][1])
-    stopper.recv()
-    stopper.send(msgpack.packb({"command": "status"}))
-    until(lambda: [guarded.step(), stopper.poll(0)][1])
-    assert msgpack.unpackb(stopper.recv())["ok"]
-    names = [request["command"] for request in guarded.heard]
-    assert names[names.index("stop") :] == ["stop", "status"]
-
-
 def test_who_stops_is_answered_while_others_stop_without_pause(
     guarded: Guarded, others: zmq.Context[Any], addresses: tuple[str, str], folder: Path
 ) -> None:

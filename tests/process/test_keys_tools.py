@@ -19,13 +19,12 @@ from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.keys import make_keys
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.replay import Wire
-from tests.conftest import own_addresses, until
+from tests.conftest import Inline, own_addresses, until
 from tests.harness.daemon_process import (
     SOFTFINGER,
     Running,
     ask,
     insist,
-    softfinger,
     until_it_says,
 )
 from tests.harness.viewed import Viewed, Watcher
@@ -65,11 +64,13 @@ def record(path: Path, *words: str) -> None:
     process = subprocess.Popen([*SOFTFINGER, "record", path, *words], stdout=subprocess.DEVNULL)
     until(lambda: path.exists() and path.stat().st_size > 3000)
     process.send_signal(signal.SIGINT)
-    assert process.wait(120.0) == 0
+    assert process.wait(300) == 0
     assert Recording(path).counts["hand/state"] > 0
 
 
-def test_tools_with_keys_see_and_command_the_hand(guarded: Guarded, tmp_path: Path) -> None:
+def test_tools_with_keys_see_and_command_the_hand(
+    guarded: Guarded, tmp_path: Path, inline: Inline
+) -> None:
     folder, addresses, _ = guarded
     stream, commands = addresses
     alice = ("--keys", str(folder / "alice"))
@@ -80,7 +81,7 @@ def test_tools_with_keys_see_and_command_the_hand(guarded: Guarded, tmp_path: Pa
     with Hand(*addresses, keys=folder / "alice", timeout=60.0) as hand:
         insist(hand.arm)
         assert hand.wait_for(lambda state: state.torque, 60.0).mode == "armed"
-        told = softfinger("send", "status", "--address", commands, *alice, "--timeout", "60")
+        told = inline("send", "status", "--address", commands, *alice, "--timeout", "60")
         assert json.loads(told.stdout)["torque"] is True
     where = ("--state", stream, "--commands", commands)
     until_it_says(("monitor", "--plain", *where, *alice), " armed  left")
@@ -96,7 +97,7 @@ def test_tools_with_keys_see_and_command_the_hand(guarded: Guarded, tmp_path: Pa
 
 
 def test_tools_without_keys_see_nothing_and_say_what_may_be_missing(
-    guarded: Guarded, tmp_path: Path
+    guarded: Guarded, tmp_path: Path, inline: Inline
 ) -> None:
     stream, commands = guarded.addresses
     path = tmp_path / "b.mcap"
@@ -110,12 +111,12 @@ def test_tools_without_keys_see_nothing_and_say_what_may_be_missing(
         )
     ]
     for tool in tools:
-        said = tool.communicate(timeout=120)[1]
+        said = tool.communicate(timeout=300)[1]
         assert tool.returncode in (1, 2), tool.args
         assert "--keys" in said, tool.args
     # Keys that can't be read are told before there is a file.
     path = tmp_path / "c.mcap"
-    done = softfinger("record", str(path), "--address", stream, "--keys", str(tmp_path / "none"))
+    done = inline("record", path, "--address", stream, "--keys", tmp_path / "none")
     assert done.returncode == 1
     assert "softfinger keys" in done.stderr
     assert not path.exists()
@@ -149,7 +150,7 @@ def test_a_recording_is_replayed_to_holders_of_keys(
                 stranger.state(0.3)
     finally:
         replay.terminate()
-        out, error = replay.communicate(timeout=120)
+        out, error = replay.communicate(timeout=300)
     assert replay.returncode == 0, error
     assert re.search(r"\d+ of \d+ messages published", out)
     assert "waiting up to 10 s for a subscriber" in error

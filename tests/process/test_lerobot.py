@@ -21,7 +21,7 @@ from softfinger.daemon.wire.schema import TactileFrame
 from softfinger.tools.recordings.features import image, observation
 from softfinger.tools.recordings.lerobot_dataset import samples
 from softfinger.tools.recordings.reader import Recording
-from softfinger.tools.recordings.writer import RecordingWriter
+from softfinger.tools.recordings.record import RecordingWriter
 from tests.conftest import Inline
 from tests.harness.daemon_process import PATIENT, Running
 from tests.harness.golden_wire import sample
@@ -55,7 +55,7 @@ def make(tmp_path: Path, addresses: tuple[str, str], monkeypatch: pytest.MonkeyP
             calibration_dir=tmp_path / "calibration",
             stream=stream,
             commands=commands,
-            timeout=60.0,
+            timeout=300,
             **options,
         )
         return make_robot_from_config(config)

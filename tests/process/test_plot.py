@@ -19,7 +19,7 @@ from softfinger.tools import style
 from softfinger.tools.analysis import plot, plots_model
 from softfinger.tools.analysis.plots_data import Missing, RecordedRun, load_run
 from softfinger.tools.recordings.reader import Recording
-from softfinger.tools.recordings.writer import RecordingWriter
+from softfinger.tools.recordings.record import RecordingWriter
 from tests.conftest import Inline
 from tests.harness.recorded_hand import record_hand
 
@@ -41,7 +41,7 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def run(path: Path) -> RecordedRun:
-    return load_run(Recording(path), -math.inf, math.inf, None)
+    return load_run(Recording(path), -math.inf, math.inf)
 
 
 def drawn(run: RecordedRun, page: str) -> Figure:
@@ -195,7 +195,7 @@ def test_one_finger_alone(tmp_path: Path) -> None:
     due = {50: {"command": "arm"}, 60: {"command": "grasp", "force": 2.0}}
     one = ('scene.fingers=["left"]', "scene.object_model=false")
     record_hand(path, due, 2.5, one)
-    run = load_run(Recording(path), -math.inf, math.inf, None)
+    run = load_run(Recording(path), -math.inf, math.inf)
     assert run.fingers == ("left",)
     for page in plot.PAGES:
         figure = drawn(run, page)

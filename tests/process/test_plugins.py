@@ -5,19 +5,23 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from softfinger.daemon.backends import backend
 from softfinger.daemon.client.hand import Hand
+from softfinger.daemon.clock import RealClock
 from softfinger.daemon.errors import PluginError, SettingsError
 from softfinger.daemon.profile.load import load
+from softfinger.daemon.simulation.emulator.pty_bus import open_pty
 from softfinger.testing import check_servos, check_shape, check_tactile
 from softfinger.tools.setup import doctor
 from tests.conftest import until
-from tests.harness.daemon_process import Running
+from tests.harness.daemon_process import PATIENT, Running, insist
 
 EXAMPLE = Path(__file__).parents[1] / "example_plugin"
 METAL = ("tactile.backend=pulsing", "servos.backend=following")
@@ -103,10 +107,39 @@ def test_a_daemon_runs_on_them(
     monkeypatch.setenv("PYTHONPATH", path)
     changes = [word for each in METAL for word in ("--set", each)]
     file = str(profile("[plugins.pulsing]\nheight = 5\n"))
-    running = start("--config", file, *changes)
+    running = start("--config", file, *changes, *PATIENT)
     with Hand(*addresses, timeout=60.0) as hand:
-        hand.arm()
-        hand.move(left=0.3, right=0.2)
+        insist(hand.arm)
+        insist(lambda: hand.move(left=0.3, right=0.2))
         until(lambda: abs(hand.state().left.q - 0.3) < 1e-3)
-        hand.disarm()
+        insist(hand.disarm)
     assert running.end() == 0
+
+
+def test_the_ascii_board_of_the_page_reads_a_port() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "plugins.md").read_text(encoding="utf-8")
+    names: dict[str, Any] = {}
+    exec(page.split("```python\n")[-1].split("```")[0], names)
+    master, slave, path = open_pty()
+    settings = load(changes=["tactile.rows=4", "tactile.cols=5", f'tactile.port=["{path}", ""]'])
+    sensor = names["AsciiBoard"](settings.tactile, RealClock(), 0)
+    ended = threading.Event()
+
+    def send() -> None:
+        while not ended.wait(0.01):
+            os.write(master, b",".join(b"%d" % (1000 * k) for k in range(20)) + b"\n1,2\n-1\nx\n")
+
+    sender = threading.Thread(target=send)
+    sender.start()
+    try:
+        sensor.open()
+        seq = sensor.latest().seq
+        until(lambda: sensor.latest().seq > seq + 2)
+        assert sensor.latest().data.tolist()[3] == [15000, 16000, 17000, 18000, 19000]
+        assert sensor.counters()["skipped_bytes"] > 0
+    finally:
+        ended.set()
+        sender.join()
+        sensor.close()
+        os.close(master)
+        os.close(slave)

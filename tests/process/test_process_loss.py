@@ -23,7 +23,9 @@ from tests.harness.daemon_process import SOFTFINGER, Running, ask, softfinger
 
 HIL = Path(__file__).parents[2] / "config" / "hil.toml"
 WATCHDOG = 1.0  # s, well above what a busy machine holds the daemon up
+REAL = ("--set", "loop.clock=real")  # else the hand waits for a daemon that stands still
 PATIENT = [
+    *REAL,
     *("--set", f"servos.watchdog={WATCHDOG}", "--set", f"servos.fault_after={WATCHDOG}"),
     *("--set", "servos.reply_timeout=0.1"),
 ]
@@ -39,7 +41,7 @@ class Rig:
         self.config = folder / "hil.toml"
         head = f'stream.address = "{addresses[0]}"\ncommands.address = "{addresses[1]}"\n'
         self.config.write_text(head + HIL.read_text(encoding="utf-8"), encoding="utf-8")
-        words = [*SOFTFINGER, "emulate", "--dir", str(self.folder), "--config", str(HIL)]
+        words = [*SOFTFINGER, "emulate", "--dir", str(self.folder), "--config", str(HIL), *REAL]
         self.hand = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
         self.daemon: Running | None = None
         assert self.hand.stdout is not None
@@ -105,7 +107,7 @@ class Rig:
         if self.daemon is not None:
             self.daemon.kill()
         self.hand.terminate()
-        self.hand.wait(timeout=60)
+        self.hand.wait(timeout=300)
         assert self.hand.stdout is not None
         self.hand.stdout.close()
 

@@ -79,7 +79,7 @@ with RealTime(settings) as measures:
 
 def run(script: str) -> Any:
     done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=60
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=300
     )
     return json.loads(done.stdout)
 

@@ -25,8 +25,7 @@ from softfinger.daemon.errors import RecordingError
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.packer import pack
 from softfinger.tools.recordings.reader import Recording
-from softfinger.tools.recordings.record import recover
-from softfinger.tools.recordings.writer import RecordingWriter
+from softfinger.tools.recordings.record import RecordingWriter, recover
 from tests.conftest import Inline, until
 from tests.harness.daemon_process import SOFTFINGER, Running, ask
 from tests.harness.fake_daemon import FakeDaemon, frame, state
@@ -54,7 +53,7 @@ def record(*words: str | Path) -> subprocess.Popen[str]:
 
 
 def ended(process: subprocess.Popen[str]) -> tuple[int, str, str]:
-    out, error = process.communicate(timeout=120)
+    out, error = process.communicate(timeout=300)
     return process.returncode, out, error
 
 
@@ -311,16 +310,6 @@ def test_a_full_disk_ends_it_with_the_reason_and_keeps_what_was_written(
     total = Recording(path).total
     assert total > 10
     assert f"{total} messages written of " in out, "what is in the file counts"
-
-
-def test_ctrl_c_ends_it_with_its_account(fake: FakeDaemon, tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
-    process = record(path, "--address", fake.state_address)
-    until(lambda: is_filled(path))
-    status, out, error = interrupted(process)
-    assert (status, error) == (0, "")
-    assert "messages written" in out
-    assert not Recording(path).truncated
 
 
 def test_what_was_sent_before_the_end_is_written(

@@ -19,8 +19,8 @@ from softfinger.daemon.types import Frame
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.packer import pack
 from softfinger.tools.recordings.reader import Recording
-from softfinger.tools.recordings.recomputed import Comparison, recompute
-from softfinger.tools.recordings.writer import RecordingWriter
+from softfinger.tools.recordings.recomputed import recompute
+from softfinger.tools.recordings.record import RecordingWriter
 from tests.conftest import Inline, until
 from tests.harness.daemon_process import PATIENT, SOFTFINGER, softfinger
 from tests.harness.golden_wire import sample
@@ -147,11 +147,11 @@ def test_a_daemon_recorded_from_its_first_tick_recomputes_to_the_last_bit(
 
 
 def test_a_recorder_that_can_not_start_ends_the_run_before_the_first_tick(
-    profile: Profile, tmp_path: Path
+    profile: Profile, tmp_path: Path, inline: Inline
 ) -> None:
     path = tmp_path / "run.mcap"
     path.write_text("mine")
-    done = softfinger("run", "--config", str(profile("")), "--record", str(path))
+    done = inline("run", "--config", profile(""), "--record", path)
     assert done.returncode == 1
     assert "exists already; nothing is written over it" in done.stderr
     assert path.read_text() == "mine"
@@ -187,7 +187,7 @@ def test_messages_go_out_as_they_were(
     until(lambda: (socket.poll(10) and came.append(socket.recv_multipart()), len(came) == 101)[1])
     assert [(topic, msgpack.unpackb(payload)) for topic, payload in came] == sent
     assert [payload for _, payload in came] == [pack(message) for _, message in sent]
-    assert "101 of 101 messages published" in process.communicate(timeout=120)[0]
+    assert "101 of 101 messages published" in process.communicate(timeout=300)[0]
 
 
 def test_a_part_at_its_own_pace(
@@ -196,21 +196,3 @@ def test_a_part_at_its_own_pace(
     words = ("--address", addresses[0], "--no-wait", "--from", "0.2", "--to", "0.4")
     done = inline("replay", played[0], *words)
     assert done.stdout.startswith(("20 of", "21 of"))
-
-
-@pytest.mark.parametrize(
-    ("content", "reason"),
-    [(b"", "empty"), (b"\x89MCAP0\r\n", "cut short"), (b"t,d\n", "not an MCAP file")],
-)
-def test_files_that_are_no_recording(
-    tmp_path: Path, inline: Inline, content: bytes, reason: str
-) -> None:
-    path = tmp_path / "bad.mcap"
-    path.write_bytes(content)
-    done = inline("replay", path, "--no-wait", "--recompute")
-    assert done.returncode == 1
-    assert reason in done.stderr
-
-
-def test_nothing_compared_is_no_sameness() -> None:
-    assert Comparison().states == 0

@@ -22,7 +22,7 @@ import pytest
 from softfinger.daemon.loop.realtime import Service
 from softfinger.tools.processes.event_log import EventLog
 from tests.conftest import Inline
-from tests.harness.daemon_process import SOFTFINGER, ask, softfinger
+from tests.harness.daemon_process import SOFTFINGER, ask
 from tests.harness.descendants import ending
 
 
@@ -144,7 +144,7 @@ def test_the_running_daemon_is_ready_alive_silent_when_stopped_and_says_its_end(
         told = b""
         while told != b"STOPPING=1":
             told = manager.next()
-        assert process.wait(timeout=60) == 0
+        assert process.wait(timeout=300) == 0
         assert process.stderr is not None
         assert process.stderr.read() == "", "all of it went into the file"
     records = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()]
@@ -180,10 +180,10 @@ def unit_sections(text: str) -> dict[str, dict[str, list[str]]]:
     return sections
 
 
-def test_the_unit_says_what_a_control_daemon_needs(tmp_path: Path) -> None:
+def test_the_unit_says_what_a_control_daemon_needs(tmp_path: Path, inline: Inline) -> None:
     config = tmp_path / "my hand 100%.toml"
     config.write_text("", encoding="utf-8")
-    done = softfinger("install-service", "--print", "--config", str(config), "--user", "root")
+    done = inline("install-service", "--print", "--config", config, "--user", "root")
     assert done.returncode == 0, done.stderr
     sections = unit_sections(done.stdout)
     service = sections["Service"]
@@ -200,14 +200,18 @@ def test_the_unit_says_what_a_control_daemon_needs(tmp_path: Path) -> None:
     assert words[4:6] == ["run", "--no-task"], "comes back disarmed"
     assert words[6:] == ["--log", "json", "--config", str(config)]
     # What it starts is there: the same words show the help.
-    shown = subprocess.run([*words[:-2], "--help"], capture_output=True, timeout=60, check=False)
+    shown = subprocess.run([*words[:-2], "--help"], capture_output=True, timeout=300, check=False)
     assert shown.returncode == 0
     analyze = shutil.which("systemd-analyze")
     if analyze is not None:
         unit = tmp_path / "softfinger.service"
         unit.write_text(done.stdout, encoding="utf-8")
         verified = subprocess.run(
-            [analyze, "verify", str(unit)], capture_output=True, text=True, timeout=60, check=False
+            [analyze, "verify", str(unit)],
+            capture_output=True,
+            text=True,
+            timeout=300,
+            check=False,
         )
         assert (verified.returncode, verified.stderr) == (0, "")
 
@@ -311,8 +315,10 @@ def test_in_the_journal_each_line_has_its_priority(
     assert json.loads(lines[0][3:])["late_s"] == 0.25
 
 
-def test_a_log_file_that_can_not_be_opened_is_told(profile: Callable[..., Path]) -> None:
-    done = softfinger("run", "--config", str(profile()), "--log-file", "/absent/log")
+def test_a_log_file_that_can_not_be_opened_is_told(
+    profile: Callable[..., Path], inline: Inline
+) -> None:
+    done = inline("run", "--config", profile(), "--log-file", "/absent/log")
     assert done.returncode == 2
     assert "--log-file /absent/log: No such file or directory" in done.stderr
 

@@ -13,8 +13,10 @@ import serial
 
 from softfinger.daemon.clock import RealClock
 from softfinger.daemon.errors import ServoError
+from softfinger.daemon.profile.load import find, load
 from softfinger.daemon.servos import checks
 from softfinger.daemon.servos import control_table as reg
+from softfinger.daemon.servos.control_table import by_name
 from softfinger.daemon.servos.dynamixel import DynamixelServos
 from softfinger.daemon.servos.port import SerialPort, latency_file
 from softfinger.daemon.types import Goal, Reading
@@ -187,6 +189,20 @@ def test_what_is_worth_knowing_is_a_notice(bus: RunningBus) -> None:
     backend.close()
     assert bus.memory(0)[span] == goal  # torque that was on stays as it was
     assert servo.torque_on
+
+
+def test_what_a_model_is_too_weak_for_is_a_notice(
+    running: Callable[..., RunningBus],
+) -> None:
+    bus = running(servos={"model": "XL330-M288"})
+    backend = connected(bus, model="XL330-M288")
+    weak = "27 N may be asked for, and it stalls at 6.5 N on this finger"
+    constant = "control.torque_constant is 1.78 N·m/A, its data sheet's 0.354"
+    assert [each.text for each in backend.notices] == 2 * [weak, constant]
+    backend.close()
+    for name in ("hil", "small"):  # their forces are their servos'
+        settings = load(find(Path(name)), Path("/tmp"))
+        assert checks.notice_strength("", by_name(settings.servos.model), settings) == []
 
 
 def test_an_adapters_latency_timer_is_asked_to_be_low(

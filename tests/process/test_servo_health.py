@@ -13,8 +13,8 @@ from softfinger.daemon.clock import RealClock, VirtualClock
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import dynamixel
 from softfinger.daemon.servos.base import Servos, make_servos
-from softfinger.daemon.servos.control_table import AMBIENT, THERMAL_TIME, by_name
 from softfinger.daemon.servos.simulated import SimulatedServos
+from softfinger.daemon.simulation.servo_model.servo_heat import ServoHeat
 from softfinger.daemon.types import Reading
 from tests.conftest import until
 from tests.harness.servos import RunningBus
@@ -49,8 +49,8 @@ def test_temperature_and_supply_come_with_the_joints(bus: RunningBus, servos: Se
     assert reading.valid
     assert reading.temperature == [25.0, 25.0]
     assert reading.voltage == pytest.approx([12.75, 12.75], abs=0.06)
-    bus.call(lambda: setattr(bus.servo(1).health, "temperature", 55.0))
-    bus.call(lambda: setattr(bus.servo(0).health, "voltage", 11.0))
+    bus.call(lambda: bus.servo(1).health.heat.warm(55.0))
+    bus.call(lambda: setattr(bus.servo(0).health, "supply", 11.0))
     until(lambda: read(servos, reading).temperature[1] > 54.0)
     assert reading.voltage[0] == pytest.approx(11.0)
     assert reading.temperature[0] == 25.0
@@ -83,6 +83,10 @@ class Loaded:
     q = dq = np.zeros(2)
     current = np.array([2.0, 0.0])
 
+    def __init__(self) -> None:
+        self.servo_heat = ServoHeat.of(Settings()), ServoHeat.of(Settings())
+        self.driven: list[tuple[int, bool]] = []
+
     def measured_current(self, joint: int) -> float:
         return self.current.item(joint)
 
@@ -90,20 +94,23 @@ class Loaded:
 
     def hold_torque_until(self, t: float) -> None: ...
 
-    def drive(self, *_: Any) -> None: ...
+    def drive(self, joint: int, mode: int, torque: bool, *_: Any) -> None:
+        self.driven.append((joint, torque))
 
 
-def test_simulated_servos_warm_with_their_current() -> None:
+def test_simulated_servos_warm_with_their_current_and_shut_down() -> None:
     clock, hand = VirtualClock(), Loaded()
     servos = SimulatedServos(Settings(), hand, clock)  # type: ignore[arg-type]
     servos.connect()
     reading = read(servos, Reading())
     assert reading.temperature == [25.0, 25.0]
-    assert reading.voltage == pytest.approx([12.75, 12.75], abs=0.06)
-    for _ in range(2000):
-        clock.sleep_until(clock.now() + 0.1)
-        servos.read(reading)
-    settled = by_name(Settings().servos.model).settled_temperature(2.0)
-    risen = (settled - AMBIENT) * (1.0 - math.exp(-clock.now() / THERMAL_TIME))
-    assert reading.temperature[0] == pytest.approx(25.0 + risen, abs=1.0)
-    assert reading.temperature[1] == 25.0
+    assert reading.voltage == pytest.approx([12.05, 12.05], abs=0.06)  # 0.35 Ω on the way
+    servos.torque_on()
+    while not read(servos, reading).alert:
+        clock.sleep_until(clock.now() + 0.05)
+        assert clock.now() < 400.0
+    # 55 K of 73 J/K by 22.5 W, which is 32 W where copper is hot; and some goes into the air.
+    assert 55.0 * 73.0 / 32.0 < clock.now() < 1.2 * 55.0 * 73.0 / 22.5
+    assert (reading.alert, reading.hardware) == (0b01, [1 << 2, 0])
+    assert reading.temperature == [80.0, 25.0]
+    assert hand.driven[-2:] == [(0, False), (1, True)]

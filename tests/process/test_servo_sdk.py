@@ -65,20 +65,6 @@ def test_any_bytes_come_and_go_unchanged(
     assert group.data[1] == data
 
 
-def test_every_register_reads_as_the_table_has_it(bus: RunningBus, line: Line) -> None:
-    port, handler = line
-    size = bus.servo(1).table.size
-    read = b""
-    for address in range(0, size, 61):
-        data, result, _ = handler.readTxRx(port, 2, address, min(61, size - address))
-        assert result == OK
-        read += bytes(data)
-    memory, live = bus.memory(1), slice(reg.REALTIME_TICK, reg.PRESENT_TEMPERATURE + 1)
-    assert read[: live.start] == memory[: live.start]
-    assert read[live.stop :] == memory[live.stop :]
-    assert handler.readTxRx(port, 2, size - 1, 2)[2] == 7
-
-
 def test_other_calls_of_the_sdk_work_through_our_handler(line: Line) -> None:
     port, handler = line
     assert handler.ping(port, 1) == (1020, OK, 0)

@@ -7,7 +7,6 @@ import http.client
 import math
 import select
 import signal
-import subprocess
 import threading
 from contextlib import ExitStack
 from pathlib import Path
@@ -28,8 +27,7 @@ from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.viewing.live_stream import TOPICS, LiveStream
 from softfinger.tools.viewing.pictures import Pictures
 from softfinger.tools.viewing.playback import Playback
-from tests.conftest import until
-from tests.harness.daemon_process import SOFTFINGER
+from tests.conftest import Inline, until
 from tests.harness.fake_daemon import FakeDaemon, event, finger, frame, state
 from tests.harness.recorded_hand import record_hand
 from tests.harness.viewed import Viewed, Watcher
@@ -236,21 +234,25 @@ def test_a_command_is_sent_once_and_not_long_after_its_picture() -> None:
     grasp = {"command": "grasp", "force": 5.0, "client": "page 1"}
     with FakeDaemon() as fake, view(fake) as viewed, Watcher(viewed.host) as page:
         path = "/command" + viewed.commanding.removeprefix(viewed.address)
-        seen = page.next()["now"]
-        assert got(viewed.host, path, "POST", {**grasp, "seen": seen}) == (200, "✓ grasp: ok")
+
+        def press() -> tuple[int, str]:
+            """Command by a picture of now: a busy machine may take too long for it."""
+            while True:
+                told = got(viewed.host, path, "POST", {**grasp, "seen": page.next()["now"]})
+                if "s behind" not in told[1]:
+                    return told
+
+        assert press() == (200, "✓ grasp: ok")
         fake.replies["grasp"] = {"ok": False, "error": "grasp: not while disarmed; arm first"}
-        seen = page.next()["now"]
-        refused = got(viewed.host, path, "POST", {**grasp, "seen": seen})
-        assert refused == (409, "✗ grasp: not while disarmed; arm first")
+        assert press() == (409, "✗ grasp: not while disarmed; arm first")
         assert fake.requests == [grasp, grasp]
-        for late in (seen - 3.0, math.nan):  # which JSON has as null
+        for late in (page.next()["now"] - 3.0, math.nan):  # which JSON has as null
             answer = got(viewed.host, path, "POST", {**grasp, "seen": late})
             assert answer[0] in (400, 409)
-        for odd in (None, "grasp", [], {"command": "grasp"}, {"seen": seen}):
+        for odd in (None, "grasp", [], {"command": "grasp"}, {"seen": 1.0}):
             assert got(viewed.host, path, "POST", odd)[0] == 400
         fake.close()
-        seen = page.next()["now"]
-        status, said = got(viewed.host, path, "POST", {**grasp, "seen": seen})
+        status, said = press()
         assert status == 504
         assert "✗ grasp: no answer" in said
         assert len(fake.requests) == 2
@@ -378,7 +380,7 @@ def test_waiting_is_told_and_a_signal_ends_it() -> None:
             until(lambda: page.next()["status"] == "lost")
             viewed.process.send_signal(signal.SIGINT)
             assert "states seen" in viewed.process.stderr.read()
-            assert viewed.process.wait(60) == 0
+            assert viewed.process.wait(300) == 0
 
 
 @pytest.mark.parametrize(
@@ -388,23 +390,23 @@ def test_waiting_is_told_and_a_signal_ends_it() -> None:
         (("empty.mcap",), "empty"),
         (("text.mcap",), "not an MCAP file"),
         (("text.mcap", "--port", "-1"), "expected a port"),
-        (("--address", "tcp://nowhere"), "tcp://nowhere"),
+        (("--address", "nowhere"), "nowhere: Invalid"),
         (("--address", "tcp://127.0.0.1:9", "--duration", "0.1"), "nothing came"),
         (("--address", "tcp://127.0.0.1:9", "--no-wait"), "no stream from tcp"),
         (("--rate", "fast"), "expected 0.1 to 100 Hz"),
     ],
 )
-def test_bad_input_is_one_clear_line(tmp_path: Path, words: tuple[str, ...], reason: str) -> None:
+def test_bad_input_is_one_clear_line(
+    tmp_path: Path,
+    inline: Inline,
+    monkeypatch: pytest.MonkeyPatch,
+    words: tuple[str, ...],
+    reason: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
     (tmp_path / "empty.mcap").touch()
     (tmp_path / "text.mcap").write_text("no recording")
-    done = subprocess.run(
-        [*SOFTFINGER, "view", "--no-browser", *words],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
+    done = inline("view", "--no-browser", *words)
     assert done.returncode in (1, 2)
     assert reason in done.stderr.splitlines()[-1]
     assert "Traceback" not in done.stderr

@@ -102,7 +102,8 @@ def test_every_button_brings_its_mode_and_a_lost_page_gives_the_hand_back(
             until(lambda: page.text(".mode") == mode)
 
         press("[name=arm]", "armed")
-        refused = send(commands, {"command": "release", "client": "another"})
+        other = {"command": "release", "client": "another"}
+        refused = send(commands, other, 60.0)
         assert "page" in refused["error"]  # it commands the hand
         press("[name=grasp]", "holding")
         assert hand.state().goal_force == pytest.approx(5.0)
@@ -132,7 +133,7 @@ def test_every_button_brings_its_mode_and_a_lost_page_gives_the_hand_back(
         press("[name=stop]", "disarmed")
         press("[name=arm]", "armed")
         page.browser.open("about:blank")
-        until(lambda: send(commands, {"command": "release", "client": "another"})["ok"])
+        until(lambda: send(commands, other, 60.0)["ok"])
         viewed.end()
 
 

@@ -32,7 +32,6 @@ from softfinger.daemon.perception import witnesses
 from softfinger.daemon.profile.load import checked
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS, GRIP_FRACTION, Frame, Goal, Reading
-from softfinger.tools.processes.kernel_build import table_cache
 
 SEQUENCES, TICKS = 1000, 5000
 HELD = 0.3  # of the sequences, at least, must come to hold
@@ -316,9 +315,7 @@ class Soak:
         self.settings = checked({"loop": {"clock": "virtual"}, "simulation": simulation})
         self.account = account or Account()
         self.account.sequences += 1
-        self.daemon = Daemon(
-            self.settings, wire=False, table_cache=table_cache(), on_event=self._hear
-        )
+        self.daemon = Daemon(self.settings, wire=False, on_event=self._hear)
         loop, clock = self.daemon.loop, self.daemon.clock
         self.must = Judge(self.account.judged)
         self.servos = FaultyServos(loop.servos, self.settings, clock, self.must)
@@ -581,9 +578,10 @@ class Soak:
         raised = asked + min(control.grip_raise_max, control.grip_raise_share * asked)
         loaded = t < self._loaded_t + _REMEMBERED
         friction = control.joint_friction / self.settings.hand.finger_length
-        bound = _TOO_MUCH * asked + 2.0 * friction  # that is given, and that holds
+        bound = _TOO_MUCH * asked
         if loaded:
             bound = max(bound, _UNSURE * min(raised, GRIP_FRACTION * most))
+        bound += 2.0 * friction  # that is given, and that holds
         lied = t < self._lied_t + _REMEMBERED
         name = RAISED if loaded else LIED if lied else CALM
         self._must_end_soon(CALM, name, force, bound, t)

@@ -9,55 +9,27 @@ import numpy as np
 import pytest
 
 from softfinger.daemon.profile.load import checked
-from softfinger.kinematics.contact.closed_form import closed_form
-from softfinger.kinematics.contact.lookup import lookup
-from softfinger.kinematics.contact.table import ContactTable
-from softfinger.tools.benchmarks import (
-    contact,
-    control,
-    estimator,
-    growth,
-    reflex,
-    scenes,
-)
-from softfinger.tools.benchmarks.contact import LAW, MODULUS, TIP
+from softfinger.tools.benchmarks import control, estimator, growth, reflex, scenes
 from softfinger.tools.benchmarks.estimator import NOISE
 from softfinger.tools.benchmarks.reflex import Overload
 from softfinger.tools.benchmarks.rigs import merged
 
 
-def test_lookups_have_their_errors() -> None:
-    tables = contact.measure(brief=True, rounds=1, count=32)
-    errors = {row["name"]: row[contact.ERROR] for table in tables for row in table.rows}
-    assert errors["closed form, constant E"] < 4e-15
+def test_lookups_have_their_errors(monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = estimator.lookups(1, 32).rows
+    errors = {row["name"]: row[estimator.LOOKUP_ERROR] for row in rows}
     assert 1e-12 < errors["table to 1e-09"] <= 1e-9
-    assert errors["table to 1e-12"] <= 1e-12
+    assert errors["table to 1e-12, called"] <= 1e-12
     assert 1e-12 < errors["RectBivariateSpline: degree 3"] < 1e-7
-
-
-def test_compiled_loops_compute_what_they_time() -> None:
-    d, theta = contact.points(16)
-    table = ContactTable.build(TIP, LAW, 1e-9)
-    points = list(zip(d, theta, strict=True))
-    found = contact.loop(table, d, theta, 2)
-    np.testing.assert_allclose(found, [lookup(table.data, *at)[:6] for at in points], rtol=1e-15)
-    found = contact.loop(None, d, theta, 2)
-    np.testing.assert_allclose(found, [closed_form(MODULUS, *at)[:6] for at in points], rtol=1e-15)
-
-
-def test_without_scipy_its_rows_are_left_out(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
     monkeypatch.setitem(sys.modules, "scipy.interpolate", None)
-    assert contact._scipy() == {}
-    assert "pip install '.[dev]'" in capsys.readouterr().err
+    assert len(estimator.lookups(1, 32).rows) == 4, "without SciPy its rows are left out"
 
 
 def test_estimates_stand_beside_the_bound() -> None:
-    (table,) = estimator.measure(brief=True, rounds=1)
+    table = estimator.frames_to_contacts(1)
     error = {row["name"]: row.get(estimator.ERROR) for row in table.rows}
     limit = error["Cramér-Rao bound"]
-    for way in ("warm, kernel", "cold, kernel"):
+    for way in ("warm", "cold"):
         assert 0.6 * limit < error[f"ml: {way}"] < 1.6 * limit
     assert error["decode: cobs"] is None
 

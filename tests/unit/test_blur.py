@@ -15,8 +15,6 @@ from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.sensor.sensor_model import Board, Imperfections, SensorModel
 from softfinger.kinematics.compiled.simd import STRIDE
-from softfinger.kinematics.contact.closed_form import Fingertip
-from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.estimation.blurred_cells import PLANES, weights
 from softfinger.kinematics.estimation.estimator import ContactEstimator
 from softfinger.kinematics.estimation.packing import INDEX_BITS
@@ -24,13 +22,8 @@ from softfinger.kinematics.estimation.state import READING, WEIGHT, EstimatorSta
 from softfinger.kinematics.sensing.cell_integrals import ACTIVE, CELL_PLANES
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid, stencil
 from tests.harness.estimator_kernels import blur_cells
+from tests.harness.paper_tip import LINEAR, MEASURED, PITCH, TIP, A, E, fisher
 
-A = 0.020
-E = 0.304e6
-TIP = Fingertip(A)
-LINEAR = Material.constant(E)
-MEASURED = Material.table_i()
-PITCH = 0.058 / 44
 NOISE = 0.002
 
 
@@ -58,19 +51,6 @@ def dense(grid, material, contact, pieces=16, margin=6):
 def tilts(degrees, azimuth):
     s = math.sin(math.radians(degrees))
     return math.asin(s * math.cos(azimuth)), math.asin(s * math.sin(azimuth))
-
-
-def bound(grid, material, truth, noise, free):
-    columns = []
-    for k, step in enumerate((1e-7, 1e-5, 1e-5, 1e-4)[: 4 if free else 3]):
-        ends = []
-        for sign in (1.0, -1.0):
-            at = [*truth, 1.0]
-            at[k] += sign * step
-            ends.append(grid.pressure(TIP, material, *at))
-        columns.append(((ends[0] - ends[1]) / (2 * step)).ravel())
-    jacobian = np.stack(columns, axis=1)
-    return np.linalg.inv(jacobian.T @ jacobian) * noise**2
 
 
 @pytest.mark.parametrize(
@@ -177,7 +157,7 @@ def test_errors_with_a_blur_are_at_the_bound_and_the_covariance_says_so(
     noise = NOISE * material.reference_modulus
     grid = SensorGrid(44, 44, PITCH, (2e-4, -5e-4), blur=blur)
     truth = (d, *tilts(degrees, 0.8))
-    covariance = bound(grid, material, truth, noise, free_gain)
+    covariance = fisher(grid, material, (*truth, 1.0), noise, free_gain)
     estimator = ContactEstimator(TIP, material, grid, noise, free_gain=free_gain)
     rng = np.random.default_rng(9)
     clean = dense(grid, material, truth)  # not the estimator's own forward model

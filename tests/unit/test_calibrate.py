@@ -252,16 +252,6 @@ def test_what_cannot_be_done_is_told_and_changes_nothing(bench, capsys, words, t
     assert (folder / "sensor.json").read_bytes() == before
 
 
-def test_frames_may_come_live_from_the_profiles_sensor(tmp_path, capsys):
-    profile = tmp_path / "live.toml"
-    profile.write_text(PROFILE.replace('clock = "virtual"', 'clock = "real"'))
-    file = tmp_path / "sensor.json"
-    words = ["--config", str(profile), "--frames", "8"]
-    assert main(["calibrate", "tare", str(file), *words]) == 0
-    assert load_calibration(file).tare.frames == 8
-    assert "8 frames" in capsys.readouterr().out
-
-
 def spoilt(content, change):
     content = json.loads(json.dumps(content))
     change(content)

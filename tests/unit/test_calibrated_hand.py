@@ -90,7 +90,7 @@ def test_a_calibrated_law_too_far_off_its_points_is_refused_by_file_and_key(sett
     )
     save_calibration(path, load_calibration(path).model_copy(update={"modulus": step}))
     with pytest.raises(SettingsError, match=r"right\.json: modulus: .*material\.force_error_max"):
-        make_models(settings, None)
+        make_models(settings)
 
 
 def test_each_tips_material_reaches_estimate_table_and_prediction(settings):

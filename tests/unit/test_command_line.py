@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from softfinger.daemon.profile.load import find, names
-from softfinger.tools.cli import SUBCOMMANDS
+from softfinger.tools.cli import SUBCOMMANDS, make_parser
 from tests.conftest import Inline
 
 
@@ -103,3 +104,22 @@ def test_profiles_and_keys_are_shown_from_any_folder(
     missing = inline("config", "reference", "tactile.radius")
     assert missing.returncode == 2
     assert "tactile.radius: found no such section or key" in missing.stderr
+
+
+@pytest.mark.parametrize(
+    ("text", "stream", "commands"),
+    [
+        ("tcp://10.0.0.7", "tcp://10.0.0.7:9872", "tcp://10.0.0.7:9873"),
+        ("ipc:///a,ipc:///b", "ipc:///a", "ipc:///b"),
+        ("tcp://10.0.0.7:1234", "tcp://10.0.0.7:1234", "tcp://10.0.0.7:1234"),
+    ],
+)
+def test_one_address_serves_every_client(text: str, stream: str, commands: str) -> None:
+    def parsed(*words: str) -> Any:
+        return make_parser({words[0]})[0].parse_args([*words, "--address", text]).address
+
+    assert parsed("send", "status") == commands
+    for words in (["status"], ["record", "a.mcap"]):
+        assert parsed(*words) == stream
+    for words in (["monitor"], ["view"]):
+        assert parsed(*words) == (stream, commands)

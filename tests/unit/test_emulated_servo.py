@@ -138,33 +138,6 @@ def test_indirect_data_stands_for_what_it_points_to(model: str, firmware: int) -
 # --- torque, modes, motion -------------------------------------------------------------------
 
 
-def test_current_based_position_mode_moves_within_its_current() -> None:
-    c = client(prepared=True)
-    c.write(reg.TORQUE_ENABLE, 1, 1)
-    c.write(reg.GOAL_CURRENT, 100, 2)
-    c.write(reg.GOAL_POSITION, 400, 4)
-    currents = []
-    for _ in range(200):
-        c.later(0.005)
-        currents.append(c.read(reg.PRESENT_CURRENT, 2))
-    assert max(currents) <= 100
-    assert abs(c.read(reg.PRESENT_POSITION, 4) - 400) <= 15
-    assert c.read(reg.MOVING, 1) == 0
-
-
-def test_torque_off_lets_go() -> None:
-    c = client(prepared=True)
-    c.write(reg.TORQUE_ENABLE, 1, 1)
-    c.write(reg.GOAL_POSITION, 300, 4)
-    c.later(0.5)
-    c.write(reg.TORQUE_ENABLE, 0, 1)
-    before = c.read(reg.PRESENT_POSITION, 4)
-    c.write(reg.GOAL_POSITION, 0, 4)
-    c.later(0.5)
-    assert abs(c.read(reg.PRESENT_POSITION, 4) - before) <= 1
-    assert c.read(reg.PRESENT_CURRENT, 2) == 0
-
-
 def test_current_mode_pushes_the_way_of_its_sign() -> None:
     c = client()
     c.write(reg.OPERATING_MODE, reg.CURRENT_MODE, 1)

@@ -123,6 +123,7 @@ def test_the_errors_are_as_large_as_the_covariance_says(
     assert valid > 0.9
 
 
+@pytest.mark.usefixtures("exact_solid_data")
 def test_a_solid_tips_are_too(subtests: pytest.Subtests) -> None:
     """With shear on the face; the places and pitches have the standard deviation that is known."""
     tip = Fingertip(0.020, "solid", 0.49, "lying")
@@ -291,9 +292,12 @@ def worst_nees(known: Uncertainty, tip: Fingertip, imperfect: Imperfection) -> f
 
 @pytest.mark.parametrize("physics", ["springs", "solid"])
 @pytest.mark.parametrize("name", IMPERFECTIONS)
-def test_imperfections_of_real_cells_are_covered_or_flagged(name: str, physics: str) -> None:
+def test_imperfections_of_real_cells_are_covered_or_flagged(
+    name: str, physics: str, request: pytest.FixtureRequest
+) -> None:
     known, imperfect = IMPERFECTIONS[name]
     tip = Fingertip(0.020, physics)  # type: ignore[arg-type]
     assert 0.7 < worst_nees(known, tip, imperfect) < 1.5
+    request.getfixturevalue("exact_solid_data")
     if (name, physics) not in (("gain", "springs"), ("slope", "solid")):  # which take no harm
         assert worst_nees(Uncertainty(), tip, imperfect) > 5.0

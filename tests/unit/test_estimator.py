@@ -8,45 +8,21 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.estimation.estimator import ContactEstimate, ContactEstimator, Readings
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
-
-A = 0.020
-E = 0.304e6
-TIP = Fingertip(A)
-LINEAR = Material.constant(E)
-MEASURED = Material.table_i()
-PITCH = 0.058 / 44
-GRID = SensorGrid(44, 44, PITCH)
-NOISE = 0.002 * E
-
-
-def tilts(theta, azimuth):
-    return (
-        math.asin(math.sin(theta) * math.cos(azimuth)),
-        math.asin(math.sin(theta) * math.sin(azimuth)),
-    )
-
-
-def fisher(grid, material, truth, noise, free_gain):
-    """Inverse Fisher information of (d, tilt_x, tilt_y[, gain]) by finite differences."""
-    steps = (1e-7, 1e-5, 1e-5, 1e-4)[: 4 if free_gain else 3]
-    columns = []
-    for k, step in enumerate(steps):
-        ends = []
-        for sign in (1.0, -1.0):
-            at = list(truth)
-            at[k] += sign * step
-            ends.append(grid.pressure(TIP, material, *at[:3], gain=at[3]))
-        columns.append(((ends[0] - ends[1]) / (2 * step)).ravel())
-    jacobian = np.stack(columns, axis=1)
-    return np.linalg.inv(jacobian.T @ jacobian) * noise**2
-
-
-def errors(estimate, truth):
-    return np.array([estimate.d, estimate.tilt_x, estimate.tilt_y, estimate.gain]) - np.array(truth)
+from tests.harness.paper_tip import (
+    GRID,
+    LINEAR,
+    MEASURED,
+    NOISE,
+    PITCH,
+    TIP,
+    E,
+    errors,
+    fisher,
+    tilts,
+)
 
 
 def test_the_public_face():

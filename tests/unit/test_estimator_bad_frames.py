@@ -13,19 +13,7 @@ from softfinger.kinematics.estimation.error_budget import Uncertainty
 from softfinger.kinematics.estimation.estimator import ContactEstimator, Readings
 from softfinger.kinematics.estimation.invalid import Invalid
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
-
-A = 0.020
-E = 0.304e6
-TIP = Fingertip(A)
-LINEAR = Material.constant(E)
-MEASURED = Material.table_i()
-PITCH = 0.058 / 44
-GRID = SensorGrid(44, 44, PITCH)
-NOISE = 0.002 * E
-
-
-def errors(estimate, truth):
-    return np.array([estimate.d, estimate.tilt_x, estimate.tilt_y, estimate.gain]) - np.array(truth)
+from tests.harness.paper_tip import GRID, LINEAR, MEASURED, NOISE, PITCH, TIP, A, errors
 
 
 def test_saturated_cells_are_left_out():

@@ -7,8 +7,6 @@ import math
 import numpy as np
 import pytest
 
-from softfinger.kinematics.contact.closed_form import Fingertip
-from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.estimation.estimator import ContactEstimator, Readings
 from softfinger.kinematics.estimation.gauss_newton import free_noise
 from softfinger.kinematics.estimation.likelihood import CLIP_BELOW, set_law
@@ -16,14 +14,11 @@ from softfinger.kinematics.estimation.state import PLANES
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from tests.harness.called import called
 from tests.harness.estimator_kernels import press_and_accumulate, state_for
+from tests.harness.paper_tip import LINEAR, PITCH, TIP, E
 
 # An inner kernel, made callable.
 free_noise = called(free_noise)
 
-E = 0.304e6
-TIP = Fingertip(0.020)
-LINEAR = Material.constant(E)
-PITCH = 0.058 / 44
 erfc = np.vectorize(math.erfc)
 
 

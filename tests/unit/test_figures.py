@@ -16,21 +16,7 @@ from softfinger.tools import cli, style
 from softfinger.tools.paper import appendix, figures
 from softfinger.tools.paper.model_pages import double_integrals
 from softfinger.tools.paper.sheets import sheet
-
-# Radius 20 mm, E = 0.304 MPa: d [mm], θ [deg], F [N], U [mJ].
-CHECKPOINTS = (
-    (2, 0, 3.8201766667652, 2.5467844445101),
-    (2, 15, 3.9549379080604, 2.7296353408105),
-    (2, 30, 4.4111600538176, 3.3957125926802),
-    (4, 0, 15.280706667061, 20.374275556081),
-    (4, 15, 15.819751632242, 21.837082726484),
-    (4, 30, 17.64464021527, 27.165700741441),
-    (6, 15, 35.594441172543, 73.700154201884),
-    (6, 30, 39.700440484359, 91.684240002365),
-    (8, 0, 61.122826668243, 162.99420444865),
-    (8, 15, 63.279006528966, 174.69666181187),
-    (8, 30, 70.578560861082, 217.32560593153),
-)
+from tests.harness.paper_tip import CHECKPOINTS
 
 
 def read(path: Path) -> dict[str, NDArray[np.float64]]:

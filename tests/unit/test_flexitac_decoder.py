@@ -119,13 +119,6 @@ def test_bytes_behind_a_frame_in_the_same_read_are_told():
     assert late.behind == len(one)
 
 
-def test_counts_are_row_major():
-    decoder = FlexiTacDecoder(ROWS, COLS)
-    decoded = decoder.feed(frame(bytes(range(CELLS))) + MARKER, 0.0)
-    assert decoded is not None
-    assert np.array_equal(decoded.data, np.arange(CELLS).reshape(ROWS, COLS))
-
-
 def test_a_frame_keeps_the_time_its_last_byte_was_read_and_its_own_array():
     images = numbered(3)
     stream = b"".join(frame(image) for image in images)
@@ -295,6 +288,3 @@ def test_another_size_is_recognised_behind_a_standing_image_with_markers_in_it()
     for _ in range(12):
         decoder.feed(frame(image), 0.0)
     assert decoder.found_cells == 256
-
-
-# --- on a pty, through pyserial -----------------------------------------------------------------

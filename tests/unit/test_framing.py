@@ -13,7 +13,6 @@ from softfinger.daemon.simulation.servo_model.framing import (
     BROADCAST,
     PacketParser,
     frame,
-    status,
 )
 
 # From the maker's Protocol 2.0 manual: (id, instruction, parameters, packet).
@@ -57,15 +56,6 @@ INSTRUCTIONS = [
         "FFFFFD00FE0900 8A 44020400 0102 72F2",
     ),
 ]
-STATUSES = [
-    (1, 0, "060426", "FFFFFD00010700 55 00 060426 655D"),
-    (2, 0, "060426", "FFFFFD00020700 55 00 060426 6F6D"),
-    (1, 0, "A6000000", "FFFFFD00010800 55 00 A6000000 8CC0"),
-    (2, 0, "1F080000", "FFFFFD00020800 55 00 1F080000 BABE"),
-    (1, 0, "", "FFFFFD00010400 55 00 A10C"),
-    (1, 0, "7700", "FFFFFD00010600 55 00 7700 C369"),
-    (2, 0, "24", "FFFFFD00020500 55 00 24 8BA9"),
-]
 
 # The header's first bytes often, since those are what is stuffed.
 PIECES = [b"\xff\xff\xfd", b"\xff", b"\xfd", b"\x00", b"\x55", b"\x12"]
@@ -75,11 +65,6 @@ payloads = st.lists(st.sampled_from(PIECES), max_size=40).map(b"".join)
 def test_published_instruction_packets() -> None:
     for packet_id, instruction, parameters, expected in INSTRUCTIONS:
         assert frame(packet_id, instruction, bytes.fromhex(parameters)) == bytes.fromhex(expected)
-
-
-def test_published_status_packets() -> None:
-    for packet_id, error, data, expected in STATUSES:
-        assert status(packet_id, error, bytes.fromhex(data)) == bytes.fromhex(expected)
 
 
 @pytest.mark.parametrize(

@@ -131,14 +131,6 @@ def test_object_from_contacts_recovers_angle_and_width(hand):
         assert disagreement == pytest.approx(0, abs=1e-14)
 
 
-def test_a_joint_offset_shows_as_disagreement():
-    hand = ReferenceHand()
-    q, pose = np.array([0.2, 0.15]), np.array([0.001, 0.08, 0.05])
-    c = hand.contacts(q, pose, WIDTH)
-    _, _, disagreement = hand.object_from_contacts(q + np.array([0.03, 0.0]), c.d, c.theta)
-    assert disagreement == pytest.approx(-0.03, abs=1e-14)
-
-
 def test_out_of_reach_and_bad_shapes_are_refused():
     hand = ReferenceHand()
     with pytest.raises(ValueError, match="out of reach"):

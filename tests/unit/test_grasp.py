@@ -1,4 +1,4 @@
-"""The reference grasp: closed forms of the symmetric grasp, steering, stiffness."""
+"""The reference grasp: closed forms of the symmetric grasp, and steering."""
 
 from __future__ import annotations
 
@@ -12,8 +12,6 @@ from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.table import ContactTable
 from tests.harness.grasp import (
     Grasp,
-    GraspError,
-    GraspState,
     sheared_contact,
 )
 from tests.harness.reference_hand import ReferenceHand
@@ -97,24 +95,6 @@ def test_symmetric_grasp_table(paper, d, degrees, normal, moment):
     np.testing.assert_allclose(grasp.gradient(state)[2:], 0, atol=1e-12)
 
 
-def test_balance_finds_the_symmetric_grasp_from_elsewhere(table):
-    grasp = Grasp(ReferenceHand(), table, WIDTH)
-    best = grasp.symmetric(0.004)
-    generator = np.random.default_rng(4)
-    for _ in range(5):
-        # The object displaced with its shears rolled along: the way back must lead back.
-        away = best.pose + generator.uniform(-1, 1, 3) * [5e-4, 5e-4, 0.02]
-        middle = 0.5 * (away + best.pose)
-        rows = grasp.hand.rolling(best.q, middle, WIDTH)
-        moved = GraspState(best.q, away, best.shear + rows[:, 2:] @ (away - best.pose))
-        energy = grasp.energy(moved)
-        back = grasp.balance(moved)
-        assert grasp.energy(back) < energy
-        np.testing.assert_allclose(grasp.gradient(back)[2:], 0, atol=1e-9)
-        # Rolling is not integrable, so the loop closes only to second order of the way.
-        np.testing.assert_allclose(back.pose, best.pose, atol=2e-5)
-
-
 @pytest.mark.parametrize(
     ("degrees", "gain"), [(0.01, 1.5207), (1, 1.520), (5, 1.5076), (10, 1.471)]
 )
@@ -127,58 +107,3 @@ def test_steering_gain(paper, degrees, gain):
     assert grasp.steer(grasp.symmetric(0.004), -delta).pose[2] == pytest.approx(
         -turned.pose[2], rel=1e-9
     )
-
-
-def test_steering_by_ten_degrees_raises_the_normal_force(paper):
-    grasp = Grasp(ReferenceHand(), paper, WIDTH)
-    start = grasp.symmetric(0.004)
-    turned = grasp.steer(start, math.radians(10), steps=128)
-    np.testing.assert_allclose(grasp.forces(start).normal, 15.40, atol=0.005)
-    np.testing.assert_allclose(grasp.forces(turned).normal, 18.35, atol=0.005)
-
-
-def test_path_integration_converges_at_second_order(paper):
-    grasp = Grasp(ReferenceHand(), paper, WIDTH)
-    start = grasp.symmetric(0.004)
-    angles = [grasp.steer(start, 0.15, steps).pose[2] for steps in (4, 8, 16, 256)]
-    errors = np.abs(np.array(angles[:3]) - angles[3])
-    assert errors[0] / errors[1] == pytest.approx(4, rel=0.1)
-    assert errors[1] / errors[2] == pytest.approx(4, rel=0.1)
-
-
-def test_gravity_is_borne_by_shear(table):
-    weight = 0.98
-    grasp = Grasp(ReferenceHand(), table, WIDTH, weight=(0.0, -weight))
-    free = Grasp(ReferenceHand(), table, WIDTH)
-    hung = grasp.balance(free.symmetric(0.004))
-    assert hung.pose[1] < free.symmetric(0.004).pose[1]
-    forces = grasp.forces(hung)
-    # Each tip's N and T in the hand's plane sum to the weight; the tips' own moments balance too.
-    np.testing.assert_allclose(forces.tangential[0], -forces.tangential[1], rtol=1e-6)
-    np.testing.assert_allclose(np.abs(forces.tangential).sum(), weight, rtol=1e-6)
-
-
-def test_stiffness_predicts_the_answer_to_a_push(table):
-    free = Grasp(ReferenceHand(), table, WIDTH)
-    state = free.symmetric(0.005)
-    stiffness = free.stiffness(state)[2:, 2:]
-    np.testing.assert_allclose(stiffness, stiffness.T, atol=1e-3 * np.abs(stiffness).max())
-    assert np.linalg.eigvalsh(stiffness)[0] > 0
-    push = np.array([1e-3, 2e-3])
-    pushed = Grasp(ReferenceHand(), table, WIDTH, weight=tuple(push)).balance(state)
-    expected = np.linalg.solve(stiffness, [*push, 0.0])
-    np.testing.assert_allclose(pushed.pose - state.pose, expected, rtol=1e-3, atol=1e-12)
-
-
-def test_impossible_grasps_are_refused(paper):
-    grasp = Grasp(ReferenceHand(), paper, WIDTH)
-    with pytest.raises(GraspError, match="open"):
-        grasp.symmetric(-0.001)
-    with pytest.raises(GraspError, match="outside"):
-        grasp.symmetric(0.017)
-    with pytest.raises(ValueError, match="out of reach"):
-        Grasp(ReferenceHand(pivot_separation=0.3), paper, WIDTH).symmetric(0.004)
-    with pytest.raises(GraspError):
-        grasp.balance(grasp.symmetric(0.004), (0.05, 0.05))
-    with pytest.raises(ValueError, match="width"):
-        Grasp(ReferenceHand(), paper, 0.0)

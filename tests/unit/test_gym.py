@@ -13,7 +13,8 @@ from gymnasium.utils.env_checker import check_env
 import softfinger.gym
 from softfinger.gym import TASKS
 from softfinger.gym.__main__ import at_random, by_law, episode
-from softfinger.gym.environment import SoftFingerEnv
+from softfinger.gym.baseline import policy
+from softfinger.gym.environment import Images, SoftFingerEnv
 
 pytestmark = pytest.mark.filterwarnings("error")
 
@@ -79,3 +80,38 @@ def test_several_hands_step_beside_each_other_as_each_would_alone() -> None:
 def test_a_wrong_word_is_named(wrong: dict[str, str]) -> None:
     with pytest.raises(ValueError, match=next(iter(wrong.values()))):
         SoftFingerEnv(**wrong)
+
+
+def test_shaping_adds_what_the_potential_has_grown_by() -> None:
+    plain, shaped = SoftFingerEnv("grasp"), SoftFingerEnv("grasp", shaped=True)
+    sums = []
+    for env in (plain, shaped):
+        env.reset(seed=1)
+        start = env._potential
+        sums.append(sum(env.step(np.ones(2, np.float32))[1] for _ in range(20)))
+    assert shaped._potential > start + 2.0  # closing is worth something before the first touch
+    assert sums[1] - sums[0] == pytest.approx(shaped._potential - start)
+    plain.close()
+    shaped.close()
+
+
+def test_images_are_of_eight_bits_channel_first() -> None:
+    env = Images(gymnasium.make("SoftFinger-Push-v0", control="law"))
+    observation, _ = env.reset(seed=1)
+    assert env.observation_space.contains(observation)
+    pressure = observation["pressure"]
+    assert (pressure.dtype, pressure.shape) == (np.uint8, (2, 44, 44))
+    assert 100 < pressure.max() <= 255, "the hand holds"
+    env.close()
+
+
+def test_the_baseline_closes_each_finger_by_its_own_features() -> None:
+    def act(d: float, force: float) -> list[float]:
+        contacts = np.array([d, 0.0, force, 0.0, 0.0, 0.0], np.float32)
+        observed = {"contacts": contacts, "joints": np.zeros(6), "goal": np.array([6.0])}
+        return policy(np.array([0.0, 5.0, 0.0, 0.0, 0.0]))(observed).tolist()
+
+    free, pressed = act(0.0, 0.0), act(0.003, 9.0)
+    assert free[0] == free[1] > 0.7
+    assert pressed[0] < -0.4
+    assert pressed[1] == free[1]

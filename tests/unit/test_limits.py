@@ -259,7 +259,7 @@ def strained(state: State) -> None:
 
 
 def warm(state: State) -> None:
-    state.reading.temperature[1] = 62.0
+    state.heat[1].time_to_limit = 42.0
 
 
 def nearly_too_much_force(state: State) -> None:
@@ -267,9 +267,9 @@ def nearly_too_much_force(state: State) -> None:
 
 
 WARNINGS: list[tuple[Callable[[State], None], str, str]] = [
-    (unequal_forces, "hand.force", "the tips feel 12.0 N and 5.0 N of one grip"),
+    (unequal_forces, "hand.force", "the left tip feels 12.0 N and the right one 5.0 N of one grip"),
     (strained, "joint.strained", "left joint grips with all of its 1.2 A"),
-    (warm, "servos.temperature", "right servo at 62 °C"),
+    (warm, "servos.heat", "right servo at 70 °C in 42 s"),
     (nearly_too_much_force, "tip.force", "left tip at 27.5 N, above 27 N"),
 ]
 
@@ -302,7 +302,7 @@ def test_a_warning_is_told_once_until_it_has_been_over(
 def test_a_warning_at_its_limit_does_not_flicker() -> None:
     judge, state = safety(), sound()
     for k in range(4000):
-        state.reading.temperature[0] = 60.0 + (0.5 if k // 700 % 2 else -0.5)
+        state.heat[0].time_to_limit = 60.0 + (0.5 if k // 700 % 2 else -0.5)
         judge.judge(state)
         later(state, 0.002)
     assert len(judge.warnings) == 1

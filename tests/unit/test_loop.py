@@ -57,29 +57,6 @@ def test_grasp_reaches_10_n_within_3_s_and_holds_it_10_s(
             assert abs(contact.force - daemon.hand.force[finger]) < 2.0 * contact.force_std < 1.5
 
 
-def test_rotate_turns_the_object_to_the_angle_and_keeps_the_grip(make: Make) -> None:
-    daemon = grasped(make(), 8.0)
-    assert daemon.hand is not None
-    for angle in (0.14, -0.14, 0.0):
-        command(daemon, "rotate", angle=angle)
-        advance_to(daemon, "holding", 5.0)
-        daemon.loop.advance(1.0)
-        assert daemon.loop.state.object.angle == pytest.approx(angle, abs=math.radians(0.2))
-        assert daemon.hand.object_pose[2] == pytest.approx(angle, abs=math.radians(0.2))
-        assert all(c.force == pytest.approx(8.0, rel=0.1) for c in daemon.loop.state.contacts)
-    assert daemon.loop.state.object.width == pytest.approx(0.040, abs=1e-4)
-
-
-def test_release_opens_the_hand_and_lets_go(make: Make) -> None:
-    daemon = grasped(make(), 8.0)
-    command(daemon, "release")
-    advance_to(daemon, "armed", 3.0)
-    state = daemon.loop.state
-    assert not any(contact.contact for contact in state.contacts)
-    assert state.reading.q == pytest.approx([0.0, 0.0], abs=0.04)
-    assert all(contact.force == 0.0 for contact in state.contacts)
-
-
 def test_move_goes_where_it_is_told_within_the_limits(make: Make) -> None:
     daemon = make()
     command(daemon, "arm")
@@ -106,17 +83,6 @@ def test_a_wall_clock_that_is_set_changes_nothing_but_timestamps(
     assert loop.state.seq == seq + round(1.0 / loop.period)
     assert loop.state.wall == pytest.approx(before + step + 1.0, abs=0.1)
     assert torque_of(daemon).all()
-
-
-def test_stop_turns_torque_off_at_the_same_tick(make: Make) -> None:
-    daemon = grasped(make(), 8.0)
-    command(daemon, "stop")
-    daemon.loop.advance(daemon.loop.period)
-    assert (daemon.loop.state.mode, daemon.loop.state.torque) == ("disarmed", False)
-    assert daemon.hand is not None
-    assert not torque_of(daemon).any()
-    daemon.loop.advance(0.2)
-    assert abs(daemon.hand.current).max() < 1e-3
 
 
 def test_a_grasp_of_nothing_ends_armed_with_a_warning(make: Make) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from softfinger.daemon.perception.perception import Repeats
+from softfinger.tools.benchmarks.rigs import SOLID
 from softfinger.tools.watched import Watched as Hand
 from tests.unit.test_control import grasped
 
@@ -64,6 +65,19 @@ def test_a_tip_that_seems_to_let_go_is_no_sudden_load(
         assert not [text for _, kind, text in hand.events if kind == "slip"]
 
 
+@pytest.mark.parametrize(("gain", "over"), [(0.5, 0.0), (1.6, 0.0), (0.6, 2.0)])
+def test_a_gain_that_changes_leaves_a_solid_tips_force(gain: float, over: float) -> None:
+    with Hand(SOLID) as hand:
+        grasped(hand, FORCE)
+        for finger in hand.plant.measurement_faults:
+            finger.begin("gain", gain, hand.plant.t, over)
+        seen = hand.watch(over + 2.0)
+        assert hand.mode == "holding"
+        assert seen.force.max() < 1.3 * FORCE
+        assert seen.force[-1].mean() == pytest.approx(FORCE, rel=0.2)
+        assert not [text for _, kind, text in hand.events if kind == "slip"]
+
+
 def test_a_sensor_that_was_blind_for_a_moment_raises_no_grip() -> None:
     with Hand({}) as hand:
         grasped(hand, FORCE)
@@ -95,6 +109,32 @@ def test_a_sensor_that_is_honest_again_is_believed_again() -> None:
         assert hand.mode == "holding"
         assert hand.plant.normal.mean() == pytest.approx(FORCE, rel=0.1)
         assert not [kind for _, kind, _ in hand.events if kind.startswith("witness")]
+
+
+def test_a_d_that_jumps_while_joints_and_the_other_tip_stand_still_is_refused() -> None:
+    with Hand({}) as hand:
+        hand.grasp(FORCE)
+        while hand.mode != "holding":
+            hand.run(0.002)
+        replay = hand.plant.measurement_faults[1]
+        replay.begin("replay", 0.35, hand.plant.t)  # from the grip's building up on
+        seen = hand.watch(0.09)
+        replay.clear()
+        assert seen.force.max() < 1.1 * FORCE
+        told = [text for _, kind, text in hand.events if kind == "witness.right_sensor"]
+        assert len(told) == 1
+        assert "mm less deep at once" in told[0]
+
+
+def test_rolling_that_both_tips_show_alike_in_a_turn_is_no_drift() -> None:
+    with Hand({}) as hand:
+        grasped(hand, 10.0)
+        hand.plant.load(twist=-0.122)
+        hand.watch(0.3)
+        hand.command("rotate", angle=0.2145)
+        hand.watch(1.5)
+        assert hand.mode == "holding"
+        assert not [event for event in hand.events if event[1].startswith("witness")]
 
 
 def test_frames_that_come_again_are_refused_and_a_new_force_is_not_built_up_on_them() -> None:

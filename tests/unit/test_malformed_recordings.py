@@ -17,7 +17,7 @@ from softfinger.tools.analysis.contacts import analyse, open_source
 from softfinger.tools.analysis.plots_data import load_run
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.recomputed import recompute, recorded_settings
-from softfinger.tools.recordings.writer import RecordingWriter
+from softfinger.tools.recordings.record import RecordingWriter
 from tests.harness.golden_wire import sample
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "grasp_and_turn.mcap"
@@ -80,10 +80,10 @@ def test_a_frame_that_is_none_is_told_and_left_out(tmp_path: Path, spoil: tuple[
     assert len(found) == 9
     assert len(told) == 1
     assert "what is sound in it is read" in told[0]
-    source = open_source(path, Settings(), None, own=True)
+    source = open_source(path, Settings(), own=True)
     contacts = analyse(source, lambda _: None)
     assert contacts[0].t.size == 9
-    load_run(Recording(path), -np.inf, np.inf, None, lambda _: None)
+    load_run(Recording(path), -np.inf, np.inf, lambda _: None)
 
 
 @pytest.mark.parametrize("name", ["settings", "calibration_left"])

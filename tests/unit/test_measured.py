@@ -177,17 +177,17 @@ def test_a_finger_takes_its_curves_from_its_file(law: TipCurves, tmp_path: Path)
         ]  # fmt: skip
 
     settings = load(HIL, tmp_path, profile(file, "safety.d_max=0.006"))
-    left, _ = make_models(settings, None)
+    left, _ = make_models(settings)
     assert left.table(0.004, 0.1).force == pytest.approx(force(0.004, 0.1), rel=0.02)
     assert left.grid.centre == law.centre
     estimator = make_estimator(settings, left.material, 0, None, left.calibration)
     assert estimator(weird(0.004, 0.1)).d == pytest.approx(0.004, rel=0.01)
 
     with pytest.raises(SettingsError, match=r"safety.d_max: found 0.012 m, expected at most 0.006"):
-        make_models(load(HIL, tmp_path, profile(file)), None)
+        make_models(load(HIL, tmp_path, profile(file)))
     save_calibration(other, empty)
     with pytest.raises(SettingsError, match=r"other.json has no curves of left; `softfinger cali"):
-        make_models(load(HIL, tmp_path, profile(other)), None)
+        make_models(load(HIL, tmp_path, profile(other)))
     with pytest.raises(SettingsError, match=r'tactile.calibration: found "" for left'):
         load(HIL, tmp_path, ["tip.physics=measured", "safety.d_max=0.006"])
     with pytest.raises(SettingsError, match="measured curves are of frames that a board sends"):

@@ -197,10 +197,11 @@ def test_temperature_of_a_servo() -> None:
     feed = fed()
     state = fake_daemon.state(1.0, 99)
     state["left"]["temperature"], state["right"]["temperature"] = 0.0, 71.5
+    state["right"]["time_to_limit"] = 42.0
     give(feed, b"hand/state", state)
     (line,) = [each for each in shown(feed).splitlines() if "servo" in each]
     assert line.split()[line.split().index("servo") :][:4] == ["servo", "—", "71.5", "°C"]
-    warned = json.dumps({"safety": {"temperature_warn": 70.0}, "commands": {"lease": 5.0}})
+    warned = json.dumps({"safety": {"heat_warn": 60.0}, "commands": {"lease": 5.0}})
 
     def style_of_the_hot_one() -> object:
         lines = MonitorPage(feed, "").lines(80, 24, 0.0, None)

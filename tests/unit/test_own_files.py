@@ -10,14 +10,15 @@ from tempfile import TemporaryDirectory
 import pytest
 
 from softfinger.daemon import own_files
-from softfinger.daemon.own_files import require_own, runtime_folder, write_bytes, write_text
-from softfinger.daemon.profile.factory import save_table
+from softfinger.daemon.diagnosis.ports import check_runtime_folder
+from softfinger.daemon.own_files import runtime_folder, write_bytes, write_text
+from softfinger.daemon.servos.base import Finding
 from softfinger.daemon.simulation.emulator.folder import FolderError, LinkFolder
 from softfinger.daemon.wire import local_stop
 from softfinger.daemon.wire.local_stop import LocalStop
-from softfinger.kinematics.contact.closed_form import Fingertip
-from softfinger.kinematics.contact.material import Material
-from softfinger.kinematics.contact.table import ContactTable
+from softfinger.kinematics.compiled import own_folder
+from softfinger.kinematics.compiled.own_folder import require_own
+from softfinger.tools.cli import main
 from softfinger.tools.processes.event_log import EventLog
 
 STRANGER = 54321
@@ -84,20 +85,28 @@ def test_own_files_and_links_are_written_as_ever(shared: Path) -> None:
         nothing.write(b"x")
 
 
-def test_the_event_log_and_the_table_use_it(
-    shared: Path, strangers: Callable[[Path], None]
+def test_a_file_appears_whole_or_not_at_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    file = tmp_path / "kept"
+    own_folder.write_whole(file, b"before")
+
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(own_folder.os, "fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        own_folder.write_whole(file, b"after")
+    assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [("kept", b"before")]
+
+
+def test_the_event_log_uses_it(shared: Path, strangers: Callable[[Path], None]) -> None:
     victim = shared.parent / "victim"
     victim.write_text("precious")
-    tip, material = Fingertip(radius=0.02), Material.constant(0.3e6)
-    table = ContactTable.build(tip, material)
-    for link in (shared / "log", shared / f"table.{os.getpid()}.part"):
-        link.symlink_to(victim)
-        strangers(link)
+    (shared / "log").symlink_to(victim)
+    strangers(shared / "log")
     with pytest.raises(PermissionError):
         EventLog(file=shared / "log")
-    with pytest.raises(PermissionError):
-        save_table(shared / "table", table, tip, material)
     assert victim.read_text() == "precious"
 
 
@@ -108,7 +117,7 @@ def test_a_folder_in_which_others_may_write_is_not_the_stand_in_hands(
     folder = tmp_path / "hand"
     folder.mkdir()
     folder.chmod(mode)
-    with pytest.raises(FolderError, match="others may write in it"):
+    with pytest.raises(FolderError, match="may be written by others"):
         LinkFolder(folder)
 
 
@@ -117,12 +126,12 @@ def test_anothers_folder_or_link_is_not_the_stand_in_hands(
 ) -> None:
     link = tmp_path / "link"
     link.symlink_to(tmp_path)
-    with pytest.raises(FolderError, match="is a link"):
+    with pytest.raises(FolderError, match="found a link"):
         LinkFolder(link)
     folder = tmp_path / "hand"
     folder.mkdir(mode=0o700)
     strangers(folder)
-    with pytest.raises(FolderError, match="belongs to another user"):
+    with pytest.raises(FolderError, match="belongs to user"):
         LinkFolder(folder)
 
 
@@ -152,6 +161,21 @@ def test_the_runtime_folder_is_the_users_own(
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     folder.chmod(0o777)
     assert runtime_folder() == tmp_path / "cache" / "softfinger" / "run"
+
+
+def test_a_runtime_folder_that_others_may_fill_is_refused_with_the_cure(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    folder = tmp_path / "softfinger"
+    assert check_runtime_folder() == Finding("pass", "runtime folder", str(folder))
+    folder.mkdir()
+    folder.chmod(0o777)
+    cure = f"chmod go-w {folder}"
+    assert check_runtime_folder().fix == cure
+    for words in (["emulate"], ["run", "--config", "hil"]):
+        assert main(words) == 2
+        assert f"{folder}: may be written by others (0777): {cure}" in capsys.readouterr().err
 
 
 def test_the_local_stop_goes_on_at_home_and_says_so(

@@ -21,7 +21,7 @@ state_message = message_maker(STATE)
 def test_unequal_cells_are_a_misfit_that_is_warned_of_and_published() -> None:
     settings = Settings()
     sensor = GivenFrames()
-    perception = Perception(settings, {0: sensor}, make_models(settings, None))
+    perception = Perception(settings, {0: sensor}, make_models(settings))
     grid = SensorGrid(rows=44, cols=44, pitch=0.058 / 44)
     pressure = grid.pressure(Fingertip(0.020), Material.table_i(), 0.005, 0.1, 0.0)
     noise = np.random.default_rng(3)

@@ -73,7 +73,7 @@ class Bench:
 
     def __init__(self, given: Settings) -> None:
         self.sensor = Given()
-        self._hand = Perception(given, {0: self.sensor}, make_models(given, None))
+        self._hand = Perception(given, {0: self.sensor}, make_models(given))
         (self.perception,) = self._hand.fingers
         self._state = State()
         self.contact = self._state.contacts[0]

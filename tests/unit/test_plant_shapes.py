@@ -178,24 +178,28 @@ def test_a_disc_is_grasped_and_rolls_between_the_tips():
     assert moved[0] > 0.001
 
 
-def test_what_a_disc_presses_on_a_sensor_is_its_force():
+@pytest.mark.parametrize("shape", ["disc", "none"])
+def test_what_a_disc_or_the_other_tip_presses_on_a_sensor_is_its_force(shape):
     settings = Settings.model_validate(
         {
-            "simulation": {"object_shape": "disc", "tactile_noise": 0.0},
+            "simulation": {"object_shape": shape, "tactile_noise": 0.0},
             "material": {"law": "constant"},
         }
     )
     clock = VirtualClock()
     hand = SimulatedHand(settings, table=PAPER)
-    sensor = SimulatedTactile(settings, hand, clock, 0)
-    sensor.open()
+    sensors = [SimulatedTactile(settings, hand, clock, finger) for finger in range(2)]
+    for sensor in sensors:
+        sensor.open()
     for joint in range(2):
-        hand.drive(joint, BOUNDED, True, 0.9, 0.4)
+        hand.drive(joint, BOUNDED, True, 0.9, 0.3)
     clock.sleep_until(2.0)
-    frame = sensor.latest()
-    assert frame is not None
     cell = settings.tactile.pitch**2 * settings.tactile.pascal_per_count
-    assert frame.data.sum() * cell == pytest.approx(hand.force[0], rel=0.01)
+    for finger, sensor in enumerate(sensors):
+        frame = sensor.latest()
+        assert frame is not None
+        assert frame.data.sum() * cell == pytest.approx(hand.force[finger], rel=0.01)
+        assert hand.force[finger] > 3
 
 
 # Tips on each other.
@@ -260,29 +264,6 @@ def test_tips_that_collide_keep_energy_and_part_again(friction):
         friction != 0.3
     ):  # without friction, or without slip, nothing is lost but what the shear held
         assert hand.energy() == pytest.approx(start, rel=0.05)
-
-
-def test_sensors_feel_the_other_tip():
-    settings = Settings.model_validate(
-        {
-            "simulation": {"object_shape": "none", "tactile_noise": 0.0},
-            "material": {"law": "constant"},
-        }
-    )
-    clock = VirtualClock()
-    hand = SimulatedHand(settings, table=PAPER)
-    sensors = [SimulatedTactile(settings, hand, clock, finger) for finger in range(2)]
-    for sensor in sensors:
-        sensor.open()
-    for joint in range(2):
-        hand.drive(joint, BOUNDED, True, 0.9, 0.3)
-    clock.sleep_until(2.0)
-    cell = settings.tactile.pitch**2 * settings.tactile.pascal_per_count
-    for finger, sensor in enumerate(sensors):
-        frame = sensor.latest()
-        assert frame is not None
-        assert frame.data.sum() * cell == pytest.approx(hand.force[finger], rel=0.01)
-        assert hand.force[finger] > 3
 
 
 def test_an_object_keeps_the_tips_apart_until_it_is_gone():

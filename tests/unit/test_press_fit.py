@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
 
-from softfinger import Fingertip, Material, SensorGrid
+from softfinger import ContactTable, Fingertip, Material, SensorGrid
 from softfinger.daemon.perception.calibration_file import load_calibration
 from softfinger.kinematics.calibration.calibration import fit_centre, fit_modulus
-from softfinger.kinematics.calibration.press_fit import Presses, compare_tips
+from softfinger.kinematics.calibration.press_fit import Presses, compare_tips, first_cycle
 from softfinger.tools.cli import main
 
 GRID = SensorGrid(32, 32, 0.058 / 32)
@@ -67,11 +68,54 @@ def test_a_solid_tips_modulus_is_found_by_its_own_force_law() -> None:
     assert found.residual < 0.03
 
 
+@pytest.mark.parametrize("base", ["bonded", "lying"])
+def test_deep_presses_of_other_elements_have_one_modulus(base: Literal["bonded", "lying"]) -> None:
+    with np.load(Path(__file__).parents[1] / "golden" / "solid_frames.npz") as file:
+        known = (file["base"] == base) & (file["theta"] == 0.0) & (file["d"] < 0.31)
+        d, force = file["d"][known] * 0.020, file["force"][known] * 0.25e6 * 0.020**2
+    tip = Fingertip(0.020, "solid", 0.49, base)
+    found = fit_modulus(d, np.zeros(len(d)), force, free_offset=False, tip=tip)
+    assert found.modulus == pytest.approx(0.25e6, rel=0.01)
+    assert not found.trend.drifts
+
+
+@pytest.mark.parametrize(
+    ("made", "fitted", "sign"),
+    [
+        (TIP, TIP, 0),
+        (TIP, Fingertip(0.020, "solid", 0.48, "lying"), 1),
+        (Fingertip(0.020, "solid", 0.48, "lying"), TIP, -1),
+    ],
+)
+def test_a_modulus_that_hides_another_law_drifts_over_depth(
+    made: Fingertip, fitted: Fingertip, sign: int
+) -> None:
+    rng = np.random.default_rng(2)
+    d = np.linspace(1e-3, 7e-3, 7)
+    force = ContactTable.build(made, RUBBER)(d, 0.0).force * (1.0 + 0.01 * rng.standard_normal(7))
+    found = fit_modulus(d, np.zeros(7), force, free_offset=False, tip=fitted)
+    assert found.trend.drifts == (sign != 0)
+    if sign:
+        assert np.sign(found.trend.drift) == sign
+        assert ("more than" in found.trend.cause) == (sign > 0)
+    assert found.trend.d == pytest.approx(d)
+    assert found.trend.modulus == pytest.approx(found.modulus / (1.0 + found.errors), rel=1e-12)
+
+
+def test_presses_again_tell_what_the_first_cycle_softens() -> None:
+    d, theta = np.array([2e-3, 4e-3, 2e-3, 4e-3, 2e-3, 2e-3]), np.array([0.0, 0, 0, 0, 0, 0.2])
+    force = np.array([1.1, 3.6, 0.9, 3.0, 1.1, 7.0])
+    assert first_cycle(d, theta, force) == pytest.approx(0.5 * (0.1 + 0.2))
+    assert first_cycle(d[-2:], theta[-2:], force[-2:]) is None
+
+
 def test_calibrate_law_says_which_tip_it_is(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    counts = np.clip(np.round(frames(TIP) / 20.0), 0, 4095).astype(np.uint16)
-    np.savez(tmp_path / "run.npz", frames=counts, d=D + LATE, theta=THETA)
+    each = frames(TIP) / 20.0
+    counts = np.clip(np.round(np.concatenate([1.1 * each[1:2], each])), 0, 4095).astype(np.uint16)
+    d, theta = np.append(D[1], D) + LATE, np.append(THETA[1], THETA)
+    np.savez(tmp_path / "run.npz", frames=counts, d=d, theta=theta)
     (tmp_path / "profile.toml").write_text(
         'tactile = { backend = "simulated", rows = 32, cols = 32, '
         f"pitch = {0.058 / 32}, pascal_per_count = 20.0, full_count = 4095 }}\n"
@@ -82,6 +126,10 @@ def test_calibrate_law_says_which_tip_it_is(
     told = capsys.readouterr().out
     assert told.startswith("law: solid, bonded, frictionless, ν 0.4")
     assert "springs: E = " in told
+    assert "E alone at 1.2, 3.2, 4.2 mm: 0.2" in told
+    assert "DRIFTS" not in told
+    assert "first presses read +10" in told
+    assert "SOFTENS" in told
     profile = (
         'tip.physics = "solid", tip.base = "bonded", tip.face = "frictionless", tip.poisson = 0.4'
     )

@@ -9,23 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from softfinger.kinematics.contact.closed_form import Fingertip
-from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
-
-A = 0.020
-E = 0.304e6
-TIP = Fingertip(A)
-LINEAR = Material.constant(E)
-MEASURED = Material.table_i()
-PITCH = 0.058 / 44
-
-
-def tilts(theta, azimuth):
-    return (
-        math.asin(math.sin(theta) * math.cos(azimuth)),
-        math.asin(math.sin(theta) * math.sin(azimuth)),
-    )
+from tests.harness.paper_tip import LINEAR, MEASURED, PITCH, TIP, A, E, tilts
 
 
 def cell_mean(grid, material, d, tilt_x, tilt_y, row, col, lines=400):

@@ -4,20 +4,16 @@ from __future__ import annotations
 
 from typing import Any
 
-import msgpack
 import pytest
-import zmq
 
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.loop.publishing import Publishing, every, plan
-from softfinger.daemon.loop.timing import Statistics, record
+from softfinger.daemon.loop.timing import Statistics
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import State
 from softfinger.daemon.wire.packer import message_maker
 from softfinger.daemon.wire.publisher import bit
-from softfinger.daemon.wire.schema import SCHEMA, STATE, STATS, TACTILE, Rates
-from tests.conftest import until
-from tests.harness.gateway import Served
+from softfinger.daemon.wire.schema import STATE, STATS, TACTILE, Rates
 
 stats_message = message_maker(STATS)
 
@@ -107,41 +103,6 @@ def test_the_plan_names_every_rate() -> None:
         assert words in told
     blind = plan(Settings.model_validate({"tactile": {"backend": "none"}}))
     assert "frames" not in blind
-
-
-def test_the_statistics_message_has_every_field_as_documented(
-    context: zmq.Context[Any], addresses: tuple[str, str]
-) -> None:
-    served = Served(addresses[0], queue=10)
-    publisher = served.publisher
-    socket = context.socket(zmq.SUB)
-    socket.subscribe("hand/stats")
-    socket.connect(addresses[0])
-    until(lambda: [served.settle(), publisher.wanted & bit(STATS)][1])
-    assert not publisher.wanted & bit(STATE)
-    statistics = Statistics()
-    record(statistics.counts, statistics.largest, (1e-6, 2e-5, 1e-5, 2e-6))
-    rates = Rates(500.0, 100.0, 99.0, 100.0, 50.0)
-    state, spreads = State(seq=503, t=1.5, wall=9.0), statistics.spreads()
-    publisher.send(STATS, state, 0.002, rates, statistics.ticks, spreads, 500)
-    until(lambda: [served.settle(), socket.poll(0)][1])
-    topic, payload = socket.recv_multipart()
-    assert topic == b"hand/stats"
-    message = msgpack.unpackb(payload)
-    assert message == {
-        "schema": SCHEMA,
-        "seq": 503,
-        "timestamp": 9.0,
-        "mono_ns": 1_500_000_000,
-        "seq_step": 500,
-        "ticks": 1,
-        "overruns": 0,
-        "period_s": 0.002,
-        **{name: spread._asdict() for name, spread in statistics.spreads().items()},
-        "rates": {"tick": 500.0, "left": 100.0, "right": 99.0, "state": 100.0, "tactile": 50.0},
-    }
-    socket.close()
-    served.close()
 
 
 def test_statistics_that_are_zero_are_still_floats() -> None:

@@ -1,4 +1,4 @@
-"""The reference integrals, against plain NumPy in other coordinates and against each other."""
+"""The reference integrals, against plain NumPy in other coordinates."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from numpy.polynomial.legendre import leggauss
 from softfinger import Fingertip, Material
 from softfinger.kinematics.contact.closed_form import closed_forms
 from softfinger.kinematics.contact.quadrature import circle_rule, gauss_rule, integrate, ratios_at
-from tests.harness.tip_profile import TipProfile, compress
 
 TIP = Fingertip(0.020)
 TABLE_I = Material.table_i()
@@ -170,90 +169,3 @@ def test_outside_the_domain() -> None:
         assert all(math.isnan(value) for value in integrate(TIP, TABLE_I, *pair))
     assert integrate(TIP, TABLE_I, np.empty((0, 2)), 0.0).force.shape == (0, 2)
     assert integrate(TIP, TABLE_I, [[1e-3], [2e-3]], [0.0, 0.1, 0.2]).energy.shape == (2, 3)
-
-
-# Past the limit of θ, where the face meets the base plate: d [mm], θ [°], F [N], U [mJ].
-CLIPPED = [
-    (8, 45, 81.266754123, 304.7619043),
-    (10, 35, 114.126873792, 465.5139860),
-    (12, 30, 153.849535079, 711.1873193),
-]
-SPHERE = TipProfile.sphere(TIP)
-
-
-@pytest.mark.parametrize(("d", "theta", "force", "energy"), CLIPPED)
-def test_clipped_force_and_energy(d: float, theta: float, force: float, energy: float) -> None:
-    depth, tilt = d * 1e-3, math.radians(theta)
-    c = compress(SPHERE, MATERIALS[0], depth, tilt)
-    np.testing.assert_allclose(c.force, force, atol=6e-10)
-    np.testing.assert_allclose(c.energy * 1e3, energy, atol=6e-8)
-    step = 2e-7
-    up, down = (compress(SPHERE, MATERIALS[0], depth + x, tilt).energy for x in (step, -step))
-    np.testing.assert_allclose(c.push, (up - down) / (2 * step), rtol=1e-7)
-    assert c.push > c.force / math.cos(tilt) * 0.8
-    assert abs(c.push * math.cos(tilt) / c.force - 1) > 1e-3  # here the two part
-
-
-@pytest.mark.parametrize("material", MATERIALS, ids=["constant", "table_i", "stiff", "soft"])
-def test_profile_of_a_sphere_is_the_sphere(material: Material) -> None:
-    d = np.array([1e-4, 4e-3, 8e-3, 19e-3])
-    theta = TIP.theta_limit(d) * np.array([0.4, 0.0, 0.99, 0.5])
-    c, exact = compress(SPHERE, material, d, theta), integrate(TIP, material, d, theta)
-    np.testing.assert_allclose(c.force, exact.force, rtol=1e-12)
-    np.testing.assert_allclose(c.energy, exact.energy, rtol=1e-12)
-    np.testing.assert_allclose(c.push, exact.energy_d, rtol=1e-12)
-
-
-def test_sphere_through_points_and_other_profiles() -> None:
-    x = np.linspace(0.0, 1.0, 9)
-    points = TipProfile(0.02 * x, 0.02 * np.sqrt(1 - x * x))
-    c, exact = compress(points, TABLE_I, 8e-3, 0.5), compress(SPHERE, TABLE_I, 8e-3, 0.5)
-    np.testing.assert_allclose(c.force, exact.force, rtol=1e-11)
-    # A tip of twice the base radius at equal height: an ellipsoid, whose contact is four times as
-    # wide at θ = 0, since base areas scale and strains stay.
-    wide = TipProfile(0.04 * x, 0.02 * np.sqrt(1 - x * x))
-    w, r = compress(wide, TABLE_I, 6e-3, 0.0), compress(SPHERE, TABLE_I, 6e-3, 0.0)
-    np.testing.assert_allclose([w.force, w.energy], [4 * r.force, 4 * r.energy], rtol=1e-11)
-    # Measured points between sphere and cylinder: against a plain midpoint sum.
-    blunt = TipProfile([0, 0.008, 0.014, 0.018, 0.02], [0.02, 0.0192, 0.0165, 0.0115, 0])
-    d, theta = 6e-3, 0.25
-    h = blunt.reach(theta) - d
-    grid = (np.arange(1600) + 0.5) / 1600 * 0.04 - 0.02
-    gx, gy = np.meshgrid(grid, grid)
-    z = blunt.height(np.hypot(gx, gy))
-    plane = np.maximum((h - gx * math.sin(theta)) / math.cos(theta), 0.0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        strain = np.where(z > plane, 1 - plane / z, 0.0)
-    area = (0.04 / 1600) ** 2
-    c = compress(blunt, TABLE_I, d, theta)
-    np.testing.assert_allclose(c.force, (TABLE_I.stress(strain) * area).sum(), rtol=1e-4)
-    energy = (z * TABLE_I.energy_density(strain) * area).sum()
-    np.testing.assert_allclose(c.energy, energy, rtol=1e-4)
-
-
-def test_compress_takes_any_input() -> None:
-    assert compress(SPHERE, TABLE_I, -1.0, 0.2) == (0.0, 0.0, 0.0)
-    assert all(math.isnan(value) for value in compress(SPHERE, TABLE_I, math.nan, 0.0))
-    assert compress(SPHERE, TABLE_I, np.empty(0), 0.0).force.shape == (0,)
-    with pytest.raises(ValueError, match="right angle"):
-        compress(SPHERE, TABLE_I, 1e-3, 2.0)
-    # Pressed flat altogether, the springs hold what they can.
-    flat = compress(SPHERE, TABLE_I, 1.0, 0.0)
-    np.testing.assert_allclose(flat.force, math.pi * 4e-4 * TABLE_I.stress(1.0), rtol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("radius", "height", "words"),
-    [
-        ([0.0], [0.02], "at least two"),
-        ([0.0, 0.01], [0.02, 0.0, 0.0], "one length"),
-        ([0.001, 0.02], [0.02, 0.0], "apex"),
-        ([0.0, 0.02], [0.02, 0.001], "rim"),
-        ([0.0, 0.01, 0.01, 0.02], [0.02, 0.01, 0.005, 0.0], "radius must rise"),
-        ([0.0, 0.01, 0.02], [0.02, 0.021, 0.0], "height must fall"),
-        ([0.0, math.nan, 0.02], [0.02, 0.01, 0.0], "finite"),
-    ],
-)
-def test_profiles_that_are_none(radius: list[float], height: list[float], words: str) -> None:
-    with pytest.raises(ValueError, match=words):
-        TipProfile(radius, height)

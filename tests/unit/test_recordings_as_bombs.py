@@ -100,7 +100,7 @@ def bomb(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     return tmp_path / "a.mcap"
 
 
-@pytest.mark.timeout(60)
+@pytest.mark.timeout(300)
 @pytest.mark.usefixtures("little_memory")
 def test_a_bomb_is_told_in_a_line(bomb: Path) -> None:
     told: list[str] = []

@@ -7,8 +7,7 @@ import pytest
 
 from softfinger.daemon.clock import VirtualClock
 from softfinger.daemon.errors import RecordingError, TactileError
-from softfinger.daemon.loop.build import Daemon
-from softfinger.daemon.profile.settings import Settings, TactileSettings
+from softfinger.daemon.profile.settings import TactileSettings
 from softfinger.daemon.tactile.replay import ReplayTactile, load_recording
 
 FRAMES = np.arange(5 * 4 * 6, dtype=np.uint16).reshape(5, 4, 6)
@@ -122,33 +121,3 @@ def test_files_that_cannot_be_read_are_told(tmp_path):
         load_recording(tmp_path, 1.0, 1.0)
     with pytest.raises(TactileError, match="found none for the left finger"):
         replay("", VirtualClock())
-
-
-def test_the_daemon_runs_on_a_recording_on_virtual_time(tmp_path):
-    path = tmp_path / "press.npz"
-    frames = np.zeros((4, 44, 44), np.uint16)
-    live = np.ones((44, 44), bool)
-    settings = Settings.model_validate(
-        {
-            "loop": {"clock": "virtual"},
-            "servos": {"backend": "none"},
-            "scene": {"fingers": ("left",)},
-            "tactile": {"backend": "replay", "recording": (str(path), "")},
-        }
-    )
-    from softfinger.daemon.profile.factory import make_grid, make_material, make_tip
-
-    for k in range(4):
-        pressure = make_grid(settings).pressure(
-            make_tip(settings), make_material(settings.material), 0.001 * (k + 1), 0.1
-        )
-        frames[k] = np.round(pressure / settings.tactile.pascal_per_count)
-    live[20, 20] = False
-    frames[:, 20, 20] = 0
-    np.savez(path, frames=frames, live=live)
-    with Daemon(settings, wire=False) as daemon:
-        seen = []
-        for _ in range(4):
-            daemon.loop.advance(0.01)
-            seen.append(daemon.loop.state.contacts[0].d)
-    assert seen[:3] == pytest.approx([0.001, 0.002, 0.003], rel=5e-3)

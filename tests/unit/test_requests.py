@@ -20,7 +20,7 @@ def test_stop_and_status_are_heard_in_every_mode() -> None:
 
 
 def test_nothing_moves_the_hand_before_it_is_armed_or_in_a_fault() -> None:
-    assert heard(Mode.DISARMED) == {"arm", "disarm", "tare", "stop", "status"}
+    assert heard(Mode.DISARMED) == {"arm", "demo", "disarm", "tare", "stop", "status"}
     assert heard(Mode.FAULT) == {"clear", "stop", "status"}
 
 

@@ -162,21 +162,16 @@ def test_a_joint_that_is_held_up_is_a_fault_and_can_be_cleared(make: Make) -> No
     hand.command("arm")
 
 
-def test_a_servo_that_gets_hot_is_told_then_a_fault_that_stands_until_it_is_cooler(
-    make: Make,
-) -> None:
+def test_a_servo_that_is_hot_is_a_fault_that_stands_until_it_is_cooler(make: Make) -> None:
     hand = make().grasp()
-    servos: Any = hand.loop.servos
-    servos._temperature[1] = 61.5
-    hand.loop.advance(1.0)
-    assert hand.warnings() == ["servos.temperature"]
-    assert hand.state.fault == ""
-    servos._temperature[1] = 70.6
+    assert hand.daemon.hand is not None
+    heat = hand.daemon.hand.servo_heat[1]
+    heat.warm(70.6)
     hand.until("fault", 1.0)
     assert hand.state.fault == "right servo at 71 °C"
     with pytest.raises(Refused, match="clear: right servo at 7"):
         hand.command("clear")
-    servos._temperature[1] = 50.0
+    heat.warm(50.0)
     hand.loop.advance(1.0)
     hand.command("clear")
 

@@ -11,6 +11,7 @@ from softfinger.daemon.perception import scales
 from softfinger.daemon.perception.scales import UNKNOWN, Prior, Scales, set_prior
 from softfinger.kinematics.compiled.kernel import kernel
 from softfinger.kinematics.compiled.layout import Pair, Records
+from softfinger.tools.benchmarks.rigs import SOLID, merged
 from softfinger.tools.watched import Watched as Hand
 from tests.unit.test_control import grasped
 
@@ -23,8 +24,10 @@ def begin(records: Records[Scales]) -> None:
 
 
 @kernel
-def height(records: Records[Scales], finger: int, value: float, variance: float) -> None:
-    scales.update_height(records[0], finger, value, variance)
+def height(
+    records: Records[Scales], finger: int, value: float, variance: float, known: float
+) -> None:
+    scales.update_height(records[0], finger, value, variance, known)
 
 
 @kernel
@@ -61,33 +64,40 @@ class Reference:
         self.p = (np.eye(8) - np.outer(gain, h)) @ self.p
 
 
-def test_the_filter_is_kalmans() -> None:
+@pytest.mark.parametrize("product", [False, True], ids=["a gain of each frame", "a fixed gain"])
+def test_the_filter_is_kalmans(product: bool) -> None:
     rng = np.random.default_rng(3)
     found, wanted = Scales(), Reference()
     set_prior(found, PRIORS, friction=0.05, inertia=0.01)
+    found.product[:] = float(product)
     begin(found.array)
     wanted.begin()
     t = 1.0
     torques(found.array, np.zeros(2), np.zeros(2), 0.0, t)  # the first only says how fast
     for k in range(200):
         finger, value, variance = k % 2, float(np.exp(rng.normal(0.3, 0.1))), 1e-3
-        height(found.array, finger, value, variance)
         h = np.zeros(8)
         h[finger] = h[2 + finger] = 1.0
-        wanted.take(h, np.log(value) - wanted.x @ h, variance + 0.02**2, np.inf)
+        miss = np.log(value) - wanted.x @ h
+        known = 300.0 * (k % 3)  # of the 1000 of its inverse variance
+        height(found.array, finger, value, variance, known)
+        more = 1.0 - known * variance
+        wanted.take(h, miss / more, variance / more + 0.02**2, np.inf)
+        height(found.array, finger, 2.0, variance, 1.0 / variance)  # no news
         moment, speed = rng.uniform(0.1, 0.5, 2), 0.0 if k % 3 else 0.03
         torque = 1.2 * moment + rng.normal(0.0, 0.3 if k % 50 == 7 else 0.02, 2)  # some far off
         before = 0.0 if k == 0 or (k - 1) % 3 else 0.03
         t += 0.01
         torques(found.array, torque, moment, speed, t)
         scaled = 0.5 * (1.0 + wanted.x[4:6]) * moment
-        h = np.concatenate([scaled, np.zeros(2), 0.5 * moment, [0.5, 0.5]])
+        by_force = [0.0 * scaled, -scaled] if product else [scaled, 0.0 * scaled]
+        h = np.concatenate([*by_force, 0.5 * moment, [0.5, 0.5]])
         miss = (0.5 * torque - scaled - 0.5 * wanted.x[6:]).sum()
         miss -= 0.05 * speed / 0.05 + 0.01 * (speed - before) / 0.01
         wanted.take(h, miss, 0.02**2)
         forces = rng.uniform(3.0, 9.0, 2)
         balance(found.array, *forces.tolist())
-        h = np.array([1.0, -1.0, 0, 0, 0, 0, 0, 0])
+        h = np.array([0, 0, -1.0, 1.0, 0, 0, 0, 0] if product else [1.0, -1.0, 0, 0, 0, 0, 0, 0])
         wanted.take(h, np.log(forces[1] / forces[0]), (0.05 + 0.4 / forces.min()) ** 2)
         if k == 100:
             begin(found.array)
@@ -124,6 +134,15 @@ def test_a_wrong_scale_is_told_from_the_tips_stiffness(case: str, force: float) 
         assert not [event for event in hand.events if event[1] == "slip"]
 
 
+@pytest.mark.parametrize("gain", [0.7, 1.0, 1.3])
+def test_torques_and_closing_tell_a_solid_tips_gain(gain: float) -> None:
+    simulation = {"tactile_gain": (gain, gain), "seed": 2}
+    with Hand(merged({"simulation": simulation}, SOLID)) as hand:
+        grasped(hand, 6.0, 3.0)
+        assert hand.plant.normal.mean() == pytest.approx(6.0, rel=0.2)
+        assert not [event for event in hand.events if event[1] == "slip"]
+
+
 def test_what_is_known_of_scales_does_not_fade_while_nothing_is_held() -> None:
     with Hand({}) as hand:
         hand.run(30.0)
@@ -154,3 +173,19 @@ def test_a_wrong_torque_constant_is_no_load() -> None:
             hand.watch(2.0)
             assert hand.plant.normal.mean() == pytest.approx(10.0, rel=0.12)
             assert not [event for event in hand.events if event[1] == "slip"]
+
+
+def test_a_force_asked_for_in_a_turn_shows_what_a_ramp_would() -> None:
+    """A torque constant that a light grip did not tell is no load of a firm one."""
+    with Hand({}) as hand:
+        hand.plant.plant.parameters.torque_constant *= 0.9
+        grasped(hand, 5.0)
+        hand.command("grasp", force=15.0)
+        hand.run(0.1)
+        hand.command("rotate", angle=-0.2)
+        hand.run(0.04)
+        hand.command("grasp", force=18.0)
+        hand.watch(2.5)
+        assert hand.mode == "holding"
+        assert hand.plant.normal.mean() == pytest.approx(18.0, rel=0.15)
+        assert not [event for event in hand.events if event[1] == "slip"]

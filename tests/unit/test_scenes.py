@@ -14,7 +14,7 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import Reading
 from softfinger.daemon.wire.packer import message_maker
 from softfinger.daemon.wire.schema import STATE
-from tests.harness.loop import Make, advance_to, command, grasped
+from tests.harness.loop import Make, advance_to, command, grasped, refusal
 
 state_message = message_maker(STATE)
 
@@ -179,3 +179,15 @@ def test_the_demo_task_grasps_turns_and_releases_by_itself(make: Make) -> None:
     assert seen[: len(once) + 2] == ["disarmed", "armed", *once]
     assert max(turned) > 0.12
     assert min(turned) < -0.12
+
+
+def test_a_demo_that_a_command_ended_is_begun_again(make: Make) -> None:
+    daemon = make(task={"name": "demo"})
+    advance_to(daemon, "holding", 6.0)
+    assert "demo: not while holding" in refusal(daemon, "demo")
+    command(daemon, "stop")
+    daemon.loop.advance(2.0)
+    assert daemon.loop.state.mode == "disarmed"
+    command(daemon, "demo")
+    advance_to(daemon, "rotating", 8.0)
+    assert "names no task" in refusal(make(), "demo")

@@ -279,6 +279,7 @@ def test_the_daemon_grasps(mode):
         loop.advance(1.5)
         assert loop.state.mode == "armed"
         assert loop.state.reading.q == pytest.approx([0.0, 0.0], abs=0.03)
+        assert not any(contact.contact or contact.force for contact in loop.state.contacts)
 
 
 def test_nothing_is_grasped_in_position_mode_but_the_joints_move():

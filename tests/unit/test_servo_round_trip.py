@@ -22,7 +22,6 @@ DATA = st.one_of(
     st.lists(st.sampled_from([0xFF, 0xFD, 0, 1, 5, 100]), min_size=1, max_size=20).map(bytes),
     st.binary(min_size=1, max_size=20),
 )
-SPANS = st.tuples(ADDRESSES, st.integers(1, 30))
 STEPS = st.one_of(
     st.tuples(st.just("write"), st.sampled_from([1, 2]), ADDRESSES, DATA),
     st.tuples(st.just("sync write"), st.just(0), ADDRESSES, DATA),

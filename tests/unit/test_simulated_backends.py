@@ -12,11 +12,9 @@ from softfinger.daemon.errors import ServoError
 from softfinger.daemon.perception.finger_model import make_estimator
 from softfinger.daemon.profile.factory import make_material
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.servos.base import make_servos
 from softfinger.daemon.servos.simulated import SimulatedServos
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.daemon.simulation.sensor.simulated_tactile import SimulatedTactile
-from softfinger.daemon.tactile.base import make_sensor
 from softfinger.daemon.types import Goal, Reading
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
@@ -94,24 +92,6 @@ def test_goals_are_whole_counts_too():
     np.testing.assert_allclose(bound / CURRENT_UNIT, math.floor(0.3 / CURRENT_UNIT), rtol=1e-12)
 
 
-def test_connect_and_torque_on_move_nothing():
-    bench = Bench(hand={"open_angle": (0.0031, -0.0123)})
-    before = bench.hand.q.copy()
-    bench.servos.connect()
-    bench.clock.sleep_until(0.5)
-    bench.servos.read(bench.reading)
-    np.testing.assert_array_equal(bench.hand.q, before)
-    bench.servos.torque_on()
-    bench.clock.sleep_until(0.59)
-    bench.servos.read(bench.reading)
-    np.testing.assert_array_equal(bench.hand.q, before)
-    # With current allowed it holds within half a count of where it was.
-    bench.goal.q = list(bench.reading.q)
-    bench.goal.current = [0.5] * 2
-    bench.run(0.5)
-    np.testing.assert_allclose(bench.hand.q, before, atol=0.6 * COUNT)
-
-
 def test_watchdog_takes_torque_off_in_silence_only():
     bench = Bench(servos={"watchdog": 0.1})
     bench.grasp(0.5, 1.0)
@@ -157,24 +137,6 @@ def test_close_takes_torque_off_and_reads_fail_after_it():
     assert bench.reading.q == q
     with pytest.raises(ServoError, match="not connected"):
         bench.servos.torque_on()
-
-
-def test_a_missing_finger_stays_zero():
-    bench = Bench(scene={"fingers": ("left",)})
-    bench.grasp(0.5, 1.0)
-    assert bench.reading.valid
-    assert bench.reading.q[0] > 0.1
-    assert bench.reading.q[1] == 0.0
-    assert bench.hand.q[1] == 0.0
-
-
-def test_a_model_that_cannot_do_it_is_refused_at_connect():
-    bench = Bench()
-    settings = bench.settings.model_copy(
-        update={"servos": bench.settings.servos.model_copy(update={"model": "XL430-W250"})}
-    )
-    with pytest.raises(ServoError, match="no current-based"):
-        SimulatedServos(settings, bench.hand, bench.clock).connect()
 
 
 # Tactile.
@@ -234,17 +196,6 @@ def test_frames_nobody_asked_for_are_counted():
     assert sensor.latest() is frame
 
 
-def test_a_frame_is_never_written_after_it_was_handed_over():
-    bench = Bench()
-    sensor = bench.sensors[0]
-    sensor.open()
-    frame = sensor.latest()
-    before = frame.data.copy()
-    bench.grasp(0.5, 0.5)
-    assert sensor.latest() is not frame
-    np.testing.assert_array_equal(frame.data, before)
-
-
 def test_noise_is_as_set_and_equal_for_one_seed():
     def frames(seed: int) -> np.ndarray:
         bench = Bench(
@@ -297,26 +248,3 @@ def test_a_long_delay_still_finds_its_sample():
         bench.clock.sleep_until(bench.clock.now() + 0.0137)
         frame = sensor.latest()
         assert 0.5 - 1e-6 <= bench.clock.now() - frame.t_sample < 0.51 + 1e-6
-
-
-def test_registries_make_them_and_two_runs_are_bit_identical():
-    def run() -> tuple[bytes, bytes]:
-        settings = Settings()
-        clock = VirtualClock()
-        hand = SimulatedHand(settings, clock.now(), table=TABLE)
-        servos = make_servos(settings, clock, hand)
-        sensor = make_sensor(settings, clock, hand, 0)
-        servos.connect()
-        sensor.open()
-        servos.torque_on()
-        goal, reading = Goal(), Reading()
-        goal.q, goal.current = [0.6, 0.6], [0.4, 0.4]
-        data = b""
-        for _ in range(250):
-            clock.sleep_until(clock.now() + 0.002)
-            servos.read(reading)
-            data += repr((reading.q, reading.current)).encode() + sensor.latest().data.tobytes()
-            servos.write(goal)
-        return data, hand.plant.array.tobytes()
-
-    assert run() == run()

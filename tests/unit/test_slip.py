@@ -99,12 +99,17 @@ class Watched:
         holding: bool = True,
         normal: float = 10.0,
         speed: float = 0.0,
+        sense: float = 1.0,
     ) -> float:
-        """So many ticks under a load, joints closing with ``speed``; the force [N] gone to."""
-        self.held.torque_residual = [self.held.load_arm * load] * 2
+        """So many ticks under a load, joints closing with ``speed``; the force [N] gone to.
+
+        ``sense``: what the right joint shows and does of the left one's; -1 is a twist.
+        """
+        torque = self.held.load_arm * load
+        self.held.torque_residual = [torque, sense * torque]
         self.held.normal = [normal, normal]
         for _ in range(ticks):
-            self.grip.torques(Reading(dq=[speed, speed]), ObjectPose(), holding)
+            self.grip.torques(Reading(dq=[speed, sense * speed]), ObjectPose(), holding)
         return self.grip.target
 
 
@@ -153,6 +158,15 @@ def test_a_load_that_comes_at_once_raises_the_grip_at_once_by_all_it_may() -> No
     watched.held.force = [FORCE + 10.0] * 2
     watched.run(2.0 * friction, 1)
     assert state.grip_force == pytest.approx(FORCE + 10.0, rel=0.03)
+
+
+def test_a_twist_that_comes_at_once_raises_the_grip_at_once() -> None:
+    friction = 0.05 / 0.03
+    for speed, raised in ((0.0, 0.0), (-GIVES_WAY, 0.0), (GIVES_WAY, 10.0)):
+        watched = at_rest()
+        assert watched.run(2.0 * friction, 1, speed=speed, sense=-1.0) == FORCE + raised
+    watched = at_rest()
+    assert watched.run(0.8 * friction, 1, speed=GIVES_WAY, sense=-1.0) == FORCE
 
 
 def test_a_load_that_stands_leaves_less_to_come() -> None:

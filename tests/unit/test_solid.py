@@ -43,7 +43,7 @@ def test_the_partials_are_those_of_one_energy(tip: Fingertip) -> None:
         # A shear up the slope adds to the force on the base, the more the steeper.
         held = c.force / (np.cos(theta) * c.energy_d) - 1.0
         assert held[2] == pytest.approx(0.0, abs=1e-12)
-        assert (held[0] < 0.15).all()
+        assert (held[0] < 0.2).all()
         assert (held[0] > held[3]).all()
         assert (held[3] > held[1]).all()
     else:
@@ -99,7 +99,7 @@ def test_the_cells_sum_to_the_force_whatever_the_grid_and_the_azimuth() -> None:
             tilt_x = math.asin(math.sin(theta) * math.cos(azimuth))
             tilt_y = math.asin(math.sin(theta) * math.sin(azimuth))
             pressure = grid.pressure(tip, RUBBER, d, tilt_x, tilt_y)
-            assert pressure.sum() * math.prod(grid.pitches) == pytest.approx(force, rel=3e-3)
+            assert pressure.sum() * math.prod(grid.pitches) == pytest.approx(force, rel=5e-3)
     along_x = GRID.pressure(tip, RUBBER, d, theta, 0.0)
     along_y = GRID.pressure(tip, RUBBER, d, 0.0, theta)
     assert along_y == pytest.approx(along_x.T, abs=1e-6 * along_x.max())
@@ -109,6 +109,7 @@ def test_the_cells_sum_to_the_force_whatever_the_grid_and_the_azimuth() -> None:
     )
 
 
+@pytest.mark.usefixtures("exact_solid_data")
 @every
 @pytest.mark.parametrize("counts", [False, True])
 def test_the_estimate_is_at_its_bound_whatever_the_shear(tip: Fingertip, counts: bool) -> None:
@@ -131,7 +132,7 @@ def test_the_estimate_is_at_its_bound_whatever_the_shear(tip: Fingertip, counts:
                     found = estimator(frame)
                 assert found.valid
                 assert found.contact
-                assert [found.shear_x, found.shear_y] == pytest.approx(shear, abs=0.1)
+                assert [found.shear_x, found.shear_y] == pytest.approx(shear, rel=0.01, abs=0.1)
                 error = [found.d - d, found.tilt_x - tilt_x, found.tilt_y - tilt_y]
                 squares.append(error @ np.linalg.solve(found.covariance[:3, :3], error) / 3.0)
     # 96 frames of three numbers: 1 ± 0.08, and more where cells that are pulled tell nothing.
@@ -142,7 +143,7 @@ def test_frames_of_other_elements_are_estimated_as_what_they_are() -> None:
     rng = np.random.default_rng(6)
     with np.load(Path(__file__).parents[1] / "golden" / "solid_frames.npz") as file:
         known = {name: file[name] for name in file.files}
-    modulus, squares = 0.304e6, []
+    modulus, squares, upright = 0.304e6, [], []
     for k, block in enumerate(known["base"]):
         base, _, face = str(block).partition("-")
         kind: Any = (base, face or "frictionless")
@@ -158,15 +159,28 @@ def test_frames_of_other_elements_are_estimated_as_what_they_are() -> None:
             assert found.valid
             error = [found.d - d, found.tilt_x - theta, found.tilt_y]
             squares.append(error @ np.linalg.solve(found.covariance[:3, :3], error) / 3.0)
+            upright += [squares[-1]] if theta == 0.0 else []
             # Within the aims, or within the noise where that hides them: at 0.5 and 1 mm.
             turned = math.radians(1.5) + 3.0 * found.tilt_x_std
             assert found.d == pytest.approx(d, rel=0.05, abs=3.0 * found.d_std)
             assert math.hypot(*error[1:]) < turned
             tilt = math.asin(math.hypot(math.sin(found.tilt_x), math.sin(found.tilt_y)))
-            assert float(table(found.d, tilt).force) == pytest.approx(
-                force, rel=0.03 if d > 0.9e-3 else 0.12
-            )
-    assert np.mean(squares) < 1.6
+            assert float(table(found.d, tilt).force) == pytest.approx(force, rel=0.03)
+    assert 0.3 < np.mean(squares) < 2.0
+    assert 0.6 < np.mean(upright) < 1.3
+
+
+def test_noise_at_the_data_s_end_takes_no_estimate_out_of_it() -> None:
+    rng = np.random.default_rng(9)
+    for tip in TIPS:
+        estimator = ContactEstimator(tip, RUBBER, GRID, NOISE)
+        for tilt in (0.0, 0.2, 0.4):
+            frame = GRID.pressure(tip, RUBBER, 0.008, tilt)
+            for _ in range(10):
+                found = estimator.update(frame + NOISE * rng.standard_normal(GRID.shape))
+                assert found.valid
+                assert found.d == pytest.approx(0.008, rel=0.005)
+                assert found.d <= 0.008
 
 
 def test_noise_and_shifted_zeros_are_no_contact() -> None:
@@ -208,12 +222,12 @@ def test_another_tips_frame_is_a_misfit() -> None:
 def test_a_smooth_misfit_widens_what_it_says() -> None:
     rng, squares = np.random.default_rng(8), []
     estimator = ContactEstimator(TIPS[0], RUBBER, GRID, NOISE)
-    frame = GRID.pressure(replace(TIPS[0], face="sticking"), RUBBER, 0.004, 0.2)
+    frame = GRID.pressure(replace(TIPS[0], base="lying"), RUBBER, 0.006, 0.2)
     for _ in range(20):
         found = estimator(frame + NOISE * rng.standard_normal(GRID.shape))
         assert found.misfit
-        assert found.d > 1.03 * 0.004
-        error = [found.d - 0.004, found.tilt_x - 0.2, found.tilt_y]
+        assert found.d < 0.97 * 0.006
+        error = [found.d - 0.006, found.tilt_x - 0.2, found.tilt_y]
         squares.append(error @ np.linalg.solve(found.covariance[:3, :3], error) / 3.0)
     assert 0.5 < np.mean(squares) < 2.0
 
@@ -245,6 +259,19 @@ def test_a_hand_with_solid_tips_grasps_turns_and_releases(make: Make) -> None:
     daemon.loop.advance(1.5)
     assert state.mode == "armed"
     assert not any(contact.contact for contact in state.contacts)
+
+
+def test_turning_to_and_fro_leaves_a_solid_tips_force_as_it_was(make: Make) -> None:
+    """Rolling moves d by what the joints don't tell well: it must not be taken for a gain."""
+    daemon = make(**load(Path("solid")).model_dump(exclude={"loop"}))
+    grasped(daemon, 10.0)
+    daemon.loop.advance(1.0)
+    hand = daemon.hand
+    assert hand is not None
+    for angle in (0.1, -0.1) * 4:
+        command(daemon, "rotate", angle=angle)
+        daemon.loop.advance(2.0)
+        assert float(np.mean(hand.force)) == pytest.approx(10.0, rel=0.04)
 
 
 def test_a_profile_that_no_solid_tip_has_is_refused() -> None:

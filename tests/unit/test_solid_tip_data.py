@@ -77,35 +77,36 @@ def test_the_other_tilt_mirrors_the_pressure(arrays: dict[str, np.ndarray]) -> N
         np.testing.assert_allclose(other[2], sign[:, None] * pressure, rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize(("d", "force"), [(1, 2.85), (4, 27.4), (6, 54.7)])
+@pytest.mark.parametrize(("d", "force"), [(1, 2.87), (4, 31.5), (6, 74.3)])
 def test_forces_of_an_axisymmetric_computation(
     arrays: dict[str, np.ndarray], d: float, force: float
 ) -> None:
-    """Bonded, ν = 0.49, a = 20 mm, E = 0.304 MPa, upright; and σ_y near 9.7 mm."""
+    """Neo-Hookean, bonded, ν = 0.49, a = 20 mm, E = 0.304 MPa, upright; and σ_y near 9.5 mm."""
     tip = SolidTip(arrays, "bonded", 0.49)
     push, _, pressure = tip.press(d * MM, 0.0)
     assert push * 0.304 * 20**2 == pytest.approx(force, rel=0.01)
     _, _, sigma = centroid_and_extent(tip.frame(pressure, PITCH, CELLS), PITCH)
-    assert sigma == pytest.approx(9.7 * MM, abs=0.2 * MM)
+    assert sigma == pytest.approx(9.5 * MM, abs=0.1 * MM)
 
 
 def test_frames_of_three_dimensional_elements(arrays: dict[str, np.ndarray]) -> None:
-    """tests/harness/solid_reference.py: another mesh, element, solver and contact algorithm."""
+    """tests/harness/solid_reference.py: other meshes, and no fit."""
     with np.load(REFERENCE) as data:
         names = ("base", "nu", "d", "theta", "push", "energy", "force", "frame")
         rows = list(zip(*(data[name] for name in names), strict=True))
     areas = np.pi * np.diff(arrays["ring_edges"] ** 2)
     place = (np.arange(CELLS) - (CELLS - 1) / 2) * PITCH
     inner = np.hypot(*np.meshgrid(place, place)) < 0.94  # the rim's stress is singular
-    assert len(rows) == 18
+    assert {str(row[0]) for row in rows} == set(BASES)
+    assert max(row[3] for row in rows) > 0.2
     for base, poisson, d, theta, push, energy, force, frame in rows:
         tip = SolidTip(arrays, str(base), poisson)
         its_push, its_energy, pressure = tip.press(d, theta)
-        assert its_push == pytest.approx(push, rel=0.002)
-        assert its_energy == pytest.approx(energy, rel=0.002)
-        assert pressure[0] @ areas == pytest.approx(force, rel=0.002)
+        assert its_push == pytest.approx(push, rel=0.01)
+        assert its_energy == pytest.approx(energy, rel=0.01)
+        assert pressure[0] @ areas == pytest.approx(force, rel=0.01)
         mine = tip.frame(pressure, PITCH, CELLS)
-        assert rms_difference(mine[inner], frame[inner]) < 0.014
-        assert rms_difference(mine, frame) < 0.04
+        # The three-dimensional meshes are coarse, at the rim above all.
+        assert rms_difference(mine[inner], frame[inner]) < (0.07 if theta else 0.015)
         moments = centroid_and_extent(mine, PITCH), centroid_and_extent(frame, PITCH)
-        np.testing.assert_allclose(*moments, rtol=0, atol=0.02 * MM)
+        np.testing.assert_allclose(*moments, rtol=0, atol=0.1 * MM)

@@ -1,4 +1,4 @@
-"""The publisher on a real socket: shapes and types on the wire, and subscribers of every kind."""
+"""The publisher on a real socket: what is on the wire, and subscribers of every kind."""
 
 from __future__ import annotations
 
@@ -13,30 +13,13 @@ import zmq
 from softfinger.daemon.types import Contact, Frame, HandFacts, Parts, SensorFacts, State
 from softfinger.daemon.wire.packer import message_maker
 from softfinger.daemon.wire.publisher import bit
-from softfinger.daemon.wire.schema import COMMAND, EVENT, SCHEMA, STATE, TACTILE
+from softfinger.daemon.wire.schema import COMMAND, EVENT, STATE, TACTILE
 from tests.conftest import until
 from tests.harness.gateway import Served
 
 state_message = message_maker(STATE)
 
 BOTH = Parts((True, True), servos=True, sensors=False)
-FINGER_FLOATS = (
-    *(
-        "q",
-        "dq",
-        "current",
-        "temperature",
-        "voltage",
-        "goal_q",
-        "goal_current",
-        "d",
-        "theta",
-        "tilt_y",
-        "force",
-        "energy",
-    ),
-    *("d_std", "theta_std", "force_std", "shear_x", "shear_y", "gain", "frame_age_s"),
-)
 
 
 def subscribe(context: zmq.Context[Any], address: str, topic: bytes = b"") -> zmq.Socket[Any]:
@@ -57,34 +40,6 @@ def receive(socket: zmq.Socket[Any], served: Served | None = None) -> tuple[byte
 def wanted(served: Served, topic: bytes = STATE) -> bool:
     served.settle()
     return bool(served.publisher.wanted & bit(topic))
-
-
-def test_state_has_every_field_of_the_public_face_with_its_type() -> None:
-    message = msgpack.unpackb(
-        msgpack.packb(state_message(State(), Parts((True, False), True, True)))
-    )
-    assert set(message) >= {
-        *("schema", "seq", "timestamp", "mono_ns", "mode", "fault"),
-        *("tick_s", "compute_s", "wake_late_s", "overruns", "left", "right", "object"),
-    }
-    for key in ("timestamp", "tick_s", "compute_s", "wake_late_s"):
-        assert isinstance(message[key], float), key
-    for finger in ("left", "right"):
-        part = message[finger]
-        assert set(FINGER_FLOATS) | {"valid", "contact", "frame_seq"} <= set(part)
-        assert all(isinstance(part[key], float) for key in FINGER_FLOATS)
-        assert isinstance(part["contact"], bool)
-    assert message["object"] == {"valid": False, "angle": 0.0, "width": 0.0}
-    assert message["schema"] == SCHEMA
-
-
-def test_a_finger_that_takes_no_part_keeps_its_shape_and_is_not_valid() -> None:
-    state = State()
-    state.reading.valid = True
-    message = state_message(state, Parts((True, False), True, False))
-    assert message["left"].keys() == message["right"].keys()
-    assert message["left"]["valid"] is True
-    assert message["right"]["valid"] is False
 
 
 def test_frame_age_counts_from_the_sample() -> None:
@@ -108,30 +63,8 @@ def test_tactile_data_is_little_endian_uint16_row_major(
     topic, message = receive(socket, served)
     assert topic == b"hand/tactile"
     assert np.array_equal(np.frombuffer(message.pop("data"), "<u2").reshape(3, 4), data)
-    assert message == {
-        "schema": SCHEMA,
-        "seq": 7,
-        "seq_step": 1,
-        "number": 0,
-        "timestamp": 99.0,
-        "mono_ns": 1_000_000_000,
-        "delay_s": 0.25,
-        "valid": True,
-        "finger": "right",
-        "rows": 3,
-        "cols": 4,
-        "pitch": 0.002,
-        "pitch_y": 0.003,
-        "centre_x": 1e-4,
-        "centre_y": -2e-4,
-        "rotation": 0.1,
-        "unit": "count",
-        "scale": 4.0,
-        "calibrated": False,
-        "calibration": "A17 2026-01-02",
-    }
-    floats = {"timestamp", "delay_s", "scale", *SensorFacts._fields[:5]}
-    assert all(isinstance(message[key], float) for key in floats)
+    assert (message["seq"], message["mono_ns"], message["delay_s"]) == (7, 1_000_000_000, 0.25)
+    assert (message["finger"], message["rows"], message["cols"]) == ("right", 3, 4)
     served.close()
 
 
@@ -203,6 +136,7 @@ def test_a_late_subscriber_gets_what_is_published_from_then_on(
     publisher = served.publisher
     for seq in range(100):
         publisher.send(STATE, State(seq=seq), BOTH)
+    served.settle()  # before anybody subscribes: that may be quicker
     late = subscribe(context, addresses[0], b"hand/state")
     until(lambda: wanted(served))
     publisher.send(STATE, State(seq=100), BOTH)
@@ -232,6 +166,7 @@ def test_who_comes_late_is_told_settings_and_events_again(
     publisher.settings(98.0, 0.5, HandFacts("0.1.0", "{}", "", "", "{}", "{}"))
     for k in range(60):
         publisher.event(99.0 + k, 1.0 + k, "info", "mode", f"event {k + 1}")
+    served.settle()  # before anybody subscribes: that may be quicker
     early = subscribe(context, addresses[0])
     told: list[tuple[bytes, dict[str, Any]]] = []
 
@@ -266,6 +201,7 @@ def test_all_of_many_late_subscribers_are_told(
         served.publisher.settings(98.0, 0.5, HandFacts("0.1.0", "{}", "", "", "{}", "{}"))
         for k in range(5):
             served.publisher.event(99.0, 1.0, "info", "mode", f"event {k}")
+        served.settle()  # before anybody subscribes: that may be quicker
         sockets = [subscribe(context, addresses[0], b"hand/event") for _ in range(40)]
         for socket in sockets:
             socket.setsockopt(zmq.SUBSCRIBE, b"hand/settings")
@@ -291,6 +227,7 @@ def test_a_long_message_comes_in_pieces_and_whole(
     sensor = SensorFacts(0.002, 0.003, 0.0, 0.0, 0.0, "count", 4.0, False, "")
     with Served(addresses[0]) as served:
         served.publisher.settings(98.0, 0.5, facts)
+        served.settle()  # before anybody subscribes: else it comes twice
         socket = subscribe(context, addresses[0])
         assert receive(socket, served)[1]["settings"] == facts.settings
         served.publisher.send(TACTILE, Frame(7, 1.0, 1.25, True, grid), grid, 1, sensor, 99.0)

@@ -12,6 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from softfinger import ContactTable, Fingertip, Material
+from softfinger.daemon.errors import SettingsError
+from softfinger.daemon.profile.factory import make_table
+from softfinger.daemon.profile.settings import Settings
 from softfinger.kinematics.compiled.kernel import kernel
 from softfinger.kinematics.compiled.simd import SHAPES
 from softfinger.kinematics.contact.closed_form import closed_forms
@@ -375,36 +378,6 @@ def test_refusals() -> None:
             ContactTable.build(TIP, TABLE_I, tolerance)
 
 
-def test_bytes_and_back(table: ContactTable) -> None:
-    content = table.to_bytes(TIP, TABLE_I)
-    again = ContactTable.from_bytes(content, TIP, TABLE_I)
-    np.testing.assert_array_equal(again.data, table.data)
-    assert again.data.ctypes.data % 64 == 0
-    assert again.certificate == table.certificate
-    for tip, material, tolerance in [
-        (Fingertip(0.021), TABLE_I, 1e-9),
-        (TIP, STIFFENING, 1e-9),
-        (TIP, TABLE_I, 1e-10),
-    ]:
-        with pytest.raises(TableError, match="belongs to another"):
-            ContactTable.from_bytes(content, tip, material, tolerance)
-
-
-@pytest.mark.parametrize("position", [0, 8, 40, 72, 80, 1000, -1])
-def test_damaged_bytes_are_rejected(table: ContactTable, position: int) -> None:
-    content = bytearray(table.to_bytes(TIP, TABLE_I))
-    content[position] ^= 0x10
-    with pytest.raises(TableError, match=r"damaged|holds no"):
-        ContactTable.from_bytes(bytes(content), TIP, TABLE_I)
-
-
-@pytest.mark.parametrize("length", [0, 5, 41, 81, 200])
-def test_cut_bytes_are_rejected(table: ContactTable, length: int) -> None:
-    content = table.to_bytes(TIP, TABLE_I)[:length]
-    with pytest.raises(TableError, match=r"damaged|holds no"):
-        ContactTable.from_bytes(content, TIP, TABLE_I)
-
-
 def test_aligned_arrays_are_zero_and_contiguous() -> None:
     for size in (0, 1, 7, 100):
         array = aligned(size)
@@ -424,3 +397,12 @@ def test_the_energy_has_its_minimum_where_nothing_is_tilted(material: Material) 
         assert np.all(np.diff(ours.energy[:51]) < 0)
         assert ours.energy_theta[50] == 0.0
         assert np.all(ours.energy_theta * theta >= 0)
+
+
+def test_hands_of_one_process_share_their_table() -> None:
+    assert make_table(Settings(), TABLE_I) is make_table(Settings(), TABLE_I)
+    finer = make_table(Settings.model_validate({"table": {"tolerance": 1e-12}}), TABLE_I)
+    assert finer.max_error <= 1e-12 < make_table(Settings(), TABLE_I).max_error
+    out_of_reach = Settings.model_validate({"table": {"tolerance": 1e-13}})
+    with pytest.raises(SettingsError, match=r"table\.tolerance: no .* reaches 1e-13"):
+        make_table(out_of_reach, TABLE_I)

@@ -51,7 +51,7 @@ class Source:
     live: NDArray[np.bool_] | None = None
 
 
-def open_source(path: Path, settings: Settings, cache: Path | None, own: bool) -> Source:
+def open_source(path: Path, settings: Settings, own: bool) -> Source:
     """Open a file of frames.
 
     With ``own`` a recording of the stream uses the settings it was made with, else ``settings``;
@@ -59,11 +59,11 @@ def open_source(path: Path, settings: Settings, cache: Path | None, own: bool) -
     Raises RecordingError with the file's name, and SettingsError or TactileError.
     """
     if path.suffix == ".mcap":
-        return _stream(path, settings, cache, own)
-    return _frames_alone(path, settings, cache, own)
+        return _stream(path, settings, own)
+    return _frames_alone(path, settings, own)
 
 
-def _stream(path: Path, settings: Settings, cache: Path | None, own: bool) -> Source:
+def _stream(path: Path, settings: Settings, own: bool) -> Source:
     from softfinger.daemon.loop.process_replay import with_calibrations
     from softfinger.tools.recordings.recomputed import recorded_settings
 
@@ -73,9 +73,9 @@ def _stream(path: Path, settings: Settings, cache: Path | None, own: bool) -> So
     if own:
         settings, calibrations = recorded_settings(recording)
         with tempfile.TemporaryDirectory() as folder:
-            models = make_models(with_calibrations(settings, calibrations, Path(folder)), cache)
+            models = make_models(with_calibrations(settings, calibrations, Path(folder)))
     else:
-        models = make_models(settings, cache)
+        models = make_models(settings)
     present = tuple(
         finger
         for finger, name in enumerate(FINGERS)
@@ -102,7 +102,7 @@ def _stream(path: Path, settings: Settings, cache: Path | None, own: bool) -> So
     return Source(settings, models, present, recording.size, frames, {})
 
 
-def _frames_alone(path: Path, settings: Settings, cache: Path | None, own: bool) -> Source:
+def _frames_alone(path: Path, settings: Settings, own: bool) -> Source:
     tactile = settings.tactile
     recording = load_recording(path, tactile.pascal_per_count, tactile.rate)
     if own:
@@ -126,7 +126,7 @@ def _frames_alone(path: Path, settings: Settings, cache: Path | None, own: bool)
             progress(k)
             yield 0, t, recording.counts[k]
 
-    models = make_models(settings, cache)
+    models = make_models(settings)
     return Source(settings, models, (0,), count, frames, recording.truths, recording.live)
 
 

@@ -58,8 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def pages() -> dict[str, Callable[[RecordedRun], Figure]]:
     """Return the function that draws each page; matplotlib is imported when one is drawn."""
-    from softfinger.tools.analysis.plots_error import draw_error
-    from softfinger.tools.analysis.plots_model import draw_angle, draw_landscape
+    from softfinger.tools.analysis.plots_model import draw_angle, draw_error, draw_landscape
 
     return dict(zip(PAGES, (draw_angle, draw_landscape, draw_error), strict=True))
 
@@ -71,7 +70,7 @@ def run(arguments: argparse.Namespace) -> int:
     from softfinger.daemon.profile.settings import Settings
     from softfinger.tools import style
     from softfinger.tools.analysis.plots_data import Missing, load_run
-    from softfinger.tools.processes.kernel_build import build_kernels, print_event, table_cache
+    from softfinger.tools.processes.kernel_build import build_kernels, print_event
     from softfinger.tools.recordings.reader import Recording
     from softfinger.tools.terminal.progress import Progress
 
@@ -81,7 +80,7 @@ def run(arguments: argparse.Namespace) -> int:
     recording = Recording(path, to_stderr("plot"))
     build_kernels(Settings(), print_event, FRAMES)
     with Progress("plot", recording.size) as progress:
-        data = load_run(recording, arguments.start, arguments.end, table_cache(), progress)
+        data = load_run(recording, arguments.start, arguments.end, progress)
     folder.mkdir(parents=True, exist_ok=True)
     drawn = 0
     with style.settings():

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import tempfile
-from array import array
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from softfinger.daemon.client.records import read, to_columns
 from softfinger.daemon.errors import RecordingError, SettingsError, SoftfingerError, TactileError
 from softfinger.daemon.loop.process_replay import with_calibrations
 from softfinger.daemon.perception.finger_model import FingerModel, make_models
@@ -25,14 +25,6 @@ from softfinger.tools.recordings.recomputed import recorded_settings
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-_TICK = ("mono_ns", "timestamp")
-_FINGER = (
-    *("valid", "contact", "d", "theta", "force", "energy"),
-    *("d_std", "theta_std", "force_std", "gain"),
-)
-_OBJECT = ("valid", "angle")
-_TRUE = ("d", "theta", "force")
-_TRUE_OBJECT = ("angle",)
 _GAP = 0.1  # s without a state, at least, that breaks a line
 
 
@@ -51,8 +43,8 @@ class RecordedRun:
     name: str
     models: tuple[FingerModel, FingerModel] | None
     why_no_model: str
-    states: dict[str, FloatArray]
-    truth: dict[str, FloatArray]
+    states: dict[str, NDArray[Any]]
+    truth: dict[str, NDArray[Any]]
     offset: float  # timestamp at t = 0
 
     @cached_property
@@ -71,8 +63,8 @@ class RecordedRun:
 
     def touching(self, finger: str) -> BoolArray:
         """Return where the finger's state is valid and in contact."""
-        valid = (self.states[f"{finger}.valid"] > 0.0) & (self.states[f"{finger}.contact"] > 0.0)
-        return valid & np.isfinite(self.states[f"{finger}.d"])
+        of = {name: self.states[f"{finger}.{name}"] for name in ("valid", "contact", "d")}
+        return np.asarray(of["valid"] & of["contact"] & np.isfinite(of["d"]))
 
     def gapped(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return t and ``values`` with a NaN in each gap of the stream, which breaks the line."""
@@ -113,65 +105,27 @@ def load_run(
     recording: Recording,
     start: float,
     end: float,
-    cache: Path | None,
     progress: Callable[[int], None] | None = None,
 ) -> RecordedRun:
     """Read what pictures need from ``start`` to ``end`` s. Raises RecordingError."""
-    states = _Columns(_TICK, {**dict.fromkeys(FINGERS, _FINGER), "object": _OBJECT})
-    true_fingers = {f"true_{name}": _TRUE for name in FINGERS}
-    truth = _Columns(("mono_ns",), {**true_fingers, "true_object": _TRUE_OBJECT})
-    for topic, message in recording.messages({schema.STATE, schema.TRUTH}, start, end, progress):
-        (states if topic == schema.STATE else truth).add(message)
-    models, why = _model(recording, cache)
+    found: dict[bytes, list[Any]] = {schema.STATE: [], schema.TRUTH: []}
+    for topic, message in recording.messages(found, start, end, progress):
+        found[topic].append(read(schema.TOPICS[topic].record, message))
+    states, truths = found.values()
+    truth = to_columns(truths) if truths else {}
     return RecordedRun(
-        recording.path.name,
-        models,
-        why,
-        states.arrays(),
-        truth.arrays() if truth.count else {},
-        recording.start,
+        recording.path.name, *_model(recording), to_columns(states), truth, recording.start
     )
 
 
-def _model(
-    recording: Recording, cache: Path | None
-) -> tuple[tuple[FingerModel, FingerModel] | None, str]:
+def _model(recording: Recording) -> tuple[tuple[FingerModel, FingerModel] | None, str]:
     try:
         settings, calibrations = recorded_settings(recording)
     except RecordingError as error:
         return None, str(error).removeprefix(f"{recording.path}: ")
     try:
         with tempfile.TemporaryDirectory() as folder:
-            models = make_models(with_calibrations(settings, calibrations, Path(folder)), cache)
+            models = make_models(with_calibrations(settings, calibrations, Path(folder)))
     except (SettingsError, TactileError, ValueError) as error:
         return None, f"its model can't be made: {error}"
     return models, ""
-
-
-class _Columns:
-    """Maps of one kind into one array a field. Maps that lack a field are skipped."""
-
-    def __init__(self, own: tuple[str, ...], nested: dict[str, tuple[str, ...]]) -> None:
-        self._own = own
-        self._nested = nested
-        self.names = [*own, *(f"{part}.{name}" for part in nested for name in nested[part])]
-        self._values = array("d")
-        self.count = 0
-
-    def add(self, message: dict[str, Any]) -> None:
-        """Add a row, unless the map lacks a field."""
-        try:
-            row = [float(message[name]) for name in self._own]
-            for part, names in self._nested.items():
-                inner = message[part]
-                row += [float(inner[name]) for name in names]
-        except (KeyError, TypeError, ValueError):
-            return
-        self._values.extend(row)
-        self.count += 1
-
-    def arrays(self) -> dict[str, FloatArray]:
-        """Return the columns by name, float64 [rows]."""
-        table = np.array(self._values, np.float64).reshape(-1, len(self.names)).T
-        columns = map(np.ascontiguousarray, table)
-        return dict(zip(self.names, columns, strict=True))

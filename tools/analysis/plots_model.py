@@ -1,4 +1,4 @@
-"""Pages that compare measurements with the contact model: over θ, and on the energy landscape.
+"""Pages of estimates beside the contact model, over θ and on the energy landscape, and of errors.
 
 The model is that of the recording's own settings and calibrations; force and energy are those of
 the state: the model times the scale of the tip's modulus that grips have found.
@@ -15,7 +15,7 @@ from softfinger.daemon.perception.finger_model import FingerModel
 from softfinger.daemon.types import FINGERS
 from softfinger.kinematics.contact.table import ContactTable
 from softfinger.tools import style
-from softfinger.tools.analysis.plots_data import FloatArray, RecordedRun
+from softfinger.tools.analysis.plots_data import BoolArray, FloatArray, Missing, RecordedRun
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -30,24 +30,25 @@ _POINTS = 700  # of each finger in one panel; more hide each other
 _CURVES = 5
 _SYMBOLS = {"left": "o", "right": "s"}
 _GRID = 241  # of the landscape along each axis
+_BINS = 41
+# Title, field, factor to the unit shown, unit
+_ROWS = (
+    ("d", "d", 1e6, "µm"),
+    ("θ", "theta", DEGREES, "°"),
+    ("force F", "force", 1.0, "N"),
+)
 
 
-def time_axis(panel: Axes, t: FloatArray) -> None:
-    """Set label and limits of the time axis."""
-    panel.set_xlabel("time [s]")
-    panel.set_xlim(float(t[0]), float(max(t[-1], t[0] + 1e-3)))
-
-
-def titled(figure: Figure, run: RecordedRun, text: str) -> None:
+def _titled(figure: Figure, run: RecordedRun, text: str) -> None:
     """Write the recording's name and ``text`` above a figure."""
     figure.suptitle(f"{run.name}: {text}", x=0.01, ha="left", fontsize=9.0)
 
 
-def _some(indices: NDArray[np.intp], count: int = _POINTS) -> NDArray[np.intp]:
-    """Return at most ``count`` of these, evenly spaced."""
-    if indices.size <= count:
+def _some(indices: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Return at most so many of these as are shown, evenly spaced."""
+    if indices.size <= _POINTS:
         return indices
-    return indices[np.linspace(0, indices.size - 1, count).astype(np.intp)]
+    return indices[np.linspace(0, indices.size - 1, _POINTS).astype(np.intp)]
 
 
 def _groups(
@@ -102,11 +103,8 @@ def draw_angle(run: RecordedRun) -> Figure:
     every = np.concatenate([run.states[f"{name}.gain"][run.touching(name)] for name in fingers])
     reach = max(1.6 * float(np.quantile(np.abs(every - 1.0), 0.98)), 0.01)
     gain.set_ylim(1.0 - reach, 1.0 + reach)
-    beyond = float((np.abs(every - 1.0) > reach).mean())
-    if beyond > 0.0:
-        gain.set_title(f"{100.0 * beyond:.2g} % beyond the frame", loc="right", fontsize=7.0)
     gain.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, borderaxespad=0.1)
-    titled(figure, run, "force and energy against θ")
+    _titled(figure, run, "force and energy against θ")
     return figure
 
 
@@ -153,27 +151,18 @@ def _against_angle(
     panel.set_ylim(bottom=0.0)
     panel.set_ylim(top=panel.get_ylim()[1] * 1.12)
     panel.margins(x=0.02)
-    labels = [f"{depth * 1e3:g} mm" for depth in depths]
-    gap, last = 0.045 * panel.get_ylim()[1], 0.0
-    for (x, y), text in zip(ends, labels, strict=True):
-        if y - last < gap:
-            continue
-        last = y
-        panel.annotate(
-            text, (x, y), (2, 2), textcoords="offset points", fontsize=6.5, ha="right", va="bottom"
-        )
+    tilts, heights = zip(*ends, strict=True)
+    style.label_ends(panel, max(tilts), heights, [f"{depth * 1e3:g} mm" for depth in depths])
     panel.legend(loc="upper left", ncols=3, columnspacing=1.0, handletextpad=0.4)
     return ScalarMappable(scale, colours)
 
 
 def _depths(d: FloatArray) -> FloatArray:
     """A few round displacements [m] that span the measured ones, at least one."""
+    from matplotlib.ticker import MaxNLocator
+
     largest = max(float(np.quantile(d, 0.995)), 2e-4) * 1e3
-    rough = largest / _CURVES
-    decade = 10.0 ** np.floor(np.log10(rough))
-    step = next(each * decade for each in (1.0, 2.0, 2.5, 5.0, 10.0) if each * decade >= rough)
-    depths: FloatArray = np.arange(1, int(np.ceil(largest / step)) + 1) * step * 1e-3
-    return depths
+    return np.asarray(MaxNLocator(_CURVES).tick_values(0.0, largest)[1:]) * 1e-3
 
 
 def draw_landscape(run: RecordedRun) -> Figure:
@@ -199,8 +188,8 @@ def draw_landscape(run: RecordedRun) -> Figure:
         panel.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=6, borderaxespad=0.1)
     above.axhline(0.0, color=style.GREY, linewidth=0.6)
     above.set_ylabel("U less that at θ = 0\nand the same d [mJ]")
-    time_axis(above, run.t)
-    titled(figure, run, "path on the energy landscape")
+    above.set_xlabel("time [s]")
+    _titled(figure, run, "path on the energy landscape")
     return figure
 
 
@@ -282,3 +271,71 @@ def draw_path(panel: Axes, d: FloatArray, theta: FloatArray, finger: str) -> Non
             clip_on=False,
             zorder=4,
         )
+
+
+def draw_error(run: RecordedRun) -> Figure:
+    """Estimate minus truth over time within ± 2σ as reported, and histograms."""
+    run.need_states()
+    if not run.truth:
+        raise Missing("no hand/truth in it: only simulated hands publish it")
+    at, true = run.matched()
+    both = {
+        name: run.touching(name)[at] & (run.truth[f"true_{name}.d"][true] > 0.0)
+        for name in run.fingers
+    }
+    if not any(each.any() for each in both.values()):
+        raise Missing("no contact in it")
+    figure = style.new_figure(7.2, 7.6)
+    axes = figure.subplots(4, 2, width_ratios=[3.4, 1.0], sharey="row", sharex="col")
+    t = run.t[at]
+    for panels, (title, field, factor, unit) in zip(axes, _ROWS, strict=False):
+        entries = []
+        for name, valid in both.items():
+            key = f"{name}.{field}"
+            error = (run.states[key][at] - run.truth[f"true_{key}"][true]) * factor
+            entries.append((name, error, run.states[f"{key}_std"][at] * factor, valid))
+        _row(panels, t, entries)
+        panels[0].set_ylabel(f"error of {title} [{unit}]")
+    error = (run.states["object.angle"][at] - run.truth["true_object.angle"][true]) * DEGREES
+    valid = (run.states["object.valid"][at] > 0.0) & np.all(list(both.values()), axis=0)
+    _row(axes[3], t, [("object", error, np.full(t.size, np.nan), valid)])
+    axes[3, 0].set_ylabel("error of φ [°]")
+    axes[3, 1].set_xlabel("share [%]")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    more, names = axes[3, 0].get_legend_handles_labels()
+    figure.legend(handles + more, labels + names, loc="outside lower center", ncols=5)
+    _titled(figure, run, "estimate minus truth; thin lines: ± 2σ as reported")
+    figure.align_ylabels()
+    axes[3, 0].set_xlabel("time [s]")
+    return figure
+
+
+def _row(
+    panels: tuple[Axes, Axes],
+    t: FloatArray,
+    entries: list[tuple[str, FloatArray, FloatArray, BoolArray]],
+) -> None:
+    """One quantity: name, error, reported σ and where both are valid, of each finger."""
+    panel, side = panels
+    known = [error[valid & np.isfinite(error)] for _, error, _, valid in entries]
+    together = np.concatenate(known)
+    if not together.size:
+        return
+    limit = 1.3 * float(np.quantile(np.abs(together), 0.995)) or 1e-12
+    for k, (name, error, std, valid) in enumerate(entries):
+        if not known[k].size:
+            continue
+        look = LINES.get(name, {"color": style.KINDS[2], "linestyle": "-"})
+        panel.plot(t, np.where(valid, error, np.nan), label=name, linewidth=0.7, **look)
+        counts, edges = np.histogram(known[k], _BINS, (-limit, limit))
+        side.stairs(100.0 * counts / known[k].size, edges, orientation="horizontal", **look)
+        text = f"{name}: mean {known[k].mean():.2g}, std {known[k].std():.2g}"
+        if np.isfinite(std[valid]).any():
+            band = np.where(valid, 2.0 * std, np.nan)
+            panel.fill_between(t, -band, band, color=look["color"], alpha=0.15, lw=0.6)
+            inside = np.abs(error[valid]) <= 2.0 * std[valid]
+            text += f", {100.0 * inside.mean():.1f} % within 2σ"
+        panel.text(
+            0.52 * k, 1.02, text, transform=panel.transAxes, fontsize=6.8, color=look["color"]
+        )
+    panel.set_ylim(-limit, limit)

@@ -8,22 +8,21 @@ import json
 import os
 import platform
 import sys
-from dataclasses import replace
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from softfinger.daemon.errors import SoftfingerError
 from softfinger.daemon.own_files import write_text
+from softfinger.tools.sweep import Sweep, add_sweep
 
 if TYPE_CHECKING:
     from softfinger.tools.benchmarks.measuring import Report, Row
 
 MEASUREMENTS = {
-    "contact": "lookup of force and energy, run time against error, beside SciPy",
-    "estimator": "pressure grid to d and tilt, run time against error",
+    "estimator": "lookup of force and energy, pressure grid to d and tilt: run time and error",
     "tick": "the tick back to back, in place and over ptys",
-    "startup": "start to the first published state, memory",
     "control": "what each grip law leaves of an object's angle",
     "reflex": "greater loads on a grip that bears one: held or lost, slid, answered",
     "scenes": "what each thing that a scene skips saves a tick",
@@ -33,10 +32,11 @@ CAMPAIGNS = {
     "faults": "faults on the emulated hand and what comes of them, an hour for 100 trials each",
     "witnesses": "false measurements, and the true force of a grip on them, a quarter of an hour",
 }
-PAGE = ("contact", "estimator", "tick", "startup")
-_PAGE_COLUMNS = ("median", "p99", "unit", "aim ≤")
+SWEPT = ("reflex", "witnesses")  # on virtual time, which others on the machine don't disturb
+PAGE = ("estimator", "tick")
+_PAGE_COLUMNS = ("median", "p99", "unit", "aim ≤", "relative error", "RMS of d [µm]")
 _CAMPAIGN = "campaign"
-FAILED, SLOWER = 1, 3  # exit statuses; 2 is for words that are refused
+FAILED = 1  # exit status; 2 is for words that are refused
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -59,26 +59,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--brief", action="store_true", help="fewer cases of each NAME, as for the page"
     )
     parser.add_argument("--full", action="store_true", help="all loads of 'reflex', not a few")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures here too")
-    parser.add_argument("--plot", type=Path, metavar="FILE", help="draw them (extra 'plot')")
     parser.add_argument(
-        "--against",
+        "--json",
         type=Path,
-        metavar="OLD.json",
-        help=f"show what is slower than in that file; exit status {SLOWER} if anything is",
+        metavar="FILE",
+        help=f"write the figures here too; after Ctrl-C the same call goes on ({', '.join(SWEPT)})",
     )
+    add_sweep(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Measure, print, and write the files that were asked for."""
-    from softfinger.tools.benchmarks.measuring import Report, slower
+    from softfinger.tools.benchmarks.measuring import Report
 
     campaign = arguments.names[:1] == [_CAMPAIGN]
     texts = CAMPAIGNS if campaign else MEASUREMENTS
     names = arguments.names[1:] if campaign else arguments.names or list(PAGE)
     try:
         _check(names, texts, arguments)
-        old = _read(arguments.against) if arguments.against else []
     except ValueError as error:
         print(f"bench: {error}", file=sys.stderr)
         return 2
@@ -88,8 +86,8 @@ def run(arguments: argparse.Namespace) -> int:
     status = 0
     for name in names:
         print(f"measuring {texts[name]} …", file=sys.stderr, flush=True)
-        found, sticks = _measured(name, campaign, arguments)
-        rows += _kept(name, [*found, sticks])
+        found = _measured(name, campaign, arguments)
+        rows += _kept(name, found)
         if any(table.failed for table in found) or not found:
             status = FAILED
         if arguments.names:
@@ -104,36 +102,37 @@ def run(arguments: argparse.Namespace) -> int:
         content = about | {"python": platform.python_version(), "rows": rows}
         with write_text(arguments.json) as file:
             file.write(json.dumps(content, indent=2) + "\n")
-    if arguments.plot:
-        _draw(tables, arguments.plot)
-    if old:
-        comparison = slower(old, rows)
-        print(comparison)
-        status = status or (SLOWER if comparison.rows else 0)
+        for name in names:
+            _journal(arguments.json, name).unlink(missing_ok=True)
     return status
 
 
-def _measured(
-    name: str, campaign: bool, arguments: argparse.Namespace
-) -> tuple[list[Report], Report]:
-    """A measurement's tables, none where it failed, and the yardsticks before and after it."""
-    from softfinger.tools.benchmarks.measuring import Report, figure, yardsticks
+def _journal(file: Path, name: str) -> Path:
+    return file.with_name(f"{file.name}.{name}.part")
 
-    before, tables = yardsticks(), []
+
+def _measured(name: str, campaign: bool, arguments: argparse.Namespace) -> list[Report]:
+    """A measurement's tables, none where it failed."""
+    tables: list[Report] = []
+    more: dict[str, Any] = {"full": True} if arguments.full else {}
+    if name in SWEPT:
+
+        def sweep(work: Callable[[Any], Any], cases: list[Any]) -> Iterator[Any]:
+            journal = _journal(arguments.json, name) if arguments.json else None
+            return Sweep(name, work, cases, journal).run(arguments.processes, arguments.scheduler)
+
+        more["sweep"] = sweep
     try:
         if campaign:
-            tables = _module(name).measure(arguments.trials, arguments.only)
+            tables = _module(name).measure(arguments.trials, arguments.only, **more)
         else:
-            more = {"full": True} if arguments.full else {}
             tables = _module(name).measure(brief=arguments.brief or not arguments.names, **more)
     except (RuntimeError, SoftfingerError) as error:  # on a busy machine a hand may let go
         print(f"bench: {name}: {error}", file=sys.stderr)
     for table in tables:
         if table.failed:
             print(*table.notes, sep="\n", file=sys.stderr)
-    after = yardsticks()
-    sticks = [figure(name, "µs", before[name] + after[name]) for name in before]
-    return tables, Report("", sticks)
+    return tables
 
 
 def _kept(name: str, tables: list[Report]) -> list[Row]:
@@ -148,8 +147,7 @@ def _kept(name: str, tables: list[Report]) -> list[Row]:
 
 def _page(tables: list[Report]) -> list[Row]:
     return [
-        {"name": f"{table.title}: {row['name']}"}
-        | {key: row.get(key) for key in (*_PAGE_COLUMNS, table.x) if key}
+        {"name": f"{table.title}: {row['name']}"} | {key: row.get(key) for key in _PAGE_COLUMNS}
         for table in tables
         for row in table.rows
     ]
@@ -157,19 +155,6 @@ def _page(tables: list[Report]) -> list[Row]:
 
 def _module(name: str) -> ModuleType:
     return importlib.import_module(f"softfinger.tools.benchmarks.{name}")
-
-
-def _draw(tables: list[Report], path: Path) -> None:
-    """Tables of points as they are, bars of the rows with the first one's unit."""
-    from softfinger.tools.benchmarks.picture import draw
-
-    panels = []
-    for table in tables:
-        bars = [row for row in table.rows if row.get("unit") == table.rows[0].get("unit")]
-        panels.append(table if table.x else replace(table, rows=bars))
-    panels = [panel for panel in panels if any("median" in row for row in panel.rows)]
-    if panels:
-        draw(panels, path)
 
 
 def _processor() -> str:
@@ -193,27 +178,6 @@ def _check(names: list[str], texts: dict[str, str], arguments: argparse.Namespac
             raise ValueError(f"found {name!r}, expected one of {', '.join(texts)}{hint}")
         if texts is CAMPAIGNS and not any(arguments.only in case for case in _module(name).NAMES):
             raise ValueError(f"--only {arguments.only}: no case of {name} has this in its name")
-    if arguments.plot:
-        from softfinger.tools.extras import MissingExtra
-        from softfinger.tools.style import settings
-
-        if texts is CAMPAIGNS:
-            raise ValueError("--plot: campaigns have no picture")
-        try:
-            settings()
-        except MissingExtra as error:
-            raise ValueError(f"--plot: {error}") from None
-
-
-def _read(path: Path) -> list[Row]:
-    """The rows of an earlier run. Raises ValueError."""
-    try:
-        found: list[Row] = json.loads(path.read_text(encoding="utf-8"))["rows"]
-        if not all({"measurement", "table", "name"} <= row.keys() for row in found):
-            raise KeyError("rows")
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"--against {path}: no figures of `bench --json`: {error}") from None
-    return found
 
 
 def _count(text: str) -> int:

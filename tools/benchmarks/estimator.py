@@ -1,15 +1,22 @@
-"""The estimator's run time and error a frame, beside the Cramér-Rao bound.
+"""Run time against error: the contact table's lookup, and the estimator's frame.
 
-All of one run, in turns, over the same frames: 44 × 44 cells on 58 mm, d = 4 mm, a tilt of 15°,
-0.2 % of the modulus as noise. "kernel" is the compiled entry called by compiled code, "call" the
-Python call of the control loop. Errors are RMS over these frames; "sensor" rows have those of a
-profile's own cells, pressed so for a second.
+All of one run, in turns. Lookups are of the same points, d up to 8 mm, half of them spread evenly
+and half by orders of magnitude down to 1 µm, |θ| up to 30°; errors are the largest relative ones,
+against the integrals with many nodes. Ours give force, energy and their four partials, SciPy's
+splines force and energy alone, interpolated as ratios to the closed form in (d, θ²).
+
+Frames are 44 × 44 cells on 58 mm, d = 4 mm, a tilt of 15°, 0.2 % of the modulus as noise, estimated
+by the control loop's Python call; a solid tip's beside springs' in the same turns. Errors are RMS
+over these frames, beside the Cramér-Rao bound; "sensor" rows have those of a profile's own cells,
+pressed so for a second.
 """
 
 from __future__ import annotations
 
+import contextlib
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -21,14 +28,11 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.emulator.tactile_board import ENCODERS
 from softfinger.daemon.simulation.sensor.simulated_tactile import make_sensor_model
 from softfinger.daemon.tactile.cobs import CobsDecoder
-from softfinger.kinematics.compiled.kernel import kernel
-from softfinger.kinematics.compiled.layout import Records
-from softfinger.kinematics.contact.closed_form import Fingertip
+from softfinger.kinematics.contact.closed_form import Fingertip, closed_forms
 from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.contact.quadrature import integrate
+from softfinger.kinematics.contact.table import ContactTable
 from softfinger.kinematics.estimation.estimator import ContactEstimator
-from softfinger.kinematics.estimation.frame_pipeline import estimate_frame
-from softfinger.kinematics.estimation.solid_projection import SolidFit
-from softfinger.kinematics.estimation.state import EstimatorState
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from softfinger.tools.benchmarks.measuring import Report, Subject, each, figure, interleave
 from softfinger.tools.benchmarks.rigs import SENSORS
@@ -38,6 +42,7 @@ Truth: TypeAlias = tuple[float, float, float]  # d [m], tilt_x, tilt_y [rad]
 
 ERROR = "RMS of d [µm]"
 TIP = Fingertip(radius=0.020)
+SOLID = Fingertip(0.020, "solid")
 MODULUS = 0.304e6  # Pa
 LINEAR = Material.constant(MODULUS)
 SIZE, WIDTH = 44, 0.058  # cells a side, m
@@ -46,23 +51,16 @@ _PASCAL_PER_COUNT = 4.0
 _FRAMES = 32
 _STEPS = (1e-7, 1e-5, 1e-5, 1e-4)
 
-
-@dataclass
-class Timed:
-    """A function to time, and the array for what it finds in the frames [n, 3]."""
-
-    subject: Subject
-    aim_us: float | None = None
-    found: FloatArray | None = None
-    truth: Truth = (0.0, 0.0, 0.0)
-
-    @property
-    def errors(self) -> dict[str, float]:
-        """RMS of d and of the tilts."""
-        return {} if self.found is None else _errors(self.found, self.truth)
+LOOKUP_ERROR = "relative error"
+_LAW = Material.table_i()
+_DEEPEST, _STEEPEST = 0.008, math.radians(30.0)  # m, rad
+_NODES = 64  # a side, of SciPy's splines
+_SINGLE = 16  # points that calls with floats go round
+_CALL_NS = 800.0  # aim of a call
 
 
-def _errors(found: FloatArray, truth: Truth) -> dict[str, float]:
+def rms_errors(found: FloatArray, truth: Truth) -> dict[str, float]:
+    """Return RMS of d and of the tilts."""
     rms = np.sqrt(np.mean((found - np.array(truth)) ** 2, axis=0))
     return {ERROR: 1e6 * float(rms[0]), "of tilts [°]": math.degrees(math.hypot(*rms[1:]))}
 
@@ -76,49 +74,111 @@ def tilts(theta: float, azimuth: float) -> tuple[float, float]:
 GRID = SensorGrid(SIZE, SIZE, WIDTH / SIZE, (0.31 * WIDTH / SIZE, -0.17 * WIDTH / SIZE))
 TRUTH: Truth = (0.004, *tilts(math.radians(15.0), 0.7))
 _CORNER: Truth = (0.008, *tilts(math.radians(30.0), 0.7))
+_LIGHT: Truth = (0.001, 0.0, 0.0)
 
 
 def measure(brief: bool = False, rounds: int = 25) -> list[Report]:
+    """Return times with errors of lookups and of frames."""
+    rounds = 10 if brief else rounds
+    return [lookups(rounds), frames_to_contacts(rounds)]
+
+
+def lookups(rounds: int, count: int = 512) -> Report:
+    """Return times of a point [ns], of ``count`` points at once and called one by one."""
+    rng = np.random.default_rng(3)
+    even = rng.uniform(0.0, _DEEPEST, count)
+    spread = 10.0 ** rng.uniform(-6.0, np.log10(_DEEPEST), count)
+    d = np.where(np.arange(count) % 2 == 0, even, spread)
+    theta = rng.uniform(-_STEEPEST, _STEEPEST, count)
+    exact = np.stack(integrate(TIP, _LAW, d, theta, 40))
+    tables = {f"table to {each:g}": ContactTable.build(TIP, _LAW, each) for each in (1e-9, 1e-12)}
+    calls: dict[str, Callable[..., Any]] = {**tables, **_splines()}
+    single = list(zip(d[:_SINGLE].tolist(), theta[:_SINGLE].tolist(), strict=True))
+    whole = {name: replace(each(call, [(d, theta)]), calls=count) for name, call in calls.items()}
+    alone = {f"{name}, called": each(call, single) for name, call in calls.items()}
+    rows = []
+    for name, taken in interleave(whole | alone, rounds).items():
+        call = calls[name.removesuffix(", called")]
+        pairs = zip(call(d, theta), exact, strict=False)  # of as many outputs as there are
+        error = max(float(np.max(np.abs(found / true - 1.0))) for found, true in pairs)
+        aim = _CALL_NS if name in alone and call in tables.values() else None
+        rows.append(figure(name, "ns", taken, aim, **{LOOKUP_ERROR: error}))
+    return Report("lookup", rows)
+
+
+def _splines() -> dict[str, Callable[..., Any]]:
+    """Force and energy as a user of SciPy would get them, by degree; empty without SciPy."""
+    with contextlib.suppress(ImportError):
+        from scipy.interpolate import RectBivariateSpline
+
+        at, squares = np.linspace(1e-9, _DEEPEST, _NODES), np.linspace(0.0, _STEEPEST**2, _NODES)
+        values = integrate(TIP, _LAW, at[:, None], np.sqrt(squares))
+        over = closed_forms(MODULUS, at[:, None], np.sqrt(squares))
+        ratios = values.force / over.force, values.energy / over.energy
+
+        def splines(degree: int) -> Callable[..., Any]:
+            f, u = (RectBivariateSpline(at, squares, each, kx=degree, ky=degree) for each in ratios)
+
+            def call(d: Any, theta: Any) -> tuple[Any, Any]:
+                cosine, square = np.cos(theta), theta * theta
+                force = math.pi * MODULUS * d * d / cosine
+                return force * f.ev(d, square), force * d / (3.0 * cosine) * u.ev(d, square)
+
+            return call
+
+        return {f"RectBivariateSpline: degree {degree}": splines(degree) for degree in (3, 5)}
+    return {}
+
+
+def frames_to_contacts(rounds: int) -> Report:
     """Return times with errors, and the bound."""
     noise = np.random.default_rng(4).standard_normal((_FRAMES, SIZE, SIZE))
     frames = GRID.pressure(TIP, LINEAR, *TRUTH) + NOISE * noise
     empty, deep = NOISE * noise, GRID.pressure(TIP, LINEAR, *_CORNER) + NOISE * noise
-    call = ContactEstimator(TIP, LINEAR, GRID, NOISE).update
-    cases = {
-        "moments: warm, kernel": kernel_case(frames, TRUTH, 1.0, method="moments"),
-        "ml: warm, kernel": kernel_case(frames, TRUTH, 15.0),
-        "ml: cold, kernel": kernel_case(frames, TRUTH, 30.0, cold=True),
-        "ml: warm, call": Timed(each(call, [(frame,) for frame in frames])),
-        "ml: at (8 mm, 30°), warm, kernel": kernel_case(deep, _CORNER, 15.0),
-        "no contact: kernel": replace(kernel_case(empty, TRUTH, 0.3), found=None),
-        "decode: cobs": Timed(decode(frames), aim_us=10.0),
+
+    def solid(truth: Truth) -> tuple[Callable[[], FloatArray], Truth, float]:
+        frames = GRID.pressure(SOLID, LINEAR, *truth) + NOISE * noise
+        return estimates(frames, tip=SOLID), truth, 15.0
+
+    cases: dict[str, tuple[Callable[[], FloatArray], Truth | None, float | None]] = {
+        "moments: warm": (estimates(frames, method="moments"), TRUTH, None),
+        "ml: warm": (estimates(frames), TRUTH, 15.0),
+        "ml: cold": (estimates(frames, cold=True), TRUTH, 30.0),
+        "ml: at (8 mm, 30°), warm": (estimates(deep), _CORNER, 15.0),
+        "solid: at 1 mm, warm": solid(_LIGHT),
+        "solid: warm": solid(TRUTH),
+        "solid: at (8 mm, 30°), warm": solid(_CORNER),
+        "no contact": (estimates(empty), None, None),
     }
-    times = interleave(
-        {name: case.subject for name, case in cases.items()}, 10 if brief else rounds
-    )
-    rows = [
-        figure(name, "µs", 1e-3 * times[name], case.aim_us, **case.errors)
-        for name, case in cases.items()
-    ]
+    subjects = {name: timed_frames(run) for name, (run, _, _) in cases.items()}
+    times = interleave({**subjects, "decode: cobs": decode(frames)}, rounds)
+    quickest = {name: float(np.min(taken)) for name, taken in times.items()}  # beside any load
+    rows = []
+    for name, (run, truth, aim) in cases.items():
+        more = rms_errors(run(), truth) if truth else {}
+        if "solid" in name:
+            more["× ml: warm"] = quickest[name] / quickest["ml: warm"]
+        rows.append(figure(name, "µs", 1e-3 * times[name], aim, **more))
+    rows.append(figure("decode: cobs", "µs", 1e-3 * times["decode: cobs"], 10.0))
     sigma = np.sqrt(np.diag(bound(jacobian(GRID, (*TRUTH, 1.0)), NOISE)))
     rows.append({"name": "Cramér-Rao bound", ERROR: 1e6 * float(sigma[0])})
     for sensor, flaws in {"ideal": {}, **SENSORS}.items():
-        errors = _errors_of(Settings.model_validate(flaws))
-        rows.append({"name": f"ml: sensor {sensor}", **errors})
-    return [Report("frame to contact", rows, ERROR)]
+        found = settled(Settings.model_validate(flaws), TRUTH)
+        rows.append({"name": f"ml: sensor {sensor}", **rms_errors(found, TRUTH)})
+    return Report("frame to contact", rows)
 
 
-def _errors_of(settings: Settings) -> dict[str, float]:
-    """Errors on the frames of a profile's sensor."""
+def settled(settings: Settings, truth: Truth, count: int = _FRAMES) -> FloatArray:
+    """Return d, tilts [count, 3] from frames of a profile's sensor that was pressed so for 1 s."""
     model = make_sensor_model(settings, 0)
     estimator = make_estimator(settings, make_material(settings.material))
     counts = np.zeros(model.grid.shape, np.uint16)
     found = []
-    for k in range(round(settings.tactile.rate) + _FRAMES):
-        model.frame(*TRUTH, counts, k / settings.tactile.rate)
+    for k in range(round(settings.tactile.rate) + count):
+        model.frame(*truth, counts, k / settings.tactile.rate)
         estimate = estimator.update(counts, settings.tactile.pascal_per_count)
         found.append((estimate.d, estimate.tilt_x, estimate.tilt_y))
-    return _errors(np.array(found[-_FRAMES:]), TRUTH)
+    return np.array(found[-count:])
 
 
 def jacobian(grid: SensorGrid, truth: tuple[float, float, float, float]) -> FloatArray:
@@ -140,44 +200,31 @@ def bound(slopes: FloatArray, noise: float, free: bool = True) -> FloatArray:
     return np.asarray(np.linalg.inv(used.T @ used) * noise**2)
 
 
-@kernel
-def _loop(
-    repeat: int,
+def estimates(
     frames: FloatArray,
-    cold: bool,
-    states: Records[EstimatorState],
-    scratch: FloatArray,
-    places: NDArray[np.int64] | None,
-    solids: Records[SolidFit] | None,
-    out: FloatArray,
-) -> None:
-    estimate = states[0].estimate
-    for _ in range(repeat):
-        for k in range(frames.shape[0]):
-            if cold:
-                estimate.warm = False
-            estimate_frame(states, frames[k], 1.0, 0.0, scratch, places, solids)
-            out[k, 0] = estimate.d
-            out[k, 1] = estimate.tilt_x
-            out[k, 2] = estimate.tilt_y
-
-
-def kernel_case(
-    frames: FloatArray,
-    truth: Truth,
-    aim_us: float | None = None,
-    cold: bool = False,
     grid: SensorGrid = GRID,
+    cold: bool = False,
+    tip: Fingertip = TIP,
     **options: Any,
-) -> Timed:
-    """Return the compiled entry, from the last estimate or from each frame alone."""
-    estimator = ContactEstimator(TIP, LINEAR, grid, NOISE, **options)
-    out = np.zeros((len(frames), 3))
+) -> Callable[[], FloatArray]:
+    """Return the control loop's calls on these frames, each alone if ``cold``: d, tilts [n, 3]."""
+    estimator = ContactEstimator(tip, LINEAR, grid, NOISE, **options)
 
-    def run(repeat: int) -> None:
-        _loop(repeat, frames, cold, estimator.state.array, *estimator.scratch, out)
+    def run() -> FloatArray:
+        found = np.empty((len(frames), 3))
+        for k, frame in enumerate(frames):
+            if cold:
+                estimator.reset()
+            estimate = estimator.update(frame)
+            found[k] = estimate.d, estimate.tilt_x, estimate.tilt_y
+        return found
 
-    return Timed(Subject(run, len(frames)), aim_us, out, truth)
+    return run
+
+
+def timed_frames(run: Callable[[], FloatArray]) -> Subject:
+    """Return `estimates` to be timed, a frame being a call."""
+    return replace(each(run, [()]), calls=len(run()))
 
 
 def decode(frames: FloatArray) -> Subject:

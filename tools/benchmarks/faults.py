@@ -1,9 +1,8 @@
 """Campaign: each fault many times on an emulated hand and its daemon, each trial seeded.
 
 For each: the safe state and the time to it, the fault's name, goals within their limits on the
-servos' wire (by the emulated hand's own record), no crash, no hang, and a hand that grips again. A
-trial that went otherwise than expected while other programs held the processors is done again and
-counted as disturbed; what must never be is never excused by that.
+servos' wire (by the emulated hand's own record), no crash, no hang, and a hand that grips again. On
+a busy machine a trial may go otherwise than expected; what must never be stands apart.
 """
 
 from __future__ import annotations
@@ -33,27 +32,20 @@ from softfinger.tools.benchmarks.rigs import Rig, RigError, stopped
 # Begins a fault; what it returns ends the fault.
 End = Callable[[], object]
 Inject = Callable[[Rig, random.Random], End]
-# works: it goes on gripping. fault: torque off by a fault. either: one of both. lets go: the joints
-# stay where they are, without a fault. dies: the daemon is gone, the servos stop by themselves.
-# stops: `stop` is sent, and no motor is driven in time, with a fault or without.
-Expect = Literal["works", "fault", "either", "lets go", "dies", "stops"]
+# works: it goes on gripping. fault: torque off by a fault. lets go: the joints stay where they are,
+# without a fault. dies: the daemon is gone, the servos stop by themselves. stops: `stop` is sent,
+# and no motor is driven in time, with a fault or without.
+Expect = Literal["works", "fault", "lets go", "dies", "stops"]
 
 _TRIALS = 100
 _SHOWN = 5  # failures that are listed of each case
 _GIVE_UP = 3  # trials in a row whose set-up failed
-_SLACK = 0.05  # s that a look may come after what it sees, and a process be late
-_WAITED = 0.015  # s between two looks that others took: what is late then is theirs
+_SLACK = 0.05  # s by which a poll may lag, and a process be late
 _RESOLUTION = 0.0016  # rad, a count of the servo's
 _CURRENT_UNIT = 0.0027  # A
-_READY_WITHIN = 15.0  # s
-_PLACE_AFTER = 5.0  # s without a grip: the object has slipped away, and is put back
-_TRIPPED = 0.7  # s in which the daemon finds that a servo was stopped
-_TRIES = 5
-_ASKEW = 0.07  # rad between the faces that the tips feel, above which an object is put upright
+_READY_WITHIN = 30.0  # s
 _GRIPPING = ("grasping", "holding", "rotating")
 _TURN = 0.08  # rad
-
-# The cases
 
 _SETTINGS = Settings()
 _WATCHDOG = _SETTINGS.servos.watchdog + 0.02  # the servo counts in steps of 20 ms
@@ -61,10 +53,9 @@ _AT_ONCE = 0.03
 _SILENT = _SETTINGS.servos.fault_after + _AT_ONCE
 _FRAMES = _SETTINGS.safety.frame_age_fault / 100.0 + 0.01 + _AT_ONCE  # of a board of 100 Hz
 _FROZEN = _SETTINGS.safety.frozen_after + 0.05  # judged in turn
-_STOP = 0.2  # s from a stop to no motor driven, whatever gets lost
+_STOP = 0.2  # s from a stop to no motor driven
 _SAME = 0.3  # s in which a hand that holds may send the same goal, of which none is missed
 _ROOM = 1 << 18  # bytes that a daemon without memory may still take
-_JUDGED = 0.1  # s: a row that is judged in turn and must stand for half of that
 
 
 @dataclass(frozen=True)
@@ -76,7 +67,7 @@ class FaultCase:
     inject: Inject
     names: tuple[str, ...] = ()  # of the fault that may latch
     within: float = 0.0  # s in which no motor must be driven any more, where it faults
-    lasts: float = 3.0  # s, at most, that it is looked at
+    lasts: float = 3.0  # s, at most, that it is watched
     holding_only: bool = False  # the hand must hold; else it may be closing or turning, too
 
 
@@ -103,17 +94,13 @@ def _killed(rig: Rig, chance: random.Random) -> End:
     return rig.start_daemon
 
 
-def _stood_still(seconds: float) -> Inject:
-    """The daemon's process is stopped for so long, then goes on."""
-
-    def inject(rig: Rig, chance: random.Random) -> End:
-        assert rig.daemon is not None
-        rig.daemon.send_signal(signal.SIGSTOP)
-        timer = threading.Timer(seconds, rig.daemon.send_signal, (signal.SIGCONT,))
-        timer.start()
-        return timer.join
-
-    return inject
+def _stood_still(rig: Rig, chance: random.Random) -> End:
+    """The daemon's process is stopped for 2 s, then goes on."""
+    assert rig.daemon is not None
+    rig.daemon.send_signal(signal.SIGSTOP)
+    timer = threading.Timer(2.0, rig.daemon.send_signal, (signal.SIGCONT,))
+    timer.start()
+    return timer.join
 
 
 def _without_memory(rig: Rig, chance: random.Random) -> End:
@@ -133,68 +120,36 @@ _works = partial(FaultCase, expect="works", lasts=0.3)
 _fault = partial(FaultCase, expect="fault")
 _silent = partial(_fault, names=("servos.silent",), within=_SILENT)
 _blind = partial(_fault, names=("tactile.silent",), within=_FRAMES)
-_MISREAD = ("tactile.silent", "tip.force", "tip.displacement", "tip.tilt", "hand.angle",
-            "hand.width")  # fmt: skip
 
 CASES: tuple[FaultCase, ...] = (
-    *(
-        (_silent if share == 1.0 and kind != "duplicate" else _works)(
-            f"replies {name}, {share:.0%}", inject=_sent(f"{kind}={share}")
-        )
-        for kind, name in (("drop", "dropped"), ("late", "late"), ("corrupt", "corrupted"),
-                           ("truncate", "truncated"), ("duplicate", "doubled"))
-        for share in (0.01, 0.1, 1.0)
-    ),
-    _fault("one servo silent", inject=_servo("silent={}", "answer={}"), names=("servos.silent",),
-           within=_WATCHDOG),
+    _works("replies dropped, 10%", inject=_sent("drop=0.1")),
+    _works("replies corrupted, 10%", inject=_sent("corrupt=0.1")),
+    _silent("replies dropped, 100%", inject=_sent("drop=1")),
+    _silent("one servo silent", inject=_servo("silent={}", "answer={}"), within=_WATCHDOG),
     _silent("one servo rebooted", inject=_servo("reboot={}", "")),
-    *(
-        _fault(f"one servo {name}", inject=_servo(f"{kind}={{0}}", "recover={0} reboot={0}"),
-               names=("servos.alert", *more), within=_SILENT)
-        for kind, name, more in (("overheat", "overheated", ("servos.temperature",)),
-                                 ("overload", "overloaded", ()),
-                                 ("undervoltage", "without supply", ("servos.voltage",)))
-    ),
-    *(
-        _fault(f"one servo's {name}", inject=_servo(f"{kind}={{}}", "recover={}"), names=(latched,),
-               within=within)
-        for kind, name, latched, within in (
-            ("stuck", "encoder stuck", "joint.dead",
-             0.05 / _SETTINGS.control.approach_speed + _JUDGED),
-            ("jump", "encoder jumped", "joint.jump", _AT_ONCE),
-            ("frozen", "readings frozen", "servos.frozen", 0.12 + _AT_ONCE),
-            ("refuse", "readings refused", "servos.silent", _SILENT),
-        )
-    ),
+    _silent("one servo overheated", inject=_servo("overheat={0}", "recover={0} reboot={0}"),
+            names=("servos.alert", "servos.temperature")),
+    _fault("one servo's encoder jumped", inject=_servo("jump={}", "recover={}"),
+           names=("joint.jump",), within=_AT_ONCE),
+    _fault("one servo's readings frozen", inject=_servo("frozen={}", "recover={}"),
+           names=("servos.frozen",), within=0.12 + _AT_ONCE),
     _fault("writes lost, 100%", inject=_sent("lose-writes=1"), names=("goal.lost",),
            within=_SAME + 0.05 + _STOP),
-    *(FaultCase(f"stop, {share:.0%} lost each way", "stops", _sent(f"lose={share} drop={share}"),
-           within=_STOP) for share in (0.0, 0.5, 0.9)),
-    FaultCase("stop, writes lost", "stops", _sent("lose-writes=1"), within=_STOP),
+    FaultCase("stop, 90% lost each way", "stops", _sent("lose=0.9 drop=0.9"), within=_STOP),
     _fault("servos' port gone and back", inject=_sent("unplug", "plug"), names=("servos.bus",),
            within=_WATCHDOG),
-    *(_blind(f"board {name}", inject=_board(f"{{}}:{words}"))
-      for name, words in (("silent", "silent"), ("noisy, 100%", "noisy=1"),
-                          ("torn, 100%", "torn=1"), ("of the wrong size", "wrong-size"))),
+    _blind("board silent", inject=_board("{}:silent")),
+    _blind("board torn, 100%", inject=_board("{}:torn=1")),
     _blind("board's port gone and back", inject=_board("{}:unplug", "{}:plug")),
     _fault("board frozen", inject=_board("{}:frozen"), names=("tactile.frozen",), within=_FROZEN,
            holding_only=True),
-    _fault("board saturated", inject=_board("{}:saturated"), names=_MISREAD[:3], within=_FRAMES),
-    FaultCase("board noisy, 10%", "either", _board("{}:noisy=0.1"), _MISREAD, 0.5, 0.5, True),
-    FaultCase("board torn, 10%", "either", _board("{}:torn=0.1"), ("tactile.silent",), 0.5, 0.5),
     FaultCase("board zero", "lets go", _board("{}:zero"), lasts=0.4, holding_only=True),
     FaultCase("daemon killed", "dies", _killed, within=_WATCHDOG),
-    # As long as a servo's reading may be old: the first one after it decides.
-    FaultCase("daemon stood still for 50 ms", "either", _stood_still(0.05), ("servos.silent",),
-              _SILENT, 0.3),
-    _fault("daemon stood still for 2 s", inject=_stood_still(2.0),
+    _fault("daemon stood still for 2 s", inject=_stood_still,
            names=("servos.bus", "servos.silent", "tactile.silent"), within=_WATCHDOG, lasts=4.0),
     _works("daemon without memory", inject=_without_memory),
 )  # fmt: skip
 NAMES = tuple(case.name for case in CASES)
-
-
-# The campaign
 
 
 @dataclass
@@ -206,14 +161,8 @@ class Trial:
     fault: str = ""  # its name
     fault_s: float = math.nan  # until the daemon published it
     safe_s: float = math.nan  # until no motor was driven any more
-    waited_s: float = 0.0  # longest between two looks that others had the processor
     wrong: str = ""  # what must never be
     missed: str = ""  # what was not as expected, and may be the busy machine's doing
-
-    @property
-    def disturbed(self) -> bool:
-        """Not as expected, while other processes held this one up: no measurement."""
-        return bool(self.missed) and not self.wrong and self.waited_s > _WAITED
 
     @property
     def failure(self) -> str:
@@ -229,8 +178,8 @@ def measure(trials: int | None = None, only: str = "") -> list[Report]:
         for case in CASES:
             if only not in case.name:
                 continue
-            found, disturbed = run_trials(trials or _TRIALS, partial(trial, rig, case))
-            row = summary(case, found, disturbed)
+            found = run_trials(trials or _TRIALS, partial(trial, rig, case))
+            row = summary(case, found)
             print(f"{case.name}: {row['passed']} of {row['trials']}", file=sys.stderr, flush=True)
             rows.append(row)
             wrong = [f"seed {each.seed}, {each.failure}" for each in found if each.failure]
@@ -239,35 +188,28 @@ def measure(trials: int | None = None, only: str = "") -> list[Report]:
     return [Report("fault", rows, notes=tuple(notes), failed=failed)]
 
 
-def run_trials(trials: int, one: Callable[[int], Trial]) -> tuple[list[Trial], int]:
-    """Return ``trials`` of ``one(seed)`` that count, and how many were disturbed and made again.
-
-    That many may be made again at most. A RigError is a failed trial; three in a row end the case.
-    """
+def run_trials(trials: int, one: Callable[[int], Trial]) -> list[Trial]:
+    """Return ``trials`` of ``one(seed)``; a RigError is a failed one, three in a row end them."""
     found: list[Trial] = []
-    disturbed = in_a_row = seed = 0
+    in_a_row = 0
     while len(found) < trials and in_a_row < _GIVE_UP:
-        seed += 1
+        seed = len(found) + 1
         try:
-            each, in_a_row = one(seed), 0
+            found.append(one(seed))
+            in_a_row = 0
         except RigError as error:
-            each, in_a_row = Trial(seed, wrong=f"the set-up failed: {error}"), in_a_row + 1
-        if each.disturbed and disturbed < trials:
-            disturbed += 1
-        else:
-            found.append(each)
-    return found, disturbed
+            found.append(Trial(seed, wrong=f"the set-up failed: {error}"))
+            in_a_row += 1
+    return found
 
 
-def summary(case: FaultCase, found: list[Trial], disturbed: int) -> Row:
+def summary(case: FaultCase, found: list[Trial]) -> Row:
     """Return counts, and times [ms] of those trials that have them: median and greatest."""
-    passed, count = sum(not each.failure for each in found), len(found)
     row: Row = {
         "name": case.name,
         "expected": case.expect,
-        "passed": passed,
-        "trials": count,
-        "disturbed": disturbed,
+        "passed": sum(not each.failure for each in found),
+        "trials": len(found),
     }
     for key, times in (
         ("fault ms", [each.fault_s for each in found]),
@@ -276,7 +218,7 @@ def summary(case: FaultCase, found: list[Trial], disturbed: int) -> Row:
         seen = 1e3 * np.array([time for time in times if np.isfinite(time)])
         row[key] = float(np.median(seen)) if seen.size else None
         row[f"{key} at most"] = float(seen.max()) if seen.size else None
-    row["allowed ms"] = 1e3 * case.within if case.expect in ("fault", "dies", "stops") else None
+    row["allowed ms"] = 1e3 * case.within or None
     counts = Counter(each.fault for each in found if each.fault)
     row["faults"] = ", ".join(f"{fault} {count}" for fault, count in counts.items())
     return row
@@ -287,10 +229,19 @@ def trial(rig: Rig, case: FaultCase, seed: int) -> Trial:
     chance = random.Random(f"{case.name} {seed}")
     found = Trial(seed)
     rig.start()
-    _grip(rig, case, chance, found)
+    if not _ready(rig, chance):
+        raise RigError(f"the hand does not grip: {rig.status()}")
+    found.phase = "holding" if case.holding_only else chance.choice(_GRIPPING)
+    if found.phase == "grasping":
+        rig.ask({"command": "grasp", "force": chance.uniform(4.0, 9.0)})
+    elif found.phase == "rotating":
+        rig.ask({"command": "rotate", "angle": chance.uniform(-_TURN, _TURN)})
+    time.sleep(chance.uniform(0.0, 0.02))
+    rig.states(0.0)
+    rig.report("forget")
     end = case.inject(rig, chance)
     try:
-        _look(rig, case, found)
+        _watch(rig, case, found)
     finally:
         end()
     judge_wire(rig, found)
@@ -300,100 +251,48 @@ def trial(rig: Rig, case: FaultCase, seed: int) -> Trial:
     elif rig.status(2.0) is None:
         found.wrong = "the daemon does not answer"
     judge(case, found)
-    stays = case.expect == "works" and not found.failure
-    if not stays and not _ready(rig, chance):
+    if not _ready(rig, chance):
         found.wrong = found.wrong or f"no working hand afterwards: {rig.status()}"
-        _start_anew(rig)
+        rig.end_daemon()
+        rig.end_hand()
     return found
 
 
-def _grip(rig: Rig, case: FaultCase, chance: random.Random, found: Trial) -> None:
-    """A hand that grips, and an empty record. Raises RigError when that can't be had."""
-    for attempt in range(_TRIES):
-        if not _ready(rig, chance):
-            if attempt:
-                raise RigError(f"the hand does not grip: {rig.status()}")
-            _start_anew(rig)
-            continue
-        if not _upright(rig):
-            _place(rig)
-            continue
-        found.phase = "holding" if case.holding_only else chance.choice(_GRIPPING)
-        if found.phase == "grasping":
-            rig.ask({"command": "grasp", "force": chance.uniform(4.0, 9.0)})
-        elif found.phase == "rotating":
-            rig.ask({"command": "rotate", "angle": chance.uniform(-_TURN, _TURN)})
-        time.sleep(chance.uniform(0.0, 0.02))
-        rig.states(0.0)
-        rig.waited()
-        # A busy machine may have let a servo's watchdog act already; then once more.
-        if not any(servo["stopped_by_watchdog"] for servo in rig.report("forget")["servos"]):
-            return
-        time.sleep(_TRIPPED)
-    raise RigError("the servos' watchdogs stop them again and again")
-
-
 def _ready(rig: Rig, chance: random.Random) -> bool:
-    """Clear, arm and grasp until the hand holds; False when it does not.
+    """Bring the hand to hold; False when it does not.
 
-    An object that slipped out of the fingers, or turned over between them, is put back in between,
-    as a person would do.
+    Faults are cleared, and the object is put between open fingers: it may have slipped out of them
+    or turned over.
     """
-    begin = now = time.monotonic()
-    place = begin + _PLACE_AFTER
-    grasp = {"command": "grasp", "force": chance.uniform(4.0, 9.0)}
-    requests: dict[str, dict[str, Any]]
-    requests = {"fault": {"command": "clear"}, "disarmed": {"command": "arm"}, "armed": grasp}
-    while now < begin + _READY_WITHIN and rig.alive:
+    end = time.monotonic() + _READY_WITHIN
+    opened = False
+    while time.monotonic() < end and rig.alive:
         mode = (rig.status(2.0) or {"mode": ""})["mode"]
         with contextlib.suppress(NoAnswer):
             if mode == "holding":
                 return True
-            if now > place:
-                place = now + _PLACE_AFTER
-                _place(rig)
-            elif mode in requests:
-                rig.ask(requests[mode], 5.0)
+            if mode == "fault":
+                rig.ask({"command": "clear"}, 5.0)
+            elif mode == "disarmed":
+                rig.ask({"command": "arm"}, 5.0)
+            elif mode == "armed" and not opened:
+                opened = rig.ask({"command": "release"}, 5.0)["ok"]
+            elif mode == "armed":
+                rig.send("place")
+                opened = False
+                rig.ask({"command": "grasp", "force": chance.uniform(4.0, 9.0)}, 5.0)
         time.sleep(0.01)
-        now = time.monotonic()
     return False
 
 
-def _upright(rig: Rig) -> bool:
-    """Return whether both tips feel opposite faces: a grip on an edge ends in another fault."""
-    states = rig.states(0.1)
-    if not states:
-        return False
-    left, right = states[-1]["left"], states[-1]["right"]
-    apart = (left["theta"] - left["q"]) - (right["theta"] + right["q"])
-    return bool(abs(apart + rig.settings.object.taper) < _ASKEW)
-
-
-def _place(rig: Rig) -> None:
-    """Put the object back, between open fingers where they can be opened."""
-    end = time.monotonic() + 2.0
-    if rig.ask({"command": "release"})["ok"]:
-        while (status := rig.status()) and status["mode"] == "releasing":
-            if time.monotonic() > end:
-                break
-            time.sleep(0.01)
-    rig.send("place")
-
-
-def _start_anew(rig: Rig) -> None:
-    rig.end_daemon()
-    rig.end_hand()
-    rig.start()
-
-
-def _look(rig: Rig, case: FaultCase, found: Trial) -> None:
+def _watch(rig: Rig, case: FaultCase, found: Trial) -> None:
     """Watch states and wire until it is clear what comes of the fault, or it has lasted."""
-    begin = now = time.monotonic()
+    begin = time.monotonic()
     modes = set()
     if case.expect == "stops":
         with contextlib.suppress(NoAnswer):
             rig.ask({"command": "stop"})
-    while now < begin + case.lasts:
+    while time.monotonic() < begin + case.lasts:
         for state in rig.states():
             t = state["mono_ns"] * 1e-9
             if state["fault"] and not found.fault and t > begin - 0.1:
@@ -403,13 +302,11 @@ def _look(rig: Rig, case: FaultCase, found: Trial) -> None:
         report = rig.report()
         if stopped(report) and math.isnan(found.safe_s):
             found.safe_s = report["monotonic"] - begin
-        found.waited_s = max(found.waited_s, rig.waited())
         safe = not math.isnan(found.safe_s)
         if safe and (found.fault or case.expect in ("dies", "stops")):
             return
         if case.expect == "lets go" and "armed" in modes:
             return
-        now = time.monotonic()
     if case.expect == "lets go":
         found.missed = f"the joints did not stay where they were: {', '.join(sorted(modes))}"
 
@@ -451,17 +348,14 @@ def judge_wire(rig: Rig, found: Trial) -> None:
 
 
 def judge(case: FaultCase, found: Trial) -> None:
-    """Return what was expected, and in time."""
+    """Compare with what was expected, and its time."""
     safe = not math.isnan(found.safe_s)
     if case.expect in ("works", "lets go"):
         if found.fault:
             found.missed = f"{found.fault} after {found.fault_s:.3f} s"
         elif safe:
             found.missed = f"no motor was driven after {found.safe_s:.3f} s"
-        return
-    if case.expect == "either" and not found.fault:
-        return
-    if not found.fault and case.expect == "fault":
+    elif not found.fault and case.expect == "fault":
         found.missed = "no fault"
     elif found.fault and case.expect != "stops" and found.fault not in case.names:
         found.missed = f"{found.fault} instead of {' or '.join(case.names)}"

@@ -8,18 +8,30 @@ from __future__ import annotations
 
 import contextlib
 import math
-from dataclasses import replace
 
 import numpy as np
 
 from softfinger.daemon.loop.realtime import RealTime
 from softfinger.daemon.profile.settings import Settings
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
-from softfinger.tools.benchmarks import estimator
-from softfinger.tools.benchmarks.estimator import ERROR, LINEAR, NOISE, TIP, TRUTH, WIDTH
+from softfinger.tools.benchmarks.estimator import (
+    ERROR,
+    LINEAR,
+    NOISE,
+    TIP,
+    TRUTH,
+    WIDTH,
+    bound,
+    decode,
+    estimates,
+    jacobian,
+    rms_errors,
+    timed_frames,
+)
 from softfinger.tools.benchmarks.measuring import (
     Report,
     Row,
+    Subject,
     figure,
     interleave,
     slopes,
@@ -45,36 +57,33 @@ def measure(brief: bool = False) -> list[Report]:
 
 
 def _grown(title: str, rows: list[Row], x: str) -> Report:
-    return Report(title, rows, x, notes=slopes(rows, x), grows=True)
+    return Report(title, rows, slopes(rows, x))
 
 
 def cells(sides: tuple[int, ...], rounds: int) -> list[Report]:
     """Time and error of an estimate, and of decoding, at the same sensor size and at one pitch."""
     x = "cells a side"
     random = np.random.default_rng(4)
-    cases = {}
-    limits = {}
+    subjects: dict[str, Subject] = {}
+    found: list[Row] = []
     for n in sides:
         noise = NOISE * random.standard_normal((_FRAMES, n, n))
         for name, pitch in (("same pitch", _PITCH), ("same size", WIDTH / n)):
             grid = SensorGrid(n, n, pitch)
             frames = grid.pressure(TIP, LINEAR, *TRUTH) + noise
-            for words, cold in (("warm", False), ("cold", True)):
-                case = estimator.kernel_case(frames, TRUTH, grid=grid, cold=cold)
-                cases[f"{words}; {name}: {n}"] = case, n
-            empty = replace(estimator.kernel_case(noise, TRUTH, grid=grid), found=None)
-            cases[f"no contact; {name}: {n}"] = empty, n
-            sigma = estimator.bound(estimator.jacobian(grid, (*TRUTH, 1.0)), NOISE)[0, 0]
-            limits[f"warm; {name}: {n}"] = 1e6 * math.sqrt(sigma)
-        cases[f"decode: {n}"] = estimator.Timed(estimator.decode(frames[:8])), n
-    times = interleave({name: case.subject for name, (case, _) in cases.items()}, rounds)
-    rows, errors = [], []
-    for name, (case, n) in cases.items():
-        rows.append(figure(name, "µs", 1e-3 * times[name], **{x: n}))
-        if name in limits:
-            error = figure(name, "µm", [case.errors[ERROR]], **{x: n})
-            errors.append(error | {"Cramér-Rao bound": limits[name]})
-    return [_grown("a frame of n × n cells", rows, x), _grown("RMS of d", errors, x)]
+            warm = estimates(frames, grid)
+            subjects[f"warm; {name}: {n}"] = timed_frames(warm)
+            subjects[f"cold; {name}: {n}"] = timed_frames(estimates(frames, grid, cold=True))
+            subjects[f"no contact; {name}: {n}"] = timed_frames(estimates(noise, grid))
+            error = figure(f"warm; {name}: {n}", "µm", [rms_errors(warm(), TRUTH)[ERROR]], **{x: n})
+            variance = bound(jacobian(grid, (*TRUTH, 1.0)), NOISE)[0, 0]
+            found.append(error | {"Cramér-Rao bound": 1e6 * math.sqrt(variance)})
+        subjects[f"decode: {n}"] = decode(frames[:8])
+    rows = [
+        figure(name, "µs", 1e-3 * taken, **{x: int(name.split(": ")[1])})
+        for name, taken in interleave(subjects, rounds).items()
+    ]
+    return [_grown("a frame of n × n cells", rows, x), _grown("RMS of d", found, x)]
 
 
 def ticks(step: int, rounds: int) -> list[Report]:

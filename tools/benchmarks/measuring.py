@@ -1,4 +1,4 @@
-"""Shared by all measurements: times in turns, tables of rows, slopes, and what became slower."""
+"""Shared by all measurements: times in turns, tables of rows, slopes."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,26 +16,15 @@ from numpy.typing import ArrayLike, NDArray
 Row = dict[str, Any]
 
 _SLICE_NS = 4e5  # of one repetition: short against the machine's hiccups, long against the clock
-_IN_SECONDS = {"ns": 1e-9, "µs": 1e-6, "ms": 1e-3, "s": 1.0}
-_SURE = 3.0  # times its noise by which a median has to rise to be called slower
-_LEAST = 0.05  # share below which no rise is of interest
-_YARDSTICKS = {"yardstick": (2_000, 51), "yardstick, long": (200_000, 9)}  # steps, samples
-_SINGLE = 0.1  # noise of a single sample, as a share; of n samples the n-th part at least
 
 
 @dataclass(frozen=True)
 class Report:
-    """Rows under a title.
-
-    ``x`` names the column that the picture draws the medians against, where there is one, with
-    lines and slopes where ``grows``.
-    """
+    """Rows under a title, and notes below them."""
 
     title: str
     rows: list[Row]
-    x: str = ""
     notes: tuple[str, ...] = ()
-    grows: bool = False
     failed: bool = False
 
     def __str__(self) -> str:
@@ -129,20 +117,6 @@ def timed(call: Callable[[], object], count: int = 1) -> list[float]:
     return samples
 
 
-def yardsticks() -> dict[str, list[float]]:
-    """Return times [µs] of fixed pieces of work: how fast this machine is just now.
-
-    A short one, and one so long that on a busy machine others have their turn meanwhile.
-    """
-    return {
-        name: timed(partial(_work, steps), count) for name, (steps, count) in _YARDSTICKS.items()
-    }
-
-
-def _work(steps: int) -> int:
-    return sum(i * i for i in range(steps))
-
-
 def slopes(rows: list[Row], x: str) -> tuple[str, ...]:
     """Return how the median of each kind of row grows with its ``x``: a note for each.
 
@@ -176,36 +150,3 @@ def by_kind(rows: list[Row]) -> dict[str, list[Row]]:
         if "median" in row:
             kinds.setdefault(str(row["name"]).split(",")[0].split(":")[0], []).append(row)
     return kinds
-
-
-def slower(old: list[Row], new: list[Row]) -> Report:
-    """Return the times and ratios of ``new`` that rose beyond the noise of both runs.
-
-    Rows are matched by measurement, table and name. Times are taken over the yardstick of their
-    runs that has become slower: neither a slower nor a busier machine makes anything slower.
-    """
-
-    def by_key(rows: list[Row]) -> dict[tuple[str, str, str], Row]:
-        chosen = [row for row in rows if row.get("unit") in {*_IN_SECONDS, "×"}]
-        return {(row["measurement"], row["table"], row["name"]): row for row in chosen}
-
-    before, after = by_key(old), by_key(new)
-    rows = []
-    common = [key for key in after if key[2] not in _YARDSTICKS and key in before]
-    for key in common:
-        ends = [before[key], after[key]]
-        if min(end["median"] or 0.0 for end in ends) <= 0.0:
-            continue
-        ratio = ends[1]["median"] / ends[0]["median"]
-        if ends[1]["unit"] != "×":
-            ratio *= _IN_SECONDS[ends[1]["unit"]] / _IN_SECONDS[ends[0]["unit"]]
-            keys = [(key[0], "", name) for name in _YARDSTICKS]
-            sticks = [(before[each], after[each]) for each in keys if each in before]
-            then, now = max(sticks, key=lambda pair: float(pair[1]["median"] / pair[0]["median"]))
-            ratio *= then["median"] / now["median"]
-            ends += [then, now]
-        noise = math.hypot(*(max(end["IQR"] / end["median"], _SINGLE / end["n"]) for end in ends))
-        if ratio > 1.0 + max(_SURE * noise, _LEAST):
-            name = ": ".join(part for part in key if part)
-            rows.append({"name": name, "ratio": ratio, "noise": noise})
-    return Report(f"slower than before, over the yardsticks: {len(rows)} of {len(common)}", rows)

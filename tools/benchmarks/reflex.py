@@ -1,10 +1,11 @@
 """A grip whose load becomes greater at once: held or lost, slid how far, how soon.
 
 A grip of 10 N bears a standing load along the object's faces, away from the palm, and then a
-greater one that stays. On virtual time, and judged by the plant. *Lost*: the object is no longer
-between the tips. *Slid*: along the tips' faces, from the midpoint of both tips; that the fingers
-lean is no slide. *Answer*: from a slip's onset to goal currents a quarter higher. *Said*: from when
-the object has gone until the mode is no longer one of a grip.
+greater one that stays, or a twist of so many newtons at the faces. On virtual time, and judged by
+the plant. *Lost*: the object is no longer between the tips. *Slid*: along the tips' faces, from the
+midpoint of both tips; that the fingers lean is no slide. *Answer*: from a slip's onset to goal
+currents a quarter higher. *Said*: from when the object has gone until the mode is no longer one of
+a grip.
 """
 
 from __future__ import annotations
@@ -13,9 +14,9 @@ import gc
 import itertools
 import math
 import random
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from statistics import fmean
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from softfinger.daemon.control.modes import GRIPPING
 from softfinger.tools.benchmarks.measuring import Report, Row, figure
@@ -33,8 +34,7 @@ _ANSWER, _SAID = 22.0, 200.0  # ms, aims
 _GRIP = 5.0  # s until it holds, at most
 _RISES, _STANDS = 1.0, 1.5  # s in which the standing load comes, and stays
 _STEPS = 50  # in which it comes
-_LOOK = 1.0  # s of the greater one
-_GONE_LOOK = 1.0  # s after which a lost object's mode is no longer waited for
+_LOOK = 1.0  # s of the greater one, and for a lost object's mode
 
 
 class Overload(NamedTuple):
@@ -46,27 +46,46 @@ class Overload(NamedTuple):
     said: float = math.nan  # s
 
 
-def measure(brief: bool = False, full: bool = False) -> list[Report]:
-    """Return a table for each kind of tips, or sensor, and mass; ``brief``: a few of them."""
-    loads = list(itertools.product(STANDING, OVERLOADS) if full else itertools.product(*THIN))
+def measure(
+    brief: bool = False, full: bool = False, sweep: Callable[..., Iterable[Any]] = map
+) -> list[Report]:
+    """Return a table for each kind of tips, or sensor, and mass; ``brief``: a few of them.
+
+    ``sweep`` is what maps trials to their outcomes, in one process or in many.
+    """
+    standing, overloads = (STANDING, OVERLOADS) if full else THIN
+    loads = [
+        *itertools.product((0.0,), overloads, ("twist",)),
+        *itertools.product(standing, overloads, ("push",)),
+    ]
     trials = _TRIALS
     if brief:
         loads, trials = loads[-1:], 1
-    tables = []
-    for (name, tips), mass in itertools.product(TIPS.items(), MASSES):
-        settings = merged({"simulation": {"object_mass": mass}}, tips)
-        tables.append(_table(f"{name}, {mass:g} kg", settings, loads, trials))
-    return tables
+    hands = {
+        f"{name}, {mass:g} kg": merged({"simulation": {"object_mass": mass}}, tips)
+        for (name, tips), mass in itertools.product(TIPS.items(), MASSES)
+    }
+    seeds = range(1, trials + 1)
+    cases = list(itertools.product(hands.values(), loads, seeds))
+    outcomes = iter(sweep(_outcome, cases))
+    return [_table(name, loads, trials, outcomes) for name in hands]
+
+
+def _outcome(case: tuple[Sections, tuple[float, float, str], int]) -> Overload:
+    settings, (standing, overload, kind), seed = case
+    try:
+        return overloaded(settings, standing, overload, seed, kind)
+    finally:
+        gc.collect()  # each trial's daemon refers to itself, with megabytes of frames
 
 
 def _table(
-    name: str, settings: Sections, loads: Sequence[tuple[float, float]], trials: int
+    name: str, loads: Sequence[tuple[float, float, str]], trials: int, outcomes: Iterator[Any]
 ) -> Report:
     rows = []
-    for standing, overload in loads:
-        found = [overloaded(settings, standing, overload, seed) for seed in range(1, trials + 1)]
-        rows.append(row(f"{standing:g} N, then {overload:g} N", found))
-        gc.collect()  # each trial's daemon refers to itself, with megabytes of frames
+    for standing, overload, kind in loads:
+        found = [Overload(*next(outcomes)) for _ in range(trials)]
+        rows.append(row(f"{standing:g} N, then a {kind} of {overload:g} N", found))
     said = [each["said ms"] for each in rows if each["held %"] < 100.0]
     note = f"  said that the object has gone: in {max(said, default=0.0):.0f} ms, aim ≤ {_SAID:g}"
     return Report(f"{name}, answer", rows, notes=(note,) if said else ())
@@ -86,8 +105,13 @@ def row(name: str, found: Sequence[Overload]) -> Row:
     }
 
 
-def overloaded(settings: Sections, standing: float, overload: float, seed: int) -> Overload:
-    """Grip, bear ``standing`` [N], then ``overload`` [N]. Raises RuntimeError without a grip."""
+def overloaded(
+    settings: Sections, standing: float, overload: float, seed: int, kind: str = "push"
+) -> Overload:
+    """Grip, bear ``standing`` [N], then ``overload`` [N], a push or a twist.
+
+    Raises RuntimeError without a grip.
+    """
     chance = random.Random(seed)
     with VirtualGrip(seed, chance, settings) as grip:
         loop, state = grip.loop, grip.state
@@ -113,7 +137,8 @@ def overloaded(settings: Sections, standing: float, overload: float, seed: int) 
                 said = min(said, state.t)
 
         grip.look = look
-        answer = grip.answer(f"push={overload}", _LOOK)
-        while gone < math.inf and said == math.inf and state.t < gone + _GONE_LOOK:
+        arm = 0.5 * grip.settings.simulation.object_width if kind == "twist" else 1.0
+        answer = grip.answer(f"{kind}={arm * overload}", _LOOK)
+        while gone < math.inf and said == math.inf and state.t < gone + _LOOK:
             loop.advance(loop.period)
         return Overload(answer, slid, gone < math.inf, said - gone if gone < math.inf else math.nan)

@@ -47,7 +47,7 @@ SOFTFINGER = (sys.executable, "-m", "softfinger")
 _KEPT = 16  # frames that take turns
 _PATIENCE = 120.0  # s for a process to be ready: kernels may be new
 _STATE_RATE = 250.0  # Hz
-_LOOK = 0.003  # s between two looks at the hand
+_POLL = 0.003  # s between two polls of the stream
 
 
 class RigError(SoftfingerError):
@@ -210,7 +210,7 @@ class Rig:
         self.config = self.folder / "hil.toml"
         head = (
             f'stream.address = "{self.stream}"\ncommands.address = "{self.commands}"\n'
-            f"stream.state_rate = {_STATE_RATE}\n"
+            f'stream.state_rate = {_STATE_RATE}\nloop.clock = "real"\n'
         )
         self.config.write_text(head + HIL.read_text(encoding="utf-8"), encoding="utf-8")
         self.settings = load(self.config, self.ports)
@@ -219,7 +219,6 @@ class Rig:
         self.hand: subprocess.Popen[str] | None = None
         self.daemon: subprocess.Popen[bytes] | None = None
         self._states: zmq.Socket[bytes] | None = None
-        self._last_waited: dict[int, float] = {}
 
     def start(self) -> None:
         """Start whatever does not run. Raises RigError."""
@@ -229,29 +228,20 @@ class Rig:
             self.start_daemon()
 
     def start_daemon(self) -> None:
-        """Start the daemon, and wait for its first answer; once more where it ends. RigError."""
-        if not self._started() and not self._started():
-            raise RigError(f"the daemon did not start: {self.log()[-1:]}")
+        """Start the daemon, and wait for its first answer. Raises RigError."""
+        end = time.monotonic() + _PATIENCE
+        words = ["run", "--config", str(self.config), "--dir", str(self.ports)]
+        log = str(self.folder / "daemon.log")
+        self.daemon = subprocess.Popen([*SOFTFINGER, *words, "--log-file", log])
+        while self.status() is None:
+            if not self.alive or time.monotonic() > end:
+                raise RigError(f"the daemon did not start: {self.log()[-1:]}")
         if self._states is not None:
             self._states.close()
         self._states = self.context.socket(zmq.SUB)
         self._states.setsockopt(zmq.LINGER, 0)
         self._states.subscribe(STATE)
         self._states.connect(self.stream)
-
-    def _started(self) -> bool:
-        begin = time.monotonic()
-        words = ["run", "--config", str(self.config), "--dir", str(self.ports)]
-        log = str(self.folder / "daemon.log")
-        daemon = self.daemon = subprocess.Popen([*SOFTFINGER, *words, "--log-file", log])
-        while self.status() is None:
-            if daemon.poll() is not None:
-                return False
-            if time.monotonic() > begin + _PATIENCE:
-                daemon.kill()
-                daemon.wait()
-                return False
-        return True
 
     def end_daemon(self, number: int = signal.SIGTERM) -> int | None:
         """Signal the daemon and wait for it; None when it hangs, and had to be killed."""
@@ -306,7 +296,7 @@ class Rig:
         return reply
 
     def report(self, more: str = "") -> dict[str, Any]:
-        """Return what was on the servos' wire; ``more``: ``forget`` begins again, ``goals``."""
+        """Return what was on the servos' wire; ``more``: ``forget`` begins again."""
         report: dict[str, Any] = json.loads(self.send(f"report {more}"))
         return report
 
@@ -329,38 +319,13 @@ class Rig:
             return None
         return status if status["ok"] else None
 
-    def states(self, wait: float = _LOOK) -> list[dict[str, Any]]:
+    def states(self, wait: float = _POLL) -> list[dict[str, Any]]:
         """Return states that came since the last call, none after ``wait`` s without one."""
-        socket = self._states
         found: list[dict[str, Any]] = []
-        if socket is None:
-            time.sleep(wait)
-            return []
-        while socket.poll(0 if found else int(wait * 1000)):
-            found.append(msgpack.unpackb(socket.recv_multipart()[1]))
+        assert self._states is not None
+        while self._states.poll(0 if found else int(wait * 1000)):
+            found.append(msgpack.unpackb(self._states.recv_multipart()[1]))
         return found
-
-    def waited(self) -> float:
-        """Return seconds that others held the processor that either process wanted."""
-        most = 0.0
-        for process in (self.daemon, self.hand):
-            if process is not None:
-                seconds = _waited_seconds(process.pid)
-                most = max(most, seconds - self._last_waited.get(process.pid, seconds))
-                self._last_waited[process.pid] = seconds
-        return most
-
-
-def _waited_seconds(process: int) -> float:
-    """Return how long a process's threads have been ready to run and did not, altogether [s].
-
-    All of them: while one waits with the interpreter's lock, the others can't go on.
-    """
-    try:
-        tasks = list(Path(f"/proc/{process}/task").iterdir())
-        return 1e-9 * sum(int((task / "schedstat").read_text().split()[1]) for task in tasks)
-    except (OSError, IndexError, ValueError):
-        return 0.0
 
 
 def stopped(report: dict[str, Any]) -> bool:

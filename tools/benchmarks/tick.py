@@ -15,7 +15,6 @@ import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -25,7 +24,6 @@ from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.loop.realtime import RealTime
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.types import Goal, Reading
 from softfinger.daemon.wire import schema
 from softfinger.tools.benchmarks.measuring import Report, Row, figure, timed
 from softfinger.tools.benchmarks.rigs import HIL, can, emulator, hold, must_hold, virtual_daemon
@@ -51,8 +49,8 @@ def measure(brief: bool = False) -> list[Report]:
     ]
 
 
-def _in_turns(rounds: int, rates: tuple[float, ...] = (100.0, 500.0, 1000.0)) -> list[Row]:
-    """The pipeline alone: back to back with and without subscribers, in place at ``rates``.
+def _in_turns(rounds: int) -> list[Row]:
+    """The pipeline alone: back to back with and without subscribers, in place at three rates.
 
     SCHED_FIFO and one processor where allowed.
     """
@@ -67,7 +65,7 @@ def _in_turns(rounds: int, rates: tuple[float, ...] = (100.0, 500.0, 1000.0)) ->
             "back to back": partial(ticks, quiet, 200),
             "back to back, state and frames subscribed": partial(ticks, heard, 200),
         }
-        for rate in rates:
+        for rate in (100.0, 500.0, 1000.0):
             turns[f"in place at {rate:g} Hz"] = partial(in_place, quiet, rate)
         with RealTime(_own_processor()):
             for _ in range(rounds):
@@ -127,14 +125,13 @@ def may_be_real_time() -> bool:
 
 
 def in_the_loop(turns: int, baud: int, changes: Sequence[str] = ()) -> Report:
-    """Return ticks over ptys of a hand that holds, and what its servos' exchanges take, in turns.
+    """Return ticks over ptys of a hand that holds, and its servos' exchanges alone, in turns.
 
     ``baud`` 0 is unpaced; ``changes`` go over the profile. A failed Report where the hand lets go,
     as on a machine that is busy.
     """
     title = f"hardware in the loop, {f'{1e-6 * baud:g} Mbaud' if baud else 'unpaced'}"
     in_place: list[float] = []
-    exchanges: list[float] = []
     back_to_back: list[float] = []
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
@@ -146,8 +143,8 @@ def in_the_loop(turns: int, baud: int, changes: Sequence[str] = ()) -> Report:
             hold(daemon)
         except SoftfingerError as error:
             return Report(title, [], notes=(str(error),), failed=True)
-        servos: Any = loop.servos
-        loop.servos = shared = _Timed(servos)
+        servos = loop.servos
+        assert servos is not None
 
         def cycle() -> None:
             servos.read(state.reading)
@@ -158,9 +155,7 @@ def in_the_loop(turns: int, baud: int, changes: Sequence[str] = ()) -> Report:
             for _ in range(_IN_TURN):
                 deadline = max(deadline + loop.period, clock.now())
                 clock.sleep_until(deadline)
-                shared.spent = 0.0
                 in_place += timed(lambda: loop.tick(clock.now()))
-                exchanges.append(shared.spent)
             back_to_back += timed(cycle, _IN_TURN)
         held = state.mode == "holding"
         loop.command({"command": "stop"})
@@ -170,27 +165,9 @@ def in_the_loop(turns: int, baud: int, changes: Sequence[str] = ()) -> Report:
     base = float(np.median(back_to_back))
     rows = [
         figure("tick", "µs", in_place, None if baud else 1.5 * base),
-        figure("its read + write", "µs", exchanges),
         figure("read + write back to back", "µs", back_to_back, None if baud else 120.0),
     ]
     if baud:
         over = np.array(back_to_back) / (1e6 * _BITS / baud)
         rows.append(figure("read + write over its bytes' own time", "×", over, 1.15))
     return Report(title, rows)
-
-
-class _Timed:
-    """Servos, and the time that was spent in their reads and writes [µs]."""
-
-    def __init__(self, servos: Any) -> None:
-        self._servos = servos
-        self.spent = 0.0
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._servos, name)
-
-    def read(self, reading: Reading) -> None:
-        self.spent += timed(lambda: self._servos.read(reading))[0]
-
-    def write(self, goal: Goal) -> None:
-        self.spent += timed(lambda: self._servos.write(goal))[0]

@@ -8,14 +8,16 @@ They run on virtual time, so nothing depends on the machine.
 from __future__ import annotations
 
 import gc
+import itertools
 import math
 import random
 import sys
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from statistics import median
+from typing import Any
 
 from softfinger.daemon.control.modes import GRIPPING
 from softfinger.daemon.simulation.emulator.emulator import DEFAULT_BOARD
@@ -150,16 +152,23 @@ class GripTrial:
         return [why for why, true in wrong.items() if true]
 
 
-def measure(trials: int | None = None, only: str = "") -> list[Report]:
-    """Return a table for each aim, of the cases whose name ``only`` is found in."""
+def measure(
+    trials: int | None = None, only: str = "", sweep: Callable[..., Iterable[Any]] = map
+) -> list[Report]:
+    """Return a table for each aim, of the cases whose name ``only`` is found in.
+
+    ``sweep`` is what maps trials to their outcomes, in one process or in many.
+    """
     trials, reports = trials or _TRIALS, []
+    cases = [each for aim in (SETTLES, BOUNDED) for each in CASES if each.aim == aim]
+    cases = [case for case in cases if only in case.name]
+    seeds = range(1, trials + 1)
+    outcomes = iter(sweep(_outcome, list(itertools.product(cases, seeds))))
     for aim in (SETTLES, BOUNDED):
         rows = []
-        for case in CASES:
-            if case.aim == aim and only in case.name:
-                found = [trial(case, seed) for seed in range(1, trials + 1)]
-                rows.append(summary(case, found))
-                gc.collect()  # each trial's daemon refers to itself, with megabytes of frames
+        for case in cases:
+            if case.aim == aim:
+                rows.append(summary(case, [GripTrial(**next(outcomes)) for _ in seeds]))
                 print(f"{case.name}: {rows[-1]['met']} of {trials}", file=sys.stderr, flush=True)
         missed = sum(row["met"] < trials for row in rows)
         if rows:
@@ -168,6 +177,13 @@ def measure(trials: int | None = None, only: str = "") -> list[Report]:
                 Report(f"force over asked: {aim}", rows, notes=(note,), failed=missed > 0)
             )
     return reports
+
+
+def _outcome(drawn: tuple[WitnessCase, int]) -> dict[str, Any]:
+    try:
+        return asdict(trial(*drawn))
+    finally:
+        gc.collect()  # each trial's daemon refers to itself, with megabytes of frames
 
 
 def trial(case: WitnessCase, seed: int) -> GripTrial:

@@ -9,11 +9,24 @@ from pathlib import Path
 from softfinger.tools.arguments import add_keys, add_profile, number, profile, stream_address
 from softfinger.tools.extras import MissingExtra, require
 
-STEPS = ("joints", "tare", "equilibrate", "curve", "centre", "modulus", "law", "scales")
+STEPS = (
+    "joints",
+    "heat",
+    "tare",
+    "equilibrate",
+    "curve",
+    "centre",
+    "modulus",
+    "law",
+    "relaxation",
+    "scales",
+)
 _EPILOG = """\
-the joints, of both fingers; FILE is a profile, made of --config's if absent:
+the joints; FILE is a profile, made of --config's if absent:
   joints       with torque off each finger is closed, opened and put upright by hand: its servo,
-               direction, zero and range
+               direction, zero and range, of both
+  heat         from the recording of a grip of some minutes, begun cold: by how much the servo of
+               --finger warms, and how fast
 
 steps of a tip, in this order; each is written into FILE, which keeps the others:
   tare         unloaded: the zero of each cell; its noise, how that correlates, and drift
@@ -23,6 +36,8 @@ steps of a tip, in this order; each is written into FILE, which keeps the others
   modulus      a run of known displacement (--d): E, or with --law the curve stress over strain
   law          presses at known depths and tilts (--d, --theta): springs or solid rubber, its E and
                ν, how well each explains the frames, and what error it leaves
+  relaxation   a press and a hold of some seconds at a known d (--d, --frames 500): how much firmer
+               the rubber is at once than in the end, for the profile
   scales       what a running daemon's grips, or a recording's, told of the tip's modulus, the
                sensor's gain and the joint's torque: the daemon begins with it next time
 
@@ -102,9 +117,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Do one step. Raises SoftfingerError or OSError; then the file is unchanged."""
     joints = arguments.step == "joints"
-    if joints and arguments.config is None:
+    if (joints or arguments.step == "heat") and arguments.config is None:
         arguments.config = arguments.file
     settings = profile(arguments)
+    if arguments.step == "heat":
+        from softfinger.tools.calibration.heat import calibrate_heat
+
+        print(f"heat: {calibrate_heat(arguments, settings)}; written to {arguments.file}")
+        return 0
     if joints:
         from softfinger.tools.calibration.joints import calibrate_joints
 

@@ -99,6 +99,16 @@ def _law(_: Any, left: Any, right: Any, data: dict[str, Any]) -> None:
     left.set(xscale="log")
 
 
+def _relaxation(_: Any, left: Any, right: Any, data: dict[str, Any]) -> None:
+    t, force, model = data["t"], data["force"], data["model"]
+    left.plot(t, force, ".", ms=2, color=style.KINDS[0], label="measured")
+    left.plot(t, model, color=style.INK, label="fit")
+    left.set(xlabel="t [s]", ylabel="F [N]")
+    left.legend()
+    right.plot(t, force - model, ".", ms=2, color=style.KINDS[0])
+    right.set(xlabel="t [s]", ylabel="measured − fit [N]")
+
+
 _PANELS = {
     "tare": _tare,
     "equilibrate": _equilibrate,
@@ -106,4 +116,5 @@ _PANELS = {
     "centre": _centre,
     "modulus": _modulus,
     "law": _law,
+    "relaxation": _relaxation,
 }

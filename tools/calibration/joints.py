@@ -10,10 +10,10 @@ import contextlib
 import math
 import re
 import tomllib
+from collections.abc import Mapping
 from typing import Any
 
 from softfinger.daemon.errors import ServoError, SettingsError
-from softfinger.daemon.own_files import write_whole
 from softfinger.daemon.profile.load import find, load, profile_text
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
@@ -21,6 +21,7 @@ from softfinger.daemon.servos.checks import CHECKED, DRIVE_REVERSE, Registers
 from softfinger.daemon.servos.protocol import ServoLine, open_line
 from softfinger.daemon.types import FINGERS
 from softfinger.kinematics.calibration.calibration import CalibrationError
+from softfinger.kinematics.compiled.own_folder import write_whole
 from softfinger.tools.arguments import own_runtime_folder
 from softfinger.tools.calibration.calibration_frames import bring
 
@@ -77,7 +78,7 @@ def calibrate_joints(arguments: argparse.Namespace, settings: Settings) -> str:
             )
     if len({new["servos"]["ids"][finger] for finger in scene}) < len(scene):
         raise CalibrationError(f"servo {new['servos']['ids'][0]} turned for both fingers")
-    return "\n  ".join([*told, *_write(arguments, new)])
+    return "\n  ".join([*told, *write_keys(arguments, new)])
 
 
 def _read(line: ServoLine, ids: list[int]) -> _Counts:
@@ -120,7 +121,7 @@ def _turned(name: str, at: dict[str, _Counts], radian: float) -> int:
     return servo
 
 
-def _write(arguments: argparse.Namespace, new: dict[str, dict[str, list[Any]]]) -> list[str]:
+def write_keys(arguments: argparse.Namespace, new: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """Put ``new`` into the file, or into a copy of the profile; nothing else in it changes."""
     changes = [f"{s}.{key} = {value}" for s, values in new.items() for key, value in values.items()]
     source = arguments.file if arguments.file.exists() else arguments.config
@@ -140,8 +141,8 @@ def _write(arguments: argparse.Namespace, new: dict[str, dict[str, list[Any]]]) 
     return changes
 
 
-def put(text: str, section: str, values: dict[str, list[Any]]) -> str:
-    """Return a profile's text with these arrays in its ``[section]``, in place or as new lines.
+def put(text: str, section: str, values: Mapping[str, Any]) -> str:
+    """Return a profile's text with these arrays or numbers in its ``[section]``, or as new lines.
 
     Without that header they are ``section.key`` where the text has such keys.
     """
@@ -153,9 +154,11 @@ def put(text: str, section: str, values: dict[str, list[Any]]) -> str:
     after = re.compile(r"(?m)^\[").search(text, start)
     end = after.start() if after else len(text)
     body = text[start:end]
-    for key, value in reversed(values.items()):
+    for key, value in reversed([*values.items()]):
         name = re.escape(prefix + key)
-        body, found = re.subn(rf"(?m)^({name}\s*=\s*)\[[^\]]*\]", rf"\g<1>{value}", body)
+        body, found = re.subn(
+            rf"(?m)^({name}\s*=\s*)(?:\[[^\]]*\]|[\w.+-]+)", rf"\g<1>{value}", body
+        )
         if not found:
             body = f"{prefix}{key} = {value}\n{body}"
     return text[:start] + body + text[end:]

@@ -45,7 +45,14 @@ from softfinger.kinematics.calibration.calibration import (
     without_end,
 )
 from softfinger.kinematics.calibration.measured_fit import CurvesError, PressSums, fit_measured
-from softfinger.kinematics.calibration.press_fit import Presses, TipFit, compare_tips
+from softfinger.kinematics.calibration.press_fit import (
+    Presses,
+    TipFit,
+    Trend,
+    compare_tips,
+    first_cycle,
+)
+from softfinger.kinematics.calibration.relaxation import fit_relaxation
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.table import ContactTable
@@ -55,6 +62,7 @@ from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from softfinger.tools.calibration.calibration_frames import Loads
 
 FloatArray = NDArray[np.float64]
+_SOFTENS = 0.03  # by which a first press may be firmer: plates and noise are no better
 Done = tuple[Calibration, str, dict[str, Any]]  # with the line to print and the picture's data
 
 
@@ -269,6 +277,7 @@ def _modulus(step: Step) -> Done:
         f"E = {found.modulus / 1e6:.4f} MPa from {np.count_nonzero(whole)} loads, zero of d at "
         f"{found.offset * 1e3:.3f} mm, force within {found.residual:.2%} rms"
     )
+    line += f"; {_over_d(found.trend)}"
     if not whole.all():
         line += f"; {np.count_nonzero(~whole)} frames left out, saturated"
     strain: list[float] = []
@@ -339,6 +348,13 @@ def _law(step: Step) -> Done:
                 f"law: none explains these presses; the best: {lines[0]}; measured: {error}"
             ) from None
         lines.append(f"measured: no curves: {error}")
+    if best.trend is not None:
+        lines.insert(1, _over_d(best.trend))
+    softer = first_cycle(d, theta, signed.sum(axis=(1, 2)))
+    if softer is not None:
+        lines.insert(1, f"first presses read {softer:+.1%} against the same ones again")
+        if softer > _SOFTENS:
+            lines[1] += ": the rubber SOFTENS; press it some times to the full depth, then anew"
     lines.append(f"for the profile: {wanted}")
     return step.result(**steps), "\n  ".join(lines), {"fits": fits}
 
@@ -382,6 +398,17 @@ def _measured_told(law: TipCurves, left: FloatArray) -> str:
     )
 
 
+def _over_d(trend: Trend) -> str:
+    """E at the least, middle and largest d, and a warning where it drifts."""
+    order = np.argsort(trend.d, kind="stable")[[0, len(trend.d) // 2, -1]]
+    values = ", ".join(f"{each / 1e6:.3f}" for each in trend.modulus[order])
+    depths = ", ".join(f"{each * 1e3:g}" for each in trend.d[order])
+    told = f"E alone at {depths} mm: {values} MPa"
+    if not trend.drifts:
+        return told
+    return f"{told}: DRIFTS by {trend.drift:+.0%} ± {trend.std:.1%}, so {trend.cause}"
+
+
 def _told(fit: TipFit) -> str:
     name = "springs" if fit.law.is_linear else f"springs, law {fit.law.name}"
     if fit.tip.physics == "solid":
@@ -398,7 +425,27 @@ def _told(fit: TipFit) -> str:
     )
 
 
+def _relaxation(step: Step) -> Done:
+    d, settings = step.loads.truths.get("d"), step.settings
+    if d is None:
+        raise CalibrationError("relaxation: expected --d, or a run that has d")
+    counts = [len(frames) for frames in step.loads.frames]
+    frames = np.concatenate(step.loads.frames)
+    force = np.array([step.converter(frame).sum() for frame in frames]) * step.cell_area
+    t = np.arange(len(force)) / settings.tactile.rate
+    table = ContactTable.build(make_tip(settings), make_material(settings.material))
+    lasting = table(np.repeat(d, counts), np.repeat(np.abs(step.theta), counts)).force
+    found = fit_relaxation(t, lasting, force, settings.tip.relaxation_times)
+    strengths = ", ".join(f"{each:.3f}" for each in found.strengths)
+    line = (
+        f"force within {found.residual:.2%} rms, {found.elastic:.2%} if the tip were elastic; for "
+        f"the profile: tip.relaxation = [{strengths}]"
+    )
+    return step.calibration, line, {"t": t, "force": force, "model": found.model}
+
+
 _STEPS = {
+    "relaxation": _relaxation,
     "tare": _tare,
     "equilibrate": _equilibrate,
     "curve": _curve,

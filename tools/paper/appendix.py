@@ -12,8 +12,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.polynomial.legendre import leggauss
 
-from softfinger.tools.paper.model_pages import CIRCLE, ENERGY, MILLI, MODULUS, TIP
+from softfinger.tools.paper.model_pages import ENERGY, MILLI, MODULUS, TIP
 from softfinger.tools.paper.sheets import (
+    CIRCLE,
+    DEPTH,
     DrawnCurve,
     Erratum,
     FigurePage,
@@ -110,14 +112,8 @@ PAGES = {
         (5.2, 4.2),
         _appendix,
         (
-            Panel(
-                _sums,
-                "displacement d [mm]",
-                "part of U [mJ]",
-                "eqs. 16, 18 and 19, each with its factor",
-                more={"xlim": (0, 8.1), "ylim": (-3200, 3600)},
-                legend={"loc": "upper left", "ncols": 2, "columnspacing": 1.0},
-            ),
+            Panel(_sums, DEPTH, "part of U [mJ]", "eqs. 16, 18 and 19, each with its factor",
+                  (0, 8.1), (-3200, 3600), {"loc": "upper left", "ncols": 2, "columnspacing": 1.0}),
         ),
         errata=(
             Erratum(
@@ -135,4 +131,4 @@ PAGES = {
         ),
         notes=("Tip of radius 20 mm, E = 0.304 MPa, as in the paper.",),
     ),
-}
+}  # fmt: skip

@@ -13,12 +13,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from softfinger.daemon.control.modes import Mode
-from softfinger.daemon.loop.build import Daemon
-from softfinger.daemon.profile.settings import Settings
 from softfinger.kinematics.hand.upright import resting_ratio
 from softfinger.tools.benchmarks.control import EQUAL_TORQUES
 from softfinger.tools.paper.sheets import DrawnCurve, FigurePage, FloatArray, Panel, Sheet, sheet
 from softfinger.tools.style import GREY, KINDS, MARKERS
+from softfinger.tools.watched import Watched
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -52,24 +51,15 @@ _CLEAR, _LOST = 0.05, 5.0  # degrees between which the maps' colours run
 def left(law: str, tilt: float, force: float = _FORCE, **simulation: Any) -> float:
     """Return the object's angle after a grasp [degrees]; NaN if it isn't held."""
     sections: dict[str, dict[str, Any]] = {
-        "loop": {"clock": "virtual"},
         "material": {"law": "constant"},
         "control": LAWS[law][0],
         "simulation": {"object_angle": float(np.radians(tilt)), **simulation},
     }
-    daemon = Daemon(Settings.model_validate(sections), wire=False)
-    loop, hand = daemon.loop, daemon.hand
-    assert hand is not None
-    try:
-        loop.advance(0.3)
-        loop.command({"command": "arm"})
-        loop.advance(0.2)
-        loop.command({"command": "grasp", "force": force})
-        loop.advance(_SECONDS)
-        held = loop.state.mode == Mode.HOLDING
-        return float(np.degrees(hand.object_pose[2])) if held else float("nan")
-    finally:
-        daemon.close()
+    with Watched(sections) as hand:
+        hand.grasp(force)
+        hand.run(_SECONDS)
+        held = hand.mode == Mode.HOLDING
+        return float(np.degrees(hand.plant.object_pose[2])) if held else float("nan")
 
 
 def _varied(name: str, value: float) -> dict[str, Any]:
@@ -134,14 +124,8 @@ PAGES = {
         (10.0, 6.4),
         basin,
         (
-            Panel(
-                _laws,
-                "put at [deg]",
-                "left [deg]",
-                f"where each law leaves the object, {_FORCE:g} N",
-                {"ylim": (-30.0, 68.0)},
-                {"loc": "upper left"},
-            ),
+            Panel(_laws, "put at [deg]", "left [deg]",
+                  f"where each law leaves the object, {_FORCE:g} N", None, (-30, 68), "upper left"),
             *(_panel(k, name, unit) for k, (name, (unit, _)) in enumerate(ACROSS.items())),
         ),
         rows=2,
@@ -150,4 +134,4 @@ PAGES = {
             "tip friction 0.6, joint friction 0.05 N·m and table friction 0.3.",
         ),
     )
-}
+}  # fmt: skip

@@ -16,8 +16,12 @@ from softfinger.kinematics.contact.closed_form import closed_forms
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.quadrature import integrate
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
-from softfinger.tools.paper.model_pages import CIRCLE, DEPTHS, MILLI, MODULUS, TILTS, TIP, Numbers
+from softfinger.tools.paper.model_pages import DEPTHS, MILLI, MODULUS, TILTS, TIP, Numbers
 from softfinger.tools.paper.sheets import (
+    CIRCLE,
+    DEPTH,
+    FORCE,
+    RELATIVE,
     DrawnCurve,
     Erratum,
     FigurePage,
@@ -84,15 +88,10 @@ def _all_tilts(numbers: Sheet) -> Iterator[DrawnCurve]:
 def _compression_panels() -> Iterator[Panel]:
     """Panels (a) to (g), one an angle, and (h) with all of them."""
     for k, (letter, tilt) in enumerate(zip("abcdefg", TILTS, strict=True)):
-        yield Panel(
-            partial(_one_tilt, tilt),
-            "displacement d [mm]" if k >= 4 else "",
-            "" if k % 4 else "total elastic force F [N]",
-            f"({letter}) {tilt}°",
-            legend=None if k else {"loc": "upper left"},
-        )
-    more = {"xlim": (0, 8.3), "ylim": (0, 82), "xticks": range(0, 9, 2)}
-    yield Panel(_all_tilts, "displacement d [mm]", "", "(h) all", more, gap=0.07)
+        labels = DEPTH if k >= 4 else "", "" if k % 4 else FORCE
+        legend = "" if k else "upper left"
+        yield Panel(partial(_one_tilt, tilt), *labels, f"({letter}) {tilt}°", legend=legend)
+    yield Panel(_all_tilts, DEPTH, "", "(h) all", (0, 8.3), (0, 82), gap=0.07)
 
 
 def tilt_and_roll() -> tuple[Sheet, ...]:
@@ -185,6 +184,12 @@ PAGES = {
                 "the model's exponent is exactly 2 at every angle, its prefactor 1/cos θ; only a "
                 "modulus that rises with strain gives more.",
             ),
+            Erratum(
+                "IV-A",
+                "an approximately constant error over d, which a higher modulus brings close",
+                "springs of any one E press with πE d²/cos θ: another E changes F by a share, "
+                "never by a constant over d.",
+            ),
         ),
         notes=(
             "Sensor: 44 × 44 cells on 58 mm × 58 mm, each averaging the pressure over its area. "
@@ -196,24 +201,11 @@ PAGES = {
         (7.6, 4.3),
         tilt_and_roll,
         (
-            Panel(
-                _rotation,
-                "relative angle θ [deg]",
-                "total elastic force F [N]",
-                "(a) the finger rotates",
-                more={"xlim": (0, TILTED), "ylim": (0, 76)},
-                legend={"loc": "upper left"},
-                gap=0.06,
-            ),
-            Panel(
-                _rolling,
-                "relative angle θ [deg]",
-                "F(θ)/F(0) at equal d",
-                "(b) then the object rolls by 20.7°",
-                more={"xlim": (-24, 18), "ylim": (0.9975, 1.038)},
-                legend={"loc": "upper center", "ncols": 2, "columnspacing": 1.0},
-                annotate=_path,
-            ),
+            Panel(_rotation, RELATIVE, FORCE, "(a) the finger rotates", (0, TILTED), (0, 76),
+                  "upper left", gap=0.06),
+            Panel(_rolling, RELATIVE, "F(θ)/F(0) at equal d", "(b) then the object rolls by 20.7°",
+                  (-24, 18), (0.9975, 1.038),
+                  {"loc": "upper center", "ncols": 2, "columnspacing": 1.0}, _path),
         ),
         layout={"width_ratios": (1.0, 1.25)},
         notes=(
@@ -223,4 +215,4 @@ PAGES = {
             "slightly before 0°, are not reproduced.",
         ),
     ),
-}
+}  # fmt: skip

@@ -14,7 +14,7 @@ NAMES = (
     *("fig3", "fig4a", "fig4b", "fig5a", "fig5b"),
     *("fig7", "fig7_run", "fig10", "fig10_run", "fig11", "solid_run"),
 )
-BY_NAME = ("basin",)  # the long ones, drawn only when they are named
+BY_NAME = ("basin", "slow_turn")  # the long ones, drawn only when they are named
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -42,10 +42,11 @@ def pages() -> dict[str, FigurePage]:
         experiment_pages,
         model_pages,
         run_pages,
+        slow_turn,
         solid_pages,
     )
 
-    modules = (model_pages, experiment_pages, run_pages, appendix, solid_pages, basin)
+    modules = (model_pages, experiment_pages, run_pages, appendix, solid_pages, basin, slow_turn)
     found = {name: page for each in modules for name, page in each.PAGES.items()}
     return {name: found[name] for name in (*NAMES, *BY_NAME)}
 

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import cache, partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from softfinger.tools.paper import runs
-from softfinger.tools.paper.model_pages import CIRCLE, DEPTHS, MILLI, TILTS
+from softfinger.tools.paper.model_pages import DEPTHS, MILLI, TILTS
 from softfinger.tools.paper.runs import SimulatedRun
 from softfinger.tools.paper.sheets import (
+    CIRCLE,
+    DEPTH,
+    DOT,
+    FORCE,
+    RELATIVE,
     DrawnCurve,
     FigurePage,
     FloatArray,
@@ -19,6 +24,7 @@ from softfinger.tools.paper.sheets import (
     Sheet,
     sheet,
     summary,
+    zero_line,
 )
 from softfinger.tools.style import GREY, INK, KINDS, label_ends, ordered
 
@@ -28,9 +34,7 @@ if TYPE_CHECKING:
 _SURE = 1.0  # mm of displacement from which on relative errors are shown
 _DEEPEST_FORCE = 1e-6 * np.pi * runs.MODULUS * 8.0**2  # N at 8 mm, upright
 _ROLLED_AT = 4  # mm, where rotation ends and the path goes on
-_DOT: dict[str, Any] = CIRCLE | {"ms": 3, "mec": INK, "mew": 0.6}
-_PATH = {"xlim": (-12.5, 10.5)}
-_ANGLE = "relative angle θ [deg]"
+_PATH = -12.5, 10.5
 
 
 def _columns(
@@ -89,7 +93,7 @@ def compression() -> tuple[Sheet, ...]:
 def _forces(*sheets: Sheet) -> Iterator[DrawnCurve]:
     for style, run in zip(ordered(len(TILTS)), sheets, strict=False):
         yield DrawnCurve(run["d"], run["F"], style)
-        yield DrawnCurve(run["d estimated"][::6], run["F estimated"][::6], _DOT)
+        yield DrawnCurve(run["d estimated"][::6], run["F estimated"][::6], DOT)
     yield DrawnCurve([], [], {"color": INK}, "model")
     yield DrawnCurve([], [], CIRCLE | {"ms": 3, "mec": INK}, "estimated from the frames")
 
@@ -111,15 +115,10 @@ def _errors(symbol: str, *sheets: Sheet) -> Iterator[DrawnCurve]:
         yield DrawnCurve(run["d"][deep], off, style | {"linewidth": 0.9}, f"{tilt}°")
 
 
-def _zero(axes: Axes, *_: Sheet) -> None:
-    axes.axhline(0.0, color=GREY, linewidth=0.7)
-
-
 def _error_panel(symbol: str, title: str, label: str, limit: float) -> Panel:
-    more = {"xlim": (0, 8), "ylim": (-1.3 * limit, limit)}
     legend = {"loc": "lower right", "ncols": 4, "title": "tilt"}
-    curves = partial(_errors, symbol)
-    return Panel(curves, "displacement d [mm]", label, title, more, legend, annotate=_zero)
+    ends = (0, 8), (-1.3 * limit, limit)
+    return Panel(partial(_errors, symbol), DEPTH, label, title, *ends, legend, zero_line)
 
 
 @cache
@@ -176,7 +175,7 @@ def _along(symbol: str, rotation: Sheet, rolling: Sheet, _: Sheet) -> Iterator[D
     ):
         yield DrawnCurve(piece[f"theta{at}"], piece[f"{symbol}{at}"], {"color": color}, name)
         theta, found = piece[f"theta estimated{at}"], piece[f"{symbol} estimated{at}"]
-        yield DrawnCurve(theta[::4], found[::4], _DOT, "estimated" if at else "")
+        yield DrawnCurve(theta[::4], found[::4], DOT, "estimated" if at else "")
 
 
 def _over_upright(_: Sheet, rolling: Sheet, minima: Sheet) -> Iterator[DrawnCurve]:
@@ -215,15 +214,7 @@ PAGES = {
         (7.6, 6.2),
         compression,
         (
-            Panel(
-                _forces,
-                "displacement d [mm]",
-                "total elastic force F [N]",
-                "(a) force",
-                more={"xlim": (0, 8.6), "ylim": (0, 78)},
-                legend={"loc": "upper left"},
-                annotate=_angles,
-            ),
+            Panel(_forces, DEPTH, FORCE, "(a) force", (0, 8.6), (0, 78), "upper left", _angles),
             _error_panel("F", "(b) error of the force", "estimate over model − 1 [%]", 5.0),
             _error_panel("d", "(c) error of the displacement", "estimate − truth [µm]", 75.0),
             _error_panel("theta", "(d) error of the angle", "estimate − truth [deg]", 0.5),
@@ -241,38 +232,14 @@ PAGES = {
         (7.6, 6.2),
         tilt_and_roll,
         (
-            Panel(
-                partial(_along, "F"),
-                _ANGLE,
-                "total elastic force F [N]",
-                "(a) force along the path",
-                _PATH,
-            ),
-            Panel(
-                partial(_along, "U"),
-                _ANGLE,
-                "elastic energy U [mJ]",
-                "(b) energy along the path",
-                _PATH,
-                legend={"loc": "lower right"},
-            ),
-            Panel(
-                _over_upright,
-                _ANGLE,
-                "U(θ)/U(0)",
-                "(c) energy while rolling, over U(0)",
-                _PATH | {"ylim": (0.86, 1.085)},
-                annotate=_show_minima,
-            ),
-            Panel(
-                _angle_errors,
-                _ANGLE,
-                "estimate − truth [deg]",
-                "(d) error of the angle while rolling",
-                _PATH,
-                legend={"loc": "lower right", "ncols": 2},
-                annotate=_zero,
-            ),
+            Panel(partial(_along, "F"), RELATIVE, FORCE, "(a) force along the path", _PATH),
+            Panel(partial(_along, "U"), RELATIVE, "elastic energy U [mJ]",
+                  "(b) energy along the path", _PATH, None, "lower right"),
+            Panel(_over_upright, RELATIVE, "U(θ)/U(0)", "(c) energy while rolling, over U(0)",
+                  _PATH, (0.86, 1.085), annotate=_show_minima),
+            Panel(_angle_errors, RELATIVE, "estimate − truth [deg]",
+                  "(d) error of the angle while rolling", _PATH, None,
+                  {"loc": "lower right", "ncols": 2}, zero_line),
         ),
         rows=2,
         notes=(
@@ -282,4 +249,4 @@ PAGES = {
             "frame. Grey: model. Least: of a parabola through the estimates, ± standard error.",
         ),
     ),
-}
+}  # fmt: skip

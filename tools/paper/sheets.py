@@ -12,13 +12,20 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from softfinger.daemon.own_files import write_text
-from softfinger.tools.style import caption, label_ends
+from softfinger.tools.style import GREY, INK, caption, label_ends
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 FloatArray = NDArray[np.float64]
+Ends = tuple[float, float]
+
+DEPTH = "displacement d [mm]"
+FORCE = "total elastic force F [N]"
+RELATIVE = "relative angle θ [deg]"
+CIRCLE: dict[str, Any] = {"marker": "o", "linestyle": "none", "mfc": "none"}
+DOT = CIRCLE | {"ms": 3, "mec": INK, "mew": 0.6}
 
 
 @dataclass(frozen=True)
@@ -94,10 +101,11 @@ class Panel:
     xlabel: str
     ylabel: str
     title: str = ""
-    more: dict[str, Any] = field(default_factory=dict)  # of matplotlib's Axes.set
-    legend: dict[str, Any] | None = None
-    gap: float = 0.05  # between the curves' ends, of the axis
+    x: Ends | None = None
+    y: Ends | None = None
+    legend: str | dict[str, Any] = ""  # its place, or more of matplotlib's words
     annotate: Callable[..., None] | None = None  # axes and sheets
+    gap: float = 0.05  # between the curves' ends, of the axis
 
     def draw(self, axes: Axes, sheets: Sequence[Sheet]) -> None:
         ended: list[tuple[float, float, str]] = []
@@ -105,14 +113,20 @@ class Panel:
             axes.plot(curve.x, curve.y, **curve.look, label=curve.label or None)
             if curve.end:
                 ended.append((np.ravel(curve.x)[-1], float(np.ravel(curve.y)[-1]), curve.end))
-        axes.set(xlabel=self.xlabel, ylabel=self.ylabel, title=self.title, **self.more)
+        axes.set(xlabel=self.xlabel, ylabel=self.ylabel, title=self.title)
+        axes.set(**{name: ends for name, ends in (("xlim", self.x), ("ylim", self.y)) if ends})
         if ended:
             right, ends, words = zip(*ended, strict=True)
             label_ends(axes, right[0], ends, words, self.gap)
         if self.annotate is not None:
             self.annotate(axes, *sheets)
-        if self.legend is not None:
-            axes.legend(**self.legend)
+        if self.legend:
+            axes.legend(**{"loc": self.legend} if isinstance(self.legend, str) else self.legend)
+
+
+def zero_line(axes: Axes, *_: Sheet) -> None:
+    """Draw a line at 0."""
+    axes.axhline(0.0, color=GREY, linewidth=0.7)
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from softfinger.daemon.errors import SettingsError
+from softfinger.daemon.own_files import runtime_fault
 from softfinger.tools.arguments import add_settings, own_runtime_folder, profile
 from softfinger.tools.ending import Interrupted, Signals
 
@@ -73,9 +74,7 @@ begins the record again, --send "report forget" does both without a gap:
                    time since the last instruction with torque on, null while it is off, and the
                    longest such [s]
     watchdog_fired count, t of the last
-    goal_currents  with --send "report goals": t and value of the newest 1000, in their order
-  object           pose (x, y [m], angle [rad]) now; pushed: t of the last push or twist; slipped: t
-                   when both tips last stuck before one slipped; both null when there was none
+  object           pose (x, y [m], angle [rad]) now
   force            what presses each tip now [N], left first
 """
 
@@ -161,7 +160,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Emulate until SIGINT, SIGTERM or SIGHUP; 1 with one line when it can't be set up."""
     arguments.dir = arguments.dir or own_runtime_folder()
     if arguments.dir is None:
-        raise SettingsError("no folder of this user's own for the ports: name one by --dir")
+        raise SettingsError(f"{runtime_fault()}; or name another folder by --dir")
     if arguments.send is not None:
         return _send(arguments.dir, arguments.send)
     if arguments.model is not None:
@@ -186,7 +185,7 @@ def _serve(settings: Settings, arguments: argparse.Namespace, signals: Signals) 
         EmulatorError,
         with_board,
     )
-    from softfinger.tools.processes.kernel_build import build_kernels, print_event, table_cache
+    from softfinger.tools.processes.kernel_build import build_kernels, print_event
 
     build_kernels(with_board(settings), print_event, EMULATED)
     servos = EmulatedServos(arguments.baud, arguments.latency, arguments.factory, arguments.ids)
@@ -196,7 +195,6 @@ def _serve(settings: Settings, arguments: argparse.Namespace, signals: Signals) 
             arguments.dir,
             servos=servos,
             faults=arguments.fault,
-            table_cache=table_cache(),
             undisturbed=signals.held,
             tell=lambda line: print(line, file=sys.stderr, flush=True),
         )

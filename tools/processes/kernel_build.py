@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import math
 import os
 import subprocess
 import sys
@@ -21,7 +22,7 @@ from softfinger.daemon.loop.warm_up import Part, WantedScene, is_built, mark_bui
 from softfinger.daemon.profile.settings import Settings
 from softfinger.kinematics.compiled.kernel import why_plain
 from softfinger.kinematics.compiled.kernel_folder import kernel_folder, remove_damaged
-from softfinger.kinematics.compiled.own_folder import user_cache
+from softfinger.tools.sweep import processors
 from softfinger.tools.terminal.progress import Progress
 
 Tell = Callable[[str, str, str], None]
@@ -29,14 +30,6 @@ Tell = Callable[[str, str, str], None]
 _ROOT = Path(__file__).parents[3]
 _MEMORY = 400e6  # bytes that a process needs at most
 _LOOK = 0.2  # s between two looks at the time
-
-
-def table_cache() -> Path | None:
-    """Return the folder of built contact tables; None without a home folder."""
-    try:
-        return user_cache()
-    except RuntimeError:
-        return None
 
 
 class Built(NamedTuple):
@@ -88,13 +81,15 @@ def _kernels(missing: list[Part]) -> int:
 
 def _jobs(missing: list[Part]) -> int:
     """Return the number of processes for cores, kernel groups and memory."""
-    cores = len(os.sched_getaffinity(0))
-    return max(1, min(cores, len(missing), int(_available() / _MEMORY)))
+    return max(1, min(processors(), len(missing), int(_available() / _MEMORY)))
 
 
 def _available() -> float:
-    """Memory that may be taken without swapping [bytes]."""
-    _, _, rest = Path("/proc/meminfo").read_text().partition("MemAvailable:")
+    """Memory that may be taken without swapping [bytes]; infinite where Linux doesn't tell."""
+    try:
+        _, _, rest = Path("/proc/meminfo").read_text().partition("MemAvailable:")
+    except OSError:
+        return math.inf
     return 1024.0 * float(rest.split()[0])
 
 
@@ -102,7 +97,7 @@ class _Build:
     """The parts that are left, and a thread for each process that builds some of them."""
 
     def __init__(self, settings: Settings, missing: list[Part], tell: Tell, bar: Progress) -> None:
-        self._head = f"{settings.model_dump_json()}\n{table_cache() or ''}\n"
+        self._head = f"{settings.model_dump_json()}\n"
         self._waiting = list(missing)
         self._under_way: dict[Part, str] = {}  # and the kernel at work
         self._changed = threading.Condition()
@@ -226,9 +221,9 @@ def _start() -> subprocess.Popen[str]:
 def main() -> None:
     """Compile kernels, a part of a scene at a time, until standard input ends.
 
-    Standard input: the settings in JSON, the folder of contact tables (empty: none), then the name
-    of a part a line. Standard output, a line each: ``kernel NAME`` as one is begun, ``done`` when a
-    part is built, ``failed REASON`` when it can't be.
+    Standard input: the settings in JSON, then the name of a part a line. Standard output, a line
+    each: ``kernel NAME`` as one is begun, ``done`` when a part is built, ``failed REASON`` when it
+    can't be.
     """
     gc.set_threshold(100_000)  # the compiler makes much that lives: looking through it costs 10 %
     out = sys.stdout
@@ -253,8 +248,7 @@ def main() -> None:
     if not head:
         return
     settings = Settings.model_validate_json(head)
-    cache = sys.stdin.readline().rstrip("\n")
-    scene = WantedScene(settings, Path(cache) if cache else None)
+    scene = WantedScene(settings)
     for line in sys.stdin:
         part = named(line.rstrip("\n"))
         try:

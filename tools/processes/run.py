@@ -22,6 +22,7 @@ from softfinger.tools.processes.beside import MonitorBeside, NoRecorder, Recorde
 from softfinger.tools.processes.event_log import EventLog
 
 _STARTED = time.monotonic()
+_DETAILS = ("realtime", "schedule")  # kinds of news that only --verbose logs
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -35,6 +36,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--log-file", type=Path, metavar="FILE", help="log to FILE's end, not to standard error"
+    )
+    parser.add_argument(
+        "--verbose", action="store_true", help="also log the real-time measures and the schedule"
     )
     parser.add_argument(
         "--no-task", action="store_true", help="stay disarmed although the profile names a task"
@@ -82,17 +86,18 @@ def _serve(
     hold_collector()
     from softfinger.daemon.loop.build import Daemon
     from softfinger.daemon.loop.publishing import plan
-    from softfinger.tools.processes.kernel_build import build_kernels, table_cache
+    from softfinger.tools.processes.kernel_build import build_kernels
 
     log.line("info", "start", f"softfinger: {_scene(settings)}", rate_hz=settings.loop.rate)
     build_kernels(settings, log.line, bar=arguments.log == "plain" and not arguments.log_file)
     daemon = None
 
     def on_event(level: str, kind: str, text: str) -> None:
-        log.line(level, kind, text, **({} if daemon is None else _numbers(daemon.loop.state)))
+        if arguments.verbose or level != "info" or kind not in _DETAILS:
+            log.line(level, kind, text, **({} if daemon is None else _numbers(daemon.loop.state)))
 
     try:
-        daemon = Daemon(settings, on_event=on_event, table_cache=table_cache())
+        daemon = Daemon(settings, on_event=on_event)
     except (SoftfingerError, ValueError) as error:
         log.plain(f"softfinger: {error}", "error")
         return 2 if isinstance(error, SettingsError) else 1  # 2: a service is not started again
@@ -107,7 +112,7 @@ def _serve(
         within = max(table.max_error for table in daemon.tables)
         ready = (
             f"ready after {seconds:.2f} s; state on {settings.stream.address}, commands on "
-            f"{settings.commands.address}; contact table within {within:.1e}"
+            f"{settings.commands.address}; next, in another terminal: softfinger send arm"
         )
         log.line("info", "start", ready, start_s=seconds, table_error=within)
         recording: Any = nullcontext()

@@ -170,14 +170,17 @@ def export(
 ) -> list[Path]:
     """Write each topic's table into ``folder``, and frames into one ``.npz`` file a sensor.
 
-    Returns the files. Raises OSError, and MissingExtra.
+    The column ``t`` counts in s from the recording's first message. Returns the files. Raises
+    OSError, and MissingExtra.
     """
     tables: dict[bytes, tuple[Table, list[Row]]] = {}  # with the rows that aren't written yet
     grids: dict[str, tuple[list[float], list[Any]]] = {}  # times and counts by finger
     files: list[Path] = []
     try:
         for topic, message in recording.messages(topics, start, end, progress):
-            row = _flat(message)
+            stamp = message.get("timestamp")
+            since = stamp - recording.start if isinstance(stamp, int | float) else math.nan
+            row = _flat(message) | {"t": since}
             if topic not in tables:
                 name = _file_name(topic)
                 if any(each.stem == name for each in files):

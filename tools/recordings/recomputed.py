@@ -7,7 +7,6 @@ import math
 import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import msgpack
@@ -78,7 +77,6 @@ def recorded_settings(recording: Recording) -> tuple[Settings, list[str]]:
 def recompute(
     recording: Recording,
     settings: Settings | None = None,
-    cache: Path | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Comparison:
     """Run the recorded inputs through the loop and compare every state.
@@ -94,7 +92,7 @@ def recompute(
         )
     result = Comparison()
     try:
-        _run(result, recording, settings or own, calibrations, cache, progress)
+        _run(result, recording, settings or own, calibrations, progress)
     except (LookupError, TypeError, ValueError, ArithmeticError, struct.error) as error:
         raise RecordingError(
             f"{recording.path}: its messages are not those of a loop: {error!r}"
@@ -107,10 +105,9 @@ def _run(
     recording: Recording,
     used: Settings,
     calibrations: list[str],
-    cache: Path | None,
     progress: Callable[[int], None] | None,
 ) -> None:
-    machine = ProcessReplay(used, calibrations, cache)
+    machine = ProcessReplay(used, calibrations)
     scene = parts(used)
     pack_state = packer(schema.STATE)
     newest = [0, 0]

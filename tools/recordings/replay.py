@@ -119,14 +119,14 @@ def _publish(arguments: argparse.Namespace, recording: Recording) -> None:
 
 def _recompute(arguments: argparse.Namespace, recording: Recording) -> int:
     from softfinger.daemon.profile.load import load
-    from softfinger.tools.processes.kernel_build import build_kernels, print_event, table_cache
+    from softfinger.tools.processes.kernel_build import build_kernels, print_event
     from softfinger.tools.recordings.recomputed import recompute
     from softfinger.tools.terminal.progress import Progress
 
     settings = None if arguments.config is None else load(arguments.config)
     build_kernels(settings or Settings(), print_event)
     with Progress("recompute", recording.size) as progress:
-        result = recompute(recording, settings, table_cache(), progress)
+        result = recompute(recording, settings, progress)
     print(
         f"{arguments.file}: {result.ticks} ticks, {result.states} states of {result.fields} fields "
         "compared"

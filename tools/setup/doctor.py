@@ -20,6 +20,7 @@ from softfinger.daemon.diagnosis.ports import (
     check_addresses,
     check_latency_timer,
     check_port,
+    check_runtime_folder,
     daemon_mode,
     note_ports,
 )
@@ -66,6 +67,7 @@ def results(settings: Settings, fix: bool) -> Iterator[Finding]:
     for kind in BUILT_IN:
         yield from (Finding("note", f"softfinger.{kind}", source(each)) for each in plugins(kind))
     yield note_ports()
+    yield check_runtime_folder()
     running = daemon_mode(settings.commands.address, settings.access.keys) if ports else ""
     free = {}
     for key, path in ports:

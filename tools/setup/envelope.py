@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import math
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,6 +24,8 @@ from softfinger.daemon.own_files import write_text
 from softfinger.daemon.profile.settings import Settings
 from softfinger.tools.arguments import add_profile, number, profile
 from softfinger.tools.extras import require
+from softfinger.tools.processes.kernel_build import build_kernels, print_event
+from softfinger.tools.sweep import Sweep, add_sweep
 
 SHAPES = ("rectangle", "disc")
 SIZES = (2, 3, 4, 5, 6, 8, 10, 15, 20, 30, 40, 60, 90)  # mm: width or diameter
@@ -57,9 +61,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     ):
         parser.add_argument(name, type=kind, nargs="+", metavar=metavar, help="of these only")
     parser.add_argument(
-        "--keep", type=Path, metavar="FILE", help="write the map, as grasp reads it"
+        "--keep",
+        type=Path,
+        metavar="FILE",
+        help="write the map, as grasp reads it; after Ctrl-C the same call goes on",
     )
     parser.add_argument("--plot", type=Path, metavar="FILE", help="draw it (extra 'plot')")
+    add_sweep(parser)
 
 
 def _between(what: str, low: float, high: float) -> Callable[[str], float]:
@@ -70,7 +78,7 @@ def _between(what: str, low: float, high: float) -> Callable[[str], float]:
 def run(arguments: argparse.Namespace) -> int:
     """Try each, print the map, and write what was asked for.
 
-    Raises SettingsError, OSError, and MissingExtra without matplotlib.
+    Raises SettingsError, SweepError, OSError, and MissingExtra without matplotlib or Dask.
     """
     settings = profile(arguments)
     if arguments.plot:
@@ -82,32 +90,45 @@ def run(arguments: argparse.Namespace) -> int:
         tuple(sorted(arguments.size or SIZES)),
     )
     print(f"{arguments.force:g} N; " + "; ".join(f"{k}: {text}" for k, text in MEANING.items()))
-    found: dict[str, list[list[Cell]]] = {}
-    for shape in shapes:
-        print(f"\n{shape}, width [mm]:".ljust(28) + "".join(f"{each:>5g}" for each in axes[2]))
-        found[shape] = []
-        for friction, mass, row in _rows(settings, shape, axes, arguments.force):
-            found[shape].append(row)
-            cells = "".join(f"{cell.outcome:>5}" for cell in row)
-            print(f"friction {friction:g}, {mass:g} kg".ljust(27) + cells, flush=True)
+    found: dict[str, list[list[Cell]]] = {shape: [] for shape in shapes}
+    frictions, masses, sizes = axes
+    results = sweep(settings, shapes, axes, arguments)
+    for shape, friction, mass in itertools.product(shapes, frictions, masses):
+        if not found[shape]:
+            print(f"\n{shape}, width [mm]:".ljust(28) + "".join(f"{each:>5g}" for each in sizes))
+        row = [Cell(*next(results)) for _ in sizes]
+        found[shape].append(row)
+        cells = "".join(f"{cell.outcome:>5}" for cell in row)
+        print(f"friction {friction:g}, {mass:g} kg".ljust(27) + cells, flush=True)
     if arguments.keep:
         _keep(arguments.keep, settings, arguments.force, axes, found)
+        _journal(arguments.keep).unlink()
     if arguments.plot:
         _draw(arguments.plot, arguments.force, axes, found)
     return 0
 
 
-def _rows(
-    settings: Settings, shape: str, axes: tuple[tuple[float, ...], ...], force: float
-) -> Iterator[tuple[float, float, list[Cell]]]:
-    frictions, masses, sizes = axes
-    for friction in frictions:
-        for mass in masses:
-            yield (
-                friction,
-                mass,
-                [grasped(settings, shape, 1e-3 * size, friction, mass, force) for size in sizes],
-            )
+def sweep(
+    settings: Settings,
+    shapes: tuple[str, ...],
+    axes: tuple[tuple[float, ...], ...],
+    arguments: argparse.Namespace,
+) -> Iterator[Cell]:
+    """Yield each grasp, sizes first, then masses, frictions and shapes."""
+    build_kernels(settings, print_event)
+    journal = _journal(arguments.keep) if arguments.keep else None
+    cases = list(itertools.product(shapes, *axes))
+    work = partial(_one, settings.model_dump(exclude_unset=True), arguments.force)
+    return Sweep("envelope", work, cases, journal).run(arguments.processes, arguments.scheduler)
+
+
+def _journal(keep: Path) -> Path:
+    return keep.with_name(keep.name + ".part")
+
+
+def _one(sections: dict[str, Any], force: float, case: tuple[str, float, float, float]) -> Cell:
+    shape, friction, mass, size = case
+    return grasped(Settings.model_validate(sections), shape, 1e-3 * size, friction, mass, force)
 
 
 def grasped(

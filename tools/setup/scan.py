@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import argparse
 import sys
+from dataclasses import replace
 
 from softfinger.daemon.diagnosis.ports import serial_ports
 from softfinger.daemon.errors import ServoError
 from softfinger.daemon.servos.control_table import BAUD_RATES
-from softfinger.daemon.servos.provisioning import ALONE, SEARCH_TIME, search
+from softfinger.daemon.servos.provisioning import ALONE, SEARCH_TIME, FoundServo, search
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -45,11 +46,15 @@ def run(arguments: argparse.Namespace) -> int:
         except ServoError as error:
             print(f"scan: {error}", file=sys.stderr)
             continue
+        rates: dict[FoundServo, list[str]] = {}
         for servo in found.servos:
-            print(f"{path}: {servo}", flush=True)
+            rates.setdefault(replace(servo, baud=0), []).append(str(servo.baud))
+        for servo, at in rates.items():
+            # An emulated servo may answer at any rate; two of one ID at two rates are two.
+            print(f"{path}: {servo.told(', '.join(at))}", flush=True)
         for garbled in found.garbled:
             print(f"{path}: {garbled}\n  → {ALONE}", flush=True)
         if not found.servos and not found.garbled:
             print(f"{path}: no servo answers at any of these rates", flush=True)
-        count += len(found.servos)
+        count += len(rates)
     return 0 if count else 1

@@ -118,7 +118,7 @@ class Feed:
         self._news: deque[ShownEvent] = deque(maxlen=EVENTS)
         self._heard: deque[tuple[float, float]] = deque(maxlen=2 * EVENTS)
         self.times: schema.LoopStatistics | None = None  # of all ticks so far
-        self.warm = math.inf  # °C from which a servo's temperature is warned about
+        self.warm = 0.0  # s before a servo's limit of temperature from which it is warned about
         self._commanding = "", -math.inf  # who has the commander's lease, until when
         self._lease = math.nan  # s
         self.commanded = math.nan  # N of the last grasp command, of any client
@@ -233,11 +233,11 @@ class Feed:
     def _read_settings(self, message: schema.HandSettings, _: float) -> None:
         settings = json.loads(message.settings or "{}")
         self._lease = number(settings, "commands", "lease")
-        warm = number(settings, "safety", "temperature_warn")
+        warm = number(settings, "safety", "heat_warn")
         self.force_default = number(settings, "control", "force_default")
         limit = number(settings, "safety", "force_max")
         self.force_limit = math.inf if math.isnan(limit) else GRIP_FRACTION * limit
-        self.warm = math.inf if math.isnan(warm) else warm
+        self.warm = 0.0 if math.isnan(warm) else warm
 
     def news(self) -> list[ShownEvent]:
         """Return the events that have come since the last call."""

@@ -20,16 +20,16 @@ import zmq
 
 from softfinger.daemon.types import FINGERS
 from softfinger.tools.arguments import (
+    ADDRESS_HELP,
     PATIENCE,
     add_keys,
+    addresses,
     client_keys,
-    command_address,
     no_stream,
     seconds,
-    stream_address,
     to_stderr,
 )
-from softfinger.tools.ending import Ending
+from softfinger.tools.ending import Ending, known
 from softfinger.tools.terminal.feed import Commander, Feed, FeedSubscriber
 from softfinger.tools.terminal.monitor_page import MonitorPage
 from softfinger.tools.terminal.terminal import KeyDecoder, Terminal, TerminalGone
@@ -38,7 +38,8 @@ from softfinger.tools.terminal.typeset import short
 STEP_ANGLE = math.radians(5.0)  # of the arrow keys
 _STEPS = ((1.0, 0.1), (5.0, 0.5), (math.inf, 1.0))  # N: up to this force, in steps of that
 _BETWEEN = 1.0  # s between two presses that add up
-_SIMPLE = {"a": "arm", "r": "release", " ": "stop", "c": "clear", "d": "disarm"}
+_SURE = 3.0  # s in which a second d means it
+_SIMPLE = {"a": "arm", "r": "release", " ": "stop", "c": "clear", "d": "disarm", "w": "demo"}
 _GRIPPING = ("grasping", "holding", "rotating")
 
 
@@ -51,6 +52,7 @@ class HandKeys:
         self._target: float | None = None  # object angle [rad]
         self._chosen = math.nan  # grasp force [N]
         self._pressed = -math.inf  # time of its last change here
+        self._asked = -math.inf  # when disarm was asked for in a grip
 
     def press(self, key: str, now: float) -> None:
         """Send the key's command; other keys do nothing."""
@@ -60,6 +62,9 @@ class HandKeys:
             self._change_force(1.0 if key in "+=" else -1.0, now)
         elif key == "g":
             self._grasp(now)
+        elif key == "d" and self._gripping and now - self._asked > _SURE:
+            self._asked = now
+            self._commander.refuse(now, "disarm: it lets the object fall; d again to do it")
         elif key in _SIMPLE:
             self._target = None
             self._commander.send(now, _SIMPLE[key], _SIMPLE[key])
@@ -129,11 +134,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "Show the hand on a live terminal page; keys arm, grasp, rotate, release and stop it, and\n"
         "choose the force. Prints a plain line a second when the output is not a terminal."
     )
-    for name, kind, what in (
-        ("--state", stream_address, "where the state stream is published"),
-        ("--commands", command_address, "where commands are taken"),
-    ):
-        parser.add_argument(name, type=kind, default="", metavar="ADDRESS", help=what)
+    parser.add_argument("--address", type=addresses, default="", help=ADDRESS_HELP)
+    parser.add_argument("--state", metavar="ADDRESS", help="where the state stream is published")
+    parser.add_argument("--commands", metavar="ADDRESS", help="where commands are taken")
     add_keys(parser)
     parser.add_argument("--client", default="", help="a name: the commander's lease is bound to it")
     parser.add_argument(
@@ -149,7 +152,7 @@ def run(args: argparse.Namespace) -> int:
 
     Raises KeyFileError.
     """
-    state, commands = args.state, args.commands
+    state, commands = args.state or args.address[0], args.commands or args.address[1]
     if args.lifeline is not None:
         _lower_priority()
     keys = client_keys(args.keys)
@@ -185,7 +188,8 @@ def _lower_priority() -> None:
 
 
 def _is_page(args: argparse.Namespace) -> bool:
-    if args.plain or os.environ.get("TERM", "dumb") == "dumb" or not sys.stdout.isatty():
+    dumb = sys.platform == "win32" or os.environ.get("TERM", "dumb") == "dumb"
+    if args.plain or dumb or not sys.stdout.isatty():
         return False
     return (sys.stdout.encoding or "").lower().replace("-", "") == "utf8"
 
@@ -193,7 +197,7 @@ def _is_page(args: argparse.Namespace) -> bool:
 class _Ending(Ending):
     """Also suspends, and ends without a stream if that is asked for."""
 
-    signals = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    signals = known("SIGINT", "SIGTERM", "SIGHUP")
 
     def __init__(self, args: argparse.Namespace) -> None:
         super().__init__(args.duration, args.lifeline)
@@ -273,6 +277,8 @@ def _page_loop(
             for key in keys.decode(typed):
                 if key == "q":
                     return ending.end()
+                if key == "?":
+                    page.explains = not page.explains
                 hand.press(key, time.monotonic())
         now = time.monotonic()
         if now < due:

@@ -62,8 +62,22 @@ _KEYS = {
     "space": "stop",
     "c": "clear",
     "d": "disarm",
+    "?": "",
     "q": "quit",
 }
+_MEANINGS = (
+    ("d", "how deep the object presses the tip in"),
+    ("θ", "tilt of the object's face against the tip"),
+    ("force", "F(d, θ), what presses the tip, normal to the face"),
+    ("energy", "U(d, θ), elastic energy in the tip"),
+    ("±", "one standard deviation"),
+    ("map age", "time since the newest pressure map was measured"),
+    ("joint, goal", "angles now and asked for; positive closes"),
+    ("current, bound", "of the motor, and the most that its goal allows"),
+    ("object", "its angle and width between the tips"),
+    ("w", "begins the profile's task again, while disarmed"),
+    ("+ -", "more or less force; a grip follows at once"),
+)
 
 # (label, field, factor, decimals, unit, field of the standard deviation)
 _ROWS = (
@@ -91,6 +105,7 @@ class MonitorPage:
     keys: bool = True  # a keyboard is there
     guarded: bool = False  # subscribed with keys
     force: float = math.nan  # N of the grasp key
+    explains: bool = False  # the numbers' meanings stand in their place
     _pressure: heatmap.FullScale = field(default_factory=lambda: heatmap.FullScale(5e3, 3.0))
     _force: heatmap.FullScale = field(default_factory=lambda: heatmap.FullScale(1.0, 0.0))
     _statistics: RecentTicks = field(default_factory=RecentTicks)
@@ -113,7 +128,7 @@ class MonitorPage:
         status = self.feed.status(now)
         maps, trend, events = _heights(width, height)
         numbers = [
-            *self._body(width, maps, now),
+            *(_meanings(width, maps + 2) if self.explains else self._body(width, maps, now)),
             rule(width, Text(self._goal())),
             *self._trends(width, trend),
             self._ticks(width),
@@ -233,7 +248,7 @@ class MonitorPage:
             finger = getattr(self.feed.state, name)
             value, style = getattr(finger, key), "default" if finger.valid else DIM
             if key == "temperature":
-                style = BAD if value >= self.feed.warm else style
+                style = BAD if finger.time_to_limit < self.feed.warm else style
                 value = value or math.nan  # 0 is not known yet
             spread = factor * getattr(finger, std) if std else math.nan
             shown = aligned(factor * value, decimals)
@@ -361,6 +376,11 @@ class MonitorPage:
                 del keys[spare]
                 line = _named(keys)
         return line
+
+
+def _meanings(width: int, lines: int) -> list[Text]:
+    named = [cut(Text.assemble((f" {name:>15}  ", KEY), text), width) for name, text in _MEANINGS]
+    return named + [Text() for _ in range(lines - len(named))]
 
 
 def _named(keys: dict[str, str]) -> Text:

@@ -14,7 +14,7 @@ from softfinger.daemon.client.command_client import UNCONFIRMED, NoAnswer, send
 from softfinger.daemon.client.connection import PATIENCE
 from softfinger.daemon.control.modes import COMMANDS
 from softfinger.daemon.errors import KeyFileError
-from softfinger.tools.arguments import add_keys, client_keys, command_address, seconds
+from softfinger.tools.arguments import ADDRESS_HELP, add_keys, client_keys, command_address, seconds
 
 _NUMBER = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*")
 _ANGLES = {"rad": 1.0, "deg": math.radians(1.0), "°": math.radians(1.0)}
@@ -24,8 +24,8 @@ _UNITS = {  # that a number may carry, by its key; without one it is SI
 }
 _EPILOG = """\
 commands: arm, disarm, tare, grasp force=N, rotate angle=RAD, hold force=N angle=RAD (setpoints of a
-stream), move left=RAD right=RAD, release, set compliance=RAD/NM, stop, clear, status. Numbers are
-SI, or carry their unit: force=10N, angle=8deg or 8°.
+stream), move left=RAD right=RAD, release, set compliance=RAD/NM, demo (the profile's task again),
+stop, clear, status. Numbers are SI, or carry their unit: force=10N, angle=8deg or 8°.
 Exit status: 0 done, 1 refused, 2 no answer or not understood here, 3 stop or disarm was received,
 but the servos have not confirmed torque off yet."""
 
@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
     parser.add_argument("command", metavar="COMMAND", choices=tuple(COMMANDS))
     parser.add_argument("values", metavar="key=value", nargs="*")
-    parser.add_argument("--address", type=command_address, default="", help="command socket")
+    parser.add_argument("--address", type=command_address, default="", help=ADDRESS_HELP)
     add_keys(parser)
     parser.add_argument("--client", default="", help="a name: the commander's lease is bound to it")
     parser.add_argument(

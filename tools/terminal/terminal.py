@@ -10,8 +10,6 @@ import contextlib
 import os
 import re
 import shutil
-import termios
-import tty
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -22,6 +20,10 @@ from rich.text import Text
 
 from softfinger.daemon.errors import SoftfingerError
 from softfinger.tools.terminal.heatmap import Depth
+
+with contextlib.suppress(ModuleNotFoundError):  # Windows has no page, but `monitor --plain`
+    import termios
+    import tty
 
 _ENTER = "\x1b[?1049h\x1b[?25l\x1b[?2004h\x1b[2J"  # alternate screen, no cursor, pastes marked
 _LEAVE = "\x18\x1b[0m\x1b[?2004l\x1b[?25h\x1b[?1049l"  # CAN ends a sequence that was cut off

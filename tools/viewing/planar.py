@@ -15,7 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softfinger.daemon.profile.settings import SimulationSettings
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.simulation.physics.plant_state import NO_OBJECT
+from softfinger.daemon.simulation.physics.shapes import shape_of
 from softfinger.daemon.types import FINGERS
 from softfinger.kinematics.hand.geometry import HandGeometry
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
@@ -195,22 +197,18 @@ class HeldObject:
         return outline
 
 
-def true_outline(simulated: SimulationSettings, truth: dict[str, Any]) -> FloatArray | None:
+def true_outline(settings: Settings, truth: dict[str, Any]) -> FloatArray | None:
     """The simulated object's outline [n, 2] m, closed, by a ``hand/truth``; None without one."""
-    shape = simulated.object_shape
-    x, y, angle = (number(truth, "true_object", key) for key in ("x", "y", "angle"))
-    if shape == "none":
+    try:
+        shape = shape_of(settings)
+    except ValueError:  # a stranger's wedge whose faces meet
         return None
-    if shape == "disc":
-        turn = np.linspace(0.0, 2.0 * math.pi, 49)
-        own = simulated.object_radius * np.column_stack((np.cos(turn), np.sin(turn)))
-    else:
-        half_height = 0.5 * simulated.object_height
-        lean = math.tan(0.5 * simulated.object_taper) if shape == "wedge" else 0.0
-        low = 0.5 * simulated.object_width + half_height * lean
-        high = 0.5 * simulated.object_width - half_height * lean
-        own = np.array([(-low, -1.0), (-high, 1.0), (high, 1.0), (low, -1.0), (-low, -1.0)])
-        own[:, 1] *= half_height
+    if shape.kind == NO_OBJECT:
+        return None
+    x, y, angle = (number(truth, "true_object", key) for key in ("x", "y", "angle"))
+    own = np.vstack((shape.corners, shape.corners[:1]))
+    if shape.roundness > 0.0:
+        own = shape.roundness * np.column_stack((np.cos(_TURN), np.sin(_TURN)))
     cosine, sine = math.cos(angle), math.sin(angle)
     turned: FloatArray = own @ np.array([(cosine, sine), (-sine, cosine)]) + (x, y)
     return turned if np.isfinite(turned).all() else None
@@ -266,7 +264,7 @@ class HandScene:
 
     def simulated(self, truth: dict[str, Any] | None) -> HandPart:
         """The simulated object's true pose, by a ``hand/truth`` if there is any."""
-        outline = None if truth is None else true_outline(self._hand.settings.simulation, truth)
+        outline = None if truth is None else true_outline(self._hand.settings, truth)
         return HandPart([] if outline is None else [Strip(outline, GOAL, 0.6)])
 
 

@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from softfinger.tools.arguments import add_stream, command_address, number, seconds
+from softfinger.tools.arguments import add_stream, addresses, number, seconds
 from softfinger.tools.ending import Ending
 from softfinger.tools.extras import require
 
@@ -25,10 +25,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "file", type=Path, nargs="?", metavar="FILE.mcap", help="a recording, instead of the stream"
     )
-    add_stream(parser)
-    parser.add_argument(
-        "--commands", type=command_address, default="", metavar="ADDRESS", help="command socket"
-    )
+    add_stream(parser, addresses)
+    parser.add_argument("--commands", metavar="ADDRESS", help="command socket, where it is apart")
     parser.add_argument(
         "--foxglove",
         type=_any_port,
@@ -64,6 +62,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.foxglove is not None and arguments.file is not None:
         print("view: --foxglove serves the stream alone, found FILE.mcap, too", file=sys.stderr)
         return 2
+    arguments.address, commands = arguments.address
+    arguments.commands = arguments.commands or commands
     with Ending(arguments.duration) as ending:
         if arguments.foxglove is None:
             require("view")

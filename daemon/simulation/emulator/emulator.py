@@ -1,4 +1,7 @@
-"""The emulated hand: physics in real time, behind servos and tactile boards on ptys.
+"""The emulated hand: physics behind servos and tactile boards on ptys, in real time.
+
+On a busy machine its time stands still for its daemon as the daemon's does for it: see
+`EmulatorClock` and `PtyServoBus.bounded`; not with ``loop.clock = "real"``.
 
 One thread, one event loop: it waits for bytes on the servos' pty or for the next thing that is
 due, answers the servos first, and does at most one slower thing (a step of the physics, a frame)
@@ -43,11 +46,10 @@ from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 from softfinger.daemon.types import FINGERS
 
 _STEP = 0.002  # s, longest that the physics lags behind
-_REQUESTS = ("report", "goals", "forget", "place")  # words to the control socket that are no fault
+_REQUESTS = ("report", "forget", "place")  # words to the control socket that are no fault
 _TURNS = {"closed": 6.0, "open": -6.0, "zero": 0.0}  # rad; a joint's stops come before 6
 _TURNING = 0.3  # A of the servo's motor, as strong as the hand that turns a joint is
 _TURN_TIME = 1.0  # s
-_SLIPS = 0.999  # of what friction bears
 _STALL = 0.05  # s; a longer interruption is left out of the hand's time
 # The board where a profile names none: that of config/hil.toml.
 DEFAULT_BOARD = {
@@ -68,10 +70,13 @@ class EmulatorClock:
     """Time of the emulated hand: real time from 0, less the interruptions of its process.
 
     Without that a process that was stopped for a minute would have to compute that minute, and
-    would answer no client meanwhile.
+    would answer no client meanwhile. ``bounded`` keeps time back where the hand waits.
     """
 
+    waits = False
+
     def __init__(self) -> None:
+        self.bounded: Callable[[float], float] = lambda t: t
         self._origin = self._last = time.monotonic()
 
     def now(self) -> float:
@@ -79,7 +84,9 @@ class EmulatorClock:
         now = time.monotonic()
         self._origin += max(now - self._last - _STALL, 0.0)
         self._last = now
-        return now - self._origin
+        t = self.bounded(now - self._origin)
+        self._origin = now - t
+        return t
 
     def wall(self) -> float:
         """Return Unix time [s]."""
@@ -116,15 +123,14 @@ class Emulator:
         *,
         servos: EmulatedServos | None = None,
         faults: Iterable[str] = (),
-        table_cache: Path | None = None,
         undisturbed: Callable[[], AbstractContextManager[None]] = contextlib.nullcontext,
         tell: Callable[[str], None] = lambda _: None,
     ) -> None:
         """Build it; nothing answers before :meth:`run`.
 
-        ``faults``: see :func:`parse_faults`. ``table_cache``: a folder where the contact table is
-        kept. ``undisturbed``: a context without exceptions of signal handlers, for making what has
-        to be removed again. ``tell`` takes the log's lines: where a plate has come to rest.
+        ``faults``: see :func:`parse_faults`. ``undisturbed``: a context without exceptions of
+        signal handlers, for making what has to be removed again. ``tell`` takes the log's lines:
+        faults that begin, and where a plate has come to rest.
         Raises EmulatorError, and SettingsError when the settings' material is no stress-strain law.
         """
         self._closers: list[Callable[[], None]] = []
@@ -140,9 +146,6 @@ class Emulator:
         self._turned = 0.0  # when a person's hand has turned a joint
         self._tell = tell
         self._advance_due = 0.0
-        self._pushed: float | None = None  # when a load on the object last changed
-        self._slipped: float | None = None  # when both tips last stuck before one slipped
-        self._stuck = 0.0  # when they last stuck, as far as was looked
         try:
             servos = servos or EmulatedServos()
             self._ids = settings.servos.ids if servos.ids is None else servos.ids
@@ -155,7 +158,7 @@ class Emulator:
             settings = with_board(settings)
             self._simulation = settings.simulation
             self.clock = EmulatorClock()
-            table = make_table(settings, make_material(settings.material), table_cache)
+            table = make_table(settings, make_material(settings.material))
             self.hand = SimulatedHand(settings, 0.0, table)
             if settings.servos.backend != "none":
                 self._add_servos(settings, servos)
@@ -180,6 +183,8 @@ class Emulator:
             servos = PtyServoBus(bus, baud=line.baud, latency=line.latency, clock=self.clock.now)
             self._closers.append(servos.unplug)
             self._links.link("servos", servos.path)
+        if settings.loop.clock != "real":
+            self.clock.bounded = servos.bounded
         self._servos = servos
 
     def _add_board(self, settings: Settings, finger: int) -> None:
@@ -277,12 +282,6 @@ class Emulator:
                 self._tell(f"plate: {finger} {press}")
                 if press.is_clear:
                     self._take_away(finger)
-        if self._slipped is None:
-            limit = _SLIPS * self._simulation.tip_friction
-            tips = zip(self.hand.tangential.tolist(), self.hand.normal.tolist(), strict=True)
-            if any(normal > 0.0 and abs(along) >= limit * normal for along, normal in tips):
-                self._slipped = self._stuck
-            self._stuck = t
 
     # --- requests and faults ---------------------------------------------------------------------
 
@@ -290,10 +289,9 @@ class Emulator:
         """Take words of the control socket: ``ok``, or ``error: `` and why none of them counts.
 
         A time behind a word counts from now. With ``report`` among them the answer is
-        :meth:`report` as JSON, and with ``goals`` each servo's newest goal currents are in it;
-        ``forget`` begins the record again; ``place`` puts the object back where it was at the
-        start, at rest and with no load on it, and takes plates away. ``press …`` is for
-        :meth:`press`, ``turn …`` for :meth:`turn`.
+        :meth:`report` as JSON; ``forget`` begins the record again; ``place`` puts the object back
+        where it was at the start, at rest and with no load on it, and takes plates away.
+        ``press …`` is for :meth:`press`, ``turn …`` for :meth:`turn`.
         """
         words = text.split()
         if words[:1] == ["turn"]:
@@ -306,7 +304,7 @@ class Emulator:
         except FaultError as error:
             return f"error: {error}"
         now = self.clock.now()
-        reply = json.dumps(self.report(now, "goals" in words)) if "report" in words else "ok"
+        reply = json.dumps(self.report(now)) if "report" in words else "ok"
         if "forget" in words:
             self._forget(now)
         if "place" in words:
@@ -369,33 +367,27 @@ class Emulator:
         self._advance(self.clock.now())
         return reply
 
-    def report(self, t: float, goals: bool = False) -> dict[str, Any]:
+    def report(self, t: float) -> dict[str, Any]:
         """Report the traffic on the servos' wire and the hand's true state; times are the hand's
         [s].
 
         ``monotonic`` is time.monotonic() at ``t``, to compare with times of other processes.
         """
         servos = self._servos.bus.report(t) if self._servos is not None else []
-        if goals and self._servos is not None:
-            for report_of, servo in zip(servos, self._servos.bus.servos, strict=True):
-                report_of["goal_currents"] = servo.goal_currents()
-        pose = self.hand.object_pose.tolist()
-        held = {"pose": pose, "pushed": self._pushed, "slipped": self._slipped}
+        held = {"pose": self.hand.object_pose.tolist()}
         hand = {"servos": servos, "object": held, "force": self.hand.force.tolist()}
         return {"t": t, "monotonic": time.monotonic(), **hand}
 
     def _forget(self, t: float) -> None:
         """Begin the record again."""
-        self._pushed = self._slipped = None
-        self._stuck = t
         if self._servos is not None:
             self._servos.bus.forget(t)
 
     def _apply(self, event: FaultEvent, t: float) -> None:
         after, part, kind, value, over = event
+        self._tell(f"fault: {event}")
         if part == OBJECT:
             self.hand.load(**{kind: value})
-            self._pushed = t
             return
         if kind in MEASUREMENT_FAULTS:
             self.hand.measurement_faults[FINGERS.index(part)].begin(kind, value, after, over)

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from softfinger.daemon.errors import SoftfingerError
-from softfinger.daemon.own_files import require_own
+from softfinger.kinematics.compiled.own_folder import require_own
 
 LINKS = ("servos", "tactile-left", "tactile-right")
 _LOCK = ".emulator.lock"
@@ -46,7 +46,8 @@ class LinkFolder:
             require_own(path)
             self._lock = self._take(path / _LOCK)
         except OSError as error:
-            raise FolderError(f"{path}: can't be used as --dir: {error.strerror}") from None
+            reason = error.strerror or error
+            raise FolderError(f"{path}: can't be used as --dir: {reason}") from None
         for name in LINKS:
             link = path / name
             if link.exists() and not link.is_symlink():

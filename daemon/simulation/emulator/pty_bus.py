@@ -76,11 +76,12 @@ class PtyServoBus:
         self._latency = latency
         self._spin = spin
         self._clock = clock
-        self._waited: float | None = None  # s this thread waited for a processor, at the last look
+        self._waited: float | None = None  # s this thread waited for a processor, at the last check
         self._statistics = -1  # the open file of this thread's scheduling statistics
         self._free_at = -math.inf  # the wire is busy until then
         self._due: list[tuple[float, int, bytes]] = []
         self._order = 0
+        self._heard = -math.inf  # when bytes last came
         self.plug()
 
     def fileno(self) -> int:
@@ -119,6 +120,28 @@ class PtyServoBus:
         servos = self.bus.next_event()
         return min(servos, self._due[0][0] - self._spin) if self._due else servos
 
+    def bounded(self, t: float) -> float:
+        """Return time ``t`` [s], or the earlier one at which the hand waits for its daemon.
+
+        With torque on and the port in a daemon's hands, silence means that this machine is late: so
+        time goes on for half of the watchdog's, a tick or more, and no further.
+        """
+        armed = [servo.watchdog for servo in self.bus.servos if servo.torque_on]
+        watchdog = min(filter(None, armed), default=math.inf)
+        bound = self._heard + 0.5 * watchdog
+        return bound if bound < t and self._owned() else t
+
+    def _owned(self) -> bool:
+        """Return whether a process has the port for itself, as the daemon does while it lives."""
+        if not self.plugged:
+            return False
+        try:
+            fcntl.flock(self._slave, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+        fcntl.flock(self._slave, fcntl.LOCK_UN)
+        return False
+
     def service(self, t: float, since: float | None = None) -> None:
         """Take what has arrived by time t [s], let the servos act, send what is due.
 
@@ -131,6 +154,7 @@ class PtyServoBus:
                     data = os.read(self._master, _READ_SIZE)
                 except OSError:  # nothing there
                     break
+                self._heard = t
                 if self._receive(data, t, arrived):
                     break  # the client takes some time for the reply
                 # Its next request often comes while its last write is being done.

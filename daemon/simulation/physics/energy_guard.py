@@ -141,3 +141,11 @@ def enter_changed(plant: Plant) -> None:
     energy = kinetic_energy(plant) + elastic_energy(plant) + weight_energy(plant)
     plant.energy = energy
     plant.allowed = min(energy, plant.allowed + work_done(plant))
+
+
+@inner_kernel
+def enter_relaxed(plant: Plant) -> None:
+    """Enter the energy of a state whose tips have relaxed, and allow as much more or less."""
+    energy = kinetic_energy(plant) + elastic_energy(plant) + weight_energy(plant)
+    plant.allowed += energy - plant.energy
+    plant.energy = energy

@@ -20,6 +20,7 @@ import math
 from softfinger.daemon.simulation.physics.energy_guard import (
     HALVINGS,
     enter_changed,
+    enter_relaxed,
     guard_step,
     is_allowed,
     on_rim,
@@ -55,7 +56,7 @@ from softfinger.daemon.simulation.physics.solver import (
     take_extra_stiffness,
     take_stiffness,
 )
-from softfinger.daemon.simulation.physics.tip import relax_shears
+from softfinger.daemon.simulation.physics.tip import relax_shears, relax_tips
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 from softfinger.kinematics.compiled.layout import Records
 from softfinger.kinematics.compiled.simd import Pointer, address
@@ -240,6 +241,7 @@ def take_sample(plant: Plant, ring: Records[Sample]) -> None:
         row.d[finger] = now.d - fraction * (now.d - before.d)
         row.theta[finger] = now.theta - fraction * (now.theta - before.theta)
         row.gain[finger] = now.gain - fraction * (now.gain - before.gain)
+        row.firmness[finger] = 1.0 if feels_tip(plant, finger) else plant.firmness[finger]
         row.curvature[finger] = now.curvature
         row.tangential[finger] = now.tangential - fraction * (now.tangential - before.tangential)
     plant.samples += 1
@@ -309,3 +311,8 @@ def step(plants: Records[Plant], table: FloatArray, ring: Records[Sample], count
             if changed != 0:
                 enter_changed(plant)
         settle(plant, ring)
+        if p.remembers:
+            # Firmness is constant within a step; what its change brings is the tip's own.
+            relax_tips(plant)
+            evaluate_state(plant, data)
+            enter_relaxed(plant)

@@ -61,6 +61,7 @@ class Sample(Record):
     d: Pair
     theta: Pair
     gain: Pair
+    firmness: Pair
     curvature: Pair
     tangential: Pair
 
@@ -89,6 +90,9 @@ class Parameters(Record):
     shear_stiffness: float  # over that of the springs
     creep: float  # share of a stuck shear that relaxes in a sub-step
     micro_slip: bool  # the footprint's edge slips before all of it does
+    remembers: bool  # the tips relax
+    relaxation: Three  # stiffness of each Prony term over the lasting one
+    relaxed: Three  # share of it that relaxes in a sub-step
     rim_stiffness: float  # [N/m]
     tolerance: float  # share of the energy that smooth steps may gain
     half_separation: float  # of the pivots [m]
@@ -250,6 +254,8 @@ class Plant(Record):
     motor_by_rate: Pair
     layers: Annotated[FloatArray, 2, LAYERS]  # shear of each tip's layers [m]
     shear_variance: Pair  # their variance [m²]
+    memory: Annotated[FloatArray, 2, 3]  # each tip's lasting force, followed by each term [N]
+    firmness: Pair  # of each tip on the object, over the lasting one
     palm_energy: float  # [J]
     tips_near: bool  # the tips on each other were evaluated
     coupled: bool  # an extra row may act in this step

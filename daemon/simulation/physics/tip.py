@@ -20,7 +20,7 @@ order in d: the footprint is narrower along the tilt by κ² = R/(R + a), the cu
 1/a + 1/R, and force and energy are κ times those of the plane, whatever θ. Integrals over the very
 springs, for a constant modulus, a = 20 mm and d up to 8 mm, are within 1.6 % of that upright and
 within 4.5 % at 30° for R = 20 and 40 mm, within 3 % and 9 % for R = 10 mm. The sensor's frame is
-rendered from those springs (`sensor.curved_face`), so its sum differs by as much. A solid tip's
+rendered from those springs (`sensor.sensor_model`), so its sum differs by as much. A solid tip's
 force goes with d^(3/2) and by √κ, as Hertz's does between a sphere and a cylinder in the limit of
 small d; its frame is the plane's times that.
 
@@ -66,6 +66,7 @@ _FADE_FROM = 1.15  # rad, where w(θ) begins to fade
 _FADE_TO = 1.35  # rad, where nothing soft is left
 _CLOSEST = 1e-3  # of the radius: how near a corner the tip's centre counts
 _WITHIN = 5e-13  # of friction's limit
+_LIMP = 0.02  # of a tip's lasting firmness: what is left of it where it comes back late
 _BEFORE_RIM = 0.03  # of the radius, when the plate is parallel to the face: end of the soft range
 
 
@@ -334,7 +335,7 @@ def touch_object(
     # it at once; losses take that of here.
     travel = max(p.step * rate_d, 0.0)
     if d + travel <= D_MIN:
-        tip.gain = fade(theta)[0] * p.factor
+        tip.gain = fade(theta)[0] * p.factor * plant.firmness[finger]
         clear_contact(tip)
         return
     theta_q = side
@@ -366,7 +367,7 @@ def touch_object(
     tip.slip_rate = t_q * q_rate - my * x_rate + mx * y_rate + rotation_t * rotation_rate
     tip.shear = now.shear[finger]
     tip.shear_variance = plant.shear_variance[finger]
-    contact_forces(p, table, tip, p.factor)
+    contact_forces(p, table, tip, p.factor * plant.firmness[finger])
     if rim + travel > 0.0:
         stiffen_by_rim(p, tip)
     tangent = tip.tangent
@@ -419,3 +420,24 @@ def relax_shears(plant: Plant) -> None:
                 square += (layers[k] - shear) ** 2
             plant.shear_variance[finger] = square / LAYERS
         state.shear[finger] = shear
+
+
+@inner_kernel
+def relax_tips(plant: Plant) -> None:
+    """Let each tip on the object follow its lasting force F∞ for a sub-step; set its firmness ρ.
+
+    ρ = 1 + Σ r_i (1 − h_i/F∞) with ḣ_i = (F∞ − h_i)/τ_i scales all of the tip's forces: pressed at
+    once it is firmer by Σ r_i than in the end, let go at once it comes back late.
+    """
+    p = plant.parameters
+    for finger in range(2):
+        tip = plant.stages[0].on_object[finger]
+        lasting = tip.force / plant.firmness[finger]
+        firmness = 1.0
+        for k in range(3):
+            plant.memory[finger, k] += p.relaxed[k] * (lasting - plant.memory[finger, k])
+            if lasting > 0.0:
+                firmness += p.relaxation[k] * (1.0 - plant.memory[finger, k] / lasting)
+            else:
+                firmness += p.relaxation[k]
+        plant.firmness[finger] = max(firmness, _LIMP)

@@ -73,6 +73,10 @@ class SimulatedTactile:
         self._radius = settings.tip.radius
         self._solid = settings.tip.physics == "solid"
         self.stage: Callable[[float], StageTouch] | None = None
+        self._relaxation = list(
+            zip(simulation.tip_relaxation, simulation.tip_relaxation_times, strict=True)
+        )
+        self._memory = [0.0] * len(self._relaxation)  # the plate's force, followed by each [N]
         self._pressed = -1  # number of the newest sample that the cells have felt
         self._frame: Frame | None = None
         self._faults = hand.measurement_faults[finger]
@@ -141,11 +145,21 @@ class SimulatedTactile:
             self._replayed = itertools.cycle(list(self._given)[-last:])
         return next(self._replayed)
 
+    def _relaxed(self, d: float, theta: float) -> float:
+        """Return a tip's firmness under the plate, a frame later; as the plant's on the object."""
+        lasting = float(self._hand.table(d, theta).force)
+        firmness = 1.0
+        for k, (strength, time) in enumerate(self._relaxation):
+            self._memory[k] += (lasting - self._memory[k]) * -math.expm1(-self._period / time)
+            firmness += strength * (1.0 - self._memory[k] / lasting if lasting > 0.0 else 1.0)
+        return max(firmness, 0.0)
+
     def _press(self, number: int) -> bool:
         """Let the cells feel sample ``number``; False when the plant no longer has it."""
         if self.stage is not None:
             touch = self.stage(number * self._period)
-            self._model.press(touch.d, touch.theta, 0.0, number * self._period)
+            firmness = self._relaxed(max(touch.d, 0.0), touch.theta)
+            self._model.press(touch.d, touch.theta, 0.0, number * self._period, 0.0, firmness)
             if touch.pressure > 0.0:
                 self._model.press_evenly(touch.pressure)
             return True
@@ -164,7 +178,9 @@ class SimulatedTactile:
         # What is left without the curvature's own share, which the cells are to show themselves.
         factor *= math.sqrt(1.0 + curvature * self._radius)
         # Force goes with d²: half a tip on the face's edge presses with half the force.
-        self._model.press(d * math.sqrt(factor), theta, 0.0, number * self._period, curvature)
+        firmness = float(sample.firmness[finger])
+        d *= math.sqrt(factor / firmness)
+        self._model.press(d, theta, 0.0, number * self._period, curvature, firmness)
         return True
 
 

@@ -5,7 +5,6 @@ In counts as they came over the wire; a goal counts whether the servo took or re
 
 from __future__ import annotations
 
-from collections import deque
 from typing import Any
 
 from softfinger.daemon.servos import control_table as reg
@@ -13,7 +12,6 @@ from softfinger.daemon.simulation.servo_model.servo_joint import POSITION_MODES,
 
 FAR = 0.05  # rad between goal and present angle at torque on that count as far
 _WATCHED = frozenset((reg.GOAL_CURRENT, reg.GOAL_POSITION))
-_CURRENTS_MAX = 1000  # goal currents
 
 
 class BusRecorder:
@@ -21,7 +19,6 @@ class BusRecorder:
 
     def __init__(self, t: float) -> None:
         self._goals: dict[int, tuple[int, int]] = {}  # register → least and greatest, counts
-        self._currents: deque[tuple[float, int]] = deque(maxlen=_CURRENTS_MAX)  # when, counts
         self._refused = 0
         self._torque_on = 0  # how often
         self._torque_t: float | None = None
@@ -38,8 +35,6 @@ class BusRecorder:
         """Record a value for a register on the wire."""
         if address not in _WATCHED:
             return
-        if address == reg.GOAL_CURRENT:
-            self._currents.append((self._last, value))
         seen = self._goals.get(address)
         if seen is None:
             self._goals[address] = value, value
@@ -75,10 +70,6 @@ class BusRecorder:
         """Record that the bus watchdog stopped the motor."""
         self._fired += 1
         self._fired_t = t
-
-    def goal_currents(self, joint: ServoJoint) -> list[tuple[float, float]]:
-        """Return the newest goal currents in their order: when each came [s], and how much [A]."""
-        return [(round(t, 6), joint.goal_current(value)) for t, value in self._currents]
 
     def report(self, t: float, joint: ServoJoint, torque: bool) -> dict[str, Any]:
         """Return the record at time t, in SI and in the joint's sense, as JSON takes it."""

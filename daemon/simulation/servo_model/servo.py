@@ -20,6 +20,7 @@ from softfinger.daemon.servos.joint import JointScale
 from softfinger.daemon.simulation.servo_model import framing
 from softfinger.daemon.simulation.servo_model.bus_recorder import BusRecorder
 from softfinger.daemon.simulation.servo_model.registers import ControlTable, Item
+from softfinger.daemon.simulation.servo_model.servo_heat import ServoHeat
 from softfinger.daemon.simulation.servo_model.servo_joint import (
     SENSE,
     STEP,
@@ -66,6 +67,7 @@ class EmulatedServo:
         eeprom: Mapping[int, int],
         *,
         firmware: int | None = None,
+        heat: ServoHeat | None = None,
         t: float = 0.0,
     ) -> None:
         self.model = model
@@ -74,7 +76,7 @@ class EmulatedServo:
         self.table = ControlTable(model, self.firmware)
         self._memory = self.table.memory
         self.silent = self.frozen = self.refuses = False
-        self.health = ServoHealth(model)
+        self.health = ServoHealth(model, heat)
         self._joint = ServoJoint(model, self.table, plant, joint, scale)
         self.recorder = BusRecorder(t)
         self._watched = 0.0  # time of the last packet the watchdog knows of
@@ -122,6 +124,12 @@ class EmulatedServo:
     def torque_on(self) -> bool:
         """True while the motor is driven."""
         return bool(self._memory[reg.TORQUE_ENABLE])
+
+    @property
+    def watchdog(self) -> float:
+        """Time of the bus watchdog [s]; 0 while it is off or has stopped the motor."""
+        ticks = self._memory[reg.BUS_WATCHDOG]
+        return ticks * reg.WATCHDOG_UNIT if ticks <= reg.WATCHDOG_MAX else 0.0
 
     @property
     def mode(self) -> int:
@@ -185,7 +193,7 @@ class EmulatedServo:
         if address >= reg.PRESENT_CURRENT and address + length <= _MOTION_END:
             self._joint.refresh_motion()
         elif table.reads(address, length, reg.REALTIME_TICK, reg.PRESENT_TEMPERATURE):
-            self._joint.refresh(t - self._booted, self.health.voltage, self.health.temperature)
+            self._joint.refresh(t - self._booted, self.health.voltage, self.health.heat.sensed)
         return table.read(address, length)
 
     def write(self, address: int, data: bytes, t: float) -> int:
@@ -237,7 +245,7 @@ class EmulatedServo:
             return framing.INSTRUCTION_ERROR
         if parameters != _CLEAR_KEY:
             return framing.DATA_RANGE
-        self._joint.refresh(t - self._booted, self.health.voltage, self.health.temperature)
+        self._joint.refresh(t - self._booted, self.health.voltage, self.health.heat.sensed)
         if self._memory[reg.MOVING]:
             return framing.RESULT_FAIL
         shift = self._joint.forget_turns()
@@ -260,10 +268,6 @@ class EmulatedServo:
             **self.recorder.report(t, self._joint, self.torque_on),
         }
 
-    def goal_currents(self) -> list[tuple[float, float]]:
-        """Return the newest goal currents on the wire: time [s] and value [A] of each."""
-        return self.recorder.goal_currents(self._joint)
-
     def fault(self, kind: str, t: float) -> None:
         """Begin one of SERVO_FAULTS. ``recover`` leaves a latched hardware error until a reboot."""
         match kind:
@@ -272,11 +276,11 @@ class EmulatedServo:
             case "reboot":
                 self.reboot(t)
             case "overheat":
-                self.health.temperature = self.table.get(reg.TEMPERATURE_LIMIT) + 5.0
+                self.health.heat.warm(self.table.get(reg.TEMPERATURE_LIMIT) + 5.0)
             case "overload":
                 self._fail(5)
             case "undervoltage":
-                self.health.voltage = (self.model.voltage_min - 10) * reg.VOLTAGE_UNIT
+                self.health.supply = (self.model.voltage_min - 10) * reg.VOLTAGE_UNIT
             case "stuck":
                 self._joint.stuck = self._joint.encoder()
             case "jump":

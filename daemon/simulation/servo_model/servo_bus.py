@@ -32,6 +32,7 @@ from softfinger.daemon.simulation.servo_model import framing
 from softfinger.daemon.simulation.servo_model.bus_recorder import BusRecorder
 from softfinger.daemon.simulation.servo_model.framing import BROADCAST, Packet, PacketParser
 from softfinger.daemon.simulation.servo_model.servo import EmulatedServo, prepared
+from softfinger.daemon.simulation.servo_model.servo_heat import ServoHeat
 
 _SYNC_READS = frozenset((framing.SYNC_READ, framing.FAST_SYNC_READ))
 _GROUP_READS = _SYNC_READS | {framing.BULK_READ, framing.FAST_BULK_READ}
@@ -108,7 +109,8 @@ class ServoBus:
         for joint, servo_id in enumerate(servos.ids if ids is None else ids):
             scale = JointScale.of(servos, joint, model)
             eeprom[reg.ID] = servo_id
-            made.append(EmulatedServo(model, plant, joint, scale, eeprom, t=t))
+            heat = ServoHeat.of(settings)
+            made.append(EmulatedServo(model, plant, joint, scale, eeprom, heat=heat, t=t))
         return cls(made, plant, seed=settings.simulation.seed)
 
     # --- time ------------------------------------------------------------------------------

@@ -2,9 +2,8 @@
 
 `ServoJoint` maps counts to angles (turns, homing offset, drive direction), follows the profile,
 drives the plant as each operating mode asks, and writes the present values into the control table.
-`ServoHealth` is what the servo suffers: heat of its motor, its supply, overload. Choices of our
-own, where the manuals say nothing: one thermal time constant, heat with the square of the current,
-overload after OVERLOAD_TIME of current at the configured limit.
+`ServoHealth` is what the servo suffers: heat (`servo_heat`), its supply, overload. A choice of our
+own, where the manuals say nothing: overload after OVERLOAD_TIME of current at the configured limit.
 """
 
 from __future__ import annotations
@@ -17,11 +16,12 @@ from softfinger.daemon.servos.base import JointPlant
 from softfinger.daemon.servos.control_table import ServoModel
 from softfinger.daemon.servos.joint import JointScale
 from softfinger.daemon.simulation.servo_model.registers import ControlTable
+from softfinger.daemon.simulation.servo_model.servo_heat import ServoHeat
 
 STEP = 0.001  # s: trajectories, velocity mode
 OVERLOAD_TIME = 2.0  # s at the current limit
 SENSE = 0.010  # s between two looks
-_VOLTAGE, _HEAT, _OVERLOAD = 0, 2, 5  # bits of the hardware error status
+_VOLTAGE = 0  # bit of the hardware error status
 POSITION_MODES = (
     reg.POSITION_MODE,
     reg.EXTENDED_POSITION_MODE,
@@ -291,17 +291,24 @@ class Profile:
 
 
 class ServoHealth:
-    """``voltage`` [V] and ``temperature`` [°C] may be set from outside."""
+    """``supply`` [V], without a load, and ``heat`` may be changed from outside."""
 
-    def __init__(self, model: ServoModel) -> None:
+    def __init__(self, model: ServoModel, heat: ServoHeat | None = None) -> None:
         self._model = model
+        self.heat = ServoHeat(model) if heat is None else heat
         self._overload = 0.0  # s
+        self._current = 0.0  # A
         self.recover()
 
     def recover(self) -> None:
         """Cool the motor and restore the supply."""
-        self.temperature = reg.AMBIENT
-        self.voltage = self._model.supply
+        self.heat.cool()
+        self.supply = self._model.supply
+
+    @property
+    def voltage(self) -> float:
+        """V, by so much less as its current takes on the way."""
+        return self.supply - reg.SAG * self._current
 
     def restart(self) -> None:
         """Restart as after a power-up: what was warm stays warm."""
@@ -312,15 +319,15 @@ class ServoHealth:
 
         ``current`` [A] flows; ``pressed``: it is at the configured limit.
         """
-        warmer = self._model.settled_temperature(current) - self.temperature
-        self.temperature += warmer * SENSE / reg.THERMAL_TIME
+        self._current = abs(current)
+        self.heat.step(current, SENSE)
         self._overload = self._overload + SENSE if pressed else 0.0
         errors = []
-        if self.temperature > table.get(reg.TEMPERATURE_LIMIT):
-            errors.append(_HEAT)
+        if self.heat.sensed > table.get(reg.TEMPERATURE_LIMIT):
+            errors.append(reg.OVERHEATING)
         low, high = table.get(reg.MIN_VOLTAGE_LIMIT), table.get(reg.MAX_VOLTAGE_LIMIT)
         if not low <= round(self.voltage / reg.VOLTAGE_UNIT) <= high:
             errors.append(_VOLTAGE)
         if self._overload >= OVERLOAD_TIME:
-            errors.append(_OVERLOAD)
+            errors.append(reg.OVERLOAD)
         return errors

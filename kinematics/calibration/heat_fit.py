@@ -1,0 +1,86 @@
+"""Heat of a servo, from a hold of minutes: what its case warms by in the end, and in what time."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from softfinger.kinematics.calibration.calibration import CalibrationError
+from softfinger.kinematics.hand.servo_heat import COPPER, HeatLaw
+
+_DOUBT = (0.4, 0.4, 3.0)  # before: of rise and time relative, of the ambient [°C]
+_READING = 0.4  # °C by which a reading in whole degrees is off, with what is like it beside it
+_STEP = 1.0  # s
+_LEAST = 8.0  # °C by which the case must warm
+_ROUNDS = 12
+
+
+class HeatFit(NamedTuple):
+    """Factors of the model's ``rise`` and ``time`` with deviations, and what they leave."""
+
+    rise: float
+    rise_std: float
+    time: float
+    time_std: float
+    ambient: float  # °C
+    residual: float  # r.m.s. of the readings [°C]
+
+
+def forecast(
+    law: HeatLaw,
+    squares: NDArray[np.float64],
+    rise: float,
+    time: float,
+    start: float,
+    ambient: float,
+) -> NDArray[np.float64]:
+    """Return the case [°C] at each of ``squares`` [A²], _STEP apart, as `hand.servo_heat` has it.
+
+    Both temperatures are ``start`` [°C] first; ``rise`` and ``time`` are factors of the law's.
+    """
+    winding = case = start
+    heating, inner, outer = law.heating * rise / time, law.winding_time * time, law.case_time * time
+    out = []
+    for square in squares.tolist():
+        out.append(case)
+        flow, over = (winding - case) / inner, case - ambient
+        winding += _STEP * (heating * square * (1.0 + COPPER * (winding - 25.0)) - flow)
+        case += _STEP * (law.share * flow - over * (max(over, 1.0) / 30.0) ** 0.25 / outer)
+    return np.array(out)
+
+
+def fit_heat(law: HeatLaw, t: ArrayLike, current: ArrayLike, reading: ArrayLike) -> HeatFit:
+    """Fit a hold: ``current`` [A] and ``reading`` [°C] over ``t`` [s], begun as warm as the room.
+
+    ``law`` has the model's own constants, which count as known to 40 %. By Gauss-Newton on the
+    logarithms. Raises CalibrationError for a hold that hardly warms the servo.
+    """
+    at, square, shown = (np.asarray(each, np.float64) for each in (t, np.square(current), reading))
+    warmed = float(shown.max() - shown[0]) if shown.size else 0.0
+    if warmed < _LEAST:
+        raise CalibrationError(
+            f"heat: found {warmed:.0f} °C of warming, expected {_LEAST:g} at least: "
+            "hold longer, or with more force"
+        )
+    grid = np.arange(at[0], at[-1], _STEP)
+    squares, readings = np.interp(grid, at, square), np.interp(grid, at, shown)
+    prior = np.array([0.0, 0.0, shown[0]])
+
+    def rows(x: NDArray[np.float64]) -> NDArray[np.float64]:
+        case = forecast(law, squares, np.exp(x[0]), np.exp(x[1]), shown[0], x[2])
+        # Whole degrees are alike for as long as they stay: each counts once, and not every second.
+        weight = np.sqrt(warmed / grid.size) / _READING
+        return np.concatenate([(case - readings) * weight, (x - prior) / _DOUBT])
+
+    x, off, steps = prior.copy(), rows(prior), np.array([1e-3, 1e-3, 1e-2])
+    for _ in range(_ROUNDS):
+        slopes = np.stack([(rows(x + step) - off) / step.max() for step in np.diag(steps)], axis=1)
+        x -= np.linalg.lstsq(slopes, off, rcond=None)[0]
+        off = rows(x)
+    std = np.sqrt(np.diag(np.linalg.inv(slopes.T @ slopes)))
+    rise, time = float(np.exp(x[0])), float(np.exp(x[1]))
+    case = forecast(law, squares, rise, time, shown[0], x[2])
+    residual = float(np.sqrt(np.mean((case - readings) ** 2)))
+    return HeatFit(rise, rise * float(std[0]), time, time * float(std[1]), float(x[2]), residual)

@@ -1,0 +1,239 @@
+"""Finite strain: ``python -m research.solid_tip.strain LINEAR OUT --folder FOLDER``.
+
+Takes the linear law's file (``python -m research.solid_tip``) and writes the neo-Hookean one, of
+the same form. What strain changes comes from `rubber`'s elements, of both kinds on the same mesh,
+so that the mesh's error goes with it: energies by their ratio, base pressures over the push by
+their difference. Upright a fine mesh does that; for a tilt a coarse one, over itself upright.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.polynomial import chebyshev
+from numpy.typing import NDArray
+
+from research.solid_tip import fit
+from research.solid_tip.__main__ import differences
+from research.solid_tip.fit import SolidTip
+from research.solid_tip.green import RING_EDGES, FloatArray, Meridian
+from research.solid_tip.rubber import HARMONICS, strained
+
+NU = fit.chebyshev_nodes(*fit.NU, 3)
+SINES = np.sin(fit.THETA_MAX) ** 2 * (1 - np.cos(np.pi * np.arange(5) / 4)) / 2  # sin²θ
+AREAS = np.pi * np.diff(RING_EDGES**2)
+# Of each block the numbers of sin²θ in `SINES` that are pressed, and at which ν. Lying rubber is
+# crushed at the far corner of the domain, where elements find no balance; it is continued there.
+TILTS = {
+    "bonded": {1: NU[1:2], 2: NU[1:2], 4: NU[1:2]},
+    "lying": {1: NU[1:2], 2: NU[1:2]},
+    "bonded-sticking": {2: NU[1:2], 4: NU[1:2]},
+    "lying-sticking": {2: NU[1:2]},
+}
+IN_ROOT = 5  # terms in √(d/a) of what strain changes, all of which begin with d/a
+
+
+NOTES = """Hemisphere of neo-Hookean rubber, W = μ/2 (J^(−2/3) tr FᵀF − 3) + κ/2 (J − 1)², pressed
+by a rigid plane: python -m research.solid_tip.strain. The plane is without friction, or sticks: it
+holds each point where it touched, coming straight along its normal from first touch on:
+T = N sin θ cos θ P[coef_0] is the force along (cos θ, 0, −sin θ) against the tip.
+Lengths in a, stresses in E; d ≤ 0.4 a, θ ≤ 36°, ν 0.45 … 0.4995. s = √(d/a), P a product of
+Chebyshev series in 2 s/s_max − 1, 2 (sin θ/sin theta_max)² − 1, and ν on nu_range:
+N = 4/(3 (1 − ν²)) s³ (1 + s P[push]), U = 8/(15 (1 − ν²)) s⁵ (1 + s P[energy]);
+p = F B_0(r) + N Σ P[coef_k] sin^m_k θ B_k(r) cos m_k φ; basis: means of B_k over rings;
+F = N cos θ (1 − sin² θ P[coef_0]), with coef_0 = 0 unless the face sticks.
+A shear force T on the face adds T B_T(r) cos(φ − φ_T); shear holds B_T's means over the rings
+(for a force at the pole of rubber at rest), as Chebyshev coefficients in ν.
+Base bonded: u = 0. Lying: u_z = 0 (held down: it may pull), free to slide but for a uniform shear
+that carries the tip's own; it presses where it has slid to, beyond 1, too. force_error,
+pressure_error: of N, and of the base pressure where it is smooth (within 0.95 a), against elements
+of other meshes, d to 0.35 a, θ to 20°. Largest and rms differences of what was fitted:
+{errors}"""
+# By tests/harness/solid_reference.py's presses. A coarse mesh hardly tells a tilted bonded rim.
+FORCE_ERROR = 0.005
+PRESSURE_ERROR = {"bonded": 0.01, "lying": 0.004}
+
+
+class Change(NamedTuple):
+    """What strain changes in presses of one θ and ν: of d, as it was sampled."""
+
+    s: FloatArray
+    energy: FloatArray  # ratio to the linear one, less 1 (n,)
+    push: FloatArray
+    lever: FloatArray  # linear U/(N d)
+    shear: FloatArray  # over the push
+    base: FloatArray  # over the push (n, H, R)
+
+
+def change(arrays: Mapping[str, FloatArray], theta: float) -> Change:
+    """Compare `rubber.strained`'s two kinds."""
+    d, push, shear, energy = (arrays[name] for name in ("d", "push", "shear", "energy"))
+    force = push * np.cos(theta) - shear * np.sin(theta)
+    found = arrays["base"][:, :, 0] @ AREAS
+    base = arrays["base"] * (force / found / push)[..., None, None]
+    ratio = shear / push
+    return Change(
+        np.sqrt(d[0]),
+        energy[1] / energy[0] - 1,
+        push[1] / push[0] - 1,
+        energy[0] / (push[0] * d[0]),
+        ratio[1] - ratio[0],
+        base[1] - base[0],
+    )
+
+
+def in_root(s: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Terms d/a T_i(s), each of them at each s (n, i), and their derivatives by d/a."""
+    x = 2 * s / fit.S_MAX - 1
+    value = chebyshev.chebvander(x, IN_ROOT - 1)
+    slope = chebyshev.chebval(x, chebyshev.chebder(np.eye(IN_ROOT))).T * (2 / fit.S_MAX)
+    return s[:, None] ** 2 * value, value + s[:, None] * slope / 2
+
+
+def coefficients(each: Change, step: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Of U's ratio (i,), T (i,), and the base pressure (i, H, R); ``step``: the cells' width."""
+    value, slope = in_root(each.s)
+    scatter = 0.001 + 0.05 * (step / each.s) ** 2
+    left = np.concatenate([value, value + (each.lever * each.s**2)[:, None] * slope])
+    right = np.concatenate([each.energy, each.push])
+    scatter = np.concatenate([scatter, 6 * scatter])
+
+    def fitted(rows: FloatArray, values: FloatArray) -> FloatArray:
+        return np.asarray(np.linalg.lstsq(rows, values, rcond=None)[0], dtype=np.float64)
+
+    energy = fitted(left / scatter[:, None], right / scatter)
+    base = fitted(value, each.base.reshape(len(value), -1))
+    return energy, fitted(value, each.shear), base.reshape(-1, *each.base.shape[1:])
+
+
+def through(points: FloatArray, values: FloatArray) -> Callable[[float], FloatArray]:
+    """The polynomial through ``values`` (their first axis) at ``points``."""
+
+    def at(point: float) -> FloatArray:
+        weights = [
+            np.prod([(point - other) / (one - other) for other in points if other != one])
+            for one in points
+        ]
+        return np.asarray(np.tensordot(weights, values, axes=1))
+
+    return at
+
+
+class Strain:
+    """What strain changes in one block, of any d, θ and ν."""
+
+    def __init__(self, block: str, tilts: Mapping[int, FloatArray], folder: Path) -> None:
+        """``tilts``: by the number of sin²θ in `SINES`, values of ν of the coarse presses."""
+        fine, coarse = Meridian(16), Meridian(8, finer=2, widest=0.2)
+
+        def of(name: str, poisson: float, mesh: Meridian, theta: float | None) -> Any:
+            file = folder / f"{block}-{name}-{poisson:.5f}.npz"
+            found = strained(block, poisson, theta, mesh, file)
+            return coefficients(
+                change(found, theta or 0.0), np.pi / 2 / (16 if mesh is fine else 8)
+            )
+
+        upright = [of("fine", poisson, fine, None) for poisson in NU]
+        self.upright = [through(NU, np.array(each)) for each in zip(*upright, strict=True)]
+        self.sines = SINES[list(tilts)]
+        theta = np.arcsin(np.sqrt(self.sines))
+        energy, shear, base, first = [], [], [], []
+        for number, angle in zip(tilts, theta, strict=True):
+            points = tilts[number]
+            each = [of(f"tilt{number}", poisson, coarse, angle) for poisson in points]
+            same = [of("coarse", poisson, coarse, None) for poisson in points]
+            parts = [np.array(part) for part in zip(*each, strict=True)]
+            itself = [np.array(part) for part in zip(*same, strict=True)]
+            energy.append(through(points, parts[0] - itself[0]))
+            shear.append(through(points, parts[1] / (np.sin(angle) * np.cos(angle))))
+            powers = np.sin(angle) ** np.arange(HARMONICS)[:, None]
+            base.append(through(points, parts[2] / powers))
+            first.append(through(points, parts[2][:, :, 0] - itself[2][:, :, 0]))
+        self.energy, self.shear, self.base, self.first = energy, shear, base, first
+
+    def at(self, poisson: float) -> Callable[[float], tuple[FloatArray, FloatArray, FloatArray]]:
+        """Of sin²θ: coefficients of U's ratio, T over N sin θ cos θ, and the base pressure."""
+        energy, _, base = (each(poisson) for each in self.upright)
+        rises, shears, bases, firsts = (
+            np.array([of(poisson) for of in each])
+            for each in (self.energy, self.shear, self.base, self.first)
+        )
+        rise = through(np.append(0.0, self.sines), np.concatenate([[0 * rises[0]], rises]))
+        first = through(np.append(0.0, self.sines), np.concatenate([[0 * firsts[0]], firsts]))
+        shear, harmonics = through(self.sines, shears), through(self.sines, bases)
+        # A small tilt hardly has the higher ones: over sin^m θ the mesh's error is all it shows.
+        least = len(self.sines) > 1
+        higher = through(self.sines[least:], bases[least:])
+
+        def of(square: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+            powers = np.sqrt(square) ** np.arange(HARMONICS)[:, None]
+            found = harmonics(square) * powers
+            found[:, 2:] = (higher(square) * powers)[:, 2:]
+            found[:, 0] = base[:, 0] + first(square)
+            return energy + rise(square), shear(square), found
+
+        return of
+
+    def strain(self, tip: SolidTip) -> fit.Samples:
+        """The linear ``tip``'s presses over the whole domain, strained."""
+        rows = []
+        at = self.at(tip.poisson)
+        for square in fit.chebyshev_nodes(0, np.sin(fit.THETA_MAX) ** 2, 9):
+            theta = float(np.arcsin(np.sqrt(square)))
+            ratio, more_shear, more_base = at(square)
+            for s in fit.chebyshev_nodes(0, fit.S_MAX, 28)[2:]:
+                d = s**2
+                push, energy, base = tip.press(d, theta)
+                shear = tip.shear(d, theta)
+                value, slope = (each[0] for each in in_root(np.array([s])))
+                strained_push = push * (1 + value @ ratio) + energy * (slope @ ratio)
+                shear += float(value @ more_shear) * np.sin(theta) * np.cos(theta)
+                pattern = np.zeros((HARMONICS, AREAS.size))
+                pattern[: len(base), : base.shape[1]] = base / push
+                pattern += np.tensordot(value, more_base, axes=1)
+                row = (d, theta, strained_push, energy * (1 + value @ ratio))
+                rows.append((*row, shear * strained_push, pattern * strained_push))
+        return fit.Samples(*(np.array(each) for each in zip(*rows, strict=True)))
+
+
+def main() -> None:
+    """Compute what is not in the folder yet, and write the file."""
+    parser = argparse.ArgumentParser(
+        prog="python -m research.solid_tip.strain", description=__doc__
+    )
+    parser.add_argument("linear", type=Path, help="file of the linear law")
+    parser.add_argument("out", type=Path, help="file to write, .npz")
+    parser.add_argument("--folder", type=Path, required=True, help="where presses are kept")
+    parser.add_argument("--tolerance", type=float, default=3e-3, help="of the modes")
+    arguments = parser.parse_args()
+    arguments.folder.mkdir(parents=True, exist_ok=True)
+    nodes = fit.chebyshev_nodes(*fit.NU, 4)
+    with np.load(arguments.linear) as file:
+        linear: dict[str, NDArray[Any]] = dict(file)
+    arrays = {name: linear[name] for name in ("s_max", "theta_max", "nu_range")}
+    arrays["ring_edges"] = RING_EDGES
+    rows = []
+    for block, tilts in TILTS.items():
+        strain = Strain(block, tilts, arguments.folder)
+        samples = [strain.strain(SolidTip(linear, block, poisson)) for poisson in nodes]
+        found = fit.fit(samples, nodes, 0.02, arguments.tolerance)
+        found["shear"] = np.pad(
+            linear[f"{block}.shear"], ((0, AREAS.size - linear["ring_edges"].size + 1), (0, 0))
+        )
+        arrays |= {f"{block}.{name}": value for name, value in found.items()}
+        arrays[f"{block}.force_error"] = np.array(FORCE_ERROR)
+        arrays[f"{block}.pressure_error"] = np.array(PRESSURE_ERROR[block.partition("-")[0]])
+        for poisson, each in zip(nodes, samples, strict=True):
+            tip = SolidTip(arrays, block, poisson)
+            rows.append(f"{block}, ν {poisson:.4f}: {differences(tip, each)}")
+        print(block, len(found["m"]), "modes")
+    arrays["notes"] = np.array(NOTES.format(errors="\n".join(rows)))
+    np.savez_compressed(arguments.out, **arrays)  # type: ignore[arg-type]
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,100 @@
+"""A baseline that learns: the cross-entropy method on ``SoftFinger-Grasp-v0``, reward shaped.
+
+``python -m softfinger.gym.baseline [GENERATIONS]`` prints the returns without the shaping after
+each, and ``--plot`` draws them; ``--processes`` and ``--scheduler`` say where the rows are tried.
+The policy is one row of weights for both fingers, each with its own features; a generation draws
+rows around the best ones of the last. For minutes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from functools import partial
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from softfinger.gym.__main__ import Policy, episode
+from softfinger.gym.environment import FORCE, Observation, SoftFingerEnv
+from softfinger.tools import style
+from softfinger.tools.sweep import Sweep, add_sweep
+
+DRAWN, KEPT, EPISODES = 24, 6, 2  # rows of a generation, the best of them, objects that each meets
+STEPS = 200
+FEATURES = 5
+_GENTLE = 0.2  # of a row of ones: an action of 1 is 1 rad/s
+_FRESH = 0.2  # added to the deviation, which falls to nothing: it would settle too soon
+
+Weights = NDArray[np.float64]
+
+
+def policy(weights: Weights) -> Policy:
+    """Return what ``weights`` [FEATURES] do."""
+
+    def act(observation: Observation) -> NDArray[np.float32]:
+        contacts, joints = observation["contacts"].reshape(2, 3), observation["joints"]
+        own = (observation["goal"] - contacts[:, 2]) / FORCE
+        touching = contacts[:, 0] > 0.0
+        features = [np.ones(2), own, own[::-1], touching, joints[2:4]]
+        action: NDArray[np.float32] = np.tanh(_GENTLE * weights @ np.array(features)).astype(
+            np.float32
+        )
+        return action
+
+    return act
+
+
+def returns(seed: int, shaped: bool, weights: Weights) -> float:
+    """Return the mean of EPISODES episodes from ``seed`` on."""
+    env = SoftFingerEnv("grasp", shaped=shaped)
+    limited = gymnasium.wrappers.TimeLimit(env, STEPS)
+    try:
+        act = policy(weights)
+        return float(np.mean([episode(limited, act, seed + k) for k in range(EPISODES)]))
+    finally:
+        limited.close()
+
+
+def learn(
+    generations: int, processes: int | None = None, scheduler: str | None = None
+) -> list[float]:
+    """Learn, a line a generation, and the mean of the last one's best rows: the returns."""
+    rng, curve = np.random.default_rng(0), []
+    mean, std = np.zeros(FEATURES), np.ones(FEATURES)
+    began = time.monotonic()
+    for k in range(generations):
+        rows = mean + std * rng.standard_normal((DRAWN, FEATURES))
+        tried = Sweep(f"{k + 1}", partial(returns, 1000 + EPISODES * k, True), list(rows))
+        found = np.array(list(tried.run(processes, scheduler)))
+        best = rows[np.argsort(found)[-KEPT:]]
+        mean, std = best.mean(axis=0), best.std(axis=0) + _FRESH / (k + 1)
+        curve.append(returns(0, False, mean))
+        spent = time.monotonic() - began
+        print(f"{k + 1:3}  {curve[-1]:6.1f} of {STEPS}  {spent:5.0f} s", flush=True)
+    print(mean)
+    return curve
+
+
+def draw(curve: list[float], path: Path) -> None:
+    """Draw the returns over the generations. Raises MissingExtra without matplotlib, OSError."""
+    with style.settings():
+        figure = style.new_figure(4.2, 2.2)
+        axes = figure.subplots()
+        axes.plot(range(1, len(curve) + 1), curve, marker="o", color=style.KINDS[0])
+        axes.set(xlabel="generation", ylabel=f"return of {STEPS}", ylim=(0, STEPS))
+        style.save(figure, path)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description="Learn to grasp by the cross-entropy method.")
+    parser.add_argument("generations", type=int, nargs="?", default=12)
+    parser.add_argument("--plot", type=Path, metavar="FILE", help="draw the returns (extra 'plot')")
+    add_sweep(parser)
+    options = vars(parser.parse_args())
+    picture = options.pop("plot")
+    found = learn(**options)
+    if picture:
+        draw(found, picture)

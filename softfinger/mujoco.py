@@ -1,0 +1,423 @@
+"""The soft tips in MuJoCo: this package's contact law and pressure grids in a scene of MuJoCo's.
+
+:class:`SoftTips` makes spheres of any model soft hemispheres: a passive force (`mjcb_passive`) from
+the contact table, with friction, and the pressure under each tip as a user sensor.
+:class:`MujocoHand` is a profile's hand, for the daemon by ``servos.backend = "mujoco"``.
+
+The law is the simulated hand's own kernel (`simulation.physics.tip`). Shear is a vector in the face
+here: that along the tilt is its d_t, that across enters as variance, U having ρ(ζ² + v). MuJoCo
+takes passive forces as they are at a step's beginning, and tips of 20 kN/m on 0.1 kg want steps
+below 1 ms then. So these are of its end, linearly implicit along the rows R of d, θ and both shears
+
+    (1 + hBA) f = f(t) + h K w + h B R a     A = R M⁻¹ Rᵀ    B = D + h K    w = R q̇
+
+with the law's stiffness K and losses D, and a the acceleration that all else gave in the last step:
+at rest f is the law's own.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Annotated, Any, Self, cast
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from softfinger.daemon.errors import SettingsError
+from softfinger.daemon.profile.factory import make_grid, make_material, make_table, make_tip
+from softfinger.daemon.profile.settings import Section, Settings
+from softfinger.daemon.servos.simulated import SimulatedServos
+from softfinger.daemon.simulation.physics.forces import current_reference
+from softfinger.daemon.simulation.physics.outline import rim_on_plane
+from softfinger.daemon.simulation.physics.plant_state import Parameters, Plant, TipContact
+from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand, set_parameters
+from softfinger.daemon.simulation.physics.tip import clear_contact, contact_forces, stiffen_by_rim
+from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
+from softfinger.kinematics.compiled.layout import Record, Records
+from softfinger.kinematics.compiled.simd import address
+from softfinger.kinematics.contact.table import ContactTable
+
+FloatArray = NDArray[np.float64]
+Vector = Annotated[FloatArray, 3]
+Work = tuple[FloatArray, FloatArray, FloatArray]
+
+_ROWS = 4  # of a tip: d, θ, shear along the tilt and across it
+_NEAR = 0.005  # m from a tip within which a step may bring a touch
+_LEAST = 1e-9  # m of a touch; sin θ of a tilt, below it any direction on the face is along it
+_SHEAR = 2  # the row of the shear along the tilt
+_AFTER_FORCES = int(mujoco.mjtStage.mjSTAGE_VEL)
+
+
+class Touch(Record):
+    """One tip on a face, in space; vectors are the world's."""
+
+    contact: TipContact
+    normal: Vector  # m, from the tip's centre into the face
+    along: Vector  # t, on the face, against the lean of the tip's axis
+    across: Vector  # m × t, which θ turns about
+    shear: Vector  # of the face against the tip [m]
+    shear_across: float  # [m]
+
+
+@inner_kernel
+def _set_frame(touch: Touch, geometry: FloatArray) -> None:
+    """Set m, t, m × t and θ from the tip's centre, axis and foremost point."""
+    m, t, tip = touch.normal, touch.along, touch.contact
+    m[:] = geometry[7:] - geometry[1:4]
+    m /= math.sqrt((m * m).sum())
+    tip.cosine = (m * geometry[4:7]).sum()
+    t[:] = tip.cosine * m - geometry[4:7]
+    tip.sine = math.sqrt((t * t).sum())
+    tip.theta = math.atan2(tip.sine, tip.cosine)
+    if tip.sine < _LEAST:
+        least = np.argmin(np.abs(m))
+        t[:] = -m[least] * m
+        t[least] += 1.0
+    t /= math.sqrt((t * t).sum())
+    touch.across[:] = np.cross(m, t)
+
+
+@inner_kernel
+def _set_forces(p: Parameters, table: Any, touch: Touch, rate_across: float) -> float:
+    """Evaluate the law for a shear in two directions; return the force across, with its loss."""
+    tip = touch.contact
+    stiffness = limit = 0.0
+    for _ in range(2):
+        tip.shear_variance = touch.shear_across**2
+        contact_forces(p, table, tip, 1.0)
+        stiffness = tip.stiffness[_SHEAR]
+        limit = p.friction * max(tip.normal, 0.0)
+        total = math.hypot(tip.tangential, stiffness * touch.shear_across)
+        if total <= limit * (1.0 + 1e-9):
+            break
+        # Slip: both shears come back on the cone, T and they falling alike.
+        tip.shear += (limit / total - 1.0) * tip.tangential / stiffness
+        touch.shear_across *= limit / total
+    touch.shear[:] = tip.shear * touch.along + touch.shear_across * touch.across
+    left = math.sqrt(max(limit * limit - tip.tangential**2, 0.0))
+    force = stiffness * touch.shear_across + tip.damping[_SHEAR] * rate_across
+    return float(min(max(force, -left), left))
+
+
+@kernel
+def press(
+    touches: Records[Touch], parameters: Records[Parameters], table: FloatArray,
+    geometry: FloatArray, jacobians: FloatArray, velocity: FloatArray, dt: float, work: Work,
+) -> None:  # fmt: skip
+    """Evaluate all tips into ``work``: rows R [4n, nv], force along each, B of the step.
+
+    ``geometry`` [n, 10]: d, centre, axis, foremost point; ``jacobians`` [n, 4, 3, nv]: of the tip,
+    then of what it touches, each of place and of rotation; ``dt`` [s]: since the last call.
+    """
+    p, data, rates = parameters[0], address(table), np.zeros(_ROWS)
+    rows, force, implicit = work
+    rows[:] = force[:] = implicit[:] = 0.0
+    for k in range(len(touches)):
+        touch, of = touches[k], jacobians[k]
+        tip, first = touch.contact, _ROWS * k
+        tip.d = geometry[k, 0]
+        tip.travel = rates[:] = 0.0
+        if tip.d > -_NEAR:
+            _set_frame(touch, geometry[k])
+            for j in range(len(velocity)):
+                for i in range(3):
+                    slide = of[2, i, j] - of[0, i, j]
+                    rows[first, j] -= touch.normal[i] * slide
+                    rows[first + 1, j] += touch.across[i] * (of[3, i, j] - of[1, i, j])
+                    rows[first + 2, j] += touch.along[i] * slide
+                    rows[first + 3, j] += touch.across[i] * slide
+                for i in range(_ROWS):
+                    rates[i] += rows[first + i, j] * velocity[j]
+            tip.travel = max(p.step * rates[0], 0.0)
+        if tip.d + tip.travel <= _LEAST:
+            clear_contact(tip)
+            touch.shear[:] = rows[first : first + _ROWS] = 0.0
+            continue
+        tip.rate_d, tip.rate_theta, tip.slip_rate = rates[0], rates[1], rates[2]
+        # The shear turns into today's face, as long as it was, and grows.
+        along, across = (touch.shear * touch.along).sum(), (touch.shear * touch.across).sum()
+        within = along * along + across * across
+        scale = math.sqrt((touch.shear**2).sum() / within) if within > 0.0 else 0.0
+        tangent = tip.sine / tip.cosine if tip.cosine > 0.0 else 0.0
+        tip.shear = scale * along + dt * (rates[2] - tangent * rates[0])
+        touch.shear_across = scale * across + dt * rates[3]
+        rim = rim_on_plane(p, tip)
+        tip.rim = max(rim, 0.0)
+        force[first + 3] = _set_forces(p, data, touch, rates[3])
+        if rim + tip.travel > 0.0:
+            stiffen_by_rim(p, tip)
+        rates[2] = tip.shear_rate
+        rows[first + 2] -= tip.tangent * rows[first]
+        for i in range(_ROWS):
+            row = min(i, _SHEAR)
+            implicit[first + i] = tip.damping[row] + p.step * tip.stiffness[row]
+            force[first + i] += p.step * tip.stiffness[row] * rates[i]
+            if i < _ROWS - 1:
+                force[first + i] += tip.along[i]
+
+
+@kernel
+def solve(
+    touches: Records[Touch], parameters: Records[Parameters], work: Work, inertial: FloatArray,
+    acceleration: FloatArray, passive: FloatArray, own: FloatArray,
+) -> None:  # fmt: skip
+    """Solve for the forces f of the step's end; add −Rᵀf to ``passive``, write its M⁻¹ to ``own``.
+
+    ``inertial`` is M⁻¹Rᵀ as rows [4n, nv], ``acceleration`` [nv] that of the last step. Tips don't
+    pull, and friction stays on its cone.
+    """
+    p = parameters[0]
+    rows, force, implicit = work
+    n = len(force)
+    matrix = np.eye(n)
+    for i in range(n):
+        push = p.step * implicit[i] * rows[i]
+        force[i] += (push * (acceleration - own)).sum()
+        for k in range(n):
+            matrix[i, k] += (push * inertial[k]).sum()
+    # No pivoting: B ≥ 0 is diagonal and A positive, so that all leading minors are above 0.
+    for i in range(n):
+        for k in range(n):
+            if k != i and matrix[k, i] != 0.0:
+                factor = matrix[k, i] / matrix[i, i]
+                force[k] -= factor * force[i]
+                matrix[k] -= factor * matrix[i]
+    force /= np.diag(matrix)
+    own[:] = 0.0
+    for k in range(len(touches)):
+        f, tangent = force[_ROWS * k : _ROWS * (k + 1)], touches[k].contact.tangent
+        normal = max(f[0] - tangent * f[2], 0.0)
+        total = math.hypot(f[2], f[3])
+        if total > p.friction * normal:
+            f[2:] *= p.friction * normal / total
+        f[0] = normal + tangent * f[2]
+    for i in range(n):
+        passive -= force[i] * rows[i]
+        own -= force[i] * inertial[i]
+
+
+class SoftTips:
+    """Makes spheres of a MuJoCo model soft tips, for as long as it is open (a context manager).
+
+    ``tips`` are geoms: spheres of ``settings.tip.radius`` whose z axis is the hemisphere's, out of
+    the finger. Each feels the nearest of the geoms ``touching``, by its tangent plane. None of them
+    may collide by MuJoCo's own contacts. A user sensor ``TIP_pressure`` of ``needstage="vel"`` gets
+    the pressure [Pa] on the grid's cells, ``tactile.rate`` times a second. ``mjcb_passive`` and
+    ``mjcb_sensor`` are taken, one model at a time. Raises SettingsError for what it can't do.
+    """
+
+    def __init__(
+        self, model: mujoco.MjModel, data: mujoco.MjData, settings: Settings,
+        tips: Sequence[str] = ("left_tip", "right_tip"), touching: Sequence[str] = ("object",),
+        table: ContactTable | None = None,
+    ) -> None:  # fmt: skip
+        if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
+            raise SettingsError("integrator: found RK4, expected Euler, implicit or implicitfast")
+        simulation = settings.simulation
+        if any(simulation.tip_relaxation) or simulation.tip_micro_slip or simulation.tip_creep_time:
+            raise SettingsError("tip_relaxation, tip_micro_slip, tip_creep_time: not in MuJoCo")
+        self._tips = [model.geom(name).id for name in tips]
+        self._touching = [model.geom(name).id for name in touching]
+        for name, geom in zip(tips, self._tips, strict=True):
+            if abs(model.geom_size[geom, 0] - settings.tip.radius) > 1e-9:
+                raise SettingsError(f"{name}: expected a sphere of {settings.tip.radius:g} m")
+        self.model, self.data = model, data
+        material = make_material(settings.material)
+        self.table = make_table(settings, material) if table is None else table
+        self._parameters = Parameters()
+        set_parameters(self._parameters, settings, self.table, model.opt.timestep)
+        n, nv = len(tips), model.nv
+        self._all = np.zeros(n, Touch.dtype)
+        self.touches = [Touch(self._all[k : k + 1]) for k in range(n)]
+        self._geometry, self._jacobians = np.zeros((n, 10)), np.zeros((n, 4, 3, nv))
+        self._work = np.zeros((_ROWS * n, nv)), np.zeros(_ROWS * n), np.zeros(_ROWS * n)
+        self._inertial, self._own = np.zeros((_ROWS * n, nv)), np.zeros(nv)
+        self._fromto, self._t = np.zeros(6), data.time
+        self._law, self._scale = (make_tip(settings), material), simulation.modulus_scale
+        self._grids = [make_grid(settings, k % 2) for k in range(n)]
+        self._sensors: list[tuple[int, FloatArray, FloatArray]] = []
+        for k, name in enumerate(tips):
+            sensor = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SENSOR, f"{name}_pressure")
+            if sensor >= 0:
+                cells = data.sensordata[model.sensor_adr[sensor] :][: model.sensor_dim[sensor]]
+                shape = self._grids[k].shape
+                self._sensors.append((k, cells.reshape(shape), np.zeros(shape)))
+        self._period, self._due = 1.0 / settings.tactile.rate, -math.inf
+
+    def __enter__(self) -> Self:
+        mujoco.set_mjcb_passive(self.add_forces)
+        mujoco.set_mjcb_sensor(self.fill_sensors)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        mujoco.set_mjcb_passive(None)
+        mujoco.set_mjcb_sensor(None)
+
+    def pressure(self, k: int, out: FloatArray | None = None) -> FloatArray:
+        """Return the pressure [Pa] on tip ``k``'s cells, float64 [rows, cols]."""
+        touch, tip = self.touches[k], self.touches[k].contact
+        frame = self.data.geom_xmat[self._tips[k]].reshape(3, 3)
+        felt = tip.d > 0.0 and tip.cosine > 0.0
+        d = min(tip.d, self._parameters.deepest) if felt else 0.0
+        x, y = np.arcsin(np.clip(touch.normal @ frame[:, :2], -1.0, 1.0)) if felt else (0.0, 0.0)
+        scale = self._scale * tip.gain if felt else 0.0
+        return self._grids[k].pressure(*self._law, d, float(x), float(y), scale, out)
+
+    def add_forces(self, model: Any, data: Any) -> None:
+        """Add the tips' forces to ``qfrc_passive``: `mjcb_passive`."""
+        if data is not self.data:
+            return
+        geometry = self._geometry
+        fromto, dt, self._t = self._fromto, data.time - self._t, data.time
+        if dt < 0.0:  # it was reset
+            self._all["shear"] = self._own[:] = dt = 0.0
+            self._due = -math.inf
+        for k, tip in enumerate(self._tips):
+            gap = _NEAR
+            for geom in self._touching:
+                found = mujoco.mj_geomDistance(model, data, tip, geom, gap, fromto)
+                if found < gap:
+                    gap, touched, point = found, geom, fromto[3:].copy()
+                    geometry[k, 7:] = fromto[:3]
+            geometry[k, 0] = -gap
+            if gap < _NEAR:
+                geometry[k, 1:4] = data.geom_xpos[tip]
+                geometry[k, 4:7] = data.geom_xmat[tip, 2::3]
+                for i, geom in ((0, tip), (2, touched)):
+                    place, turn = self._jacobians[k, i : i + 2]
+                    mujoco.mj_jac(model, data, place, turn, point, model.geom_bodyid[geom])
+        law, work = (self._all, self._parameters.array), self._work
+        press(*law, self.table.data, geometry, self._jacobians, data.qvel, dt, work)
+        mujoco.mj_solveM(model, data, self._inertial, work[0])
+        solve(*law, work, self._inertial, data.qacc, data.qfrc_passive, self._own)
+
+    def fill_sensors(self, _: Any, data: Any, stage: int) -> None:
+        """Fill the pressure sensors, which MuJoCo clears in each step: `mjcb_sensor`."""
+        if data is self.data and stage == _AFTER_FORCES:
+            is_due = data.time >= self._due
+            self._due = data.time + self._period - 1e-9 if is_due else self._due
+            for k, cells, frame in self._sensors:
+                cells[:] = self.pressure(k, frame) if is_due else frame
+
+
+def hand_mjcf(settings: Settings, p: Parameters) -> str:
+    """Return the profile's hand and a box before it as MJCF, in its plane, z towards the reader.
+
+    ``p`` is what `set_parameters` gives. Raises SettingsError for another scene.
+    """
+    shape, count = settings.simulation.object_shape, len(settings.scene.fingers)
+    if shape != "rectangle" or count != 2:
+        raise SettingsError(
+            f"object_shape: found {shape} and {count} fingers, expected rectangle and 2"
+        )
+    fingers = sensors = ""
+    for k, (name, side) in enumerate((("left", 1), ("right", -1))):
+        end = f"{side * p.offset:.9g} {p.length:.9g} 0"
+        # The hemisphere's axis is z; the sensor's x leads away from the palm on the left finger and
+        # towards it on the right one, its y to the reader.
+        fingers += f"""
+<body pos="{-side * p.half_separation:.9g} 0 0">
+<joint name="{name}" axis="0 0 {-side}" range="{p.stop_low[k]:.9g} {p.stop_high[k]:.9g}"
+ armature="{p.joint_inertia}" damping="{p.joint_damping}" frictionloss="{p.joint_friction}"/>
+<inertial pos="0 0 0" mass="1e-6" diaginertia="1e-9 1e-9 1e-9"/>
+<geom type="capsule" size="{0.3 * p.radius:.9g}" fromto="0 0 0 {end}"/>
+<geom name="{name}_tip" size="{p.radius:.9g}" pos="{end}" xyaxes="0 {side} 0 0 0 1"/>
+</body>"""
+        cells = settings.tactile.rows * settings.tactile.cols
+        sensors += f'<user name="{name}_tip_pressure" dim="{cells}" needstage="vel"/>'
+    x, y = settings.simulation.object_position
+    size, inertia = f"{p.half_width:.9g} {p.half_height:.9g} 0.03", (f"{p.inertia} " * 3).strip()
+    return f"""<mujoco model="softfinger"><compiler angle="radian" autolimits="true"/>
+<option timestep="{p.step}" integrator="implicitfast" gravity="{p.gravity[0]} {p.gravity[1]} 0"/>
+<default><geom contype="0" conaffinity="0" mass="0"/></default>
+<worldbody>{fingers}
+<body pos="{x:.9g} {y:.9g} 0">
+<joint name="x" type="slide" axis="1 0 0" frictionloss="{p.table_force:.9g}"/>
+<joint name="y" type="slide" axis="0 1 0" frictionloss="{p.table_force:.9g}"/>
+<joint name="angle" axis="0 0 1" frictionloss="{p.table_torque:.9g}"/>
+<inertial pos="0 0 0" mass="{p.mass}" diaginertia="{inertia}"/>
+<geom name="object" type="box" size="{size}"/>
+</body></worldbody>
+<actuator><motor joint="left"/><motor joint="right"/></actuator>
+<sensor>{sensors}</sensor></mujoco>"""
+
+
+@kernel
+def drive_motors(plants: Records[Plant], share: float, torque: FloatArray) -> None:
+    """Let both motors' currents follow their references by ``share``; ``torque`` [N·m] of each."""
+    plant, state = plants[0], plants[0].state
+    for j in range(2):
+        reference = current_reference(plant, j, state.position[j], state.velocity[j])
+        state.current[j] += share * (reference - state.current[j])
+        torque[j] = plant.parameters.torque_constant * state.current[j]
+
+
+class Options(Section):
+    """The profile's table ``[plugins.mujoco]``."""
+
+    timestep: Annotated[float, Field(ge=1e-4, le=0.002)] = 0.001  # s, of MuJoCo
+
+
+class MujocoHand(SimulatedHand):
+    """The simulated hand with MuJoCo for its mechanics; the motors are as there, `energy` is 0."""
+
+    def __init__(
+        self, settings: Settings, start: float = 0.0, table: ContactTable | None = None
+    ) -> None:
+        """Build the scene at rest. Raises SettingsError for what it can't have."""
+        step = Options.model_validate(settings.plugins.tables.get("mujoco", {})).timestep
+        table = table or make_table(settings, make_material(settings.material))
+        parameters = Parameters()
+        set_parameters(parameters, settings, table, step)
+        self.model = mujoco.MjModel.from_xml_string(hand_mjcf(settings, parameters))
+        self.data = mujoco.MjData(self.model)
+        self._origin = np.array([0.0, 0.0, *settings.simulation.object_position, 0.0])
+        self.tips = SoftTips(self.model, self.data, settings, table=table)
+        super().__init__(settings, start, table, step)
+
+    def _run(self, count: int) -> None:
+        plant, data, state = self.plant, self.data, self.plant.state
+        data.qpos[:], data.qvel[:] = state.position - self._origin, state.velocity
+        share = -math.expm1(-self.step / plant.parameters.electric_time)
+        with self.tips:
+            if count == 0:
+                mujoco.mj_step1(self.model, data)
+                self._feel()
+            for _ in range(count):
+                drive_motors(plant.array, share, data.ctrl)
+                data.qfrc_applied[2:] = plant.goals.load
+                mujoco.mj_step2(self.model, data)
+                mujoco.mj_step1(self.model, data)  # last, so that what the tips feel is current
+                state.position[:], state.velocity[:] = data.qpos + self._origin, data.qvel
+                self._done += 1
+                self._feel()
+
+    def _feel(self) -> None:
+        """Take over what the tips feel, and the sample that is due."""
+        plant, felt = self.plant, cast(Any, self.plant.felt).array
+        felt[:] = self.tips._all["contact"]
+        # In the plane θ has a sign, and what goes with it.
+        sign = np.where(self.tips._all["across"][:, 2] < 0.0, -1.0, 1.0)
+        for name in ("theta", "sine", "tangential", "shear"):
+            felt[name] *= sign
+        due = plant.samples * plant.parameters.sample_period
+        if self._done * self.step >= due - 1e-9:
+            row = self._ring[plant.samples % len(self._ring)]
+            row["number"], row["t"], row["firmness"] = plant.samples, due, 1.0
+            for name in ("d", "theta", "gain", "curvature", "tangential"):
+                row[name] = felt[name]
+            plant.samples += 1
+
+
+class MujocoServos(SimulatedServos):
+    """``servos.backend = "mujoco"``: the daemon's servos, on the joints of :class:`MujocoHand`."""
+
+    metal = False
+    hand = MujocoHand
+    Settings = Options
+
+    def __init__(self, *scene: Any) -> None:
+        super().__init__(*scene[:3])  # the options, last, are the hand's

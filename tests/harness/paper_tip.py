@@ -1,0 +1,65 @@
+"""The tip and sensor of most tests, the paper's: 20 mm, 0.304 MPa, 44 × 44 cells on 58 mm."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from softfinger.kinematics.contact.closed_form import Fingertip
+from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.sensing.pressure_grid import SensorGrid
+
+A = 0.020  # m
+E = 0.304e6  # Pa
+TIP = Fingertip(A)
+LINEAR = Material.constant(E)
+MEASURED = Material.table_i()
+PITCH = 0.058 / 44  # m
+GRID = SensorGrid(44, 44, PITCH)
+NOISE = 0.002 * E  # Pa
+
+# d [mm], θ [°], F [N], U [mJ] for a constant modulus.
+CHECKPOINTS = (
+    (2, 0, 3.8201766667652, 2.5467844445101),
+    (2, 15, 3.9549379080604, 2.7296353408105),
+    (2, 30, 4.4111600538176, 3.3957125926802),
+    (4, 0, 15.280706667061, 20.374275556081),
+    (4, 15, 15.819751632242, 21.837082726484),
+    (4, 30, 17.64464021527, 27.165700741441),
+    (6, 15, 35.594441172543, 73.700154201884),
+    (6, 30, 39.700440484359, 91.684240002365),
+    (8, 0, 61.122826668243, 162.99420444865),
+    (8, 15, 63.279006528966, 174.69666181187),
+    (8, 30, 70.578560861082, 217.32560593153),
+)
+
+
+def tilts(theta: float, azimuth: float) -> tuple[float, float]:
+    """Return (tilt_x, tilt_y) of a total tilt towards ``azimuth`` [rad]."""
+    return (
+        math.asin(math.sin(theta) * math.cos(azimuth)),
+        math.asin(math.sin(theta) * math.sin(azimuth)),
+    )
+
+
+def fisher(
+    grid: SensorGrid, material: Material, truth: Any, noise: float, free_gain: bool
+) -> np.ndarray[Any, Any]:
+    """Inverse Fisher information of (d, tilt_x, tilt_y[, gain]) by finite differences."""
+    columns = []
+    for k, step in enumerate((1e-7, 1e-5, 1e-5, 1e-4)[: 4 if free_gain else 3]):
+        ends = []
+        for sign in (1.0, -1.0):
+            at = list(truth)
+            at[k] += sign * step
+            ends.append(grid.pressure(TIP, material, *at[:3], gain=at[3]))
+        columns.append(((ends[0] - ends[1]) / (2 * step)).ravel())
+    jacobian = np.stack(columns, axis=1)
+    return np.linalg.inv(jacobian.T @ jacobian) * noise**2
+
+
+def errors(estimate: Any, truth: Any) -> np.ndarray[Any, Any]:
+    """Of d, both tilts and the gain."""
+    return np.array([estimate.d, estimate.tilt_x, estimate.tilt_y, estimate.gain]) - np.array(truth)

@@ -1,0 +1,150 @@
+"""Sweeps give the same bits from one process, a pool, and a cluster whose worker is killed."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from softfinger.tools.cli import main
+from softfinger.tools.sweep import Sweep, SweepError
+
+CASES = list(range(12))
+EXPECTED = [random.Random(seed).random() for seed in CASES]
+
+
+def drawn(seed: int) -> float:
+    return random.Random(seed).random()
+
+
+def dies_once(folder: Path, seed: int) -> float:
+    """Kill the worker that comes to case 5 first."""
+    if seed == 5:
+        try:
+            (folder / "died").touch(exist_ok=False)
+        except FileExistsError:
+            return drawn(seed)
+        os.kill(os.getpid(), signal.SIGKILL)
+    return drawn(seed)
+
+
+def dies(seed: int) -> float:
+    if seed == 5:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return drawn(seed)
+
+
+@pytest.mark.parametrize("processes", [1, 2])
+def test_the_results_are_the_same_in_any_number_of_processes(processes: int) -> None:
+    assert list(Sweep("drawn", drawn, CASES).run(processes)) == EXPECTED
+
+
+def test_a_worker_that_dies_costs_its_case_a_second_try(tmp_path: Path) -> None:
+    assert list(Sweep("drawn", partial(dies_once, tmp_path), CASES).run(2)) == EXPECTED
+    assert (tmp_path / "died").exists()
+
+
+def test_a_case_that_kills_each_worker_ends_the_sweep() -> None:
+    with pytest.raises(SweepError, match="workers die, at 5 or after it"):
+        list(Sweep("drawn", dies, CASES).run(2))
+
+
+def test_a_cluster_gives_the_same_and_outlives_a_worker(tmp_path: Path) -> None:
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, dashboard_address=None, protocol="tcp://"
+    ) as cluster:
+        address = cluster.scheduler_address
+        assert list(Sweep("drawn", drawn, CASES).run(scheduler=address)) == EXPECTED
+        work = partial(dies_once, tmp_path)
+        assert list(Sweep("drawn", work, CASES).run(scheduler=address)) == EXPECTED
+    assert (tmp_path / "died").exists()
+
+
+def test_a_scheduler_that_is_not_there_is_told(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("distributed")
+    monkeypatch.setattr("softfinger.tools.sweep._CONNECT", 0.2)
+    words = ["--size", "40", "--mass", "1", "--friction", "0.6", "--shape", "disc"]
+    assert main(["envelope", *words, "--scheduler", "tcp://127.0.0.1:9"]) == 1
+    assert "tcp://127.0.0.1:9: no Dask scheduler answers" in capsys.readouterr().err
+
+
+def test_an_interrupted_sweep_goes_on_from_its_journal(tmp_path: Path) -> None:
+    journal = tmp_path / "map.toml.part"
+    first = Sweep("drawn", drawn, CASES, journal).run(1)
+    assert [next(first) for _ in range(4)] == EXPECTED[:4]
+    first.close()
+    with journal.open("a", encoding="utf-8") as file:
+        file.write("[4, 0.")  # cut short
+    done = []
+
+    def counted(seed: int) -> float:
+        done.append(seed)
+        return drawn(seed)
+
+    again = Sweep("drawn", drawn, CASES, journal)
+    again._work = counted
+    again._digest = Sweep("drawn", drawn, CASES, journal)._digest
+    assert list(again.run(1)) == EXPECTED
+    assert done == CASES[4:]
+
+
+def test_another_sweeps_journal_is_refused(tmp_path: Path) -> None:
+    journal = tmp_path / "map.toml.part"
+    next(Sweep("drawn", drawn, CASES, journal).run(1))
+    with pytest.raises(SweepError, match=r"map\.toml\.part: of another sweep"):
+        list(Sweep("drawn", drawn, CASES[1:], journal).run(1))
+
+
+def test_an_envelope_is_the_same_in_one_process_and_in_two(tmp_path: Path) -> None:
+    words = ["envelope", "--shape", "rectangle", "--size", "3", "40", "--mass", "1"]
+    maps = []
+    for processes in ("1", "2"):
+        kept = tmp_path / f"{processes}.toml"
+        assert (
+            main([*words, "--friction", "0.6", "--keep", str(kept), "--processes", processes]) == 0
+        )
+        maps.append(kept.read_text(encoding="utf-8"))
+    assert maps[0] == maps[1]
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["1.toml", "2.toml"]
+
+
+def test_a_campaign_is_the_same_in_one_process_and_in_two(tmp_path: Path) -> None:
+    words = ["bench", "campaign", "witnesses", "--only", "6 N: honest", "--trials", "2"]
+    found = []
+    for processes in ("1", "2"):
+        kept = tmp_path / f"{processes}.json"
+        assert main([*words, "--json", str(kept), "--processes", processes]) == 0
+        found.append(json.loads(kept.read_text(encoding="utf-8"))["rows"])
+    assert found[0] == found[1]
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["1.json", "2.json"]
+
+
+def test_many_recordings_are_analysed_as_each_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    files = [tmp_path / f"{name}.npy" for name in "abc"]
+    rng = np.random.default_rng(1)
+    for file in files[:2]:
+        np.save(file, rng.integers(0, 900, (3, 44, 44), np.uint16))
+    files[2].write_bytes(b"no frames")
+    words = ["--config", "paper", "--no-plot"]
+    together = []
+    for file in files[:2]:
+        assert main(["analyse", str(file), *words]) == 0
+        table = file.with_name(f"{file.name}.contacts.csv")
+        together.append(table.read_text(encoding="utf-8"))
+        table.unlink()
+    assert main(["analyse", *map(str, files), *words, "--processes", "2"]) == 1
+    assert f"analyse: {files[2]}: " in capsys.readouterr().err
+    tables = sorted(tmp_path.glob("*.csv"))
+    assert [each.read_text(encoding="utf-8") for each in tables] == together
+    assert main(["analyse", *map(str, files), *words, "--csv", "x.csv"]) == 2

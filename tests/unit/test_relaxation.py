@@ -1,0 +1,187 @@
+"""Tips that relax: the plant against its Prony terms' integrals, and against its own energy."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from softfinger.daemon.profile.factory import make_material, make_tip
+from softfinger.daemon.profile.load import load
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
+from softfinger.daemon.simulation.sensor.simulated_tactile import make_sensor_model
+from softfinger.kinematics.calibration.calibration import CalibrationError
+from softfinger.kinematics.calibration.relaxation import fit_relaxation, followed
+from softfinger.kinematics.contact.table import ContactTable
+from softfinger.tools.benchmarks.rigs import SOLID
+from softfinger.tools.cli import main
+from softfinger.tools.watched import Watched
+
+STRENGTHS, TIMES = (0.2, 0.15, 0.25), (0.004, 0.07, 1.4)
+SPEED = 0.02  # m/s
+
+
+def pressed(**more: Any) -> SimulatedHand:
+    """One finger; the object is moved to and fro against it."""
+    simulation = {
+        "tip_relaxation": STRENGTHS,
+        "tip_relaxation_times": TIMES,
+        "compression_speed": SPEED,
+        "tip_friction": 0.0,
+        "tip_loss": 0.0,
+    }
+    return SimulatedHand(
+        Settings.model_validate(
+            {
+                "scene": {"fingers": ("left",)},
+                "servos": {"backend": "none"},
+                "material": {"law": "constant"},
+                "simulation": simulation | more,
+            }
+        )
+    )
+
+
+def test_a_press_and_its_release_follow_the_prony_terms() -> None:
+    hand = pressed()
+    rows = []
+    for k in range(1, 4000):
+        hand.advance(1e-3 * k)
+        d = float(hand.d[0])
+        lasting = float(hand.table(max(d, 0.0), float(hand.theta[0])).force) if d > 0.0 else 0.0
+        rows.append((hand.t, lasting, float(hand.force[0])))
+    t, lasting, force = np.array(rows).T
+    assert np.count_nonzero(np.diff((lasting > 0.0).astype(int))) >= 3  # pressed, and let go
+
+    def followed(now: float, h: np.ndarray) -> np.ndarray:
+        return (np.interp(now, t, lasting) - h) / np.array(TIMES)
+
+    found = solve_ivp(
+        followed, (t[0], t[-1]), np.zeros(3), "LSODA", t, rtol=1e-8, atol=1e-8, max_step=2e-3
+    )
+    expected = lasting + np.array(STRENGTHS) @ (lasting - found.y)
+    expected = np.where(lasting > 0.0, np.maximum(expected, 0.02 * lasting), 0.0)
+    deep = lasting > 1.0
+    np.testing.assert_allclose(force[deep], expected[deep], rtol=0.02, atol=0.05)
+    rising = deep & (np.gradient(lasting) > 0.0)
+    assert (force[rising] > 1.1 * lasting[rising]).mean() > 0.9
+    falling = deep & (np.gradient(lasting) < 0.0)
+    assert (force[falling] < lasting[falling]).any()
+
+
+def test_an_elastic_tip_is_as_it_was() -> None:
+    hand = pressed(tip_relaxation=(0.0, 0.0, 0.0))
+    for k in range(1, 2000):
+        hand.advance(1e-3 * k)
+        d = max(float(hand.d[0]), 0.0)
+        expected = float(hand.table(d, float(hand.theta[0])).force) if d > 0.0 else 0.0
+        assert float(hand.force[0]) == pytest.approx(expected, rel=1e-12, abs=1e-12)
+
+
+def test_relaxing_tips_make_no_energy() -> None:
+    """A free object between relaxing tips that bounce without other losses comes to rest."""
+    settings = Settings.model_validate(
+        {
+            "material": {"law": "constant"},
+            "hand": {"open_angle": (0.18, 0.18)},
+            "servos": {"backend": "none"},
+            "simulation": {
+                "tip_relaxation": STRENGTHS,
+                "tip_loss": 0.0,
+                "tip_friction": 0.0,
+                "table_friction": 0.0,
+                "compression_speed": 0.0,
+                "object_position": (0.0008, 0.080),
+            },
+        }
+    )
+    hand = SimulatedHand(settings)
+    speeds = []
+    for k in range(1, 1000):
+        hand.advance(2e-3 * k)
+        speeds.append(float(np.hypot(*hand.object_velocity[:2])))
+    assert max(speeds[:50]) > 0.02
+    assert max(speeds[-100:]) < 0.05 * max(speeds[:50])
+
+
+@pytest.mark.parametrize("strengths", [(0.0, 0.15, 0.25), (0.0, 0.3, 0.0), (0.0, 0.0, 0.0)])
+def test_a_press_and_hold_tells_the_strengths(strengths: tuple[float, float, float]) -> None:
+    """Of frames at 100 Hz with noise, by an ODE of its own; 4 ms are too short for these."""
+    t = np.arange(0.0, 6.0, 0.01)
+    lasting = 12.0 * np.minimum(t / 0.1, 1.0) ** 1.6
+
+    def rate(now: float, h: np.ndarray) -> np.ndarray:
+        return (12.0 * min(now / 0.1, 1.0) ** 1.6 - h) / np.array(TIMES)
+
+    h = solve_ivp(rate, (0.0, t[-1]), np.zeros(3), "LSODA", t, rtol=1e-9, max_step=0.01).y
+    force = 0.8 * (lasting + np.array(strengths) @ (lasting - h))
+    force += np.random.default_rng(3).normal(0.0, 0.02, t.size)
+    found = fit_relaxation(t, lasting, force, TIMES)
+    assert found.strengths == pytest.approx(strengths, abs=0.015)
+    assert found.strengths[0] == 0.0
+    assert found.residual < 0.02
+    if any(strengths):
+        assert found.elastic > 2.0 * found.residual
+
+
+def test_too_short_a_hold_is_refused() -> None:
+    t = np.arange(0.0, 1.0, 0.01)
+    with pytest.raises(CalibrationError, match=r"found 1\.0 s .* 2 times .* 1\.4 s"):
+        fit_relaxation(t, np.ones_like(t), np.ones_like(t), TIMES)
+
+
+def grip(aware: bool, tip: dict[str, Any]) -> tuple[float, float, list[str]]:
+    """True force over 8 N after 1 s of a hold and at its end, and what was warned of."""
+    sections: dict[str, dict[str, Any]] = {name: dict(values) for name, values in tip.items()}
+    sections.setdefault("simulation", {})["tip_relaxation"] = STRENGTHS
+    if aware:
+        sections.setdefault("tip", {})["relaxation"] = STRENGTHS
+    with Watched(sections) as hand:
+        hand.grasp(8.0)
+        hand.run(3.0)
+        first = float(np.mean(hand.plant.force)) / 8.0
+        hand.run(8.0)
+        warned = [kind for level, kind, _ in hand.events if level != "info"]
+        return first, float(np.mean(hand.plant.force)) / 8.0, warned
+
+
+@pytest.mark.parametrize("tip", [{}, SOLID])
+def test_a_hold_keeps_its_force_while_known_tips_relax(tip: dict[str, Any]) -> None:
+    first, last, warned = grip(True, tip)
+    assert last == pytest.approx(first, abs=0.01)
+    assert last == pytest.approx(1.0, abs=0.05)
+    assert warned == []
+
+
+def test_relaxation_that_nobody_told_of_is_felt_as_a_load() -> None:
+    """What the setting is for: so the hand must not be better than it is."""
+    _, last, warned = grip(False, {})
+    assert last > 1.2 or "slip" in warned
+
+
+def test_calibrate_finds_it_in_a_run_of_frames(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    profile = load(Path("sim"))
+    grid = make_sensor_model(profile, 0).grid
+    t = np.arange(0.0, 5.0, 0.01)
+    d = 0.004 * np.minimum(t / 0.2, 1.0)
+    tip, material = make_tip(profile), make_material(profile.material)
+    lasting = ContactTable.build(tip, material)(d, 0.0 * d).force
+    h = np.array([followed(t, lasting, time) for time in TIMES])
+    firmness = 1.0 + np.array([0.0, 0.2, 0.3]) @ (1.0 - h / np.maximum(lasting, 1e-12))
+    pressures = [grid.pressure(tip, material, each, 0.0) for each in d]
+    counts = [rho * p / profile.tactile.pascal_per_count
+              for rho, p in zip(firmness, pressures, strict=True)]  # fmt: skip
+    run, file = tmp_path / "press.npz", tmp_path / "left.json"
+    np.savez(run, frames=np.rint(counts).astype(np.uint16), d=d)
+    assert main(["calibrate", "relaxation", str(file), "--recording", str(run)]) == 0
+    said = capsys.readouterr().out
+    found = [float(each) for each in re.findall(r"\d\.\d{3}", said.partition("[")[2])]
+    assert found == pytest.approx([0.0, 0.2, 0.3], abs=0.02)
+    assert (tmp_path / "left.relaxation.png").stat().st_size > 1000

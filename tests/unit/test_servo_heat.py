@@ -1,0 +1,242 @@
+"""The servos' heat: the filter against plain NumPy, its forecast against an ODE solver, and what
+the hand does with it on hidden constants."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from softfinger.daemon.control.modes import Mode
+from softfinger.daemon.profile.load import load
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.safety.heat import set_law
+from softfinger.daemon.servos.control_table import by_name
+from softfinger.daemon.simulation.servo_model.servo_heat import ServoHeat
+from softfinger.kinematics.hand.servo_heat import (
+    LONGEST,
+    HeatState,
+    follow,
+    lasting_square,
+    time_to_limit,
+    winding_std,
+)
+from softfinger.tools.calibration import heat as calibrating
+from softfinger.tools.cli import main
+from softfinger.tools.watched import Watched
+from tests.harness.golden_recording import RECORDING
+from tests.soak.heat import foreseen, least_at_half_load
+
+LIMIT = 70.0
+FAST = (1.2, 0.8, 0.6)  # heating, cooling, capacity of the plant's servos
+
+
+def law(state: HeatState) -> HeatState:
+    set_law(state.law, Settings())
+    return state
+
+
+def derivative(state: HeatState, x: Any, square: float) -> Any:
+    """The equations of the module's head, of W, C, A, k."""
+    c = state.law
+    winding, case, ambient, heating = x
+    copper = 1.0 + 0.0039 * (winding - 25.0)
+    flow = (winding - case) / c.winding_time
+    draught = (max(case - ambient, 1.0) / 30.0) ** 0.25
+    return np.array(
+        [
+            heating * c.heating * square * copper - flow,
+            c.share * flow - draught * (case - ambient) / c.case_time,
+            0.0,
+            0.0,
+        ]
+    )
+
+
+def jacobian(state: HeatState, x: Any, square: float) -> Any:
+    """By differences."""
+    columns = []
+    for i in range(4):
+        step = np.zeros(4)
+        step[i] = 1e-4
+        high, low = (derivative(state, x + sign * step, square) for sign in (1.0, -1.0))
+        columns.append((high - low) / 2e-4)
+    return np.stack(columns, axis=1)
+
+
+def test_the_filter_is_a_kalman_filter_of_its_equations() -> None:
+    chance, state = np.random.default_rng(3), law(HeatState())
+    follow(state.array, 0.0, 0.5, 30.0)
+    x, p = state.x.copy(), state.p.copy()
+    assert x.tolist() == [30.0, 30.0, 25.0, 1.0]
+    last = 30.0
+    for k in range(300):
+        square, dt = float(chance.uniform(0.5, 2.0)), 0.5
+        reading = 30.0 + k // 20 + (3.0 if k > 200 else 0.0)  # steps, and one of several degrees
+        f = np.eye(4) + dt * jacobian(state, x, square)
+        x = x + dt * derivative(state, x, square)
+        p = f @ p @ f.T + dt * np.diag(np.square([0.03, 0.01, 0.1, 0.004]))
+        h = np.array([[0.0, 1.0, 0.0, 0.0]])
+        jump = reading - last
+        case, variance = reading, 9.0 / dt
+        if abs(jump) > 1.0:
+            variance = 1.0
+        elif jump:
+            case, variance = 0.5 * (reading + last), 0.0625
+        gain = p @ h.T / (h @ p @ h.T + variance)
+        x = x + (gain * (case - x[1])).ravel()
+        p = (np.eye(4) - gain @ h) @ p
+        last = reading
+        follow(state.array, square, dt, reading)
+        assert state.x == pytest.approx(x, rel=1e-6, abs=1e-6)
+    assert state.p == pytest.approx(p, rel=1e-5, abs=1e-9)
+    spread = math.hypot(math.sqrt(p[0, 0]), 0.25 * (x[0] - x[1]))
+    assert winding_std(state.array) == pytest.approx(spread, rel=1e-6)
+
+
+@pytest.mark.parametrize("square", [0.4, 1.0, 2.5])
+def test_the_time_to_the_limit_is_that_of_the_equations(square: float) -> None:
+    state = law(HeatState())
+    follow(state.array, 0.0, 0.5, 30.0)
+    state.x[:] = 45.0, 38.0, 28.0, 1.1
+
+    def reached(_: float, x: Any) -> float:
+        return float(x[1]) - LIMIT
+
+    reached.terminal = True  # type: ignore[attr-defined]
+    solved = solve_ivp(
+        lambda _, x: derivative(state, x, square),
+        (0.0, LONGEST),
+        state.x,
+        events=reached,
+        rtol=1e-8,
+    )
+    assert time_to_limit(state.array, square, LIMIT) == pytest.approx(solved.t[-1], rel=0.02)
+
+
+def test_the_lasting_current_settles_at_the_limit() -> None:
+    state = law(HeatState())
+    follow(state.array, 0.0, 0.5, 30.0)
+    square = lasting_square(state.array, LIMIT)
+    solved = solve_ivp(
+        lambda _, x: derivative(state, x, square), (0.0, 4e4), state.x, method="LSODA"
+    )
+    assert solved.y[1, -1] == pytest.approx(LIMIT, abs=0.1)
+    assert time_to_limit(state.array, square, LIMIT + 1.0) == LONGEST
+    state.x[2] = LIMIT + 5.0
+    assert lasting_square(state.array, LIMIT) == 0.0
+
+
+@pytest.mark.parametrize("seed", [2, 7, 25, 37])
+def test_the_limit_of_hidden_constants_is_foreseen(seed: int) -> None:
+    run = foreseen(seed)
+    assert run.warned >= 30.0
+    assert run.told == pytest.approx(60.0, rel=0.15)
+
+
+def test_half_of_what_lasts_warns_nobody() -> None:
+    assert least_at_half_load(1, 1800.0) > 600.0
+
+
+HOLD = 600.0  # s
+
+
+def recorded(plant: ServoHeat) -> dict[str, Any]:
+    """A hold of 1 A, as a recording has it."""
+    t, shown = np.arange(0.0, HOLD, 0.5), []
+    for _ in t:
+        plant.step(1.0, 0.5)
+        shown.append(float(round(plant.sensed)))
+    return {"t": t, "left.current": np.ones_like(t), "left.temperature": np.array(shown)}
+
+
+def test_a_hold_tells_a_servos_own_constants(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plant = ServoHeat(by_name("XM430-W350"), 1.25, 0.8, 0.8)
+    monkeypatch.setattr(calibrating, "read_recording", lambda _: recorded(plant))
+    profile = tmp_path / "my.toml"
+    profile.write_text("[servos]\nheat_time = 1.0\n")
+    assert main(["calibrate", "heat", str(profile), "--recording", "hold.mcap"]) == 0
+    assert "K/A² in" in capsys.readouterr().out
+    state, own = HeatState(), load(profile)
+    set_law(state.law, own)
+    follow(state.array, 1.0, 0.5, 25.0)
+    plant.cool()
+    state.x[:3] = 25.0
+    told = time_to_limit(state.array, 1.0, 60.0)
+    t = 0.0
+    while plant.case < 60.0:
+        plant.step(1.0, 1.0)
+        t += 1.0
+    assert told == pytest.approx(t, rel=0.05)
+    follow(law(state).array, 1.0, 0.5, 25.0)
+    state.x[:3] = 25.0
+    assert abs(time_to_limit(state.array, 1.0, 60.0) / t - 1.0) > 0.2  # by the model's own
+
+
+def test_a_hold_that_hardly_warms_tells_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    profile = tmp_path / "my.toml"
+    profile.write_text("")
+    assert main(["calibrate", "heat", str(profile), "--recording", str(RECORDING)]) == 1
+    assert "found 0 °C of warming, expected 8 at least" in capsys.readouterr().err
+
+
+def hot(force: float, seconds: float, **sections: dict[str, Any]) -> Watched:
+    """A grip on servos that soon get too hot."""
+    sections["simulation"] = {"servo_heat": FAST, "ambient": 35.0}
+    hand = Watched(sections)
+    hand.grasp(force)
+    hand.run(2.0)
+    assert hand.mode == Mode.HOLDING
+    for heat in hand.plant.servo_heat:
+        heat.warm(60.0)
+    hand.run(seconds)
+    return hand
+
+
+def heat_events(hand: Watched) -> list[tuple[str, str]]:
+    return [(level, text) for level, kind, text in hand.events if kind == "servos.heat"]
+
+
+def test_a_grip_that_gets_too_hot_is_eased_and_holds() -> None:
+    with hot(24.0, 90.0) as hand:
+        assert hand.mode == Mode.HOLDING
+        assert max(heat.sensed for heat in hand.plant.servo_heat) < LIMIT
+        assert hand.plant.force.min() > 5.0
+        told = heat_events(hand)
+        assert any("grip eased from 24.0 to" in text for _, text in told)
+        assert {level for level, _ in told} == {"warning"}
+        eased = hand.state.goal.force
+        assert eased < 22.0
+        hand.command("grasp", force=24.0)  # asked for again, while it is hot
+        hand.run(1.0)
+        assert hand.state.goal.force == pytest.approx(eased)
+
+
+@pytest.mark.parametrize(
+    ("action", "mode"), [("hold", Mode.FAULT), ("release", Mode.ARMED), ("stop", Mode.DISARMED)]
+)
+def test_where_the_load_needs_the_grip_it_is_said_and_the_action_done(
+    action: str, mode: Mode
+) -> None:
+    # What friction bears of the load is all that 24 N have: easing would let it fall.
+    control = {"object_load": 23.5}
+    with hot(24.0, 0.0, control=control, safety={"heat_action": action}) as hand:
+        for _ in range(90):
+            hand.run(1.0)
+            if hand.mode != Mode.HOLDING:
+                break
+        hand.run(2.0)
+        assert hand.mode == mode
+        ((level, text),) = heat_events(hand)[-1:]
+        assert level == "error"
+        assert text.endswith(f"and the load needs the grip: {action}")
+        if action == "hold":
+            assert hand.state.fault_name == "servos.temperature"

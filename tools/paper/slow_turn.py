@@ -1,0 +1,307 @@
+"""Sec. V's quasi-static manipulation: a slow turn, by the equations and on the simulated hand.
+
+Both tips are the paper's springs and stick; nothing else rubs. With the shear ζ of a tip
+
+    U = πE [d³/(3 cos² θ) + d² ζ tan θ + d ζ²]      ζ̇ = −ṡ + (a − d) θ̇ − ḋ tan θ
+
+its rate the face's motion along itself less the tip's rolling, and less what lies along a tilted
+face as it goes deeper (s, d, θ of `kinematics.hand.geometry`, θ of the right tip mirrored). The
+object is in balance where Σ δU = 0 for each motion of it, that is, with M = ∂U/∂θ, T = ∂U/∂ζ and
+N = ∂U/∂d − T tan θ, Σ N δd + M δθ + T (−δs + (a − d) δθ) = 0. So is every pose of a turn that is
+slow: `turned` solves that step by step, and no time, mass or damping is in it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from functools import cache, partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from softfinger.kinematics.hand.geometry import HandGeometry, tip_velocity
+from softfinger.tools.paper.runs import MODULUS
+from softfinger.tools.paper.sheets import (
+    DrawnCurve,
+    FigurePage,
+    FloatArray,
+    Panel,
+    Sheet,
+    sheet,
+)
+from softfinger.tools.style import INK, KINDS, ordered
+from softfinger.tools.watched import Watched
+
+FORCE, WIDTH = 10.0, 0.040  # N on each tip's base; m
+REACH = math.radians(8.0)  # the object's angle, there, back, and to the other side
+LEANS = (-4, -2, 0, 2, 4)  # degrees
+_SWING = 4.0  # s from 0 to REACH
+_ASIDE = np.radians(np.linspace(-2.5, 2.5, 41))
+_STEPS = 64
+_FRICTION = 0.6
+_SIDES = np.array([1.0, -1.0])
+_HAND = HandGeometry()
+_GRIP = 3.0  # s
+_FREE = {"table_friction": 0.0, "joint_friction": 0.0}
+
+
+class Held(NamedTuple):
+    """A pose of hand and object, and each tip's contact."""
+
+    q: FloatArray
+    pose: FloatArray
+    d: FloatArray
+    theta: FloatArray
+    s: FloatArray
+    shear: FloatArray
+
+    def gradient(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return N [N], M [N·m] and T [N] of both tips."""
+        d, shear = self.d, self.shear
+        tangent, inverse = np.tan(self.theta), 1.0 / np.cos(self.theta) ** 2
+        stiff = math.pi * MODULUS
+        tangential = stiff * (d**2 * tangent + 2.0 * d * shear)
+        along_d = stiff * (d**2 * inverse + 2.0 * d * shear * tangent + shear**2)
+        return (
+            along_d - tangential * tangent,
+            stiff * (2.0 / 3.0 * d**3 * tangent + d**2 * shear) * inverse,
+            tangential,
+        )
+
+    def energy(self) -> float:
+        """Return U of both tips [J]."""
+        d, shear, tangent = self.d, self.shear, np.tan(self.theta)
+        parts = d**3 / (3.0 * np.cos(self.theta) ** 2) + d**2 * shear * tangent + d * shear**2
+        return float(math.pi * MODULUS * parts.sum())
+
+    def torques(self) -> FloatArray:
+        """Return what each joint must bear [N·m], positive closing."""
+        lengths = _HAND.finger_length, _HAND.finger_offset
+        moves = np.array(
+            [tip_velocity(q, k, *lengths) for q, k in zip(self.q, _SIDES, strict=True)]
+        )
+        angle = self.pose[2]
+        normal, moment, tangential = self.gradient()
+        deeper = _SIDES * (moves @ [math.cos(angle), math.sin(angle)])
+        along = moves @ [-math.sin(angle), math.cos(angle)]
+        rolls = moment + tangential * (_HAND.tip_radius - self.d)
+        return np.asarray(normal * deeper - tangential * along + rolls)
+
+    def unbalanced(self) -> FloatArray:
+        """Return the forces along x and y [N], the moment over W [N], and the grip's error [N]."""
+        normal, moment, tangential = self.gradient()
+        angle = self.pose[2]
+        across, along = [math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]
+        tips = _HAND.tips(self.q) - self.pose[:2]
+        out = np.zeros(4)
+        out[:2] = -((_SIDES * normal) @ np.outer([1, 1], across)) + tangential.sum() * np.array(
+            along
+        )
+        rolls = moment + tangential * (_HAND.tip_radius - self.d)
+        turns = normal * _SIDES * (tips @ along) + tangential * (tips @ across) + _SIDES * rolls
+        out[2] = turns.sum() / WIDTH
+        force = math.pi * MODULUS * self.d**2 / np.cos(self.theta)
+        out[3] = force.mean() - FORCE
+        return out
+
+
+def held(q: FloatArray, pose: FloatArray, last: Held | None) -> Held:
+    """Return a pose whose tips have rolled there from ``last``; without it they are unsheared."""
+    contacts = _HAND.contacts(q, pose, WIDTH)
+    theta = _SIDES * contacts.theta
+    shear = np.zeros(2)
+    if last is not None:
+        radius = _HAND.tip_radius - 0.5 * (contacts.d + last.d)
+        shear = last.shear - (contacts.s - last.s) + radius * (theta - last.theta)
+        shear -= np.tan(0.5 * (theta + last.theta)) * (contacts.d - last.d)
+    return Held(q, pose, contacts.d, theta, contacts.s, shear)
+
+
+def solve(residual: Callable[[FloatArray], FloatArray], start: FloatArray) -> FloatArray:
+    """Return the root near ``start`` by Newton's method. Raises RuntimeError without one."""
+    x = start.copy()
+    for _ in range(30):
+        value = residual(x)
+        if np.abs(value).max() < 1e-8:
+            return x
+        steps = 1e-7 * np.eye(x.size)
+        slopes = [(residual(x + h) - residual(x - h)) / 2e-7 for h in steps]
+        x = x - np.linalg.solve(np.array(slopes).T, value)
+    raise RuntimeError(f"no balance near {start}: {residual(x)} left")
+
+
+def at_pose(x: FloatArray, angle: float, last: Held | None) -> Held:
+    """Return the pose of ``x``, the object's place [m] and both joints' angles [rad]."""
+    return held(x[2:], np.array([x[0], x[1], angle]), last)
+
+
+@cache
+def gripped() -> Held:
+    """Return the upright grip in balance, from unsheared tips ."""
+
+    def met(x: FloatArray) -> Held:
+        q = np.full(2, x[0])
+        return held(q, np.array([0.0, _HAND.tips(q)[0, 1], 0.0]), None)
+
+    first = met(solve(lambda x: met(x).unbalanced()[3:], np.array([0.15])))
+    return turned(np.zeros(1), first)[0]
+
+
+def turned(angles: FloatArray, start: Held) -> list[Held]:
+    """Return the quasi-static path from ``start`` on which the object takes ``angles`` [rad]."""
+    path = [start]
+    for angle in angles:
+        last = path[-1]
+        wanted = partial(at_pose, angle=float(angle), last=last)
+
+        def residual(x: FloatArray, of: Callable[[FloatArray], Held] = wanted) -> FloatArray:
+            return of(x).unbalanced()
+
+        found = solve(residual, np.r_[last.pose[:2], last.q])
+        path.append(wanted(found))
+    return path[1:]
+
+
+def potential(there: Held, start: Held) -> float:
+    """Return V = ΣU − τ (q1 + q2) [J], 0 at ``start``, whose equal joint torque is τ."""
+    torque = float(start.torques().mean())
+    return there.energy() - start.energy() - torque * float((there.q - start.q).sum())
+
+
+def valley(floor: Held, aside: FloatArray, start: Held) -> FloatArray:
+    """Return V over the object's angles ``aside`` [rad] of the path's ``floor``, at the same lean.
+
+    Least over all else; rolled there from ``start`` in one step; NaN where a tip would slip.
+    """
+    lean = 0.5 * float(floor.q[0] - floor.q[1])
+    torque = float(start.torques().mean())
+    found = np.full(aside.size, np.nan)
+    near = np.append(floor.pose[:2], floor.q.mean())
+    for k, more in enumerate(aside):
+        angle = float(floor.pose[2] + more)
+
+        def pose(x: FloatArray, angle: float = angle) -> Held:
+            return at_pose(np.r_[x[:2], x[2] + lean, x[2] - lean], angle, start)
+
+        def residual(x: FloatArray, of: Callable[[FloatArray], Held] = pose) -> FloatArray:
+            there = of(x)
+            closing = (there.torques().mean() - torque) / WIDTH
+            return np.append(there.unbalanced()[:2], closing)
+
+        there = pose(solve(residual, near))
+        normal, _, tangential = there.gradient()
+        if (np.abs(tangential) < _FRICTION * normal).all():
+            found[k] = potential(there, start)
+    return found
+
+
+def swing() -> FloatArray:
+    """Turn the simulated hand's object there and back; columns t, φ, lean [rad], ΣU [J], T [N].
+
+    ΣU and T are scaled to `FORCE`, with F^(3/2) and F, as the held force is off by some percent.
+    """
+    sections: dict[str, dict[str, Any]] = {
+        "material": {"law": "constant", "modulus": MODULUS},
+        "simulation": _FREE,
+    }
+    rows = []
+    with Watched(sections) as hand:
+        hand.loop.advance(0.1)
+        hand.command("arm")
+        hand.loop.advance(0.2)
+        hand.command("grasp", force=FORCE)
+        hand.loop.advance(_GRIP)
+        start, t = hand.state.t, 0.0
+        while t < 4.0 * _SWING:
+            t = hand.state.t - start
+            wanted = REACH * _triangle(t / _SWING)
+            hand.command("hold", force=FORCE, angle=wanted)
+            hand.loop.advance(0.02)
+            found = Held(
+                np.array(hand.plant.q), np.array(hand.plant.object_pose), np.array(hand.plant.d),
+                _SIDES * hand.plant.theta, np.zeros(2), np.zeros(2),
+            )  # fmt: skip
+            sheared = _SIDES * hand.plant.tangential
+            shear = (sheared - found.gradient()[2]) / (2.0 * math.pi * MODULUS * found.d)
+            scale = FORCE / hand.plant.force.mean()
+            energy = found._replace(shear=shear).energy() * scale**1.5
+            lean = 0.5 * (found.q[0] - found.q[1])
+            rows.append((t, found.pose[2], lean, energy, sheared[0] * scale))
+    return np.array(rows)
+
+
+def _triangle(turns: float) -> float:
+    """0, 1, 0, −1, 0 at 0, 1, 2, 3, 4, straight in between."""
+    return 1.0 - abs((turns + 1.0) % 4.0 - 2.0)
+
+
+@cache
+def slow_turn() -> tuple[Sheet, ...]:
+    """Return the path by the equations, the plant's, and V at some leans of the fingers."""
+    there = np.linspace(0.0, REACH, _STEPS + 1)[1:]
+    back = np.r_[there[-2::-1], -np.linspace(0.0, REACH, _STEPS + 1)]
+    start = gripped()
+    path = [start, *turned(np.r_[there, back], start)]
+    lean = np.array([0.5 * (each.q[0] - each.q[1]) for each in path])
+    equations = sheet(
+        "slow_turn_equations",
+        ("angle", "deg", [math.degrees(each.pose[2]) for each in path]),
+        ("lean", "deg", np.degrees(lean)),
+        ("energy of both tips", "mJ", [1e3 * each.energy() for each in path]),
+        ("V", "mJ", [1e3 * potential(each, start) for each in path]),
+        ("shear force", "N", [each.gradient()[2][0] for each in path]),
+    )
+    run = swing()
+    plant = sheet(
+        "slow_turn_plant",
+        ("t", "s", run[:, 0]),
+        ("angle", "deg", np.degrees(run[:, 1])),
+        ("lean", "deg", np.degrees(run[:, 2])),
+        ("energy of both tips", "mJ", 1e3 * run[:, 3]),
+        ("shear force", "N", run[:, 4]),
+    )
+    columns: list[tuple[str, str, FloatArray]] = []
+    for each in LEANS:
+        floor = path[int(np.argmin(np.abs(lean - math.radians(each))))]
+        angles = np.degrees(floor.pose[2] + _ASIDE)
+        columns.append((f"angle at {each} deg", "deg", angles))
+        columns.append((f"V at {each} deg", "mJ", 1e3 * valley(floor, _ASIDE, start)))
+    return equations, plant, sheet("slow_turn_landscape", *columns)
+
+
+def _landscape(equations: Sheet, _: Sheet, land: Sheet) -> Iterator[DrawnCurve]:
+    for lean, look in zip(LEANS, ordered(len(LEANS)), strict=True):
+        yield DrawnCurve(
+            land[f"angle at {lean} deg"], land[f"V at {lean} deg"], look, f"lean {lean}°"
+        )
+    yield DrawnCurve(equations["angle"], equations["V"], {"color": INK, "lw": 2.0}, "slow turn")
+
+
+def _both(name: str, equations: Sheet, plant: Sheet, _: Sheet) -> Iterator[DrawnCurve]:
+    look = {"color": KINDS[1], "lw": 3.0, "alpha": 0.6}
+    yield DrawnCurve(plant["angle"], plant[name], look, "simulated hand, 10 N")
+    yield DrawnCurve(equations["angle"], equations[name], {"color": INK, "lw": 1.0}, "equations")
+
+
+_ANGLE = "object's angle φ [deg]"
+PAGES = {
+    "slow_turn": FigurePage(
+        "A slow turn on the energy landscape: Sec. V's quasi-static manipulation",
+        (8.4, 6.6),
+        slow_turn,
+        (
+            Panel(_landscape, _ANGLE, "V [mJ]", "(a) the valley of the turn", None, (-0.3, 9.0),
+                  {"loc": "upper center", "ncols": 3}),
+            Panel(partial(_both, "lean"), _ANGLE, "(q1 − q2)/2 [deg]", "(b) the fingers' lean",
+                  legend="upper left"),
+            Panel(partial(_both, "energy of both tips"), _ANGLE, "ΣU [mJ]", "(c) energy"),
+            Panel(partial(_both, "shear force"), _ANGLE, "T [N]", "(d) shear force, left"),
+        ),
+        rows=2,
+        notes=(
+            "The paper's springs, stuck to an object of 40 mm, 10 N; no other friction. V: energy "
+            "of both tips less the work of equal joint torques; lines end where a tip would slip.",
+        ),
+    )
+}  # fmt: skip

@@ -1,0 +1,221 @@
+"""``softfinger validate``: this model beside published figures: agree, disagree or unknown.
+
+Each row computes its own figure when it is called, and names where the other one was published. A
+figure that nothing here models, or that no metal has shown, is unknown, with the reason.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from softfinger.daemon.profile.load import load
+from softfinger.daemon.profile.settings import Settings
+from softfinger.kinematics.contact.closed_form import Fingertip
+from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.contact.table import ContactTable
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    FloatArray = NDArray[np.float64]
+
+RADIUS, MODULUS, POISSON = 0.020, 0.304e6, 0.49  # m, Pa: the paper's tip
+DEPTHS = np.linspace(0.001, 0.007, 25)  # m
+TILTS = np.radians(np.linspace(0.0, 20.0, 41))
+FIGURES = {"agree": "✓", "disagree": "✗", "unknown": "?"}
+_TRIALS = 5
+_FRAMES = 64
+_PRESSED = 0.005, 0.2  # m, rad: of the sensors' frames
+
+
+class Beside(NamedTuple):
+    """One row: a published figure beside this project's."""
+
+    quantity: str
+    published: str
+    source: str
+    ours: str
+    verdict: str  # of FIGURES
+    why: str = ""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.epilog = "Takes some seconds: grips and frames are simulated anew."
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Print the comparisons as a table."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(box=None, padding=(0, 2, 0, 0))
+    for head in ("", "quantity", "published", "here", "source, and what stands between"):
+        table.add_column(head, overflow="fold")
+    found = list(comparisons())
+    for each in found:
+        why = f"{each.source}. {each.why}" if each.why else each.source
+        table.add_row(FIGURES[each.verdict], each.quantity, each.published, each.ours, why)
+    console = Console(width=150, highlight=False, markup=False)
+    console.print(table)
+    counted = (f"{sum(each.verdict == v for each in found)} {v}" for v in FIGURES)
+    console.print(", ".join(counted))
+    return 0
+
+
+def comparisons() -> Iterator[Beside]:
+    """Yield all rows, each computed as it comes."""
+    for rows in (_tips, _energy, _memory, _cells, _sensors, _hands):
+        yield from rows()
+
+
+def between(quantity: str, low: float, high: float, source: str, ours: float, form: str = ".2f",
+            unit: str = "", why: str = "") -> Beside:  # fmt: skip
+    """Return a row that agrees where ``ours`` is within [low, high], to the digits of ``form``."""
+    shown = [f"{each:{form}}" for each in (low, high, ours)]
+    inside = float(shown[0]) <= float(shown[2]) <= float(shown[1])
+    verdict = "agree" if inside else "disagree"
+    text = f"{shown[0]} to {shown[1]}{unit}" if low < high else f"{shown[0]}{unit}"
+    return Beside(quantity, text, source, f"{shown[2]}{unit}", verdict, why)
+
+
+def exponent(d: FloatArray, force: FloatArray) -> float:
+    """Return ζ of the least squares line of ln F = ln C + ζ ln d."""
+    return float(np.polyfit(np.log(d), np.log(force), 1)[0])
+
+
+_LAWS = {
+    "springs": Fingertip(RADIUS),
+    "solid, bonded": Fingertip(RADIUS, "solid", POISSON, "bonded"),
+    "solid, lying": Fingertip(RADIUS, "solid", POISSON, "lying"),
+    "solid, bonded, sticking": Fingertip(RADIUS, "solid", POISSON, "bonded", "sticking"),
+}
+
+
+def _table(law: str) -> Callable[..., FloatArray]:
+    table = ContactTable.build(_LAWS[law], Material.constant(MODULUS))
+    return lambda d, theta, name: np.asarray(getattr(table(d, theta), name))
+
+
+def _tips() -> Iterator[Beside]:
+    source = "Human Inspired Dexterity in Robotic Manipulation, table 7.1"
+    for law in _LAWS:
+        zeta = exponent(DEPTHS, _table(law)(DEPTHS, 0.0 * DEPTHS, "force"))
+        stiff = "of a constant modulus F = π E d², whatever E is" if law == "springs" else ""
+        yield between(f"ζ of F = C d^ζ, 1 to 7 mm: {law}", 1.46, 1.88, f"silicone cores: {source}",
+                      zeta, why=stiff)  # fmt: skip
+    radius = np.sqrt(2.0 * RADIUS * DEPTHS - DEPTHS**2)
+    yield between("γ of the contact's radius, c N^γ: springs", 0.0, 1.0 / 3.0,
+                  "Xydas & Kao, IJRR 18(9), 1999",
+                  exponent(math.pi * MODULUS * DEPTHS**2, radius))  # fmt: skip
+    yield Beside("γ of the contact's radius: solid", "0.00 to 0.33", "the same", "—", "unknown",
+                     "the data have the pressure under the base, not on the face")  # fmt: skip
+    springs = _table("springs")
+    hertz = 4.0 / 3.0 * MODULUS / 0.75 * math.sqrt(RADIUS)
+    d = np.linspace(0.004, 0.0079, 3901)
+    crossing = d[np.argmin(np.abs(springs(d, 0.0 * d, "force") - hertz * d**1.5))]
+    yield between("depth at which springs press as Hertz's half-space of ν ½ does", 6.4, 6.4,
+                  "π E d² = 4/3 E* √a d^(3/2)", 1e3 * float(crossing), ".1f", " mm")  # fmt: skip
+
+
+def _energy() -> Iterator[Beside]:
+    source = "Inoue & Hirai, the paper that this model is from"
+    for law in _LAWS:
+        energy = _table(law)(np.full(TILTS.shape, 0.004), TILTS, "energy")
+        least = math.degrees(TILTS[int(np.argmin(energy))])
+        why = (
+            ""
+            if least == 0.0
+            else f"at a fixed d the energy falls with the tilt, to {least:.0f}° of 20° looked at"
+        )
+        yield between(f"tilt of the least U at d = 4 mm: {law}", 0.0, 0.0, source, least, ".1f",
+                      "°", why)  # fmt: skip
+    yield Beside("force above the springs', in rolling", "17 %", source, "0 %", "disagree",
+                     "the paper gives no depth; solid tips press harder somewhere")  # fmt: skip
+
+
+def _memory() -> Iterator[Beside]:
+    times = Settings().tip.relaxation_times
+    yield Beside("relaxation of a fingerpad", "4 ms, 70 ms, 1.4 s", "Pawluk & Howe, 1999",
+                 ", ".join(f"{t:g} s" for t in times), "unknown",
+                 "the times are theirs; how much, `calibrate relaxation` tells")  # fmt: skip
+    yield Beside("a grasp with time", "more stable", "Tiezzi & Kao, T-RO 23(2), 2007", "—",
+                 "unknown", "nobody has looked at it here")  # fmt: skip
+    yield Beside("softening over the first cycles", "all elastomers tried",
+                 "Case et al., Soft Robotics 2015", "none", "disagree",
+                 "tips here are as they were before")  # fmt: skip
+    yield Beside("shear on a face that sticks", "depends on the path",
+                 "HydroShear, arXiv 2603.00446", "one path", "disagree",
+                 "the table holds a press straight along the normal")  # fmt: skip
+
+
+def _cells() -> Iterator[Beside]:
+    flaws = load(Path("velostat")).simulation
+    gains = [abs(each - 1.0) for each in flaws.tactile_gain]
+    yield between("velostat: gain, mounted again", 5, 32, "Tekscan, DTIC ADP011007",
+                  100.0 * max(gains), ".0f", " %")  # fmt: skip
+    yield between("velostat: a unit's cells beside each other", 0, 5, "Sensors 26(5) 1559",
+                  100.0 * flaws.tactile_gain_spread, ".0f", " %")  # fmt: skip
+    yield between("velostat: repeatability", 12, 16, "FSR kinds, J. Sensors 2018, 6561901",
+                  100.0 * flaws.tactile_hysteresis, ".0f", " %",
+                  "that is of all causes; the profile's is its hysteresis alone")  # fmt: skip
+    yield between("velostat: crosstalk, at most", 0.0, 3.3, "arXiv 2508.20959",
+                  100.0 * flaws.tactile_crosstalk, ".1f", " %")  # fmt: skip
+    yield between("velostat: response", 40, 80, "flexitac-live; one author",
+                  1e3 * flaws.tactile_response, ".0f", " ms")  # fmt: skip
+    capacitive = load(Path("capacitive")).simulation
+    yield between("capacitive: repeatability", 2, 2, "J. Sensors 2018, 6561901",
+                  100.0 * capacitive.tactile_hysteresis, ".0f", " %")  # fmt: skip
+
+
+def _sensors() -> Iterator[Beside]:
+    for name in ("ideal", "velostat", "capacitive"):
+        d, angle, force = _errors(Settings() if name == "ideal" else load(Path(name)))
+        for quantity, ours, published, unit, source in (
+            ("depth", 1e3 * d, 0.4, " mm", "Insight's localisation, arXiv 2111.05934"),
+            ("angle", math.degrees(angle), 5.0, "°", "the same, of the force"),
+            ("force", force, 0.44, " N", "uSkin 0.12, FingerTac 0.16 to 0.44, arXiv 2411.13335"),
+        ):  # fmt: skip
+            yield between(f"r.m.s. error of {quantity} at 5 mm: simulated sensor, {name}", 0.0,
+                          published, source, ours, ".2f", unit)  # fmt: skip
+
+
+def _errors(settings: Settings) -> tuple[float, float, float]:
+    """Return r.m.s. errors of d [m], tilt [rad] and force [N] of settled frames of a sensor."""
+    from softfinger.daemon.profile.factory import make_material
+    from softfinger.tools.benchmarks.estimator import settled
+
+    d, tilt = _PRESSED
+    true = ContactTable.build(_LAWS["springs"], make_material(settings.material))
+    found = settled(settings, (d, tilt, 0.0), _FRAMES)
+    force = true(found[:, 0], np.hypot(found[:, 1], found[:, 2])).force - true(d, tilt).force
+    off = np.stack((found[:, 0] - d, found[:, 1] - tilt, force))
+    of_d, of_tilt, of_force = np.sqrt(np.mean(np.square(off), axis=1))
+    return float(of_d), float(of_tilt), float(of_force)
+
+
+def _hands() -> Iterator[Beside]:
+    from softfinger.tools.benchmarks.reflex import overloaded
+
+    answers = [overloaded({}, 0.0, 13.0, seed).answer for seed in range(1, _TRIALS + 1)]
+    simulated = "on virtual time: neither a bus nor a motor's own delay beyond the plant's"
+    yield between("from a slip's onset to a firmer grip, at most", 0, 40,
+                  "answers of 35 to 40 ms, arXiv 2602.16127; people 100 ms, Delhaye 2024",
+                  1e3 * max(answers), ".0f", " ms", simulated)  # fmt: skip
+    settings = Settings()
+    yield between("torque constant of an XM430-W350", 1.78, 1.78, "ROBOTIS: 4.1 N·m at 2.3 A",
+                  settings.control.torque_constant, ".2f", " N·m/A")  # fmt: skip
+    yield Beside("friction in the servos' gears", "depends on the load",
+                     "Rhoban, arXiv 2410.08650", f"{settings.simulation.joint_friction:g} N·m",
+                     "disagree", "the plant's is Coulomb's, the same under any load")  # fmt: skip
+    hil = load(Path("hil"), Path()).tactile
+    bits = 10.0 * (hil.rows * hil.cols + 2)
+    yield between("frames of a FlexiTac board", 100, bits and hil.baud / bits, "PyFlexiTac",
+                  hil.rate, ".0f", " /s", "at most: what 2 Mbaud can carry")  # fmt: skip
+    yield Beside("all of it, on a hand of metal", "—", "nobody yet", "—", "unknown",
+                     "no hand of metal has been run with this daemon")  # fmt: skip

@@ -1,0 +1,192 @@
+"""Sweeps: independent, seeded cases over all processors, or over the workers of a Dask cluster.
+
+The results are the same to the bit however many workers there are, since a case knows nothing of
+the others. A worker that dies costs the cases it had a second try. What is done is in a journal,
+where one is wanted, from which the next call goes on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import multiprocessing
+import os
+import pickle
+import signal
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+from softfinger.daemon.errors import SoftfingerError
+from softfinger.daemon.own_files import open_regular
+from softfinger.tools.arguments import number
+from softfinger.tools.extras import require
+from softfinger.tools.terminal.progress import Progress
+
+Case = TypeVar("Case")
+Result = TypeVar("Result")
+
+_CONNECT = 10.0  # s that a scheduler may take to answer
+
+
+class SweepError(SoftfingerError):
+    """A sweep can't go on. The message says why."""
+
+
+def processors() -> int:
+    """Return how many processors this process may use; all, where it can't be kept to some."""
+    mine = getattr(os, "sched_getaffinity", lambda _: range(os.cpu_count() or 1))
+    return len(mine(0))
+
+
+def add_sweep(parser: argparse.ArgumentParser) -> None:
+    """Add ``--processes`` and ``--scheduler``."""
+    parser.add_argument(
+        "--processes",
+        type=lambda text: int(number(text, "1 to 1024 processes", 0, 1024)),
+        metavar="N",
+        help="run the cases in so many (default: one a processor)",
+    )
+    parser.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="run them on a Dask cluster, as tcp://HOST:8786 (extra 'cluster')",
+    )
+
+
+class Sweep(Generic[Case, Result]):
+    """``work`` done once for each of ``cases``; iterate over it for the results, in their order.
+
+    ``work``, cases and results are pickled; with a ``journal`` the results are JSON's. ``name`` is
+    what the progress bar says. The caller removes the journal when the results are kept.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        work: Callable[[Case], Result],
+        cases: Sequence[Case],
+        journal: Path | None = None,
+    ) -> None:
+        self._name, self._work, self._cases, self._journal = name, work, cases, journal
+        self._results: dict[int, Result] = {}
+        self._digest = hashlib.sha256(pickle.dumps((work, list(cases)))).hexdigest()
+
+    def run(self, processes: int | None = None, scheduler: str | None = None) -> Iterator[Result]:
+        """Yield the results as they come, in the cases' order.
+
+        Raises SweepError for a scheduler that doesn't answer, workers that die again and again, and
+        another sweep's journal; MissingExtra without Dask.
+        """
+        self._take_up()
+        processes = processes or processors()
+        with Progress(self._name, len(self._cases)) as progress:
+            began, before, yielded = time.monotonic(), len(self._results), 0
+            for done in self._done(processes, scheduler):
+                left = len(self._cases) - done
+                each = (time.monotonic() - began) / max(done - before, 1)
+                progress(done, f"{done}/{len(self._cases)}, {_told(left * each)} left")
+                while yielded in self._results:
+                    yield self._results[yielded]
+                    yielded += 1
+            yield from (self._results[k] for k in range(yielded, len(self._cases)))
+
+    def _done(self, processes: int, scheduler: str | None) -> Iterator[int]:
+        """Do what isn't done yet; yields how many are done."""
+        yield len(self._results)
+        if scheduler is None and processes == 1:
+            for k in self._left():
+                self._keep(k, self._work(self._cases[k]))
+                yield len(self._results)
+        before = -1
+        while self._left():
+            try:
+                with _pool(processes) if scheduler is None else _cluster(scheduler) as executor:
+                    yield from self._by(executor)
+            except BrokenProcessPool:
+                if len(self._results) == before:
+                    case = self._cases[self._left()[0]]
+                    raise SweepError(f"{self._name}: workers die, at {case} or after it") from None
+                before = len(self._results)
+
+    def _by(self, executor: Executor) -> Iterator[int]:
+        futures: dict[Future[Result], int] = {
+            executor.submit(self._work, self._cases[k]): k for k in self._left()
+        }
+        waiting = set(futures)
+        while waiting:
+            finished, waiting = wait(waiting, return_when=FIRST_COMPLETED)
+            broken = None
+            for future in finished:
+                try:
+                    self._keep(futures[future], future.result())
+                except BrokenProcessPool as error:
+                    broken = error
+            yield len(self._results)
+            if broken is not None:
+                raise broken
+
+    def _left(self) -> list[int]:
+        return [k for k in range(len(self._cases)) if k not in self._results]
+
+    def _keep(self, k: int, result: Result) -> None:
+        self._results[k] = result
+        if self._journal is not None:
+            with self._journal.open("a", encoding="utf-8") as file:
+                file.write(json.dumps([k, result]) + "\n")
+
+    def _take_up(self) -> None:
+        """Read the journal of a sweep that was interrupted, or begin one."""
+        if self._journal is None:
+            return
+        if not self._journal.exists():
+            self._journal.write_text(json.dumps(self._digest) + "\n", encoding="utf-8")
+            return
+        with open_regular(self._journal) as file:
+            lines = file.read().decode("utf-8", "replace").splitlines()
+        if not lines or lines[0] != json.dumps(self._digest):
+            raise SweepError(f"{self._journal}: of another sweep; expected this one's, or no file")
+        for line in lines[1:]:
+            try:
+                k, result = json.loads(line)
+            except ValueError:
+                break  # cut short while it was written
+            self._results[int(k)] = result
+
+
+@contextmanager
+def _pool(processes: int) -> Iterator[Executor]:
+    executor = ProcessPoolExecutor(
+        processes,
+        mp_context=multiprocessing.get_context("spawn"),
+        initializer=signal.signal,
+        initargs=(signal.SIGINT, signal.SIG_IGN),  # Ctrl-C is the parent's
+    )
+    try:
+        yield executor
+    finally:
+        executor.shutdown(wait=False, cancel_futures=True)
+
+
+@contextmanager
+def _cluster(address: str) -> Iterator[Executor]:
+    require("cluster")
+    from distributed import Client
+
+    connect: Any = Client
+    try:
+        client = connect(address, timeout=_CONNECT)
+    except (OSError, ValueError) as error:
+        raise SweepError(f"--scheduler {address}: no Dask scheduler answers: {error}") from None
+    with client:
+        yield client.get_executor()
+
+
+def _told(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest} s" if minutes else f"{rest} s"
