@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import mmap
+import os
 import time
 from pathlib import Path
 from typing import Protocol
@@ -43,7 +45,9 @@ def make_clock(settings: Settings) -> LoopClock:
     if name == "virtual":
         return VirtualClock()
     real = RealClock(settings.realtime.spin)
-    return HandClock(real) if name == "hand" else real
+    if name != "hand":
+        return real
+    return HandClock(real, None if settings.simulated else Deadline.of(settings.servos.port))
 
 
 def emulated(settings: Settings) -> bool:
@@ -55,6 +59,41 @@ def emulated(settings: Settings) -> bool:
         ports += [settings.tactile.port[FINGERS.index(name)] for name in settings.scene.fingers]
     # Its links and its control socket share a folder.
     return bool(ports) and all(Path(port).with_name("control").is_socket() for port in ports)
+
+
+class Deadline:
+    """When a daemon's next tick is due [s, by its clock], for the emulated hand to go no further.
+
+    It is in a file beside the emulator's ports that both have mapped.
+    """
+
+    NAME = ".deadline"
+
+    def __init__(self, path: Path, create: int = 0) -> None:
+        """Map ``path``; ``create`` is `os.O_CREAT` or 0. Raises OSError."""
+        file = os.open(path, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC | create, 0o600)
+        try:
+            os.ftruncate(file, 8)
+            self._value = memoryview(mmap.mmap(file, 8)).cast("d")
+        finally:
+            os.close(file)
+
+    @classmethod
+    def of(cls, port: str) -> Deadline | None:
+        """Return that of the emulator whose ``port`` this is; None where there is none."""
+        try:
+            return cls(Path(port).with_name(cls.NAME))
+        except OSError:
+            return None
+
+    @property
+    def t(self) -> float:
+        """The time that was set last [s]; 0 before."""
+        return self._value[0]
+
+    @t.setter
+    def t(self, t: float) -> None:
+        self._value[0] = t
 
 
 class RealClock:
@@ -89,13 +128,15 @@ class HandClock:
 
     Time stands between two sleeps, and a sleep ends at its deadline to the bit however late the
     machine wakes up. What that takes from the time to the next deadline is made up for; what goes
-    beyond never happens for the hand, and adds to ``behind``.
+    beyond never happens for the hand, and adds to ``behind``. An emulated hand learns by ``due``
+    how far its time may go.
     """
 
     waits = True
 
-    def __init__(self, machine: LoopClock) -> None:
+    def __init__(self, machine: LoopClock, due: Deadline | None = None) -> None:
         self._machine = machine
+        self._due = due
         self._now = machine.now()
         self.behind = 0.0
 
@@ -114,6 +155,8 @@ class HandClock:
     def sleep_until(self, t: float) -> float:
         """Sleep until the machine has come to ``t``; a deadline that it has missed is now."""
         self._now = max(t, self._now)
+        if self._due is not None:
+            self._due.t = self._now
         due = self._now + self.behind
         missed = self._machine.now() - due
         if missed <= 0.0:

@@ -103,16 +103,19 @@ class Sweep(Generic[Case, Result]):
             for k in self._left():
                 self._keep(k, self._work(self._cases[k]))
                 yield len(self._results)
-        before = -1
+        before, workers = -1, processes
         while self._left():
             try:
-                with _pool(processes) if scheduler is None else _cluster(scheduler) as executor:
+                with _pool(workers) if scheduler is None else _cluster(scheduler) as executor:
                     yield from self._by(executor)
             except BrokenProcessPool:
-                if len(self._results) == before:
+                if len(self._results) > before:
+                    before, workers = len(self._results), processes
+                elif workers > 1:
+                    workers = 1  # in order, so that the first one left is to blame
+                else:
                     case = self._cases[self._left()[0]]
-                    raise SweepError(f"{self._name}: workers die, at {case} or after it") from None
-                before = len(self._results)
+                    raise SweepError(f"{self._name}: each worker dies at {case}") from None
 
     def _by(self, executor: Executor) -> Iterator[int]:
         futures: dict[Future[Result], int] = {

@@ -79,7 +79,7 @@ class DynamixelServos:
         self._errors: GroupRead | None = None
         self._turn = 0  # which length was read last
         self._doubtful = 0  # requests to come whose replies may be mistaken for each other's
-        self._next_health = self._next_check = -math.inf  # time.monotonic()
+        self._next_health = self._next_check = -math.inf  # by the clock
         self._check_every = _CHECK_EVERY
         self._retries = 0
         self._alerts = 0
@@ -172,7 +172,7 @@ class DynamixelServos:
         Raises:
             ServoError: the port is gone, or a servo's bus watchdog has stopped it.
         """
-        now = time.monotonic()
+        now = self._clock.now()
         if now >= self._next_health:
             self._next_health = now + _HEALTH_EVERY
             found = self._exchange(_HEALTH, reading)

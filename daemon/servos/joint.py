@@ -114,7 +114,7 @@ class Joint:
     dq: float = 0.0  # [rad/s]
     sent: deque[bytes] = field(default_factory=deque)  # the last goals, as registers hold them
     ticks: int = -1  # of the servo's own clock, when that was last read
-    ticked: float = math.inf  # when that was last seen to advance, time.monotonic()
+    ticked: float = math.inf  # when that was last seen to advance, by the hand's clock
 
     @property
     def name(self) -> str:

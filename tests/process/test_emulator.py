@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import select
 import signal
 import subprocess
@@ -9,9 +10,11 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
+from softfinger.daemon.clock import Deadline, HandClock
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.emulator import emulator as module
@@ -27,6 +30,7 @@ from softfinger.daemon.simulation.emulator.folder import LINKS, FolderError, Lin
 from softfinger.tools.cli import main
 from tests.conftest import until
 from tests.harness.emulated import HIL, READY_WITHIN, SdkServos, board, emulated
+from tests.harness.late_machine import LateMachine
 
 RETURN_DELAY, OPERATING_MODE, TORQUE_ENABLE = 9, 11, 64
 GOAL_CURRENT, GOAL_POSITION, PRESENT_POSITION = 102, 116, 132
@@ -285,10 +289,10 @@ def test_the_default_board_is_the_one_of_the_hil_profile(tmp_path):
     assert hil.simulation == Settings().simulation
 
 
-def test_time_leaves_interruptions_out(monkeypatch):
+def test_time_leaves_interruptions_out(monkeypatch, tmp_path):
     now = 100.0
     monkeypatch.setattr(module.time, "monotonic", lambda: now)
-    clock = EmulatorClock()
+    clock = EmulatorClock(Deadline(tmp_path / Deadline.NAME, os.O_CREAT))
     assert clock.now() == 0.0
     now += 0.01
     assert clock.now() == pytest.approx(0.01)
@@ -296,6 +300,37 @@ def test_time_leaves_interruptions_out(monkeypatch):
     assert clock.now() == pytest.approx(0.06)
     now += 0.01
     assert clock.now() == pytest.approx(0.07)
+
+
+@pytest.mark.parametrize("late", [0.0005, 0.004, 0.03, 5.0])
+def test_time_keeps_step_with_a_daemon_on_a_late_machine(monkeypatch, tmp_path, late):
+    machine = LateMachine(100.0)
+    monkeypatch.setattr(module.time, "monotonic", machine.now)
+    clock = EmulatorClock(Deadline(tmp_path / Deadline.NAME, os.O_CREAT))
+    servos = Mock(owned=lambda: owned, answering_until=0.0)
+    clock.servos, owned = servos, True
+    daemon = HandClock(machine, Deadline.of(str(tmp_path / "servos")))
+    apart = []
+    for k in range(200):
+        daemon.sleep_until(100.0 + 0.002 * k)
+        for _ in range(10):  # the emulator looks at its clock while the daemon is not on time
+            machine.work(0.1 * late * (k % 3))
+            apart.append(clock.now() - daemon.now())
+    assert max(apart[20:]) - min(apart[20:]) <= 0.0045
+    assert daemon.behind > 100 * late or late < 0.002
+    # A reply on the wire arrives meanwhile; a daemon that is gone is waited for no longer.
+    machine.work(0.01)
+    stands = clock.now()
+    machine.work(0.01)
+    assert clock.now() == stands
+    assert clock.held
+    servos.answering_until = clock.now() + 0.016
+    machine.work(0.03)
+    assert clock.now() == servos.answering_until
+    owned = False
+    machine.work(0.02)
+    assert clock.now() == pytest.approx(servos.answering_until + 0.02)
+    assert not clock.held
 
 
 def test_an_adapters_latency_timer_has_its_range(tmp_path, capsys):

@@ -51,7 +51,7 @@ def test_a_worker_that_dies_costs_its_case_a_second_try(tmp_path: Path) -> None:
 
 
 def test_a_case_that_kills_each_worker_ends_the_sweep() -> None:
-    with pytest.raises(SweepError, match="workers die, at 5 or after it"):
+    with pytest.raises(SweepError, match="each worker dies at 5"):
         list(Sweep("drawn", dies, CASES).run(2))
 
 

@@ -1,7 +1,7 @@
 """The emulated hand: physics behind servos and tactile boards on ptys, in real time.
 
-On a busy machine its time stands still for its daemon as the daemon's does for it: see
-`EmulatorClock` and `PtyServoBus.bounded`; not with ``loop.clock = "real"``.
+On a busy machine its time stands still for its daemon as the daemon's does for it, unless that
+one's ``loop.clock`` is ``real``: see `EmulatorClock`.
 
 One thread, one event loop: it waits for bytes on the servos' pty or for the next thing that is
 due, answers the servos first, and does at most one slower thing (a step of the physics, a frame)
@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import select
 import socket
@@ -23,6 +24,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from softfinger.daemon.clock import Deadline
 from softfinger.daemon.errors import SoftfingerError
 from softfinger.daemon.profile.factory import make_material, make_table
 from softfinger.daemon.profile.settings import Settings, TactileSettings
@@ -51,6 +53,8 @@ _TURNS = {"closed": 6.0, "open": -6.0, "zero": 0.0}  # rad; a joint's stops come
 _TURNING = 0.3  # A of the servo's motor, as strong as the hand that turns a joint is
 _TURN_TIME = 1.0  # s
 _STALL = 0.05  # s; a longer interruption is left out of the hand's time
+_AHEAD = 0.002  # s that the hand's time may be ahead of its daemon's, which waits for the replies
+_HELD = 0.0005  # s from one look for a new deadline to the next
 # The board where a profile names none: that of config/hil.toml.
 DEFAULT_BOARD = {
     "backend": "flexitac",
@@ -70,13 +74,19 @@ class EmulatorClock:
     """Time of the emulated hand: real time from 0, less the interruptions of its process.
 
     Without that a process that was stopped for a minute would have to compute that minute, and
-    would answer no client meanwhile. ``bounded`` keeps time back where the hand waits.
+    would answer no client meanwhile. A daemon whose own time waits for a late machine sets
+    deadlines: from one to the next this time goes on by as much as the daemon's, give or take
+    `_AHEAD`, while ``servos`` are the daemon's.
     """
 
     waits = False
 
-    def __init__(self) -> None:
-        self.bounded: Callable[[float], float] = lambda t: t
+    def __init__(self, deadline: Deadline) -> None:
+        self.servos: PtyServoBus | None = None
+        self.held = False  # the last time was kept back
+        self._deadline = deadline
+        self._seen = 0.0
+        self._bound = math.inf  # where time waits for the next deadline
         self._origin = self._last = time.monotonic()
 
     def now(self) -> float:
@@ -84,8 +94,19 @@ class EmulatorClock:
         now = time.monotonic()
         self._origin += max(now - self._last - _STALL, 0.0)
         self._last = now
-        t = self.bounded(now - self._origin)
-        self._origin = now - t
+        t = now - self._origin
+        if (deadline := self._deadline.t) != self._seen:
+            step = max(deadline - self._seen, 0.0)
+            self._bound = min(self._bound + step, min(t, self._bound) + step + _AHEAD)
+            self._seen = deadline
+        self.held = False
+        if t > self._bound and self.servos is not None:
+            if not self.servos.owned():
+                self._bound = math.inf  # that daemon is gone
+            elif t > (bound := max(self._bound, self.servos.answering_until)):
+                self.held = True
+                self._origin += t - bound
+                t = bound
         return t
 
     def wall(self) -> float:
@@ -157,7 +178,9 @@ class Emulator:
                 self._closers.append(self._control.close)
             settings = with_board(settings)
             self._simulation = settings.simulation
-            self.clock = EmulatorClock()
+            deadline = Deadline(self._links.path / Deadline.NAME, os.O_CREAT)
+            self._closers.append((self._links.path / Deadline.NAME).unlink)
+            self.clock = EmulatorClock(deadline)
             table = make_table(settings, make_material(settings.material))
             self.hand = SimulatedHand(settings, 0.0, table)
             if settings.servos.backend != "none":
@@ -183,9 +206,7 @@ class Emulator:
             servos = PtyServoBus(bus, baud=line.baud, latency=line.latency, clock=self.clock.now)
             self._closers.append(servos.unplug)
             self._links.link("servos", servos.path)
-        if settings.loop.clock != "real":
-            self.clock.bounded = servos.bounded
-        self._servos = servos
+        self._servos = self.clock.servos = servos
 
     def _add_board(self, settings: Settings, finger: int) -> None:
         source = SimulatedTactile(settings, self.hand, self.clock, finger)
@@ -240,7 +261,9 @@ class Emulator:
             due = min(due, servos.next_event())
         if self._watched is None:
             self._watched = self._watch()
-        ready, _, _ = select.select(self._watched, (), (), max(due - start, 0.0))
+        # A time that stands still comes to nothing that is due: no haste then.
+        wait = max(due - start, _HELD if self.clock.held else 0.0)
+        ready, _, _ = select.select(self._watched, (), (), wait)
         t = self.clock.now()
         if servos is not None and (servos.fileno() in ready or servos.next_event() <= t):
             servos.service(t, start)

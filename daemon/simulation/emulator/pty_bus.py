@@ -81,7 +81,7 @@ class PtyServoBus:
         self._free_at = -math.inf  # the wire is busy until then
         self._due: list[tuple[float, int, bytes]] = []
         self._order = 0
-        self._heard = -math.inf  # when bytes last came
+        self._arrives = -math.inf  # when the last reply has arrived
         self.plug()
 
     def fileno(self) -> int:
@@ -120,18 +120,12 @@ class PtyServoBus:
         servos = self.bus.next_event()
         return min(servos, self._due[0][0] - self._spin) if self._due else servos
 
-    def bounded(self, t: float) -> float:
-        """Return time ``t`` [s], or the earlier one at which the hand waits for its daemon.
+    @property
+    def answering_until(self) -> float:
+        """When the last reply on the wire, but one that a fault holds back, has arrived [s]."""
+        return self._arrives
 
-        With torque on and the port in a daemon's hands, silence means that this machine is late: so
-        time goes on for half of the watchdog's, a tick or more, and no further.
-        """
-        armed = [servo.watchdog for servo in self.bus.servos if servo.torque_on]
-        watchdog = min(filter(None, armed), default=math.inf)
-        bound = self._heard + 0.5 * watchdog
-        return bound if bound < t and self._owned() else t
-
-    def _owned(self) -> bool:
+    def owned(self) -> bool:
         """Return whether a process has the port for itself, as the daemon does while it lives."""
         if not self.plugged:
             return False
@@ -154,7 +148,6 @@ class PtyServoBus:
                     data = os.read(self._master, _READ_SIZE)
                 except OSError:  # nothing there
                     break
-                self._heard = t
                 if self._receive(data, t, arrived):
                     break  # the client takes some time for the reply
                 # Its next request often comes while its last write is being done.
@@ -195,6 +188,8 @@ class PtyServoBus:
             if self._latency > 0.0:
                 due = math.ceil(due / self._latency) * self._latency
             self._queue(due - PASSAGE, reply.data)
+            if not reply.late:
+                self._arrives = due
         self._free_at = free_at
         return bool(replies)
 
@@ -209,7 +204,9 @@ class PtyServoBus:
             if now < due - self._spin:
                 return
             while now < due:
-                now = self._clock()
+                before, now = now, self._clock()
+                if now == before:  # the hand's time stands still
+                    return
             self._write(heapq.heappop(self._due)[2])
 
     def _write(self, data: bytes) -> None:
