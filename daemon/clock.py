@@ -62,7 +62,7 @@ def emulated(settings: Settings) -> bool:
 
 
 class Deadline:
-    """When a daemon's next tick is due [s, by its clock], for the emulated hand to go no further.
+    """Time of a daemon's next tick [s, by its clock], for the emulated hand to go no further.
 
     It is in a file beside the emulator's ports that both have mapped.
     """

@@ -307,8 +307,8 @@ def test_time_keeps_step_with_a_daemon_on_a_late_machine(monkeypatch, tmp_path, 
     machine = LateMachine(100.0)
     monkeypatch.setattr(module.time, "monotonic", machine.now)
     clock = EmulatorClock(Deadline(tmp_path / Deadline.NAME, os.O_CREAT))
-    servos = Mock(owned=lambda: owned, answering_until=0.0)
-    clock.servos, owned = servos, True
+    servos = Mock(driven=lambda: driven, answering_until=0.0)
+    clock.servos, driven = servos, True
     daemon = HandClock(machine, Deadline.of(str(tmp_path / "servos")))
     apart = []
     for k in range(200):
@@ -327,7 +327,7 @@ def test_time_keeps_step_with_a_daemon_on_a_late_machine(monkeypatch, tmp_path, 
     servos.answering_until = clock.now() + 0.016
     machine.work(0.03)
     assert clock.now() == servos.answering_until
-    owned = False
+    driven = False
     machine.work(0.02)
     assert clock.now() == pytest.approx(servos.answering_until + 0.02)
     assert not clock.held

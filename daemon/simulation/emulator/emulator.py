@@ -76,7 +76,7 @@ class EmulatorClock:
     Without that a process that was stopped for a minute would have to compute that minute, and
     would answer no client meanwhile. A daemon whose own time waits for a late machine sets
     deadlines: from one to the next this time goes on by as much as the daemon's, give or take
-    `_AHEAD`, while ``servos`` are the daemon's.
+    `_AHEAD`, while ``servos`` have their torque on and are the daemon's.
     """
 
     waits = False
@@ -101,8 +101,8 @@ class EmulatorClock:
             self._seen = deadline
         self.held = False
         if t > self._bound and self.servos is not None:
-            if not self.servos.owned():
-                self._bound = math.inf  # that daemon is gone
+            if not self.servos.driven():
+                self._bound = math.inf  # nothing moves, or that daemon is gone
             elif t > (bound := max(self._bound, self.servos.answering_until)):
                 self.held = True
                 self._origin += t - bound

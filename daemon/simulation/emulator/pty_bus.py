@@ -122,12 +122,12 @@ class PtyServoBus:
 
     @property
     def answering_until(self) -> float:
-        """When the last reply on the wire, but one that a fault holds back, has arrived [s]."""
+        """Time [s] at which the last reply, but one that a fault holds back, has arrived."""
         return self._arrives
 
-    def owned(self) -> bool:
-        """Return whether a process has the port for itself, as the daemon does while it lives."""
-        if not self.plugged:
+    def driven(self) -> bool:
+        """Return whether torque is on and a process has the port for itself, as the daemon does."""
+        if not (self.plugged and any(servo.torque_on for servo in self.bus.servos)):
             return False
         try:
             fcntl.flock(self._slave, fcntl.LOCK_SH | fcntl.LOCK_NB)
