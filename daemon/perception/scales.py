@@ -50,6 +50,8 @@ _INTERVAL_MAX = 0.1  # s
 _BALANCE_ERROR = 0.05  # of the tips' forces, and …
 _RUBBED = 0.4  # … N that a table may take off one of them
 _GATE = 3.0  # standard deviations: what is further off counts as no more than so much
+_SURER = 1e-6  # least part of a variance that one measurement leaves: rounding takes none below 0
+_HEIGHTS = 1e-3, 1e3  # of frames over the model's, beyond which it is no height
 
 
 class Prior(NamedTuple):
@@ -126,7 +128,7 @@ def _update(s: Scales, innovation: float, variance: float, gate: float) -> None:
     """Update by one measurement's ``innovation``, with `slopes` by the states.
 
     Beyond a ``gate`` [standard deviations] it weighs as if it were that far off: nobody is believed
-    alone. Leaves the slopes 0.
+    alone. What is not finite tells nothing. Leaves the slopes 0.
     """
     slopes = s.slopes
     cross = s.cross
@@ -137,12 +139,13 @@ def _update(s: Scales, innovation: float, variance: float, gate: float) -> None:
             total += s.covariance[i, j] * slopes[j]
         cross[i] = total
         expected += slopes[i] * total
-    variance = max(variance, innovation * innovation / (gate * gate) - expected)
-    inverse = 1.0 / (expected + variance)
-    for i in range(STATES):
-        s.mean[i] += cross[i] * inverse * innovation
-        for j in range(STATES):
-            s.covariance[i, j] -= cross[i] * cross[j] * inverse
+    variance = max(variance, innovation * innovation / (gate * gate) - expected, _SURER * expected)
+    if expected + variance < math.inf and abs(innovation) < math.inf:
+        inverse = 1.0 / (expected + variance)
+        for i in range(STATES):
+            s.mean[i] += cross[i] * inverse * innovation
+            for j in range(STATES):
+                s.covariance[i, j] -= cross[i] * cross[j] * inverse
     slopes[:] = 0.0
 
 
@@ -163,7 +166,8 @@ def update_height(s: Scales, finger: int, height: float, variance: float, known:
     """
     slopes = s.slopes
     slopes[MODULUS + finger] = slopes[GAIN + finger] = 1.0
-    innovation = math.log(max(height, 1e-3)) - s.mean[MODULUS + finger] - s.mean[GAIN + finger]
+    found = math.log(min(max(height, _HEIGHTS[0]), _HEIGHTS[1]))
+    innovation = found - s.mean[MODULUS + finger] - s.mean[GAIN + finger]
     new = 1.0 - known * variance
     if new > 0.0:
         noise = variance / new + _HEIGHT_ERROR * _HEIGHT_ERROR
@@ -208,7 +212,12 @@ def update_torque(s: Scales, torque: Pair, moment: Pair, speed: float, t: float)
 
 @inner_kernel
 def update_balance(s: Scales, force1: float, force2: float) -> None:
-    """Update by the balance: both tips press an object with about the same force."""
+    """Update by the balance: both tips press an object with about the same force.
+
+    Tips that don't press, as of an object that lies askew between them, tell nothing.
+    """
+    if not min(force1, force2) > 0.0:
+        return
     _by_force(s, 0, 1.0)
     _by_force(s, 1, -1.0)
     error = _BALANCE_ERROR + _RUBBED / min(force1, force2)

@@ -106,6 +106,31 @@ def test_the_filter_is_kalmans(product: bool) -> None:
     np.testing.assert_allclose(found.covariance, wanted.p, rtol=1e-7, atol=1e-14)
 
 
+def test_no_measurement_however_wild_leaves_it_surer_than_numbers_can_be() -> None:
+    rng = np.random.default_rng(8)
+    ends = [0.0, 1e-310, np.inf, -np.inf, np.nan]
+
+    def one(usual: float) -> float:
+        if rng.random() < 0.9:
+            return usual
+        wild = rng.choice([-1, 1]) * 10.0 ** rng.uniform(-12, rng.choice([1, 20, 200]))
+        return float(rng.choice([wild, wild, rng.choice(ends)]))
+
+    for _ in range(300):
+        found = Scales()
+        set_prior(found, PRIORS, friction=0.05, inertia=0.01)
+        found.product[:] = rng.integers(0, 2, 2)
+        begin(found.array)
+        for k in range(60):
+            height(found.array, int(rng.integers(0, 2)), one(1.0), max(one(1e-2), 1e-12), one(0.0))
+            moments = (one(0.2), one(0.2)), (one(0.2), one(0.2))
+            torques(found.array, *moments, one(0.1), 0.002 * k)
+            balance(found.array, one(6.0), one(6.0))
+            assert np.isfinite(found.mean).all()
+            assert (np.diag(found.covariance) > 0.0).all()
+            assert (found.slopes == 0.0).all()
+
+
 CASES: dict[str, tuple[dict[str, Any], float, float]] = {
     "honest": ({}, 1.0, 0.06),
     "both read 1.4": ({"tactile_gain": (1.4, 1.4)}, 1.4, 0.15),
