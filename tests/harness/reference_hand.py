@@ -160,10 +160,7 @@ class ReferenceHand(HandGeometry):
 
     def _angle_for(self, inward: float) -> float:
         """ψ with L sin ψ + e cos ψ = ``inward``, on the branch around 0."""
-        ratio = inward / self.reach
-        if not -1.0 <= ratio <= 1.0:
-            raise ValueError(f"out of reach: {inward:.4f} m, the finger reaches {self.reach:.4f} m")
-        return math.asin(ratio) - math.atan2(self.finger_offset, self.finger_length)
+        return math.asin(inward / self.reach) - math.atan2(self.finger_offset, self.finger_length)
 
     def object_from_contacts(
         self, q: ArrayLike, d: ArrayLike, theta: ArrayLike

@@ -1,4 +1,4 @@
-"""The hand's planar geometry against plain NumPy, finite differences and its own inverse."""
+"""The hand's planar geometry against plain NumPy; the tests' own reference hand and grasp."""
 
 from __future__ import annotations
 
@@ -7,6 +7,9 @@ import math
 import numpy as np
 import pytest
 
+from tests.harness.grasp import Grasp, sheared_contact
+from tests.harness.paper_tip import E
+from tests.harness.plant import PAPER
 from tests.harness.reference_hand import ReferenceHand
 
 HANDS = [
@@ -17,8 +20,8 @@ HANDS = [
 WIDTH = 0.04
 
 
-def random_states(count: int, seed: int = 3) -> list[tuple[np.ndarray, np.ndarray]]:
-    generator = np.random.default_rng(seed)
+def random_states(count: int) -> list[tuple[np.ndarray, np.ndarray]]:
+    generator = np.random.default_rng(3)
     return [
         (
             generator.uniform(-0.4, 0.9, 2),
@@ -43,101 +46,65 @@ def contacts_by_rotation(hand: ReferenceHand, q, pose, width) -> np.ndarray:
     return np.array([d1, d2, pose[2] + q[0], pose[2] - q[1], in_object[0][1], in_object[1][1]])
 
 
-def stacked(hand: ReferenceHand, q, pose, width=WIDTH) -> np.ndarray:
-    c = hand.contacts(q, pose, width)
-    return np.concatenate((c.d, c.theta, c.s))
-
-
 @pytest.mark.parametrize("hand", HANDS)
-def test_contact_variables_equal_the_rotation_matrix_twin(hand):
-    for q, pose in random_states(50):
+def test_contacts_and_their_jacobian_are_those_of_the_rotation_matrix_twin(hand):
+    step = 1e-6 * np.eye(5)
+    for q, pose in random_states(20):
+        c = hand.contacts(q, pose, WIDTH)
         expected = contacts_by_rotation(hand, q, pose, WIDTH)
-        np.testing.assert_allclose(stacked(hand, q, pose), expected, rtol=0, atol=1e-15)
-
-
-@pytest.mark.parametrize("hand", HANDS)
-def test_jacobians_equal_central_differences(hand):
-    step = 1e-6
-    for q, pose in random_states(20):
+        np.testing.assert_allclose(np.concatenate((c.d, c.theta, c.s)), expected, atol=1e-15)
         x = np.concatenate((q, pose))
-        numeric = np.empty((6, 5))
-        for j in range(5):
-            ahead, behind = x.copy(), x.copy()
-            ahead[j] += step
-            behind[j] -= step
-            numeric[:, j] = (
-                stacked(hand, ahead[:2], ahead[2:]) - stacked(hand, behind[:2], behind[2:])
-            ) / (2 * step)
+        ends = [
+            [contacts_by_rotation(hand, at[:2], at[2:], WIDTH) for at in (x + h, x - h)]
+            for h in step
+        ]
+        numeric = np.stack([(ahead - behind) / 2e-6 for ahead, behind in ends], axis=1)
         np.testing.assert_allclose(hand.jacobian(q, pose), numeric, atol=1e-9)
-        for finger in range(2):
-            ahead, behind = q.copy(), q.copy()
-            ahead[finger] += step
-            behind[finger] -= step
-            slope = (hand.tips(ahead) - hand.tips(behind))[finger] / (2 * step)
-            np.testing.assert_allclose(hand.tip_jacobian(q)[finger], slope, atol=1e-9)
+        for finger, sense in ((0, 1.0), (1, -1.0)):
+            inwards = sense * hand.tip_jacobian(q)[finger] @ [math.cos(pose[2]), math.sin(pose[2])]
+            assert inwards == pytest.approx(numeric[finger, finger], abs=1e-9)
 
 
-@pytest.mark.parametrize("hand", HANDS)
-def test_rolling_rows_follow_their_definition(hand):
-    for q, pose in random_states(20):
-        c = hand.contacts(q, pose, WIDTH)
-        jacobian = hand.jacobian(q, pose)
-        a = hand.tip_radius
-        first = (a - c.d[0]) * jacobian[2] - jacobian[4] - np.tan(c.theta[0]) * jacobian[0]
-        second = (a - c.d[1]) * jacobian[3] + jacobian[5] - np.tan(c.theta[1]) * jacobian[1]
-        np.testing.assert_allclose(hand.rolling(q, pose, WIDTH), [first, second], atol=1e-15)
-
-
-def test_moving_hand_and_object_mirrored_swaps_the_fingers():
-    hand = HANDS[1]
-    for q, pose in random_states(20):
-        mirrored = pose * [-1, 1, -1]
-        c = hand.contacts(q, pose, WIDTH)
-        m = hand.contacts(q[::-1], mirrored, WIDTH)
-        np.testing.assert_allclose(m.d[::-1], c.d, atol=1e-15)
-        np.testing.assert_allclose(m.theta[::-1], -c.theta, atol=1e-15)
-        np.testing.assert_allclose(m.s[::-1], c.s, atol=1e-15)
-
-
-@pytest.mark.parametrize("hand", HANDS)
-def test_inverse_kinematics_round_trip(hand):
-    generator = np.random.default_rng(5)
-    for _ in range(50):
-        pose = generator.uniform([-0.005, 0.05, -0.2], [0.005, 0.08, 0.2])
-        d = generator.uniform(-0.004, 0.008, 2)
-        q = hand.inverse(pose, d, 0.03)
-        np.testing.assert_allclose(hand.contacts(q, pose, 0.03).d, d, atol=1e-15)
-
-
-def test_symmetric_grasp_angles_of_the_default_hand():
-    hand = ReferenceHand()
-    for d, degrees in [
-        (0.002, 8.6269265587),
-        (0.004, 10.0786581078),
-        (0.006, 11.5369590328),
-        (0.008, 13.0028781629),
-    ]:
-        q = hand.inverse((0, 0.08, 0), (d, d), 0.04)
-        np.testing.assert_allclose(np.degrees(q), degrees, atol=1e-9)
-
-
-@pytest.mark.parametrize("hand", HANDS)
-def test_object_from_contacts_recovers_angle_and_width(hand):
-    for q, pose in random_states(30):
-        c = hand.contacts(q, pose, WIDTH)
-        angle, width, disagreement = hand.object_from_contacts(q, c.d, c.theta)
-        assert angle == pytest.approx(pose[2], abs=1e-14)
-        assert width == pytest.approx(WIDTH, abs=1e-14)
-        assert disagreement == pytest.approx(0, abs=1e-14)
-
-
-def test_out_of_reach_and_bad_shapes_are_refused():
-    hand = ReferenceHand()
-    with pytest.raises(ValueError, match="out of reach"):
-        hand.inverse((0.2, 0.08, 0), (0, 0), 0.04)
+def test_bad_lengths_and_shapes_are_refused():
     with pytest.raises(ValueError, match="shape"):
-        hand.tips([0.1, 0.2, 0.3])
-    with pytest.raises(ValueError, match="finger_length"):
-        ReferenceHand(finger_length=0.0)
-    with pytest.raises(ValueError, match="finger_offset"):
-        ReferenceHand(finger_offset=math.nan)
+        ReferenceHand().tips([0.1, 0.2, 0.3])
+    for wrong in ({"finger_length": 0.0}, {"finger_offset": math.nan}):
+        with pytest.raises(ValueError, match=next(iter(wrong))):
+            ReferenceHand(**wrong)
+
+
+def test_sheared_energy_equals_its_closed_form_and_checkpoint():
+    assert sheared_contact(PAPER.data, 0.006, math.radians(20), 0.0015)[0] == pytest.approx(
+        0.10953644560057, rel=1e-12
+    )
+    generator = np.random.default_rng(1)
+    for _ in range(100):
+        d, theta = generator.uniform(1e-4, 0.010), generator.uniform(-0.5, 0.5)
+        shear = generator.uniform(-0.5, 0.5) * d
+        c, t = math.cos(theta), math.tan(theta)
+        closed = math.pi * E * (d**3 / (3 * c**2) + d**2 * shear * t + d * shear**2)
+        found = sheared_contact(PAPER.data, d, theta, shear)[0]
+        assert found == pytest.approx(closed, rel=1e-11)
+
+
+@pytest.mark.parametrize(
+    ("d", "degrees", "normal", "moment"),
+    [  # d [mm], q [°], N [N], N times its lever arm [mN·m], for L 80, B 50, W 40, e 0, a 20 mm
+        (2, 8.6269265587, 3.8421597806, 303.895166),
+        (4, 10.0786581078, 15.4013956785, 1213.098241),
+        (8, 13.0028781629, 61.9376635610, 4827.960422),
+    ],
+)
+def test_symmetric_grasp_table(d, degrees, normal, moment):
+    grasp = Grasp(ReferenceHand(), PAPER, WIDTH)
+    state = grasp.symmetric(d * 1e-3)
+    forces = grasp.forces(state)
+    np.testing.assert_allclose(np.degrees(state.q), degrees, rtol=1e-10)
+    np.testing.assert_allclose(forces.normal, normal, rtol=1e-10)
+    np.testing.assert_allclose(forces.tangential, 0, atol=1e-12)
+    lever = 0.080 * np.cos(state.q)
+    np.testing.assert_allclose(forces.normal * lever * 1e3, moment, rtol=1e-8)
+    # A joint also bears the moment by which the tilted tip turns; it is 0.1 to 0.4 % here.
+    turning = forces.turning * [1, -1]
+    np.testing.assert_allclose(forces.torque, forces.normal * lever + turning, rtol=1e-12)
+    np.testing.assert_allclose(grasp.gradient(state)[2:], 0, atol=1e-12)
