@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
 
 import msgpack
 import pytest
@@ -16,12 +15,9 @@ from softfinger.daemon.wire.publisher import bit
 from softfinger.daemon.wire.schema import EVENT, STATE
 from tests.conftest import until
 from tests.harness.gateway import Served
+from tests.unit.test_commands import Asking, echo
 
 Context = zmq.Context[zmq.Socket[bytes]]
-
-
-def echo(request: dict[str, Any]) -> dict[str, Any]:
-    return {"heard": request["command"]}
 
 
 @pytest.fixture
@@ -42,25 +38,15 @@ def connect(context: Context, kind: int, address: str) -> zmq.Socket[bytes]:
     return socket
 
 
-def answer(served: Served, client: zmq.Socket[bytes]) -> dict[str, Any]:
-    until(lambda: [served.serve(echo), client.poll(0)][1])
-    reply: dict[str, Any] = msgpack.unpackb(client.recv())
-    return reply
-
-
 def is_served(served: Served, context: Context, address: str) -> bool:
     """A client that comes now is answered."""
-    client = connect(context, zmq.REQ, address)
-    client.send(msgpack.packb({"command": "status"}))
-    return bool(answer(served, client)["ok"])
+    return bool(Asking(context, served, address, "status").told()["ok"])
 
 
 def test_an_answer_that_the_loop_is_long_about_comes_and_holds_up_nobody(
     served: Served, context: Context, addresses: tuple[str, str], clock: VirtualClock
 ) -> None:
-    clients = [connect(context, zmq.REQ, addresses[1]) for _ in range(2 * bounds.UNDER_WAY)]
-    for client in clients:
-        client.send(msgpack.packb({"command": "arm"}))
+    clients = [Asking(context, served, addresses[1], "arm") for _ in range(2 * bounds.UNDER_WAY)]
     until(lambda: served.settle() or len(served.link.asked) == bounds.UNDER_WAY)
     until(lambda: served.settle() or served.service.requests._count == bounds.UNDER_WAY)
     clock.sleep_until(clock.now() + 0.9 * bounds.OLDEST)  # a machine that is busy
@@ -69,7 +55,7 @@ def test_an_answer_that_the_loop_is_long_about_comes_and_holds_up_nobody(
     clock.sleep_until(clock.now() + bounds.LATE)
     served.settle()
     assert is_served(served, context, addresses[1])
-    told = [answer(served, client) for client in clients]
+    told = [client.told() for client in clients]
     assert sum(reply.get("heard") == "arm" for reply in told) == bounds.UNDER_WAY
     late = [reply["error"] for reply in told if not reply["ok"]]
     assert all("waited too long" in error for error in late)

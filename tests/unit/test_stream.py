@@ -52,35 +52,33 @@ def test_frame_age_counts_from_the_sample() -> None:
 def test_tactile_data_is_little_endian_uint16_row_major(
     context: zmq.Context[Any], addresses: tuple[str, str]
 ) -> None:
-    served = Served(addresses[0], queue=10)
-    publisher = served.publisher
-    socket = subscribe(context, addresses[0], b"hand/tactile")
-    until(lambda: wanted(served, TACTILE))
-    assert not publisher.wanted & bit(STATE)
-    data = np.arange(12, dtype=np.uint16).reshape(3, 4) * 1000
-    facts = SensorFacts(0.002, 0.003, 1e-4, -2e-4, 0.1, "count", 4.0, False, "A17 2026-01-02")
-    publisher.send(TACTILE, Frame(7, 1.0, 1.25, True, data), data, 1, facts, 99.0)
-    topic, message = receive(socket, served)
-    assert topic == b"hand/tactile"
-    assert np.array_equal(np.frombuffer(message.pop("data"), "<u2").reshape(3, 4), data)
-    assert (message["seq"], message["mono_ns"], message["delay_s"]) == (7, 1_000_000_000, 0.25)
-    assert (message["finger"], message["rows"], message["cols"]) == ("right", 3, 4)
-    served.close()
+    with Served(addresses[0], queue=10) as served:
+        publisher = served.publisher
+        socket = subscribe(context, addresses[0], b"hand/tactile")
+        until(lambda: wanted(served, TACTILE))
+        assert not publisher.wanted & bit(STATE)
+        data = np.arange(12, dtype=np.uint16).reshape(3, 4) * 1000
+        facts = SensorFacts(0.002, 0.003, 1e-4, -2e-4, 0.1, "count", 4.0, False, "A17 2026-01-02")
+        publisher.send(TACTILE, Frame(7, 1.0, 1.25, True, data), data, 1, facts, 99.0)
+        topic, message = receive(socket, served)
+        assert topic == b"hand/tactile"
+        assert np.array_equal(np.frombuffer(message.pop("data"), "<u2").reshape(3, 4), data)
+        assert (message["seq"], message["mono_ns"], message["delay_s"]) == (7, 1_000_000_000, 0.25)
+        assert (message["finger"], message["rows"], message["cols"]) == ("right", 3, 4)
 
 
 def test_topics_nobody_subscribes_to_are_not_wanted(
     context: zmq.Context[Any], addresses: tuple[str, str]
 ) -> None:
-    served = Served(addresses[0], queue=10)
-    publisher = served.publisher
-    served.settle()
-    assert not publisher.wanted & bit(STATE)
-    socket = subscribe(context, addresses[0], b"hand")
-    until(lambda: wanted(served))
-    assert publisher.wanted & bit(TACTILE)
-    socket.close()
-    until(lambda: not wanted(served))
-    served.close()
+    with Served(addresses[0], queue=10) as served:
+        publisher = served.publisher
+        served.settle()
+        assert not publisher.wanted & bit(STATE)
+        socket = subscribe(context, addresses[0], b"hand")
+        until(lambda: wanted(served))
+        assert publisher.wanted & bit(TACTILE)
+        socket.close()
+        until(lambda: not wanted(served))
 
 
 def test_what_is_no_subscription_takes_none_from_others(
@@ -105,93 +103,64 @@ def test_what_is_no_subscription_takes_none_from_others(
 def test_a_stuck_subscriber_holds_up_nobody_and_its_queue_is_bounded(
     context: zmq.Context[Any], addresses: tuple[str, str]
 ) -> None:
-    served = Served(addresses[0], queue=50)
-    publisher = served.publisher
-    stuck = context.socket(zmq.SUB)
-    stuck.setsockopt(zmq.RCVHWM, 10)
-    stuck.setsockopt(zmq.RCVBUF, 4096)
-    stuck.setsockopt(zmq.SUBSCRIBE, b"")
-    stuck.connect(addresses[0])
-    reading = subscribe(context, addresses[0], b"hand/state")
-    until(lambda: wanted(served))
-    state = State()
-    for seq in range(20_000):
-        state.seq = seq
-        publisher.send(STATE, state, BOTH)
-        served.service.step(0.0)  # would never return if it waited for the stuck one
-        while reading.poll(0):
-            reading.recv_multipart()
-    kept = 0
-    while stuck.poll(200):
-        stuck.recv_multipart()
-        kept += 1
-    assert kept < 20_000, "the stuck subscriber's queue has no bound"
-    served.close()
-
-
-def test_a_late_subscriber_gets_what_is_published_from_then_on(
-    context: zmq.Context[Any], addresses: tuple[str, str]
-) -> None:
-    served = Served(addresses[0], queue=10)
-    publisher = served.publisher
-    for seq in range(100):
-        publisher.send(STATE, State(seq=seq), BOTH)
-    served.settle()  # before anybody subscribes: that may be quicker
-    late = subscribe(context, addresses[0], b"hand/state")
-    until(lambda: wanted(served))
-    publisher.send(STATE, State(seq=100), BOTH)
-    assert receive(late, served)[1]["seq"] == 100
-    served.close()
-
-
-def test_events_are_numbered(context: zmq.Context[Any], addresses: tuple[str, str]) -> None:
-    served = Served(addresses[0], queue=10)
-    publisher = served.publisher
-    socket = subscribe(context, addresses[0])
-    until(lambda: wanted(served))
-    publisher.event(5.0, 2.5, "info", "mode", "disarmed → armed")
-    topic, message = receive(socket, served)
-    assert topic == b"hand/event"
-    assert message["seq"] == 1
-    assert message["mono_ns"] == 2_500_000_000
-    assert (message["level"], message["kind"]) == ("info", "mode")
-    served.close()
+    with Served(addresses[0], queue=50) as served:
+        publisher = served.publisher
+        stuck = context.socket(zmq.SUB)
+        stuck.setsockopt(zmq.RCVHWM, 10)
+        stuck.setsockopt(zmq.RCVBUF, 4096)
+        stuck.setsockopt(zmq.SUBSCRIBE, b"")
+        stuck.connect(addresses[0])
+        reading = subscribe(context, addresses[0], b"hand/state")
+        until(lambda: wanted(served))
+        state = State()
+        for seq in range(20_000):
+            state.seq = seq
+            publisher.send(STATE, state, BOTH)
+            served.service.step(0.0)  # would never return if it waited for the stuck one
+            while reading.poll(0):
+                reading.recv_multipart()
+        kept = 0
+        while stuck.poll(200):
+            stuck.recv_multipart()
+            kept += 1
+        assert kept < 20_000, "the stuck subscriber's queue has no bound"
 
 
 def test_who_comes_late_is_told_settings_and_events_again(
     context: zmq.Context[Any], addresses: tuple[str, str]
 ) -> None:
-    served = Served(addresses[0], queue=200)
-    publisher = served.publisher
-    publisher.settings(98.0, 0.5, HandFacts("0.1.0", "{}", "", "", "{}", "{}"))
-    for k in range(60):
-        publisher.event(99.0 + k, 1.0 + k, "info", "mode", f"event {k + 1}")
-    served.settle()  # before anybody subscribes: that may be quicker
-    early = subscribe(context, addresses[0])
-    told: list[tuple[bytes, dict[str, Any]]] = []
+    with Served(addresses[0], queue=200) as served:
+        publisher = served.publisher
+        publisher.settings(98.0, 0.5, HandFacts("0.1.0", "{}", "", "", "{}", "{}"))
+        for k in range(60):
+            publisher.event(99.0 + k, 1.0 + k, "info", "mode", f"event {k + 1}")
+        served.settle()  # before anybody subscribes: that may be quicker
+        early = subscribe(context, addresses[0])
+        told: list[tuple[bytes, dict[str, Any]]] = []
 
-    def tick(socket: zmq.Socket[Any]) -> int:
-        served.settle()
-        while socket.poll(0):
-            told.append(receive(socket))
-        return len(told)
+        def tick(socket: zmq.Socket[Any]) -> int:
+            served.settle()
+            while socket.poll(0):
+                told.append(receive(socket))
+            return len(told)
 
-    until(lambda: tick(early) == 51)
-    assert told[0][0] == b"hand/settings"
-    assert told[0][1]["version"] == "0.1.0"
-    assert [message["seq"] for _, message in told[1:]] == list(range(11, 61))
-    assert all(message["again"] for _, message in told)
-    assert told[-1][1]["timestamp"] == 158.0  # its own, not that of the repetition
-    told.clear()
-    publisher.event(200.0, 100.0, "info", "mode", "new")
-    until(lambda: tick(early) == 1)
-    assert not told[0][1]["again"]
-    # A second subscriber, of one topic alone, is told that topic's.
-    told.clear()
-    late = subscribe(context, addresses[0], b"hand/event")
-    until(lambda: tick(late) == 50)
-    assert {topic for topic, _ in told} == {b"hand/event"}
-    served.close()
+        until(lambda: tick(early) == 51)
+        assert told[0][0] == b"hand/settings"
+        assert told[0][1]["version"] == "0.1.0"
+        assert [message["seq"] for _, message in told[1:]] == list(range(11, 61))
+        assert all(message["again"] for _, message in told)
+        last = told[-1][1]  # with its own times, not those of the repetition
+        assert (last["timestamp"], last["mono_ns"]) == (158.0, 60_000_000_000)
+        assert (last["level"], last["kind"], last["text"]) == ("info", "mode", "event 60")
+        told.clear()
+        publisher.event(200.0, 100.0, "info", "mode", "new")
+        until(lambda: tick(early) == 1)
+        assert not told[0][1]["again"]
+        # A second subscriber, of one topic alone, is told that topic's.
+        told.clear()
+        late = subscribe(context, addresses[0], b"hand/event")
+        until(lambda: tick(late) == 50)
+        assert {topic for topic, _ in told} == {b"hand/event"}
 
 
 def test_all_of_many_late_subscribers_are_told(
@@ -237,15 +206,14 @@ def test_a_long_message_comes_in_pieces_and_whole(
 def test_commands_are_told_to_those_who_ask(
     context: zmq.Context[Any], addresses: tuple[str, str]
 ) -> None:
-    served = Served(addresses[0], queue=10)
-    publisher = served.publisher
-    publisher.command(99.0, 1.0, 500, {"command": "arm"}, "")  # nobody listens: no count either
-    socket = subscribe(context, addresses[0], b"hand/command")
-    until(lambda: wanted(served, COMMAND))
-    publisher.command(99.0, 1.0, 501, {"command": "grasp", "force": 5.0, "client": "me"}, "no")
-    topic, message = receive(socket, served)
-    assert topic == b"hand/command"
-    assert (message["seq"], message["tick"], message["client"]) == (1, 501, "me")
-    assert (message["ok"], message["error"]) == (False, "no")
-    assert json.loads(message["request"]) == {"command": "grasp", "force": 5.0, "client": "me"}
-    served.close()
+    with Served(addresses[0], queue=10) as served:
+        publisher = served.publisher
+        publisher.command(99.0, 1.0, 500, {"command": "arm"}, "")  # nobody listens: no count either
+        socket = subscribe(context, addresses[0], b"hand/command")
+        until(lambda: wanted(served, COMMAND))
+        publisher.command(99.0, 1.0, 501, {"command": "grasp", "force": 5.0, "client": "me"}, "no")
+        topic, message = receive(socket, served)
+        assert topic == b"hand/command"
+        assert (message["seq"], message["tick"], message["client"]) == (1, 501, "me")
+        assert (message["ok"], message["error"]) == (False, "no")
+        assert json.loads(message["request"]) == {"command": "grasp", "force": 5.0, "client": "me"}
