@@ -9,6 +9,7 @@ import pytest
 
 from softfinger.daemon.errors import Refused
 from softfinger.daemon.loop.build import Daemon
+from softfinger.daemon.types import Event, Frame
 
 Make = Callable[..., Daemon]
 
@@ -43,3 +44,30 @@ def refusal(daemon: Daemon, name: str, **numbers: float) -> str:
     with pytest.raises(Refused) as caught:
         command(daemon, name, **numbers)
     return str(caught.value)
+
+
+def heard(daemon: Daemon) -> list[Event]:
+    """The daemon's events from now on."""
+    events: list[Event] = []
+    daemon.loop._on_event = lambda *event: events.append(event)
+    return events
+
+
+def change_frames(daemon: Daemon, finger: int, change: Callable[[Frame], Frame | None]) -> None:
+    """From now on each new frame of one sensor goes through ``change``."""
+    sensor = daemon.loop.perception.fingers[finger].sensor
+    really, last = sensor.latest, [None, None]
+
+    def latest() -> Frame | None:
+        frame = really()
+        if frame is not last[0] and frame is not None:
+            last[:] = frame, change(frame)  # type: ignore[call-overload]
+        return last[1]
+
+    sensor.latest = latest  # type: ignore[method-assign]
+
+
+def silence(daemon: Daemon) -> None:
+    """From now on no frame comes."""
+    for perception in daemon.loop.perception.fingers:
+        perception.sensor.latest = lambda kept=perception.frame: kept  # type: ignore[method-assign]

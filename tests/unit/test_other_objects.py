@@ -8,42 +8,23 @@ from typing import Any
 import numpy as np
 import pytest
 
-from softfinger.daemon.loop.build import Daemon
-from softfinger.daemon.profile.settings import Settings
+from softfinger.tools.watched import Watched
 from tests.harness.reference_hand import ReferenceHand
 
 HAND = ReferenceHand()
 SLOW: dict[str, Any] = {"rate": 25.0}
 
 
-class Rig:
-    """A daemon on virtual time and what it told."""
-
-    def __init__(self, sections: dict[str, dict[str, Any]]) -> None:
-        settings = Settings.model_validate({"loop": {"clock": "virtual"}} | sections)
-        self.events: list[tuple[str, str, str]] = []
-        self.daemon = Daemon(settings, wire=False, on_event=self.hear)
-        self.loop, self.state = self.daemon.loop, self.daemon.loop.state
-        assert self.daemon.hand is not None
-        self.plant = self.daemon.hand
-        self.loop.advance(0.3)
-
-    def __enter__(self) -> Rig:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.daemon.close()
-
-    def hear(self, *event: str) -> None:
-        self.events.append(event)  # type: ignore[arg-type]
-
-    def command(self, name: str, seconds: float, **numbers: float) -> None:
-        self.loop.command({"command": name, **numbers})
-        self.loop.advance(seconds)
+class Rig(Watched):
+    """A watched hand, brought to holding."""
 
     def grasp(self, force: float, seconds: float = 2.5) -> None:
-        self.command("arm", 0.2)
-        self.command("grasp", seconds, force=force)
+        super().grasp(force)
+        self.run(seconds)
+
+    def turn(self, angle: float, seconds: float) -> None:
+        self.command("rotate", angle=angle)
+        self.run(seconds)
 
     def warnings(self) -> list[str]:
         return [kind for level, kind, _ in self.events if level in ("warning", "error")]
@@ -77,7 +58,7 @@ def test_a_wedge_is_felt_and_turned_as_it_is(
     with Rig(sections) as rig:
         rig.grasp(8.0)
         for angle in (0.0, 0.05, -0.05):
-            rig.command("rotate", 1.5, angle=angle)
+            rig.turn(angle, 1.5)
             off = []
             for _ in range(50):
                 rig.loop.advance(0.002)
@@ -92,7 +73,7 @@ def test_a_wedge_is_felt_and_turned_as_it_is(
             assert rig.state.object.width == pytest.approx(
                 width_at_the_contacts(rig.plant), abs=2e-4
             )
-            held = rig.daemon.loop.perception.filter.grasp
+            held = rig.contact_filter.grasp
             used = np.abs(rig.plant.tangential / rig.plant.normal).max()
             assert held.shear == pytest.approx(used, abs=0.03)
             assert held.taper == pytest.approx(taper, abs=0.005)
@@ -119,7 +100,7 @@ def test_with_nothing_between_the_tips_the_hand_opens(force: float, frames: dict
             worst = max(worst, float(rig.plant.force.max()))
         rig.loop.advance(1.0)
         assert rig.state.mode == "armed"
-        assert rig.state.reading.q == pytest.approx(rig.daemon.settings.hand.open_angle, abs=0.03)
+        assert rig.state.reading.q == pytest.approx(rig.settings.hand.open_angle, abs=0.03)
         assert rig.warnings() == ["grasp"]
         assert 0.5 < worst < 4.0
         assert "nothing between the tips" in next(
@@ -132,7 +113,7 @@ def test_a_sheet_that_is_told_to_be_one_is_not_nothing() -> None:
     with Rig(sheet) as rig:
         rig.grasp(1.0, 1.6)
         assert not any("between" in text for *_, text in rig.events)
-        assert rig.loop._control._gripping or rig.state.mode == "fault"
+        assert rig.control._gripping or rig.state.mode == "fault"
 
 
 def test_a_small_disc_is_no_other_tip() -> None:
@@ -147,7 +128,7 @@ def test_a_disc_is_held_and_turned_by_the_line_between_its_contacts() -> None:
         rig.grasp(8.0)
         assert rig.plant.force == pytest.approx([8.0, 8.0], rel=0.12)
         assert rig.state.contacts[0].d / rig.plant.d[0] == pytest.approx(0.72, abs=0.03)
-        rig.command("rotate", 2.0, angle=0.08)
+        rig.turn(0.08, 2.0)
         assert rig.state.mode == "holding"
         assert rig.state.fault == ""
         tips = HAND.tips(rig.plant.q)

@@ -11,10 +11,10 @@ from softfinger.daemon.errors import Refused
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.loop.publishing import parts
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.types import Reading
+from softfinger.daemon.types import Event, Reading
 from softfinger.daemon.wire.packer import message_maker
 from softfinger.daemon.wire.schema import STATE
-from tests.harness.loop import Make, advance_to, command, grasped, refusal
+from tests.harness.loop import Make, advance_to, command, grasped, heard, refusal
 
 state_message = message_maker(STATE)
 
@@ -30,16 +30,10 @@ def test_a_person_ends_the_demo_and_it_does_not_start_again(make: Make) -> None:
     assert daemon.loop.state.mode == "armed"
 
 
-Events = list[tuple[str, str, str]]
-
-
-def holding_demo(daemon: Daemon) -> Events:
+def holding_demo(daemon: Daemon) -> list[Event]:
     """The demo, brought to holding; its events from then on."""
-    events: Events = []
-    daemon.loop._on_event = lambda *event: events.append(event)
     advance_to(daemon, "holding", 5.0)
-    events.clear()
-    return events
+    return heard(daemon)
 
 
 def test_a_simulated_hands_demo_goes_on_after_a_fault_and_says_so(make: Make) -> None:

@@ -15,7 +15,7 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import Reading
 from tests.conftest import until
 from tests.harness.gateway import Served
-from tests.harness.loop import Make, advance_to, command, grasped, refusal, torque_of
+from tests.harness.loop import Make, advance_to, command, grasped, heard, refusal, torque_of
 from tests.harness.safety import bounded
 
 
@@ -54,8 +54,7 @@ def test_torque_off_that_is_not_confirmed_is_tried_again_and_then_the_bus_falls_
 ) -> None:
     """Writes get lost and readings come, which keep the servos' watchdogs from acting."""
     daemon = make()
-    events: list[tuple[str, str, str]] = []
-    daemon.loop._on_event = lambda *event: events.append(event)
+    events = heard(daemon)
     command(daemon, "arm")
     daemon.loop.advance(0.1)
     lost = Deaf(daemon)
