@@ -117,7 +117,7 @@ def rolling_rows(
 
 
 class ReferenceHand(HandGeometry):
-    """The hand with its derivatives, its inverse kinematics and the object from two contacts."""
+    """The hand with its derivatives and its inverse kinematics."""
 
     def tip_jacobian(self, q: ArrayLike) -> FloatArray:
         """Derivatives [[∂x1/∂q1, ∂y1/∂q1], [∂x2/∂q2, ∂y2/∂q2]] [m/rad]."""
@@ -161,19 +161,3 @@ class ReferenceHand(HandGeometry):
     def _angle_for(self, inward: float) -> float:
         """ψ with L sin ψ + e cos ψ = ``inward``, on the branch around 0."""
         return math.asin(inward / self.reach) - math.atan2(self.finger_offset, self.finger_length)
-
-    def object_from_contacts(
-        self, q: ArrayLike, d: ArrayLike, theta: ArrayLike
-    ) -> tuple[float, float, float]:
-        """The object's angle φ̂ [rad], width W [m] and the contacts' disagreement [rad].
-
-        φ̂ = (θ1 + θ2 − q1 + q2)/2, W = d1 + d2 − 2a + (O2 − O1)·n(φ̂); the disagreement
-        θ1 − θ2 − q1 − q2 is zero when joints and sensors agree and the faces are parallel.
-        """
-        q1, q2 = vector(q, 2, "q")
-        theta1, theta2 = vector(theta, 2, "theta")
-        angle = 0.5 * (theta1 + theta2 - q1 + q2)
-        left, right = self.tips(q)
-        across = (right - left) @ [math.cos(angle), math.sin(angle)]
-        width = float(np.sum(vector(d, 2, "d"))) - 2.0 * self.tip_radius + across
-        return angle, width, theta1 - theta2 - q1 - q2

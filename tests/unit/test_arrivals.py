@@ -9,10 +9,8 @@ import pytest
 
 from softfinger.daemon.clock import VirtualClock
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.simulation.emulator.tactile_board import ENCODERS, TactileBoard
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.daemon.simulation.sensor.simulated_tactile import Arrivals, SimulatedTactile
-from softfinger.daemon.tactile.cobs import CobsDecoder
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.table import ContactTable
@@ -139,23 +137,3 @@ def test_cells_with_a_memory_feel_frames_that_nobody_asked_for():
     assert each.seq == every_sixth.seq
     assert each.data.any()
     np.testing.assert_array_equal(each.data, every_sixth.data)
-
-
-def test_an_emulated_board_passes_gaps_on_and_the_decoder_counts_them():
-    sensor, clock, _ = simulated({"tactile_dropped": 0.3}, {"rows": 8, "cols": 8, "pitch": 0.007})
-    sensor.open()
-    board = TactileBoard(sensor, ENCODERS["cobs"], 100.0, 0.010)
-    decoder = CobsDecoder(8, 8)
-    sent: list[bytes] = []
-    board._writer.send = lambda data: sent.append(data) or True
-    while clock.now() < 3.0:
-        board.service(clock.now())
-        clock.sleep_until(max(board.next_event(), clock.now() + 1e-4))
-    for data in sent:
-        assert decoder.feed(data, 0.0) is not None
-    first = sensor.counters()
-    assert decoder.counters()["frames"] == len(sent) == first["frames"]
-    # Those before the first one the board can't know of.
-    assert 0 <= first["missed"] - decoder.counters()["missed"] <= 3
-    assert first["missed"] > 50
-    board.close()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from pathlib import Path
 
 import pytest
@@ -18,24 +17,6 @@ from softfinger.tools.benchmarks.measuring import (
     interleave,
     slopes,
 )
-
-
-def test_a_table_is_aligned_and_leaves_out_what_is_missing() -> None:
-    rows = [
-        {"name": "a", "x µs": 7.8e-6, "n": 3},
-        {"name": "longer", "x µs": math.nan, "what": "w"},
-    ]
-    assert str(Report("times", rows, notes=("a note",))).splitlines() == [
-        "times      x µs  n  what",
-        "a       7.8e-06  3",
-        "longer              w",
-        "a note",
-    ]
-
-
-def test_a_figure_has_median_and_tail() -> None:
-    row = figure("f", "s", range(101), 60.0)
-    assert (row["median"], row["IQR"], row["p99"], row["n"]) == (50.0, 50.0, 99.0, 101)
 
 
 def test_turns_and_times(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -138,9 +119,3 @@ def test_refusals_come_before_the_measurements(
     error = capsys.readouterr().err
     assert text in error
     assert "measuring" not in error
-
-
-def test_a_number_of_trials_is_a_whole_one(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        cli.main(["bench", "campaign", "faults", "--trials", "0"])
-    assert "expected a whole number above 0" in capsys.readouterr().err

@@ -8,12 +8,6 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from softfinger.daemon.errors import SettingsError
-from softfinger.daemon.perception.finger_model import make_estimator
-from softfinger.daemon.profile.factory import make_grid, make_material
-from softfinger.daemon.profile.load import load
-from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.simulation.sensor.sensor_model import Board, Imperfections, SensorModel
 from softfinger.kinematics.compiled.simd import STRIDE
 from softfinger.kinematics.estimation.blurred_cells import PLANES, weights
 from softfinger.kinematics.estimation.estimator import ContactEstimator
@@ -22,7 +16,7 @@ from softfinger.kinematics.estimation.state import READING, WEIGHT, EstimatorSta
 from softfinger.kinematics.sensing.cell_integrals import ACTIVE, CELL_PLANES
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid, stencil
 from tests.harness.estimator_kernels import blur_cells
-from tests.harness.paper_tip import LINEAR, MEASURED, PITCH, TIP, A, E, fisher
+from tests.harness.paper_tip import LINEAR, MEASURED, PITCH, TIP, A, E, fisher, tilts
 
 NOISE = 0.002
 
@@ -46,11 +40,6 @@ def dense(grid, material, contact, pieces=16, margin=6):
     edge = margin * pieces
     kept = pressure[edge:-edge, edge:-edge]
     return kept.reshape(grid.rows, pieces, grid.cols, pieces).mean(axis=(1, 3))
-
-
-def tilts(degrees, azimuth):
-    s = math.sin(math.radians(degrees))
-    return math.asin(s * math.cos(azimuth)), math.asin(s * math.sin(azimuth))
 
 
 @pytest.mark.parametrize(
@@ -156,7 +145,7 @@ def test_errors_with_a_blur_are_at_the_bound_and_the_covariance_says_so(
 ):
     noise = NOISE * material.reference_modulus
     grid = SensorGrid(44, 44, PITCH, (2e-4, -5e-4), blur=blur)
-    truth = (d, *tilts(degrees, 0.8))
+    truth = (d, *tilts(math.radians(degrees), 0.8))
     covariance = fisher(grid, material, (*truth, 1.0), noise, free_gain)
     estimator = ContactEstimator(TIP, material, grid, noise, free_gain=free_gain)
     rng = np.random.default_rng(9)
@@ -178,7 +167,7 @@ def test_errors_with_a_blur_are_at_the_bound_and_the_covariance_says_so(
 
 def test_a_blur_that_is_not_modelled_shows():
     grid = SensorGrid(44, 44, PITCH, blur=0.001)
-    truth = (0.004, *tilts(15.0, 0.3))
+    truth = (0.004, *tilts(math.radians(15.0), 0.3))
     frame = grid.pressure(TIP, LINEAR, *truth)
     sharp = ContactEstimator(TIP, LINEAR, SensorGrid(44, 44, PITCH), NOISE * E)(frame)
     aware = ContactEstimator(TIP, LINEAR, grid, NOISE * E)(frame)
@@ -192,27 +181,13 @@ def test_moments_are_corrected_for_the_blur(blur):
     grid = SensorGrid(44, 44, PITCH, (3e-4, 1e-4), blur=blur)
     plain = SensorGrid(44, 44, PITCH, (3e-4, 1e-4))
     for d in (0.002, 0.004, 0.008):
-        truth = (d, *tilts(15.0, 1.0))
+        truth = (d, *tilts(math.radians(15.0), 1.0))
         frame = grid.pressure(TIP, LINEAR, *truth)
         e = ContactEstimator(TIP, LINEAR, grid, NOISE * E, method="moments")(frame)
         assert e.d == pytest.approx(d, rel=0.01)
         assert (e.tilt_x, e.tilt_y) == pytest.approx(truth[1:], abs=0.004)
         off = ContactEstimator(TIP, LINEAR, plain, NOISE * E, method="moments")(frame)
         assert abs(off.d - d) > 3.0 * abs(e.d - d)
-
-
-def test_a_blurred_footprint_cut_by_the_sensors_edge_still_fits():
-    grid = SensorGrid(44, 44, PITCH, centre=(0.021, 0.0), blur=0.001)
-    truth = (0.004, 0.35, 0.1)
-    clean = grid.pressure(TIP, LINEAR, *truth)
-    assert clean[:, -1].max() > 0.05 * clean.max()
-    rng = np.random.default_rng(5)
-    estimator = ContactEstimator(TIP, LINEAR, grid, NOISE * E)
-    for _ in range(20):
-        e = estimator(clean + rng.normal(0.0, NOISE * E, grid.shape))
-        assert e.valid
-        miss = np.array([e.d, e.tilt_x, e.tilt_y]) - truth
-        assert np.all(np.abs(miss) < 4.5 * np.sqrt(np.diag(e.covariance))[:3])
 
 
 def test_dead_cells_counts_and_thresholds_go_with_a_blur():
@@ -238,31 +213,6 @@ def test_dead_cells_counts_and_thresholds_go_with_a_blur():
 def test_a_blur_that_is_none_is_refused(blur):
     with pytest.raises(ValueError, match="blur"):
         SensorGrid(44, 44, PITCH, blur=blur)
-
-
-def test_the_settings_blur_goes_into_the_fingers_estimator():
-    blurred = {"tactile": {"blur": 0.001}, "simulation": {"tactile_blur": 0.001}}
-    settings = Settings.model_validate(blurred)
-    material = make_material(settings.material)
-    tactile = settings.tactile
-    sensor = SensorModel(
-        make_grid(settings),
-        TIP,
-        material,
-        Board(tactile.pascal_per_count),
-        flaws=Imperfections(noise=300.0, blur=settings.simulation.tactile_blur),
-    )
-    estimator = make_estimator(settings, material)
-    counts = np.zeros((tactile.rows, tactile.cols), np.uint16)
-    sensor.frame(0.004, 0.2, -0.1, counts)
-    e = estimator(counts, tactile.pascal_per_count)
-    assert e.valid
-    assert e.d == pytest.approx(0.004, abs=2e-5)
-    assert (e.tilt_x, e.tilt_y) == pytest.approx((0.2, -0.1), abs=2e-3)
-    with pytest.raises(
-        SettingsError, match=r"tactile\.blur: found 0\.005 m, expected at most 0\.0026"
-    ):
-        load(changes=["tactile.rows=4", "tactile.cols=4", "tactile.blur=0.005"])
 
 
 @pytest.mark.parametrize("reading", [math.nan, math.inf, 1e9])

@@ -126,10 +126,3 @@ def test_each_tips_material_reaches_estimate_table_and_prediction(settings):
         d, theta = daemon.hand.d, daemon.hand.theta
         by_truth = math.pi * TRUE * d**2 / np.cos(theta)
         assert np.abs(daemon.hand.force / by_truth - 1.0).max() < 1e-3
-
-
-def test_tips_of_one_material_share_one_table():
-    with Daemon(Settings.model_validate({"loop": {"clock": "virtual"}}), wire=False) as daemon:
-        assert daemon.models[0].table is daemon.models[1].table
-        assert daemon.hand is not None
-        assert daemon.hand.table is daemon.models[0].table

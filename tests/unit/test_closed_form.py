@@ -31,13 +31,6 @@ def test_force_and_energy_meet_the_checkpoints(
     np.testing.assert_allclose(c.energy * 1e3, energy, rtol=2e-13)
 
 
-def test_partials_meet_the_checkpoints() -> None:
-    d, theta = np.array([0.004, 0.008]), np.radians([15, 30])
-    c = closed_forms(E, d, theta)
-    np.testing.assert_allclose(c.energy_d, [16.377812044863, 81.497102224324], rtol=1e-12)
-    np.testing.assert_allclose(c.energy_theta * 1e3, [11.702457363226, 250.94599417274], rtol=1e-12)
-
-
 def test_limit_of_the_tilt() -> None:
     limits = np.degrees(TIP.theta_limit(np.array([2, 4, 6, 8, 10, 12]) * 1e-3))
     np.testing.assert_allclose(limits, [64.158, 53.130, 44.427, 36.870, 30.000, 23.578], atol=5e-4)
@@ -72,26 +65,6 @@ def test_partials_are_the_derivatives(
     f_t, u_t = (value.imag / step for value in _complex(modulus, d, theta + 1j * step))
     np.testing.assert_allclose([c.force_d, c.energy_d], [f_d, u_d], rtol=1e-13)
     np.testing.assert_allclose([c.force_theta, c.energy_theta], [f_t, u_t], rtol=1e-12)
-
-
-@given(radius=radii, modulus=moduli, part=fractions, share=shares)
-def test_identities(radius: float, modulus: float, part: float, share: float) -> None:
-    d = radius * part
-    theta = float(Fingertip(radius).theta_limit(d)) * share
-    c = closed_forms(modulus, d, theta)
-    np.testing.assert_allclose(c.energy_d, c.force / np.cos(theta), rtol=1e-14)
-    # The force times the lever of the pressure's centroid about the footprint's centre.
-    lever = (radius - d / 3 - (radius - d)) * np.sin(theta) / np.cos(theta) ** 2
-    np.testing.assert_allclose(c.energy_theta, c.force * lever, rtol=1e-6, atol=1e-300)
-    np.testing.assert_allclose(d * c.force_d, 2 * c.force, rtol=1e-14)
-    np.testing.assert_allclose(d * c.energy_d, 3 * c.energy, rtol=1e-14)
-    assert c.energy > 0
-    assert c.energy >= closed_forms(modulus, d, 0.0).energy
-    assert closed_forms(modulus, d, -theta).force == c.force
-    assert closed_forms(modulus, d, -theta).energy_theta == -c.energy_theta
-    assert closed_forms(modulus, d * 1.001, theta).force > c.force
-    twice = closed_forms(modulus, 2 * d, theta)
-    np.testing.assert_allclose([twice.force, twice.energy], [4 * c.force, 8 * c.energy], rtol=1e-14)
 
 
 def test_shapes_types_and_odd_values() -> None:

@@ -110,15 +110,6 @@ def test_frames_come_with_number_and_time_and_losses_are_told():
     assert again.steps == 1
 
 
-def test_uint8_counts_of_the_same_grid_are_read_too():
-    decoder = CobsDecoder(4, 4)
-    counts = np.arange(16, dtype=np.uint8).reshape(4, 4)
-    decoded = decoder.feed(encode(counts, 1, 0.0), 0.0)
-    assert decoded is not None
-    assert decoded.data.dtype == np.uint16
-    assert np.array_equal(decoded.data, counts)
-
-
 @pytest.mark.parametrize(
     ("spoil", "told"),
     [

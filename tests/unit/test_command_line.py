@@ -45,14 +45,6 @@ def test_the_nearest_word_is_named_for_one_that_is_not_known(inline: Inline) -> 
     assert "unrecognized arguments: --zzz" in inline("run", "--zzz").stderr
 
 
-def test_limits_fit_a_wide_terminal_and_tell_the_threshold(inline: Inline) -> None:
-    lines = inline("limits").stdout.splitlines()
-    assert max(map(len, lines)) <= 120
-    warn, fault = (line.split() for line in lines if line.startswith("tip.force "))
-    assert warn[-5:] == ["0.9", "×", "safety.force_max", "=", "30"]
-    assert fault[-4:] == ["tip", "safety.force_max", "=", "30"]
-
-
 @pytest.mark.parametrize(
     ("words", "said"),
     [

@@ -13,8 +13,6 @@ from typing import Any
 import msgpack
 import pytest
 import zmq
-from hypothesis import given
-from hypothesis import strategies as st
 
 from softfinger.daemon.client.command_client import send
 from softfinger.daemon.clock import VirtualClock
@@ -190,25 +188,6 @@ def test_the_time_that_a_command_itself_takes_is_no_pause(
         standing.sleep_until(standing.now() + 0.25)  # torque goes on in the rest of the tick
         assert arm.told()["ok"]
         assert clear.told()["ok"]
-
-
-values = st.one_of(st.none(), st.integers(0, 300), st.floats(allow_nan=False), st.text(max_size=5))
-maps = st.dictionaries(st.text(max_size=5), values, max_size=3)
-
-
-@given(
-    st.one_of(
-        st.binary(max_size=64),
-        st.builds(lambda more, name: msgpack.packb({**more, "command": name}), maps, values),
-    )
-)
-def test_any_bytes_are_decoded_or_refused(payload: bytes) -> None:
-    try:
-        request = decode(payload)
-    except Refused:
-        return
-    assert isinstance(request["command"], str)
-    assert request == msgpack.unpackb(payload)
 
 
 def test_a_stop_is_one_whatever_it_holds_besides() -> None:

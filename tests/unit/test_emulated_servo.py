@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from softfinger.daemon.servos import control_table as reg
-from softfinger.daemon.servos.control_table import MODELS, by_name
+from softfinger.daemon.servos.control_table import by_name
 from softfinger.daemon.simulation.servo_model import framing
 from softfinger.daemon.simulation.servo_model.framing import BROADCAST
 from softfinger.daemon.simulation.servo_model.servo import REBOOT_TIME
@@ -75,12 +75,6 @@ def test_eeprom_is_locked_while_torque_is_on() -> None:
     assert c.write(reg.RETURN_DELAY_TIME, 0, 1) == 0
 
 
-def test_reading_past_the_table_and_reading_gaps() -> None:
-    c = client()
-    assert c.ask(framing.READ, struct.pack("<HH", 660, 3))[0] == framing.ACCESS
-    assert c.ask(framing.READ, struct.pack("<HH", 14, 6)) == (0, bytes(6))
-
-
 @pytest.mark.parametrize(
     ("instruction", "parameters"),
     [
@@ -95,26 +89,6 @@ def test_instructions_that_it_does_not_know(instruction: int, parameters: bytes)
     before = bytes(c.bus.servos[0].table.memory)
     assert c.ask(instruction, parameters) == (framing.INSTRUCTION_ERROR, b"")
     assert bytes(c.bus.servos[0].table.memory) == before
-
-
-def test_a_model_without_current_sensing_has_no_current_registers() -> None:
-    c = client(model="XL430-W250")
-    assert c.write(reg.GOAL_CURRENT, 1, 2) == framing.ACCESS
-    assert c.write(reg.OPERATING_MODE, reg.CURRENT_BASED_POSITION_MODE, 1) == framing.DATA_RANGE
-
-
-@pytest.mark.parametrize("name", MODELS)
-def test_factory_values(name: str) -> None:
-    c = client(model=name)
-    model = by_name(name)
-    assert c.read(reg.MODEL_NUMBER, 2) == model.number
-    assert c.read(reg.RETURN_DELAY_TIME, 1) & 0xFF == 250
-    assert c.read(reg.OPERATING_MODE, 1) == reg.POSITION_MODE
-    assert c.read(reg.VELOCITY_LIMIT, 4) == model.velocity_limit
-    assert c.read(reg.POSITION_P_GAIN, 2) == model.position_gains[2]
-    assert c.read(reg.TORQUE_ENABLE, 1) == 0
-    first, data, _ = model.indirect_blocks(model.firmware)[0]
-    assert c.read(first, 2) == data
 
 
 # --- indirect addresses ----------------------------------------------------------------------
@@ -136,16 +110,6 @@ def test_indirect_data_stands_for_what_it_points_to(model: str, firmware: int) -
 
 
 # --- torque, modes, motion -------------------------------------------------------------------
-
-
-def test_current_mode_pushes_the_way_of_its_sign() -> None:
-    c = client()
-    c.write(reg.OPERATING_MODE, reg.CURRENT_MODE, 1)
-    c.write(reg.TORQUE_ENABLE, 1, 1)
-    c.write(reg.GOAL_CURRENT, -80, 2)
-    c.later(0.3)
-    assert c.read(reg.PRESENT_VELOCITY, 4) < 0
-    assert c.read(reg.PRESENT_CURRENT, 2) == -80
 
 
 def test_velocity_mode_keeps_its_speed() -> None:

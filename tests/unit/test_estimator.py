@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from softfinger.kinematics.contact.material import Material
-from softfinger.kinematics.estimation.estimator import ContactEstimate, ContactEstimator, Readings
+from softfinger.kinematics.estimation.estimator import ContactEstimate, ContactEstimator
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from tests.harness.paper_tip import (
     GRID,
@@ -23,22 +23,6 @@ from tests.harness.paper_tip import (
     fisher,
     tilts,
 )
-
-
-def test_the_public_face():
-    from softfinger import ContactEstimator as Estimator
-    from softfinger import SensorGrid as Grid
-
-    grid = Grid(rows=44, cols=44, pitch=0.058 / 44)
-    p = grid.pressure(TIP, LINEAR, 0.004, 0.2, -0.1)
-    e = Estimator(TIP, LINEAR, grid, noise=600.0)(p)
-    assert e.contact
-    assert e.valid
-    assert e.d == pytest.approx(0.004, rel=1e-5)
-    assert (e.tilt_x, e.tilt_y) == pytest.approx((0.2, -0.1), abs=1e-5)
-    assert e.gain == pytest.approx(1.0, abs=1e-4)
-    assert e.covariance.shape == (4, 4)
-    np.testing.assert_allclose(e.covariance, e.covariance.T, rtol=1e-9)
 
 
 @pytest.mark.parametrize("material", [LINEAR, MEASURED], ids=["constant", "table_i"])
@@ -391,22 +375,3 @@ def test_a_model_that_does_not_fit_shows_in_chi2_and_widens_the_covariance():
         GRID.pressure(TIP, Material.constant(2 * E), twice.d, twice.tilt_x, twice.tilt_y)
     )
     assert twice.d_std > 5.0 * ideal.d_std
-
-
-@pytest.mark.parametrize("noise", [0.0, 600.0])
-def test_a_board_that_sends_nothing_below_three_counts_biases_d_by_less_than_a_percent(noise):
-    rng = np.random.default_rng(17)
-    estimator = ContactEstimator(
-        TIP, MEASURED, GRID, max(noise, 100.0), free_gain=False, readings=Readings(threshold=3)
-    )
-    for d in (0.001, 0.002, 0.008):
-        ratios = []
-        for _ in range(40):
-            at = tilts(rng.uniform(0.0, 0.5), rng.uniform(0, 7))
-            p = GRID.pressure(TIP, MEASURED, d, *at) + noise * rng.normal(0.0, 1.0, GRID.shape)
-            counts = np.clip(np.round(p / 500.0), 0, 255)
-            counts[counts < 3] = 0
-            e = estimator(counts.astype(np.uint8), 500.0)
-            assert e.valid
-            ratios.append(e.d / d - 1.0)
-        assert abs(np.mean(ratios)) < 0.008

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from softfinger.tools import cli, style
 from softfinger.tools.paper import appendix, figures
 from softfinger.tools.paper.model_pages import double_integrals
-from softfinger.tools.paper.sheets import sheet
 from tests.harness.paper_tip import CHECKPOINTS
 
 
@@ -56,21 +55,6 @@ def test_checkpoints_over_displacement(
         integral = columns[f"{symbol} by eq. {equation} at {theta} deg [{unit}]"][row]
         assert closed == pytest.approx(value, rel=1e-13)
         assert integral == pytest.approx(value, rel=1e-11)
-
-
-@pytest.mark.parametrize(
-    ("d", "theta", "force", "energy"), [each for each in CHECKPOINTS if each[1] < 30]
-)
-def test_checkpoints_over_tilt(
-    folder: Path, d: int, theta: int, force: float, energy: float
-) -> None:
-    for name, symbol, unit, value in (("4a", "F", "N", force), ("5a", "U", "mJ", energy)):
-        columns = read(folder / f"fig{name}.csv")
-        tilt = columns["theta [deg]"]
-        curve = columns[f"{symbol} at d = {d} mm [{unit}]"]
-        assert (tilt[0], tilt[-1]) == (-25.0, 25.0)
-        assert curve[np.abs(tilt) == theta] == pytest.approx(value, rel=1e-13)
-        assert np.argmin(curve) == np.flatnonzero(tilt == 0.0)[0]
 
 
 @pytest.mark.parametrize(("name", "exponent"), [("fig4b", 2), ("fig5b", 3)])
@@ -228,15 +212,6 @@ def test_errata_and_labels_stand_in_the_pictures(drawn: tuple[Path, list[Figure]
             assert box.y1 < page.size[1] + 0.02
 
 
-def test_lines_are_told_apart_without_colour() -> None:
-    with style.settings():
-        family = style.ordered(7)
-    assert len({str(each["linestyle"]) for each in family}) == 7
-    lightness = [np.dot(each["color"][:3], (0.2126, 0.7152, 0.0722)) for each in family]
-    assert np.all(np.diff(lightness) < -0.02)
-    assert max(lightness) < 0.7  # not too light for paper
-
-
 def test_named_figures_only(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["figures", "fig3", "--out", str(tmp_path)]) == 0
     written = {"fig3.csv", "table_i.csv", "errata.csv", "fig3.png"}
@@ -250,13 +225,6 @@ def test_unknown_figure_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture
     assert not (tmp_path / "out").exists()
 
 
-def test_a_folder_that_cannot_be_made(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    file = tmp_path / "file"
-    file.write_text("")
-    assert cli.main(["figures", "fig3", "--out", str(file)]) == 1
-    assert str(file) in capsys.readouterr().err
-
-
 def test_without_matplotlib_the_numbers_are_written(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -266,11 +234,3 @@ def test_without_matplotlib_the_numbers_are_written(
     error = capsys.readouterr().err
     assert "only the CSV files were written" in error
     assert "pip install 'softfinger[plot]'" in error
-
-
-def test_cells_of_a_sheet(tmp_path: Path) -> None:
-    columns = sheet("s", ("x", "m", [1.5, np.nan]), ("word", "", ["a, b", 'say "c"']))
-    lines = columns.write(tmp_path).read_text(encoding="utf-8").splitlines()
-    assert lines == ["x [m],word", '1.5,"a, b"', ',"say ""c"""']
-    with pytest.raises(KeyError):
-        columns["y"]

@@ -180,21 +180,6 @@ def test_no_wrong_frame_whatever_the_images_hold(images, start):
 
 
 @given(
-    garbage=st.one_of(st.binary(max_size=200), nasty),
-    images=st.lists(payloads, min_size=3, max_size=5),
-)
-def test_garbage_before_a_stream_costs_at_most_its_first_frames(garbage, images):
-    images = [*images, *numbered(3)]
-    decoder = FlexiTacDecoder(ROWS, COLS)
-    stream = [garbage, *(frame(image) for image in images), MARKER]
-    found = decode(decoder, stream)
-    assert decoder.locked
-    assert found[-1] == images[-1]
-    assert found[-3:] == images[-3:] or decoder.counters()["resyncs"] > 0
-    balance(decoder, sum(map(len, stream)))
-
-
-@given(
     images=st.lists(nasty, min_size=4, max_size=8),
     torn=st.integers(2, 3),
     keep=st.integers(0, STRIDE - 1),
@@ -215,18 +200,6 @@ def test_a_truncated_frame_is_dropped_and_the_stream_found_again(images, torn, k
     assert found[-1] == images[-1]
     if keep:
         assert decoder.counters()["resyncs"] >= 1
-
-
-@given(st.lists(st.one_of(st.binary(max_size=300), nasty), max_size=12))
-def test_random_bytes_never_break_the_decoder(pieces):
-    decoder = FlexiTacDecoder(ROWS, COLS)
-    for piece in pieces:
-        decoder.feed(piece, 0.0)
-        decoder.settle()
-        assert decoder.missing >= 0
-        decoder.diagnosis()
-    balance(decoder, sum(map(len, pieces)))
-    assert len(decoder._buffer) <= 15 * STRIDE
 
 
 def test_a_standing_image_with_the_marker_in_it_is_not_guessed_at():

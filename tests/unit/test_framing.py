@@ -10,78 +10,13 @@ from hypothesis import strategies as st
 from softfinger.daemon.servos.crc import crc16
 from softfinger.daemon.simulation.servo_model import framing
 from softfinger.daemon.simulation.servo_model.framing import (
-    BROADCAST,
     PacketParser,
     frame,
 )
 
-# From the maker's Protocol 2.0 manual: (id, instruction, parameters, packet).
-INSTRUCTIONS = [
-    (1, framing.PING, "", "FFFFFD00010300 01 194E"),
-    (BROADCAST, framing.PING, "", "FFFFFD00FE0300 01 3142"),
-    (1, framing.READ, "84000400", "FFFFFD00010700 02 84000400 1D15"),
-    (1, framing.WRITE, "740000020000", "FFFFFD00010900 03 740000020000 CA89"),
-    (1, framing.FACTORY_RESET, "01", "FFFFFD00010400 06 01 A1E6"),
-    (1, framing.REBOOT, "", "FFFFFD00010300 08 2F4E"),
-    (1, framing.CLEAR, "0144584C22", "FFFFFD00010800 10 0144584C22 B1DC"),
-    (BROADCAST, framing.SYNC_READ, "840004000102", "FFFFFD00FE0900 82 840004000102 CEFA"),
-    (
-        BROADCAST,
-        framing.SYNC_WRITE,
-        "74000400 0196000000 02AA000000",
-        "FFFFFD00FE1100 83 74000400 0196000000 02AA000000 8287",
-    ),
-    (
-        BROADCAST,
-        framing.BULK_READ,
-        "0190000200 0292000100",
-        "FFFFFD00FE0D00 92 0190000200 0292000100 1A05",
-    ),
-    (
-        BROADCAST,
-        framing.BULK_WRITE,
-        "0120000200A000 021F00010050",
-        "FFFFFD00FE1000 93 0120000200A000 021F00010050 B768",
-    ),
-    (
-        BROADCAST,
-        framing.FAST_SYNC_READ,
-        "84000400 030704",
-        "FFFFFD00FE0A00 8A 84000400 030704 20F2",
-    ),
-    (
-        BROADCAST,
-        framing.FAST_SYNC_READ,
-        "44020400 0102",
-        "FFFFFD00FE0900 8A 44020400 0102 72F2",
-    ),
-]
-
 # The header's first bytes often, since those are what is stuffed.
 PIECES = [b"\xff\xff\xfd", b"\xff", b"\xfd", b"\x00", b"\x55", b"\x12"]
 payloads = st.lists(st.sampled_from(PIECES), max_size=40).map(b"".join)
-
-
-def test_published_instruction_packets() -> None:
-    for packet_id, instruction, parameters, expected in INSTRUCTIONS:
-        assert frame(packet_id, instruction, bytes.fromhex(parameters)) == bytes.fromhex(expected)
-
-
-@pytest.mark.parametrize(
-    ("packet_id", "instruction", "parameters", "misprint"),
-    [
-        # Printed with the CRC of the fast sync read example.
-        (BROADCAST, framing.FAST_BULK_READ, "0384000400 077C000200 0492000100", "20F2"),
-    ],
-)
-def test_published_packets_whose_printed_crc_is_wrong(
-    packet_id: int, instruction: int, parameters: str, misprint: str
-) -> None:
-    packet = frame(packet_id, instruction, bytes.fromhex(parameters))
-    head = bytes((packet_id, len(packet) - 7, 0, instruction))
-    assert packet[4:-2] == head + bytes.fromhex(parameters)
-    sdk = sdk_handler(2.0).updateCRC(0, packet, len(packet) - 2)
-    assert packet[-2:] == sdk.to_bytes(2, "little") != bytes.fromhex(misprint)
 
 
 @given(st.binary(max_size=300))
@@ -104,15 +39,6 @@ def test_stuffing_is_undone_and_leaves_no_header(body: bytes) -> None:
         at = packet.find(b"\xff\xff\xfd", at + 1)
     (parsed,) = PacketParser().feed(packet, 0.0)
     assert parsed.parameters == body
-
-
-def test_stuffing_of_goal_current_minus_one_and_goal_velocity_minus_three() -> None:
-    goals = (-1).to_bytes(2, "little", signed=True) + (-3).to_bytes(4, "little", signed=True)
-    packet = frame(1, framing.WRITE, b"\x66\x00" + goals)
-    assert packet[8:-2] == bytes.fromhex("6600 FFFF FDFD FFFFFF")
-    assert packet[5] == len(packet) - 7
-    (parsed,) = PacketParser().feed(packet, 0.0)
-    assert parsed.parameters[2:] == goals
 
 
 @given(

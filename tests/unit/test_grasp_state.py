@@ -65,35 +65,6 @@ def test_levers_are_the_torques_that_balance_the_grasp(grasp: Grasp, delta: floa
     assert rest == pytest.approx([shear, *forces.normal], rel=2e-3, abs=1e-8)
 
 
-@pytest.mark.parametrize("delta", [0.0, 0.06, -0.12])
-def test_object_turns_as_predicted(grasp: Grasp, delta: float) -> None:
-    state = grasp.symmetric(0.0035)
-    if delta:
-        state = grasp.steer(state, delta)
-    _, _, turn1, turn2, _, width, _ = motion_of(state)
-    small = 1e-4
-    turned = grasp.steer(state, small, steps=2).pose[2] - state.pose[2]
-    assert turned / small == pytest.approx(turn1 + turn2, rel=0.02)
-    assert width == pytest.approx(WIDTH, rel=1e-12)
-
-
-def test_arms_and_slide_are_the_derivatives_of_what_the_tips_share() -> None:
-    def both(q1: float, q2: float, angle: float) -> float:
-        tips = HAND.tips([q1, q2])
-        return -float((tips[1] - tips[0]) @ [math.cos(angle), math.sin(angle)])
-
-    at = (0.12, 0.21, -0.1)
-    arm1, arm2, _, _, slide, _, _ = held_motion(at[:2], (3e-3, 4e-3), at[2], 0.0, LENGTHS)
-    step = 1e-6
-    slopes = []
-    for j in range(3):
-        ahead, behind = list(at), list(at)
-        ahead[j] += step
-        behind[j] -= step
-        slopes.append((both(*ahead) - both(*behind)) / (2.0 * step))
-    assert [arm1, arm2, slide] == pytest.approx(slopes, rel=1e-8)
-
-
 def test_levers_without_contacts_are_zero(grasp: Grasp) -> None:
     motion = held_motion((0.1, 0.1), (0.0, 1e-3), 0.0, 0.0, LENGTHS)
     data = grasp.table.data

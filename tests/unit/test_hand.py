@@ -232,17 +232,6 @@ def test_torque_goes_off_by_itself_at_the_time_set():
 # Scenes.
 
 
-def test_one_finger_alone_has_the_object_fixed():
-    settings = Settings.model_validate({"scene": {"fingers": ("right",)}})
-    hand = SimulatedHand(settings, table=PAPER)
-    pose = hand.object_pose.copy()
-    settled(hand, (0.9, 0.9), 0.5)
-    np.testing.assert_array_equal(hand.object_pose, pose)
-    assert hand.force[1] > 5.0
-    assert hand.force[0] == 0.0
-    assert hand.d[0] == 0.0
-
-
 def test_scripted_compression_presses_both_tips_in_turn_to_eight_millimetres():
     settings = Settings.model_validate(
         {"servos": {"backend": "none"}, "simulation": {"compression_speed": 0.01}}
@@ -274,31 +263,6 @@ def test_without_servos_and_script_the_joints_stay():
     np.testing.assert_array_equal(hand.q, settings.hand.open_angle)
     # Friction's rest is viscous, so that it creeps to where the tip bears the whole push.
     assert hand.force[1] == pytest.approx(0.5, rel=0.1)
-
-
-def test_tips_roll_over_the_ends_of_the_object():
-    hand = make(object_height=0.02)
-    geometry = ReferenceHand()
-    tip = geometry.tips((0.15, 0.15))[0]
-    for height in np.linspace(0.05, 0.11, 25):
-        place(hand, (0.15, 0.15), (0.0, height, 0.0))
-        # The rectangle's point nearest to the tip's centre.
-        point = np.array([-0.02, np.clip(tip[1], height - 0.01, height + 0.01)])
-        way = point - tip
-        distance = np.hypot(*way)
-        assert hand.d[0] == pytest.approx(0.020 - distance, abs=1e-15)
-        angle = math.atan2(way[1], way[0]) + 0.15
-        assert hand.theta[0] == pytest.approx(angle, abs=1e-12)
-        assert (hand.force[0] > 0) == (distance < 0.020)
-
-
-def test_object_turned_by_a_right_angle_is_touched_on_its_other_faces():
-    hand = make()
-    place(hand, (0.05, 0.05), (0.0, 0.08, 0.5 * math.pi))
-    geometry = ReferenceHand()
-    expected = geometry.contacts((0.05, 0.05), (0.0, 0.08, 0.0), 0.060)
-    np.testing.assert_allclose(hand.d, expected.d, atol=1e-12)
-    np.testing.assert_allclose(hand.theta, expected.theta, atol=1e-12)
 
 
 # Time.

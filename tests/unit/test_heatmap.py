@@ -8,7 +8,7 @@ from rich.color import ColorTriplet
 from rich.style import Style
 
 from softfinger.tools.terminal import heatmap
-from softfinger.tools.terminal.heatmap import Depth, FullScale, fit, picture, resample, round_up
+from softfinger.tools.terminal.heatmap import Depth, FullScale, fit, picture, resample
 
 
 def lightness(colour: ColorTriplet) -> float:
@@ -56,17 +56,6 @@ def test_row_0_is_lowest_and_column_0_is_left() -> None:
     ]
 
 
-def test_every_line_is_as_wide_as_asked() -> None:
-    rng = np.random.default_rng(2)
-    depths: tuple[Depth, ...] = ("any", "fixed", "none")
-    for depth in depths:
-        for rows, cols, lines, columns in ((44, 44, 11, 22), (16, 16, 30, 61), (7, 5, 2, 3)):
-            grid = rng.normal(size=(rows, cols))
-            grid[0, 0] = np.nan
-            drawn = picture(grid, 0.5, lines, columns, depth)
-            assert [len(line) for line in drawn] == [columns] * lines
-
-
 def test_fit_keeps_cells_square() -> None:
     assert fit(44, 44, 11, 22) == (11, 22)
     assert fit(44, 44, 11, 60) == (11, 22)
@@ -74,12 +63,6 @@ def test_fit_keeps_cells_square() -> None:
     assert fit(10, 40, 11, 22) == (3, 22)
     assert fit(256, 4, 11, 22) == (11, 1)
     assert fit(12, 32, 11, 22, 32 / 12) == (11, 22)  # oblong cells of a square sensor
-
-
-def test_round_up() -> None:
-    assert [round_up(v) for v in (0.9, 1.0, 1.01, 41e3, 9.9e-7)] == pytest.approx(
-        [0.9 / 0.9, 1.0, 1.5, 50e3, 1e-6]
-    )
 
 
 def test_scale_grows_at_once_and_shrinks_late() -> None:

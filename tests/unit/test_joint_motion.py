@@ -10,10 +10,9 @@ from typing import Any
 import pytest
 
 from softfinger.daemon.loop.build import Daemon
-from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.safety.joint_motion import JointMotion
 from softfinger.daemon.types import Reading
-from tests.harness.loop import Make, advance_to, command, grasped
+from tests.harness.loop import Make, advance_to, command, grasped, refusal
 
 TICK = 0.002
 COUNT = 2.0 * math.pi / 4096
@@ -161,6 +160,8 @@ def test_grips_turns_rests_and_pushes_are_believed(make: Make, mode: str) -> Non
     hand.apply_load(0.0, 0.0)
     command(daemon, "grasp", force=6.0)
     advance_to(daemon, "holding", 6.0)
+    daemon.loop.advance(0.5)
+    assert [c.force for c in daemon.loop.state.contacts] == pytest.approx([6.0, 6.0], rel=0.05)
     for angle in (0.1, -0.1, 0.0):
         command(daemon, "rotate", angle=angle)
         daemon.loop.advance(1.5)
@@ -173,13 +174,14 @@ def test_grips_turns_rests_and_pushes_are_believed(make: Make, mode: str) -> Non
     assert daemon.loop.state.fault_name == ""
 
 
-def test_position_mode_knows_nothing_of_the_current_it_should_take() -> None:
-    settings = Settings.model_validate(
-        {"loop": {"clock": "virtual"}, "servos": {"mode": "position", "model": "XL430-W250"}}
-    )
-    with Daemon(settings, wire=False) as daemon:
-        daemon.loop.advance(0.1)
-        command(daemon, "arm")
-        command(daemon, "move", left=0.3, right=0.3)
-        daemon.loop.advance(2.0)
-        assert daemon.loop.state.fault_name == ""
+def test_position_mode_moves_and_knows_nothing_of_the_current_it_should_take(make: Make) -> None:
+    daemon = make(servos={"mode": "position", "model": "XL430-W250"})
+    command(daemon, "arm")
+    daemon.loop.advance(0.1)
+    assert "nothing bounds the current" in refusal(daemon, "grasp", force=8.0)
+    command(daemon, "move", left=0.05, right=-0.1)
+    daemon.loop.advance(1.0)
+    assert daemon.loop.state.reading.q == pytest.approx([0.05, -0.1], abs=0.01)
+    command(daemon, "move", left=0.3, right=0.3)  # onto the object
+    daemon.loop.advance(2.0)
+    assert daemon.loop.state.fault_name == ""

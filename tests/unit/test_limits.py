@@ -189,6 +189,7 @@ STRONG = {"contacts.0.force": 27.5, "contacts.1.force": 27.5}
 WARNINGS: dict[str, tuple[Changes, str]] = {
     "hand.force": ({"contacts.0.force": 12.0}, "left tip feels 12.0 N and the right one 5.0 N"),
     "joint.strained": ({"reading.current": [1.19, 0.3]}, "left joint grips with all of its 1.2 A"),
+    "tactile.misfit": ({"contacts.0.misfit": True}, "left tip feels fits no contact"),
     "servos.heat": ({"heat.1.time_to_limit": 42.0}, "right servo at 70 °C in 42 s"),
     "tip.force": (STRONG, "left tip at 27.5 N, above 27 N"),
 }

@@ -216,9 +216,3 @@ def test_nonnegative_least_squares_meets_its_optimality_conditions() -> None:
         np.testing.assert_allclose(
             nonnegative(matrix, right), nnls(matrix, right)[0], atol=1e-9, rtol=1e-9
         )
-
-
-def test_materials_compare_by_their_law() -> None:
-    assert Material.table_i() == Material.table_i()
-    assert hash(Material.table_i()) == hash(Material.table_i())
-    assert Material.constant(1e5) != Material.constant(2e5)

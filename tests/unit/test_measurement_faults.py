@@ -113,15 +113,6 @@ def test_a_sensor_lies_and_its_tip_feels_the_truth() -> None:
     assert lying.hand.measurement_faults[1]("gain", 9.0) == 1.0
 
 
-def test_counts_end_where_a_boards_do() -> None:
-    press = Press()
-    press.pressed(1)
-    press.faults.begin("drift", -1.0, press.clock.now())
-    assert press.frames(2)[-1].max() == 0
-    press.faults.begin("drift", 1.0, press.clock.now())
-    assert press.frames(2)[-1].min() == press.settings.tactile.full_count
-
-
 def test_frames_are_repeated_with_new_numbers() -> None:
     press = Press()
     kept = press.pressed(20)
@@ -135,13 +126,6 @@ def test_frames_are_repeated_with_new_numbers() -> None:
     ]
     press.faults.clear()
     assert press.frames(3)[-1].sum() > kept[-1].sum()
-
-
-def test_a_sensor_that_repeats_from_the_start_repeats_its_first_frame() -> None:
-    press = Press()
-    press.faults.begin("replay", 3.0, 0.0)
-    frames = press.pressed(3)
-    assert not any(each.any() for each in frames)
 
 
 def test_each_sensor_has_its_gain() -> None:

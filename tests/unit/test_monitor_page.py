@@ -53,23 +53,10 @@ def test_fills_the_terminal_exactly(size: tuple[int, int]) -> None:
         assert part in text
 
 
-def test_maps_grow_with_the_terminal() -> None:
-    pixels = [shown(fed(), width=w, height=h).count("▀") for w, h in ((80, 24), (120, 40))]
-    assert pixels[1] > 3 * pixels[0]
-
-
 @pytest.mark.parametrize("size", [(79, 24), (80, 23), (30, 8), (1, 1), (12, 3)])
 def test_too_small_says_so(size: tuple[int, int]) -> None:
     text = shown(fed(), width=size[0], height=size[1])
     assert size[0] < 30 or f"this is {size[0]} × {size[1]}" in text
-
-
-def test_units() -> None:
-    text = shown(fed())
-    assert "3.21±0.02  3.31±0.02 mm" in text
-    assert "12.34      12.34      mJ" in text
-    assert "24.06      25.21      °" in text
-    assert "12.0       12.0       ms" in text
 
 
 def test_nothing_known_shows_dashes() -> None:
@@ -88,15 +75,6 @@ def test_a_missing_finger_is_marked() -> None:
     assert "right not valid: all cells read above zero: tare" in text
     assert "right —" in text
     assert "left —" not in text
-
-
-def test_counts_where_the_scale_is_not_told() -> None:
-    feed = fed()
-    frame = fake_daemon.frame(1.0, 0)
-    del frame["scale"]
-    give(feed, b"hand/tactile", frame)
-    assert "counts" in shown(feed)
-    assert "kPa" not in shown(feed)
 
 
 def test_numbers_of_any_size_keep_the_columns() -> None:

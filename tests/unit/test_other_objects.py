@@ -133,8 +133,6 @@ def test_a_disc_is_held_and_turned_by_the_line_between_its_contacts() -> None:
         assert rig.state.fault == ""
         tips = HAND.tips(rig.plant.q)
         line = math.atan2(*(tips[1] - tips[0])[::-1])
-        angle, _, _ = HAND.object_from_contacts(rig.plant.q, rig.plant.d, rig.plant.theta)
-        assert angle == pytest.approx(line, abs=0.005)
         # The estimator takes the contacts for less tilted than they are.
         assert rig.state.object.angle == pytest.approx(0.8 * line, abs=0.01)
         # The disc itself has rolled on between the tips.

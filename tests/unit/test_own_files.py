@@ -46,29 +46,25 @@ def shared(tmp_path: Path) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("write", [write_text, write_bytes])
-def test_anothers_link_is_not_followed(
-    shared: Path, strangers: Callable[[Path], None], write: Callable[[Path], object]
+@pytest.mark.parametrize("write", [write_text, write_bytes, lambda path: EventLog(file=path)])
+@pytest.mark.parametrize("linked", [True, False])
+def test_anothers_link_is_not_followed_and_anothers_file_left_alone_where_all_may_write(
+    shared: Path,
+    strangers: Callable[[Path], None],
+    write: Callable[[Path], object],
+    linked: bool,
 ) -> None:
-    victim = shared.parent / "victim"
+    named = shared / "run.csv"
+    victim = shared.parent / "victim" if linked else named
     victim.write_text("precious")
-    link = shared / "run.csv"
-    link.symlink_to(victim)
-    strangers(link)
-    with pytest.raises(PermissionError, match="a link, of another user"):
-        write(link)
+    if linked:
+        named.symlink_to(victim)
+    strangers(named)
+    with pytest.raises(
+        PermissionError, match="a link, of another user" if linked else "of another"
+    ):
+        write(named)
     assert victim.read_text() == "precious"
-
-
-def test_anothers_file_where_all_may_write_is_left_alone(
-    shared: Path, strangers: Callable[[Path], None]
-) -> None:
-    file = shared / "run.csv"
-    file.write_text("theirs")
-    strangers(file)
-    with pytest.raises(PermissionError, match="of another user"):
-        write_text(file)
-    assert file.read_text() == "theirs"
 
 
 def test_own_files_and_links_are_written_as_ever(shared: Path) -> None:
@@ -100,38 +96,27 @@ def test_a_file_appears_whole_or_not_at_all(
     assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [("kept", b"before")]
 
 
-def test_the_event_log_uses_it(shared: Path, strangers: Callable[[Path], None]) -> None:
-    victim = shared.parent / "victim"
-    victim.write_text("precious")
-    (shared / "log").symlink_to(victim)
-    strangers(shared / "log")
-    with pytest.raises(PermissionError):
-        EventLog(file=shared / "log")
-    assert victim.read_text() == "precious"
-
-
-@pytest.mark.parametrize("mode", [0o777, 0o1777])
-def test_a_folder_in_which_others_may_write_is_not_the_stand_in_hands(
-    tmp_path: Path, mode: int
+@pytest.mark.parametrize(
+    ("mode", "told"),
+    [
+        (0o777, "may be written by others"),
+        (0o1777, "may be written by others"),
+        (0o700, "belongs to user"),
+        (None, "found a link"),
+    ],
+)
+def test_what_is_not_the_users_own_folder_is_not_the_stand_in_hands(
+    tmp_path: Path, strangers: Callable[[Path], None], mode: int | None, told: str
 ) -> None:
     folder = tmp_path / "hand"
-    folder.mkdir()
-    folder.chmod(mode)
-    with pytest.raises(FolderError, match="may be written by others"):
-        LinkFolder(folder)
-
-
-def test_anothers_folder_or_link_is_not_the_stand_in_hands(
-    tmp_path: Path, strangers: Callable[[Path], None]
-) -> None:
-    link = tmp_path / "link"
-    link.symlink_to(tmp_path)
-    with pytest.raises(FolderError, match="found a link"):
-        LinkFolder(link)
-    folder = tmp_path / "hand"
-    folder.mkdir(mode=0o700)
-    strangers(folder)
-    with pytest.raises(FolderError, match="belongs to user"):
+    if mode is None:
+        folder.symlink_to(tmp_path)
+    else:
+        folder.mkdir()
+        folder.chmod(mode)
+        if mode == 0o700:
+            strangers(folder)
+    with pytest.raises(FolderError, match=told):
         LinkFolder(folder)
 
 

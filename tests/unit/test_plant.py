@@ -118,17 +118,6 @@ def gradient_of_one_energy(table, depth, scene):
     assert checked > 15
 
 
-def test_friction_bounds_the_shear():
-    generator = np.random.default_rng(4)
-    for _ in range(60):
-        friction = generator.uniform(0, 2)
-        hand = make(tip_friction=friction)
-        q, angle = generator.uniform(0.1, 0.2), generator.uniform(-0.3, 0.3)
-        tip = tip_at(hand, 0, q, np.array([-0.002, 0.08, angle]), generator.normal() * 5e-3)
-        assert tip.normal > 0
-        assert abs(tip.tangential) <= friction * tip.normal * (1 + 1e-12)
-
-
 # Energy.
 
 

@@ -15,7 +15,6 @@ from softfinger.daemon.simulation.sensor.simulated_tactile import SimulatedTacti
 from tests.harness.plant import (
     BOUNDED,
     CONSTANT,
-    LOSSLESS,
     MODULUS,
     PAPER,
     TABLE_I,
@@ -145,23 +144,6 @@ def test_curvature_softens_the_contact_as_the_springs_themselves_say(curved, upr
     assert springs_on_a_cylinder(1e-4, 0.3, curved) == pytest.approx((share,) * 2, rel=1e-3)
 
 
-def test_what_the_two_contacts_tell_of_a_wedge_and_a_disc():
-    for taper in (0.2, -0.3):
-        hand = make(object_shape="wedge", object_taper=taper)
-        place(hand, (0.2, 0.17), (0.001, 0.08, 0.05))
-        angle, width, disagreement = HAND.object_from_contacts(hand.q, hand.d, hand.theta)
-        assert angle == pytest.approx(0.05, abs=1e-12)  # the bisector of the faces
-        assert disagreement == pytest.approx(-taper, abs=1e-12)  # and the angle between them
-        tips = HAND.tips(hand.q) - hand.object_pose[:2]
-        assert width == pytest.approx(0.040 - taper * tips[:, 1].mean(), abs=1.5e-3)
-    hand = make(object_shape="disc", object_radius=0.02)
-    place(hand, (0.19, 0.19), (0.0, 0.0788, 0.7))
-    angle, width, disagreement = HAND.object_from_contacts(hand.q, hand.d, hand.theta)
-    # A disc has no angle: it is that of the line between the contacts.
-    assert (angle, disagreement) == pytest.approx((0, 0), abs=0.05)
-    assert width == pytest.approx(0.04, abs=1e-4)
-
-
 def test_a_disc_is_grasped_and_rolls_between_the_tips():
     hand = make(TABLE_I, object_shape="disc", object_radius=0.02)
     settled(hand, (0.9, 0.9), 0.4)
@@ -224,48 +206,6 @@ def test_tips_press_each_other_as_each_a_plane_midway():
     assert torque == pytest.approx(CONSTANT * 0.5, rel=1e-6)
 
 
-def test_mutual_forces_are_the_gradient_of_both_tips_energy():
-    hand = make(TABLE_I, object_shape="none", tip_friction=500.0)
-    generator = np.random.default_rng(5)
-    step = 1e-7
-
-    def at(q, shears):
-        hand.plant.state.extra_shear[-2:] = shears
-        place(hand, q, (0.0, 0.08, 0.0))
-        by_shear = [tip.rows[2, :2].copy() for tip in hand.plant.stages[0].on_tip]
-        return hand.energy(), hand.plant.forces[:2].copy(), by_shear
-
-    for _ in range(100):
-        q = generator.uniform(0.42, 0.5, 2)
-        shears = generator.uniform(-1e-3, 1e-3, 2)
-        _, forces, by_shear = at(q, shears)
-        assert hand.d[0] > 0.001
-        move = generator.normal(size=2)
-        rolled = np.array([row @ move for row in by_shear])
-        high = at(q + step * move, shears + step * rolled)[0]
-        low = at(q - step * move, shears - step * rolled)[0]
-        assert -forces @ move == pytest.approx((high - low) / (2 * step), rel=1e-5, abs=1e-6)
-
-
-@pytest.mark.parametrize("friction", [0.0, 0.3, 50.0])
-def test_tips_that_collide_keep_energy_and_part_again(friction):
-    hand = make(**{**LOSSLESS, "object_shape": "none", "tip_friction": friction})
-    place(hand, (0.36, 0.33), (0.0, 0.08, 0.0), (1.5, 1.2))
-    start, met = hand.energy(), 0.0
-    while hand.t < 0.3:
-        energy = hand.energy()
-        hand.advance(hand.t + 1.5 * hand.step)
-        assert hand.energy() < energy * (1 + 1e-5)
-        met = max(met, hand.d[0])
-    assert met > 0.002
-    assert hand.d[0] < 0.0
-    assert hand.dq.max() < 0.0
-    if (
-        friction != 0.3
-    ):  # without friction, or without slip, nothing is lost but what the shear held
-        assert hand.energy() == pytest.approx(start, rel=0.05)
-
-
 def test_an_object_keeps_the_tips_apart_until_it_is_gone():
     hand = make()
     settled(hand, (0.9, 0.9), 0.4, 1.0)
@@ -320,26 +260,6 @@ def test_an_object_sticks_to_the_palm_below_friction_and_slides_above():
             assert hand.object_pose[0] == pytest.approx(at, abs=1e-9)
 
 
-def test_a_disc_rolls_down_an_incline():
-    slope = 0.2
-    hand = make(
-        object_shape="disc",
-        object_radius=0.03,
-        palm=0.05,
-        palm_friction=0.5,
-        table_friction=0.0,
-        gravity=(GRAVITY * math.sin(slope), -GRAVITY * math.cos(slope)),
-    )
-    place(hand, (-0.5, -0.5), (-0.02, 0.08, 0.0))
-    run(hand, 0.12)
-    speed = hand.object_velocity[0]
-    run(hand, 0.05)
-    assert (hand.object_velocity[0] - speed) / 0.05 == pytest.approx(
-        2 / 3 * GRAVITY * math.sin(slope), rel=0.01
-    )
-    assert hand.object_velocity[0] == pytest.approx(-0.03 * hand.object_velocity[2], rel=0.01)
-
-
 # What goes wrong is told.
 
 
@@ -357,13 +277,3 @@ def test_a_long_wedge_whose_faces_meet_is_refused():
         ValueError, match=r"found simulation\.object_width 0\.002 m, expected above"
     ):
         shape(object_shape="wedge", object_width=0.002)
-
-
-def test_scenes_pay_only_for_what_they_have():
-    # Neither rows of the palm nor of tips on each other enter the matrix of a grasp.
-    hand = make()
-    settled(hand, (0.9, 0.9), 0.4, 1.0)
-    assert not hand.plant.coupled
-    assert not hand.plant.tips_near
-    # Where the joints' friction turns over, a step may be cut by some 1e-8 J.
-    assert hand.plant.guarded < 5

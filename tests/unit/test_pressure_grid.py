@@ -82,16 +82,6 @@ def test_cells_off_the_footprint_read_exactly_zero():
 
 @pytest.mark.parametrize(
     ("d", "degrees", "force"),
-    [(2, 0, 3.8201766667652), (4, 15, 15.819751632242), (8, 30, 70.578560861082)],
-)
-def test_the_cells_sum_to_the_closed_force(d, degrees, force):
-    grid = SensorGrid(44, 44, PITCH)
-    p = grid.pressure(TIP, LINEAR, d * 1e-3, math.radians(degrees))
-    assert p.sum() * PITCH**2 == pytest.approx(force, rel=5e-6)
-
-
-@pytest.mark.parametrize(
-    ("d", "degrees", "force"),
     [(8, 45, 81.266754123), (10, 35, 114.126873792), (12, 30, 153.849535079)],
 )
 @pytest.mark.parametrize("azimuth", [0.0, 0.5, math.pi / 2])
@@ -100,20 +90,6 @@ def test_beyond_the_limit_the_strain_ends_at_the_rim(d, degrees, force, azimuth)
     p = grid.pressure(TIP, LINEAR, d * 1e-3, *tilts(math.radians(degrees), azimuth))
     assert p.sum() * PITCH**2 == pytest.approx(force, rel=2e-5)
     assert p.max() <= E * (1 + 1e-12)
-
-
-def test_moments_of_the_map_are_the_closed_ones():
-    grid = SensorGrid(44, 44, PITCH)
-    p = grid.pressure(TIP, LINEAR, 0.004, math.radians(15.0))
-    x = (np.arange(44) - 21.5) * PITCH
-    total = p.sum()
-    centroid = (p.sum(axis=0) * x).sum() / total
-    var_x = (p.sum(axis=0) * x**2).sum() / total - centroid**2 - PITCH**2 / 12
-    var_y = (p.sum(axis=1) * x**2).sum() / total - PITCH**2 / 12
-    # Moments of cell averages keep a discretisation error of a few 1e-5.
-    assert centroid == pytest.approx(4.8312888419137e-3, rel=1e-4)
-    assert var_x == pytest.approx(23.6958660463e-6, rel=3e-4)
-    assert var_y == pytest.approx(25.3333333333e-6, rel=3e-4)
 
 
 @settings(max_examples=40)

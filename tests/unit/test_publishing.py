@@ -8,14 +8,10 @@ import pytest
 
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.loop.publishing import Publishing, every, plan
-from softfinger.daemon.loop.timing import Statistics
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import State
-from softfinger.daemon.wire.packer import message_maker
 from softfinger.daemon.wire.publisher import bit
 from softfinger.daemon.wire.schema import STATE, STATS, TACTILE, Rates
-
-stats_message = message_maker(STATS)
 
 
 class Listener:
@@ -89,31 +85,3 @@ def test_a_rate_is_the_nearest_whole_number_of_ticks(
     settings = Settings.model_validate({"loop": {"rate": rate}, "stream": {"state_rate": wanted}})
     assert every(rate, wanted) == ticks
     assert f"hand/state ({rate / ticks:.4g} Hz)" in plan(settings)
-
-
-def test_the_plan_names_every_rate() -> None:
-    told = plan(Settings.model_validate({"stream": {"tactile_rate": 25.0}}))
-    for words in (
-        "every tick (500 Hz)",
-        "frames as they come (100 Hz)",
-        "every 5 ticks hand/state (100 Hz)",
-        "every 4 frames hand/tactile (25 Hz)",
-        "every 500 ticks hand/stats (1 Hz)",
-    ):
-        assert words in told
-    blind = plan(Settings.model_validate({"tactile": {"backend": "none"}}))
-    assert "frames" not in blind
-
-
-def test_statistics_that_are_zero_are_still_floats() -> None:
-    message = stats_message(
-        State(), 0.002, Rates(0.0, 0.0, 0.0, 0.0, 0.0), 0, Statistics().spreads()
-    )
-    for name in ("wake", "compute", "bus", "publish"):
-        assert [type(message[name][key]) for key in ("p50", "p99", "p999", "max")] == [float] * 4
-    assert all(isinstance(rate, float) for rate in message["rates"].values())
-
-
-def test_the_loop_counts_the_times_of_each_tick() -> None:
-    _, daemon = listened(0.5)
-    assert daemon.loop.statistics.ticks == daemon.loop.state.seq == 250

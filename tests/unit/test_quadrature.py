@@ -98,37 +98,6 @@ def test_more_nodes_change_nothing_anywhere(depth: float, share: float) -> None:
 
 
 @given(
-    depth=st.floats(5e-8, 0.999),
-    share=st.floats(-0.99999, 0.99999),
-    scale=st.floats(5e-3, 50.0),
-    modulus=st.floats(1e-5, 1e4),
-)
-def test_scaling_evenness_and_identities(
-    depth: float, share: float, scale: float, modulus: float
-) -> None:
-    d = depth * TIP.radius
-    theta = float(TIP.theta_limit(d)) * share
-    c = integrate(TIP, TABLE_I, d, theta)
-    large = Fingertip(scale * TIP.radius)
-    # Rounding of θ's limit at the other scale must not decide.
-    other = integrate(large, TABLE_I, scale * d, theta)
-    np.testing.assert_allclose(other.force, scale**2 * c.force, rtol=1e-11)
-    np.testing.assert_allclose(other.energy, scale**3 * c.energy, rtol=1e-11)
-    mirrored = integrate(TIP, TABLE_I, d, -theta)
-    assert (mirrored.force, mirrored.energy) == (c.force, c.energy)
-    assert mirrored.energy_theta == -c.energy_theta
-    np.testing.assert_allclose(c.energy_d, c.force / np.cos(theta), rtol=1e-14)
-    assert 0 < c.energy < c.energy_d * d  # the push rises with d
-    assert c.force_d > 0
-    assert c.energy_theta * theta >= 0
-    assert c.energy >= integrate(TIP, TABLE_I, d, 0.0).energy * (1 - 1e-14)
-    stiffer = Material(tuple(value * int(modulus * 1e6) for value in TABLE_I.coefficients))
-    np.testing.assert_allclose(
-        integrate(TIP, stiffer, d, theta).force, int(modulus * 1e6) * c.force, rtol=1e-13
-    )
-
-
-@given(
     slopes=st.lists(st.floats(0.05, 20.0), min_size=2, max_size=7),
     depth=st.floats(5e-8, 0.999),
     share=st.floats(-1.0, 1.0).map(lambda share: share * (1 - 1e-9)),

@@ -74,15 +74,6 @@ def test_a_press_and_its_release_follow_the_prony_terms() -> None:
     assert (force[falling] < lasting[falling]).any()
 
 
-def test_an_elastic_tip_is_as_it_was() -> None:
-    hand = pressed(tip_relaxation=(0.0, 0.0, 0.0))
-    for k in range(1, 2000):
-        hand.advance(1e-3 * k)
-        d = max(float(hand.d[0]), 0.0)
-        expected = float(hand.table(d, float(hand.theta[0])).force) if d > 0.0 else 0.0
-        assert float(hand.force[0]) == pytest.approx(expected, rel=1e-12, abs=1e-12)
-
-
 def test_relaxing_tips_make_no_energy() -> None:
     """A free object between relaxing tips that bounce without other losses comes to rest."""
     settings = Settings.model_validate(

@@ -5,10 +5,7 @@ from __future__ import annotations
 import struct
 from typing import Any
 
-import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
@@ -167,15 +164,6 @@ def test_an_old_firmware_does_not_know_fast_reads() -> None:
     assert len(new.send(BROADCAST, framing.FAST_SYNC_READ, request)) == 8 + 2 * 8
 
 
-def test_fast_sync_read_is_not_stuffed() -> None:
-    c = client(prepared=True)
-    for servo in c.bus.servos:
-        servo.table.memory[reg.GOAL_CURRENT : reg.GOAL_CURRENT + 6] = hexes("FFFFFDFFFFFF")
-    span = struct.pack("<HHB", reg.GOAL_CURRENT, 6, 1)
-    assert c.send(BROADCAST, framing.FAST_SYNC_READ, span)[8:-2] == hexes("0001 FFFFFDFFFFFF")
-    assert c.send(BROADCAST, framing.SYNC_READ, span)[8:-2] == hexes("00 FFFFFDFDFFFFFF")
-
-
 def test_a_damaged_packet_is_met_with_silence() -> None:
     damaged = bytearray(frame(1, framing.READ, struct.pack("<HH", 132, 4)))
     damaged[-1] ^= 1
@@ -257,20 +245,6 @@ def test_directions_and_zeros_of_the_settings() -> None:
         hand_bus(servos={"model": "XL330-M288"}, baud=4_500_000)
 
 
-def test_the_same_run_twice_is_the_same_to_the_bit() -> None:
-    def run() -> tuple[bytes, bytes]:
-        c = client(prepared=True)
-        out = b""
-        c.write(reg.TORQUE_ENABLE, 1, 1)
-        for i in range(200):
-            c.write(reg.GOAL_POSITION, 300 + i % 7, 4)
-            c.later(0.002)
-            out += c.send(BROADCAST, framing.FAST_SYNC_READ, struct.pack("<HHBB", 120, 27, 1, 2))
-        return out, np.array(c.bus.plant.q).tobytes()
-
-    assert run() == run()
-
-
 def test_a_reading_may_lag_behind_the_plant_but_neither_writes_nor_watchdogs_do() -> None:
     c = client(prepared=True)
     bus = c.bus
@@ -294,36 +268,6 @@ def test_a_reading_may_lag_behind_the_plant_but_neither_writes_nor_watchdogs_do(
 
 
 # --- anything at all -------------------------------------------------------------------------
-
-
-@given(
-    st.lists(
-        st.tuples(
-            st.sampled_from([0, 1, 2, 9, BROADCAST]),
-            st.integers(0, 255),
-            st.one_of(
-                st.binary(max_size=30),
-                st.builds(
-                    lambda address, body: address.to_bytes(2, "little") + body,
-                    st.integers(0, 700),
-                    st.binary(max_size=24),
-                ),
-            ),
-        ),
-        max_size=12,
-    )
-)
-def test_any_packets_are_survived_and_answered_in_form(
-    packets: list[tuple[int, int, bytes]],
-) -> None:
-    bus = make_bus()
-    for step, content in enumerate(packets):
-        reply = bus.feed(frame(*content), step * 0.02)
-        if content[1] not in (framing.FAST_SYNC_READ, framing.FAST_BULK_READ):
-            parser = PacketParser()
-            found = parser.feed(reply, 0.0)
-            assert sum(packet.size for packet in found) == len(reply)
-            assert all(p.valid and p.instruction == framing.STATUS for p in found)
 
 
 def test_thousands_of_mutated_packets_neither_crash_nor_hang() -> None:

@@ -12,8 +12,7 @@ from typing import Any, Protocol
 import pytest
 
 from softfinger.daemon.clock import Clock, VirtualClock
-from softfinger.daemon.errors import Refused, ServoError
-from softfinger.daemon.loop.build import Daemon
+from softfinger.daemon.errors import ServoError
 from softfinger.daemon.profile.settings import ServoSettings, Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos import dynamixel
@@ -218,16 +217,6 @@ def test_torque_off_and_close_let_go(make, mode):
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_values_are_whole_counts(make, mode):
-    rig = make(mode)
-    armed(rig)
-    for reading in ticks(rig, Goal(q=[0.05, -0.05], current=[0.3, 0.3]), 0.05):
-        for value, unit in [(reading.q, COUNT), (reading.current, CURRENT_UNIT)]:
-            counts = [each / unit for each in value]
-            assert counts == pytest.approx([round(count) for count in counts], abs=1e-6)
-
-
-@pytest.mark.parametrize("mode", MODES)
 def test_a_finger_that_is_not_in_the_scene_stays_zero(make, mode):
     rig = make(mode, scene={"fingers": ("right",)})
     armed(rig)
@@ -235,13 +224,6 @@ def test_a_finger_that_is_not_in_the_scene_stays_zero(make, mode):
     assert reading.q[0] == reading.dq[0] == reading.current[0] == 0.0
     assert reading.q[1] == pytest.approx(-0.1, abs=0.01)
     assert rig.torque() == [False, True]
-
-
-def test_counters_are_there_and_zero(make):
-    rig = make()
-    armed(rig)
-    counters = rig.servos.counters()
-    assert counters["timeouts"] == counters["crc"] == 0
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -253,46 +235,6 @@ def test_a_model_that_senses_no_current_can_do_position_mode_alone(make, mode):
         return
     armed(rig)
     assert ticks(rig, Goal(q=[0.08, -0.1]), 0.5)[-1].q == pytest.approx([0.08, -0.1], abs=0.01)
-
-
-# What the daemon does with them.
-
-
-def virtual(mode: str) -> Settings:
-    return Settings.model_validate(
-        {"loop": {"clock": "virtual"}, "servos": {"mode": mode}, "material": {"law": "constant"}}
-    )
-
-
-@pytest.mark.parametrize("mode", BOUNDED)
-def test_the_daemon_grasps(mode):
-    with Daemon(virtual(mode), wire=False) as daemon:
-        loop = daemon.loop
-        loop.advance(0.1)
-        loop.command({"command": "arm"})
-        loop.advance(0.1)
-        loop.command({"command": "grasp", "force": 8.0})
-        loop.advance(3.0)
-        assert (loop.state.mode, loop.state.fault) == ("holding", "")
-        assert [c.force for c in loop.state.contacts] == pytest.approx([8.0, 8.0], rel=0.05)
-        loop.command({"command": "release"})
-        loop.advance(1.5)
-        assert loop.state.mode == "armed"
-        assert loop.state.reading.q == pytest.approx([0.0, 0.0], abs=0.03)
-        assert not any(contact.contact or contact.force for contact in loop.state.contacts)
-
-
-def test_nothing_is_grasped_in_position_mode_but_the_joints_move():
-    with Daemon(virtual("position"), wire=False) as daemon:
-        loop = daemon.loop
-        loop.advance(0.1)
-        loop.command({"command": "arm"})
-        loop.advance(0.1)
-        with pytest.raises(Refused, match="nothing bounds the current"):
-            loop.command({"command": "grasp", "force": 8.0})
-        loop.command({"command": "move", "left": 0.05, "right": -0.1})
-        loop.advance(1.0)
-        assert loop.state.reading.q == pytest.approx([0.05, -0.1], abs=0.01)
 
 
 # Current mode's own loop, and what position mode checks.

@@ -124,21 +124,6 @@ def test_watchdog_can_be_left_off():
     assert bench.hand.force.min() > 5
 
 
-def test_close_takes_torque_off_and_reads_fail_after_it():
-    bench = Bench()
-    bench.grasp(0.5, 0.5)
-    q = list(bench.reading.q)
-    bench.servos.close()
-    bench.servos.close()
-    bench.hand.advance(bench.clock.now() + 0.05)
-    assert np.abs(bench.hand.current).max() < 1e-3
-    bench.servos.read(bench.reading)
-    assert not bench.reading.valid
-    assert bench.reading.q == q
-    with pytest.raises(ServoError, match="not connected"):
-        bench.servos.torque_on()
-
-
 # Tactile.
 
 
@@ -180,20 +165,6 @@ def test_frames_come_at_their_time_and_show_their_instant():
         assert estimate.tilt_x == pytest.approx(theta, abs=3e-3)
     assert frames > 10
     assert bench.hand.d[0] > 0.003
-
-
-def test_frames_nobody_asked_for_are_counted():
-    bench = Bench()
-    sensor = bench.sensors[1]
-    sensor.open()
-    bench.clock.sleep_until(0.5101)
-    frame = sensor.latest()
-    assert frame.seq == 51
-    assert frame.t_sample == pytest.approx(0.50)
-    assert sensor.counters()["frames"] == 51
-    sensor.close()
-    bench.clock.sleep_until(1.0)
-    assert sensor.latest() is frame
 
 
 def test_noise_is_as_set_and_equal_for_one_seed():

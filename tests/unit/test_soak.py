@@ -108,10 +108,3 @@ def test_a_name_is_judged_by_what_was_made_wrong(soak: Soak) -> None:
     soak.hand.refresh()
     soak._judge_witnesses("holding")
     soak._hear("warning", "witness.right_sensor", "")
-
-
-def test_what_was_never_judged_is_told() -> None:
-    account = Account()
-    assert account.never == list(virtual.ASSERTIONS)
-    account.judged.update(virtual.ASSERTIONS)
-    assert account.never == []

@@ -15,13 +15,11 @@ from softfinger import ContactTable, Fingertip, Material
 from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.profile.factory import make_table
 from softfinger.daemon.profile.settings import Settings
-from softfinger.kinematics.compiled.kernel import kernel
 from softfinger.kinematics.compiled.simd import SHAPES
 from softfinger.kinematics.contact.closed_form import closed_forms
 from softfinger.kinematics.contact.lookup import (
     START,
     TableError,
-    aligned,
     header_of,
     lookup,
     lookups,
@@ -169,14 +167,6 @@ def test_the_kernel_reads_what_the_layout_says(table: ContactTable) -> None:
         )
 
 
-def test_lookup_is_callable_from_kernels(table: ContactTable) -> None:
-    @kernel
-    def push(data: np.ndarray, d: float, theta: float) -> float:
-        return lookup(data, d, theta)[4]
-
-    assert push(table.data, 0.004, 0.2) == table(0.004, 0.2).energy_d
-
-
 @given(depth=st.floats(5e-8, 0.9999), share=st.floats(-1.0, 1.0))
 def test_properties(table: ContactTable, depth: float, share: float) -> None:
     d = depth * TIP.radius
@@ -207,15 +197,6 @@ def test_other_radii_and_moduli_scale(table: ContactTable, radius: float, modulu
     ratio = float(share) * scale**2
     for value, expected, power in zip(a, b[:6], (0, 1, -1, 0, 0, 1), strict=False):
         np.testing.assert_allclose(value, ratio * scale**power * expected, rtol=3e-12)
-
-
-def test_small_displacements_have_the_exponents_two_and_three(table: ContactTable) -> None:
-    d = TIP.radius * 10.0 ** np.arange(-8.0, -5.0)
-    c = table(d, 0.4)
-    np.testing.assert_allclose(d * c.force_d, 2 * c.force, rtol=1e-7)
-    np.testing.assert_allclose(d * c.energy_d, 3 * c.energy, rtol=1e-7)
-    np.testing.assert_allclose(np.diff(np.log10(c.force)), 2.0, rtol=1e-7)
-    np.testing.assert_allclose(np.diff(np.log10(c.energy)), 3.0, rtol=1e-7)
 
 
 def test_the_edges_of_pieces_are_seamless(table: ContactTable) -> None:
@@ -357,10 +338,6 @@ def test_numbers_are_answered_as_arrays_are(forms: list[ContactTable]) -> None:
                 np.testing.assert_allclose(one[:6], [v[i] for v in many[:6]], rtol=1e-13)
 
 
-def test_a_table_built_anew_is_the_same(table: ContactTable) -> None:
-    np.testing.assert_array_equal(ContactTable.build(TIP, TABLE_I, 1e-9).data, table.data)
-
-
 def test_a_law_off_its_points_is_warned_of() -> None:
     with pytest.warns(RuntimeWarning, match=r"makes 11\.0% of F; expected 5% at most"):
         ContactTable.build(Fingertip(0.02), HARD["root"], 1e-6)
@@ -376,27 +353,6 @@ def test_refusals() -> None:
     for tolerance in (0.0, -1.0, 1.0, math.nan):
         with pytest.raises(TableError, match="between 0 and 1"):
             ContactTable.build(TIP, TABLE_I, tolerance)
-
-
-def test_aligned_arrays_are_zero_and_contiguous() -> None:
-    for size in (0, 1, 7, 100):
-        array = aligned(size)
-        assert array.size == size
-        assert array.ctypes.data % 64 == 0 or size == 0
-        assert not array.any()
-
-
-@pytest.mark.parametrize("material", [CONSTANT, TABLE_I])
-def test_the_energy_has_its_minimum_where_nothing_is_tilted(material: Material) -> None:
-    theta = np.radians(np.linspace(-25, 25, 101))
-    table = ContactTable.build(TIP, material, 1e-9)
-    for d in (0.002, 0.004, 0.008):
-        ours = table(d, theta)
-        assert ours.energy.argmin() == 50
-        assert np.all(np.diff(ours.energy[50:]) > 0)
-        assert np.all(np.diff(ours.energy[:51]) < 0)
-        assert ours.energy_theta[50] == 0.0
-        assert np.all(ours.energy_theta * theta >= 0)
 
 
 def test_hands_of_one_process_share_their_table() -> None:

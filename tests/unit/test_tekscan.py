@@ -44,53 +44,39 @@ def test_header_frames_times_and_missing_cells():
     assert export.values.tolist() == [[[0, 5, 0], [7, 255, 1]], [[1, 2, 0], [3, 4, 5]]]
 
 
-def test_a_misspelt_key_is_understood():
-    export = parse(EXPORT.replace("COL_SPACING 0.2 cm\n", "").replace("ROW_SPACING", "ROW_SPACIGN"))
-    assert export.pitch[1] == pytest.approx(1.27e-3)
+HEAD, FRAMES = EXPORT.split("Frame 4")
+SPREAD = "".join(f"{line},,\n" for line in HEAD.splitlines())
+SAME = {
+    "line ends and no end mark": EXPORT.removesuffix("@@\n").replace("\n", "\r\n"),
+    "a spreadsheet's commas": SPREAD + "Frame 4, 0,, 6:21:52 PM,,,Raw" + FRAMES,
+    "comments that look like a header": EXPORT.replace(
+        "UNITS RAW", "COMMENTS:\nunits were wrong, cols swapped\nsecond line\nUNITS RAW"
+    ),
+    "a misspelt key": EXPORT.replace("ROW_SPACING", "ROW_SPACIGN"),
+    "a unit spelt out": EXPORT.replace("1.27 mm", "0.127 centimeters"),
+    "another unit": EXPORT.replace("1.27 mm", "0.05 inches"),
+}
 
 
-def test_line_ends_and_a_missing_end_mark_make_no_difference():
-    again = parse(EXPORT.removesuffix("@@\n").replace("\n", "\r\n"))
-    assert np.array_equal(again.values, parse(EXPORT).values)
+@pytest.mark.parametrize("text", SAME.values(), ids=SAME)
+def test_other_programs_write_the_same_in_other_ways(text):
+    export = parse(text)
+    assert export.raw
+    assert export.pitch == pytest.approx((2e-3, 1.27e-3))
+    assert np.array_equal(export.values, parse(EXPORT).values)
 
 
 @pytest.mark.parametrize(
     ("unit", "pascal"),
     [
-        ("kPa", 1e3),
-        ("KPA", 1e3),
-        ("N/cm2", 1e4),
-        ("N/mm^2", 1e6),
-        ("PSI", 6894.757),
-        ("mmHg", 133.32239),
+        *(("kPa", 1e3), ("KPA", 1e3), ("N/cm2", 1e4)),
+        *(("N/mm^2", 1e6), ("PSI", 6894.757), ("mmHg", 133.32239)),
     ],
 )
 def test_pressures_are_told_in_pa(unit, pascal):
     export = parse(EXPORT.replace("UNITS RAW", f"UNITS {unit}").replace("255", "2.55"))
     assert not export.raw
     assert export.values[0, 1, 1] == pytest.approx(2.55 * pascal)
-
-
-@pytest.mark.parametrize(
-    ("written", "pitch"),
-    [("0.127 centimeters", 1.27e-3), ("1.27 millimeters", 1.27e-3), ("0.05 inches", 1.27e-3)],
-)
-def test_units_may_be_spelt_out(written, pitch):
-    found = parse(EXPORT.replace("1.27 mm", written)).pitch
-    assert found == pytest.approx((2e-3, pitch))
-
-
-def test_comments_are_no_header_and_what_stands_below_them_is():
-    comments = "COMMENTS:\nunits were wrong, cols swapped\nsecond line\nUNITS RAW"
-    export = parse(EXPORT.replace("UNITS RAW", comments))
-    assert export.raw
-    assert export.values.shape == (2, 2, 3)
-
-
-def test_a_spreadsheets_commas_make_no_difference():
-    head, frames = EXPORT.split("Frame 4")
-    spread = "".join(f"{line},,\n" for line in head.splitlines()) + "Frame 4, 0,, 6:21:52 PM,,,Raw"
-    assert np.array_equal(parse(spread + frames).values, parse(EXPORT).values)
 
 
 def test_a_single_frame_needs_no_frame_line():

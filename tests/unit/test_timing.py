@@ -33,19 +33,6 @@ def test_quantiles_are_those_of_the_samples_within_a_bin(count: int) -> None:
         assert spreads[name].max == rows[:, j].max()
 
 
-def test_the_middle_of_known_times() -> None:
-    rows = np.tile([[1e-6, 16e-6, 8e-6, 2e-6]], (1000, 1))
-    rows[990:, 0] = 1e-4
-    rows[999, 1] = 5e-3
-    spreads = fed(rows).spreads()
-    assert spreads["wake"].p50 == pytest.approx(1e-6, rel=0.032)
-    assert spreads["wake"].p99 == pytest.approx(1e-6, rel=0.032)
-    assert spreads["wake"].p999 == pytest.approx(1e-4, rel=0.032)
-    assert spreads["compute"].p999 == pytest.approx(16e-6, rel=0.032)
-    assert spreads["compute"].max == 5e-3
-    assert spreads["bus"].p99 == spreads["bus"].max == 8e-6
-
-
 def test_times_off_the_scale_are_counted() -> None:
     statistics = fed(np.array([[0.0, -1.0, 1e-12, 1e9], [math.nan, 1e9, 0.0, 1e9]]))
     assert statistics.ticks == 2
@@ -80,10 +67,3 @@ def test_keeping_them_allocates_nothing() -> None:
     finally:
         tracemalloc.stop()
     assert grown < 1000
-
-
-def test_the_table_names_each_time_in_microseconds() -> None:
-    lines = fed(np.full((10, 4), 12.5e-6)).table()
-    assert lines[0].split() == ["p50", "p99", "p99.9", "max", "µs"]
-    assert [line.split()[0] for line in lines[1:]] == list(TIMES)
-    assert lines[1].split()[1:] == ["12.5"] * 4

@@ -13,7 +13,6 @@ from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.kinematics.hand.upright import resting_ratio, upright_spring
-from softfinger.tools.benchmarks.control import EQUAL_TORQUES
 from softfinger.tools.watched import Watched
 from tests.harness.plant import CONSTANT, CURRENT, PAPER, WIDTH, make, push_along
 
@@ -144,11 +143,3 @@ def test_a_small_hand_brings_its_object_upright() -> None:
         hand.run(4.5)
         assert hand.mode == "holding"
         assert abs(math.degrees(hand.plant.object_pose[2])) < 0.3
-
-
-def test_equal_torques_alone_leave_it_askew() -> None:
-    with Watched({"control": EQUAL_TORQUES, "simulation": {"object_angle": START}}) as hand:
-        hand.grasp(FORCE)
-        hand.run(4.5)
-        assert hand.mode == "holding"
-        assert math.degrees(hand.plant.object_pose[2]) > 3.0

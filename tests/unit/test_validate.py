@@ -35,15 +35,6 @@ def test_springs_are_no_rubber_and_say_so(rows: dict[str, Beside]) -> None:
     assert hertz.verdict == "agree"
 
 
-def test_the_papers_minimum_is_that_of_springs(rows: dict[str, Beside]) -> None:
-    assert rows["tilt of the least U at d = 4 mm: springs"].ours == "0.0°"
-
-
-def test_an_exponent_is_that_of_the_power() -> None:
-    d = np.linspace(0.001, 0.008, 9)
-    assert validate.exponent(d, 7.0 * d**1.46) == pytest.approx(1.46)
-
-
 @pytest.mark.parametrize(
     ("ours", "verdict"), [(1.456, "agree"), (1.88, "agree"), (1.454, "disagree"), (2.0, "disagree")]
 )

@@ -19,7 +19,6 @@ from softfinger.tools.viewing.known import (
     THETA_END,
     WIDTH,
     Landscape,
-    palette,
     read_settings,
 )
 from softfinger.tools.viewing.planar import (
@@ -69,13 +68,6 @@ def test_the_footprint_is_where_the_forward_model_presses(
     cell = grid.pitches[0] * grid.pitches[1]
     expected = math.pi * (2.0 * TIP.radius * d - d * d) * cosine
     assert area(shown.outline) * cell == pytest.approx(expected, rel=0.003)
-
-
-@pytest.mark.parametrize(
-    "contact", [(0.0, 0.1, 0.0), (0.02, 0.1, 0.0), (math.nan, 0.1, 0.0), (0.004, math.nan, 0.0)]
-)
-def test_no_footprint_without_a_contact(contact: tuple[float, float, float]) -> None:
-    assert footprint(GRIDS[0], TIP.radius, *contact) is None
 
 
 def test_the_grid_is_read_from_the_frame() -> None:
@@ -202,28 +194,10 @@ def test_contours_are_lines_of_equal_energy(landscape: Landscape) -> None:
         assert exact(d, theta).energy == pytest.approx(contour.energy, rel=0.01)
 
 
-def test_colours_grow_lighter_with_the_energy(landscape: Landscape) -> None:
-    colours = palette()[landscape.picture()]
-    picture = colours.astype(float) @ [0.2126, 0.7152, 0.0722]
-    assert picture.shape == (HEIGHT, WIDTH)
-    upright = picture[::-1, WIDTH // 2]  # with growing d
-    assert (np.diff(upright) >= -1.0).all()
-    assert upright[-1] > 150.0 > 60.0 > upright[0]
-    corner = colours[0, 0]
-    assert np.ptp(corner.astype(int)) < 8  # grey: 12 mm deep, no tip tilts by 45°
-
-
 def test_the_wanted_forces_energy_is_the_tables(landscape: Landscape) -> None:
     upright = ContactTable.build(TIP, Material.table_i())(np.array([0.003, 0.008]), np.zeros(2))
     assert landscape.energy_of(upright.force) == pytest.approx(upright.energy, rel=1e-4)
     assert np.isnan(landscape.energy_of(np.array([math.nan, -1.0, 1e6]))).all()
-
-
-def test_the_axes_fit_the_picture(landscape: Landscape) -> None:
-    names = [name for _, name in landscape.ticks()]
-    assert {"θ = 0°", "+20°", "d = 0", "4 mm", "12 mm"} <= set(names)
-    assert landscape.place(0.0, 0.0) == pytest.approx([WIDTH / 2, HEIGHT])
-    assert landscape.place(0.012, THETA_END) == pytest.approx([WIDTH, 0.0])
 
 
 # What is known of the hand
