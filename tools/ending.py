@@ -120,16 +120,18 @@ class Signals:
 
     @contextlib.contextmanager
     def held(self) -> Iterator[None]:
-        """Signals wait meanwhile."""
+        """Keep signals waiting meanwhile."""
         self._held = True
-        yield
-        self._held = False
+        try:
+            yield
+        finally:
+            self._held = False
         if self._ended:
             raise Interrupted
 
     def _end(self, *_: Any) -> None:
-        self._ended = True
+        first, self._ended = not self._ended, True
         if self._running is not None:
             self._running.end()
-        elif not self._held:
+        elif first and not self._held:  # a second one would cut the clean end short
             raise Interrupted

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import sys
 import time
@@ -189,19 +190,20 @@ def _serve(settings: Settings, arguments: argparse.Namespace, signals: Signals) 
 
     build_kernels(with_board(settings), print_event, EMULATED)
     servos = EmulatedServos(arguments.baud, arguments.latency, arguments.factory, arguments.ids)
-    try:
-        emulator = Emulator(
-            settings,
-            arguments.dir,
-            servos=servos,
-            faults=arguments.fault,
-            undisturbed=signals.held,
-            tell=lambda line: print(line, file=sys.stderr, flush=True),
-        )
-    except (EmulatorError, SettingsError) as error:
-        print(f"softfinger: {error}", file=sys.stderr)
-        return 1
-    try:
+    with contextlib.ExitStack() as made:
+        with signals.held():
+            try:
+                emulator = Emulator(
+                    settings,
+                    arguments.dir,
+                    servos=servos,
+                    faults=arguments.fault,
+                    tell=lambda line: print(line, file=sys.stderr, flush=True),
+                )
+            except (EmulatorError, SettingsError) as error:
+                print(f"softfinger: {error}", file=sys.stderr)
+                return 1
+            made.callback(emulator.close)
         signals.hand_over(emulator)
         if arguments.press is not None:
             problem = emulator.press(arguments.press)
@@ -210,8 +212,6 @@ def _serve(settings: Settings, arguments: argparse.Namespace, signals: Signals) 
                 return 1
         with RealTime(_unhurried(settings, arguments.baud > 0)):
             emulator.run(lambda: print("ready", flush=True))
-    finally:
-        emulator.close()
     return 0
 
 

@@ -19,7 +19,6 @@ import select
 import socket
 import time
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -144,21 +143,19 @@ class Emulator:
         *,
         servos: EmulatedServos | None = None,
         faults: Iterable[str] = (),
-        undisturbed: Callable[[], AbstractContextManager[None]] = contextlib.nullcontext,
         tell: Callable[[str], None] = lambda _: None,
     ) -> None:
         """Build it; nothing answers before :meth:`run`.
 
-        ``faults``: see :func:`parse_faults`. ``undisturbed``: a context without exceptions of
-        signal handlers, for making what has to be removed again. ``tell`` takes the log's lines:
-        faults that begin, and where a plate has come to rest.
+        ``faults``: see :func:`parse_faults`. ``tell`` takes the log's lines: faults that begin, and
+        where a plate has come to rest. No signal handler may raise meanwhile: what has been made
+        would stay behind.
         Raises EmulatorError, and SettingsError when the settings' material is no stress-strain law.
         """
         self._closers: list[Callable[[], None]] = []
         self._wake = os.pipe()
         self._closers.append(self._close_wake)
         self._stopping = False
-        self._undisturbed = undisturbed
         self._watched: list[int | TactileBoard | socket.socket] | None = None
         self._servos: PtyServoBus | None = None
         self._boards: dict[str, TactileBoard] = {}
@@ -171,11 +168,10 @@ class Emulator:
             servos = servos or EmulatedServos()
             self._ids = settings.servos.ids if servos.ids is None else servos.ids
             self._events = parse_faults(faults, self._ids)
-            with undisturbed():
-                self._links = LinkFolder(folder)
-                self._closers.append(self._links.close)
-                self._control = ControlPort(folder, self._answer)
-                self._closers.append(self._control.close)
+            self._links = LinkFolder(folder)
+            self._closers.append(self._links.close)
+            self._control = ControlPort(folder, self._answer)
+            self._closers.append(self._control.close)
             settings = with_board(settings)
             self._simulation = settings.simulation
             deadline = Deadline(self._links.path / Deadline.NAME, os.O_CREAT)
@@ -202,10 +198,9 @@ class Emulator:
             )
         except ValueError as error:
             raise EmulatorError(str(error)) from None
-        with self._undisturbed():
-            servos = PtyServoBus(bus, baud=line.baud, latency=line.latency, clock=self.clock.now)
-            self._closers.append(servos.unplug)
-            self._links.link("servos", servos.path)
+        servos = PtyServoBus(bus, baud=line.baud, latency=line.latency, clock=self.clock.now)
+        self._closers.append(servos.unplug)
+        self._links.link("servos", servos.path)
         self._servos = self.clock.servos = servos
 
     def _add_board(self, settings: Settings, finger: int) -> None:
@@ -222,8 +217,7 @@ class Emulator:
         self._sources[FINGERS[finger]] = source
         self._boards[FINGERS[finger]] = board
         self._closers.append(board.close)
-        with self._undisturbed():
-            self._links.link(f"tactile-{FINGERS[finger]}", board.path)
+        self._links.link(f"tactile-{FINGERS[finger]}", board.path)
 
     def run(self, on_ready: Callable[[], None] = lambda: None) -> None:
         """Answer until :meth:`end`. ``on_ready`` is called once everything answers."""
