@@ -21,6 +21,8 @@ from numpy.typing import NDArray
 from softfinger.daemon.errors import SoftfingerError
 
 _MOST = 1024  # rows or cols
+_HEADER_MOST = 1000  # lines
+_KEY_MOST = 40  # characters
 _LARGEST = 1e12  # of any reading, in its unit
 _LENGTHS = {
     **dict.fromkeys(("", "mm", "millimeters", "millimetres", "millimeter", "millimetre"), 1e-3),
@@ -107,12 +109,12 @@ def parse(text: str, seconds_per_frame: float = 0.01) -> Export:
 def _header(lines: list[str]) -> tuple[dict[str, str], int]:
     header: dict[str, str] = {}
     in_comments = False
-    for number, line in enumerate(lines):
+    for number, line in enumerate(lines[:_HEADER_MOST]):
         key, _, value = line.strip().rstrip(",").partition(" ")
         if key.upper() == "ASCII_DATA":
             return header, number + 1
         if key and (key.isupper() or not in_comments):
-            header[_spelt(key.upper())] = value.strip()
+            header[_spelt(key.upper()[:_KEY_MOST])] = value.strip()
             in_comments |= key.upper().startswith("COMMENT")
     raise TekscanError("no line ASCII_DATA: this is no Tekscan-style export")
 
@@ -164,7 +166,7 @@ def _frames(
 
 
 def _row(line: str, cols: int, number: int) -> NDArray[np.float64]:
-    cells = [cell.strip().upper() for cell in line.rstrip(",").split(",")]
+    cells = [cell.strip().upper() for cell in line.rstrip(",").split(",", _MOST)]
     if len(cells) != cols:
         raise TekscanError(f"line {number}: {len(cells)} cells, expected {cols}")
     try:

@@ -5,16 +5,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import msgpack
 import numpy as np
 
 from softfinger.daemon.loop.timing import Statistics, record
 from softfinger.daemon.types import Frame, HandFacts, Parts, SensorFacts, State
 from softfinger.daemon.wire import schema
-from softfinger.daemon.wire.packer import message_maker, packer
+from softfinger.daemon.wire.packer import packer
 from softfinger.kinematics.estimation.invalid import Invalid
+
+
+def message_maker(topic: bytes) -> Callable[..., dict[str, Any]]:
+    """Return the function that makes a topic's map from its source's arguments."""
+    pack = packer(topic)
+    return lambda *arguments: msgpack.unpackb(pack(*arguments))
 
 
 def golden_file(topic: bytes) -> Path:

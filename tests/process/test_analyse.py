@@ -14,10 +14,10 @@ from softfinger.daemon.errors import RecordingError
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import Frame, HandFacts, SensorFacts
 from softfinger.daemon.wire import schema
-from softfinger.daemon.wire.packer import message_maker
 from softfinger.tools.analysis.contacts import analyse, open_source, write_csv
 from softfinger.tools.recordings.record import RecordingWriter
 from tests.conftest import Inline
+from tests.harness.golden_wire import message_maker
 
 TIP, PITCH, SCALE = Fingertip(0.020), 0.058 / 44, 4.0
 DEPTHS = np.linspace(0.0, 0.005, 26)

@@ -16,13 +16,13 @@ from softfinger.daemon.perception.calibration_file import (
 )
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.wire.packer import message_maker
 from softfinger.daemon.wire.schema import TACTILE
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from softfinger.tools.calibration.calibration_frames import rising
 from softfinger.tools.cli import main
+from tests.harness.golden_wire import message_maker
 
 tactile_message = message_maker(TACTILE)
 

@@ -115,11 +115,17 @@ def packed(path: Path, method: int = zipfile.ZIP_DEFLATED, *, honest: bool = Tru
             file.write(bytes(1 << 20))
 
 
-FRAMES: dict[str, tuple[str, Callable[[Path], None]]] = {
+FRAMES: dict[str, tuple[str, Callable[[Path], object]]] = {
     "a header of 3.5 TiB": ("a.npy", claiming),
     "4 GB of holes": ("a.npy", holes),
     "an archive of zeros": ("a.npz", packed),
     "an archive that claims": ("a.npz", lambda path: packed(path, honest=False)),
+    "one line": ("a.asf", lambda path: path.write_text("1," * 8_000_000)),
+    "a header that goes on": ("a.asf", lambda path: path.write_text("1,1,1,1,1,1\n" * 400_000)),
+    "a row that goes on": (
+        "a.asf",
+        lambda path: path.write_text("ROWS 4\nCOLS 4\nASCII_DATA\n" + "1," * 8_000_000),
+    ),
     "by another compression": ("a.npz", lambda path: packed(path, zipfile.ZIP_BZIP2, honest=False)),
 }
 
@@ -127,8 +133,8 @@ FRAMES: dict[str, tuple[str, Callable[[Path], None]]] = {
 @pytest.mark.timeout(120)  # s, on a busy machine
 @pytest.mark.parametrize(("name", "make"), FRAMES.values(), ids=FRAMES)
 def test_frames_beyond_their_file_are_told(
-    tmp_path: Path, name: str, make: Callable[[Path], None]
+    tmp_path: Path, name: str, make: Callable[[Path], object]
 ) -> None:
     make(tmp_path / name)
-    with pytest.raises(RecordingError, match=r"more than|another compression"):
+    with pytest.raises(RecordingError, match=r"more than|another compression|no line|expected 4"):
         load_recording(tmp_path / name, 1.0, 100.0)

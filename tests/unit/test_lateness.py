@@ -17,8 +17,8 @@ from softfinger.daemon.loop.publishing import parts
 from softfinger.daemon.loop.timing import EVERY, FIRST, RECENT, Lateness
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import Timing
-from softfinger.daemon.wire.packer import message_maker
 from softfinger.daemon.wire.schema import STATE
+from tests.harness.golden_wire import message_maker
 from tests.harness.late_machine import LateMachine
 from tests.harness.loop import advance_to, grasped
 

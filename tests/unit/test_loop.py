@@ -13,8 +13,8 @@ import pytest
 from softfinger.daemon.errors import Refused
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.loop.publishing import parts
-from softfinger.daemon.wire.packer import message_maker
 from softfinger.daemon.wire.schema import STATE
+from tests.harness.golden_wire import message_maker
 from tests.harness.loop import (
     Make,
     advance_to,

@@ -31,8 +31,8 @@ def record(kind: int, content: bytes) -> bytes:
     return struct.pack("<BQ", kind, len(content)) + content
 
 
-def channel(topic: str) -> bytes:
-    return record(4, struct.pack("<HH", 1, 0) + text(topic) + text("json") + text(b""))
+def channel(topic: str, number: int = 1) -> bytes:
+    return record(4, struct.pack("<HH", number, 0) + text(topic) + text("json") + text(b""))
 
 
 def message(data: bytes) -> bytes:
@@ -87,6 +87,20 @@ BOMBS: dict[str, Callable[[Path], object]] = {
     "a frame of 4096²": lambda path: path.write_bytes(head() + squeezed(frame_of_zeros())),
     "lists": lambda path: path.write_bytes(
         head() + squeezed(message(b"[" + b"[]," * 2_000_000 + b"[]]"))
+    ),
+    "channels": lambda path: path.write_bytes(head() + squeezed(channel("hand/state") * 200_000)),
+    "topics": lambda path: path.write_bytes(
+        head() + squeezed(b"".join(channel(f"hand/{k}", k) + message(b"{}") for k in range(9999)))
+    ),
+    "maps in maps": lambda path: path.write_bytes(
+        head() + squeezed(message(b'{"a":' * 990 + b"1" + b"}" * 990))
+    ),
+    "50,000 fields": lambda path: path.write_bytes(
+        head()
+        + squeezed(
+            message(json.dumps({str(k): k for k in range(50_000)}).encode())
+            + message(b"{}") * 10_000
+        )
     ),
     "holes": holes,
     "chunks of holes": chunks_of_holes,

@@ -12,8 +12,8 @@ from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.loop.publishing import parts
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import Event, Reading
-from softfinger.daemon.wire.packer import message_maker
 from softfinger.daemon.wire.schema import STATE
+from tests.harness.golden_wire import message_maker
 from tests.harness.loop import Make, advance_to, command, grasped, heard, refusal
 
 state_message = message_maker(STATE)

@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from pathlib import Path
 
 import msgpack
 import pytest
 
 from softfinger.daemon.client.records import read
+from softfinger.daemon.types import Parts, State
 from softfinger.daemon.wire import schema, schema_docs
 from softfinger.daemon.wire.packer import packer
-from tests.harness.golden_wire import (
-    arguments,
-    flat,
-    golden_file,
-    sample,
-)
+from tests.harness.golden_wire import arguments, flat, golden_file, message_maker, sample
 
 PAGE = Path(schema.__file__).with_name("STREAM.md")
 KINDS = {"int": int, "float": float, "bool": bool, "str": str, "bin": bytes}
@@ -56,6 +53,22 @@ def test_the_json_schema_names_every_field(topic: bytes) -> None:
         for part in name.split("."):
             place = place["properties"][part]
         assert place["description"]
+
+
+def test_what_is_no_number_yet_goes_out_as_it_is() -> None:
+    state = State()  # no reading yet: its time is −∞, and a grip's goal is no number
+    assert message_maker(schema.INPUT)(state, (None, None))["reading"]["t"] == -math.inf
+    sent = message_maker(schema.STATE)(state, Parts((True, True), True, True))
+    assert math.isnan(sent["goal_force"])
+
+
+def test_messages_of_one_topic_are_of_one_length_while_their_texts_stay() -> None:
+    pack, scene, state = packer(schema.STATE), Parts((True, True), True, True), State()
+    first = pack(state, scene)
+    state.seq, state.timing.overruns, state.torque = 2**40, 2**33, True
+    assert len(pack(state, scene)) == len(first)
+    state.mode = "holding"
+    assert len(pack(state, scene)) == len(first) - 1
 
 
 def test_the_page_is_the_one_in_the_repository() -> None:

@@ -11,11 +11,11 @@ import pytest
 import zmq
 
 from softfinger.daemon.types import Contact, Frame, HandFacts, Parts, SensorFacts, State
-from softfinger.daemon.wire.packer import message_maker
 from softfinger.daemon.wire.publisher import bit
 from softfinger.daemon.wire.schema import COMMAND, EVENT, STATE, TACTILE
 from tests.conftest import until
 from tests.harness.gateway import Served
+from tests.harness.golden_wire import message_maker
 
 state_message = message_maker(STATE)
 

@@ -233,15 +233,15 @@ class Rig:
         words = ["run", "--config", str(self.config), "--dir", str(self.ports)]
         log = str(self.folder / "daemon.log")
         self.daemon = subprocess.Popen([*SOFTFINGER, *words, "--log-file", log])
-        while self.status() is None:
-            if not self.alive or time.monotonic() > end:
-                raise RigError(f"the daemon did not start: {self.log()[-1:]}")
         if self._states is not None:
             self._states.close()
         self._states = self.context.socket(zmq.SUB)
         self._states.setsockopt(zmq.LINGER, 0)
         self._states.subscribe(STATE)
         self._states.connect(self.stream)
+        while self.status() is None:
+            if not self.alive or time.monotonic() > end:
+                raise RigError(f"the daemon did not start: {self.log()[-1:]}")
 
     def end_daemon(self, number: int = signal.SIGTERM) -> int | None:
         """Signal the daemon and wait for it; None when it hangs, and had to be killed."""

@@ -26,8 +26,11 @@ if TYPE_CHECKING:
     from mcap.records import Chunk, Statistics
     from numpy.typing import NDArray
 
-_MESSAGE_MOST = 1 << 20  # bytes; the largest grid's frame has 0.2 MB, settings more
-_MESSAGE_LEAST = 512  # bytes that a message counts for: each takes time
+_MESSAGE_MOST = 1 << 20  # bytes; the largest grid's frame has 0.2 MB
+_SETTINGS_MOST = 4 << 20  # with the calibrations of each cell
+_RECORD_LEAST = 512  # bytes that a channel or a message counts for: each takes time
+_CHANNELS_MOST = 64
+_FIELDS_MOST = 500  # of a message
 _HEADER, _FOOTER, _CHANNEL, _MESSAGE, _CHUNK, _STATISTICS, _DATA_END = 1, 2, 4, 5, 6, 11, 15
 _RECORD = struct.Struct("<BQ")  # what each begins with: its kind, the bytes of its content
 _BEFORE_DATA = struct.Struct("<HIQQ")  # channel, number, log time and publish time of a message
@@ -140,9 +143,9 @@ class Recording:
                     continue
                 topic, convert = selected[channel]
                 try:
-                    if len(data) > _MESSAGE_MOST and topic != schema.SETTINGS:
+                    if len(data) > (_SETTINGS_MOST if topic == schema.SETTINGS else _MESSAGE_MOST):
                         raise ValueError(f"a message of {len(data) >> 20} MB")
-                    message = convert(loads(data))
+                    message = convert(_plain(loads(data)))
                 except (ValueError, TypeError, AttributeError) as error:
                     self._damaged(error)
                     continue
@@ -176,8 +179,8 @@ class Recording:
         """
         try:
             for kind, content in _records(io.BytesIO(_unpacked(chunk)), (_CHANNEL, _MESSAGE)):
+                self._count(max(0, _RECORD_LEAST - len(content)))
                 if kind == _MESSAGE:
-                    self._count(max(0, _MESSAGE_LEAST - len(content)))
                     channel, _, log_time, _ = _BEFORE_DATA.unpack_from(content)
                     yield channel, log_time, content[_BEFORE_DATA.size :]
                 elif learn:
@@ -197,6 +200,8 @@ class Recording:
         channel = Channel.read(ReadDataStream(io.BytesIO(content)))
         if channel.message_encoding == ENCODING:
             self._names[channel.id] = channel.topic
+        if len(self._names) > _CHANNELS_MOST:
+            raise ValueError(f"more than {_CHANNELS_MOST} channels")
 
     def check(self) -> bool:
         """Read every chunk; whether the file is whole and sound."""
@@ -299,6 +304,24 @@ def _records(file: IO[bytes], wanted: Collection[int]) -> Iterator[tuple[int, by
         if len(content) < length:
             raise EOFError
         yield kind, content
+
+
+def _plain(message: dict[str, Any]) -> dict[str, Any]:
+    """Return a map whose values are plain, or maps of at most two levels, with few fields in all.
+
+    Raises ValueError for another, AttributeError for what is no map.
+    """
+    count, maps = 0, [message]
+    for _ in range(3):
+        values = [value for each in maps for value in each.values()]
+        maps = [value for value in values if isinstance(value, dict)]
+        count += len(values)
+        if count > _FIELDS_MOST or list in map(type, values):
+            break
+    else:
+        if not maps:
+            return message
+    raise ValueError("a message with more fields than any topic's")
 
 
 def _unpacked(chunk: Chunk) -> bytes:

@@ -11,6 +11,7 @@ from typing import Any
 
 import msgpack
 import numpy as np
+from pydantic import ValidationError
 
 from softfinger.daemon.client.records import read
 from softfinger.daemon.errors import RecordingError
@@ -67,9 +68,11 @@ def recorded_settings(recording: Recording) -> tuple[Settings, list[str]]:
         raise RecordingError(f"{recording.path}: its hand/settings lacks {' or '.join(_SETTINGS)}")
     try:
         settings = Settings.model_validate_json(text, strict=False)
-    except ValueError as error:
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        where = "".join(f"{part}: " for part in first["loc"])
         raise RecordingError(
-            f"{recording.path}: its settings are not of this version: {error}"
+            f"{recording.path}: its settings are not of this version: {where}{first['msg']}"
         ) from None
     return without_files(settings), [str(each) for each in calibrations]
 
