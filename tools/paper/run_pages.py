@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from functools import cache, partial
 from typing import TYPE_CHECKING
 
@@ -12,27 +11,23 @@ from softfinger.tools.paper import runs
 from softfinger.tools.paper.model_pages import DEPTHS, MILLI, TILTS
 from softfinger.tools.paper.runs import SimulatedRun
 from softfinger.tools.paper.sheets import (
-    CIRCLE,
     DEPTH,
     DOT,
     FORCE,
     RELATIVE,
-    DrawnCurve,
     FigurePage,
     FloatArray,
     Panel,
     Sheet,
     sheet,
     summary,
-    zero_line,
 )
-from softfinger.tools.style import GREY, INK, KINDS, label_ends, ordered
+from softfinger.tools.style import GREY, KINDS, ordered
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _SURE = 1.0  # mm of displacement from which on relative errors are shown
-_DEEPEST_FORCE = 1e-6 * np.pi * runs.MODULUS * 8.0**2  # N at 8 mm, upright
 _ROLLED_AT = 4  # mm, where rotation ends and the path goes on
 _PATH = -12.5, 10.5
 
@@ -90,21 +85,16 @@ def compression() -> tuple[Sheet, ...]:
     return (*sheets, summary("fig7_run_errors", heads, rows))
 
 
-def _forces(*sheets: Sheet) -> Iterator[DrawnCurve]:
-    for style, run in zip(ordered(len(TILTS)), sheets, strict=False):
-        yield DrawnCurve(run["d"], run["F"], style)
-        yield DrawnCurve(run["d estimated"][::6], run["F estimated"][::6], DOT)
-    yield DrawnCurve([], [], {"color": INK}, "model")
-    yield DrawnCurve([], [], CIRCLE | {"ms": 3, "mec": INK}, "estimated from the frames")
+def _forces(axes: Axes, *sheets: Sheet) -> None:
+    for tilt, style, run in zip(TILTS, ordered(len(TILTS)), sheets, strict=False):
+        axes.plot(run["d"], run["F"], **style, label=f"{tilt}°")
+        axes.plot(run["d estimated"][::6], run["F estimated"][::6], **DOT)
+    axes.plot([], [], **DOT, label="estimated from the frames")
 
 
-def _angles(axes: Axes, *_: Sheet) -> None:
-    ends = [_DEEPEST_FORCE / float(np.cos(np.radians(tilt))) for tilt in TILTS]
-    label_ends(axes, 8.0, ends, [f"{tilt}°" for tilt in TILTS], gap=0.07)
-
-
-def _errors(symbol: str, *sheets: Sheet) -> Iterator[DrawnCurve]:
-    """Yield the errors of force [%], displacement [µm] or angle [degrees], beyond 1 mm."""
+def _errors(symbol: str, axes: Axes, *sheets: Sheet) -> None:
+    """Draw the errors of force [%], displacement [µm] or angle [degrees], beyond 1 mm."""
+    axes.axhline(0.0, color=GREY, linewidth=0.7)
     for tilt, style, run in zip(TILTS, ordered(len(TILTS)), sheets, strict=False):
         deep = run["d"] > _SURE
         truth, found = run[symbol][deep], run[f"{symbol} estimated"][deep]
@@ -112,13 +102,13 @@ def _errors(symbol: str, *sheets: Sheet) -> Iterator[DrawnCurve]:
             off = 100.0 * (found / truth - 1.0)
         else:
             off = (found - truth) * (1e3 if symbol == "d" else 1.0)
-        yield DrawnCurve(run["d"][deep], off, style | {"linewidth": 0.9}, f"{tilt}°")
+        axes.plot(run["d"][deep], off, **style | {"linewidth": 0.9}, label=f"{tilt}°")
 
 
 def _error_panel(symbol: str, title: str, label: str, limit: float) -> Panel:
     legend = {"loc": "lower right", "ncols": 4, "title": "tilt"}
     ends = (0, 8), (-1.3 * limit, limit)
-    return Panel(partial(_errors, symbol), DEPTH, label, title, *ends, legend, zero_line)
+    return Panel(partial(_errors, symbol), DEPTH, label, title, *ends, legend)
 
 
 @cache
@@ -167,45 +157,37 @@ def _minimum(theta: FloatArray, values: FloatArray) -> tuple[float, float]:
     return float(-0.5 * b / a), float(np.sqrt(slope @ covariance @ slope))
 
 
-def _along(symbol: str, rotation: Sheet, rolling: Sheet, _: Sheet) -> Iterator[DrawnCurve]:
-    """Tabulate along the path: the rotation, then the rolling at 4 mm."""
+def _along(symbol: str, axes: Axes, rotation: Sheet, rolling: Sheet, _: Sheet) -> None:
+    """Draw along the path: the rotation, then the rolling at 4 mm."""
     for piece, at, color, name in (
         (rotation, "", KINDS[1], "the finger rotates"),
         (rolling, f" at {_ROLLED_AT} mm", KINDS[0], "then the object rolls"),
     ):
-        yield DrawnCurve(piece[f"theta{at}"], piece[f"{symbol}{at}"], {"color": color}, name)
+        axes.plot(piece[f"theta{at}"], piece[f"{symbol}{at}"], color=color, label=name)
         theta, found = piece[f"theta estimated{at}"], piece[f"{symbol} estimated{at}"]
-        yield DrawnCurve(theta[::4], found[::4], DOT, "estimated" if at else "")
+        axes.plot(theta[::4], found[::4], **DOT, label="estimated" if at else "")
 
 
-def _over_upright(_: Sheet, rolling: Sheet, minima: Sheet) -> Iterator[DrawnCurve]:
-    for depth, style in zip(DEPTHS, ordered(len(DEPTHS)), strict=True):
+def _over_upright(axes: Axes, _: Sheet, rolling: Sheet, minima: Sheet) -> None:
+    least = zip(
+        DEPTHS, minima["angle of the least U estimated"], minima["its standard error, U"],
+        ordered(len(DEPTHS)), strict=True,
+    )  # fmt: skip
+    for depth, angle, error, style in least:
         theta, model = rolling[f"theta at {depth} mm"], rolling[f"U at {depth} mm"]
         level = float(np.interp(0.0, theta, model))
         found = rolling[f"U estimated at {depth} mm"]
-        yield DrawnCurve(theta, found / level, style | {"linewidth": 0.9})
-        yield DrawnCurve(theta, model / level, {"color": GREY, "linewidth": 0.7})
+        label = f"{depth} mm: least at {angle:.2f}° ± {error:.2f}°".replace("-", "−")
+        axes.plot(theta, found / level, **style | {"linewidth": 0.9}, label=label)
+        axes.plot(theta, model / level, color=GREY, linewidth=0.7)
 
 
-def _show_minima(axes: Axes, _: Sheet, rolling: Sheet, minima: Sheet) -> None:
-    """The least angles with their standard errors, enlarged, one line a displacement."""
-    found, error = minima["angle of the least U estimated"], minima["its standard error, U"]
-    inset = axes.inset_axes((0.33, 0.14, 0.4, 0.28))
-    for k, style in enumerate(ordered(len(DEPTHS))):
-        inset.errorbar(found[k], -k, xerr=error[k], fmt="o", ms=3, color=style["color"], capsize=2)
-        text = f"{DEPTHS[k]} mm: {found[k]:.2f}° ± {error[k]:.2f}°".replace("-", "−")
-        inset.text(1.03, -k, text, transform=inset.get_yaxis_transform(), va="center", fontsize=7)
-    inset.axvline(0.0, color=GREY, linewidth=0.7)
-    inset.set(xlim=(-0.8, 0.8), ylim=(0.6 - len(DEPTHS), 0.4), yticks=[])
-    inset.set_title("least at θ [deg]", fontsize=7.5, pad=2)
-    inset.tick_params(labelsize=7, pad=1)
-
-
-def _angle_errors(_: Sheet, rolling: Sheet, minima: Sheet) -> Iterator[DrawnCurve]:
+def _angle_errors(axes: Axes, _: Sheet, rolling: Sheet, minima: Sheet) -> None:
+    axes.axhline(0.0, color=GREY, linewidth=0.7)
     for depth, style in zip(DEPTHS, ordered(len(DEPTHS)), strict=True):
         theta = rolling[f"theta at {depth} mm"]
         off = rolling[f"theta estimated at {depth} mm"] - theta
-        yield DrawnCurve(theta, off, style | {"linewidth": 0.9}, f"d = {depth} mm")
+        axes.plot(theta, off, **style | {"linewidth": 0.9}, label=f"d = {depth} mm")
 
 
 PAGES = {
@@ -214,7 +196,7 @@ PAGES = {
         (7.6, 6.2),
         compression,
         (
-            Panel(_forces, DEPTH, FORCE, "(a) force", (0, 8.6), (0, 78), "upper left", _angles),
+            Panel(_forces, DEPTH, FORCE, "(a) force", (0, 8.2), (0, 78), "upper left"),
             _error_panel("F", "(b) error of the force", "estimate over model − 1 [%]", 5.0),
             _error_panel("d", "(c) error of the displacement", "estimate − truth [µm]", 75.0),
             _error_panel("theta", "(d) error of the angle", "estimate − truth [deg]", 0.5),
@@ -236,10 +218,10 @@ PAGES = {
             Panel(partial(_along, "U"), RELATIVE, "elastic energy U [mJ]",
                   "(b) energy along the path", _PATH, None, "lower right"),
             Panel(_over_upright, RELATIVE, "U(θ)/U(0)", "(c) energy while rolling, over U(0)",
-                  _PATH, (0.86, 1.085), annotate=_show_minima),
+                  _PATH, (0.86, 1.085), "lower center"),
             Panel(_angle_errors, RELATIVE, "estimate − truth [deg]",
                   "(d) error of the angle while rolling", _PATH, None,
-                  {"loc": "lower right", "ncols": 2}, zero_line),
+                  {"loc": "lower right", "ncols": 2}),
         ),
         rows=2,
         notes=(

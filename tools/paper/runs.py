@@ -54,22 +54,8 @@ class SimulatedRun:
     energy_found: FloatArray
 
 
-def solid(modulus: float) -> Sections:
-    """Return settings of a bonded solid tip of ``modulus`` [Pa] whose face is frictionless."""
-    return {
-        "tip": {"physics": "solid", "poisson": 0.49, "base": "bonded"},
-        "material": {"modulus": modulus},
-        "estimator": {"free_gain": False},
-        "safety": {"d_max": _DEEPEST},
-        "simulation": {"tip_friction": 0.0},
-    }
-
-
-def compression(tilt: float, tip: Sections | None = None) -> SimulatedRun:
-    """Press the object, its face tilted by ``tilt`` [rad], onto the tip until d is 8 mm.
-
-    ``tip`` are settings of another tip than the paper's springs.
-    """
+def compression(tilt: float) -> SimulatedRun:
+    """Press the object, its face tilted by ``tilt`` [rad], onto the tip until d is 8 mm."""
     x = -_HALF_SEPARATION + (RADIUS + 0.5 * _WIDTH + _GAP) / math.cos(tilt)
     sections: Sections = {
         "servos": {"backend": "none"},
@@ -80,7 +66,7 @@ def compression(tilt: float, tip: Sections | None = None) -> SimulatedRun:
         },
     }
     seconds = (_DEEPEST + _GAP) / math.cos(tilt) / _SPEED
-    with _daemon(sections, tip) as daemon:
+    with _daemon(sections) as daemon:
         return _collect(_frames(daemon, round(seconds / SCAN)), daemon)
 
 
@@ -116,11 +102,8 @@ def rotation() -> SimulatedRun:
         return _collect(iter(rows), daemon)
 
 
-def rolling(d: float, tip: Sections | None = None) -> SimulatedRun:
-    """Roll the object on the fixed finger from 11.5° by 20.7° to −9.2°, ``d`` [m] held.
-
-    ``tip`` as for :func:`compression`.
-    """
+def rolling(d: float) -> SimulatedRun:
+    """Roll the object on the fixed finger from 11.5° by 20.7° to −9.2°, ``d`` [m] held."""
     sections: Sections = {
         "servos": {"backend": "none"},
         "hand": {"open_angle": (TILTED, 0.0)},
@@ -130,11 +113,11 @@ def rolling(d: float, tip: Sections | None = None) -> SimulatedRun:
     def place(hand: SimulatedHand, fraction: float) -> None:
         _roll(hand, d, -ROLLED * fraction)
 
-    with _daemon(sections, tip) as daemon:
+    with _daemon(sections) as daemon:
         return _collect(_frames(daemon, _ROLL_STEPS, place), daemon)
 
 
-def _daemon(*more: Sections | None) -> Daemon:
+def _daemon(sections: Sections) -> Daemon:
     merged: Sections = {
         "scene": {"fingers": ("left",)},
         "tip": {"radius": RADIUS},
@@ -148,9 +131,8 @@ def _daemon(*more: Sections | None) -> Daemon:
             "object_height": 0.2,
         },
     }
-    for sections in more:
-        for name, values in (sections or {}).items():
-            merged[name] = merged.get(name, {}) | values
+    for name, values in sections.items():
+        merged[name] = merged.get(name, {}) | values
     return Daemon(Settings.model_validate(merged), wire=False)
 
 

@@ -14,16 +14,15 @@ slow: `turned` solves that step by step, and no time, mass or damping is in it.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import cache, partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from softfinger.kinematics.hand.geometry import HandGeometry, tip_velocity
 from softfinger.tools.paper.runs import MODULUS
 from softfinger.tools.paper.sheets import (
-    DrawnCurve,
     FigurePage,
     FloatArray,
     Panel,
@@ -32,6 +31,9 @@ from softfinger.tools.paper.sheets import (
 )
 from softfinger.tools.style import INK, KINDS, ordered
 from softfinger.tools.watched import Watched
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 FORCE, WIDTH = 10.0, 0.040  # N on each tip's base; m
 REACH = math.radians(8.0)  # the object's angle, there, back, and to the other side
@@ -138,7 +140,7 @@ def at_pose(x: FloatArray, angle: float, last: Held | None) -> Held:
 
 @cache
 def gripped() -> Held:
-    """Return the upright grip in balance, from unsheared tips ."""
+    """Return the upright grip in balance, from unsheared tips."""
 
     def met(x: FloatArray) -> Held:
         q = np.full(2, x[0])
@@ -207,11 +209,8 @@ def swing() -> FloatArray:
     }
     rows = []
     with Watched(sections) as hand:
-        hand.loop.advance(0.1)
-        hand.command("arm")
-        hand.loop.advance(0.2)
-        hand.command("grasp", force=FORCE)
-        hand.loop.advance(_GRIP)
+        hand.grasp(FORCE)
+        hand.run(_GRIP)
         start, t = hand.state.t, 0.0
         while t < 4.0 * _SWING:
             t = hand.state.t - start
@@ -270,18 +269,19 @@ def slow_turn() -> tuple[Sheet, ...]:
     return equations, plant, sheet("slow_turn_landscape", *columns)
 
 
-def _landscape(equations: Sheet, _: Sheet, land: Sheet) -> Iterator[DrawnCurve]:
+def _landscape(axes: Axes, equations: Sheet, _: Sheet, land: Sheet) -> None:
     for lean, look in zip(LEANS, ordered(len(LEANS)), strict=True):
-        yield DrawnCurve(
-            land[f"angle at {lean} deg"], land[f"V at {lean} deg"], look, f"lean {lean}°"
+        axes.plot(
+            land[f"angle at {lean} deg"], land[f"V at {lean} deg"], **look, label=f"lean {lean}°"
         )
-    yield DrawnCurve(equations["angle"], equations["V"], {"color": INK, "lw": 2.0}, "slow turn")
+    axes.plot(equations["angle"], equations["V"], color=INK, lw=2.0, label="slow turn")
 
 
-def _both(name: str, equations: Sheet, plant: Sheet, _: Sheet) -> Iterator[DrawnCurve]:
-    look = {"color": KINDS[1], "lw": 3.0, "alpha": 0.6}
-    yield DrawnCurve(plant["angle"], plant[name], look, "simulated hand, 10 N")
-    yield DrawnCurve(equations["angle"], equations[name], {"color": INK, "lw": 1.0}, "equations")
+def _both(name: str, axes: Axes, equations: Sheet, plant: Sheet, _: Sheet) -> None:
+    axes.plot(
+        plant["angle"], plant[name], color=KINDS[1], lw=3.0, alpha=0.6, label="simulated hand"
+    )
+    axes.plot(equations["angle"], equations[name], color=INK, lw=1.0, label="equations")
 
 
 _ANGLE = "object's angle φ [deg]"
