@@ -132,26 +132,6 @@ def test_landscape_shows_the_local_minimum_and_the_path(run: RecordedRun) -> Non
     assert angle[known].max() > 5.0
 
 
-def test_a_deep_landscape_marks_where_the_backing_touches(run: RecordedRun) -> None:
-    assert run.models is not None
-    with style.settings():
-        figure = style.new_figure(5, 4)
-        plots.draw_map(figure.subplots(), run.models[0].table, 0.012, 0.6)
-        figure.draw_without_rendering()
-    assert "rim of the backing touches" in figure.axes[0].get_legend_handles_labels()[1]
-
-
-def test_a_gap_in_the_stream_breaks_the_line(run: RecordedRun) -> None:
-    keep = (run.t < 1.0) | (run.t > 1.5)
-    states = {name: values[keep] for name, values in run.states.items()}
-    part = replace(run, states=states)
-    t, force = part.gapped(part.states["left.force"])
-    (at,) = np.flatnonzero(np.isnan(force))
-    assert (round(t[at], 1), round(t[at + 1], 1)) == (1.0, 1.5)
-    assert t.size == keep.sum() + 1
-    assert run.gapped(run.states["left.force"])[0].size == run.t.size
-
-
 def test_a_page_is_left_out_with_a_word(path: Path, tmp_path: Path, call: Call) -> None:
     status, said = call(path, "--pages", "angle", "--to", "0.2", "--out", tmp_path / "none")
     assert status == 1

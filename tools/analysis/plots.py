@@ -6,7 +6,6 @@ the state: the model times the scale of the tip's modulus that grips have found.
 
 from __future__ import annotations
 
-import math
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -39,7 +38,6 @@ LINES: dict[str, dict[str, Any]] = {
     "left": {"color": style.KINDS[0], "linestyle": "-"},
     "right": {"color": style.KINDS[1], "linestyle": (0, (5, 1.5))},
 }
-_GAP = 0.1  # s without a state, at least, that breaks a line
 _POINTS = 700  # of each finger in one panel; more hide each other
 _CURVES = 5
 _GRID = 241  # of the landscape along each axis
@@ -80,14 +78,6 @@ class RecordedRun:
         """Return where the finger's state is valid and in contact."""
         of = {name: self.states[f"{finger}.{name}"] for name in ("valid", "contact", "d")}
         return np.asarray(of["valid"] & of["contact"] & np.isfinite(of["d"]))
-
-    def gapped(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return t and ``values`` with a NaN in each gap of the stream, which breaks the line."""
-        t = self.t
-        steps = np.diff(t)
-        longest = max(_GAP, 10.0 * float(np.median(steps))) if steps.size else math.inf
-        at = np.flatnonzero((steps > longest) | (steps < 0.0)) + 1
-        return np.insert(t, at, t[at - 1] if at.size else t[:0]), np.insert(values, at, np.nan)
 
     def contacts(self) -> dict[str, ContactTable]:
         """Return the table of each finger that ever touched. Raises Missing without any."""
@@ -222,7 +212,7 @@ def draw_landscape(run: RecordedRun) -> Figure:
             panel.plot(theta[at] * DEGREES, d[at] * 1e3, marker, **look, label=label)
         over = table(d, theta, edge=True).energy - table(d, 0.0, edge=True).energy
         over = np.where(np.isfinite(d), over * 1e3, np.nan)
-        above.plot(*run.gapped(over), label=name, **LINES[name])
+        above.plot(run.t, over, label=name, **LINES[name])
         panel.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=6, borderaxespad=0.1)
     above.axhline(0.0, color=style.GREY, linewidth=0.6)
     above.set_ylabel("U less that at θ = 0\nand the same d [mJ]")
@@ -232,12 +222,11 @@ def draw_landscape(run: RecordedRun) -> Figure:
 
 
 def draw_map(panel: Axes, table: ContactTable, deepest: float, widest: float) -> None:
-    """Draw U(d, θ) [mJ] to ``deepest`` [m] and ±``widest`` [rad], its minimum over θ, its end."""
+    """Draw U(d, θ) [mJ] to ``deepest`` [m] and ±``widest`` [rad], its minimum over θ."""
     from matplotlib.colors import PowerNorm
 
     d = np.linspace(0.0, deepest, _GRID)[1:]
     theta = np.linspace(-widest, widest, _GRID)
-    limit = table.tip.theta_limit(d)
     contact = table(d[:, None], theta[None, :], edge=True)
     energy = np.ma.masked_where(~contact.inside, contact.energy * 1e3)
     largest = float(energy.max())
@@ -266,19 +255,6 @@ def draw_map(panel: Axes, table: ContactTable, deepest: float, widest: float) ->
             linestyle=(0, (1, 1.2)),
             label="local minimum over θ",
         )
-    shown = limit < widest
-    for side in (-1.0, 1.0):
-        if shown.any():
-            panel.fill_betweenx(
-                d * 1e3,
-                side * np.minimum(limit, widest) * DEGREES,
-                side * widest * DEGREES,
-                facecolor="white",
-                edgecolor=style.GREY,
-                hatch="xxx",
-                linewidth=0.6,
-                label="rim of the backing touches" if side > 0 else None,
-            )
     panel.set(xlabel="θ [°]", ylabel="displacement d [mm]")
     panel.set_xlim(-widest * DEGREES, widest * DEGREES)
     panel.set_ylim(0.0, deepest * 1e3)

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from softfinger.kinematics.hand.geometry import HandGeometry, tip_velocity
-from softfinger.tools.paper.runs import MODULUS
+from softfinger.tools.paper.model_pages import MODULUS
 from softfinger.tools.paper.sheets import (
     FigurePage,
     FloatArray,
@@ -133,11 +133,6 @@ def solve(residual: Callable[[FloatArray], FloatArray], start: FloatArray) -> Fl
     raise RuntimeError(f"no balance near {start}: {residual(x)} left")
 
 
-def at_pose(x: FloatArray, angle: float, last: Held | None) -> Held:
-    """Return the pose of ``x``, the object's place [m] and both joints' angles [rad]."""
-    return held(x[2:], np.array([x[0], x[1], angle]), last)
-
-
 @cache
 def gripped() -> Held:
     """Return the upright grip in balance, from unsheared tips."""
@@ -154,14 +149,14 @@ def turned(angles: FloatArray, start: Held) -> list[Held]:
     """Return the quasi-static path from ``start`` on which the object takes ``angles`` [rad]."""
     path = [start]
     for angle in angles:
-        last = path[-1]
-        wanted = partial(at_pose, angle=float(angle), last=last)
 
-        def residual(x: FloatArray, of: Callable[[FloatArray], Held] = wanted) -> FloatArray:
+        def pose(x: FloatArray, angle: float = angle, last: Held = path[-1]) -> Held:
+            return held(x[2:], np.array([x[0], x[1], angle]), last)
+
+        def residual(x: FloatArray, of: Callable[[FloatArray], Held] = pose) -> FloatArray:
             return of(x).unbalanced()
 
-        found = solve(residual, np.r_[last.pose[:2], last.q])
-        path.append(wanted(found))
+        path.append(pose(solve(residual, np.r_[path[-1].pose[:2], path[-1].q])))
     return path[1:]
 
 
@@ -184,7 +179,8 @@ def valley(floor: Held, aside: FloatArray, start: Held) -> FloatArray:
         angle = float(floor.pose[2] + more)
 
         def pose(x: FloatArray, angle: float = angle) -> Held:
-            return at_pose(np.r_[x[:2], x[2] + lean, x[2] - lean], angle, start)
+            q = np.array([x[2] + lean, x[2] - lean])
+            return held(q, np.array([x[0], x[1], angle]), start)
 
         def residual(x: FloatArray, of: Callable[[FloatArray], Held] = pose) -> FloatArray:
             there = of(x)
