@@ -92,28 +92,10 @@ def advance(s: SetpointState, windows: FloatArray, rate: float) -> float:
     return s.value
 
 
-class PairState(Record):
-    """State of both joints."""
-
-    left: SetpointState
-    right: SetpointState
-
-
 @kernel
-def _step_both(
-    pairs: Records[PairState],
-    first: FloatArray,
-    second: FloatArray,
-    targets: tuple[float, float],
-    rate: float,
-) -> tuple[bool, float, float]:
-    left = pairs[0].left
-    right = pairs[0].right
-    left.target = targets[0]
-    right.target = targets[1]
-    q1 = advance(left, first, rate)
-    q2 = advance(right, second, rate)
-    return arrived(left) and arrived(right), q1, q2
+def _step(setpoints: Records[SetpointState], windows: FloatArray, rate: float) -> bool:
+    advance(setpoints[0], windows, rate)
+    return arrived(setpoints[0])
 
 
 @kernel
@@ -137,10 +119,15 @@ class Setpoint:
         self.state.second.length = max(round(0.5 * window / dt), 1)
         self.windows = np.zeros(self.state.first.length + self.state.second.length)
         self.reset(0.0)
+        self.step(0.0)  # nothing to do yet, but compiled now and by no tick
 
     def reset(self, value: float) -> None:
         """Be at ``value``, at rest."""
         _reset(self.state.array, self.windows, value)
+
+    def step(self, rate: float) -> bool:
+        """Go on by one tick, at most ``rate`` a second; whether it is at its target."""
+        return _step(self.state.array, self.windows, rate)
 
     @property
     def target(self) -> float:
@@ -160,28 +147,3 @@ class Setpoint:
     def speed(self) -> float:
         """Present speed [1/s]."""
         return self.state.speed
-
-
-class JointSetpoints:
-    """Setpoints of both joints, moved by one call."""
-
-    def __init__(self, dt: float, window: float) -> None:
-        """Take the arguments of `Setpoint`."""
-        self._state = state = PairState()
-        self._windows = [Setpoint(dt, window, one).windows for one in (state.left, state.right)]
-        self._arrays = state.left.array, state.right.array
-        self.targets = [0.0, 0.0]  # where they go; may be set at any tick
-        self.values = [0.0, 0.0]  # where they are
-        self.step(0.0)  # nothing to do yet, but compiled now and by no tick
-
-    def reset(self, joint: int, q: float) -> None:
-        """Let one be at ``q``, at rest."""
-        _reset(self._arrays[joint], self._windows[joint], q)
-        self.targets[joint] = self.values[joint] = q
-
-    def step(self, rate: float) -> bool:
-        """Go on by one tick, at most ``rate`` a second; whether both are at their targets."""
-        first, second = self._windows
-        left, right = self.targets
-        there, *self.values = _step_both(self._state.array, first, second, (left, right), rate)
-        return there

@@ -11,7 +11,7 @@ import math
 
 from softfinger.daemon.control.grip import Grip
 from softfinger.daemon.control.modes import GRIPPING, Mode
-from softfinger.daemon.control.setpoint import JointSetpoints
+from softfinger.daemon.control.setpoint import Setpoint, SetpointState
 from softfinger.daemon.perception.contact_filter_kernels import HOLDING, OTHER, RAMPING, GraspState
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS, Event, Goal, State
@@ -56,7 +56,7 @@ class Control:
         self._touched = [state.contacts[index] for index in self._fingers]
         self._held = grasp
         dt, smooth = 1.0 / settings.loop.rate, settings.control.smooth_time
-        self._joints = JointSetpoints(dt, smooth)
+        self._joints = [Setpoint(dt, smooth, SetpointState()) for _ in FINGERS]
         self._next_angle: float | None = None  # rad to turn to once the grip holds
         self._streamed = False  # the force is a stream's setpoint
         self._still = False  # holding, and nothing but loads moves the joints
@@ -100,7 +100,7 @@ class Control:
         if self.mode is not Mode.MOVING:
             self._hold_here()
         for name, q in angles.items():
-            self._joints.targets[FINGERS.index(name)] = q
+            self._joints[FINGERS.index(name)].target = q
         self._enter(Mode.MOVING)
 
     def grasp(self, force: float) -> None:
@@ -216,7 +216,7 @@ class Control:
         """Open to the hand's open angles."""
         self._hold_here()
         for index in self._fingers:
-            self._joints.targets[index] = self._settings.hand.open_angle[index]
+            self._joints[index].target = self._settings.hand.open_angle[index]
         self._gripping = False
         self._enter(Mode.RELEASING)
 
@@ -236,7 +236,7 @@ class Control:
 
     def _hold_here(self) -> None:
         for index, q in enumerate(self._reading.q):
-            self._joints.reset(index, q)
+            self._joints[index].reset(q)
 
     # One tick
 
@@ -273,14 +273,19 @@ class Control:
     def _rest(self, goal: Goal, current: float) -> None:
         """Joints follow their setpoints, with at most ``current`` [A]."""
         for index in self._fingers:
-            goal.q[index] = self._joints.values[index]
+            goal.q[index] = self._joints[index].value
             goal.current[index] = current
 
+    def _step(self, rate: float) -> bool:
+        """Move the joints' setpoints, at most ``rate`` rad/s; whether all are at their targets."""
+        there = [joint.step(rate) for joint in self._joints]
+        return all(there)
+
     def _travel(self, dt: float) -> None:
-        if not self._joints.step(self._settings.control.move_speed):
+        if not self._step(self._settings.control.move_speed):
             return
         self._waiting += dt
-        off = max(abs(self._reading.q[i] - self._joints.targets[i]) for i in self._fingers)
+        off = max(abs(self._reading.q[i] - self._joints[i].target) for i in self._fingers)
         if off < _ARRIVED or self._waiting > _GRACE:
             if off >= _ARRIVED:
                 text = f"{self.mode.value} ended {math.degrees(off):.1f}° short of its goal"
@@ -294,17 +299,17 @@ class Control:
             contact = self._contacts[index]
             touches = contact.valid and contact.contact and contact.force > law.contact_force
             if touches and not self._touching[index]:
-                self._joints.reset(index, self._reading.q[index])
+                self._joints[index].reset(self._reading.q[index])
             self._touching[index] = touches
             if not touches:
-                self._joints.targets[index] = self._settings.hand.q_max[index]
+                self._joints[index].target = self._settings.hand.q_max[index]
                 awaited = True
         if not awaited:
             if not self._is_empty(dt):
                 self._gripping = True
                 self._grip.most = math.inf
                 self._grip.start(self._felt(), self._force)
-        elif self._joints.step(law.approach_speed):
+        elif self._step(law.approach_speed):
             self._waiting += dt
             if self._waiting > _GRACE:
                 text = "nothing to grasp within the joints' limits"

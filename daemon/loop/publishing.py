@@ -7,8 +7,6 @@ every n frames one is published. What is sent, `wire.publisher` sends; nothing i
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from softfinger.daemon.loop.timing import Statistics
 from softfinger.daemon.perception.perception import FingerPerception
 from softfinger.daemon.profile.settings import Settings
@@ -27,34 +25,6 @@ _STATS_PHASE = 3  # ticks after those of the state
 def every(rate: float, wanted: float) -> int:
     """Return of how many at ``rate`` one comes nearest to the ``wanted`` rate."""
     return max(round(rate / wanted), 1)
-
-
-def plan(settings: Settings) -> str:
-    """Return a line for people: what is done how often."""
-    rate, frames, stream = settings.loop.rate, settings.tactile.rate, settings.stream
-    parts = [f"every tick ({rate:g} Hz) read, feel, decide, bound, write"]
-    if settings.tactile.backend != "none":
-        parts[0] += f", tactile frames as they come ({frames:g} Hz)"
-        n = every(frames, stream.tactile_rate)
-        each = "frame" if n == 1 else f"{n} frames"
-        parts.append(f"every {each} hand/tactile ({frames / n:.4g} Hz)")
-    for topic, wanted in (("hand/state", stream.state_rate), ("hand/stats", _STATS_RATE)):
-        n = every(rate, wanted)
-        each = "tick" if n == 1 else f"{n} ticks"
-        parts.append(f"every {each} {topic} ({rate / n:.4g} Hz)")
-    return "; ".join(parts)
-
-
-@dataclass(slots=True)
-class _Counts:
-    """Things that have happened until time ``t`` [s]."""
-
-    t: float = 0.0
-    ticks: int = 0
-    states: int = 0
-    maps: int = 0
-    left: int = 0
-    right: int = 0
 
 
 def parts(settings: Settings) -> Parts:
@@ -91,7 +61,8 @@ class Publishing:
         self._seen: list[Frame | None] = [None, None]  # newest of each finger
         self._published = [-1, -1]  # of which n frames one went out, for each finger
         self._states = self._maps = 0  # messages that went out
-        self._counted = _Counts()  # when the rates were last published
+        # Time [s] and counts when the rates were last published.
+        self._counted: tuple[float, ...] = (0.0,) * 6
 
     def __call__(self, state: State) -> None:
         """All that is due at this tick."""
@@ -138,14 +109,7 @@ class Publishing:
         frames = [0, 0]
         for perception in self._perceptions:
             frames[perception.finger] = perception.frames
-        last = self._counted
         t = state.t + state.timing.behind_s
-        now = self._counted = _Counts(t, state.seq, self._states, self._maps, *frames)
-        per = 1.0 / (now.t - last.t) if now.t > last.t else 0.0
-        return Rates(
-            tick=per * (now.ticks - last.ticks),
-            left=per * (now.left - last.left),
-            right=per * (now.right - last.right),
-            state=per * (now.states - last.states),
-            tactile=per * (now.maps - last.maps),
-        )
+        last, self._counted = self._counted, (t, state.seq, *frames, self._states, self._maps)
+        dt, *counts = (now - before for now, before in zip(self._counted, last, strict=True))
+        return Rates(*(count / dt if dt > 0.0 else 0.0 for count in counts))

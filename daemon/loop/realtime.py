@@ -17,7 +17,6 @@ import sys
 import threading
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import NamedTuple
 
 from softfinger.daemon.profile.settings import Settings
 
@@ -57,26 +56,17 @@ def hold_collector() -> None:
     gc.disable()
 
 
-class Measure(NamedTuple):
-    """The outcome of one measure."""
-
-    granted: bool
-    text: str  # what was granted; or what was refused and what is lost by it
-    remedy: str = ""  # the command that grants it
-
-    def __str__(self) -> str:
-        return f"{self.text}; to grant it: {self.remedy}" if self.remedy else self.text
-
-
 class RealTime:
     """The measures, held while this is open: ``with RealTime(settings): loop.run()``.
 
-    To be opened in the thread that ticks, after warm-up. Never raises; ``outcomes`` says what came
-    of each. On virtual time only the collector and other threads are kept from the tick.
+    To be opened in the thread that ticks, after warm-up. Never raises; ``granted`` and ``refused``
+    say what came of each. On virtual time only the collector and other threads are kept from the
+    tick.
     """
 
     def __init__(self, settings: Settings) -> None:
-        self.outcomes: list[Measure] = []
+        self.granted: list[str] = []
+        self.refused: list[str] = []  # with what is lost, and the command that grants it
         self._undo: list[Callable[[], object]] = []
         wanted = settings.realtime
         self._keep_interpreter(wanted.freeze_collector)
@@ -99,10 +89,8 @@ class RealTime:
 
     def events(self) -> list[tuple[str, str, str]]:
         """Return the loop's events: one with all that was granted, one for each refusal."""
-        granted = ", ".join(outcome.text for outcome in self.outcomes if outcome.granted)
-        refused = [str(outcome) for outcome in self.outcomes if not outcome.granted]
-        events = [("info", "realtime", granted)] if granted else []
-        return events + [("warning", "realtime", text) for text in refused]
+        events = [("info", "realtime", ", ".join(self.granted))] if self.granted else []
+        return events + [("warning", "realtime", text) for text in self.refused]
 
     def close(self) -> None:
         """Give everything back. Never raises."""
@@ -119,11 +107,11 @@ class RealTime:
         self.close()
 
     def _granted(self, text: str, *undo: Callable[[], object]) -> None:
-        self.outcomes.append(Measure(True, text))
+        self.granted.append(text)
         self._undo += undo
 
     def _refused(self, text: str, remedy: str = "") -> None:
-        self.outcomes.append(Measure(False, text, remedy))
+        self.refused.append(f"{text}; to grant it: {remedy}" if remedy else text)
 
     def _keep_interpreter(self, freeze: bool) -> None:
         """Keep the collector and other threads from delaying the loop.

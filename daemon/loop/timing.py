@@ -27,12 +27,14 @@ _LOWEST = -29  # 2^-30 s = 0.93 ns is the first bin's lower edge; shorter times 
 _OCTAVES = 36  # up to 64 s; longer times fall into the last bin
 _PARTS = 32  # bins an octave
 _BINS = _OCTAVES * _PARTS
+_EDGES = np.ldexp(
+    0.5 + 0.5 * np.arange(1, _PARTS + 1) / _PARTS, np.arange(_OCTAVES)[:, None] + _LOWEST
+)
+_UPPER = np.append(_EDGES.ravel()[:-1], np.inf)  # edge of each bin; the last one has none
 
 LATE = 0.05  # s of lateness that is reported
 EVERY = 5.0  # s between two reports, of which each is of twice as much
 RECENT = 0.25  # s after a late tick in which it may be a fault's cause
-FIRST = 1.0  # s of ticks after which their steadiness is reported
-_STEADY = 0.2  # share of the servos' watchdog time that a pause may take without a warning
 # Limits that a late tick alone can break.
 _BY_TIME = frozenset({"servos.bus", "servos.silent", "tactile.silent", "loop.overruns"})
 
@@ -61,44 +63,14 @@ def record(counts: Counts, largest: FloatArray, times: tuple[float, float, float
         largest[i] = max(largest[i], times[i])
 
 
-@kernel
-def _quantiles(counts: Counts, largest: FloatArray, shares: FloatArray, out: FloatArray) -> None:
-    """Upper edge of each share's bin, [4, shares]; no more than the largest value."""
-    for i in range(counts.shape[0]):
-        total = 0
-        for k in range(counts.shape[1]):
-            total += counts[i, k]
-        seen = 0
-        j = 0
-        for k in range(counts.shape[1]):
-            seen += counts[i, k]
-            while j < shares.shape[0] and total > 0 and seen >= shares[j] * total:
-                octave = k // _PARTS
-                upper = math.ldexp(0.5 + 0.5 * (k - octave * _PARTS + 1) / _PARTS, octave + _LOWEST)
-                # The last bin has no upper edge.
-                out[i, j] = largest[i] if k == counts.shape[1] - 1 else min(upper, largest[i])
-                j += 1
-        while j < shares.shape[0]:
-            out[i, j] = 0.0
-            j += 1
-
-
 class Statistics:
     """The histograms of one loop. `record` is called with its two arrays once a tick."""
 
     def __init__(self) -> None:
         self.counts: Counts = np.zeros((len(TIMES), _BINS), np.int64)
         self.largest: FloatArray = np.zeros(len(TIMES))
-        self._shares = np.array(QUANTILES)
-        self._out = np.zeros((len(TIMES), len(QUANTILES)))
         record(self.counts, self.largest, (0.0, 0.0, 0.0, 0.0))  # compiles; no tick does
-        self.spreads()
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget all that was counted."""
         self.counts[:] = 0
-        self.largest[:] = 0.0
 
     @property
     def ticks(self) -> int:
@@ -107,9 +79,14 @@ class Statistics:
 
     def spreads(self) -> dict[str, TimeSpread]:
         """Return what was counted, by the names in `TIMES`; all 0 before the first tick."""
-        _quantiles(self.counts, self.largest, self._shares, self._out)
-        rows = zip(TIMES, self._out.tolist(), self.largest.tolist(), strict=True)
-        return {name: TimeSpread(row[0], row[1], row[2], largest) for name, row, largest in rows}
+        spreads = {}
+        for name, until, largest in zip(
+            TIMES, self.counts.cumsum(axis=1), self.largest, strict=True
+        ):
+            upper = _UPPER[until.searchsorted(until[-1] * np.array(QUANTILES))]
+            p50, p99, p999 = np.minimum(upper, largest).tolist()
+            spreads[name] = TimeSpread(p50, p99, p999, float(largest))
+        return spreads
 
     def table(self) -> list[str]:
         """Return the same for people, in µs."""
@@ -131,9 +108,6 @@ class Lateness:
         self._timing = timing
         self._period = 1.0 / settings.loop.rate
         self._waits = waits
-        self._watchdog = 0.0 if settings.simulated or waits else settings.servos.watchdog
-        self._begin = math.nan
-        self._worst = 0.0  # s by which a pause of the first second was longer than the period
         self._sum = 0.0  # s that ticks came late in all, or that the hand has waited
         self._reported = (0.0, -math.inf)  # that sum, and when
         self._busy_until = -math.inf
@@ -157,33 +131,11 @@ class Lateness:
         if new > max(LATE, self._reported[0]) and t - self._reported[1] > EVERY:
             self._reported = (self._sum, t)
             return "warning", "late", self._text(new)
-        return self._steadiness(t, gap) if self._watchdog else None
+        return None
 
     def _text(self, new: float) -> str:
         did = f"the hand waited {new:.2f} s" if self._waits else f"ticks came {new:.2f} s late"
         return f"this machine is busy: {did}, {self._sum:.1f} s in all"
-
-    def _steadiness(self, t: float, gap: float) -> Event | None:
-        """Once, the longest pause of the first second, against the servos' watchdog time."""
-        if math.isnan(self._begin):
-            self._begin = t
-        self._worst = max(self._worst, gap)
-        if t - self._begin < FIRST:
-            return None
-        budget, self._watchdog = self._watchdog, 0.0
-        text = (
-            "the longest pause between two ticks of the first second took "
-            f"{(self._worst + self._period) * 1e3:.3g} ms; "
-            f"the servos' watchdog stops them after {budget * 1e3:g} ms"
-        )
-        if self._worst <= _STEADY * budget:
-            return "info", "realtime", text
-        return (
-            "warning",
-            "realtime",
-            f"{text}: this machine is too busy; realtime.priority and realtime.cpus keep others "
-            "from the loop, softfinger doctor says what is missing",
-        )
 
     def with_cause(self, name: str, text: str, at_work: float) -> str:
         """Return a finding's text, after "this machine was busy" where it was so a moment ago.

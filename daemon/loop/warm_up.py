@@ -186,7 +186,7 @@ def _grip(scene: WantedScene) -> None:
 
 
 def _joints(scene: WantedScene) -> None:
-    from softfinger.daemon.control.setpoint import JointSetpoints
+    from softfinger.daemon.control.setpoint import Setpoint, SetpointState
     from softfinger.daemon.loop.timing import Statistics
     from softfinger.daemon.safety.heat import set_law
 
@@ -197,7 +197,7 @@ def _joints(scene: WantedScene) -> None:
     winding_std(heat.array)
     time_to_limit(heat.array, 1.0, 70.0)
     lasting_square(heat.array, 70.0)
-    JointSetpoints(1.0 / scene.settings.loop.rate, scene.settings.control.smooth_time)
+    Setpoint(1.0 / scene.settings.loop.rate, scene.settings.control.smooth_time, SetpointState())
     Statistics()
 
 

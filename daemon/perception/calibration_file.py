@@ -7,6 +7,7 @@ instead. What the numbers mean is in `kinematics.calibration`.
 from __future__ import annotations
 
 import json
+import math
 import os
 from datetime import UTC, datetime
 from pathlib import Path
@@ -22,14 +23,13 @@ from softfinger.daemon.profile.settings import Finite, NonNegative, Positive, Se
 from softfinger.kinematics.compiled.own_folder import write_whole
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.tip_curves import TipCurves
-from softfinger.kinematics.sensing.counts import look_up_pressure, to_pressure
+from softfinger.kinematics.sensing.counts import to_pressure
 
 FloatArray = NDArray[np.float64]
 _NAMES: tuple[Literal["left"], Literal["right"]] = ("left", "right")
 _STEPS = ("tare", "equilibrate", "curve", "centre", "modulus", "law", "scales")
 _PITCH = 1e-9  # m within which pitches are equal
 _MONOTONE_POINTS = 257
-_TABLE_STEPS = 8192  # of a curve's table: 64 KB
 _FAULTY = 0.2  # of the median range: a cell with less is nearly full without load
 
 
@@ -129,10 +129,7 @@ class ScalesStep(_StepModel):
 
 
 class Calibration(_StepModel):
-    """All steps of one sensor. Frozen: a step is put in by ``model_copy(update=…)``.
-
-    ``wants`` are the settings of ``[tip]`` that the presses of `calibrate law` want, by name.
-    """
+    """All steps of one sensor. Frozen: a step is put in by ``model_copy(update=…)``."""
 
     format: Literal[1] = 1
     sensor: Sensor
@@ -144,7 +141,6 @@ class Calibration(_StepModel):
     modulus: ModulusStep | None = None
     law: TipCurves | None = None
     scales: ScalesStep | None = None
-    wants: dict[Literal["physics", "base", "face", "poisson"], str | float] = {}
 
     @property
     def identity(self) -> str:
@@ -246,33 +242,17 @@ class Converter:
         self._curve = np.array(curve.coefficients if curve else (1.0, pascal_per_count, 0.0, 0.0))
         self._out = np.zeros(shape)
         self._full = sensor.full_count
-        self._table, self._per_step = self._tabulated(float(self.gain.max()) * sensor.full_count)
         self.live: NDArray[np.bool_] = self.gain > 0.0
-        self(np.zeros(shape, np.uint16))  # compiled here, not in the loop
+        if not math.isfinite(self.largest):
+            raise CalibrationFileError(
+                f"calibration: its curve {self._curve[1]:g}·x^{self._curve[0]:g} has no number of "
+                f"Pa for a full cell"
+            )
 
     def __call__(self, counts: NDArray[np.uint16]) -> FloatArray:
         """Pressure [Pa] of counts [rows, cols]; the array is valid until the next call."""
-        if self._table is None:
-            to_pressure(counts, self.zero, self.gain, self._curve, self._out)
-        else:
-            look_up_pressure(counts, self.zero, self.gain, self._table, self._per_step, self._out)
+        to_pressure(counts, self.zero, self.gain, self._curve, self._out)
         return self._out
-
-    def _tabulated(self, largest: float) -> tuple[FloatArray | None, float]:
-        """A power's table up to x = ``largest`` and its steps a count; None for a polynomial."""
-        exponent, factor = float(self._curve[0]), float(self._curve[1])
-        if exponent == 1.0:
-            return None, 1.0
-        step = max(self._full / _TABLE_STEPS, 1.0)
-        x = step * np.arange(int(largest / step) + 2)
-        with np.errstate(over="ignore", invalid="ignore"):
-            table = np.asarray(factor * x**exponent, np.float64)
-        if not np.isfinite(table).all():
-            raise CalibrationFileError(
-                f"calibration: its curve {factor:g}·x^{exponent:g} has no number of Pa for "
-                f"x = {largest:g}"
-            )
-        return table, 1.0 / step
 
     def readings(self, counts: FloatArray) -> FloatArray:
         """Return x = max(counts − zero, 0)·gain of (mean) counts: what the curve is fitted to."""

@@ -25,15 +25,63 @@ from softfinger.daemon.perception.contact_filter_kernels import GraspState
 from softfinger.daemon.perception.perception import FingerPerception
 from softfinger.daemon.perception.scales import GAIN, GAIN_DOUBTED
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.safety.joint_motion import JointMotion
 from softfinger.daemon.servos.control_table import VOLTAGE_UNIT, by_name, hardware_error_names
-from softfinger.daemon.types import FINGERS, Contact, State
+from softfinger.daemon.types import FINGERS, Contact, Reading, State
 
 _NEAR = 0.9  # of a fault's bound: warned from there on
 _PULL = 2.0  # A/rad with which a joint off its goal must be pulled: less than any model's own loop
 _SLOW = 0.05  # rad/s below which a joint stands
 _RISE = 0.2  # share by which the force asked for must rise, and of that the force felt
 _DEAF = 0.3  # s
+_AT_ONCE = 0.02  # rad that an angle may go beyond the greatest velocity's way in one reading
+_APART = 0.1  # rad that it may be off the way that the velocity says …
+_MEMORY = 0.1  # … over the last so many s: a velocity lags
+_LATE = 0.02  # s between two readings, or 3 ticks, from which on the sum begins again
+_GAP = 0.1  # s from which on the step is not judged either
+
+
+class JointMotion:
+    """Checks joints' angles against their velocities, and against the speed that a joint can have.
+
+    An encoder whose zero jumps, that stands still while the joint turns or drifts while it rests,
+    gives angles that contradict their velocity: then ``jumped`` has a finger's bit.
+    """
+
+    def __init__(self, fingers: Sequence[int], velocity_max: float, period: float) -> None:
+        """``period`` [s] of the ticks."""
+        self.jumped = 0
+        self._fingers = tuple(fingers)
+        self._velocity_max = velocity_max
+        self._late = max(_LATE, 3.0 * period)
+        self._gap = max(_GAP, self._late)
+        self._requested = -math.inf  # when the last good reading was asked for [s]
+        self._t = -math.inf  # and had come
+        self._q = [0.0, 0.0]
+        self._apart = [0.0, 0.0]  # rad
+
+    def follow(self, requested: float, reading: Reading) -> None:
+        """Take a reading in that was asked for at the time ``requested``."""
+        self.jumped = 0
+        t = reading.t
+        if not reading.valid or t == self._t:
+            return
+        # Each was taken somewhere between question and answer.
+        longest, dt = t - self._requested, t - self._t
+        q, before, apart = reading.q, self._q, self._apart
+        if longest < self._gap:
+            limit = self._velocity_max * longest + _AT_ONCE
+            keep = 1.0 - dt / _MEMORY if longest < self._late else 0.0
+            for i in self._fingers:
+                step = q[i] - before[i]
+                before[i] = q[i]
+                off = apart[i] = keep * (apart[i] + step - reading.dq[i] * dt)
+                if not (-limit <= step <= limit and -_APART <= off <= _APART):
+                    self.jumped |= 1 << i
+                    apart[i] = 0.0
+        else:
+            before[:] = q
+            apart[:] = 0.0, 0.0
+        self._t, self._requested = t, requested
 
 
 class View:

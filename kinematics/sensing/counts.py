@@ -30,25 +30,3 @@ def to_pressure(
                 out[i, j] = x * (c1 + x * (c2 + x * c3))
             else:
                 out[i, j] = c1 * x**exponent if x > 0.0 else 0.0
-
-
-@kernel
-def look_up_pressure(
-    counts: NDArray[np.uint16],
-    zero: FloatArray,
-    gain: FloatArray,
-    table: FloatArray,
-    per_step: float,
-    out: FloatArray,
-) -> None:
-    """Convert as :func:`to_pressure`, linearly in the curve's ``table`` of steps 1/``per_step``.
-
-    A tenth of a power's time; beyond the table the last step goes on. For p = c x^b its error is
-    below |b(b − 1)|/8 · (step/x)² of p, that of less than a tenth of a step.
-    """
-    last = table.shape[0] - 2
-    for i in range(out.shape[0]):
-        for j in range(out.shape[1]):
-            x = max(float(counts[i, j]) - zero[i, j], 0.0) * gain[i, j] * per_step
-            k = min(int(x), last)
-            out[i, j] = table[k] + (x - k) * (table[k + 1] - table[k])

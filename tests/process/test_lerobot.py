@@ -46,13 +46,15 @@ def make(tmp_path: Path, addresses: tuple[str, str], monkeypatch: pytest.MonkeyP
     subprocess.run(pip, check=True, capture_output=True)
     monkeypatch.syspath_prepend(site)
     register_third_party_plugins()
+    stream, commands = addresses
 
     def make(**options: Any) -> Any:
         kind = RobotConfig.get_choice_class("softfinger")
         config = kind(
             id="a",
             calibration_dir=tmp_path / "calibration",
-            address=",".join(addresses),
+            stream=stream,
+            commands=commands,
             timeout=300,
             **options,
         )

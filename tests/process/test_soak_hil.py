@@ -2,9 +2,18 @@
 
 from __future__ import annotations
 
+import copy
+import math
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
 import pytest
 
+from softfinger.daemon.profile.load import load
+from softfinger.tools.benchmarks.rigs import HIL
 from tests.soak import hil
+from tests.soak.faults import judge_wire
 
 
 def test_the_soak_in_real_time_judges_wire_memory_and_streams(
@@ -31,3 +40,40 @@ def test_a_process_that_grows_is_told() -> None:
     account.recorded = (5, 0)
     hil._conclude(account)
     assert [each.split()[0] for each in account.wrong] == ["leaky"]
+
+
+def servo(**changed: Any) -> dict[str, Any]:
+    return {
+        "torque": True,
+        "stopped_by_watchdog": False,
+        "goal_q": [-0.5, 1.0],
+        "goal_current": [-1.2, 1.2],
+        "goals_refused": 0,
+        "torque_on": {"count": 1, "t": 0.0, "far": 0, "farthest": 0.0, "current": 0.0},
+        "quiet": 0.001,
+        "longest_quiet": 0.01,
+        "watchdog_fired": {"count": 0, "t": None},
+    } | changed
+
+
+def judged(*servos: dict[str, Any]) -> str:
+    rig: Any = SimpleNamespace(settings=load(HIL, Path("hand")), report=lambda: {"servos": servos})
+    return judge_wire(rig)
+
+
+def test_the_wire_is_judged_by_its_record() -> None:
+    assert judged(servo(), servo(goal_q=None, goal_current=None)) == ""
+    for changed, told in (
+        ({"goal_q": [-0.5, 1.01]}, "goal angles"),
+        ({"goal_q": [-0.51, 0.0]}, "goal angles"),
+        ({"goal_current": [-1.21, 0.0]}, "goal currents"),
+        ({"goal_current": [0.0, math.nan]}, "goal currents"),
+        ({"longest_quiet": 0.3}, "without a packet"),
+        ({"goals_refused": 3}, "refused"),
+    ):
+        assert told in judged(servo(), servo(**changed))
+        assert told in judged(servo(**changed), servo())
+    far = copy.deepcopy(servo()["torque_on"]) | {"far": 1, "farthest": 0.3}
+    assert "off its goal" in judged(servo(torque_on=far))
+    fired = {"count": 1, "t": 0.1}
+    assert judged(servo(longest_quiet=0.3, goals_refused=3, watchdog_fired=fired)) == ""

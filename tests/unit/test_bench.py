@@ -9,7 +9,7 @@ import pytest
 
 from softfinger.daemon.errors import Refused
 from softfinger.tools import cli
-from softfinger.tools.benchmarks import bench, faults, growth, measuring, tick
+from softfinger.tools.benchmarks import bench, growth, measuring, tick, witnesses
 from softfinger.tools.benchmarks.measuring import (
     Report,
     Subject,
@@ -39,10 +39,10 @@ def test_turns_and_times(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_slopes_are_exponents_or_cost_for_each_more() -> None:
     rows = [figure(f"cells: {n}", "µs", [3.0 * n**2], cells=n) for n in (8, 16, 64)]
-    rows += [figure(f"sensors: {n}", "µs", [5.0 + 2.0 * n], cells=n) for n in (0, 1, 4)]
+    rows += [figure(f"sensors: {n}", "µs", [5.0 * (n > 0) + 2.0 * n], cells=n) for n in (0, 1, 4)]
     assert slopes(rows, "cells") == (
-        "  cells: ∝ (cells)^2.00",
-        "  sensors: +2 µs for each more",
+        "  cells: ∝ (cells)^2.00, at the end ^2.00",
+        "  sensors: +7 µs for 1 cells, +2 for each more",
     )
 
 
@@ -88,14 +88,14 @@ def test_a_failed_campaign_is_no_success(
 ) -> None:
     asked: list[tuple[int | None, str]] = []
 
-    def measure(trials: int | None, only: str) -> list[Report]:
+    def measure(trials: int | None, only: str, sweep: object) -> list[Report]:
         asked.append((trials, only))
         return [Report("part", [{"name": "x"}], failed=trials == 7)]
 
-    monkeypatch.setattr(faults, "measure", measure)
-    assert cli.main(["bench", "campaign", "faults"]) == 0
-    assert cli.main(["bench", "campaign", "faults", "--trials", "7", "--only", "board"]) == 1
-    assert asked == [(None, ""), (7, "board")]
+    monkeypatch.setattr(witnesses, "measure", measure)
+    assert cli.main(["bench", "campaign", "witnesses"]) == 0
+    assert cli.main(["bench", "campaign", "witnesses", "--trials", "7", "--only", "honest"]) == 1
+    assert asked == [(None, ""), (7, "honest")]
     capsys.readouterr()
 
 
@@ -103,11 +103,11 @@ def test_a_failed_campaign_is_no_success(
     ("words", "text"),
     [
         (["tik"], "found 'tik', expected one of estimator"),
-        (["faults"], "it is a campaign, `bench campaign faults`"),
-        (["campaign"], "'campaign' alone, expected one of faults, witnesses"),
+        (["witnesses"], "it is a campaign, `bench campaign witnesses`"),
+        (["campaign"], "'campaign' alone, expected one of witnesses"),
         (
-            ["campaign", "faults", "--only", "no such fault"],
-            "no case of faults has this in its name",
+            ["campaign", "witnesses", "--only", "no such lie"],
+            "no case of witnesses has this in its name",
         ),
         (["tick", "--full"], "--full: only reflex has it"),
     ],

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from softfinger.daemon.control.setpoint import JointSetpoints
+from softfinger.daemon.control.setpoint import Setpoint, SetpointState
 from softfinger.daemon.errors import Refused
 from softfinger.daemon.perception.contact_filter_kernels import HOLDING
 from softfinger.daemon.profile.load import load
@@ -227,34 +227,34 @@ def test_prediction_is_within_its_own_uncertainty_in_motion(
         assert hand.state.object.width == pytest.approx(0.040, abs=1e-4)
 
 
-def step(setpoints: JointSetpoints, rate: float) -> float:
-    setpoints.step(rate)
-    return setpoints.values[1]
+def step(setpoint: Setpoint, rate: float) -> float:
+    setpoint.step(rate)
+    return setpoint.value
 
 
 def test_a_setpoint_keeps_its_bounds_whatever_the_targets() -> None:
     rng = np.random.default_rng(2)
     dt, window, rate = 0.002, 0.1, 2.0
-    setpoints = JointSetpoints(dt, window)
+    setpoint = Setpoint(dt, window, SetpointState())
     way = []
     for tick in range(4000):
         if tick % rng.integers(1, 200) == 0:
-            setpoints.targets[1] = rng.uniform(-1.0, 1.0)
-        way.append(step(setpoints, rate))
-    way += [step(setpoints, rate) for _ in range(1200)]
+            setpoint.target = rng.uniform(-1.0, 1.0)
+        way.append(step(setpoint, rate))
+    way += [step(setpoint, rate) for _ in range(1200)]
     speed = np.diff(way) / dt
     assert np.abs(speed).max() <= rate * 1.0001
     assert np.abs(np.diff(speed)).max() / dt <= 2.0 * rate / window * 1.0001
     assert np.abs(np.diff(speed, 2)).max() / dt**2 <= 8.0 * rate / window**2 * 1.0001
     assert np.abs(way).max() <= 1.0
-    assert setpoints.step(rate)
-    assert setpoints.values == setpoints.targets
+    assert setpoint.step(rate)
+    assert setpoint.value == setpoint.target
 
 
 def test_a_step_of_the_setpoint_never_overshoots() -> None:
-    setpoints = JointSetpoints(0.002, 0.1)
-    setpoints.targets[1] = 1.0
-    way = [step(setpoints, 4.0) for _ in range(500)]
+    setpoint = Setpoint(0.002, 0.1, SetpointState())
+    setpoint.target = 1.0
+    way = [step(setpoint, 4.0) for _ in range(500)]
     assert all(np.diff(way) >= 0.0)
     assert way[-1] == 1.0
     arrival = next(k for k, value in enumerate(way) if value == 1.0)

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from softfinger.daemon.loop.build import Daemon
-from softfinger.daemon.safety.joint_motion import JointMotion
+from softfinger.daemon.safety.limits import JointMotion
 from softfinger.daemon.types import Reading
 from tests.harness.loop import Make, advance_to, command, grasped, refusal
 

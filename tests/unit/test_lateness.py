@@ -14,7 +14,7 @@ from softfinger.daemon.clock import HandClock
 from softfinger.daemon.loop import build as build_module
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.loop.publishing import parts
-from softfinger.daemon.loop.timing import EVERY, FIRST, RECENT, Lateness
+from softfinger.daemon.loop.timing import EVERY, RECENT, Lateness
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import Timing
 from softfinger.daemon.wire.schema import STATE
@@ -207,27 +207,6 @@ def looked(late: float, seconds: float) -> list[tuple[str, str, str]]:
     return [event for event in found if event is not None]
 
 
-def test_how_steady_the_first_second_was_is_told_once() -> None:
-    assert looked(0.0003, 0.9 * FIRST) == []
-    (told,) = looked(0.0003, 5.0 * FIRST)
-    assert told == (
-        "info",
-        "realtime",
-        "the longest pause between two ticks of the first second took 2.3 ms; "
-        "the servos' watchdog stops them after 100 ms",
-    )
-    (told,) = looked(0.035, 5.0 * FIRST)
-    assert told[0] == "warning"
-    for word in ("37 ms", "realtime.priority", "realtime.cpus", "softfinger doctor"):
-        assert word in told[2]
-
-
 def test_lateness_is_told_when_it_has_doubled() -> None:
     told = [event for event in looked(0.06, 17.0 * EVERY) if event[1] == "late"]
     assert len(told) == 6  # at 0, 1, 2, 4, 8 and 16 times EVERY
-
-
-def test_a_simulated_hand_has_no_budget_to_keep(on_late_machine: Build) -> None:
-    daemon, _, events = on_late_machine("auto")
-    daemon.loop.advance(3.0 * FIRST)
-    assert events == []

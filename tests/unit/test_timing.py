@@ -42,15 +42,10 @@ def test_times_off_the_scale_are_counted() -> None:
     assert spreads["compute"].p50 == pytest.approx(0.0, abs=2e-9)
 
 
-def test_nothing_counted_is_all_zero_and_reset_forgets() -> None:
+def test_nothing_counted_is_all_zero() -> None:
     statistics = Statistics()
     assert statistics.ticks == 0
     assert all(spread == (0.0, 0.0, 0.0, 0.0) for spread in statistics.spreads().values())
-    record(statistics.counts, statistics.largest, (1e-3, 1e-3, 1e-3, 1e-3))
-    assert statistics.ticks == 1
-    statistics.reset()
-    assert statistics.ticks == 0
-    assert statistics.spreads()["wake"].max == 0.0
 
 
 def test_keeping_them_allocates_nothing() -> None:

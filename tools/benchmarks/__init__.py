@@ -1,5 +1,4 @@
 """``softfinger bench``: one module for each thing it measures, and what they share.
 
-`measuring`, `picture`, `rigs` and `virtual_grip` know no single measurement; `faults` and
-`witnesses` are campaigns.
+`measuring`, `rigs` and `virtual_grip` know no single measurement; `witnesses` is a campaign.
 """

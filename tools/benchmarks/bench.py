@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 
 from softfinger.daemon.errors import SoftfingerError
 from softfinger.daemon.own_files import write_text
-from softfinger.tools.arguments import number
 from softfinger.tools.sweep import Sweep, add_sweep
 
 if TYPE_CHECKING:
@@ -30,7 +29,6 @@ MEASUREMENTS = {
     "growth": "cost and error against cells, subscribers, sensors, rate",
 }
 CAMPAIGNS = {
-    "faults": "faults on the emulated hand and what comes of them, an hour for 100 trials each",
     "witnesses": "false measurements, and the true force of a grip on them, a quarter of an hour",
 }
 SWEPT = ("reflex", "witnesses")  # on virtual time, which others on the machine don't disturb
@@ -51,7 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         f"about a minute; or '{_CAMPAIGN}' and one of {long}",
     )
     parser.add_argument(
-        "--trials", type=_trials, metavar="N", help="trials of each case of a campaign"
+        "--trials", type=_count, metavar="N", help="trials of each case of a campaign"
     )
     parser.add_argument(
         "--only", default="", metavar="TEXT", help="cases of a campaign with this in their name"
@@ -81,7 +79,6 @@ def run(arguments: argparse.Namespace) -> int:
     except ValueError as error:
         print(f"bench: {error}", file=sys.stderr)
         return 2
-    machine = _processor()
     load = [os.getloadavg()[0]]
     rows: list[Row] = []
     tables: list[Report] = []
@@ -97,14 +94,10 @@ def run(arguments: argparse.Namespace) -> int:
         tables += found
     load.append(os.getloadavg()[0])
     if not arguments.names:
-        title = f"{machine}, {os.cpu_count()} cores, load {load[0]:.1f} to {load[1]:.1f}"
+        title = f"{_processor()}, {os.cpu_count()} cores, load {load[0]:.1f} to {load[1]:.1f}"
         print(Report(title, _page(tables)))
     if arguments.json:
-        about = {
-            "machine": machine,
-            "cores": os.cpu_count(),
-            "load": load,
-        }
+        about = {"machine": _processor(), "cores": os.cpu_count(), "load": load}
         content = about | {"python": platform.python_version(), "rows": rows}
         with write_text(arguments.json) as file:
             file.write(json.dumps(content, indent=2) + "\n")
@@ -159,6 +152,10 @@ def _page(tables: list[Report]) -> list[Row]:
     ]
 
 
+def _module(name: str) -> ModuleType:
+    return importlib.import_module(f"softfinger.tools.benchmarks.{name}")
+
+
 def _processor() -> str:
     """The processor's name where Linux says it."""
     try:
@@ -166,14 +163,6 @@ def _processor() -> str:
         return next(line.split(":")[1].strip() for line in lines if line.startswith("model name"))
     except (OSError, StopIteration):
         return platform.machine()
-
-
-def _trials(text: str) -> int:
-    return int(number(text, "a whole number above 0", 1.0, includes_low=True))
-
-
-def _module(name: str) -> ModuleType:
-    return importlib.import_module(f"softfinger.tools.benchmarks.{name}")
 
 
 def _check(names: list[str], texts: dict[str, str], arguments: argparse.Namespace) -> None:
@@ -188,3 +177,10 @@ def _check(names: list[str], texts: dict[str, str], arguments: argparse.Namespac
             raise ValueError(f"found {name!r}, expected one of {', '.join(texts)}{hint}")
         if texts is CAMPAIGNS and not any(arguments.only in case for case in _module(name).NAMES):
             raise ValueError(f"--only {arguments.only}: no case of {name} has this in its name")
+
+
+def _count(text: str) -> int:
+    """A whole number above 0. Raises ArgumentTypeError with what was found."""
+    if not (text.isdecimal() and int(text) > 0):
+        raise argparse.ArgumentTypeError(f"expected a whole number above 0, found {text!r}")
+    return int(text)

@@ -22,7 +22,7 @@ import numpy as np
 import zmq
 from numpy.typing import NDArray
 
-from softfinger.daemon.client.command_client import NoAnswer, send
+from softfinger.daemon.client.command_client import NoAnswer
 from softfinger.daemon.clock import Clock
 from softfinger.daemon.errors import SoftfingerError
 from softfinger.daemon.loop.build import Daemon
@@ -302,7 +302,14 @@ class Rig:
 
     def ask(self, request: dict[str, Any], timeout: float = 2.0) -> dict[str, Any]:
         """One command and its reply. Raises NoAnswer."""
-        return send(self.commands, request, timeout)
+        with self.context.socket(zmq.REQ) as socket:
+            socket.setsockopt(zmq.LINGER, 0)
+            socket.connect(self.commands)
+            socket.send(msgpack.packb(request))
+            if not socket.poll(int(timeout * 1000)):
+                raise NoAnswer(f"no answer to {request['command']} within {timeout:g} s")
+            reply: dict[str, Any] = msgpack.unpackb(socket.recv())
+        return reply
 
     def status(self, timeout: float = 0.5) -> dict[str, Any] | None:
         """Return the daemon's status, None when it does not answer."""

@@ -22,7 +22,7 @@ from softfinger.tools.processes.beside import MonitorBeside, NoRecorder, Recorde
 from softfinger.tools.processes.event_log import EventLog
 
 _STARTED = time.monotonic()
-_DETAILS = ("realtime", "schedule")  # kinds of news that only --verbose logs
+_DETAIL = "realtime"  # kind of news that only --verbose logs
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -37,9 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--log-file", type=Path, metavar="FILE", help="log to FILE's end, not to standard error"
     )
-    parser.add_argument(
-        "--verbose", action="store_true", help="also log the real-time measures and the schedule"
-    )
+    parser.add_argument("--verbose", action="store_true", help="also log the real-time measures")
     parser.add_argument(
         "--no-task", action="store_true", help="stay disarmed although the profile names a task"
     )
@@ -85,7 +83,6 @@ def _serve(
 
     hold_collector()
     from softfinger.daemon.loop.build import Daemon
-    from softfinger.daemon.loop.publishing import plan
     from softfinger.tools.processes.kernel_build import build_kernels
 
     log.line("info", "start", f"softfinger: {_scene(settings)}", rate_hz=settings.loop.rate)
@@ -93,7 +90,7 @@ def _serve(
     daemon = None
 
     def on_event(level: str, kind: str, text: str) -> None:
-        if arguments.verbose or level != "info" or kind not in _DETAILS:
+        if arguments.verbose or level != "info" or kind != _DETAIL:
             log.line(level, kind, text, **({} if daemon is None else _numbers(daemon.loop.state)))
 
     try:
@@ -107,7 +104,6 @@ def _serve(
         signal.signal(signal.SIGUSR1, lambda *_: loop.stop())
         for event in measures.events():
             loop.emit(*event)
-        loop.emit("info", "schedule", plan(settings))
         seconds = time.monotonic() - _STARTED
         within = max(table.max_error for table in daemon.tables)
         ready = (

@@ -1,0 +1,87 @@
+"""Measurements that lie on the emulated hand, over serial bytes: its own true force is bounded."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from statistics import fmean
+from typing import Any
+
+import pytest
+
+from softfinger.tools.benchmarks.rigs import Rig
+from tests.conftest import until
+
+FORCE = 6.0  # N
+LOOK, SETTLED = 3.5, 0.5  # s of the emulated hand's time, in all and in the end
+
+GAINS = ("left:gain=0.6@0..2",)
+CURRENT = "left:current=2"
+REFUSED = ("left:shift-x=3", "right:drift=-0.2@0..2")  # the hand lets go
+
+
+@pytest.fixture(scope="module")
+def rig() -> Iterator[Rig]:
+    """An emulated hand and its daemon, which share one time."""
+    with Rig() as made:
+        text = made.config.read_text(encoding="utf-8")
+        made.config.write_text(text.replace('loop.clock = "real"\n', ""), encoding="utf-8")
+        made.start()
+        yield made
+
+
+def mode(rig: Rig) -> str:
+    return str((rig.status(60.0) or {"mode": "none"})["mode"])
+
+
+def gripped(rig: Rig) -> None:
+    """Let an honest hand hold the object at its place; a busy machine's faults are cleared."""
+    rig.send("well")
+    rig.ask({"command": "stop"}, 60.0)
+    opened = False
+
+    def goes_on() -> bool:
+        nonlocal opened
+        now = mode(rig)
+        if now == "armed" and opened:
+            rig.send("place")
+        step: dict[str, Any] = {
+            "fault": {"command": "clear"},
+            "disarmed": {"command": "arm"},
+            "armed": {"command": "grasp", "force": FORCE} if opened else {"command": "release"},
+        }.get(now, {"command": "status"})
+        carried_out = rig.ask(step, 60.0)["ok"]
+        opened = (opened or step["command"] == "release") and carried_out
+        return now == "holding"
+
+    until(goes_on)
+
+
+def watched(rig: Rig) -> Iterator[dict[str, Any]]:
+    """Yield the emulated hand's reports until it has lived for so long, or nothing drives it."""
+    begin = rig.report()["t"]
+    while True:
+        report = rig.report()
+        yield report
+        driven = any(servo["torque"] for servo in report["servos"])
+        if report["t"] > begin + LOOK or not driven:
+            return
+
+
+@pytest.mark.parametrize("lie", [*GAINS, CURRENT, *REFUSED])
+def test_a_lie_is_bounded_and_nothing_else_is_named(rig: Rig, lie: str) -> None:
+    false = f"witness.{lie.split(':')[0]}_{'current' if lie == CURRENT else 'sensor'}"
+    gripped(rig)
+    before = len(rig.log())
+    rig.send(lie)
+    reports = list(watched(rig))
+    assert max(max(report["force"]) for report in reports) < 1.3 * FORCE
+    if lie not in GAINS:  # which may be believed in part, and need not be named
+        until(lambda: any(false in line for line in rig.log()[before:]))
+    assert not [line for line in rig.log()[before:] if "witness." in line and false not in line]
+    if lie in REFUSED:
+        until(lambda: mode(rig) == "fault")
+        return
+    assert mode(rig) == "holding"
+    end = reports[-1]["t"] - SETTLED
+    last = fmean(fmean(report["force"]) for report in reports if report["t"] > end)
+    assert last == pytest.approx(FORCE, rel=0.2)
