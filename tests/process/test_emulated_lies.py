@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from softfinger.tools.benchmarks.rigs import Rig
 from tests.conftest import until
+from tests.soak.rig import Rig
 
 FORCE = 6.0  # N
 LOOK, SETTLED = 3.5, 0.5  # s of the emulated hand's time, in all and in the end

@@ -13,7 +13,7 @@ import pytest
 from softfinger.daemon.profile.load import load
 from softfinger.tools.benchmarks.rigs import HIL
 from tests.soak import hil
-from tests.soak.faults import judge_wire
+from tests.soak.rig import judge_wire
 
 
 def test_the_soak_in_real_time_judges_wire_memory_and_streams(

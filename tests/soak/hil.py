@@ -28,10 +28,10 @@ import numpy as np
 
 from softfinger.daemon.client.command_client import NoAnswer
 from softfinger.daemon.client.hand import Hand
-from softfinger.tools.benchmarks.rigs import SOFTFINGER, Rig, RigError
+from softfinger.tools.benchmarks.rigs import SOFTFINGER, RigError
 from softfinger.tools.ending import Ending
 from softfinger.tools.recordings.reader import Recording
-from tests.soak.faults import CASES, End, judge_wire
+from tests.soak.rig import CASES, End, Rig, judge_wire
 
 SECONDS = 3600.0
 SUBSCRIBERS = 3
