@@ -19,7 +19,6 @@ from softfinger.daemon.own_files import write_bytes
 from softfinger.tools.extras import require
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 DPI = 200
@@ -84,35 +83,6 @@ def ordered(count: int) -> list[dict[str, Any]]:
 
     shades = matplotlib.colormaps["viridis"](np.linspace(0.72, 0.0, count))
     return [{"color": shades[i], "linestyle": _DASHES[i % len(_DASHES)]} for i in range(count)]
-
-
-def label_ends(
-    axes: Axes, x: float, ends: Sequence[float], labels: Sequence[str], gap: float = 0.05
-) -> None:
-    """Write each label right of its line's end (x, y), pushed apart by ``gap`` of the axis."""
-    low, high = axes.get_ylim()
-    step = gap * (high - low)
-    order = np.argsort(ends)
-    places = np.array(ends, dtype=np.float64)[order]
-    for _ in range(200):  # relax until none overlap
-        lack = step - np.diff(places)
-        if not np.any(lack > 1e-9 * step):
-            break
-        push = 0.5 * np.maximum(lack, 0.0)
-        places[:-1] -= push
-        places[1:] += push
-    for rank, i in enumerate(order):
-        axes.annotate(
-            labels[i],
-            xy=(x, ends[i]),
-            xytext=(14, places[rank]),
-            textcoords=("offset points", "data"),
-            va="center",
-            fontsize=7.5,
-            color=INK,
-            annotation_clip=False,
-            arrowprops={"arrowstyle": "-", "lw": 0.4, "color": GREY, "shrinkA": 0, "shrinkB": 1},
-        )
 
 
 def caption(figure: Figure, lines: Sequence[str]) -> None:

@@ -11,7 +11,14 @@ import msgpack
 import zmq
 
 from softfinger import SoftfingerError
-from softfinger.daemon.client.connection import PATIENCE, SILENCE, default_addresses, still_waiting
+from softfinger.daemon.client.connection import (
+    PATIENCE,
+    SILENCE,
+    both_addresses,
+    default_addresses,
+    is_host,
+    still_waiting,
+)
 from softfinger.daemon.errors import HandClosed, Refused
 from softfinger.daemon.wire.keys import ClientKeys, load_client
 from softfinger.daemon.wire.local_stop import stop_locally
@@ -112,6 +119,8 @@ class HandClient(Generic[_Done]):
         keys: Path | None = None,
     ) -> None:
         usual = default_addresses()
+        if stream is not None and commands is None and ("," in stream or is_host(stream)):
+            usual, stream = both_addresses(stream, "address"), None
         self.stream_address = stream or usual[0]
         self.command_address = commands or usual[1]
         self.client = client

@@ -63,7 +63,9 @@ class Subscription(Subscriber[_Record]):
 
 
 class Hand(HandClient[None]):
-    """A hand by its two addresses. Not for use from several threads at once; make one in each.
+    """A hand by its two addresses, or by one text as ``tcp://HOST`` or ``STREAM,COMMANDS``.
+
+    Not for use from several threads at once; make one in each.
 
     The addresses are, unless given, those in the environment variable SOFTFINGER_ADDRESS
     (`client.connection.default_addresses`), or else this machine's. ``client`` is the name that

@@ -15,7 +15,11 @@ import numpy as np
 from softfinger.daemon.clock import RealClock
 from softfinger.daemon.diagnosis.ports import check_latency_timer
 from softfinger.daemon.errors import ServoError, TactileError
-from softfinger.daemon.perception.calibration_file import Converter, calibration_for
+from softfinger.daemon.perception.calibration_file import (
+    CalibrationFileError,
+    Converter,
+    calibration_for,
+)
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.base import Finding
@@ -38,6 +42,7 @@ _PATIENCE = 5.0  # s for a board: one that its adapter resets when the port is o
 _LISTEN = 0.5  # s of a board's frames
 _REST_NOISE = 3.0  # of a cell's noise, that a tared board's median cell does not reach at rest
 _OFF_RATE = 0.1  # share of the rate by which a board may be off
+_SAME_POISSON = 0.02  # by which ν may differ: presses tell it no better
 
 
 def check_servos(settings: Settings) -> list[Finding]:
@@ -107,6 +112,27 @@ def _blame_power(examined: list[Examined]) -> list[Finding]:
         return [Finding("note", "found", problem)]
     fix = "likely the power or cable from one servo to the next: swap it, then look at the supply"
     return [Finding("note", "found", f"{problem}; {min(volts):.1f} V at those that do", fix)]
+
+
+def check_law(settings: Settings, finger: int) -> Finding:
+    """Compare a tip's contact law with the one that the presses of `calibrate law` want."""
+    name, tip = f"tip {FINGERS[finger]}", settings.tip
+    try:
+        calibration = calibration_for(settings, finger)
+    except CalibrationFileError as error:
+        return Finding("FAIL", name, str(error), "`softfinger calibrate`")
+    if calibration is None or not calibration.wants:
+        problem = f"tip.physics is {tip.physics!r}, which no presses have tried"
+        return Finding("note", name, problem, "`softfinger calibrate law`")
+    for key, wanted in calibration.wants.items():
+        found = getattr(tip, key)
+        near = isinstance(wanted, float) and key == "poisson"
+        if found != wanted and not (near and abs(found - wanted) <= _SAME_POISSON):
+            problem = (
+                f"tip.{key} is {found!r}, where the presses of `calibrate law` want {wanted!r}"
+            )
+            return Finding("warn", name, problem, f"set tip.{key}")
+    return Finding("pass", name, f"{tip.physics}, the law that its presses want")
 
 
 def check_board(settings: Settings, finger: int) -> Finding:

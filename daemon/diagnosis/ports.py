@@ -40,9 +40,13 @@ def note_ports() -> Finding:
 def check_runtime_folder() -> Finding:
     """Check the folder of emulated hands' ports and of the local stop: nobody else may fill it."""
     what, _, fix = runtime_fault().partition(": chmod ")
-    if not what:
-        return Finding("pass", "runtime folder", str(runtime_folder()))
-    return Finding("warn", "runtime folder", what, fix and f"chmod {fix}")
+    if what:
+        return Finding("warn", "runtime folder", what, fix and f"chmod {fix}")
+    folder = runtime_folder()
+    if folder.exists() and folder.stat().st_mode & 0o077:
+        what = f"{folder}: others may enter it, so the local stop is elsewhere"
+        return Finding("warn", "runtime folder", what, f"chmod 700 {folder}")
+    return Finding("pass", "runtime folder", str(folder))
 
 
 def check_port(path: str, key: str, mode_of_daemon: str = "") -> Finding:

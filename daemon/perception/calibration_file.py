@@ -129,7 +129,10 @@ class ScalesStep(_StepModel):
 
 
 class Calibration(_StepModel):
-    """All steps of one sensor. Frozen: a step is put in by ``model_copy(update=…)``."""
+    """All steps of one sensor. Frozen: a step is put in by ``model_copy(update=…)``.
+
+    ``wants`` are the settings of ``[tip]`` that the presses of `calibrate law` want, by name.
+    """
 
     format: Literal[1] = 1
     sensor: Sensor
@@ -141,6 +144,7 @@ class Calibration(_StepModel):
     modulus: ModulusStep | None = None
     law: TipCurves | None = None
     scales: ScalesStep | None = None
+    wants: dict[Literal["physics", "base", "face", "poisson"], str | float] = {}
 
     @property
     def identity(self) -> str:

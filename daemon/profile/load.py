@@ -86,7 +86,7 @@ def find(path: Path) -> Path:
 
     Raises SettingsError for a bare name that neither is one of `names` nor a file here.
     """
-    if path.suffix or path.parent != Path() or path.exists():
+    if path.suffix or path.parent != Path() or (path.exists() and not path.is_dir()):
         return path
     file = _PROFILES / f"{path.name}.toml"
     if not file.exists():

@@ -153,7 +153,8 @@ def _own_folder() -> tuple[Path, str]:
         if _is_ours(folder):
             return folder, notice and f"{notice}; the local stop is in {folder}"
         refused = PermissionError(1, "is not this user's alone", str(folder))
-        notice = f"{folder} is not this user's alone"
+        ours = folder.lstat().st_uid == os.geteuid()
+        notice = f"{folder} is not this user's alone{f' (chmod 700 {folder})' * ours}"
     assert refused is not None
     raise refused
 

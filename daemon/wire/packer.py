@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import msgpack
@@ -18,16 +19,10 @@ from softfinger.daemon.wire.schema import INPUT, STATE, TOPICS
 Pack = Callable[[Any], bytes]
 
 pack = msgpack.Packer(use_bin_type=True).pack
-_float = struct.Struct(">Bd").pack
-_wide = struct.Struct(">Bq").pack
-_PACK: dict[type, Pack] = {
-    int: pack,
-    float: lambda value: _float(0xCB, value),
-    bool: lambda value: b"\xc3" if value else b"\xc2",
-    str: pack,
-    bytes: pack,
-}
-_WIDE: dict[type, Pack] = _PACK | {int: lambda value: _wide(0xD3, value)}
+_float = partial(struct.Struct(">Bd").pack, 0xCB)
+_bool = (b"\xc2", b"\xc3").__getitem__
+_PACK: dict[type, Pack] = {int: pack, float: _float, bool: _bool, str: pack, bytes: pack}
+_WIDE: dict[type, Pack] = _PACK | {int: partial(struct.Struct(">Bq").pack, 0xD3)}
 
 
 def packer(topic: bytes) -> Callable[..., bytes]:

@@ -2,11 +2,13 @@
 
 In the order in which it is done: tare (what the cells read unloaded), equilibration (what makes
 the cells alike), curve (alike readings → pressure), centre (where the tip stands on the sensor and
-how that is turned), modulus (the tip's own law). Each returns its result with the residuals.
+how that is turned), modulus (the tip's own law), relaxation (how its force falls in a hold). Each
+returns its result with the residuals.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,6 +23,7 @@ from softfinger.kinematics.calibration.press_fit import (
     Trend,
     depth_of_force,
     fit_place,
+    golden_section,
     modulus_by_force,
     trend,
 )
@@ -36,12 +39,13 @@ DEAD = 0.2  # of the median response: cells below are dead
 _EXPONENTS = (0.3, 3.0)
 _RESTLESS = 8.0  # times the usual noise
 _FEW_CELLS = 4  # may be faulty
-_BINS = 24  # of strain
 _TILT_MIN = math.radians(3.0)  # tilts that differ by less show no direction
 _UPRIGHT = math.radians(0.5)
 _LAGS = 8  # cells over which noise may be correlated
 _SEEN = 4.0  # standard errors
 _ENDED = 4.0  # of noise: a zero below it is touched by the end at 0
+_HELD = 2.0  # times the longest term to be found, at least, that a hold must last
+_ROUNDS = 25  # in which strengths and press are found in turns
 
 
 class CalibrationError(SoftfingerError, ValueError):
@@ -228,11 +232,7 @@ def _power(
     grid = np.linspace(*_EXPONENTS, 28)
     best = int(np.argmin([cost(float(b)) for b in grid]))
     low, high = float(grid[max(best - 1, 0)]), float(grid[min(best + 1, len(grid) - 1)])
-    golden = 0.5 * (math.sqrt(5.0) - 1.0)
-    for _ in range(40):
-        left, right = high - golden * (high - low), low + golden * (high - low)
-        low, high = (low, right) if cost(left) < cost(right) else (left, high)
-    exponent = 0.5 * (low + high)
+    exponent = golden_section(cost, low, high, 1e-9)
     if not _EXPONENTS[0] + 0.02 < exponent < _EXPONENTS[1] - 0.02:
         raise CalibrationError(f"curve: these loads want an exponent beyond {_EXPONENTS}")
     factor, errors = fit(exponent)
@@ -357,7 +357,7 @@ def fit_centre(
 
 @dataclass(frozen=True)
 class Modulus:
-    """E [Pa] of F = πE(d − d₀)²/cos θ; ``offset`` d₀ [m]; ``errors`` [n] relative, of the force.
+    """E [Pa] of the tip's F(d − d₀, θ); ``offset`` d₀ [m]; ``errors`` [n] relative, of the force.
 
     ``trend``: E of each load alone.
     """
@@ -369,18 +369,11 @@ class Modulus:
     trend: Trend
 
 
-def fit_modulus(
-    d: ArrayLike,
-    theta: ArrayLike,
-    force: ArrayLike,
-    free_offset: bool = True,
-    tip: Fingertip | None = None,
-) -> Modulus:
-    """Fit a constant modulus to a compression run: √(F cos θ/π) is a line in d of slope √E.
+def fit_modulus(d: ArrayLike, theta: ArrayLike, force: ArrayLike, tip: Fingertip) -> Modulus:
+    """Fit a constant modulus of ``tip``, and the run's own zero of d, to a compression run.
 
-    ``d`` [m], ``theta`` [rad], ``force`` [N] by the sensor, all [n]. ``free_offset``: the run's own
-    zero of d is fitted too. A solid ``tip`` has its own force law. Raises CalibrationError for too
-    few points.
+    ``d`` [m], ``theta`` [rad], ``force`` [N] by the sensor, all [n]. Raises CalibrationError for
+    too few points, and for a force that does not rise with d.
     """
     depth, tilt, load = (np.asarray(each, np.float64) for each in (d, theta, force))
     if not depth.shape == tilt.shape == load.shape:
@@ -389,93 +382,78 @@ def fit_modulus(
     if np.count_nonzero(used) < 3 or np.ptp(depth[used]) <= 0.0:
         raise CalibrationError("modulus: expected at least three frames of different d, pressed")
     depth, tilt, load = depth[used], tilt[used], load[used]
-    if tip is not None and tip.physics == "solid":
-        modulus, offset, fitted = modulus_by_force(depth, tilt, load, tip, free_offset)
-        if not modulus > 0.0:
-            raise CalibrationError("modulus: the force does not rise with d")
-        errors = fitted / load - 1.0
-        alone = trend(depth, modulus / (1.0 + errors), load)
-        return Modulus(modulus, offset, errors, _rms(errors), alone)
-    root = np.sqrt(load * np.cos(tilt) / math.pi)
-    rows = np.stack([depth, np.ones(len(depth))], axis=1) if free_offset else depth[:, None]
-    solution = np.linalg.lstsq(rows, root, rcond=None)[0]
-    if not solution[0] > 0.0:
+    if not np.polyfit(depth, load, 1)[0] > 0.0:
         raise CalibrationError("modulus: the force does not rise with d")
-    fitted = rows @ solution
-    offset = -float(solution[1] / solution[0]) if free_offset else 0.0
-    errors = (fitted / root) ** 2 - 1.0
-    modulus = float(solution[0]) ** 2
+    modulus, offset, fitted = modulus_by_force(depth, tilt, load, tip)
+    errors = fitted / load - 1.0
     alone = trend(depth, modulus / (1.0 + errors), load)
     return Modulus(modulus, offset, errors, _rms(errors), alone)
 
 
-@dataclass(frozen=True)
-class MeasuredLaw:
-    """Measured points of σ(ε): strain [m], stress [m] Pa; ``residual``: rms of the cells [Pa]."""
+@dataclass(frozen=True, eq=False)
+class Relaxation:
+    """Strengths r of F = c F∞ (1 + Σ r_i (1 − h_i/F∞)), ḣ_i = (F∞ − h_i)/τ_i.
 
-    strain: FloatArray
-    stress: FloatArray
-    material: Material
-    residual: float
-
-
-def fit_law(
-    frames: ArrayLike,
-    d: ArrayLike,
-    theta: ArrayLike,
-    tip: Fingertip,
-    grid: SensorGrid,
-    used: NDArray[np.bool_] | None = None,
-) -> MeasuredLaw:
-    """Return σ(ε) from a compression run: each cell under the tip is a measured point of it.
-
-    ``frames`` [n, rows, cols] Pa, ``d`` [n] m, ``theta`` [n] rad; ``used`` [n, rows, cols] leaves
-    out dead and saturated cells. A cell's strain is the model's, averaged over it; points are the
-    means over narrow bands of strain, those that noise has put out of order taken together. Raises
-    CalibrationError when the points make no law.
+    ``residual`` is the r.m.s. of F's relative errors in the hold, ``elastic`` that without any r.
     """
-    stack = _stack(frames, "modulus")
-    unit = Material.constant(1.0)
-    strains, stresses = [], []
-    valid = np.ones(stack.shape, np.bool_) if used is None else used
-    for frame, usable, depth, tilt in zip(
-        stack, valid, np.asarray(d, np.float64), np.asarray(theta, np.float64), strict=True
-    ):
-        if depth <= 0.0:
-            continue
-        if depth > tip.radius:
-            raise CalibrationError(f"modulus: d = {depth:g} m is more than the tip's radius")
-        strain = grid.pressure(tip, unit, float(depth), float(tilt))
-        inside = usable & (strain > 0.0)
-        strains.append(strain[inside])
-        stresses.append(frame[inside])
-    if not strains:
-        raise CalibrationError("modulus: no frame with d above 0")
-    strain, stress = np.concatenate(strains), np.concatenate(stresses)
-    if not strain.size:
-        raise CalibrationError("modulus: no cell under the tip has a valid reading")
-    edges = np.linspace(0.0, float(strain.max()) * (1 + 1e-12), _BINS + 1)
-    place = np.digitize(strain, edges) - 1
-    filled = np.flatnonzero(np.bincount(place, minlength=_BINS) >= 3)
-    means = _rising([(strain[place == k], stress[place == k]) for k in filled])
-    try:
-        material = Material.from_points(means[:, 0], means[:, 1])
-    except (ValueError, IndexError) as error:
-        raise CalibrationError(f"modulus: the run makes no stress-strain law: {error}") from None
-    residual = _rms(material.stress(strain) - stress)
-    return MeasuredLaw(means[:, 0], means[:, 1], material, residual)
+
+    strengths: tuple[float, ...]
+    residual: float
+    elastic: float
+    model: FloatArray  # F by the fit [N], in the press as measured
 
 
-def _rising(bands: list[tuple[FloatArray, FloatArray]]) -> FloatArray:
-    """(mean strain, mean stress) of each band, neighbours whose stress falls pooled, [k, 2]."""
-    pooled: list[list[float]] = []  # count, sum of strain, sum of stress
-    for strain, stress in bands:
-        pooled.append([float(len(strain)), float(strain.sum()), float(stress.sum())])
-        while len(pooled) > 1 and pooled[-1][2] * pooled[-2][0] <= pooled[-2][2] * pooled[-1][0]:
-            last = pooled.pop()
-            pooled[-1] = [a + b for a, b in zip(pooled[-1], last, strict=True)]
-    sums = np.array(pooled).reshape(-1, 3)
-    return np.asarray(sums[:, 1:] / sums[:, :1])
+def follow(t: FloatArray, lasting: FloatArray, time: float) -> FloatArray:
+    """Return h of ḣ = (F∞ − h)/τ, 0 at first, for a ``lasting`` F∞ straight between the ``t``."""
+    out = np.zeros_like(lasting)
+    for k in range(1, t.size):
+        step = (t[k] - t[k - 1]) / time
+        slope = (lasting[k] - lasting[k - 1]) / step if step > 0.0 else 0.0
+        start = out[k - 1] - lasting[k - 1] + slope
+        out[k] = lasting[k] - slope + start * np.exp(-step)
+    return out
+
+
+def fit_relaxation(t: ArrayLike, force: ArrayLike, times: tuple[float, ...]) -> Relaxation:
+    """Fit the strengths, none below 0, to the ``force`` [N] over ``t`` [s] of a press and its hold.
+
+    ``times`` [s] are the terms'. The press is as fast and as deep as it likes; it begins clear of
+    the tip, or what relaxed before is not found. What F∞ is in the press follows from F and the
+    strengths, so both are found in turns; in the hold it is constant. A term shorter than two
+    frames can't be told and is left 0. Raises CalibrationError for too short a hold.
+    """
+    at, load = np.asarray(t, np.float64), np.asarray(force, np.float64)
+    if at.size < 8 or not load.max() > 0.0:
+        raise CalibrationError("relaxation: expected at least eight frames of one press and hold")
+    noise = float(np.std(np.diff(load[at.size // 2 :]))) / math.sqrt(2.0)
+    held = int(np.argmax(load >= load.max() - _SEEN * noise))  # the deepest: from there it falls
+    told = [k for k, time in enumerate(times) if time > 2.0 * (at[-1] - at[0]) / (at.size - 1)]
+    if told and at[-1] - at[held] < _HELD * max(times[k] for k in told):
+        raise CalibrationError(
+            f"relaxation: found {at[-1] - at[held]:.1f} s of hold, expected at least {_HELD:g} "
+            f"times the longest of tip.relaxation_times, {max(times):g} s"
+        )
+    lasting = np.maximum(load, 0.0)
+    lasting[held:] = load[-1]
+    for _ in range(_ROUNDS):
+        memory = np.array([follow(at, lasting, times[k]) for k in told]).reshape(-1, at.size)
+        columns = np.stack([lasting, *(lasting - memory)], axis=1)[held:]
+        fits = []
+        # Of so few terms each choice is tried: the best of those whose strengths are all above 0.
+        for chosen in itertools.product((False, True), repeat=len(told)):
+            used = np.flatnonzero((True, *chosen))
+            found = np.linalg.lstsq(columns[:, used], load[held:], rcond=None)[0]
+            if (found >= 0.0).all():
+                strengths = np.zeros(len(told))
+                strengths[used[1:] - 1] = found[1:] / found[0]
+                model = columns[:, used] @ found
+                fits.append((_rms(model / load[held:] - 1.0), found[0], strengths, model))
+        error, scale, strengths, model = min(fits, key=lambda fit: fit[0])
+        passed = np.maximum(load, 0.0) / scale + strengths @ memory
+        lasting[:held] = (passed / (1.0 + strengths.sum()))[:held]
+    whole = np.zeros(len(times))
+    whole[told] = strengths
+    return Relaxation(tuple(whole.tolist()), error, fits[0][0], np.append(load[:held], model))
 
 
 def _stack(frames: ArrayLike, step: str) -> FloatArray:

@@ -6,7 +6,7 @@ Least squares over all cells of all frames, for whichever tip, by the forward mo
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 
@@ -187,17 +187,24 @@ def _best_poisson(presses: Presses, tip: Fingertip, grid: SensorGrid) -> TipFit:
     def at(poisson: float) -> TipFit:
         return fit_tip(presses, replace(tip, poisson=poisson), grid)
 
-    low, high = POISSON
-    inner = [at(high - _GOLDEN * (high - low)), at(low + _GOLDEN * (high - low))]
-    while high - low > _NARROW:
-        left, right = inner
-        if left.chi2 < right.chi2:
-            high = right.tip.poisson
-            inner = [at(high - _GOLDEN * (high - low)), left]
+    inner = golden_section(lambda poisson: at(poisson).chi2, *POISSON, _NARROW)
+    return min((at(poisson) for poisson in (inner, *POISSON)), key=lambda fit: fit.chi2)
+
+
+def golden_section(cost: Callable[[float], float], low: float, high: float, within: float) -> float:
+    """Return where ``cost`` is least between ``low`` and ``high``, ``within`` so much."""
+    left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
+    at_left, at_right = cost(left), cost(right)
+    while high - low > within:
+        if at_left < at_right:
+            high, right, at_right = right, left, at_left
+            left = high - _GOLDEN * (high - low)
+            at_left = cost(left)
         else:
-            low = left.tip.poisson
-            inner = [right, at(low + _GOLDEN * (high - low))]
-    return min([*inner, at(low), at(high)], key=lambda fit: fit.chi2)
+            low, left, at_left = left, right, at_right
+            right = low + _GOLDEN * (high - low)
+            at_right = cost(right)
+    return 0.5 * (low + high)
 
 
 def _with_errors(
@@ -298,17 +305,15 @@ def depth_of_force(tip: Fingertip, material: Material, force: FloatArray) -> Flo
 
 
 def modulus_by_force(
-    d: FloatArray, theta: FloatArray, force: FloatArray, tip: Fingertip, free_offset: bool
+    d: FloatArray, theta: FloatArray, force: FloatArray, tip: Fingertip
 ) -> tuple[float, float, FloatArray]:
-    """Fit E [Pa] and, if free, the zero of d [m] by least relative squares; the forces [n], too."""
-    unit, offset = ContactTable.build(tip, _UNIT), 0.0
-    modulus = 0.0
+    """Fit E [Pa] and the zero of d [m] by least relative squares; return the forces [n], too."""
+    unit, offset, modulus = ContactTable.build(tip, _UNIT), 0.0, 0.0
     for _ in range(30):
         c = unit(np.maximum(d - offset, 1e-9), theta)
-        columns = np.stack([c.force, -c.force_d][: 2 if free_offset else 1], axis=1)
-        found = np.linalg.lstsq(columns / force[:, None], np.ones(len(force)), rcond=None)[0]
-        modulus = float(found[0])
-        step = float(np.clip(found[1] / modulus, -5e-4, 5e-4)) if free_offset else 0.0
+        columns = np.stack([c.force, -c.force_d], axis=1) / force[:, None]
+        modulus, shift = np.linalg.lstsq(columns, np.ones(len(force)), rcond=None)[0].tolist()
+        step = float(np.clip(shift / modulus, -5e-4, 5e-4))
         offset += step
         if abs(step) < 1e-9:
             break

@@ -49,19 +49,3 @@ def upright_spring(
     width = 2.0 * (half_separation - inward - radius + d)
     gap = max(width - d, _WIDTH_MIN * radius)
     return force * half_separation * (2.0 * inward + (1.0 - 2.0 * turning) * d) / gap
-
-
-def resting_ratio(
-    d: float, width: float, spring: float, force: float, lengths: tuple[float, float, float, float]
-) -> float:
-    """Return φ/φ0 of an object of ``width`` [m] held with a joint ``spring`` [N·m/rad].
-
-    The tips are the paper's springs. ``d`` [m] and ``force`` [N] are those of each tip, ``lengths``
-    as in :func:`upright_spring`.
-    """
-    half_separation, _, _, radius = lengths
-    inward = half_separation - radius + d - 0.5 * width
-    b = spring / (force * half_separation)
-    line = 2.0 * inward - d / 3.0 - b * (width - d)
-    rolled = radius - d + inward + 0.5 * (1.0 + b) * d
-    return width * line / (width * line - 4.0 * (radius - d / 3.0) * rolled)

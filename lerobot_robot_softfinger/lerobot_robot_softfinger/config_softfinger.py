@@ -18,8 +18,6 @@ class SoftfingerConfig(RobotConfig):
     """
 
     address: str | None = None  # tcp://HOST or STREAM,COMMANDS; SOFTFINGER_ADDRESS when None
-    stream: str | None = None  # either socket, where it is elsewhere
-    commands: str | None = None
     keys: Path | None = None  # folder of this client's keys, where the daemon wants some
     control: str = "joints"
     rows: int = 44  # of the tactile grids

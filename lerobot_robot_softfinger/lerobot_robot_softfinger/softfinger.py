@@ -12,7 +12,6 @@ from lerobot.utils.decorators import check_if_already_connected, check_if_not_co
 from lerobot_robot_softfinger.config_softfinger import SoftfingerConfig
 from softfinger import Hand
 from softfinger.daemon.client import NoStream, TactileFrame
-from softfinger.daemon.client.connection import both_addresses
 from softfinger.tools.recordings.features import IMAGES, JOINTS, STATE, image, observation
 
 
@@ -49,16 +48,7 @@ class Softfinger(Robot):
     def connect(self, calibrate: bool = True) -> None:
         """Raises NoStream or NoAnswer without a daemon, ValueError for grids of another size."""
         config = self.config
-        stream = commands = None
-        if config.address:
-            stream, commands = both_addresses(config.address, "--robot.address")
-        hand = Hand(
-            config.stream or stream,
-            config.commands or commands,
-            client="lerobot",
-            timeout=config.timeout,
-            keys=config.keys,
-        )
+        hand = Hand(config.address, client="lerobot", timeout=config.timeout, keys=config.keys)
         try:
             hand.state(config.start_timeout)  # logged while it waits: a first start compiles
             hand.status()

@@ -375,11 +375,12 @@ def test_a_closed_hand_says_so(hand: Hand) -> None:
         ("ipc:///run/a, ipc:///run/b", ("ipc:///run/a", "ipc:///run/b")),
     ],
 )
-def test_addresses_from_the_environment(
-    monkeypatch: pytest.MonkeyPatch, named: str, addresses: tuple[str, str]
+@pytest.mark.parametrize("given", [False, True], ids=["environment", "argument"])
+def test_one_text_names_both_addresses(
+    monkeypatch: pytest.MonkeyPatch, named: str, addresses: tuple[str, str], given: bool
 ) -> None:
-    monkeypatch.setenv("SOFTFINGER_ADDRESS", named)
-    with Hand() as hand:
+    monkeypatch.setenv("SOFTFINGER_ADDRESS", "" if given else named)
+    with Hand(named if given else None) as hand:
         assert (hand.stream_address, hand.command_address) == addresses
 
 

@@ -17,6 +17,11 @@ import pytest
 from softfinger.daemon.diagnosis import devices, machine, ports
 from softfinger.daemon.diagnosis import machine as kernels
 from softfinger.daemon.loop import warm_up
+from softfinger.daemon.perception.calibration_file import (
+    Calibration,
+    save_calibration,
+    sensor_of,
+)
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
@@ -126,6 +131,29 @@ def test_boards_are_listened_to(hands, capsys):
     assert status == 1
     assert "256 cells" in next(line for line in lines if line.startswith("FAIL   tactile left"))
     assert "       → set tactile.rows and tactile.cols" in lines
+
+
+def test_a_tip_of_another_law_than_its_presses_want_is_told(tmp_path: Path) -> None:
+    def tips(**tip: Any) -> Settings:
+        tactile = {"calibration": (str(tmp_path / "left.json"), "")}
+        return Settings.model_validate({"tip": tip, "tactile": tactile})
+
+    made = Calibration(sensor=sensor_of(Settings(), 0), date="2026-01-01")
+    save_calibration(tmp_path / "left.json", made)
+    untried = devices.check_law(tips(), 0)
+    assert (untried.status, untried.fix) == ("note", "`softfinger calibrate law`")
+    assert "'springs', which no presses have tried" in untried.text
+    wants = {"physics": "solid", "base": "bonded", "face": "frictionless", "poisson": 0.48}
+    save_calibration(tmp_path / "left.json", made.model_copy(update={"wants": wants}))
+    told = devices.check_law(tips(), 0)
+    assert told.status == "warn"
+    assert (
+        "tip.physics is 'springs', where the presses of `calibrate law` want 'solid'" in told.text
+    )
+    assert devices.check_law(tips(physics="solid", poisson=0.47), 0).status == "pass"
+    assert devices.check_law(tips(physics="solid", poisson=0.45), 0).fix == "set tip.poisson"
+    (tmp_path / "left.json").write_text("{}")
+    assert devices.check_law(tips(), 0).status == "FAIL"
 
 
 def test_a_missing_port_and_a_missing_servo(hands, capsys):

@@ -18,7 +18,7 @@ from websockets.sync.client import ClientConnection, connect
 from softfinger.daemon.wire import schema
 from softfinger.tools import cli
 from softfinger.tools.viewing.known import ShownHand
-from softfinger.tools.viewing.planar import SPRINGS, HeldObject, touch
+from softfinger.tools.viewing.planar import SPRINGS, HandScene
 from tests.harness.daemon_process import SOFTFINGER
 from tests.harness.fake_daemon import FakeDaemon, event, frame, state
 
@@ -174,12 +174,7 @@ def check_scene(client: Client) -> None:
         assert 0.0 < arrow[2][0] < 0.045
     (outline,) = map(fields, named["object"][11])
     points = np.array([[fields(each).get(k, [0.0])[0] for k in (1, 2)] for each in outline[5]])
-    message = state(0.0, 0)
-    hand = ShownHand()
-    contacts = [touch(message, name) for name in ("left", "right")]
-    expected = HeldObject(hand.geometry).shown(
-        message, contacts, hand.settings.simulation.object_height
-    )
+    expected = HandScene(ShownHand()).parts(state(0.0, 0))["object"].strips[0].points
     assert points == pytest.approx(expected, abs=6e-3)  # it turns by 5° at most
 
 

@@ -276,7 +276,7 @@ def test_the_command_line_takes_that_way(ticking: Daemon, addresses: tuple[str, 
 
 def test_the_live_page_takes_that_way(ticking: Daemon, addresses: tuple[str, str]) -> None:
     stream, commands = addresses
-    where = ["--state", stream, "--commands", commands]
+    where = ["--address", f"{stream},{commands}"]
     with TerminalProcess([*SOFTFINGER, "monitor", *where]) as page:
         page.shows("DISARMED")
         assert ask(commands, "arm")["ok"]

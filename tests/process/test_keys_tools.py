@@ -83,7 +83,7 @@ def test_tools_with_keys_see_and_command_the_hand(
         assert hand.wait_for(lambda state: state.torque, 60.0).mode == "armed"
         told = inline("send", "status", "--address", commands, *alice, "--timeout", "60")
         assert json.loads(told.stdout)["torque"] is True
-    where = ("--state", stream, "--commands", commands)
+    where = ("--address", f"{stream},{commands}")
     until_it_says(("monitor", "--plain", *where, *alice), " armed  left")
 
     async def session() -> str:
@@ -106,7 +106,7 @@ def test_tools_without_keys_see_nothing_and_say_what_may_be_missing(
         for words in (
             ("record", str(path), "--address", stream, "--no-wait"),
             ("view", "--no-browser", "--port", "0", "--address", stream, "--no-wait"),
-            ("monitor", "--plain", "--state", stream, "--commands", commands, "--no-wait"),
+            ("monitor", "--plain", "--address", f"{stream},{commands}", "--no-wait"),
             ("send", "status", "--address", commands, "--timeout", "0.5"),
         )
     ]

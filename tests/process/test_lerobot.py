@@ -46,15 +46,13 @@ def make(tmp_path: Path, addresses: tuple[str, str], monkeypatch: pytest.MonkeyP
     subprocess.run(pip, check=True, capture_output=True)
     monkeypatch.syspath_prepend(site)
     register_third_party_plugins()
-    stream, commands = addresses
 
     def make(**options: Any) -> Any:
         kind = RobotConfig.get_choice_class("softfinger")
         config = kind(
             id="a",
             calibration_dir=tmp_path / "calibration",
-            stream=stream,
-            commands=commands,
+            address=",".join(addresses),
             timeout=300,
             **options,
         )

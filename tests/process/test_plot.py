@@ -14,10 +14,9 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 from matplotlib.text import Text
 
-from softfinger.daemon.wire import schema
 from softfinger.tools import style
-from softfinger.tools.analysis import plot, plots_model
-from softfinger.tools.analysis.plots_data import Missing, RecordedRun, load_run
+from softfinger.tools.analysis import plot, plots
+from softfinger.tools.analysis.plots import Missing, RecordedRun, load_run
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.record import RecordingWriter
 from tests.conftest import Inline
@@ -90,10 +89,10 @@ def test_command_line_writes_every_page_in_print_quality(path: Path, inline: Inl
 
 
 def test_a_page_by_name_as_svg(path: Path, tmp_path: Path, call: Call) -> None:
-    words = ("--pages", "angle", "error", "--format", "svg", "--from", 1, "--to", 2)
+    words = ("--pages", "angle", "landscape", "--format", "svg", "--from", 1, "--to", 2)
     assert call(path, *words, "--out", tmp_path / "a" / "b") == (0, "")
     files = sorted((tmp_path / "a" / "b").iterdir())
-    assert [each.name for each in files] == ["angle.svg", "error.svg"]
+    assert [each.name for each in files] == ["angle.svg", "landscape.svg"]
     for each in files:
         assert ElementTree.parse(each).getroot().tag.endswith("svg")
 
@@ -101,7 +100,7 @@ def test_a_page_by_name_as_svg(path: Path, tmp_path: Path, call: Call) -> None:
 def test_model_page_has_points_on_the_models_curves(run: RecordedRun) -> None:
     figure = drawn(run, "angle")
     assert "measured over" in texts(figure)
-    force = figure.axes[0]
+    force = figure.axes[1]
     points = np.concatenate([np.asarray(each.get_offsets()) for each in force.collections])
     depths = np.concatenate([np.asarray(each.get_array()) for each in force.collections])
     assert run.models is not None
@@ -113,7 +112,7 @@ def test_model_page_has_points_on_the_models_curves(run: RecordedRun) -> None:
 
 def test_depths_of_the_curves_are_round_and_span_the_data() -> None:
     for most in (0.2e-3, 0.9e-3, 4.7e-3, 8e-3, 12e-3):
-        depths = plots_model._depths(np.linspace(0.0, most, 1000)) * 1e3
+        depths = plots._depths(np.linspace(0.0, most, 1000)) * 1e3
         assert 1 <= len(depths) <= 6
         assert depths[-1] >= 0.99 * most * 1e3
         assert [float(f"{d:g}") for d in depths] == pytest.approx(list(depths), abs=1e-12)
@@ -133,50 +132,7 @@ def test_landscape_shows_the_local_minimum_and_the_path(run: RecordedRun) -> Non
     assert angle[known].max() > 5.0
 
 
-def test_a_deep_landscape_marks_where_the_backing_touches(run: RecordedRun) -> None:
-    assert run.models is not None
-    with style.settings():
-        figure = style.new_figure(5, 4)
-        plots_model.draw_map(figure.subplots(), run.models[0].table, 0.012, 0.6)
-        figure.draw_without_rendering()
-    assert "rim of the backing touches" in figure.axes[0].get_legend_handles_labels()[1]
-
-
-def test_error_page_tells_errors_and_how_honest_the_spread_is(run: RecordedRun) -> None:
-    figure = drawn(run, "error")
-    said = texts(figure)
-    assert "estimate minus truth" in said
-    shares = [float(line.split("% within")[0].split()[-1]) for line in said.splitlines()
-              if "% within 2σ" in line]  # fmt: skip
-    assert len(shares) == 6  # d, θ, F of both fingers
-    assert min(shares) > 80.0
-    (t, error) = lines(figure, "left")[0]  # µm
-    holding = (t > 1.0) & (t < 1.4)
-    assert 0.0 < np.nanstd(error[holding]) < 60.0
-
-
-def test_a_gap_in_the_stream_breaks_the_line(run: RecordedRun) -> None:
-    keep = (run.t < 1.0) | (run.t > 1.5)
-    states = {name: values[keep] for name, values in run.states.items()}
-    part = replace(run, states=states)
-    t, force = part.gapped(part.states["left.force"])
-    (at,) = np.flatnonzero(np.isnan(force))
-    assert (round(t[at], 1), round(t[at + 1], 1)) == (1.0, 1.5)
-    assert t.size == keep.sum() + 1
-    assert run.gapped(run.states["left.force"])[0].size == run.t.size
-
-
-def test_pages_are_left_out_with_a_word(tmp_path: Path, call: Call) -> None:
-    path = tmp_path / "a.mcap"
-    due = {50: {"command": "arm"}, 60: {"command": "grasp", "force": 6.0}}
-    record_hand(path, due, 1.5, without=(schema.TRUTH,))
-    status, said = call(path, "--out", tmp_path / "out")
-    assert status == 0
-    drawn = sorted(each.name for each in (tmp_path / "out").iterdir())
-    assert drawn == ["angle.png", "landscape.png"]
-    assert "page error left out: no hand/truth in it" in said
-    status, said = call(path, "--pages", "error", "--out", tmp_path / "none")
-    assert status == 1
+def test_a_page_is_left_out_with_a_word(path: Path, tmp_path: Path, call: Call) -> None:
     status, said = call(path, "--pages", "angle", "--to", "0.2", "--out", tmp_path / "none")
     assert status == 1
     assert "page angle left out: no contact in it" in said
@@ -184,10 +140,9 @@ def test_pages_are_left_out_with_a_word(tmp_path: Path, call: Call) -> None:
 
 def test_without_settings_there_is_no_model(path: Path, run: RecordedRun) -> None:
     bare = replace(run, models=None, why_no_model="no reason")
-    for page in ("angle", "landscape"):
+    for page in plot.PAGES:
         with pytest.raises(Missing, match="no reason"):
             plot.pages()[page](bare)
-    assert "within 2σ" in texts(drawn(bare, "error"))  # d and θ tell theirs by themselves
 
 
 def test_one_finger_alone(tmp_path: Path) -> None:
@@ -203,13 +158,13 @@ def test_one_finger_alone(tmp_path: Path) -> None:
 
 
 def test_files_that_are_no_good(tmp_path: Path, path: Path, call: Call) -> None:
-    page = ("--pages", "error", "--out")
+    page = ("--pages", "angle", "--out")
     (tmp_path / "empty.mcap").touch()
     RecordingWriter(tmp_path / "nothing.mcap").close()
     for name, reason in (
         ("empty.mcap", "empty"),
         ("none.mcap", "No such file"),
-        ("nothing.mcap", "page error left out: no hand/state in it"),
+        ("nothing.mcap", "page angle left out: no hand/state in it"),
     ):
         status, said = call(tmp_path / name, *page, tmp_path / "out")
         assert status == 1
@@ -219,7 +174,7 @@ def test_files_that_are_no_good(tmp_path: Path, path: Path, call: Call) -> None:
     status, said = call(tmp_path / "cut.mcap", *page, tmp_path / "cut")
     assert status == 0
     assert "cut short" in said
-    assert (tmp_path / "cut" / "error.png").exists()
+    assert (tmp_path / "cut" / "angle.png").exists()
     (tmp_path / "file").touch()
     status, said = call(path, *page, tmp_path / "file")
     assert status == 1

@@ -136,7 +136,7 @@ def test_many_recordings_are_analysed_as_each_alone(
     for file in files[:2]:
         np.save(file, rng.integers(0, 900, (3, 44, 44), np.uint16))
     files[2].write_bytes(b"no frames")
-    words = ["--config", "paper", "--no-plot"]
+    words = ["--config", "paper"]
     together = []
     for file in files[:2]:
         assert main(["analyse", str(file), *words]) == 0

@@ -63,7 +63,7 @@ class Kept:
 
 
 def view(fake: FakeDaemon, *words: str) -> Viewed:
-    where = ("--address", fake.state_address, "--commands", fake.command_address)
+    where = ("--address", f"{fake.state_address},{fake.command_address}")
     return Viewed(*where, *words)
 
 

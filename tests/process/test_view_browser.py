@@ -91,7 +91,7 @@ def test_every_button_brings_its_mode_and_a_lost_page_gives_the_hand_back(
     start("--config", str(profile(PATIENT)))
     stream, commands = addresses
     with (
-        Viewed("--address", stream, "--commands", commands) as viewed,
+        Viewed("--address", f"{stream},{commands}") as viewed,
         Hand(*addresses, timeout=60.0) as hand,
     ):
         page.open(viewed.commanding)
@@ -139,7 +139,7 @@ def test_every_button_brings_its_mode_and_a_lost_page_gives_the_hand_back(
 
 def test_the_page_is_quick_survives_sleep_and_reload_and_asks_nobody_else(page: Page) -> None:
     with FakeDaemon() as fake:
-        where = ("--address", fake.state_address, "--commands", fake.command_address)
+        where = ("--address", f"{fake.state_address},{fake.command_address}")
         fake.changes = {"mode": "fault", "fault": "<b>tip.force</b>: 31 N"}
         with Viewed(*where) as viewed:
             page.open(viewed.address)  # fills the browser's cache, as a second visit finds it

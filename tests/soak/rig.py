@@ -19,7 +19,7 @@ from typing import Any
 import msgpack
 import zmq
 
-from softfinger.daemon.client.command_client import NoAnswer
+from softfinger.daemon.client.command_client import NoAnswer, send
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.simulation.emulator.folder import NoEmulator, send_words
 from softfinger.daemon.wire.schema import STATE
@@ -138,14 +138,7 @@ class Rig:
 
     def ask(self, request: dict[str, Any], timeout: float = 2.0) -> dict[str, Any]:
         """One command and its reply. Raises NoAnswer."""
-        with self.context.socket(zmq.REQ) as socket:
-            socket.setsockopt(zmq.LINGER, 0)
-            socket.connect(self.commands)
-            socket.send(msgpack.packb(request))
-            if not socket.poll(int(timeout * 1000)):
-                raise NoAnswer(f"no answer to {request['command']} within {timeout:g} s")
-            reply: dict[str, Any] = msgpack.unpackb(socket.recv())
-        return reply
+        return send(self.commands, request, timeout)
 
     def status(self, timeout: float = 0.5) -> dict[str, Any] | None:
         """Return the daemon's status, None when it does not answer."""

@@ -82,6 +82,7 @@ def test_profiles_and_keys_are_shown_from_any_folder(
     inline: Inline, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "hil").mkdir()  # as a project may have one
     listed = inline("config", "list").stdout.splitlines()
     assert [line.split()[0] for line in listed] == names()
     assert all(len(line.split()) > 2 for line in listed), "each says what it is"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from softfinger.tools.paper import run_pages, solid_pages
+from softfinger.tools.paper import run_pages
 from softfinger.tools.paper.model_pages import DEPTHS, TILTS
 from softfinger.tools.paper.sheets import Sheet
 
@@ -79,20 +79,3 @@ def test_the_rotation_is_estimated_by_the_daemon(path: tuple[Sheet, ...]) -> Non
     off = rotation["theta estimated"][deep] - rotation["theta"][deep]
     assert np.sqrt(np.mean(off**2)) < 0.15
     np.testing.assert_allclose(rotation["F estimated"][deep], rotation["F"][deep], rtol=0.06)
-
-
-def test_what_a_solid_tip_explains_of_the_papers_measurements() -> None:
-    forces, free, stuck, *runs, rolled = solid_pages.solid_runs()
-    # No E makes the difference from springs one offset, whatever the face.
-    deep = forces["d"] >= 2.0
-    for face, each, modulus in (("frictionless", free, 0.125), ("sticking", stuck, 0.119)):
-        assert each["modulus"] == pytest.approx(modulus, abs=0.001)
-        upright = forces[f"F, {face}, over springs at 0 deg"][deep]
-        assert upright.min() < -3.0
-        assert upright.max() > 0.9
-    assert free["offset at 8 mm"][-1] < -20.0
-    for run in runs:
-        deep = run["F"] > 5.0
-        np.testing.assert_allclose(run["F estimated"][deep], run["F"][deep], rtol=0.03)
-    # Without friction F is largest at 0°.
-    assert rolled["theta"][np.argmax(rolled["F"])] == pytest.approx(0.0, abs=0.2)

@@ -8,7 +8,7 @@ from rich.color import ColorTriplet
 from rich.style import Style
 
 from softfinger.tools.terminal import heatmap
-from softfinger.tools.terminal.heatmap import Depth, FullScale, fit, picture, resample
+from softfinger.tools.terminal.heatmap import FullScale, fit, picture, resample
 
 
 def lightness(colour: ColorTriplet) -> float:
@@ -16,14 +16,13 @@ def lightness(colour: ColorTriplet) -> float:
     return float(np.dot((0.2126, 0.7152, 0.0722), linear))
 
 
-@pytest.mark.parametrize("depth", ["any", "fixed"])
-def test_colours_grow_lighter_step_by_step(depth: Depth) -> None:
-    bar = heatmap.colour_bar(heatmap.LEVELS, depth)
+def test_colours_grow_lighter_step_by_step() -> None:
+    bar = heatmap.colour_bar(heatmap.LEVELS, True)
     styles = [span.style for span in bar.spans if isinstance(span.style, Style)]
     colours = [style.color.get_truecolor() for style in styles if style.color]
     light = [lightness(colour) for colour in colours]
     assert light == sorted(light)
-    assert len(set(light)) == (heatmap.LEVELS if depth == "any" else 11)
+    assert len(set(light)) == heatmap.LEVELS
     assert light[-1] > 10.0 * light[0]
 
 
@@ -41,14 +40,14 @@ def test_resample_is_the_area_average() -> None:
 def test_row_0_is_lowest_and_column_0_is_left() -> None:
     grid = np.zeros((4, 4))
     grid[0, 0] = 1.0
-    lines = picture(grid, 1.0, 2, 4, "any")
+    lines = picture(grid, 1.0, 2, 4, True)
     lowest = lines[-1].spans[0]
     assert (lowest.start, lowest.end) == (0, 1)
     assert isinstance(lowest.style, Style)
     assert lowest.style.bgcolor is not None
     brightest = heatmap.colour_map()[-1]
     assert lowest.style.bgcolor.get_truecolor() == ColorTriplet(*brightest)
-    assert [line.plain for line in picture(grid, 1.0, 4, 4, "none")] == [
+    assert [line.plain for line in picture(grid, 1.0, 4, 4, False)] == [
         "    ",
         "    ",
         "    ",

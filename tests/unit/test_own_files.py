@@ -155,6 +155,8 @@ def test_a_runtime_folder_that_others_may_fill_is_refused_with_the_cure(
     folder = tmp_path / "softfinger"
     assert check_runtime_folder() == Finding("pass", "runtime folder", str(folder))
     folder.mkdir()
+    folder.chmod(0o755)
+    assert check_runtime_folder().fix == f"chmod 700 {folder}"
     folder.chmod(0o777)
     cure = f"chmod go-w {folder}"
     assert check_runtime_folder().fix == cure
@@ -178,7 +180,8 @@ def test_the_local_stop_goes_on_at_home_and_says_so(
     monkeypatch.setattr(local_stop, "_folders", lambda: iter(found))
     local = LocalStop("tcp://127.0.0.1:9873")
     try:
-        assert local.notice.startswith(f"{theirs} is not this user's alone; the local stop is in ")
+        cure = f"(chmod 700 {theirs})"
+        assert local.notice.startswith(f"{theirs} is not this user's alone {cure}; the local stop ")
         assert list(found[1].iterdir())
     finally:
         local.close()

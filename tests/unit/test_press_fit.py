@@ -74,7 +74,7 @@ def test_deep_presses_of_other_elements_have_one_modulus(base: Literal["bonded",
         known = (file["base"] == base) & (file["theta"] == 0.0) & (file["d"] < 0.31)
         d, force = file["d"][known] * 0.020, file["force"][known] * 0.25e6 * 0.020**2
     tip = Fingertip(0.020, "solid", 0.49, base)
-    found = fit_modulus(d, np.zeros(len(d)), force, free_offset=False, tip=tip)
+    found = fit_modulus(d, np.zeros(len(d)), force, tip=tip)
     assert found.modulus == pytest.approx(0.25e6, rel=0.01)
     assert not found.trend.drifts
 
@@ -93,7 +93,7 @@ def test_a_modulus_that_hides_another_law_drifts_over_depth(
     rng = np.random.default_rng(2)
     d = np.linspace(1e-3, 7e-3, 7)
     force = ContactTable.build(made, RUBBER)(d, 0.0).force * (1.0 + 0.01 * rng.standard_normal(7))
-    found = fit_modulus(d, np.zeros(7), force, free_offset=False, tip=fitted)
+    found = fit_modulus(d, np.zeros(7), force, tip=fitted)
     assert found.trend.drifts == (sign != 0)
     if sign:
         assert np.sign(found.trend.drift) == sign
@@ -136,4 +136,5 @@ def test_calibrate_law_says_which_tip_it_is(
     assert f"for the profile: {profile}" in told
     modulus = load_calibration(tmp_path / "left.json").modulus
     assert modulus is not None
+    assert load_calibration(tmp_path / "left.json").wants["physics"] == "solid"
     assert modulus.modulus == pytest.approx(0.25e6, rel=0.05)

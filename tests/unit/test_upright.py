@@ -12,7 +12,7 @@ from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
-from softfinger.kinematics.hand.upright import resting_ratio, upright_spring
+from softfinger.kinematics.hand.upright import upright_spring
 from softfinger.tools.watched import Watched
 from tests.harness.plant import CONSTANT, CURRENT, PAPER, WIDTH, make, push_along
 
@@ -20,6 +20,16 @@ LENGTHS = (0.05, 0.08, 0.0, 0.02)  # half the pivots' separation, finger, its of
 START = math.radians(5.0)
 DEPTH, FORCE = 0.0032, 10.0  # where the paper's tip has this force
 spring_of = upright_spring.py_func  # type: ignore[attr-defined]
+
+
+def resting_ratio(spring: float) -> float:
+    """Return φ/φ0 by the closed form at the head of `kinematics.hand.upright`, c = 2/3."""
+    half_separation, _, _, radius = LENGTHS
+    inward = half_separation - radius + DEPTH - 0.5 * WIDTH
+    b = spring / (FORCE * half_separation)
+    line = 2.0 * inward - DEPTH / 3.0 - b * (WIDTH - DEPTH)
+    rolled = radius - DEPTH + inward + 0.5 * (1.0 + b) * DEPTH
+    return WIDTH * line / (WIDTH * line - 4.0 * (radius - DEPTH / 3.0) * rolled)
 
 
 def at_rest(spring: float) -> SimulatedHand:
@@ -44,7 +54,7 @@ def test_stuck_tips_leave_the_object_where_the_closed_form_says(share: float) ->
     q = math.asin((LENGTHS[0] - LENGTHS[3] + DEPTH - 0.5 * WIDTH) / LENGTHS[1])
     spring = share * spring_of(q, DEPTH, FORCE, 2.0 / 3.0, LENGTHS)
     hand = at_rest(spring)
-    expected = resting_ratio(DEPTH, WIDTH, spring, FORCE, LENGTHS)
+    expected = resting_ratio(spring)
     # Left out of the closed form is q², which is 0.03.
     assert hand.object_pose[2] / START == pytest.approx(expected, abs=0.03)
     if share == 1.0:

@@ -22,11 +22,11 @@ from softfinger.tools.viewing.known import (
     read_settings,
 )
 from softfinger.tools.viewing.planar import (
-    HeldObject,
     Touch,
     finger_lines,
     footprint,
     grid_of,
+    held_outline,
     on_picture,
     tip_axes,
     tip_circle,
@@ -142,38 +142,11 @@ def test_a_free_tip_is_a_half_circle_on_its_link() -> None:
 
 def test_the_held_object_stands_between_its_faces() -> None:
     d, theta = held()
-    outline = HeldObject(HAND).outline(Q, d, theta, WIDTH_M, 0.06)
+    outline = held_outline(HAND, Q, d, theta, WIDTH_M, 0.06)
     n = np.array([math.cos(POSE[2]), math.sin(POSE[2])])
     across = (outline - POSE[:2]) @ n
     assert [across.min(), across.max()] == pytest.approx([-0.5 * WIDTH_M, 0.5 * WIDTH_M])
     assert np.ptp(outline @ np.array([-n[1], n[0]])) == pytest.approx(0.06)
-
-
-def test_the_held_object_rolls_without_slip() -> None:
-    """Its centre stays the object's along a motion that rolls by the kinematics' constraint."""
-    coordinates = np.array([*Q, *POSE])
-    held_object = HeldObject(HAND)
-    offsets = []
-    for _ in range(200):
-        contacts = HAND.contacts(coordinates[:2], coordinates[2:], WIDTH_M)
-        outline = held_object.outline(
-            (coordinates[0], coordinates[1]), contacts.d, contacts.theta, WIDTH_M, 0.06
-        )
-        offsets.append(outline[:4].mean(axis=0) - coordinates[2:4])
-        # A step in which both d stay and neither tip shears: 4 equations, the joints' antisymmetry.
-        rows = np.vstack(
-            (
-                HAND.jacobian(coordinates[:2], coordinates[2:])[:2],
-                HAND.rolling(coordinates[:2], coordinates[2:], WIDTH_M),
-                [1.0, -1.0, 0.0, 0.0, 0.0],
-            )
-        )
-        coordinates = coordinates + np.linalg.solve(rows, [0.0, 0.0, 0.0, 0.0, 5e-4])
-    angle = coordinates[4]
-    assert abs(angle - POSE[2]) > 0.05
-    along = [offset @ (-math.sin(angle), math.cos(angle)) for offset in offsets]
-    assert np.ptp(along) < 0.3e-3  # while the tips have rolled by
-    assert abs(angle - POSE[2]) * 0.016 > 0.8e-3
 
 
 # The landscape

@@ -1,4 +1,4 @@
-"""`analyse` and `plot`: recorded frames to contacts over time, and pictures of recordings.
+"""`analyse` and `plot`: recorded frames to contacts, and recordings beside the contact model.
 
 The estimate is the daemon's own.
 """

@@ -12,10 +12,7 @@ from pathlib import Path
 from softfinger.daemon.errors import SoftfingerError
 from softfinger.daemon.profile.settings import Settings
 from softfinger.tools.arguments import add_profile, profile
-from softfinger.tools.extras import MissingExtra
 from softfinger.tools.sweep import Sweep, add_sweep
-
-Analysed = tuple[int, str, str]  # exit status, what is said, what is complained about
 
 _EPILOG = """\
 FILE is a recording (.mcap), .npz with frames [n, rows, cols] and t, .npy frames or a folder of
@@ -23,8 +20,8 @@ them, or a Tekscan-style ASCII export. A recording has its settings in it. For t
 profile by --config, or what the file doesn't have, for instance
   --set tip.radius=0.02 --set tactile.pitch=0.0013 --set tactile.pascal_per_count=4
   --set tactile.noise=500 --set material.law=constant --set material.modulus=3e5
-Writes FILE.contacts.csv and FILE.contacts.png (extra 'plot') beside it. Several files are analysed
-side by side, one on each processor."""
+Writes FILE.contacts.csv beside it, which PlotJuggler draws. Several files are analysed side by
+side, one on each processor."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -32,8 +29,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("files", type=Path, nargs="+", metavar="FILE")
     add_profile(parser)
     parser.add_argument("--csv", type=Path, metavar="OUT", help="where to write the numbers")
-    parser.add_argument("--plot", type=Path, metavar="OUT", help="where to write the picture")
-    parser.add_argument("--no-plot", action="store_true", help="write only the numbers")
     add_sweep(parser)
 
 
@@ -45,31 +40,30 @@ def run(arguments: argparse.Namespace) -> int:
 
     build_kernels(settings, print_event, FRAMES)
     if len(files) == 1:
-        return _printed(*_analysed(arguments, settings, files[0]))
-    if arguments.csv or arguments.plot:
-        print("analyse: --csv and --plot go with one FILE", file=sys.stderr)
+        print(_analysed(arguments, settings, files[0]), end="")
+        return 0
+    if arguments.csv:
+        print("analyse: --csv goes with one FILE", file=sys.stderr)
         return 2
+    status = 0
     found = Sweep("analyse", partial(_one_of_many, arguments, settings), files)
-    processes = arguments.processes
-    return max([_printed(*each) for each in found.run(processes, arguments.scheduler)])
-
-
-def _printed(status: int, told: str, complaint: str) -> int:
-    print(told, end="", flush=True)
-    print(complaint, end="", file=sys.stderr, flush=True)
+    for told, complaint in found.run(arguments.processes, arguments.scheduler):
+        print(told, end="", flush=True)
+        print(complaint, end="", file=sys.stderr, flush=True)
+        status |= bool(complaint)
     return status
 
 
-def _one_of_many(arguments: argparse.Namespace, settings: Settings, path: Path) -> Analysed:
-    """Analyse one; what is wrong with it ends no other."""
+def _one_of_many(arguments: argparse.Namespace, settings: Settings, path: Path) -> tuple[str, str]:
+    """Analyse one, and return what is printed and what is wrong with it, which ends no other."""
     try:
-        return _analysed(arguments, settings, path)
+        return _analysed(arguments, settings, path), ""
     except (SoftfingerError, OSError) as error:
-        return 1, "", f"analyse: {error}\n"
+        return "", f"analyse: {error}\n"
 
 
-def _analysed(arguments: argparse.Namespace, settings: Settings, path: Path) -> Analysed:
-    from softfinger.tools.analysis.contacts import analyse, draw, open_source, write_csv
+def _analysed(arguments: argparse.Namespace, settings: Settings, path: Path) -> str:
+    from softfinger.tools.analysis.contacts import analyse, open_source, write_csv
     from softfinger.tools.terminal.progress import Progress
 
     table = arguments.csv or path.with_name(path.name + ".contacts.csv")
@@ -88,11 +82,4 @@ def _analysed(arguments: argparse.Namespace, settings: Settings, path: Path) -> 
         f"{touching} with contact, {reasons.total()} not usable; {table}\n"
     )
     told += "".join(f"  {n} not usable: {reason}\n" for reason, n in reasons.most_common())
-    if arguments.no_plot:
-        return 0, told, ""
-    picture = arguments.plot or path.with_name(path.name + ".contacts.png")
-    try:
-        draw(contacts, path.name, picture)
-    except MissingExtra as error:
-        return 1 if arguments.plot else 0, told, f"analyse: no picture: {error}\n"
-    return 0, f"{told}{picture}\n", ""
+    return told

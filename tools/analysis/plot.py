@@ -1,6 +1,6 @@
-"""``softfinger plot FILE.mcap``: a recording beside the contact model, and its errors.
+"""``softfinger plot FILE.mcap``: a recording beside the contact model.
 
-What is drawn over time alone is left to programs that open the file, Foxglove and PlotJuggler.
+What is drawn over time is left to programs that open the file, Foxglove and PlotJuggler.
 """
 
 from __future__ import annotations
@@ -17,12 +17,11 @@ from softfinger.tools.extras import require
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from softfinger.tools.analysis.plots_data import RecordedRun
+    from softfinger.tools.analysis.plots import RecordedRun
 
 PAGES = {
     "angle": "force and energy against θ beside the model's curves",
     "landscape": "the path over U(d, θ) with its local minimum",
-    "error": "estimate minus truth within ± 2σ, of a simulated hand",
 }
 
 _EPILOG = "pages:\n" + "\n".join(f"  {name:10} {what}" for name, what in PAGES.items())
@@ -58,9 +57,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def pages() -> dict[str, Callable[[RecordedRun], Figure]]:
     """Return the function that draws each page; matplotlib is imported when one is drawn."""
-    from softfinger.tools.analysis.plots_model import draw_angle, draw_error, draw_landscape
+    from softfinger.tools.analysis.plots import draw_angle, draw_landscape
 
-    return dict(zip(PAGES, (draw_angle, draw_landscape, draw_error), strict=True))
+    return dict(zip(PAGES, (draw_angle, draw_landscape), strict=True))
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -69,7 +68,7 @@ def run(arguments: argparse.Namespace) -> int:
     from softfinger.daemon.loop.warm_up import FRAMES
     from softfinger.daemon.profile.settings import Settings
     from softfinger.tools import style
-    from softfinger.tools.analysis.plots_data import Missing, load_run
+    from softfinger.tools.analysis.plots import Missing, load_run
     from softfinger.tools.processes.kernel_build import build_kernels, print_event
     from softfinger.tools.recordings.reader import Recording
     from softfinger.tools.terminal.progress import Progress

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from softfinger.daemon.errors import SoftfingerError
 from softfinger.daemon.own_files import write_text
+from softfinger.tools.arguments import number
 from softfinger.tools.sweep import Sweep, add_sweep
 
 if TYPE_CHECKING:
@@ -49,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         f"about a minute; or '{_CAMPAIGN}' and one of {long}",
     )
     parser.add_argument(
-        "--trials", type=_count, metavar="N", help="trials of each case of a campaign"
+        "--trials", type=_trials, metavar="N", help="trials of each case of a campaign"
     )
     parser.add_argument(
         "--only", default="", metavar="TEXT", help="cases of a campaign with this in their name"
@@ -79,6 +80,7 @@ def run(arguments: argparse.Namespace) -> int:
     except ValueError as error:
         print(f"bench: {error}", file=sys.stderr)
         return 2
+    machine = _processor()
     load = [os.getloadavg()[0]]
     rows: list[Row] = []
     tables: list[Report] = []
@@ -94,10 +96,14 @@ def run(arguments: argparse.Namespace) -> int:
         tables += found
     load.append(os.getloadavg()[0])
     if not arguments.names:
-        title = f"{_processor()}, {os.cpu_count()} cores, load {load[0]:.1f} to {load[1]:.1f}"
+        title = f"{machine}, {os.cpu_count()} cores, load {load[0]:.1f} to {load[1]:.1f}"
         print(Report(title, _page(tables)))
     if arguments.json:
-        about = {"machine": _processor(), "cores": os.cpu_count(), "load": load}
+        about = {
+            "machine": machine,
+            "cores": os.cpu_count(),
+            "load": load,
+        }
         content = about | {"python": platform.python_version(), "rows": rows}
         with write_text(arguments.json) as file:
             file.write(json.dumps(content, indent=2) + "\n")
@@ -152,10 +158,6 @@ def _page(tables: list[Report]) -> list[Row]:
     ]
 
 
-def _module(name: str) -> ModuleType:
-    return importlib.import_module(f"softfinger.tools.benchmarks.{name}")
-
-
 def _processor() -> str:
     """The processor's name where Linux says it."""
     try:
@@ -163,6 +165,14 @@ def _processor() -> str:
         return next(line.split(":")[1].strip() for line in lines if line.startswith("model name"))
     except (OSError, StopIteration):
         return platform.machine()
+
+
+def _trials(text: str) -> int:
+    return int(number(text, "a whole number above 0", 1.0, includes_low=True))
+
+
+def _module(name: str) -> ModuleType:
+    return importlib.import_module(f"softfinger.tools.benchmarks.{name}")
 
 
 def _check(names: list[str], texts: dict[str, str], arguments: argparse.Namespace) -> None:
@@ -177,10 +187,3 @@ def _check(names: list[str], texts: dict[str, str], arguments: argparse.Namespac
             raise ValueError(f"found {name!r}, expected one of {', '.join(texts)}{hint}")
         if texts is CAMPAIGNS and not any(arguments.only in case for case in _module(name).NAMES):
             raise ValueError(f"--only {arguments.only}: no case of {name} has this in its name")
-
-
-def _count(text: str) -> int:
-    """A whole number above 0. Raises ArgumentTypeError with what was found."""
-    if not (text.isdecimal() and int(text) > 0):
-        raise argparse.ArgumentTypeError(f"expected a whole number above 0, found {text!r}")
-    return int(text)

@@ -2,8 +2,7 @@
 
 All of one run, in turns. Lookups are of the same points, d up to 8 mm, half of them spread evenly
 and half by orders of magnitude down to 1 µm, |θ| up to 30°; errors are the largest relative ones,
-against the integrals with many nodes. Ours give force, energy and their four partials, SciPy's
-splines force and energy alone, interpolated as ratios to the closed form in (d, θ²).
+against the integrals with many nodes.
 
 Frames are 44 × 44 cells on 58 mm, d = 4 mm, a tilt of 15°, 0.2 % of the modulus as noise, estimated
 by the control loop's Python call; a solid tip's beside springs' in the same turns. Errors are RMS
@@ -13,7 +12,6 @@ pressed so for a second.
 
 from __future__ import annotations
 
-import contextlib
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -28,7 +26,7 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.emulator.tactile_board import ENCODERS
 from softfinger.daemon.simulation.sensor.simulated_tactile import make_sensor_model
 from softfinger.daemon.tactile.cobs import CobsDecoder
-from softfinger.kinematics.contact.closed_form import Fingertip, closed_forms
+from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.quadrature import integrate
 from softfinger.kinematics.contact.table import ContactTable
@@ -54,7 +52,6 @@ _STEPS = (1e-7, 1e-5, 1e-5, 1e-4)
 LOOKUP_ERROR = "relative error"
 _LAW = Material.table_i()
 _DEEPEST, _STEEPEST = 0.008, math.radians(30.0)  # m, rad
-_NODES = 64  # a side, of SciPy's splines
 _SINGLE = 16  # points that calls with floats go round
 _CALL_NS = 800.0  # aim of a call
 
@@ -92,42 +89,20 @@ def lookups(rounds: int, count: int = 512) -> Report:
     theta = rng.uniform(-_STEEPEST, _STEEPEST, count)
     exact = np.stack(integrate(TIP, _LAW, d, theta, 40))
     tables = {f"table to {each:g}": ContactTable.build(TIP, _LAW, each) for each in (1e-9, 1e-12)}
-    calls: dict[str, Callable[..., Any]] = {**tables, **_splines()}
     single = list(zip(d[:_SINGLE].tolist(), theta[:_SINGLE].tolist(), strict=True))
-    whole = {name: replace(each(call, [(d, theta)]), calls=count) for name, call in calls.items()}
-    alone = {f"{name}, called": each(call, single) for name, call in calls.items()}
     rows = []
-    for name, taken in interleave(whole | alone, rounds).items():
-        call = calls[name.removesuffix(", called")]
-        pairs = zip(call(d, theta), exact, strict=False)  # of as many outputs as there are
-        error = max(float(np.max(np.abs(found / true - 1.0))) for found, true in pairs)
-        aim = _CALL_NS if name in alone and call in tables.values() else None
-        rows.append(figure(name, "ns", taken, aim, **{LOOKUP_ERROR: error}))
+    for way, chosen, aim in (("", [(d, theta)], None), (", called", single, _CALL_NS)):
+        subjects = {f"{name}{way}": each(table, chosen) for name, table in tables.items()}
+        points = count if chosen is not single else 1
+        for (name, taken), table in zip(
+            interleave(subjects, rounds).items(), tables.values(), strict=True
+        ):
+            error = max(
+                float(np.max(np.abs(found / true - 1.0)))
+                for found, true in zip(table(d, theta), exact, strict=False)
+            )
+            rows.append(figure(name, "ns", taken / points, aim, **{LOOKUP_ERROR: error}))
     return Report("lookup", rows)
-
-
-def _splines() -> dict[str, Callable[..., Any]]:
-    """Force and energy as a user of SciPy would get them, by degree; empty without SciPy."""
-    with contextlib.suppress(ImportError):
-        from scipy.interpolate import RectBivariateSpline
-
-        at, squares = np.linspace(1e-9, _DEEPEST, _NODES), np.linspace(0.0, _STEEPEST**2, _NODES)
-        values = integrate(TIP, _LAW, at[:, None], np.sqrt(squares))
-        over = closed_forms(MODULUS, at[:, None], np.sqrt(squares))
-        ratios = values.force / over.force, values.energy / over.energy
-
-        def splines(degree: int) -> Callable[..., Any]:
-            f, u = (RectBivariateSpline(at, squares, each, kx=degree, ky=degree) for each in ratios)
-
-            def call(d: Any, theta: Any) -> tuple[Any, Any]:
-                cosine, square = np.cos(theta), theta * theta
-                force = math.pi * MODULUS * d * d / cosine
-                return force * f.ev(d, square), force * d / (3.0 * cosine) * u.ev(d, square)
-
-            return call
-
-        return {f"RectBivariateSpline: degree {degree}": splines(degree) for degree in (3, 5)}
-    return {}
 
 
 def frames_to_contacts(rounds: int) -> Report:

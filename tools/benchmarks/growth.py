@@ -1,7 +1,6 @@
 """Growth of cost and error: with cells, subscribers, sensors, rate.
 
-Each table is of one run in turns, and ends with the fitted slopes: the exponent of a power law over
-all points, and between the last two, which shows where it bends.
+Each table is of one run in turns, and ends with the fitted slopes.
 """
 
 from __future__ import annotations

@@ -120,33 +120,18 @@ def timed(call: Callable[[], object], count: int = 1) -> list[float]:
 def slopes(rows: list[Row], x: str) -> tuple[str, ...]:
     """Return how the median of each kind of row grows with its ``x``: a note for each.
 
-    The exponent of a power law, over all points and between the last two, which shows where it
-    bends; where ``x`` begins at 0, the cost of the first and then of each more.
+    The exponent of a power law; where ``x`` begins at 0, the cost of each more. A kind is a name up
+    to its first comma or colon.
     """
-    notes = []
-    for name, chosen in by_kind(rows).items():
-        at, median = (np.array([row[key] for row in chosen], float) for key in (x, "median"))
-        if len(chosen) < 3:
-            continue
-        if at[0] == 0.0:
-            first, unit = median[1] - median[0], chosen[0]["unit"]
-            more = np.polyfit(at[1:], median[1:], 1)[0]
-            notes.append(
-                f"  {name}: {first:+.3g} {unit} for {at[1]:g} {x}, {more:+.3g} for each more"
-            )
-        else:
-            at, median = np.log(at), np.log(median)
-            whole, end = np.polyfit(at, median, 1)[0], at == at[-1]  # several may be there
-            before = np.flatnonzero(~end)[-1]
-            last = (median[end].mean() - median[before]) / (at[-1] - at[before])
-            notes.append(f"  {name}: ∝ ({x})^{whole:.2f}, at the end ^{last:.2f}")
-    return tuple(notes)
-
-
-def by_kind(rows: list[Row]) -> dict[str, list[Row]]:
-    """Return rows with a median by their kind: their name up to the first comma or colon."""
     kinds: dict[str, list[Row]] = {}
     for row in rows:
-        if "median" in row:
-            kinds.setdefault(str(row["name"]).split(",")[0].split(":")[0], []).append(row)
-    return kinds
+        kinds.setdefault(str(row["name"]).split(",")[0].split(":")[0], []).append(row)
+    notes = []
+    for name, chosen in kinds.items():
+        at, median = (np.array([row[key] for row in chosen], float) for key in (x, "median"))
+        if at[0] == 0.0:
+            more = np.polyfit(at, median, 1)[0]
+            notes.append(f"  {name}: {more:+.3g} {chosen[0]['unit']} for each more")
+        else:
+            notes.append(f"  {name}: ∝ ({x})^{np.polyfit(np.log(at), np.log(median), 1)[0]:.2f}")
+    return tuple(notes)

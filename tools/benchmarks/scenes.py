@@ -2,25 +2,22 @@
 
 In µs a tick: all daemons stand side by side, on canned readings (or the simulated hand) and virtual
 time, and tick in turns. A step is switched off in a daemon of its own, from outside; what it saves
-is the median of the differences to the daemon that has it, round by round, with that median's own
-error.
+is the median of the differences to the daemon that has it, round by round.
 """
 
 from __future__ import annotations
 
 import contextlib
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.publisher import bit
 from softfinger.kinematics.estimation.estimator import ContactEstimator
-from softfinger.tools.benchmarks.measuring import Report, Row, Subject, figure, interleave
+from softfinger.tools.benchmarks.measuring import Report, Subject, figure, interleave
 from softfinger.tools.benchmarks.rigs import (
     RigError,
     Sections,
@@ -30,7 +27,6 @@ from softfinger.tools.benchmarks.rigs import (
 )
 
 _TICKS = 20  # of a call: whole periods of the frames, as of the published topics
-_SURE = 3.0  # times its own error that a saving must have to be called one
 
 
 def _as_it_is(daemon: Daemon) -> None:
@@ -89,14 +85,7 @@ STEPS: dict[str, tuple[TimedScene, TimedScene]] = {
         TimedScene(topics=("hand/state",)),
         TimedScene({"stream": {"state_rate": 500.0}}, topics=("hand/state",)),
     ),
-    "a finger": (SCENES[ONE_IDLE], SCENES[IDLE]),
     "the simulated hand": (TimedScene(), TimedScene(alter=_as_it_is)),
-    "the object's taper": (
-        TimedScene(alter=_as_it_is),
-        TimedScene({"simulation": {"object_shape": "wedge"}}, alter=_as_it_is),
-    ),
-    "sensors": (SCENES[NO_SENSORS], SCENES[IDLE]),
-    "servos": (SCENES[NO_SERVOS], SCENES[HOLDING]),
 }
 
 
@@ -113,7 +102,11 @@ def measure(brief: bool = False, rounds: int = 400) -> list[Report]:
         times = interleave(subjects, 100 if brief else rounds)
     taken = {name: 1e-3 * times[same[id(scene)]] for name, scene in scenes.items()}
     costs = [figure(name, "µs", taken[name]) for name in SCENES]
-    savings = [saving(name, taken[f"with {name}"], taken[f"without {name}"]) for name in STEPS]
+    savings = []
+    for name in STEPS:
+        had, lacked = taken[f"with {name}"], taken[f"without {name}"]
+        medians = {"with": float(np.median(had)), "without": float(np.median(lacked))}
+        savings.append(figure(name, "µs", lacked - had, **medians))
     return [Report("mean tick", costs), Report("skipped, µs a tick", savings)]
 
 
@@ -147,19 +140,3 @@ def ticking(daemon: Daemon) -> Subject:
             raise RigError(f"{mode} became {loop.state.mode}: {loop.state.fault}")
 
     return Subject(run, _TICKS)
-
-
-def saving(name: str, with_it: NDArray[np.float64], without: NDArray[np.float64]) -> Row:
-    """Return what a step saves, from the times [µs] of the same rounds with and without it."""
-    saved = without - with_it
-    # A median's error is 1.25 times a mean's; the spread is from quartiles, which no hiccup moves.
-    low, middle, high = np.percentile(saved, [25, 50, 75]).tolist()
-    error = 1.2533 * (high - low) / 1.349 / math.sqrt(len(saved))
-    return {
-        "name": name,
-        "with": float(np.median(with_it)),
-        "without": float(np.median(without)),
-        "saves": middle,
-        "±": error,
-        "measurable": middle > _SURE * error,
-    }

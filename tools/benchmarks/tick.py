@@ -9,7 +9,6 @@ a line's own time.
 from __future__ import annotations
 
 import contextlib
-import os
 import tempfile
 import time
 from collections.abc import Callable, Sequence
@@ -52,7 +51,7 @@ def measure(brief: bool = False) -> list[Report]:
 def _in_turns(rounds: int) -> list[Row]:
     """The pipeline alone: back to back with and without subscribers, in place at three rates.
 
-    SCHED_FIFO and one processor where allowed.
+    SCHED_FIFO where it is allowed.
     """
     samples: dict[str, list[float]] = {}
     used: dict[str, float] = {}  # s of the processor, of all seconds
@@ -67,7 +66,7 @@ def _in_turns(rounds: int) -> list[Row]:
         }
         for rate in (100.0, 500.0, 1000.0):
             turns[f"in place at {rate:g} Hz"] = partial(in_place, quiet, rate)
-        with RealTime(_own_processor()):
+        with RealTime(Settings.model_validate({"realtime": {"priority": _PRIORITY}})):
             for _ in range(rounds):
                 for name, turn in turns.items():
                     began, before = time.perf_counter(), time.thread_time()
@@ -86,14 +85,6 @@ def _in_turns(rounds: int) -> list[Row]:
         if "place" in row["name"]:
             row["of a processor"] = used[row["name"]]
     return rows
-
-
-def _own_processor() -> Settings:
-    """SCHED_FIFO on one processor where that is allowed; without either where it is not."""
-    if not may_be_real_time():
-        return Settings()
-    cpus = (max(os.sched_getaffinity(0)),)
-    return Settings.model_validate({"realtime": {"priority": _PRIORITY, "cpus": cpus}})
 
 
 def ticks(daemon: Daemon, count: int) -> list[float]:
@@ -115,13 +106,6 @@ def in_place(daemon: Daemon, rate: float, count: int = 0) -> list[float]:
         machine.sleep_until(deadline)
         samples += ticks(daemon, 1)
     return samples
-
-
-def may_be_real_time() -> bool:
-    """Return whether SCHED_FIFO is allowed here."""
-    settings = Settings.model_validate({"realtime": {"priority": _PRIORITY}})
-    with RealTime(settings) as measures:
-        return any("FIFO" in each for each in measures.granted)
 
 
 def in_the_loop(turns: int, baud: int, changes: Sequence[str] = ()) -> Report:

@@ -5,9 +5,13 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from softfinger.tools.arguments import add_keys, add_profile, number, profile, stream_address
-from softfinger.tools.extras import MissingExtra, require
+from softfinger.tools.extras import MissingExtra
+
+if TYPE_CHECKING:
+    from softfinger.daemon.profile.settings import Settings
 
 STEPS = (
     "joints",
@@ -33,7 +37,7 @@ steps of a tip, in this order; each is written into FILE, which keeps the others
   equilibrate  several uniform pressures: the gain of each cell, and dead cells
   curve        known weights upright on the tip (--force), or a run of known displacement (--d)
   centre       presses upright or of known tilt (--theta): the tip's place and rotation
-  modulus      a run of known displacement (--d): E, or with --law the curve stress over strain
+  modulus      a run of known displacement (--d): E; its zero of d is fitted
   law          presses at known depths and tilts (--d, --theta): springs or solid rubber, its E and
                ν, how well each explains the frames, and what error it leaves
   relaxation   a press and a hold of some seconds at a known d (--d, --frames 500): how much firmer
@@ -43,11 +47,10 @@ steps of a tip, in this order; each is written into FILE, which keeps the others
 
 Frames come live from the sensor of the profile, load by load, or from recordings: one for each
 load, or one .npz of the whole run with its own d [m], theta [rad], force [N] for each frame.
-A live modulus may come from one press at a known speed (--speed): its zero of d is fitted.
 Without a stage, try the steps on `softfinger emulate`:
   --move "softfinger emulate --send 'press depth={d}mm tilt={theta}deg'"
   --move "softfinger emulate --send 'turn {finger}={pose}'"     for joints
-Each step draws its result and residuals beside FILE, where matplotlib is installed.
+Each step draws its result and residuals as FILE.STEP.png, where matplotlib is installed.
 A new equilibrate removes curve and modulus, a new curve removes modulus, and each of these removes
 scales: they depend on it.
 """
@@ -89,23 +92,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="form of the curve (default power)",
     )
     parser.add_argument(
-        "--law", action="store_true", help="modulus: fit the whole stress-strain curve"
-    )
-    parser.add_argument(
-        "--speed",
-        type=_speed,
-        metavar="X",
-        help="modulus, live: speed of one press [mm/s], instead of --d",
-    )
-    parser.add_argument(
         "--move",
         metavar="COMMAND",
         help="live: a program that brings each load on and ends when it is there, as of a stage, "
         "instead of Enter; {force}, {d} and {theta} stand for the load's, {finger} and {pose} "
         "(closed, open, zero) for a joint's",
-    )
-    parser.add_argument(
-        "--plot", type=Path, metavar="PICTURE", help="the picture's file (default: FILE.STEP.png)"
     )
     parser.add_argument("--no-plot", action="store_true", help="draw no picture")
     parser.add_argument(
@@ -116,68 +107,41 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Do one step. Raises SoftfingerError or OSError; then the file is unchanged."""
-    joints = arguments.step == "joints"
-    if (joints or arguments.step == "heat") and arguments.config is None:
+    step = arguments.step
+    if step in ("joints", "heat") and arguments.config is None:
         arguments.config = arguments.file
     settings = profile(arguments)
-    if arguments.step == "heat":
-        from softfinger.tools.calibration.heat import calibrate_heat
+    if step in ("joints", "heat"):
+        from softfinger.tools.calibration.joints import calibrate_heat, calibrate_joints
 
-        print(f"heat: {calibrate_heat(arguments, settings)}; written to {arguments.file}")
-        return 0
-    if joints:
-        from softfinger.tools.calibration.joints import calibrate_joints
-
-        print(f"joints: {calibrate_joints(arguments, settings)}\n  written to {arguments.file}")
-        return 0
-    if arguments.step == "scales":
+        told = (calibrate_heat if step == "heat" else calibrate_joints)(arguments, settings)
+    elif step == "scales":
         from softfinger.tools.calibration.scales import calibrate_scales
 
-        print(f"scales: {calibrate_scales(arguments, settings)}; written to {arguments.file}")
-        return 0
+        told = calibrate_scales(arguments, settings)
+    else:
+        told = _calibrate_tip(arguments, settings)
+    print(f"{step}: {told}; written to {arguments.file}")
+    return 0
+
+
+def _calibrate_tip(arguments: argparse.Namespace, settings: Settings) -> str:
     from softfinger.daemon.perception.calibration_file import save_calibration
-    from softfinger.kinematics.calibration.calibration import CalibrationError
     from softfinger.tools.calibration.calibration_frames import gather
     from softfinger.tools.calibration.calibration_plot import draw
     from softfinger.tools.calibration.steps import Step, begin, done
 
-    if arguments.speed is not None and (arguments.step != "modulus" or arguments.d):
-        raise CalibrationError("--speed: only modulus takes it, instead of --d")
-    draws = _draws(arguments)
+    file = arguments.file
     calibration = begin(arguments, settings)
     loads = gather(arguments, settings, calibration)
-    calibration, line, picture = done(Step(arguments, settings, calibration, loads))
-    save_calibration(arguments.file, calibration)
-    print(f"{arguments.step}: {line}; written to {arguments.file}")
-    if draws:
-        file = arguments.file
-        path = arguments.plot or file.with_name(f"{file.stem}.{arguments.step}.png")
+    calibration, line, panels = done(Step(arguments, settings, calibration, loads))
+    save_calibration(file, calibration)
+    if not arguments.no_plot:
         try:
-            draw(arguments.step, picture, path)
-        except ValueError as error:  # a suffix that is no kind of picture
-            raise CalibrationError(f"{path}: no picture: {error}") from None
-    return 0
-
-
-def _draws(arguments: argparse.Namespace) -> bool:
-    """Return whether a picture is drawn, known before anything is measured.
-
-    Raises MissingExtra for ``--plot`` without matplotlib.
-    """
-    if arguments.no_plot:
-        return False
-    try:
-        require("plot")
-    except MissingExtra as error:
-        if arguments.plot is not None:
-            raise
-        print(f"calibrate: no picture is drawn: {error}", file=sys.stderr)
-        return False
-    return True
-
-
-def _speed(text: str) -> float:
-    return number(text, "mm/s above 0, 1000 at most", 0.0, 1000.0)
+            draw(arguments.step, panels, file.with_name(f"{file.stem}.{arguments.step}.png"))
+        except MissingExtra as error:
+            print(f"calibrate: no picture is drawn: {error}", file=sys.stderr)
+    return line
 
 
 def _frames(text: str) -> int:

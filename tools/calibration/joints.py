@@ -1,6 +1,7 @@
-"""`calibrate joints`: direction, zero and range of each joint, moved by hand with torque off.
+"""`calibrate joints` and `calibrate heat`: what is written of the servos into a profile.
 
-Of each finger the servos' counts are read where it is closed, open and at its zero.
+With torque off each finger is moved by hand, and its servo's counts are read where it is closed,
+open and at its zero. The heat's constants are from the recording of a hold of minutes.
 """
 
 from __future__ import annotations
@@ -16,14 +17,18 @@ from typing import Any
 from softfinger.daemon.errors import ServoError, SettingsError
 from softfinger.daemon.profile.load import find, load, profile_text
 from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.safety.heat import set_law
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.checks import CHECKED, DRIVE_REVERSE, Registers
 from softfinger.daemon.servos.protocol import ServoLine, open_line
 from softfinger.daemon.types import FINGERS
 from softfinger.kinematics.calibration.calibration import CalibrationError
+from softfinger.kinematics.calibration.heat_fit import fit_heat
 from softfinger.kinematics.compiled.own_folder import write_whole
+from softfinger.kinematics.hand.servo_heat import HeatLaw
 from softfinger.tools.arguments import own_runtime_folder
 from softfinger.tools.calibration.calibration_frames import bring
+from softfinger.tools.recordings.reader import read_recording
 
 _POSES = {
     "closed": "close it fully",
@@ -119,6 +124,34 @@ def _turned(name: str, at: dict[str, _Counts], radian: float) -> int:
                 f"{name} finger: servos {servo} and {other} turned, expected one: move it alone"
             )
     return servo
+
+
+def calibrate_heat(arguments: argparse.Namespace, settings: Settings) -> str:
+    """Write the constants into the profile and return what was found.
+
+    Raises CalibrationError without a recording or for too short a hold, RecordingError,
+    SettingsError.
+    """
+    if len(arguments.recording) != 1:
+        raise CalibrationError(
+            "heat: expected --recording with one hold, made by softfinger record"
+        )
+    found = read_recording(arguments.recording[0])
+    law, finger = HeatLaw(), arguments.finger
+    own = settings.model_copy(
+        update={"servos": settings.servos.model_copy(update={"heat_rise": 0.0, "heat_time": 0.0})}
+    )
+    rise, time = set_law(law, own)
+    known = found[f"{finger}.temperature"] > 0.0
+    fit = fit_heat(
+        law, *(found[key][known] for key in ("t", f"{finger}.current", f"{finger}.temperature"))
+    )
+    new = {"heat_rise": round(rise * fit.rise, 3), "heat_time": round(time * fit.time, 1)}
+    write_keys(arguments, {"servos": new})
+    return (
+        f"{new['heat_rise']:.1f} ± {rise * fit.rise_std:.1f} K/A² in {new['heat_time']:.0f} ± "
+        f"{time * fit.time_std:.0f} s, {fit.residual:.1f} °C left"
+    )
 
 
 def write_keys(arguments: argparse.Namespace, new: Mapping[str, Mapping[str, Any]]) -> list[str]:

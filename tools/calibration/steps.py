@@ -7,6 +7,7 @@ The mathematics is in `kinematics.calibration.calibration`, the file in
 from __future__ import annotations
 
 import argparse
+import json
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -39,8 +40,8 @@ from softfinger.kinematics.calibration.calibration import (
     equilibrate,
     fit_centre,
     fit_curve,
-    fit_law,
     fit_modulus,
+    fit_relaxation,
     tare,
     without_end,
 )
@@ -52,7 +53,6 @@ from softfinger.kinematics.calibration.press_fit import (
     compare_tips,
     first_cycle,
 )
-from softfinger.kinematics.calibration.relaxation import fit_relaxation
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.table import ContactTable
@@ -60,10 +60,12 @@ from softfinger.kinematics.contact.tip_curves import TipCurves
 from softfinger.kinematics.estimation.measured import MeasuredEstimator
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from softfinger.tools.calibration.calibration_frames import Loads
+from softfinger.tools.calibration.calibration_plot import Bars, Map, Panel, Points
 
 FloatArray = NDArray[np.float64]
+_UNDONE: dict[str, Any] = {"modulus": None, "law": None, "scales": None, "wants": {}}
 _SOFTENS = 0.03  # by which a first press may be firmer: plates and noise are no better
-Done = tuple[Calibration, str, dict[str, Any]]  # with the line to print and the picture's data
+Done = tuple[Calibration, str, tuple[Panel, ...]]  # with the line to print and the picture
 
 
 def begin(arguments: argparse.Namespace, settings: Settings) -> Calibration:
@@ -163,45 +165,39 @@ def done(step: Step) -> Done:
     return _STEPS[step.arguments.step](step)
 
 
+def _kept(kind: type[Any], found: object, **more: Any) -> Any:
+    """Return the file's step of this ``kind``: its fields by name from ``found``, or ``more``."""
+    values = {name: getattr(found, name) for name in kind.model_fields if hasattr(found, name)}
+    lists = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in values.items()}
+    return kind(date=now(), **(lists | more))
+
+
 def _tare(step: Step) -> Done:
     found = tare(np.concatenate(step.loads.frames))
     noise = float(np.median(found.noise))
     count = sum(map(len, step.loads.frames))
     rho = found.correlation
-    result = TareStep(
-        date=now(),
-        zero=found.zero.tolist(),
-        noise=noise,
-        frames=count,
-        correlation=rho.tolist(),
-        excess=found.excess,
-        drift=found.drift,
-    )
+    result = _kept(TareStep, found, noise=noise, frames=count)
     line = f"{count} frames, zero up to {found.zero.max():.1f} counts, noise {noise:.2f} counts"
     if rho.size:
         beside = max(float(rho[0, 1:2].sum()), float(rho[1:2, 0].sum()))
         line += f", correlated {beside:.2f} between neighbours"
     if found.drift > 0.0:
         line += f", all cells drift by {found.drift:.2f} counts"
-    return step.result(tare=result), line, {"zero": found.zero, "noise": found.noise}
+    spread = Map("noise, standard deviation [counts]", found.noise)
+    return step.result(tare=result), line, (Map("zero [counts]", found.zero), spread)
 
 
 def _equilibrate(step: Step) -> Done:
     found = equilibrate(step.loads.frames, step.converter.zero)
     dead = int(np.count_nonzero(found.gain == 0.0))
-    result = EquilibrateStep(
-        date=now(),
-        gain=found.gain.tolist(),
-        dead=dead,
-        spread=found.spread,
-        residual=found.residual,
-    )
+    result = _kept(EquilibrateStep, found, dead=dead)
     line = (
         f"{len(step.loads.frames)} pressures, cells differ by {found.spread:.2%} rms before and "
         f"{found.residual:.2%} after; {dead} dead"
     )
-    calibration = step.result(equilibrate=result, curve=None, modulus=None, law=None, scales=None)
-    return calibration, line, {"gain": found.gain}
+    calibration = step.result(equilibrate=result, curve=None, **_UNDONE)
+    return calibration, line, (Map("gain of each cell, 0: dead", found.gain),)
 
 
 def _curve(step: Step) -> Done:
@@ -224,12 +220,10 @@ def _curve(step: Step) -> Done:
     gains = step.calibration.equilibrate
     full = float(sensor.full_count) * max(map(max, gains.gain) if gains else [1.0])
     found = fit_curve(step.arguments.kind, step.readings, force, step.cell_area, full)
-    result = CurveStep(
-        date=now(), kind=found.kind, coefficients=found.coefficients, residual=found.residual
-    )
+    result = _kept(CurveStep, found)
     line = f"{found.kind} from {len(force)} loads, forces within {found.residual:.2%} rms"
-    picture = {"force": force, "errors": found.errors}
-    return step.result(curve=result, modulus=None, law=None, scales=None), line, picture
+    left = Points("residuals", "known [N]", "relative error [%]", force, 100.0 * found.errors)
+    return step.result(curve=result, **_UNDONE), line, (left,)
 
 
 def _centre(step: Step) -> Done:
@@ -242,14 +236,7 @@ def _centre(step: Step) -> Done:
         step.settings.tactile.noise,
         step.converter.live,
     )
-    result = CentreStep(
-        date=now(),
-        centre=found.centre,
-        rotation=found.rotation,
-        scale=found.scale,
-        residual=found.residual,
-        std=found.std,
-    )
+    result = _kept(CentreStep, found)
     x, y = found.centre
     rotation = (
         "rotation not measured: no press was tilted"
@@ -260,7 +247,8 @@ def _centre(step: Step) -> Done:
         f"tip at ({x * 1e3:.3f}, {y * 1e3:.3f}) ± {found.std * 1e3:.3f} mm; {rotation}; "
         f"{found.residual * 1e6:.0f} µm rms"
     )
-    return step.result(centre=result), line, {"theta": step.theta, "centre": found}
+    place = Points("tip on the sensor", "x [mm]", "y [mm]", [x * 1e3], [y * 1e3])
+    return step.result(centre=result), line, (Map("last press [Pa]", step.pressures[-1]), place)
 
 
 def _modulus(step: Step) -> Done:
@@ -280,29 +268,14 @@ def _modulus(step: Step) -> Done:
     line += f"; {_over_d(found.trend)}"
     if not whole.all():
         line += f"; {np.count_nonzero(~whole)} frames left out, saturated"
-    strain: list[float] = []
-    stress: list[float] = []
-    if step.arguments.law and tip.physics == "solid":
-        raise CalibrationError("modulus: a solid tip has a constant modulus: leave --law out")
-    if step.arguments.law:
-        grid = calibrated_grid(step.settings, FINGERS.index(sensor.finger), step.calibration)
-        live = step.converter.live & ~full
-        law = fit_law(step.pressures, d - found.offset, theta, tip, grid, live)
-        strain, stress = law.strain.tolist(), law.stress.tolist()
-        line += f"; law of {len(strain)} points, cells {law.residual:.0f} Pa rms from it"
-    result = ModulusStep(
-        date=now(),
-        modulus=found.modulus,
-        strain=strain,
-        stress=stress,
-        offset=found.offset,
-        residual=found.residual,
-    )
+    result = _kept(ModulusStep, found)
     d, theta, force = d[whole], theta[whole], force[whole]
     table = ContactTable.build(tip, Material.constant(found.modulus))
     model = table(d - found.offset, theta).force
-    picture = {"d": d, "force": force, "model": model, "fit": found, "law": (strain, stress)}
-    return step.result(modulus=result, scales=None), line, picture
+    shown = Points("constant E", "d [mm]", "F [N]", d * 1e3, force, model)
+    alone = found.trend.modulus / 1e6
+    each = Points("E of each load", "d [mm]", "E [MPa]", found.trend.d * 1e3, alone)
+    return step.result(modulus=result, scales=None), line, (shown, each)
 
 
 def _law(step: Step) -> Done:
@@ -322,26 +295,22 @@ def _law(step: Step) -> Done:
     fits = compare_tips(presses, settings.tip.radius, grid, live, material)
     best, lines = fits[0], [_told(each) for each in fits]
     steps: dict[str, Any] = {"scales": None}
-    wanted = f'tip.physics = "{best.tip.physics}"'
+    wants: dict[str, str | float] = {"physics": best.tip.physics}
     if best.tip.physics == "solid":
-        wanted += f', tip.base = "{best.tip.base}", tip.face = "{best.tip.face}"'
-        wanted += f", tip.poisson = {best.tip.poisson:.3f}"
+        wants |= {"base": best.tip.base, "face": best.tip.face}
+        wants["poisson"] = round(best.tip.poisson, 3)
     if best.valid > 0.0:
         strain = [] if best.law.is_linear else np.linspace(0.05, 1.0, 20).tolist()
-        steps["modulus"] = ModulusStep(
-            date=now(),
-            modulus=best.modulus,
-            strain=strain,
-            stress=[float(best.material.stress(each)) for each in strain],
-            offset=best.offset,
-            residual=best.force_error,
+        stress = [float(best.material.stress(each)) for each in strain]
+        steps["modulus"] = _kept(
+            ModulusStep, best, strain=strain, stress=stress, residual=best.force_error
         )
     try:
         steps["law"], left = _measured(step, live)
         d_error, theta_error = left[:2]
         lines.append(_measured_told(steps["law"], left))
         if best.valid < 1.0 or (d_error < 0.5 * best.d_error and theta_error < best.theta_error):
-            wanted = 'tip.physics = "measured"'
+            wants = {"physics": "measured"}
     except CurvesError as error:
         if best.valid == 0.0:
             raise CalibrationError(
@@ -355,8 +324,11 @@ def _law(step: Step) -> Done:
         lines.insert(1, f"first presses read {softer:+.1%} against the same ones again")
         if softer > _SOFTENS:
             lines[1] += ": the rubber SOFTENS; press it some times to the full depth, then anew"
-    lines.append(f"for the profile: {wanted}")
-    return step.result(**steps), "\n  ".join(lines), {"fits": fits}
+    told = (f"tip.{name} = {json.dumps(value)}" for name, value in wants.items())
+    lines.append(f"for the profile: {', '.join(told)}")
+    names = [" ".join(_name(each).split(", ")[:3]) for each in fits]
+    shown = Bars("error left in F [%]", names, [100.0 * each.force_error for each in fits])
+    return step.result(**steps, wants=wants), "\n  ".join(lines), (shown,)
 
 
 def _measured(step: Step, live: NDArray[np.bool_]) -> tuple[TipCurves, FloatArray]:
@@ -409,12 +381,15 @@ def _over_d(trend: Trend) -> str:
     return f"{told}: DRIFTS by {trend.drift:+.0%} ± {trend.std:.1%}, so {trend.cause}"
 
 
-def _told(fit: TipFit) -> str:
-    name = "springs" if fit.law.is_linear else f"springs, law {fit.law.name}"
+def _name(fit: TipFit) -> str:
     if fit.tip.physics == "solid":
-        name = f"solid, {fit.tip.base}, {fit.tip.face}, ν {fit.tip.poisson:.3f}"
+        return f"solid, {fit.tip.base}, {fit.tip.face}, ν {fit.tip.poisson:.3f}"
+    return "springs" if fit.law.is_linear else f"springs, law {fit.law.name}"
+
+
+def _told(fit: TipFit) -> str:
     words = (
-        f"{name}: E = {fit.modulus / 1e6:.4f} MPa, zero of d at {fit.offset * 1e3:.3f} mm, "
+        f"{_name(fit)}: E = {fit.modulus / 1e6:.4f} MPa, zero of d at {fit.offset * 1e3:.3f} mm, "
         f"χ² {fit.chi2:.2f} a cell; "
     )
     if fit.valid == 0.0:
@@ -426,22 +401,18 @@ def _told(fit: TipFit) -> str:
 
 
 def _relaxation(step: Step) -> Done:
-    d, settings = step.loads.truths.get("d"), step.settings
-    if d is None:
-        raise CalibrationError("relaxation: expected --d, or a run that has d")
-    counts = [len(frames) for frames in step.loads.frames]
     frames = np.concatenate(step.loads.frames)
     force = np.array([step.converter(frame).sum() for frame in frames]) * step.cell_area
-    t = np.arange(len(force)) / settings.tactile.rate
-    table = ContactTable.build(make_tip(settings), make_material(settings.material))
-    lasting = table(np.repeat(d, counts), np.repeat(np.abs(step.theta), counts)).force
-    found = fit_relaxation(t, lasting, force, settings.tip.relaxation_times)
+    t = np.arange(len(force)) / step.settings.tactile.rate
+    found = fit_relaxation(t, force, step.settings.tip.relaxation_times)
     strengths = ", ".join(f"{each:.3f}" for each in found.strengths)
     line = (
         f"force within {found.residual:.2%} rms, {found.elastic:.2%} if the tip were elastic; for "
         f"the profile: tip.relaxation = [{strengths}]"
     )
-    return step.calibration, line, {"t": t, "force": force, "model": found.model}
+    shown = Points("hold", "t [s]", "F [N]", t, force, found.model)
+    left = Points("residuals", "t [s]", "measured − fit [N]", t, force - found.model)
+    return step.calibration, line, (shown, left)
 
 
 _STEPS = {

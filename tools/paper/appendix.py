@@ -6,8 +6,7 @@ eq. 19 one over a length.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.polynomial.legendre import leggauss
@@ -16,7 +15,6 @@ from softfinger.tools.paper.model_pages import ENERGY, MILLI, MODULUS, TIP
 from softfinger.tools.paper.sheets import (
     CIRCLE,
     DEPTH,
-    DrawnCurve,
     Erratum,
     FigurePage,
     FloatArray,
@@ -25,6 +23,9 @@ from softfinger.tools.paper.sheets import (
     sheet,
 )
 from softfinger.tools.style import INK, KINDS
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 _NODES = 64
 _TERMS = ("first", "second", "third")
@@ -94,16 +95,16 @@ def _appendix() -> tuple[Sheet, ...]:
     return (sheet("fig11", *columns),)
 
 
-def _sums(numbers: Sheet) -> Iterator[DrawnCurve]:
+def _sums(axes: Axes, numbers: Sheet) -> None:
     d = numbers["d"]
     for name, color, dash in zip(_TERMS, KINDS, ("--", "-.", ":"), strict=False):
-        look = {"color": color, "linestyle": dash}
-        yield DrawnCurve(d, numbers[f"{name} term as printed"], look, f"{name} term")
+        printed = numbers[f"{name} term as printed"]
+        axes.plot(d, printed, dash, color=color, label=f"{name} term")
         mark = CIRCLE | {"ms": 4, "mec": color}
-        yield DrawnCurve(d[9::10], numbers[f"{name} term integrated"][9::10], mark)
-    yield DrawnCurve(d, ENERGY.at_zero_tilt(d), {"color": INK}, "sum: πEd³/3, eq. 20")
+        axes.plot(d[9::10], numbers[f"{name} term integrated"][9::10], **mark)
+    axes.plot(d, ENERGY.at_zero_tilt(d), color=INK, label="sum: πEd³/3, eq. 20")
     mark = CIRCLE | {"ms": 4, "mec": INK}
-    yield DrawnCurve(d[9::10], numbers["U integrated"][9::10], mark, "by quadrature of eq. 12")
+    axes.plot(d[9::10], numbers["U integrated"][9::10], **mark, label="by quadrature of eq. 12")
 
 
 PAGES = {

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,7 +22,6 @@ from softfinger.tools.paper.sheets import (
     DEPTH,
     FORCE,
     RELATIVE,
-    DrawnCurve,
     Erratum,
     FigurePage,
     FloatArray,
@@ -71,27 +70,28 @@ def compression() -> tuple[Sheet, ...]:
     return (sheet("fig7", *columns),)
 
 
-def _one_tilt(tilt: int, numbers: Sheet) -> Iterator[DrawnCurve]:
+def _one_tilt(tilt: int, axes: Axes, numbers: Sheet) -> None:
     d = numbers["d"]
-    yield DrawnCurve(d, numbers[f"F at {tilt} deg"], {"color": KINDS[0]}, "E = 0.304 MPa")
+    axes.plot(d, numbers[f"F at {tilt} deg"], color=KINDS[0], label="E = 0.304 MPa")
     sensed = numbers[f"F through the sensor at {tilt} deg"]
-    yield DrawnCurve(d[::8], sensed[::8], CIRCLE | {"ms": 4, "mec": INK}, "through 44 × 44 cells")
+    axes.plot(d[::8], sensed[::8], **CIRCLE | {"ms": 4, "mec": INK}, label="through 44 × 44 cells")
     law = numbers[f"F of Table I's law at {tilt} deg"]
-    yield DrawnCurve(d, law, {"linestyle": "--", "color": KINDS[1]}, "Table I's law")
+    axes.plot(d, law, linestyle="--", color=KINDS[1], label="Table I's law")
 
 
-def _all_tilts(numbers: Sheet) -> Iterator[DrawnCurve]:
+def _all_tilts(axes: Axes, numbers: Sheet) -> None:
     for tilt, style in zip(TILTS, ordered(len(TILTS)), strict=True):
-        yield DrawnCurve(numbers["d"], numbers[f"F at {tilt} deg"], style, end=f"{tilt}°")
+        axes.plot(numbers["d"], numbers[f"F at {tilt} deg"], **style, label=f"{tilt}°")
 
 
 def _compression_panels() -> Iterator[Panel]:
     """Panels (a) to (g), one an angle, and (h) with all of them."""
     for k, (letter, tilt) in enumerate(zip("abcdefg", TILTS, strict=True)):
         labels = DEPTH if k >= 4 else "", "" if k % 4 else FORCE
-        legend = "" if k else "upper left"
-        yield Panel(partial(_one_tilt, tilt), *labels, f"({letter}) {tilt}°", legend=legend)
-    yield Panel(_all_tilts, DEPTH, "", "(h) all", (0, 8.3), (0, 82), gap=0.07)
+        place = "" if k else "upper left"
+        yield Panel(partial(_one_tilt, tilt), *labels, f"({letter}) {tilt}°", legend=place)
+    legend = {"loc": "upper left", "ncols": 2}
+    yield Panel(_all_tilts, DEPTH, "", "(h) all", (0, 8.3), (0, 82), legend)
 
 
 def tilt_and_roll() -> tuple[Sheet, ...]:
@@ -125,47 +125,30 @@ def tilt_and_roll() -> tuple[Sheet, ...]:
     return sheet("fig10a", *first), sheet("fig10b", *second)
 
 
-def _rotation(rotation: Sheet, _: Sheet) -> Iterator[DrawnCurve]:
-    thin = {"color": GREY, "linewidth": 0.7}
+def _rotation(axes: Axes, rotation: Sheet, _: Sheet) -> None:
+    thin: dict[str, Any] = {"color": GREY, "linewidth": 0.7}
     for d, style in zip(DEPTHS, ordered(len(DEPTHS)), strict=True):
-        yield DrawnCurve(rotation["theta"], rotation[f"F, d up to {d} mm"], style, end=f"to {d} mm")
-        yield DrawnCurve(rotation["theta"], rotation[f"F at d = {d} mm"], thin)
-    yield DrawnCurve([], [], {"color": INK}, "d rises from first touch")
-    yield DrawnCurve([], [], thin, "d held at its last value")
+        axes.plot(
+            rotation["theta"], rotation[f"F, d up to {d} mm"], **style, label=f"d up to {d} mm"
+        )
+        axes.plot(rotation["theta"], rotation[f"F at d = {d} mm"], **thin)
+    axes.plot([], [], color=INK, label="d rises from first touch")
+    axes.plot([], [], **thin, label="d held at its last value")
 
 
-def _rolling(_: Sheet, rolling: Sheet) -> Iterator[DrawnCurve]:
+def _rolling(axes: Axes, _: Sheet, rolling: Sheet) -> None:
     theta = rolling["theta"]
-    yield DrawnCurve(
-        theta, rolling["F/F(0) at d = 4 mm"], {"color": INK}, "constant E, every d: 1/cos θ"
-    )
+    axes.plot(theta, rolling["F/F(0) at d = 4 mm"], color=INK, label="constant E, every d: 1/cos θ")
     for d, style in zip(DEPTHS, ordered(len(DEPTHS)), strict=True):
         if d in (DEPTHS[0], DEPTHS[-1]):
             law = rolling[f"F/F(0) of Table I's law at d = {d} mm"]
-            yield DrawnCurve(theta, law, style | {"linewidth": 1.1}, f"Table I's law, d = {d} mm")
+            axes.plot(theta, law, **style | {"linewidth": 1.1}, label=f"Table I's law, d = {d} mm")
     radial = rolling["F of radial springs at d = 4 mm"]
-    dotted = {"color": KINDS[1], "linestyle": ":"}
-    yield DrawnCurve(theta, radial / radial[theta == 0.0], dotted, "radial springs: flat")
-    least = {"marker": "v", "ms": 7, "color": INK, "linestyle": "none"}
-    yield DrawnCurve(0.0, 1.0, least, "minimum at 0°")
-
-
-def _path(axes: Axes, _: Sheet, rolling: Sheet) -> None:
-    theta, ratio = rolling["theta"], rolling["F/F(0) at d = 4 mm"]
-    for x, side in ((TILTED, "right"), (ROLLED, "left")):
-        value = float(ratio[np.argmin(np.abs(theta - x))])
-        axes.plot(x, value, "o", ms=4.5, color=INK)
-        axes.annotate(
-            f"{x:g}°: {value:.4f}".replace("-", "−"),
-            (x, value),
-            (6 if side == "left" else -6, -3),
-            textcoords="offset points",
-            ha=side,
-            fontsize=7.5,
-        )
-    arrow = {"arrowstyle": "->", "lw": 0.8, "color": GREY}
-    axes.annotate("", (4.2, 1.0135), (-4.8, 1.0135), arrowprops=arrow)
-    axes.text(-0.3, 1.0140, "the object rolls", ha="center", fontsize=7.5, color=GREY)
+    axes.plot(theta, radial / radial[theta == 0.0], ":", color=KINDS[1], label="radial springs")
+    for x, marker in ((TILTED, "o"), (0.0, "v"), (ROLLED, "s")):
+        ratio = float(rolling["F/F(0) at d = 4 mm"][np.argmin(np.abs(theta - x))])
+        label = f"{x:g}°: {ratio:.4f}".replace("-", "−")
+        axes.plot(x, ratio, marker, ms=5, color=INK, label=label)
 
 
 PAGES = {
@@ -202,10 +185,10 @@ PAGES = {
         tilt_and_roll,
         (
             Panel(_rotation, RELATIVE, FORCE, "(a) the finger rotates", (0, TILTED), (0, 76),
-                  "upper left", gap=0.06),
+                  "upper left"),
             Panel(_rolling, RELATIVE, "F(θ)/F(0) at equal d", "(b) then the object rolls by 20.7°",
                   (-24, 18), (0.9975, 1.038),
-                  {"loc": "upper center", "ncols": 2, "columnspacing": 1.0}, _path),
+                  {"loc": "upper center", "ncols": 2, "columnspacing": 1.0}),
         ),
         layout={"width_ratios": (1.0, 1.25)},
         notes=(

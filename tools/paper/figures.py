@@ -12,9 +12,9 @@ if TYPE_CHECKING:
 
 NAMES = (
     *("fig3", "fig4a", "fig4b", "fig5a", "fig5b"),
-    *("fig7", "fig7_run", "fig10", "fig10_run", "fig11", "solid_run"),
+    *("fig7", "fig7_run", "fig10", "fig10_run", "fig11"),
 )
-BY_NAME = ("basin", "slow_turn")  # the long ones, drawn only when they are named
+BY_NAME = ("slow_turn",)  # long: drawn only when it is named
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME",
         nargs="*",
         help=f"which: {', '.join(NAMES)} (all these if none is named); "
-        f"{', '.join(BY_NAME)}: a minute or two",
+        f"{', '.join(BY_NAME)}: a minute",
     )
     parser.add_argument(
         "--out",
@@ -38,15 +38,13 @@ def pages() -> dict[str, FigurePage]:
     """Return all figures by name."""
     from softfinger.tools.paper import (
         appendix,
-        basin,
         experiment_pages,
         model_pages,
         run_pages,
         slow_turn,
-        solid_pages,
     )
 
-    modules = (model_pages, experiment_pages, run_pages, appendix, solid_pages, basin, slow_turn)
+    modules = (model_pages, experiment_pages, run_pages, appendix, slow_turn)
     found = {name: page for each in modules for name, page in each.PAGES.items()}
     return {name: found[name] for name in (*NAMES, *BY_NAME)}
 

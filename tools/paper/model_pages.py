@@ -6,7 +6,6 @@ numerically.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -25,7 +24,6 @@ from softfinger.kinematics.contact.material import (
 from softfinger.tools.paper.sheets import (
     CIRCLE,
     DEPTH,
-    DrawnCurve,
     Erratum,
     FigurePage,
     FloatArray,
@@ -80,34 +78,23 @@ def law() -> tuple[Sheet, ...]:
     return curve, table
 
 
-def _stress(curve: Sheet, _: Sheet) -> Iterator[DrawnCurve]:
-    blue, orange = {"color": KINDS[0]}, {"color": KINDS[1], "linestyle": "--"}
-    yield DrawnCurve(curve["strain"], curve["stress"], blue, "law through Table I")
-    constant = curve["stress at constant 0.304 MPa"]
-    yield DrawnCurve(curve["strain"], constant, orange, "constant modulus, 0.304 MPa")
+def _stress(axes: Axes, curve: Sheet, _: Sheet) -> None:
+    strain, constant = curve["strain"], curve["stress at constant 0.304 MPa"]
+    axes.plot(strain, curve["stress"], color=KINDS[0], label="law through Table I")
+    axes.plot(strain, constant, "--", color=KINDS[1], label="constant modulus, 0.304 MPa")
 
 
-def _slope(curve: Sheet, table: Sheet) -> Iterator[DrawnCurve]:
-    yield DrawnCurve(curve["strain"], curve["modulus"], {"color": KINDS[0]}, "slope of the law")
-    look = {"marker": "o", "linestyle": "none", "color": "white", "mec": KINDS[0], "mew": 1.4}
-    yield DrawnCurve(table["strain"], table["modulus in the paper"], look, "Table I")
-
-
-def _entries(axes: Axes, curve: Sheet, table: Sheet) -> None:
+def _slope(axes: Axes, curve: Sheet, table: Sheet) -> None:
+    """Draw the law's slope and Table I, its numbers beside its points."""
+    axes.plot(curve["strain"], curve["modulus"], color=KINDS[0], label="slope of the law")
     measured = table["modulus in the paper"]
+    axes.plot(table["strain"], measured, "o", color="white", mec=KINDS[0], mew=1.4, label="Table I")
     axes.axhline(measured[-1], color=KINDS[1], linestyle="--", linewidth=1.2)
     axes.text(1, measured[-1] - 0.004, "Max, beyond 100 %: the paper's E", va="top", fontsize=7.5)
-    for name, x, y in zip(table["entry"], table["strain"], measured, strict=True):
-        if np.isfinite(x):
-            axes.annotate(
-                f"{y:.3f}" + (" (Min)" if name == "Min" else ""),
-                (x, y),
-                (-2, -16) if name == "Min" else (-7, 2) if x == 100.0 else (4, -11),
-                textcoords="offset points",
-                ha="right" if x == 100.0 else "left",
-                fontsize=7.5,
-                color=GREY,
-            )
+    for x, y in zip(table["strain"][:-1], measured, strict=False):
+        place = (-4, 4) if x else (2, -12)
+        axes.annotate(f"{y:.3f}", (x, y), place, textcoords="offset points", color=GREY,
+                      ha="right" if x else "left", fontsize=7.5)  # fmt: skip
 
 
 # Figs. 4 and 5
@@ -225,74 +212,56 @@ def over_depth(name: str, quantity: Plotted) -> tuple[Sheet, ...]:
     return sheet(name, *columns), summary(f"{name}_exponents", heads, rows)
 
 
-def _key(quantity: Plotted) -> Iterator[DrawnCurve]:
-    yield DrawnCurve([], [], {"color": INK}, "closed form")
-    yield DrawnCurve([], [], CIRCLE | {"ms": 4, "mec": INK}, f"eq. {quantity.equation}")
+def _key(axes: Axes, quantity: Plotted) -> None:
+    axes.plot([], [], color=INK, label="closed form")
+    axes.plot([], [], **CIRCLE | {"ms": 4, "mec": INK}, label=f"eq. {quantity.equation}")
 
 
-def _tilt_curves(quantity: Plotted, numbers: Sheet) -> Iterator[DrawnCurve]:
+def _tilt_curves(quantity: Plotted, axes: Axes, numbers: Sheet) -> None:
     theta = numbers["theta"]
     for d, style in zip(DEPTHS, ordered(len(DEPTHS)), strict=True):
         closed = numbers[f"{quantity.symbol} at d = {d} mm"]
         integral = numbers[f"{quantity.symbol} by eq. {quantity.equation} at d = {d} mm"]
-        yield DrawnCurve(theta, closed, style, end=f"d = {d} mm")
+        axes.plot(theta, closed, **style, label=f"d = {d} mm")
         look = CIRCLE | {"ms": 4, "mec": style["color"], "clip_on": False}
-        yield DrawnCurve(theta[::10], integral[::10], look)
-        marker = {"marker": "v", "ms": 6, "color": style["color"]}
-        yield DrawnCurve(0.0, closed[theta == 0.0], marker)
-    yield from _key(quantity)
-    look = {"marker": "v", "ms": 6, "color": INK, "linestyle": "none"}
-    yield DrawnCurve([], [], look, "minimum")
+        axes.plot(theta[::10], integral[::10], **look)
+        axes.plot(0.0, closed[theta == 0.0], "v", ms=6, color=style["color"])
+    _key(axes, quantity)
+    axes.plot([], [], "v", ms=6, color=INK, label="minimum")
 
 
-def _depth_curves(quantity: Plotted, numbers: Sheet, _: Sheet) -> Iterator[DrawnCurve]:
+def _depth_curves(quantity: Plotted, axes: Axes, numbers: Sheet, _: Sheet) -> None:
     d = numbers["d"]
     for tilt, style in zip(TILTS, ordered(len(TILTS)), strict=True):
         integral = numbers[f"{quantity.symbol} by eq. {quantity.equation} at {tilt} deg"]
-        yield DrawnCurve(d, numbers[f"{quantity.symbol} at {tilt} deg"], style, end=f"{tilt}°")
+        axes.plot(d, numbers[f"{quantity.symbol} at {tilt} deg"], **style, label=f"{tilt}°")
         look = CIRCLE | {"ms": 3.5, "mec": style["color"], "clip_on": False}
-        yield DrawnCurve(d[10::10], integral[10::10], look)
-    yield from _key(quantity)
+        axes.plot(d[10::10], integral[10::10], **look)
+    _key(axes, quantity)
 
 
-def _straight(quantity: Plotted, axes: Axes, numbers: Sheet, _: Sheet) -> None:
-    axes.annotate(
-        f"continuous line:\n{quantity.symbol}(d, 0) = {quantity.power}",
-        (6.0, float(numbers[f"{quantity.symbol} at 0 deg"][60])),
-        (5.4, 0.1 * quantity.largest(30.0)),
-        fontsize=7.5,
-        color=INK,
-        arrowprops={"arrowstyle": "->", "lw": 0.6, "color": GREY},
-    )
-
-
-def _factors(numbers: Sheet, _: Sheet) -> Iterator[DrawnCurve]:
+def _factors(axes: Axes, numbers: Sheet, _: Sheet) -> None:
     for tilt, style in zip(TILTS, ordered(len(TILTS)), strict=True):
         factor = numbers[f"factor at {tilt} deg"]
-        yield DrawnCurve(numbers["d"][1:], factor[1:], style, end=f"{tilt}°: {factor[-1]:.3f}")
-
-
-def _fitted(quantity: Plotted, axes: Axes, _: Sheet, exponents: Sheet) -> None:
-    off = np.max(np.abs(exponents["fitted exponent of d"] - quantity.exponent))
-    text = f"exponents fitted to the integrals:\n{quantity.exponent} ± {off:.0e}"
-    axes.text(0.03, 0.94, text, transform=axes.transAxes, va="top", fontsize=7.5)
+        axes.plot(numbers["d"][1:], factor[1:], **style, label=f"{tilt}°: {factor[-1]:.3f}")
 
 
 def _tilt_page(name: str, title: str, height: float, quantity: Plotted, **more: Any) -> FigurePage:
     legend = {"loc": "upper center", "ncols": 3}
     panel = Panel(partial(_tilt_curves, quantity), "θ [deg]", quantity.axis, "", (-25, 25),
-                  (0, 1.16 * quantity.largest(25.0)), legend)  # fmt: skip
+                  (0, 1.25 * quantity.largest(25.0)), legend)  # fmt: skip
     return FigurePage(title, (5.2, height), partial(over_tilt, name, quantity), (panel,), **more)
 
 
 def _depth_page(name: str, title: str, quantity: Plotted, **more: Any) -> FigurePage:
-    left = Panel(partial(_depth_curves, quantity), DEPTH, quantity.axis, "", (0, 8),
-                 (0, 1.12 * quantity.largest(30.0)), "upper left",
-                 partial(_straight, quantity))  # fmt: skip
+    line = f"continuous line: {quantity.symbol}(d, 0) = {quantity.power}"
+    left = Panel(partial(_depth_curves, quantity), DEPTH, quantity.axis, line, (0, 8),
+                 (0, 1.12 * quantity.largest(30.0)), "upper left")  # fmt: skip
     right = Panel(_factors, DEPTH,
                   f"{quantity.symbol} by eq. {quantity.equation} over {quantity.power}",
                   f"flat: the exponent is exactly {quantity.exponent}", (0, 8),
-                  annotate=partial(_fitted, quantity))  # fmt: skip
+                  (0.99, 1.02 + 1.4 * (quantity.largest(30.0) / quantity.largest(0.0) - 1.0)),
+                  {"loc": "upper center", "ncols": 2})  # fmt: skip
     sheets = partial(over_depth, name, quantity)
     layout = {"width_ratios": (1.15, 1.0)}
     return FigurePage(title, (7.4, 4.1), sheets, (left, right), layout=layout, **more)
@@ -315,7 +284,7 @@ PAGES = {
             Panel(_stress, "strain [%]", "stress [MPa]", "(b) stress-strain diagram",
                   legend="upper left"),
             Panel(_slope, "strain [%]", "modulus, slope of the curve [MPa]", "Table I", None,
-                  (0.0, 0.33), "lower right", _entries),
+                  (0.0, 0.33), "lower right"),
         ),
         errata=(
             Erratum(

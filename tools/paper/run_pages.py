@@ -1,40 +1,212 @@
-"""Figs. 7, 8 and 10 run in simulation (`paper.runs`): the model, what was estimated, the error."""
+"""Figs. 7, 8 and 10 run in simulation: plant, sensor, estimator and table as the daemon has them.
+
+Each run gives what is true and what was estimated from the frames, one row a frame; a figure shows
+the model, the estimates and their errors. The sensor is the paper's: 44 × 44 cells on 58 mm, 40 ms
+a scan, with noise of 0.5 % of the modulus in each cell.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from functools import cache, partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from softfinger.tools.paper import runs
-from softfinger.tools.paper.model_pages import DEPTHS, MILLI, TILTS
-from softfinger.tools.paper.runs import SimulatedRun
+from softfinger.daemon.loop.build import Daemon
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
+from softfinger.daemon.types import Contact
+from softfinger.tools.paper.model_pages import DEPTHS, MILLI, MODULUS, TILTS
 from softfinger.tools.paper.sheets import (
-    CIRCLE,
     DEPTH,
     DOT,
     FORCE,
     RELATIVE,
-    DrawnCurve,
     FigurePage,
     FloatArray,
     Panel,
     Sheet,
     sheet,
     summary,
-    zero_line,
 )
-from softfinger.tools.style import GREY, INK, KINDS, label_ends, ordered
+from softfinger.tools.style import GREY, KINDS, ordered
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+Sections = dict[str, dict[str, Any]]
+Row = tuple[tuple[float, float], tuple[float, ...]]  # true d and θ; `_estimates`
+
+RADIUS = 0.020  # m
+SCAN = 0.040  # s
+TILTED = math.radians(11.5)  # by the finger's rotation about its root
+ROLLED = math.radians(20.7)  # by the object's rolling, back
+_SPEED = 0.002  # m/s, of compression
+_GAP = 0.5e-3  # m before compression
+_DEEPEST = 0.4 * RADIUS
+_ROOT_DEPTH = 0.004  # m, that the finger's rotation ends at
+_GIVES = math.radians(3.0)
+_WIDTH = 0.040
+_HALF_SEPARATION = 0.050
+_ROLL_STEPS = 104  # frames in which the object rolls
+_LATE = 2  # frames that are on their way
 _SURE = 1.0  # mm of displacement from which on relative errors are shown
-_DEEPEST_FORCE = 1e-6 * np.pi * runs.MODULUS * 8.0**2  # N at 8 mm, upright
 _ROLLED_AT = 4  # mm, where rotation ends and the path goes on
 _PATH = -12.5, 10.5
+
+
+@dataclass(frozen=True)
+class SimulatedRun:
+    """One row a frame: truth and estimate of d [m], θ [rad], force [N] and energy [J]."""
+
+    d: FloatArray
+    theta: FloatArray
+    force: FloatArray
+    energy: FloatArray
+    d_found: FloatArray
+    theta_found: FloatArray
+    force_found: FloatArray
+    energy_found: FloatArray
+
+
+def run_compression(tilt: float) -> SimulatedRun:
+    """Press the object, its face tilted by ``tilt`` [rad], onto the tip until d is 8 mm."""
+    x = -_HALF_SEPARATION + (RADIUS + 0.5 * _WIDTH + _GAP) / math.cos(tilt)
+    sections: Sections = {
+        "servos": {"backend": "none"},
+        "simulation": {
+            "object_position": (x, 0.080),
+            "object_angle": tilt,
+            "compression_speed": _SPEED,
+        },
+    }
+    seconds = (_DEEPEST + _GAP) / math.cos(tilt) / _SPEED
+    with _daemon(sections) as daemon:
+        return _collect(_frames(daemon, round(seconds / SCAN)), daemon)
+
+
+def run_rotation() -> SimulatedRun:
+    """Turn the finger by 11.5° about its root against a fixed object, from first touch on.
+
+    The root is so far that d is 4 mm at the end. The servo moves the joint; d and θ are
+    predicted from it between frames.
+    """
+    length = _ROOT_DEPTH / math.sin(TILTED)
+    sections: Sections = {
+        "hand": {"finger_length": length},
+        "control": {"move_speed": 0.05},
+        "simulation": {
+            "object_position": (-_HALF_SEPARATION + RADIUS + 0.5 * _WIDTH, length),
+            "object_height": 0.2,
+        },
+    }
+    with _daemon(sections) as daemon:
+        loop = daemon.loop
+        loop.advance(0.3)
+        loop.command({"command": "arm"})
+        # The servo gives way under the force: its goal lies beyond.
+        loop.command({"command": "move", "left": TILTED + _GIVES})
+        assert daemon.hand is not None
+        rows: list[Row] = []
+        while loop.state.mode == "moving" or not rows:
+            loop.advance(0.5 * SCAN)
+            truth = float(daemon.hand.d[0]), float(daemon.hand.theta[0])
+            if truth[1] > TILTED:
+                break
+            rows.append((truth, _estimates(loop.state.contacts[0])))
+        return _collect(iter(rows), daemon)
+
+
+def run_rolling(d: float) -> SimulatedRun:
+    """Roll the object on the fixed finger from 11.5° by 20.7° to −9.2°, ``d`` [m] held."""
+    sections: Sections = {
+        "servos": {"backend": "none"},
+        "hand": {"open_angle": (TILTED, 0.0)},
+        "simulation": {"object_height": 0.2, "compression_speed": 0.0},
+    }
+
+    def place(hand: SimulatedHand, fraction: float) -> None:
+        _roll(hand, d, -ROLLED * fraction)
+
+    with _daemon(sections) as daemon:
+        return _collect(_frames(daemon, _ROLL_STEPS, place), daemon)
+
+
+def _daemon(sections: Sections) -> Daemon:
+    merged: Sections = {
+        "scene": {"fingers": ("left",)},
+        "tip": {"radius": RADIUS},
+        "material": {"law": "constant", "modulus": MODULUS},
+        # A calibrated sensor: what its frames are higher is the tip, which is stiffer.
+        "tactile": {"rate": 1.0 / SCAN, "noise": 0.005 * MODULUS, "gain_error": 1e-3},
+        "loop": {"clock": "virtual"},
+        "simulation": {
+            "tactile_delay": SCAN,
+            "tactile_noise": 0.005 * MODULUS,
+            "object_height": 0.2,
+        },
+    }
+    for name, values in sections.items():
+        merged[name] = merged.get(name, {}) | values
+    return Daemon(Settings.model_validate(merged), wire=False)
+
+
+def _frames(
+    daemon: Daemon, count: int, place: Callable[[SimulatedHand, float], None] | None = None
+) -> Iterator[Row]:
+    """Truth at each frame's instant, and the estimate from that frame alone."""
+    hand, loop = daemon.hand, daemon.loop
+    assert hand is not None
+    if place is not None:
+        place(hand, 0.0)
+        loop.advance(3.0 * SCAN)  # frames of before have come
+    last = loop.state.contacts[0].seq
+    for k in range(count + _LATE):
+        if place is not None:
+            place(hand, min(k / (count - 1), 1.0))
+        loop.advance(SCAN)
+        contact = loop.state.contacts[0]
+        if contact.seq == last:
+            continue
+        last = contact.seq
+        sample = hand.sample(contact.seq - 1)
+        truth = float(sample.d[0]), float(sample.theta[0])
+        yield truth, _estimates(contact)
+
+
+def _estimates(contact: Contact) -> tuple[float, ...]:
+    if not contact.contact:
+        return 0.0, math.nan, 0.0, 0.0
+    return contact.d, contact.theta, contact.force, contact.energy
+
+
+def _collect(rows: Iterator[Row], daemon: Daemon) -> SimulatedRun:
+    found = list(rows)
+    truth = np.array([each for each, _ in found])
+    estimates = np.array([each for _, each in found])
+    d, theta = np.maximum(truth[:, 0], 0.0), truth[:, 1]
+    contact = daemon.tables[0](d, theta)
+    return SimulatedRun(d, theta, contact.force, contact.energy, *estimates.T)
+
+
+def _roll(hand: SimulatedHand, d: float, angle: float) -> None:
+    """Put the held object where it has rolled to ``angle`` [rad] with ``d`` [m] held."""
+    q = float(hand.q[0])
+    parameters = hand.plant.parameters
+    length = parameters.length
+    tip = -_HALF_SEPARATION + length * math.sin(q), length * math.cos(q)
+    out = RADIUS + 0.5 * _WIDTH - d
+    along = (RADIUS - d) * angle  # the tip's place on the face, by rolling
+    parameters.script_x = tip[0] + out * math.cos(angle) + along * math.sin(angle)
+    hand.object_pose[:] = (
+        parameters.script_x,
+        tip[1] + out * math.sin(angle) - along * math.cos(angle),
+        angle,
+    )
+    hand.refresh()
 
 
 def _columns(
@@ -62,7 +234,7 @@ def compression() -> tuple[Sheet, ...]:
     """Return one sheet an angle, and one with the errors beyond 1 mm."""
     sheets, rows = [], []
     for tilt in TILTS:
-        run = runs.compression(float(np.radians(tilt)))
+        run = run_compression(float(np.radians(tilt)))
         sheets.append(sheet(f"fig7_run_{tilt}deg", *_columns(run, "")))
         deep = run.d > _SURE * MILLI
         force = (run.force_found / np.maximum(run.force, 1e-9) - 1.0)[deep]
@@ -90,21 +262,16 @@ def compression() -> tuple[Sheet, ...]:
     return (*sheets, summary("fig7_run_errors", heads, rows))
 
 
-def _forces(*sheets: Sheet) -> Iterator[DrawnCurve]:
-    for style, run in zip(ordered(len(TILTS)), sheets, strict=False):
-        yield DrawnCurve(run["d"], run["F"], style)
-        yield DrawnCurve(run["d estimated"][::6], run["F estimated"][::6], DOT)
-    yield DrawnCurve([], [], {"color": INK}, "model")
-    yield DrawnCurve([], [], CIRCLE | {"ms": 3, "mec": INK}, "estimated from the frames")
+def _forces(axes: Axes, *sheets: Sheet) -> None:
+    for tilt, style, run in zip(TILTS, ordered(len(TILTS)), sheets, strict=False):
+        axes.plot(run["d"], run["F"], **style, label=f"{tilt}°")
+        axes.plot(run["d estimated"][::6], run["F estimated"][::6], **DOT)
+    axes.plot([], [], **DOT, label="estimated from the frames")
 
 
-def _angles(axes: Axes, *_: Sheet) -> None:
-    ends = [_DEEPEST_FORCE / float(np.cos(np.radians(tilt))) for tilt in TILTS]
-    label_ends(axes, 8.0, ends, [f"{tilt}°" for tilt in TILTS], gap=0.07)
-
-
-def _errors(symbol: str, *sheets: Sheet) -> Iterator[DrawnCurve]:
-    """Yield the errors of force [%], displacement [µm] or angle [degrees], beyond 1 mm."""
+def _errors(symbol: str, axes: Axes, *sheets: Sheet) -> None:
+    """Draw the errors of force [%], displacement [µm] or angle [degrees], beyond 1 mm."""
+    axes.axhline(0.0, color=GREY, linewidth=0.7)
     for tilt, style, run in zip(TILTS, ordered(len(TILTS)), sheets, strict=False):
         deep = run["d"] > _SURE
         truth, found = run[symbol][deep], run[f"{symbol} estimated"][deep]
@@ -112,13 +279,13 @@ def _errors(symbol: str, *sheets: Sheet) -> Iterator[DrawnCurve]:
             off = 100.0 * (found / truth - 1.0)
         else:
             off = (found - truth) * (1e3 if symbol == "d" else 1.0)
-        yield DrawnCurve(run["d"][deep], off, style | {"linewidth": 0.9}, f"{tilt}°")
+        axes.plot(run["d"][deep], off, **style | {"linewidth": 0.9}, label=f"{tilt}°")
 
 
 def _error_panel(symbol: str, title: str, label: str, limit: float) -> Panel:
     legend = {"loc": "lower right", "ncols": 4, "title": "tilt"}
     ends = (0, 8), (-1.3 * limit, limit)
-    return Panel(partial(_errors, symbol), DEPTH, label, title, *ends, legend, zero_line)
+    return Panel(partial(_errors, symbol), DEPTH, label, title, *ends, legend)
 
 
 @cache
@@ -126,7 +293,7 @@ def tilt_and_roll() -> tuple[Sheet, ...]:
     """Return rotation, the rolling at each displacement, and where force and energy are least."""
     columns, minima = [], []
     for depth in DEPTHS:
-        run = runs.rolling(depth * MILLI)
+        run = run_rolling(depth * MILLI)
         columns += _columns(run, f" at {depth} mm", -1.0)
         theta = -np.degrees(run.theta)
         minima.append(
@@ -150,7 +317,7 @@ def tilt_and_roll() -> tuple[Sheet, ...]:
         ("RMS error of theta", "deg"),
     )
     return (
-        sheet("fig10_run_rotation", *_columns(runs.rotation(), "", -1.0)),
+        sheet("fig10_run_rotation", *_columns(run_rotation(), "", -1.0)),
         sheet("fig10_run_rolling", *columns),
         summary("fig10_run_minimum", heads, minima),
     )
@@ -167,45 +334,37 @@ def _minimum(theta: FloatArray, values: FloatArray) -> tuple[float, float]:
     return float(-0.5 * b / a), float(np.sqrt(slope @ covariance @ slope))
 
 
-def _along(symbol: str, rotation: Sheet, rolling: Sheet, _: Sheet) -> Iterator[DrawnCurve]:
-    """Tabulate along the path: the rotation, then the rolling at 4 mm."""
+def _along(symbol: str, axes: Axes, rotation: Sheet, rolling: Sheet, _: Sheet) -> None:
+    """Draw along the path: the rotation, then the rolling at 4 mm."""
     for piece, at, color, name in (
         (rotation, "", KINDS[1], "the finger rotates"),
         (rolling, f" at {_ROLLED_AT} mm", KINDS[0], "then the object rolls"),
     ):
-        yield DrawnCurve(piece[f"theta{at}"], piece[f"{symbol}{at}"], {"color": color}, name)
+        axes.plot(piece[f"theta{at}"], piece[f"{symbol}{at}"], color=color, label=name)
         theta, found = piece[f"theta estimated{at}"], piece[f"{symbol} estimated{at}"]
-        yield DrawnCurve(theta[::4], found[::4], DOT, "estimated" if at else "")
+        axes.plot(theta[::4], found[::4], **DOT, label="estimated" if at else "")
 
 
-def _over_upright(_: Sheet, rolling: Sheet, minima: Sheet) -> Iterator[DrawnCurve]:
-    for depth, style in zip(DEPTHS, ordered(len(DEPTHS)), strict=True):
+def _over_upright(axes: Axes, _: Sheet, rolling: Sheet, minima: Sheet) -> None:
+    least = zip(
+        DEPTHS, minima["angle of the least U estimated"], minima["its standard error, U"],
+        ordered(len(DEPTHS)), strict=True,
+    )  # fmt: skip
+    for depth, angle, error, style in least:
         theta, model = rolling[f"theta at {depth} mm"], rolling[f"U at {depth} mm"]
         level = float(np.interp(0.0, theta, model))
         found = rolling[f"U estimated at {depth} mm"]
-        yield DrawnCurve(theta, found / level, style | {"linewidth": 0.9})
-        yield DrawnCurve(theta, model / level, {"color": GREY, "linewidth": 0.7})
+        label = f"{depth} mm: least at {angle:.2f}° ± {error:.2f}°".replace("-", "−")
+        axes.plot(theta, found / level, **style | {"linewidth": 0.9}, label=label)
+        axes.plot(theta, model / level, color=GREY, linewidth=0.7)
 
 
-def _show_minima(axes: Axes, _: Sheet, rolling: Sheet, minima: Sheet) -> None:
-    """The least angles with their standard errors, enlarged, one line a displacement."""
-    found, error = minima["angle of the least U estimated"], minima["its standard error, U"]
-    inset = axes.inset_axes((0.33, 0.14, 0.4, 0.28))
-    for k, style in enumerate(ordered(len(DEPTHS))):
-        inset.errorbar(found[k], -k, xerr=error[k], fmt="o", ms=3, color=style["color"], capsize=2)
-        text = f"{DEPTHS[k]} mm: {found[k]:.2f}° ± {error[k]:.2f}°".replace("-", "−")
-        inset.text(1.03, -k, text, transform=inset.get_yaxis_transform(), va="center", fontsize=7)
-    inset.axvline(0.0, color=GREY, linewidth=0.7)
-    inset.set(xlim=(-0.8, 0.8), ylim=(0.6 - len(DEPTHS), 0.4), yticks=[])
-    inset.set_title("least at θ [deg]", fontsize=7.5, pad=2)
-    inset.tick_params(labelsize=7, pad=1)
-
-
-def _angle_errors(_: Sheet, rolling: Sheet, minima: Sheet) -> Iterator[DrawnCurve]:
+def _angle_errors(axes: Axes, _: Sheet, rolling: Sheet, minima: Sheet) -> None:
+    axes.axhline(0.0, color=GREY, linewidth=0.7)
     for depth, style in zip(DEPTHS, ordered(len(DEPTHS)), strict=True):
         theta = rolling[f"theta at {depth} mm"]
         off = rolling[f"theta estimated at {depth} mm"] - theta
-        yield DrawnCurve(theta, off, style | {"linewidth": 0.9}, f"d = {depth} mm")
+        axes.plot(theta, off, **style | {"linewidth": 0.9}, label=f"d = {depth} mm")
 
 
 PAGES = {
@@ -214,7 +373,7 @@ PAGES = {
         (7.6, 6.2),
         compression,
         (
-            Panel(_forces, DEPTH, FORCE, "(a) force", (0, 8.6), (0, 78), "upper left", _angles),
+            Panel(_forces, DEPTH, FORCE, "(a) force", (0, 8.2), (0, 78), "upper left"),
             _error_panel("F", "(b) error of the force", "estimate over model − 1 [%]", 5.0),
             _error_panel("d", "(c) error of the displacement", "estimate − truth [µm]", 75.0),
             _error_panel("theta", "(d) error of the angle", "estimate − truth [deg]", 0.5),
@@ -236,10 +395,10 @@ PAGES = {
             Panel(partial(_along, "U"), RELATIVE, "elastic energy U [mJ]",
                   "(b) energy along the path", _PATH, None, "lower right"),
             Panel(_over_upright, RELATIVE, "U(θ)/U(0)", "(c) energy while rolling, over U(0)",
-                  _PATH, (0.86, 1.085), annotate=_show_minima),
+                  _PATH, (0.86, 1.085), "lower center"),
             Panel(_angle_errors, RELATIVE, "estimate − truth [deg]",
                   "(d) error of the angle while rolling", _PATH, None,
-                  {"loc": "lower right", "ncols": 2}, zero_line),
+                  {"loc": "lower right", "ncols": 2}),
         ),
         rows=2,
         notes=(

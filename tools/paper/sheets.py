@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from softfinger.daemon.own_files import write_text
-from softfinger.tools.style import GREY, INK, caption, label_ends
+from softfinger.tools.style import INK, caption
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -83,50 +83,23 @@ class Erratum:
 
 
 @dataclass(frozen=True)
-class DrawnCurve:
-    """A line or a row of markers; ``end`` is written beside its last point."""
-
-    x: ArrayLike
-    y: ArrayLike
-    look: dict[str, Any]  # of matplotlib's plot
-    label: str = ""
-    end: str = ""
-
-
-@dataclass(frozen=True)
 class Panel:
-    """Axes of a figure: the curves by the page's sheets, and the words around them."""
+    """Axes of a figure: what draws into them from the page's sheets, and the words around it."""
 
-    curves: Callable[..., Iterable[DrawnCurve]]
+    content: Callable[..., None]  # of axes and sheets
     xlabel: str
     ylabel: str
     title: str = ""
     x: Ends | None = None
     y: Ends | None = None
     legend: str | dict[str, Any] = ""  # its place, or more of matplotlib's words
-    annotate: Callable[..., None] | None = None  # axes and sheets
-    gap: float = 0.05  # between the curves' ends, of the axis
 
     def draw(self, axes: Axes, sheets: Sequence[Sheet]) -> None:
-        ended: list[tuple[float, float, str]] = []
-        for curve in self.curves(*sheets):
-            axes.plot(curve.x, curve.y, **curve.look, label=curve.label or None)
-            if curve.end:
-                ended.append((np.ravel(curve.x)[-1], float(np.ravel(curve.y)[-1]), curve.end))
+        self.content(axes, *sheets)
         axes.set(xlabel=self.xlabel, ylabel=self.ylabel, title=self.title)
         axes.set(**{name: ends for name, ends in (("xlim", self.x), ("ylim", self.y)) if ends})
-        if ended:
-            right, ends, words = zip(*ended, strict=True)
-            label_ends(axes, right[0], ends, words, self.gap)
-        if self.annotate is not None:
-            self.annotate(axes, *sheets)
         if self.legend:
             axes.legend(**{"loc": self.legend} if isinstance(self.legend, str) else self.legend)
-
-
-def zero_line(axes: Axes, *_: Sheet) -> None:
-    """Draw a line at 0."""
-    axes.axhline(0.0, color=GREY, linewidth=0.7)
 
 
 @dataclass(frozen=True)

@@ -14,16 +14,15 @@ slow: `turned` solves that step by step, and no time, mass or damping is in it.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import cache, partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from softfinger.kinematics.hand.geometry import HandGeometry, tip_velocity
-from softfinger.tools.paper.runs import MODULUS
+from softfinger.tools.paper.model_pages import MODULUS
 from softfinger.tools.paper.sheets import (
-    DrawnCurve,
     FigurePage,
     FloatArray,
     Panel,
@@ -32,6 +31,9 @@ from softfinger.tools.paper.sheets import (
 )
 from softfinger.tools.style import INK, KINDS, ordered
 from softfinger.tools.watched import Watched
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 FORCE, WIDTH = 10.0, 0.040  # N on each tip's base; m
 REACH = math.radians(8.0)  # the object's angle, there, back, and to the other side
@@ -131,14 +133,9 @@ def solve(residual: Callable[[FloatArray], FloatArray], start: FloatArray) -> Fl
     raise RuntimeError(f"no balance near {start}: {residual(x)} left")
 
 
-def at_pose(x: FloatArray, angle: float, last: Held | None) -> Held:
-    """Return the pose of ``x``, the object's place [m] and both joints' angles [rad]."""
-    return held(x[2:], np.array([x[0], x[1], angle]), last)
-
-
 @cache
 def gripped() -> Held:
-    """Return the upright grip in balance, from unsheared tips ."""
+    """Return the upright grip in balance, from unsheared tips."""
 
     def met(x: FloatArray) -> Held:
         q = np.full(2, x[0])
@@ -152,14 +149,14 @@ def turned(angles: FloatArray, start: Held) -> list[Held]:
     """Return the quasi-static path from ``start`` on which the object takes ``angles`` [rad]."""
     path = [start]
     for angle in angles:
-        last = path[-1]
-        wanted = partial(at_pose, angle=float(angle), last=last)
 
-        def residual(x: FloatArray, of: Callable[[FloatArray], Held] = wanted) -> FloatArray:
+        def pose(x: FloatArray, angle: float = angle, last: Held = path[-1]) -> Held:
+            return held(x[2:], np.array([x[0], x[1], angle]), last)
+
+        def residual(x: FloatArray, of: Callable[[FloatArray], Held] = pose) -> FloatArray:
             return of(x).unbalanced()
 
-        found = solve(residual, np.r_[last.pose[:2], last.q])
-        path.append(wanted(found))
+        path.append(pose(solve(residual, np.r_[path[-1].pose[:2], path[-1].q])))
     return path[1:]
 
 
@@ -182,7 +179,8 @@ def valley(floor: Held, aside: FloatArray, start: Held) -> FloatArray:
         angle = float(floor.pose[2] + more)
 
         def pose(x: FloatArray, angle: float = angle) -> Held:
-            return at_pose(np.r_[x[:2], x[2] + lean, x[2] - lean], angle, start)
+            q = np.array([x[2] + lean, x[2] - lean])
+            return held(q, np.array([x[0], x[1], angle]), start)
 
         def residual(x: FloatArray, of: Callable[[FloatArray], Held] = pose) -> FloatArray:
             there = of(x)
@@ -207,11 +205,8 @@ def swing() -> FloatArray:
     }
     rows = []
     with Watched(sections) as hand:
-        hand.loop.advance(0.1)
-        hand.command("arm")
-        hand.loop.advance(0.2)
-        hand.command("grasp", force=FORCE)
-        hand.loop.advance(_GRIP)
+        hand.grasp(FORCE)
+        hand.run(_GRIP)
         start, t = hand.state.t, 0.0
         while t < 4.0 * _SWING:
             t = hand.state.t - start
@@ -270,18 +265,19 @@ def slow_turn() -> tuple[Sheet, ...]:
     return equations, plant, sheet("slow_turn_landscape", *columns)
 
 
-def _landscape(equations: Sheet, _: Sheet, land: Sheet) -> Iterator[DrawnCurve]:
+def _landscape(axes: Axes, equations: Sheet, _: Sheet, land: Sheet) -> None:
     for lean, look in zip(LEANS, ordered(len(LEANS)), strict=True):
-        yield DrawnCurve(
-            land[f"angle at {lean} deg"], land[f"V at {lean} deg"], look, f"lean {lean}°"
+        axes.plot(
+            land[f"angle at {lean} deg"], land[f"V at {lean} deg"], **look, label=f"lean {lean}°"
         )
-    yield DrawnCurve(equations["angle"], equations["V"], {"color": INK, "lw": 2.0}, "slow turn")
+    axes.plot(equations["angle"], equations["V"], color=INK, lw=2.0, label="slow turn")
 
 
-def _both(name: str, equations: Sheet, plant: Sheet, _: Sheet) -> Iterator[DrawnCurve]:
-    look = {"color": KINDS[1], "lw": 3.0, "alpha": 0.6}
-    yield DrawnCurve(plant["angle"], plant[name], look, "simulated hand, 10 N")
-    yield DrawnCurve(equations["angle"], equations[name], {"color": INK, "lw": 1.0}, "equations")
+def _both(name: str, axes: Axes, equations: Sheet, plant: Sheet, _: Sheet) -> None:
+    axes.plot(
+        plant["angle"], plant[name], color=KINDS[1], lw=3.0, alpha=0.6, label="simulated hand"
+    )
+    axes.plot(equations["angle"], equations[name], color=INK, lw=1.0, label="equations")
 
 
 _ANGLE = "object's angle φ [deg]"

@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -135,6 +136,15 @@ def _energy() -> Iterator[Beside]:
         )
         yield between(f"tilt of the least U at d = 4 mm: {law}", 0.0, 0.0, source, least, ".1f",
                       "°", why)  # fmt: skip
+    d, chosen = 1e-3 * np.arange(8, 33) / 4.0, Material.constant(1.0)
+    for face in ("frictionless", "sticking"):
+        solid = ContactTable.build(replace(_LAWS["solid, bonded"], face=face), chosen)(d, 0.0).force
+        springs = _table("springs")(d, 0.0 * d, "force")
+        modulus = float(np.polyfit(solid, springs, 1)[0])
+        over = modulus * solid - springs
+        yield Beside(f"Fig. 7's offset from springs, 2 to 8 mm: solid, bonded, {face}",
+                     "one constant", source, f"{over.min():.1f} to {over.max():.1f} N", "disagree",
+                     f"by the E that comes nearest to it, {1e-6 * modulus:.3f} MPa")  # fmt: skip
     yield Beside("force above the springs', in rolling", "17 %", source, "0 %", "disagree",
                      "the paper gives no depth; solid tips press harder somewhere")  # fmt: skip
 

@@ -72,7 +72,7 @@ class MonitorBeside:
             self._terminal = sys.stdout.fileno()
             self._attributes = termios.tcgetattr(self._terminal)
         self._lifeline = _Lifeline()
-        words = ["monitor", "--state", stream, "--commands", commands]
+        words = ["monitor", "--address", f"{stream},{commands}"]
         self.process = self._lifeline.start(words, keys)
         if on_end is not None:
             self._call_at_end(on_end)

@@ -15,8 +15,9 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import Any, NamedTuple
 
 from softfinger.daemon.loop.warm_up import Part, WantedScene, is_built, mark_built, named, parts
 from softfinger.daemon.profile.settings import Settings
@@ -94,46 +95,45 @@ def _available() -> float:
 
 
 class _Build:
-    """The parts that are left, and a thread for each process that builds some of them."""
+    """Builds parts in a few processes, each with a thread that hands it one part after another."""
 
     def __init__(self, settings: Settings, missing: list[Part], tell: Tell, bar: Progress) -> None:
         self._head = f"{settings.model_dump_json()}\n"
-        self._waiting = list(missing)
-        self._under_way: dict[Part, str] = {}  # and the kernel at work
-        self._changed = threading.Condition()
+        self._missing = missing
+        self._at: dict[str, str] = {}  # the kernel under way of each part under way
         self._total, self._begun = _kernels(missing), 0
         self._started = time.monotonic()
         self._bar, self._tell = bar, tell
         self._processes: list[subprocess.Popen[str]] = []
-        self._reasons: set[str] = set()  # told: wrong settings fail every part alike
-        self._over = False
-
-    @property
-    def failed(self) -> bool:
-        return bool(self._reasons)
+        self._own = threading.local()  # each thread's process
+        self.failed = self._over = False
 
     def run(self) -> None:
         """Build all parts; when interrupted, end every process."""
-        threads = []
+        built: dict[str, Future[str]] = {}
+        pool = ThreadPoolExecutor(_jobs(self._missing))
         try:
-            for _ in range(_jobs(self._waiting)):
-                self._processes.append(_start())
-                threads.append(threading.Thread(target=self._work, args=self._processes[-1:]))
-                threads[-1].start()
+            for part in self._missing:
+                built[part.name] = pool.submit(self._build, part, built.get(part.after))
             with self._bar as show:
-                while alive := [each for each in threads if each.is_alive()]:
-                    alive[0].join(_LOOK)
-                    at = "; ".join(f"{part.name}: {k}" for part, k in list(self._under_way.items()))
+                while wait(built.values(), _LOOK).not_done:
+                    at = "; ".join(f"{name}: {kernel}" for name, kernel in list(self._at.items()))
                     show(self._begun, f"{self._so_far()}: {at}")
-            for part in self._waiting:
-                self._fail(part, "no process is left to build it")
         finally:
             self._over = True
+            pool.shutdown(wait=False, cancel_futures=True)
             for process in self._processes:
                 process.kill()
-            for thread in threads:
-                if thread.is_alive():  # the last one never is where Ctrl-C came before its start
-                    thread.join()
+            pool.shutdown()
+            for process in self._processes:
+                with process:
+                    pass
+        reasons: set[str] = set()  # wrong settings fail every part alike
+        for name, future in built.items():
+            if (reason := future.result()) and reason not in reasons:
+                self._tell("warning", "compile", f"{name} was not compiled ahead: {reason}")
+            reasons.add(reason)
+        self.failed = reasons != {""}
 
     def _so_far(self) -> str:
         return (
@@ -141,66 +141,34 @@ class _Build:
             f"{time.monotonic() - self._started:.0f} s"
         )
 
-    def _work(self, process: subprocess.Popen[str]) -> None:
-        """Hand parts to a process until none is left, or it has ended."""
-        assert process.stdin is not None
+    def _build(self, part: Part, after: Future[str] | None) -> str:
+        """Have this thread's process build a part once ``after`` is done; why that failed."""
+        if after is not None:
+            wait([after])
+        head, process = "", getattr(self._own, "process", None)
+        if process is None:
+            process = self._own.process = _start()
+            self._processes.append(process)
+            if self._over:
+                process.kill()
+            head = self._head
         assert process.stdout is not None
-        part = None
-        try:
-            process.stdin.write(self._head)
-            while part := self._next():
-                process.stdin.write(f"{part.name}\n")
-                process.stdin.flush()
-                self._follow(part, process.stdout)
-        except BrokenPipeError:
-            pass
-        process.kill()
-        status = process.wait()
-        if part is not None:
-            self._done(part, f"its process ended with status {status}")
+        self._at[part.name] = ""
         with contextlib.suppress(BrokenPipeError):
-            process.stdin.close()
-        process.stdout.close()
-
-    def _next(self) -> Part | None:
-        """The next part that need not wait for one that is waiting or under way; None: no more."""
-        with self._changed:
-            while self._waiting:
-                names = {part.name for part in (*self._waiting, *self._under_way)}
-                free = [part for part in self._waiting if part.after not in names]
-                if free:
-                    self._waiting.remove(free[0])
-                    self._under_way[free[0]] = ""
-                    return free[0]
-                self._changed.wait()
-        return None
-
-    def _follow(self, part: Part, output: IO[str]) -> None:
-        """Read what a process says of a part, until it is built. Raises BrokenPipeError."""
-        for line in output:
+            print(f"{head}{part.name}", file=process.stdin, flush=True)
+        for line in process.stdout:
             word, _, rest = line.rstrip("\n").partition(" ")
             if word == "kernel":
                 self._begun += 1
-                self._under_way[part] = rest
-            else:
-                return self._done(part, rest if word == "failed" else "")
-        raise BrokenPipeError
-
-    def _done(self, part: Part, failure: str) -> None:
-        with self._changed:
-            del self._under_way[part]
-            self._changed.notify_all()
-        if failure:
-            self._fail(part, failure)
-        elif not self._bar.on:
-            self._tell("info", "compile", f"{part.name}: {self._so_far()}")
-
-    def _fail(self, part: Part, reason: str) -> None:
-        with self._changed:
-            if self._over or reason in self._reasons:  # interrupted, or told
-                return
-            self._reasons.add(reason)
-        self._tell("warning", "compile", f"{part.name} was not compiled ahead: {reason}")
+                self._at[part.name] = rest
+                continue
+            del self._at[part.name]
+            if word == "done" and not self._bar.on:
+                self._tell("info", "compile", f"{part.name}: {self._so_far()}")
+            return rest
+        self._own.process = None
+        del self._at[part.name]
+        return f"its process ended with status {process.wait()}"
 
 
 def _start() -> subprocess.Popen[str]:

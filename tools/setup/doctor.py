@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from softfinger.daemon.backends import BUILT_IN, backend, plugins, source
 from softfinger.daemon.diagnosis.devices import (
     check_board,
+    check_law,
     check_servos,
     repair_latency_timer,
     repair_servos,
@@ -85,6 +86,7 @@ def results(settings: Settings, fix: bool) -> Iterator[Finding]:
             finger = FINGERS.index(name)
             if free.get(tactile.port[finger], True):
                 yield check_board(settings, finger)
+            yield check_law(settings, finger)
     yield from check_machine()
     if fix:
         build_kernels(settings, print_event)

@@ -100,16 +100,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--config", type=Path, metavar="PROFILE", help="the hand's profile")
     parser.add_argument("--user", default="", help="the user it runs as (default: root)")
     parser.add_argument("--udev", action="store_true", help="the udev rules instead of the unit")
-    parser.add_argument(
-        "--name",
-        action="append",
-        default=[],
-        metavar="NAME=SERIAL",
-        help="with --udev: a link /dev/NAME to the adapter with this serial number",
-    )
-    where = parser.add_mutually_exclusive_group()
-    where.add_argument("--print", action="store_true", help="print it (default)")
-    where.add_argument("--to", type=Path, metavar="FOLDER", help=f"write {UNIT} or {RULES} there")
+    parser.add_argument("--to", type=Path, metavar="FOLDER", help=f"write {UNIT} or {RULES} there")
     parser.add_argument("--force", action="store_true", help="overwrite an existing file")
 
 
@@ -117,7 +108,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Print or write; 0, or 1 with the reason."""
     try:
         if arguments.udev:
-            name, text = RULES, rules(arguments.name)
+            name, text = RULES, _RULES
         else:
             name, text = UNIT, unit(arguments.config, arguments.user)
         if arguments.to is None:
@@ -160,17 +151,3 @@ def _quoted(word: str) -> str:
         raise ValueError(f"{word!r}: control characters can't stand in a unit")
     word = word.replace("\\", "\\\\").replace('"', '\\"').replace("%", "%%").replace("$", "$$")
     return f'"{word}"' if re.search(r"[\s\"';\\]", word) else word
-
-
-def rules(names: list[str]) -> str:
-    """Return the rules' text. Raises ValueError for a name that is none."""
-    lines = [_RULES]
-    for pair in names:
-        name, separator, serial = pair.partition("=")
-        valid = re.fullmatch(r"[A-Za-z0-9_./-]+", name) and ".." not in name and name[0] != "/"
-        if not (separator and valid and re.fullmatch(r"[A-Za-z0-9_.:-]+", serial)):
-            raise ValueError(f"found {pair!r}, expected NAME=SERIAL, as softfinger/servos=FT4THVRN")
-        lines.append(
-            f'SUBSYSTEM=="tty", ATTRS{{serial}}=="{serial}", SYMLINK+="{name}", TAG+="systemd"\n'
-        )
-    return "".join(lines)

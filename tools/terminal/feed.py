@@ -12,7 +12,7 @@ import statistics
 import time
 from bisect import insort
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -29,8 +29,6 @@ from softfinger.daemon.types import FINGERS, GRIP_FRACTION
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.local_stop import stop_locally
 
-HISTORY_STEP = 0.2  # s in one column of the trends
-HISTORY_LENGTH = 600
 WINDOW = 1.0  # s of statistics
 LATELY = 3.0  # s in which waiting for a busy machine is shown
 EVENTS = 200  # kept
@@ -92,14 +90,10 @@ class ShownEvent(NamedTuple):
 
 
 class RecentTicks(NamedTuple):
-    """Medians and worst values over the last second; NaN when unknown."""
+    """Medians over the last second; NaN when unknown."""
 
     messages: float = math.nan  # states a second
     rate: float = math.nan  # ticks a second
-    compute: float = math.nan
-    compute_max: float = math.nan
-    lateness: float = math.nan
-    lateness_max: float = math.nan
 
 
 class Feed:
@@ -125,10 +119,7 @@ class Feed:
         self.force_default = math.nan  # N of a grasp without a force
         self.force_limit = math.inf  # N that a grip may be asked for
         self.skipped = 0
-        self.history: deque[tuple[float, float]] = deque(maxlen=HISTORY_LENGTH)  # N, left, right
-        self._bin: list[tuple[float, float]] = []
-        self._bin_end = -math.inf
-        self._ticks: deque[tuple[float, float, float, float]] = deque(maxlen=10_000)
+        self._ticks: deque[tuple[float, float]] = deque(maxlen=10_000)
         self._waits: deque[tuple[float, float]] = deque(maxlen=10_000)
         self._period = 0.0  # s between states, smoothed
         self.topics: dict[bytes, Callable[[Any, float], None]] = {
@@ -158,7 +149,7 @@ class Feed:
     def _read_state(self, state: schema.HandState, now: float) -> None:
         before = self.state
         if state.seq < before.seq:  # another daemon: a new story
-            for each in (self._ticks, self._waits, self.history, self.frames, self._bin):
+            for each in (self._ticks, self._waits, self.frames):
                 each.clear()
             self._period = 0.0
             self.times, self._commanding = None, ("", -math.inf)
@@ -169,14 +160,7 @@ class Feed:
                 self._waits.append((now, waited))
         self.state, self.state_at = state, now
         self.mode, self.fault = printable(state.mode), printable(state.fault)
-        self._ticks.append((now, state.tick_s, state.compute_s, state.wake_late_s))
-        if now >= self._bin_end:
-            if self._bin:
-                left, right = zip(*self._bin, strict=True)
-                self.history.append((statistics.fmean(left), statistics.fmean(right)))
-            self._bin.clear()
-            self._bin_end = now + HISTORY_STEP
-        self._bin.append((state.left.force, state.right.force))
+        self._ticks.append((now, state.tick_s))
 
     def _read_frame(self, frame: schema.TactileFrame, now: float) -> None:
         if frame.finger not in FINGERS:
@@ -275,16 +259,8 @@ class Feed:
             self._ticks.popleft()
         if not self._ticks:
             return RecentTicks()
-        _, *columns = zip(*self._ticks, strict=True)
-        (tick, _), compute, lateness = map(_summary, columns)
-        rate = 1.0 / tick if tick > 0.0 else math.nan
-        return RecentTicks(len(self._ticks) / WINDOW, rate, *compute, *lateness)
-
-
-def _summary(values: Iterable[float]) -> tuple[float, float]:
-    """Median and largest of the finite ones, NaN without any."""
-    finite = [value for value in values if math.isfinite(value)] or [math.nan]
-    return statistics.median(finite), max(finite)
+        tick = statistics.median([tick for _, tick in self._ticks if tick > 0.0] or [math.nan])
+        return RecentTicks(len(self._ticks) / WINDOW, 1.0 / tick)
 
 
 class FeedSubscriber:

@@ -7,7 +7,6 @@ as tall as wide, so the pixels come out square.
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,13 +32,6 @@ _ANCHORS = (
 )
 
 
-# The same scale in the 256 fixed colours: the nearest ones would jump in lightness.
-_FIXED = (17, 18, 24, 30, 36, 72, 77, 113, 149, 185, 227)
-
-# What a terminal can show: any colour, 256 fixed ones, or too few for a map.
-Depth = Literal["any", "fixed", "none"]
-
-
 def colour_map() -> list[tuple[int, int, int]]:
     """Return the scale's colours from zero to full, as (red, green, blue) of 0…255."""
     at = np.linspace(0.0, len(_ANCHORS) - 1.0, LEVELS)
@@ -47,17 +39,12 @@ def colour_map() -> list[tuple[int, int, int]]:
     return [(r, g, b) for r, g, b in np.rint(channels).T.astype(int).tolist()]
 
 
-_COLOURS = {
-    "any": [Color.from_rgb(*rgb) for rgb in colour_map()],
-    "fixed": [
-        Color.from_ansi(_FIXED[round(k * (len(_FIXED) - 1) / (LEVELS - 1))]) for k in range(LEVELS)
-    ],
-}
+_COLOURS = [Color.from_rgb(*rgb) for rgb in colour_map()]
 
 
 @lru_cache(maxsize=LEVELS * LEVELS)
-def _pair_style(top: int, bottom: int, depth: Depth) -> Style:
-    return Style(color=_COLOURS[depth][top], bgcolor=_COLOURS[depth][bottom])
+def _pair_style(top: int, bottom: int) -> Style:
+    return Style(color=_COLOURS[top], bgcolor=_COLOURS[bottom])
 
 
 @lru_cache(maxsize=16)
@@ -95,23 +82,23 @@ def levels_of(pixels: FloatArray, full: float) -> NDArray[np.int64]:
     return np.rint(scaled * (LEVELS - 1)).astype(np.int64)
 
 
-def picture(grid: FloatArray, full: float, lines: int, columns: int, depth: Depth) -> list[Text]:
+def picture(grid: FloatArray, full: float, lines: int, columns: int, coloured: bool) -> list[Text]:
     """Return ``grid`` as ``lines`` of ``columns`` characters, row 0 lowest as y points up.
 
     ``full`` is the value that gets the brightest colour, or the densest shade.
     """
-    if depth == "none":
+    if not coloured:
         return [_shades(row) for row in levels_of(resample(grid, lines, columns), full)[::-1]]
     levels = levels_of(resample(grid, 2 * lines, columns), full)[::-1]
-    return [_runs(levels[2 * k], levels[2 * k + 1], depth) for k in range(lines)]
+    return [_runs(levels[2 * k], levels[2 * k + 1]) for k in range(lines)]
 
 
-def _runs(top: NDArray[np.int64], bottom: NDArray[np.int64], depth: Depth) -> Text:
+def _runs(top: NDArray[np.int64], bottom: NDArray[np.int64]) -> Text:
     """One line, neighbours of the same two colours in one span."""
     changes = np.flatnonzero(np.diff(top) | np.diff(bottom)) + 1
     starts, styles = [0, *changes.tolist()], (top * LEVELS + bottom).tolist()
     spans = [
-        Span(start, end, _pair_style(*divmod(styles[start], LEVELS), depth))
+        Span(start, end, _pair_style(*divmod(styles[start], LEVELS)))
         for start, end in zip(starts, [*starts[1:], len(styles)], strict=True)
     ]
     return Text("▀" * len(styles), spans=spans)
@@ -122,10 +109,10 @@ def _shades(levels: NDArray[np.int64]) -> Text:
     return Text("".join(SHADES[i] for i in index))
 
 
-def colour_bar(columns: int, depth: Depth) -> Text:
+def colour_bar(columns: int, coloured: bool) -> Text:
     """Return the scale from nothing to full, in one line."""
     levels = levels_of(np.linspace(0.0, 1.0, columns), 1.0)
-    return _shades(levels) if depth == "none" else _runs(levels, levels, depth)
+    return _runs(levels, levels) if coloured else _shades(levels)
 
 
 def round_up(value: float) -> float:

@@ -18,7 +18,6 @@ from typing import Any, Self
 
 import zmq
 
-from softfinger.daemon.types import FINGERS
 from softfinger.tools.arguments import (
     ADDRESS_HELP,
     PATIENCE,
@@ -30,10 +29,10 @@ from softfinger.tools.arguments import (
     to_stderr,
 )
 from softfinger.tools.ending import Ending, known
-from softfinger.tools.terminal.feed import Commander, Feed, FeedSubscriber
+from softfinger.tools.terminal.feed import Commander, Feed, FeedSubscriber, printable
 from softfinger.tools.terminal.monitor_page import MonitorPage
+from softfinger.tools.terminal.status import told
 from softfinger.tools.terminal.terminal import KeyDecoder, Terminal, TerminalGone
-from softfinger.tools.terminal.typeset import short
 
 STEP_ANGLE = math.radians(5.0)  # of the arrow keys
 _STEPS = ((1.0, 0.1), (5.0, 0.5), (math.inf, 1.0))  # N: up to this force, in steps of that
@@ -135,8 +134,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "choose the force. Prints a plain line a second when the output is not a terminal."
     )
     parser.add_argument("--address", type=addresses, default="", help=ADDRESS_HELP)
-    parser.add_argument("--state", metavar="ADDRESS", help="where the state stream is published")
-    parser.add_argument("--commands", metavar="ADDRESS", help="where commands are taken")
     add_keys(parser)
     parser.add_argument("--client", default="", help="a name: the commander's lease is bound to it")
     parser.add_argument(
@@ -152,7 +149,7 @@ def run(args: argparse.Namespace) -> int:
 
     Raises KeyFileError.
     """
-    state, commands = args.state or args.address[0], args.commands or args.address[1]
+    state, commands = args.address
     if args.lifeline is not None:
         _lower_priority()
     keys = client_keys(args.keys)
@@ -244,7 +241,7 @@ def _run_page(
     keyboard = sys.stdin.fileno() if sys.stdin is not None and sys.stdin.isatty() else None
     page.keys = keyboard is not None
     terminal = Terminal(sys.stdout.fileno(), keyboard, suspendable=not ending.beside)
-    page.depth = terminal.depth
+    page.coloured = terminal.coloured
     ending.terminal = terminal
     try:
         while not ending.over:
@@ -317,35 +314,10 @@ def _run_plain(address: str, subscriber: FeedSubscriber, ending: _Ending) -> Non
                 _say(f"{event.clock()} {event.level} {event.kind}: {event.text}")
             if status in ("live", "stale") and now >= due:
                 due = now + PLAIN_LINE
-                _say(plain_line(feed, now))
+                _say(f"{_clock()} {printable(told(feed.state))}")
         return
     # The reader has gone. Python flushes its output once more at exit: into nothing then.
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
-def plain_line(feed: Feed, now: float) -> str:
-    """Return the hand in one short line."""
-    state = feed.state
-    texts = [_clock(), feed.mode or "—"]
-    if feed.fault:
-        texts.append(f"FAULT {feed.fault}")
-    for name in FINGERS:
-        tip = getattr(state, name)
-        force, d, theta = short(tip.force, 2), short(1e3 * tip.d, 2), _degrees(tip.theta)
-        texts.append(f"{name} {force} N {d} mm {theta}")
-    if math.isfinite(state.goal_force):
-        texts.append(f"goal {state.goal_force:.1f} N")
-    texts.append(f"object {_degrees(state.object.angle)}")
-    tick = feed.statistics(now)
-    rate, compute = short(tick.rate, 0), short(1e6 * tick.compute, 0)
-    texts.append(f"tick {rate} Hz {compute} µs overruns {state.overruns}")
-    if feed.skipped:
-        texts.append(f"unreadable {feed.skipped}")
-    return "  ".join(texts)
-
-
-def _degrees(angle: float) -> str:
-    return f"{math.degrees(angle):+.1f}°" if math.isfinite(angle) else "—°"
 
 
 def _clock() -> str:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from itertools import islice
 
 from rich.text import Text
 
@@ -22,7 +21,6 @@ from softfinger.tools.terminal.typeset import (
     DIM,
     aligned,
     apart,
-    bars,
     centred,
     cut,
     faded,
@@ -101,13 +99,12 @@ class MonitorPage:
 
     feed: Feed
     address: str
-    depth: heatmap.Depth = "any"
+    coloured: bool = True  # in more than 16 colours
     keys: bool = True  # a keyboard is there
     guarded: bool = False  # subscribed with keys
     force: float = math.nan  # N of the grasp key
     explains: bool = False  # the numbers' meanings stand in their place
     _pressure: heatmap.FullScale = field(default_factory=lambda: heatmap.FullScale(5e3, 3.0))
-    _force: heatmap.FullScale = field(default_factory=lambda: heatmap.FullScale(1.0, 0.0))
     _statistics: RecentTicks = field(default_factory=RecentTicks)
     _statistics_at: float = -math.inf
 
@@ -126,12 +123,11 @@ class MonitorPage:
             self._statistics = self.feed.statistics(now)
             self._statistics_at = now
         status = self.feed.status(now)
-        maps, trend, events = _heights(width, height)
+        maps, events = _heights(width, height)
         numbers = [
             *(_meanings(width, maps + 2) if self.explains else self._body(width, maps, now)),
             rule(width, Text(self._goal())),
-            *self._trends(width, trend),
-            self._ticks(width),
+            self._ticks(),
         ]
         if status in ("stale", "lost"):
             numbers = [faded(line) for line in numbers]
@@ -220,10 +216,10 @@ class MonitorPage:
         rows, cols = frame.grid.shape
         height, columns = heatmap.fit(rows, cols, lines, box, frame.aspect)
         above = (lines - height) // 2
-        for i, line in enumerate(heatmap.picture(frame.grid, full, height, columns, self.depth)):
+        for i, line in enumerate(heatmap.picture(frame.grid, full, height, columns, self.coloured)):
             picture[above + i] = centred(line, box)
         end = f" {full * factor:g} {unit}"
-        bar = heatmap.colour_bar(max(4, box - 2 - len(end)), self.depth)
+        bar = heatmap.colour_bar(max(4, box - 2 - len(end)), self.coloured)
         return [title, *picture, Text.assemble(("0 ", DIM), bar, (end, DIM))]
 
     def _numbers(self, lines: int) -> list[Text]:
@@ -281,57 +277,17 @@ class MonitorPage:
             text += f", raised from {commanded:.1f} N"
         return text + (f", object to {angle:.1f}°" if math.isfinite(angle) else "")
 
-    def _trends(self, width: int, lines: int) -> list[Text]:
-        """The recent history of both forces, ``lines`` of bars each."""
-        columns = width - 30
-        history = self.feed.history
-        recent = list(islice(history, max(0, len(history) - columns), None))
-        full = self._force.follow(
-            max((v for pair in recent for v in pair if math.isfinite(v)), default=0.0), 0.0
-        )
-        result = []
-        for i, name in enumerate(FINGERS):
-            for row, bar in enumerate(bars([pair[i] for pair in recent], full, lines)):
-                head = Text(" " * 23)
-                if row == lines - 1:
-                    value = aligned(getattr(self.feed.state, name).force, 2)
-                    head = Text.assemble((f" force {name:<6}", DIM), f"{value:<8}", ("N ", DIM))
-                head.append(f"{bar:>{columns}} ", SIDE[name])
-                result.append(head.append("" if row else f"{full:g} N", DIM))
-        return result
-
-    def _ticks(self, width: int) -> Text:
-        """Rate and overruns, then median, tail and largest times of all ticks.
-
-        Until ``hand/stats`` arrives, those of the last second. Shorter in a narrow terminal.
-        """
-        now, of_all, overruns = self._statistics, self.feed.times, self.feed.state.overruns
-        words: tuple[str, ...] = ("µs", "p99", "max")
-        times: dict[str, tuple[float, ...]]
-        if of_all is None:
-            words = ("µs", "max")
-            times = {
-                "compute": (now.compute, now.compute_max),
-                "late": (now.lateness, now.lateness_max),
-            }
-        else:
-            spreads = {"compute": of_all.compute, "late": of_all.wake}
-            times = {name: (each.p50, each.p99, each.max) for name, each in spreads.items()}
-        head = Text(f" tick {short(now.rate, 0)} Hz").append("  overruns ", DIM)
+    def _ticks(self) -> Text:
+        """Rate and overruns, then median, tail and largest times of all ticks."""
+        times, overruns = self.feed.times, self.feed.state.overruns
+        line = Text(f" tick {short(self._statistics.rate, 0)} Hz").append("  overruns ", DIM)
         known = str(overruns) if self.feed.mode else "—"
-        head.append(known, WARN if overruns > 0 else "default")
-        full, slim = head.copy(), Text()
-        for label, values in times.items():
-            text = [micro(value) for value in values]
-            tail = "".join(
-                f" {word} {value}" for word, value in zip(words[1:], text[1:], strict=True)
-            )
-            full.append(f"  {label} ", DIM).append(f"{text[0]} µs").append(tail, DIM)
-            slim.append(f"  {label} ", DIM).append("/".join(text))
-        slim.append(" µs", DIM)
-        named = Text.assemble(head, (f"  p50/{'/'.join(words[1:])}", DIM), slim)
-        fitting = (line for line in (full, named) if line.cell_len <= width)
-        return next(fitting, Text.assemble(head, slim))
+        line.append(known, WARN if overruns > 0 else "default").append("  p50/p99/max", DIM)
+        for label, name in (("compute", "compute"), ("late", "wake")):
+            of = getattr(times, name, None)
+            values = [math.nan] * 3 if of is None else (of.p50, of.p99, of.max)
+            line.append(f"  {label} ", DIM).append("/".join(micro(value) for value in values))
+        return line.append(" µs", DIM)
 
     def _messages(self, width: int, count: int, now: float, reply: ShownReply | None) -> list[Text]:
         """A rule with the commander and the last reply, texts cut above in full, then events."""
@@ -390,15 +346,12 @@ def _named(keys: dict[str, str]) -> Text:
     return line
 
 
-def _heights(width: int, height: int) -> tuple[int, int, int]:
-    """Lines of (each map, each trend, the events) on a page of this size."""
+def _heights(width: int, height: int) -> tuple[int, int]:
+    """Lines of (each map, the events) on a page of this size."""
     spare = height - HEIGHT
     widest = (width - CENTRE - 2) // 4  # the maps' width is twice their height
     maps = max(MAP_LINES, min(widest, MAP_LINES + (2 * spare + 2) // 3))
-    spare -= maps - MAP_LINES
-    trend = 1 + min(3, spare // 4)
-    spare -= 2 * (trend - 1)
-    return maps, trend, 3 + spare
+    return maps, 5 + spare - (maps - MAP_LINES)
 
 
 def _too_small(width: int, height: int) -> list[Text]:

@@ -19,7 +19,6 @@ from rich.segment import Segment
 from rich.text import Text
 
 from softfinger.daemon.errors import SoftfingerError
-from softfinger.tools.terminal.heatmap import Depth
 
 with contextlib.suppress(ModuleNotFoundError):  # Windows has no page, but `monitor --plain`
     import termios
@@ -34,7 +33,6 @@ _COLOUR_SYSTEMS = {
     "256": ColorSystem.EIGHT_BIT,
     "standard": ColorSystem.STANDARD,
 }
-_DEPTHS: dict[Any, Depth] = {"truecolor": "any", "256": "fixed"}  # 16 are too few for a map
 
 _ARROWS = {b"D": "left", b"C": "right"}
 _KEY = re.compile(
@@ -85,7 +83,7 @@ class Terminal:
         self._console = Console()
         name = None if self._console.no_color else self._console.color_system
         self._colours = _COLOUR_SYSTEMS.get(name) if name else None
-        self.depth: Depth = _DEPTHS.get(name, "none")
+        self.coloured = name in ("truecolor", "256")  # 16 are too few for a map
 
     def __enter__(self) -> Terminal:
         if self._keyboard is not None:

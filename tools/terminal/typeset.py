@@ -12,7 +12,6 @@ from rich.style import Style
 from rich.text import Text
 
 DIM = "#8b929c"
-BARS = " ▁▂▃▄▅▆▇█"
 
 
 def cut(line: Text, columns: int) -> Text:
@@ -54,19 +53,6 @@ def faded(line: Text) -> Text:
     """Return ``line`` in the faded style of outdated data, but for the maps."""
     maps = [span for span in line.spans if isinstance(span.style, Style) and span.style.bgcolor]
     return Text(line.plain, DIM, spans=maps)
-
-
-def bars(values: list[float], full: float, lines: int) -> list[str]:
-    """Return values as bars of eighths of a line, highest line first; blank for NaN."""
-    steps = [
-        -1 if math.isnan(v) else round(min(max(v / full, 0.0), 1.0) * 8 * lines) for v in values
-    ]
-    rows = []
-    for row in reversed(range(lines)):
-        floor = 1 if row == 0 else 0  # a zero still shows as a thin line
-        cells = (max(floor, min(8, s - 8 * row)) if s >= 0 else 0 for s in steps)
-        rows.append("".join(BARS[max(0, c)] for c in cells))
-    return rows
 
 
 def aligned(value: float, decimals: int) -> str:

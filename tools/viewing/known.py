@@ -152,25 +152,18 @@ class ShownHand:
 
 
 def read_settings(message: dict[str, Any]) -> tuple[Settings, list[str]]:
-    """A ``hand/settings``, and the keys in it that could not be read."""
+    """Return a ``hand/settings``, and the keys in it that could not be read."""
     try:
         sections = json.loads(message.get("settings") or "{}")
+        return Settings.model_validate_json(json.dumps(sections)), []
+    except ValidationError as error:
+        places = [[str(key) for key in each["loc"][:2]] for each in error.errors()]
     except (TypeError, ValueError):
         return Settings(), ["all of them"]
-    passed: list[str] = []
-    for _ in range(100):
-        try:
-            return Settings.model_validate_json(json.dumps(sections)), passed
-        except ValidationError as error:
-            place = [str(key) for key in error.errors()[0]["loc"][:2]]
-            passed.append(".".join(place) or "all of them")
-            if not _drop(sections, place):
-                break
-    return Settings(), passed
-
-
-def _drop(sections: object, place: list[str]) -> bool:
-    """Take the key at ``place`` (section, key) out; False where there is none."""
-    for section in place[:-1]:
-        sections = sections.get(section) if isinstance(sections, dict) else None
-    return isinstance(sections, dict) and sections.pop(place[-1] if place else "", None) is not None
+    for *section, key in filter(None, places):
+        (sections.get(section[0], {}) if section else sections).pop(key, None)
+    try:
+        passed = sorted({".".join(place) for place in places})
+        return Settings.model_validate_json(json.dumps(sections)), passed
+    except ValidationError:
+        return Settings(), ["all of them"]

@@ -8,7 +8,6 @@ axes are x along its base and z out of it; in them the object's face is
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -138,63 +137,30 @@ def tip_axes(finger: int, q: float) -> tuple[FloatArray, FloatArray]:
     return np.array([sine, -cosine]), np.array([-cosine, -sine])
 
 
-class HeldObject:
-    """The pose of the object between both tips.
+def held_outline(
+    hand: HandGeometry,
+    q: tuple[float, float],
+    d: FloatArray,
+    theta: FloatArray,
+    width: float,
+    height: float,
+) -> FloatArray:
+    """Return the held object's outline [5, 2] m, closed, from joints and contacts, left first.
 
-    Across its faces it follows from the contacts. Along them it is taken to be centred on the
-    contacts when both begin, and to roll on the tips without slip afterwards:
-    ṡ1 = (a − d1) θ̇1, ṡ2 = −(a − d2) θ̇2, with s the tips' places along its faces.
+    Across its faces it follows from the contacts; along them it is taken to be centred on them.
     """
-
-    def __init__(self, hand: HandGeometry) -> None:
-        self._hand = hand
-        self._along: FloatArray | None = None  # s of both tips [m]
-        self._theta = np.zeros(2)
-
-    def lose(self) -> None:
-        """The object is no longer held."""
-        self._along = None
-
-    def shown(
-        self, state: dict[str, Any], contacts: Sequence[Touch | None], height: float
-    ) -> FloatArray | None:
-        """Its outline [5, 2] m by a ``hand/state``; None, and lost, where both don't hold it."""
-        left, right = contacts if len(contacts) == 2 else (None, None)
-        width = number(state, "object", "width")
-        valid = feed.field(state, "object", "valid") is True and math.isfinite(width)
-        if left is None or right is None or not valid:
-            self.lose()
-            return None
-        outline = self.outline(
-            (number(state, "left", "q"), number(state, "right", "q")),
-            np.array([left.d, right.d]),
-            np.array([left.theta, right.theta]),
-            width,
-            height,
-        )
-        return outline if np.isfinite(outline).all() else None
-
-    def outline(
-        self, q: tuple[float, float], d: FloatArray, theta: FloatArray, width: float, height: float
-    ) -> FloatArray:
-        """Its outline [5, 2] m, closed, from joints [rad], contacts (left, right), W and height."""
-        hand, a = self._hand, self._hand.tip_radius
-        angle = 0.5 * (theta[0] + theta[1] - q[0] + q[1])
-        n = np.array([math.cos(angle), math.sin(angle)])
-        t = np.array([-n[1], n[0]])
-        tips = hand.tips(q)
-        across = 0.5 * (tips[0] @ n + a - d[0] + tips[1] @ n - a + d[1])
-        if self._along is None:
-            self._along = tips @ t - (tips @ t).mean()
-        else:
-            self._along = self._along + (a - d) * (theta - self._theta) * (1.0, -1.0)
-        self._theta = theta.copy()
-        centre = across * n + (tips @ t - self._along).mean() * t
-        corners = np.array([(-1, -1), (-1, 1), (1, 1), (1, -1), (-1, -1)])
-        outline: FloatArray = (
-            centre + 0.5 * width * corners[:, :1] * n + 0.5 * height * corners[:, 1:] * t
-        )
-        return outline
+    a = hand.tip_radius
+    angle = 0.5 * (theta[0] + theta[1] - q[0] + q[1])
+    n = np.array([math.cos(angle), math.sin(angle)])
+    t = np.array([-n[1], n[0]])
+    tips = hand.tips(q)
+    across = 0.5 * (tips[0] @ n + a - d[0] + tips[1] @ n - a + d[1])
+    centre = across * n + (tips @ t).mean() * t
+    corners = np.array([(-1, -1), (-1, 1), (1, 1), (1, -1), (-1, -1)])
+    outline: FloatArray = (
+        centre + 0.5 * width * corners[:, :1] * n + 0.5 * height * corners[:, 1:] * t
+    )
+    return outline
 
 
 def true_outline(settings: Settings, truth: dict[str, Any]) -> FloatArray | None:
@@ -246,7 +212,6 @@ class HandScene:
 
     def __init__(self, hand: ShownHand) -> None:
         self._hand = hand
-        self.held = HeldObject(hand.geometry)
 
     def parts(self, state: dict[str, Any]) -> dict[str, HandPart]:
         """All but the simulated object, by a ``hand/state``."""
@@ -258,9 +223,23 @@ class HandScene:
             q = number(state, name, "q")
             index, angle = FINGERS.index(name), q if math.isfinite(q) else 0.0
             parts[name] = _part(finger_lines(hand.geometry, index, angle, contact), name, contact)
-        outline = self.held.shown(state, contacts, hand.settings.simulation.object_height)
-        parts["object"] = HandPart([] if outline is None else [Strip(outline, OBJECT, 1.4)])
+        parts["object"] = self._held(state, *contacts)
         return parts
+
+    def _held(self, state: dict[str, Any], *contacts: Touch | None) -> HandPart:
+        """The object between both tips; nothing where both don't hold it."""
+        held = [contact for contact in contacts if contact is not None]
+        if len(held) < 2 or feed.field(state, "object", "valid") is not True:
+            return HandPart([])
+        outline = held_outline(
+            self._hand.geometry,
+            (number(state, "left", "q"), number(state, "right", "q")),
+            np.array([contact.d for contact in held]),
+            np.array([contact.theta for contact in held]),
+            number(state, "object", "width"),
+            self._hand.settings.simulation.object_height,
+        )
+        return HandPart([Strip(outline, OBJECT, 1.4)] if np.isfinite(outline).all() else [])
 
     def simulated(self, truth: dict[str, Any] | None) -> HandPart:
         """The simulated object's true pose, by a ``hand/truth`` if there is any."""

@@ -26,7 +26,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "file", type=Path, nargs="?", metavar="FILE.mcap", help="a recording, instead of the stream"
     )
     add_stream(parser, addresses)
-    parser.add_argument("--commands", metavar="ADDRESS", help="command socket, where it is apart")
     parser.add_argument(
         "--foxglove",
         type=_any_port,
@@ -62,8 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.foxglove is not None and arguments.file is not None:
         print("view: --foxglove serves the stream alone, found FILE.mcap, too", file=sys.stderr)
         return 2
-    arguments.address, commands = arguments.address
-    arguments.commands = arguments.commands or commands
+    arguments.address, arguments.commands = arguments.address
     with Ending(arguments.duration) as ending:
         if arguments.foxglove is None:
             require("view")
