@@ -10,17 +10,11 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from softfinger.daemon.client import (
-        AsyncHand,
-        Hand,
-        HandClosed,
-        HandFault,
-        HandState,
-        NoAnswer,
-        NoStream,
-        NotInTime,
-        Refused,
-    )
+    from softfinger.daemon.client.asynchronous import AsyncHand
+    from softfinger.daemon.client.command_client import NoAnswer
+    from softfinger.daemon.client.hand import Hand
+    from softfinger.daemon.errors import HandClosed, HandFault, NoStream, NotInTime, Refused
+    from softfinger.daemon.wire.schema import HandState
     from softfinger.kinematics.contact.closed_form import Fingertip
     from softfinger.kinematics.contact.material import Material
     from softfinger.kinematics.contact.table import ContactTable
@@ -51,6 +45,10 @@ __all__ = [
 ]
 
 _MODULES = {
+    "AsyncHand": "daemon.client.asynchronous",
+    "Hand": "daemon.client.hand",
+    "HandState": "daemon.wire.schema",
+    "NoAnswer": "daemon.client.command_client",
     "ContactEstimator": "kinematics.estimation.estimator",
     "ContactTable": "kinematics.contact.table",
     "Fingertip": "kinematics.contact.closed_form",
@@ -67,7 +65,7 @@ class SoftfingerError(Exception):
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module 'softfinger' has no attribute {name!r}")
-    module = import_module(f"softfinger.{_MODULES.get(name, 'daemon.client')}")
+    module = import_module(f"softfinger.{_MODULES.get(name, 'daemon.errors')}")
     value = globals()[name] = getattr(module, name)
     return value
 

@@ -7,14 +7,15 @@ import fcntl
 import grp
 import os
 import re
-import socket
 import stat
 from pathlib import Path
 
+import zmq
 from serial.tools import list_ports
 
 from softfinger.daemon.client.command_client import NoAnswer, send
-from softfinger.daemon.errors import KeyFileError
+from softfinger.daemon.errors import AddressError, KeyFileError
+from softfinger.daemon.gateway.endpoints import IN_USE, bind
 from softfinger.daemon.own_files import runtime_fault, runtime_folder
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.base import Finding, Status
@@ -205,7 +206,7 @@ def _check(settings: Settings, section: str) -> Finding:
     subject, trouble = f"socket {address}", why_not_free(address)
     if not trouble:
         return Finding("pass", subject, "free")
-    if trouble != "in use":
+    if trouble != IN_USE:
         return Finding("FAIL", subject, trouble, f"set {key}")
     if mode := daemon_mode(settings.commands.address, settings.access.keys):
         text = f"a softfinger daemon runs here already ({mode}); a second one will not start"
@@ -228,51 +229,12 @@ def daemon_mode(address: str, keys: str = "") -> str:
 
 
 def why_not_free(address: str) -> str:
-    """Return why ``address`` (tcp or ipc) can't be bound, such as ``in use``; empty if it can.
-
-    It is bound for an instant, or its lock is tried, and nothing is left behind.
-    """
-    kind, _, place = address.partition("://")
-    if kind == "tcp":
-        return _tcp(place)
-    if kind == "ipc":
-        return _ipc(place)
-    return f"{kind} is no kind of address: expected tcp or ipc"
-
-
-def _tcp(place: str) -> str:
-    host, _, port = place.rpartition(":")
-    host = host.strip("[]")
-    if not port.isdigit() or not 0 < int(port) < 65536:
-        return "has no port number"
-    if host == "*":
-        host = "0.0.0.0"
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    with socket.socket(family, socket.SOCK_STREAM) as trial:
-        trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    """Return why ``address`` can't be bound, empty if it can: it is bound for an instant."""
+    with zmq.Context() as context, context.socket(zmq.REP) as trial:
         try:
-            trial.bind((host, int(port)))
-        except OSError as error:
-            if error.errno == errno.EADDRINUSE:
-                return "in use"
-            return f"can't be bound: {error.strerror or error}"
-    return ""
-
-
-def _ipc(place: str) -> str:
-    path = Path(place)
-    if not os.access(path.parent, os.W_OK):
-        return f"can't be bound: {path.parent} is not there or may not be written"
-    try:
-        lock = os.open(f"{place}.lock", os.O_RDWR | os.O_CLOEXEC)
-    except FileNotFoundError:
-        return ""
-    except OSError as error:
-        return f"can't be bound: {error.strerror}"
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        return "in use"
-    finally:
-        os.close(lock)
+            path = bind(trial, address, 0o600)
+        except AddressError as error:
+            return str(error).removeprefix(f"{address} ")
+    if path:
+        Path(path).unlink(missing_ok=True)
     return ""

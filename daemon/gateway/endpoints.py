@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
 import math
 import os
+import socket
 from collections import OrderedDict
 from collections.abc import Callable
 from pathlib import Path
@@ -27,67 +27,47 @@ from softfinger.daemon.gateway.request_queue import Client, RequestQueue
 
 _NOW = int(zmq.NOBLOCK)
 _PARTS = bounds.PARTS + 1  # and the client's route
-
-_LOCK = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
+IN_USE = "is in use; is another softfinger running?"
 
 Late = Callable[[int], list[tuple[int, bytes]]]
 
 
-class Address:
-    """A socket's address, ours until it is closed.
-
-    Whoever binds an ipc address replaces a file that another process listens on: a lock beside it
-    keeps it.
-    """
-
-    def __init__(self, socket: zmq.Socket[Any], address: str, key: str, ipc_mode: int) -> None:
-        """Bind. ``key`` is the setting that names the address. Raises AddressError."""
-        self._path = ""
-        self._lock = -1
-        before = os.umask(0o777 & ~ipc_mode)  # its rights from the first: nobody slips in before
-        try:
-            if address.startswith("ipc://"):
-                path = address.removeprefix("ipc://")
-                self._lock = _lock(path, address, key)
-                self._path = path
-            # libzmq binds numbers alone.
-            socket.bind(address.replace("tcp://localhost:", "tcp://127.0.0.1:"))
-            if self._path:
-                Path(self._path).chmod(ipc_mode)
-        except (zmq.ZMQError, OSError) as error:
-            self.close()
-            raise _bind_error(address, key, error) from None
-        finally:
-            os.umask(before)
-
-    def close(self) -> None:
-        """Give it back."""
-        if self._path:
-            for path in (self._path, self._path + ".lock"):
-                with contextlib.suppress(OSError):
-                    Path(path).unlink()
-            os.close(self._lock)
-            self._path = ""
-
-
-def _bind_error(address: str, key: str, error: zmq.ZMQError | OSError) -> AddressError:
-    if error.errno == errno.EADDRINUSE:
-        return AddressError(f"{key}: {address} is in use; is another softfinger running?")
-    return AddressError(f"{key}: can't bind {address}: {error.strerror}")
-
-
-def _lock(path: str, address: str, key: str) -> int:
-    descriptor = os.open(path + ".lock", _LOCK, 0o600)
+def bind(bound: zmq.Socket[Any], address: str, ipc_mode: int) -> str:
+    """Bind a socket; return its file, empty where there is none. Raises AddressError."""
+    path = address.removeprefix("ipc://") if address.startswith("ipc://") else ""
+    if path and (trouble := _taken(path)):
+        raise AddressError(f"{address} {trouble}")
+    bound.setsockopt(zmq.IPV6, int("[" in address))
+    before = os.umask(0o777 & ~ipc_mode)  # its rights from the first: nobody slips in before
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        os.close(descriptor)
-        raise AddressError(f"{key}: {address} is in use; is another softfinger running?") from None
-    if Path(path).exists() and not Path(path).is_socket():
-        os.close(descriptor)
-        Path(path + ".lock").unlink()
-        raise AddressError(f"{key}: {path} is there already and is no socket")
-    return descriptor
+        # libzmq binds numbers alone.
+        bound.bind(address.replace("tcp://localhost:", "tcp://127.0.0.1:"))
+        if path:
+            Path(path).chmod(ipc_mode)
+    except (zmq.ZMQError, OSError) as error:
+        if error.errno == errno.EADDRINUSE:
+            raise AddressError(f"{address} {IN_USE}") from None
+        raise AddressError(f"can't bind {address}: {error.strerror}") from None
+    finally:
+        os.umask(before)
+    return path
+
+
+def _taken(path: str) -> str:
+    """Return why a socket may not take the place of ``path``; empty if it may."""
+    if not Path(path).exists():
+        return ""
+    if not Path(path).is_socket():
+        return "is there already and is no socket"
+    with socket.socket(socket.AF_UNIX) as trial:
+        trial.setblocking(False)
+        try:
+            trial.connect(path)
+        except (FileNotFoundError, ConnectionRefusedError):  # of a process that was killed
+            return ""
+        except OSError:  # it takes nobody more, or not us
+            pass
+    return IN_USE
 
 
 class Endpoint:
@@ -107,12 +87,13 @@ class Endpoint:
         queue = config.queue if kind == zmq.XPUB else bounds.QUEUE
         self.socket.setsockopt(zmq.SNDHWM, queue)
         self.socket.setsockopt(zmq.RCVHWM, bounds.QUEUE)
-        self.socket.setsockopt(zmq.IPV6, int("[" in address))
         admission.guard(self.socket)
         try:
-            self._address = Address(self.socket, address, key, config.ipc_mode)
-        except BaseException:
+            self._path = bind(self.socket, address, config.ipc_mode)
+        except BaseException as error:
             self.socket.close()
+            if isinstance(error, AddressError):
+                raise AddressError(f"{key}: {error}") from None
             raise
 
     def _parts(self) -> list[zmq.Frame] | None:
@@ -127,7 +108,9 @@ class Endpoint:
 
     def close(self) -> None:
         self.socket.close()
-        self._address.close()
+        if self._path:
+            with contextlib.suppress(OSError):
+                Path(self._path).unlink()
 
 
 class CommandEndpoint(Endpoint):

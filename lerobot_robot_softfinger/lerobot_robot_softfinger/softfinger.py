@@ -10,8 +10,8 @@ from lerobot.robots import Robot
 from lerobot.utils.decorators import check_if_already_connected, check_if_not_connected
 
 from lerobot_robot_softfinger.config_softfinger import SoftfingerConfig
-from softfinger import Hand
-from softfinger.daemon.client import NoStream, TactileFrame
+from softfinger import Hand, NoStream
+from softfinger.daemon.wire.schema import TactileFrame
 from softfinger.tools.recordings.features import IMAGES, JOINTS, STATE, image, observation
 
 

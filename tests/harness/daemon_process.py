@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from softfinger.daemon.client import Refused
+from softfinger import Refused
 from softfinger.daemon.client.command_client import send
 
 SOFTFINGER = [sys.executable, "-m", "softfinger"]

@@ -19,8 +19,7 @@ import sys
 from pathlib import Path
 from unittest import mock
 
-from softfinger import SoftfingerError
-from softfinger.daemon.client import Hand, HandState
+from softfinger import Hand, HandState, SoftfingerError
 from softfinger.daemon.errors import SettingsError
 from softfinger.tools.arguments import profile
 from softfinger.tools.cli import main, make_parser

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from softfinger.daemon.client import Hand
+from softfinger import Hand
 from softfinger.daemon.perception.calibration_file import load_calibration
 from softfinger.daemon.wire.schema import STATE
 from softfinger.tools.cli import main

@@ -16,27 +16,16 @@ import msgpack
 import numpy as np
 import pytest
 
-from softfinger.daemon.client import (
-    AsyncHand,
-    Event,
-    Hand,
-    HandFault,
-    HandState,
-    NoAnswer,
-    NoStream,
-    NotInTime,
-    Refused,
-    TactileFrame,
-    to_columns,
-)
+from softfinger import AsyncHand, Hand, HandFault, HandState, NoAnswer, NoStream, NotInTime, Refused
 from softfinger.daemon.client.asynchronous import AsyncSubscription
 from softfinger.daemon.client.command_client import UNCONFIRMED
 from softfinger.daemon.client.connection import SILENCE
 from softfinger.daemon.client.hand import Subscription
-from softfinger.daemon.client.records import read
+from softfinger.daemon.client.records import read, to_columns
 from softfinger.daemon.client.stream import Gaps
 from softfinger.daemon.errors import HandClosed, SettingsError
 from softfinger.daemon.types import COMMAND_ADDRESS, STREAM_ADDRESS
+from softfinger.daemon.wire.schema import Event, TactileFrame
 from tests.conftest import Inline, until
 from tests.harness import fake_daemon
 from tests.harness.daemon_process import Running, insist

@@ -422,8 +422,7 @@ def test_ipc_addresses(tmp_path):
     place = f"ipc://{tmp_path / 'commands'}"
     assert ports.why_not_free(place) == ""
     with Served(commands=place):
-        assert ports.why_not_free(place) == "in use"
+        assert "is in use" in ports.why_not_free(place)
     assert ports.why_not_free(place) == ""
-    assert "is not there" in ports.why_not_free("ipc:///nowhere/at/all")
-    assert "expected tcp or ipc" in ports.why_not_free("udp://1")
-    assert ports.why_not_free("tcp://127.0.0.1:x") == "has no port number"
+    assert list(tmp_path.iterdir()) == []
+    assert "No such file" in ports.why_not_free("ipc:///nowhere/at/all")

@@ -28,7 +28,7 @@ from unittest import mock
 
 import pytest
 
-from softfinger.daemon.client import Hand, Refused
+from softfinger import Hand, Refused
 from softfinger.daemon.client.command_client import send
 from softfinger.daemon.profile.load import find, load
 from tests.conftest import own_addresses

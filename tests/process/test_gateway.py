@@ -18,7 +18,7 @@ import msgpack
 import pytest
 import zmq
 
-from softfinger.daemon.client import AsyncHand, Hand
+from softfinger import AsyncHand, Hand
 from softfinger.daemon.client.command_client import NoAnswer, send
 from softfinger.daemon.errors import AddressError
 from softfinger.daemon.gateway import bounds

@@ -14,7 +14,7 @@ import pytest
 import zmq
 import zmq.auth
 
-from softfinger.daemon.client import Hand, NoStream
+from softfinger import Hand, NoStream
 from softfinger.daemon.client.command_client import NoAnswer, send
 from softfinger.daemon.errors import KeyFileError, NoDescriptor
 from softfinger.daemon.gateway.admission import Admission, StartAnew

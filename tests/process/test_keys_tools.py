@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import pytest
 
-from softfinger.daemon.client import AsyncHand, Hand, NoStream
+from softfinger import AsyncHand, Hand, NoStream
 from softfinger.daemon.errors import RecordingError
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.keys import make_keys

@@ -9,8 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from softfinger.daemon.client import Event, Hand, HandState
+from softfinger import Hand, HandState
 from softfinger.daemon.client.hand import Subscription
+from softfinger.daemon.wire.schema import Event
 from tests.harness.daemon_process import Running
 
 Profile = Callable[[str], Path]

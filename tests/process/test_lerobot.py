@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from softfinger.daemon.client import Refused
+from softfinger import Refused
 from softfinger.daemon.client.records import read
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.schema import TactileFrame

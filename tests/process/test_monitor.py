@@ -15,7 +15,7 @@ from pathlib import Path
 import msgpack
 import pytest
 
-from softfinger.daemon.client import Hand
+from softfinger import Hand
 from tests.conftest import until
 from tests.harness.daemon_process import SOFTFINGER, Running, insist
 from tests.harness.descendants import ending

@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[2]
 PORTABLE = (
     "softfinger",
     "softfinger.testing",
-    "softfinger.daemon.client",
+    "softfinger.daemon.client.asynchronous",
     "softfinger.gym.environment",
     "softfinger.kinematics.estimation.estimator",
     "softfinger.tools.analysis.analyse",

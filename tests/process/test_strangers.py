@@ -14,7 +14,7 @@ import msgpack
 import pytest
 import zmq
 
-from softfinger.daemon.client import Hand
+from softfinger import Hand
 from tests.conftest import own_addresses
 from tests.harness.daemon_process import Running, ask, insist
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from softfinger.daemon.client import Hand
+from softfinger import Hand
 from softfinger.daemon.client.command_client import send
 from softfinger.tools.viewing.planar import COLOURS
 from tests.conftest import until

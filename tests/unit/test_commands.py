@@ -335,16 +335,7 @@ def test_an_ipc_file_has_the_rights_that_were_set(
     with Served(f"ipc://{folder}/s", f"ipc://{folder}/c", ipc_mode=mode):
         for name in ("c", "s"):
             assert stat.S_IMODE(Path(f"{folder}/{name}").stat().st_mode) == mode
-        assert stat.S_IMODE(Path(f"{folder}/c.lock").stat().st_mode) == 0o600
     assert list(folder.iterdir()) == []
-
-
-def test_a_link_in_the_place_of_an_ipc_files_lock_is_not_followed(tmp_path: Path) -> None:
-    target = tmp_path / "target"
-    (tmp_path / "c.lock").symlink_to(target)
-    with pytest.raises(AddressError, match="symbolic links"):
-        Served(commands=f"ipc://{tmp_path}/c")
-    assert not target.exists()
 
 
 def test_a_signal_while_the_sockets_are_made_ends_the_start(

@@ -16,7 +16,8 @@ import math
 import numpy as np
 from matplotlib.figure import Figure
 
-from softfinger.daemon.client import Hand, HandState, to_columns
+from softfinger import Hand, HandState
+from softfinger.daemon.client.records import to_columns
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.table import ContactTable
