@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import math
-import time
 from collections.abc import AsyncIterator, Callable, Coroutine
 from typing import Any, TypeVar
 
@@ -12,7 +11,6 @@ import zmq
 import zmq.asyncio
 
 from softfinger.daemon.client.command_client import HandClient, accepted, is_done, send
-from softfinger.daemon.client.connection import SILENCE
 from softfinger.daemon.client.stream import Subscriber, Wait
 from softfinger.daemon.errors import NoStream, Refused
 from softfinger.daemon.wire.schema import EVENT, STATE, TACTILE, Event, HandState, TactileFrame
@@ -31,18 +29,12 @@ class AsyncSubscription(Subscriber[_Record]):
 
     async def next(self, timeout: float | None) -> _Record:
         """Return the next record. Raises NoStream when none comes within ``timeout`` s."""
-        deadline = math.inf if timeout is None else time.monotonic() + timeout
-        while True:
-            left = max(deadline - time.monotonic(), 0.0)
-            come = await self._poll(left if timeout is None else min(left, SILENCE))
-            if not come and timeout is not None and left > SILENCE:
-                self._decoder.warn_of_silence(timeout)
-                come = await self._poll(left - SILENCE)
-            if not come:
-                raise self._decoder.no_stream(timeout or 0.0)
-            record = self._decoder.take(await self._socket.recv_multipart())
-            if record is not None:
-                return record
+        for seconds in self._decoder.waits(timeout):
+            if await self._poll(seconds):
+                record = self._decoder.take(await self._socket.recv_multipart())
+                if record is not None:
+                    return record
+        raise self._decoder.no_stream(timeout or 0.0)
 
     async def _poll(self, seconds: float) -> Any:
         self._require_open()

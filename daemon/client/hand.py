@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Iterator
 from typing import Any, TypeVar
 
 from softfinger.daemon.client.command_client import HandClient, accepted, is_done, send
-from softfinger.daemon.client.connection import SILENCE
 from softfinger.daemon.client.stream import Subscriber, Wait
 from softfinger.daemon.errors import NoStream, Refused
 from softfinger.daemon.wire.schema import EVENT, STATE, TACTILE, Event, HandState, TactileFrame
@@ -33,18 +31,12 @@ class Subscription(Subscriber[_Record]):
 
         A warning is logged when that takes long; without a timeout, silence may be as it should.
         """
-        deadline = math.inf if timeout is None else time.monotonic() + timeout
-        while True:
-            left = max(deadline - time.monotonic(), 0.0)
-            come = self._poll(left if timeout is None else min(left, SILENCE))
-            if not come and timeout is not None and left > SILENCE:
-                self._decoder.warn_of_silence(timeout)
-                come = self._poll(left - SILENCE)
-            if not come:
-                raise self._decoder.no_stream(timeout or 0.0)
-            record = self._decoder.take(self._socket.recv_multipart())
-            if record is not None:
-                return record
+        for seconds in self._decoder.waits(timeout):
+            if self._poll(seconds):
+                record = self._decoder.take(self._socket.recv_multipart())
+                if record is not None:
+                    return record
+        raise self._decoder.no_stream(timeout or 0.0)
 
     def _poll(self, seconds: float) -> int:
         self._require_open()

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 import warnings
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, Generic, TypeVar
 
 import zmq
 
-from softfinger.daemon.client.connection import still_waiting, subscribe, unpack
+from softfinger.daemon.client.connection import SILENCE, still_waiting, subscribe, unpack
 from softfinger.daemon.client.records import read
 from softfinger.daemon.errors import HandClosed, HandFault, NoStream, NotInTime
 from softfinger.daemon.wire.schema import SCHEMA, STATE, TOPICS, HandState
@@ -94,9 +95,24 @@ class Unpacker(Generic[_Record]):
             )
         return record
 
-    def warn_of_silence(self, timeout: float) -> None:
-        """Log that nothing has come for a while."""
-        _log.warning(still_waiting(f"{self._topic.decode()} from {self._address}", timeout))
+    def waits(self, timeout: float | None) -> Iterator[float]:
+        """Yield how long to wait for the next message [s], until ``timeout`` s are over.
+
+        Log what is waited for when that takes long; without a timeout silence may be as it should.
+        """
+        if timeout is None:
+            while True:
+                yield math.inf
+        now = time.monotonic()
+        end, warn_at = now + timeout, now + SILENCE
+        while True:
+            yield min(end, max(warn_at, now)) - now
+            now = time.monotonic()
+            if now >= end:
+                return
+            if now >= warn_at:
+                warn_at = math.inf
+                _log.warning(still_waiting(f"{self._topic.decode()} from {self._address}", timeout))
 
     def no_stream(self, timeout: float) -> NoStream:
         """Return the exception when nothing has come at all."""

@@ -29,9 +29,6 @@ def check_machine() -> list[Finding]:
         check_scheduling(),
         check_memory_lock(resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]),
         check_idle_states(Path("/dev/cpu_dma_latency")),
-        check_clock_source(
-            Path("/sys/devices/system/clocksource/clocksource0/current_clocksource")
-        ),
         check_wall_clock(time.time()),
         check_wake_ups(wake_ups()),
     ]
@@ -72,23 +69,6 @@ def check_idle_states(path: Path) -> Finding:
         return Finding("pass", name, "may be held")
     problem = "no permission to hold it: wake-ups take what idle states take"
     return Finding("warn", name, problem, GRANT_LATENCY)
-
-
-def check_clock_source(path: Path) -> Finding:
-    """Check that reading the time is cheap and fine enough."""
-    resolution = time.clock_getres(time.CLOCK_MONOTONIC)
-    if resolution > 1e-6:
-        problem = f"monotonic time has steps of {resolution * 1e6:g} µs, not ≤ 1 µs"
-        return Finding("warn", "clock", problem)
-    try:
-        source = path.read_text().strip()
-    except OSError:
-        source = "unknown"
-    if source in ("hpet", "acpi_pm", "jiffies"):
-        problem = f"the kernel reads {source}, about a microsecond each time"
-        fix = "boot with clocksource=tsc where the processor's is stable"
-        return Finding("warn", "clock", problem, fix)
-    return Finding("pass", "clock", f"monotonic, {resolution * 1e9:g} ns, source {source}")
 
 
 def check_wall_clock(now: float) -> Finding:

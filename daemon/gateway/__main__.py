@@ -15,8 +15,8 @@ from pathlib import Path
 
 from softfinger.daemon.errors import AddressError, KeyFileError
 from softfinger.daemon.gateway import bounds
-from softfinger.daemon.gateway.admission import StartAnew
 from softfinger.daemon.gateway.bounds import Config
+from softfinger.daemon.gateway.endpoints import StartAnew
 from softfinger.daemon.gateway.server import Server
 from softfinger.daemon.wire import loop_link
 

@@ -14,9 +14,8 @@ import msgpack
 import zmq
 
 from softfinger.daemon.gateway import bounds
-from softfinger.daemon.gateway.admission import Admission
 from softfinger.daemon.gateway.bounds import Config
-from softfinger.daemon.gateway.endpoints import CommandEndpoint, StreamEndpoint
+from softfinger.daemon.gateway.endpoints import Admission, CommandEndpoint, StreamEndpoint
 from softfinger.daemon.gateway.request_queue import RequestQueue, Route
 from softfinger.daemon.wire import loop_link
 from softfinger.daemon.wire.command_server import Pauses

@@ -38,8 +38,8 @@ def load(
     """Read and check a profile, a file's path or one of `names`; None: the built-in simulated hand.
 
     ``directory`` replaces ``{dir}`` in the ports. ``changes``, as ``loop.rate=1000``, go over the
-    file. Raises SettingsError with one line for every unknown key, wrong type, broken bound and
-    contradiction.
+    file. Raises SettingsError with one line for every unknown key, wrong type and broken bound; if
+    there is none, for every contradiction.
     """
     name = str(path) if path else "built-in settings"
     data = _read(find(path), name) if path else {}
@@ -54,26 +54,23 @@ def checked(
     directory: Path | None = None,
 ) -> Settings:
     """Return settings that sections ``data`` of a profile ``name`` make, otherwise as `load`."""
-    wrong: list[str] = []
-    found: list[str] = []
     try:
         settings = Settings.model_validate(data)
     except ValidationError as error:
-        settings, wrong = _valid_sections(data)
         told = error.errors(include_url=False)
-        found = [_line(details) for details in told[:_TOLD]] + [""] * len(told[_TOLD:])
-    if directory is not None:
-        settings = _with_directory(settings, directory)
-    found += [*problems(settings, wrong), *_plugin_problems(settings)]
-    if found:
-        lines = [
-            f"{'--set' if problem.split(':')[0] in changed else name}: {problem}"
-            for problem in found[:_TOLD]
-        ]
-        if len(found) > _TOLD:
-            lines.append(f"{name}: and {len(found) - _TOLD} more errors")
-        raise SettingsError("\n".join(lines))
-    return settings
+        found, more = [_line(details) for details in told[:_TOLD]], len(told) - _TOLD
+    else:
+        if directory is not None:
+            settings = _with_directory(settings, directory)
+        found, more = [*problems(settings), *_plugin_problems(settings)], 0
+        if not found:
+            return settings
+    lines = [
+        f"{'--set' if problem.split(':')[0] in changed else name}: {problem}" for problem in found
+    ]
+    if more > 0:
+        lines.append(f"{name}: and {more} more errors")
+    raise SettingsError("\n".join(lines))
 
 
 def names() -> list[str]:
@@ -170,18 +167,6 @@ def _tuples(value: Any, depth: int = 0) -> Any:
     if isinstance(value, int) and value.bit_length() > 63:  # one of 5000 digits can't be printed
         raise ValueError("an integer beyond 64 bits")
     return value
-
-
-def _valid_sections(data: dict[str, Any]) -> tuple[Settings, list[str]]:
-    """Return the settings of the sections without errors, and the names of the others."""
-    valid: dict[str, Any] = {}
-    wrong = []
-    for name, field in Settings.model_fields.items():
-        try:
-            valid[name] = type(field.default).model_validate(data.get(name, {}))
-        except ValidationError:
-            wrong.append(name)
-    return Settings(**valid), wrong
 
 
 def _plugin_problems(settings: Settings) -> Iterator[str]:

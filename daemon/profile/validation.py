@@ -1,14 +1,13 @@
 """Cross-field validation of a profile: what its keys don't allow together.
 
-One function a check, in one table with the sections it reads; each yields lines of key, found and
-expected. A check is left out when one of its sections is wrong already.
+One function a check; each yields lines of key, found and expected.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 from softfinger.daemon.backends import backend
@@ -21,14 +20,9 @@ _TCP = re.compile(r"tcp://(127(?:\.\d{1,3}){3}|localhost|\[::1\]):(\d{1,5})")
 _ANY_TCP = re.compile(r"tcp://([\w.-]+|\*|\[[0-9a-fA-F:.]+(?:%\w+)?\]):(\d{1,5})")
 
 
-def problems(settings: Settings, wrong: Collection[str] = ()) -> list[str]:
-    """Return the settings that contradict each other, sections named ``wrong`` aside."""
-    return [
-        problem
-        for sections, check in _CHECKS
-        if not set(sections).intersection(wrong)
-        for problem in check(settings)
-    ]
+def problems(settings: Settings) -> list[str]:
+    """Return the settings that contradict each other."""
+    return [problem for check in _CHECKS for problem in check(settings)]
 
 
 def shown(value: Any) -> str:
@@ -289,23 +283,23 @@ def _folder(settings: Settings) -> Iterator[str]:
             yield f"{key}: found {shown(port)}, expected --dir to say which folder {{dir}} is"
 
 
-_CHECKS: tuple[tuple[tuple[str, ...], Callable[[Settings], Iterator[str]]], ...] = (
-    (("scene",), _fingers),
-    (("servos", "tactile"), _backends),
-    (("hand",), _joints),
-    (("scene", "servos"), _servos),
-    (("servos", "loop"), _timing),
-    (("material",), _material),
-    (("tip", "material", "estimator", "safety", "tactile"), _solid_tip),
-    (("tip", "tactile", "scene"), _measured_tip),
-    (("simulation",), _wedge),
-    (("control", "safety", "loop"), _dither),
-    (("tactile",), _cells),
-    (("tactile",), _blur),
-    (("scene", "tactile"), _recordings),
-    (("servos", "tactile", "loop"), _clock),
-    (("safety",), _limits),
-    (("control", "safety", "task"), _forces),
-    (("stream", "commands", "access"), _addresses),
-    (("servos", "tactile"), _folder),
+_CHECKS = (
+    _fingers,
+    _backends,
+    _joints,
+    _servos,
+    _timing,
+    _material,
+    _solid_tip,
+    _measured_tip,
+    _wedge,
+    _dither,
+    _cells,
+    _blur,
+    _recordings,
+    _clock,
+    _limits,
+    _forces,
+    _addresses,
+    _folder,
 )

@@ -31,8 +31,7 @@ from softfinger.daemon.wire import loop_link
 from softfinger.daemon.wire.local_stop import LocalStop, stop_locally
 from softfinger.daemon.wire.publisher import GATEWAY_TOPICS, Publisher
 from tests.conftest import until
-from tests.harness.daemon_process import SOFTFINGER, Running, ask, insist, softfinger
-from tests.harness.terminal_process import TerminalProcess
+from tests.harness.daemon_process import Running, ask, insist, softfinger
 from tests.process.test_strangers import place
 
 
@@ -272,22 +271,6 @@ def test_the_command_line_takes_that_way(ticking: Daemon, addresses: tuple[str, 
     assert done.returncode == 0, done.stderr
     assert '"ok": true' in done.stdout
     assert ticking.loop.state.mode == "disarmed"
-
-
-def test_the_live_page_takes_that_way(ticking: Daemon, addresses: tuple[str, str]) -> None:
-    stream, commands = addresses
-    where = ["--address", f"{stream},{commands}"]
-    with TerminalProcess([*SOFTFINGER, "monitor", *where]) as page:
-        page.shows("DISARMED")
-        assert ask(commands, "arm")["ok"]
-        page.shows("ARMED")
-        os.kill(gateway_of(ticking).process, signal.SIGSTOP)
-        try:
-            page.type(b" ")
-            page.shows("✓ stop: ok")
-            assert ticking.loop.state.mode == "disarmed"
-        finally:
-            os.kill(gateway_of(ticking).process, signal.SIGCONT)
 
 
 def test_its_folder_and_file_are_the_users_alone(

@@ -17,7 +17,7 @@ import zmq.auth
 from softfinger import Hand, NoStream
 from softfinger.daemon.client.command_client import NoAnswer, send
 from softfinger.daemon.errors import KeyFileError, NoDescriptor
-from softfinger.daemon.gateway.admission import Admission, StartAnew
+from softfinger.daemon.gateway.endpoints import Admission, StartAnew
 from softfinger.daemon.wire.keys import load_client, load_server, make_keys
 from tests.conftest import Inline, until
 from tests.harness.daemon_process import Running
@@ -181,7 +181,7 @@ def others() -> Iterator[zmq.Context[Any]]:
 def ask(
     context: zmq.Context[Any], addresses: tuple[str, str], keys: Any
 ) -> tuple[zmq.Socket[Any], zmq.Socket[Any]]:
-    """A subscriber and a command on its way."""
+    """A subscriber and a command on its way, which says that it is another's."""
     subscriber, commander = context.socket(zmq.SUB), context.socket(zmq.DEALER)
     for socket, address in zip((subscriber, commander), addresses, strict=True):
         socket.setsockopt(zmq.LINGER, 0)
@@ -190,7 +190,7 @@ def ask(
         if socket is subscriber:
             socket.subscribe(b"")
         socket.connect(address)
-    commander.send(msgpack.packb({"command": "arm"}))
+    commander.send(msgpack.packb({"command": "arm", "client": "local"}))
     return subscriber, commander
 
 
@@ -236,18 +236,6 @@ def test_whoever_has_no_key_gets_nothing(
     until(lambda: guarded.step() or ours[1].poll(0))
     assert not theirs[0].poll(0)
     assert not theirs[1].poll(0)
-    assert guarded.heard == [{"command": "arm", "client": "alice"}]
-
-
-def test_a_client_is_who_its_key_says_whatever_it_says(
-    guarded: Guarded, others: zmq.Context[Any], addresses: tuple[str, str], folder: Path
-) -> None:
-    socket = others.socket(zmq.REQ)
-    socket.setsockopt(zmq.LINGER, 0)
-    load_client(folder / "alice").guard(socket)
-    socket.connect(addresses[1])
-    socket.send(msgpack.packb({"command": "arm", "client": "local"}))
-    until(lambda: [guarded.step(), socket.poll(0)][1])
     assert guarded.heard == [{"command": "arm", "client": "alice"}]
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from softfinger.daemon.backends import known
+from softfinger.daemon.backends import BUILT_IN, Backend, known
 from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.profile.load import load, names
 from softfinger.daemon.profile.settings import Settings
@@ -52,6 +52,12 @@ def test_a_bare_name_is_a_profile_of_the_package_wherever_that_is(
     assert load(Path(name), tmp_path) == load(CONFIG / f"{name}.toml", tmp_path)
     (tmp_path / name).write_text("loop.rate = 123.0\n")  # a file here goes before it
     assert load(Path(name)).loop.rate == 123.0
+
+
+@pytest.mark.parametrize("table", BUILT_IN.values(), ids=BUILT_IN)
+def test_every_backend_is_there(table: dict[str, Backend]) -> None:
+    for name, backend in table.items():
+        assert callable(backend.load()) or name == "none"
 
 
 def test_an_unknown_name_is_told_with_the_known_ones() -> None:
@@ -171,14 +177,6 @@ def test_dir_fills_the_ports(tmp_path: Path) -> None:
     settings = load(path, Path("/tmp/hand"))
     assert settings.servos.port == "/tmp/hand/servos"
     assert settings.tactile.port == ("/tmp/hand/a", "/dev/b")
-
-
-def test_contradictions_are_told_beside_wrong_types(tmp_path: Path) -> None:
-    lines = report(tmp_path, '[servos]\nids = [3, 3]\n[tip]\nradius = "big"\n')
-    assert lines == [
-        'tip.radius: found "big", expected a valid number',
-        "servos.ids: found [3, 3], expected two different ids",
-    ]
 
 
 def test_an_unknown_model_is_told_beside_what_else_is_wrong(tmp_path: Path) -> None:

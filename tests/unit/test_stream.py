@@ -163,31 +163,6 @@ def test_who_comes_late_is_told_settings_and_events_again(
         assert {topic for topic, _ in told} == {b"hand/event"}
 
 
-def test_all_of_many_late_subscribers_are_told(
-    context: zmq.Context[Any], addresses: tuple[str, str]
-) -> None:
-    with Served(addresses[0]) as served:
-        served.publisher.settings(98.0, 0.5, HandFacts("0.1.0", "{}", "", "", "{}", "{}"))
-        for k in range(5):
-            served.publisher.event(99.0, 1.0, "info", "mode", f"event {k}")
-        served.settle()  # before anybody subscribes: that may be quicker
-        sockets = [subscribe(context, addresses[0], b"hand/event") for _ in range(40)]
-        for socket in sockets:
-            socket.setsockopt(zmq.SUBSCRIBE, b"hand/settings")
-        heard: list[set[tuple[bytes, int]]] = [set() for _ in sockets]
-
-        def all_told() -> bool:
-            served.settle()
-            for socket, seen in zip(sockets, heard, strict=True):
-                while socket.poll(0):
-                    topic, message = receive(socket)
-                    assert message["again"], "what others are told again is known as such"
-                    seen.add((topic, message["seq"]))
-            return all(len(seen) == 6 for seen in heard)
-
-        until(all_told)
-
-
 def test_a_long_message_comes_in_pieces_and_whole(
     context: zmq.Context[Any], addresses: tuple[str, str]
 ) -> None:

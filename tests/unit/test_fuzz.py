@@ -1,9 +1,10 @@
-"""A short run of the fuzzing of commands, profiles and calibration files."""
+"""A short run of the fuzzing of commands, profiles, calibration files and boards."""
 
 from __future__ import annotations
 
 import pytest
 
+from tests.fuzz import tactile
 from tests.fuzz.commands import fuzz, random_bytes_are_decoded_or_refused
 
 
@@ -19,3 +20,12 @@ def test_odd_input_is_refused_or_carried_out_and_nothing_else(name: str, count: 
 
 def test_the_parser_takes_random_bytes() -> None:
     random_bytes_are_decoded_or_refused(20_000, seed=5)
+
+
+@pytest.mark.parametrize("target", tactile.TARGETS)
+def test_no_input_breaks_a_reader(target: str) -> None:
+    report = tactile.fuzz(target, 4000, seed=7)
+    assert report.wrong == []
+    assert report.frames > 300
+    if target == "cobs":  # the CRC lets one wrong packet in 65536 through
+        assert report.foreign <= 2
