@@ -15,7 +15,7 @@ import pytest
 import zmq
 
 from softfinger import Hand
-from tests.conftest import own_addresses
+from tests.conftest import own_addresses, until
 from tests.harness.daemon_process import Running, ask, insist
 
 
@@ -63,6 +63,21 @@ def said_to(request: bytes, address: str, wait: Callable[[], object]) -> bytes:
             while part := raw.recv(4096):
                 answer += part
     return answer
+
+
+@pytest.mark.parametrize("wrap", [lambda frames, _: frames, posted], ids=["ZMTP/1.0", "HTTP POST"])
+def test_libzmq_by_itself_takes_them_for_commands(
+    addresses: tuple[str, str],
+    context: zmq.Context[zmq.Socket[bytes]],
+    wrap: Callable[[bytes, str], bytes],
+) -> None:
+    bare = context.socket(zmq.ROUTER)
+    bare.bind(addresses[1])
+    request = wrap(old_command("arm") + old_command("arm")[2:], addresses[1])
+    with socket.create_connection(place(addresses[1]), timeout=60.0) as raw:
+        raw.sendall(request)
+        wanted = msgpack.packb({"command": "arm"})
+        until(lambda: bool(bare.poll(0)) and bare.recv_multipart()[-1] == wanted)
 
 
 @pytest.fixture(scope="module")

@@ -42,7 +42,7 @@ _FAULT_EVERY = 40.0  # s, in the mean
 _FAULT_FOR = 0.3
 _SETPOINT = 0.02  # s between two of a stream
 _STREAM = 3.0  # s that a stream takes
-_SPLIT = 64  # MB a file of the recorder
+_SPLIT = 300  # s a file of the recorder, which keeps an index of each until it is closed
 _ASKEW = ("hand.angle", "tip.tilt")  # the object lies askew, as stops leave it: it is put upright
 _DROPPED = 20.0  # s without a grip: the object has slipped away, and is put back
 _BEGUN = 1500  # states between the first listener and the last, at most
@@ -233,7 +233,7 @@ def _listeners(rig: Rig, account: Account) -> Iterator[dict[str, int]]:
         str(file),
         "--address",
         rig.stream,
-        "--split-size",
+        "--split-time",
         str(_SPLIT),
     )
     subscribe = (sys.executable, "-m", "tests.soak.hil", "--subscribe", rig.stream)
