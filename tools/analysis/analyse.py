@@ -66,6 +66,7 @@ def _analysed(arguments: argparse.Namespace, settings: Settings, path: Path) -> 
     from softfinger.tools.analysis.contacts import analyse, open_source, write_csv
     from softfinger.tools.terminal.progress import Progress
 
+    path = path if path.name else path.resolve()  # "." has no name
     table = arguments.csv or path.with_name(path.name + ".contacts.csv")
     own = arguments.config is None and not arguments.set
     source = open_source(path, settings, own)
