@@ -94,7 +94,7 @@ class CentreStep(_StepModel):
     date: str
     centre: tuple[Finite, Finite]
     rotation: Finite | None
-    scale: Finite
+    scale: Finite = 1.0
     residual: Finite
     std: NonNegative = 0.0
 

@@ -29,7 +29,6 @@ from softfinger.kinematics.calibration.press_fit import (
 )
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
-from softfinger.kinematics.estimation.estimator import ContactEstimator
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
 FloatArray = NDArray[np.float64]
@@ -41,6 +40,7 @@ _RESTLESS = 8.0  # times the usual noise
 _FEW_CELLS = 4  # may be faulty
 _TILT_MIN = math.radians(3.0)  # tilts that differ by less show no direction
 _UPRIGHT = math.radians(0.5)
+_PRESSED = 6.0  # times the noise: some cell reads more under a tip
 _LAGS = 8  # cells over which noise may be correlated
 _SEEN = 4.0  # standard errors
 _ENDED = 4.0  # of noise: a zero below it is touched by the end at 0
@@ -275,14 +275,12 @@ def without_end(means: FloatArray, zero: FloatArray, noise: float) -> FloatArray
 class Centre:
     """The tip's centre in the sensor's axes (x, y) [m], and the sensor's rotation [rad].
 
-    ``rotation`` is None where no press was tilted. ``scale`` is the centroid's measured travel over
-    the model's, 1 for a true tip; ``residual`` the rms distance [m]; ``std`` the centre's standard
-    deviation in x and in y [m].
+    ``rotation`` is None where no press was tilted. ``residual`` is what the last step changed [m],
+    ``std`` the centre's standard deviation in x and in y [m].
     """
 
     centre: tuple[float, float]
     rotation: float | None
-    scale: float
     residual: float
     std: float
 
@@ -298,10 +296,7 @@ def fit_centre(
 ) -> Centre:
     """Return centre and rotation from presses of known tilt θ [n] in the finger's plane [rad].
 
-    ``frames`` [n, rows, cols] Pa. The pressure's centroid stands at centre + (a − d/3)·n, so both
-    follow linearly from the estimated centroids; the estimate's own centre is brought along. A
-    solid tip's centroid hardly moves: its whole frames are fitted, and the residual is what the
-    last step changed.
+    ``frames`` [n, rows, cols] Pa. Whole frames are fitted; a springs' modulus need not be known.
     Raises CalibrationError when a frame shows no contact, and for tilts that are all alike but not
     upright.
     """
@@ -315,44 +310,17 @@ def fit_centre(
             f"centre: the tilts differ by less than {math.degrees(_TILT_MIN):g}°, so that tilt "
             "can't be separated from place; press upright alone, or upright and tilted further"
         )
-    if tip.physics == "solid":
-        used = np.broadcast_to(True if active is None else active, stack.shape)
-        force = stack.sum(axis=(1, 2)) * math.prod(grid.pitches)
-        presses = Presses(stack, depth_of_force(tip, material, force), np.arcsin(s), noise, used)
-        found, step, std = fit_place(presses, tip, material, grid, tilted)
-        # A press is as upright as it can be told to be: a turn is like a shift by half of it.
-        std = math.hypot(std, 0.5 * tip.radius * _UPRIGHT / math.sqrt(3.0 * len(s)))
-        return Centre(found.centre, found.rotation if tilted else None, 1.0, step, std)
-    centre, rotation, scale, residual, std = grid.centre, None, 1.0, 0.0, 0.0
-    for _ in range(4):
-        at = SensorGrid(grid.rows, grid.cols, grid.pitch, centre)
-        estimator = ContactEstimator(tip, material, at, noise, free_gain=True, active=active)
-        points, arms, scatter = np.empty((len(s), 2)), np.empty(len(s)), np.empty(len(s))
-        for k, frame in enumerate(stack):
-            estimate = estimator(frame)
-            if not (estimate.contact and estimate.valid):
-                raise CalibrationError(f"centre: press {k + 1} is no clean contact")
-            arms[k] = tip.radius - estimate.d / 3.0
-            normal = math.sin(estimate.tilt_x), math.sin(estimate.tilt_y)
-            points[k] = np.array(centre) + arms[k] * np.array(normal)
-            # A press is as upright as it can be told to be.
-            scatter[k] = arms[k] * math.hypot(estimate.tilt_x_std, _UPRIGHT / math.sqrt(3.0))
-        rows = np.ones((len(s), 1))
-        if tilted:
-            rows = np.stack([np.ones(len(s)), arms * s], axis=1)
-        solution = np.linalg.lstsq(rows, points, rcond=None)[0]
-        centre = float(solution[0, 0]), float(solution[0, 1])
-        misses = rows @ solution - points
-        residual = math.sqrt(2.0) * _rms(misses)
-        freedom = 2 * (len(s) - rows.shape[1])
-        each = math.sqrt(float((misses**2).sum()) / freedom) if freedom else 0.0
-        each = max(each, float(scatter.max()))
-        std = each * math.sqrt(float(np.linalg.inv(rows.T @ rows)[0, 0]))
-        if tilted:
-            # The finger's x axis in the sensor's: (cos, −sin) of the rotation.
-            rotation = math.atan2(-solution[1, 1], solution[1, 0])
-            scale = math.hypot(*solution[1])
-    return Centre(centre, rotation, scale, residual, std)
+    for k, frame in enumerate(stack):
+        if not frame.max() > _PRESSED * noise:
+            raise CalibrationError(f"centre: press {k + 1} is no clean contact")
+    used = np.broadcast_to(True if active is None else active, stack.shape)
+    force = (stack * used).sum(axis=(1, 2)) * math.prod(grid.pitches)
+    presses = Presses(stack, depth_of_force(tip, material, force), np.arcsin(s), noise, used)
+    found, residual, std = fit_place(presses, tip, material, grid, tilted)
+    # A press is as upright as it can be told to be: how far a turn moves the centroid.
+    lever = (0.5 if tip.physics == "solid" else 1.0) * tip.radius
+    std = math.hypot(std, lever * _UPRIGHT / math.sqrt(3.0 * len(s)))
+    return Centre(found.centre, found.rotation if tilted else None, residual, std)
 
 
 @dataclass(frozen=True)

@@ -250,9 +250,10 @@ def fit_place(
 ) -> tuple[SensorGrid, float, float]:
     """Fit the tip's centre, rotation if ``rotate``; return grid, last step [m], centre's std [m].
 
-    Gauss-Newton on place, rotation and each press' own depth, begun at ``presses.d``; the tilts are
-    known. For a tip whose centroid hardly moves with tilt, so that only the frames' shape tells.
+    Gauss-Newton on place, rotation, each press' own depth, begun at ``presses.d``, and for springs
+    the modulus; the tilts are known.
     """
+    gain, free_gain = 1.0, tip.physics == "springs"
     readings = presses.frames[presses.used] / material.reference_modulus
     depths = presses.d.copy()
 
@@ -267,8 +268,8 @@ def fit_place(
     )[presses.used]  # fmt: skip
     shift = math.inf
     for _ in range(12):
-        now = presses.of(tip, grid, depths)
-        by_depth = (presses.of(tip, grid, depths + _STEP) - now) / _STEP
+        now = gain * presses.of(tip, grid, depths)
+        by_depth = (gain * presses.of(tip, grid, depths + _STEP) - now) / _STEP
         columns = [np.where(owner == k, by_depth, 0.0) for k in range(len(depths))]
         x, y = grid.centre
         tried: Sequence[tuple[SensorGrid, float]] = [
@@ -280,10 +281,12 @@ def fit_place(
                 *tried,
                 (replace(grid, rotation=grid.rotation + _ROTATION_STEP), _ROTATION_STEP),
             ]
-        columns += [(presses.of(tip, each, depths) - now) / step for each, step in tried]
+        columns += [(gain * presses.of(tip, each, depths) - now) / step for each, step in tried]
+        columns += [now] * free_gain
         jacobian = np.stack(columns, axis=1)
         found = np.linalg.lstsq(jacobian, readings - now, rcond=None)[0]
         step, place = found[: len(depths)], found[len(depths) :]
+        gain *= 1.0 + float(np.clip(place[-1], -0.3, 0.3)) * free_gain
         depths = np.clip(depths + step, 0.3 * depths, 0.95 * tip.radius)
         shift = math.hypot(*np.clip(place[:2], -2e-3, 2e-3))
         rotation = grid.rotation + (float(np.clip(place[2], -0.5, 0.5)) if rotate else 0.0)

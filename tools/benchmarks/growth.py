@@ -49,14 +49,7 @@ _IN_TURN = 20  # ticks: whole periods of frames and state
 def measure(brief: bool = False) -> list[Report]:
     """Return all of them; ``brief`` takes every other point."""
     step, rounds = (2, 5) if brief else (1, 25)
-    return [
-        *cells(_SIDES[::step], rounds),
-        *ticks(step, 2 * rounds),
-    ]
-
-
-def _grown(title: str, rows: list[Row], x: str) -> Report:
-    return Report(title, rows, slopes(rows, x))
+    return [*cells(_SIDES[::step], rounds), *ticks(step, 2 * rounds)]
 
 
 def cells(sides: tuple[int, ...], rounds: int) -> list[Report]:
@@ -82,7 +75,10 @@ def cells(sides: tuple[int, ...], rounds: int) -> list[Report]:
         figure(name, "µs", 1e-3 * taken, **{x: int(name.split(": ")[1])})
         for name, taken in interleave(subjects, rounds).items()
     ]
-    return [_grown("a frame of n × n cells", rows, x), _grown("RMS of d", found, x)]
+    return [
+        Report("a frame of n × n cells", rows, slopes(rows, x)),
+        Report("RMS of d", found, slopes(found, x)),
+    ]
 
 
 def ticks(step: int, rounds: int) -> list[Report]:
@@ -110,8 +106,7 @@ def _over(x: str, scenes: dict[float, TimedScene], rounds: int) -> Report:
             for value, daemon in daemons.items():
                 taken = in_place(daemon, 1.0 / daemon.loop.period, _IN_TURN)
                 means[value].append(float(np.mean(taken)))
-        rates = {value: 1.0 / daemon.loop.period for value, daemon in daemons.items()}
     rows = [figure(f"tick: {value:g}", "µs", found, **{x: value}) for value, found in means.items()]
-    for row, rate in zip(rows, rates.values(), strict=True):
-        row["of a processor %"] = 1e-4 * row["median"] * rate
-    return _grown(f"tick over {x}", rows, x)
+    for row, daemon in zip(rows, daemons.values(), strict=True):
+        row["of a processor %"] = 1e-4 * row["median"] / daemon.loop.period
+    return Report(f"tick over {x}", rows, slopes(rows, x))

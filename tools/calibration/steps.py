@@ -241,7 +241,7 @@ def _centre(step: Step) -> Done:
     rotation = (
         "rotation not measured: no press was tilted"
         if found.rotation is None
-        else f"rotation {math.degrees(found.rotation):.2f}°, travel {found.scale:.3f} of the model"
+        else f"rotation {math.degrees(found.rotation):.2f}°"
     )
     line = (
         f"tip at ({x * 1e3:.3f}, {y * 1e3:.3f}) ± {found.std * 1e3:.3f} mm; {rotation}; "

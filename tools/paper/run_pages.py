@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache, partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.daemon.types import Contact
+from softfinger.tools.benchmarks.rigs import Sections, merged
 from softfinger.tools.paper.model_pages import DEPTHS, MILLI, MODULUS, TILTS
 from softfinger.tools.paper.sheets import (
     DEPTH,
@@ -37,7 +38,6 @@ from softfinger.tools.style import GREY, KINDS, ordered
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Sections = dict[str, dict[str, Any]]
 Row = tuple[tuple[float, float], tuple[float, ...]]  # true d and θ; `_estimates`
 
 RADIUS = 0.020  # m
@@ -136,7 +136,7 @@ def run_rolling(d: float) -> SimulatedRun:
 
 
 def _daemon(sections: Sections) -> Daemon:
-    merged: Sections = {
+    base: Sections = {
         "scene": {"fingers": ("left",)},
         "tip": {"radius": RADIUS},
         "material": {"law": "constant", "modulus": MODULUS},
@@ -149,9 +149,7 @@ def _daemon(sections: Sections) -> Daemon:
             "object_height": 0.2,
         },
     }
-    for name, values in sections.items():
-        merged[name] = merged.get(name, {}) | values
-    return Daemon(Settings.model_validate(merged), wire=False)
+    return Daemon(Settings.model_validate(merged(sections, base)), wire=False)
 
 
 def _frames(

@@ -71,7 +71,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def comparisons() -> Iterator[Beside]:
     """Yield all rows, each computed as it comes."""
-    for rows in (_tips, _energy, _memory, _cells, _sensors, _hands):
+    for rows in (_tips, _energy, _memory, _sensors, _hands):
         yield from rows()
 
 
@@ -164,25 +164,6 @@ def _memory() -> Iterator[Beside]:
                  "the table holds a press straight along the normal")  # fmt: skip
 
 
-def _cells() -> Iterator[Beside]:
-    flaws = load(Path("velostat")).simulation
-    gains = [abs(each - 1.0) for each in flaws.tactile_gain]
-    yield between("velostat: gain, mounted again", 5, 32, "Tekscan, DTIC ADP011007",
-                  100.0 * max(gains), ".0f", " %")  # fmt: skip
-    yield between("velostat: a unit's cells beside each other", 0, 5, "Sensors 26(5) 1559",
-                  100.0 * flaws.tactile_gain_spread, ".0f", " %")  # fmt: skip
-    yield between("velostat: repeatability", 12, 16, "FSR kinds, J. Sensors 2018, 6561901",
-                  100.0 * flaws.tactile_hysteresis, ".0f", " %",
-                  "that is of all causes; the profile's is its hysteresis alone")  # fmt: skip
-    yield between("velostat: crosstalk, at most", 0.0, 3.3, "arXiv 2508.20959",
-                  100.0 * flaws.tactile_crosstalk, ".1f", " %")  # fmt: skip
-    yield between("velostat: response", 40, 80, "flexitac-live; one author",
-                  1e3 * flaws.tactile_response, ".0f", " ms")  # fmt: skip
-    capacitive = load(Path("capacitive")).simulation
-    yield between("capacitive: repeatability", 2, 2, "J. Sensors 2018, 6561901",
-                  100.0 * capacitive.tactile_hysteresis, ".0f", " %")  # fmt: skip
-
-
 def _sensors() -> Iterator[Beside]:
     for name in ("ideal", "velostat", "capacitive"):
         d, angle, force = _errors(Settings() if name == "ideal" else load(Path(name)))
@@ -217,15 +198,8 @@ def _hands() -> Iterator[Beside]:
     yield between("from a slip's onset to a firmer grip, at most", 0, 40,
                   "answers of 35 to 40 ms, arXiv 2602.16127; people 100 ms, Delhaye 2024",
                   1e3 * max(answers), ".0f", " ms", simulated)  # fmt: skip
-    settings = Settings()
-    yield between("torque constant of an XM430-W350", 1.78, 1.78, "ROBOTIS: 4.1 N·m at 2.3 A",
-                  settings.control.torque_constant, ".2f", " N·m/A")  # fmt: skip
     yield Beside("friction in the servos' gears", "depends on the load",
-                     "Rhoban, arXiv 2410.08650", f"{settings.simulation.joint_friction:g} N·m",
+                     "Rhoban, arXiv 2410.08650", f"{Settings().simulation.joint_friction:g} N·m",
                      "disagree", "the plant's is Coulomb's, the same under any load")  # fmt: skip
-    hil = load(Path("hil"), Path()).tactile
-    bits = 10.0 * (hil.rows * hil.cols + 2)
-    yield between("frames of a FlexiTac board", 100, bits and hil.baud / bits, "PyFlexiTac",
-                  hil.rate, ".0f", " /s", "at most: what 2 Mbaud can carry")  # fmt: skip
     yield Beside("all of it, on a hand of metal", "—", "nobody yet", "—", "unknown",
                      "no hand of metal has been run with this daemon")  # fmt: skip
