@@ -296,14 +296,6 @@ def test_no_wait_without_a_daemon() -> None:
         assert f"no stream from {NOBODY} within 5 s" in page.written.decode()
 
 
-def test_plain_on_a_terminal(fake: FakeDaemon) -> None:
-    with TerminalProcess(command(fake, "--plain"), 200, 24) as page:
-        page.shows("holding ")
-        page.process.terminate()
-        assert page.ended() == 0
-        assert b"\x1b" not in page.written
-
-
 def test_no_wait_ends_with_the_stream(fake: FakeDaemon) -> None:
     with TerminalProcess(command(fake, "--no-wait")) as page:
         page.shows("HOLDING")
@@ -358,14 +350,6 @@ def test_the_page_yields_to_the_daemon_and_quitting_it_ends_both(
         assert page.is_restored()
         after = page.written[page.written.rfind(b"\x1b[?1049l") :]
         assert b"ended True" in after
-
-
-def test_interrupt_ends_both(fake: FakeDaemon, tmp_path: Path) -> None:
-    with Beside(fake, tmp_path) as page:
-        page.type(b"\x03")
-        assert page.ended() == 0
-        assert page.is_restored()
-        assert page.child_is_gone()
 
 
 def test_daemon_killed_gives_the_terminal_back(fake: FakeDaemon, tmp_path: Path) -> None:

@@ -43,6 +43,7 @@ def test_the_nearest_word_is_named_for_one_that_is_not_known(inline: Inline) -> 
         assert wrong.returncode == 2
         assert f"found {word!r}, expected a known word; nearest: {near}" in wrong.stderr
     assert "unrecognized arguments: --zzz" in inline("run", "--zzz").stderr
+    assert inline("send").stderr.endswith("required: COMMAND\n")  # and not what it may lack
 
 
 @pytest.mark.parametrize(

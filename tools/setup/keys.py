@@ -19,7 +19,7 @@ Exit status: 0 made, 1 refused."""
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
     parser.add_argument("folder", type=Path, metavar="FOLDER")
-    parser.add_argument("clients", nargs="*", metavar="CLIENT")
+    parser.add_argument("clients", nargs="*", default=[], metavar="CLIENT")
 
 
 def run(arguments: argparse.Namespace) -> int:

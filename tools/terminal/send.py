@@ -33,7 +33,7 @@ but the servos have not confirmed torque off yet."""
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
     parser.add_argument("command", metavar="COMMAND", choices=tuple(COMMANDS))
-    parser.add_argument("values", metavar="key=value", nargs="*")
+    parser.add_argument("values", metavar="key=value", nargs="*", default=[])
     parser.add_argument("--address", type=command_address, default="", help=ADDRESS_HELP)
     add_keys(parser)
     parser.add_argument("--client", default="", help="a name: the commander's lease is bound to it")
