@@ -152,16 +152,12 @@ class Grip:
 
         ``holding``: nothing but loads moves the joints.
         """
-        grip, grasp, finger = self._state.array, self._grasp.array, self._alone
-        if finger is not None:
-            torque = kernels.single_torque(
-                grip, grasp, self.force.windows, finger, reading.dq[finger]
-            )
-            return (torque, 0.0) if finger == 0 else (0.0, torque)
+        if self._alone is not None:
+            return self._torque_alone(reading, False)
         dq1, dq2 = reading.dq
         torque1, torque2, self.target, self.slipped = kernels.grip_torques(
-            grip,
-            grasp,
+            self._state.array,
+            self._grasp.array,
             self.force.windows,
             self.angle.windows,
             pose.angle if pose.valid else math.nan,
@@ -176,11 +172,14 @@ class Grip:
         Joints are read all the same. Torques that stayed as they are would turn the object on, to
         the end of what damps and steers it.
         """
-        finger = self._alone
-        if finger is not None:
-            torque = kernels.hold_goal_single(
-                self._state.array, self._grasp.array, finger, reading.dq[finger]
-            )
-            return (torque, 0.0) if finger == 0 else (0.0, torque)
+        if self._alone is not None:
+            return self._torque_alone(reading, True)
         dq1, dq2 = reading.dq
         return kernels.hold_goal(self._state.array, self._grasp.array, (dq1, dq2))
+
+    def _torque_alone(self, reading: Reading, frames_late: bool) -> tuple[float, float]:
+        finger = self._alone
+        assert finger is not None
+        grip, grasp, dq = self._state.array, self._grasp.array, reading.dq[finger]
+        torque = kernels.single_torque(grip, grasp, self.force.windows, finger, dq, frames_late)
+        return (torque, 0.0) if finger == 0 else (0.0, torque)

@@ -161,21 +161,26 @@ def single_torque(
     force_windows: FloatArray,
     finger: int,
     dq: float,
+    frames_late: bool,
 ) -> float:
-    """Return torque [N·m] of one ``finger`` on an object that stands by itself."""
+    """Return torque [N·m] of one ``finger`` on an object that stands by itself.
+
+    ``frames_late``: the force stays.
+    """
     g = grips[0]
-    target = setpoint.advance(g.force, force_windows, g.force_rate)
-    grip_force = target + _correction(g, target, grasps[0].force[finger])
-    g.grip_force = min(grip_force, _force_limit(g, 0.0, grasps[0].moment_arm[finger]))
-    return _torque_alone(g, grasps[0], finger, g.force.speed, dq)
-
-
-@kernel
-def hold_goal_single(
-    grips: Records[GripState], grasps: Records[GraspState], finger: int, dq: float
-) -> float:
-    """Replace :func:`single_torque` while frames are late."""
-    return _torque_alone(grips[0], grasps[0], finger, 0.0, dq)
+    grasp = grasps[0]
+    arm = grasp.moment_arm[finger]
+    stiffness = max(grasp.stiffness[finger], _STIFFNESS_MIN)
+    close = 0.0
+    if not frames_late:
+        target = setpoint.advance(g.force, force_windows, g.force_rate)
+        grip_force = target + _correction(g, target, grasp.force[finger])
+        g.grip_force = min(grip_force, _force_limit(g, 0.0, arm))
+        close = g.force.speed / (stiffness * arm)
+    damping = g.law.damping * math.sqrt(stiffness * arm * arm) * (close - dq)
+    torque: float = arm * g.grip_force + damping + _friction(g.law, close)
+    g.torque[finger] = torque
+    return torque
 
 
 @inner_kernel
@@ -321,18 +326,6 @@ def _equal_torques(
     g.torque[0] = common + steering
     g.torque[1] = common - steering
     return g.torque[0], g.torque[1]
-
-
-@inner_kernel
-def _torque_alone(g: GripState, grasp: GraspState, finger: int, rate: float, dq: float) -> float:
-    """Torque [N·m] of one finger whose force is to change by ``rate`` [N/s]."""
-    arm = grasp.moment_arm[finger]
-    stiffness = max(grasp.stiffness[finger], _STIFFNESS_MIN)
-    close = rate / (stiffness * arm)
-    damping = g.law.damping * math.sqrt(stiffness * arm * arm) * (close - dq)
-    torque: float = arm * g.grip_force + damping + _friction(g.law, close)
-    g.torque[finger] = torque
-    return torque
 
 
 @inner_kernel

@@ -48,14 +48,6 @@ _ATTRIBUTES = struct.Struct("=IIQiIQQQ")
 _SHORTEST, _LONGEST = 100_000, 100_000_000  # ns, between which the kernel takes a slice
 
 
-def hold_collector() -> None:
-    """Keep the collector off while everything is imported and built, which makes little garbage.
-
-    Collections over half-imported modules are a tenth of the start-up.
-    """
-    gc.disable()
-
-
 class RealTime:
     """The measures, held while this is open: ``with RealTime(settings): loop.run()``.
 

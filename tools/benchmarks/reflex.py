@@ -10,7 +10,6 @@ a grip.
 
 from __future__ import annotations
 
-import gc
 import itertools
 import math
 import random
@@ -73,10 +72,7 @@ def measure(
 
 def _outcome(case: tuple[Sections, tuple[float, float, str], int]) -> Overload:
     settings, (standing, overload, kind), seed = case
-    try:
-        return overloaded(settings, standing, overload, seed, kind)
-    finally:
-        gc.collect()  # each trial's daemon refers to itself, with megabytes of frames
+    return overloaded(settings, standing, overload, seed, kind)
 
 
 def _table(

@@ -7,6 +7,7 @@ the code that is measured.
 from __future__ import annotations
 
 import contextlib
+import gc
 import math
 import random
 from collections.abc import Callable, Sequence
@@ -74,6 +75,10 @@ class VirtualGrip(Watched):
         level, kind, _ = event
         if level != "info":
             self.alarms.append((self.now, kind))
+
+    def __exit__(self, *ended: object) -> None:
+        super().__exit__(*ended)
+        gc.collect()  # a daemon refers to itself, with megabytes of frames
 
     def command(self, name: str, **numbers: float) -> dict[str, Any]:
         """Give a command, which the hand may refuse."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import gc
 import json
 import sys
 import time
@@ -176,9 +177,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _serve(settings: Settings, arguments: argparse.Namespace, signals: Signals) -> int:
     # What follows imports numpy and numba: wrong settings are reported without waiting for them.
-    from softfinger.daemon.loop.realtime import RealTime, hold_collector
+    from softfinger.daemon.loop.realtime import RealTime
 
-    hold_collector()
+    gc.disable()  # collections over half-imported modules are a tenth of the start-up
     from softfinger.daemon.loop.warm_up import EMULATED
     from softfinger.daemon.simulation.emulator.emulator import (
         EmulatedServos,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import gc
 import math
 import signal
 import sys
@@ -79,9 +80,9 @@ def _serve(
     settings: Settings, arguments: argparse.Namespace, signals: Signals, log: EventLog
 ) -> int:
     # What follows imports numpy, numba and zmq: wrong settings are reported before.
-    from softfinger.daemon.loop.realtime import RealTime, hold_collector
+    from softfinger.daemon.loop.realtime import RealTime
 
-    hold_collector()
+    gc.disable()  # collections over half-imported modules are a tenth of the start-up
     from softfinger.daemon.loop.build import Daemon
     from softfinger.tools.processes.kernel_build import build_kernels
 
