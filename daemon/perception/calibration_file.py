@@ -11,7 +11,7 @@ import math
 import os
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,6 @@ from softfinger.daemon.profile.settings import Finite, NonNegative, Positive, Se
 from softfinger.kinematics.compiled.own_folder import write_whole
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.tip_curves import TipCurves
-from softfinger.kinematics.sensing.counts import to_pressure
 
 FloatArray = NDArray[np.float64]
 _NAMES: tuple[Literal["left"], Literal["right"]] = ("left", "right")
@@ -80,7 +79,7 @@ class EquilibrateStep(_StepModel):
 
 
 class CurveStep(_StepModel):
-    """(exponent, c_1, c_2, c_3) as for sensing.counts.to_pressure; relative residual."""
+    """(exponent b, c_1, c_2, c_3) of p = c_1 x^b + c_2 x² + c_3 x³ [Pa]; relative residual."""
 
     date: str
     kind: Literal["power", "cubic"]
@@ -234,7 +233,7 @@ def save_calibration(path: Path, calibration: Calibration) -> None:
 
 
 class Converter:
-    """Counts → Pa of one sensor, into one array that is used again."""
+    """Counts → Pa of one sensor."""
 
     def __init__(self, calibration: Calibration, pascal_per_count: float) -> None:
         """``pascal_per_count`` is taken where no curve was measured."""
@@ -244,21 +243,21 @@ class Converter:
         self.zero: FloatArray = np.array(tare.zero) if tare else np.zeros(shape)
         self.gain: FloatArray = np.array(gain.gain) if gain else np.ones(shape)
         self._curve = np.array(curve.coefficients if curve else (1.0, pascal_per_count, 0.0, 0.0))
-        self._out = np.zeros(shape)
         self._full = sensor.full_count
         self.live: NDArray[np.bool_] = self.gain > 0.0
-        if not math.isfinite(self.largest):
+        with np.errstate(over="ignore", invalid="ignore"):
+            finite = math.isfinite(self.largest)
+        if not finite:
             raise CalibrationFileError(
                 f"calibration: its curve {self._curve[1]:g}·x^{self._curve[0]:g} has no number of "
                 f"Pa for a full cell"
             )
 
     def __call__(self, counts: NDArray[np.uint16]) -> FloatArray:
-        """Pressure [Pa] of counts [rows, cols]; the array is valid until the next call."""
-        to_pressure(counts, self.zero, self.gain, self._curve, self._out)
-        return self._out
+        """Pressure [Pa] of counts [rows, cols]."""
+        return self.pressure(self.readings(counts))
 
-    def readings(self, counts: FloatArray) -> FloatArray:
+    def readings(self, counts: NDArray[Any]) -> FloatArray:
         """Return x = max(counts − zero, 0)·gain of (mean) counts: what the curve is fitted to."""
         return np.asarray(np.maximum(counts - self.zero, 0.0) * self.gain)
 
@@ -270,7 +269,7 @@ class Converter:
 
     def at(self, count: int) -> FloatArray:
         """Return pressure [Pa] of each cell when it reads ``count``, a new array."""
-        return self(np.full(self._out.shape, count, np.uint16)).copy()
+        return self(np.full(self.zero.shape, count, np.uint16))
 
     @property
     def saturation(self) -> float:

@@ -176,7 +176,6 @@ def make_estimator(
         material,
         calibrated_grid(settings, finger, calibration),
         noise=tactile.noise,
-        method=settings.estimator.method,
         free_gain=None if free_gain == "auto" else free_gain,
         active=alive,
         readings=Readings(saturation, threshold, quantum),

@@ -199,7 +199,7 @@ class EstimatorSettings(Section):
     force alone.
     """
 
-    method: Literal["moments", "ml"] = "ml"  # moments alone, or maximum likelihood
+    method: Literal["ml"] = "ml"  # maximum likelihood
     free_gain: Literal["auto", True, False] = "auto"  # estimate measured/modelled pressure too
 
 

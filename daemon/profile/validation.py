@@ -112,8 +112,6 @@ def _solid_tip(settings: Settings) -> Iterator[str]:
         return
     if settings.material.law != "constant":
         yield f'material.law: found "{settings.material.law}", expected "constant" for a solid tip'
-    if settings.estimator.method != "ml":
-        yield 'estimator.method: found "moments", expected "ml" for a solid tip'
     why = "0.4 of a solid tip's radius"
     yield from _above("safety.d_max", settings.safety.d_max, "m", 0.4 * tip.radius, why)
     if tactile.backend == "none":

@@ -160,7 +160,7 @@ def equilibrate(loads: Sequence[ArrayLike], zero: FloatArray) -> Equilibration:
 
 @dataclass(frozen=True)
 class SensorCurve:
-    """``coefficients`` (exponent, c_1, c_2, c_3) as for `sensing.counts.to_pressure`.
+    """``coefficients`` (exponent b, c_1, c_2, c_3) of p = c_1 x^b + c_2 x² + c_3 x³ [Pa].
 
     ``errors`` [n]: relative error of each known force; ``residual`` their rms.
     """

@@ -1,9 +1,9 @@
-"""Polynomials in two variables, and weighted sums of rows or columns, in SIMD lanes.
+"""Polynomials in two variables, in SIMD lanes, and addresses of arrays.
 
 And nothing of what they mean. Numba vectorises long loops, not a Horner scheme over neighbouring
 coefficients, of which each of all five polynomials is here one vector load and one fused
-multiply-add, and hardly short sums of a few dozen. So these are written as LLVM instructions. LLVM
-splits the vectors where the machine's are narrower.
+multiply-add. So it is written as LLVM instructions. LLVM splits the vectors where the machine's are
+narrower.
 """
 
 from __future__ import annotations
@@ -22,14 +22,12 @@ LANES = 5  # polynomials
 STRIDE = 8  # numbers of a vector register, and stored for each coefficient: the lanes, padded
 
 # Shapes by number: how many powers of x each power of y has, the lowest first. None; shapes cut to
-# what an analytic function needs for one precision after the other; the shape for a narrow strip of
-# x, and that of a solid tip.
+# what an analytic function needs for one precision after the other; that of a solid tip.
 SHAPES: tuple[tuple[int, ...], ...] = (
     (),
     (7, 6, 6, 6, 6, 5, 5, 4, 4, 3, 3, 3, 2, 2, 1),
     (9, 8, 8, 7, 7, 7, 6, 6, 5, 5, 5, 4, 4, 4, 3, 3, 3, 2, 1, 1),
     (10, 9, 9, 9, 9, 8, 8, 7, 7, 7, 6, 6, 6, 6, 5, 5, 5, 5, 4, 4, 4, 3, 3, 2, 2, 1),
-    (8,) * 15,
     (12,) * 6,
 )
 SIZES = tuple(STRIDE * sum(shape) for shape in SHAPES)  # numbers of one set of coefficients
@@ -101,37 +99,6 @@ def _in_powers(builder: Any, fma: Any, rows: list[Any], y: Any) -> Any:
     return fma(fma(sums[3], y, sums[2]), y2, fma(sums[1], y, sums[0]))
 
 
-def _weighted(
-    context: Any,
-    start: Any,
-    source: Any,
-    at: Any,
-    stride: Any,
-    weights: Any,
-    first: Any,
-    count: Any,
-) -> Any:
-    """Signature and code generator; see :data:`weighted`."""
-    whole = types.intp
-    signature = types.void(start, source, whole, whole, weights, whole, whole)
-
-    def generate(codegen: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        out, source, at, stride, weights, first, count = arguments
-        place = builder.bitcast(out, _VECTOR.as_pointer())
-        total = cast(Any, cgutils).alloca_once_value(builder, builder.load(place, align=8))
-        with cast(Any, cgutils).for_range(builder, count) as loop:
-            weight = builder.load(builder.gep(weights, [builder.add(first, loop.index)]))
-            offset = builder.add(at, builder.mul(stride, loop.index))
-            row = builder.bitcast(builder.gep(source, [offset]), _VECTOR.as_pointer())
-            value = builder.load(row, align=8)
-            more = _fma(builder, _broadcast(builder, weight), value, builder.load(total))
-            builder.store(more, total)
-        builder.store(builder.load(total), place, align=8)
-        return codegen.get_dummy_value()
-
-    return signature, generate
-
-
 def _address(context: Any, array: Any) -> Any:
     """Signature and code generator; see :data:`address`."""
     signature = cast(Any, types).CPointer(array.dtype)(array)
@@ -155,10 +122,6 @@ def _further(context: Any, start: Any, number: Any) -> Any:
 # number is a literal. From pointer[at] on stand, for j = 0, 1, …, the coefficients of falling
 # powers of x, STRIDE numbers each.
 polynomials = cast(Any, intrinsic(prefer_literal=True))(_polynomials)
-
-# weighted(out, source, at, stride, weights, first, count): adds Σ weights[first + k]
-# source[at + k stride : … + STRIDE] over k < count to out[0 : STRIDE], all addresses of float64.
-weighted = cast(Any, intrinsic)(_weighted)
 
 # address(array): where a contiguous array starts. Numba counts the references to an array
 # wherever a function that has it returns in several ways, and each count is an atomic instruction

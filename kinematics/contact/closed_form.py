@@ -15,12 +15,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, cast, get_args
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
+from softfinger.kinematics.compiled.kernel import inner_kernel
 from softfinger.kinematics.contact.tip_curves import TipCurves
 
 FloatArray = NDArray[np.float64]
@@ -76,10 +76,10 @@ class Fingertip:
 
     def theta_limit(self, d: ArrayLike) -> FloatArray:
         """Return the largest |θ| [rad] at d [m], asin((a − d)/a); π/2 for d ≤ 0, 0 for d ≥ a."""
-        shape, (depth,) = flatten(d)
-        out = np.empty_like(depth)
-        _limits(self.radius, depth, out)
-        return out.reshape(shape)
+        h = np.clip(self.radius - np.asarray(d, np.float64), 0.0, self.radius)
+        # The angle's cosine is the footprint's radius over a: exact near d → 0, unlike asin(h/a).
+        depth = np.clip(d, 0.0, self.radius)
+        return np.asarray(np.arctan2(h, np.sqrt(depth * (self.radius + h))))
 
 
 class Closed(NamedTuple):
@@ -93,10 +93,6 @@ class Closed(NamedTuple):
     energy_theta: FloatArray  # ∂U/∂θ [N·m/rad]
 
 
-# For numbers, which the fields' types do not name; a call's overhead counts there.
-_closed: Any = Closed
-
-
 @inner_kernel
 def theta_limit(radius: float, d: float) -> float:
     """Return asin((a − d)/a) [rad], clamped to [0, π/2]; NaN for NaN."""
@@ -107,27 +103,6 @@ def theta_limit(radius: float, d: float) -> float:
     h = radius - d
     # The angle's cosine is the footprint's radius over a: exact near d → 0, unlike asin(h/a).
     return math.atan2(h, math.sqrt(d * (radius + h)))
-
-
-@kernel
-def closed_form(
-    modulus: float, d: float, theta: float
-) -> tuple[float, float, float, float, float, float]:
-    """Return (F, U, ∂F/∂d, ∂F/∂θ, ∂U/∂d, ∂U/∂θ) of a constant modulus E [Pa]; zeros for d ≤ 0.
-
-    Free of the radius. Not clamped: past the limit of θ it continues the formulas, and NaN stays.
-    """
-    if d <= 0.0:
-        zero = 0.0 * theta  # NaN in, NaN out
-        return zero, zero, zero, zero, zero, zero
-    inverse = 1.0 / math.cos(theta)
-    slope = math.sin(theta) * inverse
-    force_by_d = math.pi * modulus * d
-    force_d = 2.0 * force_by_d * inverse
-    force = 0.5 * d * force_d
-    energy_d = force * inverse
-    energy = energy_d * d * (1.0 / 3.0)
-    return force, energy, force_d, force * slope, energy_d, 2.0 * energy * slope
 
 
 def flatten(*values: ArrayLike) -> tuple[tuple[int, ...], list[FloatArray]]:
@@ -157,8 +132,6 @@ def closed_forms(modulus: float, d: ArrayLike, theta: ArrayLike) -> Closed:
 
     Zeros for d ≤ 0; NaN in gives NaN out. Valid up to θ's limit, continued past it.
     """
-    if type(d) is float and type(theta) is float:
-        return cast(Closed, _closed(*map(np.float64, closed_form(float(modulus), d, theta))))
     depth, tilt = np.broadcast_arrays(_real(d), _real(theta))
     inverse, slope = 1.0 / np.cos(tilt), np.tan(tilt)
     force_d = 2.0 * np.pi * float(modulus) * depth * inverse
@@ -168,9 +141,3 @@ def closed_forms(modulus: float, d: ArrayLike, theta: ArrayLike) -> Closed:
     six = force, energy, force_d, force * slope, energy_d, 2.0 * energy * slope
     nothing = 0.0 * tilt + np.where(np.isnan(depth), depth, 0.0)  # NaN for NaN
     return Closed(*(np.where(depth > 0.0, each, nothing)[()] for each in six))
-
-
-@kernel
-def _limits(radius: float, d: FloatArray, out: FloatArray) -> None:
-    for i in range(d.shape[0]):
-        out[i] = theta_limit(radius, d[i])

@@ -5,9 +5,8 @@ smooth, near 1, finite at d → 0, and exact for a constant modulus, which has n
 coordinates make it analytic up to the edges of the domain: the height h = (a − d)/a, and y = u/h
 with u = √(1 − ρ²/(a² cos² θ)), which is 1 at θ = 0, 0 at the limit, even in θ, and the peak strain
 is 1 − u. The domain is cut into slabs of h, eight to an octave, which span all of y: where their
-coefficients stand depends on d alone, so that they are read while θ's cosine is being computed.
-Towards h = 0 the ratios are A + B log h with smooth A and B; below the lowest octave both are
-tabulated.
+coefficients stand depends on d alone, so that they are read while θ's cosine is being computed. It
+ends at h = 1/8, short of h = 0, towards which the ratios grow as log h.
 """
 
 from __future__ import annotations
@@ -37,22 +36,16 @@ _NEAR = 0.25 * math.pi
 
 START = 16  # of the coefficients in a table's array: a whole number of cache lines
 
-VERSION = 3.0
-
-OCTAVES = 3  # of h above the corner
+OCTAVES = 3  # of h
 SLAB_BITS = 3  # 2^3 slabs to an octave
-LOWEST = 0.5**OCTAVES  # h where the corner begins
-H_MIN = 0.5**54  # less than any h but 0
+LOWEST = 0.5**OCTAVES  # h where the domain ends
+_H_MIN = LOWEST * (1.0 + 2.0**-52)  # the first number above it
+_END = LOWEST * (1.0 - 1e-12)  # h that is outside, not by rounding alone
 
 # The forms of a table, as numbers in SHAPES: the closed form, and slabs by rising degree.
 CLOSED = 0
 SLABS = (1, 2, 3)
 
-# The corner h → 0, the same for all slabs: its pieces over y, and the shape of A and of B in each.
-CORNER_PIECES = 2
-CORNER_SHAPE = 4
-
-_BLOCK = 256  # points that `lookups` takes at once, so that they stay in the first cache
 _MANTISSA = 52
 _FRACTION = (1 << _MANTISSA) - 1
 _ONE = 1023 << _MANTISSA  # the bits of 1.0
@@ -62,12 +55,10 @@ _FIRST = ((1023 - OCTAVES) << _MANTISSA) + 1  # those of the first number above 
 class TableHeader(Record):
     """Head of a table's array."""
 
-    format: float  # VERSION
     form: float  # CLOSED, or one of SLABS
     radius: float  # [m]
     modulus: float  # at no strain [Pa]
     inverse_radius: float
-    corner: float  # where its coefficients start
     tolerance: float
     max_error: float  # bound of the relative error
     worst_d: float  # where the piece errs most that has the largest [m]
@@ -150,8 +141,8 @@ def _slab(h: float) -> tuple[int, float]:
 
 
 @inlined_kernel
-def from_slab(p: Pointer, form: int, h: float, y: float) -> Ratios:
-    """Return the five ratios above the corner. The numbers of shapes are literals."""
+def _from_slab(p: Pointer, form: int, h: float, y: float) -> Ratios:
+    """Return the five ratios. The numbers of shapes are literals."""
     i, x = _slab(h)
     y = 2.0 * y - 1.0
     if form == 1:
@@ -163,64 +154,16 @@ def from_slab(p: Pointer, form: int, h: float, y: float) -> Ratios:
     return ratios
 
 
-@inner_kernel
-def from_corner(p: Pointer, h: float, y: float) -> Ratios:
-    """Evaluate the five ratios A + B log h below the lowest octave."""
-    y *= CORNER_PIECES
-    j = min(int(y), CORNER_PIECES - 1)
-    y = 2.0 * (y - j) - 1.0
-    x = (2.0 / LOWEST) * h - 1.0
-    at = int(header(p).corner) + 2 * j * SIZES[CORNER_SHAPE]
-    a_f, a_u, a_fd, a_ft, a_ut = polynomials(p, at, 4, x, y)
-    b_f, b_u, b_fd, b_ft, b_ut = polynomials(p, at + SIZES[CORNER_SHAPE], 4, x, y)
-    # At h = 0 the logarithm's factors vanish, or θ and with it the partial does.
-    scale = math.log(max(h, H_MIN))
-    return (
-        a_f + scale * b_f,
-        a_u + scale * b_u,
-        a_fd + scale * b_fd,
-        a_ft + scale * b_ft,
-        a_ut + scale * b_ut,
-    )
-
-
-@inlined_kernel
-def _ratios(
-    p: Pointer, form: int, h: float, s: float, c: float, gap: float
-) -> tuple[float, Ratios]:
-    """1/cos θ and the five ratios; gap = cos² θ u² = h² − sin² θ."""
-    if h > LOWEST:
-        both = 1.0 / (c * h)
-        inverse = both * h
-        y = math.sqrt(gap) * both
-        return inverse, from_slab(p, form, h, y)
-    inverse = 1.0 / c
-    s = abs(s)
-    y = math.sqrt((h - s) * (h + s)) * inverse / h if h > s else 0.0
-    return inverse, from_corner(p, h, y)
-
-
 @inlined_kernel
 def _at(p: Pointer, d: float, h: float, s: float, c: float, gap: float, inside: bool) -> Six:
     """Evaluate :func:`lookup` inside the domain."""
     form = int(header(p).form)
-    if form == CLOSED:
-        inverse = 1.0 / c
-        slope = s * inverse
-        force_by_d = math.pi * header(p).modulus * d * inverse
-        force = force_by_d * d
-        energy = force * inverse * d * (1.0 / 3.0)
-        force_d = 2.0 * force_by_d
-        return (
-            force,
-            energy,
-            force_d,
-            force * slope,
-            force * inverse,
-            2.0 * energy * slope,
-            inside,
-        )
-    inverse, (r_f, r_u, r_fd, r_ft, r_ut) = _ratios(p, form, h, s, c, gap)
+    inverse = 1.0 / c
+    r_f, r_u, r_fd, r_ft, r_ut = 1.0, 1.0, 1.0, 1.0, 1.0
+    if form != CLOSED:
+        both = 1.0 / (c * h)
+        inverse = both * h
+        r_f, r_u, r_fd, r_ft, r_ut = _from_slab(p, form, h, math.sqrt(gap) * both)
     slope = s * inverse
     force_by_d = math.pi * header(p).modulus * d * inverse
     force = force_by_d * d
@@ -240,9 +183,11 @@ def _at(p: Pointer, d: float, h: float, s: float, c: float, gap: float, inside: 
 def _slowly(p: Pointer, d: float, theta: float) -> tuple[float, float, float, float, float, bool]:
     """d, h, sin θ, cos θ, gap and ``inside`` at any d > 0 and θ, clamped to the domain."""
     radius = header(p).radius
-    inside = d <= radius
-    d = min(d, radius)
     h = (radius - d) * header(p).inverse_radius
+    inside = h >= _END
+    if h < _H_MIN:
+        h = _H_MIN
+        d = radius * (1.0 - h)
     if abs(theta) <= HALF_PI:
         s, c = _sine_cosine(theta)
         gap = c * c - d * header(p).inverse_radius * (1.0 + h)
@@ -250,7 +195,7 @@ def _slowly(p: Pointer, d: float, theta: float) -> tuple[float, float, float, fl
             return d, h, s, c, gap, inside
     limit = theta_limit(radius, d)
     # At the limit itself, rounding may have led here.
-    inside = inside and abs(theta) <= limit
+    inside = inside and abs(theta) <= limit * (1.0 + 1e-12)
     s, c = _sine_cosine(min(max(theta, -limit), limit))
     return d, h, s, c, 0.0, inside
 
@@ -266,7 +211,7 @@ def lookup_at(p: Pointer, d: float, theta: float) -> Six:
     s, c = _near_sine_cosine(theta)
     gap = c * c - rho2
     inside = True
-    if not (d > 0.0 and gap >= 0.0 and h >= 0.0 and abs(theta) <= _NEAR):
+    if not (d > 0.0 and gap >= 0.0 and h > LOWEST and abs(theta) <= _NEAR):
         if math.isnan(d) or math.isnan(theta):
             nan = math.nan
             return nan, nan, nan, nan, nan, nan, False
@@ -305,26 +250,6 @@ def stiffness_ahead(p: Pointer, scale: float, depth: float) -> float:
     return scale * depth
 
 
-@inlined_kernel
-def _coordinates(p: Pointer, d: FloatArray, theta: FloatArray, work: FloatArray) -> None:
-    """y, h, 1/cos θ and tan θ of a block into ``work`` [4 * _BLOCK].
-
-    y is NaN outside the domain and in the corner, where :func:`lookup` has to be asked.
-    """
-    for i in range(d.shape[0]):
-        h = (header(p).radius - d[i]) * header(p).inverse_radius
-        rho2 = d[i] * header(p).inverse_radius * (1.0 + h)
-        s, c = _sine_cosine(theta[i])
-        gap = c * c - rho2
-        both = 1.0 / (c * h)
-        # No branch, which would keep the loop out of SIMD lanes.
-        usual = (d[i] > 0.0) & (gap >= 0.0) & (h > LOWEST) & (abs(theta[i]) <= HALF_PI)
-        work[i] = math.sqrt(max(gap, 0.0)) * both if usual else math.nan
-        work[i + _BLOCK] = h
-        work[i + 2 * _BLOCK] = both * h
-        work[i + 3 * _BLOCK] = s * both * h
-
-
 @kernel
 def lookups(
     data: FloatArray,
@@ -333,37 +258,9 @@ def lookups(
     out: FloatArray,
     inside: NDArray[np.bool_],
 ) -> None:
-    """Evaluate :func:`lookup` at each d, θ [n] into ``out`` [6, n] and ``inside`` [n], to rounding.
-
-    In two passes over blocks: the coordinates, in SIMD lanes over the points, then the polynomials.
-    """
+    """Evaluate :func:`lookup` at each d, θ [n] into ``out`` [6, n] and ``inside`` [n]."""
     p = address(data)
-    form = int(header(p).form)
-    force_by_d = math.pi * header(p).modulus
-    work = np.empty(4 * _BLOCK)
-    for start in range(0, d.shape[0], _BLOCK):
-        stop = min(start + _BLOCK, d.shape[0])
-        _coordinates(p, d[start:stop], theta[start:stop], work)
-        for k in range(start, stop):
-            y = work[k - start]
-            if math.isnan(y):
-                out[0, k], out[1, k], out[2, k], out[3, k], out[4, k], out[5, k], inside[k] = (
-                    lookup_at(p, d[k], theta[k])
-                )
-                continue
-            r_f, r_u, r_fd, r_ft, r_ut = 1.0, 1.0, 1.0, 1.0, 1.0
-            if form != CLOSED:
-                r_f, r_u, r_fd, r_ft, r_ut = from_slab(p, form, work[k - start + _BLOCK], y)
-            inverse = work[k - start + 2 * _BLOCK]
-            slope = work[k - start + 3 * _BLOCK]
-            force_d = 2.0 * force_by_d * d[k] * inverse
-            force = 0.5 * force_d * d[k]
-            energy_d = force * inverse
-            energy = energy_d * d[k] * (1.0 / 3.0)
-            out[0, k] = force * r_f
-            out[1, k] = energy * r_u
-            out[2, k] = force_d * r_fd
-            out[3, k] = force * slope * r_ft
-            out[4, k] = energy_d * r_f
-            out[5, k] = 2.0 * energy * slope * r_ut
-            inside[k] = True
+    for k in range(d.shape[0]):
+        out[0, k], out[1, k], out[2, k], out[3, k], out[4, k], out[5, k], inside[k] = lookup_at(
+            p, d[k], theta[k]
+        )

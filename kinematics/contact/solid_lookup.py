@@ -16,8 +16,8 @@ import numpy as np
 from numba import types
 from numba.extending import intrinsic
 
-from softfinger.kinematics.compiled.kernel import inlined_kernel, inner_kernel, kernel
-from softfinger.kinematics.compiled.layout import Record, Records
+from softfinger.kinematics.compiled.kernel import inlined_kernel, inner_kernel
+from softfinger.kinematics.compiled.layout import Record
 from softfinger.kinematics.compiled.simd import (
     SHAPES,
     SIZES,
@@ -33,7 +33,7 @@ from softfinger.kinematics.contact.material_fit import MaterialError
 from softfinger.kinematics.contact.solid_data import FloatArray, solid_data, with_partials
 from softfinger.kinematics.contact.tip_curves import TipCurves
 
-_SHAPE = 5
+_SHAPE = 4
 
 Lanes: TypeAlias = tuple[float, float, float, float, float]
 
@@ -124,7 +124,7 @@ def energy_lanes(table: SolidTable, t: float, square: float) -> Lanes:
     """Return g(t, sin² θ), ∂g/∂t, ∂²g/∂t², ∂g/∂sin² θ, ∂²g/∂t ∂sin² θ."""
     x = t * table.by_root - 1.0
     y = square * table.by_square - 1.0
-    lanes: Lanes = polynomials(address(table.coefficients), 0, 5, x, y)
+    lanes: Lanes = polynomials(address(table.coefficients), 0, 4, x, y)
     return lanes
 
 
@@ -135,7 +135,7 @@ def _held(table: SolidTable, t: float, square: float) -> Triple:
         return 1.0, 0.0, 0.0
     x = t * table.by_root - 1.0
     y = square * table.by_square - 1.0
-    q, q_t, q_s, _, _ = polynomials(address(table.stick), 0, 5, x, y)
+    q, q_t, q_s, _, _ = polynomials(address(table.stick), 0, 4, x, y)
     return 1.0 - square * q, -square * q_t, -q - square * q_s
 
 
@@ -209,18 +209,6 @@ def _solid_normal_at(
         0.25 * table.modulus * a * t * (15.0 * g + t * (9.0 * g_t + t * g_tt)),
         chain * size * (2.5 * g_s + 0.5 * t * g_ts),
     )
-
-
-@kernel
-def solid_lookups(
-    tables: Records[SolidTable], d: FloatArray, theta: FloatArray, out: FloatArray, inside: Any
-) -> None:
-    """Evaluate `lookup.lookups`."""
-    p = address(tables)
-    for k in range(d.shape[0]):
-        out[0, k], out[1, k], out[2, k], out[3, k], out[4, k], out[5, k], inside[k] = (
-            _solid_lookup_at(p, d[k], theta[k])
-        )
 
 
 def _is_solid(start: Any) -> bool:

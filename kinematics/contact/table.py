@@ -23,7 +23,7 @@ from softfinger.kinematics.contact.lookup import (
     lookups,
 )
 from softfinger.kinematics.contact.material import Material
-from softfinger.kinematics.contact.solid_lookup import SolidTable, solid_lookups, solid_table
+from softfinger.kinematics.contact.solid_lookup import SolidTable, solid_table
 from softfinger.kinematics.contact.table_build import build
 
 FloatArray = NDArray[np.float64]
@@ -68,8 +68,8 @@ class ContactTable:
     """Force, energy and first partials of one tip of one material, by lookup.
 
     ``data`` is the flat float64 array that :func:`lookup` takes, ``max_error`` the bound of the
-    relative error of any output. The domain is 0 < d ≤ a and |θ| ≤ asin((a − d)/a). A solid tip's
-    ``data`` is a :class:`SolidTable`, which is exact for the data of `solid_data`, so that
+    relative error of any output. The domain is 0 < d ≤ 7/8 a and |θ| ≤ asin((a − d)/a). A solid
+    tip's ``data`` is a :class:`SolidTable`, which is exact for the data of `solid_data`, so that
     ``max_error`` is theirs, and the domain what they cover.
     """
 
@@ -142,7 +142,7 @@ class ContactTable:
         shape, (depth, tilt) = flatten(d, theta)
         out = np.empty((6, depth.size))
         within = np.empty(depth.size, dtype=np.bool_)
-        self._look_up(depth, tilt, out, within)
+        lookups(self.data, depth, tilt, out, within)
         if not (edge or within.all()):
             self._warn(depth, tilt)
         f, u, f_d, f_theta, u_d, u_theta = (row.reshape(shape) for row in out)
@@ -150,15 +150,10 @@ class ContactTable:
             f, u, f_d, f_theta, u_d, u_theta, within.reshape(shape), self.max_error
         )
 
-    def _look_up(
-        self, d: FloatArray, theta: FloatArray, out: FloatArray, within: NDArray[np.bool_]
-    ) -> None:
-        (solid_lookups if self.is_solid else lookups)(self.data, d, theta, out, within)
-
     def _warn(self, d: FloatArray, theta: FloatArray) -> None:
         """Warn the caller's caller of points outside the domain, but for NaN."""
         within = np.empty(d.size, dtype=np.bool_)
-        self._look_up(d * _EDGE, theta * _EDGE, np.empty((6, d.size)), within)
+        lookups(self.data, d * _EDGE, theta * _EDGE, np.empty((6, d.size)), within)
         outside = np.flatnonzero(~(within | np.isnan(d) | np.isnan(theta)))
         if outside.size:
             first = outside[0]

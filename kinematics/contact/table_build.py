@@ -23,15 +23,11 @@ from softfinger.kinematics.compiled.simd import LANES, SHAPES, SIZES, STRIDE
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.lookup import (
     CLOSED,
-    CORNER_PIECES,
-    CORNER_SHAPE,
-    H_MIN,
     LOWEST,
     OCTAVES,
     SLAB_BITS,
     SLABS,
     START,
-    VERSION,
     TableError,
     aligned,
     header_of,
@@ -48,9 +44,6 @@ FloatArray = NDArray[np.float64]
 
 ROUNDING = 16.0 * np.finfo(float).eps  # of the closed forms and the kernel's last products
 _MORE_ROWS, _MORE_COLUMNS = 4, 6  # Chebyshev coefficients in h and y beyond those kept
-_CORNER_DEEPEST = 34  # octaves of h that the corner's fit is sampled over
-_CORNER_OCTAVES = (-OCTAVES, -4, -6, -9, -14, -24, -54)  # pieces of log₂ h; no float lies below
-_CORNER_NODES = 14  # in each of them
 _SLAB_ENDS = np.arange(1, 1 + (1 << SLAB_BITS)) / (1 << SLAB_BITS)
 # Of the slabs over h, from LOWEST to 1.
 _EDGES = [
@@ -108,11 +101,9 @@ def build(tip: Fingertip, material: Material, tolerance: float) -> FloatArray:
 
 def _made(tip: Fingertip, law: LawTerms, form: int, tolerance: float, limit: float) -> FloatArray:
     """The array of one form, left unfinished where its error's bound passes ``limit``."""
-    corner = START + len(_EDGES[1:]) * SIZES[form]
-    size = corner + 2 * CORNER_PIECES * SIZES[CORNER_SHAPE]
-    data = aligned(START if form == CLOSED else size)
+    data = aligned(START + len(_EDGES[1:]) * SIZES[form])
     header = header_of(data)
-    header.format, header.form, header.tolerance, header.corner = VERSION, form, tolerance, corner
+    header.form, header.tolerance = form, tolerance
     header.radius, header.modulus = tip.radius, law.modulus
     header.inverse_radius = 1.0 / tip.radius
     worst = _Worst(ROUNDING, 0.5, 0.0)
@@ -142,14 +133,8 @@ def _filled(data: FloatArray, law: LawTerms, form: int) -> Iterator[_Worst]:
         numbers = _powers(terms * mask, columns)
         data[at : at + numbers.size] = numbers
         at += numbers.size
-        rounding = _rounding(terms * mask, (high + low) / (high - low), 1, low)
+        rounding = _rounding(terms * mask, (high + low) / (high - low), low)
         yield _bound(values, terms * ~mask, rounding, h, y)
-    for j in range(CORNER_PIECES):
-        fitted = _corner(law, j)
-        numbers = np.concatenate([_powers(piece, SHAPES[CORNER_SHAPE]) for piece in fitted])
-        data[at : at + numbers.size] = numbers
-        at += numbers.size
-        yield from _corner_bounds(law, j, fitted)
 
 
 def _bound(
@@ -177,7 +162,7 @@ def _bound(
     return _Worst(float(bounds[k]) + ROUNDING, float(h[-1 - i // 4]), float(y[-1 - j // 4]))
 
 
-def _rounding(terms: FloatArray, steep: float, y_pieces: int, low: float) -> FloatArray:
+def _rounding(terms: FloatArray, steep: float, low: float) -> FloatArray:
     """Bound of what rounding does to a piece's five ratios, from their Chebyshev ``terms``.
 
     Sums of powers, each over some 32 roundings at most; h, off by two ulps, ``steep`` being h over
@@ -189,7 +174,7 @@ def _rounding(terms: FloatArray, steep: float, y_pieces: int, low: float) -> Flo
     powers = np.abs(_to_powers(len(i))), np.abs(_to_powers(len(j)))
     sums = 32.0 * np.einsum("ai,bj,kij->k", *powers, size, optimize=True)
     by_h = 2.0 * (steep + 1.0) * (i**2 * size).sum(axis=(1, 2))
-    second = (2.0 * y_pieces) ** 2 * (j**2 * (j**2 - 1.0) / 3.0 * size).sum(axis=(1, 2))
+    second = 4.0 * (j**2 * (j**2 - 1.0) / 3.0 * size).sum(axis=(1, 2))
     total: FloatArray = np.finfo(float).eps * (sums + by_h + 2.0 * second / low**2)
     return total
 
@@ -250,58 +235,6 @@ def _ratios_at(law: LawTerms, h: FloatArray, y: FloatArray) -> FloatArray:
         law.gauss, law.circle, law.polynomials, delta.ravel(), h.ravel(), s.ravel(), c.ravel(), out
     )
     return out.reshape(LANES, *h.shape)
-
-
-def _corner(law: LawTerms, piece: int) -> FloatArray:
-    """Chebyshev coefficients [2, 5, h, y] of A and B, of one piece over y of the corner.
-
-    A and B of R = A + B log h are found by least squares in h at each node of y. Only their sum is
-    well determined; since it is found linearly, it is interpolated in y as R itself would be.
-    """
-    shape = SHAPES[CORNER_SHAPE]
-    rows, columns = shape[0], len(shape)
-    nodes, in_y = _nodes(columns)
-    y = (piece + 0.5 * (nodes + 1.0)) / CORNER_PIECES
-    near, _ = _nodes(2 * rows)
-    h = np.concatenate(
-        [0.5 * LOWEST * (near + 1.0), LOWEST * 0.5 ** np.arange(1, _CORNER_DEEPEST, 1.0)]
-    )
-    values = np.moveaxis(_ratios_at(law, h[:, None], y[None, :]), 0, 1).reshape(h.size, -1)
-    basis = chebyshev.chebvander(2.0 * h / LOWEST - 1.0, rows - 1)
-    matrix = np.concatenate([basis, basis * np.log(h)[:, None]], axis=1)
-    found = np.linalg.lstsq(matrix, values, rcond=1e-14)[0]
-    terms = found.reshape(2, rows, LANES, columns)
-    # From values at the nodes of y to coefficients.
-    return np.asarray(np.einsum("bj,pikj->pkib", in_y, terms, optimize=True))
-
-
-def _corner_bounds(law: LawTerms, piece: int, fitted: FloatArray) -> Iterator[_Worst]:
-    """Bounds of the corner's error, in pieces of log h down to the least h, and at d = a itself.
-
-    In log h what is left of the ratios is smooth: powers of h are exponentials, and towards h = 0
-    only α + β log h is left.
-    """
-    rows, columns = fitted.shape[2:]
-    x, y = _nodes(_CORNER_NODES)[0], _nodes(columns + _MORE_COLUMNS)[0]
-    ys = (piece + 0.5 * (y + 1.0)) / CORNER_PIECES
-    in_y = chebyshev.chebvander(y, columns - 1)
-    for high, low in pairwise(_CORNER_OCTAVES):
-        h = 2.0 ** (0.5 * (high + low) + 0.5 * (high - low) * x)
-        values = _ratios_at(law, h[:, None], ys[None, :])
-        in_h = chebyshev.chebvander(2.0 * h / LOWEST - 1.0, rows - 1)
-        ours = np.einsum("xi,pkij,yj->pkxy", in_h, fitted, in_y, optimize=True)
-        lost = _terms(values - ours[0] - np.log(h)[:, None] * ours[1])
-        rounding = _rounding(fitted[0], 1.0, CORNER_PIECES, 1.0)
-        rounding -= low * math.log(2.0) * _rounding(fitted[1], 1.0, CORNER_PIECES, 1.0)
-        yield _bound(values, lost, rounding, h, ys)
-    if piece == 0:
-        # At d = a the kernel takes h = LEAST in the logarithm, and θ and y are 0.
-        one = np.ones((1, 1))
-        exact = _ratios_at(law, 0.0 * one, 0.0 * one)[:3, 0, 0]
-        ends = (-1.0) ** np.arange(rows), (-1.0) ** np.arange(columns)
-        a, b = np.einsum("i,pkij,j->pk", ends[0], fitted, ends[1], optimize=True)
-        lost = np.abs(a + math.log(H_MIN) * b)[:3] - exact
-        yield _Worst(float(np.max(np.abs(lost) / exact)) + ROUNDING, 0.0, 0.0)
 
 
 @cache

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from softfinger.kinematics.compiled.kernel import fast_inner_kernel, inner_kernel
-from softfinger.kinematics.compiled.simd import STRIDE, IntPointer, Pointer, further, weighted
+from softfinger.kinematics.compiled.simd import IntPointer, Pointer, further
 from softfinger.kinematics.estimation.packing import INDEX_BITS
 from softfinger.kinematics.estimation.state import READING, WEIGHT, EstimatorState
 from softfinger.kinematics.sensing.cell_integrals import ACTIVE, CELL_PLANES
@@ -27,19 +27,23 @@ def pieces_to_fit(width: float) -> int:
 
 
 def weights(stencil: FloatArray, pieces: int) -> FloatArray:
-    """Return a cell's weights over the pieces of cells, float64 [n], n a multiple of ``pieces``.
+    """Return a cell's weights over the pieces of cells, float64 [n], averaged over its own.
 
-    They begin at the piece with the cell's own number times ``pieces``: the stencil, averaged over
-    the cell's pieces, and zeros.
+    They begin at the piece with the cell's own number times ``pieces``.
     """
-    whole = np.convolve(stencil, np.full(pieces, 1.0 / pieces))
-    return np.pad(whole, (0, -len(whole) % pieces))
+    return np.convolve(stencil, np.full(pieces, 1.0 / pieces))
 
 
 @fast_inner_kernel
 def _clear(out: Pointer, first: int, last: int) -> None:
     for k in range(first, last):
         out[k] = 0.0
+
+
+@fast_inner_kernel
+def _add(weight: float, source: Pointer, step: int, count: int, out: Pointer) -> None:
+    for k in range(count):
+        out[k] += weight * source[step * k]
 
 
 @fast_inner_kernel
@@ -52,15 +56,7 @@ def _read(row: Pointer, active: Pointer, scale: float, n: int, size: int, out: P
 
 @fast_inner_kernel
 def _locate(state: EstimatorState, indices: IntPointer) -> tuple[int, int, int, int]:
-    """Turn ``indices`` into those in the scratch of :func:`blur_cells`; the box they lie in.
-
-    There, columns of one remainder by the pieces of a cell stand together.
-    """
-    width = state.blur.width
-    pieces_x = state.blur.pieces_x
-    phase = width // pieces_x
-    shift = 0 if pieces_x == 1 else pieces_x // 2
-    rest = pieces_x - 1
+    """Turn ``indices`` into flat ones of the model's grid; return the box they lie in."""
     low = left = 1 << 30
     high = right = 0
     for k in range(state.fit.count):
@@ -70,7 +66,7 @@ def _locate(state: EstimatorState, indices: IntPointer) -> tuple[int, int, int, 
         high = max(high, i + 1)
         left = min(left, j)
         right = max(right, j + 1)
-        indices[k] = i * width + (j & rest) * phase + (j >> shift)
+        indices[k] = i * state.model.cols + j
     return low, high, left, right
 
 
@@ -86,47 +82,37 @@ def blur_cells(
     if state.fit.count == 0:
         return
     blur = state.blur
-    size = state.model.rows * state.model.cols
+    width = state.model.cols
+    size = state.model.rows * width
     cols = state.grid.cols
     pieces_x = blur.pieces_x
     pieces_y = blur.pieces_y
-    n_x = blur.weights_x
-    n_y = blur.weights_y
-    width = blur.width
-    phase = width // pieces_x
     low, high, left, right = _locate(state, indices)
-    first = max(left // pieces_x - n_x + 1, 0)
+    first = max((left - blur.weights_x + pieces_x) // pieces_x, 0)
     last = min((right - 1) // pieces_x + 1, cols)
-    bottom = max((low - n_y + pieces_y) // pieces_y, 0)
+    bottom = max((low - blur.weights_y + pieces_y) // pieces_y, 0)
     top = min((high - 1) // pieces_y + 1, state.grid.rows)
     wide = last - first
-    # The columns of ``between`` that the box needs, of each phase; what lies right of them is 0.
-    ahead = wide + n_x + STRIDE
     packed = further(scratch, state.at.packed)
     source = further(scratch, state.at.fine)
     between = further(scratch, state.at.half)
     across = further(scratch, state.at.across)
     along = further(scratch, state.at.along)
+    _clear(between, 0, width)
     for plane in range(PLANES):
         _clear(source, low * width, high * width)
         for k in range(state.fit.count):
             source[indices[k]] = packed[plane * size + k]
         for i in range(bottom, top):
-            begin = max(pieces_y * i, low)
-            number = min(pieces_y * i + n_y, high) - begin
             out = further(packed, plane * size + (i - bottom) * wide)
+            _clear(between, left, right)
+            for row in range(max(pieces_y * i, low), min(pieces_y * i + blur.weights_y, high)):
+                start = further(source, row * width + left)
+                weight = along[row - pieces_y * i]
+                _add(weight, start, 1, right - left, further(between, left))
             _clear(out, 0, wide)
-            _clear(between, 0, width)
-            for p in range(pieces_x):
-                at = p * phase + first
-                for j in range(at, min(at + ahead, (p + 1) * phase - STRIDE + 1), STRIDE):
-                    here = further(between, j)
-                    skip = begin - pieces_y * i
-                    weighted(here, source, begin * width + j, width, along, skip, number)
-            for j in range(0, wide, STRIDE):
-                for p in range(pieces_x):
-                    at = p * phase + first + j
-                    weighted(further(out, j), between, at, 1, across, p * n_x, n_x)
+            for k in range(blur.weights_x):
+                _add(across[k], further(between, pieces_x * first + k), pieces_x, wide, out)
     cells = further(scratch, state.at.cells)
     for i in range(bottom, top):
         active = further(cells, (i * CELL_PLANES + ACTIVE) * cols + first)

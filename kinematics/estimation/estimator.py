@@ -9,12 +9,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from softfinger.kinematics.compiled.simd import STRIDE
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.estimation.blurred_cells import pieces_to_fit, weights
@@ -140,13 +139,12 @@ class ContactEstimator:
     """Estimates the contact under one tip from frames of a pressure grid.
 
     Takes the tip, its material, the grid, and ``noise``, a cell's standard deviation [Pa].
-    ``method`` is "ml" (maximum likelihood) or "moments". ``free_gain`` also estimates measured over
-    modelled pressure, by default for a tip of springs alone: a solid tip's frame hardly changes its
-    shape with d, which then shows in the force only. Otherwise it is 1. ``active`` [rows, cols]
-    bool masks dead cells. ``readings`` says where the board's readings end. ``known`` are the
-    sensor's other uncertainties, none by default: they widen the covariance, and make the activity
-    test as much less sensitive. A material's own ``fit_error`` counts among them. The fit goes up
-    to a tilt of 71.57° (tan 3), and no further.
+    ``free_gain`` also estimates measured over modelled pressure, by default for a tip of springs
+    alone: a solid tip's frame hardly changes its shape with d, which then shows in the force only.
+    Otherwise it is 1. ``active`` [rows, cols] bool masks dead cells. ``readings`` says where the
+    board's readings end. ``known`` are the sensor's other uncertainties, none by default: they
+    widen the covariance, and make the activity test as much less sensitive. A material's own
+    ``fit_error`` counts among them. The fit goes up to a tilt of 71.57° (tan 3), and no further.
 
     Raises ValueError for arguments out of their range.
     """
@@ -158,7 +156,6 @@ class ContactEstimator:
         grid: SensorGrid,
         noise: float,
         *,
-        method: Literal["ml", "moments"] = "ml",
         free_gain: bool | None = None,
         active: NDArray[np.bool_] | None = None,
         readings: Readings | None = None,
@@ -171,10 +168,6 @@ class ContactEstimator:
                 "a measured tip has no model of its frames: expected a tip of springs or solid; "
                 "softfinger.kinematics.estimation.measured.MeasuredEstimator is for a measured one"
             )
-        if method not in ("ml", "moments"):
-            raise ValueError(f"method must be 'ml' or 'moments', got {method!r}")
-        if tip.physics == "solid" and method == "moments":
-            raise ValueError("method must be 'ml' for a solid tip: its moments hardly show d and θ")
         if active is not None and np.shape(active) != grid.shape:
             raise ValueError(f"active must have shape {grid.shape}, got {np.shape(active)}")
         readings = readings or Readings()
@@ -195,7 +188,6 @@ class ContactEstimator:
         options.free_gain = tip.physics == "springs" if free_gain is None else free_gain
         options.tolerance = _TOLERANCE
         options.iterations = _ITERATIONS
-        options.moments_only = method == "moments"
         options.peak_level = PEAK_LEVEL
         options.patch_level = PATCH_LEVEL
         options.r_squared_min = _R_SQUARED_MIN
@@ -214,7 +206,7 @@ class ContactEstimator:
                 tip, material, pattern, solid.weights.table.deepest
             )
         else:
-            set_law(state.law, material.law)
+            set_law(state.law, material)
             state.moments.ratios = moment_ratios(tip, material)
             set_budget(state, known, grid, tip, material.fit_error)
             self.scratch = *_lay_out(state, grid, tip, alive), None
@@ -381,13 +373,10 @@ def _lay_out(
         model.pitch_x, model.pitch_y = pitch_x / number[0], pitch_y / number[1]
         model.x = geometry.x - len(across) // 2 * model.pitch_x
         model.y = geometry.y - len(along) // 2 * model.pitch_y
-        # By the remainder of a piece's column first.
-        across = weights(across, number[0]).reshape(-1, number[0]).T
-        along = weights(along, number[1])
+        across, along = weights(across, number[0]), weights(along, number[1])
         blur.pieces_x, blur.pieces_y = number
-        blur.weights_x, blur.weights_y = across.shape[1], len(along)
-        blur.width = number[0] * (grid.cols + 2 * STRIDE) + across.size
-        fine, half = np.zeros((finer.rows + 1, blur.width)), np.zeros(blur.width)
+        blur.weights_x, blur.weights_y = len(across), len(along)
+        fine, half = np.zeros(finer.shape), np.zeros(finer.cols)
         arrays |= {"pieces": pieces, "across": across, "along": along, "fine": fine, "half": half}
         indices = np.zeros(finer.rows * finer.cols, dtype=np.int64)
     rows, cols = state.model.rows, state.model.cols

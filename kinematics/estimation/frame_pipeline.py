@@ -1,7 +1,6 @@
 """The estimator's one compiled entry: the order of the steps for one pressure frame.
 
-Activity test, outliers, then moments or maximum likelihood, from the last estimate or from the
-frame alone.
+Activity test, outliers, then maximum likelihood, from the last estimate or from the frame alone.
 """
 
 from __future__ import annotations
@@ -16,18 +15,12 @@ from softfinger.kinematics.estimation.detection import (
     restore_outliers,
     without_outliers,
 )
-from softfinger.kinematics.estimation.gauss_newton import (
-    check_fit,
-    energy_of,
-    fit,
-    linearise,
-    solve,
-)
+from softfinger.kinematics.estimation.gauss_newton import energy_of, fit
 from softfinger.kinematics.estimation.invalid import Invalid
-from softfinger.kinematics.estimation.moments import start, track
-from softfinger.kinematics.estimation.solid_projection import SolidFit, presses, solid_kernel
+from softfinger.kinematics.estimation.moments import start
+from softfinger.kinematics.estimation.solid_projection import SolidFit, presses
 from softfinger.kinematics.estimation.state import OUTLIERS_MAX, EstimatorState, Matrix
-from softfinger.kinematics.sensing.footprint import FloatArray, IntArray, set_face
+from softfinger.kinematics.sensing.footprint import FloatArray, IntArray
 
 # Noise that ends at 0 raises its neighbourhoods' sums: so much more makes alarms as rare again.
 CLIPPED_MORE = 0.5
@@ -45,27 +38,6 @@ ABOVE_MOST, ABOVE_NOISE, ABOVE_PEAK = 0.95, 3.0, 0.4
 FULL_MOST = 0.5  # full cells of those above half of the peak, which leave no shape to fit
 ZERO_MAX = 0.22  # known error of the cells' zeros over the peak: beyond, none of it is straight
 SHARED_MAX = 0.5  # standard deviation of d by known uncertainties, over d: beyond, it's anything
-
-
-@inner_kernel
-def _by_moments(
-    solid: SolidFit | None,
-    state: EstimatorState,
-    frame: Pointer,
-    scratch: Pointer,
-    indices: IntArray | None,
-) -> Invalid:
-    """Moments from the last estimate, or from the frame alone if that fails."""
-    if not (state.estimate.warm and track(state, frame, further(scratch, state.at.centres))):
-        start(solid, state, frame, scratch, indices)
-    return _check_moments(state, frame, scratch, indices)
-
-
-@solid_kernel(_by_moments)
-def _without_moments(
-    solid: SolidFit, state: EstimatorState, frame: Pointer, scratch: Pointer, indices: IntArray
-) -> Invalid:
-    return Invalid.UNSETTLED
 
 
 @inner_kernel
@@ -144,39 +116,6 @@ def _set_r_squared(state: EstimatorState) -> tuple[float, float]:
 
 
 @inner_kernel
-def _check_moments(
-    state: EstimatorState, frame: Pointer, scratch: Pointer, indices: IntArray | None
-) -> Invalid:
-    """Check that the model accounts for the frame at the moments' contact, as for the fit.
-
-    By one step of the likelihood's, which takes off what the moments' own small errors leave.
-    """
-    fit = state.fit
-    estimate = state.estimate
-    set_face(fit.face, state.grid.radius, estimate.d, estimate.n_x, estimate.n_y)
-    fit.gain = estimate.gain
-    linearise(state, frame, scratch, indices)
-    if not solve(fit, state.options.free_gain):
-        return Invalid.UNSETTLED
-    variance = check_fit(None, state, further(scratch, state.at.packed))
-    if not variance > 0.0:
-        return Invalid.UNSETTLED
-    _set_r_squared(state)
-    wider = variance / state.signal.variance
-    if state.budget.correlated:
-        # Moments weigh the large scales alone, as all of a deep footprint's patterns do.
-        wider *= math.sqrt(
-            state.budget.variance_factor[-1, 1, 1] * state.budget.variance_factor[-1, 2, 2]
-        )
-    for i in range(4):
-        for j in range(4):
-            fit.covariance[i, j] *= wider
-    if estimate.r_squared < state.options.r_squared_min:
-        return Invalid.MODEL
-    return _tip_problem(state)
-
-
-@inner_kernel
 def _to_tilts(state: EstimatorState, covariance: Matrix, rotated: Matrix) -> None:
     """Turn the estimate from normals in the sensor's axes to tilts in the finger's.
 
@@ -232,10 +171,7 @@ def _estimate(
 ) -> Invalid:
     """Estimate a frame with a contact; returns why that can't be used."""
     estimate = state.estimate
-    if state.options.moments_only:
-        reason = _by_moments(solid, state, frame, scratch, indices)
-    else:
-        reason = _likelihood(solid, state, frame, scratch, indices)
+    reason = _likelihood(solid, state, frame, scratch, indices)
     if reason == Invalid.NONE and not GAIN_MIN < estimate.gain < GAIN_MAX:
         reason = Invalid.MODEL
     if reason == Invalid.NONE and not estimate.d < D_MAX * state.grid.radius:

@@ -11,15 +11,14 @@ from __future__ import annotations
 
 from typing import TypeAlias
 
-import numpy as np
-
 from softfinger.kinematics.compiled.kernel import fast_inner_kernel, inlined_kernel
 from softfinger.kinematics.compiled.simd import Pointer, address
+from softfinger.kinematics.contact.lookup import Triple
+from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.estimation.state import (
     ALONG_X,
     ALONG_Y,
     FRACTION,
-    LAW_PIECES,
     LAW_TERMS,
     PLAIN,
     READING,
@@ -28,11 +27,11 @@ from softfinger.kinematics.estimation.state import (
     EstimatorState,
     Law,
 )
-from softfinger.kinematics.sensing.footprint import FloatArray
 
 # What `compress` makes of the first planes of the packed cells.
 STRESS, BY_U, BY_V, BY_W = FRACTION, PLAIN, ALONG_X, ALONG_Y
-Eight: TypeAlias = tuple[float, float, float, float, float, float, float, float]
+Two: TypeAlias = tuple[float, float]
+Terms: TypeAlias = tuple[Two, Two, Two, Two, Two, Two]  # in pairs
 
 # A cell that can't read below its floor (0, or the smallest count sent) reads more than the
 # pressure on average, by E[max(z + e, 0)] − z standard deviations at a pressure of z above it,
@@ -43,32 +42,12 @@ CLIP_BELOW = 2.0
 CLIP = (0.399207, -0.275277, 0.0188358, 0.0260713, -0.00538491)
 
 
-def set_law(law: Law, coefficients: FloatArray) -> None:
-    """Convert any material's law [pieces, order] to one of two forms.
-
-    A law of one polynomial of at most LAW_TERMS terms is kept; any other becomes LAW_PIECES cubics
-    by value and slope at the pieces' ends, within 1e-9 of a smooth law.
-    """
-    pieces, order = coefficients.shape
-    law.is_polynomial = pieces == 1 and order <= LAW_TERMS
-    law.bent = not law.is_polynomial or bool(coefficients[0, 2:].any())
-    if law.is_polynomial:
-        law.polynomial[:order] = coefficients[0]
-        return
-    strain = np.linspace(0.0, 1.0, LAW_PIECES + 1)
-    index = np.minimum((strain * pieces).astype(int), pieces - 1)
-    t = strain * pieces - index
-    value = np.zeros_like(strain)
-    slope = np.zeros_like(strain)
-    for j in range(order - 1, -1, -1):
-        slope = slope * t + value
-        value = value * t + coefficients[index, j]
-    slope *= pieces / LAW_PIECES
-    law.cubics[:, 0] = value
-    law.cubics[:, 1] = slope
-    rise = np.diff(value)
-    law.cubics[:-1, 2] = 3.0 * rise - 2.0 * slope[:-1] - slope[1:]
-    law.cubics[:-1, 3] = slope[:-1] + slope[1:] - 2.0 * rise
+def set_law(law: Law, material: Material) -> None:
+    """Take the ``material``'s law. Raises ValueError for one of more than LAW_TERMS terms."""
+    if material.degree >= LAW_TERMS:
+        raise ValueError(f"a law's degree must be below {LAW_TERMS}, got {material.degree}")
+    law.bent = not material.is_linear
+    law.polynomial[1 : material.degree + 1] = [float(each) for each in material.coefficients]
 
 
 @fast_inner_kernel
@@ -85,17 +64,10 @@ def footprint_energy(state: EstimatorState, packed: Pointer) -> tuple[float, flo
 
 
 @inlined_kernel
-def _polynomial(c: Eight, strain: float) -> tuple[float, float, float]:
-    """A polynomial, its slope and half its second derivative."""
-    value, slope, half = c[7], 0.0, 0.0
-    half, slope, value = half * strain + slope, slope * strain + value, value * strain + c[6]
-    half, slope, value = half * strain + slope, slope * strain + value, value * strain + c[5]
-    half, slope, value = half * strain + slope, slope * strain + value, value * strain + c[4]
-    half, slope, value = half * strain + slope, slope * strain + value, value * strain + c[3]
-    half, slope, value = half * strain + slope, slope * strain + value, value * strain + c[2]
+def _two_more(half: float, slope: float, value: float, c: Two, strain: float) -> Triple:
+    """Two steps of Horner's scheme for a polynomial, its slope and half its second derivative."""
     half, slope, value = half * strain + slope, slope * strain + value, value * strain + c[1]
-    half, slope, value = half * strain + slope, slope * strain + value, value * strain + c[0]
-    return value, slope, half
+    return half * strain + slope, slope * strain + value, value * strain + c[0]
 
 
 @inlined_kernel
@@ -139,11 +111,15 @@ def compress(state: EstimatorState, packed: Pointer) -> None:
     v = state.fit.face.v
     w = state.fit.face.w
     size = state.model.rows * state.model.cols
-    # It doesn't change within the loop, of which the compiler makes two.
-    polynomial = state.law.is_polynomial
     p = address(state.law.polynomial)
-    c = (p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7])
-    cubics = address(state.law.cubics)
+    c: Terms = (
+        (p[0], p[1]),
+        (p[2], p[3]),
+        (p[4], p[5]),
+        (p[6], p[7]),
+        (p[8], p[9]),
+        (p[10], p[11]),
+    )
     for k in range(state.fit.count):
         # Arrays are read here alone: a function that took one would keep the loop out of lanes.
         fraction = packed[FRACTION * size + k]
@@ -151,19 +127,12 @@ def compress(state: EstimatorState, packed: Pointer) -> None:
         g_x = packed[ALONG_X * size + k]
         g_y = packed[ALONG_Y * size + k]
         strain = min(max(1.0 - (u * g - v * g_x - w * g_y), 0.0), 1.0)
-        if polynomial:
-            stress, slope, half = _polynomial(c, strain)
-        else:
-            t = strain * LAW_PIECES
-            piece = np.int32(t)
-            t -= piece
-            at = 4 * piece
-            c1 = cubics[at + 1]
-            c2 = cubics[at + 2]
-            c3 = cubics[at + 3]
-            stress = cubics[at] + t * (c1 + t * (c2 + t * c3))
-            slope = (c1 + t * (2.0 * c2 + t * 3.0 * c3)) * LAW_PIECES
-            half = (c2 + 3.0 * t * c3) * (LAW_PIECES * LAW_PIECES)
+        half, slope, stress = _two_more(0.0, 0.0, 0.0, c[5], strain)
+        half, slope, stress = _two_more(half, slope, stress, c[4], strain)
+        half, slope, stress = _two_more(half, slope, stress, c[3], strain)
+        half, slope, stress = _two_more(half, slope, stress, c[2], strain)
+        half, slope, stress = _two_more(half, slope, stress, c[1], strain)
+        half, slope, stress = _two_more(half, slope, stress, c[0], strain)
         # From a strain of 1 on the stress stays, and what varies there doesn't show.
         half = half if strain < 1.0 else 0.0
         stress = fraction * (stress + half * packed[VARIANCE * size + k])

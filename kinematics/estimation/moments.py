@@ -150,38 +150,6 @@ def _d_from_extent(m: Moments, a: float, distance: float) -> float:
 
 
 @inner_kernel
-def _store(state: EstimatorState) -> None:
-    """The moments' contact becomes the estimate."""
-    estimate = state.estimate
-    estimate.d = state.moments.d
-    estimate.n_x = state.moments.n_x
-    estimate.n_y = state.moments.n_y
-    estimate.gain = state.moments.gain
-
-
-@inner_kernel
-def track(state: EstimatorState, frame: Pointer, centres: Pointer) -> bool:
-    """Take moments from the last estimate, again while the footprint moves by about a cell."""
-    estimate = state.estimate
-    m = state.moments
-    a = state.grid.radius
-    near = 0.5 * min(state.grid.pitch_x, state.grid.pitch_y)
-    for _ in range(8):
-        m.d = estimate.d
-        m.n_x = estimate.n_x
-        m.n_y = estimate.n_y
-        refine(state, frame, centres)
-        grown = math.sqrt(m.d * (2.0 * a - m.d)) - math.sqrt(estimate.d * (2.0 * a - estimate.d))
-        shift = a * math.hypot(m.n_x - estimate.n_x, m.n_y - estimate.n_y)
-        _store(state)
-        if not m.gain > 0.0:
-            return False
-        if abs(grown) + shift < near:
-            return True
-    return False
-
-
-@inner_kernel
 def start(
     solid: SolidFit | None,
     state: EstimatorState,
@@ -207,10 +175,13 @@ def start(
         size = state.grid.rows * state.grid.cols
         m.total, m.x, m.y, m.number = 1.0, centres[X * size + at], centres[Y * size + at], 1.0
     _set_from_area(m, state.grid, cells_factor * m.number)
-    refine(state, frame, centres)
-    refine(state, frame, centres)
-    _store(state)
-    state.estimate.gain = min(max(m.gain, 0.02), 50.0)
+    _refine(state, frame, centres)
+    _refine(state, frame, centres)
+    estimate = state.estimate
+    estimate.d = m.d
+    estimate.n_x = m.n_x
+    estimate.n_y = m.n_y
+    estimate.gain = min(max(m.gain, 0.02), 50.0)
 
 
 @inner_kernel
@@ -264,12 +235,11 @@ def _set_normal(m: Moments, n_x: float, n_y: float) -> None:
 
 
 @inner_kernel
-def refine(state: EstimatorState, frame: Pointer, centres: Pointer) -> None:
+def _refine(state: EstimatorState, frame: Pointer, centres: Pointer) -> None:
     """Refine the contact in ``state.moments`` by the moments over its footprint, a cell wider.
 
     Where the gain is fixed the displacement comes from the force, otherwise from the extent, and
-    the gain from the force; 0 where nothing presses. ``state.fit.covariance`` takes that of
-    (d, n_x, n_y, gain) from white noise over those cells.
+    the gain from the force; 0 where nothing presses.
     """
     m = state.moments
     grid = state.grid
@@ -278,14 +248,9 @@ def refine(state: EstimatorState, frame: Pointer, centres: Pointer) -> None:
     margin = _MARGIN * math.hypot(grid.pitch_x, grid.pitch_y) + _BLUR_MARGIN * blur
     rho = min(math.sqrt(max(m.d * (2.0 * a - m.d), 0.0)) + margin, 0.99 * a)
     set_face(m.face, a, a - math.sqrt(a * a - rho * rho), m.n_x, m.n_y)
-    m.radius = rho
     # Besides the blur, a point spreads over its cell.
     own = (grid.pitch_x * grid.pitch_x + grid.pitch_y * grid.pitch_y) / 12.0 + 2.0 * blur * blur
     footprint_moments(state, frame, centres, own)
-    covariance = state.fit.covariance
-    for i in range(4):
-        for j in range(4):
-            covariance[i, j] = 0.0
     m.gain = 0.0
     if m.total > 0.0:
         _set_contact(state)
@@ -293,16 +258,12 @@ def refine(state: EstimatorState, frame: Pointer, centres: Pointer) -> None:
 
 @inner_kernel
 def _set_contact(state: EstimatorState) -> None:
-    """Set :func:`refine`'s contact from the moments."""
+    """Set :func:`_refine`'s contact from the moments."""
     m = state.moments
     grid = state.grid
     a = grid.radius
-    noise = state.signal.noise
     modulus = state.options.modulus / state.signal.scale
-    covariance = state.fit.covariance
-    total = m.total
-    force = total * grid.pitch_x * grid.pitch_y
-    relative = noise * noise * m.number / (total * total)  # variance of the force over its square
+    force = m.total * grid.pitch_x * grid.pitch_y
     d = m.d
     if state.options.free_gain:
         d = max(_d_from_extent(m, a, math.hypot(m.x, m.y)), 1e-4 * a)
@@ -313,22 +274,9 @@ def _set_contact(state: EstimatorState) -> None:
         for _ in range(4):
             d = math.sqrt(plain / _ratio(m, a, d, 0))
             d = min(max(d, 1e-4 * a), 0.95 * a)
-        covariance[0, 0] = 0.25 * relative * d * d
     m.d = d
     distance = _ratio(m, a, d, 1) * (a - d / 3.0)
     _set_normal(m, m.x / distance, m.y / distance)
     if state.options.free_gain:
         cosine = math.sqrt(1.0 - m.n_x * m.n_x - m.n_y * m.n_y)
-        gain = force * cosine / (math.pi * modulus * d * d * _ratio(m, a, d, 0))
-        m.gain = gain
-        # Over a disc of that many cells: mean of (r² − trace)².
-        square = m.number * grid.pitch_x * grid.pitch_y / math.pi
-        variance = square * square / 3.0 - m.trace * square + m.trace * m.trace
-        slope = (4.0 * a - 2.0 * d) / 6.0
-        by_d = relative * variance / (slope * slope)
-        covariance[0, 0] = by_d
-        covariance[3, 3] = gain * gain * (relative + 4.0 * by_d / (d * d))
-        covariance[0, 3] = covariance[3, 0] = -2.0 * gain * by_d / d
-    covariance[1, 1] = covariance[2, 2] = (
-        relative * 0.25 * m.radius * m.radius / (distance * distance)
-    )
+        m.gain = force * cosine / (math.pi * modulus * d * d * _ratio(m, a, d, 0))

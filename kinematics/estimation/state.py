@@ -21,8 +21,7 @@ STRIPS = 264  # of cut cells integrated at once, of each level
 OWNERS = 128  # cut cells at once, of each level
 OUTLIERS_MAX = 6  # left out of one frame
 RATIO_POINTS = 33
-LAW_PIECES = 128
-LAW_TERMS = 8  # of a law that is one polynomial
+LAW_TERMS = 12
 # Images of shared errors: a shift of all cells, its slopes in x and y, the tip's place in x and y,
 # and the pitch.
 SHIFT, SLOPE_X, SLOPE_Y, PLACE_X, PLACE_Y, SCALING = range(6)
@@ -50,15 +49,12 @@ class Options(Record):
     rotation: float  # of the sensor [rad]
     iterations: int
     free_gain: bool
-    moments_only: bool
 
 
 class Law(Record):
-    """The material's σ(ε): a polynomial, lowest first, or cubics in t = ε · LAW_PIECES − k."""
+    """The material's σ(ε), a polynomial."""
 
-    cubics: Annotated[FloatArray, LAW_PIECES + 1, 4]
-    polynomial: Annotated[FloatArray, LAW_TERMS]
-    is_polynomial: bool
+    polynomial: Annotated[FloatArray, LAW_TERMS]  # lowest first
     bent: bool  # curved, so that the strain's variance counts
 
 
@@ -126,7 +122,6 @@ class Moments(Record):
     y: float
     trace: float  # of the covariance
     number: float  # cells
-    radius: float  # of the disc that the sums are over
     d: float
     n_x: float
     n_y: float
@@ -214,9 +209,8 @@ class Blur(Record):
 
     pieces_x: int  # of a cell
     pieces_y: int
-    weights_x: int  # for each remainder of a piece's column
+    weights_x: int
     weights_y: int
-    width: int  # of a row of scratch
 
 
 class Offsets(Record):
@@ -228,10 +222,10 @@ class Offsets(Record):
     lines: int  # and on those between rows
     packed: int  # [PLANES, cells]
     pieces: int  # planes of the pieces of cells; the following ones are for a blur alone
-    across: int  # weights [pieces, n]
+    across: int  # weights [n]
     along: int
-    fine: int  # [rows of pieces + 1, width]
-    half: int  # [width]
+    fine: int  # [rows, cols] of pieces
+    half: int  # [cols]
 
 
 class EstimatorState(Record):

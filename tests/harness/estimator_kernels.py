@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from softfinger.kinematics.compiled.kernel import kernel
 from softfinger.kinematics.compiled.layout import Records
 from softfinger.kinematics.compiled.simd import address
-from softfinger.kinematics.estimation import blurred_cells, detection, likelihood
+from softfinger.kinematics.estimation import detection, likelihood
 from softfinger.kinematics.estimation.state import PLANES, EstimatorState
 
 FloatArray = NDArray[np.float64]
@@ -34,14 +34,3 @@ def press_and_accumulate(states: Records[EstimatorState], packed: FloatArray) ->
     """:func:`likelihood.compress`, then :func:`likelihood.accumulate`."""
     likelihood.compress(states[0], address(packed))
     likelihood.accumulate(states[0], address(packed))
-
-
-@kernel
-def blur_cells(
-    states: Records[EstimatorState],
-    frame: FloatArray,
-    scratch: FloatArray,
-    indices: NDArray[np.int64],
-) -> None:
-    """:func:`blurred_cells.blur_cells`."""
-    blurred_cells.blur_cells(states[0], address(frame), address(scratch), address(indices))

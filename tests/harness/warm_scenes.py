@@ -40,8 +40,7 @@ SCENES: dict[str, dict[str, Any]] = {
     },
     "sensors without servos": {"servos": {"backend": "none"}},
     "servos without sensors": {"tactile": {"backend": "none"}},
-    "moments, imperfect sensors, current mode, upright grip": {
-        "estimator": {"method": "moments"},
+    "imperfect sensors, current mode, upright grip": {
         "simulation": {"tactile_blur": 5e-4, "tactile_jitter": 0.004},
         "servos": {"mode": "current"},
         "control": {"law": "upright"},

@@ -8,14 +8,8 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from softfinger.kinematics.compiled.simd import STRIDE
-from softfinger.kinematics.estimation.blurred_cells import PLANES, weights
 from softfinger.kinematics.estimation.estimator import ContactEstimator
-from softfinger.kinematics.estimation.packing import INDEX_BITS
-from softfinger.kinematics.estimation.state import READING, WEIGHT, EstimatorState
-from softfinger.kinematics.sensing.cell_integrals import ACTIVE, CELL_PLANES
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid, stencil
-from tests.harness.estimator_kernels import blur_cells
 from tests.harness.paper_tip import LINEAR, MEASURED, PITCH, TIP, A, E, fisher, tilts
 
 NOISE = 0.002
@@ -71,66 +65,6 @@ def test_stencils_have_the_gaussians_moments():
     assert stencil(0.0).tolist() == [1.0]
 
 
-@pytest.mark.parametrize("pieces", [1, 2])
-@pytest.mark.parametrize("width", [0.3, 1.4])
-def test_spreading_of_packed_parts_matches_its_plain_twin(pieces, width):
-    rng = np.random.default_rng(6)
-    rows, cols = 13, 17
-    one = stencil(width * pieces)
-    reach = len(one) // 2
-    high, wide = rows * pieces + 2 * reach, cols * pieces + 2 * reach
-    whole = weights(one, pieces)
-    across = np.ascontiguousarray(whole.reshape(-1, pieces).T)
-    frame = rng.random((rows, cols))
-    cells = np.zeros((rows, CELL_PLANES, cols))
-    cells[:, ACTIVE] = rng.random((rows, cols)) > 0.1
-    padded = pieces * (cols + 2 * STRIDE) + len(whole)
-    state = EstimatorState()
-    state.grid.rows, state.grid.cols = rows, cols
-    state.model.rows, state.model.cols = high, wide
-    state.signal.scale = 2.0
-    blur, at = state.blur, state.at
-    blur.pieces_x = blur.pieces_y = pieces
-    blur.weights_x, blur.weights_y, blur.width = across.shape[1], len(whole), padded
-    at.cells, at.across = 7 * high * wide, 7 * high * wide + cells.size
-    at.along = at.across + across.size
-    at.fine = at.along + len(whole)
-    at.half = at.fine + (high + 1) * padded
-    scratch = np.zeros(at.half + padded)
-    scratch[at.cells : at.fine] = np.concatenate([cells.ravel(), across.ravel(), whole])
-    for low, left, tall, broad in ((0, 0, high, wide), (3, 4, 5, 6), (high - 2, wide - 3, 2, 3)):
-        i, j = (each.ravel() for each in np.mgrid[low : low + tall, left : left + broad])
-        indices = (i << INDEX_BITS) | j
-        packed = np.zeros((7, high * wide))
-        packed[:PLANES, : len(i)] = rng.random((PLANES, len(i)))
-        expected = np.zeros((PLANES, rows, cols))
-        for plane in range(PLANES):
-            field = np.zeros((high, wide))
-            field[i, j] = packed[plane, : len(i)]
-            blurred = np.zeros((rows * pieces, cols * pieces))
-            for y in range(len(one)):
-                for x in range(len(one)):
-                    part = field[y : y + rows * pieces, x : x + cols * pieces]
-                    blurred += one[y] * one[x] * part
-            expected[plane] = blurred.reshape(rows, pieces, cols, pieces).mean(axis=(1, 3))
-        state.fit.count = len(i)
-        scratch[: packed.size] = packed.ravel()
-        blur_cells(state.array, frame, scratch, indices.copy())
-        packed, count = scratch[: packed.size].reshape(packed.shape), state.fit.count
-        # Cells that take part are told by their readings, of which no two are equal.
-        seen = 0
-        for k in range(count):
-            if packed[WEIGHT, k]:
-                at = np.argwhere(2.0 * frame == packed[READING, k])[0]
-                np.testing.assert_allclose(
-                    packed[:PLANES, k], expected[:, at[0], at[1]], atol=1e-12
-                )
-                expected[:, at[0], at[1]] = 0.0
-                seen += 1
-        assert seen > 0
-        assert np.all(expected * cells[:, ACTIVE] == 0.0)
-
-
 @pytest.mark.parametrize(
     ("material", "blur", "d", "degrees", "free_gain"),
     [
@@ -174,20 +108,6 @@ def test_a_blur_that_is_not_modelled_shows():
     assert abs(aware.d - truth[0]) < 0.1 * aware.d_std
     assert abs(sharp.d - truth[0]) > 5.0 * aware.d_std
     assert sharp.chi2 > 10 * aware.chi2
-
-
-@pytest.mark.parametrize("blur", [0.0005, 0.0015])
-def test_moments_are_corrected_for_the_blur(blur):
-    grid = SensorGrid(44, 44, PITCH, (3e-4, 1e-4), blur=blur)
-    plain = SensorGrid(44, 44, PITCH, (3e-4, 1e-4))
-    for d in (0.002, 0.004, 0.008):
-        truth = (d, *tilts(math.radians(15.0), 1.0))
-        frame = grid.pressure(TIP, LINEAR, *truth)
-        e = ContactEstimator(TIP, LINEAR, grid, NOISE * E, method="moments")(frame)
-        assert e.d == pytest.approx(d, rel=0.01)
-        assert (e.tilt_x, e.tilt_y) == pytest.approx(truth[1:], abs=0.004)
-        off = ContactEstimator(TIP, LINEAR, plain, NOISE * E, method="moments")(frame)
-        assert abs(off.d - d) > 3.0 * abs(e.d - d)
 
 
 def test_dead_cells_counts_and_thresholds_go_with_a_blur():

@@ -149,31 +149,6 @@ def test_measured_over_modelled_pressure_is_the_gain():
     assert np.all(known.covariance[3] == 0.0)
 
 
-@pytest.mark.parametrize("material", [LINEAR, MEASURED], ids=["constant", "table_i"])
-@pytest.mark.parametrize("free_gain", [True, False])
-def test_moments_are_close_and_say_how_close(material, free_gain):
-    noise = 0.002 * material.reference_modulus
-    rng = np.random.default_rng(5)
-    estimator = ContactEstimator(TIP, material, GRID, noise, method="moments", free_gain=free_gain)
-    for d in (0.001, 0.002, 0.004, 0.008):
-        truth = (d, *tilts(0.3, 1.1), 1.0)
-        clean = GRID.pressure(TIP, material, *truth[:3])
-        e = estimator(clean)
-        # Discretisation and the ratios' weak dependence on tilt.
-        assert e.d == pytest.approx(d, rel=0.01)
-        assert (e.tilt_x, e.tilt_y) == pytest.approx(truth[1:3], abs=0.004)
-        miss = np.array(
-            [
-                errors(estimator.update(clean + rng.normal(0.0, noise, GRID.shape)), truth)
-                for _ in range(100)
-            ]
-        )
-        sigma = np.sqrt(np.diag(e.covariance))
-        n = 4 if free_gain else 3
-        assert np.all(miss.std(axis=0)[:n] < 1.5 * sigma[:n])
-        assert np.all(miss.std(axis=0)[:n] > 0.4 * sigma[:n])
-
-
 def test_warm_and_cold_starts_agree_within_the_noise():
     rng = np.random.default_rng(11)
     estimator = ContactEstimator(TIP, MEASURED, GRID, 700.0)

@@ -39,7 +39,7 @@ def test_cells_near_the_floor_are_compared_with_what_they_read_on_average(floor)
         packed[5] = 3300.0
         u = (1.0 - model / gain / E) / g
         state = state_for(packed)
-        set_law(state.law, LINEAR.law)
+        set_law(state.law, LINEAR)
         state.signal.saturation, state.signal.floor = math.inf, floor
         state.fit.face.u, state.fit.gain, state.fit.clip = u, gain, noise
         press_and_accumulate(state.array, packed.copy())
@@ -148,15 +148,14 @@ def test_a_misfit_is_flagged_and_good_frames_are_not():
     good = grid.pressure(TIP, LINEAR, 0.003)
     hertz *= good.sum() / hertz.sum()
     estimator = ContactEstimator(TIP, LINEAR, grid, noise)
-    moments = ContactEstimator(TIP, LINEAR, grid, noise, method="moments")
     for clean, expected in ((good, False), (hertz, True)):
         for _ in range(100):
             frame = clean + rng.normal(0.0, noise, grid.shape)
-            for e in (estimator.update(frame), moments.update(frame)):
-                assert e.contact
-                assert e.misfit is expected
-                # Such a pressure hides 38 % of d; smoothly, as cells that read unequally don't.
-                assert e.valid is not expected
+            e = estimator.update(frame)
+            assert e.contact
+            assert e.misfit is expected
+            # Such a pressure hides 38 % of d; smoothly, as cells that read unequally don't.
+            assert e.valid is not expected
     unequal = good * rng.normal(1.0, 0.1, grid.shape)
     e = estimator(unequal)
     assert e.misfit

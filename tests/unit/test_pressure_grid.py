@@ -6,8 +6,6 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from tests.harness.paper_tip import LINEAR, MEASURED, PITCH, TIP, A, E, tilts
@@ -90,24 +88,6 @@ def test_beyond_the_limit_the_strain_ends_at_the_rim(d, degrees, force, azimuth)
     p = grid.pressure(TIP, LINEAR, d * 1e-3, *tilts(math.radians(degrees), azimuth))
     assert p.sum() * PITCH**2 == pytest.approx(force, rel=2e-5)
     assert p.max() <= E * (1 + 1e-12)
-
-
-@settings(max_examples=40)
-@given(
-    d=st.floats(1e-4, 8e-3),
-    theta=st.floats(0.0, 0.55),
-    azimuth=st.floats(-math.pi, math.pi),
-    x=st.floats(-5e-4, 5e-4),
-    y=st.floats(-5e-4, 5e-4),
-)
-def test_halving_the_pitch_averages_four_cells_to_one(d, theta, azimuth, x, y):
-    coarse = SensorGrid(20, 24, (0.002, 0.0022), centre=(x, y))
-    fine = SensorGrid(40, 48, (0.001, 0.0011), centre=(x, y))
-    at = tilts(theta, azimuth)
-    p = coarse.pressure(TIP, MEASURED, d, *at)
-    q = fine.pressure(TIP, MEASURED, d, *at)
-    mean = q.reshape(20, 2, 24, 2).mean(axis=(1, 3))
-    np.testing.assert_allclose(p, mean, atol=1e-6 * MEASURED.reference_modulus)
 
 
 def test_rows_run_along_y_and_columns_along_x():

@@ -82,8 +82,6 @@ def test_small_contacts_are_hertzs_and_large_ones_end_where_the_data_do(tip: Fin
 def test_what_no_solid_tip_has_is_refused() -> None:
     with pytest.raises(MaterialError, match="constant modulus"):
         ContactTable.build(TIPS[0], Material.table_i())
-    with pytest.raises(ValueError, match="'ml' for a solid tip"):
-        ContactEstimator(TIPS[0], RUBBER, GRID, NOISE, method="moments")
     with pytest.raises(ValueError, match=r"poisson must be 0\.45 to 0\.4995"):
         Fingertip(0.02, "solid", 0.5)
     with pytest.raises(ValueError, match="base must be 'bonded' or 'lying'"):
@@ -281,11 +279,7 @@ def test_a_profile_that_no_solid_tip_has_is_refused() -> None:
         settings = Settings.model_validate({"tip": {"physics": "solid"}, **sections})
         return [each.partition(":")[0] for each in problems(settings)]
 
-    assert wrong(estimator={"method": "moments"}) == [
-        "material.law",
-        "estimator.method",
-        "safety.d_max",
-    ]
+    assert wrong() == ["material.law", "safety.d_max"]
     sound = {"material": {"law": "constant"}, "safety": {"d_max": 0.008}}
     assert wrong(**sound) == []
     assert wrong(**sound, tactile={"blur": 0.008}) == ["tactile.blur"]

@@ -58,14 +58,35 @@ def test_a_shear_force_turns_the_base_by_its_height(arrays: dict[str, np.ndarray
         assert others == pytest.approx([0.0] * len(others), abs=1e-4)
 
 
-@pytest.mark.parametrize(("d", "force"), [(1, 2.87), (4, 31.5), (6, 74.3)])
-def test_forces_of_an_axisymmetric_computation(
-    arrays: dict[str, np.ndarray], d: float, force: float
+# Of elements of another kind: triangles and tetrahedra, quadratic displacements with linear
+# pressures (Taylor and Hood), and a plane that pushes by a penalty within the faces' points.
+# Neo-Hookean, bonded, ν = 0.49, a = 20 mm, E = 0.304 MPa.
+TAYLOR_HOOD = [  # d [mm], θ [°], N [N], tolerance
+    (0.9985, 0, 2.8482, 3e-3),
+    (1.9979, 0, 8.9695, 3e-3),
+    (3.9966, 0, 31.512, 3e-3),
+    (5.9950, 0, 74.250, 3e-3),
+    (7.4931, 0, 127.53, 3e-3),
+    (0.9980, 20, 2.842, 0.011),
+    (2.9970, 20, 17.857, 0.006),
+    (5.9948, 20, 69.644, 0.006),
+    (6.9938, 20, 98.387, 0.006),
+]
+
+
+@pytest.mark.parametrize(("d", "tilt", "force", "tolerance"), TAYLOR_HOOD)
+def test_forces_of_other_elements(
+    arrays: dict[str, np.ndarray], d: float, tilt: float, force: float, tolerance: float
 ) -> None:
-    """Neo-Hookean, bonded, ν = 0.49, a = 20 mm, E = 0.304 MPa, upright; and σ_y near 9.5 mm."""
     tip = SolidTip(arrays, "bonded", 0.49)
-    push, _, pressure = tip.press(d * MM, 0.0)
-    assert push * 0.304 * 20**2 == pytest.approx(force, rel=0.01)
+    push = tip.press(d * MM, np.radians(tilt))[0]
+    assert push * 0.304 * 20**2 == pytest.approx(force, rel=tolerance)
+
+
+@pytest.mark.parametrize("d", [1, 4, 6])
+def test_the_extent_hardly_tells_the_depth(arrays: dict[str, np.ndarray], d: float) -> None:
+    tip = SolidTip(arrays, "bonded", 0.49)
+    pressure = tip.press(d * MM, 0.0)[2]
     _, _, sigma = centroid_and_extent(tip.frame(pressure, PITCH, CELLS), PITCH)
     assert sigma == pytest.approx(9.5 * MM, abs=0.1 * MM)
 

@@ -15,12 +15,9 @@ from softfinger import ContactTable, Fingertip, Material
 from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.profile.factory import make_table
 from softfinger.daemon.profile.settings import Settings
-from softfinger.kinematics.compiled.simd import SHAPES
 from softfinger.kinematics.contact.closed_form import closed_forms
 from softfinger.kinematics.contact.lookup import (
-    START,
     TableError,
-    header_of,
     lookup,
     lookups,
 )
@@ -81,13 +78,13 @@ def worst(table: ContactTable, material: Material, d: np.ndarray, theta: np.ndar
 def hard_points(
     radius: float, points: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Random d [m] and θ [rad] over the domain, crowded at its edges and corners; d = a first."""
+    """Random d [m] and θ [rad] over the domain, crowded at its edges and corners; its end first."""
     which = rng.integers(0, 9, points)
     small = 10.0 ** rng.uniform(-9.0, -0.3, points)
     least = 10.0 ** rng.uniform(-16.0, -0.3, points)
     even = rng.uniform(0.0, 1.0, points)
-    d = np.where(which < 3, small, np.where(which < 5, 1.0 - least, even)) * radius
-    d[:3] = radius
+    d = np.where(which < 3, small, np.where(which < 5, 1.0 - least, even)) * 0.875 * radius
+    d[:3] = 0.875 * radius
     limit = Fingertip(radius).theta_limit(d)
     near = 10.0 ** rng.uniform(-12.0, 0.0, points)
     kind = np.where(which % 3 == 0, rng.uniform(0.0, 1.0, points), 1.0 - near)
@@ -138,36 +135,7 @@ def test_constant_modulus_is_the_closed_form() -> None:
     np.testing.assert_allclose(table([2e-3, 8e-3], np.radians([0, 30])).force, force, rtol=1e-13)
 
 
-def twin(data: np.ndarray, d: float, theta: float) -> float:
-    """The force of a slab, from the array in plain NumPy: piece by hand, powers summed."""
-    radius, form = header_of(data).radius, int(header_of(data).form)
-    h = (radius - d) / radius
-    edges = np.concatenate([np.linspace(low, 2 * low, 8, False) for low in (0.125, 0.25, 0.5)])
-    edges = np.append(edges, 1.0)
-    i = int(np.flatnonzero(edges < h)[-1])
-    x = (2 * h - edges[i] - edges[i + 1]) / (edges[i + 1] - edges[i])
-    u2 = 1.0 - (1.0 - h * h) / math.cos(theta) ** 2
-    y = 2.0 * math.sqrt(u2) / h - 1.0
-    at = START + i * 8 * sum(SHAPES[form])
-    total = 0.0
-    for j, terms in enumerate(SHAPES[form]):
-        for k in range(terms - 1, -1, -1):
-            total += data[at] * x**k * y**j
-            at += 8
-    return math.pi * header_of(data).modulus * d * d / math.cos(theta) * total
-
-
-def test_the_kernel_reads_what_the_layout_says(table: ContactTable) -> None:
-    rng = np.random.default_rng(2)
-    for _ in range(50):
-        d = TIP.radius * rng.uniform(1e-6, 0.87)
-        theta = float(TIP.theta_limit(d)) * rng.uniform(-0.99, 0.99)
-        np.testing.assert_allclose(
-            lookup(table.data, d, theta)[0], twin(table.data, d, theta), rtol=1e-12
-        )
-
-
-@given(depth=st.floats(5e-8, 0.9999), share=st.floats(-1.0, 1.0))
+@given(depth=st.floats(5e-8, 0.875), share=st.floats(-1.0, 1.0))
 def test_properties(table: ContactTable, depth: float, share: float) -> None:
     d = depth * TIP.radius
     theta = float(TIP.theta_limit(d)) * share
@@ -204,12 +172,12 @@ def test_the_edges_of_pieces_are_seamless(table: ContactTable) -> None:
     for h in edges:
         d = TIP.radius * (1 - h * (1 + np.array([-1e-12, 0.0, 1e-12])))
         theta = 0.7 * TIP.theta_limit(d)
-        keep = (d > 0) & (d <= TIP.radius)
+        keep = d > 0
         assert worst(table, TABLE_I, d[keep], theta[keep]) < 1e-9
 
 
 def test_who_asks_outside_the_domain_is_warned(table: ContactTable) -> None:
-    d = np.array([-1e-3, 0.0, math.nan, 0.004, 0.021, 0.02, 0.004])
+    d = np.array([-1e-3, 0.0, math.nan, 0.004, 0.018, 0.0175, 0.004])
     theta = np.array([0.0, 9.0, 0.0, 1.5, 0.0, 0.0, math.nan])
     with pytest.warns(RuntimeWarning, match=r"2 of 7 points .* at d = 4 mm, θ = 85.9°") as caught:
         table(d, theta)
@@ -230,10 +198,10 @@ def test_outside_the_domain_is_clamped_and_flagged(table: ContactTable) -> None:
             assert not c.inside
             assert c.force == edge.force
             assert c.energy_theta == sign * edge.energy_theta
-    full = table(0.02, 0.0)
-    assert full.inside
-    for d in (0.02 * (1 + 1e-15), 0.021, 1.0, 1e300, math.inf):
-        for theta in (0.0, 0.3, -5.0):
+    for theta in (0.0, 0.1, -0.12):
+        full = table(0.0175, theta)
+        assert full.inside
+        for d in (0.0175 * (1 + 1e-11), 0.02, 1.0, 1e300, math.inf):
             c = table(d, theta)
             assert not c.inside
             assert c.force == full.force
@@ -318,9 +286,8 @@ def test_what_is_no_real_number_is_refused(table: ContactTable, wrong: object) -
 
 @pytest.mark.filterwarnings("ignore:.* outside the contact table")
 def test_numbers_are_answered_as_arrays_are(forms: list[ContactTable]) -> None:
-    rng = np.random.default_rng(11)
-    d, theta = hard_points(TIP.radius, 700, rng)
-    odd = [-1.0, 0.0, 0.02, 0.03, math.inf, math.nan, 0.004, 0.004, 0.004, 1e-9, 0.0199]
+    d, theta = hard_points(TIP.radius, 100, np.random.default_rng(11))
+    odd = [-1.0, 0.0, 0.02, 0.03, math.inf, math.nan, 0.004, 0.004, 0.004, 1e-9, 0.0174]
     tilts = [0.3, 0.3, 0.0, 0.1, 0.2, 0.1, math.nan, -math.inf, 1.4, -1.57, 0.001]
     d, theta = np.concatenate([d, odd]), np.concatenate([theta, tilts])
     for table in forms:
@@ -329,13 +296,7 @@ def test_numbers_are_answered_as_arrays_are(forms: list[ContactTable]) -> None:
             one = table(float(d[i]), float(theta[i]))
             assert type(one.force) is float
             assert type(one.inside) is bool
-            assert one.inside == many.inside[i]
-            assert one.max_error == many.max_error
-            # Near the limit the last digit of θ moves y by the root of that.
-            np.testing.assert_allclose(one[:6], [v[i] for v in many[:6]], rtol=3e-9, atol=1e-300)
-            inner = abs(theta[i]) < 0.99 * TIP.theta_limit(np.nan_to_num(d[i]))
-            if inner and 1e-4 < d[i] < 0.0199:
-                np.testing.assert_allclose(one[:6], [v[i] for v in many[:6]], rtol=1e-13)
+            np.testing.assert_array_equal(one, [v[i] for v in many[:7]] + [many.max_error])
 
 
 def test_a_law_off_its_points_is_warned_of() -> None:
