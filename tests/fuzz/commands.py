@@ -1,20 +1,16 @@
-"""Random, mutated and oversized input to all that takes input from outside; a refusal or nothing.
+"""Random, mutated and oversized commands, profiles and calibration files: a refusal or nothing.
 
-``python -m tests.fuzz.commands --count N`` gives N messages to a running hand's commands, every
-hundredth through a real socket, N profiles and N calibration files; ``--only commands`` and so on
-chooses. A short run of each is among the tests. It ends at the first input that is neither carried
-out nor refused, and prints it.
+Commands go to a running hand, every hundredth through a real socket.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import random
 import struct
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -24,12 +20,12 @@ import msgpack
 import zmq
 
 from softfinger.daemon.control.modes import COMMANDS
-from softfinger.daemon.errors import Refused, SettingsError
+from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.perception.calibration_file import CalibrationFileError, load_calibration
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.wire.command_server import decode
+from tests.fuzz import mutated
 from tests.harness.gateway import Served
 
 ROOT = Path(__file__).parents[2]
@@ -47,29 +43,6 @@ class Counts(dict[str, int]):
 
     def add(self, what: str) -> None:
         self[what] = self.get(what, 0) + 1
-
-
-def mutated(rng: random.Random, data: bytes) -> bytes:
-    """Some bytes changed, cut, doubled, put in or grown far too large."""
-    made = bytearray(data)
-    for _ in range(rng.choice((1, 1, 2, 5, 20))):
-        kind = rng.randrange(7)
-        at = rng.randrange(len(made) + 1)
-        if kind == 0 and made:
-            made[at % len(made)] = rng.randrange(256)
-        elif kind == 1 and made:
-            made[at % len(made)] ^= 1 << rng.randrange(8)
-        elif kind == 2:
-            del made[at : at + rng.randrange(1, 9)]
-        elif kind == 3:
-            made[at:at] = rng.randbytes(rng.randrange(1, 9))
-        elif kind == 4:
-            made[at:at] = made[at : at + rng.randrange(1, 30)]
-        elif kind == 5:
-            del made[at:]
-        elif rng.random() < 0.02:
-            made[at:at] = rng.randbytes(1) * rng.choice((100, 5000, 20_000))
-    return bytes(made)
 
 
 # --- commands ---------------------------------------------------------------------------------
@@ -305,32 +278,3 @@ def fuzz(name: str, count: int, seed: int) -> Counts:
     finally:
         target.close()
     return counts
-
-
-def random_bytes_are_decoded_or_refused(count: int, seed: int) -> None:
-    """The parser alone, on bytes without any form."""
-    rng = random.Random(seed)
-    for _ in range(count):
-        try:
-            decode(rng.randbytes(rng.randrange(60)))
-        except Refused:
-            pass
-
-
-def _main(words: list[str] | None = None) -> Iterator[str]:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--count", type=int, default=10_000)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--only", choices=TARGETS)
-    arguments = parser.parse_args(words)
-    for name in [arguments.only] if arguments.only else TARGETS:
-        begin = time.monotonic()
-        counts = fuzz(name, arguments.count, arguments.seed)
-        took = time.monotonic() - begin
-        told = ", ".join(f"{number} {what}" for what, number in sorted(counts.items()))
-        yield f"{name}: {arguments.count} in {took:.0f} s: {told}"
-
-
-if __name__ == "__main__":
-    for line in _main():
-        print(line, flush=True)

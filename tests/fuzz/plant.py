@@ -1,20 +1,17 @@
 """Random commands, pushes and parameters against the simulated hand, in every scene it has.
 
-The tests run some thousand commands; ``python -m tests.fuzz.plant --count 1000000`` runs a million.
 A hand's commands are drawn in one go and carried out inside one compiled loop.
 """
 
 from __future__ import annotations
 
-import argparse
 import math
-import sys
-import time
 
 import numpy as np
 
 from softfinger.daemon.simulation.physics.plant import step
 from softfinger.kinematics.compiled.kernel import kernel
+from tests.fuzz import Report
 from tests.harness.plant import BOUNDED, CURRENT, PAPER, POSITION, TABLE_I, make
 
 LONGER = 10  # times the step that the plant chooses, in one hand of three
@@ -154,22 +151,8 @@ def abuse(seed: int, count: int = EACH) -> str:
     return f"seed {seed}, command {at}: {WRONG[code]}" if code != FINE else ""
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--count", type=int, default=100_000, help="commands in all")
-    parser.add_argument("--seed", type=int, default=1000, help="of the first hand")
-    options = parser.parse_args()
-    bad, begin = 0, time.perf_counter()
-    hands = max(options.count // EACH, 1)
-    for seed in range(options.seed, options.seed + hands):
-        wrong = abuse(seed)
-        if wrong:
-            bad += 1
-            print(wrong, flush=True)
-    seconds = time.perf_counter() - begin
-    print(f"{hands * EACH} commands to {hands} hands in {seconds:.0f} s, {bad} hands went wrong")
-    return 1 if bad else 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+def fuzz(count: int, seed: int) -> Report:
+    """Send ``count`` commands in all, each EACH of them to a hand of its own."""
+    hands = max(count // EACH, 1)
+    found = [abuse(each) for each in range(1000 * seed, 1000 * seed + hands)]
+    return Report(hands, [each for each in found if each])

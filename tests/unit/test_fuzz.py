@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from tests.fuzz import tactile
-from tests.fuzz.commands import fuzz, random_bytes_are_decoded_or_refused
+from tests.fuzz.commands import fuzz
 
 
 @pytest.mark.parametrize(
@@ -18,14 +18,10 @@ def test_odd_input_is_refused_or_carried_out_and_nothing_else(name: str, count: 
     assert counts["done"] > 0.01 * count, "some of it must be sound, or nothing is tried"
 
 
-def test_the_parser_takes_random_bytes() -> None:
-    random_bytes_are_decoded_or_refused(20_000, seed=5)
-
-
 @pytest.mark.parametrize("target", tactile.TARGETS)
 def test_no_input_breaks_a_reader(target: str) -> None:
     report = tactile.fuzz(target, 4000, seed=7)
     assert report.wrong == []
-    assert report.frames > 300
+    assert report.through > 300
     if target == "cobs":  # the CRC lets one wrong packet in 65536 through
         assert report.foreign <= 2
