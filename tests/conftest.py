@@ -25,6 +25,7 @@ import zmq
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.settings import Settings
 from softfinger.tools.cli import main
+from softfinger.tools.processes import kernel_build
 from tests.harness import descendants
 from tests.harness.daemon_process import Running
 from tests.harness.loop import Make
@@ -33,8 +34,6 @@ from tests.harness.loop import Make
 hypothesis.settings.register_profile("same", deadline=None, derandomize=True, max_examples=50)
 hypothesis.settings.register_profile("search", deadline=None, max_examples=1000)
 hypothesis.settings.load_profile("same")
-
-pytest_plugins = ["pytester"]  # for the test of this file
 
 _PORTS = itertools.count(9872)
 _OUR_OWN: set[int] = set()  # processes that no test started
@@ -104,7 +103,7 @@ def addresses() -> tuple[str, str]:
 
 
 @pytest.fixture
-def profile(tmp_path: Path, addresses: tuple[str, str]) -> Callable[[str], Path]:
+def profile(tmp_path: Path, addresses: tuple[str, str]) -> Profile:
     """Writes a profile on the test's addresses, with ``text`` added to it."""
 
     def write(text: str = "", name: str = "profile.toml") -> Path:
@@ -120,7 +119,7 @@ def profile(tmp_path: Path, addresses: tuple[str, str]) -> Callable[[str], Path]
 
 
 @pytest.fixture
-def start() -> Iterator[Callable[..., Running]]:
+def start() -> Iterator[Start]:
     """Starts daemons that are killed when the test ends before them."""
     started: list[Running] = []
 
@@ -142,12 +141,17 @@ class Told(NamedTuple):
 
 
 Inline = Callable[..., Told]
+Addresses = tuple[str, str]
+Profile = Callable[..., Path]
+Start = Callable[..., Running]
 
 
 @pytest.fixture
 def inline(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Inline:
     """Runs a subcommand in this process, for tests of its work and not of its process."""
     monkeypatch.setattr(os, "nice", lambda _: 0)  # the tests' own priority stays
+    # Whichever test comes first on a machine compiles, and none is about being told so.
+    monkeypatch.setattr(kernel_build, "print_event", lambda *_: None)
 
     def run(*words: object) -> Told:
         capsys.readouterr()

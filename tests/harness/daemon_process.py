@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import signal
 import subprocess
 import sys
@@ -26,24 +27,49 @@ PATIENCE = {
 PATIENT = [word for key, value in PATIENCE.items() for word in ("--set", f"{key}={value}")]
 
 
-def softfinger(*words: str, timeout: float = 300.0) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [*SOFTFINGER, *words], capture_output=True, text=True, timeout=timeout, check=False
-    )
+def python(*words: object, **options: Any) -> subprocess.CompletedProcess[str]:
+    """A program of this Python that ends by itself: its status and what it said."""
+    call = [sys.executable, *map(str, words)]
+    return subprocess.run(call, capture_output=True, text=True, check=False, **options)
+
+
+def softfinger(*words: object, **options: Any) -> subprocess.CompletedProcess[str]:
+    """A subcommand that ends by itself."""
+    return python("-m", "softfinger", *words, **options)
+
+
+def pip_installed(package: Path, folder: Path) -> Path:
+    """Where a package of this tree is, as pip installs it, for itself alone."""
+    shutil.copytree(package, folder / "source")  # builds leave files
+    options = ("--no-deps", "--no-build-isolation", "--no-index", "--quiet")
+    words = ("install", *options, "--target", folder / "site", folder / "source")
+    done = python("-m", "pip", *words)
+    assert done.returncode == 0, done.stderr
+    return folder / "site"
+
+
+def started(*words: object, **options: Any) -> subprocess.Popen[str]:
+    """A subcommand that runs, with pipes for what it says."""
+    pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    return subprocess.Popen([*SOFTFINGER, *map(str, words)], **pipes | options)
+
+
+def _held_up(error: str) -> bool:
+    """Whether a command was refused for what a busy machine does."""
+    return "send it again" in error or "were not read at this tick" in error
 
 
 def ask(address: str, name: str, **numbers: float) -> dict[str, Any]:
     """The reply to a command, sent again where the daemon was held up and says so."""
     while True:
         reply = send(address, {"command": name, **numbers}, timeout=120.0)
-        if reply["ok"] or "send it again" not in reply["error"]:
+        if reply["ok"] or not _held_up(reply["error"]):
             return reply
 
 
 def until_it_says(words: Sequence[str | Path], text: str) -> None:
     """Run a tool until it prints a line with ``text``; it is ended then, and must end well."""
-    process = subprocess.Popen([*SOFTFINGER, *words], text=True, stdout=subprocess.PIPE)
-    assert process.stdout is not None
+    process = started(*words, stderr=None)
     assert any(text in line for line in process.stdout), f"{text!r} never came"
     process.terminate()
     process.communicate(timeout=300)
@@ -56,7 +82,7 @@ def insist(command: Callable[[], object]) -> None:
         try:
             command()
         except Refused as refused:
-            if "send it again" not in str(refused):
+            if not _held_up(str(refused)):
                 raise
         else:
             return
@@ -66,11 +92,8 @@ class Running:
     """A ``softfinger run`` in a process of its own, ready when constructed."""
 
     def __init__(self, *words: str) -> None:
-        self.process = subprocess.Popen(
-            [*SOFTFINGER, "run", *words], stderr=subprocess.PIPE, text=True
-        )
+        self.process = started("run", *words, stdout=None)
         self.lines: list[str] = []
-        assert self.process.stderr is not None
         for line in self.process.stderr:
             self.lines.append(line)
             if "running, disarmed" in line:
@@ -80,7 +103,6 @@ class Running:
     def end(self, number: int = signal.SIGTERM) -> int:
         """Send a signal, read the rest of what it says, and return the exit status."""
         self.process.send_signal(number)
-        assert self.process.stderr is not None
         self.lines += self.process.stderr.readlines()
         return self.process.wait(timeout=300)
 
@@ -88,5 +110,4 @@ class Running:
         """End it however it stands, if it has not ended yet."""
         self.process.kill()
         self.process.wait()
-        assert self.process.stderr is not None
         self.process.stderr.close()

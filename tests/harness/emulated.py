@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import re
+import select
+import signal
+import subprocess
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,8 +20,10 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.emulator.emulator import Emulator
 from softfinger.daemon.tactile.flexitac import FlexiTac
 from softfinger.tools.cli import main
+from tests.harness.daemon_process import SOFTFINGER
 
 HIL = Path(__file__).parents[2] / "config" / "hil.toml"
+_COMPILED = re.compile(r"^(compil(ing|ed) .*|.*: \d+ of about \d+, .*)\n", re.MULTILINE)
 READY_WITHIN = 200.0  # s; kernels may have to be compiled
 
 
@@ -37,6 +43,39 @@ def emulated(
         made.end()
         runner.join()
         made.close()
+
+
+class EmulatorProcess:
+    """``softfinger emulate`` with these arguments, in a process of its own."""
+
+    def __init__(self, *arguments: str | Path) -> None:
+        pipes: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+        self.popen: subprocess.Popen[str] = subprocess.Popen(
+            [*SOFTFINGER, "emulate", *arguments], **pipes
+        )
+
+    def ready(self) -> EmulatorProcess:
+        """Wait for the first line, which must be ``ready``."""
+        found = select.select([self.popen.stdout], [], [], READY_WITHIN)[0]
+        line = self.popen.stdout.readline() if found else "nothing"
+        if line != "ready\n":
+            self.popen.kill()
+            raise AssertionError(f"{line!r} instead of ready: {self.popen.communicate()[1]}")
+        return self
+
+    def end(self, number: int = signal.SIGTERM) -> tuple[int, str, str]:
+        """Send a signal; exit status and what else was printed, but for kernels it compiled."""
+        self.popen.send_signal(number)
+        out, err = self.popen.communicate(timeout=300)
+        return self.popen.returncode, out, _COMPILED.sub("", err)
+
+    def __enter__(self) -> EmulatorProcess:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.popen.returncode is None:
+            self.popen.kill()
+            self.popen.communicate()
 
 
 class PatientPort(PortHandler):

@@ -14,11 +14,18 @@ import msgpack
 import numpy as np
 import zmq
 
+from softfinger.daemon.wire import schema
+from tests.harness.golden_wire import sample
+
+_STATE, _TACTILE, _EVENT = map(sample, (schema.STATE, schema.TACTILE, schema.EVENT))
+
+
+def now() -> dict[str, Any]:
+    return {"timestamp": time.time(), "mono_ns": time.monotonic_ns()}
+
 
 def finger(t: float, side: int) -> dict[str, Any]:
-    force = 10.0 + 2.0 * math.sin(1.3 * t + side)
-    return {
-        "valid": True,
+    found: dict[str, Any] = _STATE[("left", "right")[side]] | {
         "q": 0.42 + 0.02 * side,
         "dq": 0.1 * math.cos(t),
         "current": 0.213,
@@ -28,46 +35,20 @@ def finger(t: float, side: int) -> dict[str, Any]:
         "goal_current": 0.35,
         "d": 3.21e-3 + 0.1e-3 * side,
         "theta": math.radians(5.0) * math.sin(0.5 * t) * (1 - 2 * side),
-        "force": force,
+        "force": 10.0 + 2.0 * math.sin(1.3 * t + side),
         "energy": 12.34e-3,
-        "d_std": 0.02e-3,
         "theta_std": math.radians(0.1),
         "force_std": 0.05,
-        "shear_x": 0.0,
-        "shear_y": 0.0,
-        "tilt_y": 0.0,
-        "gain": 1.0,
-        "modulus_scale": 1.0,
-        "modulus_scale_std": 0.07,
-        "sensor_gain": 1.0,
-        "sensor_gain_std": 0.07,
-        "torque_scale": 1.0,
-        "torque_scale_std": 0.07,
-        "misfit": False,
-        "contact": True,
-        "frame_seq": 7,
         "frame_age_s": 0.012,
-        "invalid": "",
-        "winding": 44.0,
-        "winding_std": 1.5,
-        "case": 41.2,
-        "case_std": 0.2,
-        "time_to_limit": 3600.0,
     }
+    return found | dict.fromkeys(("shear_x", "shear_y", "tilt_y"), 0.0)
 
 
 def state(t: float, seq: int) -> dict[str, Any]:
     return {
-        "schema": 1,
+        **_STATE,
+        **now(),
         "seq": seq,
-        "seq_step": 5,
-        "timestamp": time.time(),
-        "mono_ns": time.monotonic_ns(),
-        "mode": "holding",
-        "fault": "",
-        "fault_name": "",
-        "torque": True,
-        "tick_s": 0.002,
         "compute_s": 11e-6,
         "wake_late_s": 3e-6,
         "overruns": 0,
@@ -86,39 +67,15 @@ def frame(t: float, side: int, size: int = 44) -> dict[str, Any]:
     shape = np.clip(1.0 - (x**2 + y**2) / 12.0**2, 0.0, None) * (45e3 / 4.0)
     noise = np.random.default_rng(int(t * 1000)).normal(0.0, 380.0, shape.shape)
     counts = np.clip(shape + noise, 0, 65535).astype("<u2")
-    return {
-        "schema": 1,
-        "seq": int(t * 25),
-        "timestamp": time.time(),
-        "mono_ns": time.monotonic_ns(),
-        "delay_s": 0.01,
-        "valid": True,
-        "finger": ("left", "right")[side],
-        "rows": size,
-        "cols": size,
-        "pitch": 0.058 / size,
-        "pitch_y": 0.058 / size,
-        "centre_x": 0.0,
-        "centre_y": 0.0,
-        "rotation": 0.0,
-        "unit": "count",
-        "scale": 4.0,
-        "calibrated": False,
-        "calibration": "",
-        "data": counts.tobytes(),
-    }
+    square = {"rows": size, "cols": size, "pitch": 0.058 / size, "pitch_y": 0.058 / size}
+    middle = dict.fromkeys(("centre_x", "centre_y", "rotation"), 0.0)
+    told = _TACTILE | now() | square | middle | {"finger": ("left", "right")[side]}
+    told |= {"seq": int(t * 25), "seq_step": 1, "number": int(t * 25)}
+    return told | {"data": counts.tobytes()}
 
 
 def event(seq: int, kind: str, text: str, level: str = "info") -> dict[str, Any]:
-    return {
-        "schema": 1,
-        "seq": seq,
-        "timestamp": time.time(),
-        "mono_ns": time.monotonic_ns(),
-        "level": level,
-        "kind": kind,
-        "text": text,
-    }
+    return _EVENT | now() | {"seq": seq, "level": level, "kind": kind, "text": text}
 
 
 class FakeDaemon:

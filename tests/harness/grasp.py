@@ -18,6 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import root
 
 from softfinger import SoftfingerError
 from softfinger.kinematics.compiled.kernel import kernel
@@ -32,8 +33,7 @@ from tests.harness.reference_hand import (
 
 FloatArray = NDArray[np.float64]
 
-_TOLERANCE = 1e-12  # of the contact forces, for balance
-_ITERATIONS = 60
+_TOLERANCE = 1e-9  # of the contact forces, for balance
 
 
 class GraspError(SoftfingerError, ValueError):
@@ -71,12 +71,12 @@ def grasp_gradient(
     weight: FloatArray,
     shear: FloatArray,
     gradient: FloatArray,
-) -> tuple[float, bool]:
-    """Energy at ``coordinates`` [5], rolled there from ``start`` with ``start_shear`` [2].
+) -> bool:
+    """Gradient at ``coordinates`` [5], rolled there from ``start`` with ``start_shear`` [2].
 
     ``lengths`` is (B, L, e, a, W), ``weight`` gravity's force on the object (x, y). Writes the
     shears [2], rolled by the rows at the middle of the way, and the gradient [5] along the rows at
-    its end. Returns (energy, both contacts inside the table and closed).
+    its end. Returns whether both contacts are inside the table and closed.
     """
     half, length, offset, radius, width = lengths
     variables = np.empty(6)
@@ -93,25 +93,23 @@ def grasp_gradient(
     contact_variables(coordinates, half, length, offset, radius, width, variables)
     contact_jacobian(coordinates, half, length, offset, jacobian)
     rolling_rows(variables, jacobian, radius, rows)
-    energy = -weight[0] * coordinates[2] - weight[1] * coordinates[3]
     gradient[:] = 0.0
     gradient[2] = -weight[0]
     gradient[3] = -weight[1]
     sound = True
     for finger in range(2):
         d = variables[finger]
-        elastic, by_d, by_theta, tangential, inside = sheared_contact(
+        _, by_d, by_theta, tangential, inside = sheared_contact(
             data, d, variables[2 + finger], shear[finger]
         )
         sound = sound and inside and d > 0.0
-        energy += elastic
         for j in range(5):
             gradient[j] += (
                 by_d * jacobian[finger, j]
                 + by_theta * jacobian[2 + finger, j]
                 + tangential * rows[finger, j]
             )
-    return energy, sound
+    return sound
 
 
 @dataclass(frozen=True)
@@ -173,7 +171,7 @@ class Grasp:
         # T = 0 of the tip's energy: d_t = −(d/2) tan θ.
         shear = -0.5 * d * np.tan(q) * [1.0, -1.0]
         state = GraspState(q, np.array([0.0, self.hand.tips(q)[0, 1], 0.0]), shear)
-        self._check(self._evaluate(state.coordinates, state)[3])
+        self._check(self._evaluate(state.coordinates, state)[2])
         return state
 
     def gradient(self, state: GraspState) -> FloatArray:
@@ -181,7 +179,7 @@ class Grasp:
 
         The first two are the torques the joints must hold; the last three vanish in balance.
         """
-        return self._evaluate(state.coordinates, state)[1]
+        return self._evaluate(state.coordinates, state)[0]
 
     def forces(self, state: GraspState) -> GraspForces:
         """Forces and moments of both contacts and the joints' torques."""
@@ -197,41 +195,24 @@ class Grasp:
     def balance(self, state: GraspState, q: ArrayLike | None = None) -> GraspState:
         """Bring the joints to ``q`` (2,) at once and let the object roll to where it balances.
 
-        A damped Newton iteration on the gradient that never lets the energy rise where the energy
-        is convex. Take small steps: the shears roll along one straight way. Raises GraspError when
-        a contact opens or leaves the table, or when no balance is found.
+        Take small steps: the shears roll along one straight way. Raises GraspError when a contact
+        opens or leaves the table, or when no balance is found.
         """
         x = state.coordinates
         if q is not None:
             x[:2] = q
-        energy, gradient, shear, sound = self._evaluate(x, state)
-        for _ in range(_ITERATIONS):
-            self._check(sound)
-            scale = np.abs(gradient[:2]).sum() / self.hand.reach + np.abs(self._weight).sum()
-            residual = np.abs(gradient[2:]) / [1.0, 1.0, self.hand.tip_radius]
-            if residual.max() <= _TOLERANCE * scale:
-                return GraspState(x[:2].copy(), x[2:].copy(), shear)
-            hessian = self._hessian(x, state)[2:, 2:]
-            move = -_positive(hessian, gradient[2:])
-            slope = gradient[2:] @ move
-            share = 1.0
-            while True:
-                trial = x.copy()
-                trial[2:] += share * move
-                found = self._evaluate(trial, state)
-                # Near balance the energy is flat to rounding; then a smaller gradient decides.
-                lower = found[0] <= energy + 1e-4 * share * slope
-                flatter = np.abs(found[1][2:]).max() < 0.5 * np.abs(gradient[2:]).max()
-                if found[3] and (lower or flatter):
-                    break
-                share *= 0.5
-                if share < 1e-6:
-                    if residual.max() <= 1e3 * _TOLERANCE * scale:
-                        return GraspState(x[:2].copy(), x[2:].copy(), shear)
-                    raise GraspError("no balance found along the rolling increments")
-            x = trial
-            energy, gradient, shear, sound = found
-        raise GraspError(f"no balance found in {_ITERATIONS} iterations")
+        per_force = np.array([1.0, 1.0, 1.0 / self.hand.tip_radius])
+
+        def residual(pose: FloatArray) -> FloatArray:
+            return self._evaluate(np.concatenate((x[:2], pose)), state)[0][2:] * per_force
+
+        x[2:] = root(residual, x[2:], tol=1e-14).x
+        gradient, shear, sound = self._evaluate(x, state)
+        self._check(sound)
+        scale = np.abs(gradient[:2]).sum() / self.hand.reach + np.abs(self._weight).sum()
+        if np.abs(residual(x[2:])).max() > _TOLERANCE * scale:
+            raise GraspError("no balance found along the rolling increments")
+        return GraspState(x[:2].copy(), x[2:].copy(), shear)
 
     def move(self, state: GraspState, q: ArrayLike, steps: int = 32) -> GraspState:
         """Bring the joints to ``q`` (2,) in ``steps`` equal steps, balancing the object in each."""
@@ -251,43 +232,14 @@ class Grasp:
 
     def _evaluate(
         self, coordinates: FloatArray, start: GraspState
-    ) -> tuple[float, FloatArray, FloatArray, bool]:
-        shear = np.empty(2)
-        gradient = np.empty(5)
-        energy, sound = grasp_gradient(
-            self.table.data,
-            coordinates,
-            start.coordinates,
-            start.shear,
-            self._lengths,
-            self._weight,
-            shear,
-            gradient,
-        )
-        return energy, gradient, shear, sound
-
-    def _hessian(self, coordinates: FloatArray, start: GraspState) -> FloatArray:
-        steps = 1e-6 * np.array([1.0, 1.0, self.hand.tip_radius, self.hand.tip_radius, 1.0])
-        columns = []
-        for j in range(5):
-            ahead, behind = coordinates.copy(), coordinates.copy()
-            ahead[j] += steps[j]
-            behind[j] -= steps[j]
-            difference = self._evaluate(ahead, start)[1] - self._evaluate(behind, start)[1]
-            columns.append(difference / (2.0 * steps[j]))
-        return np.stack(columns, axis=1)
+    ) -> tuple[FloatArray, FloatArray, bool]:
+        """The gradient (5,), both shears, and whether both contacts are closed and in the table."""
+        shear, gradient = np.empty(2), np.empty(5)
+        ends = (coordinates, start.coordinates, start.shear)
+        sound = grasp_gradient(self.table.data, *ends, self._lengths, self._weight, shear, gradient)
+        return gradient, shear, sound
 
     @staticmethod
     def _check(sound: bool) -> None:
         if not sound:
             raise GraspError("a contact is open or outside the tip's range")
-
-
-def _positive(hessian: FloatArray, gradient: FloatArray) -> FloatArray:
-    """Newton's step for the symmetric part, its negative directions turned downhill."""
-    values, vectors = np.linalg.eigh(0.5 * (hessian + hessian.T))
-    if values[0] > 0.0:
-        # The exact, slightly unsymmetric matrix keeps the convergence quadratic.
-        return np.asarray(np.linalg.solve(hessian, gradient))
-    floor = 1e-3 * np.abs(values).max()
-    return np.asarray(vectors @ ((vectors.T @ gradient) / np.maximum(np.abs(values), floor)))

@@ -20,7 +20,6 @@ def command(daemon: Daemon, name: str, **numbers: float) -> dict[str, Any]:
 
 def torque_of(daemon: Daemon) -> Any:
     """Whether the plant's servos have torque, each."""
-    assert daemon.hand is not None
     return daemon.hand.torque_on
 
 

@@ -77,7 +77,6 @@ def published(
     taken: Messages = []
     with Daemon(settings) as daemon:
         publisher = daemon.publisher
-        assert publisher is not None
         publisher._link = Keeping(taken)
         publisher.settings(daemon.clock.wall(), daemon.clock.now(), facts(settings, daemon.models))
         daemon.loop._server = script

@@ -6,8 +6,6 @@ The thread serves tests of behaviour; what is timed runs the bus in a process of
 from __future__ import annotations
 
 import math
-import os
-import queue
 import select
 import struct
 import threading
@@ -29,6 +27,7 @@ from softfinger.daemon.simulation.servo_model.servo import EmulatedServo
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 from tests.harness.free_joints import FreeJoints
 
+_LOOK = 0.005  # s until a bus looks for what was done to it
 RADIAN = 2.0 * math.pi / COUNTS_PER_TURN
 
 
@@ -180,8 +179,7 @@ class RunningBus:
         self.bus = bus
         self.port = PtyServoBus(bus, baud=baud, clock=clock)
         self._clock = clock
-        self._jobs: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
-        self._wake_read, self._wake_write = os.pipe()
+        self._between_packets = threading.Lock()
         self._running = True
         self._thread = threading.Thread(target=self._serve, daemon=True)
         self._thread.start()
@@ -198,40 +196,21 @@ class RunningBus:
         return self.call(lambda: bytes(self.servo(index).table.memory))
 
     def call(self, job: Callable[[], Any]) -> Any:
-        """Run ``job`` in the serving thread, between two packets, and return what it gave."""
-        done: queue.SimpleQueue[tuple[bool, Any]] = queue.SimpleQueue()
-
-        def run() -> None:
-            try:
-                done.put((True, job()))
-            except BaseException as error:
-                done.put((False, error))
-
-        self._jobs.put(run)
-        os.write(self._wake_write, b"!")
-        fine, value = done.get(timeout=60)
-        if not fine:
-            raise value
-        return value
+        """Run ``job`` between two packets, and return what it gave."""
+        with self._between_packets:
+            return job()
 
     def fault(self, text: str) -> None:
         self.call(lambda: put_fault(self.bus, text, self._clock()))
 
     def close(self) -> None:
         self._running = False
-        os.write(self._wake_write, b"!")
         self._thread.join()
         self.port.unplug()
-        os.close(self._wake_read)
-        os.close(self._wake_write)
 
     def _serve(self) -> None:
         while self._running:
-            wait = max(0.0, self.port.next_event() - self._clock())
-            ports = [self.port] if self.port.fileno() >= 0 else []
-            ready, _, _ = select.select([*ports, self._wake_read], [], [], wait)
-            if self._wake_read in ready:
-                os.read(self._wake_read, 1)
-                while not self._jobs.empty():
-                    self._jobs.get()()
-            self.port.service(self._clock())
+            wait = min(max(0.0, self.port.next_event() - self._clock()), _LOOK)
+            select.select([self.port], [], [], wait)
+            with self._between_packets:
+                self.port.service(self._clock())

@@ -7,6 +7,7 @@ import threading
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,7 +60,10 @@ def why_not_open(sensor: TactileSensor) -> str:
 class Rig:
     """One backend with what it needs around it. Use as a context."""
 
-    def __init__(self, backend: str, folder: Path, fault: str = "", rows: int = ROWS) -> None:
+    def __init__(
+        self, backend: str, folder: Path, fault: str = "", rows: int = ROWS, source: Any = None
+    ) -> None:
+        """``source`` makes a serial board's frames, by default a new image each."""
         self.backend = backend
         self._stack = ExitStack()
         self._stop = threading.Event()
@@ -74,7 +78,7 @@ class Rig:
         self.clock: Clock = RealClock() if backend in SERIAL else VirtualClock()
         hand = None
         if backend in SERIAL:
-            self.images = _Images()
+            self.images = source or _Images()
             self.board = TactileBoard(self.images, ENCODERS[backend], RATE, 0.0)
             self._faults = parse_faults([f"right:{fault}"] if fault else [], ())
             self._stack.callback(self.board.close)
@@ -91,8 +95,7 @@ class Rig:
         if backend == "simulated":
             hand = SimulatedHand(settings, self.clock.now())
         sensor = make_sensor(settings, self.clock, hand, 1)
-        assert sensor is not None
-        self.sensor: TactileSensor = sensor
+        self.sensor = sensor
         self._stack.callback(sensor.close)
 
     def __enter__(self) -> Rig:
@@ -100,11 +103,6 @@ class Rig:
 
     def __exit__(self, *_: object) -> None:
         self._stack.close()
-
-    def newest(self) -> Frame:
-        frame = self.sensor.latest()
-        assert frame is not None
-        return frame
 
     def wait(self, condition: Callable[[Frame], object]) -> Frame:
         """Let time pass until a frame fulfils ``condition``."""
@@ -116,7 +114,7 @@ class Rig:
             return frame is not None and bool(condition(frame))
 
         until(holds)
-        return self.newest()
+        return self.sensor.latest()
 
     def unplug(self) -> None:
         """Take the board's port away, in the thread that serves it."""

@@ -23,7 +23,6 @@ class Viewed:
             stderr=subprocess.PIPE,
             text=True,
         )
-        assert self.process.stdout is not None
         self.address = self.commanding = ""
         for line in self.process.stdout:
             self.commanding = self.commanding or line.split()[1]
