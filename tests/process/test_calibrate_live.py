@@ -5,29 +5,26 @@ from __future__ import annotations
 import contextlib
 import io
 import math
-import select
 import sys
-import threading
 
 import numpy as np
 import pytest
 
 from softfinger.daemon.clock import RealClock, VirtualClock
 from softfinger.daemon.perception.calibration_file import load_calibration
-from softfinger.daemon.simulation.emulator.tactile_board import ENCODERS, TactileBoard
 from softfinger.daemon.types import Frame
 from softfinger.kinematics.contact.material import Material
 from softfinger.tools.calibration import calibration_frames
 from softfinger.tools.cli import main
+from tests.harness.tactile import Rig
 from tests.unit.test_calibrate import CENTRE, EXPONENT, NOISE, PROFILE, ROTATION, TIP, E, MadeUp, N
 
 MATERIAL = Material.constant(E)
-RATE = 400.0  # Hz
 FRAMES = 12
 
 
 class Bench:
-    """A board on a pty over the made-up sensor; each Enter puts the next load on."""
+    """A board's frames of the made-up sensor; each Enter puts the next load on."""
 
     def __init__(self) -> None:
         self.sensor = MadeUp()
@@ -35,10 +32,6 @@ class Bench:
         self._clock = RealClock()
         self._images = [self.sensor.counts(np.zeros((N, N)), 64)]
         self._number = 0
-        self.board = TactileBoard(self, ENCODERS["cobs"], RATE, 0.0)
-        self._over = threading.Event()
-        self._thread = threading.Thread(target=self._serve, daemon=True)
-        self._thread.start()
 
     def latest(self) -> Frame:
         self._number += 1
@@ -53,25 +46,14 @@ class Bench:
         self._images[0] = self.sensor.counts(self.loads.pop(0), 64)
         return "\n"
 
-    def _serve(self) -> None:
-        t = 0.0
-        while not self._over.is_set():
-            select.select([], [], [], 1.0 / RATE)
-            t += 1.0 / RATE
-            self.board.service(t)
-
-    def close(self) -> None:
-        self._over.set()
-        self._thread.join()
-        self.board.close()
-
 
 @pytest.fixture(scope="module")
 def live(tmp_path_factory):
     """All steps that are done load by load, live; the folder, the sensor, and all that was said."""
     folder = tmp_path_factory.mktemp("live")
     bench = Bench()
-    port = PROFILE.replace('"simulated"', f'"cobs"\nport = ["{bench.board.path}", "none"]')
+    rig = Rig("cobs", folder, source=bench)
+    port = PROFILE.replace('"simulated"', f'"cobs"\nport = ["{rig.board.path}", "none"]')
     (folder / "profile.toml").write_text(port.replace('clock = "virtual"', 'clock = "real"'))
     patch = pytest.MonkeyPatch()
     patch.setattr(sys, "stdin", bench)
@@ -97,7 +79,7 @@ def live(tmp_path_factory):
     with contextlib.redirect_stdout(io.StringIO()) as said:
         step("relaxation", [pressed(0.003)], "--no-plot", "--d", "3", "--frames", "320")
     patch.undo()
-    bench.close()
+    rig.__exit__()
     (folder / "relaxation").write_text(said.getvalue())
     return folder
 

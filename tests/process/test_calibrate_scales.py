@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,20 +13,14 @@ from softfinger.daemon.wire.schema import STATE
 from softfinger.tools.cli import main
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.watched import Watched
-from tests.harness.daemon_process import Running, insist
+from tests.harness.daemon_process import insist
 from tests.harness.recorded_hand import record_hand
 from tests.unit.test_control import grasped
 
 WRONG = {"tactile_gain": (0.6, 1.4)}
 
 
-def test_a_daemon_begins_with_what_grips_told(
-    start: Callable[..., Running],
-    profile: Callable[[str], Path],
-    addresses: tuple[str, str],
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_daemon_begins_with_what_grips_told(start, profile, addresses, tmp_path, capsys):
     start("--config", str(profile("[simulation]\ntactile_gain = [0.6, 1.4]\n")))
     files = tuple(str(tmp_path / f"{name}.json") for name in ("left", "right"))
 
@@ -46,7 +39,6 @@ def test_a_daemon_begins_with_what_grips_told(
         assert [calibrate(0), calibrate(1)] == [0, 0]
         found = [load_calibration(Path(file)).scales for file in files]
     for step, gain in zip(found, (0.6, 1.4), strict=True):
-        assert step is not None
         assert step.gain[0] == pytest.approx(gain, rel=0.1)
         assert step.modulus[0] == pytest.approx(1.0, rel=0.1)
     assert f"gain {found[0].gain[0]:.3f} ± " in capsys.readouterr().out  # type: ignore[union-attr]
@@ -59,9 +51,7 @@ def test_a_daemon_begins_with_what_grips_told(
         assert not [event for event in after.events if event[1].startswith("witness")]
 
 
-def test_a_recordings_last_state_tells_as_much(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_recordings_last_state_tells_as_much(tmp_path, capsys):
     run, file = tmp_path / "run.mcap", tmp_path / "left.json"
     due: dict[int, dict[str, Any]] = {
         100: {"command": "arm"},
@@ -73,7 +63,6 @@ def test_a_recordings_last_state_tells_as_much(
     *_, (_, last) = Recording(run).messages({STATE})
     told = last["left"]
     found = load_calibration(file).scales
-    assert found is not None
     mean, std = told["torque_scale"], told["torque_scale_std"]
     assert found.torque == pytest.approx((mean, std / mean))
     without = tmp_path / "without.mcap"

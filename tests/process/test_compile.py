@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import os
 import signal
 import subprocess
-import sys
 import threading
 from pathlib import Path
 
+import psutil
 import pytest
 
 from softfinger.daemon.loop.warm_up import named
 from softfinger.daemon.profile.settings import Settings
 from softfinger.tools.processes import kernel_build
 from tests.conftest import until
-from tests.harness.daemon_process import SOFTFINGER
+from tests.harness.daemon_process import python, softfinger, started
+from tests.harness.descendants import ending
 
 BARE = ["--set", "servos.backend=dynamixel", "--set", "tactile.backend=none"]
 
@@ -31,13 +31,7 @@ def environment(folder: Path) -> dict[str, str]:
 
 def compiled(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
     """The whole command."""
-    return subprocess.run(
-        [*SOFTFINGER, "compile", *BARE, *words],
-        env=environment(folder),
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    return softfinger("compile", *BARE, *words, env=environment(folder))
 
 
 def steep(folder: Path) -> Path:
@@ -51,19 +45,11 @@ def steep(folder: Path) -> Path:
     return file
 
 
-def test_a_part_is_compiled_once_and_its_kernels_are_as_many_as_the_bar_says(
-    tmp_path: Path,
-) -> None:
+def test_a_part_is_compiled_once_and_its_kernels_are_as_many_as_the_bar_says(tmp_path):
     table = named("contact table")
     settings = Settings().model_dump_json()
-    done = subprocess.run(
-        [sys.executable, "-m", "softfinger.tools.processes.kernel_build"],
-        input=f"{settings}\n{table.name}\n",
-        env=environment(tmp_path),
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    own = {"input": f"{settings}\n{table.name}\n", "env": environment(tmp_path)}
+    done = python("-m", "softfinger.tools.processes.kernel_build", **own)
     *kernels, last = done.stdout.splitlines()
     assert last == "done"
     # Counted for the newest Numba: the lowest one tells of a third fewer.
@@ -87,17 +73,7 @@ def test_a_part_is_compiled_once_and_its_kernels_are_as_many_as_the_bar_says(
     assert "contact table was not compiled ahead: SettingsError: table.tolerance" in bad.stderr
 
 
-def alive(folder: Path) -> list[str]:
-    """Processes that compile into ``folder``."""
-    found = []
-    for process in Path("/proc").glob("[0-9]*"):
-        with contextlib.suppress(OSError):
-            if str(folder).encode() in (process / "environ").read_bytes():
-                found.append(process.name)
-    return found
-
-
-def test_ctrl_c_before_a_thread_has_begun_is_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ctrl_c_before_a_thread_has_begun_is_no_error(monkeypatch):
     def interrupted(_: threading.Thread) -> None:
         raise KeyboardInterrupt
 
@@ -107,7 +83,7 @@ def test_ctrl_c_before_a_thread_has_begun_is_no_error(monkeypatch: pytest.Monkey
         kernel_build.build_kernels(Settings(), lambda *_: None, bar=False)
 
 
-def test_one_line_says_that_numba_alone_compiles_and_why(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_line_says_that_numba_alone_compiles_and_why(monkeypatch):
     monkeypatch.setattr(kernel_build, "is_built", lambda *_: False)
     monkeypatch.setattr(kernel_build, "why_plain", "Numba 99.0 is new")
     monkeypatch.setattr(kernel_build._Build, "run", lambda _: None)
@@ -118,18 +94,11 @@ def test_one_line_says_that_numba_alone_compiles_and_why(monkeypatch: pytest.Mon
     ]
 
 
-def test_ctrl_c_ends_every_process(tmp_path: Path) -> None:
-    process = subprocess.Popen(
-        [*SOFTFINGER, "compile"], env=environment(tmp_path), stderr=subprocess.PIPE, text=True
-    )
-    assert process.stderr is not None
-    try:
+def test_ctrl_c_ends_every_process(tmp_path):
+    with ending(started("compile", env=environment(tmp_path))) as process:
         assert process.stderr.readline().startswith("compiling kernels, on the first start only:")
-        until(lambda: len(alive(tmp_path)) > 1)
+        until(psutil.Process(process.pid).children)
+        compilers = psutil.Process(process.pid).children()
         process.send_signal(signal.SIGINT)
         assert (process.wait(300.0), process.stderr.read()) == (130, "")
-        until(lambda: not alive(tmp_path))
-    finally:
-        process.kill()
-        process.wait()
-        process.stderr.close()
+        assert psutil.wait_procs(compilers, timeout=300.0)[1] == []

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import subprocess
-from pathlib import Path
 
 import pytest
-
-from tests.conftest import Inline
 
 pytest.importorskip("shtab")
 
@@ -19,7 +16,7 @@ echo "${COMPREPLY[@]}"
 """
 
 
-def test_a_tab_completes(inline: Inline, tmp_path: Path) -> None:
+def test_a_tab_completes(inline, tmp_path):
     script = tmp_path / "script"
     script.write_text(inline("completion", "bash").stdout, encoding="utf-8")
     (tmp_path / "my.toml").touch()

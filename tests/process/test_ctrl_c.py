@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import signal
-import subprocess
-import sys
 
 import pytest
+
+from tests.harness.daemon_process import python
 
 # Presses Ctrl-C at the import of a module.
 _AT = """
@@ -23,25 +23,14 @@ sys.exit(cli.main(sys.argv[2:]))
 
 
 @pytest.mark.parametrize(
-    ("module", "words"),
+    ("module", "words", "status"),
     [
-        ("argparse", ["limits"]),
-        ("pydantic", ["run"]),
-        ("softfinger.tools.terminal.feed", ["monitor"]),
+        ("argparse", ["limits"], -signal.SIGINT),
+        ("pydantic", ["run"], -signal.SIGINT),
+        ("softfinger.tools.terminal.feed", ["monitor"], -signal.SIGINT),
+        ("softfinger.daemon.safety.limits", ["limits"], 130),  # a keyboard interrupt again
     ],
 )
-def test_it_ends_the_process_as_any_other(module: str, words: list[str]) -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", _AT, module, *words], capture_output=True, text=True, timeout=300
-    )
-    assert (done.returncode, done.stderr) == (-signal.SIGINT, "")
-
-
-def test_later_it_is_a_keyboard_interrupt_again() -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", _AT, "softfinger.daemon.safety.limits", "limits"],
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-    assert (done.returncode, done.stderr) == (130, "")
+def test_it_ends_the_process_as_any_other(module, words, status):
+    done = python("-c", _AT, module, *words)
+    assert (done.returncode, done.stderr) == (status, "")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import struct
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -16,55 +16,16 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.control_table import by_name
 from softfinger.daemon.servos.dynamixel import DynamixelServos
-from softfinger.daemon.servos.port import PortGone
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 from softfinger.daemon.types import Goal, Reading
 from tests.conftest import until
 from tests.harness.servos import (
     RADIAN,
-    RunningBus,
     backend_settings,
-    connected,
-    hand_bus,
     make_bus,
 )
 
-Run = Callable[[ServoBus], RunningBus]
-Connect = Callable[..., DynamixelServos]
 FIRMWARES = pytest.mark.parametrize("firmware", [44, 48], ids=["sync read", "fast sync read"])
-
-
-@pytest.fixture
-def running() -> Iterator[Run]:
-    """Starts buses that end with the test."""
-    buses: list[RunningBus] = []
-
-    def start(bus: ServoBus) -> RunningBus:
-        buses.append(RunningBus(bus))
-        return buses[-1]
-
-    yield start
-    for bus in buses:
-        bus.close()
-
-
-@pytest.fixture
-def bus(running: Run) -> RunningBus:
-    return running(hand_bus(time.monotonic()))
-
-
-@pytest.fixture
-def connect(running: object) -> Iterator[Connect]:
-    """Connects backends, which close before their buses end."""
-    made: list[DynamixelServos] = []
-
-    def start(bus: RunningBus, **servos: Any) -> DynamixelServos:
-        made.append(connected(bus, **servos))
-        return made[-1]
-
-    yield start
-    for each in made:
-        each.close()
 
 
 def placed(firmware: int, *counts: int) -> ServoBus:
@@ -101,9 +62,7 @@ def read(backend: DynamixelServos) -> Reading:
 
 
 @FIRMWARES
-def test_what_is_read_is_what_the_servos_have(
-    running: Run, firmware: int, connect: Connect
-) -> None:
+def test_what_is_read_is_what_the_servos_have(running, firmware, connect):
     now = time.monotonic()
     bus = running(placed(firmware, 2048, 2048))
     backend = connect(bus, zero=(2048, 2048))
@@ -123,21 +82,7 @@ def test_what_is_read_is_what_the_servos_have(
     assert [bool(n) for n in map(str, backend.notices)] == [True] * (2 if firmware == 44 else 0)
 
 
-def test_goals_arrive_as_counts_and_bounds_are_kept(bus: RunningBus, connect: Connect) -> None:
-    backend = connect(bus)
-    backend.torque_on()
-    backend.write(Goal(q=[0.25, -0.1], current=[0.8, 99.0]))
-    read(backend)  # the write has no answer; this one comes after it
-    left, right = (bus.memory(i)[reg.GOAL_CURRENT :] for i in (0, 1))
-    assert struct.unpack_from("<h", left)[0] == int(0.8 / 2.69e-3)
-    assert struct.unpack_from("<h", right)[0] == 1193  # the current limit
-    assert struct.unpack_from("<i", left, 14)[0] == 2048 + round(0.25 / RADIAN)
-    assert struct.unpack_from("<i", right, 14)[0] == 2048 + round(0.1 / RADIAN)
-    backend.close()
-    until(lambda: not bus.servo(0).torque_on and not bus.servo(1).torque_on)
-
-
-def test_torque_on_starts_where_the_joint_is(bus: RunningBus, connect: Connect) -> None:
+def test_torque_on_starts_where_the_joint_is(bus, connect):
     def place() -> None:
         bus.bus.plant.q[:] = (0.4, -0.3)
         for servo in bus.bus.servos:
@@ -159,10 +104,10 @@ def test_torque_on_starts_where_the_joint_is(bus: RunningBus, connect: Connect) 
     assert read(backend).q == pytest.approx([0.4, -0.3], abs=RADIAN)
     assert backend.torque_off(Reading())
     assert all(bus.memory(i)[reg.TORQUE_ENABLE] == 0 for i in (0, 1))
-    assert all(bus.memory(i)[reg.BUS_WATCHDOG] == 0 for i in (0, 1))
+    until(lambda: all(bus.memory(i)[reg.BUS_WATCHDOG] == 0 for i in (0, 1)))  # is not answered
 
 
-def test_torque_is_refused_where_the_joint_can_not_be(bus: RunningBus, connect: Connect) -> None:
+def test_torque_is_refused_where_the_joint_can_not_be(bus, connect):
     bus.call(lambda: bus.bus.plant.q.__setitem__(1, 4.0))
     backend = connect(bus)
     assert [n for n in map(str, backend.notices) if "servo 2 (right): the joint is at 229°" in n]
@@ -175,8 +120,8 @@ def test_torque_is_refused_where_the_joint_can_not_be(bus: RunningBus, connect: 
 @pytest.mark.parametrize(
     ("model", "level"), [("XM430-W350", 2), ("XL330-M288", 1), ("XC330-T288", 2)]
 )
-def test_the_joints_go_where_they_are_told(running: Run, model: str, level: int) -> None:
-    bus = running(hand_bus(time.monotonic(), {"model": model}))
+def test_the_joints_go_where_they_are_told(running, model, level):
+    bus = running(servos={"model": model})
     bus.call(lambda: [s.table.set(reg.STATUS_RETURN_LEVEL, level) for s in bus.bus.servos])
     safety = {"current_max": by_name(model).stall_current, "current_move": 0.1}
     settings = changed(backend_settings(bus.path, model=model), safety=safety)
@@ -192,22 +137,10 @@ def test_the_joints_go_where_they_are_told(running: Run, model: str, level: int)
     backend.close()
 
 
-def test_an_alert_is_told_and_arming_is_refused(bus: RunningBus, connect: Connect) -> None:
-    backend = connect(bus)
-    bus.fault("overload=2")
-    reading = Reading()
-    backend.read(reading)
-    assert reading.valid
-    assert reading.alert == 2
-    with pytest.raises(ServoError, match=r"servo 2 \(right\): hardware error: overload"):
-        backend.torque_on()
-    assert not bus.servo(0).torque_on
-
-
 # --- when the bus goes wrong -------------------------------------------------------------------
 
 
-def test_a_missing_reply_costs_the_deadline_and_no_more(bus: RunningBus, connect: Connect) -> None:
+def test_a_missing_reply_costs_the_deadline_and_no_more(bus, connect):
     backend = connect(bus, reply_timeout=1.0)
     reading = Reading()
     backend.read(reading)
@@ -227,30 +160,9 @@ def test_a_missing_reply_costs_the_deadline_and_no_more(bus: RunningBus, connect
     assert reading.valid
 
 
-def test_a_damaged_reply_is_asked_for_again(bus: RunningBus, connect: Connect) -> None:
-    backend = connect(bus)
-    bus.fault("corrupt=0.5")
-    reading = Reading()
-    good = 0
-    for _ in range(60):
-        before = backend.counters()["retries"]
-        backend.read(reading)
-        good += reading.valid
-        if reading.valid:
-            assert reading.q == [0.0, 0.0]  # never a wrong number
-        assert backend.counters()["retries"] - before <= 1
-        if backend.counters()["timeouts"] + backend.counters()["torn"] > 3:
-            break
-    assert good > 3
-    assert backend.counters()["crc"] > 0
-    bus.fault("corrupt=0")
-
-
-@pytest.mark.parametrize("kind", ["duplicate", "truncate", "drop"])
+@pytest.mark.parametrize("kind", ["corrupt", "duplicate", "truncate", "drop"])
 @FIRMWARES
-def test_unruly_replies_give_right_numbers_or_none(
-    running: Run, kind: str, firmware: int, connect: Connect
-) -> None:
+def test_unruly_replies_give_right_numbers_or_none(running, kind, firmware, connect):
     bus = running(placed(firmware, 2148, 1998))
     backend = connect(bus, reply_timeout=0.05)
     bus.fault(f"{kind}=0.4")
@@ -258,21 +170,22 @@ def test_unruly_replies_give_right_numbers_or_none(
 
     def some() -> bool:
         nonlocal good
+        before = backend.counters()["retries"]
         backend.read(reading)
+        assert backend.counters()["retries"] - before <= 1
         if reading.valid:
             good += 1
             assert reading.q == pytest.approx([100 * RADIAN, 50 * RADIAN])
         return good > 3 and reading.seq >= 30
 
     until(some)
+    assert kind != "corrupt" or backend.counters()["crc"] > 0
     bus.fault(f"{kind}=0")
     until(lambda: (backend.read(reading), reading.valid)[1])
 
 
 @FIRMWARES
-def test_a_late_reply_is_not_taken_for_the_next_questions(
-    running: Run, firmware: int, connect: Connect
-) -> None:
+def test_a_late_reply_is_not_taken_for_the_next_questions(running, firmware, connect):
     bus = running(placed(firmware, 0, 0))
     backend = connect(bus, reply_timeout=0.004, zero=(0, 0))  # a late one comes after 0.01
     reading = Reading()
@@ -290,10 +203,8 @@ def test_a_late_reply_is_not_taken_for_the_next_questions(
     until(lambda: at_another_place(reading.seq) or reading.valid)
 
 
-def test_the_servos_own_watchdog_stops_them_and_that_is_told(
-    bus: RunningBus, connect: Connect
-) -> None:
-    backend = connect(bus, watchdog=0.04)
+def test_the_servos_own_watchdog_stops_them_and_that_is_told(bus, connect):
+    backend = connect(bus, watchdog=0.5)
     backend.torque_on()
     goal = Goal(q=[0.9, 0.9], current=[0.05, 0.05])
     backend.write(goal)
@@ -311,47 +222,27 @@ def test_the_servos_own_watchdog_stops_them_and_that_is_told(
     assert backend.counters()["timeouts"] == 0
 
 
-def test_a_stop_by_the_watchdog_is_found_though_all_was_sent_in_time(
-    bus: RunningBus, connect: Connect
-) -> None:
-    # As where an adapter held packets up that the port had taken.
+@pytest.mark.parametrize(
+    "what", ["its bus watchdog stopped it", "its bus watchdog is off, as after"]
+)
+def test_a_servo_that_stopped_by_itself_is_found_though_all_was_sent_in_time(bus, connect, what):
+    # As where an adapter held packets up that the port had taken, or power was lost for a moment.
     backend = connect(bus)
     backend.torque_on()
     goal, reading = Goal(q=[0.1, 0.1], current=[0.05, 0.05]), Reading()
     backend.write(goal)
     servo = bus.servo(1)
-    bus.call(lambda: servo.table.set(reg.BUS_WATCHDOG, reg.WATCHDOG_ERROR))
-    with pytest.raises(ServoError, match=r"right.*: its bus watchdog stopped it"):
-        until(lambda: backend.read(reading) or backend.write(goal))
-
-
-def test_a_servo_that_lost_its_power_for_a_moment_is_found(
-    bus: RunningBus, connect: Connect
-) -> None:
-    backend = connect(bus)
-    backend.torque_on()
-    goal, reading = Goal(q=[0.1, 0.1], current=[0.05, 0.05]), Reading()
-    backend.write(goal)
-    servo = bus.servo(1)
-    bus.call(lambda: servo.reboot(time.monotonic()))
-    with pytest.raises(ServoError, match=r"right.*: its bus watchdog is off, as after a reboot"):
+    if "off" in what:
+        bus.call(lambda: servo.reboot(time.monotonic()))
+    else:
+        bus.call(lambda: servo.table.set(reg.BUS_WATCHDOG, reg.WATCHDOG_ERROR))
+    with pytest.raises(ServoError, match=f"right.*: {what}"):
         until(lambda: backend.read(reading) or backend.write(goal))
     assert backend.torque_off(Reading())
     backend.torque_on()
 
 
-def test_a_port_that_goes_away(bus: RunningBus, connect: Connect) -> None:
-    backend = connect(bus)
-    backend.torque_on()
-    bus.call(bus.port.unplug)
-    with pytest.raises(PortGone, match="the port is gone"):
-        backend.read(Reading())
-    with pytest.raises(ServoError):
-        backend.torque_off(Reading())
-    backend.close()
-
-
-def test_torque_off_counts_once_every_servo_says_so(bus: RunningBus, connect: Connect) -> None:
+def test_torque_off_counts_once_every_servo_says_so(bus, connect):
     backend = connect(bus, reply_timeout=0.25)
     backend.torque_on()
     bus.fault("silent=2")
@@ -362,22 +253,9 @@ def test_torque_off_counts_once_every_servo_says_so(bus: RunningBus, connect: Co
     assert not bus.servo(1).torque_on
 
 
-def test_writes_that_get_lost_are_never_taken_for_done(bus: RunningBus, connect: Connect) -> None:
-    backend = connect(bus, watchdog=0.0)
-    backend.torque_on()
-    bus.fault("lose-writes=1")
-    reading = Reading()
-    for _ in range(5):
-        assert not backend.torque_off(reading)
-        assert reading.valid
-    assert bus.servo(0).torque_on
-    bus.fault("lose-writes=0")
-    assert backend.torque_off(reading)
-
-
 @pytest.mark.parametrize("mode", ["current-based position", "current", "position"])
-def test_goals_that_do_not_arrive_are_noticed(running: Run, mode: str, connect: Connect) -> None:
-    bus = running(hand_bus(time.monotonic(), {"mode": mode}))
+def test_goals_that_do_not_arrive_are_noticed(running, mode, connect):
+    bus = running(servos={"mode": mode})
     backend = connect(bus, mode=mode)
     backend.torque_on()
     reading, goal = Reading(), Goal(current=[0.2, 0.2])
@@ -403,9 +281,7 @@ def test_goals_that_do_not_arrive_are_noticed(running: Run, mode: str, connect: 
     until(lambda: tick().lost == 0)
 
 
-def test_a_servo_that_answers_with_the_same_bytes_again_and_again_is_noticed(
-    bus: RunningBus, connect: Connect
-) -> None:
+def test_a_servo_that_answers_with_the_same_bytes_again_and_again_is_noticed(bus, connect):
     backend = connect(bus)
     reading = Reading()
     backend.read(reading)
@@ -421,9 +297,7 @@ def test_a_servo_that_answers_with_the_same_bytes_again_and_again_is_noticed(
 
 
 @FIRMWARES
-def test_an_answer_with_an_error_is_no_reading(
-    running: Run, firmware: int, connect: Connect
-) -> None:
+def test_an_answer_with_an_error_is_no_reading(running, firmware, connect):
     bus = running(placed(firmware))
     backend = connect(bus)
     reading = Reading()
@@ -436,7 +310,7 @@ def test_an_answer_with_an_error_is_no_reading(
     assert reading.valid
 
 
-def test_close_turns_torque_off_on_a_bad_line(bus: RunningBus, connect: Connect) -> None:
+def test_close_turns_torque_off_on_a_bad_line(bus, connect):
     backend = connect(bus, reply_timeout=0.01)
     backend.torque_on()
     bus.fault("drop=0.3")
@@ -454,7 +328,7 @@ def test_nothing_works_before_connect() -> None:
         backend.torque_on()
 
 
-def test_a_scene_with_one_finger_asks_for_one_servo(bus: RunningBus) -> None:
+def test_a_scene_with_one_finger_asks_for_one_servo(bus):
     bus.fault("silent=1")
     settings = changed(backend_settings(bus.path), scene={"fingers": ("right",)})
     backend = DynamixelServos(settings, RealClock())

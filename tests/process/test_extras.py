@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-from pathlib import Path
-
 import pytest
 
+from tests.harness.daemon_process import python
 from tests.process.test_record import written
 
 
@@ -21,21 +18,14 @@ from tests.process.test_record import written
         ("pyarrow", "export run.mcap --format parquet", "parquet"),
     ],
 )
-def test_a_missing_extra_is_named(tmp_path: Path, missing: str, words: str, extra: str) -> None:
+def test_a_missing_extra_is_named(tmp_path, missing, words, extra):
     written(tmp_path / "run.mcap", 20)
     code = (
         f"import sys; sys.modules[{missing!r}] = None\n"
         "from softfinger.tools.cli import main\n"
         "sys.exit(main(sys.argv[1:]))"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code, *words.split()],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
+    done = python("-c", code, *words.split(), cwd=tmp_path)
     assert (done.returncode, done.stdout) == (1, "")
     assert done.stderr.count("\n") == 1
     assert f"pip install 'softfinger[{extra}]'" in done.stderr

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import struct
-import subprocess
 import time
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ from softfinger.daemon.wire import schema
 from softfinger.tools import cli
 from softfinger.tools.viewing.known import ShownHand
 from softfinger.tools.viewing.planar import SPRINGS, HandScene
-from tests.harness.daemon_process import SOFTFINGER
+from tests.harness.daemon_process import started
 from tests.harness.fake_daemon import FakeDaemon, event, frame, state
 
 TOPICS = {
@@ -92,8 +91,7 @@ class Client:
 def test_a_client_reads_every_channel_of_the_running_hand() -> None:
     with FakeDaemon() as fake:
         words = ["view", "--foxglove", "0", "--address", fake.state_address]
-        process = subprocess.Popen([*SOFTFINGER, *words], stdout=subprocess.PIPE, text=True)
-        assert process.stdout is not None
+        process = started(*words, stderr=None)
         try:
             line = process.stdout.readline()
             address, layout = line.split()[1], Path(line.split("layout: ")[1].strip())
@@ -185,6 +183,6 @@ def check_events(client: Client, early: dict[str, Any]) -> None:
     assert fields(line[1][0])[1] == [int(early["timestamp"])]
 
 
-def test_foxglove_is_for_the_stream_alone(capsys: pytest.CaptureFixture[str]) -> None:
+def test_foxglove_is_for_the_stream_alone(capsys):
     assert cli.main(["view", "run.mcap", "--foxglove"]) == 2
     assert "--foxglove serves the stream alone" in capsys.readouterr().err

@@ -59,13 +59,13 @@ def ask(door: Door, fields: str = "Host: 127.0.0.1:8765\r\n") -> tuple[socket.so
         ("", 403),
     ],
 )
-def test_only_this_machine_and_foxglove_are_let_in(door: Door, fields: str, answer: int) -> None:
+def test_only_this_machine_and_foxglove_are_let_in(door, fields, answer):
     client, answered = ask(door, fields)
     with client:
         assert answered == f"HTTP/1.1 {answer}".encode()
 
 
-def test_a_client_that_reads_nothing_makes_room_for_another(door: Door) -> None:
+def test_a_client_that_reads_nothing_makes_room_for_another(door):
     lazy = [ask(door) for _ in range(CLIENTS)]
     assert {answered for _, answered in lazy} == {b"HTTP/1.1 101"}
     late = b"HTTP/1.1 503"
@@ -78,7 +78,7 @@ def test_a_client_that_reads_nothing_makes_room_for_another(door: Door) -> None:
         each.close()
 
 
-def test_a_request_without_an_end_is_not_waited_for(door: Door) -> None:
+def test_a_request_without_an_end_is_not_waited_for(door):
     with socket.create_connection(("127.0.0.1", door.port), timeout=WAIT) as client:
         client.sendall(b"GET / HTTP/1.1\r\n")
         assert client.recv(100) == b""

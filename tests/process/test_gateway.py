@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import os
 import select
 import signal
@@ -10,19 +11,20 @@ import stat
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import msgpack
+import psutil
 import pytest
 import zmq
 
 from softfinger import AsyncHand, Hand
 from softfinger.daemon.client.command_client import NoAnswer, send
 from softfinger.daemon.errors import AddressError
-from softfinger.daemon.gateway import bounds
+from softfinger.daemon.gateway import bounds, supervisor
 from softfinger.daemon.gateway.bounds import Config
 from softfinger.daemon.gateway.server import Server
 from softfinger.daemon.gateway.supervisor import Gateway
@@ -31,8 +33,9 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.wire import loop_link
 from softfinger.daemon.wire.local_stop import LocalStop, stop_locally
 from softfinger.daemon.wire.publisher import GATEWAY_TOPICS, Publisher
-from tests.conftest import until
-from tests.harness.daemon_process import Running, ask, insist, softfinger
+from tests.conftest import Addresses, until
+from tests.harness.daemon_process import SOFTFINGER, ask, insist, python, softfinger
+from tests.harness.terminal_process import TerminalProcess
 from tests.process.test_strangers import place
 
 
@@ -46,7 +49,7 @@ def own_folder(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 @pytest.fixture
-def ticking(addresses: tuple[str, str], own_folder: Path) -> Iterator[Daemon]:
+def ticking(addresses: Addresses, own_folder: Path) -> Iterator[Daemon]:
     """A daemon that ticks in a thread; its gateway is a process."""
     settings = Settings.model_validate(
         {
@@ -63,12 +66,6 @@ def ticking(addresses: tuple[str, str], own_folder: Path) -> Iterator[Daemon]:
         thread.join()
 
 
-def gateway_of(daemon: Daemon) -> Gateway:
-    """The process that serves a daemon's clients."""
-    assert daemon.gateway is not None
-    return daemon.gateway
-
-
 def events(hand: Hand, text: str) -> bool:
     """Wait until an event says ``text``."""
     with hand.events(timeout=60.0) as told:
@@ -76,10 +73,8 @@ def events(hand: Hand, text: str) -> bool:
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSEGV])
-def test_a_gateway_that_dies_is_started_again_while_the_loop_goes_on(
-    ticking: Daemon, addresses: tuple[str, str], number: int
-) -> None:
-    gateway, loop = gateway_of(ticking), ticking.loop
+def test_a_gateway_that_dies_is_started_again_while_the_loop_goes_on(ticking, addresses, number):
+    gateway, loop = ticking.gateway, ticking.loop
     with Hand(*addresses, timeout=60.0) as hand:
         insist(hand.arm)
         stream = hand.stream(timeout=60.0)
@@ -97,8 +92,8 @@ def test_a_gateway_that_dies_is_started_again_while_the_loop_goes_on(
 
 
 def test_who_subscribes_before_the_loop_has_the_new_gateway_gets_its_last_events(
-    addresses: tuple[str, str], context: zmq.Context[zmq.Socket[bytes]]
-) -> None:
+    addresses, context
+):
     link = loop_link.Link()
     Publisher(link).event(0.0, 0.0, "info", "test", "while there was no gateway")
     ours, theirs = loop_link.pair()
@@ -126,14 +121,12 @@ def test_who_subscribes_before_the_loop_has_the_new_gateway_gets_its_last_events
         server.close()
 
 
-def test_the_gateway_leaves_with_its_daemon(
-    profile: Callable[..., Path], addresses: tuple[str, str], start: Callable[..., Running]
-) -> None:
+def test_the_gateway_leaves_with_its_daemon(profile, addresses, start):
     running = start("--config", str(profile()))
-    (gateway,) = children(running.process.pid)
+    (gateway,) = psutil.Process(running.process.pid).children()
     running.process.kill()
     running.process.wait()
-    until(lambda: not Path(f"/proc/{gateway}").exists() or is_zombie(gateway))
+    assert psutil.wait_procs([gateway], timeout=300.0)[1] == []
 
 
 HANGING = """
@@ -165,27 +158,16 @@ sys.exit(gateway.main(sys.argv[1:]))
         ("STALLED", "select.select([], [], [], 0.5)", 0),  # as if it were stopped or starved
     ],
 )
-def test_a_gateway_that_hangs_ends_itself_and_a_busy_machine_ends_none(
-    bound: str, does: str, status: int
-) -> None:
+def test_a_gateway_that_hangs_ends_itself_and_a_busy_machine_ends_none(bound, does, status):
     ours, theirs = loop_link.pair()
     with ours, theirs:
         config = Config("", "", GATEWAY_TOPICS, 100).to_json()
-        ended = subprocess.run(
-            [
-                sys.executable,
-                "-c",
-                HANGING.format(bound=bound, does=does),
-                str(theirs.fileno()),
-                config,
-            ],
-            pass_fds=(theirs.fileno(),),
-            timeout=300,
-        )
+        script, link = HANGING.format(bound=bound, does=does), theirs.fileno()
+        ended = python("-c", script, link, config, pass_fds=(link,))
     assert ended.returncode == status
 
 
-def test_a_gateway_that_is_stopped_is_started_anew(addresses: tuple[str, str]) -> None:
+def test_a_gateway_that_is_stopped_is_started_anew(addresses):
     gateway = Gateway(Config(*addresses, GATEWAY_TOPICS, 100)).wait()
     try:
         stopped = gateway.process
@@ -196,7 +178,7 @@ def test_a_gateway_that_is_stopped_is_started_anew(addresses: tuple[str, str]) -
         gateway.close()
 
 
-def test_its_memory_has_a_bound_and_it_yields_to_the_loop(addresses: tuple[str, str]) -> None:
+def test_its_memory_has_a_bound_and_it_yields_to_the_loop(addresses):
     gateway = Gateway(Config(*addresses, GATEWAY_TOPICS, 100)).wait()
     try:
         limits = Path(f"/proc/{gateway.process}/limits").read_text(encoding="ascii")
@@ -209,9 +191,7 @@ def test_its_memory_has_a_bound_and_it_yields_to_the_loop(addresses: tuple[str, 
         gateway.close()
 
 
-def test_a_loop_whose_gateway_reads_nothing_drops_messages_and_goes_on(
-    addresses: tuple[str, str],
-) -> None:
+def test_a_loop_whose_gateway_reads_nothing_drops_messages_and_goes_on(addresses):
     gateway = Gateway(Config(*addresses, GATEWAY_TOPICS, 100)).wait()
     try:
         publisher = Publisher(gateway.link)
@@ -226,24 +206,19 @@ def test_a_loop_whose_gateway_reads_nothing_drops_messages_and_goes_on(
         gateway.close()
 
 
-def test_it_imports_no_numpy() -> None:
-    code = (
-        "import sys, softfinger.daemon.gateway.__main__\n"
-        "assert not {'numpy', 'numba', 'pydantic'} & set(sys.modules), 'too much'"
-    )
-    done = os.spawnv(os.P_WAIT, sys.executable, [sys.executable, "-c", code])
-    assert done == 0
-
-
 # --- a stop past all clients --------------------------------------------------------------------
 
 
-def test_a_stop_on_this_machine_needs_no_place_among_the_clients(
-    ticking: Daemon, addresses: tuple[str, str]
-) -> None:
-    with Hand(*addresses, timeout=60.0) as hand:
+def test_a_stop_on_this_machine_needs_no_place_among_the_clients(ticking, addresses, monkeypatch):
+    monkeypatch.setattr(supervisor, "_LOOKS", math.inf)  # a stopped gateway is not replaced
+    where = ["--address", ",".join(addresses)]
+    with (
+        Hand(*addresses, timeout=60.0) as hand,
+        TerminalProcess([*SOFTFINGER, "monitor", *where]) as page,
+    ):
         insist(hand.arm)
-        os.kill(gateway_of(ticking).process, signal.SIGSTOP)  # nobody is served
+        page.shows("ARMED")
+        os.kill(ticking.gateway.process, signal.SIGSTOP)  # nobody is served
         try:
             assert send(addresses[1], {"command": "stop"}, timeout=60.0)["ok"] is True
             assert ticking.loop.state.mode == "disarmed"
@@ -253,31 +228,21 @@ def test_a_stop_on_this_machine_needs_no_place_among_the_clients(
                     return bool(await other.command("stop"))
 
             assert asyncio.run(stop())
+            done = softfinger("send", "stop", "--address", addresses[1])
+            assert (done.returncode, '"ok": true' in done.stdout) == (0, True), done.stderr
+            page.type(b" ")
+            page.shows("✓ stop: ok")
             with pytest.raises(NoAnswer):
                 send(addresses[1], {"command": "status"}, timeout=0.2)
         finally:
-            os.kill(gateway_of(ticking).process, signal.SIGCONT)
+            os.kill(ticking.gateway.process, signal.SIGCONT)
         assert hand.wait_for(lambda state: not state.torque, 60.0).mode == "disarmed"
         hand.stop()
         insist(hand.arm)  # what comes after its answer is heard
         hand.stop()
 
 
-def test_the_command_line_takes_that_way(ticking: Daemon, addresses: tuple[str, str]) -> None:
-    assert ask(addresses[1], "arm")["ok"]
-    os.kill(gateway_of(ticking).process, signal.SIGSTOP)
-    try:
-        done = softfinger("send", "stop", "--address", addresses[1])
-    finally:
-        os.kill(gateway_of(ticking).process, signal.SIGCONT)
-    assert done.returncode == 0, done.stderr
-    assert '"ok": true' in done.stdout
-    assert ticking.loop.state.mode == "disarmed"
-
-
-def test_its_folder_and_file_are_the_users_alone(
-    own_folder: Path, addresses: tuple[str, str]
-) -> None:
+def test_its_folder_and_file_are_the_users_alone(own_folder, addresses):
     local = LocalStop(addresses[1])
     host, port = place(addresses[1])
     assert stat.S_IMODE(own_folder.stat().st_mode) == 0o700
@@ -288,12 +253,7 @@ def test_its_folder_and_file_are_the_users_alone(
     assert list(own_folder.iterdir()) == []
 
 
-def test_a_folder_that_others_may_enter_is_not_taken(
-    own_folder: Path,
-    addresses: tuple[str, str],
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
-) -> None:
+def test_a_folder_that_others_may_enter_is_not_taken(own_folder, addresses, monkeypatch, tmp_path):
     own_folder.mkdir(mode=0o755)
     monkeypatch.setattr("softfinger.daemon.wire.local_stop._folders", lambda: iter([own_folder]))
     with pytest.raises(AddressError, match="is not this user's alone"):
@@ -305,18 +265,14 @@ def test_a_folder_that_others_may_enter_is_not_taken(
     assert stop_locally(addresses[1], 0.1) is None
 
 
-def test_the_socket_of_a_daemon_that_was_killed_is_taken_over(
-    own_folder: Path, addresses: tuple[str, str]
-) -> None:
+def test_the_socket_of_a_daemon_that_was_killed_is_taken_over(own_folder, addresses):
     killed = LocalStop(addresses[1])
     killed._socket.close()
     assert stop_locally(addresses[1], 0.1) is None
     LocalStop(addresses[1]).close()
 
 
-def test_a_stop_for_another_machine_stops_nothing_here(
-    own_folder: Path, addresses: tuple[str, str]
-) -> None:
+def test_a_stop_for_another_machine_stops_nothing_here(own_folder, addresses):
     local = LocalStop(addresses[1])
     for host in ("hand.example", "192.0.2.1", "127.0.0.2"):
         assert stop_locally(f"tcp://{host}:{place(addresses[1])[1]}", 0.1) is None
@@ -324,34 +280,13 @@ def test_a_stop_for_another_machine_stops_nothing_here(
     local.close()
 
 
-def children(process: int) -> list[int]:
-    found = []
-    for task in Path(f"/proc/{process}/task").iterdir():
-        found += [int(each) for each in (task / "children").read_text(encoding="ascii").split()]
-    return found
-
-
-def is_zombie(process: int) -> bool:
-    try:
-        return " Z " in Path(f"/proc/{process}/stat").read_text(encoding="ascii")
-    except OSError:
-        return True
-
-
-def test_a_loop_that_ends_while_its_gateway_starts_is_no_error(addresses: tuple[str, str]) -> None:
+def test_a_loop_that_ends_while_its_gateway_starts_is_no_error(addresses):
     ours, theirs = loop_link.pair()
     config = Config(*addresses, GATEWAY_TOPICS, 10, 200, 10.0, 0o600, "")
     with ours, theirs:
+        words = ["-m", "softfinger.daemon.gateway", str(theirs.fileno()), config.to_json()]
         process = subprocess.Popen(
-            [
-                sys.executable,
-                "-m",
-                "softfinger.daemon.gateway",
-                str(theirs.fileno()),
-                config.to_json(),
-            ],
-            pass_fds=(theirs.fileno(),),
-            stderr=subprocess.PIPE,
+            [sys.executable, *words], pass_fds=(theirs.fileno(),), stderr=subprocess.PIPE
         )
     assert process.communicate()[1] == b""
     assert process.returncode == 0

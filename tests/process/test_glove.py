@@ -23,7 +23,6 @@ def test_a_frame_is_index_halves_and_newline():
     data = encode_glove(np.array([[0, 31], [32, 1023]], np.uint16), 2)
     assert data == bytes([13, 11, 11, 11, 42, 12, 11, 42, 42, 10])
     decoded = GloveDecoder(2, 2).feed(data, 3.0)
-    assert decoded is not None
     assert decoded.t == 3.0
     assert decoded.data.tolist() == [[0, 31], [32, 1023]]
     assert encode_glove(np.full((1, 1), 60000, np.uint16)) == bytes([11, 42, 42, 10])
@@ -97,8 +96,8 @@ def test_a_damaged_frame_is_dropped_and_told(spoil, told):
 def test_the_board_is_asked_for_each_frame_and_again_when_an_answer_is_lost(tmp_path):
     with Rig("glove", tmp_path, fault="torn=0.5") as rig:
         rig.sensor.open()
-        first = rig.newest().seq
-        until(lambda: rig.newest().seq >= first + 5)
+        first = rig.sensor.latest().seq
+        until(lambda: rig.sensor.latest().seq >= first + 5)
         counters = rig.sensor.counters()
         # It answers requests only: nothing is sent that was not asked for.
         assert rig.board.sent <= counters["frames"] + counters["resyncs"] + 3

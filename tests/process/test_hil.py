@@ -1,202 +1,264 @@
-"""Hardware in the loop: the daemon's process on the stand-in hand's, over real serial bytes."""
+"""Hardware in the loop: the daemon's process on the stand-in hand's, over real serial bytes.
+
+The stand-in hand tells by its control socket what was on the servos' wire, and when their bus
+watchdog stopped them: where the daemon dies, stands still, or loses its port.
+"""
 
 from __future__ import annotations
 
 import json
 import select
 import signal
-import subprocess
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import msgpack
 import pytest
-import zmq
 
+from softfinger import Hand, HandState
 from softfinger.daemon.simulation.emulator.folder import send_words
-from tests.conftest import own_addresses, until
-from tests.harness.daemon_process import PATIENT, SOFTFINGER, Running, ask, softfinger
+from tests.conftest import Addresses, until
+from tests.harness.daemon_process import Running, ask, insist, softfinger
+from tests.harness.emulated import HIL, EmulatorProcess
 
-HIL = Path(__file__).parents[2] / "config" / "hil.toml"
-
-
-class Emulated:
-    """A stand-in hand in a process of its own, ready when constructed."""
-
-    def __init__(self, folder: Path) -> None:
-        folder.mkdir()
-        self.folder = folder
-        words = ("emulate", "--dir", str(folder), "--config", str(HIL))
-        self.process = subprocess.Popen([*SOFTFINGER, *words], stdout=subprocess.PIPE, text=True)
-        assert self.process.stdout is not None
-        assert self.process.stdout.readline() == "ready\n"
-
-    def end(self) -> None:
-        self.process.terminate()
-        self.process.wait(timeout=300)
-        assert self.process.stdout is not None
-        self.process.stdout.close()
+WATCHDOG = 1.0  # s, well above what a busy machine holds the daemon up
+REAL = [
+    *("--set", "loop.clock=real"),  # else the hand waits for a daemon that stands still
+    *("--set", f"servos.watchdog={WATCHDOG}", "--set", f"servos.fault_after={WATCHDOG}"),
+    *("--set", "servos.reply_timeout=0.1"),
+]
 
 
-def profile(path: Path) -> tuple[Path, tuple[str, str]]:
-    """config/hil.toml at ``path``, on addresses of its own."""
-    stream, commands = addresses = own_addresses()
-    head = f'stream.address = "{stream}"\ncommands.address = "{commands}"\n'
-    path.write_text(head + HIL.read_text(encoding="utf-8"), encoding="utf-8")
-    return path, addresses
+class Rig:
+    """The stand-in hand, and a daemon on it that can be started again."""
+
+    def __init__(self, folder: Path, addresses: Addresses, *words: str) -> None:
+        self.folder = folder / "hand"
+        self.words = words
+        self.commands = addresses[1]
+        self.config = folder / "hil.toml"
+        head = f'stream.address = "{addresses[0]}"\ncommands.address = "{addresses[1]}"\n'
+        self.config.write_text(head + HIL.read_text(encoding="utf-8"), encoding="utf-8")
+        self.hand = EmulatorProcess("--dir", self.folder, "--config", HIL, *words[:2]).ready()
+        self.daemon: Running | None = None
+
+    def start(self) -> Running:
+        self.daemon = Running("--config", str(self.config), "--dir", str(self.folder), *self.words)
+        return self.daemon
+
+    def send(self, name: str, **numbers: float) -> dict[str, Any]:
+        return ask(self.commands, name, **numbers)
+
+    def status(self) -> dict[str, Any]:
+        return self.send("status")
+
+    def report(self) -> dict[str, Any]:
+        report: dict[str, Any] = json.loads(send_words(self.folder, "report"))
+        return report
+
+    def stopped(self) -> bool:
+        return all(servo["stopped_by_watchdog"] for servo in self.report()["servos"])
+
+    def at_work(self) -> None:
+        """Arm, and be under way when this returns. A busy machine may trip it before."""
+
+        def under_way() -> bool:
+            if self.status()["mode"] == "fault":
+                self.send("clear")
+            self.send("arm")
+            self.send("move", left=0.3, right=0.3)
+            servos = self.report()["servos"]
+            return all(each["torque"] and not each["stopped_by_watchdog"] for each in servos)
+
+        until(under_way)
+
+    def works(self) -> None:
+        """From disarmed: arm, go somewhere, be there. A busy machine may trip it on the way."""
+        until(lambda: self.goes_to(-0.1) and self.goes_to(0.1))
+        for servo in self.report()["servos"]:
+            assert not servo["stopped_by_watchdog"]
+            assert servo["torque_on"]["far"] == 0, "torque went on with a goal elsewhere"
+        assert self.send("disarm")["ok"]
+        until(lambda: not any(servo["torque"] for servo in self.report()["servos"]))
+
+    def goes_to(self, target: float) -> bool:
+        mode = self.status()["mode"]
+        if mode == "fault":
+            self.send("clear")
+        elif mode == "disarmed":
+            self.send("arm")
+        if not self.send("move", left=target, right=target)["ok"]:
+            return False
+        while (mode := self.status()["mode"]) == "moving":
+            pass
+        angles = [servo["q"] for servo in self.report()["servos"]]
+        return mode == "armed" and angles == pytest.approx([target, target], abs=0.05)
+
+    def cleared(self) -> bool:
+        reply = self.send("clear")
+        return bool(reply["ok"] or "not while disarmed" in reply["error"])
+
+    def close(self) -> None:
+        if self.daemon is not None:
+            self.daemon.kill()
+        self.hand.end()
 
 
-class Pair(NamedTuple):
-    """A stand-in hand and a daemon on it, for several tests."""
-
-    folder: Path
-    stream: str
-    commands: str
-
-
-@pytest.fixture(scope="module")
-def pair(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Pair]:
-    place = tmp_path_factory.mktemp("pair")
-    hand = Emulated(place / "hand")
-    config, addresses = profile(place / "hil.toml")
-    # It sits out a busy machine's stalls.
-    daemon = Running("--config", str(config), "--dir", str(hand.folder), *PATIENT)
-    yield Pair(hand.folder, *addresses)
-    try:
-        status, said = daemon.end(signal.SIGINT), "".join(daemon.lines)
-        assert status == ("ended with a fault" in said), said  # a busy machine may trip it
-    finally:
-        daemon.kill()
-        hand.end()
+@pytest.fixture
+def rig(tmp_path: Path, addresses: Addresses) -> Iterator[Rig]:
+    rig = Rig(tmp_path, addresses, *REAL)
+    yield rig
+    rig.close()
 
 
-class Stream:
-    """The state stream of a running daemon."""
-
-    def __init__(self, context: zmq.Context[Any], address: str) -> None:
-        self._socket = context.socket(zmq.SUB)
-        self._socket.subscribe("hand/state")
-        self._socket.connect(address)
-
-    def next(self) -> dict[str, Any]:
-        assert self._socket.poll(60_000), "no state for 60 s"
-        state: dict[str, Any] = msgpack.unpackb(self._socket.recv_multipart()[1])
-        return state
-
-    def newest(self) -> dict[str, Any]:
-        state = self.next()
-        while self._socket.poll(0):
-            state = self.next()
-        return state
-
-
-def near(state: dict[str, Any], force: float) -> bool:
-    return all(abs(state[f]["force"] - force) <= 0.05 * force for f in ("left", "right"))
-
-
-def held_on(pair: Pair, stream: Stream, count: int) -> list[dict[str, Any]]:
-    """So many states in a row of a hand that holds with 10 N.
-
-    One that a busy machine made let go, as it must, is told to take hold again.
-    """
-    held: list[dict[str, Any]] = []
-    next_step = {"fault": "clear", "disarmed": "arm", "armed": "grasp"}
-
-    def look() -> bool:
-        state = stream.next()
-        if state["mode"] == "holding" and (held or near(state, 10.0)):
-            held.append(state)
-        else:
-            held.clear()
-            if command := next_step.get(state["mode"]):
-                force = {"force": 10.0} if command == "grasp" else {}
-                reply = ask(pair.commands, command, **force)
-                print(state["mode"], state["fault"], command, reply)  # shown if it fails
-        return len(held) == count
-
-    until(look, 500.0)
-    return held
-
-
-def test_arm_grasp_10_n_hold_release_and_stop_over_bytes(
-    pair: Pair, context: zmq.Context[Any]
-) -> None:
-    stream = Stream(context, pair.stream)
-    before = stream.next()
-    assert (before["mode"], before["torque"]) == ("disarmed", False)
-    held = held_on(pair, stream, 60)
-    # A busy machine may keep a reading or a frame from being fresh for a moment.
-    sound = [state for state in held if state["left"]["valid"] and state["right"]["valid"]]
-    assert sum(near(state, 10.0) for state in sound) > 0.9 * len(sound) > 0
-    assert sound[-1]["object"]["width"] == pytest.approx(0.040, abs=1e-3)
-    assert ask(pair.commands, "release")["ok"]
-    until(lambda: stream.newest()["mode"] == "armed")
-    state = stream.newest()
-    assert not state["left"]["contact"]
-    assert not state["right"]["contact"]
-    assert abs(state["left"]["q"]) < 0.05
-    assert ask(pair.commands, "stop")["ok"]
-    until(lambda: not stream.newest()["torque"])
+def near(state: HandState, force: float) -> bool:
+    return all(abs(tip.force - force) <= 0.05 * force for tip in (state.left, state.right))
 
 
 @pytest.mark.waits
-def test_daemon_and_emulated_hand_wait_for_each_other(
-    tmp_path: Path, context: zmq.Context[Any]
-) -> None:
-    hand = Emulated(tmp_path / "hand")
-    config, (stream_address, commands) = profile(tmp_path / "hil.toml")
-    daemon = Running("--config", str(config), "--dir", str(hand.folder))
+def test_a_grasp_over_bytes_by_a_daemon_and_a_hand_that_wait_for_each_other(tmp_path, addresses):
+    rig = Rig(tmp_path, addresses)
     try:
-        stream = Stream(context, stream_address)
-        assert ask(commands, "arm")["ok"]
-        assert ask(commands, "grasp", force=8.0)["ok"]
-        # Older states of an armed hand may still be in the queue.
-        until(lambda: (mode := stream.next()["mode"]) == "holding" or mode == "fault")
-        for process in (daemon.process, hand.process):
-            stood = stream.newest()["behind_s"] + 0.4
-            process.send_signal(signal.SIGSTOP)
-            select.select([], [], [], 0.5)  # five times what the servos' watchdog allows
-            process.send_signal(signal.SIGCONT)
-            until(lambda at=stood: stream.next()["behind_s"] > at)
-        state = stream.newest()
-        assert (state["mode"], state["fault"]) == ("holding", "")
-        report = json.loads(send_words(hand.folder, "report"))
-        assert not any(servo["watchdog_fired"]["count"] for servo in report["servos"])
-        # A daemon that is gone is waited for no longer.
-        daemon.kill()
-        until(lambda: stopped(hand.folder))
+        daemon = rig.start()
+        with Hand(*addresses, timeout=120.0) as hand:
+            before = hand.state()
+            assert (before.mode, before.torque) == ("disarmed", False)
+            insist(hand.arm)
+            insist(lambda: hand.grasp(force=10.0))
+            hand.wait_for(lambda state: state.mode == "holding", 120.0)
+            for process in (daemon.process, rig.hand.popen):
+                stood = hand.state().behind_s + 0.4
+                process.send_signal(signal.SIGSTOP)
+                select.select([], [], [], 0.5)  # five times what the servos' watchdog allows
+                process.send_signal(signal.SIGCONT)
+                hand.wait_for(lambda state, at=stood: state.behind_s > at, 120.0)
+            with hand.stream(120.0) as states:
+                held = [next(states) for _ in range(60)]
+            assert {(state.mode, state.fault) for state in held} == {("holding", "")}
+            # A frame that comes late keeps a contact from being valid for a moment.
+            sound = [state for state in held if state.left.valid and state.right.valid]
+            assert sum(near(state, 10.0) for state in sound) > 0.9 * len(sound) > 0
+            assert sound[-1].object.width == pytest.approx(0.040, abs=1e-3)
+            insist(hand.release)
+            hand.wait_for(lambda state: state.mode == "armed", 120.0)
+            state = hand.state()
+            assert (state.left.contact, state.right.contact) == (False, False)
+            assert abs(state.left.q) < 0.05
+            hand.stop()
+            hand.wait_for(lambda state: not state.torque, 120.0)
+            assert not any(each["watchdog_fired"]["count"] for each in rig.report()["servos"])
+            insist(hand.arm)
+            hand.wait_for(lambda state: state.torque, 120.0)
+        daemon.kill()  # one that is gone is waited for no longer
+        until(rig.stopped)
     finally:
-        daemon.kill()
-        hand.end()
+        rig.close()
 
 
-def stopped(folder: Path) -> bool:
-    """Whether the servos' watchdogs have stopped them."""
-    servos = json.loads(send_words(folder, "report"))["servos"]
-    return all(servo["stopped_by_watchdog"] for servo in servos)
+def stops_in_time(rig: Rig, lose: Callable[[], object]) -> None:
+    """Each servo stops once the watchdog's time has passed since the last packet it heard."""
+    before = rig.report()["servos"]
+    lose()
+    until(rig.stopped)
+    report = rig.report()
+    for servo, earlier in zip(report["servos"], before, strict=True):
+        fired, heard = servo["watchdog_fired"], report["t"] - servo["quiet"]
+        assert fired["count"] == earlier["watchdog_fired"]["count"] + 1
+        assert fired["t"] - heard == pytest.approx(WATCHDOG, abs=1e-6)
 
 
-def test_a_second_daemon_on_the_same_ports_says_so_before_torque_is_on(
-    pair: Pair, tmp_path: Path
-) -> None:
-    config, _ = profile(tmp_path / "other.toml")
-    second = softfinger("run", "--config", str(config), "--dir", str(pair.folder))
-    assert second.returncode == 1
-    assert f"{pair.folder}/servos" in second.stderr.splitlines()[-1]
-    assert "Traceback" not in second.stderr
-    ask(pair.commands, "disarm")
-    reply = ask(pair.commands, "arm")
-    assert reply["ok"], f"the first one must live on: {reply}"
-    assert ask(pair.commands, "disarm")["ok"]
+def test_servos_stop_by_themselves_and_the_hand_works_again(rig):
+    # Boards of another size than the profile's are no start.
+    where = ("--config", str(rig.config), "--dir", str(rig.folder))
+    done = softfinger("run", *where, "--set", "tactile.rows=16")
+    assert done.returncode == 1
+    last = done.stderr.splitlines()[-1]
+    assert "1024" in last
+    assert "16" in last
+    assert "Traceback" not in done.stderr
+
+    # Killed: nothing is left that could say anything to the servos.
+    daemon = rig.start()
+    rig.at_work()
+    stops_in_time(rig, daemon.kill)
+    daemon = rig.start()
+    status = rig.status()
+    assert (status["mode"], status["torque"], status["fault"]) == ("disarmed", False, "")
+    assert rig.stopped(), "starting touches nothing"
+    send_words(rig.folder, "forget")
+    rig.works()
+
+    # Stopped for longer than the watchdog allows, then continued.
+    rig.at_work()
+    stops_in_time(rig, lambda: daemon.process.send_signal(signal.SIGSTOP))
+    daemon.process.send_signal(signal.SIGCONT)
+    until(lambda: rig.status()["mode"] == "fault")
+    assert rig.status()["fault_name"] in ("servos.bus", "servos.silent")
+    until(rig.cleared)
+    send_words(rig.folder, "forget")
+    rig.works()
+
+    # Unplugged, and plugged in again.
+    rig.at_work()
+    stops_in_time(rig, lambda: send_words(rig.folder, "unplug"))
+    until(lambda: rig.status()["mode"] == "fault")
+    assert rig.status()["fault_name"] == "servos.bus"
+    assert not rig.send("clear")["ok"], "nothing is there to be cleared"
+    send_words(rig.folder, "plug")
+    until(rig.cleared)
+    send_words(rig.folder, "forget")
+    rig.works()
+
+    # The other end of the line is gone for good.
+    assert rig.send("arm")["ok"]
+    rig.hand.popen.kill()
+    until(lambda: rig.status()["mode"] == "fault")
+    assert rig.status()["fault_name"] == "servos.bus"
+    assert not rig.send("clear")["ok"]
+    assert daemon.end() == 1
+    assert "ended with a fault" in "".join(daemon.lines)
 
 
-def test_the_daemon_lives_through_a_torn_tactile_stream(pair: Pair) -> None:
-    def counters() -> dict[str, int]:
-        told: dict[str, int] = ask(pair.commands, "status")["counters"]["tactile-left"]
-        return told
+def test_what_gets_lost_on_the_line_does_not_keep_torque_on(rig):
+    rig.start()
 
-    before = counters()["frames"]
-    assert send_words(pair.folder, "left:torn") == "ok"
-    until(lambda: counters()["resyncs"] > 2 and counters()["frames"] > before + 20)
-    assert send_words(pair.folder, "left:well") == "ok"
+    # A stop of which no write arrives, though readings do, and feed the servos' watchdogs.
+    rig.at_work()
+    send_words(rig.folder, "lose-writes=1")
+    told = softfinger("send", "stop", "--address", rig.commands)
+    assert told.returncode == 3
+    assert json.loads(told.stdout)["torque_off"] == "unconfirmed"
+    assert "have not confirmed torque off" in told.stderr
+    until(rig.stopped)
+    assert rig.status()["torque"], "they are stopped, and it is not confirmed to be off"
+    send_words(rig.folder, "lose-writes=0")
+    until(lambda: not rig.status()["torque"])
+    assert not any(servo["torque"] for servo in rig.report()["servos"])
+    until(rig.cleared)
+
+    # Goals that no longer arrive are noticed by themselves. A busy machine may trip the hand first.
+    def goals_are_missed() -> bool:
+        rig.at_work()
+        send_words(rig.folder, "lose-writes=1")
+        until(lambda: rig.status()["mode"] == "fault")
+        told = rig.status()["fault_name"]
+        until(rig.stopped)
+        send_words(rig.folder, "lose-writes=0")
+        until(rig.cleared)
+        return bool(told == "goal.lost")
+
+    until(goals_are_missed)
+
+    # Nine packets in ten, both ways.
+    rig.at_work()
+    send_words(rig.folder, "lose=0.9 drop=0.9")
+    rig.send("stop")
+    until(
+        lambda: (
+            not any(s["torque"] and not s["stopped_by_watchdog"] for s in rig.report()["servos"])
+        )
+    )
+    send_words(rig.folder, "well")
+    until(lambda: not rig.status()["torque"])
+    until(lambda: rig.status()["mode"] == "disarmed" or rig.cleared())
+    rig.works()

@@ -6,7 +6,6 @@ import asyncio
 import json
 import re
 import signal
-import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -19,12 +18,12 @@ from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.keys import make_keys
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.replay import Wire
-from tests.conftest import Inline, own_addresses, until
+from tests.conftest import Addresses, own_addresses, until
 from tests.harness.daemon_process import (
-    SOFTFINGER,
     Running,
     ask,
     insist,
+    started,
     until_it_says,
 )
 from tests.harness.viewed import Viewed, Watcher
@@ -36,7 +35,7 @@ class Guarded(NamedTuple):
     """A daemon that lets in the clients of ``folder`` alone."""
 
     folder: Path
-    addresses: tuple[str, str]
+    addresses: Addresses
     recording: Path  # of itself
 
 
@@ -61,16 +60,14 @@ def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Guarded]:
 
 def record(path: Path, *words: str) -> None:
     """Record until something was recorded."""
-    process = subprocess.Popen([*SOFTFINGER, "record", path, *words], stdout=subprocess.DEVNULL)
+    process = started("record", path, *words)
     until(lambda: path.exists() and path.stat().st_size > 3000)
     process.send_signal(signal.SIGINT)
     assert process.wait(300) == 0
     assert Recording(path).counts["hand/state"] > 0
 
 
-def test_tools_with_keys_see_and_command_the_hand(
-    guarded: Guarded, tmp_path: Path, inline: Inline
-) -> None:
+def test_tools_with_keys_see_and_command_the_hand(guarded, tmp_path, inline):
     folder, addresses, _ = guarded
     stream, commands = addresses
     alice = ("--keys", str(folder / "alice"))
@@ -96,13 +93,11 @@ def test_tools_with_keys_see_and_command_the_hand(
     assert ask(commands, "stop")["ok"]
 
 
-def test_tools_without_keys_see_nothing_and_say_what_may_be_missing(
-    guarded: Guarded, tmp_path: Path, inline: Inline
-) -> None:
+def test_tools_without_keys_see_nothing_and_say_what_may_be_missing(guarded, tmp_path, inline):
     stream, commands = guarded.addresses
     path = tmp_path / "b.mcap"
     tools = [
-        subprocess.Popen([*SOFTFINGER, *words], stderr=subprocess.PIPE, text=True)
+        started(*words)
         for words in (
             ("record", str(path), "--address", stream, "--no-wait"),
             ("view", "--no-browser", "--port", "0", "--address", stream, "--no-wait"),
@@ -122,24 +117,17 @@ def test_tools_without_keys_see_nothing_and_say_what_may_be_missing(
     assert not path.exists()
 
 
-def test_a_daemon_with_keys_records_itself(guarded: Guarded) -> None:
+def test_a_daemon_with_keys_records_itself(guarded):
     until(lambda: guarded.recording.stat().st_size > 3000)
     first = next(message for _, message in Recording(guarded.recording).messages([b"hand/input"]))
     assert first["seq"] == 1
 
 
-def test_a_recording_is_replayed_to_holders_of_keys(
-    addresses: tuple[str, str], tmp_path: Path
-) -> None:
+def test_a_recording_is_replayed_to_holders_of_keys(addresses, tmp_path):
     path, folder = tmp_path / "run.mcap", tmp_path / "keys"
     make_keys(folder, ["alice"])
     written(path, 20)
-    replay = subprocess.Popen(
-        [*SOFTFINGER, "replay", str(path), "--address", addresses[0], "--keys", str(folder)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    replay = started("replay", path, "--address", addresses[0], "--keys", folder)
     try:
         with (
             Hand(*addresses, keys=folder / "alice", timeout=60.0) as hand,
@@ -164,14 +152,12 @@ def test_a_recording_is_replayed_to_holders_of_keys(
         ("nonsense", "expected tcp://127.0.0.1:PORT"),
     ],
 )
-def test_nothing_is_replayed_to_other_machines_without_keys(address: str, reason: str) -> None:
+def test_nothing_is_replayed_to_other_machines_without_keys(address, reason):
     with pytest.raises(RecordingError, match=reason):
         Wire(address)
 
 
-def test_late_subscribers_of_a_replay_are_told_settings_and_events_again(
-    addresses: tuple[str, str],
-) -> None:
+def test_late_subscribers_of_a_replay_are_told_settings_and_events_again(addresses):
     told = {"schema": 1, "seq": 1, "again": False, "timestamp": 1.0, "mono_ns": 5, "settings": "{}"}
     event = {"schema": 1, "seq": 7, "again": False, "timestamp": 2.0, "text": "b"}
     with Wire(addresses[0]) as wire, Hand(*addresses, timeout=60.0) as late:

@@ -4,23 +4,22 @@ from __future__ import annotations
 
 import select
 import signal
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Iterator
 
 import pytest
 
 from softfinger import Hand, HandState
 from softfinger.daemon.client.hand import Subscription
 from softfinger.daemon.wire.schema import Event
+from tests.conftest import Addresses
 from tests.harness.daemon_process import Running
 
-Profile = Callable[[str], Path]
 STILL = 1.0  # s, ten times what the watchdog and the frames' age allow
 PATIENCE = 60.0  # s for anything to happen on a busy machine
 
 
 @pytest.fixture
-def hand(addresses: tuple[str, str]) -> Iterator[Hand]:
+def hand(addresses: Addresses) -> Iterator[Hand]:
     with Hand(*addresses, timeout=PATIENCE) as hand:
         yield hand
 
@@ -39,9 +38,7 @@ def told(events: Subscription[Event], kind: str, text: str) -> str:
     return next(each.text for each in events if each.kind == kind and text in each.text)
 
 
-def test_a_simulated_hand_outlives_a_machine_that_stands_still(
-    start: Callable[..., Running], profile: Profile, hand: Hand
-) -> None:
+def test_a_simulated_hand_outlives_a_machine_that_stands_still(start, profile, hand):
     running = start("--config", str(profile('task.name = "demo"\n')))
     with hand.stream(PATIENCE) as states, hand.events(PATIENCE) as events:
         before = after(states, "holding")
@@ -57,9 +54,7 @@ def test_a_simulated_hand_outlives_a_machine_that_stands_still(
     assert running.end() == 0
 
 
-def test_on_real_time_it_faults_names_the_busy_machine_and_begins_again(
-    start: Callable[..., Running], profile: Profile, hand: Hand
-) -> None:
+def test_on_real_time_it_faults_names_the_busy_machine_and_begins_again(start, profile, hand):
     running = start("--config", str(profile('task.name = "demo"\nloop.clock = "real"\n')))
     with hand.stream(PATIENCE) as states, hand.events(PATIENCE) as events:
         after(states, "holding")

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import copy
 import json
-import shutil
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -22,8 +19,8 @@ from softfinger.tools.recordings.features import image, observation
 from softfinger.tools.recordings.lerobot_dataset import samples
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.record import RecordingWriter
-from tests.conftest import Inline
-from tests.harness.daemon_process import PATIENT, Running
+from tests.conftest import Addresses, Inline
+from tests.harness.daemon_process import PATIENT, pip_installed
 from tests.harness.golden_wire import sample
 from tests.process.test_record import frame
 
@@ -31,7 +28,7 @@ PACKAGE = Path(__file__).parents[2] / "lerobot_robot_softfinger"
 
 
 @pytest.fixture
-def make(tmp_path: Path, addresses: tuple[str, str], monkeypatch: pytest.MonkeyPatch) -> Any:
+def make(tmp_path: Path, addresses: Addresses, monkeypatch: pytest.MonkeyPatch) -> Any:
     """Makes the robot as LeRobot's programs do, of the installed package."""
     monkeypatch.setenv("HF_HOME", str(tmp_path / "hf"))
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
@@ -39,12 +36,7 @@ def make(tmp_path: Path, addresses: tuple[str, str], monkeypatch: pytest.MonkeyP
     from lerobot.robots import RobotConfig, make_robot_from_config
     from lerobot.utils.import_utils import register_third_party_plugins
 
-    source, site = tmp_path / "source", tmp_path / "site"
-    shutil.copytree(PACKAGE, source)  # builds leave files
-    options = ("--no-deps", "--no-build-isolation", "--no-index", "--quiet", "--target", str(site))
-    pip = (sys.executable, "-m", "pip", "install", *options, str(source))
-    subprocess.run(pip, check=True, capture_output=True)
-    monkeypatch.syspath_prepend(site)
+    monkeypatch.syspath_prepend(pip_installed(PACKAGE, tmp_path / "robot"))
     register_third_party_plugins()
 
     def make(**options: Any) -> Any:
@@ -71,9 +63,7 @@ def act_until(robot: Any, action: dict[str, float], done: Callable[[dict[str, An
     raise AssertionError(f"not by {action}; the last: {found}")
 
 
-def test_lerobot_drives_and_records_the_simulated_hand(
-    make: Any, start: Callable[..., Running], profile: Callable[[str], Path], tmp_path: Path
-) -> None:
+def test_lerobot_drives_and_records_the_simulated_hand(make, start, profile, tmp_path):
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
     from lerobot.utils.errors import DeviceNotConnectedError
 
@@ -178,7 +168,7 @@ class Exported:
         self.names = self.info["features"]["observation.state"]["names"]
 
 
-def test_a_recording_is_a_dataset_at_its_sensors_rate(tmp_path: Path, inline: Inline) -> None:
+def test_a_recording_is_a_dataset_at_its_sensors_rate(tmp_path, inline):
     exported = Exported(tmp_path, inline)
     rows, names = exported.rows, exported.names
     assert (exported.info["fps"], exported.info["total_frames"], len(rows)) == (25, 51, 51)
@@ -193,7 +183,7 @@ def test_a_recording_is_a_dataset_at_its_sensors_rate(tmp_path: Path, inline: In
     assert exported.stats["observation.state"]["mean"][place] == pytest.approx(mean)
 
 
-def test_other_rates_repeat_frames_with_their_age(tmp_path: Path, inline: Inline) -> None:
+def test_other_rates_repeat_frames_with_their_age(tmp_path, inline):
     recorded(tmp_path / "a.mcap")
     rows = list(samples(Recording(tmp_path / "a.mcap"), 50, end=1.0))
     ages = [observation(*row)["right.touch_age"] for row in rows]
@@ -202,9 +192,7 @@ def test_other_rates_repeat_frames_with_their_age(tmp_path: Path, inline: Inline
     assert (done.returncode, "leave out --topics" in done.stderr) == (1, True)
 
 
-def test_lerobot_loads_the_dataset(
-    tmp_path: Path, inline: Inline, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_lerobot_loads_the_dataset(tmp_path, inline, monkeypatch):
     monkeypatch.setenv("HF_HOME", str(tmp_path / "hf"))
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     pytest.importorskip("lerobot")

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
 from softfinger.tools.cli import main
+from tests.harness.daemon_process import python
 
 ROOT = Path(__file__).parents[2]
 PORTABLE = (
@@ -74,12 +74,7 @@ environment.close()
 
 
 def elsewhere(script: str, *arguments: str) -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", ELSEWHERE + script, *arguments],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-    )
+    done = python("-c", ELSEWHERE + script, *arguments, cwd=ROOT)
     assert done.returncode == 0, done.stderr
 
 
@@ -89,9 +84,7 @@ def test_modules_without_a_tick_import_without_linux() -> None:
 
 
 @pytest.mark.parametrize("system", ["darwin", "win32"])
-def test_the_daemon_says_that_it_needs_linux(
-    system: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_daemon_says_that_it_needs_linux(system, monkeypatch, capsys):
     monkeypatch.setattr(sys, "platform", system)
     assert main(["run"]) == 1
     said = capsys.readouterr().err

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 from pathlib import Path
 
-import pytest
+from tests.harness.daemon_process import python
 
 # All kernels of the default scene: the recording runs the estimator, the filter and the grip, the
 # loop the simulated hand and its sensors.
@@ -26,16 +24,8 @@ sys.exit(pytest.main(["-q", "-n0", "-p", "no:cacheprovider", *files]))
 """
 
 
-def test_tests_of_the_loop_and_its_kernels_pass_with_numba_alone(
-    request: pytest.FixtureRequest,
-) -> None:
-    assert request.config.cache is not None
+def test_tests_of_the_loop_and_its_kernels_pass_with_numba_alone(request):
     kept = str(request.config.cache.mkdir("plain-numba"))  # apart: those of others are in use
-    done = subprocess.run(
-        [sys.executable, "-c", SCRIPT],
-        cwd=Path(__file__).parents[2],
-        env=os.environ | {"NUMBA_CACHE_DIR": kept},
-        capture_output=True,
-        text=True,
-    )
+    environment = os.environ | {"NUMBA_CACHE_DIR": kept}
+    done = python("-c", SCRIPT, cwd=Path(__file__).parents[2], env=environment)
     assert done.returncode == 0, done.stdout + done.stderr

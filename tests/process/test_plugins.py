@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 import threading
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +18,7 @@ from softfinger.daemon.simulation.emulator.pty_bus import open_pty
 from softfinger.testing import check_servos, check_shape, check_tactile
 from softfinger.tools.setup import doctor
 from tests.conftest import until
-from tests.harness.daemon_process import PATIENT, Running, insist
+from tests.harness.daemon_process import PATIENT, insist, pip_installed
 
 EXAMPLE = Path(__file__).parents[1] / "example_plugin"
 METAL = ("tactile.backend=pulsing", "servos.backend=following")
@@ -30,13 +27,7 @@ METAL = ("tactile.backend=pulsing", "servos.backend=following")
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The example, installed as pip installs it, into a folder of its own."""
-    site = tmp_path_factory.mktemp("site")
-    options = ("--no-deps", "--no-build-isolation", "--no-index", "--quiet", "--target", str(site))
-    pip = (sys.executable, "-m", "pip", "install")
-    source = tmp_path_factory.mktemp("source") / "example"
-    subprocess.run(["cp", "-r", str(EXAMPLE), str(source)], check=True)  # builds leave files
-    subprocess.run([*pip, *options, str(source)], check=True, capture_output=True)
-    return site
+    return pip_installed(EXAMPLE, tmp_path_factory.mktemp("plugin"))
 
 
 @pytest.fixture
@@ -46,12 +37,16 @@ def here(installed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("here")
-def test_the_example_does_what_a_backend_has_to(caplog: pytest.LogCaptureFixture) -> None:
+def test_the_example_does_what_a_backend_has_to(caplog):
     settings = load(changes=METAL)
     check_tactile(settings)
     assert not caplog.records  # a closed board has no frame, which is no failure
     check_servos(settings, torque=True)
     check_shape(load(changes=["simulation.object_shape=hexagon"]))
+    found = {each.subject: each for each in doctor.results(settings, False)}
+    assert found["servos"].text.startswith("following: a plugin's")
+    assert "44 × 44 cells" in found["tactile left"].text
+    assert "/dev/ttyUSB0" not in found  # asks nothing of ports that it may not have
 
 
 @pytest.mark.usefixtures("here")
@@ -66,6 +61,10 @@ def test_one_report_has_the_plugins_errors() -> None:
     with pytest.raises(SettingsError) as caught:
         load(changes=wrong)
     report = str(caught.value)
+    with pytest.raises(SettingsError, match=r"broken of softfinger-example 1\.0 fails to load"):
+        load(changes=["tactile.backend=broken"])
+    with pytest.raises(PluginError):
+        backend("tactile", "broken")
     for part in (
         "plugins.pulsing.height: found -1",
         "plugins.pulsing.hight: found an unknown key, expected a known one; nearest: height",
@@ -77,30 +76,7 @@ def test_one_report_has_the_plugins_errors() -> None:
         load(changes=["simulation.object_shape=hexagonal"])
 
 
-@pytest.mark.usefixtures("here")
-def test_doctor_hears_the_boards_and_asks_nothing_of_ports_that_they_may_not_have() -> None:
-    found = {each.subject: each for each in doctor.results(load(changes=METAL), False)}
-    assert found["servos"].text.startswith("following: a plugin's")
-    assert "44 × 44 cells" in found["tactile left"].text
-    assert "/dev/ttyUSB0" not in found
-
-
-@pytest.mark.usefixtures("here")
-def test_a_broken_plugin_is_named_and_the_others_work() -> None:
-    with pytest.raises(SettingsError, match=r"broken of softfinger-example 1\.0 fails to load"):
-        load(changes=["tactile.backend=broken"])
-    with pytest.raises(PluginError):
-        backend("tactile", "broken")
-    assert load(changes=METAL).tactile.backend == "pulsing"
-
-
-def test_a_daemon_runs_on_them(
-    installed: Path,
-    start: Callable[..., Running],
-    profile: Callable[..., Path],
-    addresses: tuple[str, str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_daemon_runs_on_them(installed, start, profile, addresses, monkeypatch):
     path = os.pathsep.join((str(installed), os.environ.get("PYTHONPATH", "")))
     monkeypatch.setenv("PYTHONPATH", path)
     changes = [word for each in METAL for word in ("--set", each)]

@@ -67,27 +67,7 @@ def wires() -> Iterator[list[Wire]]:
         wire.close()
 
 
-def test_replies_take_the_wires_time_and_the_return_delay(wires: list[Wire]) -> None:
-    wires.append(wire := Wire(make_bus(), 57600, spin=0.0))
-    wire.send(PING)
-    byte = 10 / 57600
-    due = (len(PING) + PONG) * byte + 500e-6 - 2 * PASSAGE
-    assert wire.when(due - 1e-5) == b""
-    assert len(wire.when(2e-5)) == PONG
-
-
-def test_replies_of_a_group_follow_each_other(wires: list[Wire]) -> None:
-    wires.append(wire := Wire(make_bus(), 57600, spin=0.0))
-    wire.send(frame(BROADCAST, framing.PING))
-    byte = 10 / 57600
-    first = (len(PING) + PONG) * byte + 500e-6 - 2 * PASSAGE
-    assert len(wire.when(first + 1e-5)) == PONG
-    second = PONG * byte + 500e-6
-    assert wire.when(second - 3e-5) == b""
-    assert len(wire.when(5e-5)) == PONG
-
-
-def test_the_wire_carries_one_thing_at_a_time(wires: list[Wire]) -> None:
+def test_replies_take_the_wires_time_and_the_return_delay_one_after_another(wires):
     wires.append(wire := Wire(make_bus(), 57600, spin=0.0))
     write = frame(BROADCAST, framing.WRITE, b"\x41\x00\x01")
     wire.send(write)
@@ -95,16 +75,25 @@ def test_the_wire_carries_one_thing_at_a_time(wires: list[Wire]) -> None:
     due = (len(write) + len(PING) + PONG) * 10 / 57600 + 500e-6 - 2 * PASSAGE
     assert wire.when(due - 1e-5) == b""
     assert len(wire.when(2e-5)) == PONG
+    wires.append(wire := Wire(make_bus(), 57600, spin=0.0))
+    wire.send(frame(BROADCAST, framing.PING))
+    byte = 10 / 57600
+    first = (len(PING) + PONG) * byte + 500e-6 - 2 * PASSAGE
+    assert wire.when(first - 1e-5) == b""
+    assert len(wire.when(2e-5)) == PONG
+    second = PONG * byte + 500e-6  # the replies of a group follow each other
+    assert wire.when(second - 4e-5) == b""
+    assert len(wire.when(6e-5)) == PONG
 
 
-def test_an_adapters_latency_timer_holds_replies(wires: list[Wire]) -> None:
+def test_an_adapters_latency_timer_holds_replies(wires):
     wires.append(wire := Wire(make_bus(), 57600, spin=0.0, latency=0.016))
     wire.send(PING)
     assert wire.when(1.0080 - wire.t - 1e-4) == b""  # 1.008 = 63 × 16 ms
     assert len(wire.when(2e-4)) == PONG
 
 
-def test_a_late_reply_is_late_even_unpaced(wires: list[Wire]) -> None:
+def test_a_late_reply_is_late_even_unpaced(wires):
     wires.append(wire := Wire(make_bus(), 0, spin=0.0))
     put_fault(wire.port.bus, "late=1", wire.t)
     wire.send(PING)
@@ -112,24 +101,21 @@ def test_a_late_reply_is_late_even_unpaced(wires: list[Wire]) -> None:
     assert len(wire.when(0.002)) == PONG
 
 
-def test_another_rate_is_met_with_silence_and_the_right_one_answered(wires: list[Wire]) -> None:
+def test_another_rate_is_met_with_silence_and_the_right_one_answered(wires):
     wires.append(wire := Wire(make_bus(), 57600, spin=0.0))
     for baud, answers in ((1_000_000, 0), (57600, PONG), (4_000_000, 0), (57600, PONG)):
         wire.client.baudrate = baud
         assert wire.port.client_baud() == baud
         wire.send(PING)
         assert len(wire.when(0.02)) == answers
-
-
-def test_unpaced_answers_at_any_rate_at_once(wires: list[Wire]) -> None:
-    wires.append(wire := Wire(make_bus(), 0, spin=0.0))
+    wires.append(unpaced := Wire(make_bus(), 0, spin=0.0))
     for baud in (9600, 4_000_000):
-        wire.client.baudrate = baud
-        wire.send(PING)
-        assert len(wire.received()) == PONG
+        unpaced.client.baudrate = baud
+        unpaced.send(PING)
+        assert len(unpaced.received()) == PONG
 
 
-def test_a_client_may_come_and_go_and_leave_the_terminal_cooked(wires: list[Wire]) -> None:
+def test_a_client_may_come_and_go_and_leave_the_terminal_cooked(wires):
     wires.append(wire := Wire(make_bus(), 0, spin=0.0))
     wire.client.close()
     for _ in range(3):
@@ -144,7 +130,7 @@ def test_a_client_may_come_and_go_and_leave_the_terminal_cooked(wires: list[Wire
         os.close(end)
 
 
-def test_a_client_that_never_reads_does_not_hold_the_bus_up(wires: list[Wire]) -> None:
+def test_a_client_that_never_reads_does_not_hold_the_bus_up(wires):
     wires.append(wire := Wire(make_bus(), 0, spin=0.0))
     request = frame(1, framing.READ, b"\x00\x00\x93\x00")
     for _ in range(400):  # far more than a terminal holds
@@ -152,7 +138,7 @@ def test_a_client_that_never_reads_does_not_hold_the_bus_up(wires: list[Wire]) -
     assert wire.port.bus.packets == 400
 
 
-def test_the_terminal_goes_and_comes_back_and_the_servos_go_on(wires: list[Wire]) -> None:
+def test_the_terminal_goes_and_comes_back_and_the_servos_go_on(wires):
     wires.append(wire := Wire(make_bus(), 0, spin=0.0))
     wire.port.unplug()
     assert (wire.port.plugged, wire.port.fileno()) == (False, -1)

@@ -6,8 +6,6 @@ import ctypes
 import json
 import os
 import struct
-import subprocess
-import sys
 import time
 from typing import Any
 
@@ -16,6 +14,7 @@ import pytest
 from softfinger.daemon.clock import RealClock
 from softfinger.daemon.loop.realtime import _ATTRIBUTE_CALLS, RealTime, _set_slice
 from softfinger.daemon.profile.settings import Settings
+from tests.harness.daemon_process import python
 
 # What the system says of a process that asked for everything: before, during and after.
 HELD = """
@@ -78,9 +77,8 @@ with RealTime(settings) as measures:
 
 
 def run(script: str) -> Any:
-    done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=300
-    )
+    done = python("-c", script)
+    assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
 
 
@@ -131,6 +129,14 @@ def test_what_is_not_wanted_is_not_asked_for() -> None:
     settings = Settings.model_validate({"realtime": {**nothing, "freeze_collector": False}})
     with RealTime(settings) as measures:
         assert measures.events() == []
+    settings = Settings.model_validate(
+        {"loop": {"clock": "virtual"}, "realtime": {"priority": 7, "cpus": (0,)}}
+    )
+    affinity = os.sched_getaffinity(0)
+    with RealTime(settings) as measures:  # virtual time waits for nothing
+        assert (measures.granted, measures.refused) == (["collector frozen"], [])
+        assert os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_OTHER
+        assert os.sched_getaffinity(0) == affinity
 
 
 def test_a_short_slice_is_had_where_the_kernel_knows_it_and_given_back() -> None:
@@ -153,19 +159,8 @@ def _slice(get_call: int) -> int:
     return int(struct.unpack("=IIQiIQQQ", told.raw)[5])
 
 
-def test_virtual_time_waits_for_nothing_and_asks_for_nothing() -> None:
-    settings = Settings.model_validate(
-        {"loop": {"clock": "virtual"}, "realtime": {"priority": 7, "cpus": (0,)}}
-    )
-    affinity = os.sched_getaffinity(0)
-    with RealTime(settings) as measures:
-        assert (measures.granted, measures.refused) == (["collector frozen"], [])
-        assert os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_OTHER
-        assert os.sched_getaffinity(0) == affinity
-
-
 @pytest.mark.parametrize("spin", [0.0, 2e-4])
-def test_a_sleep_never_ends_early_and_the_spin_is_within_it(spin: float) -> None:
+def test_a_sleep_never_ends_early_and_the_spin_is_within_it(spin):
     clock, before = RealClock(spin), time.thread_time()
     for _ in range(20):
         deadline = clock.now() + 1e-3

@@ -90,7 +90,7 @@ def rig(tmp_path: Path) -> Iterator[Rig]:
     made.close()
 
 
-def test_an_unplugged_bus_comes_back_on_command_and_limp(rig: Rig) -> None:
+def test_an_unplugged_bus_comes_back_on_command_and_limp(rig):
     loop = rig.loop
     rig.does("arm")
     rig.until(lambda: rig.torque() == [1, 1])
@@ -114,7 +114,7 @@ def test_an_unplugged_bus_comes_back_on_command_and_limp(rig: Rig) -> None:
     rig.until(lambda: rig.torque() == [1, 1])
 
 
-def test_clear_of_another_fault_leaves_the_port_alone(rig: Rig) -> None:
+def test_clear_of_another_fault_leaves_the_port_alone(rig):
     rig.does("arm")
     assert rig.emulator.request("overload=1") == "ok"
     rig.until(lambda: rig.loop.state.mode == "fault")
@@ -122,7 +122,7 @@ def test_clear_of_another_fault_leaves_the_port_alone(rig: Rig) -> None:
     assert ("info", "servos", "connected anew") not in rig.events
 
 
-def test_a_boards_port_comes_back_on_clear_and_on_arm(tmp_path: Path) -> None:
+def test_a_boards_port_comes_back_on_clear_and_on_arm(tmp_path):
     board = {
         "backend": "flexitac",
         "port": (str(tmp_path / "tactile-left"), str(tmp_path / "tactile-right")),

@@ -11,12 +11,12 @@ import resource
 import signal
 import subprocess
 import tracemalloc
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import msgpack
 import numpy as np
+import psutil
 import pytest
 import zmq
 
@@ -26,30 +26,17 @@ from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.packer import pack
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.record import RecordingWriter, recover
-from tests.conftest import Inline, until
-from tests.harness.daemon_process import SOFTFINGER, Running, ask
-from tests.harness.fake_daemon import FakeDaemon, frame, state
-from tests.harness.golden_wire import flat, sample
+from tests.conftest import until
+from tests.harness.daemon_process import ask, started
+from tests.harness.fake_daemon import frame
+from tests.harness.golden_wire import sample
 
-Profile = Callable[[str], Path]
 TOPICS = tuple(schema.TOPICS)
 EVENT = schema.EVENT
 
 
-@pytest.fixture
-def fake() -> Iterator[FakeDaemon]:
-    daemon = FakeDaemon()
-    yield daemon
-    daemon.close()
-
-
-def record(*words: str | Path) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [*SOFTFINGER, "record", *map(str, words)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+def record(*words: object, **options: Any) -> subprocess.Popen[str]:
+    return started("record", *words, **options)
 
 
 def ended(process: subprocess.Popen[str]) -> tuple[int, str, str]:
@@ -82,7 +69,7 @@ def written(path: Path, count: int = 400) -> list[tuple[bytes, dict[str, Any]]]:
     return sent
 
 
-def test_what_is_read_is_what_was_published(tmp_path: Path) -> None:
+def test_what_is_read_is_what_was_published(tmp_path):
     sent = written(tmp_path / "a.mcap")
     recording = Recording(tmp_path / "a.mcap")
     read = list(recording.messages())
@@ -98,7 +85,7 @@ def test_what_is_read_is_what_was_published(tmp_path: Path) -> None:
     assert recording.counts["hand/tactile/left"] == 20
 
 
-def test_a_recordings_states_are_columns(tmp_path: Path) -> None:
+def test_a_recordings_states_are_columns(tmp_path):
     states = [message for topic, message in written(tmp_path / "a.mcap") if topic == schema.STATE]
     columns = read_recording(tmp_path / "a.mcap")
     assert columns["seq"].tolist() == list(range(400))
@@ -114,7 +101,7 @@ def test_a_recordings_states_are_columns(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("topic", TOPICS)
-def test_every_topic_keeps_its_bytes_and_has_a_schema(tmp_path: Path, topic: bytes) -> None:
+def test_every_topic_keeps_its_bytes_and_has_a_schema(tmp_path, topic):
     from mcap.reader import make_reader
 
     path = tmp_path / "a.mcap"
@@ -127,7 +114,6 @@ def test_every_topic_keeps_its_bytes_and_has_a_schema(tmp_path: Path, topic: byt
     assert message == golden
     with path.open("rb") as file:
         [(schema, channel, raw)] = make_reader(file).iter_messages()
-    assert schema is not None
     assert (schema.encoding, channel.message_encoding) == ("jsonschema", "json")
     described = json.loads(schema.data)["properties"]
     assert set(json.loads(raw.data)) == set(described)
@@ -157,7 +143,7 @@ def test_the_layouts_name_only_fields_that_are_streamed() -> None:
     assert {each.replace(".", "/") for each in (*curves, *paths)} <= fields
 
 
-def test_numbers_that_are_none_come_back_as_such(tmp_path: Path) -> None:
+def test_numbers_that_are_none_come_back_as_such(tmp_path):
     writer = RecordingWriter(tmp_path / "a.mcap")
     message = sample(schema.STATE)
     message["left"]["force"] = math.nan
@@ -171,7 +157,7 @@ def test_numbers_that_are_none_come_back_as_such(tmp_path: Path) -> None:
     assert math.isnan(read["tick_s"])  # JSON has no infinity either
 
 
-def test_a_part_in_time_and_by_topic(tmp_path: Path) -> None:
+def test_a_part_in_time_and_by_topic(tmp_path):
     sent = written(tmp_path / "a.mcap", 2000)  # several chunks
     recording = Recording(tmp_path / "a.mcap")
     assert recording.chunks > 3
@@ -183,7 +169,7 @@ def test_a_part_in_time_and_by_topic(tmp_path: Path) -> None:
     assert seen == sorted(seen)
 
 
-def test_a_recording_cut_anywhere_is_read_up_to_there_and_closed(tmp_path: Path) -> None:
+def test_a_recording_cut_anywhere_is_read_up_to_there_and_closed(tmp_path):
     sent = written(tmp_path / "whole.mcap", 1500)
     whole = (tmp_path / "whole.mcap").read_bytes()
     path = tmp_path / "cut.mcap"
@@ -206,7 +192,7 @@ def test_a_recording_cut_anywhere_is_read_up_to_there_and_closed(tmp_path: Path)
     assert sorted(each.name for each in tmp_path.iterdir()) == ["cut.mcap", "whole.mcap"]
 
 
-def test_a_recording_with_flipped_bits_never_raises_more_than_its_error(tmp_path: Path) -> None:
+def test_a_recording_with_flipped_bits_never_raises_more_than_its_error(tmp_path):
     written(tmp_path / "whole.mcap", 300)
     whole = (tmp_path / "whole.mcap").read_bytes()
     path = tmp_path / "bent.mcap"
@@ -224,7 +210,7 @@ def test_a_recording_with_flipped_bits_never_raises_more_than_its_error(tmp_path
     assert whole_again < 50
 
 
-def test_files_that_are_no_recording(tmp_path: Path) -> None:
+def test_files_that_are_no_recording(tmp_path):
     path = tmp_path / "a.mcap"
     for content, reason in ((b"", "empty"), (b"seq,d\n1,2\n", "not an MCAP file")):
         path.write_bytes(content)
@@ -244,9 +230,7 @@ def test_files_that_are_no_recording(tmp_path: Path) -> None:
         Recording(tmp_path / "other.mcap")
 
 
-def test_recording_a_running_daemon_loses_nothing_unseen(
-    start: Callable[..., Running], profile: Profile, addresses: tuple[str, str], tmp_path: Path
-) -> None:
+def test_recording_a_running_daemon_loses_nothing_unseen(start, profile, addresses, tmp_path):
     start("--config", str(profile("")), "--set", "stream.state_rate=500")
     path = tmp_path / "run.mcap"
     process = record(path, "--address", addresses[0])
@@ -268,27 +252,7 @@ def test_recording_a_running_daemon_loses_nothing_unseen(
     assert recording.count(schema.TACTILE) > 0
 
 
-def test_a_killed_recorder_leaves_a_file_that_can_be_closed(
-    fake: FakeDaemon, tmp_path: Path
-) -> None:
-    """Chunks that take seconds to fill are written all the same."""
-    path = tmp_path / "run.mcap"
-    process = record(path, "--address", fake.state_address)
-    until(lambda: is_filled(path))
-    process.kill()
-    ended(process)
-    recording = Recording(path)
-    assert recording.truncated
-    assert recording.total > 0
-    assert ended(record(path, "--recover"))[0] == 0
-    closed = Recording(path)
-    assert not closed.truncated
-    assert closed.total == recording.total
-
-
-def test_a_full_disk_ends_it_with_the_reason_and_keeps_what_was_written(
-    fake: FakeDaemon, tmp_path: Path
-) -> None:
+def test_a_full_disk_ends_it_with_the_reason_and_keeps_what_was_written(fake, tmp_path):
     path = tmp_path / "run.mcap"
     fake.changes = {"padding": os.urandom(10_000).hex()}  # can't be compressed away
 
@@ -296,13 +260,7 @@ def test_a_full_disk_ends_it_with_the_reason_and_keeps_what_was_written(
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
         resource.setrlimit(resource.RLIMIT_FSIZE, (400_000, 400_000))
 
-    process = subprocess.Popen(
-        [*SOFTFINGER, "record", str(path), "--address", fake.state_address],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        preexec_fn=small_disk,
-    )
+    process = record(path, "--address", fake.state_address, preexec_fn=small_disk)
     status, out, error = ended(process)
     assert status == 1
     assert "File too large" in error
@@ -312,9 +270,7 @@ def test_a_full_disk_ends_it_with_the_reason_and_keeps_what_was_written(
     assert f"{total} messages written of " in out, "what is in the file counts"
 
 
-def test_what_was_sent_before_the_end_is_written(
-    addresses: tuple[str, str], tmp_path: Path
-) -> None:
+def test_what_was_sent_before_the_end_is_written(addresses, tmp_path):
     context: zmq.Context[Any] = zmq.Context()
     publisher = context.socket(zmq.XPUB)
     publisher.setsockopt(zmq.SNDHWM, 0)
@@ -336,7 +292,7 @@ def test_what_was_sent_before_the_end_is_written(
     assert seqs == list(range(5000))
 
 
-def test_split_files_follow_each_other(fake: FakeDaemon, tmp_path: Path) -> None:
+def test_split_files_follow_each_other(fake, tmp_path):
     path = tmp_path / "run.mcap"
     process = record(path, "--address", fake.state_address, "--split-time", "0.2")
     files = [path, tmp_path / "run-2.mcap", tmp_path / "run-3.mcap"]
@@ -346,27 +302,26 @@ def test_split_files_follow_each_other(fake: FakeDaemon, tmp_path: Path) -> None
     assert seqs == list(range(seqs[0], seqs[-1] + 5, 5))
 
 
-def test_from_and_to_cut_the_stream(fake: FakeDaemon, tmp_path: Path) -> None:
+def test_from_and_to_cut_the_stream(fake, tmp_path):
     path = tmp_path / "run.mcap"
     process = record(path, "--address", fake.state_address, "--from", "0.3", "--to", "0.8")
     assert ended(process)[0] == 0
     assert 0.0 < Recording(path).duration < 0.52
 
 
-def test_no_daemon_is_waited_for_or_not(addresses: tuple[str, str], tmp_path: Path) -> None:
+def test_no_daemon_is_waited_for_or_not(addresses, tmp_path):
     process = record(tmp_path / "a.mcap", "--address", addresses[0], "--no-wait")
     status, _, error = ended(process)
     assert status == 1
     assert f"no stream from {addresses[0]} within 5 s" in error
     process = record(tmp_path / "b.mcap", "--address", addresses[0])
-    assert process.stderr is not None
     assert "waiting for a stream" in process.stderr.readline()
     process.send_signal(signal.SIGTERM)
     assert ended(process)[0] == 0
     assert not list(tmp_path.iterdir())  # nothing came, and nothing is in the next one's way
 
 
-def test_garbage_on_the_stream_is_counted_and_left_out(fake: FakeDaemon, tmp_path: Path) -> None:
+def test_garbage_on_the_stream_is_counted_and_left_out(fake, tmp_path):
     path = tmp_path / "run.mcap"
     process = record(path, "--address", fake.state_address)
     until(lambda: is_filled(path))
@@ -380,12 +335,7 @@ def test_garbage_on_the_stream_is_counted_and_left_out(fake: FakeDaemon, tmp_pat
     assert "could not be read and were left out" in out
 
 
-def test_fake_states_are_of_the_contract() -> None:
-    """What these tests publish is what a daemon would."""
-    assert set(flat(state(0.0, 1))) == set(flat(sample(schema.STATE)))
-
-
-def test_topics_by_name(fake: FakeDaemon, tmp_path: Path) -> None:
+def test_topics_by_name(fake, tmp_path):
     path = tmp_path / "a.mcap"
     process = record(path, "--address", fake.state_address, "--topics", "hand/tactile")
     until(lambda: path.exists() and path.stat().st_size > 20_000)
@@ -396,7 +346,7 @@ def test_topics_by_name(fake: FakeDaemon, tmp_path: Path) -> None:
     assert "found topic 'dreams', expected one of state, tactile" in error
 
 
-def test_what_was_told_again_does_not_stretch_the_recordings_time(tmp_path: Path) -> None:
+def test_what_was_told_again_does_not_stretch_the_recordings_time(tmp_path):
     """A daemon that runs for hours tells a recorder its first events and settings again."""
     path = tmp_path / "a.mcap"
     writer = RecordingWriter(path)
@@ -416,9 +366,7 @@ def test_what_was_told_again_does_not_stretch_the_recordings_time(tmp_path: Path
     assert Recording(tmp_path / "b.mcap").count(b"hand/settings") == 1
 
 
-def test_a_damaged_chunk_is_told_and_left_out_and_recovered(
-    tmp_path: Path, addresses: tuple[str, str], inline: Inline
-) -> None:
+def test_a_damaged_chunk_is_told_and_left_out_and_recovered(tmp_path, addresses, inline):
     path = tmp_path / "bent.mcap"
     sent = written(path, 2000)
     assert Recording(path).check()
@@ -442,7 +390,7 @@ def test_a_damaged_chunk_is_told_and_left_out_and_recovered(
     assert Recording(path).check()
 
 
-def test_a_file_that_is_closed_leaves_no_memory(tmp_path: Path) -> None:
+def test_a_file_that_is_closed_leaves_no_memory(tmp_path):
     tracemalloc.start()
     try:
         before = tracemalloc.get_traced_memory()[0]
@@ -460,24 +408,13 @@ def test_a_file_that_is_closed_leaves_no_memory(tmp_path: Path) -> None:
 # --- `run --record` --------------------------------------------------------------------------
 
 
-def recorder_of(daemon: Running) -> int:
-    process = daemon.process.pid
-    found = [
-        int(child)
-        for task in Path(f"/proc/{process}/task").iterdir()
-        for child in (task / "children").read_text().split()
-    ]
-    [recorder] = [each for each in found if b"record" in Path(f"/proc/{each}/cmdline").read_bytes()]
-    return recorder
+def killed(recorder: psutil.Process, _: Path) -> None:
+    recorder.kill()
 
 
-def killed(recorder: int, _: Path) -> None:
-    os.kill(recorder, signal.SIGKILL)
-
-
-def disk_full(recorder: int, path: Path) -> None:
+def disk_full(recorder: psutil.Process, path: Path) -> None:
     most = path.stat().st_size + 1000
-    resource.prlimit(recorder, resource.RLIMIT_FSIZE, (most, most))
+    recorder.rlimit(psutil.RLIMIT_FSIZE, (most, most))
 
 
 @pytest.mark.parametrize(
@@ -489,16 +426,12 @@ def disk_full(recorder: int, path: Path) -> None:
     ids=["killed", "disk full"],
 )
 def test_a_recorder_that_ends_is_told_at_once_and_by_the_exit_status(
-    start: Callable[..., Running],
-    profile: Profile,
-    addresses: tuple[str, str],
-    tmp_path: Path,
-    end: Callable[[int, Path], None],
-    why: str,
-) -> None:
+    start, profile, addresses, tmp_path, end, why
+):
     path = tmp_path / "run.mcap"
     daemon = start("--config", str(profile("")), "--record", str(path))
-    recorder = recorder_of(daemon)
+    children = psutil.Process(daemon.process.pid).children()
+    [recorder] = [each for each in children if "record" in each.cmdline()]
     until(lambda: path.stat().st_size > 10_000)
     with Hand(*addresses, timeout=60.0) as hand, hand.events(timeout=60.0) as events:
         hand.state()

@@ -3,30 +3,24 @@
 from __future__ import annotations
 
 import json
-import subprocess
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import msgpack
-import numpy as np
 import pytest
 import zmq
 
 from softfinger.daemon.errors import RecordingError
 from softfinger.daemon.profile.load import load
-from softfinger.daemon.types import Frame
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.packer import pack
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.recomputed import recompute
 from softfinger.tools.recordings.record import RecordingWriter
-from tests.conftest import Inline, until
-from tests.harness.daemon_process import PATIENT, SOFTFINGER, softfinger
+from tests.conftest import until
+from tests.harness.daemon_process import PATIENT, softfinger, started
 from tests.harness.golden_wire import sample
 from tests.harness.recorded_hand import Messages, Script, published
-
-Profile = Callable[[str], Path]
 
 
 @pytest.fixture(scope="module")
@@ -62,9 +56,7 @@ def _copy(message: dict[str, Any]) -> dict[str, Any]:
     return copied
 
 
-def test_the_same_inputs_give_the_same_states_to_the_last_bit(
-    taken: Messages, tmp_path: Path
-) -> None:
+def test_the_same_inputs_give_the_same_states_to_the_last_bit(taken, tmp_path):
     result = recompute(record(tmp_path / "a.mcap", taken))
     assert result.from_start
     assert result.ticks == result.states == 1150
@@ -73,7 +65,7 @@ def test_the_same_inputs_give_the_same_states_to_the_last_bit(
     assert result.differences == {}
 
 
-def test_other_settings_show_where_they_first_matter(taken: Messages, tmp_path: Path) -> None:
+def test_other_settings_show_where_they_first_matter(taken, tmp_path):
     recording = record(tmp_path / "a.mcap", taken)
     used = load(changes=["loop.clock=virtual", "stream.state_rate=500", "control.force_gain=0.5"])
     result = recompute(recording, used)
@@ -85,7 +77,7 @@ def test_other_settings_show_where_they_first_matter(taken: Messages, tmp_path: 
     assert different.recorded != different.recomputed
 
 
-def test_a_changed_reading_is_found(taken: Messages, tmp_path: Path) -> None:
+def test_a_changed_reading_is_found(taken, tmp_path):
     bent = [(topic, _copy(message)) for topic, message in taken]
     for topic, message in bent:
         if topic == schema.INPUT and message["seq"] == 400:
@@ -96,7 +88,7 @@ def test_a_changed_reading_is_found(taken: Messages, tmp_path: Path) -> None:
     assert min(each.first_tick for each in result.differences.values()) == 400
 
 
-def test_what_lacks_in_a_recording_is_told(taken: Messages, tmp_path: Path) -> None:
+def test_what_lacks_in_a_recording_is_told(taken, tmp_path):
     def without(topic: bytes) -> Recording:
         path = tmp_path / f"{topic.decode().replace('/', '-')}.mcap"
         return record(path, [each for each in taken if each[0] != topic])
@@ -124,8 +116,8 @@ def test_what_lacks_in_a_recording_is_told(taken: Messages, tmp_path: Path) -> N
 
 
 def test_a_daemon_recorded_from_its_first_tick_recomputes_to_the_last_bit(
-    profile: Profile, tmp_path: Path, inline: Inline
-) -> None:
+    profile, tmp_path, inline
+):
     path = tmp_path / "run.mcap"
     words = ("--duration", "3", "--set", "task.name=demo", "--record", str(path))
     done = softfinger("run", "--config", str(profile("")), *words, *PATIENT)
@@ -147,8 +139,8 @@ def test_a_daemon_recorded_from_its_first_tick_recomputes_to_the_last_bit(
 
 
 def test_a_recorder_that_can_not_start_ends_the_run_before_the_first_tick(
-    profile: Profile, tmp_path: Path, inline: Inline
-) -> None:
+    profile, tmp_path, inline
+):
     path = tmp_path / "run.mcap"
     path.write_text("mine")
     done = inline("run", "--config", profile(""), "--record", path)
@@ -163,26 +155,18 @@ def played(tmp_path: Path) -> tuple[Path, Messages]:
     for k in range(100):
         state = {**sample(schema.STATE), "seq": k, "timestamp": 1e9 + 0.01 * k}
         sent.append((schema.STATE, state))
-    counts = np.ones((4, 5), np.uint16)
-    assert Frame(1, 0.0, 0.0, True, counts).valid
     sent.append((schema.TACTILE, {**sample(schema.TACTILE), "timestamp": 1e9 + 0.5}))
     path = tmp_path / "a.mcap"
     record(path, sent)
     return path, sent
 
 
-def test_messages_go_out_as_they_were(
-    played: tuple[Path, Messages], addresses: tuple[str, str], context: zmq.Context[Any]
-) -> None:
+def test_messages_go_out_as_they_were(played, addresses, context):
     path, sent = played
     socket = context.socket(zmq.SUB)
     socket.setsockopt(zmq.SUBSCRIBE, b"")
     socket.connect(addresses[0])
-    process = subprocess.Popen(
-        [*SOFTFINGER, "replay", str(path), "--address", addresses[0], "--speed", "20"],
-        stdout=subprocess.PIPE,
-        text=True,
-    )
+    process = started("replay", path, "--address", addresses[0], "--speed", "20")
     came: list[list[bytes]] = []
     until(lambda: (socket.poll(10) and came.append(socket.recv_multipart()), len(came) == 101)[1])
     assert [(topic, msgpack.unpackb(payload)) for topic, payload in came] == sent
@@ -190,9 +174,7 @@ def test_messages_go_out_as_they_were(
     assert "101 of 101 messages published" in process.communicate(timeout=300)[0]
 
 
-def test_a_part_at_its_own_pace(
-    played: tuple[Path, Messages], addresses: tuple[str, str], inline: Inline
-) -> None:
+def test_a_part_at_its_own_pace(played, addresses, inline):
     words = ("--address", addresses[0], "--no-wait", "--from", "0.2", "--to", "0.4")
     done = inline("replay", played[0], *words)
     assert done.stdout.startswith(("20 of", "21 of"))

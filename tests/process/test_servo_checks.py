@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,26 +19,7 @@ from softfinger.daemon.servos.control_table import by_name
 from softfinger.daemon.servos.dynamixel import DynamixelServos
 from softfinger.daemon.servos.port import SerialPort, latency_file
 from softfinger.daemon.types import Goal, Reading
-from tests.harness.servos import RunningBus, backend_settings, connected, hand_bus
-
-
-@pytest.fixture
-def running() -> Iterator[Callable[..., RunningBus]]:
-    """Starts buses that end with the test."""
-    buses: list[RunningBus] = []
-
-    def start(baud: int = 0, **options: Any) -> RunningBus:
-        buses.append(RunningBus(hand_bus(time.monotonic(), baud=baud, **options), baud))
-        return buses[-1]
-
-    yield start
-    for bus in buses:
-        bus.close()
-
-
-@pytest.fixture
-def bus(running: Callable[..., RunningBus]) -> RunningBus:
-    return running()
+from tests.harness.servos import backend_settings, connected
 
 
 def refusal(path: str, **servos: Any) -> list[str]:
@@ -51,7 +31,7 @@ def refusal(path: str, **servos: Any) -> list[str]:
     return str(caught.value).splitlines()
 
 
-def test_connect_changes_nothing_and_stiffens_nothing(bus: RunningBus) -> None:
+def test_connect_changes_nothing_and_stiffens_nothing(bus):
     live = slice(reg.REALTIME_TICK, reg.PRESENT_TEMPERATURE + 1)
 
     def settled() -> list[bytes]:
@@ -120,13 +100,7 @@ REBOOT = ": remove the cause, then `softfinger doctor --fix` reboots it"
     ],
     ids=["factory-new and overloaded", "supply and limit", "drive mode", "model"],
 )
-def test_everything_wrong_is_listed_with_its_fix(
-    running: Callable[..., RunningBus],
-    options: dict[str, Any],
-    faults: list[str],
-    registers: dict[int, int],
-    told: list[str],
-) -> None:
+def test_everything_wrong_is_listed_with_its_fix(running, options, faults, registers, told):
     bus = running(**options)
     for fault in faults:
         bus.fault(fault)
@@ -137,14 +111,14 @@ def test_everything_wrong_is_listed_with_its_fix(
     assert [line for line in lines if "input voltage" not in line] == told
 
 
-def test_a_model_without_current_control(running: Callable[..., RunningBus]) -> None:
+def test_a_model_without_current_control(running):
     bus = running(servos={"model": "XL430-W250", "mode": "position"})
     lines = refusal(bus.path, model="XL430-W250")
     assert sum("no current-based position mode" in line for line in lines) == 2
 
 
 @pytest.mark.parametrize("silent", [(2,), (1, 2)])
-def test_servos_that_do_not_answer(bus: RunningBus, silent: tuple[int, ...]) -> None:
+def test_servos_that_do_not_answer(bus, silent):
     for servo in silent:
         bus.fault(f"silent={servo}")
     (line,) = refusal(bus.path, reply_timeout=0.5)
@@ -153,14 +127,14 @@ def test_servos_that_do_not_answer(bus: RunningBus, silent: tuple[int, ...]) -> 
     assert line.startswith(missing if silent == (2,) else nothing)
 
 
-def test_the_wrong_rate_is_met_with_silence(running: Callable[..., RunningBus]) -> None:
+def test_the_wrong_rate_is_met_with_silence(running):
     bus = running(baud=1_000_000)
     (line,) = refusal(bus.path, baud=3_000_000, reply_timeout=0.05)
     assert "no servo answers at 3000000 baud" in line
     connected(bus, baud=1_000_000).close()
 
 
-def test_ports_that_can_not_be_used(bus: RunningBus) -> None:
+def test_ports_that_can_not_be_used(bus):
     assert "no such port: plug the adapter in" in refusal("/dev/does-not-exist")[0]
     assert "no such port: start `softfinger emulate`" in refusal("/tmp/does-not-exist/servos")[0]
     first = connected(bus)
@@ -172,7 +146,7 @@ def test_ports_that_can_not_be_used(bus: RunningBus) -> None:
     connected(bus).close()  # free again
 
 
-def test_what_is_worth_knowing_is_a_notice(bus: RunningBus) -> None:
+def test_what_is_worth_knowing_is_a_notice(bus):
     servo = bus.servo(0)
     bus.call(lambda: servo.table.set(reg.DRIVE_MODE, 0b0001))
     bus.call(lambda: servo.write(reg.TORQUE_ENABLE, b"\x01", time.monotonic()))
@@ -191,9 +165,7 @@ def test_what_is_worth_knowing_is_a_notice(bus: RunningBus) -> None:
     assert servo.torque_on
 
 
-def test_what_a_model_is_too_weak_for_is_a_notice(
-    running: Callable[..., RunningBus],
-) -> None:
+def test_what_a_model_is_too_weak_for_is_a_notice(running):
     bus = running(servos={"model": "XL330-M288"})
     backend = connected(bus, model="XL330-M288")
     weak = "27 N may be asked for, and it stalls at 6.5 N on this finger"
@@ -205,9 +177,7 @@ def test_what_a_model_is_too_weak_for_is_a_notice(
         assert checks.notice_strength("", by_name(settings.servos.model), settings) == []
 
 
-def test_an_adapters_latency_timer_is_asked_to_be_low(
-    bus: RunningBus, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_adapters_latency_timer_is_asked_to_be_low(bus, tmp_path, monkeypatch):
     name = Path(os.path.realpath(bus.path)).name
     (tmp_path / name / "device").mkdir(parents=True)
     place = tmp_path / name / "device" / "latency_timer"

@@ -3,40 +3,28 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import pytest
 
-from softfinger.daemon.clock import RealClock, VirtualClock
+from softfinger.daemon.clock import VirtualClock
+from softfinger.daemon.errors import ServoError
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import dynamixel
-from softfinger.daemon.servos.base import Servos, make_servos
+from softfinger.daemon.servos.base import Servos
+from softfinger.daemon.servos.dynamixel import DynamixelServos
 from softfinger.daemon.servos.simulated import SimulatedServos
 from softfinger.daemon.simulation.servo_model.servo_heat import ServoHeat
 from softfinger.daemon.types import Reading
 from tests.conftest import until
 from tests.harness.servos import RunningBus
+from tests.process.conftest import Connect
 
 
 @pytest.fixture
-def bus() -> Iterator[RunningBus]:
-    bus = RunningBus()
-    yield bus
-    bus.close()
-
-
-@pytest.fixture
-def servos(bus: RunningBus) -> Iterator[Servos]:
-    settings = Settings.model_validate(
-        {"servos": {"backend": "dynamixel", "port": bus.path, "reply_timeout": 1.0}}
-    )
-    servos = make_servos(settings, RealClock(), None)
-    assert servos is not None
-    servos.connect()
-    yield servos
-    servos.close()
+def servos(bus: RunningBus, connect: Connect) -> DynamixelServos:
+    return connect(bus)
 
 
 def read(servos: Servos, reading: Reading) -> Reading:
@@ -44,7 +32,7 @@ def read(servos: Servos, reading: Reading) -> Reading:
     return reading
 
 
-def test_temperature_and_supply_come_with_the_joints(bus: RunningBus, servos: Servos) -> None:
+def test_temperature_and_supply_come_with_the_joints(bus, servos):
     reading = read(servos, Reading())
     assert reading.valid
     assert reading.temperature == [25.0, 25.0]
@@ -56,9 +44,7 @@ def test_temperature_and_supply_come_with_the_joints(bus: RunningBus, servos: Se
     assert reading.temperature[0] == 25.0
 
 
-def test_both_kinds_of_read_give_the_same_joints(
-    bus: RunningBus, servos: Servos, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_both_kinds_of_read_give_the_same_joints(bus, servos, monkeypatch):
     monkeypatch.setattr(dynamixel, "_HEALTH_EVERY", math.inf)  # one wide read, and no other
     wide = read(servos, Reading())
     narrow = read(servos, Reading())
@@ -68,13 +54,16 @@ def test_both_kinds_of_read_give_the_same_joints(
     assert servos.counters()["timeouts"] == 0
 
 
-def test_an_alert_tells_which_hardware_error_it_is(bus: RunningBus, servos: Servos) -> None:
+def test_an_alert_tells_which_hardware_error_it_is_and_arming_is_refused(bus, servos):
     reading = read(servos, Reading())
     assert reading.hardware == [0, 0]
     bus.fault("overload=2")
     until(lambda: read(servos, reading).alert)
-    assert reading.alert == 0b10
+    assert (reading.valid, reading.alert) == (True, 0b10)
     assert reading.hardware == [0, 1 << 5]
+    with pytest.raises(ServoError, match=r"servo 2 \(right\): hardware error: overload"):
+        servos.torque_on()
+    assert not bus.servo(0).torque_on
 
 
 class Loaded:

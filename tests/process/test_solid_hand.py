@@ -37,9 +37,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
         path.unlink()
 
 
-def test_its_recording_recomputes_to_the_last_bit(
-    recorded: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_its_recording_recomputes_to_the_last_bit(recorded, capsys):
     assert main(["replay", "--recompute", str(recorded)]) == 0
     assert "identical to the last bit" in capsys.readouterr().out
     states = [each for _, each in Recording(recorded).messages([schema.STATE])]
@@ -47,7 +45,7 @@ def test_its_recording_recomputes_to_the_last_bit(
     assert max(abs(each["left"]["shear_x"]) for each in states) > 0.2
 
 
-def test_analyse_and_plot_read_it(recorded: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_analyse_and_plot_read_it(recorded, capsys):
     assert main(["analyse", str(recorded)]) == 0
     assert ", 0 not usable" in capsys.readouterr().out
     out = recorded.parent / "plots"

@@ -8,15 +8,15 @@ from __future__ import annotations
 
 import contextlib
 import socket
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import msgpack
 import pytest
 import zmq
 
 from softfinger import Hand
-from tests.conftest import own_addresses, until
-from tests.harness.daemon_process import Running, ask, insist
+from tests.conftest import until
+from tests.harness.daemon_process import ask, insist
 
 
 def old_frame(body: bytes, more: bool = False) -> bytes:
@@ -66,11 +66,7 @@ def said_to(request: bytes, address: str, wait: Callable[[], object]) -> bytes:
 
 
 @pytest.mark.parametrize("wrap", [lambda frames, _: frames, posted], ids=["ZMTP/1.0", "HTTP POST"])
-def test_libzmq_by_itself_takes_them_for_commands(
-    addresses: tuple[str, str],
-    context: zmq.Context[zmq.Socket[bytes]],
-    wrap: Callable[[bytes, str], bytes],
-) -> None:
+def test_libzmq_by_itself_takes_them_for_commands(addresses, context, wrap):
     bare = context.socket(zmq.ROUTER)
     bare.bind(addresses[1])
     request = wrap(old_command("arm") + old_command("arm")[2:], addresses[1])
@@ -80,44 +76,26 @@ def test_libzmq_by_itself_takes_them_for_commands(
         until(lambda: bool(bare.poll(0)) and bare.recv_multipart()[-1] == wanted)
 
 
-@pytest.fixture(scope="module")
-def daemon() -> Iterator[tuple[str, str]]:
-    """A daemon's addresses, for all tests."""
-    stream, commands = addresses = own_addresses()
-    where = ("--set", f"stream.address={stream}", "--set", f"commands.address={commands}")
-    running = Running(*where)
-    yield addresses
-    running.kill()
-
-
 @pytest.mark.parametrize("wrap", [lambda frames, _: frames, posted], ids=["ZMTP/1.0", "HTTP POST"])
-def test_a_web_page_commands_nothing(
-    daemon: tuple[str, str], wrap: Callable[[bytes, str], bytes]
-) -> None:
-    request = wrap(old_command("arm") + old_command("arm")[2:], daemon[1])
-    with Hand(*daemon, timeout=60.0) as hand:
-        answer = said_to(request, daemon[1], lambda: [ask(daemon[1], "status") for _ in range(20)])
+def test_a_web_page_commands_and_reads_nothing(daemon, wrap):
+    request = wrap(old_command("arm") + old_command("arm")[2:], daemon.commands)
+    with Hand(*daemon.addresses, timeout=60.0) as hand:
+        answer = said_to(
+            request, daemon.commands, lambda: [ask(daemon.commands, "status") for _ in range(20)]
+        )
         assert b"ok" not in answer
         assert hand.state().mode == "disarmed"
         insist(hand.arm)  # a client is still heard
         assert hand.wait_for(lambda state: state.torque, 60.0).mode == "armed"
         hand.stop()
+        request = wrap(old_frame(b"") + old_frame(b"\x01hand/"), daemon.addresses[0])
+        assert b"hand/" not in said_to(request, daemon.addresses[0], lambda: hand.collect(0.5))
 
 
-@pytest.mark.parametrize("wrap", [lambda frames, _: frames, posted], ids=["ZMTP/1.0", "HTTP POST"])
-def test_a_web_page_reads_nothing(
-    daemon: tuple[str, str], wrap: Callable[[bytes, str], bytes]
-) -> None:
-    request = wrap(old_frame(b"") + old_frame(b"\x01hand/"), daemon[0])
-    with Hand(*daemon, timeout=60.0) as hand:
-        answer = said_to(request, daemon[0], lambda: hand.collect(0.5))
-        assert b"hand/" not in answer
-
-
-def test_a_plain_socket_of_today_is_let_in(daemon: tuple[str, str]) -> None:
+def test_a_plain_socket_of_today_is_let_in(daemon):
     with zmq.Context() as context, context.socket(zmq.REQ) as client:
         client.setsockopt(zmq.LINGER, 0)
-        client.connect(daemon[1])
+        client.connect(daemon.commands)
         client.send(msgpack.packb({"command": "status"}))
         assert client.poll(60_000)
         assert msgpack.unpackb(client.recv())["ok"] is True

@@ -22,7 +22,7 @@ def rig(request, tmp_path):
 def test_open_brings_a_first_good_frame(rig):
     assert rig.sensor.latest() is None
     rig.sensor.open()
-    frame = rig.newest()
+    frame = rig.sensor.latest()
     assert isinstance(frame, Frame)
     assert frame.valid
     assert frame.seq >= 1
@@ -33,7 +33,7 @@ def test_open_brings_a_first_good_frame(rig):
 
 def test_a_frame_stays_the_same_object_until_a_newer_one_and_is_never_written_again(rig):
     rig.sensor.open()
-    first = rig.newest()
+    first = rig.sensor.latest()
     kept = first.data.copy()
     later = rig.wait(lambda frame: frame.seq >= first.seq + 5)
     assert later is not first
@@ -46,7 +46,7 @@ def test_a_frame_stays_the_same_object_until_a_newer_one_and_is_never_written_ag
 
 def test_numbers_and_times_only_rise(rig):
     rig.sensor.open()
-    seen = [rig.newest()]
+    seen = [rig.sensor.latest()]
     while len(seen) < 12:
         seen.append(rig.wait(lambda frame: frame is not seen[-1]))
     assert (np.diff([frame.seq for frame in seen]) > 0).all()
@@ -81,7 +81,7 @@ def test_it_opens_again_after_close(backend, tmp_path):
         rig.sensor.open()
         rig.sensor.close()
         rig.sensor.open()
-        seq = rig.newest().seq
+        seq = rig.sensor.latest().seq
         assert rig.wait(lambda frame: frame.seq > seq).valid
 
 
@@ -90,7 +90,7 @@ def test_counts_are_those_that_were_sent_row_by_row(backend, tmp_path):
     with Rig(backend, tmp_path) as rig:
         rig.sensor.open()
         for _ in range(5):
-            seq = rig.newest().seq
+            seq = rig.sensor.latest().seq
             frame = rig.wait(lambda frame, seq=seq: frame.seq > seq)
             assert any(np.array_equal(frame.data, image(k)) for k in range(160))
 
@@ -124,10 +124,10 @@ def test_a_board_that_falls_silent_leaves_the_last_frame(backend, tmp_path):
         rig.wait(lambda frame: rig.images.number > 60)  # 40 of them were sent
 
         def silent() -> bool:  # earlier frames may yet be on their way
-            last, number = rig.newest(), rig.images.number
+            last, number = rig.sensor.latest(), rig.images.number
             rig.wait(lambda frame: rig.images.number > number + 10)
             assert last.valid
-            return rig.newest() is last
+            return rig.sensor.latest() is last
 
         until(silent)
 
@@ -139,7 +139,7 @@ def test_a_frozen_board_goes_on_with_numbers_and_times_and_one_image(backend, tm
         rig.wait(lambda frame: rig.images.number > 60)
 
         def still() -> bool:  # earlier frames may yet be on their way
-            first = rig.newest()
+            first = rig.sensor.latest()
             later = rig.wait(lambda frame: frame.seq >= first.seq + 3)
             assert later.t_sample > first.t_sample
             assert later.valid

@@ -3,25 +3,17 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
-from pathlib import Path
 from typing import Any
 
-from tests.harness.daemon_process import SOFTFINGER
-from tests.harness.descendants import ending
+from tests.harness.daemon_process import python
+from tests.harness.emulated import EmulatorProcess
 from tests.harness.warm_scenes import HIL, SCENES
 
 
-def test_no_kernel_is_compiled_or_loaded_in_a_running_loop(tmp_path: Path) -> None:
-    emulate = [*SOFTFINGER, "emulate", "--dir", str(tmp_path), "--config", str(HIL)]
-    with ending(subprocess.Popen(emulate, stdout=subprocess.PIPE, text=True)) as hand:
-        assert hand.stdout is not None
-        assert hand.stdout.readline() == "ready\n"
-        done = subprocess.run(
-            [sys.executable, "-m", "tests.harness.warm_scenes", str(tmp_path)],
-            capture_output=True, text=True, check=True, timeout=290,
-        )  # fmt: skip
+def test_no_kernel_is_compiled_or_loaded_in_a_running_loop(tmp_path):
+    with EmulatorProcess("--dir", tmp_path, "--config", HIL) as hand:
+        hand.ready()
+        done = python("-m", "tests.harness.warm_scenes", tmp_path)
     told: dict[str, dict[str, Any]] = {}
     for line in done.stdout.splitlines():
         scene = json.loads(line)

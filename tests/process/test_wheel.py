@@ -6,7 +6,6 @@ import contextlib
 import os
 import shutil
 import subprocess
-import sys
 import tomllib
 import zipfile
 from importlib.metadata import PackageNotFoundError, metadata
@@ -14,6 +13,8 @@ from pathlib import Path
 
 import pytest
 from packaging.specifiers import SpecifierSet
+
+from tests.harness.daemon_process import python
 
 ROOT = Path(__file__).parents[2]
 _FOREIGN = 'raise ImportError("a package of somebody else, imported in the place of ours")\n'
@@ -46,9 +47,7 @@ def copied(source: Path) -> Path:
 
 def build(what: str, source: Path, into: Path) -> subprocess.CompletedProcess[str]:
     words = f"import setuptools.build_meta as backend; backend.build_{what}({str(into)!r})"
-    return subprocess.run(
-        [sys.executable, "-c", words], cwd=source, capture_output=True, text=True, check=False
-    )
+    return python("-c", words, cwd=source)
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +70,7 @@ def wheel(sdist: Path) -> Path:
     return packed
 
 
-def test_the_sdist_carries_what_its_tests_and_pages_need(sdist: Path) -> None:
+def test_the_sdist_carries_what_its_tests_and_pages_need(sdist):
     assert all((sdist / name).is_file() for name in _SOURCES)
     for folder in ("docs", "tests"):
         files = [each for each in (ROOT / folder).rglob("*") if each.is_file()]
@@ -80,7 +79,7 @@ def test_the_sdist_carries_what_its_tests_and_pages_need(sdist: Path) -> None:
 
 
 @pytest.mark.parametrize("found", ["a file", "nothing"])
-def test_a_clone_without_links_is_not_built(found: str, tmp_path: Path) -> None:
+def test_a_clone_without_links_is_not_built(found, tmp_path):
     source = copied(tmp_path / "source")
     link = source / "softfinger" / "daemon"
     link.unlink()
@@ -94,7 +93,7 @@ def test_a_clone_without_links_is_not_built(found: str, tmp_path: Path) -> None:
     assert not list(tmp_path.glob("*.whl"))
 
 
-def test_it_holds_one_package_with_all_its_data(wheel: Path) -> None:
+def test_it_holds_one_package_with_all_its_data(wheel):
     names = set(zipfile.ZipFile(wheel).namelist())
     assert {name.split("/")[0].split("-")[0] for name in names} == {"softfinger"}
     for rooms in ("daemon", "kinematics", "tools"):
@@ -107,7 +106,7 @@ def test_it_holds_one_package_with_all_its_data(wheel: Path) -> None:
     assert not any(name.startswith("softfinger/tests") for name in names)
 
 
-def test_a_script_beside_an_editable_clone_finds_the_package(tmp_path: Path) -> None:
+def test_a_script_beside_an_editable_clone_finds_the_package(tmp_path):
     """The clone's folder has the package's name, and stands before what is installed."""
     source = copied(tmp_path / "softfinger")
     assert build("editable", source, tmp_path).returncode == 0
@@ -116,12 +115,12 @@ def test_a_script_beside_an_editable_clone_finds_the_package(tmp_path: Path) -> 
     script = tmp_path / "script.py"
     begin = f"import site; site.addsitedir({str(tmp_path / 'site')!r})\n"
     script.write_text(begin + "from softfinger import Refused, __file__ as at; print(at)\n")
-    words = [sys.executable, "-S", str(script)]  # without the site that this test itself runs in
-    told = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
+    alone = os.environ | {"PYTHONPATH": ""}  # without the site that this test itself runs in
+    told = python("-S", script, cwd=tmp_path, env=alone)
     assert told.stdout.strip() == str(source / "softfinger" / "__init__.py"), told.stderr
 
 
-def test_folders_of_the_same_names_are_in_nobodys_way(wheel: Path, tmp_path: Path) -> None:
+def test_folders_of_the_same_names_are_in_nobodys_way(wheel, tmp_path):
     site, here = tmp_path / "site", tmp_path / "here"
     zipfile.ZipFile(wheel).extractall(site)
     for folder in (site / "daemon", here / "tools", here / "daemon", here / "config"):
@@ -130,9 +129,7 @@ def test_folders_of_the_same_names_are_in_nobodys_way(wheel: Path, tmp_path: Pat
 
     def run(*words: str) -> str:
         environment = {**os.environ, "PYTHONPATH": str(site)}
-        done = subprocess.run(
-            [sys.executable, *words], cwd=here, env=environment, capture_output=True, text=True
-        )
+        done = python(*words, cwd=here, env=environment)
         assert done.returncode == 0, done.stderr
         return done.stdout
 

@@ -1,0 +1,92 @@
+"""What several of these tests share: buses, backends on them, a daemon, and a made-up one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+
+from softfinger.daemon.servos.dynamixel import DynamixelServos
+from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
+from tests.conftest import own_addresses
+from tests.harness.daemon_process import Running, ask
+from tests.harness.fake_daemon import FakeDaemon
+from tests.harness.servos import RunningBus, connected
+
+Run = Callable[..., RunningBus]
+Connect = Callable[..., DynamixelServos]
+
+
+@pytest.fixture
+def running() -> Iterator[Run]:
+    """Starts buses that end with the test: a given one, or the settings' servos."""
+    buses: list[RunningBus] = []
+
+    def start(bus: ServoBus | None = None, **options: Any) -> RunningBus:
+        buses.append(RunningBus(bus, **options))
+        return buses[-1]
+
+    yield start
+    for each in buses:
+        each.close()
+
+
+@pytest.fixture
+def bus(running: Run) -> RunningBus:
+    """A bus with the settings' servos."""
+    return running()
+
+
+@pytest.fixture
+def connect(running: Run) -> Iterator[Connect]:
+    """Connects backends, which close before their buses end."""
+    made: list[DynamixelServos] = []
+
+    def start(bus: RunningBus, **servos: Any) -> DynamixelServos:
+        made.append(connected(bus, **servos))
+        return made[-1]
+
+    yield start
+    for each in made:
+        each.close()
+
+
+@pytest.fixture
+def fake() -> Iterator[FakeDaemon]:
+    """A daemon's sockets, with formulas behind them."""
+    with FakeDaemon() as fake:
+        yield fake
+
+
+class Shared(NamedTuple):
+    """A daemon of several tests, each of which leaves it disarmed."""
+
+    running: Running
+    profile: Path
+    addresses: tuple[str, str]  # stream and commands
+
+    @property
+    def commands(self) -> str:
+        return self.addresses[1]
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Shared]:
+    stream, commands = own_addresses()
+    path = tmp_path_factory.mktemp("shared") / "profile.toml"
+    text = f'stream.address = "{stream}"\ncommands.address = "{commands}"\n'
+    path.write_text(text + "loop.rate = 100.0\n", encoding="utf-8")
+    running = Running("--config", str(path))
+    yield Shared(running, path, (stream, commands))
+    running.kill()
+
+
+@pytest.fixture
+def daemon(shared: Shared) -> Iterator[Shared]:
+    """The module's daemon, disarmed and without a fault before a test and after it."""
+    yield shared
+    assert ask(shared.commands, "stop")["ok"]
+    ask(shared.commands, "clear")  # refused where there is no fault
+    assert ask(shared.commands, "status")["mode"] == "disarmed"
