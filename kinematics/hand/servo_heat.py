@@ -29,9 +29,9 @@ LONGEST = 3600.0  # s, the longest time to a limit that is told
 _ROOM = 25.0  # °C
 _STILL = 30.0  # K over the air for which τ_c holds
 _FIRST = (6.0, 0.5, 8.0, 0.35)  # standard deviations at the first reading [°C], of k relative
-_WANDER = (0.03, 0.01, 0.1, 0.004)  # and what they gain in a second's square root
-_STEP_STD = 0.25  # °C, of the case where its reading steps
-_STAY_STD = 3.0  # °C, of a reading a second that stays: as likely anywhere in its step
+_WANDER = (0.03, 0.01, 0.2, 0.01)  # and what they gain in a second's square root
+_STEP_STD = 0.12  # °C, of the case where its reading steps
+_STAY_STD = 6.0  # °C, of a reading a second that stays: as likely anywhere in its step
 _COUPLING = 0.25  # of W − C that τ_w may be off by: nothing shows it
 
 
