@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from unittest.mock import Mock
@@ -17,7 +16,6 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.emulator import emulator as module
 from softfinger.daemon.simulation.emulator.emulator import (
     DEFAULT_BOARD,
-    EmulatedServos,
     Emulator,
     EmulatorClock,
     EmulatorError,
@@ -25,7 +23,7 @@ from softfinger.daemon.simulation.emulator.emulator import (
 )
 from softfinger.daemon.simulation.emulator.folder import LINKS, FolderError, LinkFolder
 from tests.conftest import until
-from tests.harness.emulated import HIL, EmulatorProcess, SdkServos, board, emulated
+from tests.harness.emulated import HIL, EmulatorProcess, SdkServos, board
 from tests.harness.late_machine import LateMachine
 
 RETURN_DELAY, OPERATING_MODE, TORQUE_ENABLE = 9, 11, 64
@@ -112,18 +110,6 @@ def test_links_of_a_killed_emulator_are_replaced_and_an_interruption_is_survived
         servos.close()
         assert process.end(signal.SIGHUP) == (0, "", "")
     assert not any(path.is_symlink() for path in tmp_path.iterdir())
-
-
-def test_paced_servos_wait_for_the_latency_timer(tmp_path):
-    with emulated(tmp_path, servos=EmulatedServos(1_000_000, 0.008)):
-        servos = SdkServos(tmp_path, 1_000_000)
-        assert servos.ping(1) == 1020
-        start = time.monotonic()
-        for _ in range(5):
-            assert servos.ping(1) == 1020
-        # Each reply waits for the adapter's latency timer, and so for the one after it.
-        assert time.monotonic() - start > 4 * 0.008
-        servos.close()
 
 
 @pytest.mark.parametrize("name", ["servos", "control"])

@@ -86,13 +86,6 @@ def test_replies_take_the_wires_time_and_the_return_delay_one_after_another(wire
     assert len(wire.when(6e-5)) == PONG
 
 
-def test_an_adapters_latency_timer_holds_replies(wires):
-    wires.append(wire := Wire(make_bus(), 57600, spin=0.0, latency=0.016))
-    wire.send(PING)
-    assert wire.when(1.0080 - wire.t - 1e-4) == b""  # 1.008 = 63 × 16 ms
-    assert len(wire.when(2e-4)) == PONG
-
-
 def test_a_late_reply_is_late_even_unpaced(wires):
     wires.append(wire := Wire(make_bus(), 0, spin=0.0))
     put_fault(wire.port.bus, "late=1", wire.t)

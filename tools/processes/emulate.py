@@ -107,13 +107,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "0 answers at once and at any rate (default)",
     )
     parser.add_argument(
-        "--latency",
-        type=_milliseconds,
-        default=0.0,
-        metavar="MS",
-        help="a USB adapter's latency timer, which holds replies up; with --baud",
-    )
-    parser.add_argument(
         "--factory",
         action="store_true",
         help="servos as they leave the factory: position mode, 500 µs return delay; in all with "
@@ -135,17 +128,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--fault", action="append", default=[], metavar="FAULT", help="what goes wrong; see below"
     )
-
-
-def _milliseconds(text: str) -> float:
-    """Seconds."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = -1.0
-    if not 0.0 <= value <= 255.0:
-        raise argparse.ArgumentTypeError(f"expected 0 to 255 ms, found {text}")
-    return value / 1000.0
 
 
 def _ids(text: str) -> tuple[int, ...]:
@@ -190,7 +172,7 @@ def _serve(settings: Settings, arguments: argparse.Namespace, signals: Signals) 
     from softfinger.tools.processes.kernel_build import build_kernels, print_event
 
     build_kernels(with_board(settings), print_event, EMULATED)
-    servos = EmulatedServos(arguments.baud, arguments.latency, arguments.factory, arguments.ids)
+    servos = EmulatedServos(arguments.baud, arguments.factory, arguments.ids)
     with contextlib.ExitStack() as made:
         with signals.held():
             try:

@@ -124,7 +124,6 @@ class EmulatedServos:
     """Emulation options of the servos, beside the settings."""
 
     baud: int = 0  # 0: they answer at once and at any rate
-    latency: float = 0.0  # s of a USB adapter's timer, with a ``baud``
     factory: bool = False  # as they leave the factory but for their IDs and rate
     ids: tuple[int, ...] | None = None  # others than the settings', even one for both
 
@@ -198,7 +197,7 @@ class Emulator:
             )
         except ValueError as error:
             raise EmulatorError(str(error)) from None
-        servos = PtyServoBus(bus, baud=line.baud, latency=line.latency, clock=self.clock.now)
+        servos = PtyServoBus(bus, baud=line.baud, clock=self.clock.now)
         self._closers.append(servos.unplug)
         self._links.link("servos", servos.path)
         self._servos = self.clock.servos = servos

@@ -1,9 +1,8 @@
 """A servo bus behind a pseudo-terminal, served by somebody else's event loop.
 
 It owns the terminal and the time on the wire: replies leave when their last byte would have
-arrived at the client's baud rate, return delays and a USB adapter's latency included; or at once,
-unpaced. Times on the wire are absolute: time in which this process did not run, which no servo
-ever loses, does not count.
+arrived at the client's baud rate, return delays included; or at once, unpaced. Times on the wire
+are absolute: time in which this process did not run, which no servo ever loses, does not count.
 """
 
 from __future__ import annotations
@@ -55,7 +54,6 @@ class PtyServoBus:
     Args:
         baud: 0 answers at any rate and at once. Above 0 a servo ignores a client whose port is
             set to another rate than its own, and replies take their time on the wire.
-        latency: s, a USB adapter's latency timer: replies come at multiples of it.
         spin: s before a paced reply is due in which :meth:`service` waits for it awake, since a
             sleep ends late by a timer's slack.
     """
@@ -65,7 +63,6 @@ class PtyServoBus:
         bus: ServoBus,
         *,
         baud: int = 0,
-        latency: float = 0.0,
         spin: float = 0.00012,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -73,7 +70,6 @@ class PtyServoBus:
         bus.parser.gap = _GAP
         bus.lag = _LAG
         self._baud = baud
-        self._latency = latency
         self._spin = spin
         self._clock = clock
         self._waited: float | None = None  # s this thread waited for a processor, at the last check
@@ -185,8 +181,6 @@ class PtyServoBus:
         for reply in replies:
             free_at += reply.delay + len(reply.data) * byte_time
             due = free_at + reply.late
-            if self._latency > 0.0:
-                due = math.ceil(due / self._latency) * self._latency
             self._queue(due - PASSAGE, reply.data)
             if not reply.late:
                 self._arrives = due
