@@ -25,7 +25,7 @@ from softfinger.kinematics.hand.servo_heat import (
     time_to_limit,
     winding_std,
 )
-from softfinger.tools.calibration import heat as calibrating
+from softfinger.tools.calibration import joints as calibrating
 from softfinger.tools.cli import main
 from softfinger.tools.watched import Watched
 from tests.harness.golden_recording import RECORDING
