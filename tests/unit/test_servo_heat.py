@@ -79,14 +79,14 @@ def test_the_filter_is_a_kalman_filter_of_its_equations() -> None:
         reading = 30.0 + k // 20 + (3.0 if k > 200 else 0.0)  # steps, and one of several degrees
         f = np.eye(4) + dt * jacobian(state, x, square)
         x = x + dt * derivative(state, x, square)
-        p = f @ p @ f.T + dt * np.diag(np.square([0.03, 0.01, 0.1, 0.004]))
+        p = f @ p @ f.T + dt * np.diag(np.square([0.03, 0.01, 0.2, 0.01]))
         h = np.array([[0.0, 1.0, 0.0, 0.0]])
         jump = reading - last
-        case, variance = reading, 9.0 / dt
+        case, variance = reading, 36.0 / dt
         if abs(jump) > 1.0:
             variance = 1.0
         elif jump:
-            case, variance = 0.5 * (reading + last), 0.0625
+            case, variance = 0.5 * (reading + last), 0.0144
         gain = p @ h.T / (h @ p @ h.T + variance)
         x = x + (gain * (case - x[1])).ravel()
         p = (np.eye(4) - gain @ h) @ p
