@@ -302,13 +302,6 @@ def test_split_files_follow_each_other(fake, tmp_path):
     assert seqs == list(range(seqs[0], seqs[-1] + 5, 5))
 
 
-def test_from_and_to_cut_the_stream(fake, tmp_path):
-    path = tmp_path / "run.mcap"
-    process = record(path, "--address", fake.state_address, "--from", "0.3", "--to", "0.8")
-    assert ended(process)[0] == 0
-    assert 0.0 < Recording(path).duration < 0.52
-
-
 def test_no_daemon_is_waited_for_or_not(addresses, tmp_path):
     process = record(tmp_path / "a.mcap", "--address", addresses[0], "--no-wait")
     status, _, error = ended(process)

@@ -62,13 +62,15 @@ def schema_of(topic: bytes) -> tuple[str, dict[str, Any]]:
         return topic.decode().replace("/", "."), described
     name, fields = _FOXGLOVE[topic]
     own = described["properties"].items()
-    described["properties"] = fields | {_kept_as(each, fields): field for each, field in own}
+    described["properties"] = fields | {
+        _STORED_AS[each] if each in fields else each: field for each, field in own
+    }
     return name, described
 
 
 def to_json(topic: bytes) -> Converter:
     """Return the converter of maps to JSON. It may change the map."""
-    return {schema.TACTILE: _image, schema.EVENT: _log}.get(topic, _as_it_is)
+    return {schema.TACTILE: _image, schema.EVENT: _log}.get(topic, lambda message: message)
 
 
 def from_json(topic: bytes) -> Converter:
@@ -76,14 +78,6 @@ def from_json(topic: bytes) -> Converter:
     fields = schema.TOPICS[topic].fields if topic in schema.TOPICS else ()
     floats = [field.name.split(".") for field in fields if field.kind == "float"]
     return _Restored(topic, floats)
-
-
-def _kept_as(name: str, fields: dict[str, Any]) -> str:
-    return _STORED_AS[name] if name in fields else name
-
-
-def _as_it_is(message: dict[str, Any]) -> dict[str, Any]:
-    return message
 
 
 def _stamp(unix: object) -> dict[str, int]:

@@ -21,7 +21,6 @@ from softfinger.daemon.wire import schema
 from softfinger.tools.arguments import (
     ALL,
     PATIENCE,
-    add_range,
     add_split,
     add_stream,
     client_keys,
@@ -46,7 +45,7 @@ from softfinger.tools.recordings.channels import (
 from softfinger.tools.recordings.reader import Recording
 
 _EPILOG = """\
-Ends with Ctrl-C, after --duration, or at --to; prints what it wrote and what was lost on the way.
+Ends with Ctrl-C or after --duration; prints what it wrote and what was lost on the way.
 With --split-size or --split-time it goes on in FILE-2.mcap, FILE-3.mcap and so on.
 `replay --recompute` needs --topics all; `run --record` records that from the first tick on.
 Exit status: 0 written, 1 not or not all, with the reason."""
@@ -199,7 +198,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("file", type=Path, metavar="FILE.mcap", help="must not exist yet")
     add_stream(parser)
     parser.add_argument("--duration", type=seconds, metavar="S", help="end after S seconds")
-    add_range(parser)
     parser.add_argument(
         "--topics",
         nargs="+",
@@ -234,12 +232,10 @@ class _Recorder:
         self._keys = client_keys(arguments.keys)  # before there is a file
         self._gaps: dict[bytes, Gaps] = {}
         self._writers = [RecordingWriter(arguments.file)]  # the last is being written
-        self._first: float | None = None  # the stream's first timestamp
         self._opened = time.monotonic()
         self._messages = 0  # received, to be written
         self._unreadable = 0
         self._waiting = False  # and said so
-        self._complete = False  # --to is reached
 
     def record(self) -> int:
         """Take messages until the end."""
@@ -267,14 +263,14 @@ class _Recorder:
         began = shown = last = time.monotonic()
         ending.begin()
         failure = ""
-        while not (ending.over or self._complete):
+        while not ending.over:
             taken = self._take_batch(socket)
             if taken < _BATCH:
                 ending.wait(_STEP)
             now = time.monotonic()
             if taken:
                 last = now
-            elif self._first is None and now - began > _SILENCE:
+            elif not self._messages and now - began > _SILENCE:
                 if arguments.no_wait and now - began > PATIENCE:
                     failure = no_stream(arguments.address, arguments.keys)
                     break
@@ -293,16 +289,14 @@ class _Recorder:
         """Take the messages that wait; their number, ``_BATCH`` at most."""
         count = 0
         for message in drain(socket, _BATCH):
-            count += 1
             self._take(message)
-            if self._complete:
-                break
+            count += 1
         return count
 
     def _read_remaining(self, socket: zmq.Socket[bytes], quiet: float) -> None:
         """Take the messages that wait, and those that arrive within ``quiet`` s."""
         began = time.monotonic()
-        while not self._complete:
+        while True:
             behind = self._take_batch(socket) == _BATCH
             age = time.monotonic() - began
             if behind and age < _BACKLOG:
@@ -316,19 +310,7 @@ class _Recorder:
         except ValueError:
             self._unreadable += 1
             return
-        stamp = message.get("timestamp")
-        when = stamp if isinstance(stamp, float) else time.time()
-        if message.get("again") is not True:  # a repeated one is older than the recording
-            if self._first is None:
-                self._first = when
-            if when - self._first < self._arguments.start:
-                return
-            if when - self._first > self._arguments.end:
-                self._complete = True
-                return
-        if topic not in self._gaps:
-            self._gaps[topic] = Gaps()
-        if self._gaps[topic].take(message):
+        if self._gaps.setdefault(topic, Gaps()).take(message):
             self._split_if_due()
             self._writers[-1].add(topic, message)
             self._messages += 1
