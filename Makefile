@@ -13,7 +13,7 @@ WORKERS := $(shell expr $$(nproc) + 2) # some wait for something while the other
 COVERAGE = $(shell $(BIN)/python -c "import sys; print('--cov' * (sys.version_info >= (3, 12)))")
 LOWEST_PIP := build/lowest/bin/python -m pip --disable-pip-version-check --quiet install
 SERVO_TESTS := tests/process/test_servo_sdk.py tests/unit/test_servo_round_trip.py
-LOWEST_TESTS := tests/process/test_servo_checks.py $(addprefix tests/unit/test_,settings.py packer.py schema.py)
+LOWEST_TESTS := tests/process/test_servo_checks.py $(addprefix tests/unit/test_,settings.py schema.py)
 TO_RUN := $(VENV)/.ready-run
 TO_TEST := $(VENV)/.ready-test
 TO_DOCUMENT := $(VENV)/.ready-docs

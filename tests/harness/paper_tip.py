@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 import numpy as np
+from scipy.ndimage import gaussian_filter
 
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
@@ -42,6 +43,29 @@ def tilts(theta: float, azimuth: float) -> tuple[float, float]:
         math.asin(math.sin(theta) * math.cos(azimuth)),
         math.asin(math.sin(theta) * math.sin(azimuth)),
     )
+
+
+def dense(
+    grid: SensorGrid, material: Material, contact: Any, pieces: int = 16, margin: int = 6
+) -> np.ndarray[Any, Any]:
+    """Pressure sampled ``pieces`` times a cell's side, blurred by SciPy, averaged over cells."""
+    d, tilt_x, tilt_y = contact
+    axes = []
+    for cells, pitch, centre in zip((grid.cols, grid.rows), grid.pitches, grid.centre, strict=True):
+        count = (cells + 2 * margin) * pieces
+        axes.append((np.arange(count) + 0.5 - 0.5 * count) * pitch / pieces - centre)
+    x, y = axes[0][None, :], axes[1][:, None]
+    n_x, n_y = grid.to_sensor(math.sin(tilt_x), math.sin(tilt_y))
+    face = (A - d - n_x * x - n_y * y) / math.sqrt(1.0 - n_x**2 - n_y**2)
+    inside = x * x + y * y < A * A
+    height = np.sqrt(np.where(inside, A * A - x * x - y * y, 1.0))
+    strain = np.where(inside, 1.0 - np.maximum(face, 0.0) / height, 0.0)
+    pressure = material.stress(np.clip(strain, 0.0, 1.0))
+    widths = [grid.blur / pitch * pieces for pitch in grid.pitches[::-1]]
+    pressure = gaussian_filter(pressure, widths, truncate=6.0)
+    edge = margin * pieces
+    kept = pressure[edge:-edge, edge:-edge]
+    return np.asarray(kept.reshape(grid.rows, pieces, grid.cols, pieces).mean(axis=(1, 3)))
 
 
 def fisher(

@@ -133,14 +133,6 @@ class ReferenceHand(HandGeometry):
         contact_jacobian(coordinates, *lengths, out)
         return out
 
-    def rolling(self, q: ArrayLike, pose: ArrayLike, width: float) -> FloatArray:
-        """Rows (2, 5) that give (ḋ_t1, ḋ_t2) from the velocities of (q1, q2, x, y, φ)."""
-        c = self.contacts(q, pose, width)
-        out = np.empty((2, 5))
-        variables = np.concatenate((c.d, c.theta, c.s))
-        rolling_rows(variables, self.jacobian(q, pose), self.tip_radius, out)
-        return out
-
     def inverse(self, pose: ArrayLike, d: ArrayLike, width: float) -> FloatArray:
         """Joint angles (2,) that press ``d`` (2,) [m] into an object of ``width`` at ``pose``.
 

@@ -11,11 +11,7 @@ from softfinger.daemon.clock import VirtualClock
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.daemon.simulation.sensor.simulated_tactile import Arrivals, SimulatedTactile
-from softfinger.kinematics.contact.closed_form import Fingertip
-from softfinger.kinematics.contact.material import Material
-from softfinger.kinematics.contact.table import ContactTable
-
-TABLE = ContactTable.build(Fingertip(radius=0.020), Material.constant(0.304e6))
+from tests.harness.plant import PAPER
 
 
 def collect(arrivals, until, step=0.0005):
@@ -86,7 +82,7 @@ def simulated(simulation, tactile=None):
         }
     )
     clock = VirtualClock()
-    hand = SimulatedHand(settings, table=TABLE)
+    hand = SimulatedHand(settings, table=PAPER)
     return SimulatedTactile(settings, hand, clock, 0), clock, hand
 
 

@@ -1,21 +1,40 @@
-"""``softfinger bench``: tables, turns, slopes, comparison of runs, and the command line."""
+"""Benchmarks and campaigns in short: their errors and bounds, and what is judged how."""
 
 from __future__ import annotations
 
 import json
+import math
+import random
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from softfinger.daemon.errors import Refused
 from softfinger.tools import cli
-from softfinger.tools.benchmarks import bench, growth, measuring, tick, witnesses
+from softfinger.tools.benchmarks import (
+    bench,
+    control,
+    estimator,
+    growth,
+    measuring,
+    reflex,
+    tick,
+    witnesses,
+)
 from softfinger.tools.benchmarks.measuring import (
     Report,
     Subject,
     figure,
     interleave,
-    slopes,
+)
+from softfinger.tools.benchmarks.virtual_grip import VirtualGrip, Watch
+from softfinger.tools.benchmarks.witnesses import (
+    BOUNDED,
+    SETTLES,
+    GripTrial,
+    WitnessCase,
+    measure,
 )
 
 
@@ -35,15 +54,6 @@ def test_turns_and_times(monkeypatch: pytest.MonkeyPatch) -> None:
     assert order == ["a", "a", "b", "b"] + ["a", "b"] * 3
     assert times["a"].tolist() == [100.0] * 3
     assert times["b"].tolist() == [7e6] * 3
-
-
-def test_slopes_are_exponents_or_cost_for_each_more() -> None:
-    rows = [figure(f"cells: {n}", "µs", [3.0 * n**2], cells=n) for n in (8, 16, 64)]
-    rows += [figure(f"sensors: {n}", "µs", [5.0 + 2.0 * n], cells=n) for n in (0, 1, 4)]
-    assert slopes(rows, "cells") == (
-        "  cells: ∝ (cells)^2.00",
-        "  sensors: +2 µs for each more",
-    )
 
 
 # The command line
@@ -119,3 +129,89 @@ def test_refusals_come_before_the_measurements(
     error = capsys.readouterr().err
     assert text in error
     assert "measuring" not in error
+
+
+def test_lookups_have_their_errors() -> None:
+    rows = estimator.lookups(1, 32).rows
+    errors = {row["name"]: row[estimator.LOOKUP_ERROR] for row in rows}
+    assert 1e-12 < errors["table to 1e-09"] <= 1e-9
+    assert errors["table to 1e-12, called"] <= 1e-12
+
+
+def test_estimates_stand_beside_the_bound() -> None:
+    table = estimator.frames_to_contacts(1)
+    error = {row["name"]: row.get(estimator.ERROR) for row in table.rows}
+    limit = error["Cramér-Rao bound"]
+    for way in ("warm", "cold"):
+        assert 0.6 * limit < error[f"ml: {way}"] < 1.6 * limit
+    assert error["decode: cobs"] is None
+
+
+def test_a_law_that_does_not_turn_the_object_leaves_it_askew(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(control, "WAYS", {"energy": control.WAYS["energy"]})
+    (table,) = control.measure(brief=True)
+    assert [4.0 < row["median"] < 5.0 for row in table.rows] == [True]
+
+
+def test_a_load_that_is_held_slides_and_one_that_is_lost_is_said() -> None:
+    held = reflex.overloaded({}, 0.0, 13.0, 1)
+    assert 0.0 < held.answer < 0.022
+    assert 0.0 < held.slid < 0.02
+    assert not held.lost
+    weak = {"control": {"grip_raise_max": 0.0}, "simulation": {"object_mass": 0.1}}
+    lost = reflex.overloaded(weak, 0.0, 18.0, 1)
+    assert lost.lost
+    assert 0.0 <= lost.said < 1.0
+
+
+def holding(force: float = 8.0) -> VirtualGrip:
+    grip = VirtualGrip(1, random.Random(1), {})
+    grip.command("arm")
+    grip.loop.advance(0.1)
+    grip.command("grasp", force=force)
+    assert grip.until("holding", 3.0)
+    return grip
+
+
+def test_a_true_hand_meets_its_aim() -> None:
+    (table,) = measure(2, "6 N: honest")
+    (row,) = table.rows
+    assert (row["met"], row["trials"], table.failed) == (2, 2, False)
+    assert row["least"] == pytest.approx(1.0, abs=0.08)  # torque constants are off by up to 10 %
+    assert row["peak"] < 1.15
+    assert (row["named"], row["missed"], row["events"]) == ("", "", "")
+
+
+def test_a_watch_measures_forces_times_and_places() -> None:
+    watch = Watch(10.0)
+    for k, force in enumerate((10.0, 14.0, 15.0, 12.0, 13.5, 9.0, 9.0)):
+        place = (0.0, 0.08 + (0.02 if k == 6 else 0.001 * k))
+        watch.see(0.1 * k, (force, 10.0), place, torque=k != 6)
+    assert watch.peak == 1.5
+    assert watch.above == pytest.approx(0.1)  # from 0.1 to 0.2 s
+    assert watch.slid == pytest.approx(0.005)
+    assert watch.settled() == pytest.approx((1.25 + 1.1 + 1.175 + 0.95 + 0.95) / 5)
+
+
+@pytest.mark.parametrize(
+    ("aim", "changes", "missed"),
+    [
+        (SETTLES, {}, []),
+        (SETTLES, {"settled": 1.25}, ["force"]),
+        (SETTLES, {"settled": math.nan}, ["force"]),
+        (SETTLES, {"events": [(1.0, "slip")]}, ["raised"]),
+        (SETTLES, {"held": False}, ["not held"]),
+        (SETTLES, {"events": [(1.0, "witness.right_sensor")]}, ["named wrongly"]),
+        (BOUNDED, {"above": 0.06, "settled": 2.0}, ["too strong"]),
+        (BOUNDED, {"events": []}, ["not named"]),
+        (BOUNDED, {"events": [(1.31, "witness.left_sensor")]}, ["not named"]),
+        (BOUNDED, {"events": [(0.2, "hand.width")]}, ["not named"]),
+    ],
+)
+def test_what_misses_an_aim(aim: str, changes: dict[str, object], missed: list[str]) -> None:
+    case = WitnessCase("a case", aim, 6.0, "left:drift=0.2@0..2", ("left_sensor",), comes=2.0)
+    met = GripTrial(("left_sensor",), settled=1.0, events=[(1.29, "witness.left_sensor")])
+    assert met.missed(case) == []
+    assert replace(met, **changes).missed(case) == missed

@@ -6,34 +6,16 @@ import math
 
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter
 
+from softfinger.daemon.perception.finger_model import make_estimator
+from softfinger.daemon.profile.factory import make_material
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.simulation.sensor.simulated_tactile import make_sensor_model
 from softfinger.kinematics.estimation.estimator import ContactEstimator
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid, stencil
-from tests.harness.paper_tip import LINEAR, MEASURED, PITCH, TIP, A, E, fisher, tilts
+from tests.harness.paper_tip import LINEAR, MEASURED, PITCH, TIP, E, dense, tilts
 
 NOISE = 0.002
-
-
-def dense(grid, material, contact, pieces=16, margin=6):
-    """Pressure sampled ``pieces`` times a cell's side, blurred by SciPy, averaged over cells."""
-    d, tilt_x, tilt_y = contact
-    axes = []
-    for cells, pitch, centre in zip((grid.cols, grid.rows), grid.pitches, grid.centre, strict=True):
-        count = (cells + 2 * margin) * pieces
-        axes.append((np.arange(count) + 0.5 - 0.5 * count) * pitch / pieces - centre)
-    x, y = axes[0][None, :], axes[1][:, None]
-    n_x, n_y = grid.to_sensor(math.sin(tilt_x), math.sin(tilt_y))
-    face = (A - d - n_x * x - n_y * y) / math.sqrt(1.0 - n_x**2 - n_y**2)
-    inside = x * x + y * y < A * A
-    height = np.sqrt(np.where(inside, A * A - x * x - y * y, 1.0))
-    strain = np.where(inside, 1.0 - np.maximum(face, 0.0) / height, 0.0)
-    pressure = material.stress(np.clip(strain, 0.0, 1.0))
-    widths = [grid.blur / pitch * pieces for pitch in grid.pitches[::-1]]
-    pressure = gaussian_filter(pressure, widths, truncate=6.0)
-    edge = margin * pieces
-    kept = pressure[edge:-edge, edge:-edge]
-    return kept.reshape(grid.rows, pieces, grid.cols, pieces).mean(axis=(1, 3))
 
 
 @pytest.mark.parametrize(
@@ -65,40 +47,6 @@ def test_stencils_have_the_gaussians_moments():
     assert stencil(0.0).tolist() == [1.0]
 
 
-@pytest.mark.parametrize(
-    ("material", "blur", "d", "degrees", "free_gain"),
-    [
-        (LINEAR, 0.0006, 0.001, 20.0, True),
-        (LINEAR, 0.001, 0.004, 15.0, False),
-        (MEASURED, 0.0016, 0.006, 25.0, True),
-        (MEASURED, 0.0004, 0.002, 10.0, False),
-    ],
-)
-def test_errors_with_a_blur_are_at_the_bound_and_the_covariance_says_so(
-    material, blur, d, degrees, free_gain
-):
-    noise = NOISE * material.reference_modulus
-    grid = SensorGrid(44, 44, PITCH, (2e-4, -5e-4), blur=blur)
-    truth = (d, *tilts(math.radians(degrees), 0.8))
-    covariance = fisher(grid, material, (*truth, 1.0), noise, free_gain)
-    estimator = ContactEstimator(TIP, material, grid, noise, free_gain=free_gain)
-    rng = np.random.default_rng(9)
-    clean = dense(grid, material, truth)  # not the estimator's own forward model
-    frames = 300
-    miss = np.empty((frames, 3))
-    nees = np.empty(frames)
-    for k in range(frames):
-        e = estimator.update(clean + rng.normal(0.0, noise, grid.shape))
-        assert e.valid
-        miss[k] = (e.d - truth[0], e.tilt_x - truth[1], e.tilt_y - truth[2])
-        nees[k] = miss[k] @ np.linalg.solve(e.covariance[:3, :3], miss[k]) / 3.0
-    ratio = np.sqrt((miss**2).mean(axis=0) / np.diag(covariance)[:3])
-    # 300 frames scatter the ratio by 4 %.
-    assert np.all(ratio < 1.13), ratio
-    assert np.all(ratio > 0.85), ratio
-    assert abs(nees.mean() - 1.0) < 4.0 * math.sqrt(2.0 / (3 * frames)) + 0.05
-
-
 def test_a_blur_that_is_not_modelled_shows():
     grid = SensorGrid(44, 44, PITCH, blur=0.001)
     truth = (0.004, *tilts(math.radians(15.0), 0.3))
@@ -108,25 +56,6 @@ def test_a_blur_that_is_not_modelled_shows():
     assert abs(aware.d - truth[0]) < 0.1 * aware.d_std
     assert abs(sharp.d - truth[0]) > 5.0 * aware.d_std
     assert sharp.chi2 > 10 * aware.chi2
-
-
-def test_dead_cells_counts_and_thresholds_go_with_a_blur():
-    rng = np.random.default_rng(7)
-    grid = SensorGrid(44, 44, PITCH, blur=0.0008)
-    active = rng.random(grid.shape) > 0.02
-    truth = (0.003, 0.2, -0.1)
-    clean = grid.pressure(TIP, MEASURED, *truth)
-    estimator = ContactEstimator(TIP, MEASURED, grid, 600.0, active=active, free_gain=False)
-    score = []
-    for _ in range(150):
-        counts = np.clip(np.round((clean + rng.normal(0.0, 600.0, grid.shape)) / 50.0), 0, 65535)
-        counts[~active] = 65535
-        e = estimator.update(counts.astype(np.uint16), 50.0)
-        assert e.valid
-        miss = np.array([e.d, e.tilt_x, e.tilt_y]) - truth
-        score.append(miss / np.sqrt(np.diag(e.covariance))[:3])
-    assert np.all(np.abs(np.mean(score, axis=0)) < 4.5 / math.sqrt(150))
-    assert np.all(np.sqrt(np.mean(np.square(score), axis=0)) < 1.2)
 
 
 @pytest.mark.parametrize("blur", [-1e-4, math.nan, math.inf, 0.05])
@@ -148,3 +77,14 @@ def test_cells_out_of_the_tips_reach_are_not_used_however_far_the_blur_goes(read
     assert usual.valid
     assert found.valid
     assert found.d == usual.d
+
+
+def test_the_settings_blurs_go_into_the_simulated_sensor_and_the_fingers_estimator():
+    sensor, truth = {"blur": 0.001, "noise": 300.0}, {"tactile_blur": 0.001, "tactile_noise": 300.0}
+    settings = Settings.model_validate({"tactile": sensor, "simulation": truth})
+    counts = np.zeros((44, 44), np.uint16)
+    make_sensor_model(settings, 0).frame(0.004, 0.2, -0.1, counts)
+    estimator = make_estimator(settings, make_material(settings.material))
+    e = estimator(counts, settings.tactile.pascal_per_count)
+    assert e.d == pytest.approx(0.004, abs=5e-5)
+    assert (e.tilt_x, e.tilt_y) == pytest.approx((0.2, -0.1), abs=2e-3)

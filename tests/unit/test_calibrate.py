@@ -130,6 +130,16 @@ def test_each_step_finds_what_the_sensor_was_made_with(bench):
     )
 
 
+def test_counts_become_the_pressure_that_made_them(bench):
+    folder, sensor = bench
+    converter = Converter(load_calibration(folder / "sensor.json"), 20.0)
+    pressure = sensor.grid.pressure(TIP, Material.constant(E), 0.004, 0.2)
+    found = converter(sensor.press(0.004, 0.2)[0]).copy()
+    live = converter.live & (pressure > 5e3)
+    assert np.abs(found[live] / pressure[live] - 1).max() < 0.05
+    assert np.abs(found[~live & (pressure == 0)]).mean() < 50.0
+
+
 def daemon_settings(folder, recording, **tactile) -> Settings:
     settings = load(folder / "profile.toml")
     tactile = {

@@ -16,7 +16,7 @@ import zmq
 
 from softfinger.daemon.client.command_client import send
 from softfinger.daemon.clock import VirtualClock
-from softfinger.daemon.errors import AddressError, Refused
+from softfinger.daemon.errors import Refused
 from softfinger.daemon.gateway import bounds
 from softfinger.daemon.gateway.bounds import Config
 from softfinger.daemon.gateway.supervisor import Gateway
@@ -197,21 +197,6 @@ def test_a_stop_is_one_whatever_it_holds_besides() -> None:
         decode(msgpack.packb({"command": "arm", "how": ["now"]}))
 
 
-@pytest.mark.parametrize("transport", ["tcp", "ipc"])
-def test_a_second_server_on_the_same_address_is_told(
-    addresses: tuple[str, str], tmp_path_factory: pytest.TempPathFactory, transport: str
-) -> None:
-    address = addresses[1]
-    if transport == "ipc":
-        address = f"ipc://{tmp_path_factory.mktemp('s')}/c"
-    with (
-        Served(commands=address),
-        pytest.raises(AddressError, match="is another softfinger running"),
-    ):
-        Served(commands=address)
-    Served(commands=address).close()
-
-
 class Flood:
     """Clients that send without waiting for answers; nothing serves yet."""
 
@@ -314,17 +299,6 @@ def test_clients_that_flood_leave_others_a_place(
         assert msgpack.unpackb(other.recv())["ok"]
         assert flood.sockets
         assert len(heard) < 1100, "it waited for more than those that were before it"
-
-
-def test_many_clients_that_ask_once_each_are_all_answered(
-    context: zmq.Context[Any], addresses: tuple[str, str]
-) -> None:
-    context.set(zmq.MAX_SOCKETS, 2000)
-    with Served(commands=addresses[1], clock=VirtualClock()) as served:
-        flood = Flood(context, addresses[1], clients=300, each=1)
-        replies: list[dict[str, Any]] = []
-        until(lambda: [served.serve(echo), flood.collect(replies) >= 300][1])
-        assert all(reply["ok"] for reply in replies)
 
 
 @pytest.mark.parametrize("mode", [0o600, 0o660])

@@ -1,8 +1,8 @@
-"""The site's pages are made, and each link of README and docs leads somewhere, in the repository
-and on the site; without MkDocs, which `make docs` has."""
+"""The site's pages are made, their links lead somewhere, and quoted messages the program's."""
 
 from __future__ import annotations
 
+import ast
 import importlib.util
 import re
 from pathlib import Path
@@ -81,3 +81,36 @@ def test_every_erratum_is_told(site: tuple[ModuleType, dict[str, str]]) -> None:
     for page in pages().values():
         assert all(each.holds in text for each in page.errata)
     assert "15.8197516322" in text  # F at 4 mm, 15°
+
+
+ROW = re.compile(r"(?m)^\| ([^|]*) \|.*\|.*\|$")
+
+
+def texts() -> set[str]:
+    """Every text in the sources, with … for the values in it."""
+    found = set()
+    for path in [
+        *ROOT.glob("daemon/**/*.py"),
+        *ROOT.glob("tools/**/*.py"),
+        *ROOT.glob("kinematics/**/*.py"),
+    ]:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                found.add(node.value)
+            elif isinstance(node, ast.JoinedStr):
+                parts = node.values
+                found.add("".join(p.value if isinstance(p, ast.Constant) else "…" for p in parts))  # type: ignore[misc]
+    return found
+
+
+def test_every_message_is_the_programs_own() -> None:
+    page = (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8")
+    quoted = [text for row in ROW.findall(page) for text in re.findall(r"`([^`]+)`", row)]
+    assert len(quoted) > 45
+    known = "\n".join(texts())
+    unknown = []
+    for message in quoted:
+        words = r"[^\n]*".join(map(re.escape, filter(None, re.split(r" ?… ?", message.strip()))))
+        if not re.search(words, known):
+            unknown.append(message)
+    assert unknown == []

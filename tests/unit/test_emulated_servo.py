@@ -1,14 +1,19 @@
-"""What an emulated servo's registers do: access and limits, motion, watchdog, errors, resets."""
+"""What an emulated servo's registers do: access, units, motion, watchdog, errors, resets."""
 
 from __future__ import annotations
 
+import math
 import struct
 from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from softfinger.daemon.profile.settings import ServoSettings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.control_table import by_name
+from softfinger.daemon.servos.joint import JointScale
 from softfinger.daemon.simulation.servo_model import framing
 from softfinger.daemon.simulation.servo_model.servo import REBOOT_TIME
 from softfinger.daemon.simulation.servo_model.servo_joint import OVERLOAD_TIME
@@ -249,3 +254,21 @@ def test_reboot_resets_ram_and_keeps_eeprom() -> None:
     assert c.read(reg.RETURN_DELAY_TIME, 1) == 3
     assert c.read(reg.LED, 1) == c.read(reg.TORQUE_ENABLE, 1) == 0
     assert c.read(reg.GOAL_POSITION, 4) == 1234
+
+
+@given(
+    direction=st.sampled_from([-1, 1]),
+    zero=st.integers(-5000, 5000),
+    ratio=st.floats(0.1, 50.0),
+    counts=st.integers(-100_000, 100_000),
+)
+def test_units_there_and_back(direction: int, zero: int, ratio: float, counts: int) -> None:
+    servos = ServoSettings(direction=(direction, direction), zero=(zero, zero), gear_ratio=ratio)
+    scale = JointScale.of(servos, 1)
+    assert scale.position_counts(scale.angle(counts)) == counts
+    assert scale.velocity_counts(scale.rate(counts)) == counts
+    assert scale.current_counts(scale.amperes(counts)) == counts
+    assert scale.angle(zero) == 0.0
+    turn = scale.angle(zero + direction * 4096)
+    assert turn == pytest.approx(2.0 * math.pi / ratio)
+    assert scale.bound_counts(-5 * 2.69e-3) == 5

@@ -43,11 +43,10 @@ def test_outside_of_it_the_reply_says_what_and_why() -> None:
 def test_a_grasp_outside_is_warned_of_in_its_reply() -> None:
     for width, warned in ((0.002, True), (0.040, False)):
         with Watched({"object": {"width": width, "width_min": 0.0005}}) as hand:
-            loop = hand._daemon.loop
-            loop.advance(0.3)
-            loop.command({"command": "arm"})
-            loop.advance(0.2)
-            reply = loop.command({"command": "grasp", "force": 10.0})
+            hand.run(0.3)
+            hand.command("arm")
+            hand.run(0.2)
+            reply = hand.command("grasp", force=10.0)
             assert reply["mode"] == "grasping"
             assert ("warning" in reply) == warned
 

@@ -15,22 +15,25 @@ from softfinger.kinematics.estimation.error_budget import Uncertainty
 from softfinger.kinematics.estimation.estimator import ContactEstimator
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from softfinger.kinematics.sensing.solid_pressure import SolidPressure
+from tests.harness.paper_tip import LINEAR, NOISE, PITCH, TIP
 
-E = 0.304e6
-TIP = Fingertip(0.020)
-LINEAR = Material.constant(E)
-PITCH = 0.058 / 44
 PLACE = (2e-4, -5e-4)
 GRID = SensorGrid(44, 44, PITCH, PLACE)
-NOISE = 608.0
 LENGTH = 1.5  # cells over which the noise is correlated
 LAGS = np.arange(8.0)
 CORRELATION = np.exp(-(LAGS[:, None] ** 2 + LAGS**2) / (2.0 * LENGTH**2))
 SMOOTH = np.exp(-((np.arange(58) - np.arange(7, 51)[:, None]) ** 2) / LENGTH**2)
 SMOOTH /= np.sqrt((SMOOTH[20] ** 2).sum())
-FRAMES = 200
 
-Frame = Callable[[tuple[float, float, float], np.random.Generator], np.ndarray]
+SPRINGS, SOLID = TIP, Fingertip(0.020, "solid", 0.49, "lying")
+CASES = {
+    "correlated": Uncertainty(correlation=CORRELATION),
+    "baseline": Uncertainty(baseline=1000.0),
+    "centre": Uncertainty(centre=5e-4),
+    "pitch": Uncertainty(pitch=0.01),
+    "modulus": Uncertainty(modulus=0.05),
+    "all": Uncertainty(baseline=1000.0, centre=5e-4, correlation=CORRELATION),
+}
 
 
 def correlated_noise(rng: np.random.Generator) -> np.ndarray:
@@ -41,132 +44,67 @@ def white(rng: np.random.Generator) -> np.ndarray:
     return rng.normal(0.0, NOISE, GRID.shape)
 
 
-def moved(truth: tuple[float, float, float], rng: np.random.Generator) -> np.ndarray:
-    x, y = np.array(PLACE) + rng.normal(0.0, 5e-4, 2)
-    return SensorGrid(44, 44, PITCH, (float(x), float(y))).pressure(TIP, LINEAR, *truth)
-
-
-def stretched(truth: tuple[float, float, float], rng: np.random.Generator) -> np.ndarray:
-    share = 1.0 + rng.normal(0.0, 0.01)
-    place = PLACE[0] * share, PLACE[1] * share
-    return SensorGrid(44, 44, PITCH * share, place).pressure(TIP, LINEAR, *truth)
-
-
 def clean(truth: tuple[float, float, float], _: np.random.Generator) -> np.ndarray:
     return GRID.pressure(TIP, LINEAR, *truth)
 
 
-CASES: dict[str, tuple[Uncertainty, bool, Frame]] = {
-    "correlated": (
-        Uncertainty(correlation=CORRELATION),
-        True,
-        lambda truth, rng: clean(truth, rng) + correlated_noise(rng),
-    ),
-    "baseline": (
-        Uncertainty(baseline=1000.0),
-        True,
-        lambda truth, rng: clean(truth, rng) + white(rng) + rng.normal(0.0, 1000.0),
-    ),
-    "centre": (
-        Uncertainty(centre=5e-4),
-        True,
-        lambda truth, rng: moved(truth, rng) + white(rng),
-    ),
-    "pitch": (
-        Uncertainty(pitch=0.01),
-        True,
-        lambda truth, rng: stretched(truth, rng) + white(rng),
-    ),
-    "modulus": (
-        Uncertainty(modulus=0.05),
-        False,
-        lambda truth, rng: clean(truth, rng) * (1.0 + rng.normal(0.0, 0.05)) + white(rng),
-    ),
-    "all": (
-        Uncertainty(baseline=1000.0, centre=5e-4, correlation=CORRELATION),
-        True,
-        lambda truth, rng: moved(truth, rng) + correlated_noise(rng) + rng.normal(0.0, 1000.0),
-    ),
-}
+def really(known: Uncertainty) -> list[SensorGrid]:
+    """Sensors whose places or pitches have the standard deviation that is known, one by one."""
+    turns = np.arange(8) * 0.25 * math.pi + 0.1
+    if known.centre:
+        off = [(7.07e-4 * math.cos(turn), 7.07e-4 * math.sin(turn)) for turn in turns]
+        return [replace(GRID, centre=(PLACE[0] + x, PLACE[1] + y)) for x, y in off]
+    return [
+        replace(GRID, pitch=PITCH * share, centre=(PLACE[0] * share, PLACE[1] * share))
+        for share in ((1.0 - known.pitch, 1.0 + known.pitch) if known.pitch else (1.0,))
+    ]
 
 
-def nees(
-    known: Uncertainty | None, free: bool, frame: Frame, d: float, degrees: float
-) -> tuple[float, float]:
-    """Mean normalised square of the estimates' errors, a parameter; share of valid ones."""
-    theta = math.radians(degrees)
-    truth = (
-        d,
-        math.asin(math.sin(theta) * math.cos(1.0)),
-        math.asin(math.sin(theta) * math.sin(1.0)),
-    )
-    estimator = ContactEstimator(TIP, LINEAR, GRID, NOISE, free_gain=free, known=known)
-    rng = np.random.default_rng(11)
-    n = 4 if free else 3
-    squares = []
-    for _ in range(FRAMES):
-        e = estimator(frame(truth, rng))
-        if e.contact and e.valid:
+def nees(tip: Fingertip, case: str, told: bool, d: float, theta: float) -> tuple[float, float]:
+    """Mean normalised square of the estimates' errors, a parameter; share of valid ones.
+
+    A solid tip's face is sheared, too.
+    """
+    known = CASES[case]
+    truth = np.array([d, theta, -0.5 * theta])
+    free = tip is SPRINGS and not known.modulus
+    given = known if told else None
+    estimator = ContactEstimator(tip, LINEAR, GRID, NOISE, free_gain=free, known=given)
+    grids, out = really(known), np.empty(GRID.shape)
+    press = [SolidPressure(tip, LINEAR, grid.images(tip)) for grid in grids if tip is SOLID]
+    rng, squares, frames = np.random.default_rng(12), [], 96 if tip is SOLID else 192
+    for k in range(frames):
+        gain = 1.0 + rng.normal(0.0, known.modulus)
+        if tip is SOLID:
+            shear = tuple(rng.normal(0.0, 0.1, 2))
+            press[k % len(press)]((d, *np.sin(truth[1:])), gain, out, shear)
+        else:
+            grids[k % len(grids)].pressure(tip, LINEAR, *truth, gain=gain, out=out)
+        noise = white(rng) if known.correlation is None else correlated_noise(rng)
+        e = estimator(out + noise + rng.normal(0.0, known.baseline))
+        if e.contact and e.valid and not e.misfit:
+            n = 4 if free else 3  # with the gain
             error = (np.array([e.d, e.tilt_x, e.tilt_y, e.gain]) - [*truth, 1.0])[:n]
-            squares.append(error @ np.linalg.solve(e.covariance[:n, :n], error))
-    return float(np.mean(squares)) / n, len(squares) / FRAMES
-
-
-@pytest.mark.parametrize(("d", "degrees"), [(0.001, 0.0), (0.002, 20.0), (0.006, 10.0)])
-@pytest.mark.parametrize("case", CASES)
-def test_the_errors_are_as_large_as_the_covariance_says(
-    case: str, d: float, degrees: float
-) -> None:
-    known, free, frame = CASES[case]
-    score, valid = nees(known, free, frame, d, degrees)
-    assert 0.8 < score < 1.3
-    assert valid > 0.9
+            squares.append(error @ np.linalg.solve(e.covariance[:n, :n], error) / n)
+    return float(np.mean(squares)), len(squares) / frames
 
 
 @pytest.mark.usefixtures("exact_solid_data")
-def test_a_solid_tips_are_too(subtests: pytest.Subtests) -> None:
-    """With shear on the face; the places and pitches have the standard deviation that is known."""
-    tip = Fingertip(0.020, "solid", 0.49, "lying")
-
-    def frames(grid: SensorGrid) -> SolidPressure:
-        return SolidPressure(tip, LINEAR, grid.images(tip))
-
-    straight = frames(GRID)
-    turns = np.arange(8) * 0.25 * math.pi + 0.1
-    moved = [
-        frames(replace(GRID, centre=(PLACE[0] + 7.07e-4 * c, PLACE[1] + 7.07e-4 * s)))
-        for c, s in zip(np.cos(turns), np.sin(turns), strict=True)
-    ]
-    stretched = [
-        frames(replace(GRID, pitch=PITCH * share, centre=(PLACE[0] * share, PLACE[1] * share)))
-        for share in (0.99, 1.01)
-    ]
-    out = np.empty(GRID.shape)
-    for case, (known, _, _) in CASES.items():
-        models = moved if known.centre else stretched if known.pitch else [straight]
-        estimator = ContactEstimator(tip, LINEAR, GRID, NOISE, known=known)
-        for d, theta in ((0.001, 0.0), (0.002, 0.4), (0.006, 0.2)):
-            truth = (d, theta, -0.5 * theta)
-            rng, squares = np.random.default_rng(12), []
-            for k in range(96):
-                gain = 1.0 + rng.normal(0.0, known.modulus)
-                shear = tuple(rng.normal(0.0, 0.1, 2))
-                contact = (d, math.sin(truth[1]), math.sin(truth[2]))
-                models[k % len(models)](contact, gain, out, shear)
-                noise = white(rng) if known.correlation is None else correlated_noise(rng)
-                found = estimator(out + noise + rng.normal(0.0, known.baseline))
-                if found.valid and not found.misfit:
-                    error = np.array([found.d, found.tilt_x, found.tilt_y]) - truth
-                    squares.append(error @ np.linalg.solve(found.covariance[:3, :3], error) / 3)
-            with subtests.test(case=case, d=d):
-                assert 0.7 < np.mean(squares) < 1.35
-                assert len(squares) > 80
+@pytest.mark.parametrize(("d", "theta"), [(0.001, 0.0), (0.002, 0.4), (0.006, 0.2)])
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("tip", [SPRINGS, SOLID], ids=lambda tip: tip.physics)
+def test_the_errors_are_as_large_as_the_covariance_says(
+    tip: Fingertip, case: str, d: float, theta: float
+) -> None:
+    score, valid = nees(tip, case, True, d, theta)
+    low, high = (0.7, 1.35) if tip is SOLID else (0.8, 1.3)
+    assert low < score < high
+    assert valid > (0.83 if tip is SOLID else 0.9)
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_without_it_they_are_not(case: str) -> None:
-    _, free, frame = CASES[case]
-    assert nees(None, free, frame, 0.002, 20.0)[0] > 5.0
+    assert nees(SPRINGS, case, False, 0.002, 0.35)[0] > 5.0
 
 
 def test_what_frames_share_is_told_apart_and_nothing_known_adds_nothing() -> None:

@@ -19,6 +19,7 @@ from tests.harness.paper_tip import (
     PITCH,
     TIP,
     E,
+    dense,
     errors,
     fisher,
     tilts,
@@ -66,22 +67,29 @@ def test_the_bias_stays_small_where_the_outline_all_but_meets_the_rim(d, degrees
 
 @pytest.mark.parametrize("free_gain", [True, False])
 @pytest.mark.parametrize(
-    ("material", "d", "degrees", "azimuth", "percent"),
+    ("material", "d", "degrees", "azimuth", "percent", "blur"),
     [
-        (LINEAR, 0.0005, 0.0, 0.0, 0.1),
-        (LINEAR, 0.001, 20.0, 1.0, 0.2),
-        (LINEAR, 0.004, 30.0, 2.0, 0.2),
-        (LINEAR, 0.008, 10.0, -2.0, 2.0),
-        (MEASURED, 0.002, 15.0, 0.5, 0.5),
-        (MEASURED, 0.006, 30.0, -1.0, 0.2),
+        (LINEAR, 0.0005, 0.0, 0.0, 0.1, 0.0),
+        (LINEAR, 0.001, 20.0, 1.0, 0.2, 0.0),
+        (LINEAR, 0.004, 30.0, 2.0, 0.2, 0.0),
+        (LINEAR, 0.008, 10.0, -2.0, 2.0, 0.0),
+        (MEASURED, 0.002, 15.0, 0.5, 0.5, 0.0),
+        (MEASURED, 0.006, 30.0, -1.0, 0.2, 0.0),
+        (LINEAR, 0.001, 20.0, 0.8, 0.2, 0.0006),
+        (MEASURED, 0.002, 10.0, 0.8, 0.2, 0.0004),
+        (MEASURED, 0.006, 25.0, 0.8, 0.2, 0.0016),
     ],
 )
-def test_errors_are_at_the_cramer_rao_bound(material, d, degrees, azimuth, percent, free_gain):
-    grid = SensorGrid(44, 44, PITCH, centre=(2e-4, -5e-4))
+def test_errors_are_at_the_cramer_rao_bound(
+    material, d, degrees, azimuth, percent, blur, free_gain
+):
+    grid = SensorGrid(44, 44, PITCH, centre=(2e-4, -5e-4), blur=blur)
     noise = percent / 100 * material.reference_modulus
     truth = (d, *tilts(math.radians(degrees), azimuth), 1.0)
     bound = fisher(grid, material, truth, noise, free_gain)
     clean = grid.pressure(TIP, material, *truth[:3])
+    if blur:  # not by the estimator's own forward model
+        clean = dense(grid, material, truth[:3])
     estimator = ContactEstimator(TIP, material, grid, noise, free_gain=free_gain)
     rng = np.random.default_rng(3)
     n = 4 if free_gain else 3
@@ -251,24 +259,6 @@ def test_quantisation_widens_the_covariance():
     coarse = estimator(np.round(clean / 1000.0).astype(np.uint8), 1000.0)
     expected = math.sqrt((100.0**2 + 1000.0**2 / 12) / (100.0**2 + 4.0**2 / 12))
     assert coarse.d_std / fine.d_std == pytest.approx(expected, rel=0.02)
-
-
-@pytest.mark.parametrize("noise", [200.0, 1520.0])
-@pytest.mark.parametrize("pitch", [0.058 / 32, 0.00125])
-def test_eight_bits_of_500_pa_give_d_within_a_percent(noise, pitch):
-    grid = SensorGrid(32, 32, pitch)
-    estimator = ContactEstimator(TIP, MEASURED, grid, noise, free_gain=False)
-    rng = np.random.default_rng(2)
-    for d in (0.001, 0.0015, 0.003, 0.008):
-        ratios = []
-        for _ in range(25):
-            at = tilts(rng.uniform(0.0, 0.45), rng.uniform(0, 7))
-            p = grid.pressure(TIP, MEASURED, d, *at)
-            e = estimator(np.minimum(np.round(p / 500.0), 255).astype(np.uint8), 500.0)
-            assert e.valid
-            ratios.append(e.d / d - 1.0)
-        assert abs(np.mean(ratios)) < 0.004
-        assert np.max(np.abs(ratios)) < (0.015 if d == 0.001 else 0.006)
 
 
 @pytest.mark.parametrize("free_gain", [True, False])

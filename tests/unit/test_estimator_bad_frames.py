@@ -142,25 +142,20 @@ class TestBadFrames:
                 assert e.rejected == 1
                 assert abs(e.d - without.d) < 1.5 * without.d_std
 
-    @pytest.mark.parametrize(
-        "frame",
-        [np.zeros((44, 43)), np.zeros((44, 44, 1)), np.zeros(44), np.zeros((0, 0))],
-    )
-    def test_a_wrong_shape_is_refused(self, free_gain, frame):
-        with pytest.raises(ValueError, match=r"shape \(44, 44\)"):
-            self.estimator(free_gain).update(frame)
 
-    @pytest.mark.parametrize("kind", [np.int32, np.int64, bool, np.complex128, ">u2", object])
-    def test_a_wrong_type_is_refused(self, free_gain, kind):
-        with pytest.raises(ValueError, match="uint8, uint16, float32 or float64"):
-            self.estimator(free_gain).update(EMPTY.astype(kind))
-        with pytest.raises(ValueError, match="list"):
-            self.estimator(free_gain).update(EMPTY.tolist())
-
-    @pytest.mark.parametrize("scale", [0.0, -4.0, math.nan, math.inf])
-    def test_a_wrong_scale_is_refused(self, free_gain, scale):
-        with pytest.raises(ValueError, match="pascal_per_count"):
-            self.estimator(free_gain).update(EMPTY, scale)
+@pytest.mark.parametrize(
+    ("frame", "scale", "told"),
+    [
+        *((np.zeros(shape), 1.0, r"shape \(44, 44\)") for shape in ((44, 43), (44, 44, 1), 44)),
+        *((EMPTY.astype(kind), 1.0, "uint8, uint16, float32 or float64")
+          for kind in (np.int32, bool, np.complex128, ">u2", object)),
+        (EMPTY.tolist(), 1.0, "list"),
+        *((EMPTY, scale, "pascal_per_count") for scale in (0.0, -4.0, math.nan, math.inf)),
+    ],
+)  # fmt: skip
+def test_what_is_no_frame_is_refused(frame, scale, told):
+    with pytest.raises(ValueError, match=told):
+        ContactEstimator(TIP, MEASURED, GRID, 600.0).update(frame, scale)
 
 
 @pytest.mark.parametrize("free_gain", [True, False])

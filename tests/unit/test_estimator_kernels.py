@@ -12,9 +12,7 @@ from softfinger.kinematics.estimation.cell_centres import cell_centres
 from softfinger.kinematics.estimation.likelihood import set_law
 from softfinger.kinematics.estimation.state import EstimatorState, Law
 from tests.harness.estimator_kernels import activity
-
-LINEAR = Material.constant(0.304e6)
-MEASURED = Material.table_i()
+from tests.harness.paper_tip import LINEAR, MEASURED
 
 
 def test_activity_matches_its_plain_twin():

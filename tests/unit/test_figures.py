@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import csv
 import sys
 from collections.abc import Callable
@@ -10,11 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from matplotlib.image import imread
 from numpy.typing import NDArray
 
 from softfinger.tools import cli, style
-from softfinger.tools.paper import appendix, figures
+from softfinger.tools.paper import appendix, figures, validate
 from softfinger.tools.paper.model_pages import double_integrals
+from softfinger.tools.paper.validate import Beside
 from tests.harness.paper_tip import CHECKPOINTS
 
 
@@ -57,23 +60,6 @@ def test_checkpoints_over_displacement(
         assert integral == pytest.approx(value, rel=1e-11)
 
 
-@pytest.mark.parametrize(("name", "exponent"), [("fig4b", 2), ("fig5b", 3)])
-def test_exponents_are_exact_and_only_the_prefactor_depends_on_the_tilt(
-    folder: Path, name: str, exponent: int
-) -> None:
-    columns = list(read(folder / f"{name}_exponents.csv").values())
-    theta, fitted, factor, expected = columns
-    np.testing.assert_array_equal(theta, np.arange(0.0, 31.0, 5.0))
-    np.testing.assert_allclose(fitted, exponent, atol=1e-11)
-    np.testing.assert_allclose(expected, np.cos(np.radians(theta)) ** (1 - exponent), rtol=1e-13)
-    np.testing.assert_allclose(factor, expected, rtol=1e-11)
-    curves = read(folder / f"{name}.csv")
-    for tilt, value in zip(theta, expected, strict=True):
-        flat = curves[f"factor at {tilt:g} deg [1]"]
-        assert np.isnan(flat[0])  # nothing over nothing at d = 0
-        np.testing.assert_allclose(flat[1:], value, rtol=1e-10)
-
-
 def test_double_integrals_meet_the_one_dimensional_form() -> None:
     # Another route to eqs. 3 and 10: y by hand, x by Gauss in t. Tilted close to the limit, 36.87°.
     a, d, theta, modulus = 0.02, 0.008, np.radians(34.0), 0.304e6
@@ -93,19 +79,12 @@ def test_double_integrals_meet_the_one_dimensional_form() -> None:
 
 def test_table_i(folder: Path) -> None:
     with (folder / "table_i.csv").open(encoding="utf-8") as file:
-        rows = list(csv.reader(file))
-    assert rows[0] == [
-        "entry",
-        "strain [%]",
-        "modulus in the paper [MPa]",
-        "modulus of the law [MPa]",
-    ]
-    assert [row[0] for row in rows[1:]] == ["Min", "20 %", "40 %", "60 %", "80 %", "100 %", "Max"]
+        entries, strains, papers, laws = zip(*list(csv.reader(file))[1:], strict=True)
+    assert entries == ("Min", "20 %", "40 %", "60 %", "80 %", "100 %", "Max")
     printed = (0.135, 0.149, 0.182, 0.201, 0.207, 0.255, 0.304)
-    assert [float(row[2]) for row in rows[1:]] == pytest.approx(printed)
-    for row in rows[1:-1]:
-        assert float(row[3]) == pytest.approx(float(row[2]), rel=1e-12)
-    assert rows[-1][1] == rows[-1][3] == ""  # beyond the law's range
+    assert [float(each) for each in papers] == pytest.approx(printed)
+    assert [float(each) for each in laws[:-1]] == pytest.approx(printed[:-1], rel=1e-12)
+    assert strains[-1] == laws[-1] == ""  # beyond the law's range
     curve = read(folder / "fig3.csv")
     slope = np.gradient(curve["stress [MPa]"], curve["strain [%]"] / 100.0)
     np.testing.assert_allclose(slope[1:-1], curve["modulus [MPa]"][1:-1], rtol=2e-3)
@@ -160,56 +139,29 @@ def test_checkpoints_of_the_appendix(of: Callable[..., appendix.Terms]) -> None:
     assert of(a, d).energy(a, 0.304, d) == pytest.approx(20.374275556081, rel=1e-12)
 
 
-def test_the_appendix_over_displacement(folder: Path) -> None:
-    columns = read(folder / "fig11.csv")
-    d = columns["d [mm]"]
-    for how in ("as printed", "integrated"):
-        # The terms cancel, to a part in 10⁴ at 0.1 mm.
-        np.testing.assert_allclose(columns[f"U {how} [mJ]"], np.pi * 0.304 / 3 * d**3, rtol=1e-7)
-    np.testing.assert_allclose(columns["theta_max [deg]"] + columns["p [deg]"], 90.0, rtol=1e-13)
-
-
-def test_every_figure_has_picture_and_errata(folder: Path) -> None:
-    from matplotlib.image import imread
-
-    for name in figures.NAMES:
+def test_every_picture_is_drawn_whole_with_its_errata(drawn: tuple[Path, list[Figure]]) -> None:
+    folder, kept = drawn
+    with (folder / "errata.csv").open(encoding="utf-8") as file:
+        errata = [(row["figure"], row["holds"]) for row in csv.DictReader(file)]
+    for name, figure in zip(figures.NAMES, kept, strict=True):
         page, picture = figures.pages()[name], imread(folder / f"{name}.png")
         height, width = picture.shape[:2]
-        size = (width / style.DPI, height / style.DPI)
-        assert size == pytest.approx(page.size, abs=0.01)
+        assert (width / style.DPI, height / style.DPI) == pytest.approx(page.size, abs=0.01)
         # Something is drawn, in every quarter of it.
         dark = picture[..., :3].min(axis=-1) < 0.8
         for rows in (slice(None, height // 2), slice(height // 2, None)):
             for columns in (slice(None, width // 2), slice(width // 2, None)):
                 assert dark[rows, columns].mean() > 0.01, name
-    with (folder / "errata.csv").open(encoding="utf-8") as file:
-        errata = list(csv.DictReader(file))
-    holds = dict.fromkeys(figures.NAMES, "")
-    for row in errata:
-        holds[row["figure"]] += row["holds"]
-    assert "exponent is exactly 2" in holds["fig4b"]
-    assert "exponent is exactly 3" in holds["fig5b"]
-    assert "1/cos θ" in holds["fig4b"]
-    assert "1/cos² θ" in holds["fig5b"]
-    assert "rises with strain" in holds["fig3"]
-    assert "dt" in holds["fig11"]
-    assert "polar coordinates" in holds["fig11"]
-
-
-def test_errata_and_labels_stand_in_the_pictures(drawn: tuple[Path, list[Figure]]) -> None:
-    for name, figure in zip(figures.NAMES, drawn[1], strict=True):
-        page = figures.pages()[name]
         with style.settings():
             text = " ".join(figure.get_supxlabel().split())
             for erratum in page.errata:
                 assert erratum.holds in text
+                assert (name, erratum.holds) in errata
             assert all("[" in axes.get_xlabel() for axes in figure.axes[-1:])  # a unit
             # Nothing written lies outside the sheet.
             box = figure.get_tightbbox()
-            assert box.x0 > -0.02
-            assert box.y0 > -0.02
-            assert box.x1 < page.size[0] + 0.02
-            assert box.y1 < page.size[1] + 0.02
+            assert min(box.x0, box.y0) > -0.02
+            assert max(box.x1 - page.size[0], box.y1 - page.size[1]) < 0.02
 
 
 def test_named_figures_only(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -217,12 +169,6 @@ def test_named_figures_only(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     written = {"fig3.csv", "table_i.csv", "errata.csv", "fig3.png"}
     assert {path.name for path in tmp_path.iterdir()} == written
     assert {Path(line).name for line in capsys.readouterr().out.splitlines()} == written
-
-
-def test_unknown_figure_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["figures", "fig6", "--out", str(tmp_path / "out")]) == 2
-    assert "found 'fig6', expected one of fig3, fig4a" in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
 
 
 def test_without_matplotlib_the_numbers_are_written(
@@ -234,3 +180,46 @@ def test_without_matplotlib_the_numbers_are_written(
     error = capsys.readouterr().err
     assert "only the CSV files were written" in error
     assert "pip install 'softfinger[plot]'" in error
+
+
+@pytest.fixture(scope="module")
+def rows() -> dict[str, Beside]:
+    return {each.quantity: each for each in validate.comparisons()}
+
+
+def test_every_row_has_its_source_and_a_verdict_and_every_disagreement_a_reason(
+    rows: dict[str, Beside],
+) -> None:
+    assert len(rows) >= 15
+    for each in rows.values():
+        assert each.source
+        assert each.verdict in validate.FIGURES
+        assert each.verdict == "agree" or each.why, each.quantity
+
+
+def test_springs_are_no_rubber_and_say_so(rows: dict[str, Beside]) -> None:
+    springs = rows["ζ of F = C d^ζ, 1 to 7 mm: springs"]
+    assert (springs.ours, springs.verdict) == ("2.00", "disagree")
+    crossing = (4.0 / (3.0 * 0.75 * np.pi)) ** 2 * 20.0
+    hertz = rows["depth at which springs press as Hertz's half-space of ν ½ does"]
+    assert hertz.ours == f"{crossing:.1f} mm"
+    assert hertz.verdict == "agree"
+
+
+@pytest.mark.parametrize(
+    ("ours", "verdict"), [(1.456, "agree"), (1.88, "agree"), (1.454, "disagree"), (2.0, "disagree")]
+)
+def test_a_figure_agrees_within_the_published_digits(ours: float, verdict: str) -> None:
+    assert validate.between("ζ", 1.46, 1.88, "a book", ours).verdict == verdict
+
+
+def test_the_command_prints_each_row_and_counts(
+    rows: dict[str, Beside],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(validate, "comparisons", lambda: iter(rows.values()))
+    assert validate.run(argparse.Namespace()) == 0
+    printed = capsys.readouterr().out
+    assert printed.count("✗") == sum(each.verdict == "disagree" for each in rows.values())
+    assert printed.splitlines()[-1].endswith("unknown")

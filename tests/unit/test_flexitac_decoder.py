@@ -6,7 +6,7 @@ import itertools
 
 import numpy as np
 import pytest
-from hypothesis import assume, example, given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from softfinger.daemon.tactile.flexitac import MARKER, FlexiTacDecoder
@@ -119,26 +119,6 @@ def test_bytes_behind_a_frame_in_the_same_read_are_told():
     assert late.behind == len(one)
 
 
-def test_a_frame_keeps_the_time_its_last_byte_was_read_and_its_own_array():
-    images = numbered(3)
-    stream = b"".join(frame(image) for image in images)
-    decoder = FlexiTacDecoder(ROWS, COLS)
-    assert decoder.feed(stream[: STRIDE - 1], 1.0) is None
-    assert decoder.missing == 0  # no lock yet
-    assert decoder.feed(stream[STRIDE - 1 : STRIDE], 2.0) is None
-    first = decoder.feed(stream[STRIDE : STRIDE + 3], 3.0)
-    assert first is not None
-    assert first.t == 2.0
-    assert decoder.missing == STRIDE - 3
-    kept = first.data.copy()
-    assert decoder.feed(stream[STRIDE + 3 : 2 * STRIDE], 4.0) is None
-    second = decoder.settle()
-    assert second is not None
-    assert second.t == 4.0
-    decoder.feed(stream[2 * STRIDE :] + b"\xff" * 500, 5.0)
-    assert np.array_equal(first.data, kept)
-
-
 @given(
     images=st.lists(st.one_of(payloads, nasty), min_size=1, max_size=8),
     start=st.integers(0, STRIDE),
@@ -177,29 +157,6 @@ def test_no_wrong_frame_whatever_the_images_hold(images, start):
     found = decode(FlexiTacDecoder(ROWS, COLS), [stream, MARKER])
     assert found == images[len(images) - len(found) :]
     assert images[-1] in found
-
-
-@given(
-    images=st.lists(nasty, min_size=4, max_size=8),
-    torn=st.integers(2, 3),
-    keep=st.integers(0, STRIDE - 1),
-)
-def test_a_truncated_frame_is_dropped_and_the_stream_found_again(images, torn, keep):
-    images = [*numbered(2, first=50), *images, *numbered(3)]
-    frames = [frame(image) for image in images]
-    frames[torn] = frames[torn][:keep]
-    # Nothing tells a splice that happens to carry AA 55 where its frame must end.
-    rest = b"".join(frames[torn:])
-    assume(rest[STRIDE : STRIDE + 2] != MARKER)
-    decoder = FlexiTacDecoder(ROWS, COLS)
-    found = decode(decoder, [*frames, MARKER])
-    sent = [image for k, image in enumerate(images) if k != torn]
-    # Images may repeat: what came out must be a subsequence of what was sent whole.
-    left = iter(sent)
-    assert all(image in left for image in found)
-    assert found[-1] == images[-1]
-    if keep:
-        assert decoder.counters()["resyncs"] >= 1
 
 
 def test_a_standing_image_with_the_marker_in_it_is_not_guessed_at():

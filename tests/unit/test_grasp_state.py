@@ -65,12 +65,6 @@ def test_levers_are_the_torques_that_balance_the_grasp(grasp: Grasp, delta: floa
     assert rest == pytest.approx([shear, *forces.normal], rel=2e-3, abs=1e-8)
 
 
-def test_levers_without_contacts_are_zero(grasp: Grasp) -> None:
-    motion = held_motion((0.1, 0.1), (0.0, 1e-3), 0.0, 0.0, LENGTHS)
-    data = grasp.table.data
-    assert holding_levers(data, data, (0.0, 1e-3), (0.1, -0.1), 0.0, motion) == (0.0,) * 5
-
-
 def faces(q, d, angle: float, taper: float):
     """Both faces' n and t, the tips' centres and velocities, and what rolls: a − d − v·t."""
     n, t = [], []
@@ -202,12 +196,13 @@ def test_load_is_what_the_tips_bear(table: ContactTable, load: float, delta: flo
     assert again - found == pytest.approx(more / slope, rel=0.02)
 
 
-def test_without_two_contacts_there_is_no_load(table: ContactTable) -> None:
+def test_without_two_contacts_there_are_no_levers_and_no_load(table: ContactTable) -> None:
     motion = held_motion((0.1, 0.1), (0.0, 1e-3), 0.0, 0.0, LENGTHS)
     data = table.data
     rolled = (0.0, 0.0)
     found = load_torques(data, data, (0.0, 1e-3), (0.1, -0.1), 0.0, motion, rolled, (0.5, 0.5))
     assert found == (0.0, 0.0, 0.0, 0.0)
+    assert holding_levers(data, data, (0.0, 1e-3), (0.1, -0.1), 0.0, motion) == (0.0,) * 5
 
 
 def test_torques_that_no_load_explains_give_a_finite_one(table: ContactTable) -> None:

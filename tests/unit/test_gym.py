@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import importlib
-import sys
-
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-import softfinger.gym
 from softfinger.gym import TASKS
 from softfinger.gym.__main__ import at_random, by_law, episode
 from softfinger.gym.baseline import policy
@@ -24,14 +20,6 @@ def test_gymnasiums_checker_has_nothing_to_say(task: str) -> None:
     env = gymnasium.make(f"SoftFinger-{task.capitalize()}-v0")
     check_env(env.unwrapped, skip_render_check=True)
     env.close()
-
-
-def test_without_gymnasium_the_import_says_what_to_install(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setitem(sys.modules, "gymnasium", None)
-    with pytest.raises(ImportError, match=r"pip install 'softfinger\[gym\]'"):
-        importlib.reload(softfinger.gym)
 
 
 def test_a_seed_gives_the_same_bits_and_another_one_others() -> None:
@@ -58,28 +46,6 @@ def test_the_built_in_law_turns_and_holds_and_a_random_agent_does_not() -> None:
         assert np.mean(random) < most
         by_joints.close()
         law.close()
-
-
-def test_several_hands_step_beside_each_other_as_each_would_alone() -> None:
-    both = gymnasium.make_vec("SoftFinger-Grasp-v0", 2, vectorization_mode="sync")
-    seen, _ = both.reset(seed=[3, 4])
-    actions = np.full((2, 2), 0.5, np.float32)
-    for _ in range(5):
-        seen, *_ = both.step(actions)
-    both.close()
-    alone = SoftFingerEnv("grasp")
-    alone.reset(seed=4)
-    for _ in range(5):
-        mine, *_ = alone.step(actions[1])
-    alone.close()
-    for key, part in mine.items():
-        assert (seen[key][1] == part).all()
-
-
-@pytest.mark.parametrize("wrong", [{"task": "juggle"}, {"control": "mind"}])
-def test_a_wrong_word_is_named(wrong: dict[str, str]) -> None:
-    with pytest.raises(ValueError, match=next(iter(wrong.values()))):
-        SoftFingerEnv(**wrong)
 
 
 def test_shaping_adds_what_the_potential_has_grown_by() -> None:

@@ -128,14 +128,6 @@ def test_a_dropped_object_comes_to_rest_on_the_palm():
     assert highest > 0.01  # the tilted one rocked before it lay still
 
 
-def test_a_push_onto_the_palm_is_borne_by_it():
-    hand = make(palm=0.045, object_mass=0.02)
-    hand.apply_load(0.0, -20.0)
-    run(hand, 0.5)
-    assert hand.object_pose[1] == pytest.approx(0.045 + 0.03 - 20.0 / 2e5, rel=1e-6)
-    assert hand.object_pose[2] == pytest.approx(0.0, abs=1e-9)
-
-
 def test_a_collision_keeps_momentum_and_energy():
     hand = make(object_mass=0.05, **LOSSLESS)
     place(hand, (0.0, 0.0), (-0.005, 0.08, 0.0), velocity=(-0.5, 0.0, 0.0))
@@ -175,15 +167,6 @@ def test_position_moves_are_well_damped_and_bounded_by_the_goal_current():
     np.testing.assert_allclose(hand.q, 0.1, atol=0.01)
 
 
-def test_goal_current_is_reached_a_tenth_of_a_radian_away():
-    hand = make()
-    hand.plant.parameters.joints_held = True
-    for joint, away in ((0, 0.1), (1, -0.1)):
-        hand.drive(joint, BOUNDED, True, away, 1.0)
-    run(hand, 0.02)
-    np.testing.assert_allclose(hand.current, [1.0, -1.0], rtol=1e-6)
-
-
 def test_modes_torque_and_electrics():
     hand = make(joint_friction=0.0, joint_damping=0.0)
     place(hand, (0.0, 0.0), (0.0, 0.3, 0.0))
@@ -218,17 +201,6 @@ def test_end_stops_and_no_load_speed_bound_the_joints():
     assert -0.57 < hand.q[1] < -0.55
 
 
-def test_torque_goes_off_by_itself_at_the_time_set():
-    hand = make()
-    place(hand, (0.0, 0.0), (0.0, 0.3, 0.0))
-    hand.drive(0, BOUNDED, True, 0.5, 0.3)
-    hand.hold_torque_until(0.05)
-    run(hand, 0.049)
-    assert hand.current[0] == pytest.approx(0.3)
-    run(hand, 0.011)
-    assert hand.current[0] < 1e-3
-
-
 # Scenes.
 
 
@@ -251,18 +223,6 @@ def test_scripted_compression_presses_both_tips_in_turn_to_eight_millimetres():
     d = hand.d[0]
     assert d > 0.004
     assert hand.force[0] == pytest.approx(math.pi * MODULUS * d * d / math.cos(hand.theta[0]))
-
-
-def test_without_servos_and_script_the_joints_stay():
-    settings = Settings.model_validate(
-        {"servos": {"backend": "none"}, "simulation": {"compression_speed": 0.0}}
-    )
-    hand = SimulatedHand(settings, table=PAPER)
-    hand.apply_load(0.5, 0.0)
-    run(hand, 1.0)
-    np.testing.assert_array_equal(hand.q, settings.hand.open_angle)
-    # Friction's rest is viscous, so that it creeps to where the tip bears the whole push.
-    assert hand.force[1] == pytest.approx(0.5, rel=0.1)
 
 
 # Time.

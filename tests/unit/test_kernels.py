@@ -1,4 +1,4 @@
-"""The kernel decorators, and which sources a compiled kernel may depend on."""
+"""The kernel decorators and their records; which sources a compiled kernel may depend on."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ import sys
 import types
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, cast
+from typing import Annotated, Any, cast
 
 import numba
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from softfinger import daemon, kinematics
 from softfinger.kinematics import compiled
@@ -20,6 +22,7 @@ from softfinger.kinematics.compiled import kernel as decorators
 from softfinger.kinematics.compiled import plain
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 from softfinger.kinematics.compiled.kernel_folder import kernel_sources
+from softfinger.kinematics.compiled.layout import Pair, Record, Records, _kind
 from softfinger.kinematics.contact.closed_form import theta_limit
 
 
@@ -99,3 +102,38 @@ def test_the_caches_name_covers_all_that_kernels_are_made_of() -> None:
                 assert used.__file__ is not None
                 assert Path(used.__file__).resolve() in sources, f"{function}: {name}"
     assert count > 150
+
+
+class Tip(Record):
+    d: float
+    cells: int
+
+
+class Memory(Record):
+    spread: Pair
+    newest: Tip
+    tip: Annotated[Records[Tip], 2]
+
+
+def test_a_record_is_a_view_of_its_array() -> None:
+    memory = Memory()
+    memory.spread = [3.0, 4.0]
+    memory.tip[1].d = 2.0
+    assert memory.array[0]["spread"][1] == 4.0  # type: ignore[index]
+    assert memory.array[0]["tip"]["d"].tolist() == [0.0, 2.0]  # type: ignore[index]
+    with pytest.raises(TypeError, match="Tip: expected"):
+        Tip(np.zeros(1, Memory.dtype))
+
+
+def test_what_is_no_field_is_an_error() -> None:
+    memory = Memory()
+    with pytest.raises(AttributeError):
+        memory.spred = 1.0  # type: ignore[attr-defined]
+    with pytest.raises(AttributeError, match="newest is a record: set its fields"):
+        memory.newest = Tip()
+
+
+def test_arrays_are_known_by_the_aliases_of_every_numpy() -> None:
+    of_2_5 = types.GenericAlias(np.ndarray, (np.float64,))  # NDArray[np.float64] there
+    for alias in (NDArray[np.float64], of_2_5):
+        assert _kind(Annotated[alias, 3]) == (None, np.float64, (3,))

@@ -1,4 +1,4 @@
-"""A machine that is late: what a simulated hand, a hand on real time and a person get of it."""
+"""A machine that is late: what each clock, a simulated hand, a real one and a person get of it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from softfinger.daemon.clock import HandClock
+from softfinger.daemon.clock import HandClock, LoopClock, RealClock, VirtualClock, make_clock
 from softfinger.daemon.loop import build as build_module
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.loop.publishing import parts
@@ -109,19 +109,6 @@ def test_a_simulated_hand_waits_for_the_machine_and_says_so_now_and_then(
     assert told[1:] == ["this machine is busy: the hand waited 0.50 s, 0.9 s in all"]
 
 
-def test_a_long_wait_is_told_with_all_before_it_at_the_tick_that_ends_it(
-    on_late_machine: Build,
-) -> None:
-    daemon, machine, events = on_late_machine("auto")
-    machine.late_by = [0.0] * 100 + [0.4] + [0.0] * 50 + [0.3] + [0.0] * 50 + [6.0]
-    daemon.loop.advance(6.9)
-    told = [text for level, kind, text in events if kind == "late"]
-    assert told == [
-        "this machine is busy: the hand waited 0.40 s, 0.4 s in all",
-        "this machine is busy: the hand waited 6.30 s, 6.7 s in all",
-    ]
-
-
 def test_a_duration_is_the_machines(on_late_machine: Build) -> None:
     daemon, machine, _ = on_late_machine("auto")
     begin = machine.now()
@@ -210,3 +197,61 @@ def looked(late: float, seconds: float) -> list[tuple[str, str, str]]:
 def test_lateness_is_told_when_it_has_doubled() -> None:
     told = [event for event in looked(0.06, 17.0 * EVERY) if event[1] == "late"]
     assert len(told) == 6  # at 0, 1, 2, 4, 8 and 16 times EVERY
+
+
+def test_virtual_time_moves_only_by_waiting_and_never_back() -> None:
+    clock = VirtualClock(3.0)
+    assert clock.now() == clock.wall() == clock.host() == 3.0
+    assert clock.sleep_until(4.5) == 0.0
+    assert clock.now() == clock.wall() == clock.host() == 4.5
+    clock.sleep_until(1.0)
+    assert clock.now() == 4.5
+
+
+def test_a_hands_time_stands_between_sleeps_and_ends_them_at_their_deadline() -> None:
+    machine = LateMachine(100.0)
+    clock = HandClock(machine)
+    machine.work(0.001)
+    assert (clock.now(), clock.host()) == (100.0, 100.001)
+    machine.late_by = [0.0015]
+    assert clock.sleep_until(100.002) == pytest.approx(0.0015)
+    assert clock.now() == 100.002
+    assert clock.host() == pytest.approx(100.0035)
+    clock.sleep_until(100.004)  # what is left of the period makes up for it
+    assert (clock.now(), clock.host()) == (100.004, 100.004)
+    assert clock.behind == 0.0
+
+
+def test_a_hands_time_leaves_out_what_the_machine_missed() -> None:
+    machine = LateMachine(100.0)
+    clock = HandClock(machine)
+    machine.late_by = [5.0]  # it was stopped
+    assert clock.sleep_until(100.002) == pytest.approx(5.0)
+    assert clock.sleep_until(100.004) == 0.0, "a deadline that was missed is now"
+    assert clock.now() == 100.004
+    assert clock.behind == pytest.approx(4.998)
+    machine.work(1.0)
+    clock.sleep_until(100.006)
+    assert clock.behind == pytest.approx(5.996)
+    clock.sleep_until(100.008)
+    assert clock.host() == pytest.approx(100.008 + clock.behind)
+    clock.sleep_until(50.0)
+    assert clock.now() == 100.008, "never back"
+
+
+@pytest.mark.parametrize(
+    ("sections", "kind"),
+    [
+        ({}, HandClock),
+        ({"loop": {"clock": "hand"}}, HandClock),
+        ({"loop": {"clock": "real"}}, RealClock),
+        ({"loop": {"clock": "virtual"}}, VirtualClock),
+        ({"servos": {"backend": "none"}}, HandClock),
+        ({"servos": {"backend": "dynamixel"}, "tactile": {"backend": "none"}}, RealClock),
+        ({"servos": {"backend": "none"}, "tactile": {"backend": "flexitac"}}, RealClock),
+    ],
+)
+def test_only_a_hand_without_metal_has_a_time_of_its_own(
+    sections: dict[str, dict[str, str]], kind: type[LoopClock]
+) -> None:
+    assert type(make_clock(Settings.model_validate(sections))) is kind

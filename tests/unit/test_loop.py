@@ -98,27 +98,6 @@ def test_a_grasp_of_nothing_ends_armed_with_a_warning(make: Make) -> None:
     assert any(kind == "grasp" for _, kind, _ in events)
 
 
-def test_too_much_force_latches_a_fault_that_waits_for_clear(make: Make) -> None:
-    daemon = make(safety={"force_max": 6.0}, control={"contact_force": 0.2})
-    command(daemon, "arm")
-    command(daemon, "grasp", force=5.0)
-    advance_to(daemon, "holding", 3.0)
-    assert daemon.hand is not None
-    # Something squeezes the fingers together, harder than the limit allows.
-    daemon.loop._control._grip.retarget(9.0)
-    advance_to(daemon, "fault", 3.0)
-    state = daemon.loop.state
-    assert "above 6 N" in state.fault
-    assert not state.torque
-    with pytest.raises(Refused, match="clear the fault first"):
-        command(daemon, "arm")
-    daemon.loop.advance(1.0)
-    command(daemon, "clear")
-    daemon.loop.advance(0.1)
-    assert (state.mode, state.fault) == ("disarmed", "")
-    command(daemon, "arm")
-
-
 def test_an_error_of_a_backend_ends_the_loop_with_torque_off(
     make: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,4 +1,4 @@
-"""What sensors of the simulated hand read wrong, while the hand itself is as it was."""
+"""Faults in words; what sensors of the simulated hand read wrong, while the hand is as it was."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ import pytest
 from softfinger.daemon.clock import VirtualClock
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
+from softfinger.daemon.simulation.faults import FaultError, parse_faults
 from softfinger.daemon.simulation.measurement_faults import MEASUREMENT_FAULTS, MeasurementFaults
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.daemon.simulation.sensor.simulated_tactile import SimulatedTactile
-from softfinger.daemon.simulation.servo_model import framing
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
+from tests.harness.servos import BusClient
 
 SHAPE = (5, 7)
 
@@ -139,32 +140,90 @@ def test_each_sensor_has_its_gain() -> None:
 def test_a_servo_reports_another_current_than_flows() -> None:
     settings = Settings()
     hand = SimulatedHand(settings)
-    bus = ServoBus.from_settings(settings, hand)
-    bus.advance(0.0)
-    unit = bus.servos[0].model.current_unit
+    client = BusClient(ServoBus.from_settings(settings, hand))
+    unit = client.bus.servos[0].model.current_unit
     signs = settings.servos.direction
     for servo, sign in zip((1, 2), signs, strict=True):
-        write(bus, servo, reg.TORQUE_ENABLE, b"\x01")
-        write(bus, servo, reg.GOAL_CURRENT, (200).to_bytes(2, "little"))
-        write(bus, servo, reg.GOAL_POSITION, (2048 + sign * 600).to_bytes(4, "little"))
-    bus.advance(1.5)
+        client.write(reg.TORQUE_ENABLE, 1, 1, servo)
+        client.write(reg.GOAL_CURRENT, 200, 2, servo)
+        client.write(reg.GOAL_POSITION, 2048 + sign * 600, 4, servo)
+    client.later(1.5 - client.t)
     flows = hand.current.copy()
     assert np.all(flows > 0.9 * 200 * unit)
     hand.measurement_faults[1].begin("current", 0.5, 1.0, 1.0)
     assert [hand.measured_current(0), hand.measured_current(1)] == [flows[0], 0.75 * flows[1]]
-    bus.advance(2.5)
-    counts = [sign * present(bus, servo) for servo, sign in zip((1, 2), signs, strict=True)]
+    client.later(1.0)
+    counts = [
+        sign * client.read(reg.PRESENT_CURRENT, 2, servo)
+        for servo, sign in zip((1, 2), signs, strict=True)
+    ]
     assert counts == [round(hand.current[0] / unit), round(0.5 * hand.current[1] / unit)]
     np.testing.assert_allclose(hand.current, flows, rtol=0.02)  # the goal is carried out as it was
 
 
-def write(bus: ServoBus, servo: int, address: int, data: bytes) -> None:
-    words = address.to_bytes(2, "little") + data
-    bus.feed(framing.frame(servo, framing.WRITE, words), bus.now)
+def test_faults_in_words() -> None:
+    words = [" silent=2@3 ", "silent", "left:torn=0.2", "right:frozen@1e1", "drop=0.1", "unplug@2"]
+    assert parse_faults(words, (1, 2)) == [
+        (0.0, "left", "silent", 1.0, 0.0),
+        (0.0, "right", "silent", 1.0, 0.0),
+        (0.0, "left", "torn", 0.2, 0.0),
+        (0.0, "servos", "drop", 0.1, 0.0),
+        (2.0, "servos", "unplug", 1.0, 0.0),
+        (3.0, "servos", "silent", 2.0, 0.0),
+        (10.0, "right", "frozen", 1.0, 0.0),
+    ]
+    assert parse_faults(["twist=-0.3@1", "push=15"], (1, 2)) == [
+        (0.0, "object", "push", 15.0, 0.0),
+        (1.0, "object", "twist", -0.3, 0.0),
+    ]
+    assert parse_faults(["well", "left:well@1", "right:plug", "noisy"], (1, 2)) == [
+        (0.0, "servos", "well", 1.0, 0.0),
+        (0.0, "left", "well", 1.0, 0.0),
+        (0.0, "right", "well", 1.0, 0.0),
+        (0.0, "right", "plug", 1.0, 0.0),
+        (0.0, "left", "noisy", 0.1, 0.0),
+        (0.0, "right", "noisy", 0.1, 0.0),
+        (1.0, "left", "well", 1.0, 0.0),
+    ]
+    assert parse_faults(["left:gain=0.5@3..5", "current=2", "drift=-.2@.5...75"], (1, 2)) == [
+        (0.0, "left", "current", 2.0, 0.0),
+        (0.0, "right", "current", 2.0, 0.0),
+        (0.5, "left", "drift", -0.2, 0.25),
+        (0.5, "right", "drift", -0.2, 0.25),
+        (3.0, "left", "gain", 0.5, 2.0),
+    ]
 
 
-def present(bus: ServoBus, servo: int) -> int:
-    """Register 126, present current."""
-    span = reg.PRESENT_CURRENT.to_bytes(2, "little") + b"\x02\x00"
-    reply = bus.feed(framing.frame(servo, framing.READ, span), bus.now)
-    return int.from_bytes(reply[9:11], "little", signed=True)
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("", "wrong-size"),
+        ("melted", "wrong-size"),
+        ("left:melted", "wrong-size"),
+        ("left:drop=0.1", "wrong-size"),
+        ("drop", "drop, late, .* =PROBABILITY"),
+        ("middle:torn", "left: or right:"),
+        ("push", "push, twist =NUMBER"),
+        ("push=inf", "not a number"),
+        ("gain", "gain, shift-x, .* =NUMBER"),
+        ("gain=-1", "0 … 100"),
+        ("drift=1.5", "-1 … 1"),
+        ("replay=4", "0 … 3"),
+        ("gain=2@3..1", "'1' is no time of 3 s or more"),
+        ("gain=2@3..", "'' is no time of 3 s or more"),
+        ("mirror=1@1..2", "mirror comes at once, at 1"),
+        ("push=3@1..2", "push comes at once, at 1"),
+        ("torn=2", "0 … 1"),
+        ("left:silent=2", "0 … 1"),
+        ("drop=7", "0 … 1"),
+        ("torn=much", "not a number"),
+        ("torn@never", "no time of 0 s or more"),
+        ("torn@-1", "no time of 0 s or more"),
+        ("drop=0.1@inf", "no time of 0 s or more"),
+        ("silent=9", "no servo has that ID"),
+        ("reboot=1.5", "no servo has that ID"),
+    ],
+)
+def test_faults_that_can_not_be_understood(text: str, told: str) -> None:
+    with pytest.raises(FaultError, match=told):
+        parse_faults([text], (1, 2))

@@ -1,4 +1,4 @@
-"""The page as text, without a terminal: sizes, hostile streams, states, keys."""
+"""The page as text, without a terminal: sizes, hostile streams, states, keys, pressure maps."""
 
 from __future__ import annotations
 
@@ -8,14 +8,19 @@ from collections.abc import Sequence
 from typing import Any
 
 import msgpack
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rich.color import ColorTriplet
 from rich.console import Console
+from rich.style import Style
 from rich.text import Text
 
 from softfinger.kinematics.estimation.invalid import Invalid
+from softfinger.tools.terminal import heatmap
 from softfinger.tools.terminal.feed import Feed, ShownReply
+from softfinger.tools.terminal.heatmap import picture, resample
 from softfinger.tools.terminal.monitor_page import MonitorPage
 from softfinger.tools.terminal.terminal import KeyDecoder
 from tests.harness import fake_daemon
@@ -140,32 +145,6 @@ def test_a_new_daemon_begins_a_new_story() -> None:
     assert feed.statistics(3.0).messages == 10.0
     give(feed, b"hand/state", fake_daemon.state(0.0, 1), 3.0)
     assert feed.statistics(3.0).messages == 1.0
-
-
-STATS = {
-    "schema": 1,
-    **{part: {"p50": 12e-6, "p99": 34e-6, "p999": 40e-6, "max": 561e-6} for part in
-       ("wake", "compute", "bus", "publish")},
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("factor", [1.0, 1e3, 1e6, math.inf])
-def test_quantiles_of_all_ticks_fit_beside_each_other(factor: float) -> None:
-    feed = fed()
-    slow = {
-        part: {share: factor * value for share, value in times.items()}
-        for part, times in STATS.items()
-        if isinstance(times, dict)
-    }
-    give(feed, b"hand/stats", STATS | slow)
-    give(feed, b"hand/state", fake_daemon.state(1.0, 99) | {"overruns": 123456})
-    (line,) = [each for each in shown(feed).splitlines() if " tick " in each]
-    assert "overruns 123456" in line
-    if factor < 1e5:
-        assert {1.0: "late 12/34/561 µs", 1e3: "compute 12ms/34ms/561ms  late"}[factor] in line
-    give(feed, b"hand/state", fake_daemon.state(1.0, 99) | {"overruns": 7})
-    if factor == 1.0:
-        assert "  p50/p99/max  compute 12/34/561  late 12/34/561 µs" in shown(feed)
 
 
 def test_temperature_of_a_servo() -> None:
@@ -311,3 +290,32 @@ def test_keys() -> None:
     assert keys.decode(b"a\x1b[200~go") == ["a"]
     assert keys.decode(b"go\x1b[20") == []
     assert keys.decode(b"1~q") == ["q"]
+
+
+def test_resample_is_the_area_average() -> None:
+    grid = np.random.default_rng(1).random((44, 44))
+    blocks = grid.reshape(22, 2, 11, 4).mean(axis=(1, 3))
+    assert resample(grid, 22, 11) == pytest.approx(blocks, abs=1e-12)
+    assert resample(grid, 88, 132) == pytest.approx(np.kron(grid, np.ones((2, 3))), abs=1e-12)
+    # On sizes that don't divide: the twin counts on a common refinement.
+    fine = np.kron(grid, np.ones((17, 9)))
+    twin = fine.reshape(17, 44, 9, 44).mean(axis=(1, 3))
+    assert resample(grid, 17, 9) == pytest.approx(twin, abs=1e-12)
+
+
+def test_row_0_is_lowest_and_column_0_is_left() -> None:
+    grid = np.zeros((4, 4))
+    grid[0, 0] = 1.0
+    lines = picture(grid, 1.0, 2, 4, True)
+    lowest = lines[-1].spans[0]
+    assert (lowest.start, lowest.end) == (0, 1)
+    assert isinstance(lowest.style, Style)
+    assert lowest.style.bgcolor is not None
+    brightest = heatmap.colour_map()[-1]
+    assert lowest.style.bgcolor.get_truecolor() == ColorTriplet(*brightest)
+    assert [line.plain for line in picture(grid, 1.0, 4, 4, False)] == [
+        "    ",
+        "    ",
+        "    ",
+        "█   ",
+    ]

@@ -121,6 +121,7 @@ def test_a_small_disc_is_no_other_tip() -> None:
     with Rig({"simulation": {"object_shape": "disc", "object_radius": 0.010}}) as rig:
         rig.grasp(8.0)
         assert rig.state.mode == "holding"
+        assert rig.contacts[0].misfit
 
 
 def test_a_disc_is_held_and_turned_by_the_line_between_its_contacts() -> None:

@@ -20,28 +20,11 @@ from softfinger.daemon.perception.finger_model import make_estimator, make_model
 from softfinger.daemon.perception.perception import Perception
 from softfinger.daemon.profile.factory import make_material
 from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.tactile.replay import GivenFrames
 from softfinger.daemon.types import Frame, State
 
 PASCAL_PER_COUNT = 150.0
 FULL = 255  # 38 kPa, less than the contact's peak of 46 kPa
-
-
-class Given:
-    """A sensor whose newest frame is chosen by the test."""
-
-    frame: Frame | None = None
-
-    def open(self) -> None:
-        pass
-
-    def latest(self) -> Frame | None:
-        return self.frame
-
-    def counters(self) -> dict[str, int]:
-        return {}
-
-    def close(self) -> None:
-        pass
 
 
 def settings(**tactile: object) -> Settings:
@@ -72,7 +55,7 @@ class Bench:
     """One finger's perception and a board whose cells rest at ``base`` counts."""
 
     def __init__(self, given: Settings) -> None:
-        self.sensor = Given()
+        self.sensor = GivenFrames()
         self._hand = Perception(given, {0: self.sensor}, make_models(given))
         (self.perception,) = self._hand.fingers
         self._state = State()

@@ -14,10 +14,7 @@ from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.daemon.simulation.sensor.simulated_tactile import SimulatedTactile
 from tests.harness.plant import (
     BOUNDED,
-    CONSTANT,
-    MODULUS,
     PAPER,
-    TABLE_I,
     make,
     place,
     run,
@@ -144,22 +141,6 @@ def test_curvature_softens_the_contact_as_the_springs_themselves_say(curved, upr
     assert springs_on_a_cylinder(1e-4, 0.3, curved) == pytest.approx((share,) * 2, rel=1e-3)
 
 
-def test_a_disc_is_grasped_and_rolls_between_the_tips():
-    hand = make(TABLE_I, object_shape="disc", object_radius=0.02)
-    settled(hand, (0.9, 0.9), 0.4)
-    assert hand.force == pytest.approx([hand.force.mean()] * 2, rel=0.05)
-    assert hand.force.min() > 3
-    before = hand.object_pose.copy()
-    # One finger forward, one back: a disc rolls, moved on and turned.
-    torques = np.array([0.5, 0.36])
-    for joint in range(2):
-        hand.drive(joint, BOUNDED, True, 0.9, float(torques[joint]))
-    run(hand, 0.15)
-    moved = hand.object_pose - before
-    assert abs(moved[2]) > 0.02
-    assert moved[0] > 0.001
-
-
 @pytest.mark.parametrize("shape", ["disc", "none"])
 def test_what_a_disc_or_the_other_tip_presses_on_a_sensor_is_its_force(shape):
     settings = Settings.model_validate(
@@ -185,25 +166,6 @@ def test_what_a_disc_or_the_other_tip_presses_on_a_sensor_is_its_force(shape):
 
 
 # Tips on each other.
-
-
-def test_tips_press_each_other_as_each_a_plane_midway():
-    hand = make(object_shape="none", joint_friction=0.0)
-    settled(hand, (0.9, 0.9), 0.5, 4.0)
-    q = float(hand.q[0])
-    assert hand.q[1] == pytest.approx(q, abs=1e-9)
-    assert hand.on_other_tip.tolist() == [1.0, 1.0]
-    # The plane stands at x = 0: each tip as deep as it reaches past it, tilted by its finger.
-    d = RADIUS - (HAND.half_separation - HAND.finger_length * math.sin(q))
-    np.testing.assert_allclose(hand.d, d, atol=1e-12)
-    np.testing.assert_allclose(hand.theta, [q, -q], atol=1e-12)
-    np.testing.assert_allclose(hand.force, math.pi * MODULUS * d * d / math.cos(q), rtol=1e-9)
-    # At rest each joint bears L cos q of ∂U/∂d, its tip's ∂U/∂θ, and what the stuck shears hold.
-    left, right = hand.plant.stages[0].on_tip
-    by_d = float(hand.normal[0] + hand.tangential[0] * math.tan(q))
-    by_shear = sum(tip.along[2] * tip.rows[2, 0] for tip in (left, right))
-    torque = by_d * HAND.finger_length * math.cos(q) + left.along[1] + by_shear
-    assert torque == pytest.approx(CONSTANT * 0.5, rel=1e-6)
 
 
 def test_an_object_keeps_the_tips_apart_until_it_is_gone():

@@ -6,11 +6,12 @@ import math
 
 import pytest
 
-from softfinger import ContactTable, Fingertip, Material
+from softfinger import ContactTable, Material
 from softfinger.daemon.simulation.emulator.plate import Plate, PlateError, parse_presses
 from softfinger.daemon.simulation.sensor.simulated_tactile import StageTouch
+from tests.harness.paper_tip import TIP
 
-TABLE = ContactTable.build(Fingertip(0.020), Material.constant(0.3e6))
+TABLE = ContactTable.build(TIP, Material.constant(0.3e6))
 FORCE = math.pi * 0.3e6 * 0.004**2  # N at 4 mm
 
 

@@ -12,7 +12,7 @@ import pytest
 from softfinger import ContactTable, Fingertip, Material, SensorGrid
 from softfinger.daemon.perception.calibration_file import load_calibration
 from softfinger.kinematics.calibration.calibration import fit_centre, fit_modulus
-from softfinger.kinematics.calibration.press_fit import Presses, compare_tips, first_cycle
+from softfinger.kinematics.calibration.press_fit import Presses, compare_tips
 from softfinger.tools.cli import main
 
 GRID = SensorGrid(32, 32, 0.058 / 32)
@@ -100,13 +100,6 @@ def test_a_modulus_that_hides_another_law_drifts_over_depth(
         assert ("more than" in found.trend.cause) == (sign > 0)
     assert found.trend.d == pytest.approx(d)
     assert found.trend.modulus == pytest.approx(found.modulus / (1.0 + found.errors), rel=1e-12)
-
-
-def test_presses_again_tell_what_the_first_cycle_softens() -> None:
-    d, theta = np.array([2e-3, 4e-3, 2e-3, 4e-3, 2e-3, 2e-3]), np.array([0.0, 0, 0, 0, 0, 0.2])
-    force = np.array([1.1, 3.6, 0.9, 3.0, 1.1, 7.0])
-    assert first_cycle(d, theta, force) == pytest.approx(0.5 * (0.1 + 0.2))
-    assert first_cycle(d[-2:], theta[-2:], force[-2:]) is None
 
 
 def test_calibrate_law_says_which_tip_it_is(

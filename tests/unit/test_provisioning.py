@@ -203,22 +203,6 @@ def test_factory_servos_together_are_reported_and_not_changed(wired: Callable[..
     assert [bytes(each.table.memory[: reg.RAM]) for each in bus.servos] == before
 
 
-@pytest.mark.parametrize("spoil", ["torque", "mute"])
-def test_a_servo_that_holds_or_is_mute_is_set_too(wired: Callable[..., Bus], spoil: str) -> None:
-    bus = wired(ids=(1, 7))
-    stray = bus.servos[1].table
-    if spoil == "torque":
-        stray.set(reg.TORQUE_ENABLE, 1)
-    else:
-        stray.set(reg.STATUS_RETURN_LEVEL, 0)
-    done, problems = bus.provision()
-    assert problems == []
-    assert f"{RIGHT}: ID 7 → 2" in done
-    assert (spoil == "torque") == any("torque off" in line for line in done)
-    assert not bus.servos[1].torque_on
-    assert stray.get(reg.STATUS_RETURN_LEVEL) == 2
-
-
 @pytest.mark.parametrize(
     ("fault", "register", "value", "done"),
     [

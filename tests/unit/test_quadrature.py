@@ -1,4 +1,4 @@
-"""The reference integrals, against plain NumPy in other coordinates."""
+"""One tip's closed forms and reference integrals, against plain NumPy in other coordinates."""
 
 from __future__ import annotations
 
@@ -12,15 +12,17 @@ from hypothesis import strategies as st
 from numpy.polynomial.legendre import leggauss
 
 from softfinger import Fingertip, Material
-from softfinger.kinematics.contact.closed_form import closed_forms
+from softfinger.kinematics.contact.closed_form import (
+    closed_forms,
+)
 from softfinger.kinematics.contact.quadrature import circle_rule, gauss_rule, integrate, ratios_at
+from tests.harness.paper_tip import CHECKPOINTS, LINEAR, TIP, E
+from tests.harness.paper_tip import MEASURED as TABLE_I
 
-TIP = Fingertip(0.020)
-TABLE_I = Material.table_i()
 X = np.linspace(0.0, 0.8, 30)
 STIFFENING = Material.from_points(X, 2e4 * np.expm1(3 * X))
 SOFTENING = Material.from_points(X, 1e5 * np.tanh(2 * X))
-MATERIALS = [Material.constant(0.304e6), TABLE_I, STIFFENING, SOFTENING]
+MATERIALS = [LINEAR, TABLE_I, STIFFENING, SOFTENING]
 
 
 def twin(
@@ -130,5 +132,77 @@ def test_outside_the_domain() -> None:
     assert integrate(TIP, TABLE_I, -1e-3, 0.1) == (0.0,) * 6
     for pair in [(0.021, 0.0), (8e-3, 0.7), (8e-3, 3.2), (math.nan, 0), (1e-3, math.nan)]:
         assert all(math.isnan(value) for value in integrate(TIP, TABLE_I, *pair))
-    assert integrate(TIP, TABLE_I, np.empty((0, 2)), 0.0).force.shape == (0, 2)
     assert integrate(TIP, TABLE_I, [[1e-3], [2e-3]], [0.0, 0.1, 0.2]).energy.shape == (2, 3)
+
+
+radii = st.floats(1e-4, 1.0)
+moduli = st.floats(1.0, 1e9)
+fractions = st.floats(5e-8, 0.9999)  # of the radius
+# Of θ's limit; a tilt that is nearly a denormal number has no relative precision.
+shares = st.floats(-1.0, 1.0).map(lambda share: share if abs(share) > 1e-150 else 0.0)
+
+
+@pytest.mark.parametrize(("d", "theta", "force", "energy"), CHECKPOINTS)
+def test_force_and_energy_meet_the_checkpoints(
+    d: float, theta: float, force: float, energy: float
+) -> None:
+    c = closed_forms(E, d * 1e-3, math.radians(theta))
+    np.testing.assert_allclose(c.force, force, rtol=2e-13)
+    np.testing.assert_allclose(c.energy * 1e3, energy, rtol=2e-13)
+
+
+def test_limit_of_the_tilt() -> None:
+    limits = np.degrees(TIP.theta_limit(np.array([2, 4, 6, 8, 10, 12]) * 1e-3))
+    np.testing.assert_allclose(limits, [64.158, 53.130, 44.427, 36.870, 30.000, 23.578], atol=5e-4)
+    assert TIP.theta_limit(-1.0) == TIP.theta_limit(0.0) == math.pi / 2
+    assert TIP.theta_limit(0.02) == TIP.theta_limit(1.0) == 0.0
+    assert math.isnan(TIP.theta_limit(math.nan))
+    # Its cosine is √(2ad − d²)/a, to all digits even where asin((a − d)/a) has lost them.
+    d = 10.0 ** np.arange(-17.0, -2.0)
+    np.testing.assert_allclose(
+        np.pi / 2 - Fingertip(1.0).theta_limit(d),
+        np.arcsin(np.sqrt(d * (2 - d))),
+        rtol=1e-7,
+        atol=2e-16,
+    )
+
+
+def _complex(modulus: float, d: complex, theta: complex) -> tuple[complex, complex]:
+    """Force and energy in complex arithmetic, for derivatives without differences."""
+    force = math.pi * modulus * d * d / np.cos(theta)
+    return force, force * d / (3 * np.cos(theta))
+
+
+@given(radius=radii, modulus=moduli, part=fractions, share=shares)
+def test_partials_are_the_derivatives(
+    radius: float, modulus: float, part: float, share: float
+) -> None:
+    d = radius * part
+    theta = float(Fingertip(radius).theta_limit(d)) * share
+    c = closed_forms(modulus, d, theta)
+    step = 1e-40
+    f_d, u_d = (value.imag / step for value in _complex(modulus, d + 1j * step, theta))
+    f_t, u_t = (value.imag / step for value in _complex(modulus, d, theta + 1j * step))
+    np.testing.assert_allclose([c.force_d, c.energy_d], [f_d, u_d], rtol=1e-13)
+    np.testing.assert_allclose([c.force_theta, c.energy_theta], [f_t, u_t], rtol=1e-12)
+
+
+def test_shapes_types_and_odd_values() -> None:
+    grid = closed_forms(E, np.full((3, 1), 0.004), np.zeros(4))
+    assert grid.force.shape == (3, 4)
+    for d in (-1e-3, 0.0, -math.inf):
+        assert closed_forms(E, d, 0.2) == (0.0,) * 6
+    for pair in [(math.nan, 0.1), (0.004, math.nan), (-1.0, math.nan), (0.004, math.inf)]:
+        assert all(math.isnan(value) for value in closed_forms(E, *pair))
+    assert closed_forms(E, math.inf, 0.0).force == math.inf
+
+
+@pytest.mark.parametrize("radius", [0.0, -0.02, math.nan, math.inf])
+def test_a_tip_needs_a_radius(radius: float) -> None:
+    with pytest.raises(ValueError, match="radius must be positive"):
+        Fingertip(radius)
+
+
+def test_a_radius_in_millimetres_is_refused_with_the_metres_it_means() -> None:
+    with pytest.raises(ValueError, match=r"in metres, at most 1, not 20; 20 mm is 0\.02"):
+        Fingertip(20.0)

@@ -144,16 +144,3 @@ def test_stop_works_in_every_mode_within_one_tick(make: Make) -> None:
     command(daemon, "stop")
     loop.advance(loop.period)
     assert (state.mode, torque_of(daemon).any()) == ("fault", False), "a stop clears nothing"
-
-
-@pytest.mark.parametrize(("taper", "told"), [(0.0, ["hand.angle"]), (0.17, [])])
-def test_a_wedge_looks_like_a_shifted_sensor_unless_it_is_told(
-    make: Make, taper: float, told: list[str]
-) -> None:
-    simulation = {"object_shape": "wedge", "object_taper": 0.17}
-    daemon = make(simulation=simulation, object={"taper": taper})
-    events = heard(daemon)
-    grasped(daemon, 5.0)
-    daemon.loop.advance(1.0)
-    assert daemon.loop.state.fault == ""
-    assert [kind for level, kind, _ in events if level == "warning"] == told

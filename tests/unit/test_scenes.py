@@ -19,17 +19,6 @@ from tests.harness.loop import Make, advance_to, command, grasped, heard, refusa
 state_message = message_maker(STATE)
 
 
-def test_a_person_ends_the_demo_and_it_does_not_start_again(make: Make) -> None:
-    daemon = make(task={"name": "demo"})
-    advance_to(daemon, "holding", 5.0)
-    daemon.loop.stop()
-    daemon.loop.advance(1.0)
-    assert daemon.loop.state.mode == "disarmed"
-    command(daemon, "arm")
-    daemon.loop.advance(15.0)
-    assert daemon.loop.state.mode == "armed"
-
-
 def holding_demo(daemon: Daemon) -> list[Event]:
     """The demo, brought to holding; its events from then on."""
     advance_to(daemon, "holding", 5.0)

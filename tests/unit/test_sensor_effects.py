@@ -9,13 +9,9 @@ import pytest
 
 from softfinger.daemon.simulation.sensor import sensor_model
 from softfinger.daemon.simulation.sensor.sensor_model import Board, Imperfections, SensorModel
-from softfinger.kinematics.contact.closed_form import Fingertip
-from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
+from tests.harness.paper_tip import LINEAR, MEASURED, PITCH, TIP, E
 
-A, E, PITCH = 0.020, 0.304e6, 0.058 / 44
-TIP = Fingertip(A)
-LINEAR = Material.constant(E)
 CONTACTS = [(0.0005, 0.1, -0.2), (0.002, 0.3, 0.1), (0.006, 0.0, -0.4)]
 
 
@@ -114,45 +110,6 @@ def test_blur_is_the_continuous_convolution(width):
         assert np.abs(sharp - expected).max() > 10 * np.abs(model._pressure - expected).max() or (
             width < 3e-4
         )
-
-
-def test_blur_keeps_the_force_and_adds_its_variance_each_way():
-    grid = SensorGrid(50, 44, (PITCH, 0.0011))
-    x = (np.arange(44) - 21.5) * PITCH
-    y = (np.arange(50) - 24.5) * 0.0011
-    moments = []
-    for width in (0.0, 1.2e-3):
-        model = sensor(grid, blur=width)
-        model.press(0.004, 0.1, 0.05)
-        p = model._pressure / model._pressure.sum()
-        moments.append(
-            (
-                model._pressure.sum(),
-                p.sum(axis=0) @ x**2 - (p.sum(axis=0) @ x) ** 2,
-                p.sum(axis=1) @ y**2 - (p.sum(axis=1) @ y) ** 2,
-            )
-        )
-    sharp, blurred = moments
-    assert blurred[0] == pytest.approx(sharp[0], rel=1e-5)
-    assert blurred[1] - sharp[1] == pytest.approx(1.2e-3**2, rel=2e-3)
-    assert blurred[2] - sharp[2] == pytest.approx(1.2e-3**2, rel=2e-3)
-
-
-def test_hysteresis_is_the_prandtl_ishlinskii_sum_of_plays():
-    rng = np.random.default_rng(1)
-    path = np.abs(np.cumsum(rng.normal(0.0, 1.0, (60, 3, 4)), axis=0)) * 1e4
-    excess = 0.1
-    plays = np.zeros((sensor_model.PLAYS, 3, 4))
-    twin = np.zeros_like(plays)
-    shares = 2 * excess * (np.arange(sensor_model.PLAYS) + 0.5) / sensor_model.PLAYS
-    for p in path:
-        out = p.copy()
-        sensor_model.hysteresis(out, excess, plays)
-        high = (1 + shares)[:, None, None] * p
-        twin = np.maximum(p, np.minimum(high, twin))
-        np.testing.assert_allclose(out, twin.mean(axis=0), rtol=1e-12)
-        assert np.all(out >= p)
-        assert np.all(out <= (1 + excess) * p * (1 + 1e-12))
 
 
 def test_loading_is_unchanged_unloading_reads_more_and_loops_close():
@@ -347,3 +304,47 @@ def test_all_at_once_is_the_same_for_a_seed():
         np.testing.assert_array_equal(
             counts(first, contact, 0.01 * k), counts(again, contact, 0.01 * k)
         )
+
+
+COUNT = 2.5  # Pa
+
+
+def frame(grid: SensorGrid, d: float, tilt: float, curvature: float) -> np.ndarray:
+    sensor = SensorModel(grid, TIP, MEASURED, Board(COUNT))
+    out = np.zeros(grid.shape, np.uint16)
+    sensor.frame(d, tilt, 0.0, out, curvature=curvature)
+    return out * COUNT
+
+
+def literal(d: float, tilt: float, radius: float, rotation: float, parts: int = 24) -> np.ndarray:
+    """Mean pressure on 44 × 44 cells, each of ``parts``² points, sensor turned by ``rotation``."""
+    at = (np.arange(44 * parts) + 0.5) * PITCH / parts - 0.029
+    sensor_x, sensor_y = np.meshgrid(at, at)
+    x = math.cos(rotation) * sensor_x - math.sin(rotation) * sensor_y
+    away = TIP.radius - d + radius
+    root = np.sqrt(np.maximum(radius**2 - (x - away * math.sin(tilt)) ** 2, 0.0))
+    face = np.where(root > 0.0, away * math.cos(tilt) - root, np.inf)
+    length = np.sqrt(np.maximum(TIP.radius**2 - sensor_x**2 - sensor_y**2, 1e-30))
+    pressure = MEASURED.stress(np.maximum(1.0 - np.minimum(face / length, 1.0), 0.0))
+    return np.asarray(pressure.reshape(44, parts, 44, parts).mean(axis=(1, 3)))
+
+
+@pytest.mark.parametrize("rotation", [0.0, 0.4])
+@pytest.mark.parametrize(("d", "tilt"), [(0.001, -0.1), (0.004, 0.3), (0.006, -0.4)])
+@pytest.mark.parametrize("radius", [0.012, 0.04])
+def test_cells_read_the_springs_under_the_cylinder(
+    radius: float, d: float, tilt: float, rotation: float
+) -> None:
+    grid = SensorGrid(44, 44, PITCH, rotation=rotation)
+    found = frame(grid, d, tilt, 1.0 / radius)
+    expected = literal(d, tilt, radius, rotation)
+    assert np.abs(found - expected).max() < 1.5e-3 * MEASURED.reference_modulus
+    assert found.sum() == pytest.approx(expected.sum(), rel=1e-3)
+
+
+def test_a_face_that_is_all_but_plane_reads_like_a_plane_one() -> None:
+    grid = SensorGrid(44, 44, PITCH, rotation=0.2)
+    plane, curved = frame(grid, 0.004, 0.25, 0.0), frame(grid, 0.004, 0.25, 1e-5)
+    assert np.abs(plane - curved).max() < 6e-4 * MEASURED.reference_modulus
+    assert not frame(grid, 0.0, 0.25, 50.0).any()
+    assert not frame(grid, -0.001, 0.25, 50.0).any()

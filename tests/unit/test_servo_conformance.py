@@ -22,15 +22,12 @@ from softfinger.daemon.servos.joint import current_toward
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 from softfinger.daemon.types import Goal, Reading
-from softfinger.kinematics.contact.closed_form import Fingertip
-from softfinger.kinematics.contact.material import Material
-from softfinger.kinematics.contact.table import ContactTable
 from tests.harness.free_joints import FreeJoints
+from tests.harness.plant import PAPER
 from tests.harness.servos import DirectPort
 
 COUNT = 2 * math.pi / 4096
 CURRENT_UNIT = 2.69e-3
-TABLE = ContactTable.build(Fingertip(radius=0.020), Material.constant(0.304e6))
 MODES = ("current-based position", "current", "position")
 BOUNDED = ("current-based position", "current")
 
@@ -54,7 +51,7 @@ class SimulatedRig:
     def __init__(self, _: pytest.MonkeyPatch, **sections: Any) -> None:
         settings = Settings.model_validate({"material": {"law": "constant"}, **sections})
         self.clock: Clock = VirtualClock()
-        self._hand = SimulatedHand(settings, table=TABLE)
+        self._hand = SimulatedHand(settings, table=PAPER)
         made = make_servos(settings, self.clock, self._hand)
         assert made is not None
         self.servos = made

@@ -245,12 +245,6 @@ def test_absurd_settings_are_told_in_one_line(tmp_path: Path, text: str, line: s
     assert all(len(each) < 300 for each in lines)
 
 
-def test_a_byte_order_mark_is_no_error(tmp_path: Path) -> None:
-    path = tmp_path / "profile.toml"
-    path.write_bytes(b"\xef\xbb\xbf[loop]\nrate = 100.0\n")
-    assert load(path).loop.rate == 100.0
-
-
 def test_changes_go_over_the_file_and_are_checked_with_it(tmp_path: Path) -> None:
     file = tmp_path / "my.toml"
     file.write_text("loop.rate = 250.0\n[tip]\nradius = 0.015\n")

@@ -9,21 +9,16 @@ import pytest
 
 from softfinger.daemon.clock import VirtualClock
 from softfinger.daemon.errors import ServoError
-from softfinger.daemon.perception.finger_model import make_estimator
-from softfinger.daemon.profile.factory import make_material
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.simulated import SimulatedServos
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.daemon.simulation.sensor.simulated_tactile import SimulatedTactile
 from softfinger.daemon.types import Goal, Reading
-from softfinger.kinematics.contact.closed_form import Fingertip
-from softfinger.kinematics.contact.material import Material
-from softfinger.kinematics.contact.table import ContactTable
+from tests.harness.plant import PAPER
 
 COUNT = 2 * math.pi / 4096
 CURRENT_UNIT = 2.69e-3
 SPEED_UNIT = 0.229 * 2 * math.pi / 60
-TABLE = ContactTable.build(Fingertip(radius=0.020), Material.constant(0.304e6))
 
 
 class Bench:
@@ -33,7 +28,7 @@ class Bench:
         sections.setdefault("material", {"law": "constant"})
         self.settings = Settings.model_validate(sections)
         self.clock = VirtualClock()
-        self.hand = SimulatedHand(self.settings, table=TABLE)
+        self.hand = SimulatedHand(self.settings, table=PAPER)
         self.servos = SimulatedServos(self.settings, self.hand, self.clock)
         self.sensors = [
             SimulatedTactile(self.settings, self.hand, self.clock, finger) for finger in (0, 1)
@@ -125,68 +120,6 @@ def test_watchdog_can_be_left_off():
 
 
 # Tactile.
-
-
-def test_frames_come_at_their_time_and_show_their_instant():
-    bench = Bench(simulation={"tactile_delay": 0.013, "tactile_noise": 0.0})
-    sensor = bench.sensors[0]
-    assert sensor.latest() is None
-    sensor.open()
-    assert bench.clock.now() == pytest.approx(0.013)
-    first = sensor.latest()
-    assert first is not None
-    assert (first.seq, first.t_sample, first.t_arrival) == (1, 0.0, 0.013)
-    assert first.data.shape == (44, 44)
-    assert first.data.dtype == np.uint16
-    bench.grasp(0.5, 0.2)
-    settings = bench.settings
-    estimator = make_estimator(settings, make_material(settings.material))
-    truth = {}
-    seen = first.seq
-    frames = 0
-    for _ in range(200):
-        bench.run(0.001, period=0.001)
-        truth[round(bench.clock.now(), 6)] = (bench.hand.d[0], bench.hand.theta[0])
-        frame = sensor.latest()
-        assert frame is sensor.latest()
-        age = bench.clock.now() - frame.t_sample
-        assert 0.013 - 1e-6 <= age < 0.013 + 0.010 + 1e-6
-        if frame.seq == seen:
-            continue
-        seen = frame.seq
-        assert frame.t_sample == pytest.approx((frame.seq - 1) * 0.010)
-        instant = min(truth, key=lambda t: abs(t - frame.t_sample))
-        if abs(instant - frame.t_sample) > 0.0006:
-            continue
-        frames += 1
-        estimate = estimator(frame.data * settings.tactile.pascal_per_count)
-        d, theta = truth[instant]
-        assert estimate.d == pytest.approx(d, abs=3e-5)
-        assert estimate.tilt_x == pytest.approx(theta, abs=3e-3)
-    assert frames > 10
-    assert bench.hand.d[0] > 0.003
-
-
-def test_noise_is_as_set_and_equal_for_one_seed():
-    def frames(seed: int) -> np.ndarray:
-        bench = Bench(
-            simulation={"seed": seed, "tactile_noise": 400.0},
-            tactile={"pascal_per_count": 4.0},
-        )
-        for sensor in bench.sensors:
-            sensor.open()
-        bench.grasp(0.6, 1.0)
-        return np.stack([sensor.latest().data for sensor in bench.sensors])
-
-    first, again, other = frames(3), frames(3), frames(4)
-    np.testing.assert_array_equal(first, again)
-    assert (first != other).any()
-    assert (first[0] != first[1]).any()
-    # Cells well inside the footprint: the difference of two seeds has √2 of the noise.
-    pressed = first[0].astype(float) > 4000
-    difference = (first[0].astype(float) - other[0].astype(float))[pressed]
-    assert pressed.sum() > 100
-    assert difference.std() == pytest.approx(math.sqrt(2) * 100, rel=0.25)
 
 
 def test_a_softer_tip_than_the_settings_reads_less_pressure():

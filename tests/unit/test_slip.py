@@ -179,12 +179,6 @@ def test_a_load_that_stands_leaves_less_to_come() -> None:
     assert watched.run(3.0 + 0.8 * friction, 1, speed=GIVES_WAY) == FORCE + 10.0
 
 
-def test_the_raise_is_at_most_a_share_of_the_force_asked_for() -> None:
-    watched = Watched(4.0, grip_raise_share=0.5)
-    watched.grip.begin_holding()
-    assert watched.run(50.0, 500, normal=4.0) == pytest.approx(6.0)
-
-
 def test_solid_tips_show_a_load_by_themselves() -> None:
     watched = at_rest()
     watched.held.sheared = 1.0
@@ -220,8 +214,11 @@ def test_noise_of_the_currents_is_no_load_and_a_load_in_it_is(force: float) -> N
 
 
 def test_the_raise_is_bounded_by_its_setting_and_by_the_force_that_is_a_fault() -> None:
-    for more, expected in ((2.0, 12.0), (100.0, 27.0), (0.0, 10.0)):
-        watched = Watched(grip_raise_max=more, grip_raise_share=10.0)
+    for more, share, expected in (
+        *((2.0, 10.0, 12.0), (100.0, 10.0, 27.0), (0.0, 10.0, 10.0)),
+        (10.0, 0.5, 15.0),
+    ):
+        watched = Watched(grip_raise_max=more, grip_raise_share=share)
         watched.grip.begin_holding()
         assert watched.run(50.0, 500) == pytest.approx(expected)
 

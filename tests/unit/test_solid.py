@@ -15,7 +15,6 @@ from softfinger import ContactEstimator, ContactTable, Fingertip, Material, Sens
 from softfinger.daemon.loop.build import facts
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
-from softfinger.kinematics.contact.material import MaterialError
 from softfinger.kinematics.estimation.estimator import Readings
 from softfinger.kinematics.sensing.solid_pressure import SolidPressure
 from tests.harness.loop import Make, command, grasped
@@ -77,15 +76,6 @@ def test_small_contacts_are_hertzs_and_large_ones_end_where_the_data_do(tip: Fin
         assert not table(0.004, 0.7).inside
     assert table(-1e-3, 0.1).force == 0.0
     assert math.isnan(table(math.nan, 0.1).force)
-
-
-def test_what_no_solid_tip_has_is_refused() -> None:
-    with pytest.raises(MaterialError, match="constant modulus"):
-        ContactTable.build(TIPS[0], Material.table_i())
-    with pytest.raises(ValueError, match=r"poisson must be 0\.45 to 0\.4995"):
-        Fingertip(0.02, "solid", 0.5)
-    with pytest.raises(ValueError, match="base must be 'bonded' or 'lying'"):
-        Fingertip(0.02, "solid", base="glued")  # type: ignore[arg-type]
 
 
 def test_the_cells_sum_to_the_force_whatever_the_grid_and_the_azimuth() -> None:

@@ -1,4 +1,4 @@
-"""The solid tip's data file: limits, identities, and frames of another finite element method."""
+"""The solid tip's data file and its finite elements, against another finite element method."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 import softfinger.kinematics.contact as contact
 from research.solid_tip.fit import NU, SolidTip, rms_difference
+from research.solid_tip.green import Meridian
 
 FILE = Path(contact.__file__).parent / "solid_tip.npz"
 REFERENCE = Path(__file__).parents[1] / "golden" / "solid_frames.npz"
@@ -33,29 +34,6 @@ def arrays() -> dict[str, np.ndarray]:
 
 def tips(arrays: dict[str, np.ndarray]) -> list[SolidTip]:
     return [SolidTip(arrays, base, poisson) for base in BASES for poisson in (*NU, 0.49)]
-
-
-def test_the_push_is_the_energy_s_slope_and_the_base_carries_it(
-    arrays: dict[str, np.ndarray],
-) -> None:
-    areas = np.pi * np.diff(arrays["ring_edges"] ** 2)
-    for tip in tips(arrays):
-        for d in (0.01, 0.1, 0.39):
-            for theta in (0.0, 0.3, -0.6):
-                push, _, pressure = tip.press(d, theta)
-                step = 1e-5 * d
-                slope = (tip.press(d + step, theta)[1] - tip.press(d - step, theta)[1]) / (2 * step)
-                assert push == pytest.approx(slope, rel=1e-7)
-                if not tip.coef[0].any():  # without friction
-                    assert pressure[0] @ areas == pytest.approx(push * np.cos(theta), rel=1e-6)
-
-
-def test_a_shear_force_turns_the_base_by_its_height(arrays: dict[str, np.ndarray]) -> None:
-    levers = np.pi * np.diff(arrays["ring_edges"] ** 3) / 3
-    for base in BASES:
-        each_nu, *others = arrays[f"{base}.shear"].T @ levers  # Chebyshev's, along ν
-        assert each_nu == pytest.approx(0.992, abs=1e-3)  # mean height of the cap it acts on
-        assert others == pytest.approx([0.0] * len(others), abs=1e-4)
 
 
 # Of elements of another kind: triangles and tetrahedra, quadratic displacements with linear
@@ -112,3 +90,45 @@ def test_frames_of_three_dimensional_elements(arrays: dict[str, np.ndarray]) -> 
         assert rms_difference(mine[inner], frame[inner]) < (0.07 if theta else 0.015)
         moments = centroid_and_extent(mine, PITCH), centroid_and_extent(frame, PITCH)
         np.testing.assert_allclose(*moments, rtol=0, atol=0.1 * MM)
+
+
+THETA, D = np.radians(20.0), 0.25
+
+
+def test_a_linear_press_is_in_balance_and_a_sticking_one_stiffer() -> None:
+    from research.solid_tip.contact import TiltedPlane
+    from research.solid_tip.fit import RING_EDGES, Samples
+    from research.solid_tip.green import green
+
+    surface = green(rings=12, poisson=0.48, bonded=True, base_harmonics=9)
+    press = TiltedPlane(surface, THETA, D).press(D)
+    plane = TiltedPlane(surface, THETA, D, sticking=True)
+    stuck = [plane.press(d) for d in np.linspace(0.2, np.sqrt(D), 8) ** 2][-1]
+    bases = Samples.of([press, stuck], surface.base_radius).base
+    for each, base in zip((press, stuck), bases, strict=True):
+        force = base[0] @ np.diff(RING_EDGES**2) * np.pi
+        balance = each.push * np.cos(THETA) - each.shear * np.sin(THETA)
+        assert force == pytest.approx(balance, rel=1e-9)
+    assert 1.05 < stuck.push / press.push < 1.15
+    assert -0.1 < stuck.shear / stuck.push < -0.05
+
+
+def test_neo_hookean_elements_press_as_the_data_file_says() -> None:
+    pytest.importorskip("pypardiso")
+    from research.solid_tip.rubber import MIDDLES, Body
+
+    with np.load(FILE) as data:
+        tip = SolidTip(data, "lying", 0.48)
+    mesh = Meridian(8, finer=2, widest=0.2)
+    softer, press = (
+        next(Body(mesh, 0.48, False, None, linear=linear).press([D])) for linear in (True, False)
+    )
+    push, energy, pressure = tip.press(D, 0.0)
+    assert press.energy == pytest.approx(energy, rel=0.01)
+    assert press.push == pytest.approx(push, rel=0.02)
+    assert press.push > 1.07 * softer.push
+    near = MIDDLES < 0.9
+    assert rms_difference(press.base[0, near], pressure[0, near]) < 0.03
+    spread = MIDDLES > 1.0
+    assert press.base[0, spread].any()
+    assert not softer.base[0, spread].any()

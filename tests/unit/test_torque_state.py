@@ -9,9 +9,8 @@ import msgpack
 import pytest
 import zmq
 
-from softfinger.daemon.errors import Refused, ServoError
+from softfinger.daemon.errors import ServoError
 from softfinger.daemon.loop.build import Daemon
-from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import Reading
 from tests.conftest import until
 from tests.harness.gateway import Served
@@ -31,22 +30,6 @@ def test_a_non_finite_goal_is_a_fault_though_a_command_was_refused_for_it(
     daemon.loop.advance(daemon.loop.period)
     assert daemon.loop.state.fault_name == "goal.number"
     command(daemon, "clear")
-
-
-def test_servos_that_fall_silent_latch_a_fault(make: Make) -> None:
-    daemon = make()
-    command(daemon, "arm")
-    daemon.loop.advance(0.1)
-    assert daemon.loop.servos is not None
-
-    def failing(reading: Any) -> None:
-        reading.valid = False
-
-    daemon.loop.servos.read = failing  # type: ignore[method-assign]
-    advance_to(daemon, "fault", 0.2)
-    assert "no good reading" in daemon.loop.state.fault
-    with pytest.raises(Refused, match="clear: servos: no good reading"):
-        command(daemon, "clear")
 
 
 def test_torque_off_that_is_not_confirmed_is_tried_again_and_then_the_bus_falls_silent(
@@ -209,13 +192,3 @@ def test_arm_waits_until_torque_off_is_confirmed(make: Make) -> None:
     assert "arm: the servos have not confirmed torque off yet" in refusal(daemon, "arm")
     daemon.loop.advance(3 * daemon.loop.period)
     command(daemon, "arm")
-
-
-def test_arm_is_refused_before_the_servos_were_read() -> None:
-    settings = Settings.model_validate({"loop": {"clock": "virtual"}})
-    with Daemon(settings, wire=False) as daemon:
-        assert daemon.loop.servos is not None
-        daemon.loop.servos.read = lambda reading: None  # type: ignore[method-assign]
-        daemon.loop.advance(0.01)
-        with pytest.raises(Refused, match="arm: servos: no good reading yet"):
-            command(daemon, "arm")

@@ -8,9 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.load import load
-from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.kinematics.hand.upright import upright_spring
 from softfinger.tools.watched import Watched
@@ -108,24 +106,15 @@ def test_solid_tips_come_upright_too() -> None:
 
 def test_ticks_that_come_late_do_not_make_the_dither_slow() -> None:
     # At a quarter of its frequency it would swing the object out of the grip.
-    sections = {
-        "loop": {"clock": "virtual"},
-        "control": {"law": "upright"},
-        "simulation": {"object_angle": START},
-    }
-    with Daemon(Settings.model_validate(sections), wire=False) as daemon:
-        loop, clock = daemon.loop, daemon.clock
-        loop.advance(0.3)
-        loop.command({"command": "arm"})
-        loop.advance(0.2)
-        loop.command({"command": "grasp", "force": FORCE})
-        loop.advance(0.8)
+    with Watched({"control": {"law": "upright"}, "simulation": {"object_angle": START}}) as hand:
+        hand.grasp(FORCE)
+        hand.run(0.8)
+        clock = hand._daemon.clock
         for _ in range(500):
-            clock.sleep_until(clock.now() + 4.0 * loop.period)
-            loop.tick(clock.now())
-        assert loop.state.mode == "holding", loop.state.fault
-        assert daemon.hand is not None
-        assert abs(math.degrees(daemon.hand.object_pose[2])) < 0.3
+            clock.sleep_until(clock.now() + 4.0 * hand.loop.period)
+            hand.loop.tick(clock.now())
+        assert hand.mode == "holding", hand.state.fault
+        assert abs(math.degrees(hand.plant.object_pose[2])) < 0.3
 
 
 def test_a_raised_grip_that_comes_back_does_not_hold_the_dither_at_one_side() -> None:

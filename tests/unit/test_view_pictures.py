@@ -129,17 +129,6 @@ def test_a_pressed_tip_ends_at_the_objects_face(finger: int) -> None:
     assert foot == pytest.approx((0.02 - d[finger] / 3.0) * math.sin(theta[finger]))
 
 
-def test_a_free_tip_is_a_half_circle_on_its_link() -> None:
-    lines = finger_lines(HAND, 1, 0.3)
-    centre = HAND.tips((0.3, 0.3))[1]
-    assert np.linalg.norm(lines.skin - centre, axis=1) == pytest.approx(0.02)
-    assert lines.link[0] == pytest.approx([0.05, 0.0])
-    assert np.linalg.norm(lines.link[1] - lines.link[0]) == pytest.approx(0.08)
-    assert np.linalg.norm(lines.link[2] - lines.link[1]) == pytest.approx(0.005)
-    assert lines.link[2] == pytest.approx(centre)
-    assert (lines.face, lines.push, lines.strain.max()) == (None, None, 0.0)
-
-
 def test_the_held_object_stands_between_its_faces() -> None:
     d, theta = held()
     outline = held_outline(HAND, Q, d, theta, WIDTH_M, 0.06)
@@ -165,12 +154,6 @@ def test_contours_are_lines_of_equal_energy(landscape: Landscape) -> None:
         theta = (contour.line[:, 0] / WIDTH * 2.0 - 1.0) * THETA_END
         d = (1.0 - contour.line[:, 1] / HEIGHT) * landscape.d_end
         assert exact(d, theta).energy == pytest.approx(contour.energy, rel=0.01)
-
-
-def test_the_wanted_forces_energy_is_the_tables(landscape: Landscape) -> None:
-    upright = ContactTable.build(TIP, Material.table_i())(np.array([0.003, 0.008]), np.zeros(2))
-    assert landscape.energy_of(upright.force) == pytest.approx(upright.energy, rel=1e-4)
-    assert np.isnan(landscape.energy_of(np.array([math.nan, -1.0, 1e6]))).all()
 
 
 # What is known of the hand
