@@ -24,7 +24,7 @@ from softfinger.daemon.errors import SettingsError
 from softfinger.tools.arguments import profile
 from softfinger.tools.cli import main, make_parser
 from softfinger.tools.terminal.status import told
-from tests.harness.daemon_process import PATIENT, SOFTFINGER, Running
+from tests.harness.daemon_process import SOFTFINGER, Running
 
 _BUSY = "DOCUMENTED_BUSY"  # set for what a command starts: that runs on its own
 _ENDLESS = {"run", "monitor", "view", "replay", "envelope", "bench"}
@@ -115,7 +115,7 @@ class Softfinger:
         self._end_daemon()
         stream, commands = (f"ipc://{Path.cwd()}/{each}" for each in ("stream", "commands"))
         own = ("--set", f"stream.address={stream}", "--set", f"commands.address={commands}")
-        self._daemon = Running(*words[1:], *own, *PATIENT)
+        self._daemon = Running(*words[1:], *own)
         self._usual = os.environ["SOFTFINGER_ADDRESS"]
         os.environ["SOFTFINGER_ADDRESS"] = f"{stream},{commands}"
         return 0
