@@ -77,6 +77,7 @@ INDIRECT_ADDRESS: Final = 168
 BAUD_RATES: Final = (9600, 57600, 115200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000)
 COUNTS_PER_TURN: Final = 4096
 VELOCITY_UNIT: Final = 0.229 * 2.0 * math.pi / 60.0  # rad/s a count
+ACCELERATION_UNIT: Final = 214.577 * 2.0 * math.pi / 3600.0  # rad/s² a count
 VOLTAGE_UNIT: Final = 0.1  # V a count
 RETURN_DELAY_UNIT: Final = 2e-6  # s a count
 WATCHDOG_UNIT: Final = 0.020  # s a count

@@ -19,10 +19,15 @@ SEEDS = (
     frame(2, framing.WRITE, struct.pack("<HI", reg.GOAL_POSITION, 9)),
     frame(1, framing.WRITE, struct.pack("<HB", reg.OPERATING_MODE, 4)),
     frame(1, framing.REBOOT),
+    frame(2, framing.CLEAR, b"\x01DXL\x22"),
+    frame(2, framing.FACTORY_RESET, b"\x02"),
     frame(BROADCAST, framing.PING),
     frame(BROADCAST, framing.SYNC_READ, struct.pack("<HHBB", 126, 10, 1, 2)),
     frame(BROADCAST, framing.FAST_SYNC_READ, struct.pack("<HHBB", 120, 27, 1, 2)),
     frame(BROADCAST, framing.SYNC_WRITE, struct.pack("<HHBBBB", 64, 1, 1, 1, 2, 1)),
+    frame(BROADCAST, framing.BULK_READ, struct.pack("<BHHBHH", 1, 132, 4, 2, 146, 1)),
+    frame(BROADCAST, framing.FAST_BULK_READ, struct.pack("<BHHBHH", 1, 132, 4, 2, 146, 1)),
+    frame(BROADCAST, framing.BULK_WRITE, struct.pack("<BHHIBHHB", 1, 116, 4, 7, 2, 64, 1, 1)),
 )
 
 

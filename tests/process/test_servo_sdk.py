@@ -46,11 +46,18 @@ def test_any_bytes_come_and_go_unchanged(bus, line, data, kind):
 def test_other_calls_of_the_sdk_work_through_our_handler(line):
     port, handler = line
     assert handler.ping(port, 1) == (1020, OK, 0)
-    assert handler.write4ByteTxRx(port, 1, reg.GOAL_VELOCITY, 77) == (OK, 0)
-    assert handler.read4ByteTxRx(port, 1, reg.GOAL_VELOCITY) == (77, OK, 0)
+    assert handler.write4ByteTxRx(port, 1, reg.PROFILE_VELOCITY, 77) == (OK, 0)
+    assert handler.read4ByteTxRx(port, 1, reg.PROFILE_VELOCITY) == (77, OK, 0)
     assert handler.write1ByteTxOnly(port, 2, reg.LED, 1) == OK
     # Nobody waits for that reply, which must not be taken for the next one's.
     assert handler.read1ByteTxRx(port, 2, reg.LED) == (1, OK, 0)
+    bulk = sdk.GroupBulkRead(port, handler)
+    bulk.addParam(1, reg.PRESENT_POSITION, 4)
+    bulk.addParam(2, reg.PRESENT_TEMPERATURE, 1)
+    for exchange in ("txRxPacket", "fastBulkRead"):
+        assert getattr(bulk, exchange, lambda: OK)() == OK  # version 3.7 has no fast reads
+        assert bulk.getData(1, reg.PRESENT_POSITION, 4) == 2048
+        assert bulk.getData(2, reg.PRESENT_TEMPERATURE, 1) == 25
     assert handler.reboot(port, 1) == (OK, 0)
 
 

@@ -15,6 +15,7 @@ from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.control_table import by_name
 from softfinger.daemon.servos.joint import JointScale
 from softfinger.daemon.simulation.servo_model import framing
+from softfinger.daemon.simulation.servo_model.framing import BROADCAST
 from softfinger.daemon.simulation.servo_model.servo import REBOOT_TIME
 from softfinger.daemon.simulation.servo_model.servo_joint import OVERLOAD_TIME
 from tests.harness.servos import RADIAN, BusClient, make_bus, put_fault
@@ -39,8 +40,6 @@ def client(**options: Any) -> BusClient:
         (reg.BAUD_RATE, 8, 1, framing.DATA_RANGE),
         (reg.OPERATING_MODE, 2, 1, framing.DATA_RANGE),
         (reg.OPERATING_MODE, reg.PWM_MODE, 1, framing.DATA_RANGE),
-        (reg.OPERATING_MODE, reg.VELOCITY_MODE, 1, framing.DATA_RANGE),
-        (reg.PROFILE_VELOCITY, 1, 4, framing.DATA_RANGE),
         (reg.SHADOW_ID, 9, 1, framing.DATA_RANGE),
         (reg.STARTUP_CONFIGURATION, 1, 1, framing.DATA_RANGE),
         (reg.ID, 253, 1, framing.DATA_RANGE),
@@ -87,7 +86,6 @@ def test_eeprom_is_locked_while_torque_is_on() -> None:
         (0x77, b""),
         (0x04, struct.pack("<HB", reg.LED, 1)),  # registered write
         (0x05, b""),  # action
-        (0x06, b"\x01"),  # factory reset
         (0x20, b"\x01CTRL"),  # control table backup
     ],
 )
@@ -119,27 +117,76 @@ def test_indirect_data_stands_for_what_it_points_to(model: str, firmware: int) -
 # --- torque, modes, motion -------------------------------------------------------------------
 
 
-def test_a_mode_change_resets_goals_and_gains() -> None:
+def test_velocity_mode_keeps_its_speed() -> None:
+    c = client()
+    c.write(reg.OPERATING_MODE, reg.VELOCITY_MODE, 1)
+    c.write(reg.TORQUE_ENABLE, 1, 1)
+    c.write(reg.GOAL_VELOCITY, 60, 4)
+    c.later(1.0)
+    assert abs(c.read(reg.PRESENT_VELOCITY, 4) - 60) <= 2
+
+
+def test_a_profile_takes_the_time_it_should() -> None:
+    c = client()
+    c.write(reg.PROFILE_VELOCITY, 50, 4)  # 11.45 rpm: 1024 counts take 1.31 s
+    c.write(reg.TORQUE_ENABLE, 1, 1)
+    c.write(reg.GOAL_POSITION, 1024, 4)
+    c.later(0.65)
+    half = c.read(reg.PRESENT_POSITION, 4)
+    assert abs(half - 508) < 60
+    assert c.read(reg.MOVING, 1) == 1
+    c.later(0.9)
+    assert abs(c.read(reg.PRESENT_POSITION, 4) - 1024) <= 5
+
+
+def test_time_based_profile() -> None:
+    c = client()
+    c.write(reg.DRIVE_MODE, 4, 1)
+    c.write(reg.PROFILE_VELOCITY, 2000, 4)  # ms
+    c.write(reg.PROFILE_ACCELERATION, 500, 4)
+    c.write(reg.TORQUE_ENABLE, 1, 1)
+    c.write(reg.GOAL_POSITION, 1000, 4)
+    c.later(1.0)
+    assert abs(c.read(reg.POSITION_TRAJECTORY, 4) - 500) < 10
+    c.later(0.95)
+    assert c.read(reg.MOVING_STATUS, 1) & 2
+    c.later(0.1)
+    assert c.read(reg.POSITION_TRAJECTORY, 4) == 1000
+
+
+def test_a_mode_change_resets_goals_gains_and_profiles() -> None:
     c = client(counts=(700, 0))
     for address, value, size in (
         (reg.POSITION_P_GAIN, 5, 2),
+        (reg.PROFILE_VELOCITY, 30, 4),
         (reg.GOAL_CURRENT, 3, 2),
         (reg.GOAL_PWM, 4, 2),
     ):
         assert c.write(address, value, size) == 0
     assert c.write(reg.OPERATING_MODE, reg.CURRENT_BASED_POSITION_MODE, 1) == 0
     assert c.read(reg.POSITION_P_GAIN, 2) == 800
+    assert c.read(reg.PROFILE_VELOCITY, 4) == 0
     assert c.read(reg.GOAL_CURRENT, 2) == 1193
     assert c.read(reg.GOAL_PWM, 2) == 885
     assert c.read(reg.GOAL_POSITION, 4) == 700
 
 
-def test_turns_are_kept_until_position_mode() -> None:
+def test_turns_are_kept_until_position_mode_or_clear() -> None:
     c = client(prepared=True)
+    c.bus.plant.q[0] = 5000 * RADIAN
+    assert c.read(reg.PRESENT_POSITION, 4) == 5000
+    assert c.ask(framing.CLEAR, b"\x01DXL\x22")[0] == 0
+    assert c.read(reg.PRESENT_POSITION, 4) == 904
     c.bus.plant.q[0] = 9000 * RADIAN
-    assert c.read(reg.PRESENT_POSITION, 4) == 9000
+    assert c.read(reg.PRESENT_POSITION, 4) == 4904
     assert c.write(reg.OPERATING_MODE, reg.POSITION_MODE, 1) == 0
     assert c.read(reg.PRESENT_POSITION, 4) == 808
+
+
+def test_clear_fails_while_the_shaft_moves() -> None:
+    c = client()
+    c.bus.plant.dq[0] = 3.0
+    assert c.ask(framing.CLEAR, b"\x01DXL\x22")[0] == framing.RESULT_FAIL
 
 
 def test_homing_offset_and_reverse_mode() -> None:
@@ -236,7 +283,7 @@ def test_overload_after_its_time_at_the_current_limit() -> None:
     assert c.bus.servos[0].torque_on is False
 
 
-# --- reboot ----------------------------------------------------------------------------------
+# --- reboot, reset, backup -------------------------------------------------------------------
 
 
 def test_reboot_resets_ram_and_keeps_eeprom() -> None:
@@ -244,6 +291,7 @@ def test_reboot_resets_ram_and_keeps_eeprom() -> None:
     for address, value, size in (
         (reg.RETURN_DELAY_TIME, 3, 1),
         (reg.LED, 1, 1),
+        (reg.PROFILE_VELOCITY, 9, 4),
         (reg.TORQUE_ENABLE, 1, 1),
     ):
         assert c.write(address, value, size) == 0
@@ -252,7 +300,9 @@ def test_reboot_resets_ram_and_keeps_eeprom() -> None:
     assert c.send(1, framing.PING) == b""
     c.later(0.01)
     assert c.read(reg.RETURN_DELAY_TIME, 1) == 3
-    assert c.read(reg.LED, 1) == c.read(reg.TORQUE_ENABLE, 1) == 0
+    assert (
+        c.read(reg.LED, 1) == c.read(reg.PROFILE_VELOCITY, 4) == c.read(reg.TORQUE_ENABLE, 1) == 0
+    )
     assert c.read(reg.GOAL_POSITION, 4) == 1234
 
 
@@ -272,3 +322,23 @@ def test_units_there_and_back(direction: int, zero: int, ratio: float, counts: i
     turn = scale.angle(zero + direction * 4096)
     assert turn == pytest.approx(2.0 * math.pi / ratio)
     assert scale.bound_counts(-5 * 2.69e-3) == 5
+
+
+@pytest.mark.parametrize(
+    ("option", "new_id", "baud"), [(0xFF, 1, 1), (1, 5, 1), (2, 5, 3)], ids=["all", "id", "baud"]
+)
+def test_factory_reset(option: int, new_id: int, baud: int) -> None:
+    c = client(ids=(5, 6))
+    c.write(reg.BAUD_RATE, 3, 1, packet_id=5)
+    c.write(reg.RETURN_DELAY_TIME, 3, 1, packet_id=5)
+    assert c.ask(framing.FACTORY_RESET, bytes((option,)), packet_id=5)[0] == 0
+    c.later(REBOOT_TIME)
+    assert c.read(reg.BAUD_RATE, 1, packet_id=new_id) == baud
+    assert c.read(reg.RETURN_DELAY_TIME, 1, packet_id=new_id) & 0xFF == 250
+
+
+def test_a_broadcast_factory_reset_of_everything_is_ignored() -> None:
+    c = client(ids=(5, 6))
+    assert c.send(BROADCAST, framing.FACTORY_RESET, b"\xff") == b""
+    assert c.ask(framing.PING, packet_id=5)[0] == 0
+    assert c.ask(framing.FACTORY_RESET, b"\x07", packet_id=5)[0] == framing.DATA_RANGE

@@ -60,7 +60,9 @@ THREE = {**XC330, "ids": (3, 7, 4), "counts": (166, 2079, 1023)}
                 "00 04 FF030000 D19E",
             ],
         ),
+        (XC330, "010400 06 01 A1E6", [DONE]),
         (XC330, "010300 08 2F4E", [DONE]),
+        (XC330, "010800 10 0144584C22 B1DC", [DONE]),
     ],
     ids=[
         "ping",
@@ -68,7 +70,9 @@ THREE = {**XC330, "ids": (3, 7, 4), "counts": (166, 2079, 1023)}
         "read",
         "sync read",
         "fast sync read",
+        "factory reset",
         "reboot",
+        "clear",
     ],
 )
 def test_published_exchanges(options: dict[str, Any], asked: str, answers: list[str]) -> None:
@@ -82,6 +86,33 @@ def test_published_writes() -> None:
     assert left.get(reg.GOAL_POSITION) == 512
     assert bus.feed(hexes("FFFFFD00FE1100 83 74000400 0196000000 02AA000000 8287"), 0.0) == b""
     assert [servo.table.get(reg.GOAL_POSITION) for servo in bus.servos] == [150, 170]
+
+
+def test_published_bulk_read_and_bulk_write() -> None:
+    bus = make_bus()
+    bus.servos[0].health.supply = 11.9
+    bus.servos[1].health.heat.warm(36.0)
+    assert bus.feed(hexes("FFFFFD00FE0D00 92 0190000200 0292000100 1A05"), 0.0) == hexes(
+        "FFFFFD00010600 55 00 7700 C369", "FFFFFD00020500 55 00 24 8BA9"
+    )
+    bus.servos[0].table.set(reg.MAX_VOLTAGE_LIMIT, 150)
+    bus.servos[1].table.set(reg.TEMPERATURE_LIMIT, 70)
+    packet = hexes("FFFFFD00FE1000 93 0120000200A000 021F00010050 B768")
+    assert bus.feed(packet, 0.0) == b""
+    assert bus.servos[0].table.get(reg.MAX_VOLTAGE_LIMIT) == 160
+    assert bus.servos[1].table.get(reg.TEMPERATURE_LIMIT) == 80
+
+
+def test_published_fast_bulk_read() -> None:
+    bus = make_bus("XC330-T288", (3, 7, 4), counts=(166, 0, 0))
+    bus.servos[2].health.heat.warm(31.0)
+    pwm = bus.servos[1]
+    pwm.table.set(reg.TORQUE_ENABLE, 1)
+    bus.plant.current[1] = 421 / 885 * pwm.model.stall_current
+    request = frame(BROADCAST, framing.FAST_BULK_READ, hexes("0384000400077C0002000492000100"))
+    assert bus.feed(request, 0.0) == hexes(
+        "FFFFFD00FE1400 55 00 03 A6000000 67A4", "00 07 A501 2474", "00 04 1F D9C1"
+    )
 
 
 # --- who answers, and when ---

@@ -13,15 +13,11 @@ from softfinger.daemon.servos.control_table import ServoModel
 from softfinger.daemon.simulation.servo_model import framing
 
 _GAIN_MAX = 16_383
-_MODES = (  # that are emulated
-    reg.CURRENT_MODE,
-    reg.POSITION_MODE,
-    reg.EXTENDED_POSITION_MODE,
-    reg.CURRENT_BASED_POSITION_MODE,
-)
+_PROFILE_MAX = 32_767
 _OFFSET_MAX = 1_044_479
 _MULTI_TURN = 1_048_575
 _STARTUP_FIRMWARE = 45
+_LAYOUTS = 64  # spans whose layout is remembered
 _FORMATS = {1: "<B", 2: "<H", 4: "<I"}
 _GOALS = (reg.GOAL_PWM, reg.GOAL_CURRENT, reg.GOAL_VELOCITY, reg.GOAL_POSITION)
 _LIMITS = {
@@ -105,8 +101,8 @@ def _items_of(model: ServoModel, firmware: int) -> list[Item]:
         _setting(reg.BUS_WATCHDOG, 1, 0, 0, reg.WATCHDOG_MAX),
         _setting(reg.GOAL_PWM, 2, 885, -885, 885),
         _setting(reg.GOAL_VELOCITY, 4, 0, -model.velocity_max, model.velocity_max),
-        _setting(reg.PROFILE_ACCELERATION, 4, 0, 0, 0),
-        _setting(reg.PROFILE_VELOCITY, 4, 0, 0, 0),
+        _setting(reg.PROFILE_ACCELERATION, 4, 0, 0, _PROFILE_MAX),
+        _setting(reg.PROFILE_VELOCITY, 4, 0, 0, _PROFILE_MAX),
         _setting(reg.GOAL_POSITION, 4, 0, -_MULTI_TURN, _MULTI_TURN),
         _read_only(reg.REALTIME_TICK, 2),
         _read_only(reg.MOVING, 1),
@@ -148,7 +144,7 @@ class ControlTable:
         self.size = model.highest_address(firmware) + 1
         self.memory = bytearray(self.size)
         self.at = {item.address: item for item in self.items}
-        self._modes = [mode for mode in _MODES if mode in model.modes]
+        self._modes = model.modes
         self._start: list[int | None] = [None] * self.size  # byte → its item's first address
         self._unpack, self._pack = {}, {}
         for item in self.items:
@@ -162,7 +158,9 @@ class ControlTable:
             for address, data, entries in model.indirect_blocks(firmware)
             for i in range(entries)
         }
+        self._pointers = frozenset(self._indirect.values())
         self._first_indirect = min(self._indirect)
+        self._layouts: dict[tuple[int, int], tuple[int, list[tuple[Item, int]]]] = {}
         self.reset()
 
     # --- values ----------------------------------------------------------------------------------
@@ -177,15 +175,20 @@ class ControlTable:
         item = self.at[address]
         mask = (1 << 8 * item.size) - 1
         self.memory[address : address + item.size] = (value & mask).to_bytes(item.size, "little")
+        if address in self._pointers:
+            self._layouts.clear()
 
     def put(self, item: Item, value: int) -> None:
         """Store a value that lies in the item's range."""
         self._pack[item.address](self.memory, item.address, value)
+        if item.address in self._pointers:
+            self._layouts.clear()
 
-    def reset(self) -> None:
-        """Restore factory defaults."""
+    def reset(self, keep: tuple[int, ...] = ()) -> None:
+        """Restore factory defaults everywhere but in the items at the addresses ``keep``."""
         for item in self.items:
-            self.set(item.address, item.default)
+            if item.address not in keep:
+                self.set(item.address, item.default)
 
     def reset_ram(self) -> None:
         """Restore the RAM as after a power-up."""
@@ -233,7 +236,8 @@ class ControlTable:
         nothing is to be written, the items before the bad one neither; the values that were
         understood are there all the same where only another register forbids one.
         """
-        error, layout = self._layout(address, len(data))
+        span = address, len(data)
+        error, layout = self._layouts.get(span) or self._layout(*span)
         if error:
             return error, []
         plan: list[tuple[Item, int]] = []
@@ -260,6 +264,12 @@ class ControlTable:
 
     def _layout(self, address: int, length: int) -> tuple[int, list[tuple[Item, int]]]:
         """Return the items that a span writes, with their offsets in its data, or the error."""
+        layout = self._lay_out(address, length)
+        if len(self._layouts) < _LAYOUTS:
+            self._layouts[address, length] = layout
+        return layout
+
+    def _lay_out(self, address: int, length: int) -> tuple[int, list[tuple[Item, int]]]:
         if length == 0:
             return framing.DATA_LENGTH, []
         if address + length > self.size:

@@ -1,10 +1,10 @@
 """One emulated Dynamixel X servo: what its registers do, over a joint of a plant.
 
-Torque, operating modes, limits, bus watchdog, hardware errors and shutdown, reboot; packets belong
-to :mod:`simulation.servo_model.servo_bus`. Velocity and PWM mode, profiles, a secondary ID and a
-startup configuration, which no client of a hand is known to set, are out of range here. Choices of
-our own, where the manuals say nothing: a write that breaks any rule changes nothing at all; torque
-on after a shutdown is refused with RESULT_FAIL.
+Torque, operating modes, limits, profiles, bus watchdog, hardware errors and shutdown, reboot;
+packets belong to :mod:`simulation.servo_model.servo_bus`. PWM mode, a secondary ID and a startup
+configuration, which no client is known to set, are out of range here. Choices of our own, where
+the manuals say nothing: a write that breaks any rule changes nothing at all; torque on after a
+shutdown is refused with RESULT_FAIL.
 """
 
 from __future__ import annotations
@@ -21,14 +21,27 @@ from softfinger.daemon.simulation.servo_model import framing
 from softfinger.daemon.simulation.servo_model.bus_recorder import BusRecorder
 from softfinger.daemon.simulation.servo_model.registers import ControlTable, Item
 from softfinger.daemon.simulation.servo_model.servo_heat import ServoHeat
-from softfinger.daemon.simulation.servo_model.servo_joint import SENSE, ServoHealth, ServoJoint
+from softfinger.daemon.simulation.servo_model.servo_joint import (
+    SENSE,
+    STEP,
+    ServoHealth,
+    ServoJoint,
+)
 
 REBOOT_TIME = 0.34  # s without an answer
 JUMP = 130  # counts, 0.2 rad at the shaft, by which an encoder's zero jumps
 _MOTION_END = reg.PRESENT_POSITION + 4
 _EFFECTIVE = frozenset(  # registers whose writing does more than change them
-    (reg.TORQUE_ENABLE, reg.OPERATING_MODE, reg.GOAL_POSITION, reg.BUS_WATCHDOG)
+    (
+        reg.TORQUE_ENABLE,
+        reg.OPERATING_MODE,
+        reg.GOAL_POSITION,
+        reg.GOAL_VELOCITY,
+        reg.BUS_WATCHDOG,
+    )
 )
+_CLEAR_FIRMWARE = 42
+_CLEAR_KEY = b"\x01DXL\x22"
 
 
 def prepared(model: ServoModel, mode: int) -> dict[int, int]:
@@ -69,6 +82,7 @@ class EmulatedServo:
         self._watched = 0.0  # time of the last packet the watchdog knows of
         self._booted = t
         self._boot_at = -math.inf  # a reboot ends then
+        self._next_step = math.inf
         self._next_sense = t
         for address, value in eeprom.items():
             self.table.set(address, value)
@@ -134,7 +148,7 @@ class EmulatedServo:
 
     def next_event(self) -> float:
         """Return when :meth:`act` next has something to do [s]."""
-        due = self._next_sense
+        due = self._next_step if self._next_step < self._next_sense else self._next_sense
         if self._boot_at > -math.inf:
             return min(due, self._boot_at)
         memory = self._memory
@@ -157,6 +171,12 @@ class EmulatedServo:
             self.table.set(reg.BUS_WATCHDOG, reg.WATCHDOG_ERROR)
             self.recorder.fired(t)
             self._stop()
+        if t >= self._next_step:
+            if self.torque_on and self._joint.moves_by_itself():
+                self._next_step = t + STEP
+                self._joint.follow()
+            else:
+                self._next_step = math.inf
         if t >= self._next_sense:
             self._next_sense = t + SENSE
             self._sense()
@@ -188,6 +208,8 @@ class EmulatedServo:
             if item.address in _EFFECTIVE:
                 self._effect(item.address, value, t)
         torque = self._memory[reg.TORQUE_ENABLE]
+        if torque and self._joint.moves_by_itself():
+            self._next_step = min(self._next_step, t + STEP)
         if limp and torque:
             current = self.table.get(reg.GOAL_CURRENT) if self.model.senses_current else 0
             goals = self.table.get(reg.GOAL_POSITION), current
@@ -201,8 +223,36 @@ class EmulatedServo:
         """Switch torque off, be silent for REBOOT_TIME, then restore the RAM as after power-up."""
         self.table.set(reg.TORQUE_ENABLE, 0)
         self._joint.drive()
+        self._next_step = math.inf
         self._boot_at = t + REBOOT_TIME
         self._next_sense = self._boot_at
+
+    def factory_reset(self, option: bytes, t: float) -> int:
+        """Restore factory defaults (FF all, 01 keeps ID, 02 ID and baud rate), then reboot."""
+        if len(option) != 1:
+            return framing.DATA_LENGTH
+        keep = {0xFF: (), 1: (reg.ID,), 2: (reg.ID, reg.BAUD_RATE)}.get(option[0])
+        if keep is None:
+            return framing.DATA_RANGE
+        self.table.set(reg.TORQUE_ENABLE, 0)
+        self.table.reset(keep)
+        self.reboot(t)
+        return framing.OK
+
+    def clear(self, parameters: bytes, t: float) -> int:
+        """Bring the position back into one turn; fails while the shaft moves."""
+        if self.firmware < _CLEAR_FIRMWARE:
+            return framing.INSTRUCTION_ERROR
+        if parameters != _CLEAR_KEY:
+            return framing.DATA_RANGE
+        self._joint.refresh(t - self._booted, self.health.voltage, self.health.heat.sensed)
+        if self._memory[reg.MOVING]:
+            return framing.RESULT_FAIL
+        shift = self._joint.forget_turns()
+        self.table.set(reg.GOAL_POSITION, self.table.get(reg.GOAL_POSITION) - shift)
+        self._joint.profile.hold(self._joint.profile.position - shift)
+        self._joint.drive()
+        return framing.OK
 
     def report(self, t: float) -> dict[str, Any]:
         """Return the servo's state and the record of what it was sent."""
@@ -269,7 +319,7 @@ class EmulatedServo:
                 self._joint.aim()
         elif address == reg.OPERATING_MODE:
             self._reset_mode()
-        elif address == reg.GOAL_POSITION and self.torque_on:
+        elif address in (reg.GOAL_POSITION, reg.GOAL_VELOCITY) and self.torque_on:
             self._joint.aim()
         elif address == reg.BUS_WATCHDOG:
             self._watched = t
@@ -279,6 +329,8 @@ class EmulatedServo:
         for item in table.items:
             if reg.VELOCITY_I_GAIN <= item.address <= reg.FEEDFORWARD_1ST_GAIN:
                 table.set(item.address, item.default)
+        table.set(reg.PROFILE_ACCELERATION, 0)
+        table.set(reg.PROFILE_VELOCITY, 0)
         if self.mode == reg.POSITION_MODE:
             self._joint.forget_turns()
         self._reset_goals()
@@ -300,6 +352,7 @@ class EmulatedServo:
         self._joint.forget_turns()
         self._reset_goals()
         self._joint.hold()
+        self._next_step = math.inf
         self._next_sense = t + SENSE
         self._joint.drive()
 
@@ -311,6 +364,8 @@ class EmulatedServo:
         if self.mode == reg.CURRENT_MODE:
             table.set(reg.GOAL_CURRENT, 0)
         table.set(reg.GOAL_VELOCITY, 0)
+        table.set(reg.PROFILE_ACCELERATION, 0)
+        table.set(reg.PROFILE_VELOCITY, 0)
         table.set(reg.GOAL_POSITION, self._joint.position())
         self._joint.hold()
         self._joint.drive()

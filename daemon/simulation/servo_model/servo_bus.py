@@ -3,15 +3,15 @@
 It takes bytes and the time and gives bytes, so that tests and fuzzers need no port; the
 pseudo-terminal around it is :mod:`simulation.emulator.pty_bus`. In group reads a servo answers
 after it has heard the one named before it; so where one is missing, those after it stay silent.
-Registered writes, bulk reads and writes, factory resets, clearing of turns and backups, which no
-client of a hand is known to send, are answered with an instruction error.
+Registered writes and control table backups, which no client is known to send, are answered with an
+instruction error.
 """
 
 from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import lru_cache, reduce
 from itertools import zip_longest
 from operator import and_
@@ -34,9 +34,21 @@ from softfinger.daemon.simulation.servo_model.framing import BROADCAST, Packet, 
 from softfinger.daemon.simulation.servo_model.servo import EmulatedServo, prepared
 from softfinger.daemon.simulation.servo_model.servo_heat import ServoHeat
 
-_GROUP_READS = frozenset((framing.SYNC_READ, framing.FAST_SYNC_READ))
+_SYNC_READS = frozenset((framing.SYNC_READ, framing.FAST_SYNC_READ))
+_GROUP_READS = _SYNC_READS | {framing.BULK_READ, framing.FAST_BULK_READ}
+_FAST_READS = frozenset((framing.FAST_SYNC_READ, framing.FAST_BULK_READ))
 _READS = _GROUP_READS | {framing.PING, framing.READ}
+_TO_ALL = frozenset(  # what a broadcast may ask besides reads, without an answer
+    (
+        framing.WRITE,
+        framing.FACTORY_RESET,
+        framing.REBOOT,
+        framing.CLEAR,
+    )
+)
+_FACTORY_RESET_GUARD = 42  # firmware that ignores a broadcast reset of everything
 _SPAN = struct.Struct("<HH")  # address, length
+_ITEM = struct.Struct("<BHH")  # ID, address, length
 
 
 class TimedReply(NamedTuple):
@@ -213,24 +225,25 @@ class ServoBus:
         if instruction in _GROUP_READS:
             return self._group_read(instruction, data, servos, t)
         if instruction == framing.SYNC_WRITE:
-            for servo_id, address, values in _sync_items(data):
-                for servo in servos:
-                    if servo.id == servo_id:
-                        servo.write(address, values, t)
-        elif instruction in (framing.WRITE, framing.REBOOT):  # without an answer
+            _write_each(_sync_items(data), servos, t)
+        elif instruction == framing.BULK_WRITE:
+            _write_each(_bulk_items(data), servos, t)
+        elif instruction in _TO_ALL:
             for servo in servos:
-                _execute(servo, instruction, data, t)
+                guarded = servo.firmware >= _FACTORY_RESET_GUARD and data == b"\xff"
+                if instruction != framing.FACTORY_RESET or not guarded:
+                    _execute(servo, instruction, data, t)
         return []
 
     def _group_read(
         self, instruction: int, data: bytes, servos: list[EmulatedServo], t: float
     ) -> list[TimedReply]:
-        address, length, ids, piece = _requested(data)
-        fast = instruction == framing.FAST_SYNC_READ
+        requested, piece = _requested(instruction, data)
+        fast = instruction in _FAST_READS
         replies: list[TimedReply] = []
         block = b""
         crc, delay = 0, 0.0
-        for servo_id in ids:
+        for servo_id, address, length in requested:
             same = [servo for servo in servos if servo.answers_reads(servo_id, fast)]
             if not same or (fast and len(same) > 1):
                 break
@@ -256,16 +269,31 @@ class ServoBus:
 
 
 @lru_cache(maxsize=32)
-def _requested(data: bytes) -> tuple[int, int, bytes, bytes]:
-    """Address and length of the span that a sync read asks for, of whom, and a fast reply's head.
+def _requested(instruction: int, data: bytes) -> tuple[list[tuple[int, int, int]], bytes]:
+    """ID, address and length of each span that a group read asks for, and how a fast reply begins.
 
-    Nobody is asked where it is cut, or an ID stands in it twice.
+    There are none where it is cut, or an ID stands in it twice.
     """
-    if len(data) < _SPAN.size or len(set(data[_SPAN.size :])) < len(data) - _SPAN.size:
-        return 0, 0, b"", b""
-    address, length = _SPAN.unpack_from(data)
-    ids = data[_SPAN.size :]
-    return address, length, ids, framing.fast_head(1 + (length + 4) * len(ids))
+    requested: list[tuple[int, int, int]] = []
+    if instruction not in _SYNC_READS:
+        if len(data) % _ITEM.size == 0:
+            requested = list(_ITEM.iter_unpack(data))
+    elif len(data) >= 5:
+        address, length = _SPAN.unpack_from(data)
+        requested = [(servo_id, address, length) for servo_id in data[4:]]
+    if len({servo_id for servo_id, _, _ in requested}) < len(requested):
+        return [], b""
+    return requested, framing.fast_head(1 + sum(length + 4 for _, _, length in requested))
+
+
+def _write_each(
+    items: Iterable[tuple[int, int, bytes]], servos: list[EmulatedServo], t: float
+) -> None:
+    """Write each servo's part of a group write: ID, address, data."""
+    for servo_id, address, data in items:
+        for servo in servos:
+            if servo.id == servo_id:
+                servo.write(address, data, t)
 
 
 def _sync_items(data: bytes) -> Iterator[tuple[int, int, bytes]]:
@@ -276,6 +304,15 @@ def _sync_items(data: bytes) -> Iterator[tuple[int, int, bytes]]:
     if length and (len(data) - _SPAN.size) % size == 0:
         for i in range(_SPAN.size, len(data), size):
             yield data[i], address, data[i + 1 : i + size]
+
+
+def _bulk_items(data: bytes) -> Iterator[tuple[int, int, bytes]]:
+    i = 0
+    while i + _ITEM.size <= len(data):
+        servo_id, address, length = _ITEM.unpack_from(data, i)
+        i += _ITEM.size + length
+        if i <= len(data):
+            yield servo_id, address, data[i - length : i]
 
 
 def _status(servo: EmulatedServo, error: int, data: bytes = b"") -> TimedReply:
@@ -297,9 +334,13 @@ def _execute(servo: EmulatedServo, instruction: int, data: bytes, t: float) -> t
             if len(data) < 3:
                 return framing.DATA_LENGTH, b""
             return servo.write(data[0] | data[1] << 8, data[2:], t), b""
+        case framing.FACTORY_RESET:
+            return servo.factory_reset(data, t), b""
         case framing.REBOOT:
             servo.reboot(t)
             return framing.OK, b""
+        case framing.CLEAR:
+            return servo.clear(data, t), b""
     return framing.INSTRUCTION_ERROR, b""
 
 

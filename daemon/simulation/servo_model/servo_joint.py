@@ -1,13 +1,14 @@
 """The physical side of an emulated servo: between its registers and a joint of the plant.
 
-`ServoJoint` maps counts to angles (turns, homing offset, drive direction), drives the plant as each
-operating mode asks, and writes the present values into the control table.
+`ServoJoint` maps counts to angles (turns, homing offset, drive direction), follows the profile,
+drives the plant as each operating mode asks, and writes the present values into the control table.
 `ServoHealth` is what the servo suffers: heat (`servo_heat`), its supply, overload. A choice of our
 own, where the manuals say nothing: overload after OVERLOAD_TIME of current at the configured limit.
 """
 
 from __future__ import annotations
 
+import math
 import struct
 
 from softfinger.daemon.servos import control_table as reg
@@ -17,6 +18,7 @@ from softfinger.daemon.servos.joint import JointScale
 from softfinger.daemon.simulation.servo_model.registers import ControlTable
 from softfinger.daemon.simulation.servo_model.servo_heat import ServoHeat
 
+STEP = 0.001  # s: trajectories, velocity mode
 OVERLOAD_TIME = 2.0  # s at the current limit
 SENSE = 0.010  # s between two looks
 _VOLTAGE = 0  # bit of the hardware error status
@@ -25,9 +27,12 @@ POSITION_MODES = (
     reg.EXTENDED_POSITION_MODE,
     reg.CURRENT_BASED_POSITION_MODE,
 )
+_PER_VELOCITY = reg.VELOCITY_UNIT * reg.COUNTS_PER_TURN / (2.0 * math.pi)  # counts/s a count
+_PER_ACCELERATION = reg.ACCELERATION_UNIT * reg.COUNTS_PER_TURN / (2.0 * math.pi)
 _ARRIVED = 20  # counts from the goal that count as there
 _PRESENT = struct.Struct("<HBBhhiiiiHB")  # registers 120 … 146
 _MOTION = struct.Struct("<hii")  # registers 126 … 135
+_PROFILE = struct.Struct("<II").unpack_from  # registers 108 … 115: acceleration, velocity
 _U32 = struct.Struct("<I").unpack_from
 _I32 = struct.Struct("<i").unpack_from
 _I16 = struct.Struct("<h").unpack_from
@@ -44,7 +49,7 @@ class ServoJoint:
         joint: int,
         scale: JointScale,
     ) -> None:
-        self._goal = 0  # counts, in force
+        self.profile = Profile()
         self._model = model
         self._senses_current = model.senses_current
         self._table = table
@@ -98,29 +103,57 @@ class ServoJoint:
         (offset,) = _I32(memory, reg.HOMING_OFFSET)
         return within + int(offset)
 
-    def goal_angle(self, counts: int) -> float:
-        """Return joint angle [rad] that a goal position means."""
+    def _angle(self, position: float) -> float:
         memory = self._memory
-        within = counts - _I32(memory, reg.HOMING_OFFSET)[0]
+        within = position - _I32(memory, reg.HOMING_OFFSET)[0]
         if memory[reg.DRIVE_MODE] & 1:
             within = -within
         return self._scale.angle(within + self._turns * reg.COUNTS_PER_TURN)
+
+    def goal_angle(self, counts: int) -> float:
+        """Return joint angle [rad] that a goal position means."""
+        return self._angle(counts)
 
     def goal_current(self, counts: int) -> float:
         """Return the current [A] of a goal current, positive closing; a bound's sign is void."""
         return self._scale.amperes(self.sign * counts)
 
-    # --- goal --------------------------------------------------------------------------------
+    # --- trajectory --------------------------------------------------------------------------
 
     def hold(self) -> None:
-        """Let the goal be where the shaft is."""
-        self._goal = self.position()
+        """End the trajectory where the shaft is."""
+        self.profile.hold(self.position())
 
     def aim(self) -> None:
-        """Take the goal position, in the modes that have one."""
-        memory = self._memory
-        if memory[reg.OPERATING_MODE] in POSITION_MODES:
-            (self._goal,) = _I32(memory, reg.GOAL_POSITION)
+        """Start the trajectory to the goal position as the profile registers ask."""
+        memory, profile = self._memory, self.profile
+        if memory[reg.OPERATING_MODE] not in POSITION_MODES:
+            return
+        target = float(_I32(memory, reg.GOAL_POSITION)[0])
+        acceleration, speed = _PROFILE(memory, reg.PROFILE_ACCELERATION)
+        if not speed and not acceleration:
+            profile.hold(target)
+        elif memory[reg.DRIVE_MODE] & 4:
+            profile.aim_in(target, speed / 1000.0, acceleration / 1000.0)
+        else:
+            profile.aim(target, speed * _PER_VELOCITY, acceleration * _PER_ACCELERATION)
+
+    def moves_by_itself(self) -> bool:
+        """Return whether :meth:`follow` has work while torque is on."""
+        mode = self._memory[reg.OPERATING_MODE]
+        if mode in POSITION_MODES:
+            return self.profile.busy
+        return mode == reg.VELOCITY_MODE
+
+    def follow(self) -> None:
+        """Advance whatever moves by itself by one STEP."""
+        mode = self._memory[reg.OPERATING_MODE]
+        if mode in POSITION_MODES:
+            self.profile.step(STEP)
+        elif mode == reg.VELOCITY_MODE:
+            self.profile.velocity = self._table.get(reg.GOAL_VELOCITY) * _PER_VELOCITY
+            self.profile.position += self.profile.velocity * STEP
+        self.drive()
 
     # --- plant -------------------------------------------------------------------------------
 
@@ -132,13 +165,13 @@ class ServoJoint:
             self._plant.drive(joint, reg.CURRENT_MODE, False, 0.0, 0.0)
         elif mode == reg.CURRENT_BASED_POSITION_MODE:
             bound = abs(_I16(memory, reg.GOAL_CURRENT)[0]) * self._model.current_unit
-            goal = self.goal_angle(self._goal)
+            goal = self._angle(self.profile.position)
             self._plant.drive(joint, reg.CURRENT_BASED_POSITION_MODE, True, goal, bound)
         elif mode == reg.CURRENT_MODE:
             current = self._scale.amperes(self.sign * table.get(reg.GOAL_CURRENT))
             self._plant.drive(joint, reg.CURRENT_MODE, True, 0.0, current)
         else:
-            goal = self.goal_angle(self._goal)
+            goal = self._angle(self.profile.position)
             self._plant.drive(joint, reg.POSITION_MODE, True, goal, self.current_limit)
 
     def _motion(self) -> tuple[int, int, int]:
@@ -164,28 +197,97 @@ class ServoJoint:
 
     def refresh(self, seconds: float, voltage: float, temperature: float) -> None:
         """Bring registers 120 … 146 up to date, ``seconds`` after power-up."""
-        memory = self._memory
+        profile, memory = self.profile, self._memory
         current, velocity, position = self._motion()
         pwm = 0
         if memory[reg.TORQUE_ENABLE]:
             ampere, rate = self._plant.current.item(self._joint), self._plant.dq.item(self._joint)
             duty = self._load * ampere + self._speed * rate
             pwm = max(-885, min(885, round(self.sign * 885.0 * duty)))
+        busy = profile.busy
+        arrived = not busy and abs(profile.target - position) <= _ARRIVED
         _PRESENT.pack_into(
             memory,
             reg.REALTIME_TICK,
             int(seconds * 1000.0 + 1e-6) & 0x7FFF,
             abs(velocity) > _U32(memory, reg.MOVING_THRESHOLD)[0],
-            abs(self._goal - position) <= _ARRIVED,
+            arrived | busy << 1,
             pwm,
             current,
             velocity,
             position,
-            0,  # of a trajectory, which is at its end
-            self._goal,
+            round(profile.velocity / _PER_VELOCITY),
+            round(profile.position),
             max(0, round(voltage / reg.VOLTAGE_UNIT)),
             max(0, min(255, round(temperature))),
         )
+
+
+_NEAR = 1e-6  # counts: below it the square root's rounding would never let the trajectory arrive
+
+
+class Profile:
+    """The trajectory to a goal, velocity- or time-based: where it is and how fast it goes.
+
+    A limit of 0 means none.
+    """
+
+    def __init__(self) -> None:
+        self.position = 0.0  # counts
+        self.velocity = 0.0  # counts/s
+        self.target = 0.0
+        self.speed = 0.0  # greatest velocity, 0 = at once
+        self.acceleration = 0.0  # counts/s², 0 = at once
+
+    @property
+    def busy(self) -> bool:
+        """True while the trajectory still moves towards its target."""
+        return self.position != self.target or self.velocity != 0.0
+
+    def hold(self, position: float) -> None:
+        """Stand still at a position."""
+        self.position = self.target = position
+        self.velocity = 0.0
+
+    def aim(self, target: float, speed: float, acceleration: float) -> None:
+        """Go to a target with these limits (velocity-based profile)."""
+        self.target, self.speed, self.acceleration = target, speed, acceleration
+        if speed == 0.0 and acceleration == 0.0:
+            self.hold(target)
+
+    def aim_in(self, target: float, duration: float, ramp: float) -> None:
+        """Go to a target in ``duration`` seconds with ramps of ``ramp`` (time-based profile)."""
+        if duration <= 0.0:
+            self.hold(target)
+            return
+        ramp = min(ramp, duration / 2.0)
+        speed = abs(target - self.position) / (duration - ramp)
+        self.aim(target, speed, speed / ramp if ramp > 0.0 else 0.0)
+
+    def step(self, dt: float) -> None:
+        """Go on by dt [s]: a trapezoid, which never passes its target."""
+        distance = self.target - self.position
+        if distance == 0.0 and self.velocity == 0.0:
+            return
+        if abs(distance) < _NEAR and abs(self.velocity) <= max(self.acceleration * dt, _NEAR):
+            self.hold(self.target)
+            return
+        limit = self.speed if self.speed > 0.0 else math.inf
+        if self.acceleration > 0.0:
+            # The speed from which it can still stop at the target, over the coming step too.
+            a = self.acceleration
+            stop = math.sqrt(2.0 * a * abs(distance) + (a * dt / 2.0) ** 2) - a * dt / 2.0
+            speed = math.copysign(min(limit, stop), distance)
+            change = max(-a * dt, min(a * dt, speed - self.velocity))
+            velocity = self.velocity + change
+        else:
+            velocity = math.copysign(min(limit, abs(distance) / dt), distance)
+        move = velocity * dt
+        if distance * move >= 0.0 and abs(move) >= abs(distance):
+            self.hold(self.target)
+            return
+        self.position += move
+        self.velocity = velocity
 
 
 class ServoHealth:
