@@ -68,7 +68,8 @@ _SHEAR_JUMP = 0.6  # N: frames scatter by 0.1
 _YIELDS = 0.01  # rad/s that both joints give way faster than just before: half a count of one
 _FAST = 0.1  # rad/s, likewise
 _SIGNS = 4.0  # standard deviations, of the angle and of the torques, more than that
-_BOTH = 0.5  # of the mean of both joints' torques: each must show so much of a sudden load
+_BOTH = 0.5  # of the mean of both joints' torques: each must show so much of a load, …
+_AT_ONCE = 0.25  # … and so much of one that comes at once, while a joint may still stick
 _BALANCED = 0.6  # of both tips' mean force: each must feel so much, as of any object that is free
 _ARM_MIN = 0.2  # of the object's width: a load's lever is not taken for less
 _SPARE_MIN = 0.3  # of the friction: where rolling takes more, a firmer grip hardly helps
@@ -214,7 +215,7 @@ def _average(
         off = 0.5 * (off1 + sense * off2)
         before = 0.5 * (s.smooth[0] + sense * s.smooth[1])
         before -= s.still if k == 0 else min(max(before, -friction), friction)
-        alike = min(off1 * off, sense * off2 * off) > _BOTH * off * off
+        alike = min(off1 * off, sense * off2 * off) > _AT_ONCE * off * off
         gives = 0.5 * (s.speed[0] - dq[0] + sense * (s.speed[1] - dq[1]))
         yields = gives * math.copysign(1.0, off) > _YIELDS
         flicker = _SIGNS * math.sqrt(s.variance[k]) + unsettled

@@ -160,6 +160,9 @@ def test_a_load_that_is_held_slides_and_one_that_is_lost_is_said() -> None:
     assert 0.0 < held.answer < 0.022
     assert 0.0 < held.slid < 0.02
     assert not held.lost
+    # A joint that still sticks shows a quarter of what the other does.
+    sticking = reflex.overloaded({"simulation": {"object_mass": 0.5}}, 6.0, 15.0, 1)
+    assert (sticking.answer < 0.022, sticking.slid < 0.012, sticking.lost) == (True, True, False)
     weak = {"control": {"grip_raise_max": 0.0}, "simulation": {"object_mass": 0.1}}
     lost = reflex.overloaded(weak, 0.0, 18.0, 1)
     assert lost.lost
