@@ -5,9 +5,8 @@ the contact table, with friction, and the pressure under each tip as a user sens
 :class:`MujocoHand` is a profile's hand, for the daemon by ``servos.backend = "mujoco"``.
 
 The law is the simulated hand's own kernel (`simulation.physics.tip`). Shear is a vector in the face
-here: that along the tilt is its d_t, that across enters as variance, U having ρ(ζ² + v). MuJoCo
-takes passive forces as they are at a step's beginning, and tips of 20 kN/m on 0.1 kg want steps
-below 1 ms then. So these are of its end, linearly implicit along the rows R of d, θ and both shears
+here: that along the tilt is its d_t, that across enters as variance, U having ρ(ζ² + v). Forces are
+those of a step's end (docs/mujoco.md), linearly implicit along the rows R of d, θ and both shears
 
     (1 + hBA) f = f(t) + h K w + h B R a     A = R M⁻¹ Rᵀ    B = D + h K    w = R q̇
 
@@ -23,7 +22,6 @@ from typing import Annotated, Any, Self, cast
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from softfinger.daemon.errors import SettingsError
@@ -32,7 +30,13 @@ from softfinger.daemon.profile.settings import Section, Settings
 from softfinger.daemon.servos.simulated import SimulatedServos
 from softfinger.daemon.simulation.physics.forces import current_reference
 from softfinger.daemon.simulation.physics.outline import rim_on_plane
-from softfinger.daemon.simulation.physics.plant_state import Parameters, Plant, TipContact
+from softfinger.daemon.simulation.physics.plant_state import (
+    FloatArray,
+    Parameters,
+    Plant,
+    Three,
+    TipContact,
+)
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand, set_parameters
 from softfinger.daemon.simulation.physics.tip import clear_contact, contact_forces, stiffen_by_rim
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
@@ -40,14 +44,13 @@ from softfinger.kinematics.compiled.layout import Record, Records
 from softfinger.kinematics.compiled.simd import address
 from softfinger.kinematics.contact.table import ContactTable
 
-FloatArray = NDArray[np.float64]
-Vector = Annotated[FloatArray, 3]
 Work = tuple[FloatArray, FloatArray, FloatArray]
 
 _ROWS = 4  # of a tip: d, θ, shear along the tilt and across it
 _NEAR = 0.005  # m from a tip within which a step may bring a touch
 _LEAST = 1e-9  # m of a touch; sin θ of a tilt, below it any direction on the face is along it
 _SHEAR = 2  # the row of the shear along the tilt
+_LEFT_OUT = ("tip_relaxation", "tip_micro_slip", "tip_creep_time", "joint_load_friction")
 _AFTER_FORCES = int(mujoco.mjtStage.mjSTAGE_VEL)
 
 
@@ -55,10 +58,10 @@ class Touch(Record):
     """One tip on a face, in space; vectors are the world's."""
 
     contact: TipContact
-    normal: Vector  # m, from the tip's centre into the face
-    along: Vector  # t, on the face, against the lean of the tip's axis
-    across: Vector  # m × t, which θ turns about
-    shear: Vector  # of the face against the tip [m]
+    normal: Three  # m, from the tip's centre into the face
+    along: Three  # t, on the face, against the lean of the tip's axis
+    across: Three  # m × t, which θ turns about
+    shear: Three  # of the face against the tip [m]
     shear_across: float  # [m]
 
 
@@ -122,15 +125,14 @@ def press(
         tip.travel = rates[:] = 0.0
         if tip.d > -_NEAR:
             _set_frame(touch, geometry[k])
-            for j in range(len(velocity)):
-                for i in range(3):
-                    slide = of[2, i, j] - of[0, i, j]
-                    rows[first, j] -= touch.normal[i] * slide
-                    rows[first + 1, j] += touch.across[i] * (of[3, i, j] - of[1, i, j])
-                    rows[first + 2, j] += touch.along[i] * slide
-                    rows[first + 3, j] += touch.across[i] * slide
-                for i in range(_ROWS):
-                    rates[i] += rows[first + i, j] * velocity[j]
+            for i in range(3):
+                slide = of[2, i] - of[0, i]
+                rows[first] -= touch.normal[i] * slide
+                rows[first + 1] += touch.across[i] * (of[3, i] - of[1, i])
+                rows[first + 2] += touch.along[i] * slide
+                rows[first + 3] += touch.across[i] * slide
+            for i in range(_ROWS):
+                rates[i] = (rows[first + i] * velocity).sum()
             tip.travel = max(p.step * rates[0], 0.0)
         if tip.d + tip.travel <= _LEAST:
             clear_contact(tip)
@@ -217,8 +219,8 @@ class SoftTips:
         if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
             raise SettingsError("integrator: found RK4, expected Euler, implicit or implicitfast")
         simulation = settings.simulation
-        if any(simulation.tip_relaxation) or simulation.tip_micro_slip or simulation.tip_creep_time:
-            raise SettingsError("tip_relaxation, tip_micro_slip, tip_creep_time: not in MuJoCo")
+        if found := [name for name in _LEFT_OUT if np.any(getattr(simulation, name))]:
+            raise SettingsError(f"{found[0]}: not in MuJoCo")
         self._tips = [model.geom(name).id for name in tips]
         self._touching = [model.geom(name).id for name in touching]
         for name, geom in zip(tips, self._tips, strict=True):

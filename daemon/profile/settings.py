@@ -384,6 +384,10 @@ class SimulationSettings(Section):
     joint_inertia: Factor = 0.010  # kg·m² at the joint: finger and reflected rotor
     joint_damping: NonNegative = 0.02  # N·m·s/rad
     joint_friction: NonNegative = 0.05  # N·m, Coulomb
+    joint_stribeck: NonNegative = 0.0  # N·m of friction more at rest
+    # share of the gears' torque that is friction, and so much more of it at rest
+    joint_load_friction: tuple[Fraction, Fraction] = (0.0, 0.0)
+    joint_stribeck_speed: Positive = 0.12  # rad/s over which what is more at rest falls to 1/e
     servo_heat: tuple[Factor, Factor, Factor] = (1.0, 1.0, 1.0)  # of heating, cooling, capacity
     ambient: Annotated[float, Field(ge=-40, le=80)] = 25.0  # °C around the servos
     compression_speed: NonNegative = 0.004  # m/s, presses the object on the tips; no servos only

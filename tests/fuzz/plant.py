@@ -109,7 +109,7 @@ def random_hand(generator: np.random.Generator, long: bool = False):
         "object_radius": float(generator.uniform(0.005, 0.03)),
         "object_taper": float(generator.uniform(-1, 1)),
         "object_mass": float(10 ** generator.uniform(-3, 1)),
-        "modulus_scale": modulus / float(table.data[3]),
+        "modulus_scale": modulus / float(table.header.modulus),
         "tip_friction": float(generator.uniform(0, 2)),
         "palm_friction": float(generator.uniform(0, 2)),
         "palm": float(generator.uniform(-0.05, 0.045)),
@@ -119,6 +119,8 @@ def random_hand(generator: np.random.Generator, long: bool = False):
         "tip_shear_stiffness": float(10 ** generator.uniform(-1, 1)),
         "tip_creep_time": float(generator.choice([0.0, 0.01, 1.0])),
         "tip_micro_slip": bool(generator.integers(2)),
+        "joint_stribeck": float(generator.uniform(0, 0.1)),
+        "joint_load_friction": tuple(generator.uniform(0, 0.3, 2).tolist()),
     }
     hand = make(table, **parameters)
     if long:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
+from softfinger.daemon.profile.settings import SimulationSettings, TactileSettings
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
@@ -87,3 +88,14 @@ def fisher(
 def errors(estimate: Any, truth: Any) -> np.ndarray[Any, Any]:
     """Of d, both tilts and the gain."""
     return np.array([estimate.d, estimate.tilt_x, estimate.tilt_y, estimate.gain]) - np.array(truth)
+
+
+def board(pascal_per_count: float = 1.0, **range_: int) -> TactileSettings:
+    """A board of the sensor's, of 16 bits by default."""
+    return TactileSettings(pascal_per_count=pascal_per_count, **range_)
+
+
+def flawed(**flaws: float) -> SimulationSettings:
+    """A simulated sensor without any flaw but these."""
+    named = {"noise": 0.0, **flaws}
+    return SimulationSettings(**{f"tactile_{name}": value for name, value in named.items()})

@@ -67,6 +67,25 @@ def test_quasi_static_steering_gain(degrees, gain):
     assert hand.object_pose[2] / turned == pytest.approx(gain, abs=2e-3)
 
 
+def test_load_dependent_friction_is_the_gears_efficiency():
+    # A share μ of motor's and contact's torque: (1 − μ)/(1 + μ) arrives, driven back its inverse.
+    share, rest = 0.25, 0.02  # and N·m, half of each only at rest
+    simulation = {"joint_friction": 0.5 * rest, "joint_stribeck": 0.5 * rest, "joint_damping": 0.0}
+    simulation |= {"joint_load_friction": (0.5 * share, 0.5 * share), "joint_stribeck_speed": 50.0}
+    settings = {"scene": {"fingers": ("left",)}, "simulation": simulation}
+    hand = SimulatedHand(Settings.model_validate(settings), table=PAPER)
+    hand.plant.parameters.no_load_speed, hand.plant.parameters.joint_speed = 1e9, 1e-5
+    place(hand, (0.15, 0.0), (0.0, 0.08, 0.0))
+    arrived = []
+    for amperes in (*np.linspace(0.3, 0.8, 401), *np.linspace(0.8, 0.2, 481)):
+        hand.drive(0, CURRENT, True, 0.0, amperes)
+        run(hand, 0.003)
+        arrived.append(-hand.plant.external[0])
+    driving, driven = (CONSTANT * amperes for amperes in (0.8, 0.2))
+    assert arrived[400] == pytest.approx((driving * (1 - share) - rest) / (1 + share), rel=0.02)
+    assert arrived[-1] == pytest.approx((driven * (1 + share) + rest) / (1 - share), rel=0.02)
+
+
 def test_gravity_pulls_a_free_object_and_a_grasp_holds_it():
     hand = make(gravity=(0.0, -9.80665))
     run(hand, 0.1)

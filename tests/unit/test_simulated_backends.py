@@ -55,24 +55,6 @@ class Bench:
 # Servos.
 
 
-def test_readings_are_whole_counts_of_the_configured_model():
-    bench = Bench()
-    bench.grasp(0.5, 0.1)
-    reading, hand = bench.reading, bench.hand
-    assert reading.valid
-    assert reading.t == bench.clock.now()
-    for value, true, unit in [
-        (reading.q, hand.q, COUNT),
-        (reading.dq, hand.dq, SPEED_UNIT),
-        (reading.current, hand.current, CURRENT_UNIT),
-    ]:
-        counts = np.array(value) / unit
-        np.testing.assert_allclose(counts, np.round(counts), atol=1e-9)
-        # The hand has not moved since it was read, so rounding is the only difference.
-        np.testing.assert_allclose(value, true, atol=0.5 * unit * (1 + 1e-9))
-    assert np.abs(hand.q - np.array(reading.q)).max() > 0
-
-
 def test_goals_are_whole_counts_too():
     bench = Bench()
     bench.servos.connect()

@@ -123,6 +123,9 @@ def shorten(plant: Plant, scale: float) -> None:
         now.position[j] = before.position[j] + scale * (now.position[j] - before.position[j])
     for j in range(2):
         now.shear[j] = before.shear[j] + scale * (now.shear[j] - before.shear[j])
+        layers, earlier = plant.layers[j], plant.earlier_layers[j]
+        layers[:] = earlier + scale * (layers - earlier)
+        plant.shear_variance[j] = ((layers - layers.mean()) ** 2).mean()
     for j in range(SHEARS):
         displacement = now.extra_shear[j] - before.extra_shear[j]
         now.extra_shear[j] = before.extra_shear[j] + scale * displacement

@@ -1,6 +1,6 @@
 """Contacts that only some scenes have: the object on the palm, and both tips on each other.
 
-Their rows join the step's full matrix (`solver`).
+Their rows join the step's matrix (`solver`).
 
 The palm is a plane along x. Each corner of the object, or a disc's lowest point, is on springs: one
 that is below the palm is pushed up with a viscous loss, which doesn't pull. Along the palm a second
@@ -228,8 +228,6 @@ def touch_each_other(
         return
     plant.tips_near = near
     if touching:
-        if not plant.coupled:
-            clear_extra(plant, 0, PALM_ROWS)
         plant.coupled = True
         for finger in range(2):
             tip = stage.on_tip[finger]
@@ -240,13 +238,11 @@ def touch_each_other(
                 extra.stiffness = tip.stiffness[r]
                 extra.damping = tip.damping[r]
                 extra.shear = 1 + CORNERS + finger if r == ALONG_SHEAR else 0
-    elif plant.coupled:
-        clear_extra(plant, PALM_ROWS, EXTRA_ROWS)
 
 
 @inner_kernel
-def clear_extra(plant: Plant, first: int, last: int) -> None:
-    """Take the extra rows from ``first`` to before ``last`` out of the matrix."""
-    for number in range(first, last):
+def clear_extra(plant: Plant) -> None:
+    """Take the extra rows out of the matrix."""
+    for number in range(EXTRA_ROWS):
         plant.extra[number].stiffness = 0.0
         plant.extra[number].damping = 0.0

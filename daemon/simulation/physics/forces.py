@@ -7,7 +7,11 @@ from __future__ import annotations
 
 import math
 
-from softfinger.daemon.simulation.physics.extra_contacts import touch_each_other, touch_palm
+from softfinger.daemon.simulation.physics.extra_contacts import (
+    clear_extra,
+    touch_each_other,
+    touch_palm,
+)
 from softfinger.daemon.simulation.physics.plant_state import (
     CURRENT_BASED_POSITION_MODE,
     CURRENT_MODE,
@@ -98,10 +102,27 @@ def free_object(plant: Plant, now: Motion) -> None:
 
 
 @inner_kernel
-def free_joint(plant: Plant, finger: int, q: float, rate: float) -> float:
+def joint_friction(plant: Plant, finger: int, rate: float, current: float) -> float:
+    """Return how much friction [N·m] a joint has by its motor's ``current`` and by its load.
+
+    Base, Stribeck and load terms are those identified for such servos (model M4 of Rhoban's,
+    arXiv 2410.08650), the gears' torque being |external − motor|.
+    """
+    p = plant.parameters
+    still = math.exp(-abs(rate) / p.stribeck_speed)
+    gears = abs(plant.external[finger] - p.torque_constant * current)
+    share = p.load_friction[0] + still * p.load_friction[1]
+    friction: float = p.joint_friction + still * p.stribeck + share * gears
+    return friction
+
+
+@inner_kernel
+def free_joint(plant: Plant, finger: int, now: Motion) -> float:
     """Return torque [N·m] of a joint's friction and end stops; sets its drag."""
     p = plant.parameters
-    drag = p.joint_damping + p.joint_friction / math.sqrt(rate * rate + p.joint_speed**2)
+    q, rate = now.position[finger], now.velocity[finger]
+    friction = joint_friction(plant, finger, rate, now.current[finger])
+    drag = p.joint_damping + friction / math.sqrt(rate * rate + p.joint_speed**2)
     beyond = min(q - p.stop_low[finger], 0.0) + max(q - p.stop_high[finger], 0.0)
     if beyond != 0.0:
         drag += math.sqrt(p.stop_stiffness * p.joint_inertia)
@@ -139,15 +160,16 @@ def evaluate_hand(plant: Plant, table: Pointer, now: Motion, stage: Stage, is_fi
     ny = math.sin(now.position[4])
     with_object = p.shape != NO_OBJECT
     free_object(plant, now)
-    if is_first:
+    if is_first and plant.coupled:
         plant.coupled = False
+        clear_extra(plant)
     if with_object:
         touch_palm(plant, now, stage, nx, ny, is_first)
     for finger in range(2):
-        q = now.position[finger]
-        torque = free_joint(plant, finger, q, now.velocity[finger])
+        torque = free_joint(plant, finger, now)
+        plant.external[finger] = -torque
         if p.present[finger] != 0:
-            place_finger(plant, finger, q)
+            place_finger(plant, finger, now.position[finger])
             if with_object:
                 tip = stage.on_object[finger]
                 touch_object(plant, table, tip, finger, now, nx, ny)
@@ -158,6 +180,8 @@ def evaluate_hand(plant: Plant, table: Pointer, now: Motion, stage: Stage, is_fi
         forces[finger] = torque
     if p.present[0] != 0 and p.present[1] != 0:
         touch_each_other(plant, table, now, stage, is_first)
+    for finger in range(2):
+        plant.external[finger] += forces[finger]
 
 
 @inner_kernel

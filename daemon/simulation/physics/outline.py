@@ -1,18 +1,13 @@
 """The object's outline as a tip sees it: the nearest point, and the rim of the tip's backing plate.
 
-The object is rigid and convex: a rectangle, a polygon or a disc.
+The object is rigid and convex: a polygon or a disc.
 """
 
 from __future__ import annotations
 
 import math
 
-from softfinger.daemon.simulation.physics.plant_state import (
-    POLYGON,
-    RECTANGLE,
-    Parameters,
-    TipContact,
-)
+from softfinger.daemon.simulation.physics.plant_state import DISC, Parameters, TipContact
 from softfinger.kinematics.compiled.kernel import inner_kernel
 
 FACE = -1.0  # radius of curvature that means a plane face
@@ -20,31 +15,17 @@ _SMALLEST = 1e-12  # m
 
 
 @inner_kernel
-def nearest_on_rectangle(p: Parameters, u: float, v: float) -> tuple[float, float, float, float]:
+def nearest(p: Parameters, u: float, v: float) -> tuple[float, float, float, float]:
     """Return inward direction and distance of the boundary from a point (u, v) in its frame.
 
-    The direction leads from an outer point to the nearest one of the rectangle. For a point inside
+    The direction leads from an outer point to the nearest one of the outline. For a point inside
     the distance is negative, to the nearest face, and the direction that face's inward normal. The
-    last result is the boundary's radius of curvature there: 0 on a corner, ``FACE`` on a face.
+    last result is the boundary's radius of curvature there: 0 on a corner, ``FACE`` on a face, a
+    disc's radius.
     """
-    across = max(abs(u) - p.half_width, 0.0)
-    along = max(abs(v) - p.half_height, 0.0)
-    to_left = -1.0 if u > 0.0 else 1.0
-    down = -1.0 if v > 0.0 else 1.0
-    if along == 0.0:
-        depth = abs(u) - p.half_width
-        if across == 0.0 and abs(v) - p.half_height > depth:
-            return 0.0, down, abs(v) - p.half_height, FACE
-        return to_left, 0.0, depth, FACE
-    if across == 0.0:
-        return 0.0, down, along, FACE
-    distance = math.sqrt(across * across + along * along)
-    return to_left * across / distance, down * along / distance, distance, 0.0
-
-
-@inner_kernel
-def nearest_on_polygon(p: Parameters, u: float, v: float) -> tuple[float, float, float, float]:
-    """Evaluate :func:`nearest_on_rectangle` for the edges of the outline."""
+    if p.shape == DISC:
+        away = max(math.sqrt(u * u + v * v), _SMALLEST)
+        return -u / away, -v / away, away - p.roundness, p.roundness
     best = -math.inf
     face = 0
     for k in range(p.corners):
@@ -77,19 +58,6 @@ def nearest_on_polygon(p: Parameters, u: float, v: float) -> tuple[float, float,
                     to_v = to_corner_v / length
             return to_u, to_v, distance, 0.0
     return -p.outline[face].normal_x, -p.outline[face].normal_y, best, FACE
-
-
-@inner_kernel
-def nearest(p: Parameters, u: float, v: float) -> tuple[float, float, float, float]:
-    """Evaluate :func:`nearest_on_rectangle` for any shape of the object; a disc's radius last."""
-    if p.shape == RECTANGLE:
-        found: tuple[float, float, float, float] = nearest_on_rectangle(p, u, v)
-    elif p.shape == POLYGON:
-        found = nearest_on_polygon(p, u, v)
-    else:
-        away = max(math.sqrt(u * u + v * v), _SMALLEST)
-        found = (-u / away, -v / away, away - p.roundness, p.roundness)
-    return found
 
 
 @inner_kernel

@@ -8,9 +8,9 @@ each motor are advanced by fixed sub-steps of a two-stage Rosenbrock method (ROS
 It is of second order whatever matrix A is, and L-stable where A is the Jacobian; A here holds what
 is stiff: the contacts' normal, turning and shear stiffness with their losses, end stops, friction
 at its secant, the motors' lag and the servos' loops. Of the unknowns only the five accelerations
-are coupled, and mostly the joints only through the object, so that a step costs two evaluations of
-the tips and one 3 × 3 factorisation; palm and tips on each other make it 5 × 5. Coulomb slip is a
-return of the shears into their limits at the start of a step. The energy guard has the last word.
+are coupled, so that a step costs two evaluations of the tips and one 5 × 5 factorisation. Coulomb
+slip is a return of the shears into their limits at the start of a step. The energy guard has the
+last word.
 """
 
 from __future__ import annotations
@@ -50,9 +50,7 @@ from softfinger.daemon.simulation.physics.solver import (
     add_extra_shears,
     along_row,
     factorise,
-    factorise_full,
     solve,
-    solve_full,
     take_extra_stiffness,
     take_stiffness,
 )
@@ -93,11 +91,9 @@ def load_motors(plant: Plant, now: Motion, k: Motion, g: float) -> None:
 @inner_kernel
 def finish_stage(plant: Plant, k: Motion, g: float) -> None:
     """Solve for the velocities of ``k`` and add what they bring to its other rates."""
+    solve(plant, k)
     if plant.coupled:
-        solve_full(plant, k)
         add_extra_shears(plant, k, g)
-    else:
-        solve(plant, k)
     for j in range(5):
         k.position[j] += g * k.velocity[j]
     for j in range(2):
@@ -121,11 +117,9 @@ def first_stage(plant: Plant, g: float) -> None:
         k.extra_shear[j] = stage.extra_rate[j] if plant.coupled else 0.0
     set_motor_slopes(plant, g)
     load_motors(plant, state, k, g)
+    factorise(plant, g)
     if plant.coupled:
-        factorise_full(plant, g)
         take_extra_stiffness(plant, k, g)
-    else:
-        factorise(plant, g)
     take_stiffness(plant, k, g)
     finish_stage(plant, k, g)
 
@@ -287,6 +281,7 @@ def step(plants: Records[Plant], table: FloatArray, ring: Records[Sample], count
             state.velocity[2] = (script_x(plant, t + h) - script_x(plant, t)) / h
             evaluate_state(plant, data)
         plant.earlier = plant.state
+        plant.earlier_layers[:] = plant.layers
         was_on_rim = on_rim(plant)
         first_stage(plant, g)
         go_to_second_stage(plant, h)

@@ -20,9 +20,8 @@ Flags = Annotated[NDArray[np.int64], 2]  # 0 or 1 for each finger
 
 # Shapes of the object.
 NO_OBJECT = 0
-RECTANGLE = 1
-POLYGON = 2  # convex
-DISC = 3
+POLYGON = 1  # convex
+DISC = 2
 
 # Operating modes, by the servos' own numbers.
 CURRENT_MODE = 0
@@ -119,6 +118,9 @@ class Parameters(Record):
     joint_inertia: float  # [kg·m²]
     joint_damping: float  # [N·m·s/rad]
     joint_friction: float  # [N·m]
+    stribeck: float  # more at rest [N·m]
+    load_friction: Pair  # share of the gears' torque, and more of it at rest
+    stribeck_speed: float  # over which what is more at rest falls to 1/e [rad/s]
     joint_speed: float  # below it joint friction is viscous [rad/s]
     torque_constant: float  # [N·m/A]
     electric_time: float  # lag of the current [s]
@@ -211,17 +213,6 @@ class ExtraRow(Record):
 
 
 class Factors(Record):
-    """The step's matrix, factorised, of the scene where only the tips touch the object."""
-
-    joint: Pair  # inverse pivots
-    coupling: Annotated[FloatArray, 2, 3]  # of each joint to x, y, φ
-    pivot: Three  # inverse, of the object's 3 × 3 Schur complement as L D Lᵀ
-    l10: float
-    l20: float
-    l21: float
-
-
-class Full(Record):
     """The step's matrix over all coordinates, factorised as L D Lᵀ."""
 
     inverse: Five  # pivots
@@ -249,10 +240,12 @@ class Plant(Record):
     fingers: Annotated[Records[Finger], 2]
     forces: Five  # on the coordinates, but for the motors'
     drag: Five  # friction over velocity
+    external: Pair  # contacts' torque on each joint, as last evaluated [N·m]
     load: Five  # right-hand side of the step's equations
     motor_by_q: Pair  # slopes of the motors' torques for the matrix
     motor_by_rate: Pair
     layers: Annotated[FloatArray, 2, LAYERS]  # shear of each tip's layers [m]
+    earlier_layers: Annotated[FloatArray, 2, LAYERS]  # before the step
     shear_variance: Pair  # their variance [m²]
     memory: Annotated[FloatArray, 2, 3]  # each tip's lasting force, followed by each term [N]
     firmness: Pair  # of each tip on the object, over the lasting one
@@ -261,4 +254,3 @@ class Plant(Record):
     coupled: bool  # an extra row may act in this step
     extra: Annotated[Records[ExtraRow], EXTRA_ROWS]
     factors: Factors
-    full: Full

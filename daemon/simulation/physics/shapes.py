@@ -15,7 +15,6 @@ from softfinger.daemon.simulation.physics.plant_state import (
     DISC,
     NO_OBJECT,
     POLYGON,
-    RECTANGLE,
 )
 
 FloatArray = NDArray[np.float64]
@@ -96,7 +95,7 @@ def polygon(corners: ArrayLike, kind: int = POLYGON) -> Shape:
 
 def rectangle(simulation: SimulationSettings) -> Shape:
     """Return a box of the settings' width and height."""
-    return polygon(_trapezoid(simulation, 0.0), RECTANGLE)
+    return polygon(_trapezoid(simulation, 0.0))
 
 
 def wedge(simulation: SimulationSettings) -> Shape:

@@ -156,6 +156,9 @@ def _joints(p: Parameters, settings: Settings) -> None:
     p.joint_inertia = inertia
     p.joint_damping = simulation.joint_damping
     p.joint_friction = simulation.joint_friction
+    p.stribeck = simulation.joint_stribeck
+    p.load_friction[:] = simulation.joint_load_friction
+    p.stribeck_speed = simulation.joint_stribeck_speed
     p.joint_speed = JOINT_SPEED
     p.torque_constant = constant
     p.electric_time = ELECTRIC_TIME

@@ -15,12 +15,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from softfinger.daemon.profile.settings import SimulationSettings
+from softfinger.daemon.profile.settings import SimulationSettings, TactileSettings
 from softfinger.daemon.simulation.measurement_faults import MeasurementFaults
 from softfinger.kinematics.compiled.kernel import kernel
 from softfinger.kinematics.compiled.layout import Record, Records
@@ -125,85 +125,11 @@ def render_curved(contacts: Records[CurvedContact], law: FloatArray, out: FloatA
             out[i, j] = weight * total
 
 
-@dataclass(frozen=True, slots=True)
-class Imperfections:
-    """A sensor's imperfections; the default has none.
-
-    - ``noise`` [Pa]: a cell's standard deviation from frame to frame.
-    - ``gain_spread``: standard deviation of the cells' sensitivities round 1.
-    - ``dead``: share of cells that always read 0 and that no setting names.
-    - ``blur`` [m]: the elastomer spreads a point's pressure, standard deviation.
-    - ``hysteresis``: a cell being unloaded reads up to this share more than when it was loaded.
-    - ``creep``, ``creep_time`` [s]: a cell's reading rises by this share under a lasting pressure.
-    - ``response`` [s]: a cell's reading follows the pressure with a first-order lag.
-    - ``exponent``: a cell reads p^exponent, right at the board's full scale.
-    - ``fold`` [Pa]: above it a cell reads fold²/p, the less the harder it is pressed; 0: never.
-    - ``crosstalk``: each cell reads this share of its row's and of its column's mean too much.
-    - ``row_noise`` [Pa]: standard deviation from frame to frame of what a row's cells share.
-    - ``drift`` [Pa], ``gain_drift``, ``drift_time`` [s]: how far each cell's zero, and the gain of
-      all cells together, drift over such a time, as with the room's temperature.
-
-    Raises ValueError for values out of their range.
-    """
-
-    noise: float = 0.0
-    gain_spread: float = 0.0
-    dead: float = 0.0
-    blur: float = 0.0
-    hysteresis: float = 0.0
-    creep: float = 0.0
-    creep_time: float = 10.0
-    response: float = 0.0
-    exponent: float = 1.0
-    fold: float = 0.0
-    crosstalk: float = 0.0
-    row_noise: float = 0.0
-    drift: float = 0.0
-    gain_drift: float = 0.0
-    drift_time: float = 60.0
-
-    def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if not 0.0 <= value < math.inf:
-                raise ValueError(f"{field.name} must not be negative, got {value}")
-        if self.dead > 1.0:
-            raise ValueError(f"dead must be a share of the cells, got {self.dead}")
-        for name in ("creep_time", "exponent", "drift_time"):
-            if not getattr(self, name) > 0.0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
-
-    @classmethod
-    def of(cls, simulation: SimulationSettings) -> Imperfections:
-        """Return the imperfections of the settings."""
-        values = simulation.model_dump()
-        return cls(**{each.name: values[f"tactile_{each.name}"] for each in fields(cls)})
-
-
-@dataclass(frozen=True, slots=True)
-class Board:
-    """Range of a board: the pressure of a count, the largest one, the smallest that is sent.
-
-    Below ``threshold`` it sends 0. Raises ValueError for values out of their range.
-    """
-
-    pascal_per_count: float
-    full_count: int = 65535  # 255 for 8 bits
-    threshold: int = 0
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.full_count <= 65535:
-            raise ValueError(f"full_count must be 1 … 65535, got {self.full_count}")
-        if not 0.0 < self.pascal_per_count < math.inf:
-            raise ValueError(f"pascal_per_count must be positive, got {self.pascal_per_count}")
-
-
 class SensorModel:
-    """A pressure sensor under one simulated tip.
+    """A pressure sensor under one simulated tip: the board's range, and what is imperfect.
 
     ``gain`` is what it reads over the material's pressure, and ``dead`` has the cells (row, col)
-    that always read 0. Two models of equal arguments and calls give equal frames. Raises ValueError
-    for arguments out of their range.
+    that always read 0. Two models of equal arguments and calls give equal frames.
     """
 
     def __init__(
@@ -211,47 +137,49 @@ class SensorModel:
         grid: SensorGrid,
         tip: Fingertip,
         material: Material,
-        board: Board,
-        flaws: Imperfections | None = None,
+        board: TactileSettings,
+        flaws: SimulationSettings,
         *,
         seed: int | Sequence[int] = 0,
         gain: float = 1.0,
         dead: Sequence[tuple[int, int]] = (),
     ) -> None:
-        if not 0.0 < gain < math.inf:
-            raise ValueError(f"gain must be positive, got {gain}")
         self.grid = grid
-        self._flaws = flaws = flaws or Imperfections()
+        self._flaws = flaws
         self._per_count = board.pascal_per_count
         self._law = material.law
         self._ends = (board.threshold, board.full_count)
         self._generator = np.random.Generator(np.random.SFC64(seed))
         shape = grid.shape
         deviations = self._generator.standard_normal(shape)
-        sensitivity = gain * np.maximum(1.0 + flaws.gain_spread * deviations, 0.0) / self._per_count
+        sensitivity = (
+            gain * np.maximum(1.0 + flaws.tactile_gain_spread * deviations, 0.0) / self._per_count
+        )
         for row, col in dead:
             sensitivity[row, col] = 0.0
-        if flaws.dead > 0.0:
-            sensitivity[self._generator.random(shape) < flaws.dead] = 0.0
+        if flaws.tactile_dead > 0.0:
+            sensitivity[self._generator.random(shape) < flaws.tactile_dead] = 0.0
         self._sensitivity = sensitivity
         self._pressure = self._rendered = np.zeros(shape)
         cells = grid
-        if flaws.blur > 0.0:
-            n_x, n_y = (min(blur_pieces(flaws.blur / pitch), _PIECES_MAX) for pitch in grid.pitches)
+        if flaws.tactile_blur > 0.0:
+            n_x, n_y = (
+                min(blur_pieces(flaws.tactile_blur / pitch), _PIECES_MAX) for pitch in grid.pitches
+            )
             self._pieces = n_x, n_y
-            self._stencils, cells = replace(grid, blur=flaws.blur).finer(self._pieces)
+            self._stencils, cells = replace(grid, blur=flaws.tactile_blur).finer(self._pieces)
             self._rendered = np.zeros(cells.shape)
         self._columns = np.empty((cells.cols + 1, 2))
         self._solid: SolidPressure | None = None
         if tip.physics == "solid":
-            blurred = replace(grid, blur=flaws.blur)
+            blurred = replace(grid, blur=flaws.tactile_blur)
             self._solid = SolidPressure(tip, material, blurred.images(tip))
         self._plane, self._curved = Rendering(), CurvedContact()
         for contact in (self._plane, self._curved):
             contact.grid.assign(cells.on(tip))
         self._plane.gain = 1.0
         self._curved.across_x, self._curved.across_y = grid.to_sensor(1.0, 0.0)
-        self._plays = np.zeros((PLAYS if flaws.hysteresis > 0.0 else 0, *shape))
+        self._plays = np.zeros((PLAYS if flaws.tactile_hysteresis > 0.0 else 0, *shape))
         self._creep_lag, self._response_lag = np.zeros((2, 2, *shape))
         self._offset = np.zeros(shape)  # counts
         self._warmer = np.zeros(1)  # the gain's excess
@@ -270,7 +198,11 @@ class SensorModel:
     def remembers(self) -> bool:
         """True if readings depend on earlier contacts, not on the present one alone."""
         flaws = self._flaws
-        return flaws.hysteresis > 0.0 or flaws.creep > 0.0 or flaws.response > 0.0
+        return (
+            flaws.tactile_hysteresis > 0.0
+            or flaws.tactile_creep > 0.0
+            or flaws.tactile_response > 0.0
+        )
 
     def frame(
         self,
@@ -323,21 +255,23 @@ class SensorModel:
                 render(self._plane.array, self._law, self._columns, self._rendered)
             if fraction != 1.0:
                 self._rendered *= fraction
-            if flaws.blur > 0.0:
+            if flaws.tactile_blur > 0.0:
                 pressure[:] = average(self._rendered, *self._stencils, self._pieces)
-        if flaws.hysteresis > 0.0:
-            hysteresis(pressure, flaws.hysteresis, self._plays)
-        if flaws.creep > 0.0:
-            pressure += flaws.creep * lag(pressure, flaws.creep_time, elapsed, self._creep_lag)
-        if flaws.response > 0.0:
-            pressure[:] = lag(pressure, flaws.response, elapsed, self._response_lag)
-        if flaws.drift > 0.0:
+        if flaws.tactile_hysteresis > 0.0:
+            hysteresis(pressure, flaws.tactile_hysteresis, self._plays)
+        if flaws.tactile_creep > 0.0:
+            pressure += flaws.tactile_creep * lag(
+                pressure, flaws.tactile_creep_time, elapsed, self._creep_lag
+            )
+        if flaws.tactile_response > 0.0:
+            pressure[:] = lag(pressure, flaws.tactile_response, elapsed, self._response_lag)
+        if flaws.tactile_drift > 0.0:
             self._generator.standard_normal(out=self._normals)
-            deviation = flaws.drift / self._per_count
-            drift(self._offset, deviation, flaws.drift_time, elapsed, self._normals)
-        if flaws.gain_drift > 0.0:
+            deviation = flaws.tactile_drift / self._per_count
+            drift(self._offset, deviation, flaws.tactile_drift_time, elapsed, self._normals)
+        if flaws.tactile_gain_drift > 0.0:
             normal = self._generator.standard_normal(1)
-            drift(self._warmer, flaws.gain_drift, flaws.drift_time, elapsed, normal)
+            drift(self._warmer, flaws.tactile_gain_drift, flaws.tactile_drift_time, elapsed, normal)
 
     def press_evenly(self, pressure: float) -> None:
         """Let all cells feel this pressure [Pa], as under a bladder, in the last press' place."""
@@ -349,28 +283,30 @@ class SensorModel:
         """Write the counts of what the cells feel into ``out``, with ``faults`` as at ``t`` [s]."""
         flaws = self._flaws
         felt = self._pressure
-        if flaws.exponent != 1.0 or flaws.fold > 0.0:
-            felt = curve(felt, flaws.exponent, self._full_scale, flaws.fold)
+        if flaws.tactile_exponent != 1.0 or flaws.tactile_fold > 0.0:
+            felt = curve(felt, flaws.tactile_exponent, self._full_scale, flaws.tactile_fold)
         np.multiply(felt, self._sensitivity, out=self._signal)
-        if flaws.gain_drift > 0.0:
+        if flaws.tactile_gain_drift > 0.0:
             self._signal *= np.maximum(1.0 + self._warmer, 0.0)
         if faults is not None:
             faults.apply(self._signal, self._ends[1], t)
-        if flaws.crosstalk > 0.0:
-            crosstalk(self._signal, flaws.crosstalk, *self._lines)
-        if flaws.row_noise > 0.0:
+        if flaws.tactile_crosstalk > 0.0:
+            crosstalk(self._signal, flaws.tactile_crosstalk, *self._lines)
+        if flaws.tactile_row_noise > 0.0:
             rows = self._lines[0]
-            if not flaws.crosstalk > 0.0:
+            if not flaws.tactile_crosstalk > 0.0:
                 rows[:] = 0.0
-            rows += self._generator.normal(0.0, flaws.row_noise / self._per_count, rows.shape)
-        if flaws.noise > 0.0:
+            rows += self._generator.normal(
+                0.0, flaws.tactile_row_noise / self._per_count, rows.shape
+            )
+        if flaws.tactile_noise > 0.0:
             self._generator.standard_normal(out=self._normals)
         count(
             self._signal,
             self._offset,
             self._lines,
             self._sensitivity,
-            flaws.noise / self._per_count,
+            flaws.tactile_noise / self._per_count,
             self._normals,
             self._ends,
             out,

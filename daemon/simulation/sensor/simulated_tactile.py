@@ -16,7 +16,7 @@ from softfinger.daemon.profile.factory import make_grid, make_material, make_tip
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.measurement_faults import LONGEST_REPLAY
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
-from softfinger.daemon.simulation.sensor.sensor_model import Board, Imperfections, SensorModel
+from softfinger.daemon.simulation.sensor.sensor_model import SensorModel
 from softfinger.daemon.types import Frame
 
 
@@ -27,8 +27,8 @@ def make_sensor_model(settings: Settings, finger: int) -> SensorModel:
         make_grid(settings, finger),
         make_tip(settings),
         make_material(settings.material),
-        Board(tactile.pascal_per_count, tactile.full_count, tactile.threshold),
-        Imperfections.of(simulation),
+        tactile,
+        simulation,
         seed=(simulation.seed, finger),
         gain=simulation.modulus_scale * simulation.tactile_gain[finger],
         dead=tactile.dead[finger],
