@@ -1,9 +1,7 @@
 """Stress-strain laws of the tip's material, and nothing of its shape.
 
 A law σ(ε) is one polynomial on strain ε ∈ [0, 1] with σ(0) = 0 and a positive slope everywhere, so
-it is smooth and monotone, and every integral over it converges fast. Kernels see it as tables of
-polynomial pieces; where the degree is high the same polynomial is expanded about several points,
-since monomials of high degree lose digits.
+it is smooth and monotone, and every integral over it converges fast.
 """
 
 from __future__ import annotations
@@ -31,31 +29,24 @@ TABLE_I_MAXIMUM = 0.304e6
 # of its own: c_1, c_2, … [Pa], exact.
 _TABLE_I = "135000 0 610000/9 4671875/12 -3015625/3 14453125/18 -4296875/21"
 
-_PIECE_DEGREE = 8  # up to here one expansion about 0 keeps all digits
-_PIECES = 8
-
 
 @inner_kernel
 def stress_at(law: FloatArray, strain: float) -> float:
-    """Return σ(ε) [Pa] of ``law`` [pieces, order]; 0 for ε ≤ 0, continued linearly beyond ε = 1."""
+    """Return σ(ε) [Pa] of ``law`` [order]; 0 for ε ≤ 0, continued linearly beyond ε = 1."""
     if strain <= 0.0:
         return 0.0
-    pieces, order = law.shape
+    order = law.shape[0]
     if not strain < 1.0:
-        # Value and slope at the end of the last piece, u = 1 there.
         value: float = 0.0
         slope: float = 0.0
         for j in range(order):
-            value += law[pieces - 1, j]
-            slope += j * law[pieces - 1, j]
-        more: float = pieces * (strain - 1.0)
+            value += law[j]
+            slope += j * law[j]
+        more: float = strain - 1.0
         return value + more * slope
-    u = strain * pieces
-    k = int(u)
-    u -= k
-    result: float = law[k, order - 1]
+    result: float = law[order - 1]
     for j in range(order - 2, -1, -1):
-        result = result * u + law[k, j]
+        result = result * strain + law[j]
     return result
 
 
@@ -80,8 +71,8 @@ class Material:
             raise MaterialError("the law needs a positive modulus at zero strain")
         object.__setattr__(self, "coefficients", c)
         stress = (Fraction(0), *c)
-        object.__setattr__(self, "law", self._expand(stress))
-        object.__setattr__(self, "energy_law", self._expand(_integral(stress)))
+        object.__setattr__(self, "law", _floats(stress))
+        object.__setattr__(self, "energy_law", _floats(_integral(stress)))
         slope = np.polynomial.polynomial.polyval(
             np.linspace(0.0, 1.0, 513), [float(j * value) for j, value in enumerate(c, 1)]
         )
@@ -176,7 +167,7 @@ class Material:
         return _evaluate(self.energy_law, strain, 2)
 
     def expansions(self) -> FloatArray:
-        """Expand the law over E₀ for the quadrature: float64 [7, pieces, order].
+        """Expand the law over E₀ for the quadrature: float64 [7, order].
 
         With S = σ/ε, W = 2w/ε², T = dσ/dε, each 1 at ε = 0, and X_1 = (X − X(0))/ε,
         X_2 = (X_1 − X_1(0))/ε: the rows are S_1, W_1, T_1, S_2, S_2′, T_2, T_2′. They are
@@ -192,35 +183,19 @@ class Material:
             rows.append(second)
             rows.append([value * j for j, value in enumerate(second)][1:] or [Fraction(0)])
         order = max(len(row) for row in rows)
-        return np.stack([self._expand([*row, *[Fraction(0)] * (order - len(row))]) for row in rows])
-
-    def _expand(self, polynomial: Sequence[Fraction]) -> FloatArray:
-        """Expand a polynomial in ε about the pieces' starts, in u = ε·pieces − k; exactly."""
-        pieces = 1 if self.degree <= _PIECE_DEGREE else _PIECES
-        table = np.empty((pieces, len(polynomial)))
-        for k in range(pieces):
-            shifted = _shift(polynomial, Fraction(k, pieces))
-            table[k] = [float(value / pieces**j) for j, value in enumerate(shifted)]
-        return table
+        return np.stack([_floats([*row, *[Fraction(0)] * (order - len(row))]) for row in rows])
 
 
 def _evaluate(law: FloatArray, strain: ArrayLike, order: int) -> FloatArray:
-    """The pieces of ``law`` at ``strain``; 0 below 0, beyond 1 Taylor's series to ``order``."""
+    """``law`` at ``strain``; 0 below 0, beyond 1 Taylor's series to ``order``."""
     x = np.asarray(strain, dtype=np.float64)
-    pieces = len(law)
-    u = np.clip(x, 0.0, 1.0) * pieces
-    if pieces == 1:
-        terms = law[0]
-    else:
-        k = np.minimum(np.nan_to_num(u), pieces - 1).astype(np.intp)
-        u = u - k
-        terms = np.moveaxis(law[k], -1, 0)
-    value = terms[-1]
-    for term in terms[-2::-1]:
+    u = np.clip(x, 0.0, 1.0)
+    value = law[-1]
+    for term in law[-2::-1]:
         value = value * u + term
     if (x > 1.0).any():
-        beyond = np.maximum(x - 1.0, 0.0) * pieces
-        last = np.polynomial.Polynomial(law[-1])
+        beyond = np.maximum(x - 1.0, 0.0)
+        last = np.polynomial.Polynomial(law)
         for n in range(1, order + 1):
             value = value + last.deriv(n)(1.0) / math.factorial(n) * beyond**n
     return np.asarray(np.where(x <= 0.0, 0.0, value))
@@ -230,10 +205,5 @@ def _integral(polynomial: Sequence[Fraction]) -> list[Fraction]:
     return [Fraction(0), *(value / (j + 1) for j, value in enumerate(polynomial))]
 
 
-def _shift(polynomial: Sequence[Fraction], start: Fraction) -> list[Fraction]:
-    """Coefficients of p(start + x) in x, by repeated synthetic division."""
-    work = list(polynomial)
-    for first in range(len(work)):
-        for j in range(len(work) - 2, first - 1, -1):
-            work[j] += start * work[j + 1]
-    return work
+def _floats(polynomial: Sequence[Fraction]) -> FloatArray:
+    return np.array([float(value) for value in polynomial])

@@ -57,11 +57,11 @@ def nodes_for(degree: int) -> int:
 
 
 @inner_kernel
-def _horner(table: FloatArray, row: int, piece: int, u: float) -> float:
-    order = table.shape[2]
-    value: float = table[row, piece, order - 1]
+def _horner(table: FloatArray, row: int, u: float) -> float:
+    order = table.shape[1]
+    value: float = table[row, order - 1]
     for j in range(order - 2, -1, -1):
-        value = value * u + table[row, piece, j]
+        value = value * u + table[row, j]
     return value
 
 
@@ -103,9 +103,8 @@ def ratios(
         c = math.sqrt(delta * (1.0 + h))
     y1 = math.sqrt(c * c / (1.0 + s))
     span = delta / (y0 + y1)  # y1 − y0
-    pieces = polynomials.shape[1]
-    first_s = polynomials[0, 0, 0]
-    first_t = polynomials[2, 0, 0]
+    first_s = polynomials[0, 0]
+    first_t = polynomials[2, 0]
     count = circle.shape[1]
     nodes = gauss.shape[1]
     # Poles lie at y = 0, unless y0 = 0, and at y² = −2 sin θ; there are none when h = 0.
@@ -139,15 +138,13 @@ def ratios(
             a_t2 = 0.0
             for j in range(count):
                 strain = mean + amplitude * circle[0, j]
-                u = min(max(strain, 0.0), 1.0) * pieces
-                k = min(int(u), pieces - 1)
-                u -= k
-                a_s1 += _horner(polynomials, 0, k, u)
-                a_w1 += _horner(polynomials, 1, k, u)
-                a_t1 += _horner(polynomials, 2, k, u)
+                u = min(max(strain, 0.0), 1.0)
+                a_s1 += _horner(polynomials, 0, u)
+                a_w1 += _horner(polynomials, 1, u)
+                a_t1 += _horner(polynomials, 2, u)
                 curvature = circle[1, j] * t * q / p2
-                a_s2 += _horner(polynomials, 3, k, u) + curvature * _horner(polynomials, 4, k, u)
-                a_t2 += _horner(polynomials, 5, k, u) + curvature * _horner(polynomials, 6, k, u)
+                a_s2 += _horner(polynomials, 3, u) + curvature * _horner(polynomials, 4, u)
+                a_t2 += _horner(polynomials, 5, u) + curvature * _horner(polynomials, 6, u)
             a_s1 /= count
             a_w1 /= count
             a_t1 /= count

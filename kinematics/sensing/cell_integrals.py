@@ -15,7 +15,6 @@ import numpy as np
 
 from softfinger.kinematics.compiled.kernel import fast_inner_kernel, inner_kernel
 from softfinger.kinematics.compiled.layout import Record
-from softfinger.kinematics.contact.material import stress_at
 from softfinger.kinematics.sensing.footprint import (
     GAUSS_NODES,
     GAUSS_WEIGHTS,
@@ -145,11 +144,7 @@ def _polynomial(nodes: Nodes, coefficients: FloatArray) -> None:
 def evaluate(nodes: Nodes, face: Face, a: float, law: FloatArray) -> None:
     """Evaluate strain, at most 1, and stress at the nodes, in SIMD lanes."""
     _strains(nodes, face, a)
-    if law.shape[0] == 1:
-        _polynomial(nodes, law[0])
-    else:
-        for k in range(nodes.count):
-            nodes.stress[k] = stress_at(law, nodes.strain[k])
+    _polynomial(nodes, law)
 
 
 @inner_kernel

@@ -25,7 +25,7 @@ STRAIN = np.linspace(0.0, 1.0, 201)
 
 
 def laws() -> list[Material]:
-    """One of each kind, the last with several expansion pieces."""
+    """One of each kind, the last of a high degree."""
     x = np.linspace(0.0, 0.8, 30)
     return [
         Material.constant(0.304e6),
@@ -39,7 +39,7 @@ def test_constant_modulus() -> None:
     material = Material.constant(0.304e6)
     np.testing.assert_allclose(material.stress(STRAIN), 0.304e6 * STRAIN, rtol=1e-15)
     np.testing.assert_allclose(material.energy_density(STRAIN), 0.152e6 * STRAIN**2, rtol=1e-15)
-    np.testing.assert_array_equal(material.law, [[0.0, 0.304e6]])
+    np.testing.assert_array_equal(material.law, [0.0, 0.304e6])
     assert material.is_linear
     for modulus in (0.0, -1.0, math.nan, math.inf):
         with pytest.raises(MaterialError, match="positive"):
@@ -50,7 +50,6 @@ def test_table_i_has_the_papers_slopes() -> None:
     material = Material.table_i()
     assert material.reference_modulus == 0.135e6
     assert not material.is_linear
-    assert material.law.shape[0] == 1
     for tenths, modulus in zip(range(0, 12, 2), TABLE_I_MODULUS, strict=True):
         terms = enumerate(material.coefficients)
         assert sum((j + 1) * c * Fraction(tenths, 10) ** j for j, c in terms) == modulus
@@ -72,12 +71,12 @@ def test_a_law_is_smooth_rising_and_consistent(index: int) -> None:
     inner = STRAIN[:-1, None] + 0.5 * (points + 1) * np.diff(STRAIN)[:, None]
     parts = 0.5 * np.diff(STRAIN) * (material.stress(inner) * weights).sum(axis=1)
     np.testing.assert_allclose(energy[1:], np.cumsum(parts), rtol=1e-12)
-    # The exact polynomial, in plain arithmetic, is what the pieces hold.
+    # The exact polynomial, in plain arithmetic.
     powers = [float(c) for c in material.coefficients]
     for strain in (1e-9, 0.124999, 0.125, 0.3, 0.75, 1.0 - 1e-12):
         exact = math.fsum(c * strain**j for j, c in enumerate(powers, 1))
         scale = math.fsum(abs(c) * strain**j for j, c in enumerate(powers, 1))
-        assert abs(stress_at(material.law, strain) - exact) <= 1e-15 * scale + 1e-15 * exact
+        assert abs(stress_at(material.law, strain) - exact) <= 3e-15 * scale
 
 
 @pytest.mark.parametrize("index", range(4))
@@ -85,7 +84,7 @@ def test_outside_zero_to_one(index: int) -> None:
     material = laws()[index]
     for strain in (0.3, 1.0, 1.7):
         np.testing.assert_allclose(
-            stress_at(material.law, strain), material.stress(strain), rtol=1e-14
+            stress_at(material.law, strain), material.stress(strain), rtol=3e-14
         )
     for strain in (0.0, -0.0, -0.3, -math.inf):
         assert stress_at(material.law, strain) == material.stress(strain) == 0.0
