@@ -30,6 +30,7 @@ from softfinger.daemon.simulation.physics.plant_state import (
 from softfinger.daemon.simulation.physics.shapes import shape_of
 from softfinger.daemon.simulation.servo_model.servo_heat import ServoHeat
 from softfinger.daemon.types import FINGERS
+from softfinger.kinematics.contact.lookup import LOWEST
 from softfinger.kinematics.contact.table import ContactTable
 from softfinger.kinematics.hand.geometry import HandGeometry
 
@@ -81,7 +82,7 @@ def stiff_step(settings: Settings, table: ContactTable) -> float:
 
 def _deepest(settings: Settings, table: ContactTable) -> float:
     """d [m] up to which the tips' law holds."""
-    return float(table.header.deepest) if table.is_solid else settings.tip.radius
+    return float(table.header.deepest if table.is_solid else (1.0 - LOWEST) * settings.tip.radius)
 
 
 def set_parameters(p: Parameters, settings: Settings, table: ContactTable, step: float) -> None:
