@@ -9,6 +9,7 @@ compiled anew.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import platform
@@ -129,8 +130,9 @@ def is_marked(folder: OwnFolder, part: str) -> bool:
 
 
 def mark(folder: OwnFolder, part: str) -> None:
-    """Mark the kernels of ``part`` as compiled. Raises OSError."""
-    folder.write(part + _MARK, b"")
+    """Mark the kernels of ``part`` as compiled; where that fails they are looked for anew."""
+    with contextlib.suppress(OSError):  # another process may have pruned the folder meanwhile
+        folder.write(part + _MARK, b"")
 
 
 def _prune(base: Path, current: Path) -> None:
