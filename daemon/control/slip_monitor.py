@@ -61,6 +61,7 @@ _LEARN = 1.0  # s in which the friction at rest is learnt
 _HOLD_TIME = 1.0  # s that a raised grip is kept after the need for it has gone
 _BACK = 2.0  # s in which it then comes back by all of `grip_raise_max`
 _TURNED_MORE = 0.5  # fraction that the grip is raised by when the object turns in it
+_EACH = 0.15  # of such turning: each tip must show so much
 _WELL = 1.5  # times what the tips' shear explains: the object turns in the grip
 _FORGET = 2.0  # s in which turning that no joint explains is forgotten: warmth, creep
 _JUMP_MIN = 0.01  # N·m of a jump, besides
@@ -104,8 +105,8 @@ class SlipState(Record):
     speed: Pair  # of the joints, averaged [rad/s]
     felt: float  # the load that solid tips feel, averaged [N]
     age: float  # since holding began, up to `_LEARN` [s]
-    unexplained_rotation: float  # sum of unexplained turning that has been looked at [rad]
-    away: float  # unexplained turning that is not forgotten yet [rad]
+    unexplained_rotation: Pair  # sums of unexplained turning that have been looked at [rad]
+    away: Pair  # unexplained turning that is not forgotten yet, as each tip shows it [rad]
     needed: float  # force for the margin, kept for a while [N]
     force_limit: float  # that the grip may be raised to [N]
     idle: float  # since that was needed [s]
@@ -130,7 +131,8 @@ def forget(s: SlipState) -> None:
     s.turned = s.known = s.reflex = False
     s.load = s.felt = s.still = s.age = 0.0
     s.smooth[:] = s.variance[:] = s.speed[:] = 0.0
-    s.unexplained_rotation = s.away = s.needed = s.force_limit = s.idle = 0.0
+    s.unexplained_rotation[:] = s.away[:] = 0.0
+    s.needed = s.force_limit = s.idle = 0.0
 
 
 @inner_kernel
@@ -141,8 +143,8 @@ def begin(s: SlipState, grasp: GraspState) -> None:
         return
     friction = s.law.joint_friction
     s.still = min(max(mean(s.smooth), -friction), friction)
-    s.unexplained_rotation = grasp.unexplained_rotation
-    s.away = 0.0
+    s.unexplained_rotation[:] = grasp.unexplained_rotation
+    s.away[:] = 0.0
     s.age = _SMOOTH
 
 
@@ -167,7 +169,7 @@ def update(
         _estimate_load(s, grasp)
         _watch_turning(s, grasp)
     else:
-        s.unexplained_rotation = grasp.unexplained_rotation
+        s.unexplained_rotation[:] = grasp.unexplained_rotation
     # A grip that bears less than the joints' friction hides is not judged by their torques.
     seen = s.load if law.friction * commanded * grasp.load_arm > law.joint_friction else 0.0
     felt = max(abs(grasp.sheared) - grasp.shear * mean(grasp.normal), 0.0)
@@ -283,14 +285,21 @@ def _alike(s: SlipState) -> float:
 
 @inner_kernel
 def _watch_turning(s: SlipState, grasp: GraspState) -> None:
-    """Look for turning beyond what the tips' shear explains."""
-    s.away += grasp.unexplained_rotation - s.unexplained_rotation - s.away * s.law.dt / _FORGET
-    s.unexplained_rotation = grasp.unexplained_rotation
+    """Look for turning beyond what the tips' shear explains, and that both tips show.
+
+    One that shows the contrary of the other, or next to nothing of it, is a faulty witness.
+    """
+    for k in range(2):
+        s.away[k] += grasp.unexplained_rotation[k] - s.unexplained_rotation[k]
+        s.away[k] -= s.away[k] * s.law.dt / _FORGET
+        s.unexplained_rotation[k] = grasp.unexplained_rotation[k]
+    away = s.away[0] + s.away[1]
     depth = grasp.d[0] + grasp.d[1]
     sheared = 0.5 * s.law.friction * depth / s.law.width
-    if abs(s.away) > _WELL * sheared + _SIGNS * grasp.angle_std:
+    alike = min(s.away[0] * away, s.away[1] * away) > _EACH * away * away
+    if alike and abs(away) > _WELL * sheared + _SIGNS * grasp.angle_std:
         s.turned = True
-        s.away = 0.0
+        s.away[:] = 0.0
 
 
 @inner_kernel

@@ -116,7 +116,7 @@ class GraspState(Record):
     force: Pair  # of the tips, their moduli's scale times their tables' [N]
     angle_std: float  # standard deviation of the object's angle [rad]
     taper: float  # α between the object's faces, as both tips feel them [rad]
-    unexplained_rotation: float  # of the object, by no joint, summed [rad]
+    unexplained_rotation: Pair  # of the object, by no joint, summed, as each tip shows it [rad]
     turning: float  # ∂U/∂θ over F θ d of the tips, upright: set once
     q: Pair  # tracked joints [rad]
     moment_arm: Pair  # ∂(d1 + d2)/∂q [m]
@@ -169,7 +169,7 @@ class FilterState(Record):
     taper: float  # α as found [rad]
     taper_variance: float
     taper_covariance: float  # with φ
-    unexplained_rotation: float  # sum of what frames have corrected of φ [rad]
+    unexplained_rotation: Pair  # sum of what each tip's frames have corrected of φ [rad]
     grasp: GraspState
 
 
@@ -576,7 +576,7 @@ def update(
     f.grasp.witnesses.corrected[finger] += tip.d.mean - before_it
     predicted = f.angle.mean
     _update_angle(f, sense, angle_since, angle, angle_variance)
-    f.unexplained_rotation += f.angle.mean - predicted
+    f.unexplained_rotation[finger] += f.angle.mean - predicted
     return True
 
 
@@ -694,7 +694,7 @@ def write_grasp(
     grasp.t = f.t
     grasp.angle_std = math.sqrt(_variance(f.angle, f.count))
     grasp.taper = taper
-    grasp.unexplained_rotation = f.unexplained_rotation
+    grasp.unexplained_rotation[:] = f.unexplained_rotation
     arm1, arm2, turn1, turn2, grasp.jacobian_slide, width, _ = motion
     grasp.moment_arm[0] = arm1
     grasp.moment_arm[1] = arm2

@@ -197,6 +197,18 @@ def test_what_one_joint_alone_shows_is_no_sudden_load() -> None:
             assert not watched.grip.slip.reflex
 
 
+@pytest.mark.parametrize(
+    ("shown", "raised"), [((0.3, 0.3), True), ((0.6, 0.0), False), ((0.6, -0.2), False)]
+)
+def test_a_turn_that_one_tip_alone_shows_is_not_believed(
+    shown: tuple[float, float], raised: bool
+) -> None:
+    """Its image is mirrored or has shifted."""
+    watched = at_rest()
+    watched.held.unexplained_rotation = list(shown)
+    assert (watched.run(0.0, 1) > FORCE) == raised
+
+
 @pytest.mark.parametrize("force", [5.0, 10.0])
 def test_noise_of_the_currents_is_no_load_and_a_load_in_it_is(force: float) -> None:
     """30 mA on each, for a minute; a load towards the palm is the hardest to see."""
