@@ -149,7 +149,6 @@ def test_links_that_lead_elsewhere_by_now_are_left_alone(tmp_path):
         (["--ids", "1"], 2, "expected two IDs of 0 to 252"),
         (["--ids", "1,253"], 2, "expected two IDs of 0 to 252"),
         (["--ids", "1,x"], 2, "expected two IDs of 0 to 252"),
-        (["--latency", "-1"], 2, "expected 0 to 255 ms"),
     ],
 )
 def test_what_cannot_be_emulated_is_told_in_one_line(tmp_path, inline, options, status, told):

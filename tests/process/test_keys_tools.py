@@ -81,7 +81,7 @@ def test_tools_with_keys_see_and_command_the_hand(guarded, tmp_path, inline):
         told = inline("send", "status", "--address", commands, *alice, "--timeout", "60")
         assert json.loads(told.stdout)["torque"] is True
     where = ("--address", f"{stream},{commands}")
-    until_it_says(("monitor", "--plain", *where, *alice), " armed  left")
+    until_it_says(("monitor", "--plain", *where, *alice), " armed")
 
     async def session() -> str:
         async with AsyncHand(*addresses, keys=folder / "alice", timeout=60.0) as hand:
