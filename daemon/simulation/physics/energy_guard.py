@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 
-from softfinger.daemon.simulation.physics.plant_state import SHEARS, Plant
+from softfinger.daemon.simulation.physics.plant_state import LAYERS, SHEARS, Plant
 from softfinger.kinematics.compiled.kernel import inner_kernel
 
 LOSSLESS_TOLERANCE = 1e-3  # of the energy, what smooth steps may gain in all without losses
@@ -124,8 +124,13 @@ def shorten(plant: Plant, scale: float) -> None:
     for j in range(2):
         now.shear[j] = before.shear[j] + scale * (now.shear[j] - before.shear[j])
         layers, earlier = plant.layers[j], plant.earlier_layers[j]
-        layers[:] = earlier + scale * (layers - earlier)
-        plant.shear_variance[j] = ((layers - layers.mean()) ** 2).mean()
+        mean = square = 0.0
+        for k in range(LAYERS):  # whole arrays at once would load Numba's ufuncs at each start
+            layers[k] = earlier[k] + scale * (layers[k] - earlier[k])
+            mean += layers[k] / LAYERS
+        for k in range(LAYERS):
+            square += (layers[k] - mean) ** 2
+        plant.shear_variance[j] = square / LAYERS
     for j in range(SHEARS):
         displacement = now.extra_shear[j] - before.extra_shear[j]
         now.extra_shear[j] = before.extra_shear[j] + scale * displacement
