@@ -145,8 +145,6 @@ def _energy() -> Iterator[Beside]:
         yield Beside(f"Fig. 7's offset from springs, 2 to 8 mm: solid, bonded, {face}",
                      "one constant", source, f"{over.min():.1f} to {over.max():.1f} N", "disagree",
                      f"by the E that comes nearest to it, {1e-6 * modulus:.3f} MPa")  # fmt: skip
-    yield Beside("force above the springs', in rolling", "17 %", source, "0 %", "disagree",
-                     "the paper gives no depth; solid tips press harder somewhere")  # fmt: skip
 
 
 def _memory() -> Iterator[Beside]:
@@ -200,6 +198,6 @@ def _hands() -> Iterator[Beside]:
                   1e3 * max(answers), ".0f", " ms", simulated)  # fmt: skip
     yield Beside("friction in the servos' gears", "depends on the load",
                      "Rhoban, arXiv 2410.08650", f"{Settings().simulation.joint_friction:g} N·m",
-                     "disagree", "the plant's is Coulomb's, the same under any load")  # fmt: skip
+                     "disagree", "by default the plant's is Coulomb's, the same under any load")  # fmt: skip
     yield Beside("all of it, on a hand of metal", "—", "nobody yet", "—", "unknown",
                      "no hand of metal has been run with this daemon")  # fmt: skip
