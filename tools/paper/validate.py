@@ -198,6 +198,6 @@ def _hands() -> Iterator[Beside]:
                   1e3 * max(answers), ".0f", " ms", simulated)  # fmt: skip
     yield Beside("friction in the servos' gears", "depends on the load",
                      "Rhoban, arXiv 2410.08650", f"{Settings().simulation.joint_friction:g} N·m",
-                     "disagree", "by default the plant's is Coulomb's, the same under any load")  # fmt: skip
+                     "disagree", "by default Coulomb's, the same under any load")  # fmt: skip
     yield Beside("all of it, on a hand of metal", "—", "nobody yet", "—", "unknown",
                      "no hand of metal has been run with this daemon")  # fmt: skip
