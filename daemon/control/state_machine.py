@@ -57,6 +57,7 @@ class Control:
         self._held = grasp
         dt, smooth = 1.0 / settings.loop.rate, settings.control.smooth_time
         self._joints = [Setpoint(dt, smooth, SetpointState()) for _ in FINGERS]
+        self._limp = True  # two ticks ago torque was off
         self._next_angle: float | None = None  # rad to turn to once the grip holds
         self._streamed = False  # the force is a stream's setpoint
         self._still = False  # holding, and nothing but loads moves the joints
@@ -242,11 +243,14 @@ class Control:
 
     def step(self, dt: float, goal: Goal) -> None:
         """Fill ``goal`` for this tick; ``goal.valid`` is False while torque is to be off."""
+        limp, self._limp = self._limp, not goal.valid
         goal.valid = self.torque
         goal.force = goal.angle = math.nan
         if not self.torque:
             return
         mode = self.mode
+        if limp and mode is Mode.ARMED:
+            self._hold_here()  # torque has gone on since the last tick: the joints may have moved
         if mode is Mode.MOVING or mode is Mode.RELEASING:
             self._travel(dt)
         elif mode is Mode.GRASPING and not self._gripping:

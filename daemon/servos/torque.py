@@ -26,6 +26,7 @@ _GOAL_BYTES = (
 )
 _COPIES = 2  # of each packet of torque off, since nothing is answered
 _ON_WITHIN = 50  # reply timeouts in which torque must be on: the loop stands still meanwhile
+_STILL = 8  # counts by which a limp joint may move between its goal and torque on, 0.7°
 
 
 class Torque:
@@ -74,20 +75,11 @@ class Torque:
         goals = self._choose_goals()
         if self._mode != reg.POSITION_MODE:
             self._store_all(reg.GOAL_CURRENT, bytes(2), "goal current")
-        positions = self._positions()
-        strayed = [
-            check_angle(joint.name, joint.scale.angle(positions[i]), self._hand, joint.finger)
-            for i, joint in self._joints.items()
-        ]
-        if any(strayed):
-            raise ServoError("\n".join(str(each) for each in strayed if each))
-        if self._mode != reg.CURRENT_MODE:
-            packed = {each: struct.pack("<i", counts) for each, counts in positions.items()}
-            self._store(reg.GOAL_POSITION, packed, "goal position")
+        self.may_be_on = True
         # It measures from torque on, and must stop what can't be verified to be on.
         if self._ticks:
             self._store_all(reg.BUS_WATCHDOG, bytes((self._ticks,)), "watchdog armed")
-        self.may_be_on = True
+        positions = self._aim_here()
         self._store_all(reg.TORQUE_ENABLE, b"\x01", "torque on")
         for servo_id, joint in self._joints.items():
             joint.sent.clear()
@@ -109,6 +101,24 @@ class Torque:
         if self.may_be_on:
             self._watchdog_off.send([b"\x00"] * len(self._joints))
         self.may_be_on = False
+
+    def _aim_here(self) -> dict[int, int]:
+        """Set the goal positions to where the joints are, until these rest there [counts]."""
+        while True:
+            positions = self._positions()
+            strayed = [
+                check_angle(joint.name, joint.scale.angle(positions[i]), self._hand, joint.finger)
+                for i, joint in self._joints.items()
+            ]
+            if any(strayed):
+                raise ServoError("\n".join(str(each) for each in strayed if each))
+            if self._mode == reg.CURRENT_MODE:
+                return positions
+            packed = {each: struct.pack("<i", counts) for each, counts in positions.items()}
+            self._store(reg.GOAL_POSITION, packed, "goal position")
+            after = self._positions()
+            if all(abs(after[i] - positions[i]) <= _STILL for i in after):
+                return positions
 
     def _choose_goals(self) -> GroupWrite:
         """The one sync write of a tick: goal current, goal position, or both side by side."""

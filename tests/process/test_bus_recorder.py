@@ -70,11 +70,11 @@ def test_goals_through_group_writes_and_indirect_addresses() -> None:
     places = (reg.GOAL_CURRENT, reg.GOAL_CURRENT + 1, *range(116, 120))
     for servo in (1, 2):
         assert hand.write(servo, reg.INDIRECT_ADDRESS, "6H", *places) == 0
-    goal = struct.pack("<hi", 10, 2048 + 30)
+    goal = struct.pack("<hi", 10, 2048 + 40)
     data = struct.pack("<HHB", 224, 6, 1) + goal + b"\x02" + goal
     hand.bus.feed(frame(BROADCAST, framing.SYNC_WRITE, data), hand.t)
-    assert hand.report(1)["goal_q"] == pytest.approx([30 * RADIAN] * 2)
-    assert hand.report(2)["goal_q"] == pytest.approx([-30 * RADIAN] * 2)  # the right one's sense
+    assert hand.report(1)["goal_q"] == pytest.approx([40 * RADIAN] * 2)
+    assert hand.report(2)["goal_q"] == pytest.approx([-40 * RADIAN] * 2)  # the right one's sense
     assert hand.report(2)["goal_current"] == pytest.approx([-10 * UNIT] * 2)
 
 
@@ -82,6 +82,7 @@ def test_torque_on_far_from_the_goal() -> None:
     hand = Hand()
     hand.write(1, reg.GOAL_POSITION, "i", 2048 + 10)
     hand.write(1, reg.GOAL_CURRENT, "h", 20)
+    assert hand.report(1)["goal_q"] is None, "the angle that a limp joint has is no way to go"
     hand.write(1, reg.TORQUE_ENABLE, "B", 1)
     hand.write(1, reg.TORQUE_ENABLE, "B", 1)  # it was on
     on = hand.report(1)["torque_on"]
@@ -89,6 +90,8 @@ def test_torque_on_far_from_the_goal() -> None:
     assert (on["count"], on["far"], on["t"]) == (1, 0, hand.t)
     assert on["farthest"] == pytest.approx(10 * RADIAN)
     assert on["current"] == pytest.approx(20 * UNIT)
+    hand.write(1, reg.GOAL_POSITION, "i", 2048 + 10)
+    assert hand.report(1)["goal_q"] == pytest.approx([10 * RADIAN] * 2)
     hand.write(1, reg.TORQUE_ENABLE, "B", 0)
     hand.write(1, reg.GOAL_POSITION, "i", 2048 + 500)
     hand.write(1, reg.TORQUE_ENABLE, "B", 1)

@@ -16,6 +16,7 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.control_table import by_name
 from softfinger.daemon.servos.dynamixel import DynamixelServos
+from softfinger.daemon.servos.protocol import ServoLine
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 from softfinger.daemon.types import Goal, Reading
 from tests.conftest import until
@@ -105,6 +106,25 @@ def test_torque_on_starts_where_the_joint_is(bus, connect):
     assert backend.torque_off(Reading())
     assert all(bus.memory(i)[reg.TORQUE_ENABLE] == 0 for i in (0, 1))
     until(lambda: all(bus.memory(i)[reg.BUS_WATCHDOG] == 0 for i in (0, 1)))  # is not answered
+
+
+def test_torque_on_waits_for_a_joint_that_moves_meanwhile(bus, connect, monkeypatch):
+    backend = connect(bus)
+    ways = [0.2, 0.1, 0.05]
+    really = ServoLine.store
+
+    def store(line, address, values):
+        failed = really(line, address, values)
+        if address == reg.GOAL_POSITION and ways:
+            way = ways.pop()
+            bus.call(lambda: bus.bus.plant.q.__iadd__(way))
+        return failed
+
+    monkeypatch.setattr(ServoLine, "store", store)
+    backend.torque_on()
+    for servo in bus.bus.report(time.monotonic()):
+        assert servo["torque"]
+        assert servo["torque_on"]["farthest"] < 0.01
 
 
 def test_torque_is_refused_where_the_joint_can_not_be(bus, connect):

@@ -32,6 +32,18 @@ def test_a_non_finite_goal_is_a_fault_though_a_command_was_refused_for_it(
     command(daemon, "clear")
 
 
+def test_joints_are_held_where_they_are_once_torque_is_on(make: Make) -> None:
+    """Switching it on takes the servos a while, in which a limp joint goes on."""
+    daemon = make()
+    daemon.loop.advance(daemon.loop.period)
+    command(daemon, "arm")
+    daemon.loop.advance(daemon.loop.period)
+    daemon.hand.q[0] += 0.01
+    for _ in range(10):
+        daemon.loop.advance(daemon.loop.period)
+        assert daemon.loop.state.goal.q == pytest.approx(list(daemon.hand.q), abs=2e-3)
+
+
 def test_torque_off_that_is_not_confirmed_is_tried_again_and_then_the_bus_falls_silent(
     make: Make,
 ) -> None:

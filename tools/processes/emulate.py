@@ -67,7 +67,7 @@ begins the record again, --send "report forget" does both without a gap:
                    it stopped the motor), stopped_by_watchdog: the state now
     goal_q, goal_current
                    least and greatest goal that came [rad, A; positive closes], refused ones too;
-                   null when none came
+                   null when none came; goals near where a limp joint is are left out
     goals_refused  how many writes with a goal the servo refused
     torque_on      count, t of the last; far: how often the goal was more than 0.05 rad away,
                    farthest [rad], current: greatest goal current in force [A]

@@ -31,9 +31,11 @@ class BusRecorder:
         self._fired_t: float | None = None
         self._off_t: float | None = None
 
-    def goal(self, address: int, value: int) -> None:
-        """Record a value for a register on the wire."""
+    def goal(self, address: int, value: int, joint: ServoJoint, torque: bool) -> None:
+        """Record a value for a register on the wire, but none near where a limp joint is."""
         if address not in _WATCHED:
+            return
+        if address == reg.GOAL_POSITION and not torque and _away(joint, value) <= FAR:
             return
         seen = self._goals.get(address)
         if seen is None:
@@ -52,7 +54,7 @@ class BusRecorder:
         self._torque_t = self._last = t
         self._current = max(self._current, abs(joint.goal_current(current)))
         if mode in POSITION_MODES:
-            away = abs(joint.goal_angle(position) - joint.goal_angle(joint.position()))
+            away = _away(joint, position)
             self._far += away > FAR
             self._farthest = max(self._farthest, away)
 
@@ -92,3 +94,8 @@ class BusRecorder:
             "longest_quiet": max(self._quiet, quiet) if torque else self._quiet,
             "watchdog_fired": {"count": self._fired, "t": self._fired_t},
         }
+
+
+def _away(joint: ServoJoint, position: int) -> float:
+    """Return how far a goal is from where the joint is [rad]."""
+    return abs(joint.goal_angle(position) - joint.goal_angle(joint.position()))

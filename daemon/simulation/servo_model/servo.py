@@ -299,14 +299,14 @@ class EmulatedServo:
     def _checked(self, address: int, data: bytes) -> tuple[int, list[tuple[Item, int]]]:
         error, plan = self.table.plan(address, data)
         for item, value in plan:
-            self.recorder.goal(item.address, value)
+            self.recorder.goal(item.address, value, self._joint, self.torque_on)
         if error:
             # Goals that were on the wire are recorded though the table would not have them.
             values = self.table.values(address, data)
             if reg.GOAL_CURRENT in values or reg.GOAL_POSITION in values:
                 self.recorder.refused()
             for each, value in values.items():
-                self.recorder.goal(each, value)
+                self.recorder.goal(each, value, self._joint, self.torque_on)
         return error, plan
 
     def _effect(self, address: int, value: int, t: float) -> None:
