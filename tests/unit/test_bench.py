@@ -16,7 +16,6 @@ from softfinger.tools.benchmarks import (
     bench,
     control,
     estimator,
-    growth,
     measuring,
     reflex,
     tick,
@@ -86,10 +85,10 @@ def test_a_measurement_that_fails_leaves_the_others(
     def let_go(brief: bool) -> list[Report]:
         raise Refused("the hand let go")
 
-    monkeypatch.setattr(growth, "measure", let_go)
-    assert cli.main(["bench", "growth", "tick"]) == 1
+    monkeypatch.setattr(control, "measure", let_go)
+    assert cli.main(["bench", "control", "tick"]) == 1
     printed = capsys.readouterr()
-    assert "bench: growth: the hand let go" in printed.err
+    assert "bench: control: the hand let go" in printed.err
     assert "pipeline alone" in printed.out
 
 

@@ -26,8 +26,6 @@ MEASUREMENTS = {
     "tick": "the tick back to back, in place and over ptys",
     "control": "what each grip law leaves of an object's angle",
     "reflex": "greater loads on a grip that bears one: held or lost, slid, answered",
-    "scenes": "what each thing that a scene skips saves a tick",
-    "growth": "cost and error against cells, subscribers, sensors, rate",
 }
 CAMPAIGNS = {
     "witnesses": "false measurements, and the true force of a grip on them, a quarter of an hour",

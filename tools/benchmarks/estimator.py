@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -134,8 +134,7 @@ def frames_to_contacts(rounds: int) -> Report:
             more["× ml: warm"] = quickest[name] / quickest["ml: warm"]
         rows.append(figure(name, "µs", 1e-3 * times[name], aim, **more))
     rows.append(figure("decode: cobs", "µs", 1e-3 * times["decode: cobs"], 10.0))
-    sigma = np.sqrt(np.diag(bound(jacobian(GRID, (*TRUTH, 1.0)), NOISE)))
-    rows.append({"name": "Cramér-Rao bound", ERROR: 1e6 * float(sigma[0])})
+    rows.append({"name": "Cramér-Rao bound", ERROR: 1e6 * bound()})
     for sensor, flaws in {"ideal": {}, **SENSORS}.items():
         found = settled(Settings.model_validate(flaws), TRUTH)
         rows.append({"name": f"ml: sensor {sensor}", **rms_errors(found, TRUTH)})
@@ -155,34 +154,24 @@ def settled(settings: Settings, truth: Truth, count: int = _FRAMES) -> FloatArra
     return np.array(found[-count:])
 
 
-def jacobian(grid: SensorGrid, truth: tuple[float, float, float, float]) -> FloatArray:
-    """Return ∂ pressure/∂(d, tilt_x, tilt_y, gain) [cells, 4], by central differences."""
-    columns = []
-    for k, step in enumerate(_STEPS):
-        ends = []
-        for sign in (1.0, -1.0):
-            at = list(truth)
-            at[k] += sign * step
-            ends.append(grid.pressure(TIP, LINEAR, at[0], at[1], at[2], at[3]))
-        columns.append(((ends[0] - ends[1]) / (2.0 * step)).ravel())
-    return np.stack(columns, axis=1)
+def bound() -> float:
+    """Return the Cramér-Rao bound of d [m] from all cells, with both tilts and the gain unknown.
 
-
-def bound(slopes: FloatArray, noise: float, free: bool = True) -> FloatArray:
-    """Return the Cramér-Rao covariance of (d, tilt_x, tilt_y[, gain]) from all cells."""
-    used = slopes[:, : 4 if free else 3]
-    return np.asarray(np.linalg.inv(used.T @ used) * noise**2)
+    The slopes of pressure by (d, tilt_x, tilt_y, gain) are central differences.
+    """
+    at, slopes = np.array([*TRUTH, 1.0]), []
+    for step in np.diag(_STEPS):
+        above, below = (GRID.pressure(TIP, LINEAR, *(at + by)) for by in (step, -step))
+        slopes.append(((above - below) / (2.0 * step.max())).ravel())
+    covariance = np.linalg.inv(np.array(slopes) @ np.transpose(slopes)) * NOISE**2
+    return float(np.sqrt(covariance[0, 0]))
 
 
 def estimates(
-    frames: FloatArray,
-    grid: SensorGrid = GRID,
-    cold: bool = False,
-    tip: Fingertip = TIP,
-    **options: Any,
+    frames: FloatArray, cold: bool = False, tip: Fingertip = TIP
 ) -> Callable[[], FloatArray]:
     """Return the control loop's calls on these frames, each alone if ``cold``: d, tilts [n, 3]."""
-    estimator = ContactEstimator(tip, LINEAR, grid, NOISE, **options)
+    estimator = ContactEstimator(tip, LINEAR, GRID, NOISE)
 
     def run() -> FloatArray:
         found = np.empty((len(frames), 3))

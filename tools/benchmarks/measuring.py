@@ -1,4 +1,4 @@
-"""Shared by all measurements: times in turns, tables of rows, slopes."""
+"""Shared by all measurements: times in turns, tables of rows."""
 
 from __future__ import annotations
 
@@ -115,23 +115,3 @@ def timed(call: Callable[[], object], count: int = 1) -> list[float]:
         call()
         samples.append((time.perf_counter_ns() - before) * 1e-3)
     return samples
-
-
-def slopes(rows: list[Row], x: str) -> tuple[str, ...]:
-    """Return how the median of each kind of row grows with its ``x``: a note for each.
-
-    The exponent of a power law; where ``x`` begins at 0, the cost of each more. A kind is a name up
-    to its first comma or colon.
-    """
-    kinds: dict[str, list[Row]] = {}
-    for row in rows:
-        kinds.setdefault(str(row["name"]).split(",")[0].split(":")[0], []).append(row)
-    notes = []
-    for name, chosen in kinds.items():
-        at, median = (np.array([row[key] for row in chosen], float) for key in (x, "median"))
-        if at[0] == 0.0:
-            more = np.polyfit(at, median, 1)[0]
-            notes.append(f"  {name}: {more:+.3g} {chosen[0]['unit']} for each more")
-        else:
-            notes.append(f"  {name}: ∝ ({x})^{np.polyfit(np.log(at), np.log(median), 1)[0]:.2f}")
-    return tuple(notes)

@@ -15,6 +15,7 @@ import numpy as np
 import zmq
 from numpy.typing import NDArray
 
+from softfinger.daemon.client.connection import subscribe
 from softfinger.daemon.clock import Clock
 from softfinger.daemon.errors import SoftfingerError
 from softfinger.daemon.loop.build import Daemon
@@ -62,24 +63,18 @@ def merged(sections: Sections, base: Sections) -> dict[str, dict[str, Any]]:
 
 
 @contextlib.contextmanager
-def virtual_daemon(
-    sections: Sections, *topics: str | bytes, subscribers: int = 1
-) -> Iterator[Daemon]:
+def virtual_daemon(*topics: bytes) -> Iterator[Daemon]:
     """Yield a daemon on virtual time at its own addresses, with ``topics`` subscribed to."""
     with tempfile.TemporaryDirectory() as folder, zmq.Context() as context:
-        base = {
+        sections = {
             "loop": {"clock": "virtual"},
             "stream": {"address": f"ipc://{folder}/stream"},
             "commands": {"address": f"ipc://{folder}/commands"},
         }
-        settings = Settings.model_validate(merged(sections, base))
+        settings = Settings.model_validate(sections)
         with Daemon(settings) as daemon:
-            for _ in range(subscribers if topics else 0):
-                socket = context.socket(zmq.SUB)
-                socket.setsockopt(zmq.LINGER, 0)
-                for topic in topics:
-                    socket.subscribe(topic)
-                socket.connect(settings.stream.address)
+            if topics:
+                subscribe(context, settings.stream.address, *topics)
             try:
                 yield daemon
             finally:
@@ -161,11 +156,10 @@ class CannedSensor(_Canned):
         return self._frame
 
 
-def can(daemon: Daemon, every_tick: bool = False) -> None:
+def can(daemon: Daemon) -> None:
     """Put canned backends in place of a daemon's, so that a tick costs what it does by itself.
 
     They repeat the next frames and the last reading: one frame alone would be a frozen sensor.
-    Frames are new at the settings' rate, or at every tick.
     """
     loop, period = daemon.loop, 1.0 / daemon.settings.tactile.rate
     fingers = loop.perception.fingers
@@ -176,6 +170,6 @@ def can(daemon: Daemon, every_tick: bool = False) -> None:
             assert finger.frame is not None
             kept.append(finger.frame.data)
     for kept, finger in zip(grids, fingers, strict=True):
-        finger.sensor = CannedSensor(kept, 0.0 if every_tick else period, daemon.clock)
+        finger.sensor = CannedSensor(kept, period, daemon.clock)
     if loop.servos is not None:
         loop.servos = CannedServos(loop.state.reading, daemon.clock)

@@ -36,7 +36,7 @@ _IN_TURN = 20  # cycles
 def measure(brief: bool = False) -> list[Report]:
     """Return ticks of a hand that holds an object [µs], a second on virtual time [ms]."""
     rows = _in_turns(10 if brief else 40)
-    with virtual_daemon({}) as daemon:
+    with virtual_daemon() as daemon:
         hold(daemon)
         second = timed(partial(daemon.loop.advance, 1.0), 3 if brief else 20)
         rows.append(figure("with the simulated hand", "µs", ticks(daemon, 2_000)))
@@ -55,8 +55,7 @@ def _in_turns(rounds: int) -> list[Row]:
     """
     samples: dict[str, list[float]] = {}
     used: dict[str, float] = {}  # s of the processor, of all seconds
-    topics = (schema.STATE, schema.TACTILE)
-    with virtual_daemon({}) as quiet, virtual_daemon({}, *topics) as heard:
+    with virtual_daemon() as quiet, virtual_daemon(schema.STATE, schema.TACTILE) as heard:
         for daemon in (quiet, heard):
             hold(daemon)
             can(daemon)
@@ -97,11 +96,11 @@ def ticks(daemon: Daemon, count: int) -> list[float]:
     return samples
 
 
-def in_place(daemon: Daemon, rate: float, count: int = 0) -> list[float]:
+def in_place(daemon: Daemon, rate: float) -> list[float]:
     """Return times of ticks [µs] that each wake at a deadline of the machine's time; of 0.15 s."""
     machine = RealClock(daemon.settings.realtime.spin)
     deadline, samples = machine.now(), []
-    for _ in range(count or round(0.15 * rate)):
+    for _ in range(round(0.15 * rate)):
         deadline += 1.0 / rate
         machine.sleep_until(deadline)
         samples += ticks(daemon, 1)
