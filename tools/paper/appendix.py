@@ -20,7 +20,6 @@ from softfinger.tools.paper.sheets import (
     FloatArray,
     Panel,
     Sheet,
-    sheet,
 )
 from softfinger.tools.style import INK, KINDS
 
@@ -82,17 +81,17 @@ def integrated_terms(radius: float, d: FloatArray) -> Terms:
 def _appendix() -> tuple[Sheet, ...]:
     d = np.arange(1, 81) / 10.0  # the terms cancel to nothing at d = 0
     metres = d * MILLI
-    columns: list[tuple[str, str, FloatArray]] = [("d", "mm", d)]
+    columns = {"d [mm]": d}
     for how, terms in (
         ("as printed", printed_terms(TIP.radius, metres)),
         ("integrated", integrated_terms(TIP.radius, metres)),
     ):
         for name, term in zip(_TERMS, terms.terms(TIP.radius, MODULUS, metres), strict=True):
-            columns.append((f"{name} term {how}", "mJ", 1e3 * term))
-        columns.append((f"U {how}", "mJ", 1e3 * terms.energy(TIP.radius, MODULUS, metres)))
+            columns[f"{name} term {how} [mJ]"] = 1e3 * term
+        columns[f"U {how} [mJ]"] = 1e3 * terms.energy(TIP.radius, MODULUS, metres)
     theta_max, p = limits(TIP.radius, metres)
-    columns += [("theta_max", "deg", np.degrees(theta_max)), ("p", "deg", np.degrees(p))]
-    return (sheet("fig11", *columns),)
+    columns |= {"theta_max [deg]": np.degrees(theta_max), "p [deg]": np.degrees(p)}
+    return (Sheet("fig11", columns),)
 
 
 def _sums(axes: Axes, numbers: Sheet) -> None:

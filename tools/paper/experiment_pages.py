@@ -27,7 +27,6 @@ from softfinger.tools.paper.sheets import (
     FloatArray,
     Panel,
     Sheet,
-    sheet,
 )
 from softfinger.tools.style import GREY, INK, KINDS, ordered
 
@@ -55,19 +54,19 @@ def compression() -> tuple[Sheet, ...]:
     """Tabulate force over displacement at each angle: the model and the sum of the cells."""
     material = Material.constant(MODULUS)
     d = np.arange(81) / 10.0
-    columns: list[tuple[str, str, FloatArray]] = [("d", "mm", d)]
+    columns = {"d [mm]": d}
     for tilt in TILTS:
         theta = np.float64(tilt)
         sensed = [
             np.sum(GRID.pressure(TIP, material, each * MILLI, np.radians(theta), 0.0)) * PITCH**2
             for each in d
         ]
-        columns += [
-            (f"F at {tilt} deg", "N", _force(d, theta)),
-            (f"F through the sensor at {tilt} deg", "N", np.array(sensed)),
-            (f"F of Table I's law at {tilt} deg", "N", _force_table_i(d, theta)),
-        ]
-    return (sheet("fig7", *columns),)
+        columns |= {
+            f"F at {tilt} deg [N]": _force(d, theta),
+            f"F through the sensor at {tilt} deg [N]": np.array(sensed),
+            f"F of Table I's law at {tilt} deg [N]": _force_table_i(d, theta),
+        }
+    return (Sheet("fig7", columns),)
 
 
 def _one_tilt(tilt: int, axes: Axes, numbers: Sheet) -> None:
@@ -103,26 +102,25 @@ def tilt_and_roll() -> tuple[Sheet, ...]:
     tilting = -np.arange(0, 116) / 10.0
     rolling = np.arange(-115, 93) / 10.0
     rise = np.sin(np.radians(tilting)) / np.sin(np.radians(TILTED))
-    first: list[tuple[str, str, FloatArray]] = [("theta", "deg", tilting)]
-    second: list[tuple[str, str, FloatArray]] = [("theta", "deg", rolling)]
+    first, second = {"theta [deg]": tilting}, {"theta [deg]": rolling}
     for deepest in DEPTHS:
         d = np.float64(deepest)
-        first += [
-            (f"d up to {deepest} mm", "mm", d * rise),
-            (f"F, d up to {deepest} mm", "N", _force(d * rise, tilting)),
-            (f"F at d = {deepest} mm", "N", _force(d, tilting)),
-        ]
+        first |= {
+            f"d up to {deepest} mm [mm]": d * rise,
+            f"F, d up to {deepest} mm [N]": _force(d * rise, tilting),
+            f"F at d = {deepest} mm [N]": _force(d, tilting),
+        }
         force, law = _force(d, rolling), _force_table_i(d, rolling)
         # Springs that point at the tip's centre (Nguyen and Arimoto): N = πE d², whatever the tilt.
         radial = np.full(rolling.shape, math.pi * MODULUS * (d * MILLI) ** 2)
-        second += [
-            (f"F at d = {deepest} mm", "N", force),
-            (f"F/F(0) at d = {deepest} mm", "1", force / force[rolling == 0.0]),
-            (f"F of Table I's law at d = {deepest} mm", "N", law),
-            (f"F/F(0) of Table I's law at d = {deepest} mm", "1", law / law[rolling == 0.0]),
-            (f"F of radial springs at d = {deepest} mm", "N", radial),
-        ]
-    return sheet("fig10a", *first), sheet("fig10b", *second)
+        second |= {
+            f"F at d = {deepest} mm [N]": force,
+            f"F/F(0) at d = {deepest} mm [1]": force / force[rolling == 0.0],
+            f"F of Table I's law at d = {deepest} mm [N]": law,
+            f"F/F(0) of Table I's law at d = {deepest} mm [1]": law / law[rolling == 0.0],
+            f"F of radial springs at d = {deepest} mm [N]": radial,
+        }
+    return Sheet("fig10a", first), Sheet("fig10b", second)
 
 
 def _rotation(axes: Axes, rotation: Sheet, _: Sheet) -> None:

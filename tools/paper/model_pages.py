@@ -29,7 +29,6 @@ from softfinger.tools.paper.sheets import (
     FloatArray,
     Panel,
     Sheet,
-    sheet,
     summary,
 )
 from softfinger.tools.style import GREY, INK, KINDS, ordered
@@ -61,21 +60,19 @@ def law() -> tuple[Sheet, ...]:
     """Return the law over strain, and Table I with the law at its strains."""
     material = Material.table_i()
     strain, nodes = np.arange(101) / 100.0, np.array(TABLE_I_STRAIN)
-    curve = sheet(
-        "fig3",
-        ("strain", "%", np.arange(101.0)),
-        ("stress", "MPa", material.stress(strain) * MPA),
-        ("modulus", "MPa", _tangent(material, strain) * MPA),
-        ("stress at constant 0.304 MPa", "MPa", TABLE_I_MAXIMUM * strain * MPA),
-    )
-    table = sheet(
-        "table_i",
-        ("entry", "", ["Min", *(f"{100.0 * each:g} %" for each in nodes[1:]), "Max"]),
-        ("strain", "%", [*(100.0 * nodes), np.nan]),
-        ("modulus in the paper", "MPa", np.array([*TABLE_I_MODULUS, TABLE_I_MAXIMUM]) * MPA),
-        ("modulus of the law", "MPa", [*(_tangent(material, nodes) * MPA), np.nan]),
-    )
-    return curve, table
+    curve = {
+        "strain [%]": np.arange(101.0),
+        "stress [MPa]": material.stress(strain) * MPA,
+        "modulus [MPa]": _tangent(material, strain) * MPA,
+        "stress at constant 0.304 MPa [MPa]": TABLE_I_MAXIMUM * strain * MPA,
+    }
+    table = {
+        "entry": ["Min", *(f"{100.0 * each:g} %" for each in nodes[1:]), "Max"],
+        "strain [%]": [*(100.0 * nodes), np.nan],
+        "modulus in the paper [MPa]": np.array([*TABLE_I_MODULUS, TABLE_I_MAXIMUM]) * MPA,
+        "modulus of the law [MPa]": [*(_tangent(material, nodes) * MPA), np.nan],
+    }
+    return Sheet("fig3", curve), Sheet("table_i", table)
 
 
 def _stress(axes: Axes, curve: Sheet, _: Sheet) -> None:
@@ -166,12 +163,12 @@ class Plotted:
     def axis(self) -> str:
         return f"{self.label} {self.symbol} [{self.unit}]"
 
-    def columns(self, d: Numbers, theta: Numbers, at: str) -> list[tuple[str, str, FloatArray]]:
+    def columns(self, d: Numbers, theta: Numbers, at: str) -> dict[str, FloatArray]:
         """Return columns of the closed form and of the double integral."""
-        return [
-            (f"{self.symbol} {at}", self.unit, self.closed(d, theta)),
-            (f"{self.symbol} by eq. {self.equation} {at}", self.unit, self.integral(d, theta)),
-        ]
+        return {
+            f"{self.symbol} {at} [{self.unit}]": self.closed(d, theta),
+            f"{self.symbol} by eq. {self.equation} {at} [{self.unit}]": self.integral(d, theta),
+        }
 
 
 FORCE = Plotted("F", "total elastic force", "N", 1.0, 0, 2, 3, "πEd²", "1/cos θ", np.pi)
@@ -183,10 +180,10 @@ ENERGY = Plotted(
 def over_tilt(name: str, quantity: Plotted) -> tuple[Sheet, ...]:
     """Tabulate over θ from −25° to 25° at each displacement."""
     theta = np.arange(-50, 51) / 2.0
-    columns: list[tuple[str, str, FloatArray]] = [("theta", "deg", theta)]
+    columns = {"theta [deg]": theta}
     for d in DEPTHS:
-        columns += quantity.columns(np.float64(d), theta, f"at d = {d} mm")
-    return (sheet(name, *columns),)
+        columns |= quantity.columns(np.float64(d), theta, f"at d = {d} mm")
+    return (Sheet(name, columns),)
 
 
 def over_depth(name: str, quantity: Plotted) -> tuple[Sheet, ...]:
@@ -196,20 +193,22 @@ def over_depth(name: str, quantity: Plotted) -> tuple[Sheet, ...]:
     """
     d = np.arange(81) / 10.0
     power = quantity.at_zero_tilt(d)
-    columns: list[tuple[str, str, FloatArray]] = [("d", "mm", d)]
+    columns = {"d [mm]": d}
     rows = []
     for tilt in TILTS:
         theta, at = np.float64(tilt), f"at {tilt} deg"
-        pair = quantity.columns(d, theta, at)
-        integral = pair[1][2]
+        columns |= quantity.columns(d, theta, at)
+        cosine, integral = np.cos(np.radians(theta)), quantity.integral(d, theta)
         factor = np.divide(integral, power, out=np.full_like(d, np.nan), where=d > 0)
-        columns += [*pair, (f"factor {at}", "1", factor)]
-        exponent = np.polyfit(np.log(d[1:]), np.log(integral[1:]), 1)[0]
-        cosine = np.cos(np.radians(theta)) ** (1 - quantity.exponent)
-        rows.append((tilt, exponent, factor[-1], cosine))
-    heads = [("theta", "deg"), ("fitted exponent of d", "1"), ("fitted factor", "1")]
-    heads.append((f"factor {quantity.prefactor}", "1"))
-    return sheet(name, *columns), summary(f"{name}_exponents", heads, rows)
+        columns[f"factor {at} [1]"] = factor
+        row = {
+            "theta [deg]": tilt,
+            "fitted exponent of d [1]": np.polyfit(np.log(d[1:]), np.log(integral[1:]), 1)[0],
+            "fitted factor [1]": factor[-1],
+            f"factor {quantity.prefactor} [1]": cosine ** (1 - quantity.exponent),
+        }
+        rows.append(row)
+    return Sheet(name, columns), summary(f"{name}_exponents", rows)
 
 
 def _key(axes: Axes, quantity: Plotted) -> None:

@@ -8,8 +8,7 @@ a scan, with noise of 0.5 % of the modulus in each cell.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator
 from functools import cache, partial
 from typing import TYPE_CHECKING
 
@@ -30,7 +29,6 @@ from softfinger.tools.paper.sheets import (
     FloatArray,
     Panel,
     Sheet,
-    sheet,
     summary,
 )
 from softfinger.tools.style import GREY, KINDS, ordered
@@ -56,23 +54,10 @@ _LATE = 2  # frames that are on their way
 _SURE = 1.0  # mm of displacement from which on relative errors are shown
 _ROLLED_AT = 4  # mm, where rotation ends and the path goes on
 _PATH = -12.5, 10.5
+_SCALES = {"d": 1e3, "theta": 1.0}  # of the errors shown
 
 
-@dataclass(frozen=True)
-class SimulatedRun:
-    """One row a frame: truth and estimate of d [m], θ [rad], force [N] and energy [J]."""
-
-    d: FloatArray
-    theta: FloatArray
-    force: FloatArray
-    energy: FloatArray
-    d_found: FloatArray
-    theta_found: FloatArray
-    force_found: FloatArray
-    energy_found: FloatArray
-
-
-def run_compression(tilt: float) -> SimulatedRun:
+def run_compression(tilt: float) -> dict[str, FloatArray]:
     """Press the object, its face tilted by ``tilt`` [rad], onto the tip until d is 8 mm."""
     x = -_HALF_SEPARATION + (RADIUS + 0.5 * _WIDTH + _GAP) / math.cos(tilt)
     sections: Sections = {
@@ -85,10 +70,10 @@ def run_compression(tilt: float) -> SimulatedRun:
     }
     seconds = (_DEEPEST + _GAP) / math.cos(tilt) / _SPEED
     with _daemon(sections) as daemon:
-        return _collect(_frames(daemon, round(seconds / SCAN)), daemon)
+        return _columns(_frames(daemon, round(seconds / SCAN)), daemon)
 
 
-def run_rotation() -> SimulatedRun:
+def run_rotation() -> dict[str, FloatArray]:
     """Turn the finger by 11.5° about its root against a fixed object, from first touch on.
 
     The root is so far that d is 4 mm at the end. The servo moves the joint; d and θ are
@@ -117,11 +102,11 @@ def run_rotation() -> SimulatedRun:
             if truth[1] > TILTED:
                 break
             rows.append((truth, _estimates(loop.state.contacts[0])))
-        return _collect(iter(rows), daemon)
+        return _columns(rows, daemon, sign=-1.0)
 
 
-def run_rolling(d: float) -> SimulatedRun:
-    """Roll the object on the fixed finger from 11.5° by 20.7° to −9.2°, ``d`` [m] held."""
+def run_rolling(depth: int) -> dict[str, FloatArray]:
+    """Roll the object on the fixed finger from 11.5° by 20.7° to −9.2°, ``depth`` [mm] held."""
     sections: Sections = {
         "servos": {"backend": "none"},
         "hand": {"open_angle": (TILTED, 0.0)},
@@ -129,10 +114,11 @@ def run_rolling(d: float) -> SimulatedRun:
     }
 
     def place(hand: SimulatedHand, fraction: float) -> None:
-        _roll(hand, d, -ROLLED * fraction)
+        _roll(hand, depth * MILLI, -ROLLED * fraction)
 
     with _daemon(sections) as daemon:
-        return _collect(_frames(daemon, _ROLL_STEPS, place), daemon)
+        rows = _frames(daemon, _ROLL_STEPS, place)
+        return _columns(rows, daemon, f" at {depth} mm", -1.0)
 
 
 def _daemon(sections: Sections) -> Daemon:
@@ -181,13 +167,21 @@ def _estimates(contact: Contact) -> tuple[float, ...]:
     return contact.d, contact.theta, contact.force, contact.energy
 
 
-def _collect(rows: Iterator[Row], daemon: Daemon) -> SimulatedRun:
-    found = list(rows)
-    truth = np.array([each for each, _ in found])
-    estimates = np.array([each for _, each in found])
+def _columns(
+    rows: Iterable[Row], daemon: Daemon, suffix: str = "", sign: float = 1.0
+) -> dict[str, FloatArray]:
+    """Return truth and estimates, a row a frame; ``sign`` is that of the paper's angle."""
+    truth, estimates = (np.array(each) for each in zip(*rows, strict=True))
     d, theta = np.maximum(truth[:, 0], 0.0), truth[:, 1]
     contact = daemon.tables[0](d, theta)
-    return SimulatedRun(d, theta, contact.force, contact.energy, *estimates.T)
+    columns = {}
+    for name, unit, factor, true, found in zip(
+        ("d", "theta", "F", "U"), ("mm", "deg", "N", "mJ"), (1e3, math.degrees(sign), 1.0, 1e3),
+        (d, theta, contact.force, contact.energy), estimates.T, strict=True,
+    ):  # fmt: skip
+        columns[f"{name}{suffix} [{unit}]"] = factor * true
+        columns[f"{name} estimated{suffix} [{unit}]"] = factor * found
+    return columns
 
 
 def _roll(hand: SimulatedHand, d: float, angle: float) -> None:
@@ -207,22 +201,6 @@ def _roll(hand: SimulatedHand, d: float, angle: float) -> None:
     hand.refresh()
 
 
-def _columns(
-    run: SimulatedRun, suffix: str, sign: float = 1.0
-) -> list[tuple[str, str, FloatArray]]:
-    """A run's columns in the figures' units; ``sign`` is that of the paper's angle."""
-    return [
-        (f"d{suffix}", "mm", 1e3 * run.d),
-        (f"d estimated{suffix}", "mm", 1e3 * run.d_found),
-        (f"theta{suffix}", "deg", sign * np.degrees(run.theta)),
-        (f"theta estimated{suffix}", "deg", sign * np.degrees(run.theta_found)),
-        (f"F{suffix}", "N", run.force),
-        (f"F estimated{suffix}", "N", run.force_found),
-        (f"U{suffix}", "mJ", 1e3 * run.energy),
-        (f"U estimated{suffix}", "mJ", 1e3 * run.energy_found),
-    ]
-
-
 def _rms(off: FloatArray) -> float:
     return float(np.sqrt(np.mean(off**2)))
 
@@ -232,32 +210,30 @@ def compression() -> tuple[Sheet, ...]:
     """Return one sheet an angle, and one with the errors beyond 1 mm."""
     sheets, rows = [], []
     for tilt in TILTS:
-        run = run_compression(float(np.radians(tilt)))
-        sheets.append(sheet(f"fig7_run_{tilt}deg", *_columns(run, "")))
-        deep = run.d > _SURE * MILLI
-        force = (run.force_found / np.maximum(run.force, 1e-9) - 1.0)[deep]
-        energy = (run.energy_found / np.maximum(run.energy, 1e-12) - 1.0)[deep]
-        rows.append(
-            (
-                tilt,
-                1e3 * float(run.d[run.d_found > 0.0][0]),
-                1e6 * _rms((run.d_found - run.d)[deep]),
-                _rms(np.degrees(run.theta_found - run.theta)[deep]),
-                100.0 * float(force.mean()),
-                100.0 * _rms(force),
-                100.0 * _rms(energy),
-            )
-        )
-    heads = (
-        ("tilt", "deg"),
-        ("d at the first estimate", "mm"),
-        ("RMS error of d", "um"),
-        ("RMS error of theta", "deg"),
-        ("mean error of F", "%"),
-        ("RMS error of F", "%"),
-        ("RMS error of U", "%"),
+        run = Sheet(f"fig7_run_{tilt}deg", run_compression(float(np.radians(tilt))))
+        sheets.append(run)
+        force, energy = (_deep_errors(run, symbol) for symbol in "FU")
+        row = {
+            "tilt [deg]": tilt,
+            "d at the first estimate [mm]": run["d"][run["d estimated"] > 0.0][0],
+            "RMS error of d [um]": _rms(_deep_errors(run, "d")),
+            "RMS error of theta [deg]": _rms(_deep_errors(run, "theta")),
+            "mean error of F [%]": force.mean(),
+            "RMS error of F [%]": _rms(force),
+            "RMS error of U [%]": _rms(energy),
+        }
+        rows.append(row)
+    return (*sheets, summary("fig7_run_errors", rows))
+
+
+def _deep_errors(run: Sheet, symbol: str) -> FloatArray:
+    """Return the errors beyond 1 mm: of d [µm], θ [degrees], force or energy [%]."""
+    deep = run["d"] > _SURE
+    truth, found = run[symbol][deep], run[f"{symbol} estimated"][deep]
+    relative = symbol in ("F", "U")
+    return np.asarray(
+        100.0 * (found / truth - 1.0) if relative else _SCALES[symbol] * (found - truth)
     )
-    return (*sheets, summary("fig7_run_errors", heads, rows))
 
 
 def _forces(axes: Axes, *sheets: Sheet) -> None:
@@ -268,16 +244,10 @@ def _forces(axes: Axes, *sheets: Sheet) -> None:
 
 
 def _errors(symbol: str, axes: Axes, *sheets: Sheet) -> None:
-    """Draw the errors of force [%], displacement [µm] or angle [degrees], beyond 1 mm."""
     axes.axhline(0.0, color=GREY, linewidth=0.7)
     for tilt, style, run in zip(TILTS, ordered(len(TILTS)), sheets, strict=False):
-        deep = run["d"] > _SURE
-        truth, found = run[symbol][deep], run[f"{symbol} estimated"][deep]
-        if symbol == "F":
-            off = 100.0 * (found / truth - 1.0)
-        else:
-            off = (found - truth) * (1e3 if symbol == "d" else 1.0)
-        axes.plot(run["d"][deep], off, **style | {"linewidth": 0.9}, label=f"{tilt}°")
+        d, off = run["d"][run["d"] > _SURE], _deep_errors(run, symbol)
+        axes.plot(d, off, **style | {"linewidth": 0.9}, label=f"{tilt}°")
 
 
 def _error_panel(symbol: str, title: str, label: str, limit: float) -> Panel:
@@ -289,36 +259,26 @@ def _error_panel(symbol: str, title: str, label: str, limit: float) -> Panel:
 @cache
 def tilt_and_roll() -> tuple[Sheet, ...]:
     """Return rotation, the rolling at each displacement, and where force and energy are least."""
-    columns, minima = [], []
+    columns: dict[str, FloatArray] = {}
     for depth in DEPTHS:
-        run = run_rolling(depth * MILLI)
-        columns += _columns(run, f" at {depth} mm", -1.0)
-        theta = -np.degrees(run.theta)
-        minima.append(
-            (
-                depth,
-                *_minimum(theta, run.force_found),
-                *_minimum(theta, run.energy_found),
-                100.0 * _rms(run.force_found / run.force - 1.0),
-                100.0 * _rms(run.energy_found / run.energy - 1.0),
-                _rms(np.degrees(run.theta_found - run.theta)),
-            )
+        columns |= run_rolling(depth)
+    rolling, minima = Sheet("fig10_run_rolling", columns), []
+    for depth in DEPTHS:
+        row: dict[str, float] = {"d [mm]": depth}
+        true, found = (
+            {each: rolling[f"{each}{of} at {depth} mm"] for each in ("theta", "F", "U")}
+            for of in ("", " estimated")
         )
-    heads = (
-        ("d", "mm"),
-        ("angle of the least F estimated", "deg"),
-        ("its standard error, F", "deg"),
-        ("angle of the least U estimated", "deg"),
-        ("its standard error, U", "deg"),
-        ("RMS error of F", "%"),
-        ("RMS error of U", "%"),
-        ("RMS error of theta", "deg"),
-    )
-    return (
-        sheet("fig10_run_rotation", *_columns(run_rotation(), "", -1.0)),
-        sheet("fig10_run_rolling", *columns),
-        summary("fig10_run_minimum", heads, minima),
-    )
+        for each in "FU":
+            least, error = _minimum(true["theta"], found[each])
+            row[f"angle of the least {each} estimated [deg]"] = least
+            row[f"its standard error, {each} [deg]"] = error
+        for each in "FU":
+            row[f"RMS error of {each} [%]"] = 100.0 * _rms(found[each] / true[each] - 1.0)
+        row["RMS error of theta [deg]"] = _rms(found["theta"] - true["theta"])
+        minima.append(row)
+    rotation = Sheet("fig10_run_rotation", run_rotation())
+    return rotation, rolling, summary("fig10_run_minimum", minima)
 
 
 def _minimum(theta: FloatArray, values: FloatArray) -> tuple[float, float]:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from softfinger.daemon.own_files import write_text
 from softfinger.tools.style import INK, caption
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FloatArray = NDArray[np.float64]
+Columns = Mapping[str, Any]
 Ends = tuple[float, float]
 
 DEPTH = "displacement d [mm]"
@@ -30,41 +31,34 @@ DOT = CIRCLE | {"ms": 3, "mec": INK, "mew": 0.6}
 
 @dataclass(frozen=True)
 class Sheet:
-    """Columns of equal length under the name of their file: (name, unit, values) of each.
+    """Columns of equal length by their heads, ``name [unit]``, under the name of their file.
 
     Values are texts, or numbers of which NaN is written as an empty cell. The unit 1 is that of a
     number without one; texts have none.
     """
 
     name: str
-    columns: tuple[tuple[str, str, NDArray[Any]], ...]
+    columns: Columns
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         """The values of the column called ``name``. Raises KeyError when there is none."""
-        return {title: values for title, _, values in self.columns}[name]
+        heads = {head.partition(" [")[0]: head for head in self.columns}
+        return np.asarray(self.columns[heads[name]])
 
     def write(self, folder: Path) -> Path:
-        """Write ``folder``/name.csv, one header line with units; returns its path."""
+        """Write ``folder``/name.csv; returns its path."""
         path = folder / f"{self.name}.csv"
         with write_text(path, newline="") as file:
             writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(
-                [f"{name} [{unit}]" if unit else name for name, unit, _ in self.columns]
-            )
-            for row in zip(*(values for _, _, values in self.columns), strict=True):
+            writer.writerow(self.columns)
+            for row in zip(*self.columns.values(), strict=True):
                 writer.writerow([_cell(value) for value in row])
         return path
 
 
-def sheet(name: str, *columns: tuple[str, str, ArrayLike]) -> Sheet:
-    """Return a sheet from (name, unit, values) of each column."""
-    return Sheet(name, tuple((title, unit, np.asarray(v)) for title, unit, v in columns))
-
-
-def summary(name: str, columns: Sequence[tuple[str, str]], rows: ArrayLike) -> Sheet:
-    """Return a sheet of numbers from (name, unit) of each column and its rows."""
-    values = np.asarray(rows, dtype=np.float64).T
-    return sheet(name, *((*column, each) for column, each in zip(columns, values, strict=True)))
+def summary(name: str, rows: Sequence[Mapping[str, Any]]) -> Sheet:
+    """Return a sheet of rows with the same heads."""
+    return Sheet(name, {head: [row[head] for row in rows] for head in rows[0]})
 
 
 def _cell(value: Any) -> str:
@@ -128,11 +122,9 @@ class FigurePage:
 
 def errata_sheet(pages: dict[str, FigurePage]) -> Sheet:
     """Return the errata of these pages, one a row."""
-    rows = [(name, each) for name, page in pages.items() for each in page.errata]
-    return sheet(
-        "errata",
-        ("figure", "", [name for name, _ in rows]),
-        ("place in the paper", "", [each.place for _, each in rows]),
-        ("printed", "", [each.printed for _, each in rows]),
-        ("holds", "", [each.holds for _, each in rows]),
-    )
+    rows = [
+        {"figure": name, "place in the paper": e.place, "printed": e.printed, "holds": e.holds}
+        for name, page in pages.items()
+        for e in page.errata
+    ]
+    return summary("errata", rows)

@@ -22,13 +22,7 @@ import numpy as np
 
 from softfinger.kinematics.hand.geometry import HandGeometry, tip_velocity
 from softfinger.tools.paper.model_pages import MODULUS
-from softfinger.tools.paper.sheets import (
-    FigurePage,
-    FloatArray,
-    Panel,
-    Sheet,
-    sheet,
-)
+from softfinger.tools.paper.sheets import FigurePage, FloatArray, Panel, Sheet, summary
 from softfinger.tools.style import INK, KINDS, ordered
 from softfinger.tools.watched import Watched
 
@@ -194,8 +188,8 @@ def valley(floor: Held, aside: FloatArray, start: Held) -> FloatArray:
     return found
 
 
-def swing() -> FloatArray:
-    """Turn the simulated hand's object there and back; columns t, φ, lean [rad], ΣU [J], T [N].
+def swing() -> list[dict[str, float]]:
+    """Turn the simulated hand's object there and back; a row every 20 ms.
 
     ΣU and T are scaled to `FORCE`, with F^(3/2) and F, as the held force is off by some percent.
     """
@@ -221,9 +215,15 @@ def swing() -> FloatArray:
             shear = (sheared - found.gradient()[2]) / (2.0 * math.pi * MODULUS * found.d)
             scale = FORCE / hand.plant.force.mean()
             energy = found._replace(shear=shear).energy() * scale**1.5
-            lean = 0.5 * (found.q[0] - found.q[1])
-            rows.append((t, found.pose[2], lean, energy, sheared[0] * scale))
-    return np.array(rows)
+            row = {
+                "t [s]": t,
+                "angle [deg]": math.degrees(found.pose[2]),
+                "lean [deg]": math.degrees(0.5 * (found.q[0] - found.q[1])),
+                "energy of both tips [mJ]": 1e3 * energy,
+                "shear force [N]": sheared[0] * scale,
+            }
+            rows.append(row)
+    return rows
 
 
 def _triangle(turns: float) -> float:
@@ -239,30 +239,23 @@ def slow_turn() -> tuple[Sheet, ...]:
     start = gripped()
     path = [start, *turned(np.r_[there, back], start)]
     lean = np.array([0.5 * (each.q[0] - each.q[1]) for each in path])
-    equations = sheet(
-        "slow_turn_equations",
-        ("angle", "deg", [math.degrees(each.pose[2]) for each in path]),
-        ("lean", "deg", np.degrees(lean)),
-        ("energy of both tips", "mJ", [1e3 * each.energy() for each in path]),
-        ("V", "mJ", [1e3 * potential(each, start) for each in path]),
-        ("shear force", "N", [each.gradient()[2][0] for each in path]),
-    )
-    run = swing()
-    plant = sheet(
-        "slow_turn_plant",
-        ("t", "s", run[:, 0]),
-        ("angle", "deg", np.degrees(run[:, 1])),
-        ("lean", "deg", np.degrees(run[:, 2])),
-        ("energy of both tips", "mJ", 1e3 * run[:, 3]),
-        ("shear force", "N", run[:, 4]),
-    )
-    columns: list[tuple[str, str, FloatArray]] = []
+    equations = {
+        "angle [deg]": [math.degrees(each.pose[2]) for each in path],
+        "lean [deg]": np.degrees(lean),
+        "energy of both tips [mJ]": [1e3 * each.energy() for each in path],
+        "V [mJ]": [1e3 * potential(each, start) for each in path],
+        "shear force [N]": [each.gradient()[2][0] for each in path],
+    }
+    landscape: dict[str, FloatArray] = {}
     for each in LEANS:
         floor = path[int(np.argmin(np.abs(lean - math.radians(each))))]
-        angles = np.degrees(floor.pose[2] + _ASIDE)
-        columns.append((f"angle at {each} deg", "deg", angles))
-        columns.append((f"V at {each} deg", "mJ", 1e3 * valley(floor, _ASIDE, start)))
-    return equations, plant, sheet("slow_turn_landscape", *columns)
+        landscape[f"angle at {each} deg [deg]"] = np.degrees(floor.pose[2] + _ASIDE)
+        landscape[f"V at {each} deg [mJ]"] = 1e3 * valley(floor, _ASIDE, start)
+    return (
+        Sheet("slow_turn_equations", equations),
+        summary("slow_turn_plant", swing()),
+        Sheet("slow_turn_landscape", landscape),
+    )
 
 
 def _landscape(axes: Axes, equations: Sheet, _: Sheet, land: Sheet) -> None:
