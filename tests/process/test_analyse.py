@@ -12,7 +12,7 @@ from softfinger import Fingertip, Material, SensorGrid
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import Frame, HandFacts, SensorFacts
 from softfinger.daemon.wire import schema
-from softfinger.tools.analysis.contacts import analyse, open_source, write_csv
+from softfinger.tools.analysis.analyse import analyse, open_source, write_csv
 from softfinger.tools.recordings.record import RecordingWriter
 from tests.harness.golden_wire import message_maker
 

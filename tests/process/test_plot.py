@@ -16,7 +16,7 @@ from matplotlib.text import Text
 
 from softfinger.tools import style
 from softfinger.tools.analysis import plot
-from softfinger.tools.analysis.plots import Missing, RecordedRun, load_run
+from softfinger.tools.analysis.plot import Missing, RecordedRun, load_run
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.record import RecordingWriter
 from tests.conftest import Inline
@@ -45,7 +45,7 @@ def run(path: Path) -> RecordedRun:
 
 def drawn(run: RecordedRun, page: str) -> Figure:
     with style.settings():
-        return plot.pages()[page](run)
+        return plot.PAGES[page](run)
 
 
 def texts(figure: Figure) -> str:
@@ -133,7 +133,7 @@ def test_without_settings_there_is_no_model(path, run):
     bare = replace(run, models=None, why_no_model="no reason")
     for page in plot.PAGES:
         with pytest.raises(Missing, match="no reason"):
-            plot.pages()[page](bare)
+            plot.PAGES[page](bare)
 
 
 def test_one_finger_alone(tmp_path):

@@ -12,8 +12,8 @@ import pytest
 from softfinger.daemon.errors import RecordingError
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.wire import schema
-from softfinger.tools.analysis.contacts import analyse, open_source
-from softfinger.tools.analysis.plots import load_run
+from softfinger.tools.analysis.analyse import analyse, open_source
+from softfinger.tools.analysis.plot import load_run
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.recomputed import recompute, recorded_settings
 from softfinger.tools.recordings.record import RecordingWriter

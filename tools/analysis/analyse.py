@@ -1,18 +1,41 @@
-"""``softfinger analyse FILE``: d, θ, force and energy over time from recorded pressure frames."""
+"""``softfinger analyse FILE``: d, θ, force and energy over time from recorded pressure frames.
+
+By the daemon's own perception. A recording of the stream (.mcap) has its own settings and
+calibrations. A file of frames alone (.npz, .npy or a folder of these, a Tekscan-style export) is
+the profile's left sensor, with its own number of cells, and its own pitch where the file has it.
+"""
 
 from __future__ import annotations
 
 import argparse
+import csv
 import sys
 import time
 from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from softfinger.daemon.errors import SoftfingerError
+import numpy as np
+from numpy.typing import NDArray
+
+from softfinger.daemon.errors import RecordingError, SettingsError, SoftfingerError
+from softfinger.daemon.loop.warm_up import FRAMES
+from softfinger.daemon.own_files import write_text
+from softfinger.daemon.perception.finger_model import FingerModel, make_models
+from softfinger.daemon.perception.perception import Perception
 from softfinger.daemon.profile.settings import Settings
-from softfinger.tools.arguments import add_profile, profile
+from softfinger.daemon.tactile.replay import GivenFrames, load_recording
+from softfinger.daemon.types import FINGERS, Frame, State
+from softfinger.daemon.wire import schema
+from softfinger.kinematics.estimation.invalid import REASONS, Invalid
+from softfinger.tools.arguments import add_profile, profile, to_stderr
+from softfinger.tools.processes.kernel_build import build_kernels, print_event
+from softfinger.tools.recordings.reader import Recording
+from softfinger.tools.recordings.recomputed import counts_of, recorded_models
 from softfinger.tools.sweep import Sweep, add_sweep
+from softfinger.tools.terminal.progress import Progress as ProgressBar
 
 _EPILOG = """\
 FILE is a recording (.mcap), .npz with frames [n, rows, cols] and t, .npy frames or a folder of
@@ -35,9 +58,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Analyse and write. Raises SoftfingerError or OSError where there is one file."""
     settings, files = profile(arguments), arguments.files
-    from softfinger.daemon.loop.warm_up import FRAMES
-    from softfinger.tools.processes.kernel_build import build_kernels, print_event
-
     build_kernels(settings, print_event, FRAMES)
     if len(files) == 1:
         print(_analysed(arguments, settings, files[0]), end="")
@@ -63,15 +83,12 @@ def _one_of_many(arguments: argparse.Namespace, settings: Settings, path: Path) 
 
 
 def _analysed(arguments: argparse.Namespace, settings: Settings, path: Path) -> str:
-    from softfinger.tools.analysis.contacts import analyse, open_source, write_csv
-    from softfinger.tools.terminal.progress import Progress
-
     path = path if path.name else path.resolve()  # "." has no name
     table = arguments.csv or path.with_name(path.name + ".contacts.csv")
     own = arguments.config is None and not arguments.set
     source = open_source(path, settings, own)
     began = time.perf_counter()
-    with Progress("analyse", source.total) as progress:
+    with ProgressBar("analyse", source.total) as progress:
         contacts = analyse(source, progress)
     elapsed = time.perf_counter() - began
     write_csv(table, contacts)
@@ -84,3 +101,177 @@ def _analysed(arguments: argparse.Namespace, settings: Settings, path: Path) -> 
     )
     told += "".join(f"  {n} not usable: {reason}\n" for reason, n in reasons.most_common())
     return told
+
+
+FloatArray = NDArray[np.float64]
+Counts = NDArray[np.uint16]
+Progress = Callable[[int], None]
+
+
+@dataclass(frozen=True)
+class Source:
+    """Frames of the sensors in one file: ``frames(progress)`` yields (finger, t [s], counts).
+
+    ``t`` counts from the first frame; ``total`` is the end of ``progress``. ``truths`` is the true
+    contact at each frame, by name, where a file of one sensor has it.
+    """
+
+    settings: Settings
+    models: tuple[FingerModel, FingerModel]
+    fingers: tuple[int, ...]
+    total: int
+    frames: Callable[[Progress], Iterator[tuple[int, float, Counts]]]
+    truths: dict[str, NDArray[np.float64]]
+    live: NDArray[np.bool_] | None = None
+
+
+def open_source(path: Path, settings: Settings, own: bool) -> Source:
+    """Open a file of frames.
+
+    With ``own`` a recording of the stream uses the settings it was made with, else ``settings``;
+    frames alone need ``settings``, and have their shape unless the file tells its pitch itself.
+    Raises RecordingError with the file's name, and SettingsError or TactileError.
+    """
+    if path.suffix == ".mcap":
+        return _stream(path, settings, own)
+    return _frames_alone(path, settings, own)
+
+
+def _stream(path: Path, settings: Settings, own: bool) -> Source:
+    recording = Recording(path, to_stderr("analyse"))
+    if not recording.count(schema.TACTILE):
+        raise RecordingError(f"{path}: no tactile frames in it")
+    if own:
+        settings, models = recorded_models(recording)
+    else:
+        models = make_models(settings)
+    present = tuple(
+        finger
+        for finger, name in enumerate(FINGERS)
+        if f"{schema.TACTILE.decode()}/{name}" in recording.counts
+    )
+
+    def frames(progress: Progress) -> Iterator[tuple[int, float, Counts]]:
+        first = None
+        for _, message in recording.messages([schema.TACTILE], progress=progress):
+            counts = counts_of(recording, message, settings)
+            first = message["timestamp"] if first is None else first
+            yield FINGERS.index(message["finger"]), message["timestamp"] - first, counts
+
+    return Source(settings, models, present, recording.size, frames, {})
+
+
+def _frames_alone(path: Path, settings: Settings, own: bool) -> Source:
+    tactile = settings.tactile
+    recording = load_recording(path, tactile.pascal_per_count, tactile.rate)
+    if own:
+        raise SettingsError(
+            f"{path}: no settings in it: name the tip and the sensor by --config PROFILE, as "
+            "--config paper, or by --set"
+        )
+    count, rows, cols = recording.counts.shape
+    changes: dict[str, float] = {"rows": rows, "cols": cols}
+    if recording.pitch is not None:
+        changes["pitch"], changes["pitch_y"] = recording.pitch
+    elif (rows, cols) != (tactile.rows, tactile.cols):
+        raise SettingsError(
+            f"{path}: frames of {rows} × {cols} cells, expected {tactile.rows} × {tactile.cols}: "
+            "set tactile.rows, tactile.cols and tactile.pitch"
+        )
+    settings = settings.model_copy(update={"tactile": tactile.model_copy(update=changes)})
+
+    def frames(progress: Progress) -> Iterator[tuple[int, float, Counts]]:
+        for k, t in enumerate(recording.t.tolist()):
+            progress(k)
+            yield 0, t, recording.counts[k]
+
+    models = make_models(settings)
+    return Source(settings, models, (0,), count, frames, recording.truths, recording.live)
+
+
+# The contact's fields and their units; the CSV's header says name_unit.
+COLUMNS = (
+    ("d", "m"),
+    ("d_std", "m"),
+    ("theta", "rad"),
+    ("theta_std", "rad"),
+    ("tilt_y", "rad"),
+    ("force", "N"),
+    ("energy", "J"),
+    ("gain", ""),
+)
+
+
+@dataclass(frozen=True)
+class Contacts:
+    """One sensor's contacts, a row a frame. ``values`` by the names in COLUMNS, SI units."""
+
+    finger: str
+    t: FloatArray
+    invalid: NDArray[np.int64]  # an `Invalid` each
+    contact: NDArray[np.bool_]
+    values: dict[str, FloatArray]
+    truths: dict[str, FloatArray]
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """Frames whose estimate can be used."""
+        return np.equal(self.invalid, Invalid.NONE)
+
+    def reasons(self) -> Counter[str]:
+        """Count the reasons for which frames can't be used."""
+        return Counter(REASONS[k].text for k in self.invalid[~self.valid])
+
+
+class _Pass:
+    """One sensor's perception and its rows."""
+
+    def __init__(self, source: Source, finger: int) -> None:
+        self._sensor = GivenFrames(source.live)
+        self._perception = Perception(source.settings, {finger: self._sensor}, source.models)
+        self._state = State()
+        self._contact = self._state.contacts[finger]
+        self._rows: list[tuple[float, ...]] = []
+
+    def add(self, t: float, counts: NDArray[np.uint16]) -> None:
+        self._sensor.frame = Frame(len(self._rows) + 1, t, t, True, counts)
+        self._state.t = t
+        self._perception.update(self._state)
+        contact = self._contact
+        values = [getattr(contact, name) for name, _ in COLUMNS]
+        self._rows.append((t, contact.invalid, contact.contact, *values))
+
+    def contacts(self, finger: int, truths: dict[str, FloatArray]) -> Contacts:
+        table = np.array(self._rows, np.float64).reshape(-1, 3 + len(COLUMNS)).T
+        values = {name: table[3 + k] for k, (name, _) in enumerate(COLUMNS)}
+        return Contacts(
+            FINGERS[finger], table[0], table[1].astype(int), table[2] > 0.0, values, truths
+        )
+
+
+def analyse(source: Source, progress: Progress) -> list[Contacts]:
+    """Return the contacts of each sensor. Raises what the source's frames raise."""
+    passes = {finger: _Pass(source, finger) for finger in source.fingers}
+    for finger, t, counts in source.frames(progress):
+        passes[finger].add(t, counts)
+    return [each.contacts(finger, source.truths) for finger, each in passes.items()]
+
+
+def write_csv(path: Path, contacts: list[Contacts]) -> None:
+    """Write one line a frame, sensors one after the other; names with units. Raises OSError."""
+    names = [f"{name}_{unit}" if unit else name for name, unit in COLUMNS]
+    truths = sorted({name for each in contacts for name in each.truths})
+    units = dict(COLUMNS)
+    with write_text(path, newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        known = [f"{name}_true_{units[name]}" for name in truths]
+        writer.writerow(["t_s", "finger", "valid", "contact", *names, *known, "invalid"])
+        for each in contacts:
+            columns = [each.values[name] for name, _ in COLUMNS]
+            columns += [each.truths[name] for name in truths]
+            numbers = zip(*(column.tolist() for column in columns), strict=True)
+            for t, invalid, touches, row in zip(
+                each.t.tolist(), each.invalid.tolist(), each.contact.tolist(), numbers, strict=True
+            ):
+                start = f"{t:.6f}", each.finger, int(not invalid), int(touches)
+                writer.writerow([*start, *row, REASONS[invalid].text])

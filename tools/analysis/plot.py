@@ -1,6 +1,8 @@
-"""``softfinger plot FILE.mcap``: a recording beside the contact model.
+"""``softfinger plot FILE.mcap``: a recording beside the contact model, over θ and on its landscape.
 
-What is drawn over time is left to programs that open the file, Foxglove and PlotJuggler.
+The model is that of the recording's own settings and calibrations; force and energy are those of
+the state: the model times the scale of the tip's modulus that grips have found. What is drawn over
+time is left to programs that open the file, Foxglove and PlotJuggler.
 """
 
 from __future__ import annotations
@@ -8,28 +10,54 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from softfinger.daemon.client.records import read, to_columns
+from softfinger.daemon.errors import RecordingError, SettingsError, SoftfingerError, TactileError
+from softfinger.daemon.loop.warm_up import FRAMES
+from softfinger.daemon.perception.finger_model import FingerModel
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.types import FINGERS
+from softfinger.daemon.wire import schema
+from softfinger.kinematics.contact.table import ContactTable
+from softfinger.tools import style
 from softfinger.tools.arguments import add_range, to_stderr
 from softfinger.tools.extras import require
+from softfinger.tools.processes.kernel_build import build_kernels, print_event
+from softfinger.tools.recordings.reader import Recording
+from softfinger.tools.recordings.recomputed import recorded_models
+from softfinger.tools.terminal.progress import Progress
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from softfinger.tools.analysis.plots import RecordedRun
-
-PAGES = {
-    "angle": "force and energy against θ beside the model's curves",
-    "landscape": "the path over U(d, θ) with its local minimum",
-}
-
-_EPILOG = "pages:\n" + "\n".join(f"  {name:10} {what}" for name, what in PAGES.items())
-_EPILOG += """
+_EPILOG = """\
+pages:
+  angle      force and energy against θ beside the model's curves
+  landscape  the path over U(d, θ) with its local minimum
 
 A page whose data the recording lacks is left out, with the reason. Needs the extra 'plot'.
 Foxglove and PlotJuggler open the file, too, and draw any field over time.
 Exit status: 0 when at least one page was drawn."""
+
+
+FloatArray = NDArray[np.float64]
+
+DEGREES = 180.0 / np.pi
+LINES: dict[str, dict[str, Any]] = {
+    "left": {"color": style.KINDS[0], "linestyle": "-"},
+    "right": {"color": style.KINDS[1], "linestyle": (0, (5, 1.5))},
+}
+_POINTS = 700  # of each finger in one panel; more hide each other
+_CURVES = 5
+_GRID = 241  # of the landscape along each axis
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -55,25 +83,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_range(parser)
 
 
-def pages() -> dict[str, Callable[[RecordedRun], Figure]]:
-    """Return the function that draws each page; matplotlib is imported when one is drawn."""
-    from softfinger.tools.analysis.plots import draw_angle, draw_landscape
-
-    return dict(zip(PAGES, (draw_angle, draw_landscape), strict=True))
-
-
 def run(arguments: argparse.Namespace) -> int:
     """Draw; 1 when no page was drawn. Raises RecordingError, MissingExtra or OSError."""
     require("plot")  # before a long recording is read
-    from softfinger.daemon.loop.warm_up import FRAMES
-    from softfinger.daemon.profile.settings import Settings
-    from softfinger.tools import style
-    from softfinger.tools.analysis.plots import Missing, load_run
-    from softfinger.tools.processes.kernel_build import build_kernels, print_event
-    from softfinger.tools.recordings.reader import Recording
-    from softfinger.tools.terminal.progress import Progress
-
-    draws = pages()
     path: Path = arguments.file
     folder = arguments.out or path.with_name(path.name + ".plots")
     recording = Recording(path, to_stderr("plot"))
@@ -85,7 +97,7 @@ def run(arguments: argparse.Namespace) -> int:
     with style.settings():
         for name in (name for name in PAGES if name in (arguments.pages or PAGES)):
             try:
-                figure = draws[name](data)
+                figure = PAGES[name](data)
             except Missing as missing:
                 print(f"plot: page {name} left out: {missing}", file=sys.stderr)
                 continue
@@ -94,3 +106,220 @@ def run(arguments: argparse.Namespace) -> int:
                 print(folder / f"{name}.{suffix}")
             drawn += 1
     return 0 if drawn else 1
+
+
+class Missing(SoftfingerError):
+    """The recording lacks what a picture needs. The message says what."""
+
+
+@dataclass(frozen=True)
+class RecordedRun:
+    """A recording, or a part of it. SI units; ``t`` counts from the recording's first message.
+
+    ``states`` is one array a field, by the names of the stream, nested ones with a dot.
+    """
+
+    name: str
+    models: tuple[FingerModel, FingerModel] | None
+    why_no_model: str
+    states: dict[str, NDArray[Any]]
+    offset: float  # timestamp at t = 0
+
+    @cached_property
+    def t(self) -> FloatArray:
+        """Time of each state [s], by the daemon's monotonic clock."""
+        mono, wall = self.states["mono_ns"], self.states["timestamp"]
+        if not mono.size:
+            return mono
+        t: FloatArray = (mono - mono[0]) * 1e-9 + (wall[0] - self.offset)
+        return t
+
+    @cached_property
+    def fingers(self) -> tuple[str, ...]:
+        """The fingers that took part."""
+        return tuple(name for name in FINGERS if self.states[f"{name}.valid"].any())
+
+    def touching(self, finger: str) -> NDArray[np.bool_]:
+        """Return where the finger's state is valid and in contact."""
+        of = {name: self.states[f"{finger}.{name}"] for name in ("valid", "contact", "d")}
+        return np.asarray(of["valid"] & of["contact"] & np.isfinite(of["d"]))
+
+    def contacts(self) -> dict[str, ContactTable]:
+        """Return the table of each finger that ever touched. Raises Missing without any."""
+        if not self.t.size:
+            raise Missing("no hand/state in it")
+        touched = [name for name in self.fingers if self.touching(name).any()]
+        if not touched:
+            raise Missing("no contact in it")
+        if self.models is None:
+            raise Missing(self.why_no_model)
+        return {name: self.models[FINGERS.index(name)].table for name in touched}
+
+
+def load_run(
+    recording: Recording,
+    start: float,
+    end: float,
+    progress: Callable[[int], None] | None = None,
+) -> RecordedRun:
+    """Read what pictures need from ``start`` to ``end`` s. Raises RecordingError."""
+    messages = recording.messages([schema.STATE], start, end, progress)
+    record = schema.TOPICS[schema.STATE].record
+    states = to_columns([read(record, message) for _, message in messages])
+    return RecordedRun(recording.path.name, *_model(recording), states, recording.start)
+
+
+def _model(recording: Recording) -> tuple[tuple[FingerModel, FingerModel] | None, str]:
+    try:
+        return recorded_models(recording)[1], ""
+    except RecordingError as error:
+        return None, str(error).removeprefix(f"{recording.path}: ")
+    except (SettingsError, TactileError, ValueError) as error:
+        return None, f"its model can't be made: {error}"
+
+
+def _titled(figure: Figure, run: RecordedRun, text: str) -> None:
+    """Write the recording's name and ``text`` above a figure."""
+    figure.suptitle(f"{run.name}: {text}", x=0.01, ha="left", fontsize=9.0)
+
+
+def draw_angle(run: RecordedRun) -> Figure:
+    """Draw F and U against θ on curves at fixed d, and measured over modelled pressure."""
+    tables = run.contacts()
+    rows = len(tables)
+    figure = style.new_figure(7.2, 1.9 + 3.0 * rows)
+    grid = figure.add_gridspec(rows + 1, 2, height_ratios=[*[1.0] * rows, 0.5])
+    gain = figure.add_subplot(grid[rows, :])
+    gains = []
+    for row, (name, table) in enumerate(tables.items()):
+        at = np.flatnonzero(run.touching(name))
+        if at.size > _POINTS:
+            at = at[np.linspace(0, at.size - 1, _POINTS).astype(np.intp)]
+        seen = {each: run.states[f"{name}.{each}"][at]
+                for each in ("d", "theta", "force", "energy", "gain")}  # fmt: skip
+        for column, (field, label, factor) in enumerate(
+            (("force", "force F [N]", 1.0), ("energy", "energy U [mJ]", 1e3))
+        ):
+            panel = figure.add_subplot(grid[row, column])
+            mesh = _against_angle(panel, seen, table, field, factor)
+            panel.set(ylabel=label, xlabel="θ [°]", title=f"{name} finger")
+        bar = figure.colorbar(mesh, ax=figure.axes[-2:], shrink=0.9)
+        bar.set_label("displacement d [mm]")
+        look = {"marker": ".", "linestyle": "none", "color": LINES[name]["color"], "alpha": 0.6}
+        gain.plot(seen["theta"] * DEGREES, seen["gain"], **look, label=name)
+        gains.append(seen["gain"])
+    gain.axhline(1.0, color=style.INK, linewidth=0.8)
+    gain.set(xlabel="θ [°]", ylabel="measured over\nmodelled pressure")
+    reach = max(1.6 * float(np.quantile(np.abs(np.concatenate(gains) - 1.0), 0.98)), 0.01)
+    gain.set_ylim(1.0 - reach, 1.0 + reach)
+    gain.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, borderaxespad=0.1)
+    _titled(figure, run, "force and energy against θ")
+    return figure
+
+
+def _against_angle(
+    panel: Axes, seen: dict[str, FloatArray], table: ContactTable, field: str, factor: float
+) -> Any:
+    """Points coloured by d over the model's curves; returns the colour bar's mappable."""
+    from matplotlib.colors import Normalize
+
+    depths = _depths(seen["d"])
+    widest = max(1.1 * float(np.abs(seen["theta"]).max()), 5.0 / DEGREES)
+    scale = Normalize(0.0, depths[-1] * 1e3 / 0.85)  # the yellow end is too faint in print
+    for depth in depths:
+        limit = float(table.tip.theta_limit(depth))
+        tilt = np.linspace(-min(widest, limit), min(widest, limit), 181)
+        curve = getattr(table(depth, tilt), field) * factor
+        panel.plot(tilt * DEGREES, curve, color=style.GREY, linewidth=0.9, zorder=1)
+        panel.annotate(f"{depth * 1e3:g} mm", (tilt[-1] * DEGREES, curve[-1]), fontsize=7)
+    points = panel.scatter(
+        seen["theta"] * DEGREES, seen[field] * factor, c=seen["d"] * 1e3, cmap="viridis",
+        norm=scale, s=9, linewidths=0.0, zorder=2, rasterized=True, label="recorded",
+    )  # fmt: skip
+    panel.plot([], [], color=style.GREY, linewidth=0.9, label="model at a fixed d")
+    panel.set_ylim(bottom=0.0)
+    panel.set_ylim(top=panel.get_ylim()[1] * 1.12)
+    panel.margins(x=0.02)
+    panel.legend(loc="upper left", ncols=3, columnspacing=1.0, handletextpad=0.4)
+    return points
+
+
+def _depths(d: FloatArray) -> FloatArray:
+    """A few round displacements [m] that span the measured ones, at least one."""
+    from matplotlib.ticker import MaxNLocator
+
+    largest = max(float(np.quantile(d, 0.995)), 2e-4) * 1e3
+    return np.asarray(MaxNLocator(_CURVES).tick_values(0.0, largest)[1:]) * 1e-3
+
+
+def draw_landscape(run: RecordedRun) -> Figure:
+    """Return paths over U(d, θ) with its minimum over θ, and their height above θ = 0 over time."""
+    tables = run.contacts()
+    figure = style.new_figure(7.0, 2.2 + 4.0 * len(tables))
+    panels = figure.subplots(len(tables) + 1, 1, height_ratios=[*[1.0] * len(tables), 0.4])
+    above = panels[-1]
+    for panel, (name, table) in zip(panels, tables.items(), strict=False):
+        touching = run.touching(name)
+        d, theta = (
+            np.where(touching, run.states[f"{name}.{each}"], np.nan) for each in ("d", "theta")
+        )
+        widest = max(1.15 * float(np.nanmax(np.abs(theta))), 10.0 / DEGREES)
+        draw_map(panel, table, 1.15 * float(np.nanmax(d)), widest)
+        panel.plot(theta * DEGREES, d * 1e3, label=f"{name} finger", **LINES[name])
+        first, last = np.flatnonzero(touching)[[0, -1]]
+        for at, marker, label in ((first, "^", "begins"), (last, "s", "ends")):
+            look = {"color": LINES[name]["color"], "markersize": 5, "markeredgecolor": "white"}
+            look |= {"linestyle": "none", "clip_on": False, "zorder": 4}
+            panel.plot(theta[at] * DEGREES, d[at] * 1e3, marker, **look, label=label)
+        over = table(d, theta, edge=True).energy - table(d, 0.0, edge=True).energy
+        over = np.where(np.isfinite(d), over * 1e3, np.nan)
+        above.plot(run.t, over, label=name, **LINES[name])
+        panel.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=6, borderaxespad=0.1)
+    above.axhline(0.0, color=style.GREY, linewidth=0.6)
+    above.set_ylabel("U less that at θ = 0\nand the same d [mJ]")
+    above.set_xlabel("time [s]")
+    _titled(figure, run, "path on the energy landscape")
+    return figure
+
+
+def draw_map(panel: Axes, table: ContactTable, deepest: float, widest: float) -> None:
+    """Draw U(d, θ) [mJ] to ``deepest`` [m] and ±``widest`` [rad], its minimum over θ."""
+    from matplotlib.colors import PowerNorm
+
+    d = np.linspace(0.0, deepest, _GRID)[1:]
+    theta = np.linspace(-widest, widest, _GRID)
+    contact = table(d[:, None], theta[None, :], edge=True)
+    energy = np.ma.masked_where(~contact.inside, contact.energy * 1e3)
+    largest = float(energy.max())
+    round_ones = {float(f"{largest * (k / 8.0) ** 2:.2g}") for k in range(8)}
+    levels = np.array([*sorted(round_ones), largest])
+    panel.contourf(
+        theta * DEGREES,
+        d * 1e3,
+        energy,
+        levels,
+        cmap="Greys",
+        norm=PowerNorm(0.5, 0.0, 2.2 * largest),
+    )
+    lines = panel.contour(
+        theta * DEGREES, d * 1e3, energy, levels[1:-1], colors=style.GREY, linewidths=0.5
+    )
+    low = [level for level in levels[1:-1] if level < 0.65 * largest]  # others run out of the frame
+    panel.clabel(lines, low, fmt=lambda level: f"{level:.3g} mJ", fontsize=6.5)
+    minima = theta[np.argmin(energy, axis=1)]
+    local = np.abs(minima) < 0.99 * widest  # a bonded solid tip's energy falls to the sides
+    if local.any():
+        panel.plot(
+            np.where(local, minima, np.nan) * DEGREES,
+            d * 1e3,
+            color=style.INK,
+            linestyle=(0, (1, 1.2)),
+            label="local minimum over θ",
+        )
+    panel.set(xlabel="θ [°]", ylabel="displacement d [mm]")
+    panel.set_xlim(-widest * DEGREES, widest * DEGREES)
+    panel.set_ylim(0.0, deepest * 1e3)
+    panel.grid(visible=False)
+
+
+PAGES = {"angle": draw_angle, "landscape": draw_landscape}

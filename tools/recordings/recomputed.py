@@ -5,18 +5,22 @@ from __future__ import annotations
 import json
 import math
 import struct
+import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import msgpack
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from softfinger.daemon.client.records import read
 from softfinger.daemon.errors import RecordingError
-from softfinger.daemon.loop.process_replay import ProcessReplay
+from softfinger.daemon.loop.process_replay import ProcessReplay, with_calibrations
 from softfinger.daemon.loop.publishing import parts
+from softfinger.daemon.perception.finger_model import FingerModel, make_models
 from softfinger.daemon.profile.load import without_files
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS, Frame
@@ -77,6 +81,35 @@ def recorded_settings(recording: Recording) -> tuple[Settings, list[str]]:
     return without_files(settings), [str(each) for each in calibrations]
 
 
+def recorded_models(recording: Recording) -> tuple[Settings, tuple[FingerModel, FingerModel]]:
+    """Return the recording's settings, and the models of its fingers by its own calibrations.
+
+    Raises RecordingError, SettingsError, TactileError.
+    """
+    settings, calibrations = recorded_settings(recording)
+    with tempfile.TemporaryDirectory() as folder:
+        return settings, make_models(with_calibrations(settings, calibrations, Path(folder)))
+
+
+def counts_of(
+    recording: Recording, message: dict[str, Any], settings: Settings
+) -> NDArray[np.uint16]:
+    """Return a frame's counts. Raises RecordingError for pressures, or a grid of another shape."""
+    if message.get("unit") != "count":
+        raise RecordingError(
+            f"{recording.path}: frames in {message.get('unit')!r}, expected counts: "
+            'record with stream.tactile_unit = "count"'
+        )
+    shape, expected = (message["rows"], message["cols"]), settings.tactile
+    if shape != (expected.rows, expected.cols):
+        raise RecordingError(
+            f"{recording.path}: its frames have {shape[0]} × {shape[1]} cells, the settings' "
+            f"sensors {expected.rows} × {expected.cols}: another hand's recording, or another "
+            "hand's settings"
+        )
+    return np.frombuffer(message["data"], "<u2").reshape(shape)
+
+
 def recompute(
     recording: Recording,
     settings: Settings | None = None,
@@ -115,7 +148,7 @@ def _run(
     pack_state = packer(schema.STATE)
     newest = [0, 0]
     last = 0
-    for tick, frames, commands, state in _ticks(recording, progress):
+    for tick, frames, commands, state in _ticks(recording, used, progress):
         if result.ticks == 0:
             result.from_start = tick["seq"] == 1
         else:
@@ -131,12 +164,6 @@ def _run(
             if counts is None:
                 result.missing_frames += 1
                 continue
-            if counts.shape != (used.tactile.rows, used.tactile.cols):
-                raise RecordingError(
-                    f"{recording.path}: its frames have {counts.shape[0]} × {counts.shape[1]} "
-                    f"cells, the settings' sensors {used.tactile.rows} × {used.tactile.cols}: "
-                    "another hand's recording, or another hand's settings"
-                )
             taken[finger] = Frame(
                 part["frame_seq"],
                 part["frame_t"],
@@ -159,7 +186,9 @@ _Tick = tuple[
 ]
 
 
-def _ticks(recording: Recording, progress: Callable[[int], None] | None) -> Iterator[_Tick]:
+def _ticks(
+    recording: Recording, used: Settings, progress: Callable[[int], None] | None
+) -> Iterator[_Tick]:
     """Yield each tick: its frames and commands come before its input, its state after it."""
     wanted = (schema.INPUT, schema.TACTILE, schema.COMMAND, schema.STATE)
     frames: dict[tuple[int, int], Any] = {}
@@ -167,19 +196,13 @@ def _ticks(recording: Recording, progress: Callable[[int], None] | None) -> Iter
     waiting: dict[str, Any] | None = None
     for topic, message in recording.messages(wanted, progress=progress):
         if topic == schema.TACTILE:
-            if message.get("unit") != "count":
-                raise RecordingError(
-                    f"{recording.path}: frames in {message.get('unit')!r}, expected counts: "
-                    'record with stream.tactile_unit = "count"'
-                )
             if message.get("seq_step") != 1:
                 raise RecordingError(
                     f"{recording.path}: one of {message.get('seq_step')} frames was published, "
                     "all are needed: record with stream.tactile_rate at the sensors' own"
                 )
             finger = FINGERS.index(message["finger"])
-            counts = np.frombuffer(message["data"], "<u2").reshape(message["rows"], message["cols"])
-            frames[finger, message["seq"]] = counts
+            frames[finger, message["seq"]] = counts_of(recording, message, used)
             frames.pop((finger, message["seq"] - 2), None)
         elif topic == schema.COMMAND:
             command = read(schema.AnsweredCommand, message)
