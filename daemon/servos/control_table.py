@@ -1,7 +1,8 @@
 """The Dynamixel X series' control table: addresses, units, operating modes and models.
 
 Plain data from the servo maker's manuals; what a joint's counts are in rad, rad/s and A is in
-`servos.joint`. The client and the emulated servos both read it; nothing here talks to a servo.
+`servos.joint`. The client and the emulated servos both read it, and share the CRC of their packets;
+nothing here talks to a servo.
 """
 
 from __future__ import annotations
@@ -269,3 +270,20 @@ def name_of(number: int) -> str:
     """Return the name of the model with this ``number`` in its ping; the number if unknown."""
     names = [model.name for model in MODELS.values() if model.number == number]
     return names[0] if names else f"model number {number}"
+
+
+def _crc_of(byte: int) -> int:
+    crc = byte << 8
+    for _ in range(8):
+        crc = crc << 1 ^ (0x8005 if crc & 0x8000 else 0)
+    return crc & 0xFFFF
+
+
+_CRCS: Final = [_crc_of(byte) for byte in range(256)]
+
+
+def crc16(data: bytes, crc: int = 0) -> int:
+    """Return CRC-16 (polynomial 0x8005, initial 0) that ends every packet."""
+    for byte in data:
+        crc = crc << 8 & 0xFF00 ^ _CRCS[crc >> 8 ^ byte]
+    return crc

@@ -6,7 +6,7 @@ import random
 import struct
 
 from softfinger.daemon.servos import control_table as reg
-from softfinger.daemon.servos.crc import crc16
+from softfinger.daemon.servos.control_table import crc16
 from softfinger.daemon.simulation.servo_model import framing
 from softfinger.daemon.simulation.servo_model.framing import BROADCAST, PacketParser, frame
 from softfinger.daemon.simulation.servo_model.servo import REBOOT_TIME, EmulatedServo

@@ -7,7 +7,7 @@ from dynamixel_sdk import PacketHandler as sdk_handler
 from hypothesis import given
 from hypothesis import strategies as st
 
-from softfinger.daemon.servos.crc import crc16
+from softfinger.daemon.servos.control_table import crc16
 from softfinger.daemon.simulation.servo_model import framing
 from softfinger.daemon.simulation.servo_model.framing import (
     PacketParser,

@@ -31,21 +31,18 @@ class BusRecorder:
         self._fired_t: float | None = None
         self._off_t: float | None = None
 
-    def goal(self, address: int, value: int, joint: ServoJoint, torque: bool) -> None:
-        """Record a value for a register on the wire, but none near where a limp joint is."""
-        if address not in _WATCHED:
-            return
-        if address == reg.GOAL_POSITION and not torque and _away(joint, value) <= FAR:
-            return
-        seen = self._goals.get(address)
-        if seen is None:
-            self._goals[address] = value, value
-        elif not seen[0] <= value <= seen[1]:
-            self._goals[address] = min(seen[0], value), max(seen[1], value)
-
-    def refused(self) -> None:
-        """Record that the servo refused a write that had a goal in it."""
-        self._refused += 1
+    def goals(
+        self, values: dict[int, int], joint: ServoJoint, torque: bool, refused: bool
+    ) -> None:
+        """Record a write: values by register, but no angle near where a limp joint is."""
+        goals = _WATCHED & values.keys()
+        self._refused += refused and bool(goals)
+        for address in goals:
+            value = values[address]
+            if address == reg.GOAL_POSITION and not torque and _away(joint, value) <= FAR:
+                continue
+            least, greatest = self._goals.get(address, (value, value))
+            self._goals[address] = min(least, value), max(greatest, value)
 
     def torque_on(self, t: float, joint: ServoJoint, mode: int, goals: tuple[int, int]) -> None:
         """Record torque on at time t with these goals (position, current) in force, in counts."""

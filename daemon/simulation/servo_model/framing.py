@@ -6,9 +6,10 @@ means something.
 
 from __future__ import annotations
 
+import re
 from typing import Final, NamedTuple
 
-from softfinger.daemon.servos.crc import crc16
+from softfinger.daemon.servos.control_table import crc16
 
 HEADER: Final = b"\xff\xff\xfd"
 BROADCAST: Final = 0xFE
@@ -40,8 +41,7 @@ ALERT: Final = 0x80
 MAX_LENGTH: Final = 1024  # longest packet a servo takes; a longer length field is noise
 _PREFIX: Final = HEADER + b"\x00"
 _STUFFED: Final = HEADER + b"\xfd"
-_ASKED_AGAIN: Final = frozenset((READ, SYNC_READ, FAST_SYNC_READ, BULK_READ, FAST_BULK_READ))
-_KNOWN: Final = 32  # requests remembered
+_UNSTUFFED: Final = re.compile(rb"\xff\xff\xfd[^\xfd]")
 
 
 def frame(packet_id: int, instruction: int, parameters: bytes = b"") -> bytes:
@@ -72,17 +72,6 @@ class Packet(NamedTuple):
     size: int  # bytes it took on the wire
 
 
-def _is_plain(data: bytes) -> bool:
-    """Return whether it is one whole packet without stuffing, as nearly all are."""
-    return (
-        10 <= len(data) <= MAX_LENGTH
-        and data[:4] == _PREFIX
-        and 7 + (data[5] | data[6] << 8) == len(data)
-        and data[4] not in (0xFD, 0xFF)
-        and data.find(HEADER, 7, -2) < 0
-    )
-
-
 def _packet(raw: bytes) -> Packet:
     """The whole packet that ``raw`` is."""
     valid = crc16(raw[:-2]) == raw[-2] | raw[-1] << 8
@@ -102,31 +91,15 @@ class PacketParser:
         self.gap = gap
         self.dropped = 0  # bytes that belonged to no packet
         self._buffer = bytearray()
-        self._known: dict[bytes, list[Packet]] = {}
         self._last = 0.0
 
     def feed(self, data: bytes, t: float) -> list[Packet]:
         """Return the packets that ``data``, arriving at time t [s], completes."""
-        buffer = self._buffer
-        if buffer and t - self._last > self.gap:
-            self.dropped += len(buffer)
-            buffer.clear()
+        if t - self._last > self.gap:
+            self._drop(len(self._buffer))
         self._last = t
-        if not buffer:
-            known = self._known.get(data)
-            if known is not None:
-                return known
-            if _is_plain(data):
-                packets = [_packet(data)]
-                # A client asks the same thing tick after tick.
-                if packets[0].instruction in _ASKED_AGAIN and len(self._known) < _KNOWN:
-                    self._known[data] = packets
-                return packets
-        buffer += data
-        packets = []
-        while (packet := self._next()) is not None:
-            packets.append(packet)
-        return packets
+        self._buffer += data
+        return list(iter(self._next, None))
 
     def reset(self) -> None:
         """Forget a packet begun."""
@@ -138,16 +111,14 @@ class PacketParser:
 
     def _next(self) -> Packet | None:
         buffer = self._buffer
-        while buffer:
+        while True:
             start = buffer.find(_PREFIX)
             if start < 0:
                 # Keep what may be the beginning of a header.
                 keep = next((n for n in (3, 2, 1) if buffer.endswith(_PREFIX[:n])), 0)
-                if len(buffer) > keep:
-                    self._drop(len(buffer) - keep)
+                self._drop(len(buffer) - keep)
                 return None
-            if start:
-                self._drop(start)
+            self._drop(start)
             if len(buffer) < 7:
                 return None
             packet_id = buffer[4]
@@ -156,27 +127,14 @@ class PacketParser:
                 self._drop(len(HEADER))
                 continue
             end = 7 + length
-            intruder = self._header_within(min(end - 2, len(buffer)))
-            if intruder >= 0:
-                self._drop(intruder)
+            body = bytes(buffer[7 : end - 2])
+            if len(buffer) > end - 2:
+                body += b"\0"  # no stuffing follows a header that ends the body
+            if intruder := _UNSTUFFED.search(body):
+                self._drop(7 + intruder.start())
                 continue
             if len(buffer) < end:
                 return None
             raw = bytes(buffer[:end])
             del buffer[:end]
             return _packet(raw)
-        return None
-
-    def _header_within(self, end: int) -> int:
-        """Return where an unstuffed FF FF FD stands in the body so far received, or -1."""
-        buffer = self._buffer
-        at = buffer.find(HEADER, 7, end)
-        while at >= 0:
-            after = at + len(HEADER)
-            if after >= end:
-                # The deciding byte is not here yet, or the body ends with a lone FF FF FD.
-                return at if after < len(buffer) else -1
-            if buffer[after] != 0xFD:
-                return at
-            at = buffer.find(HEADER, after, end)
-        return -1

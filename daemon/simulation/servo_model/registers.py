@@ -17,7 +17,6 @@ _PROFILE_MAX = 32_767
 _OFFSET_MAX = 1_044_479
 _MULTI_TURN = 1_048_575
 _STARTUP_FIRMWARE = 45
-_LAYOUTS = 64  # spans whose layout is remembered
 _FORMATS = {1: "<B", 2: "<H", 4: "<I"}
 _GOALS = (reg.GOAL_PWM, reg.GOAL_CURRENT, reg.GOAL_VELOCITY, reg.GOAL_POSITION)
 _LIMITS = {
@@ -145,22 +144,16 @@ class ControlTable:
         self.memory = bytearray(self.size)
         self.at = {item.address: item for item in self.items}
         self._modes = model.modes
-        self._start: list[int | None] = [None] * self.size  # byte → its item's first address
-        self._unpack, self._pack = {}, {}
+        self._unpack = {}
         for item in self.items:
-            self._start[item.address : item.address + item.size] = [item.address] * item.size
             form = _FORMATS[item.size]
             layout = struct.Struct(form.lower() if item.signed else form)
             self._unpack[item.address] = layout.unpack_from
-            self._pack[item.address] = layout.pack_into
         self._indirect = {
             data + i: address + 2 * i
             for address, data, entries in model.indirect_blocks(firmware)
             for i in range(entries)
         }
-        self._pointers = frozenset(self._indirect.values())
-        self._first_indirect = min(self._indirect)
-        self._layouts: dict[tuple[int, int], tuple[int, list[tuple[Item, int]]]] = {}
         self.reset()
 
     # --- values ----------------------------------------------------------------------------------
@@ -175,14 +168,6 @@ class ControlTable:
         item = self.at[address]
         mask = (1 << 8 * item.size) - 1
         self.memory[address : address + item.size] = (value & mask).to_bytes(item.size, "little")
-        if address in self._pointers:
-            self._layouts.clear()
-
-    def put(self, item: Item, value: int) -> None:
-        """Store a value that lies in the item's range."""
-        self._pack[item.address](self.memory, item.address, value)
-        if item.address in self._pointers:
-            self._layouts.clear()
 
     def reset(self, keep: tuple[int, ...] = ()) -> None:
         """Restore factory defaults everywhere but in the items at the addresses ``keep``."""
@@ -211,20 +196,11 @@ class ControlTable:
 
     def read(self, address: int, length: int) -> bytes:
         """Return the bytes of a span inside the table, indirect data resolved."""
-        end = address + length
-        if end <= self._first_indirect:
-            return bytes(self.memory[address:end])
-        memory, resolve = self.memory, self.resolve
-        return bytes(memory[resolve(i)] for i in range(address, end))
+        return bytes(self.memory[self.resolve(i)] for i in range(address, address + length))
 
     def reads(self, address: int, length: int, first: int, last: int) -> bool:
         """Return whether reading the span shows any byte of ``first`` … ``last``."""
-        end = address + length
-        if address <= last and end > first:
-            return True
-        if end <= self._first_indirect:
-            return False
-        return any(first <= self.resolve(i) <= last for i in range(address, end))
+        return any(first <= self.resolve(i) <= last for i in range(address, address + length))
 
     # --- writing ---------------------------------------------------------------------------------
 
@@ -233,62 +209,27 @@ class ControlTable:
 
         Every item must be written whole; one that is cut gives DATA_LENGTH, a read-only or
         undefined byte ACCESS, a value out of the item's own range DATA_RANGE. With an error
-        nothing is to be written, the items before the bad one neither; the values that were
-        understood are there all the same where only another register forbids one.
+        nothing is to be written, the items before the bad one neither.
         """
-        span = address, len(data)
-        error, layout = self._layouts.get(span) or self._layout(*span)
-        if error:
-            return error, []
-        plan: list[tuple[Item, int]] = []
-        for item, begin in layout:
-            (value,) = self._unpack[item.address](data, begin)
-            if not item.low <= value <= item.high:
-                return framing.DATA_RANGE, []
-            plan.append((item, value))
-        for item, value in plan:
-            error = error or self._refusal(item, value)
-        return error, plan
-
-    def values(self, address: int, data: bytes) -> dict[int, int]:
-        """Return the value of each register that a write has whole, allowed or not."""
-        places = [self.resolve(i) for i in range(address, min(address + len(data), self.size))]
-        found = {}
-        for i, place in enumerate(places):
-            item = self.at.get(place)
-            if item is not None and places[i : i + item.size] == list(
-                range(place, place + item.size)
-            ):
-                (found[place],) = self._unpack[place](data, i)
-        return found
-
-    def _layout(self, address: int, length: int) -> tuple[int, list[tuple[Item, int]]]:
-        """Return the items that a span writes, with their offsets in its data, or the error."""
-        layout = self._lay_out(address, length)
-        if len(self._layouts) < _LAYOUTS:
-            self._layouts[address, length] = layout
-        return layout
-
-    def _lay_out(self, address: int, length: int) -> tuple[int, list[tuple[Item, int]]]:
-        if length == 0:
+        if not data:
             return framing.DATA_LENGTH, []
-        if address + length > self.size:
+        if address + len(data) > self.size:
             return framing.ACCESS, []
-        places = [self.resolve(i) for i in range(address, address + length)]
-        layout: list[tuple[Item, int]] = []
+        places = [self.resolve(address + i) for i in range(len(data))]
+        plan: list[tuple[Item, int]] = []
         i = 0
-        while i < length:
-            start = self._start[places[i]]
-            if start is None:
+        while i < len(data):
+            item = self.at.get(places[i])
+            if item is None or not item.writable:
                 return framing.ACCESS, []
-            item = self.at[start]
-            if not item.writable or places[i] != start:
-                return framing.ACCESS, []
-            if places[i : i + item.size] != list(range(start, start + item.size)):
+            if places[i : i + item.size] != list(range(places[i], places[i] + item.size)):
                 return framing.DATA_LENGTH, []
-            layout.append((item, i))
+            plan.append((item, self._unpack[item.address](data, i)[0]))
             i += item.size
-        return framing.OK, layout
+        if not all(item.low <= value <= item.high for item, value in plan):
+            return framing.DATA_RANGE, plan
+        refusals = (self._refusal(item, value) for item, value in plan)
+        return next(filter(None, refusals), framing.OK), plan
 
     def _refusal(self, item: Item, value: int) -> int:
         """The error of writing ``value`` because of what other registers hold; OK if allowed."""

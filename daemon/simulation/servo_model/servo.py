@@ -19,7 +19,7 @@ from softfinger.daemon.servos.control_table import ServoModel
 from softfinger.daemon.servos.joint import JointScale
 from softfinger.daemon.simulation.servo_model import framing
 from softfinger.daemon.simulation.servo_model.bus_recorder import BusRecorder
-from softfinger.daemon.simulation.servo_model.registers import ControlTable, Item
+from softfinger.daemon.simulation.servo_model.registers import ControlTable
 from softfinger.daemon.simulation.servo_model.servo_heat import ServoHeat
 from softfinger.daemon.simulation.servo_model.servo_joint import (
     SENSE,
@@ -30,7 +30,6 @@ from softfinger.daemon.simulation.servo_model.servo_joint import (
 
 REBOOT_TIME = 0.34  # s without an answer
 JUMP = 130  # counts, 0.2 rad at the shaft, by which an encoder's zero jumps
-_MOTION_END = reg.PRESENT_POSITION + 4
 _EFFECTIVE = frozenset(  # registers whose writing does more than change them
     (
         reg.TORQUE_ENABLE,
@@ -132,6 +131,10 @@ class EmulatedServo:
         return ticks * reg.WATCHDOG_UNIT if ticks <= reg.WATCHDOG_MAX else 0.0
 
     @property
+    def _armed(self) -> bool:
+        return self.torque_on and self.watchdog > 0.0
+
+    @property
     def mode(self) -> int:
         return self._memory[reg.OPERATING_MODE]
 
@@ -148,14 +151,10 @@ class EmulatedServo:
 
     def next_event(self) -> float:
         """Return when :meth:`act` next has something to do [s]."""
-        due = self._next_step if self._next_step < self._next_sense else self._next_sense
+        due = min(self._next_step, self._next_sense)
         if self._boot_at > -math.inf:
             return min(due, self._boot_at)
-        memory = self._memory
-        ticks = memory[reg.BUS_WATCHDOG]
-        if 0 < ticks <= reg.WATCHDOG_MAX and memory[reg.TORQUE_ENABLE]:
-            return min(due, self._watched + ticks * reg.WATCHDOG_UNIT)
-        return due
+        return min(due, self._watched + self.watchdog) if self._armed else due
 
     def act(self, t: float) -> None:
         """Do what is due at time t; the plant must have been advanced to it."""
@@ -165,9 +164,7 @@ class EmulatedServo:
                 return
             self._boot_at = -math.inf
             self._start(t)
-        ticks = self._memory[reg.BUS_WATCHDOG]
-        armed = 0 < ticks <= reg.WATCHDOG_MAX and self.torque_on
-        if armed and t >= self._watched + ticks * reg.WATCHDOG_UNIT:
+        if self._armed and t >= self._watched + self.watchdog:
             self.table.set(reg.BUS_WATCHDOG, reg.WATCHDOG_ERROR)
             self.recorder.fired(t)
             self._stop()
@@ -190,20 +187,20 @@ class EmulatedServo:
             return None
         if self.frozen:
             return table.read(address, length)
-        if address >= reg.PRESENT_CURRENT and address + length <= _MOTION_END:
-            self._joint.refresh_motion()
-        elif table.reads(address, length, reg.REALTIME_TICK, reg.PRESENT_TEMPERATURE):
+        if table.reads(address, length, reg.REALTIME_TICK, reg.PRESENT_TEMPERATURE):
             self._joint.refresh(t - self._booted, self.health.voltage, self.health.heat.sensed)
         return table.read(address, length)
 
     def write(self, address: int, data: bytes, t: float) -> int:
         """Write a span; the error number, 0 when all of it was done."""
-        error, plan = self._checked(address, data)
+        error, plan = self.table.plan(address, data)
+        values = {item.address: value for item, value in plan}
+        self.recorder.goals(values, self._joint, self.torque_on, error != framing.OK)
         if error:
             return error
         limp = not self._memory[reg.TORQUE_ENABLE]
         for item, value in plan:
-            self.table.put(item, value)
+            self.table.set(item.address, value)
         for item, value in plan:
             if item.address in _EFFECTIVE:
                 self._effect(item.address, value, t)
@@ -256,14 +253,14 @@ class EmulatedServo:
 
     def report(self, t: float) -> dict[str, Any]:
         """Return the servo's state and the record of what it was sent."""
-        ticks = self._memory[reg.BUS_WATCHDOG]
+        stopped = self._memory[reg.BUS_WATCHDOG] == reg.WATCHDOG_ERROR
         return {
             "id": self.id,
             "torque": self.torque_on,
             "mode": self.mode,
             "hardware_error": self._memory[reg.HARDWARE_ERROR_STATUS],
-            "watchdog": ticks * reg.WATCHDOG_UNIT if ticks <= reg.WATCHDOG_MAX else None,
-            "stopped_by_watchdog": ticks == reg.WATCHDOG_ERROR,
+            "watchdog": None if stopped else self.watchdog,
+            "stopped_by_watchdog": stopped,
             "q": self._joint.goal_angle(self._joint.position()),
             **self.recorder.report(t, self._joint, self.torque_on),
         }
@@ -294,20 +291,7 @@ class EmulatedServo:
                 self.frozen = self.refuses = False
                 self._joint.stuck, self._joint.shift = None, 0
 
-    # --- rules of writing ------------------------------------------------------------------
-
-    def _checked(self, address: int, data: bytes) -> tuple[int, list[tuple[Item, int]]]:
-        error, plan = self.table.plan(address, data)
-        for item, value in plan:
-            self.recorder.goal(item.address, value, self._joint, self.torque_on)
-        if error:
-            # Goals that were on the wire are recorded though the table would not have them.
-            values = self.table.values(address, data)
-            if reg.GOAL_CURRENT in values or reg.GOAL_POSITION in values:
-                self.recorder.refused()
-            for each, value in values.items():
-                self.recorder.goal(each, value, self._joint, self.torque_on)
-        return error, plan
+    # --- what a write does ------------------------------------------------------------------
 
     def _effect(self, address: int, value: int, t: float) -> None:
         if address == reg.TORQUE_ENABLE:

@@ -20,8 +20,7 @@ from typing import Any, NamedTuple
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.base import JointPlant
-from softfinger.daemon.servos.control_table import by_name
-from softfinger.daemon.servos.crc import crc16
+from softfinger.daemon.servos.control_table import by_name, crc16
 from softfinger.daemon.servos.joint import JointScale
 from softfinger.daemon.simulation.faults import (
     LINE_FAULTS,

@@ -31,11 +31,6 @@ _PER_VELOCITY = reg.VELOCITY_UNIT * reg.COUNTS_PER_TURN / (2.0 * math.pi)  # cou
 _PER_ACCELERATION = reg.ACCELERATION_UNIT * reg.COUNTS_PER_TURN / (2.0 * math.pi)
 _ARRIVED = 20  # counts from the goal that count as there
 _PRESENT = struct.Struct("<HBBhhiiiiHB")  # registers 120 … 146
-_MOTION = struct.Struct("<hii")  # registers 126 … 135
-_PROFILE = struct.Struct("<II").unpack_from  # registers 108 … 115: acceleration, velocity
-_U32 = struct.Struct("<I").unpack_from
-_I32 = struct.Struct("<i").unpack_from
-_I16 = struct.Struct("<h").unpack_from
 
 
 class ServoJoint:
@@ -51,7 +46,6 @@ class ServoJoint:
     ) -> None:
         self.profile = Profile()
         self._model = model
-        self._senses_current = model.senses_current
         self._table = table
         self._memory = table.memory
         self._plant = plant
@@ -97,22 +91,12 @@ class ServoJoint:
     def position(self) -> int:
         """Return present position in counts, as register 132 has it."""
         within = self.encoder() - self._turns * reg.COUNTS_PER_TURN
-        memory = self._memory
-        if memory[reg.DRIVE_MODE] & 1:
-            within = -within
-        (offset,) = _I32(memory, reg.HOMING_OFFSET)
-        return within + int(offset)
+        return self.sign * within + self._table.get(reg.HOMING_OFFSET)
 
-    def _angle(self, position: float) -> float:
-        memory = self._memory
-        within = position - _I32(memory, reg.HOMING_OFFSET)[0]
-        if memory[reg.DRIVE_MODE] & 1:
-            within = -within
-        return self._scale.angle(within + self._turns * reg.COUNTS_PER_TURN)
-
-    def goal_angle(self, counts: int) -> float:
+    def goal_angle(self, counts: float) -> float:
         """Return joint angle [rad] that a goal position means."""
-        return self._angle(counts)
+        within = self.sign * (counts - self._table.get(reg.HOMING_OFFSET))
+        return self._scale.angle(within + self._turns * reg.COUNTS_PER_TURN)
 
     def goal_current(self, counts: int) -> float:
         """Return the current [A] of a goal current, positive closing; a bound's sign is void."""
@@ -126,11 +110,11 @@ class ServoJoint:
 
     def aim(self) -> None:
         """Start the trajectory to the goal position as the profile registers ask."""
-        memory, profile = self._memory, self.profile
+        memory, table, profile = self._memory, self._table, self.profile
         if memory[reg.OPERATING_MODE] not in POSITION_MODES:
             return
-        target = float(_I32(memory, reg.GOAL_POSITION)[0])
-        acceleration, speed = _PROFILE(memory, reg.PROFILE_ACCELERATION)
+        target = float(table.get(reg.GOAL_POSITION))
+        acceleration, speed = table.get(reg.PROFILE_ACCELERATION), table.get(reg.PROFILE_VELOCITY)
         if not speed and not acceleration:
             profile.hold(target)
         elif memory[reg.DRIVE_MODE] & 4:
@@ -164,45 +148,31 @@ class ServoJoint:
         if not memory[reg.TORQUE_ENABLE]:
             self._plant.drive(joint, reg.CURRENT_MODE, False, 0.0, 0.0)
         elif mode == reg.CURRENT_BASED_POSITION_MODE:
-            bound = abs(_I16(memory, reg.GOAL_CURRENT)[0]) * self._model.current_unit
-            goal = self._angle(self.profile.position)
+            bound = abs(table.get(reg.GOAL_CURRENT)) * self._model.current_unit
+            goal = self.goal_angle(self.profile.position)
             self._plant.drive(joint, reg.CURRENT_BASED_POSITION_MODE, True, goal, bound)
         elif mode == reg.CURRENT_MODE:
             current = self._scale.amperes(self.sign * table.get(reg.GOAL_CURRENT))
             self._plant.drive(joint, reg.CURRENT_MODE, True, 0.0, current)
         else:
-            goal = self._angle(self.profile.position)
+            goal = self.goal_angle(self.profile.position)
             self._plant.drive(joint, reg.POSITION_MODE, True, goal, self.current_limit)
-
-    def _motion(self) -> tuple[int, int, int]:
-        """Registers 126, 128 and 132: current (or load), velocity, position."""
-        if self.stuck is not None:
-            return 0, 0, self.position()
-        plant, joint, scale = self._plant, self._joint, self._scale
-        ampere = plant.measured_current(joint)
-        if self._senses_current:
-            current = scale.current_counts(ampere)
-        else:  # the register is present load, 0.1 %
-            current = round(1000.0 * self._load * ampere)
-        velocity = scale.velocity_counts(plant.dq.item(joint))
-        if self._memory[reg.DRIVE_MODE] & 1:
-            current, velocity = -current, -velocity
-        if not -32768 <= current <= 32767:
-            current = -32768 if current < 0 else 32767
-        return current, velocity, self.position()
-
-    def refresh_motion(self) -> None:
-        """Bring registers 126 … 135 up to date, which is all that most reads ask for."""
-        _MOTION.pack_into(self._memory, reg.PRESENT_CURRENT, *self._motion())
 
     def refresh(self, seconds: float, voltage: float, temperature: float) -> None:
         """Bring registers 120 … 146 up to date, ``seconds`` after power-up."""
-        profile, memory = self.profile, self._memory
-        current, velocity, position = self._motion()
-        pwm = 0
+        profile, memory, position = self.profile, self._memory, self.position()
+        plant, joint, scale = self._plant, self._joint, self._scale
+        current = velocity = pwm = 0
+        if self.stuck is None:
+            ampere = plant.measured_current(joint)
+            if self._model.senses_current:
+                current = scale.current_counts(ampere)
+            else:  # the register is present load, 0.1 %
+                current = round(1000.0 * self._load * ampere)
+            current = max(-32768, min(32767, self.sign * current))
+            velocity = self.sign * scale.velocity_counts(plant.dq.item(joint))
         if memory[reg.TORQUE_ENABLE]:
-            ampere, rate = self._plant.current.item(self._joint), self._plant.dq.item(self._joint)
-            duty = self._load * ampere + self._speed * rate
+            duty = self._load * plant.current.item(joint) + self._speed * plant.dq.item(joint)
             pwm = max(-885, min(885, round(self.sign * 885.0 * duty)))
         busy = profile.busy
         arrived = not busy and abs(profile.target - position) <= _ARRIVED
@@ -210,7 +180,7 @@ class ServoJoint:
             memory,
             reg.REALTIME_TICK,
             int(seconds * 1000.0 + 1e-6) & 0x7FFF,
-            abs(velocity) > _U32(memory, reg.MOVING_THRESHOLD)[0],
+            abs(velocity) > self._table.get(reg.MOVING_THRESHOLD),
             arrived | busy << 1,
             pwm,
             current,
