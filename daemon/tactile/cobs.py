@@ -101,36 +101,13 @@ def unstuff(packet: NDArray[np.uint8], out: NDArray[np.uint8]) -> int:
     return size if left == 0 else -1
 
 
-# By rows: what a byte adds to the CRC behind so many others.
-_CRCS = np.array(
-    [[binascii.crc_hqx(bytes([v, *bytes(k)]), 0) for v in range(256)] for k in range(16)],
-    np.uint16,
-)
-
-
-@kernel
-def crc16(message: NDArray[np.uint8], size: int) -> int:
-    """Return the CRC of the first ``size`` bytes, 16 at a time: five times as fast as `crc_hqx`."""
-    crc = np.uint16(_CRC_START)
-    whole = size - size % 16
-    for k in range(0, whole, 16):
-        behind = _CRCS[15, (crc >> 8) ^ message[k]] ^ _CRCS[14, (crc & 0xFF) ^ message[k + 1]]
-        for j in range(2, 16):
-            behind ^= _CRCS[15 - j, message[k + j]]
-        crc = behind
-    for k in range(whole, size):
-        crc = np.uint16(crc << 8) ^ _CRCS[0, (crc >> 8) ^ message[k]]
-    return int(crc)
-
-
 class CobsDecoder(DelimitedDecoder):
     """Bytes of our framing in, frames of counts with number and board's time out."""
 
     def __init__(self, rows: int, cols: int) -> None:
         super().__init__(rows, cols, b"\0", longest_frame(rows, cols))
         # Compiled here, and not when the first frame comes.
-        message = np.zeros(self.longest, np.uint8)
-        crc16(message, unstuff(np.frombuffer(bytearray(b"\1"), np.uint8), message))
+        unstuff(np.frombuffer(bytearray(b"\1"), np.uint8), np.zeros(1, np.uint8))
         self._bad_crc = 0
         self._missed = 0
         self._seq: int | None = None
@@ -147,7 +124,10 @@ class CobsDecoder(DelimitedDecoder):
         if size < _HEADER.size:
             self._reason = "packets too short or not COBS"
             return None
-        if crc16(message, size) != _CRC.unpack_from(message.data, size)[0]:
+        if (
+            binascii.crc_hqx(message.data[:size], _CRC_START)
+            != _CRC.unpack_from(message.data, size)[0]
+        ):
             self._bad_crc += 1
             self._reason = "packets whose CRC is wrong"
             return None

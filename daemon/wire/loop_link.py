@@ -8,14 +8,13 @@ bounds what is on the way, and the gateway bounds what it sends to what the loop
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import math
 import select
 import socket
 import struct
 from collections import deque
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 # From the loop. A message too long for one packet comes in pieces.
 PUBLISH = b"P"  # topic's index, flags, piece of the message
@@ -46,20 +45,10 @@ _PIECE = 60_000
 _ROOM = 1 << 20  # bytes that may be on the way; the kernel may allow less
 _LOOK = 16  # packets taken in at a tick
 _WAITING = 64  # replies and fences that wait for room
-_OURS, _OTHER = 0, 1  # of the descriptors that are looked at
 _NOTICES = 20
 _PATIENCE = 2.0  # s for room on the way to a new gateway
 _FENCES = 1 << 32  # that are told apart
 _EVENTS = 50  # events that a gateway is given anew
-
-# The system's poll without giving up the GIL, which to get back may cost a whole switch interval.
-poll = ctypes.PyDLL(None).poll
-
-
-class PollFd(ctypes.Structure):
-    """One descriptor, as the system's poll takes it."""
-
-    _fields_ = (("fd", ctypes.c_int), ("events", ctypes.c_short), ("revents", ctypes.c_short))
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,8 +120,8 @@ class Link:
         self._waiting: deque[bytes] = deque(maxlen=_WAITING)
         self._last_events: deque[bytes] = deque(maxlen=_EVENTS)
         self.called = False  # something came at the descriptor of `watch`
-        self._polled = (PollFd * 2)(PollFd(-1, select.POLLIN, 0), PollFd(-1, select.POLLIN, 0))
-        self._asked_of: Any = ctypes.byref(self._polled)
+        self._other = -1  # that descriptor
+        self._poll = select.poll()
 
     def offer(self, end: socket.socket) -> None:
         """Use this from the next look on. From any thread."""
@@ -140,7 +129,8 @@ class Link:
 
     def watch(self, descriptor: int) -> None:
         """Look at another descriptor, too: `called` is set when something waits there."""
-        self._polled[_OTHER].fd = descriptor
+        self._other = descriptor
+        self._poll.register(descriptor, select.POLLIN)
 
     def look(self) -> None:
         """Take in the gateway's packets. Less than a microsecond when there are none."""
@@ -148,10 +138,9 @@ class Link:
             self._adopt()
         if self._waiting:
             self._send_waiting()
-        if not poll(self._asked_of, 2, 0):
-            return
-        self.called = self._polled[_OTHER].revents != 0
-        if self._socket is None or not self._polled[_OURS].revents:
+        ready = [descriptor for descriptor, _ in self._poll.poll(0)]
+        self.called = self._other in ready
+        if self._socket is None or self._socket.fileno() not in ready:
             return
         for _ in range(_LOOK):
             try:
@@ -196,16 +185,16 @@ class Link:
         self._disconnect()
         self._socket, self._offered = self._offered, None
         assert self._socket is not None
-        self._polled[_OURS].fd = self._socket.fileno()
+        self._poll.register(self._socket, select.POLLIN)
         for packet in self._last_events:
             self._send(packet)
         self.raise_fence()
 
     def _disconnect(self) -> None:
         if self._socket is not None:
+            self._poll.unregister(self._socket)
             self._socket.close()
             self._socket = None
-            self._polled[_OURS].fd = -1
         self.wanted = 0
         self.asked.clear()
         self.stops.clear()

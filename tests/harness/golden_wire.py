@@ -15,7 +15,7 @@ import numpy as np
 from softfinger.daemon.loop.timing import Statistics, record
 from softfinger.daemon.types import Frame, HandFacts, Parts, SensorFacts, State
 from softfinger.daemon.wire import schema
-from softfinger.daemon.wire.packer import packer
+from softfinger.daemon.wire.publisher import packer
 from softfinger.kinematics.estimation.invalid import Invalid
 
 

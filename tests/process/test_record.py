@@ -23,7 +23,7 @@ import zmq
 from softfinger import Hand, read_recording
 from softfinger.daemon.errors import RecordingError
 from softfinger.daemon.wire import schema
-from softfinger.daemon.wire.packer import pack
+from softfinger.daemon.wire.publisher import pack
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.record import RecordingWriter, recover
 from tests.conftest import until

@@ -13,7 +13,7 @@ import zmq
 from softfinger.daemon.errors import RecordingError
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.wire import schema
-from softfinger.daemon.wire.packer import pack
+from softfinger.daemon.wire.publisher import pack
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.recomputed import recompute
 from softfinger.tools.recordings.record import RecordingWriter

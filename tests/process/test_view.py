@@ -22,7 +22,7 @@ import zmq
 from websockets.exceptions import InvalidStatus
 
 from softfinger.daemon.wire import schema
-from softfinger.daemon.wire.packer import pack
+from softfinger.daemon.wire.publisher import pack
 from softfinger.tools.ending import Ending
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.viewing.live_stream import TOPICS, LiveStream, ViewError

@@ -8,8 +8,12 @@ import pytest
 from softfinger.daemon.clock import VirtualClock
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
-from softfinger.daemon.simulation.faults import FaultError, parse_faults
-from softfinger.daemon.simulation.measurement_faults import MEASUREMENT_FAULTS, MeasurementFaults
+from softfinger.daemon.simulation.faults import (
+    MEASUREMENT_FAULTS,
+    FaultError,
+    MeasurementFaults,
+    parse_faults,
+)
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.daemon.simulation.sensor.simulated_tactile import SimulatedTactile
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus

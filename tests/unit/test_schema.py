@@ -13,7 +13,7 @@ import pytest
 from softfinger.daemon.client.records import read
 from softfinger.daemon.types import Parts, State
 from softfinger.daemon.wire import schema, schema_docs
-from softfinger.daemon.wire.packer import packer
+from softfinger.daemon.wire.publisher import packer
 from tests.harness.golden_wire import arguments, flat, golden_file, message_maker, sample
 
 PAGE = Path(schema.__file__).with_name("STREAM.md")

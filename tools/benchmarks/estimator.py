@@ -133,7 +133,7 @@ def frames_to_contacts(rounds: int) -> Report:
         if "solid" in name:
             more["× ml: warm"] = quickest[name] / quickest["ml: warm"]
         rows.append(figure(name, "µs", 1e-3 * times[name], aim, **more))
-    rows.append(figure("decode: cobs", "µs", 1e-3 * times["decode: cobs"], 10.0))
+    rows.append(figure("decode: cobs", "µs", 1e-3 * times["decode: cobs"], 20.0))
     rows.append({"name": "Cramér-Rao bound", ERROR: 1e6 * bound()})
     for sensor, flaws in {"ideal": {}, **SENSORS}.items():
         found = settled(Settings.model_validate(flaws), TRUTH)

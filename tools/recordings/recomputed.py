@@ -25,7 +25,7 @@ from softfinger.daemon.profile.load import without_files
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS, Frame
 from softfinger.daemon.wire import schema
-from softfinger.daemon.wire.packer import packer
+from softfinger.daemon.wire.publisher import packer
 from softfinger.tools.recordings.reader import Recording
 
 # Fields that depend on the machine and the moment, not on the loop's inputs.

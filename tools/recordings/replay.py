@@ -16,8 +16,7 @@ from softfinger.daemon.own_files import write_text
 from softfinger.daemon.profile.settings import Settings, StreamSettings
 from softfinger.daemon.profile.validation import address_problem
 from softfinger.daemon.wire import schema
-from softfinger.daemon.wire.packer import pack
-from softfinger.daemon.wire.publisher import GATEWAY_TOPICS
+from softfinger.daemon.wire.publisher import GATEWAY_TOPICS, pack
 from softfinger.tools.arguments import add_range, number, to_stderr
 from softfinger.tools.ending import Ending
 

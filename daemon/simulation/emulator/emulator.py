@@ -33,6 +33,7 @@ from softfinger.daemon.simulation.emulator.plate import Plate, PlateError, parse
 from softfinger.daemon.simulation.emulator.pty_bus import PtyServoBus
 from softfinger.daemon.simulation.emulator.tactile_board import ENCODERS, TactileBoard, encoder_for
 from softfinger.daemon.simulation.faults import (
+    MEASUREMENT_FAULTS,
     OBJECT,
     SERVOS,
     FaultError,
@@ -40,7 +41,6 @@ from softfinger.daemon.simulation.faults import (
     LineFaults,
     parse_faults,
 )
-from softfinger.daemon.simulation.measurement_faults import MEASUREMENT_FAULTS
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.daemon.simulation.sensor.simulated_tactile import SimulatedTactile
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
@@ -259,7 +259,7 @@ class Emulator:
         ready, _, _ = select.select(self._watched, (), (), wait)
         t = self.clock.now()
         if servos is not None and (servos.fileno() in ready or servos.next_event() <= t):
-            servos.service(t, start)
+            servos.service(t)
         for each in ready:
             if isinstance(each, TactileBoard):
                 each.hear()

@@ -31,7 +31,6 @@ PASSAGE = 15e-6
 # s by which what a reading shows may be older than its reply, as in a servo, which measures at
 # intervals of its own: so that the physics is computed beside the exchange, not within it.
 _LAG = 0.0005
-_SCHEDSTAT = "/proc/thread-self/schedstat"  # ns run, ns waited for a processor, times run
 
 
 def open_pty() -> tuple[int, int, str]:
@@ -72,8 +71,6 @@ class PtyServoBus:
         self._baud = baud
         self._spin = spin
         self._clock = clock
-        self._waited: float | None = None  # s this thread waited for a processor, at the last check
-        self._statistics = -1  # the open file of this thread's scheduling statistics
         self._free_at = -math.inf  # the wire is busy until then
         self._due: list[tuple[float, int, bytes]] = []
         self._order = 0
@@ -101,9 +98,6 @@ class PtyServoBus:
             os.close(self._master)
             os.close(self._slave)
         self._master = self._slave = -1
-        if self._statistics >= 0:
-            os.close(self._statistics)
-        self._statistics = -1
 
     def client_baud(self) -> int:
         """Return the rate that the terminal is set to."""
@@ -132,37 +126,22 @@ class PtyServoBus:
         fcntl.flock(self._slave, fcntl.LOCK_UN)
         return False
 
-    def service(self, t: float, since: float | None = None) -> None:
-        """Take what has arrived by time t [s], let the servos act, send what is due.
-
-        ``since``: when the caller began to wait because nothing was there; t by default.
-        """
+    def service(self, t: float) -> None:
+        """Take what has arrived by time t [s], let the servos act, send what is due."""
         if self.plugged:
-            arrived = self._arrival(t, t if since is None else since) if self._baud else t
             for _ in range(_AT_A_TIME):
                 try:
                     data = os.read(self._master, _READ_SIZE)
                 except OSError:  # nothing there
                     break
-                if self._receive(data, t, arrived):
+                if self._receive(data, t):
                     break  # the client takes some time for the reply
                 # Its next request often comes while its last write is being done.
-                arrived = t = max(t, self._clock())
+                t = max(t, self._clock())
         self.bus.advance(t)
         self._send()
 
-    def _arrival(self, t: float, since: float) -> float:
-        """Return when bytes seen at time t came, if others had the processor from then on."""
-        try:
-            if self._statistics < 0:
-                self._statistics = os.open(_SCHEDSTAT, os.O_RDONLY | os.O_CLOEXEC)
-            waited = int(os.pread(self._statistics, 100, 0).split()[1]) * 1e-9
-        except OSError:  # a kernel without scheduling statistics
-            return t
-        last, self._waited = self._waited, waited
-        return t if last is None else min(t, max(since, t - (waited - last)))
-
-    def _receive(self, data: bytes, t: float, arrived: float) -> bool:
+    def _receive(self, data: bytes, t: float) -> bool:
         """Let the servos act on ``data``; whether there is a reply."""
         if not self._baud:
             replies = self.bus.exchange(data, t)
@@ -176,7 +155,7 @@ class PtyServoBus:
         if baud <= 0:
             return False
         byte_time = _BITS_PER_BYTE / baud
-        free_at = max(self._free_at, arrived - PASSAGE) + len(data) * byte_time
+        free_at = max(self._free_at, t - PASSAGE) + len(data) * byte_time
         replies = self.bus.exchange(data, t, baud)
         for reply in replies:
             free_at += reply.delay + len(reply.data) * byte_time

@@ -15,7 +15,7 @@ import numpy as np
 from softfinger.daemon.profile.factory import make_material, make_table
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.control_table import by_name
-from softfinger.daemon.simulation.measurement_faults import MeasurementFaults
+from softfinger.daemon.simulation.faults import MeasurementFaults
 from softfinger.daemon.simulation.physics import plant
 from softfinger.daemon.simulation.physics.energy_guard import LOSSLESS_TOLERANCE
 from softfinger.daemon.simulation.physics.plant_state import (

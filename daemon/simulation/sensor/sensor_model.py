@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softfinger.daemon.profile.settings import SimulationSettings, TactileSettings
-from softfinger.daemon.simulation.measurement_faults import MeasurementFaults
+from softfinger.daemon.simulation.faults import MeasurementFaults
 from softfinger.kinematics.compiled.kernel import kernel
 from softfinger.kinematics.compiled.layout import Record, Records
 from softfinger.kinematics.contact.closed_form import Fingertip

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from softfinger.daemon.clock import Clock
 from softfinger.daemon.profile.factory import make_grid, make_material, make_tip
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.simulation.measurement_faults import LONGEST_REPLAY
+from softfinger.daemon.simulation.faults import LONGEST_REPLAY
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.daemon.simulation.sensor.sensor_model import SensorModel
 from softfinger.daemon.types import Frame

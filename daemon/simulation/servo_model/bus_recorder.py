@@ -31,9 +31,7 @@ class BusRecorder:
         self._fired_t: float | None = None
         self._off_t: float | None = None
 
-    def goals(
-        self, values: dict[int, int], joint: ServoJoint, torque: bool, refused: bool
-    ) -> None:
+    def goals(self, values: dict[int, int], joint: ServoJoint, torque: bool, refused: bool) -> None:
         """Record a write: values by register, but no angle near where a limp joint is."""
         goals = _WATCHED & values.keys()
         self._refused += refused and bool(goals)
