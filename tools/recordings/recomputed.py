@@ -9,7 +9,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgpack
 import numpy as np
@@ -18,15 +18,15 @@ from pydantic import ValidationError
 
 from softfinger.daemon.client.records import read
 from softfinger.daemon.errors import RecordingError
-from softfinger.daemon.loop.process_replay import ProcessReplay, with_calibrations
-from softfinger.daemon.loop.publishing import parts
-from softfinger.daemon.perception.finger_model import FingerModel, make_models
 from softfinger.daemon.profile.load import without_files
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS, Frame
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.publisher import packer
 from softfinger.tools.recordings.reader import Recording
+
+if TYPE_CHECKING:
+    from softfinger.daemon.perception.finger_model import FingerModel
 
 # Fields that depend on the machine and the moment, not on the loop's inputs.
 _TIMING = frozenset({"tick_s", "compute_s", "wake_late_s", "overruns", "behind_s", "seq_step"})
@@ -87,6 +87,9 @@ def recorded_models(recording: Recording) -> tuple[Settings, tuple[FingerModel, 
     Raises RecordingError, SettingsError, TactileError.
     """
     settings, calibrations = recorded_settings(recording)
+    from softfinger.daemon.loop.process_replay import with_calibrations
+    from softfinger.daemon.perception.finger_model import make_models
+
     with tempfile.TemporaryDirectory() as folder:
         return settings, make_models(with_calibrations(settings, calibrations, Path(folder)))
 
@@ -143,6 +146,10 @@ def _run(
     calibrations: list[str],
     progress: Callable[[int], None] | None,
 ) -> None:
+    # What has no settings and no inputs is refused before the loop is loaded.
+    from softfinger.daemon.loop.process_replay import ProcessReplay
+    from softfinger.daemon.loop.publishing import parts
+
     machine = ProcessReplay(used, calibrations)
     scene = parts(used)
     pack_state = packer(schema.STATE)

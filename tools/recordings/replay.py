@@ -13,7 +13,7 @@ from softfinger.daemon.errors import AddressError, RecordingError
 from softfinger.daemon.gateway.bounds import Config
 from softfinger.daemon.gateway.supervisor import Gateway
 from softfinger.daemon.own_files import write_text
-from softfinger.daemon.profile.settings import Settings, StreamSettings
+from softfinger.daemon.profile.settings import StreamSettings
 from softfinger.daemon.profile.validation import address_problem
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.publisher import GATEWAY_TOPICS, pack
@@ -118,12 +118,14 @@ def _publish(arguments: argparse.Namespace, recording: Recording) -> None:
 
 def _recompute(arguments: argparse.Namespace, recording: Recording) -> int:
     from softfinger.daemon.profile.load import load
-    from softfinger.tools.processes.kernel_build import build_kernels, print_event
-    from softfinger.tools.recordings.recomputed import recompute
+    from softfinger.tools.recordings.recomputed import recompute, recorded_settings
     from softfinger.tools.terminal.progress import Progress
 
+    recorded, _ = recorded_settings(recording)  # refuses what has none before kernels are loaded
+    from softfinger.tools.processes.kernel_build import build_kernels, print_event
+
     settings = None if arguments.config is None else load(arguments.config)
-    build_kernels(settings or Settings(), print_event)
+    build_kernels(settings or recorded, print_event)
     with Progress("recompute", recording.size) as progress:
         result = recompute(recording, settings, progress)
     print(
