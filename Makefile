@@ -7,11 +7,13 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-INSTALL := $(BIN)/python -m pip --disable-pip-version-check install --constraint constraints.txt
+# Byte code is then made of what is imported; most of the packages' modules never are.
+PIP_INSTALL := -m pip --disable-pip-version-check install --no-compile
+INSTALL := $(BIN)/python $(PIP_INSTALL) --constraint constraints.txt
 WORKERS := $(shell expr $$(nproc) + 2) # some wait for something while the others compute
 # Which lines no test ran is told where Python can count them for next to nothing (3.12 and later).
 COVERAGE = $(shell $(BIN)/python -c "import sys; print('--cov' * (sys.version_info >= (3, 12)))")
-LOWEST_PIP := build/lowest/bin/python -m pip --disable-pip-version-check --quiet install
+LOWEST_PIP := build/lowest/bin/python $(PIP_INSTALL) --quiet
 SERVO_TESTS := tests/process/test_servo_sdk.py tests/unit/test_servo_round_trip.py
 LOWEST_TESTS := tests/process/test_servo_checks.py $(addprefix tests/unit/test_,settings.py schema.py)
 TO_RUN := $(VENV)/.ready-run
