@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import math
 from collections.abc import AsyncIterator, Callable, Coroutine
 from typing import Any, TypeVar
 
@@ -11,7 +10,7 @@ import zmq
 import zmq.asyncio
 
 from softfinger.daemon.client.command_client import HandClient, accepted, is_done, send
-from softfinger.daemon.client.stream import Subscriber, Wait
+from softfinger.daemon.client.stream import Subscriber, Wait, no_stream
 from softfinger.daemon.errors import NoStream, Refused
 from softfinger.daemon.wire.schema import EVENT, STATE, TACTILE, Event, HandState, TactileFrame
 
@@ -29,21 +28,18 @@ class AsyncSubscription(Subscriber[_Record]):
 
     async def next(self, timeout: float | None) -> _Record:
         """Return the next record. Raises NoStream when none comes within ``timeout`` s."""
-        for seconds in self._decoder.waits(timeout):
-            if await self._poll(seconds):
-                record = self._decoder.take(await self._socket.recv_multipart())
+        for milliseconds in self._waits(timeout):
+            if await self._socket.poll(milliseconds):
+                record = self._take(await self._socket.recv_multipart())
                 if record is not None:
                     return record
-        raise self._decoder.no_stream(timeout or 0.0)
-
-    async def _poll(self, seconds: float) -> Any:
-        self._require_open()
-        return await self._socket.poll(math.ceil(seconds * 1e3) if seconds < math.inf else None)
+        raise no_stream(self._address, self._topic, timeout or 0.0)
 
     async def skip(self) -> None:
         """Drop what waits: the next record is one that is still to come."""
-        while await self._poll(0.0):
-            self._decoder.take(await self._socket.recv_multipart())
+        self._require_open()
+        while await self._socket.poll(0):
+            self._take(await self._socket.recv_multipart())
 
     async def __aenter__(self) -> AsyncSubscription[_Record]:
         return self

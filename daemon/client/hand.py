@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator
 from typing import Any, TypeVar
 
 from softfinger.daemon.client.command_client import HandClient, accepted, is_done, send
-from softfinger.daemon.client.stream import Subscriber, Wait
+from softfinger.daemon.client.stream import Subscriber, Wait, no_stream
 from softfinger.daemon.errors import NoStream, Refused
 from softfinger.daemon.wire.schema import EVENT, STATE, TACTILE, Event, HandState, TactileFrame
 
@@ -31,21 +30,18 @@ class Subscription(Subscriber[_Record]):
 
         A warning is logged when that takes long; without a timeout, silence may be as it should.
         """
-        for seconds in self._decoder.waits(timeout):
-            if self._poll(seconds):
-                record = self._decoder.take(self._socket.recv_multipart())
+        for milliseconds in self._waits(timeout):
+            if self._socket.poll(milliseconds):
+                record = self._take(self._socket.recv_multipart())
                 if record is not None:
                     return record
-        raise self._decoder.no_stream(timeout or 0.0)
-
-    def _poll(self, seconds: float) -> int:
-        self._require_open()
-        return int(self._socket.poll(math.ceil(seconds * 1e3) if seconds < math.inf else None))
+        raise no_stream(self._address, self._topic, timeout or 0.0)
 
     def skip(self) -> None:
         """Drop what waits: the next record is one that is still to come."""
-        while self._poll(0.0):
-            self._decoder.take(self._socket.recv_multipart())
+        self._require_open()
+        while self._socket.poll(0):
+            self._take(self._socket.recv_multipart())
 
     def __enter__(self) -> Subscription[_Record]:
         return self

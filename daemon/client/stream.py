@@ -1,4 +1,9 @@
-"""A topic's messages as records: decoding, lost messages, and waiting for a state."""
+"""A topic's messages as records: decoding, lost messages, and waiting for a state.
+
+A message is data of unknown origin: a field that is missing or of another type is NaN, 0, False or
+empty here, and unknown fields are ignored, so that a program goes on with the fields it knows when
+the daemon's schema is newer.
+"""
 
 from __future__ import annotations
 
@@ -7,21 +12,65 @@ import math
 import time
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import fields
+from functools import cache, partial
+from operator import attrgetter
 from typing import Any, Generic, TypeVar
 
+import numpy as np
 import zmq
+from numpy.typing import NDArray
 
 from softfinger.daemon.client.connection import SILENCE, still_waiting, subscribe, unpack
-from softfinger.daemon.client.records import read
 from softfinger.daemon.errors import HandClosed, HandFault, NoStream, NotInTime
-from softfinger.daemon.wire.schema import SCHEMA, STATE, TOPICS, HandState
+from softfinger.daemon.wire.schema import SCHEMA, STATE, TOPICS, HandState, fields_of
 
 _Record = TypeVar("_Record")
 
 _REPEATED = 1000  # messages that are known when they are repeated
 
 _log = logging.getLogger(__name__)
+
+
+def read(record: type[_Record], message: object) -> _Record:
+    """Return a topic's map as its record of `wire.schema`.
+
+    Raises ValueError for a tactile frame that is no grid.
+    """
+    given = message if isinstance(message, dict) else {}
+    plan = _converters(record)  # type: ignore[arg-type]  # a class is hashable
+    return record(*(convert(given.get(name)) for name, convert in plan))
+
+
+@cache
+def _converters(record: Any) -> list[tuple[str, Callable[[object], Any]]]:
+    kinds: list[tuple[str, Any]] = [(each.name, each.type) for each in fields(record)]
+    return [(name, _CONVERTERS.get(kind) or partial(read, kind)) for name, kind in kinds]
+
+
+def _as_float(value: object) -> float:
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    return float(value) if number else math.nan  # type: ignore[arg-type]
+
+
+_CONVERTERS: dict[Any, Callable[[object], Any]] = {
+    float: _as_float,
+    int: lambda value: value if type(value) is int else 0,
+    str: lambda value: value if isinstance(value, str) else "",
+    bool: lambda value: value is True,
+    bytes: lambda value: value if isinstance(value, bytes) else b"",
+}
+
+
+def to_columns(states: Iterable[Any]) -> dict[str, NDArray[Any]]:
+    """Return states as one array a field, nested ones with a dot (``left.force``), in their order.
+
+    ``pandas.DataFrame(to_columns(states))`` takes it as it is. Records of another topic, too.
+    """
+    rows = list(states)
+    names = [field.name for field in fields_of(type(rows[0]) if rows else HandState)]
+    return {name: np.array([attrgetter(name)(row) for row in rows]) for name in names}
 
 
 class Gaps:
@@ -64,18 +113,44 @@ class Gaps:
         return True
 
 
-class Unpacker(Generic[_Record]):
-    """Turns one topic's messages into records."""
+def no_stream(address: str, topic: bytes, timeout: float) -> NoStream:
+    """Return the exception when nothing has come at all."""
+    return NoStream(
+        f"no {topic.decode()} from {address} within {timeout:g} s; is softfinger running?"
+    )
 
-    def __init__(self, address: str, topic: bytes) -> None:
+
+class Subscriber(Generic[_Record]):
+    """A topic's socket and records: what `Subscription` and `AsyncSubscription` have in common.
+
+    ``unreadable`` counts the messages that could not be read, and were left out.
+    """
+
+    def __init__(
+        self, context: zmq.Context[Any], address: str, topic: bytes, timeout: float | None
+    ) -> None:
         self._address = address
         self._topic = topic
+        self._timeout = timeout
         self._record: type[_Record] = TOPICS[topic].record
         self._warned = False
-        self.gaps = Gaps()
+        self._gaps = Gaps()
         self.unreadable = 0
+        self._socket: Any = subscribe(context, address, topic)
 
-    def take(self, frames: list[bytes]) -> _Record | None:
+    @property
+    def lost(self) -> int:
+        """Messages that never arrived, by the gaps in their ``seq``."""
+        return self._gaps.lost
+
+    def close(self) -> None:
+        self._socket.close()
+
+    def _require_open(self) -> None:
+        if self._socket.closed:
+            raise HandClosed("this subscription is closed: make another")
+
+    def _take(self, frames: list[bytes]) -> _Record | None:
         """Return the record of one message, None when it can't be read or was received before."""
         try:
             _, message = unpack(frames)
@@ -83,7 +158,7 @@ class Unpacker(Generic[_Record]):
         except ValueError:
             self.unreadable += 1
             return None
-        if not self.gaps.take(message):
+        if not self._gaps.take(message):
             return None
         found = message.get("schema")
         if found != SCHEMA and not self._warned:
@@ -95,59 +170,26 @@ class Unpacker(Generic[_Record]):
             )
         return record
 
-    def waits(self, timeout: float | None) -> Iterator[float]:
-        """Yield how long to wait for the next message [s], until ``timeout`` s are over.
+    def _waits(self, timeout: float | None) -> Iterator[int | None]:
+        """Yield how long to wait for the next message [ms], until ``timeout`` s are over.
 
         Log what is waited for when that takes long; without a timeout silence may be as it should.
         """
         if timeout is None:
             while True:
-                yield math.inf
+                self._require_open()
+                yield None
         now = time.monotonic()
         end, warn_at = now + timeout, now + SILENCE
         while True:
-            yield min(end, max(warn_at, now)) - now
+            self._require_open()
+            yield math.ceil(1e3 * (min(end, max(warn_at, now)) - now))
             now = time.monotonic()
             if now >= end:
                 return
             if now >= warn_at:
                 warn_at = math.inf
                 _log.warning(still_waiting(f"{self._topic.decode()} from {self._address}", timeout))
-
-    def no_stream(self, timeout: float) -> NoStream:
-        """Return the exception when nothing has come at all."""
-        return NoStream(
-            f"no {self._topic.decode()} from {self._address} within {timeout:g} s; "
-            "is softfinger running?"
-        )
-
-
-class Subscriber(Generic[_Record]):
-    """A topic's socket and decoder: what `Subscription` and `AsyncSubscription` have in common."""
-
-    def __init__(
-        self, context: zmq.Context[Any], address: str, topic: bytes, timeout: float | None
-    ) -> None:
-        self._timeout = timeout
-        self._decoder = Unpacker[_Record](address, topic)
-        self._socket: Any = subscribe(context, address, topic)
-
-    @property
-    def lost(self) -> int:
-        """Messages that never arrived, by the gaps in their ``seq``."""
-        return self._decoder.gaps.lost
-
-    @property
-    def unreadable(self) -> int:
-        """Messages that could not be read, and were left out."""
-        return self._decoder.unreadable
-
-    def close(self) -> None:
-        self._socket.close()
-
-    def _require_open(self) -> None:
-        if self._socket.closed:
-            raise HandClosed("this subscription is closed: make another")
 
 
 class Wait:
@@ -178,7 +220,7 @@ class Wait:
     def over(self, address: str) -> NotInTime | NoStream:
         """Return the exception when no further state came."""
         if self._last is None:
-            return Unpacker[HandState](address, STATE).no_stream(self._timeout)
+            return no_stream(address, STATE, self._timeout)
         return NotInTime(
             f"not within {self._timeout:g} s; the last state: mode {self._last.mode}, "
             f"tick {self._last.seq}"

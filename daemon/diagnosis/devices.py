@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 
 from softfinger.daemon.clock import RealClock
-from softfinger.daemon.diagnosis.ports import check_latency_timer
 from softfinger.daemon.errors import ServoError, TactileError
 from softfinger.daemon.perception.calibration_file import (
     CalibrationFileError,
@@ -23,7 +22,7 @@ from softfinger.daemon.perception.calibration_file import (
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.base import Finding
-from softfinger.daemon.servos.checks import Examined, examine
+from softfinger.daemon.servos.checks import Examined, check_latency_timer, examine
 from softfinger.daemon.servos.control_table import ServoModel, by_name
 from softfinger.daemon.servos.port import latency_file
 from softfinger.daemon.servos.protocol import open_line

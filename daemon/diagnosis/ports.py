@@ -18,8 +18,8 @@ from softfinger.daemon.errors import AddressError, KeyFileError
 from softfinger.daemon.gateway.endpoints import IN_USE, bind
 from softfinger.daemon.own_files import runtime_fault, runtime_folder
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.servos.base import Finding, Status
-from softfinger.daemon.servos.port import bring_it, latency_file
+from softfinger.daemon.servos.base import Finding
+from softfinger.daemon.servos.port import bring_it
 from softfinger.daemon.wire.keys import load_client
 
 _PROC = Path("/proc")
@@ -168,29 +168,6 @@ def _pseudo_terminal(folder: Path, link: Path) -> int:
         return -1
     match = re.search(r"^tty-index:\s*(\d+)", (folder / "fdinfo" / link.name).read_text(), re.M)
     return int(match[1]) if match else -1
-
-
-# --- latency timer ---------------------------------------------------------------------------
-
-
-def check_latency_timer(path: str, reply_timeout: float, *sysfs: Path) -> Finding | None:
-    """Judge a USB adapter's latency timer against the time [s] a reply may take; None without one.
-
-    A reply waits in the adapter until the timer is over, so 16 ms hold a read to 60 Hz.
-    """
-    place = latency_file(path, *sysfs)
-    if place is None:
-        return None
-    subject = f"{path} latency timer"
-    try:
-        latency = int(place.read_text())
-    except (OSError, ValueError) as error:
-        return Finding("warn", subject, f"can't be read: {error}")
-    if latency <= 1:
-        return Finding("pass", subject, f"{latency} ms")
-    status: Status = "FAIL" if latency * 1e-3 >= reply_timeout else "warn"
-    fix = f"softfinger doctor --fix, or: echo 1 | sudo tee {place}"
-    return Finding(status, subject, f"{latency} ms, so every read takes that long", fix)
 
 
 _PATIENCE = 0.5  # s for a daemon to answer

@@ -52,7 +52,7 @@ class Gateway:
             process = subprocess.Popen(
                 # -P: a folder named daemon where this was started is not ours.
                 [
-                    *(sys.executable, "-P", "-m", __package__),
+                    *(sys.executable, "-P", "-m", f"{__package__}.server"),
                     *(str(theirs.fileno()), self._config.to_json()),
                 ],
                 pass_fds=(theirs.fileno(),),
@@ -115,19 +115,14 @@ class Gateway:
     def _wait(self) -> int:
         """Wait for its end; one that is stopped is ended: its own timers don't run then."""
         process, stopped = self._process, 0
-        try:
-            ended = os.pidfd_open(process.pid)
-        except OSError:  # it has ended and was waited for, or this kernel is older than 5.3
-            return process.wait()
-        try:
-            while not select.select([ended], [], [], _LOOK)[0]:
+        while True:
+            try:
+                return process.wait(_LOOK)
+            except subprocess.TimeoutExpired:
                 stopped = stopped + 1 if _is_stopped(process.pid) else 0
-                if stopped == _LOOKS:
-                    self.link.notices.append("the process that serves clients was stopped")
-                    process.kill()
-        finally:
-            os.close(ended)
-        return process.wait()
+            if stopped == _LOOKS:
+                self.link.notices.append("the process that serves clients was stopped")
+                process.kill()
 
     def close(self) -> None:
         """Disconnect, and wait until all has been sent."""

@@ -176,19 +176,12 @@ class Safety:
             self._sent_q[:] = present
             self._sent_current[:] = (0.0, 0.0)
         self._sent_seq = state.seq
-        sent, travel, limit = self._sent_current, self._travel, self._limits.current_max
         for i, low, high in self._ends:
-            commanded = current[i]
-            if (
-                not (low <= q[i] <= high and -travel <= q[i] - present[i] <= travel)
-                or not 0.0 <= commanded <= limit
-                or commanded > sent[i] + self._rise
-            ):
-                self._bound_one(goal, i, low, high, present[i])
-                if not goal.valid:
-                    return
+            self._bound_one(goal, i, low, high, present[i])
+            if not goal.valid:
+                return
             self._sent_q[i] = q[i]
-            sent[i] = current[i]
+            self._sent_current[i] = current[i]
         if goal.valid:
             servos.write(goal)
 

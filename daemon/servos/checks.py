@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from softfinger.daemon.profile.settings import GeometrySettings, Settings
 from softfinger.daemon.servos import control_table as reg
-from softfinger.daemon.servos.base import Finding
+from softfinger.daemon.servos.base import Finding, Status
 from softfinger.daemon.servos.control_table import ServoModel
 from softfinger.daemon.servos.joint import JointScale, servo_name
 from softfinger.daemon.servos.port import latency_file
@@ -245,14 +246,21 @@ def check_angle(name: str, q: float, hand: GeometrySettings, finger: int) -> Fin
     return Finding("FAIL", name, problem, cure)
 
 
-def latency_of(path: str) -> tuple[float, list[Finding]]:
-    """Return a USB adapter's latency timer [s], 0 without one; and what is wrong with it."""
-    place = latency_file(path)
+def check_latency_timer(path: str, reply_timeout: float, *sysfs: Path) -> Finding | None:
+    """Judge a USB adapter's latency timer against the time [s] a reply may take; None without one.
+
+    A reply waits in the adapter until the timer is over, so 16 ms hold a read to 60 Hz.
+    """
+    place = latency_file(path, *sysfs)
+    if place is None:
+        return None
+    subject = f"{path} latency timer"
     try:
-        milliseconds = 0 if place is None else int(place.read_text())
-    except (OSError, ValueError):
-        milliseconds = 0
-    if milliseconds <= 1:
-        return milliseconds * 1e-3, []
-    problem = f"the adapter's latency timer is {milliseconds} ms, so a read takes that long"
-    return milliseconds * 1e-3, [Finding("warn", path, problem, f"{FIX} sets it to 1 ms")]
+        latency = int(place.read_text())
+    except (OSError, ValueError) as error:
+        return Finding("warn", subject, f"can't be read: {error}")
+    if latency <= 1:
+        return Finding("pass", subject, f"{latency} ms")
+    status: Status = "FAIL" if latency * 1e-3 >= reply_timeout else "warn"
+    fix = f"softfinger doctor --fix, or: echo 1 | sudo tee {place}"
+    return Finding(status, subject, f"{latency} ms, so every read takes that long", fix)

@@ -25,7 +25,7 @@ from softfinger.daemon.errors import ServoError
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.base import Finding
-from softfinger.daemon.servos.checks import examine, latency_of
+from softfinger.daemon.servos.checks import check_latency_timer, examine
 from softfinger.daemon.servos.control_table import ServoModel, by_name
 from softfinger.daemon.servos.joint import Joint, JointScale
 from softfinger.daemon.servos.port import BITS_PER_BYTE, PortGone, SerialPort
@@ -139,8 +139,9 @@ class DynamixelServos:
                 f"{', '.join(str(each.id) for each in found)}): check power and wiring; "
                 "`softfinger doctor` looks for them at every rate"
             )
-        latency, slow = latency_of(port.port_name)
-        errors, notices = (slow, []) if latency >= allowed else ([], slow)
+        slow = check_latency_timer(port.port_name, allowed)
+        errors = [slow] if slow and slow.status == "FAIL" else []
+        notices = [slow] if slow and slow.status == "warn" else []
         for each in found:
             errors += each.errors
             notices += each.notices

@@ -123,15 +123,14 @@ class Joint:
 
     def goal(self, servos: ServoSettings, mode: int, q: float, current: float) -> bytes:
         """Return a goal [rad, A] as the registers of this mode hold it."""
-        scale = self.scale
+        scale, position = self.scale, self.scale.position_counts(q)
+        counts = bound = min(scale.bound_counts(current), self.bound)
         if mode == reg.POSITION_MODE:
-            low, high = self.ends
-            return _POSITION.pack(min(max(scale.position_counts(q), low), high))
-        bound = min(scale.bound_counts(current), self.bound)
-        if mode == reg.CURRENT_BASED_POSITION_MODE:
-            return _CURRENT_AND_POSITION.pack(bound, scale.position_counts(q))
-        counts = scale.current_counts(current_toward(servos, q, current, self.q, self.dq))
-        return _CURRENT.pack(min(max(counts, -bound), bound))
+            position = min(max(position, self.ends[0]), self.ends[1])
+        elif mode == reg.CURRENT_MODE:
+            counts = scale.current_counts(current_toward(servos, q, current, self.q, self.dq))
+            counts = min(max(counts, -bound), bound)
+        return pack_goal(mode, counts, position)
 
 
 def pack_goal(mode: int, current: int, position: int) -> bytes:

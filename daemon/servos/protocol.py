@@ -233,26 +233,17 @@ class FastGroupRead(GroupRead):
 
 
 class GroupWrite:
-    """A sync write of one span of several servos, whose packet's beginning is built once."""
+    """A sync write of one span of several servos."""
 
     def __init__(self, port: SerialPort, address: int, length: int, ids: Sequence[int]) -> None:
         self._port = port
         self._span = struct.pack("<HH", address, length)
-        size = 7 + len(ids) * (1 + length)  # instruction, span, values, CRC
-        self._head = _PREFIX + struct.pack("<BHB", BROADCAST_ID, size, INST_SYNC_WRITE) + self._span
-        self._crc = crc16(self._head)
         self.ids = [bytes((servo_id,)) for servo_id in ids]
 
     def send(self, values: Sequence[bytes]) -> None:
         """Write each servo's bytes, in the order of their IDs; nothing is answered."""
-        body = b""
-        for name, value in zip(self.ids, values, strict=True):
-            body += name + value
-        if _HEADER in body:  # to be stuffed, which changes the length
-            packet = packed(BROADCAST_ID, INST_SYNC_WRITE, self._span + body)
-        else:
-            packet = self._head + body + crc16(body, self._crc).to_bytes(2, "little")
-        self._port.send(packet)
+        body = b"".join(name + value for name, value in zip(self.ids, values, strict=True))
+        self._port.send(packed(BROADCAST_ID, INST_SYNC_WRITE, self._span + body))
 
 
 # --- single servos, outside the tick -------------------------------------------------------------

@@ -7,7 +7,8 @@ after frame. There is no length, number or checksum, and ``AA 55`` may occur amo
 from __future__ import annotations
 
 import math
-from collections import deque
+from collections import Counter, deque
+from itertools import combinations
 from typing import Literal
 
 import numpy as np
@@ -76,22 +77,11 @@ class FlexiTacDecoder(Decoder):
 
     @property
     def found_cells(self) -> int:
-        """Cells of a frame by the markers' spacing while there is no lock; 0 if it doesn't tell."""
-        ordered = list(self._markers)
-        markers = set(ordered)
-        spans: dict[int, int] = {}  # spacing → bytes covered by its longest chain up to the end
-        for i, marker in enumerate(ordered):
-            for earlier in ordered[:i]:
-                spacing = marker - earlier
-                if spacing < _SMALLEST_GRID + len(MARKER) or ordered[-1] - marker >= spacing:
-                    continue
-                while earlier - spacing in markers:
-                    earlier -= spacing
-                if marker - earlier >= 2 * spacing:
-                    spans[spacing] = max(spans.get(spacing, 0), marker - earlier)
-        # A pattern within an image breaks off where the image ends, the frames' markers never do.
-        spacing = max(spans, key=lambda m: (spans[m], -m), default=0)
-        return spacing - len(MARKER) if spacing not in (0, self.frame_bytes) else 0
+        """Cells of a frame by the commonest distance of markers while there is no lock, else 0."""
+        apart = Counter(b - a for a, b in combinations(self._markers, 2))
+        spacings = [each for each in apart if each >= _SMALLEST_GRID + len(MARKER)]
+        spacing = max(spacings, key=lambda each: (apart[each], -each), default=0)
+        return spacing - len(MARKER) if apart[spacing] > 2 and spacing != self.frame_bytes else 0
 
     def counters(self) -> dict[str, int]:
         """Return the usual counters and ``ambiguous``: searches that found no certain marker."""

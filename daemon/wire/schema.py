@@ -2,7 +2,7 @@
 
 A topic is a record. Each of its fields has a unit and a meaning, and is taken from a source: by a
 function, or as the source's attribute of the same name. From it follow the packers
-(`wire.publisher`), the records that clients read (`client.records`), the page ``STREAM.md`` and the
+(`wire.publisher`), the records that clients read (`client.stream`), the page ``STREAM.md`` and the
 JSON schemas of recordings (`wire.schema_docs`).
 
 Fields are only ever added, none is left out, and a float is always sent as a float. SI units.

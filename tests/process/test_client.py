@@ -18,8 +18,7 @@ from softfinger.daemon.client.asynchronous import AsyncSubscription
 from softfinger.daemon.client.command_client import UNCONFIRMED
 from softfinger.daemon.client.connection import SILENCE
 from softfinger.daemon.client.hand import Subscription
-from softfinger.daemon.client.records import read, to_columns
-from softfinger.daemon.client.stream import Gaps
+from softfinger.daemon.client.stream import Gaps, read, to_columns
 from softfinger.daemon.errors import HandClosed, SettingsError
 from softfinger.daemon.types import COMMAND_ADDRESS, STREAM_ADDRESS
 from softfinger.daemon.wire.schema import Event, TactileFrame
@@ -226,7 +225,7 @@ def test_missing_fields_are_not_a_number() -> None:
         ("import softfinger; softfinger.Hand; softfinger.AsyncHand", {"pydantic"}),
         ("import softfinger.tools.terminal.monitor", {"pydantic", "asyncio"}),
         ("import softfinger.tools.terminal.send", {"pydantic", "asyncio", "numpy"}),
-        ("import softfinger.daemon.gateway.__main__", {"pydantic", "numpy"}),
+        ("import softfinger.daemon.gateway.server", {"pydantic", "numpy"}),
     ],
 )
 def test_clients_and_the_gateway_load_nothing_of_the_daemon(code, absent):

@@ -25,6 +25,7 @@ from softfinger.daemon.perception.calibration_file import (
 )
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.servos import checks
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.simulation.emulator.emulator import EmulatedServos
 from softfinger.kinematics.compiled.kernel_folder import find_folder
@@ -288,19 +289,19 @@ def test_latency_timer_is_judged_and_repaired(tmp_path, monkeypatch):
     timer = sysfs / "ttyUSB7" / "device" / "latency_timer"
     timer.parent.mkdir(parents=True)
     timer.write_text("16\n")
-    slow = ports.check_latency_timer(path, 0.004, sysfs)
+    slow = checks.check_latency_timer(path, 0.004, sysfs)
     assert slow.status == "FAIL"
     assert "softfinger doctor --fix" in slow.fix
-    assert ports.check_latency_timer(path, 0.05, sysfs).status == "warn"
+    assert checks.check_latency_timer(path, 0.05, sysfs).status == "warn"
     with monkeypatch.context() as refused:
         refused.setattr(Path, "write_text", Mock(side_effect=PermissionError(13, "denied")))
         found = devices.repair_latency_timer(path, sysfs)
     assert (found.status, found.fix) == ("warn", f"echo 1 | sudo tee {timer}")
     assert devices.repair_latency_timer(path, sysfs).status == "fixed"
     assert timer.read_text() == "1"
-    assert ports.check_latency_timer(path, 0.004, sysfs).status == "pass"
+    assert checks.check_latency_timer(path, 0.004, sysfs).status == "pass"
     assert devices.repair_latency_timer(path, sysfs) is None
-    assert ports.check_latency_timer("/dev/pts/0", 0.004, sysfs) is None
+    assert checks.check_latency_timer("/dev/pts/0", 0.004, sysfs) is None
 
 
 # This machine.

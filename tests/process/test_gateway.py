@@ -131,7 +131,7 @@ def test_the_gateway_leaves_with_its_daemon(profile, addresses, start):
 
 HANGING = """
 import select, sys
-from softfinger.daemon.gateway import __main__ as gateway, bounds
+from softfinger.daemon.gateway import bounds, server as gateway
 from softfinger.daemon.gateway.server import Server
 
 bounds.{bound} = 0.1
@@ -284,7 +284,7 @@ def test_a_loop_that_ends_while_its_gateway_starts_is_no_error(addresses):
     ours, theirs = loop_link.pair()
     config = Config(*addresses, GATEWAY_TOPICS, 10, 200, 10.0, 0o600, "")
     with ours, theirs:
-        words = ["-m", "softfinger.daemon.gateway", str(theirs.fileno()), config.to_json()]
+        words = ["-m", "softfinger.daemon.gateway.server", str(theirs.fileno()), config.to_json()]
         process = subprocess.Popen(
             [sys.executable, *words], pass_fds=(theirs.fileno(),), stderr=subprocess.PIPE
         )

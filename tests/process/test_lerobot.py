@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from softfinger import Refused
-from softfinger.daemon.client.records import read
+from softfinger.daemon.client.stream import read
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.schema import TactileFrame
 from softfinger.tools.recordings.features import image, observation

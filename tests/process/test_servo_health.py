@@ -15,7 +15,7 @@ from softfinger.daemon.servos import dynamixel
 from softfinger.daemon.servos.base import Servos
 from softfinger.daemon.servos.dynamixel import DynamixelServos
 from softfinger.daemon.servos.simulated import SimulatedServos
-from softfinger.daemon.simulation.servo_model.servo_heat import ServoHeat
+from softfinger.daemon.simulation.servo_model.servo_joint import ServoHeat
 from softfinger.daemon.types import Reading
 from tests.conftest import until
 from tests.harness.servos import RunningBus

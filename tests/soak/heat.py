@@ -3,7 +3,7 @@
 Each run draws a model of servo, factors of its heating, cooling and heat capacity (0.75 to 1.33),
 the room (15 to 35 °C), a current of 1.15 to 1.8 times what it would bear for ever, and when the
 room gets warmer or colder by 5 or 8 °C. The daemon's filter sees the thermometer's whole degrees
-and a current with 3 % of noise; the plant is `servo_model.servo_heat`. ``--grips N`` adds whole
+and a current with 3 % of noise; the plant is `servo_model.servo_joint`. ``--grips N`` adds whole
 hands on virtual time that grip too hard for too long.
 """
 
@@ -18,7 +18,7 @@ from typing import NamedTuple
 from softfinger.daemon.control.modes import GRIPPING
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.safety.heat import HeatWatch
-from softfinger.daemon.simulation.servo_model.servo_heat import ServoHeat
+from softfinger.daemon.simulation.servo_model.servo_joint import ServoHeat
 from softfinger.daemon.types import State
 from softfinger.tools.watched import Watched
 

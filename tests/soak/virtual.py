@@ -29,8 +29,7 @@ from typing import Any
 import msgpack
 import numpy as np
 
-from softfinger.daemon.client.records import read
-from softfinger.daemon.client.stream import Gaps
+from softfinger.daemon.client.stream import Gaps, read
 from softfinger.daemon.control.modes import COMMANDS, Mode
 from softfinger.daemon.errors import Refused, ServoError
 from softfinger.daemon.loop.build import Daemon

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from softfinger.daemon.client.records import read
+from softfinger.daemon.client.stream import read
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.schema import HandState, TactileFrame
 from softfinger.tools.recordings.features import STATE, image, observation

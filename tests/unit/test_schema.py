@@ -10,7 +10,7 @@ from pathlib import Path
 import msgpack
 import pytest
 
-from softfinger.daemon.client.records import read
+from softfinger.daemon.client.stream import read
 from softfinger.daemon.types import Parts, State
 from softfinger.daemon.wire import schema, schema_docs
 from softfinger.daemon.wire.publisher import packer

@@ -16,7 +16,7 @@ from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.safety.heat import set_law
 from softfinger.daemon.servos.control_table import by_name
-from softfinger.daemon.simulation.servo_model.servo_heat import ServoHeat
+from softfinger.daemon.simulation.servo_model.servo_joint import ServoHeat
 from softfinger.kinematics.hand.servo_heat import (
     LONGEST,
     HeatState,

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softfinger.daemon.client.records import read, to_columns
+from softfinger.daemon.client.stream import read, to_columns
 from softfinger.daemon.errors import RecordingError, SettingsError, SoftfingerError, TactileError
 from softfinger.daemon.loop.warm_up import FRAMES
 from softfinger.daemon.perception.finger_model import FingerModel

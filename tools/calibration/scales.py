@@ -11,7 +11,7 @@ import argparse
 from collections import deque
 
 from softfinger.daemon.client.hand import Hand
-from softfinger.daemon.client.records import read
+from softfinger.daemon.client.stream import read
 from softfinger.daemon.perception.calibration_file import ScalesStep, now, save_calibration
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.wire.schema import STATE, HandState

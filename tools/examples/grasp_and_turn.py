@@ -17,7 +17,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from softfinger import Hand, HandState
-from softfinger.daemon.client.records import to_columns
+from softfinger.daemon.client.stream import to_columns
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.table import ContactTable

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softfinger.daemon.client.records import read
+from softfinger.daemon.client.stream import read
 from softfinger.daemon.errors import RecordingError
 from softfinger.daemon.own_files import write_bytes, write_text
 from softfinger.daemon.types import FINGERS

@@ -45,7 +45,7 @@ def read_recording(path: str | Path) -> dict[str, NDArray[Any]]:
     from the first state on [s]. ``pandas.DataFrame(read_recording("run.mcap"))`` takes it as it is.
     Raises RecordingError for a file that is no recording or holds no state.
     """
-    from softfinger.daemon.client.records import read, to_columns
+    from softfinger.daemon.client.stream import read, to_columns
     from softfinger.daemon.wire.schema import STATE, HandState
 
     recording = Recording(Path(path))

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from softfinger.daemon.client.records import read
+from softfinger.daemon.client.stream import read
 from softfinger.daemon.errors import RecordingError
 from softfinger.daemon.profile.load import without_files
 from softfinger.daemon.profile.settings import Settings

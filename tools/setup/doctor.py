@@ -19,7 +19,6 @@ from softfinger.daemon.diagnosis.devices import (
 from softfinger.daemon.diagnosis.machine import check_kernels, check_machine
 from softfinger.daemon.diagnosis.ports import (
     check_addresses,
-    check_latency_timer,
     check_port,
     check_runtime_folder,
     daemon_mode,
@@ -27,6 +26,7 @@ from softfinger.daemon.diagnosis.ports import (
 )
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.base import Finding
+from softfinger.daemon.servos.checks import check_latency_timer
 from softfinger.daemon.types import FINGERS
 from softfinger.tools.arguments import add_profile, profile
 from softfinger.tools.processes.kernel_build import build_kernels, print_event

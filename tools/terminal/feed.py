@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from softfinger.daemon.client.command_client import LOCALLY, UNCONFIRMED
 from softfinger.daemon.client.connection import PATIENCE, SILENCE, drain, subscribe, unpack
-from softfinger.daemon.client.records import read
+from softfinger.daemon.client.stream import read
 from softfinger.daemon.control.modes import UNLEASED
 from softfinger.daemon.types import FINGERS, GRIP_FRACTION
 from softfinger.daemon.wire import schema

@@ -19,7 +19,7 @@ import foxglove.messages as fm
 import orjson
 from foxglove.channels import LogChannel, RawImageChannel, SceneUpdateChannel
 
-from softfinger.daemon.client.records import read
+from softfinger.daemon.client.stream import read
 from softfinger.daemon.types import FINGERS
 from softfinger.daemon.wire import schema
 from softfinger.tools.arguments import client_keys, to_stderr

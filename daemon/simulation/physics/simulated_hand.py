@@ -28,7 +28,7 @@ from softfinger.daemon.simulation.physics.plant_state import (
     Sample,
 )
 from softfinger.daemon.simulation.physics.shapes import shape_of
-from softfinger.daemon.simulation.servo_model.servo_heat import ServoHeat
+from softfinger.daemon.simulation.servo_model.servo_joint import ServoHeat
 from softfinger.daemon.types import FINGERS
 from softfinger.kinematics.contact.lookup import LOWEST
 from softfinger.kinematics.contact.table import ContactTable

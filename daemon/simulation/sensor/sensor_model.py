@@ -301,16 +301,9 @@ class SensorModel:
             )
         if flaws.tactile_noise > 0.0:
             self._generator.standard_normal(out=self._normals)
-        count(
-            self._signal,
-            self._offset,
-            self._lines,
-            self._sensitivity,
-            flaws.tactile_noise / self._per_count,
-            self._normals,
-            self._ends,
-            out,
-        )
+        signal = self._signal + self._offset + self._lines[0][:, None] + self._lines[1]
+        signal += flaws.tactile_noise / self._per_count * self._normals
+        count(signal, self._sensitivity > 0.0, self._ends, out)
 
 
 # --- what a soft, resistive sensor does to the pressure: in place, on arrays [rows, cols] --------
@@ -386,28 +379,14 @@ def crosstalk(signal: FloatArray, fraction: float, rows: FloatArray, cols: Float
     np.multiply(fraction, signal.mean(axis=0), out=cols)
 
 
-@kernel
 def count(
-    signal: FloatArray,
-    offset: FloatArray,
-    lines: tuple[FloatArray, FloatArray],
-    active: FloatArray,
-    noise: float,
-    normals: FloatArray,
-    ends: tuple[int, int],
-    out: NDArray[np.uint16],
+    signal: FloatArray, active: NDArray[np.bool_], ends: tuple[int, int], out: NDArray[np.uint16]
 ) -> None:
-    """Round signal + offset + both ``lines``' crosstalk + noise to counts, into ``out``.
+    """Round a signal in counts, into ``out``; cells that aren't ``active`` read 0.
 
-    All in counts. Cells of ``active`` 0 read 0; ``ends`` are the smallest count that is sent, below
-    which goes 0, and the largest there is.
+    ``ends`` are the smallest count that is sent, below which goes 0, and the largest there is.
     """
-    rows, cols = lines
     lowest, full = ends
-    height, width = out.shape
-    for i in range(height):
-        for j in range(width):
-            value = signal[i, j] + offset[i, j] + rows[i] + cols[j] + noise * normals[i, j] + 0.5
-            value = min(max(value, 0.0), full + 0.5)
-            value = value if active[i, j] > 0.0 and value >= lowest else 0.0
-            out[i, j] = np.uint16(value)
+    value = np.clip(signal + 0.5, 0.0, full + 0.5)
+    value[~active | (value < lowest)] = 0.0
+    out[:] = value  # cut to whole numbers

@@ -20,11 +20,11 @@ from softfinger.daemon.servos.joint import JointScale
 from softfinger.daemon.simulation.servo_model import framing
 from softfinger.daemon.simulation.servo_model.bus_recorder import BusRecorder
 from softfinger.daemon.simulation.servo_model.registers import ControlTable
-from softfinger.daemon.simulation.servo_model.servo_heat import ServoHeat
 from softfinger.daemon.simulation.servo_model.servo_joint import (
     SENSE,
     STEP,
     ServoHealth,
+    ServoHeat,
     ServoJoint,
 )
 

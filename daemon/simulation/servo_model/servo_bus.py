@@ -31,7 +31,7 @@ from softfinger.daemon.simulation.servo_model import framing
 from softfinger.daemon.simulation.servo_model.bus_recorder import BusRecorder
 from softfinger.daemon.simulation.servo_model.framing import BROADCAST, Packet, PacketParser
 from softfinger.daemon.simulation.servo_model.servo import EmulatedServo, prepared
-from softfinger.daemon.simulation.servo_model.servo_heat import ServoHeat
+from softfinger.daemon.simulation.servo_model.servo_joint import ServoHeat
 
 _SYNC_READS = frozenset((framing.SYNC_READ, framing.FAST_SYNC_READ))
 _GROUP_READS = _SYNC_READS | {framing.BULK_READ, framing.FAST_BULK_READ}

@@ -2,7 +2,7 @@
 
 `ServoJoint` maps counts to angles (turns, homing offset, drive direction), follows the profile,
 drives the plant as each operating mode asks, and writes the present values into the control table.
-`ServoHealth` is what the servo suffers: heat (`servo_heat`), its supply, overload. A choice of our
+`ServoHealth` is what the servo suffers: heat (`ServoHeat`), its supply, overload. A choice of our
 own, where the manuals say nothing: overload after OVERLOAD_TIME of current at the configured limit.
 """
 
@@ -10,13 +10,14 @@ from __future__ import annotations
 
 import math
 import struct
+from typing import Self
 
+from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.base import JointPlant
-from softfinger.daemon.servos.control_table import ServoModel
+from softfinger.daemon.servos.control_table import ServoModel, by_name
 from softfinger.daemon.servos.joint import JointScale
 from softfinger.daemon.simulation.servo_model.registers import ControlTable
-from softfinger.daemon.simulation.servo_model.servo_heat import ServoHeat
 
 STEP = 0.001  # s: trajectories, velocity mode
 OVERLOAD_TIME = 2.0  # s at the current limit
@@ -193,6 +194,10 @@ class ServoJoint:
         )
 
 
+ROOM = 25.0  # °C
+_LAG = 4.0  # s, of the thermometer
+_CONVECTION = 0.006  # 1/K that the cooling grows by
+_LONGEST = 1.0  # s of a step
 _NEAR = 1e-6  # counts: below it the square root's rounding would never let the trajectory arrive
 
 
@@ -258,6 +263,57 @@ class Profile:
             return
         self.position += move
         self.velocity = velocity
+
+
+class ServoHeat:
+    """Heat of one servo. ``ambient`` [°C] may be changed at any time.
+
+    Written apart from the daemon's own model (`kinematics.hand.servo_heat`), with other constants:
+    copper's resistance rises, the case cools by convection, which grows with what it is warmer, and
+    the thermometer on the board lags behind the case. ``heating``, ``cooling`` and ``capacity`` are
+    factors of the model's own.
+    """
+
+    def __init__(
+        self, model: ServoModel, heating: float = 1.0, cooling: float = 1.0, capacity: float = 1.0
+    ) -> None:
+        self.ambient = self.winding = self.case = self.sensed = ROOM
+        self._resistance = 1.08 * heating * model.resistance
+        self._winding = 0.05 * capacity * model.heat_capacity  # J/K
+        self._case = 0.93 * capacity * model.heat_capacity
+        self._coupling = 1.0 / (0.35 * model.case_resistance)  # W/K
+        self._cooling = 0.85 * cooling / model.case_resistance
+
+    @classmethod
+    def of(cls, settings: Settings) -> Self:
+        """Return a servo of the settings' model, as warm as the room."""
+        simulation = settings.simulation
+        heat = cls(by_name(settings.servos.model), *simulation.servo_heat)
+        heat.ambient = simulation.ambient
+        heat.cool()
+        return heat
+
+    def cool(self) -> None:
+        """Bring all of it to the ambient temperature."""
+        self.winding = self.case = self.sensed = self.ambient
+
+    def warm(self, temperature: float) -> None:
+        """Bring all of it to this temperature [°C]."""
+        self.winding = self.case = self.sensed = temperature
+
+    def step(self, current: float, seconds: float) -> None:
+        """Go on by ``seconds`` with this ``current`` [A]."""
+        while seconds > 0.0:
+            dt = min(seconds, _LONGEST)
+            seconds -= dt
+            copper = 1.0 + 0.0039 * (self.winding - ROOM)
+            inward = self._coupling * (self.winding - self.case)
+            over = self.case - self.ambient
+            outward = self._cooling * (1.0 + _CONVECTION * max(over, 0.0)) * over
+            heat = self._resistance * copper * current * current
+            self.winding += (heat - inward) * dt / self._winding
+            self.sensed += (self.case - self.sensed) * dt / _LAG
+            self.case += (inward - outward) * dt / self._case
 
 
 class ServoHealth:
