@@ -165,12 +165,14 @@ def inline(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) 
 
 
 def until(condition: Callable[[], object], seconds: float = 150.0) -> None:
-    """Call ``condition`` until it holds; the time allowed only bounds a hang."""
-    deadline = time.monotonic() + seconds
+    """Call ``condition`` until it holds, less often in time; ``seconds`` only bound a hang."""
+    begin = time.monotonic()
     while not condition():
-        if time.monotonic() > deadline:
+        waited = time.monotonic() - begin
+        if waited > seconds:
             raise TimeoutError(f"not within {seconds:g} s: {condition}")
-        select.select([], [], [], 0.002)  # leaves the processor to what is waited for
+        # Leaves the processor to what is waited for.
+        select.select([], [], [], min(0.002 + 0.01 * waited, 0.02))
 
 
 @pytest.fixture

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import select
 from collections.abc import Iterator
 from statistics import fmean
 from typing import Any
@@ -14,9 +15,9 @@ from tests.soak.rig import Rig
 FORCE = 6.0  # N
 LOOK, SETTLED = 3.5, 0.5  # s of the emulated hand's time, in all and in the end
 
-GAINS = ("left:gain=0.6@0..2",)
+GAIN = "left:gain=0.6@0..2"
 CURRENT = "left:current=2"
-REFUSED = ("left:shift-x=3", "right:drift=-0.2@0..2")  # the hand lets go
+REFUSED = "left:shift-x=3"  # the hand lets go
 
 
 @pytest.fixture(scope="module")
@@ -65,9 +66,10 @@ def watched(rig: Rig) -> Iterator[dict[str, Any]]:
         driven = any(servo["torque"] for servo in report["servos"])
         if report["t"] > begin + LOOK or not driven:
             return
+        select.select([], [], [], 0.005)  # the processor is for those who grip
 
 
-@pytest.mark.parametrize("lie", [*GAINS, CURRENT, *REFUSED])
+@pytest.mark.parametrize("lie", [GAIN, CURRENT, REFUSED])
 def test_a_lie_is_bounded_and_nothing_else_is_named(rig: Rig, lie: str) -> None:
     false = f"witness.{lie.split(':')[0]}_{'current' if lie == CURRENT else 'sensor'}"
     gripped(rig)
@@ -75,10 +77,10 @@ def test_a_lie_is_bounded_and_nothing_else_is_named(rig: Rig, lie: str) -> None:
     rig.send(lie)
     reports = list(watched(rig))
     assert max(max(report["force"]) for report in reports) < 1.3 * FORCE
-    if lie not in GAINS:  # which may be believed in part, and need not be named
+    if lie != GAIN:  # which may be believed in part, and need not be named
         until(lambda: any(false in line for line in rig.log()[before:]))
     assert not [line for line in rig.log()[before:] if "witness." in line and false not in line]
-    if lie in REFUSED:
+    if lie == REFUSED:
         until(lambda: mode(rig) == "fault")
         return
     assert mode(rig) == "holding"

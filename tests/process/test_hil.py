@@ -89,8 +89,8 @@ class Rig:
             self.send("arm")
         if not self.send("move", left=target, right=target)["ok"]:
             return False
-        while (mode := self.status()["mode"]) == "moving":
-            pass
+        until(lambda: self.status()["mode"] != "moving")
+        mode = self.status()["mode"]
         angles = [servo["q"] for servo in self.report()["servos"]]
         return mode == "armed" and angles == pytest.approx([target, target], abs=0.05)
 

@@ -40,7 +40,7 @@ class Rig:
 
     def until(self, condition: Callable[[], object]) -> None:
         """Tick until ``condition`` holds."""
-        until(lambda: self.loop.advance(0.02) or condition())
+        until(lambda: self.loop.advance(0.1) or condition())
 
     def does(self, name: str) -> dict[str, Any]:
         """Give a command until it is carried out: a busy machine's readings may be too old."""
