@@ -14,10 +14,11 @@ import psutil
 import pytest
 from websockets.sync.client import ClientConnection, connect
 
+from softfinger.daemon.client.records import read
 from softfinger.daemon.wire import schema
 from softfinger.tools import cli
 from softfinger.tools.viewing.known import ShownHand
-from softfinger.tools.viewing.planar import SPRINGS, HandScene
+from softfinger.tools.viewing.planar import SPRINGS, hand_parts
 from tests.harness.daemon_process import started
 from tests.harness.fake_daemon import FakeDaemon, event, frame, state
 
@@ -172,8 +173,8 @@ def check_scene(client: Client) -> None:
         assert 0.0 < arrow[2][0] < 0.045
     (outline,) = map(fields, named["object"][11])
     points = np.array([[fields(each).get(k, [0.0])[0] for k in (1, 2)] for each in outline[5]])
-    expected = HandScene(ShownHand()).parts(state(0.0, 0))["object"].strips[0].points
-    assert points == pytest.approx(expected, abs=6e-3)  # it turns by 5° at most
+    expected = hand_parts(ShownHand(), read(schema.HandState, state(0.0, 0)))["object"]
+    assert points == pytest.approx(expected.strips[0].points, abs=6e-3)  # it turns by 5° at most
 
 
 def check_events(client: Client, early: dict[str, Any]) -> None:

@@ -26,9 +26,8 @@ from softfinger.daemon.wire.publisher import pack
 from softfinger.tools.ending import Ending
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.viewing.live_stream import TOPICS, LiveStream, ViewError
-from softfinger.tools.viewing.page import listen
+from softfinger.tools.viewing.page import Playback, listen
 from softfinger.tools.viewing.pictures import Pictures
-from softfinger.tools.viewing.playback import Playback
 from tests.conftest import until
 from tests.harness.fake_daemon import FakeDaemon, event, finger, frame, state
 from tests.harness.recorded_hand import record_hand

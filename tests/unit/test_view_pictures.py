@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from softfinger.daemon.client.records import read
 from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.wire.schema import TactileFrame
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.table import ContactTable
@@ -22,7 +24,6 @@ from softfinger.tools.viewing.known import (
     read_settings,
 )
 from softfinger.tools.viewing.planar import (
-    Touch,
     finger_lines,
     footprint,
     grid_of,
@@ -71,14 +72,16 @@ def test_the_footprint_is_where_the_forward_model_presses(
 
 
 def test_the_grid_is_read_from_the_frame() -> None:
-    told = {"rows": 30, "cols": 50, "pitch": 0.0012, "pitch_y": 0.0019}
-    told |= {"centre_x": 0.002, "centre_y": -0.001, "rotation": 0.4}
-    assert grid_of(told) == GRIDS[1]
-    square = grid_of({"rows": 44, "cols": 44, "pitch": 0.058 / 44})
+    def told(rows: int, cols: int, **fields: float) -> TactileFrame:
+        message = {"rows": rows, "cols": cols, "data": bytes(2 * rows * cols), **fields}
+        return read(TactileFrame, message)
+
+    placed = {"centre_x": 0.002, "centre_y": -0.001, "rotation": 0.4}
+    assert grid_of(told(30, 50, pitch=0.0012, pitch_y=0.0019, **placed)) == GRIDS[1]
+    square = grid_of(told(44, 44, pitch=0.058 / 44))
     assert square is not None
     assert square.pitches == GRIDS[0].pitches
-    assert grid_of({"rows": 44, "cols": 44}) is None
-    assert grid_of({"rows": "44", "cols": 44, "pitch": 0.001}) is None
+    assert grid_of(told(44, 44)) is None
     rim = tip_circle(GRIDS[0], TIP.radius)
     assert rim.max(axis=0) == pytest.approx([22.0 + 0.020 / GRIDS[0].pitches[0]] * 2)
     assert on_picture(GRIDS[1], np.zeros((1, 2)))[0] == pytest.approx(
@@ -103,7 +106,7 @@ def held() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 @pytest.mark.parametrize("finger", [0, 1])
 def test_a_pressed_tip_ends_at_the_objects_face(finger: int) -> None:
     d, theta = held()
-    lines = finger_lines(HAND, finger, Q[finger], Touch(d[finger], theta[finger], 8.0))
+    lines = finger_lines(HAND, finger, Q[finger], d[finger], theta[finger])
     n = np.array([math.cos(POSE[2]), math.sin(POSE[2])])
     outwards = -n if finger == 0 else n  # of the object, through this face
 

@@ -71,6 +71,7 @@ class ShownFrame(NamedTuple):
     scale: float  # Pa per count, NaN when unknown
     grid: NDArray[np.float64]  # [rows, cols] pressures, Pa; counts where the scale isn't known
     aspect: float  # a cell's height over its width
+    source: schema.TactileFrame
 
 
 class ShownEvent(NamedTuple):
@@ -173,6 +174,7 @@ class Feed:
             frame.scale if known else math.nan,
             grid,
             aspect if 0.01 < aspect < 100.0 else 1.0,
+            frame,
         )
 
     def _read_event(self, event: schema.Event, _: float) -> None:

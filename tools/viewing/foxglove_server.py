@@ -52,6 +52,7 @@ class FoxgloveServer(Viewer):
             name: RawImageChannel(f"{schema.TACTILE.decode()}/{name}", context=context)
             for name in FINGERS
         }
+        self._frames: dict[str, dict[str, Any]] = {}  # by finger
         self._events: deque[dict[str, Any]] = deque(maxlen=_EVENTS)
         host = hidden_host()
         try:
@@ -75,7 +76,9 @@ class FoxgloveServer(Viewer):
         """One message, whatever it holds."""
         if not super().take(topic, message):
             return False
-        if topic == schema.EVENT:
+        if topic == schema.TACTILE:
+            self._frames[text(message, "finger")] = message
+        elif topic == schema.EVENT:
             self._events.append(message)
         elif topic in self._numbers and self._numbers[topic].has_sinks():
             try:
@@ -87,16 +90,15 @@ class FoxgloveServer(Viewer):
 
     def draw(self) -> None:
         """Send the newest frames, the scene, and events if somebody looks at them."""
-        for message in self.frames.values():
+        for message in self._frames.values():
             try:
                 self._image(read(schema.TactileFrame, message))
             except (ValueError, KeyError):
                 self.unreadable += 1
-        self.frames.clear()
-        state = self.newest.pop(schema.STATE, None)
+        self._frames.clear()
+        state, truth = self.newest.pop(schema.STATE, None), self.newest.get(schema.TRUTH)
         if state is not None and self._scene.has_sinks():
-            simulated = self.parts.simulated(self.newest.get(schema.TRUTH))
-            parts = self.parts.parts(state) | {"simulated": simulated}
+            parts = planar.hand_parts(self.hand, read(schema.HandState, state), truth)
             entities = [_entity(name, part) for name, part in parts.items()]
             self._scene.log(fm.SceneUpdate(entities=entities), log_time=_ns(self.time))
         while self._log.has_sinks() and self._events:

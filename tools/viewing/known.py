@@ -21,22 +21,18 @@ from pydantic import ValidationError
 from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.profile.factory import make_material, make_tip
 from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.simulation.physics.simulated_hand import geometry_of
 from softfinger.daemon.types import FINGERS
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.lookup import TableError
 from softfinger.kinematics.contact.table import ContactTable
-from softfinger.kinematics.hand.geometry import HandGeometry
+from softfinger.tools.terminal import heatmap
 
 FloatArray = NDArray[np.float64]
 
 WIDTH, HEIGHT = 240, 200  # pixels
 THETA_END = math.radians(45.0)  # the picture's, to both sides
-# Dark to light in even steps, from blue over green to yellow: in order in grey, too.
-_RAMP = np.array(
-    [(38, 32, 84), (45, 70, 130), (38, 110, 142), (38, 148, 136), (84, 184, 112), (236, 226, 88)]
-)
 _APART = 0.1  # of the picture's height, from one contour line to the next
-_OUTSIDE = (112, 112, 116)  # where no such contact can be
 _LEVELS = 1e-3 * np.array([1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000])  # J
 
 
@@ -74,13 +70,13 @@ class Landscape:
         return energy
 
     def picture(self) -> NDArray[np.uint8]:
-        """Indices [HEIGHT, WIDTH] into `palette`, the last where no such contact can be."""
+        """Levels [HEIGHT, WIDTH] of `heatmap`'s colours, one more where no such contact can be."""
         theta = (2.0 * (np.arange(WIDTH) + 0.5) / WIDTH - 1.0) * THETA_END
         d = (1.0 - (np.arange(HEIGHT) + 0.5) / HEIGHT) * self.d_end
         depth, angle = np.meshgrid(d, theta, indexing="ij")
         contact = self._table(depth, angle, edge=True)
-        share = np.clip(np.cbrt(np.asarray(contact.energy) / self._energy[-1]), 0.0, 1.0)
-        return np.where(contact.inside, share * 254.0, 255.0).astype(np.uint8)
+        levels = heatmap.levels_of(np.cbrt(np.asarray(contact.energy) / self._energy[-1]), 1.0)
+        return np.where(contact.inside, levels, heatmap.LEVELS).astype(np.uint8)
 
     def contours(self) -> list[Contour]:
         """Lines of equal energy at round values, as far as the contact's domain goes."""
@@ -114,13 +110,6 @@ class Landscape:
         return ticks
 
 
-def palette() -> NDArray[np.uint8]:
-    """Colours [256, 3] of the landscape's picture."""
-    at = np.linspace(0.0, len(_RAMP) - 1.0, 255)
-    ramp = [np.interp(at, range(len(_RAMP)), channel) for channel in _RAMP.T]
-    return np.vstack((np.transpose(ramp), _OUTSIDE)).astype(np.uint8)
-
-
 _TOLERANCE = 1e-6  # relative error of a table for a picture
 
 
@@ -133,13 +122,7 @@ class ShownHand:
         self.fingers = tuple(name for name in FINGERS if name in scene.fingers)
         self.servos = self.settings.servos.backend != "none"
         self.sensors = self.settings.tactile.backend != "none"
-        lengths = self.settings.hand
-        self.geometry = HandGeometry(
-            lengths.pivot_separation,
-            lengths.finger_length,
-            lengths.finger_offset,
-            self.settings.tip.radius,
-        )
+        self.geometry = geometry_of(self.settings)
 
     def landscape(self) -> Landscape | None:
         """The energy landscape of the settings' material; None where no table can be made of it."""

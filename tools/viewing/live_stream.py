@@ -20,7 +20,6 @@ from softfinger.tools.arguments import PATIENCE, no_stream, waiting
 from softfinger.tools.ending import Ending
 from softfinger.tools.terminal.feed import number, printable, text
 from softfinger.tools.viewing.known import ShownHand, read_settings
-from softfinger.tools.viewing.planar import HandScene
 
 LOOPBACK = "127.0.0.1"
 TOPICS = (
@@ -63,14 +62,11 @@ class Viewer:
         """Forget all but the hand: what comes next is of another time."""
         self.time = math.nan
         self.newest: dict[bytes, dict[str, Any]] = {}
-        self.frames: dict[str, dict[str, Any]] = {}  # by finger
         self.gaps = {topic: Gaps() for topic in TOPICS}
-        self.parts = HandScene(self.hand)
 
     def know(self, hand: ShownHand) -> None:
         """Show this hand from now on."""
         self.hand = hand
-        self.parts = HandScene(hand)
 
     def take(self, topic: bytes, message: Any) -> bool:
         """Keep one message; False where it can't be read, or came before."""
@@ -88,8 +84,6 @@ class Viewer:
                 f"the stream is of schema {message.get('schema')!r:.20}, this viewer knows "
                 f"{schema.SCHEMA}; it keeps to the fields it knows"
             )
-        if topic == TACTILE:
-            self.frames[text(message, "finger")] = message
         self.newest[topic] = message
         if topic == schema.STATE:
             self.time = stamp

@@ -26,15 +26,16 @@ from softfinger.tools.terminal import heatmap
 from softfinger.tools.terminal.feed import Feed, number
 from softfinger.tools.terminal.typeset import micro, short
 from softfinger.tools.viewing import planar
-from softfinger.tools.viewing.known import HEIGHT, WIDTH, ShownHand, palette
+from softfinger.tools.viewing.known import HEIGHT, WIDTH, ShownHand
 from softfinger.tools.viewing.live_stream import Viewer
-from softfinger.tools.viewing.planar import COLOURS, GOAL, LATE, LEVELS, OBJECT, touch
+from softfinger.tools.viewing.planar import COLOURS, GOAL, LATE, LEVELS, OBJECT, touches
 
 SECONDS = 12.0  # of the past in the plots
 _STEP = 0.1  # s from one column of the plots to the next
 _EVENTS = 30  # shown
 _LATELY = 5.0  # s for which a warning counts as present
 _WHITE, _FAINT = (255, 255, 255), (255, 255, 255, 0.56)
+_OUTSIDE = (112, 112, 116)  # where no such contact can be
 _DEGREE = math.degrees(1.0)
 _MODES = {
     "disarmed": (120, 120, 120),
@@ -92,29 +93,26 @@ class Pictures(Viewer):
         self._pressure = heatmap.FullScale(5e3)
         super().clear()
 
-    @property
-    def _state(self) -> dict[str, Any]:
-        return self.newest.get(schema.STATE, {})
-
     def _moment(self) -> float:
         return time.monotonic() if self._live else self.time
 
     def take(self, topic: bytes, message: Any) -> bool:
         """One message, whatever it holds."""
-        state, when = self._state, self.time
+        state, when = self.feed.state, self.time
         if not super().take(topic, message):
             return False
-        if topic == schema.STATE and number(message, "seq") < number(state, "seq"):
+        if topic == schema.STATE and number(message, "seq") < state.seq:
             self._columns.clear()  # they are another daemon's
             for trail in self._trails.values():
                 trail.clear()
         elif topic == schema.STATE and 0.0 <= when // _STEP != self.time // _STEP:
             self._columns.append(self._column(when))  # the last state of a step stays
             for name, trail in self._trails.items():
-                if (contact := touch(state, name)) is None:
-                    trail.clear()
+                finger = state.finger(name)
+                if touches(finger):
+                    trail.append((finger.d, finger.theta))
                 else:
-                    trail.append((contact.d, contact.theta))
+                    trail.clear()
         self.feed.sort_in(topic, message, self._moment())
         return True
 
@@ -135,7 +133,7 @@ class Pictures(Viewer):
             contours = [each for each in landscape.contours() if len(each.line) > 1]
             at = [(each.line[len(each.line) // 8], 1e3 * each.energy) for each in contours]
             still = {
-                "image": _image(landscape.picture(), "energy"),
+                "image": _image(landscape.picture()),
                 "lines": [(_FAINT, 1.0, _flat(each.line)) for each in contours],
                 "texts": [(_WHITE, *_flat(place), f"{energy:g} mJ") for place, energy in at]
                 + [(GOAL, *_flat(place), words) for place, words in landscape.ticks()],
@@ -149,7 +147,7 @@ class Pictures(Viewer):
             "plots": [plot for plot in plots if plot["lines"]],
             "modes": _MODES,
             "levels": LEVELS,
-            "palettes": {"pressure": heatmap.colour_map(), "energy": palette().tolist()},
+            "palette": [*heatmap.colour_map(), _OUTSIDE],
             "commands": {name: list(modes) for name, (modes, _) in COMMANDS.items()},
         }
         self._scene = orjson.dumps(scene)
@@ -214,8 +212,8 @@ class Pictures(Viewer):
         self._publish(self._scene, orjson.dumps(picture))
 
     def _hand(self) -> dict[str, Any]:
-        parts = self.parts.parts(self._state)
-        every = [*parts.values(), self.parts.simulated(self.newest.get(schema.TRUTH))]
+        truth = self.newest.get(schema.TRUTH)
+        every = planar.hand_parts(self.hand, self.feed.state, truth).values()
         strips = [strip for part in every for strip in part.strips]
         lines = [(strip.colour, 1e-3 * strip.width, _flat(strip.points)) for strip in strips]
         texts = []
@@ -229,26 +227,25 @@ class Pictures(Viewer):
 
     def _maps(self, now: float) -> dict[str, Any]:
         """Each tip's frame with its rim, and footprint and centroid of the contact."""
-        frames = {name: each for name, each in self.feed.frames.items() if name in self.frames}
+        frames = self.feed.frames
         peak = max((float(frame.grid.max()) for frame in frames.values()), default=0.0)
         full = self._pressure.follow(peak, now)
         maps = {}
         for name, frame in frames.items():
             unit, factor = ("counts", 1.0) if math.isnan(frame.scale) else ("kPa", 1e-3)
             lines, dots = [], []
-            grid, radius = planar.grid_of(self.frames[name]), self.hand.settings.tip.radius
+            grid, radius = planar.grid_of(frame.source), self.hand.settings.tip.radius
             if grid is not None:
                 lines.append((COLOURS[name], 1.0, _flat(planar.tip_circle(grid, radius))))
-            contact = touch(self._state, name)
-            if grid is not None and contact is not None:
-                tilt_y = number(self._state, name, "tilt_y")
-                tilts = contact.theta, tilt_y if math.isfinite(tilt_y) else 0.0
+            contact = self.feed.state.finger(name)
+            if grid is not None and touches(contact):
+                tilts = contact.theta, contact.tilt_y if math.isfinite(contact.tilt_y) else 0.0
                 place = planar.footprint(grid, radius, contact.d, *tilts)
                 if place is not None:
                     lines.append((_WHITE, 1.5, _flat(place.outline)))
                     dots.append((COLOURS[name], *_flat(place.centroid)))
             maps[name] = {
-                "image": _image(heatmap.levels_of(frame.grid, full).astype(np.uint8), "pressure"),
+                "image": _image(heatmap.levels_of(frame.grid, full).astype(np.uint8)),
                 "lines": lines,
                 "dots": dots,
                 "note": f"peak {factor * frame.grid.max():.1f} of {factor * full:g} {unit}",
@@ -259,8 +256,8 @@ class Pictures(Viewer):
         """Each contact on the landscape, with its trail."""
         lines, dots = [], []
         for name in self.hand.fingers:
-            contact = touch(self._state, name)
-            if contact is not None and self._landscape is not None:
+            contact = self.feed.state.finger(name)
+            if touches(contact) and self._landscape is not None:
                 trail = np.array([*self._trails[name], (contact.d, contact.theta)])
                 places = self._landscape.place(*trail.T)
                 lines.append((COLOURS[name], 2.0, _flat(places)))
@@ -324,7 +321,6 @@ def _flat(points: NDArray[np.float64]) -> list[float]:
     return flat
 
 
-def _image(levels: NDArray[np.uint8], colours: str) -> dict[str, Any]:
+def _image(levels: NDArray[np.uint8]) -> dict[str, Any]:
     rows, cols = levels.shape
-    data = base64.b64encode(levels.tobytes()).decode()
-    return {"rows": rows, "cols": cols, "palette": colours, "data": data}
+    return {"rows": rows, "cols": cols, "data": base64.b64encode(levels.tobytes()).decode()}

@@ -14,14 +14,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from softfinger.daemon.client.records import read
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.physics.plant_state import NO_OBJECT
 from softfinger.daemon.simulation.physics.shapes import shape_of
 from softfinger.daemon.types import FINGERS
+from softfinger.daemon.wire.schema import (
+    FingerState,
+    HandState,
+    TactileFrame,
+    TrueObject,
+    TrueState,
+)
 from softfinger.kinematics.hand.geometry import HandGeometry
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
-from softfinger.tools.terminal import feed
-from softfinger.tools.terminal.feed import number
 from softfinger.tools.viewing.known import ShownHand
 
 # The left finger is blue, the right one orange, goals are grey: distinguishable for colour-blind
@@ -50,23 +56,9 @@ SPRINGS = 17  # drawn in a tip, of the continuum that the model has
 _ANGLES = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 61)
 
 
-@dataclass(frozen=True)
-class Touch:
-    """One tip's contact: d [m], θ [rad], F [N]."""
-
-    d: float
-    theta: float
-    force: float
-
-
-def touch(state: dict[str, Any] | None, name: str) -> Touch | None:
-    """One tip's contact in a ``hand/state``, None where there is none."""
-    if feed.field(state, name, "contact") is not True:
-        return None
-    d, theta, force = (number(state, name, key) for key in ("d", "theta", "force"))
-    if not (math.isfinite(d) and math.isfinite(theta) and d > 0.0):
-        return None
-    return Touch(d, theta, force if math.isfinite(force) else 0.0)
+def touches(finger: FingerState) -> bool:
+    """Return whether a tip has a contact that can be drawn."""
+    return finger.contact and 0.0 < finger.d < math.inf and math.isfinite(finger.theta)
 
 
 @dataclass(frozen=True)
@@ -84,9 +76,9 @@ class FingerLines:
 
 
 def finger_lines(
-    hand: HandGeometry, finger: int, q: float, contact: Touch | None = None
+    hand: HandGeometry, finger: int, q: float, d: float = 0.0, theta: float = 0.0
 ) -> FingerLines:
-    """The lines of finger 0 (left) or 1 (right) at joint angle ``q`` [rad]."""
+    """The lines of finger 0 (left) or 1 (right) at joint angle ``q`` [rad]; ``d`` [m] 0: free."""
     a = hand.tip_radius
     centre = hand.tips((q, q))[finger]
     along, out = tip_axes(finger, q)
@@ -103,17 +95,17 @@ def finger_lines(
     free = np.sqrt(a * a - inner * inner)
     skin, length = a * np.cos(_ANGLES), free
     face = normal = push = None
-    if contact is not None and 0.0 < contact.d < a and abs(contact.theta) < 0.5 * math.pi:
-        sine, cosine, h = math.sin(contact.theta), math.cos(contact.theta), a - contact.d
+    if 0.0 < d < a and abs(theta) < 0.5 * math.pi:
+        sine, cosine, h = math.sin(theta), math.cos(theta), a - d
         skin = np.clip((h - rim * sine) / cosine, 0.0, skin)
         length = np.clip((h - inner * sine) / cosine, 0.0, free)
-        rho = math.sqrt(2.0 * a * contact.d - contact.d**2)
+        rho = math.sqrt(2.0 * a * d - d**2)
         middle, inwards = h * np.array([sine, cosine]), np.array([sine, cosine])
         ends = middle + np.outer((-rho, rho), (cosine, -sine))
         face = place(ends[:, 0], ends[:, 1])
         lines = np.array([middle, middle - 0.6 * a * inwards])
         normal = place(lines[:, 0], lines[:, 1])
-        x = (a - contact.d / 3.0) * sine  # the centroid of pressure
+        x = (a - d / 3.0) * sine  # the centroid of pressure
         at = place(np.array([x]), np.array([(h - x * sine) / cosine]))[0]
         push = np.array([at, out])
     springs = np.stack((place(inner, np.zeros(SPRINGS)), place(inner, length)), axis=1)
@@ -163,20 +155,20 @@ def held_outline(
     return outline
 
 
-def true_outline(settings: Settings, truth: dict[str, Any]) -> FloatArray | None:
-    """The simulated object's outline [n, 2] m, closed, by a ``hand/truth``; None without one."""
+def true_outline(settings: Settings, pose: TrueObject) -> FloatArray | None:
+    """The simulated object's outline [n, 2] m, closed, at its true ``pose``; None without one."""
     try:
         shape = shape_of(settings)
     except ValueError:  # a stranger's wedge whose faces meet
         return None
     if shape.kind == NO_OBJECT:
         return None
-    x, y, angle = (number(truth, "true_object", key) for key in ("x", "y", "angle"))
     own = np.vstack((shape.corners, shape.corners[:1]))
     if shape.roundness > 0.0:
         own = shape.roundness * np.column_stack((np.cos(_TURN), np.sin(_TURN)))
-    cosine, sine = math.cos(angle), math.sin(angle)
-    turned: FloatArray = own @ np.array([(cosine, sine), (-sine, cosine)]) + (x, y)
+    # NumPy's, of which an infinite angle is NaN.
+    cosine, sine = np.cos(pose.angle), np.sin(pose.angle)
+    turned: FloatArray = own @ np.array([(cosine, sine), (-sine, cosine)]) + (pose.x, pose.y)
     return turned if np.isfinite(turned).all() else None
 
 
@@ -207,61 +199,51 @@ class HandPart:
     pushes: list[Push] = field(default_factory=list)
 
 
-class HandScene:
-    """The moving hand: its parts by name, always all of them."""
-
-    def __init__(self, hand: ShownHand) -> None:
-        self._hand = hand
-
-    def parts(self, state: dict[str, Any]) -> dict[str, HandPart]:
-        """All but the simulated object, by a ``hand/state``."""
-        hand = self._hand
-        half = hand.geometry.half_separation + 0.012
-        parts = {"palm": HandPart([Strip(np.array([(-half, 0.0), (half, 0.0)]), SPRING, 2.4)])}
-        contacts = [touch(state, name) for name in hand.fingers]
-        for name, contact in zip(hand.fingers, contacts, strict=True):
-            q = number(state, name, "q")
-            index, angle = FINGERS.index(name), q if math.isfinite(q) else 0.0
-            parts[name] = _part(finger_lines(hand.geometry, index, angle, contact), name, contact)
-        parts["object"] = self._held(state, *contacts)
-        return parts
-
-    def _held(self, state: dict[str, Any], *contacts: Touch | None) -> HandPart:
-        """The object between both tips; nothing where both don't hold it."""
-        held = [contact for contact in contacts if contact is not None]
-        if len(held) < 2 or feed.field(state, "object", "valid") is not True:
-            return HandPart([])
-        outline = held_outline(
-            self._hand.geometry,
-            (number(state, "left", "q"), number(state, "right", "q")),
-            np.array([contact.d for contact in held]),
-            np.array([contact.theta for contact in held]),
-            number(state, "object", "width"),
-            self._hand.settings.simulation.object_height,
-        )
-        return HandPart([Strip(outline, OBJECT, 1.4)] if np.isfinite(outline).all() else [])
-
-    def simulated(self, truth: dict[str, Any] | None) -> HandPart:
-        """The simulated object's true pose, by a ``hand/truth`` if there is any."""
-        outline = None if truth is None else true_outline(self._hand.settings, truth)
-        return HandPart([] if outline is None else [Strip(outline, GOAL, 0.6)])
+def hand_parts(
+    hand: ShownHand, state: HandState, truth: dict[str, Any] | None = None
+) -> dict[str, HandPart]:
+    """Return the moving hand's parts by name, always all of them; ``truth``: a ``hand/truth``."""
+    half = hand.geometry.half_separation + 0.012
+    parts = {"palm": HandPart([Strip(np.array([(-half, 0.0), (half, 0.0)]), SPRING, 2.4)])}
+    for name in hand.fingers:
+        parts[name] = _finger_part(hand.geometry, name, state.finger(name))
+    parts["object"] = _held(hand, state)
+    pose = read(TrueState, truth).true_object
+    outline = None if truth is None else true_outline(hand.settings, pose)
+    parts["simulated"] = HandPart([] if outline is None else [Strip(outline, GOAL, 0.6)])
+    return parts
 
 
-def _part(finger: FingerLines, name: str, contact: Touch | None) -> HandPart:
+def _held(hand: ShownHand, state: HandState) -> HandPart:
+    """The object between both tips; nothing where both don't hold it."""
+    tips = [state.finger(name) for name in hand.fingers]
+    if len(tips) < 2 or not state.object.valid or not all(map(touches, tips)):
+        return HandPart([])
+    q = state.left.q, state.right.q
+    d, theta = (np.array([getattr(tip, key) for tip in tips]) for key in ("d", "theta"))
+    height = hand.settings.simulation.object_height
+    outline = held_outline(hand.geometry, q, d, theta, state.object.width, height)
+    return HandPart([Strip(outline, OBJECT, 1.4)] if np.isfinite(outline).all() else [])
+
+
+def _finger_part(hand: HandGeometry, name: str, state: FingerState) -> HandPart:
     """One finger with its tip, and where it touches the face and the force's arrow."""
-    colour = COLOURS[name]
+    contact = (state.d, state.theta) if touches(state) else ()
+    q, colour = state.q if math.isfinite(state.q) else 0.0, COLOURS[name]
+    finger = finger_lines(hand, FINGERS.index(name), q, *contact)
     lines = ((finger.link, 5.2), (finger.base, 2.4), (finger.skin, 1.0))
     strips = [Strip(line, colour, width) for line, width in lines]
     for spring, strain in zip(finger.springs, finger.strain, strict=True):
         share = min(4.0 * float(strain), 1.0)
         shade = between(SPRING, LEVELS["error"], share)
         strips.append(Strip(spring, shade, 0.5 + 0.7 * share))
-    if contact is None or finger.face is None or finger.normal is None or finger.push is None:
+    if finger.face is None or finger.normal is None or finger.push is None:
         return HandPart(strips)
     strips += [Strip(finger.face, OBJECT, 2.0), Strip(finger.normal, GOAL, 0.7)]
     at, direction = finger.push
-    way = min(_ARROW * contact.force, _ARROW_LONGEST) * direction
-    return HandPart(strips, [Push(at, way, f"{contact.force:.1f} N", colour)])
+    force = state.force if math.isfinite(state.force) else 0.0
+    way = min(_ARROW * force, _ARROW_LONGEST) * direction
+    return HandPart(strips, [Push(at, way, f"{force:.1f} N", colour)])
 
 
 # A picture's coordinates are cells: x along the columns, y along the rows, from the corner of the
@@ -280,16 +262,13 @@ class Footprint:
     centroid: FloatArray
 
 
-def grid_of(frame: dict[str, Any]) -> SensorGrid | None:
+def grid_of(frame: TactileFrame) -> SensorGrid | None:
     """The grid of a ``hand/tactile``, None where its fields make none."""
-    rows, cols = frame.get("rows"), frame.get("cols")
-    pitch = number(frame, "pitch")
-    if type(rows) is not int or type(cols) is not int:
-        return None
-    more = [number(frame, key) for key in ("pitch_y", "centre_x", "centre_y", "rotation")]
+    more = (frame.pitch_y, frame.centre_x, frame.centre_y, frame.rotation)
     pitch_y, x, y, rotation = (value if math.isfinite(value) else 0.0 for value in more)
+    pitches = frame.pitch, pitch_y or frame.pitch
     try:
-        return SensorGrid(rows, cols, (pitch, pitch_y or pitch), (x, y), rotation)
+        return SensorGrid(frame.rows, frame.cols, pitches, (x, y), rotation)
     except ValueError:
         return None
 
