@@ -25,7 +25,7 @@ import zmq
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.settings import Settings
 from softfinger.tools.cli import main
-from softfinger.tools.processes import kernel_build
+from softfinger.tools.processes import compile as kernels
 from tests.harness import descendants
 from tests.harness.daemon_process import Running
 from tests.harness.loop import Make
@@ -151,7 +151,7 @@ def inline(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) 
     """Runs a subcommand in this process, for tests of its work and not of its process."""
     monkeypatch.setattr(os, "nice", lambda _: 0)  # the tests' own priority stays
     # Whichever test comes first on a machine compiles, and none is about being told so.
-    monkeypatch.setattr(kernel_build, "print_event", lambda *_: None)
+    monkeypatch.setattr(kernels, "print_event", lambda *_: None)
 
     def run(*words: object) -> Told:
         capsys.readouterr()

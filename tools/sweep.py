@@ -1,4 +1,4 @@
-"""Sweeps: independent, seeded cases over all processors, or over the workers of a Dask cluster.
+"""Long work: its progress bar, and sweeps of seeded cases over processors or a Dask cluster.
 
 The results are the same to the bit however many workers there are, since a case knows nothing of
 the others. A worker that dies costs the cases it had a second try. What is done is in a journal,
@@ -13,7 +13,9 @@ import json
 import multiprocessing
 import os
 import pickle
+import shutil
 import signal
+import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
@@ -26,16 +28,46 @@ from softfinger.daemon.errors import SoftfingerError
 from softfinger.daemon.own_files import open_regular
 from softfinger.tools.arguments import number
 from softfinger.tools.extras import require
-from softfinger.tools.terminal.progress import Progress
 
 Case = TypeVar("Case")
 Result = TypeVar("Result")
 
 _CONNECT = 10.0  # s that a scheduler may take to answer
+_REDRAW = 0.1  # s between two pictures of a bar
+_BAR = 20  # columns
 
 
 class SweepError(SoftfingerError):
     """A sweep can't go on. The message says why."""
+
+
+class Progress:
+    """``with Progress("analyse", total) as progress: progress(done)``; written to stderr."""
+
+    def __init__(self, what: str, total: int, on: bool = True) -> None:
+        self._what = what
+        self._total = max(total, 1)
+        self._shown = -1.0
+        self.on = on and sys.stderr.isatty()
+
+    def __call__(self, done: int, note: str = "") -> None:
+        """Show that ``done`` of the total is done, with ``note`` instead of the percentage."""
+        if not self.on or time.monotonic() - self._shown < _REDRAW:
+            return
+        self._shown = time.monotonic()
+        fraction = min(done / self._total, 1.0)
+        full = round(fraction * _BAR)
+        bar = "█" * full + "·" * (_BAR - full)
+        line = f"{self._what} {bar} {note or f'{fraction:4.0%}'}"
+        columns = shutil.get_terminal_size().columns
+        print(f"\r{line[: columns - 1]}\x1b[K", end="", file=sys.stderr, flush=True)
+
+    def __enter__(self) -> Progress:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.on:
+            print("\r\x1b[K", end="", file=sys.stderr, flush=True)
 
 
 def processors() -> int:

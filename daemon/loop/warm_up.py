@@ -1,7 +1,7 @@
 """The kernels that a scene needs, by parts of the pipeline: run once, so that no tick compiles any.
 
 `loop.build` runs every part before there is a loop, and so before torque can be on. Where a
-part was never compiled, `processes.kernel_build` runs it before in a process of its own. A part
+part was never compiled, `processes.compile` runs it before in a process of its own. A part
 builds what it needs, runs it on a made-up contact, and throws it away; what a scene lacks has no
 part.
 """

@@ -12,7 +12,7 @@ from lerobot.utils.decorators import check_if_already_connected, check_if_not_co
 from lerobot_robot_softfinger.config_softfinger import SoftfingerConfig
 from softfinger import Hand, NoStream
 from softfinger.daemon.wire.schema import TactileFrame
-from softfinger.tools.recordings.features import IMAGES, JOINTS, STATE, image, observation
+from softfinger.tools.recordings.lerobot_dataset import IMAGES, JOINTS, STATE, image, observation
 
 
 class Softfinger(Robot):

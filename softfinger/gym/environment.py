@@ -22,7 +22,7 @@ from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
 from softfinger.gym import STEP, TASKS
-from softfinger.tools.processes.kernel_build import build_kernels, print_event
+from softfinger.tools.processes.compile import build_kernels, print_event
 
 Observation = dict[str, NDArray[Any]]
 

@@ -14,7 +14,7 @@ import pytest
 
 from softfinger.daemon.loop.warm_up import named
 from softfinger.daemon.profile.settings import Settings
-from softfinger.tools.processes import kernel_build
+from softfinger.tools.processes import compile as kernels
 from tests.conftest import until
 from tests.harness.daemon_process import python, softfinger, started
 from tests.harness.descendants import ending
@@ -49,7 +49,7 @@ def test_a_part_is_compiled_once_and_its_kernels_are_as_many_as_the_bar_says(tmp
     table = named("contact table")
     settings = Settings().model_dump_json()
     own = {"input": f"{settings}\n{table.name}\n", "env": environment(tmp_path)}
-    done = python("-m", "softfinger.tools.processes.kernel_build", **own)
+    done = python("-m", "softfinger.tools.processes.compile", **own)
     *kernels, last = done.stdout.splitlines()
     assert last == "done"
     # Counted for the newest Numba: the lowest one tells of a third fewer.
@@ -78,17 +78,17 @@ def test_ctrl_c_before_a_thread_has_begun_is_no_error(monkeypatch):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(threading.Thread, "start", interrupted)
-    monkeypatch.setattr(kernel_build, "is_built", lambda *_: False)
+    monkeypatch.setattr(kernels, "is_built", lambda *_: False)
     with pytest.raises(KeyboardInterrupt):
-        kernel_build.build_kernels(Settings(), lambda *_: None, bar=False)
+        kernels.build_kernels(Settings(), lambda *_: None, bar=False)
 
 
 def test_one_line_says_that_numba_alone_compiles_and_why(monkeypatch):
-    monkeypatch.setattr(kernel_build, "is_built", lambda *_: False)
-    monkeypatch.setattr(kernel_build, "why_plain", "Numba 99.0 is new")
-    monkeypatch.setattr(kernel_build._Build, "run", lambda _: None)
+    monkeypatch.setattr(kernels, "is_built", lambda *_: False)
+    monkeypatch.setattr(kernels, "why_plain", "Numba 99.0 is new")
+    monkeypatch.setattr(kernels._Build, "run", lambda _: None)
     told: list[str] = []
-    kernel_build.build_kernels(Settings(), lambda *event: told.append(event[2]), bar=False)
+    kernels.build_kernels(Settings(), lambda *event: told.append(event[2]), bar=False)
     assert [text for text in told if "99.0" in text] == [
         "compiled by Numba alone, in twice the time: Numba 99.0 is new"
     ]

@@ -14,7 +14,7 @@ import psutil
 import pytest
 from websockets.sync.client import ClientConnection, connect
 
-from softfinger.daemon.client.records import read
+from softfinger.daemon.client.stream import read
 from softfinger.daemon.wire import schema
 from softfinger.tools import cli
 from softfinger.tools.viewing.known import ShownHand

@@ -15,8 +15,7 @@ from softfinger import Refused
 from softfinger.daemon.client.stream import read
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.schema import TactileFrame
-from softfinger.tools.recordings.features import image, observation
-from softfinger.tools.recordings.lerobot_dataset import samples
+from softfinger.tools.recordings.lerobot_dataset import image, observation, samples
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.record import RecordingWriter
 from tests.conftest import Addresses, Inline

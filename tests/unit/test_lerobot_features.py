@@ -11,7 +11,7 @@ import pytest
 from softfinger.daemon.client.stream import read
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.schema import HandState, TactileFrame
-from softfinger.tools.recordings.features import STATE, image, observation
+from softfinger.tools.recordings.lerobot_dataset import STATE, image, observation
 from tests.harness.golden_wire import sample
 
 

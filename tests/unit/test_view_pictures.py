@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from softfinger.daemon.client.records import read
+from softfinger.daemon.client.stream import read
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.wire.schema import TactileFrame
 from softfinger.kinematics.contact.closed_form import Fingertip

@@ -31,11 +31,10 @@ from softfinger.daemon.types import FINGERS, Frame, State
 from softfinger.daemon.wire import schema
 from softfinger.kinematics.estimation.invalid import REASONS, Invalid
 from softfinger.tools.arguments import add_profile, profile, to_stderr
-from softfinger.tools.processes.kernel_build import build_kernels, print_event
+from softfinger.tools.processes.compile import build_kernels, print_event
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.recomputed import counts_of, recorded_models
-from softfinger.tools.sweep import Sweep, add_sweep
-from softfinger.tools.terminal.progress import Progress as ProgressBar
+from softfinger.tools.sweep import Progress, Sweep, add_sweep
 
 _EPILOG = """\
 FILE is a recording (.mcap), .npz with frames [n, rows, cols] and t, .npy frames or a folder of
@@ -88,7 +87,7 @@ def _analysed(arguments: argparse.Namespace, settings: Settings, path: Path) -> 
     own = arguments.config is None and not arguments.set
     source = open_source(path, settings, own)
     began = time.perf_counter()
-    with ProgressBar("analyse", source.total) as progress:
+    with Progress("analyse", source.total) as progress:
         contacts = analyse(source, progress)
     elapsed = time.perf_counter() - began
     write_csv(table, contacts)
@@ -105,7 +104,7 @@ def _analysed(arguments: argparse.Namespace, settings: Settings, path: Path) -> 
 
 FloatArray = NDArray[np.float64]
 Counts = NDArray[np.uint16]
-Progress = Callable[[int], None]
+OnProgress = Callable[[int], None]
 
 
 @dataclass(frozen=True)
@@ -120,7 +119,7 @@ class Source:
     models: tuple[FingerModel, FingerModel]
     fingers: tuple[int, ...]
     total: int
-    frames: Callable[[Progress], Iterator[tuple[int, float, Counts]]]
+    frames: Callable[[OnProgress], Iterator[tuple[int, float, Counts]]]
     truths: dict[str, NDArray[np.float64]]
     live: NDArray[np.bool_] | None = None
 
@@ -151,7 +150,7 @@ def _stream(path: Path, settings: Settings, own: bool) -> Source:
         if f"{schema.TACTILE.decode()}/{name}" in recording.counts
     )
 
-    def frames(progress: Progress) -> Iterator[tuple[int, float, Counts]]:
+    def frames(progress: OnProgress) -> Iterator[tuple[int, float, Counts]]:
         first = None
         for _, message in recording.messages([schema.TACTILE], progress=progress):
             counts = counts_of(recording, message, settings)
@@ -180,7 +179,7 @@ def _frames_alone(path: Path, settings: Settings, own: bool) -> Source:
         )
     settings = settings.model_copy(update={"tactile": tactile.model_copy(update=changes)})
 
-    def frames(progress: Progress) -> Iterator[tuple[int, float, Counts]]:
+    def frames(progress: OnProgress) -> Iterator[tuple[int, float, Counts]]:
         for k, t in enumerate(recording.t.tolist()):
             progress(k)
             yield 0, t, recording.counts[k]
@@ -249,7 +248,7 @@ class _Pass:
         )
 
 
-def analyse(source: Source, progress: Progress) -> list[Contacts]:
+def analyse(source: Source, progress: OnProgress) -> list[Contacts]:
     """Return the contacts of each sensor. Raises what the source's frames raise."""
     passes = {finger: _Pass(source, finger) for finger in source.fingers}
     for finger, t, counts in source.frames(progress):

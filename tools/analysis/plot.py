@@ -29,10 +29,10 @@ from softfinger.kinematics.contact.table import ContactTable
 from softfinger.tools import style
 from softfinger.tools.arguments import add_range, to_stderr
 from softfinger.tools.extras import require
-from softfinger.tools.processes.kernel_build import build_kernels, print_event
+from softfinger.tools.processes.compile import build_kernels, print_event
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.recomputed import recorded_models
-from softfinger.tools.terminal.progress import Progress
+from softfinger.tools.sweep import Progress
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -1,11 +1,45 @@
-"""``softfinger compile``: the kernels of a hand, compiled now instead of at its first start."""
+"""``softfinger compile``, and what a first start does: a scene's kernels, on all cores.
+
+The daemon then only loads them and stays small. Each process takes one part of the pipeline after
+another (`loop.warm_up`); parts that need the contact table wait for it.
+"""
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import gc
+import math
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from pathlib import Path
+from typing import Any, NamedTuple
 
+from softfinger.daemon.loop.warm_up import (
+    ALL,
+    Part,
+    WantedScene,
+    is_built,
+    mark_built,
+    named,
+    parts,
+)
+from softfinger.daemon.profile.settings import Settings
+from softfinger.kinematics.compiled.kernel import why_plain
+from softfinger.kinematics.compiled.kernel_folder import kernel_folder, remove_damaged
 from softfinger.tools.arguments import add_profile, profile
-from softfinger.tools.processes.kernel_build import build_kernels, print_event
+from softfinger.tools.sweep import Progress, processors
+
+Tell = Callable[[str, str, str], None]
+
+_ROOT = Path(__file__).parents[3]
+_MEMORY = 400e6  # bytes that a process needs at most
+_LOOK = 0.2  # s between two looks at the time
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -17,12 +51,208 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Compile what is missing; 1 when something could not be. Raises SettingsError."""
-    settings = profile(arguments)
-    from softfinger.daemon.loop.warm_up import ALL
-
-    built = build_kernels(settings, print_event, ALL if arguments.all else None)
+    built = build_kernels(profile(arguments), print_event, ALL if arguments.all else None)
     if built.failed:
         return 1
     if not built.parts:
         print("all kernels are compiled")
     return 0
+
+
+class Built(NamedTuple):
+    """The result: how many parts were missing, and whether one could not be built."""
+
+    parts: int
+    failed: bool
+
+
+def print_event(_level: str, _kind: str, text: str) -> None:
+    """Print an event on standard error, for tools without a log."""
+    print(text, file=sys.stderr, flush=True)
+
+
+def build_kernels(
+    settings: Settings, tell: Tell, wanted: Sequence[Part] | None = None, bar: bool = True
+) -> Built:
+    """Build the missing parts of ``wanted``, by default of the whole scene.
+
+    Silent and quick when none is missing. Progress is a bar on standard error if that is a
+    terminal and ``bar`` allows it, else a call of ``tell`` for each part, as (level, kind, text);
+    failures go to ``tell``, too. When interrupted it ends every process.
+    """
+    folder = kernel_folder()
+    if folder is not None and (count := remove_damaged(folder)):
+        text = f"{folder.path}: {count} damaged files are compiled anew"
+        tell("warning", "compile", text)
+    missing = [part for part in wanted or parts(settings) if not is_built(part, settings)]
+    if not missing:
+        return Built(0, False)
+    if folder is None:
+        tell("warning", "compile", "kernels are compiled in this process, for half a minute")
+        return Built(0, False)
+    if why_plain:
+        tell("info", "compile", f"compiled by Numba alone, in twice the time: {why_plain}")
+    names = ", ".join(part.name for part in missing)
+    tell("info", "compile", f"compiling kernels, on the first start only: {names}")
+    started = time.monotonic()
+    build = _Build(settings, missing, tell, Progress("compiling kernels", _kernels(missing), bar))
+    build.run()
+    if not build.failed:
+        tell("info", "compile", f"compiled in {time.monotonic() - started:.1f} s")
+    return Built(len(missing), build.failed)
+
+
+def _kernels(missing: list[Part]) -> int:
+    return sum(part.kernels for part in missing)
+
+
+def _jobs(missing: list[Part]) -> int:
+    """Return the number of processes for cores, kernel groups and memory."""
+    return max(1, min(processors(), len(missing), int(_available() / _MEMORY)))
+
+
+def _available() -> float:
+    """Memory that may be taken without swapping [bytes]; infinite where Linux doesn't tell."""
+    try:
+        _, _, rest = Path("/proc/meminfo").read_text().partition("MemAvailable:")
+    except OSError:
+        return math.inf
+    return 1024.0 * float(rest.split()[0])
+
+
+class _Build:
+    """Builds parts in a few processes, each with a thread that hands it one part after another."""
+
+    def __init__(self, settings: Settings, missing: list[Part], tell: Tell, bar: Progress) -> None:
+        self._head = f"{settings.model_dump_json()}\n"
+        self._missing = missing
+        self._at: dict[str, str] = {}  # the kernel under way of each part under way
+        self._total, self._begun = _kernels(missing), 0
+        self._started = time.monotonic()
+        self._bar, self._tell = bar, tell
+        self._processes: list[subprocess.Popen[str]] = []
+        self._own = threading.local()  # each thread's process
+        self.failed = self._over = False
+
+    def run(self) -> None:
+        """Build all parts; when interrupted, end every process."""
+        built: dict[str, Future[str]] = {}
+        pool = ThreadPoolExecutor(_jobs(self._missing))
+        try:
+            for part in self._missing:
+                built[part.name] = pool.submit(self._build, part, built.get(part.after))
+            with self._bar as show:
+                while wait(built.values(), _LOOK).not_done:
+                    at = "; ".join(f"{name}: {kernel}" for name, kernel in list(self._at.items()))
+                    show(self._begun, f"{self._so_far()}: {at}")
+        finally:
+            self._over = True
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in self._processes:
+                process.kill()
+            pool.shutdown()
+            for process in self._processes:
+                with process:
+                    pass
+        reasons: set[str] = set()  # wrong settings fail every part alike
+        for name, future in built.items():
+            if (reason := future.result()) and reason not in reasons:
+                self._tell("warning", "compile", f"{name} was not compiled ahead: {reason}")
+            reasons.add(reason)
+        self.failed = reasons != {""}
+
+    def _so_far(self) -> str:
+        return (
+            f"{min(self._begun, self._total)} of about {self._total}, "
+            f"{time.monotonic() - self._started:.0f} s"
+        )
+
+    def _build(self, part: Part, after: Future[str] | None) -> str:
+        """Have this thread's process build a part once ``after`` is done; why that failed."""
+        if after is not None:
+            wait([after])
+        head, process = "", getattr(self._own, "process", None)
+        if process is None:
+            process = self._own.process = _start()
+            self._processes.append(process)
+            if self._over:
+                process.kill()
+            head = self._head
+        assert process.stdout is not None
+        self._at[part.name] = ""
+        with contextlib.suppress(BrokenPipeError):
+            print(f"{head}{part.name}", file=process.stdin, flush=True)
+        for line in process.stdout:
+            word, _, rest = line.rstrip("\n").partition(" ")
+            if word == "kernel":
+                self._begun += 1
+                self._at[part.name] = rest
+                continue
+            del self._at[part.name]
+            if word == "done" and not self._bar.on:
+                self._tell("info", "compile", f"{part.name}: {self._so_far()}")
+            return rest
+        self._own.process = None
+        del self._at[part.name]
+        return f"its process ended with status {process.wait()}"
+
+
+def _start() -> subprocess.Popen[str]:
+    """A process that runs `main`."""
+    # -P: a folder named tools where this was started is not ours.
+    command = [sys.executable, "-P", "-m", "softfinger.tools.processes.compile"]
+    path = os.pathsep.join(filter(None, (str(_ROOT), os.environ.get("PYTHONPATH"))))
+    return subprocess.Popen(
+        command,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        env=os.environ | {"PYTHONPATH": path},
+        text=True,
+        process_group=0,  # Ctrl-C is for this process, which ends it
+    )
+
+
+def main() -> None:
+    """Compile kernels, a part of a scene at a time, until standard input ends.
+
+    Standard input: the settings in JSON, then the name of a part a line. Standard output, a line
+    each: ``kernel NAME`` as one is begun, ``done`` when a part is built, ``failed REASON`` when it
+    can't be.
+    """
+    gc.set_threshold(100_000)  # the compiler makes much that lives: looking through it costs 10 %
+    out = sys.stdout
+    sys.stdout = sys.stderr  # whatever else prints, prints there
+
+    def tell(line: str) -> None:
+        print(line, file=out, flush=True)
+
+    from numba.core import event as numba_event
+
+    events: Any = numba_event
+
+    class Compiling(numba_event.Listener):
+        def on_start(self, event: Any) -> None:
+            tell(f"kernel {event.data['dispatcher'].py_func.__name__}")
+
+        def on_end(self, event: Any) -> None:
+            pass
+
+    events.register("numba:compile", Compiling())
+    head = sys.stdin.readline()
+    if not head:
+        return
+    settings = Settings.model_validate_json(head)
+    scene = WantedScene(settings)
+    for line in sys.stdin:
+        part = named(line.rstrip("\n"))
+        try:
+            part.run(scene)
+        except Exception as error:
+            tell(f"failed {type(error).__name__}: {error}".replace("\n", " "))
+        else:
+            mark_built(part, settings)
+            tell("done")
+
+
+if __name__ == "__main__":
+    main()

@@ -169,7 +169,7 @@ def _serve(settings: Settings, arguments: argparse.Namespace, signals: Signals) 
         EmulatorError,
         with_board,
     )
-    from softfinger.tools.processes.kernel_build import build_kernels, print_event
+    from softfinger.tools.processes.compile import build_kernels, print_event
 
     build_kernels(with_board(settings), print_event, EMULATED)
     servos = EmulatedServos(arguments.baud, arguments.factory, arguments.ids)

@@ -84,7 +84,7 @@ def _serve(
 
     gc.disable()  # collections over half-imported modules are a tenth of the start-up
     from softfinger.daemon.loop.build import Daemon
-    from softfinger.tools.processes.kernel_build import build_kernels
+    from softfinger.tools.processes.compile import build_kernels
 
     log.line("info", "start", f"softfinger: {_scene(settings)}", rate_hz=settings.loop.rate)
     build_kernels(settings, log.line, bar=arguments.log == "plain" and not arguments.log_file)

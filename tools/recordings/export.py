@@ -50,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Export; 1 when there is nothing to export. Raises RecordingError, MissingExtra, OSError."""
-    from softfinger.tools.terminal.progress import Progress
+    from softfinger.tools.sweep import Progress
 
     path: Path = arguments.file
     lerobot: bool = arguments.lerobot

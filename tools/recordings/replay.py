@@ -119,10 +119,10 @@ def _publish(arguments: argparse.Namespace, recording: Recording) -> None:
 def _recompute(arguments: argparse.Namespace, recording: Recording) -> int:
     from softfinger.daemon.profile.load import load
     from softfinger.tools.recordings.recomputed import recompute, recorded_settings
-    from softfinger.tools.terminal.progress import Progress
+    from softfinger.tools.sweep import Progress
 
     recorded, _ = recorded_settings(recording)  # refuses what has none before kernels are loaded
-    from softfinger.tools.processes.kernel_build import build_kernels, print_event
+    from softfinger.tools.processes.compile import build_kernels, print_event
 
     settings = None if arguments.config is None else load(arguments.config)
     build_kernels(settings or recorded, print_event)

@@ -29,7 +29,7 @@ from softfinger.daemon.servos.base import Finding
 from softfinger.daemon.servos.checks import check_latency_timer
 from softfinger.daemon.types import FINGERS
 from softfinger.tools.arguments import add_profile, profile
-from softfinger.tools.processes.kernel_build import build_kernels, print_event
+from softfinger.tools.processes.compile import build_kernels, print_event
 
 _EPILOG = """\
 exit status: 0 when nothing failed (warnings may remain), 1 when something did, 2 for settings that

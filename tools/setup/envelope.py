@@ -24,7 +24,7 @@ from softfinger.daemon.own_files import write_text
 from softfinger.daemon.profile.settings import Settings
 from softfinger.tools.arguments import add_profile, number, profile
 from softfinger.tools.extras import require
-from softfinger.tools.processes.kernel_build import build_kernels, print_event
+from softfinger.tools.processes.compile import build_kernels, print_event
 from softfinger.tools.sweep import Sweep, add_sweep
 
 SHAPES = ("rectangle", "disc")

@@ -39,7 +39,7 @@ from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.keys import ClientKeys
 from softfinger.tools.arguments import client_keys, to_stderr
 from softfinger.tools.ending import Ending
-from softfinger.tools.processes.kernel_build import build_kernels
+from softfinger.tools.processes.compile import build_kernels
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.terminal.feed import judge, number
 from softfinger.tools.viewing.live_stream import LOOPBACK, NICE, TOPICS, ViewError, follow

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softfinger.daemon.client.records import read
+from softfinger.daemon.client.stream import read
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.physics.plant_state import NO_OBJECT
 from softfinger.daemon.simulation.physics.shapes import shape_of
