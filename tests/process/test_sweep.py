@@ -100,7 +100,7 @@ def test_another_sweeps_journal_is_refused(tmp_path):
 
 
 ENVELOPE = "envelope --shape rectangle --size 3 40 --mass 1 --friction 0.6 --keep"
-CAMPAIGN = "bench campaign witnesses --only '6 N: honest' --trials 2 --json"
+CAMPAIGN = "bench witnesses --only '6 N: honest' --trials 2 --json"
 
 
 @pytest.mark.parametrize("words", [ENVELOPE, CAMPAIGN], ids=["envelope", "campaign"])

@@ -1,4 +1,4 @@
-"""Benchmarks and campaigns in short: their errors and bounds, and what is judged how."""
+"""Benchmarks in short: their errors and bounds, and what is judged how."""
 
 from __future__ import annotations
 
@@ -92,18 +92,18 @@ def test_a_measurement_that_fails_leaves_the_others(
     assert "pipeline alone" in printed.out
 
 
-def test_a_failed_campaign_is_no_success(
+def test_a_measurement_that_misses_its_aim_is_no_success(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     asked: list[tuple[int | None, str]] = []
 
-    def measure(trials: int | None, only: str, sweep: object) -> list[Report]:
+    def measure(brief: bool, trials: int | None, only: str, sweep: object) -> list[Report]:
         asked.append((trials, only))
         return [Report("part", [{"name": "x"}], failed=trials == 7)]
 
     monkeypatch.setattr(witnesses, "measure", measure)
-    assert cli.main(["bench", "campaign", "witnesses"]) == 0
-    assert cli.main(["bench", "campaign", "witnesses", "--trials", "7", "--only", "honest"]) == 1
+    assert cli.main(["bench", "witnesses"]) == 0
+    assert cli.main(["bench", "witnesses", "--trials", "7", "--only", "honest"]) == 1
     assert asked == [(None, ""), (7, "honest")]
     capsys.readouterr()
 
@@ -112,13 +112,9 @@ def test_a_failed_campaign_is_no_success(
     ("words", "text"),
     [
         (["tik"], "found 'tik', expected one of estimator"),
-        (["witnesses"], "it is a campaign, `bench campaign witnesses`"),
-        (["campaign"], "'campaign' alone, expected one of witnesses"),
-        (
-            ["campaign", "witnesses", "--only", "no such lie"],
-            "no case of witnesses has this in its name",
-        ),
-        (["tick", "--full"], "--full: only reflex has it"),
+        (["witnesses", "--only", "no such lie"], "no case of witnesses has this in its name"),
+        (["tick", "--full"], "--full: reflex alone has it"),
+        (["--trials", "3"], "--trials: witnesses alone has it"),
     ],
 )
 def test_refusals_come_before_the_measurements(
@@ -178,7 +174,7 @@ def holding(force: float = 8.0) -> VirtualGrip:
 
 
 def test_a_true_hand_meets_its_aim() -> None:
-    (table,) = measure(2, "6 N: honest")
+    (table,) = measure(trials=2, only="6 N: honest")
     (row,) = table.rows
     assert (row["met"], row["trials"], table.failed) == (2, 2, False)
     assert row["least"] == pytest.approx(1.0, abs=0.08)  # torque constants are off by up to 10 %

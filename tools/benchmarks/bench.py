@@ -26,32 +26,29 @@ MEASUREMENTS = {
     "tick": "the tick back to back, in place and over ptys",
     "control": "what each grip law leaves of an object's angle",
     "reflex": "greater loads on a grip that bears one: held or lost, slid, answered",
-}
-CAMPAIGNS = {
     "witnesses": "false measurements, and the true force of a grip on them, a quarter of an hour",
 }
 SWEPT = ("reflex", "witnesses")  # on virtual time, which others on the machine don't disturb
 PAGE = ("estimator", "tick")
 _PAGE_COLUMNS = ("median", "p99", "unit", "aim ≤", "relative error", "RMS of d [µm]")
-_CAMPAIGN = "campaign"
+_OWN = {"full": "reflex", "trials": "witnesses", "only": "witnesses"}  # options of one of them
 FAILED = 1  # exit status; 2 is for words that are refused
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    single = ", ".join(f"{name} ({text})" for name, text in MEASUREMENTS.items())
-    long = ", ".join(f"{name} ({text})" for name, text in CAMPAIGNS.items())
+    known = ", ".join(f"{name} ({text})" for name, text in MEASUREMENTS.items())
     parser.add_argument(
         "names",
         metavar="NAME",
         nargs="*",
-        help=f"what to measure: {single}; without a name one page of the figures that matter, in "
-        f"about a minute; or '{_CAMPAIGN}' and one of {long}",
+        help=f"what to measure: {known}; without a name one page of the figures that matter, in "
+        "about a minute",
     )
     parser.add_argument(
-        "--trials", type=_trials, metavar="N", help="trials of each case of a campaign"
+        "--trials", type=_trials, metavar="N", help="trials of each case of 'witnesses'"
     )
     parser.add_argument(
-        "--only", default="", metavar="TEXT", help="cases of a campaign with this in their name"
+        "--only", default="", metavar="TEXT", help="its cases with this in their name"
     )
     parser.add_argument(
         "--brief", action="store_true", help="fewer cases of each NAME, as for the page"
@@ -70,11 +67,9 @@ def run(arguments: argparse.Namespace) -> int:
     """Measure, print, and write the files that were asked for."""
     from softfinger.tools.benchmarks.measuring import Report
 
-    campaign = arguments.names[:1] == [_CAMPAIGN]
-    texts = CAMPAIGNS if campaign else MEASUREMENTS
-    names = arguments.names[1:] if campaign else arguments.names or list(PAGE)
+    names = arguments.names or list(PAGE)
     try:
-        _check(names, texts, arguments)
+        _check(names, arguments)
     except ValueError as error:
         print(f"bench: {error}", file=sys.stderr)
         return 2
@@ -84,8 +79,8 @@ def run(arguments: argparse.Namespace) -> int:
     tables: list[Report] = []
     status = 0
     for name in names:
-        print(f"measuring {texts[name]} …", file=sys.stderr, flush=True)
-        found = _measured(name, campaign, arguments)
+        print(f"measuring {MEASUREMENTS[name]} …", file=sys.stderr, flush=True)
+        found = _measured(name, arguments)
         rows += _kept(name, found)
         if any(table.failed for table in found) or not found:
             status = FAILED
@@ -97,11 +92,7 @@ def run(arguments: argparse.Namespace) -> int:
         title = f"{machine}, {os.cpu_count()} cores, load {load[0]:.1f} to {load[1]:.1f}"
         print(Report(title, _page(tables)))
     if arguments.json:
-        about = {
-            "machine": machine,
-            "cores": os.cpu_count(),
-            "load": load,
-        }
+        about = {"machine": machine, "cores": os.cpu_count(), "load": load}
         content = about | {"python": platform.python_version(), "rows": rows}
         with write_text(arguments.json) as file:
             file.write(json.dumps(content, indent=2) + "\n")
@@ -114,10 +105,10 @@ def _journal(file: Path, name: str) -> Path:
     return file.with_name(f"{file.name}.{name}.part")
 
 
-def _measured(name: str, campaign: bool, arguments: argparse.Namespace) -> list[Report]:
+def _measured(name: str, arguments: argparse.Namespace) -> list[Report]:
     """A measurement's tables, none where it failed."""
     tables: list[Report] = []
-    more: dict[str, Any] = {"full": True} if arguments.full else {}
+    more = {key: getattr(arguments, key) for key, of in _OWN.items() if of == name}
     if name in SWEPT:
 
         def sweep(work: Callable[[Any], Any], cases: list[Any]) -> Iterator[Any]:
@@ -126,10 +117,7 @@ def _measured(name: str, campaign: bool, arguments: argparse.Namespace) -> list[
 
         more["sweep"] = sweep
     try:
-        if campaign:
-            tables = _module(name).measure(arguments.trials, arguments.only, **more)
-        else:
-            tables = _module(name).measure(brief=arguments.brief or not arguments.names, **more)
+        tables = _module(name).measure(brief=arguments.brief or not arguments.names, **more)
     except (RuntimeError, SoftfingerError) as error:  # on a busy machine a hand may let go
         print(f"bench: {name}: {error}", file=sys.stderr)
     for table in tables:
@@ -173,15 +161,13 @@ def _module(name: str) -> ModuleType:
     return importlib.import_module(f"softfinger.tools.benchmarks.{name}")
 
 
-def _check(names: list[str], texts: dict[str, str], arguments: argparse.Namespace) -> None:
-    """Return what can be refused before anything is measured. Raises ValueError."""
-    if not names:
-        raise ValueError(f"'{_CAMPAIGN}' alone, expected one of {', '.join(texts)} after it")
-    if arguments.full and (texts is CAMPAIGNS or names != ["reflex"]):
-        raise ValueError("--full: only reflex has it")
+def _check(names: list[str], arguments: argparse.Namespace) -> None:
+    """Refuse what can be refused before anything is measured. Raises ValueError."""
+    for key, name in _OWN.items():
+        if getattr(arguments, key) and names != [name]:
+            raise ValueError(f"--{key}: {name} alone has it")
     for name in names:
-        if name not in texts:
-            hint = f": it is a campaign, `bench {_CAMPAIGN} {name}`" if name in CAMPAIGNS else ""
-            raise ValueError(f"found {name!r}, expected one of {', '.join(texts)}{hint}")
-        if texts is CAMPAIGNS and not any(arguments.only in case for case in _module(name).NAMES):
-            raise ValueError(f"--only {arguments.only}: no case of {name} has this in its name")
+        if name not in MEASUREMENTS:
+            raise ValueError(f"found {name!r}, expected one of {', '.join(MEASUREMENTS)}")
+    if arguments.only and not any(arguments.only in case for case in _module(names[0]).NAMES):
+        raise ValueError(f"--only {arguments.only}: no case of {names[0]} has this in its name")

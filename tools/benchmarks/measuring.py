@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from softfinger.tools.terminal.typeset import plain_table, table_text
+
 # One measured thing; each key is the heading of its column, "name" the first of them.
 Row = dict[str, Any]
 
@@ -30,18 +32,14 @@ class Report:
     def __str__(self) -> str:
         """Aligned text; numbers with four digits, nothing for None and NaN."""
         keys = list(dict.fromkeys(key for row in self.rows for key in row)) or ["name"]
-        lines = [[self.title if key == "name" else key for key in keys]]
-        lines += [[_cell(row.get(key)) for key in keys] for row in self.rows]
-        widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-        words = [any(isinstance(row.get(key), str) for row in self.rows) for key in keys]
-        aligned = [
-            "  ".join(
-                cell.ljust(width) if left else cell.rjust(width)
-                for cell, width, left in zip(line, widths, words, strict=True)
-            ).rstrip()
-            for line in lines
-        ]
-        return "\n".join([*aligned, *self.notes])
+        table = plain_table()
+        for key in keys:
+            left = any(isinstance(row.get(key), str) for row in self.rows)
+            title = self.title if key == "name" else key
+            table.add_column(title, justify="left" if left else "right", no_wrap=True)
+        for row in self.rows:
+            table.add_row(*(_cell(row.get(key)) for key in keys))
+        return "\n".join([table_text(table, 10_000), *self.notes])
 
 
 def _cell(value: Any) -> str:

@@ -1,4 +1,4 @@
-"""Campaign: what a grip is measured by goes wrong, and the plant says what the grip does then.
+"""What a grip is measured by goes wrong, and the plant says what the grip does then.
 
 Each case is a grip with a false measurement or an odd tip; each trial of it draws from a seed of
 its own noise, instants, the finger, the object's mass and an error of the joints' torque constant.
@@ -152,13 +152,17 @@ class GripTrial:
 
 
 def measure(
-    trials: int | None = None, only: str = "", sweep: Callable[..., Iterable[Any]] = map
+    brief: bool = False,
+    trials: int | None = None,
+    only: str = "",
+    sweep: Callable[..., Iterable[Any]] = map,
 ) -> list[Report]:
     """Return a table for each aim, of the cases whose name ``only`` is found in.
 
-    ``sweep`` is what maps trials to their outcomes, in one process or in many.
+    ``brief``: one trial of each. ``sweep`` is what maps trials to their outcomes, in one process or
+    in many.
     """
-    trials, reports = trials or _TRIALS, []
+    trials, reports = trials or (1 if brief else _TRIALS), []
     cases = [each for aim in (SETTLES, BOUNDED) for each in CASES if each.aim == aim]
     cases = [case for case in cases if only in case.name]
     seeds = range(1, trials + 1)

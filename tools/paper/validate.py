@@ -20,6 +20,7 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.table import ContactTable
+from softfinger.tools.terminal.typeset import plain_table, table_text
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -52,20 +53,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Print the comparisons as a table."""
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(box=None, padding=(0, 2, 0, 0))
+    table = plain_table()
     for head in ("", "quantity", "published", "here", "source, and what stands between"):
         table.add_column(head, overflow="fold")
     found = list(comparisons())
     for each in found:
         why = f"{each.source}. {each.why}" if each.why else each.source
         table.add_row(FIGURES[each.verdict], each.quantity, each.published, each.ours, why)
-    console = Console(width=150, highlight=False, markup=False)
-    console.print(table)
-    counted = (f"{sum(each.verdict == v for each in found)} {v}" for v in FIGURES)
-    console.print(", ".join(counted))
+    print(table_text(table, 150))
+    print(", ".join(f"{sum(each.verdict == v for each in found)} {v}" for v in FIGURES))
     return 0
 
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from softfinger.daemon.profile.settings import Settings
 from softfinger.tools.arguments import add_profile, profile
+from softfinger.tools.terminal.typeset import plain_table, table_text
 
 if TYPE_CHECKING:
     from softfinger.daemon.safety.limits import Limit
@@ -19,20 +20,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Print the table. Raises SettingsError."""
     settings = profile(arguments)
-    from rich.console import Console
-    from rich.table import Table
-
     from softfinger.daemon.safety.limits import LIMITS
 
-    table = Table(box=None, padding=(0, 2, 0, 0), show_header=False)
+    table = plain_table(heads=False)
     for wrapped in (False, False, True, True):
         table.add_column(no_wrap=not wrapped, overflow="fold")
     for row in LIMITS:
         table.add_row(row.name, row.level, row.quantity, "\n".join(_values(settings, row)))
-    console = Console(width=120, highlight=False, markup=False)
-    with console.capture() as printed:
-        console.print(table)
-    print("\n".join(line.rstrip() for line in printed.get().splitlines()))
+    print(table_text(table, 120))
     return 0
 
 

@@ -9,9 +9,23 @@ import math
 
 from rich.console import Console
 from rich.style import Style
+from rich.table import Table
 from rich.text import Text
 
 DIM = "#8b929c"
+
+
+def plain_table(*, heads: bool = True) -> Table:
+    """Return a table without lines, two columns between its own."""
+    return Table(box=None, padding=(0, 2, 0, 0), show_header=heads)
+
+
+def table_text(table: Table, width: int) -> str:
+    """Return a table as text without colours, in at most ``width`` columns."""
+    console = Console(width=width, highlight=False, markup=False, color_system=None)
+    with console.capture() as printed:
+        console.print(table)
+    return "\n".join(line.rstrip() for line in printed.get().splitlines())
 
 
 def cut(line: Text, columns: int) -> Text:
