@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from softfinger.daemon.profile.settings import Settings
     from softfinger.daemon.wire.keys import ClientKeys
 
-ADDRESS_HELP = "where the daemon is: tcp://HOST, STREAM,COMMANDS, or one socket"
 PATIENCE = 5.0  # s that `--no-wait` gives a stream to arrive
 
 
@@ -69,15 +68,8 @@ def own_runtime_folder() -> Path | None:
     return None if runtime_fault() else runtime_folder()
 
 
-def add_keys(parser: argparse.ArgumentParser) -> None:
-    """``--keys``, for a client of a daemon that may require them. `client_keys` loads them."""
-    parser.add_argument(
-        "--keys", type=Path, metavar="FOLDER", help="this client's keys, from `softfinger keys`"
-    )
-
-
 def client_keys(folder: Path | None) -> ClientKeys | None:
-    """The keys that `add_keys` names, to guard a socket or a context with before it connects.
+    """The keys that `add_daemon` names, to guard a socket or a context with before it connects.
 
     Raises KeyFileError.
     """
@@ -175,17 +167,38 @@ def add_range(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_stream(
-    parser: argparse.ArgumentParser, kind: Callable[[str], Any] = stream_address
+def add_daemon(
+    parser: argparse.ArgumentParser, kind: Callable[[str], Any], client: bool = False
 ) -> None:
-    """``--address``, ``--keys`` and ``--no-wait`` of a subscriber; ``addresses`` takes both."""
-    parser.add_argument("--address", type=kind, default="", help=ADDRESS_HELP)
-    add_keys(parser)
+    """``--address`` and ``--keys``, and ``--client`` of one that commands."""
+    where = "where the daemon is: tcp://HOST, STREAM,COMMANDS, or one socket"
+    parser.add_argument("--address", type=kind, default="", help=where)
+    parser.add_argument(
+        "--keys", type=Path, metavar="FOLDER", help="this client's keys, from `softfinger keys`"
+    )
+    if client:
+        name = "a name: the commander's lease is bound to it"
+        parser.add_argument("--client", default="", help=name)
+
+
+def add_stream(
+    parser: argparse.ArgumentParser,
+    kind: Callable[[str], Any] = stream_address,
+    client: bool = False,
+) -> None:
+    """`add_daemon`, ``--no-wait`` and ``--duration``, of a subscriber."""
+    add_daemon(parser, kind, client)
     parser.add_argument(
         "--no-wait",
         action="store_true",
-        help=f"end with an error when nothing arrives within {PATIENCE:g} s",
+        help=f"end with an error when nothing arrives within {PATIENCE:g} s (monitor: or it ends)",
     )
+    add_duration(parser)
+
+
+def add_duration(parser: argparse.ArgumentParser) -> None:
+    """``--duration``."""
+    parser.add_argument("--duration", type=seconds, metavar="S", help="end after S seconds")
 
 
 def add_split(parser: argparse.ArgumentParser) -> None:

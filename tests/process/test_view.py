@@ -25,7 +25,7 @@ from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.publisher import pack
 from softfinger.tools.ending import Ending
 from softfinger.tools.recordings.reader import Recording
-from softfinger.tools.viewing.live_stream import TOPICS, LiveStream, ViewError
+from softfinger.tools.viewing.live_stream import TOPICS, ViewError, live_stream
 from softfinger.tools.viewing.page import Playback, listen
 from softfinger.tools.viewing.pictures import Pictures
 from tests.conftest import until
@@ -335,13 +335,13 @@ def test_while_nothing_is_read_states_wait(context, addresses):
     publisher.setsockopt(zmq.SNDHWM, 2000)  # as the daemon's
     publisher.bind(addresses[0])
     kept = Kept(live=True)
-    with LiveStream(addresses[0]) as stream:
+    with live_stream(addresses[0]) as drain:
         until(lambda: {publisher.recv()[1:] for _ in TOPICS} == set(TOPICS))
         for k in range(1, 10_001):
             publisher.send_multipart([schema.STATE, pack({**state(0.0, k), "seq_step": 1})])
             if k % 100 == 0:
                 select.select([], [], [], 0.005)  # as fast as libzmq's own thread takes them
-        until(lambda: stream.drain(kept.pictures, 0.0) == 0)
+        until(lambda: drain(kept.pictures, 0.0) == 0)
     kept.pictures.draw()
     assert kept.pictures.states == 10_000
     assert "0 lost, 0 unreadable" in kept.newest["facts"]

@@ -116,15 +116,13 @@ def test_status_follows_the_age() -> None:
     assert [slow.status(99 + age) for age in (2.0, 4.0, 11.0)] == ["live", "stale", "lost"]
 
 
-def test_statistics_of_the_last_second() -> None:
+def test_the_rate_is_that_of_the_states() -> None:
     feed = Feed()
+    assert math.isnan(feed.rate)
     for k in range(300):
-        tick = 1.0 if k == 250 or k < 150 else 1.0 / 400.0
-        state = fake_daemon.state(0.01 * k, k) | {"tick_s": tick}
+        state = fake_daemon.state(0.01 * k, k) | {"mono_ns": (k + 1) * 10**7}
         give(feed, b"hand/state", state, 0.01 * k)
-    recent = feed.statistics(2.995)
-    assert recent.rate == pytest.approx(400.0)
-    assert recent.messages == pytest.approx(100.0, abs=1.0)
+    assert feed.rate == pytest.approx(100.0)
 
 
 def test_a_busy_machine_is_told_while_a_simulated_hand_waits_for_it() -> None:
@@ -141,10 +139,11 @@ def test_a_busy_machine_is_told_while_a_simulated_hand_waits_for_it() -> None:
 def test_a_new_daemon_begins_a_new_story() -> None:
     feed = Feed()
     for k in range(10):
-        give(feed, b"hand/state", fake_daemon.state(0.0, 1000 + k), 3.0)
-    assert feed.statistics(3.0).messages == 10.0
+        state = fake_daemon.state(0.0, 1000 + k) | {"mono_ns": (k + 1) * 10**7}
+        give(feed, b"hand/state", state, 3.0)
+    assert feed.rate == pytest.approx(100.0)
     give(feed, b"hand/state", fake_daemon.state(0.0, 1), 3.0)
-    assert feed.statistics(3.0).messages == 1.0
+    assert math.isnan(feed.rate)
 
 
 def test_temperature_of_a_servo() -> None:

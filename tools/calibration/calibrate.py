@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from softfinger.daemon.client.hand import Hand
 from softfinger.daemon.client.stream import read
 from softfinger.daemon.wire.schema import STATE, HandState
-from softfinger.tools.arguments import add_keys, add_profile, number, profile, stream_address
+from softfinger.tools.arguments import add_daemon, add_profile, number, profile, stream_address
 from softfinger.tools.extras import MissingExtra
 from softfinger.tools.recordings.reader import Recording
 
@@ -106,10 +106,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "(closed, open, zero) for a joint's",
     )
     parser.add_argument("--no-plot", action="store_true", help="draw no picture")
-    parser.add_argument(
-        "--address", type=stream_address, default="", help="scales: the daemon's stream"
-    )
-    add_keys(parser)
+    add_daemon(parser, stream_address)  # of scales
 
 
 def run(arguments: argparse.Namespace) -> int:

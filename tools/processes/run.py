@@ -17,7 +17,7 @@ from softfinger.daemon.errors import SettingsError, SoftfingerError
 from softfinger.daemon.loop.realtime import Service
 from softfinger.daemon.profile.settings import Settings, TaskSettings
 from softfinger.daemon.types import State
-from softfinger.tools.arguments import add_profile, add_split, profile, seconds
+from softfinger.tools.arguments import add_duration, add_profile, add_split, profile
 from softfinger.tools.ending import Interrupted, Signals
 from softfinger.tools.processes.beside import MonitorBeside, NoRecorder, RecorderBeside
 from softfinger.tools.processes.event_log import EventLog
@@ -28,7 +28,7 @@ _DETAIL = "realtime"  # kind of news that only --verbose logs
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_profile(parser)
-    parser.add_argument("--duration", type=seconds, metavar="S", help="end after S seconds")
+    add_duration(parser)
     parser.add_argument(
         "--monitor", action="store_true", help="show the live page here; q ends both"
     )

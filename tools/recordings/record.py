@@ -25,7 +25,6 @@ from softfinger.tools.arguments import (
     add_stream,
     client_keys,
     no_stream,
-    seconds,
     to_stderr,
     topic,
     waiting,
@@ -197,7 +196,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
     parser.add_argument("file", type=Path, metavar="FILE.mcap", help="must not exist yet")
     add_stream(parser)
-    parser.add_argument("--duration", type=seconds, metavar="S", help="end after S seconds")
     parser.add_argument(
         "--topics",
         nargs="+",

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import math
-import statistics
 import time
 from bisect import insort
 from collections import deque
@@ -29,7 +28,6 @@ from softfinger.daemon.types import FINGERS, GRIP_FRACTION
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.local_stop import stop_locally
 
-WINDOW = 1.0  # s of statistics
 LATELY = 3.0  # s in which waiting for a busy machine is shown
 EVENTS = 200  # kept
 _DRAIN_LIMIT = 4000  # messages taken at once, so that a flood can't keep the page from drawing
@@ -90,13 +88,6 @@ class ShownEvent(NamedTuple):
             return "--:--:--"
 
 
-class RecentTicks(NamedTuple):
-    """Medians over the last second; NaN when unknown."""
-
-    messages: float = math.nan  # states a second
-    rate: float = math.nan  # ticks a second
-
-
 class Feed:
     """Takes messages, remembers what a page shows. ``now`` is monotonic seconds throughout.
 
@@ -120,7 +111,6 @@ class Feed:
         self.force_default = math.nan  # N of a grasp without a force
         self.force_limit = math.inf  # N that a grip may be asked for
         self.skipped = 0
-        self._ticks: deque[tuple[float, float]] = deque(maxlen=10_000)
         self._waits: deque[tuple[float, float]] = deque(maxlen=10_000)
         self._period = 0.0  # s between states, smoothed
         self.topics: dict[bytes, Callable[[Any, float], None]] = {
@@ -150,8 +140,8 @@ class Feed:
     def _read_state(self, state: schema.HandState, now: float) -> None:
         before = self.state
         if state.seq < before.seq:  # another daemon: a new story
-            for each in (self._ticks, self._waits, self.frames):
-                each.clear()
+            self._waits.clear()
+            self.frames.clear()
             self._period = 0.0
             self.times, self._commanding = None, ("", -math.inf)
             self.commanded = math.nan
@@ -161,7 +151,6 @@ class Feed:
                 self._waits.append((now, waited))
         self.state, self.state_at = state, now
         self.mode, self.fault = printable(state.mode), printable(state.fault)
-        self._ticks.append((now, state.tick_s))
 
     def _read_frame(self, frame: schema.TactileFrame, now: float) -> None:
         if frame.finger not in FINGERS:
@@ -255,14 +244,10 @@ class Feed:
             self._waits.popleft()
         return sum(waited for _, waited in self._waits)
 
-    def statistics(self, now: float) -> RecentTicks:
-        """Return statistics of the last second's states."""
-        while self._ticks and self._ticks[0][0] < now - WINDOW:
-            self._ticks.popleft()
-        if not self._ticks:
-            return RecentTicks()
-        tick = statistics.median([tick for _, tick in self._ticks if tick > 0.0] or [math.nan])
-        return RecentTicks(len(self._ticks) / WINDOW, 1.0 / tick)
+    @property
+    def rate(self) -> float:
+        """States a second, NaN when unknown."""
+        return 1.0 / self._period if self._period else math.nan
 
 
 class FeedSubscriber:

@@ -19,13 +19,11 @@ from typing import Any, Self
 import zmq
 
 from softfinger.tools.arguments import (
-    ADDRESS_HELP,
     PATIENCE,
-    add_keys,
+    add_stream,
     addresses,
     client_keys,
     no_stream,
-    seconds,
     to_stderr,
 )
 from softfinger.tools.ending import Ending, known
@@ -133,13 +131,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "Show the hand on a live terminal page; keys arm, grasp, rotate, release and stop it, and\n"
         "choose the force. Prints a plain line a second when the output is not a terminal."
     )
-    parser.add_argument("--address", type=addresses, default="", help=ADDRESS_HELP)
-    add_keys(parser)
-    parser.add_argument("--client", default="", help="a name: the commander's lease is bound to it")
-    parser.add_argument(
-        "--no-wait", action="store_true", help="end when no daemon is running, or when it ends"
-    )
-    parser.add_argument("--duration", type=seconds, metavar="S", help="end after S seconds")
+    add_stream(parser, addresses, client=True)
     parser.add_argument("--plain", action="store_true", help="plain lines, no page")
     parser.add_argument("--lifeline", type=int, help=argparse.SUPPRESS)  # end when it closes
 

@@ -15,7 +15,7 @@ from rich.text import Text
 from softfinger.daemon.types import FINGERS
 from softfinger.daemon.wire.schema import SCHEMA
 from softfinger.tools.terminal import heatmap
-from softfinger.tools.terminal.feed import Feed, RecentTicks, ShownReply
+from softfinger.tools.terminal.feed import Feed, ShownReply
 from softfinger.tools.terminal.status import why_invalid
 from softfinger.tools.terminal.typeset import (
     DIM,
@@ -105,8 +105,6 @@ class MonitorPage:
     force: float = math.nan  # N of the grasp key
     explains: bool = False  # the numbers' meanings stand in their place
     _pressure: heatmap.FullScale = field(default_factory=lambda: heatmap.FullScale(5e3, 3.0))
-    _statistics: RecentTicks = field(default_factory=RecentTicks)
-    _statistics_at: float = -math.inf
 
     def lines(self, width: int, height: int, now: float, reply: ShownReply | None) -> list[Text]:
         """Return the page as ``height`` lines of exactly ``width`` columns."""
@@ -119,9 +117,6 @@ class MonitorPage:
         return page
 
     def _page(self, width: int, height: int, now: float, reply: ShownReply | None) -> list[Text]:
-        if now - self._statistics_at >= 0.5:  # so that the numbers can be read
-            self._statistics = self.feed.statistics(now)
-            self._statistics_at = now
         status = self.feed.status(now)
         maps, events = _heights(width, height)
         numbers = [
@@ -148,8 +143,7 @@ class MonitorPage:
         if status == "waiting":
             right = Text("○ no stream yet ", WARN)
         elif status == "live":
-            rate = short(self._statistics.messages, 0)
-            right = Text.assemble(("● live ", GOOD), (f"{rate} Hz ", DIM))
+            right = Text.assemble(("● live ", GOOD), (f"{short(feed.rate, 0)} Hz ", DIM))
         else:
             sign, style = ("◐ stale", WARN) if status == "stale" else ("○ lost", BAD)
             right = Text(f"{sign} {short(feed.age(now), 1)} s ", style)
@@ -280,7 +274,8 @@ class MonitorPage:
     def _ticks(self) -> Text:
         """Rate and overruns, then median, tail and largest times of all ticks."""
         times, overruns = self.feed.times, self.feed.state.overruns
-        line = Text(f" tick {short(self._statistics.rate, 0)} Hz").append("  overruns ", DIM)
+        rate = math.nan if times is None else times.rates.tick
+        line = Text(f" tick {short(rate, 0)} Hz").append("  overruns ", DIM)
         known = str(overruns) if self.feed.mode else "—"
         line.append(known, WARN if overruns > 0 else "default").append("  p50/p99/max", DIM)
         for label, name in (("compute", "compute"), ("late", "wake")):

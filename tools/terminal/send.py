@@ -14,7 +14,7 @@ from softfinger.daemon.client.command_client import UNCONFIRMED, NoAnswer, send
 from softfinger.daemon.client.connection import PATIENCE
 from softfinger.daemon.control.modes import COMMANDS
 from softfinger.daemon.errors import KeyFileError
-from softfinger.tools.arguments import ADDRESS_HELP, add_keys, client_keys, command_address, seconds
+from softfinger.tools.arguments import add_daemon, client_keys, command_address, seconds
 
 _NUMBER = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*")
 _ANGLES = {"rad": 1.0, "deg": math.radians(1.0), "°": math.radians(1.0)}
@@ -34,9 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
     parser.add_argument("command", metavar="COMMAND", choices=tuple(COMMANDS))
     parser.add_argument("values", metavar="key=value", nargs="*", default=[])
-    parser.add_argument("--address", type=command_address, default="", help=ADDRESS_HELP)
-    add_keys(parser)
-    parser.add_argument("--client", default="", help="a name: the commander's lease is bound to it")
+    add_daemon(parser, command_address, client=True)
     parser.add_argument(
         "--timeout",
         type=seconds,

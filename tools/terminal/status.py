@@ -13,12 +13,11 @@ from softfinger.daemon.errors import NoStream
 from softfinger.daemon.types import FINGERS
 from softfinger.daemon.wire.schema import HandState
 from softfinger.kinematics.estimation.invalid import Invalid
-from softfinger.tools.arguments import ADDRESS_HELP, add_keys, no_stream, stream_address
+from softfinger.tools.arguments import add_daemon, no_stream, stream_address
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--address", type=stream_address, default="", help=ADDRESS_HELP)
-    add_keys(parser)
+    add_daemon(parser, stream_address)
     parser.add_argument("--json", action="store_true", help="the whole state, for programs")
 
 

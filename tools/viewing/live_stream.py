@@ -5,7 +5,9 @@ from __future__ import annotations
 import argparse
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from functools import partial
 from typing import Any
 
 import zmq
@@ -112,10 +114,10 @@ def follow(
     """Show the stream that ``arguments`` name until the end. Raises ViewError."""
     period = 1.0 / arguments.rate
     silent = False
-    with LiveStream(arguments.address, keys) as stream:
+    with live_stream(arguments.address, keys) as drain_to:
         due = last = time.monotonic()
         while not ending.over:
-            count = stream.drain(viewer, due)
+            count = drain_to(viewer, due)
             now = time.monotonic()
             if count:
                 last = now
@@ -136,60 +138,54 @@ def follow(
             after = time.monotonic()
             # Never busy for more than half of its time, however slow the machine is.
             due = after + max(period - (after - now), min(after - now, _REST))
-        stream.drain(viewer, 0.0)
+        drain_to(viewer, 0.0)
         viewer.draw()
 
 
-class LiveStream:
-    """A context that reads ``address``, with the client's keys if any. Raises ViewError.
+Drain = Callable[[Viewer, float], int]
+
+
+@contextmanager
+def live_stream(address: str, keys: ClientKeys | None = None) -> Iterator[Drain]:
+    """Subscribe to ``address``, with the client's keys if any; yields `_drain` of it.
 
     While a picture is drawn nothing is read, on a busy machine for seconds. Messages wait meanwhile
     in libzmq's queues: a long one for small messages, of which every one counts, a shorter one for
-    frames, of which the newest is drawn. Only what these don't hold is lost.
+    frames, of which the newest is drawn. Only what these don't hold is lost. Raises ViewError.
     """
-
-    def __init__(self, address: str, keys: ClientKeys | None = None) -> None:
-        self.address = address
-        self._context: zmq.Context[Any] = zmq.Context()
-        small = [topic for topic in TOPICS if topic != TACTILE]
+    small = [topic for topic in TOPICS if topic != TACTILE]
+    with ExitStack() as stack:
+        context = stack.enter_context(zmq.Context())
         try:
             if keys is not None:
-                keys.guard(self._context)
-            self._sockets = (
-                subscribe(self._context, address, *small, queue=_QUEUE),
-                subscribe(self._context, address, TACTILE, queue=_FRAMES),
-            )
+                keys.guard(context)
+            sockets = [
+                stack.enter_context(subscribe(context, address, *small, queue=_QUEUE)),
+                stack.enter_context(subscribe(context, address, TACTILE, queue=_FRAMES)),
+            ]
         except zmq.ZMQError as error:
-            self.close()
             raise ViewError(f"{address}: {error}") from None
-        self._poller = zmq.Poller()
-        for socket in self._sockets:
-            self._poller.register(socket, zmq.POLLIN)
+        poller = zmq.Poller()
+        for socket in sockets:
+            poller.register(socket, zmq.POLLIN)
+        yield partial(_drain, sockets, poller)
 
-    def drain(self, viewer: Viewer, until: float) -> int:
-        """Give ``viewer`` the messages until the monotonic time ``until`` [s]; their number."""
-        count = 0
-        while True:
-            left = until - time.monotonic()
-            if not self._poller.poll(max(0, int(1e3 * left))):
-                if left <= 1e-3:
-                    return count
-                continue
-            for socket in self._sockets:
-                for message in drain(socket, _AT_ONCE):
-                    count += 1
-                    try:
-                        viewer.take(*unpack(message))
-                    except ValueError:
-                        viewer.unreadable += 1
-            if left <= 0.0:
+
+def _drain(sockets: list[zmq.Socket[Any]], poller: zmq.Poller, viewer: Viewer, until: float) -> int:
+    """Give ``viewer`` the messages until the monotonic time ``until`` [s]; their number."""
+    count = 0
+    while True:
+        left = until - time.monotonic()
+        if not poller.poll(max(0, int(1e3 * left))):
+            if left <= 1e-3:
                 return count
-
-    def close(self) -> None:
-        self._context.destroy(linger=0)
-
-    def __enter__(self) -> LiveStream:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
+            continue
+        for socket in sockets:
+            for message in drain(socket, _AT_ONCE):
+                count += 1
+                try:
+                    viewer.take(*unpack(message))
+                except ValueError:
+                    viewer.unreadable += 1
+        if left <= 0.0:
+            return count

@@ -291,14 +291,15 @@ class Pictures(Viewer):
         def each(key: str, factor: float, decimals: int) -> str:
             return " / ".join(short(factor * getattr(finger, key), decimals) for finger in fingers)
 
-        facts = [f"tick {short(feed.statistics(now).rate, 0)} Hz", f"overruns {state.overruns}"]
+        facts = [f"overruns {state.overruns}"]
         if (times := feed.times) is not None:
             stages = {"work": times.compute, "late": times.wake}
             for name, of in {**stages, "bus": times.bus, "publish": times.publish}.items():
                 spread = ", ".join(micro(value) for value in (of.p50, of.p99, of.p999, of.max))
                 facts.append(f"{name} [µs] p50, 99, 99.9, max: {spread}")
-            rates = short(times.rates.left, 0), short(times.rates.right, 0)
-            facts.append(f"frames {' / '.join(rates)} Hz")
+            rates = times.rates
+            facts.insert(0, f"tick {short(rates.tick, 0)} Hz")
+            facts.append(f"frames {short(rates.left, 0)} / {short(rates.right, 0)} Hz")
         who = feed.commander(now)
         return [
             *facts,

@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from softfinger.tools.arguments import add_stream, addresses, number, seconds
+from softfinger.tools.arguments import add_stream, addresses, number
 from softfinger.tools.ending import Ending
 from softfinger.tools.extras import require
 
@@ -45,7 +45,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="HZ",
         help="pictures a second at most (default 10)",
     )
-    parser.add_argument("--duration", type=seconds, metavar="S", help="end after S seconds")
 
 
 def _any_port(text: str) -> int:
