@@ -2,7 +2,7 @@
 
 Families that are ordered (by displacement, by angle) take colours of falling lightness, which stay
 in order in grey and for colour-blind readers, each with a dash of its own. Things of different
-kinds take the colours of Okabe and Ito, each with a marker of its own.
+kinds take the colours of Okabe and Ito.
 """
 
 from __future__ import annotations
@@ -25,7 +25,6 @@ DPI = 200
 GREY = "#707070"
 INK = "#202020"
 KINDS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000", "#999999")
-MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 _DASHES: tuple[Any, ...] = (
     "-",
     (0, (5, 1.5)),

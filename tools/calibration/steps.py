@@ -247,8 +247,7 @@ def _centre(step: Step) -> Done:
         f"tip at ({x * 1e3:.3f}, {y * 1e3:.3f}) ± {found.std * 1e3:.3f} mm; {rotation}; "
         f"{found.residual * 1e6:.0f} µm rms"
     )
-    place = Points("tip on the sensor", "x [mm]", "y [mm]", [x * 1e3], [y * 1e3])
-    return step.result(centre=result), line, (Map("last press [Pa]", step.pressures[-1]), place)
+    return step.result(centre=result), line, (Map("last press [Pa]", step.pressures[-1]),)
 
 
 def _modulus(step: Step) -> Done:

@@ -60,11 +60,7 @@ class MonitorBeside:
     """
 
     def __init__(
-        self,
-        stream: str,
-        commands: str,
-        keys: str = "",
-        on_end: Callable[[], None] | None = None,
+        self, stream: str, commands: str, on_end: Callable[[], None], keys: str = ""
     ) -> None:
         self._attributes: list[Any] | None = None
         # A standard output that was closed, or is no file, is no terminal either.
@@ -74,10 +70,6 @@ class MonitorBeside:
         self._lifeline = _Lifeline()
         words = ["monitor", "--address", f"{stream},{commands}"]
         self.process = self._lifeline.start(words, keys)
-        if on_end is not None:
-            self._call_at_end(on_end)
-
-    def _call_at_end(self, on_end: Callable[[], None]) -> None:
         called = False
 
         def child_changed(*_: Any) -> None:  # also when the child was stopped or continued
@@ -175,10 +167,3 @@ class RecorderBeside:
             self._process.kill()
             self._watch.join()
         return self._said
-
-    def __enter__(self) -> RecorderBeside:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if not self._closing:
-            self.close()

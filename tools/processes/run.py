@@ -112,18 +112,22 @@ def _serve(
             f"{settings.commands.address}; next, in another terminal: softfinger send arm"
         )
         log.line("info", "start", ready, start_s=seconds, table_error=within)
-        recording: Any = nullcontext()
+        recording: Any = None
         if arguments.record is not None:
             try:
                 recording = _record(arguments, settings, daemon)
             except NoRecorder as error:
                 log.plain(f"softfinger: {error}")
                 return 1
+        page: AbstractContextManager[Any] = nullcontext()
         log.quiet = arguments.monitor  # from here on the page owns the terminal
-        with _page(settings, loop) if arguments.monitor else nullcontext():
+        if arguments.monitor:
+            addresses = settings.stream.address, settings.commands.address
+            page = MonitorBeside(*addresses, loop.end, settings.access.keys)
+        with page:
             loop.run(arguments.duration)
         log.quiet = False
-    if arguments.record is not None:
+    if recording is not None:
         for line in recording.close().splitlines():
             log.plain(line)
         if recording.failed:
@@ -140,7 +144,7 @@ def _serve(
         log.plain(f"softfinger: ended with a fault: {state.fault}", "error")
     if state.torque:
         log.plain("softfinger: torque could not be turned off and may still be on", "error")
-    unrecorded = arguments.record is not None and recording.failed
+    unrecorded = recording is not None and recording.failed
     return 1 if state.fault or state.torque or unrecorded else 0
 
 
@@ -176,15 +180,6 @@ def _record(arguments: argparse.Namespace, settings: Settings, daemon: Any) -> A
         if (value := getattr(arguments, name)) is not None:
             words += [f"--{name.replace('_', '-')}", str(value)]
     return RecorderBeside(words, subscribed, ended, settings.access.keys)
-
-
-def _page(settings: Settings, loop: Any) -> AbstractContextManager[Any]:
-    return MonitorBeside(
-        settings.stream.address,
-        settings.commands.address,
-        keys=settings.access.keys,
-        on_end=loop.end,
-    )
 
 
 def _scene(settings: Settings) -> str:

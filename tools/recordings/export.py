@@ -235,6 +235,4 @@ def _columns(topic: bytes, first: Row) -> list[tuple[str, str]]:
 
 
 def _cell(value: Any) -> Any:
-    if isinstance(value, float):
-        return "" if math.isnan(value) else repr(value)
-    return int(value) if isinstance(value, bool) else value
+    return "" if value != value else int(value) if isinstance(value, bool) else value

@@ -42,12 +42,6 @@ SPRING = (150, 150, 150)
 LEVELS = {"info": (120, 120, 120), "warning": (214, 140, 0), "error": (214, 54, 40)}
 
 
-def between(first: Colour, second: Colour, share: float) -> Colour:
-    """A mixture of two colours with ``share`` of the second."""
-    red, green, blue = (round(a + share * (b - a)) for a, b in zip(first, second, strict=True))
-    return red, green, blue
-
-
 FloatArray = NDArray[np.float64]
 
 _ARROW = 1.6e-3  # m of a force's arrow a newton
@@ -234,9 +228,9 @@ def _finger_part(hand: HandGeometry, name: str, state: FingerState) -> HandPart:
     lines = ((finger.link, 5.2), (finger.base, 2.4), (finger.skin, 1.0))
     strips = [Strip(line, colour, width) for line, width in lines]
     for spring, strain in zip(finger.springs, finger.strain, strict=True):
-        share = min(4.0 * float(strain), 1.0)
-        shade = between(SPRING, LEVELS["error"], share)
-        strips.append(Strip(spring, shade, 0.5 + 0.7 * share))
+        fraction = min(4.0 * float(strain), 1.0)
+        mixed = (1.0 - fraction) * np.array(SPRING) + fraction * np.array(LEVELS["error"])
+        strips.append(Strip(spring, tuple(np.rint(mixed).tolist()), 0.5 + 0.7 * fraction))
     if finger.face is None or finger.normal is None or finger.push is None:
         return HandPart(strips)
     strips += [Strip(finger.face, OBJECT, 2.0), Strip(finger.normal, GOAL, 0.7)]
