@@ -17,8 +17,6 @@ from softfinger.daemon.profile.load import find
 
 UNIT = "softfinger.service"
 RULES = "70-softfinger.rules"
-# s without a tick after which systemd ends the daemon: `clear` and `arm` may wait for two boards.
-_WATCHDOG = 10
 _EPILOG = """\
 Without --to it only prints. To install:
   sudo softfinger install-service --config /etc/softfinger/hand.toml --user $USER \\
@@ -27,72 +25,6 @@ Without --to it only prints. To install:
   sudo systemctl daemon-reload && sudo systemctl enable --now softfinger
   sudo udevadm control --reload && sudo udevadm trigger
 Exit status: 0 done, 1 not written."""
-
-_UNIT = """\
-[Unit]
-Description=softfinger, the daemon of a hand with soft fingertips
-After=local-fs.target network.target
-StartLimitIntervalSec=60
-StartLimitBurst=5
-
-[Service]
-Type=notify
-NotifyAccess=main
-ExecStart={command}
-{user}SupplementaryGroups=dialout
-UMask=0077
-# Each line of the log has its priority; one without is a traceback, or a report on settings:
-# journalctl -u softfinger -p warning; -o cat gives the JSON objects alone.
-SyslogIdentifier=softfinger
-SyslogLevel=err
-KillSignal=SIGTERM
-# The first start compiles the kernels.
-TimeoutStartSec=300
-TimeoutStopSec=10
-# Fed by the control loop itself: a loop that stands still is ended. The servos' own bus watchdog
-# has stopped them long before.
-WatchdogSec={watchdog}
-# A daemon that died comes back disarmed, whatever task its profile names. Wrong settings (2) stay
-# wrong.
-Restart=on-failure
-RestartSec=1
-RestartPreventExitStatus=2
-LimitRTPRIO=90
-LimitNICE=-20
-LimitMEMLOCK=infinity
-OOMScoreAdjust=-900
-DevicePolicy=closed
-DeviceAllow=char-ttyUSB rw
-DeviceAllow=char-ttyACM rw
-DeviceAllow=char-ttyS rw
-DeviceAllow=/dev/cpu_dma_latency rw
-CacheDirectory=softfinger
-RuntimeDirectory=softfinger
-RuntimeDirectoryMode=0700
-Environment=XDG_CACHE_HOME=/var/cache
-NoNewPrivileges=yes
-ProtectSystem=strict
-ProtectHome=read-only
-ProtectKernelTunables=yes
-ProtectKernelModules=yes
-ProtectControlGroups=yes
-RestrictAddressFamilies=AF_UNIX AF_INET AF_INET6 AF_NETLINK
-RestrictSUIDSGID=yes
-LockPersonality=yes
-
-[Install]
-WantedBy=multi-user.target
-"""
-
-_RULES = """\
-# Serial ports of servos and tactile boards: for the group dialout, out of ModemManager's hands.
-SUBSYSTEM=="tty", KERNEL=="ttyUSB*|ttyACM*", GROUP="dialout", MODE="0660", \
-ENV{ID_MM_DEVICE_IGNORE}="1"
-# A reply waits in an FTDI adapter until its latency timer is over: 1 ms in place of 16.
-ACTION=="add|change", SUBSYSTEM=="usb-serial", DRIVER=="ftdi_sio", ATTR{latency_timer}="1"
-# Holding this device at 0 keeps the processor from sleeping deeply between two ticks.
-KERNEL=="cpu_dma_latency", GROUP="dialout", MODE="0660"
-"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -108,7 +40,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Print or write; 0, or 1 with the reason."""
     try:
         if arguments.udev:
-            name, text = RULES, _RULES
+            name, text = RULES, _file(RULES)
         else:
             name, text = UNIT, unit(arguments.config, arguments.user)
         if arguments.to is None:
@@ -142,7 +74,11 @@ def unit(config: Path | None, user: str) -> str:
             raise ValueError(f"{user}: no such user") from None
         line = f"User={user}\n"
     command = " ".join(_quoted(word) for word in words)
-    return _UNIT.format(command=command, user=line, watchdog=_WATCHDOG)
+    return _file(UNIT).format(command=command, user=line)
+
+
+def _file(name: str) -> str:
+    return Path(__file__).with_name(name).read_text(encoding="utf-8")
 
 
 def _quoted(word: str) -> str:
