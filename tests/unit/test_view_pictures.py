@@ -16,6 +16,7 @@ from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.table import ContactTable
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
+from softfinger.tools.terminal.heatmap import LEVELS
 from softfinger.tools.viewing.known import (
     HEIGHT,
     THETA_END,
@@ -149,14 +150,19 @@ def landscape() -> Landscape:
     return Landscape(ContactTable.build(TIP, Material.table_i(), tolerance=1e-6), 0.02, 0.012)
 
 
-def test_contours_are_lines_of_equal_energy(landscape: Landscape) -> None:
+def test_colours_are_steps_of_the_energys_cube_root(landscape: Landscape) -> None:
     exact = ContactTable.build(TIP, Material.table_i(), tolerance=1e-9)
-    contours = landscape.contours()
-    assert len(contours) >= 4
-    for contour in contours:
-        theta = (contour.line[:, 0] / WIDTH * 2.0 - 1.0) * THETA_END
-        d = (1.0 - contour.line[:, 1] / HEIGHT) * landscape.d_end
-        assert exact(d, theta).energy == pytest.approx(contour.energy, rel=0.01)
+    levels = landscape.picture()
+    rows, cols = np.nonzero(levels < LEVELS)
+    theta = ((cols + 0.5) / WIDTH * 2.0 - 1.0) * THETA_END
+    d = (1.0 - (rows + 0.5) / HEIGHT) * landscape.d_end
+    root = np.cbrt(exact(d, theta, edge=True).energy / landscape.highest)
+    assert landscape.highest == pytest.approx(float(exact(landscape.d_end, 0.0).energy), rel=1e-5)
+    assert levels[rows, cols] / (LEVELS - 1.0) == pytest.approx(
+        np.minimum(root, 1.0), abs=0.6 / (LEVELS - 1.0)
+    )
+    assert (np.abs(theta) <= TIP.theta_limit(d) + 1e-3).all()
+    assert (levels == LEVELS).any()  # no such contact
 
 
 # What is known of the hand

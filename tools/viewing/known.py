@@ -3,15 +3,14 @@
 Keys of another version that can't be read keep their defaults, so that the rest is shown.
 
 The picture has θ to the right and d upwards; its coordinates are pixels from the upper left corner,
-as an image's are. Colour goes with the cube root of U, which grows in proportion to d, so that the
-valley along θ = 0 shows at every depth.
+as an image's are. Colour goes in steps with the cube root of U, which grows in proportion to d, so
+that the valley along θ = 0 shows at every depth; the edge of a step is a line of equal energy.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,7 +22,6 @@ from softfinger.daemon.profile.factory import make_material, make_tip
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.physics.simulated_hand import geometry_of
 from softfinger.daemon.types import FINGERS
-from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.lookup import TableError
 from softfinger.kinematics.contact.table import ContactTable
 from softfinger.tools.terminal import heatmap
@@ -32,16 +30,6 @@ FloatArray = NDArray[np.float64]
 
 WIDTH, HEIGHT = 240, 200  # pixels
 THETA_END = math.radians(45.0)  # the picture's, to both sides
-_APART = 0.1  # of the picture's height, from one contour line to the next
-_LEVELS = 1e-3 * np.array([1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000])  # J
-
-
-@dataclass(frozen=True)
-class Contour:
-    """A line of equal energy [J], [n, 2] pixels."""
-
-    energy: float
-    line: FloatArray
 
 
 class Landscape:
@@ -55,6 +43,7 @@ class Landscape:
         self._d = np.linspace(1e-6 * radius, self.d_end, 400)
         upright = table(self._d, np.zeros_like(self._d))
         self._force, self._energy = np.asarray(upright.force), np.asarray(upright.energy)
+        self.highest = float(self._energy[-1])  # J, upright, of the last colour
 
     def place(self, d: FloatArray | float, theta: FloatArray | float) -> FloatArray:
         """Pixels [..., 2] of displacements [m] and angles [rad]; NaN stays NaN."""
@@ -75,26 +64,8 @@ class Landscape:
         d = (1.0 - (np.arange(HEIGHT) + 0.5) / HEIGHT) * self.d_end
         depth, angle = np.meshgrid(d, theta, indexing="ij")
         contact = self._table(depth, angle, edge=True)
-        levels = heatmap.levels_of(np.cbrt(np.asarray(contact.energy) / self._energy[-1]), 1.0)
+        levels = heatmap.levels_of(np.cbrt(np.asarray(contact.energy) / self.highest), 1.0)
         return np.where(contact.inside, levels, heatmap.LEVELS).astype(np.uint8)
-
-    def contours(self) -> list[Contour]:
-        """Lines of equal energy at round values, as far as the contact's domain goes."""
-        theta = np.linspace(-THETA_END, THETA_END, 121)
-        depth, angle = np.meshgrid(self._d, theta, indexing="ij")
-        energy = np.asarray(self._table(depth, angle, edge=True).energy)
-        contours: list[Contour] = []
-        last = 0.0
-        for level in _LEVELS[self._energy[-1] > _LEVELS]:
-            upright = float(np.interp(level, self._energy, self._d))
-            if upright - last < _APART * self.d_end:
-                continue
-            last = upright
-            # U grows with d: one depth for each angle.
-            d = np.array([np.interp(level, energy[:, k], self._d) for k in range(len(theta))])
-            inside = np.abs(theta) <= Fingertip(self._radius).theta_limit(d)
-            contours.append(Contour(float(level), self.place(d[inside], theta[inside])))
-        return contours
 
     def ticks(self) -> list[tuple[FloatArray, str]]:
         """Return where the axes' numbers stand [2], and what they say."""

@@ -34,7 +34,7 @@ SECONDS = 12.0  # of the past in the plots
 _STEP = 0.1  # s from one column of the plots to the next
 _EVENTS = 30  # shown
 _LATELY = 5.0  # s for which a warning counts as present
-_WHITE, _FAINT = (255, 255, 255), (255, 255, 255, 0.56)
+_WHITE = (255, 255, 255)
 _OUTSIDE = (112, 112, 116)  # where no such contact can be
 _DEGREE = math.degrees(1.0)
 _MODES = {
@@ -130,14 +130,8 @@ class Pictures(Viewer):
             panels = [*maps[:1], *panels, *maps[1:]]
         self._landscape = landscape = hand.landscape()
         if landscape is not None:
-            contours = [each for each in landscape.contours() if len(each.line) > 1]
-            at = [(each.line[len(each.line) // 8], 1e3 * each.energy) for each in contours]
-            still = {
-                "image": _image(landscape.picture()),
-                "lines": [(_FAINT, 1.0, _flat(each.line)) for each in contours],
-                "texts": [(_WHITE, *_flat(place), f"{energy:g} mJ") for place, energy in at]
-                + [(GOAL, *_flat(place), words) for place, words in landscape.ticks()],
-            }
+            texts = [(GOAL, *_flat(place), words) for place, words in landscape.ticks()]
+            still = {"image": _image(landscape.picture()), "texts": texts}
             box = -30, WIDTH + 8, -6, HEIGHT + 14
             panels.append(_panel("landscape", "Energy landscape U(d, θ)", *box, still=still))
         plots = [{"title": name, "lines": self._lines(*of)} for name, of in _PLOTS.items()]
@@ -262,7 +256,8 @@ class Pictures(Viewer):
                 places = self._landscape.place(*trail.T)
                 lines.append((COLOURS[name], 2.0, _flat(places)))
                 dots.append((COLOURS[name], *_flat(places[-1])))
-        return {"lines": lines, "dots": dots}
+        highest = math.nan if self._landscape is None else 1e3 * self._landscape.highest
+        return {"lines": lines, "dots": dots, "note": f"0 to {short(highest, 0)} mJ, ∝ ∛U"}
 
     def _limits(self) -> str:
         """Return what holds the hand back: a recent warning, the grip's goal, the nearest limit."""
