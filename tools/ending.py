@@ -8,8 +8,8 @@ import select
 import signal
 import socket
 import time
-from collections.abc import Iterator
-from typing import Any, Protocol, Self
+from collections.abc import Callable, Iterator
+from typing import Any, Self
 
 
 def known(*names: str) -> tuple[signal.Signals, ...]:
@@ -87,13 +87,6 @@ class Ending:
         self._wake.close()
 
 
-class Endable(Protocol):
-    """Loop or emulator that runs until it is ended, at any moment."""
-
-    def end(self) -> None:
-        """End soon."""
-
-
 class Interrupted(BaseException):
     """A signal asked for the end before anything ran. No ``except Exception`` may hold it up."""
 
@@ -107,14 +100,14 @@ class Signals:
     """Every signal that would end the process ends it quietly, at whatever stage."""
 
     def __init__(self) -> None:
-        self._running: Endable | None = None
+        self._end_running: Callable[[], None] | None = None
         self._ended = self._held = False
         for number in _ENDING:
             signal.signal(number, self._end)
 
-    def hand_over(self, running: Endable) -> None:
-        """Let signals end ``running`` from now on. Raises Interrupted when one came before."""
-        self._running = running
+    def hand_over(self, end: Callable[[], None]) -> None:
+        """Let signals call ``end`` from now on. Raises Interrupted when one came before."""
+        self._end_running = end
         if self._ended:
             raise Interrupted
 
@@ -131,7 +124,7 @@ class Signals:
 
     def _end(self, *_: Any) -> None:
         first, self._ended = not self._ended, True
-        if self._running is not None:
-            self._running.end()
+        if self._end_running is not None:
+            self._end_running()
         elif first and not self._held:  # a second one would cut the clean end short
             raise Interrupted

@@ -6,7 +6,9 @@ import json
 import math
 import random
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from timeit import Timer
 
 import pytest
 
@@ -23,7 +25,6 @@ from softfinger.tools.benchmarks import (
 )
 from softfinger.tools.benchmarks.measuring import (
     Report,
-    Subject,
     figure,
     interleave,
 )
@@ -38,21 +39,19 @@ from softfinger.tools.benchmarks.witnesses import (
 
 
 def test_turns_and_times(monkeypatch: pytest.MonkeyPatch) -> None:
-    clock = [0]
+    clock = [0.0]
     order: list[str] = []
-    monkeypatch.setattr(measuring.time, "perf_counter_ns", lambda: clock[0])
+    monkeypatch.setattr(measuring, "Timer", partial(Timer, timer=lambda: clock[0]))
 
-    def subject(name: str, cost: int, calls: int) -> Subject:
-        def run(repeat: int) -> None:
-            order.append(name)
-            clock[0] += cost * calls * repeat
+    def run(name: str, cost: float) -> None:
+        order.append(name)
+        clock[0] += cost
 
-        return Subject(run, calls)
-
-    times = interleave({"a": subject("a", 100, 5), "b": subject("b", 7_000_000, 1)}, rounds=3)
-    assert order == ["a", "a", "b", "b"] + ["a", "b"] * 3
-    assert times["a"].tolist() == [100.0] * 3
-    assert times["b"].tolist() == [7e6] * 3
+    subjects = {"a": partial(run, "a", 1e-4), "b": partial(run, "b", 7e-3)}
+    times = interleave(subjects, rounds=3)
+    assert order == ["a", "a", "b", "b"] + ["a"] * 4 + ["b"] + ["a"] * 4 + ["b"] + ["a"] * 4 + ["b"]
+    assert times["a"] == pytest.approx([1e5] * 3)
+    assert times["b"] == pytest.approx([7e6] * 3)
 
 
 # The command line

@@ -13,9 +13,9 @@ pressed so for a second.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import replace
-from typing import TypeAlias
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +32,7 @@ from softfinger.kinematics.contact.quadrature import integrate
 from softfinger.kinematics.contact.table import ContactTable
 from softfinger.kinematics.estimation.estimator import ContactEstimator
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
-from softfinger.tools.benchmarks.measuring import Report, Subject, each, figure, interleave
+from softfinger.tools.benchmarks.measuring import Report, figure, interleave
 from softfinger.tools.benchmarks.rigs import SENSORS
 
 FloatArray = NDArray[np.float64]
@@ -91,9 +91,11 @@ def lookups(rounds: int, count: int = 512) -> Report:
     tables = {f"table to {each:g}": ContactTable.build(TIP, _LAW, each) for each in (1e-9, 1e-12)}
     single = list(zip(d[:_SINGLE].tolist(), theta[:_SINGLE].tolist(), strict=True))
     rows = []
-    for way, chosen, aim in (("", [(d, theta)], None), (", called", single, _CALL_NS)):
-        subjects = {f"{name}{way}": each(table, chosen) for name, table in tables.items()}
-        points = count if chosen is not single else 1
+    for way, chosen, points, aim in (
+        ("", [(d, theta)], count, None),
+        (", called", single, _SINGLE, _CALL_NS),
+    ):
+        subjects = {f"{name}{way}": partial(each, table, chosen) for name, table in tables.items()}
         for (name, taken), table in zip(
             interleave(subjects, rounds).items(), tables.values(), strict=True
         ):
@@ -124,8 +126,9 @@ def frames_to_contacts(rounds: int) -> Report:
         "solid: at (8 mm, 30°), warm": solid(_CORNER),
         "no contact": (estimates(empty), None, None),
     }
-    subjects = {name: timed_frames(run) for name, (run, _, _) in cases.items()}
-    times = interleave({**subjects, "decode: cobs": decode(frames)}, rounds)
+    subjects: dict[str, Callable[[], object]] = {name: run for name, (run, _, _) in cases.items()}
+    subjects["decode: cobs"] = decode(frames)
+    times = {name: taken / _FRAMES for name, taken in interleave(subjects, rounds).items()}
     quickest = {name: float(np.min(taken)) for name, taken in times.items()}  # beside any load
     rows = []
     for name, (run, truth, aim) in cases.items():
@@ -185,13 +188,15 @@ def estimates(
     return run
 
 
-def timed_frames(run: Callable[[], FloatArray]) -> Subject:
-    """Return `estimates` to be timed, a frame being a call."""
-    return replace(each(run, [()]), calls=len(run()))
+def each(call: Callable[..., object], arguments: Sequence[tuple[Any, ...]]) -> None:
+    """Call with each of these arguments."""
+    for one in arguments:
+        call(*one)
 
 
-def decode(frames: FloatArray) -> Subject:
-    """Return a cobs board's bytes to counts."""
+def decode(frames: FloatArray) -> Callable[[], object]:
+    """Return a cobs board's bytes to counts, of all frames."""
     counts = np.maximum(frames / _PASCAL_PER_COUNT, 0.0).astype(np.uint16)
     packets = [ENCODERS["cobs"].encode(frame, k, 0.01 * k) for k, frame in enumerate(counts)]
-    return each(CobsDecoder(*frames.shape[1:]).feed, [(packet, 0.0) for packet in packets])
+    feed = CobsDecoder(*frames.shape[1:]).feed
+    return partial(each, feed, [(packet, 0.0) for packet in packets])

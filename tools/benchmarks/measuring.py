@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import gc
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from timeit import Timer
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from softfinger.tools.terminal.typeset import plain_table, table_text
 # One measured thing; each key is the heading of its column, "name" the first of them.
 Row = dict[str, Any]
 
-_SLICE_NS = 4e5  # of one repetition: short against the machine's hiccups, long against the clock
+_SLICE = 4e-4  # s of one repetition: short against the machine's hiccups, long against the clock
 
 
 @dataclass(frozen=True)
@@ -56,52 +56,22 @@ def figure(name: str, unit: str, samples: ArrayLike, aim: float | None = None, *
     return {"name": name, **spread, "unit": unit, "aim ≤": aim, "n": int(values.size), **more}
 
 
-@dataclass(frozen=True)
-class Subject:
-    """Something to time: ``run(repeat)`` does ``repeat`` × ``calls`` calls."""
-
-    run: Callable[[int], object]
-    calls: int = 1
-
-
-def each(call: Callable[..., object], arguments: Sequence[tuple[Any, ...]]) -> Subject:
-    """Return calls from Python with each of these arguments."""
-
-    def run(repeat: int) -> None:
-        for _ in range(repeat):
-            for one in arguments:
-                call(*one)
-
-    return Subject(run, len(arguments))
-
-
-def interleave(subjects: dict[str, Subject], rounds: int) -> dict[str, NDArray[np.float64]]:
+def interleave(
+    subjects: Mapping[str, Callable[[], object]], rounds: int
+) -> dict[str, NDArray[np.float64]]:
     """Return nanoseconds a call of each subject in each round, float64 [rounds].
 
     They take turns, so that a slow minute slows all of them. Each is called once before, which
-    compiles it, and then repeated often enough to fill a slice.
+    compiles it, and then repeated often enough to fill a slice; nothing is collected meanwhile.
     """
-    repeats = {}
-    for name, subject in subjects.items():
-        subject.run(1)
-        before = time.perf_counter_ns()
-        subject.run(1)
-        spent = max(time.perf_counter_ns() - before, 1)
-        repeats[name] = max(1, round(_SLICE_NS / spent))
+    timers, repeats = {name: Timer(run) for name, run in subjects.items()}, {}
+    for name, timer in timers.items():
+        timer.timeit(1)
+        repeats[name] = max(1, round(_SLICE / max(timer.timeit(1), 1e-9)))
     times = {name: np.empty(rounds) for name in subjects}
-    collecting = gc.isenabled()
-    gc.disable()
-    try:
-        for i in range(rounds):
-            for name, subject in subjects.items():
-                repeat = repeats[name]
-                before = time.perf_counter_ns()
-                subject.run(repeat)
-                spent = time.perf_counter_ns() - before
-                times[name][i] = spent / (repeat * subject.calls)
-    finally:
-        if collecting:
-            gc.enable()
+    for i in range(rounds):
+        for name, timer in timers.items():
+            times[name][i] = 1e9 * timer.timeit(repeats[name]) / repeats[name]
     return times
 
 

@@ -106,11 +106,6 @@ def _kernels(missing: list[Part]) -> int:
     return sum(part.kernels for part in missing)
 
 
-def _jobs(missing: list[Part]) -> int:
-    """Return the number of processes for cores, kernel groups and memory."""
-    return max(1, min(processors(), len(missing), int(_available() / _MEMORY)))
-
-
 def _available() -> float:
     """Memory that may be taken without swapping [bytes]; infinite where Linux doesn't tell."""
     try:
@@ -137,7 +132,8 @@ class _Build:
     def run(self) -> None:
         """Build all parts; when interrupted, end every process."""
         built: dict[str, Future[str]] = {}
-        pool = ThreadPoolExecutor(_jobs(self._missing))
+        jobs = max(1, min(processors(), len(self._missing), int(_available() / _MEMORY)))
+        pool = ThreadPoolExecutor(jobs)
         try:
             for part in self._missing:
                 built[part.name] = pool.submit(self._build, part, built.get(part.after))

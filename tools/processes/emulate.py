@@ -187,7 +187,7 @@ def _serve(settings: Settings, arguments: argparse.Namespace, signals: Signals) 
                 print(f"softfinger: {error}", file=sys.stderr)
                 return 1
             made.callback(emulator.close)
-        signals.hand_over(emulator)
+        signals.hand_over(emulator.end)
         if arguments.press is not None:
             problem = emulator.press(arguments.press)
             if problem.startswith("error: "):

@@ -101,7 +101,7 @@ def _serve(
         return 2 if isinstance(error, SettingsError) else 1  # 2: a service is not started again
     with daemon, _service(daemon.loop), RealTime(settings) as measures:
         loop = daemon.loop
-        signals.hand_over(loop)
+        signals.hand_over(loop.end)
         signal.signal(signal.SIGUSR1, lambda *_: loop.stop())
         for event in measures.events():
             loop.emit(*event)

@@ -147,7 +147,7 @@ def write_dataset(rows: Iterator[Sample], folder: Path, fps: int, task: str) -> 
             k = len(numbers["index"])
             row: dict[str, Any] = {
                 "observation.state": list(observation(state, frames).values()),
-                "action": [_finite(getattr(state, name).goal_q) for name in FINGERS],
+                "action": np.nan_to_num([getattr(state, name).goal_q for name in FINGERS]).tolist(),
                 "timestamp": k / fps,
                 "frame_index": k,
                 "episode_index": 0,
@@ -235,10 +235,6 @@ def _write_meta(folder: Path, info: dict[str, Any], stats: Any, task: str) -> li
         with write_text(path) as text:
             json.dump(content, text, indent=4)
     return [*tables, *texts]
-
-
-def _finite(value: float) -> float:
-    return value if math.isfinite(value) else 0.0
 
 
 def _stats(values: NDArray[np.float64]) -> dict[str, list[Any]]:

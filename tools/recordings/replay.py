@@ -50,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--speed",
-        type=_factor,
+        type=lambda text: number(text, "a factor above 0", 0.0),
         default=1.0,
         metavar="X",
         help="publish X times as fast (default 1)",
@@ -73,10 +73,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def _factor(text: str) -> float:
-    return number(text, "a factor above 0", 0.0)
-
-
 def run(arguments: argparse.Namespace) -> int:
     """Publish or compare. Raises RecordingError, SettingsError, TactileError or OSError."""
     from softfinger.tools.recordings.reader import Recording
@@ -89,8 +85,6 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _publish(arguments: argparse.Namespace, recording: Recording) -> None:
-    from softfinger.tools.recordings.replay import Wire
-
     sent = 0
     with Ending() as ending, Wire(arguments.address, arguments.keys) as wire:
         if not arguments.no_wait:
