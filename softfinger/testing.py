@@ -26,7 +26,7 @@ _POLL = 1e-3  # s, as a tick
 
 
 def check_tactile(settings: Settings, frames: int = 20, patience: float = 10.0) -> None:
-    """Open the board under each finger, twice, and look at so many frames of it.
+    """Open the board under each finger, twice, and check ``frames`` of its frames.
 
     ``patience`` [s] bounds the wait for them. No object is needed.
     """

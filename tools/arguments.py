@@ -89,7 +89,7 @@ def stream_address(text: str) -> str:
 
 
 def command_address(text: str) -> str:
-    """The commands' address, likewise."""
+    """The commands' address, as `stream_address`."""
     return addresses(text)[1]
 
 
@@ -204,7 +204,7 @@ def add_duration(parser: argparse.ArgumentParser) -> None:
 def add_split(parser: argparse.ArgumentParser) -> None:
     """``--split-size`` and ``--split-time``: a recorder's memory grows with its file."""
     parser.add_argument(
-        "--split-size", type=megabytes, metavar="MB", help="begin a new file after so many MB"
+        "--split-size", type=megabytes, metavar="MB", help="begin a new file after this size"
     )
     parser.add_argument(
         "--split-time", type=seconds, metavar="S", help="begin a new file after S seconds"

@@ -97,7 +97,7 @@ _ENDING = known("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGUSR2", "SIGALRM")
 
 
 class Signals:
-    """Every signal that would end the process ends it quietly, at whatever stage."""
+    """Every signal that would end the process ends it quietly, at any stage."""
 
     def __init__(self) -> None:
         self._end_running: Callable[[], None] | None = None

@@ -82,7 +82,7 @@ def add_sweep(parser: argparse.ArgumentParser) -> None:
         "--processes",
         type=lambda text: int(number(text, "1 to 1024 processes", 0, 1024)),
         metavar="N",
-        help="run the cases in so many (default: one a processor)",
+        help="run the cases in N processes (default: one a processor)",
     )
     parser.add_argument(
         "--scheduler",

@@ -38,7 +38,7 @@ _MOST = 200.0  # of any observation: N, A, rad/s
 
 
 class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
-    """A hand and an object whose size, mass, friction and place are drawn anew each episode.
+    """A hand and an object whose size, mass, friction and place are drawn for each episode.
 
     ``task``:
 
@@ -53,7 +53,7 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     up to 0.02 rad, positive closes; ``law``, it sets what the built-in law grips with (1 to 12 N)
     and turns to (−0.25 to 0.25 rad).
 
-    Observation, float32 in SI units but for the counts: ``joints`` [6], angles, velocities and
+    Observation, float32 in SI units, counts uint16: ``joints`` [6], angles, velocities and
     currents, left before right; ``contacts`` [6], d, θ and force of each tip; ``pressure`` [2,
     rows, cols], uint16, the newest frames; ``goal`` [1], N or rad.
 

@@ -1,7 +1,7 @@
 """A grip whose load becomes greater at once: held or lost, slid how far, how soon.
 
 A grip of 10 N bears a standing load along the object's faces, away from the palm, and then a
-greater one that stays, or a twist of so many newtons at the faces. On virtual time, and judged by
+greater one that stays, or a twist of as many newtons at the faces. On virtual time, and judged by
 the plant. *Lost*: the object is no longer between the tips. *Slid*: along the tips' faces, from the
 midpoint of both tips; that the fingers lean is no slide. *Answer*: from a slip's onset to goal
 currents a quarter higher. *Said*: from when the object has gone until the mode is no longer one of

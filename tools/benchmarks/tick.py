@@ -87,7 +87,7 @@ def _in_turns(rounds: int) -> list[Row]:
 
 
 def ticks(daemon: Daemon, count: int) -> list[float]:
-    """Return times of so many ticks on virtual time, one after the other [µs]."""
+    """Return times of ``count`` ticks on virtual time, one after the other [µs]."""
     loop, clock = daemon.loop, daemon.clock
     samples = []
     for _ in range(count):

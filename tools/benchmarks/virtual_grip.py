@@ -113,7 +113,7 @@ class VirtualGrip(Watched):
     def answer(self, words: str, seconds: float) -> float:
         """Return the time from the slip that ``words`` cause to raised goal currents [s].
 
-        NaN where nothing slips in so many ``seconds``, infinity without an answer.
+        NaN where nothing slips in ``seconds``, infinity without an answer.
         """
         state, loop = self.state, self.loop
         calm = sum(state.goal.current)

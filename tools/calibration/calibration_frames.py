@@ -112,7 +112,7 @@ def _while_pressed(
     told: str,
     load: Mapping[str, float],
 ) -> NDArray[np.uint16]:
-    """Frames from before a load is brought on until so many after it."""
+    """Frames from before a load is brought on until ``--frames`` after it."""
     before: deque[NDArray[np.uint16]] = deque(maxlen=_BEFORE)
     frames = _fresh(backend, clock, clock.now())
     with ThreadPoolExecutor(1) as pool:

@@ -322,7 +322,7 @@ def _law(step: Step) -> Done:
     if softer is not None:
         lines.insert(1, f"first presses read {softer:+.1%} against the same ones again")
         if softer > _SOFTENS:
-            lines[1] += ": the rubber SOFTENS; press it some times to the full depth, then anew"
+            lines[1] += ": the rubber SOFTENS; press it some times to the full depth, then again"
     told = (f"tip.{name} = {json.dumps(value)}" for name, value in wants.items())
     lines.append(f"for the profile: {', '.join(told)}")
     names = [" ".join(_name(each).split(", ")[:3]) for each in fits]

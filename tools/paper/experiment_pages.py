@@ -111,7 +111,7 @@ def tilt_and_roll() -> tuple[Sheet, ...]:
             f"F at d = {deepest} mm [N]": _force(d, tilting),
         }
         force, law = _force(d, rolling), _force_table_i(d, rolling)
-        # Springs that point at the tip's centre (Nguyen and Arimoto): N = πE d², whatever the tilt.
+        # Springs that point at the tip's centre (Nguyen and Arimoto): N = πE d² at any tilt.
         radial = np.full(rolling.shape, math.pi * MODULUS * (d * MILLI) ** 2)
         second |= {
             f"F at d = {deepest} mm [N]": force,

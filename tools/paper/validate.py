@@ -48,7 +48,7 @@ class Beside(NamedTuple):
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.epilog = "Takes some seconds: grips and frames are simulated anew."
+    parser.epilog = "Takes some seconds: grips and frames are simulated."
 
 
 def run(arguments: argparse.Namespace) -> int:

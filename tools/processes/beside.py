@@ -125,7 +125,7 @@ class RecorderBeside:
         self._closing = False
         self._said = ""
         self._lifeline = _Lifeline()
-        # A session of its own: Ctrl-C is for the daemon, whose last messages are recorded too.
+        # Its own session: Ctrl-C is for the daemon, whose last messages are recorded too.
         self._process = self._lifeline.start(
             ["record", *words],
             keys,

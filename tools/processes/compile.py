@@ -217,7 +217,7 @@ def main() -> None:
     """
     gc.set_threshold(100_000)  # the compiler makes much that lives: looking through it costs 10 %
     out = sys.stdout
-    sys.stdout = sys.stderr  # whatever else prints, prints there
+    sys.stdout = sys.stderr  # for all other prints
 
     def tell(line: str) -> None:
         print(line, file=out, flush=True)

@@ -102,7 +102,7 @@ class EventLog:
 
 
 def _clock(date: str, timestamp: float) -> str:
-    """The time of day, or the seconds of a clock that is none."""
+    """The time of day, or the seconds of a nonsensical clock."""
     try:
         clock = time.strftime(date, time.localtime(timestamp))
     except (OverflowError, OSError, ValueError):

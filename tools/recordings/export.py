@@ -211,7 +211,7 @@ def export(
 
 
 def _file_name(topic: bytes) -> str:
-    """A topic's name as a file's, whatever a recording calls it: neither hidden nor elsewhere."""
+    """A topic's name as a file's, from any recording: neither hidden nor in another folder."""
     return re.sub(r"[^A-Za-z0-9._-]", "-", topic.decode()).lstrip(".")[:100] or "topic"
 
 

@@ -252,7 +252,7 @@ class _Images:
         self._last: tuple[TactileFrame, dict[str, Any], NDArray[np.int64]] | None = None
 
     def png(self, frame: TactileFrame) -> dict[str, Any]:
-        if self._last is None or self._last[0] is not frame:  # the same one again isn't packed anew
+        if self._last is None or self._last[0] is not frame:  # the same one is packed once
             pixels = image(frame)
             levels = np.bincount(pixels[:, :, 0].ravel(), minlength=256)
             self._last = frame, {"bytes": _png(pixels), "path": None}, levels

@@ -57,7 +57,7 @@ def read_recording(path: str | Path) -> dict[str, NDArray[Any]]:
 
 
 class Recording:
-    """A recording that exists. Raises RecordingError when it is none.
+    """A recording that exists. Raises RecordingError for another file.
 
     ``counts`` messages by channel, and ``start`` and ``end`` [Unix s] (NaN when empty) come from
     the summary at the file's end. A file without one, as a killed recorder leaves it, is
@@ -287,7 +287,7 @@ class Recording:
 def _records(file: IO[bytes], wanted: Collection[int]) -> Iterator[tuple[int, bytes]]:
     """Yield kind and content of the records that are ``wanted``, until the end.
 
-    Raises EOFError for one that is cut short, ValueError for what is none or is too long.
+    Raises EOFError for one that is cut short, ValueError for an invalid or too long one.
     """
     while head := file.read(_RECORD.size):
         if len(head) < _RECORD.size:

@@ -172,7 +172,7 @@ class Wire:
         self._link = self._gateway.link
 
     def subscribed(self, seconds: float) -> bool:
-        """Wait so many seconds, or until the subscribers change; whether there are any."""
+        """Wait ``seconds``, or until the subscribers change; whether there are any."""
         self._link.wait(seconds)
         return bool(self._link.wanted)
 

@@ -283,7 +283,7 @@ class _Pending:
 class Commander:
     """Sends commands without waiting for their replies. The newest one is kept in ``reply``.
 
-    Each command has a request socket of its own: an answer that never comes holds nothing up,
+    Each command has its own request socket: an answer that never comes holds nothing up,
     a stop least of all. To a daemon of this user on this machine, a stop goes past all clients; its
     answer comes at the next tick, and a daemon that stands still is given a moment for it.
     """

@@ -64,7 +64,7 @@ def rule(width: int, title: Text, note: Text | None = None) -> Text:
 
 
 def faded(line: Text) -> Text:
-    """Return ``line`` in the faded style of outdated data, but for the maps."""
+    """Return ``line`` in the faded style of outdated data, except the maps."""
     maps = [span for span in line.spans if isinstance(span.style, Style) and span.style.bgcolor]
     return Text(line.plain, DIM, spans=maps)
 

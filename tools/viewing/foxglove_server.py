@@ -73,7 +73,7 @@ class FoxgloveServer(Viewer):
         self._server.stop()
 
     def take(self, topic: bytes, message: Any) -> bool:
-        """One message, whatever it holds."""
+        """Take one message of any content."""
         if not super().take(topic, message):
             return False
         if topic == schema.TACTILE:
@@ -107,7 +107,7 @@ class FoxgloveServer(Viewer):
     def _image(self, frame: schema.TactileFrame) -> None:
         self._images[frame.finger].log(
             fm.RawImage(
-                timestamp=_time(frame.timestamp),
+                timestamp=fm.Timestamp.from_epoch_secs(frame.timestamp),
                 frame_id=frame.finger,
                 width=frame.cols,
                 height=frame.rows,
@@ -121,7 +121,7 @@ class FoxgloveServer(Viewer):
     def _event(self, event: dict[str, Any]) -> None:
         stamp = number(event, "timestamp")
         line = fm.Log(
-            timestamp=_time(stamp),
+            timestamp=fm.Timestamp.from_epoch_secs(stamp),
             level=_LEVELS.get(text(event, "level"), fm.LogLevel.Unknown),
             message=text(event, "text"),
             name=text(event, "kind"),
@@ -183,10 +183,6 @@ def _channel(topic: bytes, context: foxglove.Context) -> foxglove.Channel:
 
 def _ns(stamp: float) -> int:
     return int(stamp * 1e9)
-
-
-def _time(stamp: float) -> fm.Timestamp:
-    return fm.Timestamp(sec=int(stamp), nsec=_ns(stamp % 1.0))
 
 
 def serve(arguments: argparse.Namespace, ending: Ending) -> None:

@@ -1,4 +1,4 @@
-"""The stream as page and Foxglove server read it: drained in time, drawn so many times a second."""
+"""The stream as page and Foxglove server read it: drained in time, drawn at a rate."""
 
 from __future__ import annotations
 

@@ -105,7 +105,7 @@ class Newest:
 
 
 class Playback:
-    """A recording's place, and that it is ``playing``. ``run`` is for a thread of its own."""
+    """A recording's place, and that it is ``playing``. ``run`` is for its own thread."""
 
     def __init__(self, recording: Recording, pictures: Pictures, period: float) -> None:
         self._recording = recording

@@ -97,7 +97,7 @@ class Pictures(Viewer):
         return time.monotonic() if self._live else self.time
 
     def take(self, topic: bytes, message: Any) -> bool:
-        """One message, whatever it holds."""
+        """Take one message of any content."""
         state, when = self.feed.state, self.time
         if not super().take(topic, message):
             return False
