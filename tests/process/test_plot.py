@@ -114,19 +114,19 @@ def test_landscape_shows_the_local_minimum_and_the_path(run):
     assert angle[known].max() > 5.0
 
 
-def test_a_page_by_name_as_svg_or_left_out_with_a_word(path, tmp_path, call):
-    words = ("--pages", "angle", "landscape", "--format", "svg", "--from", 1, "--to", 2)
+def test_pages_as_svg_or_one_line(path, tmp_path, call):
+    words = ("--format", "svg", "--from", 1, "--to", 2)
     assert call(path, *words, "--out", tmp_path / "a" / "b") == (0, "")
     files = sorted((tmp_path / "a" / "b").iterdir())
     assert [each.name for each in files] == ["angle.svg", "landscape.svg"]
     assert ElementTree.parse(files[0]).getroot().tag.endswith("svg")
-    status, said = call(path, "--pages", "angle", "--to", "0.2", "--out", tmp_path / "none")
+    status, said = call(path, "--to", "0.2", "--out", tmp_path / "none")
     assert status == 1
-    assert "page angle left out: no contact in it" in said
+    assert "plot: no contact in it" in said
     RecordingWriter(tmp_path / "nothing.mcap").close()
-    status, said = call(tmp_path / "nothing.mcap", "--pages", "angle", "--out", tmp_path / "none")
+    status, said = call(tmp_path / "nothing.mcap", "--out", tmp_path / "none")
     assert status == 1
-    assert "page angle left out: no hand/state in it" in said
+    assert "plot: no hand/state in it" in said
 
 
 def test_without_settings_there_is_no_model(path, run):
@@ -149,10 +149,9 @@ def test_one_finger_alone(tmp_path):
 
 
 def test_a_recording_that_was_cut_short_is_drawn(tmp_path, path, call):
-    page = ("--pages", "angle", "--out")
     whole = path.read_bytes()
     (tmp_path / "cut.mcap").write_bytes(whole[: len(whole) * 2 // 3])
-    status, said = call(tmp_path / "cut.mcap", *page, tmp_path / "cut")
+    status, said = call(tmp_path / "cut.mcap", "--out", tmp_path / "cut")
     assert status == 0
     assert "cut short" in said
     assert (tmp_path / "cut" / "angle.png").exists()

@@ -49,5 +49,5 @@ def test_analyse_and_plot_read_it(recorded, capsys):
     assert main(["analyse", str(recorded)]) == 0
     assert ", 0 not usable" in capsys.readouterr().out
     out = recorded.parent / "plots"
-    assert main(["plot", str(recorded), "--out", str(out), "--pages", "landscape", "angle"]) == 0
+    assert main(["plot", str(recorded), "--out", str(out)]) == 0
     assert sorted(each.name for each in out.iterdir()) == ["angle.png", "landscape.png"]

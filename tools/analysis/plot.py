@@ -8,7 +8,6 @@ time is left to programs that open the file, Foxglove and PlotJuggler.
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -43,9 +42,7 @@ pages:
   angle      force and energy against θ beside the model's curves
   landscape  the path over U(d, θ) with its local minimum
 
-A page whose data the recording lacks is left out, with the reason. Needs the extra 'plot'.
-Foxglove and PlotJuggler open the file, too, and draw any field over time.
-Exit status: 0 when at least one page was drawn."""
+Needs the extra 'plot'. Foxglove and PlotJuggler open the file too, and draw any field over time."""
 
 
 FloatArray = NDArray[np.float64]
@@ -67,13 +64,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--out", type=Path, metavar="DIR", help="output folder (default: FILE.plots)"
     )
     parser.add_argument(
-        "--pages",
-        nargs="+",
-        choices=tuple(PAGES),
-        metavar="PAGE",
-        help="pages to draw (default: all)",
-    )
-    parser.add_argument(
         "--format",
         nargs="+",
         choices=("png", "svg", "pdf"),
@@ -84,7 +74,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Draw; 1 when no page was drawn. Raises RecordingError, MissingExtra or OSError."""
+    """Draw. Raises RecordingError, Missing, MissingExtra or OSError."""
     require("plot")  # before a long recording is read
     path: Path = arguments.file
     folder = arguments.out or path.with_name(path.name + ".plots")
@@ -93,19 +83,13 @@ def run(arguments: argparse.Namespace) -> int:
     with Progress("plot", recording.size) as progress:
         data = load_run(recording, arguments.start, arguments.end, progress)
     folder.mkdir(parents=True, exist_ok=True)
-    drawn = 0
     with style.settings():
-        for name in (name for name in PAGES if name in (arguments.pages or PAGES)):
-            try:
-                figure = PAGES[name](data)
-            except Missing as missing:
-                print(f"plot: page {name} left out: {missing}", file=sys.stderr)
-                continue
+        for name, draw in PAGES.items():
+            figure = draw(data)
             for suffix in arguments.format:
                 style.save(figure, folder / f"{name}.{suffix}")
                 print(folder / f"{name}.{suffix}")
-            drawn += 1
-    return 0 if drawn else 1
+    return 0
 
 
 class Missing(SoftfingerError):

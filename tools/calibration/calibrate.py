@@ -57,7 +57,7 @@ load, or one .npz of the whole run with its own d [m], theta [rad], force [N] fo
 Without a stage, try the steps on `softfinger emulate`:
   --move "softfinger emulate --send 'press depth={d}mm tilt={theta}deg'"
   --move "softfinger emulate --send 'turn {finger}={pose}'"     for joints
-Each step draws its result and residuals as FILE.STEP.png, where matplotlib is installed.
+Each step but law draws its result and residuals as FILE.STEP.png, where matplotlib is installed.
 A new equilibrate removes curve and modulus, a new curve removes modulus, and each of these removes
 scales: they depend on it.
 """
@@ -138,7 +138,7 @@ def _calibrate_tip(arguments: argparse.Namespace, settings: Settings) -> str:
     loads = gather(arguments, settings, calibration)
     calibration, line, panels = done(Step(arguments, settings, calibration, loads))
     save_calibration(file, calibration)
-    if not arguments.no_plot:
+    if panels and not arguments.no_plot:
         try:
             draw(arguments.step, panels, file.with_name(f"{file.stem}.{arguments.step}.png"))
         except MissingExtra as error:

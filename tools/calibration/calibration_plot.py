@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from softfinger.tools import style
@@ -42,19 +41,7 @@ class Points(NamedTuple):
         axes.set(title=self.title, xlabel=self.xlabel, ylabel=self.ylabel)
 
 
-class Bars(NamedTuple):
-    """One value for each name."""
-
-    title: str
-    names: list[str]
-    values: list[float]
-
-    def draw(self, _: Any, axes: Any) -> None:
-        axes.barh(self.names, np.nan_to_num(self.values), color=style.KINDS[: len(self.names)])
-        axes.set(title=self.title)
-
-
-Panel = Map | Points | Bars
+Panel = Map | Points
 
 
 def draw(step: str, panels: tuple[Panel, ...], path: Path) -> None:

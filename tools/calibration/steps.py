@@ -60,7 +60,7 @@ from softfinger.kinematics.contact.tip_curves import TipCurves
 from softfinger.kinematics.estimation.measured import MeasuredEstimator
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from softfinger.tools.calibration.calibration_frames import Loads
-from softfinger.tools.calibration.calibration_plot import Bars, Map, Panel, Points
+from softfinger.tools.calibration.calibration_plot import Map, Panel, Points
 
 FloatArray = NDArray[np.float64]
 _UNDONE: dict[str, Any] = {"modulus": None, "law": None, "scales": None, "wants": {}}
@@ -325,9 +325,7 @@ def _law(step: Step) -> Done:
             lines[1] += ": the rubber SOFTENS; press it some times to the full depth, then again"
     told = (f"tip.{name} = {json.dumps(value)}" for name, value in wants.items())
     lines.append(f"for the profile: {', '.join(told)}")
-    names = [" ".join(_name(each).split(", ")[:3]) for each in fits]
-    shown = Bars("error left in F [%]", names, [100.0 * each.force_error for each in fits])
-    return step.result(**steps, wants=wants), "\n  ".join(lines), (shown,)
+    return step.result(**steps, wants=wants), "\n  ".join(lines), ()
 
 
 def _measured(step: Step, live: NDArray[np.bool_]) -> tuple[TipCurves, FloatArray]:
