@@ -33,7 +33,7 @@ def test_page_shows_the_hand_and_whether_its_stream_is_there(fake):
         fake.send_event("mode", "before the page was there")
         page.shows("HOLDING", "● live", "LEFT contact", "RIGHT contact", "kPa", "▀" * 22)
         page.shows("3.21±0.02", "3.31±0.02", "±0.10", "12.34", "24.06", "0.213", "0.350")
-        page.shows("4.98 °", "40.00 mm wide", "tick 500 Hz")
+        page.shows("4.98 °", "40.00 mm wide", "overruns 0")
         fake.send_event("mode", "grasping → holding")
         page.shows("grasping → holding")
         bright = {page.screen.buffer[y][x].fg for y in range(3, 14) for x in range(22)}

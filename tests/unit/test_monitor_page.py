@@ -116,9 +116,11 @@ def test_status_follows_the_age() -> None:
     assert [slow.status(99 + age) for age in (2.0, 4.0, 11.0)] == ["live", "stale", "lost"]
 
 
-def test_the_rate_is_that_of_the_states() -> None:
+def test_the_rates_are_those_of_states_and_ticks() -> None:
     feed = Feed()
     assert math.isnan(feed.rate)
+    give(feed, b"hand/stats", {"rates": {"tick": 400.0}}, 0.0)
+    assert "tick 400 Hz" in shown(feed)
     for k in range(300):
         state = fake_daemon.state(0.01 * k, k) | {"mono_ns": (k + 1) * 10**7}
         give(feed, b"hand/state", state, 0.01 * k)
