@@ -1,4 +1,4 @@
-"""What a grip is measured by goes wrong, and the plant says what the grip does then.
+"""False measurements of a grip: what it does then, by the plant.
 
 Each case is a grip with a false measurement or an odd tip; each trial of it draws from a seed of
 its own noise, instants, the finger, the object's mass and an error of the joints' torque constant.
