@@ -112,15 +112,18 @@ class AsyncHand(HandClient[Coroutine[Any, Any, None]]):
                 if wait.ends_with(state):
                     return state
 
-    async def command(self, name: str, **numbers: float) -> dict[str, Any]:
-        """Send one command and return the reply. Raises Refused with the reason, and NoAnswer."""
+    async def command(self, name: str, **numbers: float | None) -> dict[str, Any]:
+        """Send one command, without numbers that are None, and return the reply.
+
+        Raises Refused with the reason, and NoAnswer.
+        """
         request = self._request(name, numbers)
         reply = await asyncio.to_thread(
             send, self.command_address, request, self.timeout, self._keys
         )
         return accepted(reply)
 
-    async def _carry_out(self, command: str, **numbers: float) -> None:
+    async def _carry_out(self, command: str, **numbers: float | None) -> None:
         try:
             await self.command(command, **numbers)
         except Refused:

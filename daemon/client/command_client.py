@@ -138,12 +138,13 @@ class HandClient(Generic[_Done]):
         if self._context.closed:
             raise HandClosed(f"this {type(self).__name__} is closed: make another")
 
-    def _request(self, name: str, numbers: dict[str, float]) -> dict[str, Any]:
+    def _request(self, name: str, numbers: dict[str, float | None]) -> dict[str, Any]:
         self._require_open()
+        given = {key: value for key, value in numbers.items() if value is not None}
         envelope = {"client": self.client} if self.client else {}
-        return {"command": name, **numbers, **envelope}
+        return {"command": name, **given, **envelope}
 
-    def _carry_out(self, command: str, **numbers: float) -> _Done:
+    def _carry_out(self, command: str, **numbers: float | None) -> _Done:
         raise NotImplementedError
 
     def arm(self) -> _Done:
@@ -160,14 +161,11 @@ class HandClient(Generic[_Done]):
 
     def move(self, left: float | None = None, right: float | None = None) -> _Done:
         """Move joints to angles [rad]."""
-        angles = {"left": left, "right": right}
-        return self._carry_out(
-            "move", **{finger: angle for finger, angle in angles.items() if angle is not None}
-        )
+        return self._carry_out("move", left=left, right=right)
 
     def grasp(self, force: float | None = None) -> _Done:
         """Close, and press with ``force`` [N] on each tip; the settings' force when None."""
-        return self._carry_out("grasp", **({} if force is None else {"force": force}))
+        return self._carry_out("grasp", force=force)
 
     def rotate(self, angle: float) -> _Done:
         """Turn the grasped object to ``angle`` [rad] in the hand's frame."""
@@ -180,10 +178,7 @@ class HandClient(Generic[_Done]):
         yet grasps first. A turn is bounded by what the grip reaches, and goes at most at
         ``control.rotate_speed``.
         """
-        given = {"force": force, "angle": angle}
-        return self._carry_out(
-            "hold", **{key: value for key, value in given.items() if value is not None}
-        )
+        return self._carry_out("hold", force=force, angle=angle)
 
     def release(self) -> _Done:
         """Open."""

@@ -123,12 +123,15 @@ class Hand(HandClient[None]):
                 if wait.ends_with(state):
                     return state
 
-    def command(self, name: str, **numbers: float) -> dict[str, Any]:
-        """Send one command and return the reply. Raises Refused with the reason, and NoAnswer."""
+    def command(self, name: str, **numbers: float | None) -> dict[str, Any]:
+        """Send one command, without numbers that are None, and return the reply.
+
+        Raises Refused with the reason, and NoAnswer.
+        """
         request = self._request(name, numbers)
         return accepted(send(self.command_address, request, self.timeout, self._keys))
 
-    def _carry_out(self, command: str, **numbers: float) -> None:
+    def _carry_out(self, command: str, **numbers: float | None) -> None:
         try:
             self.command(command, **numbers)
         except Refused:

@@ -35,13 +35,11 @@ EventSink = Callable[[str, str, str], None]
 class Commands(Protocol):
     """A source of commands: `wire.command_server.CommandServer`, or a recording."""
 
+    notices: deque[str]  # news of the process that serves clients, for events
+
     @property
     def refused_by_pace(self) -> int:
         """Commands refused because too many came."""
-
-    @property
-    def notices(self) -> deque[str]:
-        """News of the process that serves clients, for events."""
 
     def serve(self, handler: Handler) -> None:
         """Carry out through ``handler`` what is due at this tick."""

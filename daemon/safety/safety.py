@@ -128,14 +128,11 @@ class Safety:
             self._turn = (self._turn + 1) % len(self._in_turn)
             self._in_turn[self._turn].check_limit(view, state, found, self.warnings)
         gripping = state.mode in GRIPPING
-        self.must_hold = False
-        if gripping and self._has_sensors:
-            oldest, contacts = state.t - self._hold_age, state.contacts
-            for i in view.fingers:
-                if contacts[i].t_valid < oldest:
-                    self.must_hold = True
-            if self.must_hold:
-                self._count("tactile.late")
+        oldest, contacts = state.t - self._hold_age, state.contacts
+        late = any(contacts[i].t_valid < oldest for i in view.fingers)
+        self.must_hold = gripping and self._has_sensors and late
+        if self.must_hold:
+            self._count("tactile.late")
         if found:
             for watch in self._faults:
                 if watch in found and (gripping or not watch.limit.gripping):

@@ -92,17 +92,9 @@ class JointPlant(Protocol):
     Index 0 is the left finger's joint; positive closes.
     """
 
-    @property
-    def q(self) -> FloatArray:
-        """True joint angles [rad] at the time last advanced to."""
-
-    @property
-    def dq(self) -> FloatArray:
-        """True joint velocities [rad/s]."""
-
-    @property
-    def current(self) -> FloatArray:
-        """True motor currents [A]."""
+    q: FloatArray  # true joint angles [rad] at the time last advanced to
+    dq: FloatArray  # true joint velocities [rad/s]
+    current: FloatArray  # true motor currents [A]
 
     def measured_current(self, joint: int) -> float:
         """Return the motor current [A] of a joint as its servo measures it."""

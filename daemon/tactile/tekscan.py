@@ -3,14 +3,13 @@
 Such a file starts with lines ``KEY value``, up to ``ASCII_DATA @@``. Then each frame is a line
 ``Frame n`` (more may stand behind it) and its rows, cells separated by commas, ``B`` where the
 sensor has no cell; a line ``@@`` may end it. The export of a single frame has no ``Frame`` line.
-Keys are misspelt in the wild (``SENSEL_AERA``); lengths come in mm, cm, m or in, abbreviated or
-spelt out, areas in their squares, readings raw or in a unit of pressure. Below ``COMMENTS:`` stands
-free text, in which only words in capitals are keys; a spreadsheet leaves commas at the lines' ends.
+Lengths come in mm, cm, m or in, abbreviated or spelt out, readings raw or in a unit of pressure.
+Below ``COMMENTS:`` stands free text, in which only words in capitals are keys; a spreadsheet leaves
+commas at the lines' ends.
 """
 
 from __future__ import annotations
 
-import difflib
 import math
 import re
 from dataclasses import dataclass
@@ -22,7 +21,6 @@ from softfinger.daemon.errors import SoftfingerError
 
 _MOST = 1024  # rows or cols
 _HEADER_MOST = 1000  # lines
-_KEY_MOST = 40  # characters
 _LARGEST = 1e12  # of any reading, in its unit
 _LENGTHS = {
     **dict.fromkeys(("", "mm", "millimeters", "millimetres", "millimeter", "millimetre"), 1e-3),
@@ -47,15 +45,6 @@ _PRESSURES = {
     "kg/cm2": 98066.5,
     "kgf/cm2": 98066.5,
 }
-_KEYS = (
-    "ROWS",
-    "COLS",
-    "ROW_SPACING",
-    "COL_SPACING",
-    "SENSEL_AREA",
-    "SECONDS_PER_FRAME",
-    "UNITS",
-)
 
 
 class TekscanError(SoftfingerError, ValueError):
@@ -114,16 +103,9 @@ def _header(lines: list[str]) -> tuple[dict[str, str], int]:
         if key.upper() == "ASCII_DATA":
             return header, number + 1
         if key and (key.isupper() or not in_comments):
-            header[_spelt(key.upper()[:_KEY_MOST])] = value.strip()
+            header[key.upper()] = value.strip()
             in_comments |= key.upper().startswith("COMMENT")
     raise TekscanError("no line ASCII_DATA: this is no Tekscan-style export")
-
-
-def _spelt(key: str) -> str:
-    """The known key that a misspelt one means; short keys must be right, they differ too little."""
-    if key in _KEYS or len(key) < 8:
-        return key
-    return (difflib.get_close_matches(key, _KEYS, n=1, cutoff=0.9) or [key])[0]
 
 
 def _frames(
@@ -187,30 +169,25 @@ def _count(header: dict[str, str], key: str) -> int:
     return int(text)
 
 
-def _quantity(header: dict[str, str], key: str, units: dict[str, float], power: int = 1) -> float:
+def _quantity(header: dict[str, str], key: str, units: dict[str, float]) -> float:
     """A number with its unit, in SI."""
-    match = re.fullmatch(r"([-+0-9.eE]+)\s*([A-Za-z]*)\s*\^?\s*([23]?)", header[key])
+    match = re.fullmatch(r"([-+0-9.eE]+)\s*([A-Za-z]*)", header[key])
     try:
         value = float(match[1]) if match else math.nan
     except ValueError:
         value = math.nan
     unit = match[2].lower() if match else ""
-    wrong_power = match is not None and match[3] not in ("", str(power))
-    if not math.isfinite(value) or unit not in units or wrong_power:
+    if not math.isfinite(value) or unit not in units:
         known = ", ".join(name for name in units if 0 < len(name) <= 4)
         raise TekscanError(f"{key}: found {header[key]!r}, expected a number in one of {known}")
-    return float(value * units[unit] ** power)
+    return value * units[unit]
 
 
 def _pitch(header: dict[str, str]) -> tuple[float, float]:
-    """(x, y) from the spacings, or from the area of a square cell."""
-    side = math.nan
-    if "SENSEL_AREA" in header:
-        area = _quantity(header, "SENSEL_AREA", _LENGTHS, power=2)
-        side = math.sqrt(area) if area > 0.0 else math.nan
+    """(x, y) from the spacings."""
     found = []
     for key in ("COL_SPACING", "ROW_SPACING"):
-        value = _quantity(header, key, _LENGTHS) if key in header else side
+        value = _quantity(header, key, _LENGTHS) if key in header else math.nan
         if value <= 0.0:
             raise TekscanError(f"{key}: expected a length above 0")
         found.append(value)

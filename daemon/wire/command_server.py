@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections import deque
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -60,6 +59,7 @@ class CommandServer:
         After a longer one it is refused: nobody who sent it knows any more what it would do.
         """
         self._link = link
+        self.notices = link.notices  # the gateway's warnings, to be published as events
         self._local = local
         self._pauses = Pauses(longest_pause)
         self._worked = False  # a command that changes something was carried out at the last tick
@@ -72,11 +72,6 @@ class CommandServer:
     def refused_by_pace(self) -> int:
         """Requests refused because too many came."""
         return self._link.refused
-
-    @property
-    def notices(self) -> deque[str]:
-        """The gateway's warnings, to be published as events."""
-        return self._link.notices
 
     def serve(self, handler: Handler) -> None:
         """Have ``handler`` carry out what is due at this tick.

@@ -52,7 +52,6 @@ SAME = {
     "comments that look like a header": EXPORT.replace(
         "UNITS RAW", "COMMENTS:\nunits were wrong, cols swapped\nsecond line\nUNITS RAW"
     ),
-    "a misspelt key": EXPORT.replace("ROW_SPACING", "ROW_SPACIGN"),
     "a unit spelt out": EXPORT.replace("1.27 mm", "0.127 centimeters"),
     "another unit": EXPORT.replace("1.27 mm", "0.05 inches"),
 }
@@ -82,14 +81,6 @@ def test_pressures_are_told_in_pa(unit, pascal):
 def test_a_single_frame_needs_no_frame_line():
     single = EXPORT.split("Frame 4")[0] + "0,5,B,\n7,255,1,\n@@\n"
     assert np.array_equal(parse(single).values, parse(EXPORT).values[:1])
-
-
-@pytest.mark.parametrize(
-    ("area", "side"), [("1.6129 mm2", 1.27e-3), ("0.016129 cm2", 1.27e-3), ("0.0025 in2", 1.27e-3)]
-)
-def test_without_spacings_the_area_tells_the_pitch(area, side):
-    text = EXPORT.replace("ROW_SPACING 1.27 mm\n", "").replace("COL_SPACING 0.2 cm\n", "")
-    assert parse(text.replace("0.0254 cm2", area)).pitch == pytest.approx((side, side), rel=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -15,8 +15,7 @@ import contextlib
 import json
 import math
 import os
-import select
-import socket
+import selectors
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -155,7 +154,9 @@ class Emulator:
         self._wake = os.pipe()
         self._closers.append(self._close_wake)
         self._stopping = False
-        self._watched: list[int | TactileBoard | socket.socket] | None = None
+        # poll and epoll would wait for whole milliseconds.
+        self._selector = selectors.SelectSelector()
+        self._selector.register(self._wake[0], selectors.EVENT_READ)
         self._servos: PtyServoBus | None = None
         self._boards: dict[str, TactileBoard] = {}
         self._sources: dict[str, SimulatedTactile] = {}
@@ -169,7 +170,7 @@ class Emulator:
             self._events = parse_faults(faults, self._ids)
             self._links = LinkFolder(folder)
             self._closers.append(self._links.close)
-            self._control = ControlPort(folder, self._answer)
+            self._control = ControlPort(folder, self._answer, self._selector)
             self._closers.append(self._control.close)
             settings = with_board(settings)
             self._simulation = settings.simulation
@@ -201,6 +202,7 @@ class Emulator:
         self._closers.append(servos.unplug)
         self._links.link("servos", servos.path)
         self._servos = self.clock.servos = servos
+        self._selector.register(servos, selectors.EVENT_READ)
 
     def _add_board(self, settings: Settings, finger: int) -> None:
         source = SimulatedTactile(settings, self.hand, self.clock, finger)
@@ -215,6 +217,7 @@ class Emulator:
         )
         self._sources[FINGERS[finger]] = source
         self._boards[FINGERS[finger]] = board
+        self._selector.register(board, selectors.EVENT_READ, board.hear)
         self._closers.append(board.close)
         self._links.link(f"tactile-{FINGERS[finger]}", board.path)
 
@@ -252,20 +255,16 @@ class Emulator:
         start = self.clock.now()
         if servos is not None:
             due = min(due, servos.next_event())
-        if self._watched is None:
-            self._watched = self._watch()
         # A time that stands still comes to nothing that is due: no haste then.
         wait = max(due - start, _HELD if self.clock.held else 0.0)
-        ready, _, _ = select.select(self._watched, (), (), wait)
+        ready = [key for key, _ in self._selector.select(wait)]
         t = self.clock.now()
-        if servos is not None and (servos.fileno() in ready or servos.next_event() <= t):
+        asked = servos in [key.fileobj for key in ready]
+        if servos is not None and (asked or servos.next_event() <= t):
             servos.service(t)
-        for each in ready:
-            if isinstance(each, TactileBoard):
-                each.hear()
-            elif isinstance(each, socket.socket):
-                self._control.serve([each])
-                self._watched = None
+        for key in ready:
+            if key.data is not None:
+                key.data()
         late = [board for board in boards if board.next_event() <= t]
         if late:
             self._advance(t)
@@ -273,21 +272,9 @@ class Emulator:
         elif self._advance_due <= t:
             self._advance(t)
 
-    def _watch(self) -> list[int | TactileBoard | socket.socket]:
-        """Return the sources of bytes."""
-        watched: list[int | TactileBoard | socket.socket] = [
-            self._wake[0],
-            *self._control.sockets(),
-            *[board for board in self._boards.values() if board.plugged],
-        ]
-        if self._servos is not None and self._servos.plugged:
-            watched.append(self._servos.fileno())
-        return watched
-
     def _advance(self, t: float) -> None:
         while self._events and self._events[0].after <= t:
             self._apply(self._events.pop(0), t)
-            self._watched = None
         if self._servos is not None:
             self._servos.bus.advance(t)
         else:
@@ -416,10 +403,14 @@ class Emulator:
         name = part if part == SERVOS else f"tactile-{part}"
         if kind == "unplug":
             self._links.unlink(name)
+            if device.plugged:
+                self._selector.unregister(device)
             device.unplug()
         elif kind == "plug":
             if not device.plugged:
                 device.plug()
+                hear = device.hear if isinstance(device, TactileBoard) else None
+                self._selector.register(device, selectors.EVENT_READ, hear)
                 self._links.link(name, device.path)
         elif isinstance(device, TactileBoard):
             if kind == "well":

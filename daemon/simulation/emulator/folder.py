@@ -9,9 +9,11 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
+import selectors
 import socket
 import stat
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 from softfinger.daemon.errors import SoftfingerError
@@ -105,11 +107,17 @@ class NoEmulator(SoftfingerError):
 
 
 class ControlPort:
-    """Listens at ``folder``/control; each message is handed to ``handle``, whose text goes back."""
+    """Listens at ``folder``/control; each message is handed to ``handle``, whose text goes back.
 
-    def __init__(self, folder: Path, handle: Callable[[str], str]) -> None:
+    Who waits at ``selector`` calls the data of what is readable.
+    """
+
+    def __init__(
+        self, folder: Path, handle: Callable[[str], str], selector: selectors.BaseSelector
+    ) -> None:
         """Raises FolderError when the name is taken by something that is no socket."""
         self._handle = handle
+        self._selector = selector
         self._folder = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         self._clients: list[socket.socket] = []
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -122,28 +130,16 @@ class ControlPort:
             self._listener.bind(_address(self._folder))
             self._listener.listen(_CLIENTS)
             self._listener.setblocking(False)
+            selector.register(self._listener, selectors.EVENT_READ, self._accept)
         except BaseException:
             self._listener.close()
             os.close(self._folder)
             raise
 
-    def sockets(self) -> list[socket.socket]:
-        """Return the sockets to wait for; :meth:`serve` those that are readable."""
-        return [self._listener, *self._clients]
-
-    def serve(self, ready: list[socket.socket]) -> None:
-        """Take new clients and answer one message of each that has sent one."""
-        for each in ready:
-            if each is self._listener:
-                self._accept()
-            elif each in self._clients:
-                self._answer(each)
-
     def close(self) -> None:
         """Hang up and take the socket away."""
-        for each in self.sockets():
+        for each in (self._listener, *self._clients):
             each.close()
-        self._clients.clear()
         with contextlib.suppress(OSError):
             os.unlink(_CONTROL, dir_fd=self._folder)
         os.close(self._folder)
@@ -153,8 +149,10 @@ class ControlPort:
             client, _ = self._listener.accept()
             client.setblocking(False)
             self._clients.append(client)
+            answer = partial(self._answer, client)
+            self._selector.register(client, selectors.EVENT_READ, answer)
             if len(self._clients) > _CLIENTS:
-                self._clients.pop(0).close()
+                self._hang_up(self._clients[0])
 
     def _answer(self, client: socket.socket) -> None:
         try:
@@ -164,8 +162,13 @@ class ControlPort:
                 return
         except OSError:
             pass
-        self._clients.remove(client)
-        client.close()
+        self._hang_up(client)
+
+    def _hang_up(self, client: socket.socket) -> None:
+        if client in self._clients:
+            self._clients.remove(client)
+            self._selector.unregister(client)
+            client.close()
 
 
 def send_words(folder: Path, text: str) -> str:

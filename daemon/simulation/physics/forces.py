@@ -7,14 +7,13 @@ from __future__ import annotations
 
 import math
 
+from softfinger.daemon.servos.control_table import CURRENT_BASED_POSITION_MODE, CURRENT_MODE
 from softfinger.daemon.simulation.physics.extra_contacts import (
     clear_extra,
     touch_each_other,
     touch_palm,
 )
 from softfinger.daemon.simulation.physics.plant_state import (
-    CURRENT_BASED_POSITION_MODE,
-    CURRENT_MODE,
     NO_OBJECT,
     Motion,
     Plant,

@@ -23,11 +23,6 @@ NO_OBJECT = 0
 POLYGON = 1  # convex
 DISC = 2
 
-# Operating modes, by the servos' own numbers.
-CURRENT_MODE = 0
-POSITION_MODE = 3
-CURRENT_BASED_POSITION_MODE = 5
-
 # Rows of a tip's contact.
 ALONG_D = 0
 ALONG_THETA = 1

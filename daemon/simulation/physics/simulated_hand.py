@@ -14,15 +14,17 @@ import numpy as np
 
 from softfinger.daemon.profile.factory import make_material, make_table
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.servos.control_table import by_name
+from softfinger.daemon.servos.control_table import (
+    CURRENT_BASED_POSITION_MODE,
+    CURRENT_MODE,
+    POSITION_MODE,
+    by_name,
+)
 from softfinger.daemon.simulation.faults import MeasurementFaults
 from softfinger.daemon.simulation.physics import plant
 from softfinger.daemon.simulation.physics.energy_guard import LOSSLESS_TOLERANCE
 from softfinger.daemon.simulation.physics.plant_state import (
-    CURRENT_BASED_POSITION_MODE,
-    CURRENT_MODE,
     NO_OBJECT,
-    POSITION_MODE,
     Parameters,
     Plant,
     Sample,

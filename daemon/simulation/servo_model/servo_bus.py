@@ -28,9 +28,8 @@ from softfinger.daemon.simulation.faults import (
     FaultSource,
 )
 from softfinger.daemon.simulation.servo_model import framing
-from softfinger.daemon.simulation.servo_model.bus_recorder import BusRecorder
 from softfinger.daemon.simulation.servo_model.framing import BROADCAST, Packet, PacketParser
-from softfinger.daemon.simulation.servo_model.servo import EmulatedServo, prepared
+from softfinger.daemon.simulation.servo_model.servo import BusRecorder, EmulatedServo, prepared
 from softfinger.daemon.simulation.servo_model.servo_joint import ServoHeat
 
 _SYNC_READS = frozenset((framing.SYNC_READ, framing.FAST_SYNC_READ))
