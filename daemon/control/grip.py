@@ -60,7 +60,7 @@ class Grip:
         law.rotate_bandwidth = 2.0 * math.pi * control.rotate_bandwidth
         law.rotate_speed = control.rotate_speed
         law.damping = 2.0 * control.damping_ratio * math.sqrt(control.joint_inertia)
-        law.friction = control.joint_friction
+        law.friction, law.driving = control.joint_friction, control.driving
         law.torque_error = control.torque_error
         law.friction_speed = control.friction_speed
         law.torque_max = settings.safety.current_max * control.torque_constant

@@ -42,6 +42,7 @@ class GripLaw(Record):
     rotate_speed: float  # [rad/s]
     damping: float  # 2 ζ √J, times √stiffness the damping [N·m·s/rad]
     friction: float  # of a joint [N·m]
+    driving: float  # motor's torque over the tip's of a joint that closes
     friction_speed: float  # from which on all of it is given [rad/s]
     torque_max: float  # [N·m]
     torque_error: float  # relative, of the joints' torque constants
@@ -178,7 +179,8 @@ def single_torque(
         g.grip_force = min(grip_force, _force_limit(g, 0.0, arm))
         close = g.force.speed / (stiffness * arm)
     damping = g.law.damping * math.sqrt(stiffness * arm * arm) * (close - dq)
-    torque: float = arm * g.grip_force + damping + _friction(g.law, close)
+    geared = _geared(g.law, arm * g.grip_force, close)
+    torque: float = geared + damping + _friction(g.law, close)
     g.torque[finger] = torque
     return torque
 
@@ -280,8 +282,11 @@ def _torques(
     steering = g.joint_stiffness * error
     steering += law.damping * math.sqrt(g.joint_stiffness) * (offset_rate - 0.5 * (dq[0] - dq[1]))
     lever = grasp.moment_arm if law.upright else grasp.energy_arm
-    g.torque[0] = lever[0] * g.grip_force + damping + steering + _friction(law, close + offset_rate)
-    g.torque[1] = lever[1] * g.grip_force + damping - steering + _friction(law, close - offset_rate)
+    for k in range(2):
+        sense = 1.0 - 2.0 * k
+        rate = close + sense * offset_rate
+        geared = _geared(law, lever[k] * g.grip_force, rate)
+        g.torque[k] = geared + damping + sense * steering + _friction(law, rate)
     return g.torque[0], g.torque[1]
 
 
@@ -301,7 +306,8 @@ def _equal_torques(
     closed = mean(q)
     arm = law.length * math.cos(closed) - law.offset * math.sin(closed)
     damping = law.damping * math.sqrt(_mean_stiffness(grasp) * arm * arm)
-    common = arm * g.grip_force + damping * (close - 0.5 * (dq[0] + dq[1])) + _friction(law, close)
+    damped = damping * (close - 0.5 * (dq[0] + dq[1]))
+    common = _geared(law, arm * g.grip_force, close) + damped + _friction(law, close)
     antisymmetric = 0.5 * (q[0] - q[1])
     steering = -0.5 * damping * (dq[0] - dq[1])
     if g.dither_elapsed < law.dither_time:
@@ -326,6 +332,16 @@ def _equal_torques(
     g.torque[0] = common + steering
     g.torque[1] = common - steering
     return g.torque[0], g.torque[1]
+
+
+@inner_kernel
+def _geared(law: GripLaw, torque: float, rate: float) -> float:
+    """Return the motor's torque for a tip's [N·m] at the commanded ``rate`` [rad/s] of a joint.
+
+    One that rests is given what it needs to close.
+    """
+    opening = min(max(-rate / law.friction_speed, 0.0), 1.0)
+    return torque * (law.driving - opening * (law.driving - 1.0 / law.driving))
 
 
 @inner_kernel

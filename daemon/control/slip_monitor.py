@@ -4,8 +4,9 @@ With the names of `SlipLaw`, `SlipState` and `GraspState`, at each tick:
 
     standing torque    mean(torque_residual) − closing · joint_friction, averaged: smooth
     load L of a tip    smooth − still = load_arm L + load_curvature L²        (`load_of`)
-    sure               |L| − (1/2 … 3/2) joint_friction/load_arm
-    s.load             min(max(4 sure, 0), |L| + joint_friction/slope)
+    s.friction         joint_friction + load_friction · mean normal force · its lever
+    sure               |L| − (1/2 … 3/2) s.friction/load_arm
+    s.load             min(max(4 sure, 0), |L| + s.friction/slope)
     spare              friction (1 − margin) − shear         of the normal force, for a load
     needed             max(s.load, felt, object_load/2)/spare
     force              min(max(commanded, needed), force_limit)
@@ -16,32 +17,30 @@ turn of the object beyond μ (d1 + d2)/2W · _WELL, raises the force at once.
 
 What these sensors show, and what they don't:
 
-- A pressure grid feels normal pressure only; shear does not change it.
+- A pressure grid feels normal pressure only, no shear. A solid tip's frames show the
+  shear on its face, to 0.1 N.
 - The joints' currents show a load along the faces: what pressure does not explain of a torque is
   shear (`hand.grasp_state`), where both joints show it alike; what frames that drift explain is
   taken off before (`perception.witnesses`), and a wrong torque constant is no load
   (`perception.scales`). A joint's friction hides a load of its torque over W turn, 1.7 N a tip at
-  the default hand. Up to that, what is seen when holding begins, and what changes slower than in a
-  second, is taken as friction. Less than half of it is no sign of a load; a load that is seen is
-  taken for more by what friction may hide. So a grip whose tips' friction bears less than about
-  twice that is not guarded well, at the default hand below 7 N, and below 2.8 N not at all.
-- A solid tip's frames show the shear on its face, to 0.1 N.
+  the default hand; gears with friction of their own load hide more, the firmer the grip is. Up to
+  that, what is seen when holding begins, and what changes slower than in a second, is taken as
+  friction. Less than half of it is no sign of a load; a load that is seen is taken for more by what
+  friction may hide. So a grip whose tips' friction bears less than about twice that is not guarded
+  well, at the default hand below 7 N, and below 2.8 N not at all.
 - A load towards the palm wedges the object between the tips: it shows less, and needs more to slip.
+  Of a sudden one the torques never show more than lever²/4 bow, or 0.07 N·m at 10 N.
 - The object's angle is known twice, from frames and from the joints by rolling. What frames correct
   and no joint explains is shear of the tips up to μ (d1 + d2)/2W, and slip well beyond.
-- An object that slides along its parallel faces without turning changes no d, no θ and no joint:
-  once it slides, nothing shows it until a tip comes to its edge. So the margin is kept before, and
-  ``control.tip_friction`` must not be more than the real friction.
+- An object that slides along its parallel faces without turning changes no d, no θ and no joint. So
+  the margin is kept before, and ``control.tip_friction`` must not be more than the real friction.
 - While the grip is built up or the object turns, currents also move the joints: the last load is
   kept. A load that grows by more than about 10 N a second is too fast for that.
 - One that comes at once makes the joints give way, and their damping shows it before the sensors
   do: where both joints' torques jump by more than they flicker while the encoders say that the
   joints give way, and what stands and comes leaves too little of the friction, it is believed at
   the same tick; so is a twist, of which they show the contrary. A sliding tip shows no more than
-  friction bears, so how much is to come is not known: the grip is raised by all it may, as fast as
-  ``safety.current_rate`` lets it. Of a load
-  towards the palm the torques show less the greater it is, never more than lever²/4 bow, or
-  0.07 N·m at 10 N: a sudden one is hardly seen.
+  friction bears, so the grip is raised by all it may, as fast as ``safety.current_rate`` lets it.
 """
 
 from __future__ import annotations
@@ -85,6 +84,7 @@ class SlipLaw(Record):
     friction: float  # Coulomb, tip on object
     margin: float  # fraction of it that is kept unused
     joint_friction: float  # [N·m]
+    load_friction: float  # fraction of the tip's moment that gears hold until the joint opens
     object_load: float  # [N]
     shear_shows: bool  # in the tips' frames
     raise_max: float  # [N]
@@ -95,6 +95,7 @@ class SlipState(Record):
     """Load, friction and margin of one held object."""
 
     law: SlipLaw
+    friction: float  # of a joint, what gears hold of this tick's force included [N·m]
     load: float  # that each tip may bear along its face, hidden part included [N]
     turned: bool  # the object has turned in the grip, at this tick
     reflex: bool  # it has, or a load came at once: the grip is to be raised at once
@@ -120,6 +121,7 @@ def set_law(law: SlipLaw, settings: Settings) -> None:
     law.force_max = GRIP_FRACTION * settings.safety.force_max
     law.friction, law.margin = control.tip_friction, control.slip_margin
     law.joint_friction = control.joint_friction
+    law.load_friction = control.load_held
     law.object_load = control.object_load
     law.shear_shows = settings.tip.physics == "solid"
     law.raise_max, law.raise_ratio = control.grip_raise_max, control.grip_raise_share
@@ -129,7 +131,7 @@ def set_law(law: SlipLaw, settings: Settings) -> None:
 def forget(s: SlipState) -> None:
     """Forget the object: nothing is held any more, or something else."""
     s.turned = s.known = s.reflex = False
-    s.load = s.felt = s.still = s.age = 0.0
+    s.load = s.felt = s.still = s.age = s.friction = 0.0
     s.smooth[:] = s.variance[:] = s.speed[:] = 0.0
     s.unexplained_rotation[:] = s.away[:] = 0.0
     s.needed = s.force_limit = s.idle = 0.0
@@ -141,8 +143,7 @@ def begin(s: SlipState, grasp: GraspState) -> None:
     s.known = grasp.load_arm > 0.0
     if not s.known:
         return
-    friction = s.law.joint_friction
-    s.still = min(max(mean(s.smooth), -friction), friction)
+    s.still = min(max(mean(s.smooth), -s.friction), s.friction)
     s.unexplained_rotation[:] = grasp.unexplained_rotation
     s.away[:] = 0.0
     s.age = _SMOOTH
@@ -159,6 +160,8 @@ def update(
     """
     law = s.law
     s.turned = False
+    moment = mean(grasp.normal) * mean(grasp.moment_arm)
+    s.friction = law.joint_friction + law.load_friction * moment
     raised = min(law.raise_max, law.raise_ratio * commanded)
     s.force_limit = max(min(commanded + raised, law.force_max), commanded)
     monitored = holding and s.known and grasp.load_arm > 0.0
@@ -171,7 +174,7 @@ def update(
     else:
         s.unexplained_rotation[:] = grasp.unexplained_rotation
     # A grip that bears less than the joints' friction hides is not judged by their torques.
-    seen = s.load if law.friction * commanded * grasp.load_arm > law.joint_friction else 0.0
+    seen = s.load if law.friction * commanded * grasp.load_arm > s.friction else 0.0
     felt = max(abs(grasp.sheared) - grasp.shear * mean(grasp.normal), 0.0)
     if law.shear_shows:  # what torques say beyond that is a force that is not known well
         seen = min(seen, felt + _SHEAR_JUMP)
@@ -205,8 +208,8 @@ def _average(
     read wrongly, and no frame's error, by which one tip alone seems to let go. A twist makes
     joints show the contrary of each other.
     """
-    friction = s.law.joint_friction
-    known = closing * friction
+    friction = s.friction
+    known = closing * (friction if closing < 0.0 else s.law.joint_friction)
     off1 = grasp.torque_residual[0] - known - s.smooth[0]
     off2 = grasp.torque_residual[1] - known - s.smooth[1]
     unsettled = _JUMP_MIN + friction * max(1.0 - s.age / _LEARN, 0.0)  # they may come to rest
@@ -259,16 +262,16 @@ def _estimate_load(s: SlipState, grasp: GraspState) -> None:
     off = _alike(s) - s.still
     load, slope = load_of(off, grasp.load_arm, grasp.load_curvature)
     load = abs(load)
-    friction = law.joint_friction / grasp.load_arm
+    friction = s.friction / grasp.load_arm
     s.age = min(s.age + law.dt, _LEARN)
     if load < friction:
         # So little may as well be friction that gives way; what comes slower stays hidden.
         still = s.still + off * law.dt / s.age
-        s.still = min(max(still, -law.joint_friction), law.joint_friction)
+        s.still = min(max(still, -s.friction), s.friction)
     # Half the friction is no sign yet, and after a motion it may turn round; from all of it on
     # as much may be hidden.
     sure = load - (0.5 + max(1.0 - s.age / _LEARN, 0.0)) * friction
-    undetected = law.joint_friction / max(slope, _ARM_MIN * law.width)
+    undetected = s.friction / max(slope, _ARM_MIN * law.width)
     s.load = min(max(4.0 * sure, 0.0), load + undetected)
 
 
@@ -279,7 +282,7 @@ def _alike(s: SlipState) -> float:
     smaller = 0.0
     if s.smooth[0] * s.smooth[1] > 0.0:
         smaller = min(abs(s.smooth[0]), abs(s.smooth[1]))
-    force_limit = smaller / _BOTH + s.law.joint_friction
+    force_limit = smaller / _BOTH + s.friction
     return min(max(both, -force_limit), force_limit)
 
 

@@ -22,6 +22,7 @@ _GOAL_OFFSET = (
 _ARRIVED = 0.03  # rad from the goal
 _GRACE = 1.0  # s after the ramp's end in which a joint that friction holds may still arrive
 _SETTLED_FORCE = 0.03  # share of the force target
+_HELD_OVER = 0.12  # likewise: more than that gears don't hold of what came too much
 _SETTLED_ANGLE = 0.5 * math.pi / 180.0
 _SETTLED_FOR = 0.2  # s
 _FOLLOWED = 0.25  # share of a stream's force, within which a grip follows it
@@ -328,7 +329,8 @@ class Control:
     def _approach_current(self) -> float:
         """A tip that meets the object before it is felt shall not press beyond the force wanted."""
         law = self._settings.control
-        pressed = 0.5 * self._force * self._settings.hand.finger_length + law.joint_friction
+        pressed = 0.5 * self._force * self._settings.hand.finger_length * law.driving
+        pressed += law.joint_friction
         return min(law.approach_current, pressed / law.torque_constant)
 
     def _hold(self, dt: float, goal: Goal) -> None:
@@ -427,7 +429,9 @@ class Control:
             if self._streamed and self.mode is Mode.GRASPING:  # it may never rest
                 wanted = grip.force.value
                 settled = abs(wanted - grip.target) < _FOLLOWED * grip.target
-            settled = settled and abs(self._felt() - wanted) < _SETTLED_FORCE * grip.target
+            most = _SETTLED_FORCE + min(self._settings.control.load_held, _HELD_OVER)
+            off = self._felt() - wanted
+            settled = settled and -_SETTLED_FORCE * grip.target < off < most * grip.target
             settled = settled and not grip.shaking
         self._waiting = self._waiting + dt if settled else 0.0
         if self._waiting <= _SETTLED_FOR:

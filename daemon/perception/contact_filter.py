@@ -81,7 +81,7 @@ class ContactFilter:
         state.response = settings.tactile.response
         state.relaxation[:] = settings.tip.relaxation
         state.relaxation_time[:] = settings.tip.relaxation_times
-        state.torque_constant = settings.control.torque_constant
+        state.torque_constant = settings.control.torque_constant / settings.control.driving
         state.taper = state.assumed_taper = settings.object.taper
         state.alone = len(self._fingers) == 1
         state.gain_known = settings.estimator.free_gain is False
@@ -92,7 +92,13 @@ class ContactFilter:
             state.tip[finger].law[:] = np.hypot(law, table.max_error)
             state.tip[finger].firmness = 1.0 + sum(settings.tip.relaxation)
         control = settings.control
-        set_prior(state.grasp.scales, priors, control.joint_friction, control.joint_inertia)
+        set_prior(
+            state.grasp.scales,
+            priors,
+            control.joint_friction,
+            control.joint_inertia,
+            control.load_held,
+        )
         self._priors = priors
         self._history: Any = np.zeros(
             round(kernels.HISTORY * settings.loop.rate) + 2, dtype=Past.dtype

@@ -156,7 +156,7 @@ class FilterState(Record):
     response: float  # of the cells [s]
     relaxation: Annotated[FloatArray, 3]  # of the tips: `tip.relaxation`, and …
     relaxation_time: Annotated[FloatArray, 3]  # … its times [s]
-    torque_constant: float  # [N·m/A]
+    torque_constant: float  # of what arrives at the tip of a joint that closes [N·m/A]
     assumed_taper: float  # `object.taper` [rad]
     alone: bool  # one finger
     gain_known: bool  # by the settings, where frames don't tell it

@@ -13,8 +13,9 @@ Frames that were fitted with a fixed gain, as of a solid tip, show F e^γ: there
 tells A, and what tells F tells γ. One frame can't tell ε from γ. A Kalman filter holds (ε, γ, κ, o)
 of both fingers, with priors: a modulus is known to some 20 % before it was calibrated, a sensor's
 gain changes by 5-32 % when it is mounted again (DTIC ADP011007), a torque constant is good to 10 %.
-Torques are taken in only while a grip's force ramps: a wrong scale grows with the force, a load
-along the faces doesn't. The height is taken in with each frame; what changes of it in a lasting
+Torques, as they arrive through gears that close, are taken in only while a grip's force ramps: a
+wrong scale grows with it, a load along the faces doesn't. Of those that have fallen again gears may
+hold the rest. The height is taken in with each frame; what changes of it in a lasting
 grip is the sensor's, for a modulus doesn't jump. What was found stays for later grips; `softfinger
 calibrate scales` keeps it.
 """
@@ -74,6 +75,8 @@ class Scales(Record):
     prior: Annotated[FloatArray, STATES]  # … its variances
     friction: float  # of a joint that moves [N·m]
     inertia: float  # of a joint [kg·m²]
+    held: float  # fraction of the tips' moment that gears hold while the torque goes back
+    most: float  # greatest torque of the grip, of both joints' mean [N·m]
     speed: float  # of the joints' closing when torques were taken in last [rad/s]
     t: float  # and when that was [s]
     modulus: Pair  # e^ε: force over the table's
@@ -86,10 +89,17 @@ class Scales(Record):
 
 
 def set_prior(
-    scales: Scales, fingers: tuple[Prior, Prior], friction: float, inertia: float
+    scales: Scales,
+    fingers: tuple[Prior, Prior],
+    friction: float,
+    inertia: float,
+    held: float,
 ) -> None:
-    """Begin with what is known of each finger; joints have ``friction`` [N·m], ``inertia``."""
-    scales.friction, scales.inertia = friction, inertia
+    """Begin with what is known of each finger; joints have ``friction`` [N·m], ``inertia``.
+
+    Of the tips' moment gears hold the fraction ``held`` while the torque goes back.
+    """
+    scales.friction, scales.inertia, scales.held = friction, inertia, held
     for k, prior in enumerate(fingers):
         scales.expected[MODULUS + k] = math.log(prior.modulus[0])
         scales.expected[GAIN + k] = math.log(prior.gain[0])
@@ -112,7 +122,7 @@ def begin_grip(s: Scales) -> None:
             else:
                 s.covariance[i, j] *= 1.0 - _FORGET
         s.covariance[i, i] += s.prior[i] * (1.0 if i >= OFFSET else _FORGET)
-    s.mean[OFFSET] = s.mean[OFFSET + 1] = 0.0
+    s.mean[OFFSET] = s.mean[OFFSET + 1] = s.most = 0.0
 
 
 @inner_kernel
@@ -207,7 +217,11 @@ def update_torque(s: Scales, torque: Pair, moment: Pair, speed: float, t: float)
     noise = _TORQUE_NOISE
     if abs(speed) > _MOVING:
         noise = _MOVING_NOISE
-    _update(s, innovation, noise * noise, _GATE)
+    # Where torques have gone back, the gears hold something between nothing and all of it.
+    given = 0.5 * (torque[0] + torque[1])
+    s.most = max(s.most, given)
+    held = min(s.most - given, s.held * 0.5 * (moment[0] + moment[1]))
+    _update(s, innovation, noise * noise + held * held, _GATE)
 
 
 @inner_kernel

@@ -34,6 +34,7 @@ Counts = Annotated[int, Field(ge=-1_048_575, le=1_048_575)]
 Modulus = Annotated[float, Field(ge=1, le=1e10, allow_inf_nan=False)]  # Pa
 Fraction = Annotated[float, Field(ge=0, le=1)]
 Ratio = Annotated[float, Field(ge=0.1, le=10)]
+GearLoss = Annotated[float, Field(ge=0, le=0.5)]
 Finger = Literal["left", "right"]
 Index = Annotated[int, Field(ge=0, le=255)]
 Cells = tuple[tuple[Index, Index], ...]
@@ -283,6 +284,7 @@ class ControlSettings(Section):
     joint_inertia: Factor = 0.010  # kg·m², finger and rotor: what is damped
     damping_ratio: NonNegative = 0.7  # of that inertia on the tips' and the joints' stiffness
     joint_friction: NonNegative = 0.05  # N·m of Coulomb friction, given where motion is wanted
+    joint_load_friction: GearLoss = 0.0  # share of the gears' torque: MX-64 0.23, XL330 0.3
     friction_speed: Positive = 0.02  # rad/s wanted from which on all of it is given
     tip_friction: Positive = 0.6  # Coulomb, tip on object, that is counted on
     slip_margin: Fraction = 0.2  # share of that friction which is kept unused
@@ -290,6 +292,19 @@ class ControlSettings(Section):
     grip_raise_max: NonNegative = 10.0  # N that the grip may be raised to keep the margin …
     grip_raise_share: NonNegative = 1.0  # … and of the force asked for; the smaller one binds
     envelope: str = ""  # what the hand holds, by `softfinger envelope --keep`; "": the built-in's
+
+    @property
+    def driving(self) -> float:
+        """Return a motor's torque over the tip's where the joint closes, (1 + μ)/(1 − μ).
+
+        Gears bear both torques, and a share μ of each is friction. Where it opens, the inverse.
+        """
+        return (1.0 + self.joint_load_friction) / (1.0 - self.joint_load_friction)
+
+    @property
+    def load_held(self) -> float:
+        """Return the fraction of a tip's moment that gears hold until the joint opens."""
+        return 1.0 - self.driving**-2
 
 
 class SafetySettings(Section):

@@ -227,7 +227,7 @@ def test_a_warning_at_its_limit_does_not_flicker() -> None:
 
 def test_each_witness_that_is_doubted_is_named() -> None:
     grasp = GraspState()
-    set_prior(grasp.scales, (UNKNOWN, UNKNOWN), 0.05, 0.01)
+    set_prior(grasp.scales, (UNKNOWN, UNKNOWN), 0.05, 0.01, 0.0)
     judge, state = safety(grasp=grasp), sound()
     judged(judge, state, 0.5)
     assert judge.warnings == []

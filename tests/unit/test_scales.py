@@ -11,11 +11,20 @@ from softfinger.daemon.perception import scales
 from softfinger.daemon.perception.scales import UNKNOWN, Prior, Scales, set_prior
 from softfinger.kinematics.compiled.kernel import kernel
 from softfinger.kinematics.compiled.layout import Pair, Records
-from softfinger.tools.benchmarks.rigs import SOLID, merged
+from softfinger.tools.benchmarks.rigs import SOLID, Sections, merged
 from softfinger.tools.watched import Watched as Hand
 from tests.unit.test_control import grasped
 
 PRIORS = UNKNOWN, Prior(modulus=(1.3, 0.05))
+HELD = 0.3  # of the tips' moment, by gears
+
+# As identified (model M4 of Rhoban's BAM, arXiv 2410.08650): base, Stribeck's, load's, its speed.
+SERVOS: dict[str, tuple[float, float, tuple[float, float], float, float]] = {
+    "XL330": (0.002, 0.0004, (0.25, 0.05), 0.12, 0.018),
+    "MX-64": (0.062, 0.024, (0.0, 0.23), 1.5, 0.015),
+    "MX-106": (0.0, 0.105, (0.009, 0.222), 1.62, 0.051),
+}
+FRICTION = ("friction", "stribeck", "load_friction", "stribeck_speed", "damping")
 
 
 @kernel
@@ -48,13 +57,14 @@ class Reference:
         self.prior = np.array([0.2**2, 0.05**2, *[0.25**2] * 2, *[0.1**2] * 2, offset, offset])
         self.x = np.array([0.0, np.log(1.3), 0, 0, 0, 0, 0, 0])
         self.p = np.diag(self.prior)
+        self.most = 0.0  # torque [N·m]
 
     def begin(self) -> None:
         kept, forgotten = self.p * 0.9, np.diag(self.prior) * 0.1
         self.p = kept + forgotten
         self.p[6:, :] = self.p[:, 6:] = 0.0
         self.p[6:, 6:] = np.diag(self.prior[6:])
-        self.x[6:] = 0.0
+        self.x[6:] = self.most = 0.0
 
     def take(self, h: np.ndarray[Any, Any], miss: float, r: float, gate: float = 3.0) -> None:
         s = h @ self.p @ h
@@ -68,7 +78,7 @@ class Reference:
 def test_the_filter_is_kalmans(product: bool) -> None:
     rng = np.random.default_rng(3)
     found, wanted = Scales(), Reference()
-    set_prior(found, PRIORS, friction=0.05, inertia=0.01)
+    set_prior(found, PRIORS, friction=0.05, inertia=0.01, held=HELD)
     found.product[:] = float(product)
     begin(found.array)
     wanted.begin()
@@ -94,7 +104,10 @@ def test_the_filter_is_kalmans(product: bool) -> None:
         h = np.concatenate([*by_force, 0.5 * moment, [0.5, 0.5]])
         miss = (0.5 * torque - scaled - 0.5 * wanted.x[6:]).sum()
         miss -= 0.05 * speed / 0.05 + 0.01 * (speed - before) / 0.01
-        wanted.take(h, miss, 0.02**2)
+        given = torque.mean()
+        wanted.most = max(wanted.most, given)
+        held = min(wanted.most - given, HELD * moment.mean())
+        wanted.take(h, miss, 0.02**2 + held**2)
         forces = rng.uniform(3.0, 9.0, 2)
         balance(found.array, *forces.tolist())
         h = np.array([0, 0, -1.0, 1.0, 0, 0, 0, 0] if product else [1.0, -1.0, 0, 0, 0, 0, 0, 0])
@@ -118,7 +131,7 @@ def test_no_measurement_however_wild_leaves_it_surer_than_numbers_can_be() -> No
 
     for _ in range(300):
         found = Scales()
-        set_prior(found, PRIORS, friction=0.05, inertia=0.01)
+        set_prior(found, PRIORS, friction=0.05, inertia=0.01, held=HELD)
         found.product[:] = rng.integers(0, 2, 2)
         begin(found.array)
         for k in range(60):
@@ -157,6 +170,39 @@ def test_a_wrong_scale_is_told_from_the_tips_stiffness(case: str, force: float) 
         off = contact.force - hand.plant.force[0]
         assert abs(off) < 2.5 * contact.force_std < 0.4 * force
         assert not [event for event in hand.events if event[1] == "slip"]
+
+
+def with_friction(servo: str, tips: Sections) -> Hand:
+    own = {f"joint_{name}": value for name, value in zip(FRICTION, SERVOS[servo], strict=True)}
+    known = {"joint_load_friction": 0.23, "joint_friction": 0.06}
+    return Hand(merged({"simulation": own, "control": known}, tips))
+
+
+@pytest.mark.parametrize("servo", SERVOS)
+@pytest.mark.parametrize("tips", [{}, SOLID], ids=["springs", "solid"])
+@pytest.mark.parametrize("force", [6.0, 12.0])
+def test_friction_that_grows_with_the_load_is_neither_force_nor_load(
+    servo: str, tips: Sections, force: float
+) -> None:
+    with with_friction(servo, tips) as hand:
+        grasped(hand, force)
+        hand.watch(2.0)
+        assert hand.plant.normal.mean() == pytest.approx(force, rel=0.2)
+        assert not [event for event in hand.events if event[1].startswith(("slip", "witness"))]
+
+
+@pytest.mark.parametrize("servo", SERVOS)
+def test_gears_that_hold_are_driven_back_for_a_weaker_grip_and_a_turn(servo: str) -> None:
+    with with_friction(servo, {}) as hand:
+        grasped(hand, 12.0)
+        hand.command("grasp", force=6.0)
+        hand.watch(1.0)
+        assert hand.plant.normal.mean() == pytest.approx(6.0, rel=0.2)
+        hand.command("rotate", angle=0.15)
+        hand.watch(2.0)
+        assert hand.state.mode == "holding"
+        assert hand.plant.object_pose[2] == pytest.approx(0.15, abs=0.01)
+        assert not [event for event in hand.events if event[1].startswith(("slip", "witness"))]
 
 
 @pytest.mark.parametrize("gain", [0.7, 1.0, 1.3])
