@@ -140,14 +140,6 @@ class Timing:
     busy_s: float = 0.0  # that this machine has just kept the loop from a tick, or 0
 
 
-def _contacts() -> list[Contact]:
-    return [Contact(), Contact()]
-
-
-def _warmth() -> list[Warmth]:
-    return [Warmth(), Warmth()]
-
-
 @dataclass(slots=True)
 class State:
     """All of the above for one tick: what is published."""
@@ -164,10 +156,10 @@ class State:
     read_error: str = ""  # of the servos' bus at this tick
     write_error: str = ""
     reading: Reading = field(default_factory=Reading)
-    contacts: list[Contact] = field(default_factory=_contacts)
+    contacts: list[Contact] = field(default_factory=lambda: [Contact(), Contact()])
     object: ObjectPose = field(default_factory=ObjectPose)
     goal: Goal = field(default_factory=Goal)
-    heat: list[Warmth] = field(default_factory=_warmth)
+    heat: list[Warmth] = field(default_factory=lambda: [Warmth(), Warmth()])
     timing: Timing = field(default_factory=Timing)
 
 

@@ -77,11 +77,11 @@ class Loop:
         self._task = Task.named(settings)
         self._safety = Safety(settings, servos is not None, bool(sensors), grasp, sensors)
         self._heat = HeatWatch(settings, self.state)
-        self._torque = TorqueState(
+        self.torque = TorqueState(
             servos, settings.servos, self.state, self._safety, self._fail, self.emit
         )
         self._requests = Requests(
-            settings, self.state, self._control, self._safety, self._torque, perception, self.emit
+            settings, self.state, self._control, self._safety, self.torque, perception, self.emit
         )
         self._after_opening: Breach | None = None  # a fault for when the hand is open
         self.statistics = Statistics()
@@ -95,15 +95,6 @@ class Loop:
         self._stopping = False
         self._began = -math.inf  # the present tick, in the machine's time
         self._commanded = False  # a command was carried out at this tick, which may take long
-
-    @property
-    def servos(self) -> Servos | None:
-        """The servo backend, None in a scene without."""
-        return self._torque.servos
-
-    @servos.setter
-    def servos(self, servos: Servos | None) -> None:
-        self._torque.servos = servos
 
     # From outside the tick, a signal handler included
 
@@ -137,7 +128,7 @@ class Loop:
             self.advance(duration)
         finally:
             self._control.torque = False
-            self._torque.end()
+            self.torque.end()
             if self.state.torque:
                 self.emit("error", "end", "ended, torque MAY STILL BE ON")
             else:
@@ -194,7 +185,7 @@ class Loop:
         self.perception.update(state)
         self._decide()
         decided = clock.host()
-        self._torque.write(self._control.torque, now)
+        self.torque.write(self._control.torque, now)
         written = clock.host()
         if self._publishing is not None:
             self._publishing(state)
@@ -216,7 +207,7 @@ class Loop:
         state, reading = self.state, self.state.reading
         state.read_error = state.write_error = ""
         try:
-            self._torque.read(reading)
+            self.torque.read(reading)
         except ServoError as error:
             reading.valid = False
             state.read_error = str(error)

@@ -150,6 +150,7 @@ def _touches(contact: Contact) -> bool:
 # From the share of the bound to judge by to what is wrong, or an empty text. A check changes
 # nothing; NaN is past any bound.
 Check = Callable[[View, State, float], str]
+FingerCheck = Callable[[View, State, float, int], str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,6 +174,18 @@ class Limit:
     def __call__(self, check: Check) -> Check:
         """Enter the row with its check. Several rows may decorate one, the lowest comes first."""
         LIMITS.append(replace(self, check=check))
+        return check
+
+    def each(self, check: FingerCheck) -> FingerCheck:
+        """Enter the row with a check of one finger, of which the first that is wrong is told."""
+
+        def judge(view: View, state: State, fraction: float) -> str:
+            for i in view.fingers:
+                if found := check(view, state, fraction, i):
+                    return found
+            return ""
+
+        self(judge)
         return check
 
 
@@ -222,36 +235,29 @@ def _servos_alert(view: View, state: State, _: float) -> str:
 
 
 @Limit("servos.heat", "time until a servo is at its limit of temperature, by its thermal model",
-    "warn", ("safety.heat_warn", "safety.heat_action"), "servos", in_turn=True)  # fmt: skip
-def _servos_warm(view: View, state: State, fraction: float) -> str:
-    for i in view.fingers:
-        left = state.heat[i].time_to_limit
-        if not left >= view.limits.heat_warn / fraction:
-            return f"{FINGERS[i]} servo at {view.limits.temperature_max:g} °C in {left:.0f} s"
-    return ""
+    "warn", ("safety.heat_warn", "safety.heat_action"), "servos", in_turn=True).each  # fmt: skip
+def _servos_warm(view: View, state: State, fraction: float, i: int) -> str:
+    left = state.heat[i].time_to_limit
+    if left >= view.limits.heat_warn / fraction:
+        return ""
+    return f"{FINGERS[i]} servo at {view.limits.temperature_max:g} °C in {left:.0f} s"
 
 
 @Limit("servos.temperature", "temperature of a servo", "fault", ("safety.temperature_max",),
-    "servos", in_turn=True)  # fmt: skip
-def _servos_hot(view: View, state: State, fraction: float) -> str:
-    for i in view.fingers:
-        temperature = state.reading.temperature[i]
-        if not temperature < fraction * view.limits.temperature_max:
-            return f"{FINGERS[i]} servo at {temperature:.0f} °C"
-    return ""
+    "servos", in_turn=True).each  # fmt: skip
+def _servos_hot(view: View, state: State, fraction: float, i: int) -> str:
+    temperature = state.reading.temperature[i]
+    well = temperature < fraction * view.limits.temperature_max
+    return "" if well else f"{FINGERS[i]} servo at {temperature:.0f} °C"
 
 
 @Limit("servos.voltage", "supply of a servo", "fault", ("safety.voltage_min", "safety.voltage_max"),
-    "servos", in_turn=True, lasts=0.1)  # fmt: skip
-def _servos_voltage(view: View, state: State, _: float) -> str:
-    low, high = view.voltage
-    for i in view.fingers:
-        voltage = state.reading.voltage[i]
-        if voltage and not low <= voltage <= high:
-            return (
-                f"{FINGERS[i]} servo's supply at {voltage:.1f} V, outside {low:.1f} to {high:.1f} V"
-            )
-    return ""
+    "servos", in_turn=True, lasts=0.1).each  # fmt: skip
+def _servos_voltage(view: View, state: State, _: float, i: int) -> str:
+    (low, high), voltage = view.voltage, state.reading.voltage[i]
+    if not voltage or low <= voltage <= high:
+        return ""
+    return f"{FINGERS[i]} servo's supply at {voltage:.1f} V, outside {low:.1f} to {high:.1f} V"
 
 
 # --- joints ---------------------------------------------------------------------------------------
@@ -260,24 +266,17 @@ _PAST_STOP = 0.1  # rad beyond a joint limit that a push may take a joint
 
 
 @Limit("joint.angle", "joint angle, 0.1 rad past its limits", "fault", ("hand.q_min", "hand.q_max"),
-    "servos")  # fmt: skip
-def _joint_angle(view: View, state: State, _: float) -> str:
-    hand = view.settings.hand
-    for i in view.fingers:
-        q = state.reading.q[i]
-        if not hand.q_min[i] - _PAST_STOP <= q <= hand.q_max[i] + _PAST_STOP:
-            return f"{FINGERS[i]} joint at {q:.3f} rad, outside its limits"
-    return ""
+    "servos").each  # fmt: skip
+def _joint_angle(view: View, state: State, _: float, i: int) -> str:
+    hand, q = view.settings.hand, state.reading.q[i]
+    inside = hand.q_min[i] - _PAST_STOP <= q <= hand.q_max[i] + _PAST_STOP
+    return "" if inside else f"{FINGERS[i]} joint at {q:.3f} rad, outside its limits"
 
 
-@Limit("joint.velocity", "joint velocity", "fault", ("safety.velocity_max",), "servos")
-def _joint_velocity(view: View, state: State, _: float) -> str:
-    bound = view.limits.velocity_max
-    for i in view.fingers:
-        dq = state.reading.dq[i]
-        if not -bound <= dq <= bound:
-            return f"{FINGERS[i]} joint at {dq:.2f} rad/s, too fast"
-    return ""
+@Limit("joint.velocity", "joint velocity", "fault", ("safety.velocity_max",), "servos").each
+def _joint_velocity(view: View, state: State, _: float, i: int) -> str:
+    bound, dq = view.limits.velocity_max, state.reading.dq[i]
+    return "" if -bound <= dq <= bound else f"{FINGERS[i]} joint at {dq:.2f} rad/s, too fast"
 
 
 @Limit("joint.jump",
@@ -298,8 +297,8 @@ _PULLED = 0.25  # of what is expected
 
 
 @Limit("joint.dead", "joint that stands 0.05 rad off its goal without current for 0.05 s", "fault",
-    needs="servos", in_turn=True, lasts=0.05)  # fmt: skip
-def _joint_dead(view: View, state: State, _: float) -> str:
+    needs="servos", in_turn=True, lasts=0.05).each  # fmt: skip
+def _joint_dead(view: View, state: State, _: float, i: int) -> str:
     """Off its goal it stands, and no current pulls it there. A joint that is held back takes some.
 
     In position mode nothing is known of the current that it should take.
@@ -307,29 +306,25 @@ def _joint_dead(view: View, state: State, _: float) -> str:
     goal, reading = state.goal, state.reading
     if not (state.torque and goal.valid) or view.settings.servos.mode == "position":
         return ""
-    for i in view.fingers:
-        error = goal.q[i] - reading.q[i]
-        if abs(error) < _OFF or abs(reading.dq[i]) > _SLOW:
-            continue
-        expected = min(goal.current[i], view.pull * abs(error))
-        toward = math.copysign(1.0, error) * reading.current[i]
-        if expected > _FELT and toward < _PULLED * expected:
-            return (
-                f"{FINGERS[i]} joint stands {math.degrees(abs(error)):.1f}° off its goal and "
-                f"takes {toward:.2f} A of {goal.current[i]:.2f} A to get there: encoder, "
-                "current sensor or motor"
-            )
-    return ""
+    error = goal.q[i] - reading.q[i]
+    if abs(error) < _OFF or abs(reading.dq[i]) > _SLOW:
+        return ""
+    expected = min(goal.current[i], view.pull * abs(error))
+    toward = math.copysign(1.0, error) * reading.current[i]
+    if not (expected > _FELT and toward < _PULLED * expected):
+        return ""
+    return (
+        f"{FINGERS[i]} joint stands {math.degrees(abs(error)):.1f}° off its goal and takes "
+        f"{toward:.2f} A of {goal.current[i]:.2f} A to get there: encoder, current sensor or motor"
+    )
 
 
-@Limit("joint.current", "measured current", "fault", ("safety.current_fault",), "servos", lasts=0.1)
-def _joint_current(view: View, state: State, _: float) -> str:
-    bound = view.limits.current_fault
-    for i in view.fingers:
-        current = state.reading.current[i]
-        if not -bound <= current <= bound:
-            return f"{FINGERS[i]} joint takes {current:.2f} A, above {bound:g} A"
-    return ""
+@Limit("joint.current", "measured current", "fault", ("safety.current_fault",), "servos",
+    lasts=0.1).each  # fmt: skip
+def _joint_current(view: View, state: State, _: float, i: int) -> str:
+    bound, current = view.limits.current_fault, state.reading.current[i]
+    well = -bound <= current <= bound
+    return "" if well else f"{FINGERS[i]} joint takes {current:.2f} A, above {bound:g} A"
 
 
 _FULL_CURRENT = 0.9  # of a goal's bound: a joint that takes more has no reserve
@@ -337,40 +332,32 @@ _FULL_CURRENT = 0.9  # of a goal's bound: a joint that takes more has no reserve
 
 @Limit("joint.stall", "current at its bound, off the goal, and standing", "fault",
     ("safety.stall_error", "safety.stall_time"), "servos", in_turn=True,
-    lasts="stall_time")  # fmt: skip
-def _joint_stall(view: View, state: State, _: float) -> str:
+    lasts="stall_time").each  # fmt: skip
+def _joint_stall(view: View, state: State, _: float, i: int) -> str:
     if not state.torque or not state.goal.valid or state.mode in GRIPPING:
         return ""
     reading, goal = state.reading, state.goal
     by_current = view.settings.servos.mode != "position"
-    for i in view.fingers:
-        error = goal.q[i] - reading.q[i]
-        bound = goal.current[i] if by_current else view.limits.current_max
-        if (
-            abs(error) > view.limits.stall_error
-            and abs(reading.current[i]) >= _FULL_CURRENT * bound
-            and abs(reading.dq[i]) < _SLOW
-        ):
-            return (
-                f"{FINGERS[i]} joint has stalled, {math.degrees(abs(error)):.1f}° off its goal "
-                f"at {abs(reading.current[i]):.2f} A"
-            )
-    return ""
+    error, current = abs(goal.q[i] - reading.q[i]), abs(reading.current[i])
+    full = _FULL_CURRENT * (goal.current[i] if by_current else view.limits.current_max)
+    stands = current >= full and abs(reading.dq[i]) < _SLOW
+    if not (stands and error > view.limits.stall_error):
+        return ""
+    off = f"{math.degrees(error):.1f}° off its goal"
+    return f"{FINGERS[i]} joint has stalled, {off} at {current:.2f} A"
 
 
 _ALL = 0.95  # of the greatest current there may be: a grip that takes more can't be firmer
 
 
 @Limit("joint.strained", "grip that takes all the current there may be", "warn",
-    ("safety.current_max",), "servos", in_turn=True, lasts=1.0)  # fmt: skip
-def _joint_strained(view: View, state: State, fraction: float) -> str:
-    if not state.torque or state.mode not in GRIPPING:
-        return ""
+    ("safety.current_max",), "servos", in_turn=True, lasts=1.0).each  # fmt: skip
+def _joint_strained(view: View, state: State, fraction: float, i: int) -> str:
     limit = view.limits.current_max
-    for i in view.fingers:
-        if not abs(state.reading.current[i]) < _ALL * fraction * limit:
-            return f"{FINGERS[i]} joint grips with all of its {limit:g} A"
-    return ""
+    well = abs(state.reading.current[i]) < _ALL * fraction * limit
+    if not state.torque or state.mode not in GRIPPING or well:
+        return ""
+    return f"{FINGERS[i]} joint grips with all of its {limit:g} A"
 
 
 LIMITS.append(Limit("torque.off", "torque off not confirmed within half the watchdog's time: the "
@@ -407,60 +394,51 @@ LIMITS += [
 # --- tips -----------------------------------------------------------------------------------------
 
 
-@Limit("tip.force", "normal force of a tip", "fault", ("safety.force_max",), "sensors")
-@Limit(
-    "tip.force", "normal force of a tip", "warn", ("safety.force_max",), "sensors", fraction=_NEAR
-)
-def _tip_force(view: View, state: State, fraction: float) -> str:
-    bound = fraction * view.limits.force_max
-    for i in view.fingers:
-        contact = state.contacts[i]
-        if _touches(contact) and not contact.force <= bound:
-            return f"{FINGERS[i]} tip at {contact.force:.1f} N, above {bound:g} N"
-    return ""
+@Limit("tip.force", "normal force of a tip", "fault", ("safety.force_max",), "sensors").each
+@Limit("tip.force", "normal force of a tip", "warn", ("safety.force_max",), "sensors",
+    fraction=_NEAR).each  # fmt: skip
+def _tip_force(view: View, state: State, fraction: float, i: int) -> str:
+    bound, contact = fraction * view.limits.force_max, state.contacts[i]
+    if not _touches(contact) or contact.force <= bound:
+        return ""
+    return f"{FINGERS[i]} tip at {contact.force:.1f} N, above {bound:g} N"
 
 
-@Limit("tip.displacement", "displacement of a tip", "fault", ("safety.d_max",), "sensors")
+@Limit("tip.displacement", "displacement of a tip", "fault", ("safety.d_max",), "sensors").each
 @Limit("tip.displacement", "displacement of a tip", "warn", ("safety.d_max",), "sensors",
-    fraction=_NEAR)  # fmt: skip
-def _tip_displacement(view: View, state: State, fraction: float) -> str:
-    bound = fraction * view.limits.d_max
-    for i in view.fingers:
-        contact = state.contacts[i]
-        if _touches(contact) and not contact.d <= bound:
-            return f"{FINGERS[i]} tip at {contact.d * 1e3:.2f} mm, above {bound * 1e3:g} mm"
-    return ""
+    fraction=_NEAR).each  # fmt: skip
+def _tip_displacement(view: View, state: State, fraction: float, i: int) -> str:
+    bound, contact = fraction * view.limits.d_max, state.contacts[i]
+    if not _touches(contact) or contact.d <= bound:
+        return ""
+    return f"{FINGERS[i]} tip at {contact.d * 1e3:.2f} mm, above {bound * 1e3:g} mm"
 
 
 _TILT = "|θ| against asin(1 − d/a) less a margin"
 
 
-@Limit("tip.tilt", _TILT, "fault", ("safety.theta_margin",), "sensors")
-@Limit("tip.tilt", _TILT, "warn", ("safety.theta_margin",), "sensors", fraction=_NEAR)
-def _tip_tilt(view: View, state: State, fraction: float) -> str:
+@Limit("tip.tilt", _TILT, "fault", ("safety.theta_margin",), "sensors").each
+@Limit("tip.tilt", _TILT, "warn", ("safety.theta_margin",), "sensors", fraction=_NEAR).each
+def _tip_tilt(view: View, state: State, fraction: float, i: int) -> str:
     """|θ| ≤ fraction·(asin(1 − d/a) − margin).
 
     At asin(1 − d/a) the object's plane reaches the rim of the tip's backing plate. Checked with
     sin, which is defined for every finite angle.
     """
     radius, margin = view.settings.tip.radius, view.limits.theta_margin
-    for i in view.fingers:
-        contact = state.contacts[i]
-        if not _touches(contact):
-            continue
-        tilt = abs(contact.theta) / fraction + margin
-        if contact.inside and tilt <= 1.57 and math.sin(tilt) <= 1.0 - contact.d / radius:
-            continue
-        if not contact.inside and view.settings.tip.physics != "springs":
-            tilt = math.degrees(math.hypot(contact.theta, contact.tilt_y))
-            deep = f"{FINGERS[i]} tip {contact.d * 1e3:.2f} mm deep at {tilt:.1f}°"
-            return f"{deep}: its law ends before"
-        limit = fraction * (math.asin(min(max(1.0 - contact.d / radius, 0.0), 1.0)) - margin)
-        return (
-            f"{FINGERS[i]} tip at {math.degrees(contact.theta):.1f}°, "
-            f"past {math.degrees(limit):.1f}° at this depth"
-        )
-    return ""
+    contact = state.contacts[i]
+    if not _touches(contact):
+        return ""
+    tilt = abs(contact.theta) / fraction + margin
+    if contact.inside and tilt <= 1.57 and math.sin(tilt) <= 1.0 - contact.d / radius:
+        return ""
+    if not contact.inside and view.settings.tip.physics != "springs":
+        tilt = math.degrees(math.hypot(contact.theta, contact.tilt_y))
+        deep = f"{FINGERS[i]} tip {contact.d * 1e3:.2f} mm deep at {tilt:.1f}°"
+        return f"{deep}: its law ends before"
+    limit = fraction * (math.asin(min(max(1.0 - contact.d / radius, 0.0), 1.0)) - margin)
+    tilt = math.degrees(contact.theta)
+    return f"{FINGERS[i]} tip at {tilt:.1f}°, past {math.degrees(limit):.1f}° at this depth"
 
 
 # --- sensors --------------------------------------------------------------------------------------
@@ -470,17 +448,15 @@ LIMITS.append(Limit("tactile.late", "age of the last sound frame: nothing is mov
 
 
 @Limit("tactile.silent", "age of the last sound frame", "fault",
-    ("safety.frame_age_fault", "safety.frame_age_action"), "sensors", gripping=True)  # fmt: skip
-def _tactile_silent(view: View, state: State, _: float) -> str:
-    bound = view.limits.frame_age_fault / view.settings.tactile.rate
-    for i in view.fingers:
-        contact = state.contacts[i]
-        age = state.t - contact.t_valid
-        if not age <= bound:
-            what = "frame" if contact.t_arrival == contact.t_valid else "sound estimate"
-            doubt = _doubt(view, i)
-            return doubt or f"tactile: no {what} of the {FINGERS[i]} sensor for {age:.3f} s"
-    return ""
+    ("safety.frame_age_fault", "safety.frame_age_action"), "sensors",
+    gripping=True).each  # fmt: skip
+def _tactile_silent(view: View, state: State, _: float, i: int) -> str:
+    contact = state.contacts[i]
+    age = state.t - contact.t_valid
+    if age <= view.limits.frame_age_fault / view.settings.tactile.rate:
+        return ""
+    what = "frame" if contact.t_arrival == contact.t_valid else "sound estimate"
+    return _doubt(view, i) or f"tactile: no {what} of the {FINGERS[i]} sensor for {age:.3f} s"
 
 
 def _doubt(view: View, finger: int) -> str:
@@ -583,15 +559,14 @@ def _tactile_saturated(view: View, _: State, fraction: float) -> str:
 
 
 @Limit("tactile.misfit", "frames that fit no contact of the model", "warn", ("tactile.noise",),
-    "sensors", in_turn=True, lasts=0.5)  # fmt: skip
-def _tactile_misfit(view: View, state: State, _: float) -> str:
-    for i in view.fingers:
-        if state.contacts[i].misfit:
-            return (
-                f"tactile: what the {FINGERS[i]} tip feels fits no contact of the model; d and "
-                "theta may be biased (another material, unequal cells, more noise than set)"
-            )
-    return ""
+    "sensors", in_turn=True, lasts=0.5).each  # fmt: skip
+def _tactile_misfit(_: View, state: State, __: float, i: int) -> str:
+    if not state.contacts[i].misfit:
+        return ""
+    return (
+        f"tactile: what the {FINGERS[i]} tip feels fits no contact of the model; d and theta may "
+        "be biased (another material, unequal cells, more noise than set)"
+    )
 
 
 # --- the hand and its grip ------------------------------------------------------------------------

@@ -380,8 +380,8 @@ class Soak:
         self.daemon = Daemon(self.settings, wire=False, on_event=self._hear)
         loop, clock = self.daemon.loop, self.daemon.clock
         self.must = Judge(self.account.judged, self.account.broken if listener else None)
-        self.servos = FaultyServos(loop.servos, self.settings, clock, self.must)
-        loop.servos = self.servos
+        self.servos = FaultyServos(loop.torque.servos, self.settings, clock, self.must)
+        loop.torque.servos = self.servos
         source = np.random.default_rng(seed)
         self.sensors = [
             FaultySensor(each.sensor, self.settings, source) for each in loop.perception.fingers

@@ -108,7 +108,7 @@ def test_a_jump_beside_lost_readings_is_found() -> None:
 
 def spoil(daemon: Daemon, how: Callable[[Reading], None]) -> None:
     """From now on readings are spoilt after they were taken."""
-    servos = daemon.loop.servos
+    servos = daemon.loop.torque.servos
     assert servos is not None
     really = servos.read
 

@@ -155,7 +155,7 @@ def test_work_that_takes_long_is_named_too_but_not_what_a_command_took(
     on_late_machine: Build,
 ) -> None:
     daemon, machine, _ = on_late_machine("real", task={"name": "demo"})
-    servos, state = daemon.loop.servos, daemon.loop.state
+    servos, state = daemon.loop.torque.servos, daemon.loop.state
     assert servos is not None
     really = servos.torque_on
 

@@ -47,7 +47,7 @@ def test_a_simulated_hands_demo_goes_on_after_a_fault_and_says_so(make: Make) ->
 
 def test_a_demo_that_cannot_clear_its_fault_tries_again(make: Make) -> None:
     daemon = make(task={"name": "demo"})
-    events, servos = holding_demo(daemon), daemon.loop.servos
+    events, servos = holding_demo(daemon), daemon.loop.torque.servos
     assert servos is not None
     really = servos.read
 

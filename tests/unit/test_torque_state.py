@@ -101,8 +101,8 @@ class Deaf:
     """Servos that answer, and hear nothing of what is written: so many tries, or until mended."""
 
     def __init__(self, daemon: Daemon, tries: float = math.inf) -> None:
-        assert daemon.loop.servos is not None
-        self._servos = daemon.loop.servos
+        assert daemon.loop.torque.servos is not None
+        self._servos = daemon.loop.torque.servos
         self._really = self._servos.torque_off
         self._most = tries
         self.tries = 0
@@ -122,7 +122,7 @@ class Deaf:
 
 def test_arming_that_fails_is_a_fault_with_torque_off(make: Make) -> None:
     daemon = make()
-    servos = daemon.loop.servos
+    servos = daemon.loop.torque.servos
     assert servos is not None
     really = servos.torque_on
 
@@ -154,9 +154,9 @@ def test_a_stall_that_trips_the_servos_watchdog_is_a_fault_and_not_an_idle_hand(
 
 def test_stop_and_disarm_turn_torque_off_whatever_the_state_and_a_stop_say(make: Make) -> None:
     daemon = make()
-    assert daemon.loop.servos is not None
+    assert daemon.loop.torque.servos is not None
     for name, more in (("stop", {}), ("disarm", {}), ("stop", {"client": 5, "why": "smoke"})):
-        daemon.loop.servos.torque_on()  # as another program may have done
+        daemon.loop.torque.servos.torque_on()  # as another program may have done
         assert command(daemon, name, **more)["torque_off"] == "confirmed"
         daemon.loop.advance(daemon.loop.period)
         assert daemon.hand is not None

@@ -171,5 +171,5 @@ def can(daemon: Daemon) -> None:
             kept.append(finger.frame.data)
     for kept, finger in zip(grids, fingers, strict=True):
         finger.sensor = CannedSensor(kept, period, daemon.clock)
-    if loop.servos is not None:
-        loop.servos = CannedServos(loop.state.reading, daemon.clock)
+    if loop.torque.servos is not None:
+        loop.torque.servos = CannedServos(loop.state.reading, daemon.clock)

@@ -126,7 +126,7 @@ def in_the_loop(turns: int, baud: int, changes: Sequence[str] = ()) -> Report:
             hold(daemon)
         except SoftfingerError as error:
             return Report(title, [], notes=(str(error),), failed=True)
-        servos = loop.servos
+        servos = loop.torque.servos
         assert servos is not None
 
         def cycle() -> None:

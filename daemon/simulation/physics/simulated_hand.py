@@ -339,11 +339,6 @@ class SimulatedHand:
         """Contact samples taken so far; number k was taken at ``start`` + k / tactile.rate."""
         return self.plant.samples
 
-    @property
-    def stored_samples(self) -> int:
-        """Number of newest samples that are stored."""
-        return len(self._rows)
-
     def sample(self, number: int) -> Sample:
         """Return sample ``number``, valid until a newer one replaces it.
 

@@ -16,24 +16,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from softfinger.daemon.profile.settings import SimulationSettings, TactileSettings
 from softfinger.daemon.simulation.faults import MeasurementFaults
-from softfinger.kinematics.compiled.kernel import kernel
-from softfinger.kinematics.compiled.layout import Record, Records
 from softfinger.kinematics.contact.closed_form import Fingertip
-from softfinger.kinematics.contact.material import Material, stress_at
-from softfinger.kinematics.sensing.footprint import (
-    Face,
-    Grid,
-    cols_touched,
-    rows_touched,
-    set_extremes,
-    set_face,
-)
+from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.sensing.pressure_grid import (
     Rendering,
     SensorGrid,
@@ -48,81 +39,6 @@ FloatArray = NDArray[np.float64]
 PLAYS = 4
 _PIECES_MAX = 3  # of a cell's side for the blur: within 2.5e-4 of the modulus
 _POINTS = 4  # of a cell's side: within 5e-4 of the modulus up to d = a/5, 2e-3 near the rim
-
-
-class CurvedContact(Record):
-    """A cylinder's face on a grid of cells."""
-
-    d: float  # how deep it is in the hemisphere along the normal [m]
-    n_x: float  # the normal leads from the tip's centre to the axis, a − d + R away
-    n_y: float
-    across_x: float  # unit vector at right angles to the axis in the base's plane
-    across_y: float
-    curvature: float  # curvature 1/R [1/m]
-    grid: Grid
-    face: Face
-
-
-@kernel
-def render_curved(contacts: Records[CurvedContact], law: FloatArray, out: FloatArray) -> None:
-    """Write the pressure [Pa] of a cylinder's face on each cell into ``out`` [rows, cols].
-
-    ``law`` is the material's. With p the way across the axis
-
-        z = c_z − √(R² − (p − c_p)²),    ε = 1 − z/√(a² − x² − y²)
-
-    The mean over a cell is that of points spread evenly in it.
-    """
-    contact = contacts[0]
-    grid = contact.grid
-    face = contact.face
-    a = grid.radius
-    d = contact.d
-    n_x = contact.n_x
-    n_y = contact.n_y
-    curvature = contact.curvature
-    across_x = contact.across_x
-    across_y = contact.across_y
-    pitch_x = grid.pitch_x
-    pitch_y = grid.pitch_y
-    out[:] = 0.0
-    if not (d > 0.0 and curvature > 0.0 and n_x * n_x + n_y * n_y < 1.0):
-        return
-    # The cylinder lies behind its tangent plane, so it presses on no more cells than that.
-    set_face(face, a, min(d, a), n_x, n_y)
-    set_extremes(face, a)
-    if not face.low < face.high:
-        return
-    first_row, last_row = rows_touched(face, grid)
-    first_col, last_col = cols_touched(face, grid)
-    roundness = 1.0 / curvature
-    away = a - d + roundness
-    c_p = away * (n_x * across_x + n_y * across_y)
-    c_z = away * math.sqrt(1.0 - n_x * n_x - n_y * n_y)
-    weight = 1.0 / (_POINTS * _POINTS)
-    step_x = pitch_x / _POINTS
-    step_y = pitch_y / _POINTS
-    for i in range(first_row, last_row):
-        y_cell = grid.y + i * pitch_y + 0.5 * step_y
-        for j in range(first_col, last_col):
-            x_cell = grid.x + j * pitch_x + 0.5 * step_x
-            total = 0.0
-            for k in range(_POINTS):
-                y = y_cell + k * step_y
-                rim = a * a - y * y
-                for m in range(_POINTS):
-                    x = x_cell + m * step_x
-                    square = rim - x * x
-                    if square <= 0.0:
-                        continue
-                    off = x * across_x + y * across_y - c_p
-                    under = roundness * roundness - off * off
-                    if under <= 0.0:
-                        continue
-                    z = max(c_z - math.sqrt(under), 0.0)
-                    if z * z < square:
-                        total += stress_at(law, 1.0 - z / math.sqrt(square))
-            out[i, j] = weight * total
 
 
 class SensorModel:
@@ -147,7 +63,7 @@ class SensorModel:
         self.grid = grid
         self._flaws = flaws
         self._per_count = board.pascal_per_count
-        self._law = material.law
+        self._material, self._radius = material, tip.radius
         self._ends = (board.threshold, board.full_count)
         self._generator = np.random.Generator(np.random.SFC64(seed))
         shape = grid.shape
@@ -161,7 +77,7 @@ class SensorModel:
             sensitivity[self._generator.random(shape) < flaws.tactile_dead] = 0.0
         self._sensitivity = sensitivity
         self._pressure = self._rendered = np.zeros(shape)
-        cells = grid
+        cells, self._pieces = grid, (1, 1)
         if flaws.tactile_blur > 0.0:
             n_x, n_y = (
                 min(blur_pieces(flaws.tactile_blur / pitch), _PIECES_MAX) for pitch in grid.pitches
@@ -174,11 +90,9 @@ class SensorModel:
         if tip.physics == "solid":
             blurred = replace(grid, blur=flaws.tactile_blur)
             self._solid = SolidPressure(tip, material, blurred.images(tip))
-        self._plane, self._curved = Rendering(), CurvedContact()
-        for contact in (self._plane, self._curved):
-            contact.grid.assign(cells.on(tip))
+        self._cells, self._plane = cells, Rendering()
+        self._plane.grid.assign(cells.on(tip))
         self._plane.gain = 1.0
-        self._curved.across_x, self._curved.across_y = grid.to_sensor(1.0, 0.0)
         self._plays = np.zeros((PLAYS if flaws.tactile_hysteresis > 0.0 else 0, *shape))
         self._creep_lag, self._response_lag = np.zeros((2, 2, *shape))
         self._offset = np.zeros(shape)  # counts
@@ -246,13 +160,11 @@ class SensorModel:
             along = self.grid.to_sensor(shear, 0.0)
             self._solid((d, n_x, n_y), fraction, pressure, along)
         else:
-            contact = self._curved if curvature > 0.0 else self._plane
-            contact.d, contact.n_x, contact.n_y = d, n_x, n_y
             if curvature > 0.0:
-                self._curved.curvature = curvature
-                render_curved(self._curved.array, self._law, self._rendered)
+                self._render_curved(d, n_x, n_y, 1.0 / curvature)
             else:
-                render(self._plane.array, self._law, self._columns, self._rendered)
+                self._plane.d, self._plane.n_x, self._plane.n_y = d, n_x, n_y
+                render(self._plane.array, self._material.law, self._columns, self._rendered)
             if fraction != 1.0:
                 self._rendered *= fraction
             if flaws.tactile_blur > 0.0:
@@ -272,6 +184,52 @@ class SensorModel:
         if flaws.tactile_gain_drift > 0.0:
             normal = self._generator.standard_normal(1)
             drift(self._warmer, flaws.tactile_gain_drift, flaws.tactile_drift_time, elapsed, normal)
+
+    @cached_property
+    def _points(self) -> tuple[FloatArray, FloatArray, NDArray[np.intp], int]:
+        """Points spread evenly in the cells under the hemisphere, and how many are in a cell.
+
+        Of each: its place across the cylinder's axis, the hemisphere's height there [m], its cell.
+        """
+        cells, side = self._cells, -(-_POINTS // min(self._pieces))
+        x, y = (
+            (np.arange(count * side) + 0.5) * pitch / side - 0.5 * count * pitch - centre
+            for count, pitch, centre in zip(
+                (cells.cols, cells.rows), cells.pitches, cells.centre, strict=True
+            )
+        )
+        square = self._radius**2 - x**2 - y[:, None] ** 2
+        inside = square > 0.0
+        across_x, across_y = self.grid.to_sensor(1.0, 0.0)
+        across = across_x * x + across_y * y[:, None]
+        cell = np.arange(len(y))[:, None] // side * cells.cols + np.arange(len(x)) // side
+        return across[inside], np.sqrt(square[inside]), cell[inside], side * side
+
+    def _render_curved(self, d: float, n_x: float, n_y: float, roundness: float) -> None:
+        """Render the pressure [Pa] of a cylinder of radius R = ``roundness`` [m] on each cell.
+
+        The normal (n_x, n_y, …) leads from the tip's centre to the axis, a − d + R away. With p the
+        way across the axis
+
+            z = c_z − √(R² − (p − c_p)²),    ε = 1 − z/√(a² − x² − y²)
+
+        The mean over a cell is that of its points.
+        """
+        out = self._rendered
+        tilted = n_x * n_x + n_y * n_y
+        if not (d > 0.0 and tilted < 1.0):
+            out[:] = 0.0
+            return
+        across, height, cell, count = self._points
+        across_x, across_y = self.grid.to_sensor(1.0, 0.0)
+        away = self._radius - d + roundness
+        off = across - away * (n_x * across_x + n_y * across_y)
+        under = roundness * roundness - off * off
+        z = away * math.sqrt(1.0 - tilted) - np.sqrt(np.maximum(under, 0.0))
+        touched = (z < height) & (under > 0.0)
+        strain = 1.0 - np.maximum(z[touched], 0.0) / height[touched]
+        sums = np.bincount(cell[touched], self._material.stress(strain), out.size)
+        out[:] = sums.reshape(out.shape) / count
 
     def press_evenly(self, pressure: float) -> None:
         """Let all cells feel this pressure [Pa], as under a bladder, in the last press' place."""

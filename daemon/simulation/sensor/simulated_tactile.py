@@ -163,9 +163,10 @@ class SimulatedTactile:
             if touch.pressure > 0.0:
                 self._model.press_evenly(touch.pressure)
             return True
-        if number < self._hand.samples - self._hand.stored_samples:
+        try:
+            sample = self._hand.sample(number)
+        except LookupError:
             return False
-        sample = self._hand.sample(number)
         finger = self._finger
         d, theta = float(sample.d[finger]), float(sample.theta[finger])
         factor, curvature = float(sample.gain[finger]), float(sample.curvature[finger])
