@@ -124,13 +124,15 @@ def test_energy_never_rises_without_input(trial):
     # time in three with a step ten times too long.
     generator = np.random.default_rng(trial)
     hand = random_hand(generator, trial % 3 == 0)
-    place(
-        hand,
+    held = hand.plant.parameters.object_held
+    where = (
         generator.uniform(0.10, 0.45 if trial % 2 else 0.25, 2),
         generator.uniform([-0.003, 0.07, -0.2], [0.003, 0.09, 0.2]),
-        generator.normal(size=2) * 2,
-        generator.normal(size=3) * [0.3, 0.3, 3] * (not hand.plant.parameters.object_held),
     )
+    speeds = generator.normal(size=2) * 2, generator.normal(size=3) * [0.3, 0.3, 3] * (not held)
+    place(hand, *where)
+    at_rest = hand.energy()
+    place(hand, *where, *speeds)
     start = energy = hand.energy()
     scale = abs(start) + 1e-3
     for _ in range(1500):
@@ -138,7 +140,8 @@ def test_energy_never_rises_without_input(trial):
         later = hand.energy()
         assert later <= energy + 1e-12 * scale
         energy = later
-    assert energy < start - 1e-4 * scale
+    # Where joints stick the tips stay pressed, by part of what moved, too.
+    assert energy < start - min(1e-3 * scale, 0.25 * (start - at_rest))
 
 
 # Abuse.
