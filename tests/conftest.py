@@ -104,13 +104,15 @@ def addresses() -> tuple[str, str]:
 
 @pytest.fixture
 def profile(tmp_path: Path, addresses: tuple[str, str]) -> Profile:
-    """Writes a profile on the test's addresses, with ``text`` added to it."""
+    """Writes a profile on the test's addresses, with ``text`` added to it; of 100 ticks a second,
+    where it names no other rate: daemons of several tests share the processors."""
 
     def write(text: str = "", name: str = "profile.toml") -> Path:
         path = tmp_path / name
         stream, commands = addresses
+        rate = "" if "loop.rate" in text else "loop.rate = 100.0\n"
         path.write_text(
-            f'stream.address = "{stream}"\ncommands.address = "{commands}"\n{text}',
+            f'stream.address = "{stream}"\ncommands.address = "{commands}"\n{rate}{text}',
             encoding="utf-8",
         )
         return path

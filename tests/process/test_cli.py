@@ -46,10 +46,12 @@ def test_duration_ends_by_itself_and_settings_come_from_the_command_line(profile
     path = str(profile(""))
     done = inline("run", "--config", path, "--set", "loop.rate=quick", "--set", "tip.radius=9")
     assert done.returncode == 2
-    assert '--set: loop.rate: found "quick", expected a valid number' in done.stderr
-    done = softfinger("run", "--config", path, "--set", "loop.rate=100", "--duration", "0.3")
+    assert sorted(line.partition(": found")[0] for line in done.stderr.splitlines()) == [
+        "--set: loop.rate", "--set: tip.radius"
+    ]  # fmt: skip
+    done = softfinger("run", "--config", path, "--set", "loop.rate=250", "--duration", "0.3")
     assert done.returncode == 0, done.stderr
-    assert "simulated, 100 Hz" in done.stderr
+    assert "simulated, 250 Hz" in done.stderr
     assert "ended, torque off" in done.stderr
 
 
@@ -61,34 +63,12 @@ def test_a_second_daemon_says_so_and_ends(daemon):
     assert any(f"{each} is in use; is another softfinger" in second.stderr for each in taken)
 
 
-def test_bad_settings_end_it_with_the_whole_report(profile, inline):
-    path = profile("[lop]\nrate = 3\n[tip]\nradius = 'big'\n")
-    done = inline("run", "--config", path)
-    assert done.returncode == 2
-    assert done.stderr.splitlines() == [
-        f'{path}: tip.radius: found "big", expected a valid number',
-        f"{path}: lop: found an unknown key, expected a known one; nearest: loop",
-    ]
-
-
-@pytest.mark.parametrize(
-    ("text", "error"),
-    [
-        (
-            '[servos]\nbackend = "dynamixel"\nport = "/dev/absent"\n[tactile]\nbackend = "none"\n',
-            "/dev/absent",
-        ),
-        (
-            '[servos]\nbackend = "none"\n[tactile]\nbackend = "flexitac"\nport = ["/dev/no", "x"]',
-            "/dev/no",
-        ),
-    ],
-)
-def test_a_missing_port_is_named(profile, inline, text, error):
+def test_a_missing_port_is_named(profile, inline):
+    text = '[servos]\nbackend = "dynamixel"\nport = "/dev/absent"\n[tactile]\nbackend = "none"\n'
     done = inline("run", "--config", profile(text))
     assert done.returncode == 1
-    (line,) = [line for line in done.stderr.splitlines() if line.startswith("softfinger: ")][-1:]
-    assert error in line
+    assert done.stderr.splitlines()[-1].startswith("softfinger: ")
+    assert "/dev/absent" in done.stderr.splitlines()[-1]
     assert "Traceback" not in done.stderr
 
 

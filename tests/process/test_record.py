@@ -231,7 +231,7 @@ def test_files_that_are_no_recording(tmp_path):
 
 
 def test_recording_a_running_daemon_loses_nothing_unseen(start, profile, addresses, tmp_path):
-    start("--config", str(profile("")), "--set", "stream.state_rate=500")
+    start("--config", str(profile("loop.rate = 500.0\nstream.state_rate = 500.0\n")))
     path = tmp_path / "run.mcap"
     process = record(path, "--address", addresses[0])
     until(lambda: is_filled(path))

@@ -90,12 +90,3 @@ def test_a_web_page_commands_and_reads_nothing(daemon, wrap):
         hand.stop()
         request = wrap(old_frame(b"") + old_frame(b"\x01hand/"), daemon.addresses[0])
         assert b"hand/" not in said_to(request, daemon.addresses[0], lambda: hand.collect(0.5))
-
-
-def test_a_plain_socket_of_today_is_let_in(daemon):
-    with zmq.Context() as context, context.socket(zmq.REQ) as client:
-        client.setsockopt(zmq.LINGER, 0)
-        client.connect(daemon.commands)
-        client.send(msgpack.packb({"command": "status"}))
-        assert client.poll(60_000)
-        assert msgpack.unpackb(client.recv())["ok"] is True
