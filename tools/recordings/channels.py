@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+from softfinger.daemon.client.stream import read
 from softfinger.daemon.types import FINGERS
 from softfinger.daemon.wire import schema, schema_docs
 
@@ -119,19 +120,6 @@ def _log(message: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _is_frame(message: dict[str, Any]) -> bool:
-    """Return whether a map is a frame: a finger's, with a time and as many cells as rows × cols."""
-    rows, cols, stamp = (message.get(name) for name in ("rows", "cols", "timestamp"))
-    return (
-        message.get("finger") in FINGERS
-        and isinstance(stamp, float)
-        and math.isfinite(stamp)
-        and type(rows) is type(cols) is int
-        and min(rows, cols) > 0
-        and len(message["data"]) == 2 * rows * cols
-    )
-
-
 class _Restored:
     """Nulls are NaN again, bytes are bytes, and an image or a log line is the topic's own map.
 
@@ -156,8 +144,9 @@ class _Restored:
             message = {name: message[name] for name in self._names if name in message} | message
         if self._image:
             message["data"] = base64.b64decode(message.get("data") or "")
-            if not _is_frame(message):
-                raise ValueError("a tactile frame whose fields do not fit together")
+            frame = read(schema.TactileFrame, message)
+            if frame.finger not in FINGERS or not math.isfinite(frame.timestamp):
+                raise ValueError("a tactile frame without its finger or time")
         for path in self._floats:
             place: Any = message
             for part in path[:-1]:

@@ -37,26 +37,14 @@ class Landscape:
 
     def __init__(self, table: ContactTable, radius: float, d_end: float) -> None:
         self._table = table
-        self._radius = radius
         self.d_end = min(d_end, 0.95 * radius)
-        # Force and energy upright: `energy_of` interpolates them.
-        self._d = np.linspace(1e-6 * radius, self.d_end, 400)
-        upright = table(self._d, np.zeros_like(self._d))
-        self._force, self._energy = np.asarray(upright.force), np.asarray(upright.energy)
-        self.highest = float(self._energy[-1])  # J, upright, of the last colour
+        self.highest = float(table(self.d_end, 0.0).energy)  # J, of the last colour
 
     def place(self, d: FloatArray | float, theta: FloatArray | float) -> FloatArray:
         """Pixels [..., 2] of displacements [m] and angles [rad]; NaN stays NaN."""
         x = (np.asarray(theta) / THETA_END + 1.0) * 0.5 * WIDTH
         y = (1.0 - np.asarray(d) / self.d_end) * HEIGHT
         return np.stack(np.broadcast_arrays(x, y), axis=-1)
-
-    def energy_of(self, force: FloatArray) -> FloatArray:
-        """U [J] of upright contacts that press with ``force`` [N]; NaN beyond the picture."""
-        energy: FloatArray = np.interp(
-            force, self._force, self._energy, left=math.nan, right=math.nan
-        )
-        return energy
 
     def picture(self) -> NDArray[np.uint8]:
         """Levels [HEIGHT, WIDTH] of `heatmap`'s colours, one more where no such contact can be."""

@@ -52,7 +52,7 @@ _PLOTS = {  # title: factor, fields of `hand/state`; {}_std is a deviation, wher
     "Displacement d [mm]": (1e3, "left.d right.d"),
     "Object's angle [°]": (_DEGREE, "object.angle goal_angle"),
     "Tilt θ [°]": (_DEGREE, "left.theta right.theta"),
-    "Energy [mJ]": (1e3, "left.energy right.energy goal_energy"),
+    "Energy [mJ]": (1e3, "left.energy right.energy"),
     "Joints [°]": (_DEGREE, "left.q right.q left.goal_q right.goal_q"),
     "Currents [A]": (1.0, "left.current right.current left.goal_current right.goal_current"),
     "Tick [µs]": (1e6, "compute_s wake_late_s"),
@@ -170,11 +170,8 @@ class Pictures(Viewer):
         state = self.feed.state
         row: list[Any] = [when, self.feed.mode]
         for path, factor in self._fields:
-            value: Any = math.nan
-            if path == "goal_energy" and self._landscape is not None:
-                value = self._landscape.energy_of(np.array(state.goal_force))
-            elif path != "goal_energy" and (path != "object.angle" or state.object.valid):
-                value = attrgetter(path)(state)
+            known = path != "object.angle" or state.object.valid
+            value = attrgetter(path)(state) if known else math.nan
             row.append(float(f"{factor * value:.5g}"))
         return row
 
