@@ -308,8 +308,8 @@ class Emulator:
             return f"error: {error}"
         now = self.clock.now()
         reply = json.dumps(self.report(now)) if "report" in words else "ok"
-        if "forget" in words:
-            self._forget(now)
+        if "forget" in words and self._servos is not None:
+            self._servos.bus.forget(now)
         if "place" in words:
             self.hand.place_object()
             for finger in list(self._plates):
@@ -380,11 +380,6 @@ class Emulator:
         held = {"pose": self.hand.object_pose.tolist()}
         hand = {"servos": servos, "object": held, "force": self.hand.force.tolist()}
         return {"t": t, "monotonic": time.monotonic(), **hand}
-
-    def _forget(self, t: float) -> None:
-        """Begin the record again."""
-        if self._servos is not None:
-            self._servos.bus.forget(t)
 
     def _apply(self, event: FaultEvent, t: float) -> None:
         after, part, kind, value, over = event

@@ -30,15 +30,6 @@ from softfinger.daemon.simulation.servo_model.servo_joint import (
 
 REBOOT_TIME = 0.34  # s without an answer
 JUMP = 130  # counts, 0.2 rad at the shaft, by which an encoder's zero jumps
-_EFFECTIVE = frozenset(  # registers whose writing does more than change them
-    (
-        reg.TORQUE_ENABLE,
-        reg.OPERATING_MODE,
-        reg.GOAL_POSITION,
-        reg.GOAL_VELOCITY,
-        reg.BUS_WATCHDOG,
-    )
-)
 FAR = 0.05  # rad between goal and present angle at torque on that count as far
 _WATCHED = frozenset((reg.GOAL_CURRENT, reg.GOAL_POSITION))
 _CLEAR_FIRMWARE = 42
@@ -204,8 +195,7 @@ class EmulatedServo:
         for item, value in plan:
             self.table.set(item.address, value)
         for item, value in plan:
-            if item.address in _EFFECTIVE:
-                self._effect(item.address, value, t)
+            self._effect(item.address, value, t)
         torque = self._memory[reg.TORQUE_ENABLE]
         if torque and self._joint.moves_by_itself():
             self._next_step = min(self._next_step, t + STEP)

@@ -116,9 +116,7 @@ class ServoJoint:
             return
         target = float(table.get(reg.GOAL_POSITION))
         acceleration, speed = table.get(reg.PROFILE_ACCELERATION), table.get(reg.PROFILE_VELOCITY)
-        if not speed and not acceleration:
-            profile.hold(target)
-        elif memory[reg.DRIVE_MODE] & 4:
+        if memory[reg.DRIVE_MODE] & 4:
             profile.aim_in(target, speed / 1000.0, acceleration / 1000.0)
         else:
             profile.aim(target, speed * _PER_VELOCITY, acceleration * _PER_ACCELERATION)
