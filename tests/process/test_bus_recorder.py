@@ -89,7 +89,6 @@ def test_torque_on_far_from_the_goal() -> None:
     assert hand.report(1)["torque"]
     assert (on["count"], on["far"], on["t"]) == (1, 0, hand.t)
     assert on["farthest"] == pytest.approx(10 * RADIAN)
-    assert on["current"] == pytest.approx(20 * UNIT)
     hand.write(1, reg.GOAL_POSITION, "i", 2048 + 10)
     assert hand.report(1)["goal_q"] == pytest.approx([10 * RADIAN] * 2)
     hand.write(1, reg.TORQUE_ENABLE, "B", 0)

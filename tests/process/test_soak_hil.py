@@ -45,7 +45,7 @@ def servo(**changed: Any) -> dict[str, Any]:
         "goal_q": [-0.5, 1.0],
         "goal_current": [-1.2, 1.2],
         "goals_refused": 0,
-        "torque_on": {"count": 1, "t": 0.0, "far": 0, "farthest": 0.0, "current": 0.0},
+        "torque_on": {"count": 1, "t": 0.0, "far": 0, "farthest": 0.0},
         "quiet": 0.001,
         "longest_quiet": 0.01,
         "watchdog_fired": {"count": 0, "t": None},

@@ -70,8 +70,7 @@ begins the record again, --send "report forget" does both without a gap:
                    null when none came; goals near where a limp joint is are left out
     goals_refused  how many writes with a goal the servo refused
     torque_on      count, t of the last; far: how often the goal was more than 0.05 rad away,
-                   farthest [rad], current: greatest goal current in force [A]
-    torque_off     when it was last switched off, null before
+                   farthest [rad]
     quiet, longest_quiet
                    time since the last instruction with torque on, null while it is off, and the
                    longest such [s]

@@ -200,11 +200,8 @@ class EmulatedServo:
         if torque and self._joint.moves_by_itself():
             self._next_step = min(self._next_step, t + STEP)
         if limp and torque:
-            current = self.table.get(reg.GOAL_CURRENT) if self.model.senses_current else 0
-            goals = self.table.get(reg.GOAL_POSITION), current
-            self.recorder.torque_on(t, self._joint, self.mode, goals)
-        elif not limp and not torque:
-            self.recorder.torque_off(t)
+            goal = self.table.get(reg.GOAL_POSITION)
+            self.recorder.torque_on(t, self._joint, self.mode, goal)
         self._joint.drive()
         return framing.OK
 
@@ -374,12 +371,10 @@ class BusRecorder:
         self._torque_t: float | None = None
         self._far = 0
         self._farthest = 0.0  # rad
-        self._current = 0.0  # A, greatest goal at torque on
         self._last = t  # when a packet was heard
         self._quiet = 0.0  # s, longest with torque on
         self._fired = 0
         self._fired_t: float | None = None
-        self._off_t: float | None = None
 
     def goals(self, values: dict[int, int], joint: ServoJoint, torque: bool, refused: bool) -> None:
         """Record a write: values by register, but no angle near where a limp joint is."""
@@ -392,20 +387,14 @@ class BusRecorder:
             least, greatest = self._goals.get(address, (value, value))
             self._goals[address] = min(least, value), max(greatest, value)
 
-    def torque_on(self, t: float, joint: ServoJoint, mode: int, goals: tuple[int, int]) -> None:
-        """Record torque on at time t with these goals (position, current) in force, in counts."""
-        position, current = goals
+    def torque_on(self, t: float, joint: ServoJoint, mode: int, position: int) -> None:
+        """Record torque on at time t with this goal in force, in counts."""
         self._torque_on += 1
         self._torque_t = self._last = t
-        self._current = max(self._current, abs(joint.goal_current(current)))
         if mode in POSITION_MODES:
             away = _away(joint, position)
             self._far += away > FAR
             self._farthest = max(self._farthest, away)
-
-    def torque_off(self, t: float) -> None:
-        """Record torque off at time t."""
-        self._off_t = t
 
     def heard(self, t: float, torque: bool) -> None:
         """Record a packet at time t that the servo understood."""
@@ -432,9 +421,7 @@ class BusRecorder:
                 "t": self._torque_t,
                 "far": self._far,
                 "farthest": self._farthest,
-                "current": self._current,
             },
-            "torque_off": self._off_t,
             "quiet": quiet if torque else None,
             "longest_quiet": max(self._quiet, quiet) if torque else self._quiet,
             "watchdog_fired": {"count": self._fired, "t": self._fired_t},
