@@ -331,7 +331,7 @@ def test_an_answer_with_an_error_is_no_reading(running, firmware, connect):
 
 
 def test_close_turns_torque_off_on_a_bad_line(bus, connect):
-    backend = connect(bus, reply_timeout=0.01)
+    backend = connect(bus, reply_timeout=0.1)
     backend.torque_on()
     bus.fault("drop=0.3")
     backend.close()
