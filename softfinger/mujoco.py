@@ -18,7 +18,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Annotated, Any, Self, cast
+from contextlib import suppress
+from typing import Annotated, Any, Self
 
 import mujoco
 import numpy as np
@@ -30,10 +31,12 @@ from softfinger.daemon.profile.settings import Section, Settings
 from softfinger.daemon.servos.simulated import SimulatedServos
 from softfinger.daemon.simulation.physics.forces import current_reference
 from softfinger.daemon.simulation.physics.outline import rim_on_plane
+from softfinger.daemon.simulation.physics.plant import settle
 from softfinger.daemon.simulation.physics.plant_state import (
     FloatArray,
     Parameters,
     Plant,
+    Sample,
     Three,
     TipContact,
 )
@@ -242,11 +245,9 @@ class SoftTips:
         self._grids = [make_grid(settings, k % 2) for k in range(n)]
         self._sensors: list[tuple[int, FloatArray, FloatArray]] = []
         for k, name in enumerate(tips):
-            sensor = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SENSOR, f"{name}_pressure")
-            if sensor >= 0:
-                cells = data.sensordata[model.sensor_adr[sensor] :][: model.sensor_dim[sensor]]
-                shape = self._grids[k].shape
-                self._sensors.append((k, cells.reshape(shape), np.zeros(shape)))
+            with suppress(KeyError):  # there is none
+                cells = data.sensor(f"{name}_pressure").data.reshape(self._grids[k].shape)
+                self._sensors.append((k, cells, np.zeros(cells.shape)))
         self._period, self._due = 1.0 / settings.tactile.rate, -math.inf
 
     def __enter__(self) -> Self:
@@ -357,6 +358,19 @@ def drive_motors(plants: Records[Plant], share: float, torque: FloatArray) -> No
         torque[j] = plant.parameters.torque_constant * state.current[j]
 
 
+@kernel
+def feel(plants: Records[Plant], touches: Records[Touch], ring: Records[Sample]) -> None:
+    """Let the plant's tips feel what MuJoCo's do, and take the samples that are due."""
+    plant = plants[0]
+    for k in range(2):
+        plant.stages[0].on_object[k] = touches[k].contact
+        tip = plant.stages[0].on_object[k]
+        if touches[k].across[2] < 0.0:  # in the plane θ has a sign, and what goes with it
+            tip.theta, tip.sine = -tip.theta, -tip.sine
+            tip.tangential, tip.shear = -tip.tangential, -tip.shear
+    settle(plant, ring)
+
+
 class Options(Section):
     """The profile's table ``[plugins.mujoco]``."""
 
@@ -387,31 +401,15 @@ class MujocoHand(SimulatedHand):
         with self.tips:
             if count == 0:
                 mujoco.mj_step1(self.model, data)
-                self._feel()
+                feel(plant.array, self.tips._all, self._ring)
             for _ in range(count):
                 drive_motors(plant.array, share, data.ctrl)
                 data.qfrc_applied[2:] = plant.goals.load
                 mujoco.mj_step2(self.model, data)
                 mujoco.mj_step1(self.model, data)  # last, so that what the tips feel is current
                 state.position[:], state.velocity[:] = data.qpos + self._origin, data.qvel
-                self._done += 1
-                self._feel()
-
-    def _feel(self) -> None:
-        """Take over what the tips feel, and the sample that is due."""
-        plant, felt = self.plant, cast(Any, self.plant.felt).array
-        felt[:] = self.tips._all["contact"]
-        # In the plane θ has a sign, and what goes with it.
-        sign = np.where(self.tips._all["across"][:, 2] < 0.0, -1.0, 1.0)
-        for name in ("theta", "sine", "tangential", "shear"):
-            felt[name] *= sign
-        due = plant.samples * plant.parameters.sample_period
-        if self._done * self.step >= due - 1e-9:
-            row = self._ring[plant.samples % len(self._ring)]
-            row["number"], row["t"], row["firmness"] = plant.samples, due, 1.0
-            for name in ("d", "theta", "gain", "curvature", "tangential"):
-                row[name] = felt[name]
-            plant.samples += 1
+                self._done = plant.steps = self._done + 1
+                feel(plant.array, self.tips._all, self._ring)
 
 
 class MujocoServos(SimulatedServos):
