@@ -36,14 +36,6 @@ _SYNC_READS = frozenset((framing.SYNC_READ, framing.FAST_SYNC_READ))
 _GROUP_READS = _SYNC_READS | {framing.BULK_READ, framing.FAST_BULK_READ}
 _FAST_READS = frozenset((framing.FAST_SYNC_READ, framing.FAST_BULK_READ))
 _READS = _GROUP_READS | {framing.PING, framing.READ}
-_TO_ALL = frozenset(  # what a broadcast may ask besides reads, without an answer
-    (
-        framing.WRITE,
-        framing.FACTORY_RESET,
-        framing.REBOOT,
-        framing.CLEAR,
-    )
-)
 _FACTORY_RESET_GUARD = 42  # firmware that ignores a broadcast reset of everything
 _SPAN = struct.Struct("<HH")  # address, length
 _ITEM = struct.Struct("<BHH")  # ID, address, length
@@ -226,7 +218,7 @@ class ServoBus:
             _write_each(_sync_items(data), servos, t)
         elif instruction == framing.BULK_WRITE:
             _write_each(_bulk_items(data), servos, t)
-        elif instruction in _TO_ALL:
+        else:  # what else a broadcast may ask is done without an answer
             for servo in servos:
                 guarded = servo.firmware >= _FACTORY_RESET_GUARD and data == b"\xff"
                 if instruction != framing.FACTORY_RESET or not guarded:
