@@ -182,7 +182,7 @@ class TactileSettings(Section):
     skew_error: Annotated[float, Field(ge=0, le=0.01)] = 0.0  # m that a face goes during a scan
     # What neighbours share, of the pressure: crosstalk is below 3.3 % with a good read-out (arXiv
     # 2508.20959), linearity ± 3 % (FlexiForce's manual).
-    smooth_error: Annotated[float, Field(ge=0, le=1)] = 0.03
+    smooth_error: Annotated[float, Field(ge=0, le=1)] = 0.035
     gain_error: Annotated[float, Field(gt=0, le=1)] = 0.25  # relative, likewise of all cells alike
     latency: Delay = 0.005  # s from the middle of a scan to the first byte on the wire
     response: Delay = 0.0  # s, first-order lag of the cells, made up for by the joints

@@ -6,7 +6,7 @@ With J the Jacobian by (gain, u, v, w), JᵀJ = L Lᵀ, white noise of σ² leav
     shared error q     m mᵀ,   m = size (JᵀJ)⁻¹ Jᵀq                              (`systematic`)
       of second order  (0.7 d Δ²)² + (0.8 d ω²)² + (1.6 ω² d²/a)² in d, … (`add_second_order`)
       it leaves        Σ size² qᵀq − m·(size Jᵀq)
-    smooth error       (JᵀJ)⁻¹ smooth² Σ p²/5, p the model's pressures       (`systematic`)
+    smooth error       W (JᵀJ)⁻¹ W smooth² Σ p², p the model's pressures      (`systematic`)
     radius             m of the pitch, and d size in depth                       (`deepen`)
     rotation, scan     (n × z) rotation, and in w the way over the rows' length    (`turn`)
     smooth misfit      Σ r_k r_(k−1) − n ρ₁ σ² − decrement             (`undetected_misfit`)
@@ -15,10 +15,11 @@ C is the noise's correlation by lag, as `calibrate` measures it: K, the ``varian
 on the footprint's size beside the correlation's and is tabulated over d. The q are images of what
 is the same in every frame: a shift of all cells, its slopes in x and y, the tip's centre in x and
 y, the pitch, and the modulus or gain, ``size`` their standard deviations; Δ is m's part in depth
-over d, ω² = ``rotated`` its rotation squared. An error that is smooth over the footprint, of any
-shape, has about five directions, of which J's are four. r_k are the residuals of the packed cells:
-single cells' noise adds nothing to the product of neighbours on average, a misfit that is smooth
-over the footprint all of it.
+over d, ω² = ``rotated`` its rotation squared. W² are the fractions of a smooth error's square that
+look like a change of d and the gain, and of a tilt: the errors of real cells are nearly as
+symmetric as the pressure. r_k are the residuals of the packed cells: single cells' noise adds
+nothing to the product of neighbours on average, a misfit that is smooth over the footprint all of
+it.
 
 Kernels that take ``solid`` first depend on the tip: those here are of springs, and `solid_budget`
 has a solid tip's, of which a scene compiles the ones it needs.
@@ -67,8 +68,9 @@ _FEW = 48.0  # cells within which nothing is smooth or rough
 # % of the modulus.
 _D_BY_DEPTH, _GAIN_BY_DEPTH = 0.7, 0.6
 _D_BY_ROTATION, _GAIN_BY_ROTATION, _BY_ROTATION_AT_DEPTH = 0.8, 2.0, 1.6
-# Of an error's squares, spread over all that is smooth over a footprint: what one direction has.
-_SMOOTH = 0.2
+# Of an error's squares, smooth over a footprint: what d (and the gain), each tilt, and no parameter
+# has. Curves, hysteresis and crosstalk are nearly as symmetric as the pressure.
+_SMOOTH_IN_DEPTH, _SMOOTH_IN_TILT, _SMOOTH_LEFT = 0.15, 0.06, 0.2
 _SURE = 6.0  # standard deviations that noise alone hardly makes of neighbours' products
 
 
@@ -458,11 +460,14 @@ def systematic(
     )
     displacement = budget.displacement
     pressure = fit.sums.normal[0]
-    smooth = smooth_square(solid, state) * _SMOOTH * gain * gain * pressure
+    smooth = smooth_square(solid, state) * gain * gain * pressure
+    deep = math.sqrt(_SMOOTH_IN_DEPTH * smooth)
+    tilted = math.sqrt(_SMOOTH_IN_TILT * smooth)
+    parts = (deep, deep, tilted, tilted)
     for i in range(4):
         for j in range(4):
-            out[i, j] = smooth * fit.inverse[i, j]
-    remaining = 0.0
+            out[i, j] = parts[i] * parts[j] * fit.inverse[i, j]
+    remaining: float = _SMOOTH_LEFT * smooth
     for source in range(SOURCES + 2):
         size = sizes[source]
         if size == 0.0:
