@@ -17,6 +17,8 @@ from tests.process.test_record import written
         ("foxglove", "view --foxglove", "pip install 'softfinger[foxglove]'"),
         ("pyarrow", "export run.mcap --format parquet", "pip install 'softfinger[parquet]'"),
         ("numba", "replay --recompute run.mcap", "no hand/settings in it"),
+        ("numba", "analyse run.mcap", "no hand/settings in it"),
+        ("numba", "plot none.mcap", "none.mcap: No such file"),
     ],
 )
 def test_a_missing_package_is_named_if_it_is_needed(tmp_path, missing, words, told):

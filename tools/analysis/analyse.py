@@ -16,25 +16,25 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from softfinger.daemon.errors import RecordingError, SettingsError, SoftfingerError
-from softfinger.daemon.loop.warm_up import FRAMES
 from softfinger.daemon.own_files import write_text
-from softfinger.daemon.perception.finger_model import FingerModel, make_models
-from softfinger.daemon.perception.perception import Perception
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.tactile.replay import GivenFrames, load_recording
 from softfinger.daemon.types import FINGERS, Frame, State
 from softfinger.daemon.wire import schema
 from softfinger.kinematics.estimation.invalid import REASONS, Invalid
 from softfinger.tools.arguments import add_profile, profile, to_stderr
-from softfinger.tools.processes.compile import build_kernels, print_event
 from softfinger.tools.recordings.reader import Recording
-from softfinger.tools.recordings.recomputed import counts_of, recorded_models
+from softfinger.tools.recordings.recomputed import counts_of, recorded_models, recorded_settings
 from softfinger.tools.sweep import Progress, Sweep, add_sweep
+
+if TYPE_CHECKING:
+    from softfinger.daemon.perception.finger_model import FingerModel
 
 _EPILOG = """\
 FILE is a recording (.mcap), .npz with frames [n, rows, cols] and t, .npy frames or a folder of
@@ -57,7 +57,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Analyse and write. Raises SoftfingerError or OSError where there is one file."""
     settings, files = profile(arguments), arguments.files
-    build_kernels(settings, print_event, FRAMES)
     if len(files) == 1:
         print(_analysed(arguments, settings, files[0]), end="")
         return 0
@@ -65,6 +64,7 @@ def run(arguments: argparse.Namespace) -> int:
         print("analyse: --csv goes with one FILE", file=sys.stderr)
         return 2
     status = 0
+    _compile(settings)
     found = Sweep("analyse", partial(_one_of_many, arguments, settings), files)
     for told, complaint in found.run(arguments.processes, arguments.scheduler):
         print(told, end="", flush=True)
@@ -86,6 +86,7 @@ def _analysed(arguments: argparse.Namespace, settings: Settings, path: Path) -> 
     table = arguments.csv or path.with_name(path.name + ".contacts.csv")
     own = arguments.config is None and not arguments.set
     source = open_source(path, settings, own)
+    _compile(source.settings)
     began = time.perf_counter()
     with Progress("analyse", source.total) as progress:
         contacts = analyse(source, progress)
@@ -102,6 +103,13 @@ def _analysed(arguments: argparse.Namespace, settings: Settings, path: Path) -> 
     return told
 
 
+def _compile(settings: Settings) -> None:
+    from softfinger.daemon.loop.warm_up import FRAMES
+    from softfinger.tools.processes.compile import build_kernels, print_event
+
+    build_kernels(settings, print_event, FRAMES)
+
+
 FloatArray = NDArray[np.float64]
 Counts = NDArray[np.uint16]
 OnProgress = Callable[[int], None]
@@ -111,12 +119,13 @@ OnProgress = Callable[[int], None]
 class Source:
     """Frames of the sensors in one file: ``frames(progress)`` yields (finger, t [s], counts).
 
+    Kernels are loaded where ``models`` is called, not for a file that can't be read.
     ``t`` counts from the first frame; ``total`` is the end of ``progress``. ``truths`` is the true
     contact at each frame, by name, where a file of one sensor has it.
     """
 
     settings: Settings
-    models: tuple[FingerModel, FingerModel]
+    models: Callable[[], tuple[FingerModel, FingerModel]]
     fingers: tuple[int, ...]
     total: int
     frames: Callable[[OnProgress], Iterator[tuple[int, float, Counts]]]
@@ -140,10 +149,9 @@ def _stream(path: Path, settings: Settings, own: bool) -> Source:
     recording = Recording(path, to_stderr("analyse"))
     if not recording.count(schema.TACTILE):
         raise RecordingError(f"{path}: no tactile frames in it")
+    models = partial(recorded_models, recording) if own else partial(_models_of, settings)
     if own:
-        settings, models = recorded_models(recording)
-    else:
-        models = make_models(settings)
+        settings, _ = recorded_settings(recording)
     present = tuple(
         finger
         for finger, name in enumerate(FINGERS)
@@ -184,8 +192,14 @@ def _frames_alone(path: Path, settings: Settings, own: bool) -> Source:
             progress(k)
             yield 0, t, recording.counts[k]
 
-    models = make_models(settings)
+    models = partial(_models_of, settings)
     return Source(settings, models, (0,), count, frames, recording.truths, recording.live)
+
+
+def _models_of(settings: Settings) -> tuple[FingerModel, FingerModel]:
+    from softfinger.daemon.perception.finger_model import make_models
+
+    return make_models(settings)
 
 
 # The contact's fields and their units; the CSV's header says name_unit.
@@ -225,9 +239,13 @@ class Contacts:
 class _Pass:
     """One sensor's perception and its rows."""
 
-    def __init__(self, source: Source, finger: int) -> None:
+    def __init__(
+        self, source: Source, models: tuple[FingerModel, FingerModel], finger: int
+    ) -> None:
+        from softfinger.daemon.perception.perception import Perception
+
         self._sensor = GivenFrames(source.live)
-        self._perception = Perception(source.settings, {finger: self._sensor}, source.models)
+        self._perception = Perception(source.settings, {finger: self._sensor}, models)
         self._state = State()
         self._contact = self._state.contacts[finger]
         self._rows: list[tuple[float, ...]] = []
@@ -250,7 +268,8 @@ class _Pass:
 
 def analyse(source: Source, progress: OnProgress) -> list[Contacts]:
     """Return the contacts of each sensor. Raises what the source's frames raise."""
-    passes = {finger: _Pass(source, finger) for finger in source.fingers}
+    models = source.models()
+    passes = {finger: _Pass(source, models, finger) for finger in source.fingers}
     for finger, t, counts in source.frames(progress):
         passes[finger].add(t, counts)
     return [each.contacts(finger, source.truths) for finger, each in passes.items()]

@@ -19,16 +19,12 @@ from numpy.typing import NDArray
 
 from softfinger.daemon.client.stream import read, to_columns
 from softfinger.daemon.errors import RecordingError, SettingsError, SoftfingerError, TactileError
-from softfinger.daemon.loop.warm_up import FRAMES
-from softfinger.daemon.perception.finger_model import FingerModel
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS
 from softfinger.daemon.wire import schema
-from softfinger.kinematics.contact.table import ContactTable
 from softfinger.tools import style
 from softfinger.tools.arguments import add_range, to_stderr
 from softfinger.tools.extras import require
-from softfinger.tools.processes.compile import build_kernels, print_event
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.recomputed import recorded_models
 from softfinger.tools.sweep import Progress
@@ -36,6 +32,9 @@ from softfinger.tools.sweep import Progress
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from softfinger.daemon.perception.finger_model import FingerModel
+    from softfinger.kinematics.contact.table import ContactTable
 
 _EPILOG = """\
 pages:
@@ -78,7 +77,10 @@ def run(arguments: argparse.Namespace) -> int:
     require("plot")  # before a long recording is read
     path: Path = arguments.file
     folder = arguments.out or path.with_name(path.name + ".plots")
-    recording = Recording(path, to_stderr("plot"))
+    recording = Recording(path, to_stderr("plot"))  # what is none is refused before kernels load
+    from softfinger.daemon.loop.warm_up import FRAMES
+    from softfinger.tools.processes.compile import build_kernels, print_event
+
     build_kernels(Settings(), print_event, FRAMES)
     with Progress("plot", recording.size) as progress:
         data = load_run(recording, arguments.start, arguments.end, progress)
@@ -155,7 +157,7 @@ def load_run(
 
 def _model(recording: Recording) -> tuple[tuple[FingerModel, FingerModel] | None, str]:
     try:
-        return recorded_models(recording)[1], ""
+        return recorded_models(recording), ""
     except RecordingError as error:
         return None, str(error).removeprefix(f"{recording.path}: ")
     except (SettingsError, TactileError, ValueError) as error:

@@ -81,8 +81,8 @@ def recorded_settings(recording: Recording) -> tuple[Settings, list[str]]:
     return without_files(settings), [str(each) for each in calibrations]
 
 
-def recorded_models(recording: Recording) -> tuple[Settings, tuple[FingerModel, FingerModel]]:
-    """Return the recording's settings, and the models of its fingers by its own calibrations.
+def recorded_models(recording: Recording) -> tuple[FingerModel, FingerModel]:
+    """Return the models of a recording's fingers by its own settings and calibrations.
 
     Raises RecordingError, SettingsError, TactileError.
     """
@@ -91,7 +91,7 @@ def recorded_models(recording: Recording) -> tuple[Settings, tuple[FingerModel, 
     from softfinger.daemon.perception.finger_model import make_models
 
     with tempfile.TemporaryDirectory() as folder:
-        return settings, make_models(with_calibrations(settings, calibrations, Path(folder)))
+        return make_models(with_calibrations(settings, calibrations, Path(folder)))
 
 
 def counts_of(
