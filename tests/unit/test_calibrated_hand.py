@@ -73,7 +73,7 @@ def test_what_a_calibration_measured_of_its_errors_reaches_the_estimator():
     assert known.baseline == pytest.approx(math.hypot(300.0, 100.0 * 4.0))
     assert (known.centre, known.pitch, known.modulus) == (1e-4, pytest.approx(0.02), 0.0)
     np.testing.assert_array_equal(known.correlation, [[1.0, 0.5]])
-    assert uncertainty(Settings(), None) == Uncertainty(gain=0.25, smooth=0.03)
+    assert uncertainty(Settings(), None) == Uncertainty(gain=0.25, smooth=0.035)
 
 
 def test_a_calibrated_law_too_far_off_its_points_is_refused_by_file_and_key(settings):
