@@ -217,7 +217,7 @@ def notice_servo(
 
 
 def notice_strength(name: str, model: ServoModel, settings: Settings) -> list[Finding]:
-    """Return the findings on forces and a torque constant that a model can't have."""
+    """Return the findings on forces, torque constant and friction that a model can't have."""
     gear, lever = settings.servos.gear_ratio, settings.hand.finger_length
     force = GRIP_FRACTION * settings.safety.force_max
     bound, constant = gear * model.stall[0] / lever, gear * model.torque_constant
@@ -229,6 +229,10 @@ def notice_strength(name: str, model: ServoModel, settings: Settings) -> list[Fi
     if constant and not 1.0 / _CONSTANT_OFF < given / constant < _CONSTANT_OFF:
         text = f"control.torque_constant is {given:g} N·m/A, its data sheet's {constant:.3g}"
         found.append(Finding("warn", name, text, f"control.torque_constant = {constant:.3g}"))
+    if model.gear_loss and not settings.control.joint_load_friction:
+        text = f"its gears take {model.gear_loss:g} of their torque, so a grip may never settle"
+        fix = f"control.joint_load_friction = {model.gear_loss:g}"
+        found.append(Finding("warn", name, text, fix))
     return found
 
 

@@ -155,6 +155,7 @@ class ServoModel:
     modes: tuple[int, ...] = tuple(MODE_NAMES)
     pwm_slope: int | None = None  # default of register 62, where the model has it
     small: bool = False  # X330 frame: its indirect map moved with firmware 53
+    gear_loss: float = 0.0  # share of the gears' torque that is friction, if published
 
     @property
     def senses_current(self) -> bool:
@@ -236,7 +237,7 @@ _MODELS: tuple[tuple[Any, ...], ...] = (
      165, (33.5, 58.5, 44.0)),
     ("XL330-M288", 1200, 53, 6, 1e-3, 1750, 445, 2047, 70, 35, 70,
      (1600, 180), (0, 0, 400), 53, 5, 46, (0.52, 1.47, 5.0),
-     18, (20.0, 34.0, 26.0), _ALL, 140, True),
+     18, (20.0, 34.0, 26.0), _ALL, 140, True, 0.25),
     ("XL330-M077", 1190, 53, 6, 1e-3, 1750, 1620, 2047, 70, 35, 70,
      (400, 40), (0, 400, 400), 53, 5, 46, (0.215, 1.47, 5.0),
      18, (20.0, 34.0, 26.0), _ALL, 140, True),

@@ -170,7 +170,8 @@ def test_what_a_model_is_too_weak_for_is_a_notice(running):
     backend = connected(bus, model="XL330-M288")
     weak = "27 N may be asked for, and it stalls at 6.5 N on this finger"
     constant = "control.torque_constant is 1.78 N·m/A, its data sheet's 0.354"
-    assert [each.text for each in backend.notices] == 2 * [weak, constant]
+    gears = "its gears take 0.25 of their torque, so a grip may never settle"
+    assert [each.text for each in backend.notices] == 2 * [weak, constant, gears]
     backend.close()
     for name in ("hil", "small"):  # their forces are their servos'
         settings = load(find(Path(name)), Path("/tmp"))
