@@ -78,6 +78,9 @@ def by_law(observation: Observation) -> NDArray[np.float32]:
 
 
 if __name__ == "__main__":
+    # Other processes find what is imported by its name, not what only runs under this one.
+    from softfinger.gym.__main__ import main
+
     parser = argparse.ArgumentParser(description="Returns of a random agent and of the law.")
     parser.add_argument("episodes", type=int, nargs="?", default=20)
     parser.add_argument("profile", nargs="?", default="sim")

@@ -1,4 +1,4 @@
-"""The example programs run as they stand, against a real daemon."""
+"""The example programs, and the gym's, run as they stand."""
 
 from __future__ import annotations
 
@@ -32,3 +32,12 @@ def test_grasp_and_turn(start, profile, addresses, tmp_path):
         near = abs(pixels * 255.0 - colour).max(axis=2) < 25.0
         assert near.sum() > 300, colour
     assert daemon.end() == 0
+
+
+def test_the_gyms_table_comes_from_several_processes():
+    done = python("-m", "softfinger.gym", "1", "--processes", "2")
+    assert done.returncode == 0, done.stderr
+    found = re.findall(r"^(\w+) +(\w+) +([\d.]+) ± 0\.0", done.stdout, re.MULTILINE)
+    returns = {(task, agent): float(value) for task, agent, value in found}
+    assert len(returns) == 6
+    assert all(returns[task, "law"] > returns[task, "random"] for task, _ in returns)
