@@ -113,9 +113,14 @@ def set_prior(
 
 @inner_kernel
 def begin_grip(s: Scales) -> None:
-    """Begin a new grip: offsets are unknown again, and the rest becomes a little less certain."""
+    """Begin a new grip: offsets are unknown again, and the rest becomes a little less certain.
+
+    It goes back as much towards what is set: nothing measured ties modulus and torque constant
+    together to it, and over a thousand grips they would drift away.
+    """
     s.gripping = True
     for i in range(STATES):
+        s.mean[i] += 0.5 * _FORGET * (s.expected[i] - s.mean[i])
         for j in range(STATES):
             if i >= OFFSET or j >= OFFSET:
                 s.covariance[i, j] = 0.0
