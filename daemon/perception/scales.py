@@ -16,8 +16,8 @@ gain changes by 5-32 % when it is mounted again (DTIC ADP011007), a torque const
 Torques, as they arrive through gears that close, are taken in only while a grip's force ramps: a
 wrong scale grows with it, a load along the faces doesn't. Of those that have fallen again gears may
 hold the rest. The height is taken in with each frame; what changes of it in a lasting
-grip is the sensor's, for a modulus doesn't jump. What was found stays for later grips; `softfinger
-calibrate scales` keeps it.
+grip is the sensor's, for a modulus doesn't jump. What was found stays for later grips, 5 % less
+with each; `softfinger calibrate scales` keeps it.
 """
 
 from __future__ import annotations
@@ -115,8 +115,8 @@ def set_prior(
 def begin_grip(s: Scales) -> None:
     """Begin a new grip: offsets are unknown again, and the rest becomes a little less certain.
 
-    It goes back as much towards what is set: nothing measured ties modulus and torque constant
-    together to it, and over a thousand grips they would drift away.
+    Means go back towards what is set as standard deviations do. Nothing measured tells a stiffer
+    tip from a smaller torque constant: without that, both would drift from grip to grip.
     """
     s.gripping = True
     for i in range(STATES):
