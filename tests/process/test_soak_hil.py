@@ -38,6 +38,15 @@ def test_a_process_that_grows_is_told() -> None:
     assert [each.split()[0] for each in account.wrong] == ["leaky"]
 
 
+def test_a_hand_that_hardly_holds_is_told() -> None:
+    for held, told in (40, []), (20, ["20 of 100 grasps came to hold"]):
+        account = hil.Account(seconds=30.0, held=held)
+        account.looked, account.received, account.recorded = [(0.0, 0)], [(5, 0)], (5, 0)
+        account.done["grasp"] = 100
+        hil._conclude(account)
+        assert account.wrong == told
+
+
 def servo(**changed: Any) -> dict[str, Any]:
     return {
         "torque": True,

@@ -4,8 +4,8 @@ The daemon's process on the emulated hand's, with a recorder, three subscribers 
 grasps, turns, moves, releases and streams setpoints at 50 Hz, while faults come to servos, boards
 and the daemon itself. What was on the servos' wire is judged every few seconds by the emulated
 hand's record; each process's memory must be flat, nothing may be lost that is not counted, and the
-ticks of the end must be as punctual as those of the beginning. Faults that a busy machine brings
-about are counted, told and cleared.
+ticks of the end must be as punctual as those of the beginning, and three grasps of ten must come to
+hold. Faults that a busy machine brings about are counted, told and cleared.
 """
 
 from __future__ import annotations
@@ -45,6 +45,8 @@ _STREAM = 3.0  # s that a stream takes
 _SPLIT = 300  # s a file of the recorder, which keeps an index of each until it is closed
 _ASKEW = ("hand.angle", "tip.tilt")  # the object lies askew, as stops leave it: it is put upright
 _DROPPED = 20.0  # s without a grip: the object has slipped away, and is put back
+_HELD = 0.3  # of the grasps, at least, must come to hold, where there are …
+_MANY = 50  # … or more
 _BEGUN = 1500  # states between the first listener and the last, at most
 
 
@@ -59,6 +61,7 @@ class Account:
     done: Counter[str] = field(default_factory=Counter)  # commands carried out
     injected: Counter[str] = field(default_factory=Counter)
     faults: Counter[str] = field(default_factory=Counter)
+    held: int = 0  # grips that came to hold
     placed: int = 0  # times that the object was put upright
     received: list[tuple[int, int]] = field(default_factory=list)  # by subscribers, and lost
     recorded: tuple[int, int] = 0, 0  # states that came to the recorder, by its files; lost
@@ -105,7 +108,7 @@ class Account:
                 f"{1e3 * last:.2f} ms in the last",
                 f"subscribers' states, and lost: {self.received}; recorder's: {self.recorded}",
                 f"modes: {told(self.modes)}",
-                f"carried out: {told(self.done)}",
+                f"carried out: {told(self.done)}; {self.held} grips came to hold",
                 f"injected: {told(self.injected)}",
                 f"faults: {told(self.faults)}; the object put upright {self.placed} times",
                 f"wrong: {'; '.join(self.wrong) or 'nothing'}",
@@ -125,7 +128,7 @@ def soak(seconds: float, seed: int = 1) -> Account:
         processes = others.enter_context(_listeners(rig, account))
         begin = time.monotonic()
         next_look, gripped, fault_at = begin + _LOOK, begin, begin + _LOOK
-        last, end_fault, ends_at = "", None, math.inf
+        last, last_mode, end_fault, ends_at = "", "", None, math.inf
         while (now := time.monotonic()) < begin + seconds:
             try:
                 _listen(rig, account, chance.uniform(0.01, 0.1))
@@ -136,6 +139,8 @@ def soak(seconds: float, seed: int = 1) -> Account:
                 account.ticks, account.overruns = status["seq"], status["overruns"]
                 mode = status["mode"]
                 account.modes[mode] += 1
+                account.held += last_mode == "grasping" and mode in ("holding", "rotating")
+                last_mode = mode
                 gripped = now if mode == "holding" else gripped
                 if status["fault"] and status["fault"] != last:
                     account.faults[status["fault_name"]] += 1
@@ -286,6 +291,9 @@ def _conclude(account: Account) -> None:
     for name, more in account.growth().items():
         if more > _FLAT:
             account.wrong.append(f"{name} grew by {more:.1f} MB")
+    grasps = account.done["grasp"]
+    if grasps >= _MANY and account.held < _HELD * grasps:
+        account.wrong.append(f"{account.held} of {grasps} grasps came to hold")
     counts = [sum(each) for each in (*account.received, account.recorded)]
     if max(counts) - min(counts) > _BEGUN:
         account.wrong.append(f"numbers of states differ: {account.received}, {account.recorded}")
