@@ -157,6 +157,8 @@ def soak(seconds: float, seed: int = 1) -> Account:
                     request = _next(chance, mode)
                     if request is not None and rig.ask(request, 5.0)["ok"]:
                         account.done[str(request["command"])] += 1
+                    elif request is not None and mode == "armed":  # a lost board: arm opens it
+                        rig.ask({"command": "disarm"}, 5.0)
                 if end_fault is not None and now > ends_at:
                     end_fault()
                     end_fault, ends_at = None, math.inf
