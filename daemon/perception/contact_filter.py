@@ -134,15 +134,27 @@ class ContactFilter:
         )
 
     def update(
-        self, finger: int, frame: Frame, estimate: ContactEstimate, contact: Contact
+        self,
+        finger: int,
+        frame: Frame,
+        estimate: ContactEstimate,
+        contact: Contact,
+        changes: bool = True,
     ) -> None:
-        """Update by a finger's new ``frame`` and its ``estimate``; write both into ``contact``."""
+        """Update by a finger's new ``frame`` and its ``estimate``; write both into ``contact``.
+
+        In a contact a frame that ``changes`` nothing, bit by bit, tells nothing new: a frozen
+        sensor sends it while the joints close.
+        """
         contact.seq, contact.t, contact.t_arrival = frame.seq, frame.t_sample, frame.t_arrival
         self._invalid[finger] = estimate.invalid if frame.valid else Invalid.FRAME
         if self._invalid[finger]:
             return  # nothing is learnt: the contact is carried on, and grows older
         # Before a first reading nothing is known of the joints: the frame stands for itself.
         in_contact = estimate.contact and self._read
+        if in_contact and self._in_contact[finger] and not changes:
+            contact.t_valid = frame.t_arrival
+            return
         if in_contact and not kernels.update(
             self._state.array,
             self._history,

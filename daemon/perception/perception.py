@@ -60,7 +60,8 @@ class Perception:
             if frame is not None:
                 if each.repeats.long:
                     frame = replace(frame, valid=False)
-                self.filter.update(each.finger, frame, each.estimate, state.contacts[each.finger])
+                contact = state.contacts[each.finger]
+                self.filter.update(each.finger, frame, each.estimate, contact, each.changes)
         self.filter.write_contacts(state.t, state.contacts, state.object, state.phase)
 
 
@@ -86,8 +87,8 @@ class Repeats:
         """True if the frames have repeated for long enough to be sure."""
         return self._enabled and self._run >= self._enough
 
-    def seen_before(self, data: NDArray[np.uint16]) -> bool:
-        """Take in a frame; whether it differs from the last."""
+    def differs(self, data: NDArray[np.uint16]) -> bool:
+        """Take in a frame; return whether it differs from the last."""
         digest = hash(data.tobytes())
         number, digests = self._number + 1, self._digests
         before = self._seen.get(digest)
@@ -115,7 +116,8 @@ class FingerPerception:
         self.sensor = sensor
         self.frame: Frame | None = None
         self.frames = 0  # that came
-        self.changed = 0.0  # when one that differs from the last arrived [s]
+        self.changes = True  # the newest differs from the last
+        self.changed = 0.0  # when one that does arrived [s]
         # A recording that plays from its start again repeats itself.
         self.repeats = Repeats(settings.tactile.rate, tactile.backend != "replay")
         self.estimate = ContactEstimate()  # of the last valid frame
@@ -152,7 +154,8 @@ class FingerPerception:
         frame, last = self.sensor.latest(), self.frame
         if frame is None or frame is last:
             return None
-        if self.repeats.seen_before(frame.data):
+        self.changes = self.repeats.differs(frame.data)
+        if self.changes:
             self.changed = frame.t_arrival
         self.frame = frame
         self.frames += 1

@@ -51,6 +51,7 @@ _INTERVAL_MAX = 0.1  # s
 _BALANCE_ERROR = 0.05  # of the tips' forces, and …
 _RUBBED = 0.4  # … N that a table may take off one of them
 _GATE = 3.0  # standard deviations: what is further off counts as no more than so much
+_TORQUE_MOST = 0.3  # fraction, beyond which no torque constant is off
 _SURER = 1e-6  # least part of a variance that one measurement leaves: rounding takes none below 0
 _HEIGHTS = 1e-3, 1e3  # of frames over the model's, beyond which it is no height
 
@@ -161,6 +162,9 @@ def _update(s: Scales, innovation: float, variance: float, gate: float) -> None:
             s.mean[i] += cross[i] * inverse * innovation
             for j in range(STATES):
                 s.covariance[i, j] -= cross[i] * cross[j] * inverse
+        for i in range(TORQUE, OFFSET):
+            off = s.mean[i] - s.expected[i]
+            s.mean[i] = s.expected[i] + min(max(off, -_TORQUE_MOST), _TORQUE_MOST)
     slopes[:] = 0.0
 
 

@@ -165,7 +165,7 @@ def test_a_real_load_and_a_real_turn_are_no_lie(load: tuple[float, float, float]
 
 def given(repeats: Repeats, frames: list[int]) -> bool:
     for number in frames:
-        repeats.seen_before(np.full((2, 2), number, np.uint16))
+        repeats.differs(np.full((2, 2), number, np.uint16))
     return repeats.long
 
 

@@ -73,6 +73,7 @@ class Reference:
         r = max(r, miss**2 / gate**2 - s)
         gain = self.p @ h / (s + r)
         self.x = self.x + gain * miss
+        self.x[4:6] = self.expected[4:6] + np.clip(self.x[4:6] - self.expected[4:6], -0.3, 0.3)
         self.p = (np.eye(8) - np.outer(gain, h)) @ self.p
 
 
@@ -223,6 +224,34 @@ def test_grips_that_tell_nothing_lead_back_to_what_is_set() -> None:
     for _ in range(100):
         begin(record.array)
     np.testing.assert_allclose(record.mean, record.expected, atol=0.01)
+
+
+def test_no_torque_constant_is_learnt_that_no_servo_has() -> None:
+    record = Scales()
+    set_prior(record, PRIORS, 0.05, 0.01, 0.0)
+    moment = np.full(2, 0.3)
+    for k in range(1000):
+        if k % 100 == 0:
+            begin(record.array)
+        torques(record.array, -moment, moment, 0.0, 0.01 * k)
+    np.testing.assert_allclose(record.mean[scales.TORQUE : scales.OFFSET], -0.3)
+
+
+def test_a_sensor_that_freezes_in_the_ramp_teaches_nothing() -> None:
+    """Its frames repeat the last while the joints close: the joints carry the contact on."""
+    with Hand({}) as hand:
+        hand.grasp(8.0)
+        while hand.plant.normal.min() < 2.0:
+            hand.run(0.002)
+        hand.plant.measurement_faults[0].begin("replay", 0.01, hand.now)
+        frozen = hand.watch(0.3)
+        hand.plant.measurement_faults[0].clear()
+        assert frozen.force.max() < 1.2 * 8.0
+        learnt = hand.contact_filter.grasp.scales.mean[: scales.OFFSET]
+        np.testing.assert_allclose(learnt, 0.0, atol=0.08)
+        hand.run(1.5)
+        assert hand.mode == "holding"
+        assert hand.plant.normal.mean() == pytest.approx(8.0, rel=0.1)
 
 
 def test_what_is_known_of_scales_does_not_fade_while_nothing_is_held() -> None:
