@@ -456,7 +456,10 @@ def _tactile_silent(view: View, state: State, _: float, i: int) -> str:
     if age <= view.limits.frame_age_fault / view.settings.tactile.rate:
         return ""
     what = "frame" if contact.t_arrival == contact.t_valid else "sound estimate"
-    return _doubt(view, i) or f"tactile: no {what} of the {FINGERS[i]} sensor for {age:.3f} s"
+    cure = ""
+    if any(each.finger == i and each.sensor.counters().get("port_lost") for each in view.sensors):
+        cure = ": its port is gone, and `clear`, or `disarm` and `arm`, opens it again"
+    return _doubt(view, i) or f"tactile: no {what} of the {FINGERS[i]} sensor for {age:.3f} s{cure}"
 
 
 def _doubt(view: View, finger: int) -> str:

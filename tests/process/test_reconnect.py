@@ -159,6 +159,8 @@ def test_a_boards_port_comes_back_on_clear_and_on_arm(tmp_path):
         rig.does("arm")
         assert rig.events[-1][:2] != ("info", "tactile")
         assert any("no such port" in text for level, _, text in rig.events if level == "warning")
+        rig.until(lambda: loop.state.t - loop.state.contacts[0].t_valid > 0.9)
+        rig.refuses("grasp", "its port is gone, and `clear`, or `disarm` and `arm`, opens it again")
         rig.does("disarm")
         assert rig.emulator.request("left:plug") == "ok"
         until(Path(rig.settings.tactile.port[0]).exists)
