@@ -17,7 +17,6 @@ _EXTRAS = {  # what the message says, and the modules
         ("starlette", "uvicorn", "websockets", "orjson"),
     ),
     "foxglove": ("Foxglove's server needs foxglove-sdk and orjson", ("foxglove", "orjson")),
-    "parquet": ("Parquet files need pyarrow", ("pyarrow",)),
     "cluster": ("a cluster's workers need dask and distributed", ("distributed",)),
     "gym": ("the environments need gymnasium", ("gymnasium",)),
 }

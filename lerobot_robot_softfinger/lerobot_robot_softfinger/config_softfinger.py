@@ -5,7 +5,7 @@ from pathlib import Path
 
 from lerobot.robots import RobotConfig
 
-from softfinger.tools.recordings.lerobot_dataset import FULL_SCALE
+from lerobot_robot_softfinger.features import FULL_SCALE
 
 
 @RobotConfig.register_subclass("softfinger")

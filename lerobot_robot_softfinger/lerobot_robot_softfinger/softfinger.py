@@ -10,9 +10,9 @@ from lerobot.robots import Robot
 from lerobot.utils.decorators import check_if_already_connected, check_if_not_connected
 
 from lerobot_robot_softfinger.config_softfinger import SoftfingerConfig
+from lerobot_robot_softfinger.features import IMAGES, JOINTS, STATE, image, observation
 from softfinger import Hand, NoStream
 from softfinger.daemon.wire.schema import TactileFrame
-from softfinger.tools.recordings.lerobot_dataset import IMAGES, JOINTS, STATE, image, observation
 
 
 class Softfinger(Robot):

@@ -10,56 +10,52 @@ import numpy as np
 import pytest
 
 from softfinger.daemon.wire import schema
-from softfinger.tools.recordings.export import BLOCK, CsvTable, ParquetTable, export
+from softfinger.tools.recordings.export import export
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.record import RecordingWriter
 from tests.harness.golden_wire import flat, sample
 from tests.process.test_record import written
 
+STATES = 2050
+
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("recording") / "a.mcap"
-    written(path, BLOCK + 50)
+    written(path, STATES)
     return path
 
 
 def test_csv_has_every_field_with_all_its_digits(path, tmp_path):
-    export(Recording(path), tmp_path, CsvTable, [schema.STATE])
+    export(Recording(path), tmp_path, [schema.STATE])
     with (tmp_path / "hand-state.csv").open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
-    assert len(rows) == BLOCK + 50
+    assert len(rows) == STATES
     expected = flat(sample(schema.STATE))
     assert list(rows[0]) == [*expected, "t"]
     for name, value in expected.items():
         if name not in ("seq", "timestamp"):
             told = rows[-1][name]
             assert told == str(value) if isinstance(value, str) else float(told) == value, name
-    assert [int(row["seq"]) for row in rows] == list(range(BLOCK + 50))
+    assert [int(row["seq"]) for row in rows] == list(range(STATES))
 
 
-def test_parquet_keeps_types_and_frames(path, tmp_path):
-    import pyarrow.parquet
-
-    topics = [schema.STATE, schema.TACTILE]
-    files = export(Recording(path), tmp_path, ParquetTable, topics)
+def test_frames_are_arrays(path, tmp_path):
+    files = export(Recording(path), tmp_path, [schema.TACTILE])
     assert {file.name for file in files} == {
-        "hand-state.parquet",
-        "hand-tactile.parquet",
+        "hand-tactile.csv",
         "tactile-left.npz",
         "tactile-right.npz",
     }
-    table = pyarrow.parquet.read_table(tmp_path / "hand-state.parquet")
-    assert table.num_rows == BLOCK + 50
-    kinds = {"seq": "int64", "left.force": "double", "torque": "bool", "mode": "string"}
-    assert {name: str(table.schema.field(name).type) for name in kinds} == kinds
-    assert table["left.force"][0].as_py() == sample(schema.STATE)["left"]["force"]
-    frames = pyarrow.parquet.read_table(tmp_path / "hand-tactile.parquet")
     raw = np.load(tmp_path / "tactile-left.npz")
     assert raw["frames"].shape == (103, 44, 44)
     assert raw["t"][0] == 0.0
-    left = [k for k, name in enumerate(frames["finger"].to_pylist()) if name == "left"]
-    assert frames["data"][left[5]].as_py() == raw["frames"][5].tobytes()
+    recorded = [m for _, m in Recording(path).messages([schema.TACTILE]) if m["finger"] == "left"]
+    assert recorded[5]["data"] == raw["frames"][5].tobytes()
+    with (tmp_path / "hand-tactile.csv").open(newline="", encoding="utf-8") as file:
+        [row, *_] = csv.DictReader(file)
+    assert "data" not in row
+    assert row["rows"] == "44"
 
 
 def test_numbers_that_are_none_are_empty_cells(tmp_path):
@@ -69,7 +65,7 @@ def test_numbers_that_are_none_are_empty_cells(tmp_path):
     message["news"] = 3.5  # of a newer daemon
     writer.add(schema.STATE, message)
     writer.close()
-    export(Recording(tmp_path / "a.mcap"), tmp_path, CsvTable, [schema.STATE])
+    export(Recording(tmp_path / "a.mcap"), tmp_path, [schema.STATE])
     with (tmp_path / "hand-state.csv").open(newline="", encoding="utf-8") as file:
         [row] = csv.DictReader(file)
     assert (row["left.force"], row["news"]) == ("", "3.5")
@@ -81,7 +77,7 @@ def test_files_have_plain_names_whatever_the_topics_are_called(tmp_path):
         writer.add(topic, {"timestamp": 1e9, "a": 1})
     writer.close()
     recording = Recording(tmp_path / "a.mcap")
-    files = export(recording, tmp_path, CsvTable, recording.topics)
+    files = export(recording, tmp_path, recording.topics)
     names = {file.name for file in files}
     assert names == {"hidden.csv", "-[2Jhand-..-..-x.csv".replace("[", "-"), "nul-.csv", "-.csv"}
     assert {file.name for file in tmp_path.iterdir()} == names | {"a.mcap"}

@@ -15,7 +15,6 @@ from tests.process.test_record import written
         ("mcap", "record new.mcap", "pip install 'softfinger[record]'"),
         ("starlette", "view", "pip install 'softfinger[view]'"),
         ("foxglove", "view --foxglove", "pip install 'softfinger[foxglove]'"),
-        ("pyarrow", "export run.mcap --format parquet", "pip install 'softfinger[parquet]'"),
         ("numba", "replay --recompute run.mcap", "no hand/settings in it"),
         ("numba", "analyse run.mcap", "no hand/settings in it"),
         ("numba", "plot none.mcap", "none.mcap: No such file"),

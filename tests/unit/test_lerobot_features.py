@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import runpy
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,8 +13,12 @@ import pytest
 from softfinger.daemon.client.stream import read
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.schema import HandState, TactileFrame
-from softfinger.tools.recordings.lerobot_dataset import STATE, image, observation
 from tests.harness.golden_wire import sample
+
+PACKAGE = Path(__file__).parents[2] / "lerobot_robot_softfinger"
+# Alone: the package itself imports LeRobot.
+features = runpy.run_path(str(PACKAGE / "lerobot_robot_softfinger" / "features.py"))
+STATE, image, observation = (features[name] for name in ("STATE", "image", "observation"))
 
 
 def frame(counts: list[list[int]], t: float, scale: float = 1000.0) -> TactileFrame:

@@ -1,0 +1,45 @@
+"""LeRobot's names for a state and its frames; imports nothing of LeRobot's."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softfinger.daemon.types import FINGERS
+from softfinger.daemon.wire.schema import HandState, TactileFrame
+
+_PLAIN = {"pos": "q", "vel": "dq", "current": "current", "contact": "contact"}
+_FELT = ("d", "theta", "force")  # 0 while nothing touches the tip
+_OBJECT = ("angle", "width")  # 0 while the object's pose is not known
+STATE = tuple(
+    [f"{name}.{each}" for name in FINGERS for each in (*_PLAIN, *_FELT, "touch_age")]
+    + [f"object.{each}" for each in _OBJECT]
+)
+JOINTS = tuple(f"{name}.pos" for name in FINGERS)
+IMAGES = {name: f"{name}_touch" for name in FINGERS}
+FULL_SCALE = 127.5e3  # Pa, 500 Pa a step of an 8-bit image
+
+
+def observation(state: HandState, frames: Mapping[str, TactileFrame]) -> dict[str, float]:
+    """Return the numbers of `STATE`, in SI units; ``frames`` are the newest by finger.
+
+    ``touch_age`` [s] is how long before the state its finger's frame was sampled.
+    """
+    values: list[float] = []
+    for name in FINGERS:
+        finger = getattr(state, name)
+        values += [getattr(finger, field) for field in _PLAIN.values()]
+        values += [getattr(finger, field) if finger.contact else 0.0 for field in _FELT]
+        values.append((state.mono_ns - frames[name].mono_ns) * 1e-9)
+    values += [getattr(state.object, field) if state.object.valid else 0.0 for field in _OBJECT]
+    finite = (float(value) if math.isfinite(value) else 0.0 for value in values)
+    return dict(zip(STATE, finite, strict=True))
+
+
+def image(frame: TactileFrame, full_scale: float = FULL_SCALE) -> NDArray[np.uint8]:
+    """Return a frame's pressure as an image [rows, cols, 3], white from ``full_scale`` [Pa] on."""
+    grey = np.clip(np.rint(frame.pressure() * (255.0 / full_scale)), 0.0, 255.0)
+    return np.repeat(grey.astype(np.uint8)[:, :, np.newaxis], 3, axis=2)
