@@ -13,23 +13,16 @@ and carries its shears along. Balance is where the energy is stationary along th
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import root
 
 from softfinger import SoftfingerError
-from softfinger.kinematics.compiled.kernel import kernel
-from softfinger.kinematics.contact.lookup import lookup
 from softfinger.kinematics.contact.table import ContactTable
-from tests.harness.reference_hand import (
-    ReferenceHand,
-    contact_jacobian,
-    contact_variables,
-    rolling_rows,
-)
+from tests.harness.reference_hand import ReferenceHand
 
 FloatArray = NDArray[np.float64]
 
@@ -40,76 +33,21 @@ class GraspError(SoftfingerError, ValueError):
     """No such grasp: a contact opens, leaves the tip's range, or no balance is found."""
 
 
-@kernel
 def sheared_contact(
-    data: FloatArray, d: float, theta: float, shear: float
-) -> tuple[float, float, float, float, bool]:
-    """(U, ∂U/∂d, ∂U/∂θ, T = ∂U/∂d_t, inside) of a tip with shear ``shear`` [m]; zeros for d ≤ 0."""
-    force, energy, force_d, force_theta, energy_d, energy_theta, inside = lookup(data, d, theta)
-    if d <= 0.0:
-        return 0.0, 0.0, 0.0, 0.0, inside
-    sine = math.sin(theta)
-    cosine = math.cos(theta)
-    bend = shear / d
+    table: ContactTable, d: Any, theta: Any, shear: Any
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, Any]:
+    """(U, ∂U/∂d, ∂U/∂θ, T = ∂U/∂d_t, inside) of tips with shears ``shear`` [m]; zeros for d ≤ 0."""
+    c = table(d, theta, edge=True)
+    sine, cosine = np.sin(theta), np.cos(theta)
+    bend = np.where(np.greater(d, 0.0), shear / np.where(np.greater(d, 0.0), d, 1.0), 0.0)
     stretch = shear * (sine + cosine * bend)
     return (
-        energy + force * stretch,
-        energy_d + force_d * stretch - force * cosine * bend * bend,
-        energy_theta + force_theta * stretch + force * shear * (cosine - sine * bend),
-        force * (sine + 2.0 * cosine * bend),
-        inside,
+        c.energy + c.force * stretch,
+        c.energy_d + c.force_d * stretch - c.force * cosine * bend * bend,
+        c.energy_theta + c.force_theta * stretch + c.force * shear * (cosine - sine * bend),
+        c.force * (sine + 2.0 * cosine * bend),
+        c.inside,
     )
-
-
-@kernel
-def grasp_gradient(
-    data: FloatArray,
-    coordinates: FloatArray,
-    start: FloatArray,
-    start_shear: FloatArray,
-    lengths: FloatArray,
-    weight: FloatArray,
-    shear: FloatArray,
-    gradient: FloatArray,
-) -> bool:
-    """Gradient at ``coordinates`` [5], rolled there from ``start`` with ``start_shear`` [2].
-
-    ``lengths`` is (B, L, e, a, W), ``weight`` gravity's force on the object (x, y). Writes the
-    shears [2], rolled by the rows at the middle of the way, and the gradient [5] along the rows at
-    its end. Returns whether both contacts are inside the table and closed.
-    """
-    half, length, offset, radius, width = lengths
-    variables = np.empty(6)
-    jacobian = np.empty((6, 5))
-    rows = np.empty((2, 5))
-    middle = 0.5 * (coordinates + start)
-    contact_variables(middle, half, length, offset, radius, width, variables)
-    contact_jacobian(middle, half, length, offset, jacobian)
-    rolling_rows(variables, jacobian, radius, rows)
-    for finger in range(2):
-        shear[finger] = start_shear[finger]
-        for j in range(5):
-            shear[finger] += rows[finger, j] * (coordinates[j] - start[j])
-    contact_variables(coordinates, half, length, offset, radius, width, variables)
-    contact_jacobian(coordinates, half, length, offset, jacobian)
-    rolling_rows(variables, jacobian, radius, rows)
-    gradient[:] = 0.0
-    gradient[2] = -weight[0]
-    gradient[3] = -weight[1]
-    sound = True
-    for finger in range(2):
-        d = variables[finger]
-        _, by_d, by_theta, tangential, inside = sheared_contact(
-            data, d, variables[2 + finger], shear[finger]
-        )
-        sound = sound and inside and d > 0.0
-        for j in range(5):
-            gradient[j] += (
-                by_d * jacobian[finger, j]
-                + by_theta * jacobian[2 + finger, j]
-                + tangential * rows[finger, j]
-            )
-    return sound
 
 
 @dataclass(frozen=True)
@@ -152,15 +90,6 @@ class Grasp:
         self.table = table
         self.width = width
         self._weight = np.array(weight, dtype=np.float64)
-        self._lengths = np.array(
-            [
-                hand.half_separation,
-                hand.finger_length,
-                hand.finger_offset,
-                hand.tip_radius,
-                width,
-            ]
-        )
 
     def symmetric(self, d: float) -> GraspState:
         """Both tips pressed by ``d`` [m], the object upright at their height, no shear force.
@@ -183,14 +112,10 @@ class Grasp:
 
     def forces(self, state: GraspState) -> GraspForces:
         """Forces and moments of both contacts and the joints' torques."""
-        c = self.hand.contacts(state.q, state.pose, self.width)
-        looked_up = self.table(c.d, c.theta)
-        rows = [
-            sheared_contact(self.table.data, c.d[i], c.theta[i], state.shear[i]) for i in range(2)
-        ]
-        by_d, turning, tangential = (np.array([row[k] for row in rows]) for k in (1, 2, 3))
-        normal = by_d - tangential * np.tan(c.theta)
-        return GraspForces(looked_up.force, normal, tangential, turning, self.gradient(state)[:2])
+        d, theta, _ = self.hand.variables(state.coordinates, self.width).T
+        _, by_d, turning, tangential, _ = sheared_contact(self.table, d, theta, state.shear)
+        normal, torque = by_d - tangential * np.tan(theta), self.gradient(state)[:2]
+        return GraspForces(self.table(d, theta).force, normal, tangential, turning, torque)
 
     def balance(self, state: GraspState, q: ArrayLike | None = None) -> GraspState:
         """Bring the joints to ``q`` (2,) at once and let the object roll to where it balances.
@@ -214,30 +139,31 @@ class Grasp:
             raise GraspError("no balance found along the rolling increments")
         return GraspState(x[:2].copy(), x[2:].copy(), shear)
 
-    def move(self, state: GraspState, q: ArrayLike, steps: int = 32) -> GraspState:
-        """Bring the joints to ``q`` (2,) in ``steps`` equal steps, balancing the object in each."""
-        target = np.asarray(q, dtype=np.float64)
-        start = state.q
-        for k in range(1, steps + 1):
-            state = self.balance(state, start + (target - start) * (k / steps))
-        return state
-
-    def steer(self, state: GraspState, delta: float, steps: int = 32) -> GraspState:
+    def steer(self, state: GraspState, delta: float) -> GraspState:
         """Turn both fingers by ``delta`` [rad] to the right (q1 + δ, q2 − δ), in balance.
 
         The object turns the other way round from the fingers, by about
         2(a − d + L sin q + e cos q)/W for each radian.
         """
-        return self.move(state, state.q + np.array([delta, -delta]), steps)
+        ways = state.q + np.outer(np.arange(1, 17) / 16, [delta, -delta])
+        for q in ways:
+            state = self.balance(state, q)
+        return state
 
     def _evaluate(
         self, coordinates: FloatArray, start: GraspState
     ) -> tuple[FloatArray, FloatArray, bool]:
         """The gradient (5,), both shears, and whether both contacts are closed and in the table."""
-        shear, gradient = np.empty(2), np.empty(5)
-        ends = (coordinates, start.coordinates, start.shear)
-        sound = grasp_gradient(self.table.data, *ends, self._lengths, self._weight, shear, gradient)
-        return gradient, shear, sound
+        moved = coordinates - start.coordinates
+        middle = start.coordinates + 0.5 * moved
+        shear = start.shear + self.hand.rolling_rows(middle, self.width) @ moved
+        d, theta, _ = self.hand.variables(coordinates, self.width).T
+        _, *slopes, inside = sheared_contact(self.table, d, theta, shear)
+        by_d, by_theta, _ = self.hand.jacobian(coordinates).swapaxes(0, 1)
+        rows = (by_d, by_theta, self.hand.rolling_rows(coordinates, self.width))
+        gradient = sum(slope @ row for slope, row in zip(slopes, rows, strict=True))
+        gradient[2:4] -= self._weight
+        return gradient, shear, bool((inside & (d > 0.0)).all())
 
     @staticmethod
     def _check(sound: bool) -> None:
