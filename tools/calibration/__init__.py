@@ -1,1 +1,1 @@
-"""`calibrate`: its frames, steps and pictures."""
+"""`calibrate`: its frames and steps."""
