@@ -10,6 +10,7 @@ import random
 import struct
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -36,13 +37,6 @@ _ODD = (
     *(float("nan"), float("inf"), float("-inf"), "", "stop", "x" * 5000, "\0", "é\u202e", b"\xff"),
     *([], {}, [[]], {"command": "stop"}, msgpack.Timestamp(1), msgpack.ExtType(5, b"x")),
 )
-
-
-class Counts(dict[str, int]):
-    """How often each thing happened."""
-
-    def add(self, what: str) -> None:
-        self[what] = self.get(what, 0) + 1
 
 
 # --- commands ---------------------------------------------------------------------------------
@@ -263,14 +257,14 @@ TARGETS: dict[str, Callable[[], Any]] = {
 }
 
 
-def fuzz(name: str, count: int, seed: int) -> Counts:
-    """Give ``count`` inputs to one target. Raises what should not have been raised."""
-    target, rng, counts = TARGETS[name](), random.Random(seed), Counts()
+def fuzz(name: str, count: int, seed: int) -> Counter[str]:
+    """What became of ``count`` inputs to a target. Raises what should not have been raised."""
+    target, rng, counts = TARGETS[name](), random.Random(seed), Counter[str]()
     try:
         for _ in range(count):
             before = rng.getstate()
             try:
-                counts.add(target.give(rng)[0])
+                counts[target.give(rng)[0]] += 1
             except BaseException:
                 rng.setstate(before)
                 print(f"{name}, seed {seed}, input {sum(counts.values())}", file=sys.stderr)

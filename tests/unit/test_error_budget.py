@@ -136,6 +136,11 @@ def scanned(tip: Fingertip, d: float, x: float, y: float, sign: float) -> np.nda
     return np.stack(rows)
 
 
+def misplaced(by: Callable[[float], dict[str, Any]]) -> Imperfection:
+    """Cells that stand, or are turned, otherwise than is known."""
+    return lambda tip, d, x, y, sign: pressed(tip, d, x, y, replace(FLAT, **by(sign)))
+
+
 # What real cells have and a sensor's model lacks, and what has to be known for it.
 IMPERFECTIONS: dict[str, tuple[Uncertainty, Imperfection]] = {
     "unloading": (Uncertainty(gain=0.1, smooth=0.04), unloading),
@@ -145,23 +150,11 @@ IMPERFECTIONS: dict[str, tuple[Uncertainty, Imperfection]] = {
         Uncertainty(baseline=1000.0),
         lambda tip, d, x, y, sign: pressed(tip, d, x, y) + 1000.0 * sign,
     ),
-    "centre": (
-        Uncertainty(centre=5e-4),
-        lambda tip, d, x, y, sign: pressed(
-            tip, d, x, y, replace(FLAT, centre=(5e-4 * sign, 5e-4 * sign))
-        ),
-    ),
-    "pitch": (
-        Uncertainty(pitch=0.01),
-        lambda tip, d, x, y, sign: pressed(
-            tip, d, x, y, replace(FLAT, pitch=PITCH * (1.0 + 0.01 * sign))
-        ),
-    ),
+    "centre": (Uncertainty(centre=5e-4), misplaced(lambda s: {"centre": (5e-4 * s, 5e-4 * s)})),
+    "pitch": (Uncertainty(pitch=0.01), misplaced(lambda s: {"pitch": PITCH * (1.0 + 0.01 * s)})),
     "rotation": (
         Uncertainty(rotation=math.radians(2.0)),
-        lambda tip, d, x, y, sign: pressed(
-            tip, d, x, y, replace(FLAT, rotation=sign * math.radians(2.0))
-        ),
+        misplaced(lambda s: {"rotation": math.radians(2.0) * s}),
     ),
     "slope": (
         Uncertainty(slope=1000.0),

@@ -20,14 +20,8 @@ payloads = st.lists(st.sampled_from(PIECES), max_size=40).map(b"".join)
 
 
 @given(st.binary(max_size=300))
-def test_crc_equals_long_division_and_the_sdk(data: bytes) -> None:
-    value = 0
-    for byte in data:
-        value ^= byte << 8
-        for _ in range(8):
-            value = (value << 1 ^ 0x8005) & 0xFFFF if value & 0x8000 else value << 1
-    assert crc16(data) == value
-    assert sdk_handler(2.0).updateCRC(0, data, len(data)) == value
+def test_crc_equals_the_sdks(data: bytes) -> None:
+    assert crc16(data) == sdk_handler(2.0).updateCRC(0, data, len(data))
 
 
 @given(payloads)

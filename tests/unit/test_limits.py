@@ -59,6 +59,7 @@ FAULTS: dict[str, tuple[Changes, str, str]] = {
     "force": ({"contacts.1.force": 31.0}, "tip.force", "right tip at 31.0 N, above 30 N"),
     "depth": ({"contacts.1.d": 0.013}, "tip.displacement", "right tip at 13.00 mm, above 12"),
     "rim": ({"contacts.0.theta": -math.asin(0.8) + 0.04}, "tip.tilt", "left tip at -50.8°, past 5"),
+    "late": ({"timing.late_in_row": 100}, "loop.overruns", "loop: 100 overruns in a row"),
     "outside": ({"contacts.0.inside": False}, "tip.tilt", "left tip at 5.7°, past"),
 }
 THINNER: Changes = {"object.width": 0.0355}
@@ -139,12 +140,6 @@ def test_late_frames_hold_the_goals_before_they_are_a_fault() -> None:
     state.mode = Mode.ARMED
     assert judge.judge(state) is None
     assert not judge.must_hold
-
-
-def test_overruns_in_a_row_are_a_cause() -> None:
-    judge, state = safety(), sound()
-    state.timing.late_in_row = SETTINGS.safety.overruns_fault
-    assert judged(judge, state) == ("loop.overruns", "loop: 100 overruns in a row")
 
 
 def felt(finger: int, theta: float) -> Sensor:

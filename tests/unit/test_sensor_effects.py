@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import pytest
 from softfinger.daemon.simulation.sensor import sensor_model
 from softfinger.daemon.simulation.sensor.sensor_model import SensorModel
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
-from tests.harness.paper_tip import LINEAR, MEASURED, PITCH, TIP, E, board, flawed
+from tests.harness.paper_tip import LINEAR, MEASURED, PITCH, TIP, E, board, dense, flawed
 
 CONTACTS = [(0.0005, 0.1, -0.2), (0.002, 0.3, 0.1), (0.006, 0.0, -0.4)]
 
@@ -60,28 +61,13 @@ def test_gains_are_each_cells_own_and_dead_cells_read_zero():
     assert (4.0 * first[strong] / clean[strong]).std() == pytest.approx(0.05, rel=0.25)
 
 
-def spread(fine, width):
-    """Dense continuous convolution: a Gaussian over a grid much finer than it, both ways."""
-    reach = math.ceil(7 * width)
-    weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / width) ** 2)
-    weights /= weights.sum()
-    for axis in (0, 1):
-        fine = np.apply_along_axis(lambda line: np.convolve(line, weights, "same"), axis, fine)
-    return fine
-
-
 @pytest.mark.parametrize("width", [1e-4, 2e-4, 5e-4, 1e-3, 2e-3])
 def test_blur_is_the_continuous_convolution(width):
     # A grid that the footprint leaves: what presses beyond its edge is spread onto it too.
-    rows, cols, parts, centre = 16, 20, 16, (3e-4, 5.3e-3)
-    model = sensor(SensorGrid(rows, cols, PITCH, centre), blur=width)
-    margin = math.ceil(7 * width / PITCH)
-    shape = ((rows + 2 * margin) * parts, (cols + 2 * margin) * parts)
-    dense = SensorGrid(*shape, PITCH / parts, centre)
+    blurred = SensorGrid(16, 20, PITCH, (3e-4, 5.3e-3), blur=width)
+    model = sensor(replace(blurred, blur=0.0), blur=width)
     for contact in CONTACTS:
-        fine = spread(dense.pressure(TIP, LINEAR, *contact), width / PITCH * parts)
-        cells = fine.reshape(shape[0] // parts, parts, -1, parts).mean(axis=(1, 3))
-        expected = cells[margin:-margin, margin:-margin]
+        expected = dense(blurred, LINEAR, contact, margin=math.ceil(7 * width / PITCH))
         model.press(*contact)
         np.testing.assert_allclose(model._pressure, expected, rtol=0, atol=2.5e-4 * E)
         sharp = model.grid.pressure(TIP, LINEAR, *contact)

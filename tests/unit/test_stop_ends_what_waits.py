@@ -8,6 +8,8 @@ connection, in the gateway, on the link, or in the loop's hands when a stop is c
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
 from tempfile import TemporaryDirectory
 from typing import Any
 from unittest.mock import patch
@@ -78,8 +80,9 @@ class Scene:
         return {}
 
 
-@given(st.lists(action, max_size=60))
-def test_nothing_that_arrived_before_a_stop_is_carried_out(actions: list[tuple[str, int]]) -> None:
+@contextmanager
+def played() -> Iterator[Scene]:
+    """A scene whose gateway reads and answers in the scene's own way."""
     with TemporaryDirectory() as folder:
         scene = Scene(folder)
         with (
@@ -87,46 +90,46 @@ def test_nothing_that_arrived_before_a_stop_is_carried_out(actions: list[tuple[s
             patch.object(CommandEndpoint, "_send", scene.send),
             scene.served,
         ):
-            for what, client in actions:
-                scene.act(what, client)
-            for _ in range(100):  # all that was sent has been read, stops included
-                scene.act("gateway")
-                scene.act("loop")
-            asked = sum(what in ("arm", "stop") for what, _ in actions)
-            assert len(scene.replies) == asked, "every request is answered, and once"
-            # And what arrives after it is carried out.
-            scene.ask(0, command="arm", force=1e9)
-            for _ in range(3):
-                scene.act("gateway")
-                scene.act("loop")
-            assert scene.replies[asked:] == [{"ok": True}]
+            yield scene
+
+
+@given(st.lists(action, max_size=60))
+def test_nothing_that_arrived_before_a_stop_is_carried_out(actions: list[tuple[str, int]]) -> None:
+    with played() as scene:
+        for what, client in actions:
+            scene.act(what, client)
+        for _ in range(100):  # all that was sent has been read, stops included
+            scene.act("gateway")
+            scene.act("loop")
+        asked = sum(what in ("arm", "stop") for what, _ in actions)
+        assert len(scene.replies) == asked, "every request is answered, and once"
+        # And what arrives after it is carried out.
+        scene.ask(0, command="arm", force=1e9)
+        for _ in range(3):
+            scene.act("gateway")
+            scene.act("loop")
+        assert scene.replies[asked:] == [{"ok": True}]
 
 
 def test_a_backlog_that_libzmq_hands_on_bit_by_bit_dies_with_a_stop() -> None:
     """Nothing waits at times, and still most of what arrived before is to come."""
-    with TemporaryDirectory() as folder:
-        scene = Scene(folder)
-        with (
-            patch.object(CommandEndpoint, "_parts", scene.read),
-            patch.object(CommandEndpoint, "_send", scene.send),
-            scene.served,
-        ):
-            scene.reading = 1e-5
-            scene.stopped_at = 2
-            scene.served.server.raise_fence()
-            for _ in range(500):
-                for client in range(20):
-                    scene.ask(client, command="arm", force=1.0)
-                while scene.arrived:
-                    scene.act("gateway")
-                scene.act("loop")
-            for _ in range(3):
-                scene.act("time")
+    with played() as scene:
+        scene.reading = 1e-5
+        scene.stopped_at = 2
+        scene.served.server.raise_fence()
+        for _ in range(500):
+            for client in range(20):
+                scene.ask(client, command="arm", force=1.0)
+            while scene.arrived:
                 scene.act("gateway")
-                scene.act("loop")
-            assert [reply["ok"] for reply in scene.replies] == [False] * 10_000
-            scene.ask(0, command="arm", force=1e9)
-            for _ in range(3):
-                scene.act("gateway")
-                scene.act("loop")
-            assert scene.replies[-1]["ok"]
+            scene.act("loop")
+        for _ in range(3):
+            scene.act("time")
+            scene.act("gateway")
+            scene.act("loop")
+        assert [reply["ok"] for reply in scene.replies] == [False] * 10_000
+        scene.ask(0, command="arm", force=1e9)
+        for _ in range(3):
+            scene.act("gateway")
+            scene.act("loop")
+        assert scene.replies[-1]["ok"]
