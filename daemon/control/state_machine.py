@@ -179,7 +179,8 @@ class Control:
             return HOLDING
         # A force that a turn began with has shown what torques tell of it.
         known = self.mode is Mode.ROTATING and self._grip.commanded == self._still_at[0]
-        return OTHER if self.mode not in GRIPPING or self._grip.turning or known else RAMPING
+        tells = self.mode in GRIPPING and not (self._grip.turning or known or self._empty > 0.0)
+        return RAMPING if tells else OTHER
 
     def set(self, compliance: float) -> None:
         """Set the angle by which the grip gives way to a torque [rad/(N·m)]."""

@@ -38,6 +38,8 @@ from softfinger.daemon.perception.scales import (
     UNKNOWN,
     Prior,
     Scales,
+    begin_touch,
+    end_touch,
     set_prior,
 )
 from softfinger.daemon.profile.settings import Settings
@@ -173,7 +175,7 @@ class ContactFilter:
         ):
             self._invalid[finger] = Invalid.JOINTS
             return
-        self._in_contact[finger] = in_contact
+        self._touch(finger, in_contact)
         self._news = True
         contact.t_valid = frame.t_arrival
         contact.contact, contact.gain = estimate.contact, estimate.gain
@@ -190,6 +192,15 @@ class ContactFilter:
                 self._priors[finger],
                 self._state.radius,
             )
+
+    def _touch(self, finger: int, in_contact: bool) -> None:
+        """Note whether a finger's tip touches; what scales learn of a touch may end with it."""
+        touching = any(self._in_contact)
+        self._in_contact[finger] = in_contact
+        if not touching and in_contact:
+            begin_touch(self.grasp.scales)
+        elif touching and not any(self._in_contact):
+            end_touch(self.grasp.scales)
 
     def write_contacts(
         self, t: float, contacts: list[Contact], pose: ObjectPose, phase: int = kernels.OTHER

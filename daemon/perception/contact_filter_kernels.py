@@ -731,6 +731,7 @@ def write_grasp(
     grasp.torque_residual[1] = modulus2 * remaining2
     grasp.load_curvature = 2.0 * curvature / (modulus1 + modulus2)
     _learn_scales(f, phase == RAMPING)
+    grasp.scales.proven = grasp.scales.proven or phase == HOLDING
     if grasp.load_arm > 0.0:
         dt = f.t - f.checked
         if phase == HOLDING and f.phase != HOLDING:

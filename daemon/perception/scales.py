@@ -16,8 +16,8 @@ gain changes by 5-32 % when it is mounted again (DTIC ADP011007), a torque const
 Torques, as they arrive through gears that close, are taken in only while a grip's force ramps: a
 wrong scale grows with it, a load along the faces doesn't. Of those that have fallen again gears may
 hold the rest. The height is taken in with each frame; what changes of it in a lasting
-grip is the sensor's, for a modulus doesn't jump. What was found stays for later grips, 5 % less
-with each; `softfinger calibrate scales` keeps it.
+grip is the sensor's, for a modulus doesn't jump. What was found in a grip that came to hold stays
+for later ones, 5 % less with each; `softfinger calibrate scales` keeps it.
 """
 
 from __future__ import annotations
@@ -87,6 +87,9 @@ class Scales(Record):
     slopes: Annotated[FloatArray, STATES]  # scratch: of a measurement by the states
     cross: Annotated[FloatArray, STATES]  # scratch
     gripping: bool  # both tips touch, and have since `begin_grip`
+    kept_mean: Annotated[FloatArray, STATES]  # as they were before this touch, and …
+    kept_covariance: Annotated[FloatArray, STATES, STATES]
+    proven: bool  # … what it taught came to hold
 
 
 def set_prior(
@@ -110,6 +113,19 @@ def set_prior(
     scales.mean[:] = scales.expected
     scales.covariance[:] = np.diag(scales.prior)
     scales.modulus[:] = np.exp(scales.mean[MODULUS : MODULUS + 2])
+
+
+def begin_touch(scales: Scales) -> None:
+    """Keep what is known before anything touches a tip."""
+    scales.kept_mean[:], scales.kept_covariance[:] = scales.mean, scales.covariance
+    scales.proven = False
+
+
+def end_touch(scales: Scales) -> None:
+    """Forget what a touch taught that came to no hold: tips that pressed each other, a fault."""
+    if not scales.proven:
+        scales.mean[:], scales.covariance[:] = scales.kept_mean, scales.kept_covariance
+        scales.modulus[:] = np.exp(scales.mean[MODULUS : MODULUS + 2])
 
 
 @inner_kernel

@@ -254,6 +254,25 @@ def test_a_sensor_that_freezes_in_the_ramp_teaches_nothing() -> None:
         assert hand.plant.normal.mean() == pytest.approx(8.0, rel=0.1)
 
 
+def test_tips_that_close_on_nothing_teach_nothing() -> None:
+    with Hand({}) as hand:
+        hand.run(0.3)
+        hand.command("arm")
+        hand.run(0.5)
+        hand.plant.object_pose[:] = 0.0, 0.25, 0.0  # out of reach
+        for k in range(4):
+            hand.command("grasp", force=3.0 + 2.0 * k)
+            seen = hand.watch(3.5)
+            assert seen.force.max() > 0.3
+            assert hand.mode == "armed"
+            np.testing.assert_array_equal(hand.contact_filter.grasp.scales.mean, 0.0)
+        hand.plant.place_object()
+        hand.command("grasp", force=8.0)
+        hand.run(2.0)
+        assert hand.mode == "holding"
+        assert hand.plant.normal.mean() == pytest.approx(8.0, rel=0.1)
+
+
 def test_what_is_known_of_scales_does_not_fade_while_nothing_is_held() -> None:
     with Hand({}) as hand:
         hand.run(30.0)
