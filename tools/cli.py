@@ -50,7 +50,7 @@ GROUPS = {  # subcommands: the room of tools/ that its module is in, and what it
         "config": ("setup", "list and show the profiles, and every setting with its default"),
         "compile": ("processes", "compile a hand's kernels ahead of its first start"),
         "keys": ("setup", "make the keys that addresses outside this machine need"),
-        "install-service": ("setup", "print or write a systemd unit and udev rules"),
+        "install-service": ("setup", "print a systemd unit and udev rules"),
         "completion": ("setup", "print what completes these words in bash, zsh or fish"),
     },
     "develop": {

@@ -201,27 +201,13 @@ def test_the_rules_are_keys_operators_and_quoted_values(inline):
     [
         ("--user", "nobody-of-that-name"),
         ("--config", "/absent.toml"),
-        ("--to", "/absent"),
     ],
 )
 def test_what_can_not_be_installed_is_told(inline, words):
     done = inline("install-service", *words)
-    assert done.returncode == 1
+    assert done.returncode == 2
     assert done.stdout == ""
     assert done.stderr.startswith("install-service: ")
-
-
-def test_it_writes_where_it_is_asked_to_and_over_nothing(inline, tmp_path):
-    done = inline("install-service", "--to", tmp_path)
-    path = tmp_path / "softfinger.service"
-    assert done.stdout.strip() == str(path)
-    path.write_text("mine", encoding="utf-8")
-    again = inline("install-service", "--to", tmp_path)
-    assert again.returncode == 1
-    assert "exists already; --force" in again.stderr
-    assert path.read_text(encoding="utf-8") == "mine"
-    assert inline("install-service", "--to", tmp_path, "--force").returncode == 0
-    assert "[Service]" in path.read_text(encoding="utf-8")
 
 
 # --- logs -------------------------------------------------------------------------------------
