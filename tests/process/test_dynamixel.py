@@ -5,14 +5,12 @@ from __future__ import annotations
 import math
 import struct
 import time
-from collections.abc import Callable
-from typing import Any
 
 import pytest
 
 from softfinger.daemon.clock import RealClock
 from softfinger.daemon.errors import ServoError
-from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.profile.settings import SafetySettings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.control_table import by_name
 from softfinger.daemon.servos.dynamixel import DynamixelServos
@@ -20,11 +18,7 @@ from softfinger.daemon.servos.protocol import ServoLine
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 from softfinger.daemon.types import Goal, Reading
 from tests.conftest import until
-from tests.harness.servos import (
-    RADIAN,
-    backend_settings,
-    make_bus,
-)
+from tests.harness.servos import RADIAN, backend_settings, make_bus
 
 FIRMWARES = pytest.mark.parametrize("firmware", [44, 48], ids=["sync read", "fast sync read"])
 
@@ -34,23 +28,6 @@ def placed(firmware: int, *counts: int) -> ServoBus:
     return make_bus(
         "XM430-W350", firmware=firmware, prepared=True, counts=counts, t=time.monotonic()
     )
-
-
-def changed(settings: Settings, **sections: Any) -> Settings:
-    parts = Settings.model_validate(sections)
-    return settings.model_copy(update={name: getattr(parts, name) for name in sections})
-
-
-def go(backend: DynamixelServos, goal: Goal, done: Callable[[Reading], bool]) -> Reading:
-    reading = Reading()
-
-    def there() -> bool:
-        backend.read(reading)
-        backend.write(goal)
-        return done(reading)
-
-    until(there)
-    return reading
 
 
 def read(backend: DynamixelServos) -> Reading:
@@ -143,13 +120,19 @@ def test_torque_is_refused_where_the_joint_can_not_be(bus, connect):
 def test_the_joints_go_where_they_are_told(running, model, level):
     bus = running(servos={"model": model})
     bus.call(lambda: [s.table.set(reg.STATUS_RETURN_LEVEL, level) for s in bus.bus.servos])
-    safety = {"current_max": by_name(model).stall_current, "current_move": 0.1}
-    settings = changed(backend_settings(bus.path, model=model), safety=safety)
+    safety = SafetySettings(current_max=by_name(model).stall_current, current_move=0.1)
+    settings = backend_settings(bus.path, model=model).model_copy(update={"safety": safety})
     backend = DynamixelServos(settings, RealClock())
     backend.connect()
     backend.torque_on()
-    goal = Goal(q=[0.3, -0.2], current=[0.5, 0.5])
-    reading = go(backend, goal, lambda r: r.q == pytest.approx(goal.q, abs=0.01))
+    goal, reading = Goal(q=[0.3, -0.2], current=[0.5, 0.5]), Reading()
+
+    def there() -> bool:
+        backend.read(reading)
+        backend.write(goal)
+        return reading.q == pytest.approx(goal.q, abs=0.01)
+
+    until(there)
     assert reading.valid
     counters = backend.counters()
     counters.pop("timeouts")  # a busy machine's
@@ -346,15 +329,3 @@ def test_nothing_works_before_connect() -> None:
         backend.read(Reading())
     with pytest.raises(ServoError, match="not connected"):
         backend.torque_on()
-
-
-def test_a_scene_with_one_finger_asks_for_one_servo(bus):
-    bus.fault("silent=1")
-    settings = changed(backend_settings(bus.path), scene={"fingers": ("right",)})
-    backend = DynamixelServos(settings, RealClock())
-    backend.connect()
-    backend.torque_on()
-    goal = Goal(q=[9.0, 0.2], current=[0.5, 0.5])
-    reading = go(backend, goal, lambda reading: abs(reading.q[1] - 0.2) < 0.01)
-    backend.close()
-    assert reading.q[0] == 0.0

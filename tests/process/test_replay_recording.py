@@ -19,6 +19,7 @@ from softfinger.tools.recordings.recomputed import recompute
 from softfinger.tools.recordings.record import RecordingWriter
 from tests.conftest import until
 from tests.harness.daemon_process import PATIENT, softfinger, started
+from tests.harness.golden_recording import MADE_ON, RECORDING, machine_class
 from tests.harness.golden_wire import sample
 from tests.harness.recorded_hand import Messages, Script, published
 
@@ -178,3 +179,15 @@ def test_a_part_at_its_own_pace(played, addresses, inline):
     words = ("--address", addresses[0], "--no-wait", "--from", "0.2", "--to", "0.4")
     done = inline("replay", played[0], *words)
     assert done.stdout.startswith(("20 of", "21 of"))
+
+
+def test_the_golden_recording_gives_the_same_states() -> None:
+    result = recompute(Recording(RECORDING))
+    assert result.from_start
+    assert (result.ticks, result.states) == (1000, 1000)
+    assert (result.missing_ticks, result.missing_frames) == (0, 0)
+    if json.loads(MADE_ON.read_text(encoding="utf-8")) == machine_class():
+        assert result.differences == {}, "not identical to the last bit"
+    for name, difference in result.differences.items():
+        assert isinstance(difference.recorded, float), f"{name}: {difference}"
+        assert difference.worst < 1e-9, f"{name}: {difference}"

@@ -7,7 +7,7 @@ import struct
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from softfinger.daemon.profile.settings import ServoSettings
@@ -17,7 +17,7 @@ from softfinger.daemon.servos.joint import JointScale
 from softfinger.daemon.simulation.servo_model import framing
 from softfinger.daemon.simulation.servo_model.framing import BROADCAST
 from softfinger.daemon.simulation.servo_model.servo import REBOOT_TIME
-from softfinger.daemon.simulation.servo_model.servo_joint import OVERLOAD_TIME
+from softfinger.daemon.simulation.servo_model.servo_joint import OVERLOAD_TIME, Profile
 from tests.harness.servos import RADIAN, BusClient, make_bus, put_fault
 
 
@@ -342,3 +342,33 @@ def test_a_broadcast_factory_reset_of_everything_is_ignored() -> None:
     assert c.send(BROADCAST, framing.FACTORY_RESET, b"\xff") == b""
     assert c.ask(framing.PING, packet_id=5)[0] == 0
     assert c.ask(framing.FACTORY_RESET, b"\x07", packet_id=5)[0] == framing.DATA_RANGE
+
+
+@settings(max_examples=40)
+@given(
+    start=st.floats(-1000, 1000),
+    target=st.floats(-1000, 1000),
+    speed=st.floats(500, 5000),
+    acceleration=st.floats(500, 1e5),
+)
+def test_a_profile_arrives_without_passing_and_within_its_limits(
+    start: float, target: float, speed: float, acceleration: float
+) -> None:
+    profile = Profile()
+    profile.hold(start)
+    profile.aim(target, speed, acceleration)
+    dt = 0.001
+    ideal = abs(target - start) / speed + speed / acceleration
+    last_velocity, steps = 0.0, 0
+    while profile.busy:
+        before = profile.position
+        profile.step(dt)
+        steps += 1
+        low, high = sorted((start, target))
+        assert low - 1e-6 <= profile.position <= high + 1e-6
+        assert abs(profile.position - before) <= speed * dt * (1 + 1e-9)
+        if profile.busy:
+            assert abs(profile.velocity - last_velocity) <= acceleration * dt * (1 + 1e-6)
+        last_velocity = profile.velocity
+        assert steps * dt <= 1.05 * ideal + 0.05
+    assert profile.position == target

@@ -170,13 +170,6 @@ def test_a_port_that_goes_away_ends_a_search(
         search("line")
 
 
-def test_factory_modes_are_changed(wired: Callable[..., Bus]) -> None:
-    bus = wired(factory=True)
-    done = named(LEFT, *MODE_AND_DELAY) + named(RIGHT, *MODE_AND_DELAY)
-    assert bus.provision() == (done, [])
-    assert bus.provision() == ([], [])
-
-
 def test_two_factory_servos_are_set_up_one_after_the_other(wired: Callable[..., Bus]) -> None:
     bus = wired(baud=57600, ids=(1, 1), factory=True)
     bus.servos[1].silent = True

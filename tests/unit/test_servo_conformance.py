@@ -24,7 +24,7 @@ from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 from softfinger.daemon.types import Goal, Reading
 from tests.harness.free_joints import FreeJoints
 from tests.harness.plant import PAPER
-from tests.harness.servos import DirectPort
+from tests.harness.servos import DirectPort, put_fault
 
 COUNT = 2 * math.pi / 4096
 CURRENT_UNIT = 2.69e-3
@@ -216,6 +216,8 @@ def test_torque_off_and_close_let_go(make, mode):
 @pytest.mark.parametrize("mode", MODES)
 def test_a_finger_that_is_not_in_the_scene_stays_zero(make, mode):
     rig = make(mode, scene={"fingers": ("right",)})
+    if isinstance(rig, DynamixelRig):
+        put_fault(rig.bus, "silent=1", 0.0)  # that one is not asked
     armed(rig)
     reading = ticks(rig, Goal(q=[0.1, -0.1], current=[0.4, 0.4]), 0.4)[-1]
     assert reading.q[0] == reading.dq[0] == reading.current[0] == 0.0

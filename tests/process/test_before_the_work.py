@@ -1,0 +1,92 @@
+"""A subcommand before its work: packages that are missing, Ctrl-C at an import, completion."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+
+import pytest
+
+from tests.harness.daemon_process import python
+from tests.process.test_record import written
+
+
+@pytest.mark.parametrize(
+    ("missing", "words", "told"),
+    [
+        ("matplotlib", "plot run.mcap", "pip install 'softfinger[plot]'"),
+        ("mcap", "record new.mcap", "pip install 'softfinger[record]'"),
+        ("starlette", "view", "pip install 'softfinger[view]'"),
+        ("foxglove", "view --foxglove", "pip install 'softfinger[foxglove]'"),
+        ("numba", "replay --recompute run.mcap", "no hand/settings in it"),
+        ("numba", "analyse run.mcap", "no hand/settings in it"),
+        ("numba", "plot none.mcap", "none.mcap: No such file"),
+    ],
+)
+def test_a_missing_package_is_named_if_it_is_needed(tmp_path, missing, words, told):
+    written(tmp_path / "run.mcap", 20)
+    code = (
+        f"import sys; sys.modules[{missing!r}] = None\n"
+        "from softfinger.tools.cli import main\n"
+        "sys.exit(main(sys.argv[1:]))"
+    )
+    done = python("-c", code, *words.split(), cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr.count("\n") == 1
+    assert told in done.stderr
+    assert not (tmp_path / "new.mcap").exists()
+
+
+# Presses Ctrl-C at the import of a module.
+_AT = """
+import builtins, os, signal, sys
+from softfinger.tools import cli
+really = builtins.__import__
+def patched(name, *rest, **more):
+    if name == sys.argv[1]:
+        os.kill(os.getpid(), signal.SIGINT)
+    return really(name, *rest, **more)
+builtins.__import__ = patched
+sys.exit(cli.main(sys.argv[2:]))
+"""
+
+
+@pytest.mark.parametrize(
+    ("module", "words", "status"),
+    [
+        ("argparse", ["limits"], -signal.SIGINT),
+        ("pydantic", ["run"], -signal.SIGINT),
+        ("softfinger.tools.terminal.feed", ["monitor"], -signal.SIGINT),
+        ("softfinger.daemon.safety.limits", ["limits"], 130),  # a keyboard interrupt again
+    ],
+)
+def test_ctrl_c_while_a_subcommand_is_imported_ends_it_as_any_process(module, words, status):
+    done = python("-c", _AT, module, *words)
+    assert (done.returncode, done.stderr) == (status, "")
+
+
+_TAB = """
+source "$1"; shift
+COMP_WORDS=("$@") COMP_CWORD=$(($# - 1))
+"$(complete -p softfinger | sed 's/.* -F \\([^ ]*\\) .*/\\1/')" softfinger "${@: -1}" "${@: -2:1}"
+echo "${COMPREPLY[@]}"
+"""
+
+
+def test_a_tab_completes(inline, tmp_path):
+    """By the script that `softfinger completion bash` prints."""
+    pytest.importorskip("shtab")
+    script = tmp_path / "script"
+    script.write_text(inline("completion", "bash").stdout, encoding="utf-8")
+    (tmp_path / "my.toml").touch()
+    for words, completed in (
+        (("re",), "record replay"),
+        (("send", "ro"), "rotate"),
+        (("run", "--log-"), "--log-file"),
+        (("run", "--log", ""), "plain json"),
+        (("calibrate", "cu"), "curve"),
+        (("run", "--config", "my"), "my.toml"),
+    ):
+        call = ["bash", "--norc", "-c", _TAB, "bash", script, "softfinger", *words]
+        done = subprocess.run(call, cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert done.stdout.strip() == completed
