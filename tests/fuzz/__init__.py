@@ -1,7 +1,5 @@
 """Fuzzing: random and mutated input. The tests run a little of it, `python -m tests.fuzz` hours."""
 
-from __future__ import annotations
-
 import random
 from typing import NamedTuple
 

@@ -3,8 +3,6 @@
 It ends at the first input that raises what it must not, and prints what else is wrong.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import time

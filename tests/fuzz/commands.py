@@ -3,8 +3,6 @@
 Commands go to a running hand, every hundredth through a real socket.
 """
 
-from __future__ import annotations
-
 import json
 import random
 import struct

@@ -3,8 +3,6 @@
 A hand's commands are drawn in one go and carried out inside one compiled loop.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

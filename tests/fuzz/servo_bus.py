@@ -1,7 +1,5 @@
 """Random and mutated packets against the emulated servo bus."""
 
-from __future__ import annotations
-
 import random
 import struct
 

@@ -1,7 +1,5 @@
 """Random and mutated bytes against every tactile framing and the reader of ASCII exports."""
 
-from __future__ import annotations
-
 import random
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Inner kernels as tests call them: from Python, which needs a wrapper that they don't have."""
 
-from __future__ import annotations
-
 from typing import Any, TypeVar
 
 from softfinger.kinematics.compiled.kernel import kernel

@@ -1,7 +1,5 @@
 """``softfinger`` as real processes: one that ends by itself, and a daemon that runs."""
 
-from __future__ import annotations
-
 import shutil
 import signal
 import subprocess

@@ -4,8 +4,6 @@ As a program, with a word, it waits for the end of its standard input, and then 
 that has this word in its environment.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import os

@@ -4,8 +4,6 @@ What goes on until somebody ends it is parsed, with its profile, and not run; an
 started as a process of its own, in the place of the one before it.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json

@@ -1,7 +1,5 @@
 """Steps of the estimator as tests call them: inner kernels behind a kernel that Python may call."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -5,8 +5,6 @@ servo's inner position loop in current; it is stepped with a fixed step, so a ru
 The constants are about an XM430-W350 with nothing on its horn.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -4,8 +4,6 @@
 the hand does; the file beside it names the machine and packages that made it.
 """
 
-from __future__ import annotations
-
 import json
 import platform
 from pathlib import Path

@@ -3,8 +3,6 @@
 ``python -m tests.harness.golden_wire`` writes the bytes anew, after a field was added.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

@@ -11,8 +11,6 @@ integrated in general, so that a grasp depends on its path: what moves here move
 and carries its shears along. Balance is where the energy is stationary along those increments.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

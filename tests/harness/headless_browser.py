@@ -3,8 +3,6 @@
 Everything it keeps is in a folder of the test's; it has no network beyond what the page asks for.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """A machine whose time moves by its own work and sleeps alone, and that wakes up late when told."""
 
-from __future__ import annotations
-
 from softfinger.daemon.clock import VirtualClock
 
 

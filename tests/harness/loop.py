@@ -1,7 +1,5 @@
 """A whole daemon on the virtual clock, without sockets, and what tests do with it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

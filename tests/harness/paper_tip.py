@@ -1,7 +1,5 @@
 """The tip and sensor of most tests, the paper's: 20 mm, 0.304 MPa, 44 × 44 cells on 58 mm."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

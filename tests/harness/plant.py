@@ -1,7 +1,5 @@
 """What the tests of the simulated hand share: making one, putting it somewhere, letting it run."""
 
-from __future__ import annotations
-
 import math
 
 from softfinger.daemon.profile.settings import Settings

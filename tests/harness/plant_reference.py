@@ -5,8 +5,6 @@ Contacts are geometric functions of the coordinates (q1, q2, x, y, φ), differen
 steps; forces come from the closed form of the tips' energy.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The simulated hand at work on the virtual clock: what it publishes, and recordings of that."""
 
-from __future__ import annotations
-
 from collections import deque
 from pathlib import Path
 from tempfile import TemporaryDirectory

@@ -7,8 +7,6 @@ A tip that rolls without slip shears by
 where the tan θ term keeps the virtual work consistent. Coordinates are ordered (q1, q2, x, y, φ).
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

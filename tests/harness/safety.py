@@ -1,7 +1,5 @@
 """States for the limits to judge, and a `Safety` that does."""
 
-from __future__ import annotations
-
 from typing import Any, cast
 
 import numpy as np

@@ -4,8 +4,6 @@
 that the data file was fitted to, without its polynomials, modes and linear law. Needs pypardiso.
 """
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

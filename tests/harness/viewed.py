@@ -1,7 +1,5 @@
 """``softfinger view`` in a process of its own, and its pictures as a page gets them."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 from typing import Any, Self

@@ -6,8 +6,6 @@ scene runs in a fork of a process that has called no kernel yet, so that none is
 another scene.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

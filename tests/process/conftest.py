@@ -1,7 +1,5 @@
 """What several of these tests share: buses, backends on them, a daemon, and a made-up one."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple

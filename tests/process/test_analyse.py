@@ -1,7 +1,5 @@
 """``softfinger analyse``: recorded frames of every kind become contacts, as the daemon's would."""
 
-from __future__ import annotations
-
 import csv
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A subcommand before its work: packages that are missing, Ctrl-C at an import, completion."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 

@@ -1,7 +1,5 @@
 """`bench tick` in short: a hand that holds over ptys, its servos emulated by another process."""
 
-from __future__ import annotations
-
 from softfinger.tools.benchmarks import tick
 from softfinger.tools.benchmarks.measuring import Report
 from tests.conftest import until

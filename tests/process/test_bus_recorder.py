@@ -1,7 +1,5 @@
 """The record of what was on the servos' wire, by the bus itself and through the control socket."""
 
-from __future__ import annotations
-
 import json
 import struct
 

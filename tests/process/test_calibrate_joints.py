@@ -1,7 +1,5 @@
 """`softfinger calibrate joints` on the emulated hand, whose joints a person's hand turns."""
 
-from __future__ import annotations
-
 import shlex
 import sys
 

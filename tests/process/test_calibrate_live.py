@@ -1,7 +1,5 @@
 """`softfinger calibrate` live: a board on a pty pressed load by load."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import math

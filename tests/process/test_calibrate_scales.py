@@ -1,7 +1,5 @@
 """`softfinger calibrate scales`: what grips told is kept, and the next daemon begins with it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

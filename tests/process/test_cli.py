@@ -1,7 +1,5 @@
 """The command line, as real processes: run, send, signals, a second daemon, bad settings."""
 
-from __future__ import annotations
-
 import json
 import select
 import signal

@@ -1,7 +1,5 @@
 """The client for programs, against a real daemon and against streams that a daemon never sends."""
 
-from __future__ import annotations
-
 import asyncio
 import inspect
 import json

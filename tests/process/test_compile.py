@@ -1,7 +1,5 @@
 """Kernels compiled ahead: `softfinger compile`, its processes, what is said; none in the loop."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

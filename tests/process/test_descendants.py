@@ -1,7 +1,5 @@
 """What tests started ends with them: their own children, and what those left behind them."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

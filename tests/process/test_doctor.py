@@ -1,7 +1,5 @@
 """`softfinger doctor` and `softfinger scan`: against emulated hands, and its checks one by one."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import resource

@@ -11,8 +11,6 @@ Behind `softfinger status` stands what it shows: the test waits until the hand's
 angle are so.
 """
 
-from __future__ import annotations
-
 import contextlib
 import importlib.util
 import os

@@ -1,7 +1,5 @@
 """The Dynamixel backend over the real SDK and pyserial against emulated servos on a pty."""
 
-from __future__ import annotations
-
 import math
 import struct
 import time

@@ -1,7 +1,5 @@
 """Measurements that lie on the emulated hand, over serial bytes: its own true force is bounded."""
 
-from __future__ import annotations
-
 import select
 from collections.abc import Iterator
 from statistics import fmean

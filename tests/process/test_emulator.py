@@ -1,7 +1,5 @@
 """`softfinger emulate`: its process, its ports, and what it refuses."""
 
-from __future__ import annotations
-
 import os
 import signal
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """An emulated hand's boards, scenes and faults, and the control socket that sets them."""
 
-from __future__ import annotations
-
 import socket
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The example programs, and the gym's, run as they stand."""
 
-from __future__ import annotations
-
 import re
 
 import pytest

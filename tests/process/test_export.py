@@ -1,7 +1,5 @@
 """``softfinger export``: a recording's numbers in the files that others read."""
 
-from __future__ import annotations
-
 import csv
 import math
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The FlexiTac backend on real ptys through pyserial."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """``softfinger view --foxglove``: what a client of Foxglove's protocol reads from it."""
 
-from __future__ import annotations
-
 import json
 import struct
 import time

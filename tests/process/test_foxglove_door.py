@@ -1,7 +1,5 @@
 """The door before Foxglove's server: who is let in, and who is shown out."""
 
-from __future__ import annotations
-
 import socket
 import socketserver
 import threading

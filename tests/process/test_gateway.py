@@ -1,7 +1,5 @@
 """The gateway's process may hang, die or be killed: the loop goes on; and a stop's own way."""
 
-from __future__ import annotations
-
 import asyncio
 import math
 import os

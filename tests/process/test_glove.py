@@ -1,7 +1,5 @@
 """The glove-style board's framing as pure bytes, and its poll on a real pty."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

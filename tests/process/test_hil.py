@@ -4,8 +4,6 @@ The stand-in hand tells by its control socket what was on the servos' wire, and 
 watchdog stopped them: where the daemon dies, stands still, or loses its port.
 """
 
-from __future__ import annotations
-
 import json
 import select
 import signal

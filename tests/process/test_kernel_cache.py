@@ -3,8 +3,6 @@
 A small package of this shape, with the real decorators, is changed and run in processes of its own.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Keys: the files, and that nobody without one gets anything from the daemon's sockets."""
 
-from __future__ import annotations
-
 import errno
 import os
 import stat

@@ -1,7 +1,5 @@
 """Every tool that speaks with a daemon does so with keys, and says so where it lacks them."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import re

@@ -1,7 +1,5 @@
 """The demo as a process that stands still for a second while it is at work."""
 
-from __future__ import annotations
-
 import select
 import signal
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """The hand as a robot of LeRobot: found, driven and recorded by the real package."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The monitor as a person meets it: the real process on a pseudo-terminal, on real sockets."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

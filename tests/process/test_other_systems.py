@@ -1,7 +1,5 @@
 """What needs no tick imports and works without what Linux alone has, as on macOS and Windows."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """With a Numba that the compiler was not tested with, Numba alone compiles the same kernels."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

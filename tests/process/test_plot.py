@@ -1,7 +1,5 @@
 """``softfinger plot``: a recording's pages, what is on them, and recordings that lack something."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Backends of an installed package: found, checked, and run by a real daemon."""
 
-from __future__ import annotations
-
 import os
 import threading
 from pathlib import Path

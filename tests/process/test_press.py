@@ -1,7 +1,5 @@
 """Calibration without metal: `emulate --press` and `calibrate` on a tip of solid rubber."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

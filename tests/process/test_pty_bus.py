@@ -1,7 +1,5 @@
 """The servo bus on a pseudo-terminal: the wire's time, rates, links, and coming and going."""
 
-from __future__ import annotations
-
 import os
 import select
 import termios

@@ -1,7 +1,5 @@
 """Measures for a steady tick: had and given back where allowed, told where they are not."""
 
-from __future__ import annotations
-
 import ctypes
 import json
 import os

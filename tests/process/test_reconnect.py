@@ -1,7 +1,5 @@
 """The servos' port goes away under a running daemon and comes back: only on command, torque off."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable, Iterator
 from pathlib import Path

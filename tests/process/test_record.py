@@ -1,7 +1,5 @@
 """Recordings: everything that was published is in them, whatever happens to the recorder."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import math

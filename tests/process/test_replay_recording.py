@@ -1,7 +1,5 @@
 """Recordings replayed: on the wire as they were, and through today's code to the same states."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The daemon as a service: signs of life on a real socket, unit, rules, logs, closed streams."""
 
-from __future__ import annotations
-
 import configparser
 import json
 import math

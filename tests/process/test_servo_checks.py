@@ -1,7 +1,5 @@
 """What connecting finds: everything that is wrong at once, with its fix, and nothing changed."""
 
-from __future__ import annotations
-
 import os
 import time
 from pathlib import Path

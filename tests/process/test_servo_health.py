@@ -1,7 +1,5 @@
 """Temperature, supply and hardware errors of the servos, from the wire to the limits' table."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The maker's SDK, plain and through our packet handler, against emulated servos on a pty."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import dynamixel_sdk as sdk

@@ -1,7 +1,5 @@
 """The soak in real time, in short: it runs, and judges wire, memory and what is lost."""
 
-from __future__ import annotations
-
 import copy
 import math
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A hand with solid tips, recorded by a real daemon: what the tools make of the recording."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

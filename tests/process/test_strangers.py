@@ -4,8 +4,6 @@ A web page can have a browser POST bytes of its choice to any port of this machi
 to read as frames of ZMTP/1.0, which has no handshake that could tell a browser from a client.
 """
 
-from __future__ import annotations
-
 import contextlib
 import socket
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Sweeps give the same bits from one process, a pool, and a cluster whose worker is killed."""
 
-from __future__ import annotations
-
 import json
 import os
 import random

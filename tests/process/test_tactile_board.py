@@ -1,7 +1,5 @@
 """The emulated tactile board: what it puts on its pty, when, and what its faults do."""
 
-from __future__ import annotations
-
 import os
 import select
 

@@ -1,7 +1,5 @@
 """What every tactile backend must do, whatever it reads."""
 
-from __future__ import annotations
-
 import threading
 
 import numpy as np

@@ -1,7 +1,5 @@
 """``softfinger view``: its pictures are the stream's, and who may have them; what can go wrong."""
 
-from __future__ import annotations
-
 import base64
 import http.client
 import math

@@ -1,7 +1,5 @@
 """The page of ``softfinger view`` in a real browser: what it shows, and what its buttons do."""
 
-from __future__ import annotations
-
 import math
 import os
 import signal

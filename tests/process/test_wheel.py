@@ -1,7 +1,5 @@
 """The wheel: one package, whole, whatever else the environment and the current folder hold."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import shutil

@@ -1,7 +1,5 @@
 """When simulated frames arrive, and what the sensors and boards over them count."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

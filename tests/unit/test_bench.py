@@ -1,7 +1,5 @@
 """Benchmarks in short: their errors and bounds, and what is judged how."""
 
-from __future__ import annotations
-
 import json
 import math
 import random

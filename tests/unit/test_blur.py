@@ -1,7 +1,5 @@
 """The elastomer's blur: forward against a dense convolution, and in the estimator at the bound."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

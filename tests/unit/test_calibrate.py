@@ -1,7 +1,5 @@
 """`softfinger calibrate`: a made-up sensor, step by step, into a file that the daemon applies."""
 
-from __future__ import annotations
-
 import json
 import math
 

@@ -1,7 +1,5 @@
 """Two tips that were calibrated to different materials: each finger's forces are by its own."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

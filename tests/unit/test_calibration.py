@@ -1,7 +1,5 @@
 """The mathematics of calibration: each step recovers what a sensor was made with."""
 
-from __future__ import annotations
-
 import math
 import sys
 

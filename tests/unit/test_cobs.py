@@ -1,7 +1,5 @@
 """Our framing: its bytes as documented, its decoder against a plain twin, its times."""
 
-from __future__ import annotations
-
 import re
 import struct
 

@@ -1,7 +1,5 @@
 """The command line's front: first steps, profiles shown, numbers with units."""
 
-from __future__ import annotations
-
 import math
 import tomllib
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Command server and client on real sockets."""
 
-from __future__ import annotations
-
 import math
 import os
 import select

@@ -1,7 +1,5 @@
 """The filter between frames at its beginning: a tip that touches before anything was read."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

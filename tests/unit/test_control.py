@@ -1,7 +1,5 @@
 """What the control reaches on the simulated hand, judged by the plant's truth; and its parts."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The site's pages are made, their links lead somewhere, and quoted messages the program's."""
 
-from __future__ import annotations
-
 import ast
 import importlib.util
 import re

@@ -1,7 +1,5 @@
 """What an emulated servo's registers do: access, units, motion, watchdog, errors, resets."""
 
-from __future__ import annotations
-
 import math
 import struct
 from typing import Any

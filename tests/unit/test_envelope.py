@@ -1,7 +1,5 @@
 """What the hand holds: tried on virtual time, kept as a map, and asked by `grasp`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

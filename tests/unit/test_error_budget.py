@@ -1,7 +1,5 @@
 """The covariance carries what frames don't show: errors are as large as it says, in each case."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

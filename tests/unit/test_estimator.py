@@ -1,7 +1,5 @@
 """The estimator: at the Cramér-Rao bound, honest about it, and never a silent number."""
 
-from __future__ import annotations
-
 import math
 import tracemalloc
 

@@ -1,7 +1,5 @@
 """Wrong frames and arguments: a flagged estimate or a clear error, never a silent number."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The estimator on counts, which end at 0 or at the smallest one that a board sends."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The estimator's kernels against plain NumPy twins."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

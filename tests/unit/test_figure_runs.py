@@ -1,7 +1,5 @@
 """The paper's experiments run in simulation: paths, errors of estimates, the slow turn."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The figures' numbers against published and derived values, their files, and their pictures."""
 
-from __future__ import annotations
-
 import argparse
 import csv
 import sys

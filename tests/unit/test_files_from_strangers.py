@@ -1,7 +1,5 @@
 """Files that somebody else has made end in one line, soon, and without much memory."""
 
-from __future__ import annotations
-
 import base64
 import json
 import os

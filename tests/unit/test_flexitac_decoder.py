@@ -1,7 +1,5 @@
 """FlexiTac framing as pure bytes."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

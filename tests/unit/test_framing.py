@@ -1,7 +1,5 @@
 """Protocol 2.0 framing: the maker's published packets byte for byte, and the parser's promises."""
 
-from __future__ import annotations
-
 import pytest
 from dynamixel_sdk import PacketHandler as sdk_handler
 from hypothesis import given

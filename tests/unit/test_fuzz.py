@@ -1,7 +1,5 @@
 """A short run of the fuzzing of commands, profiles, calibration files and boards."""
 
-from __future__ import annotations
-
 import pytest
 
 from tests.fuzz import tactile

@@ -1,7 +1,5 @@
 """What a client may do to the gateway: each bound, and that others are served meanwhile."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import msgpack

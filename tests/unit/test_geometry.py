@@ -1,7 +1,5 @@
 """The hand's planar geometry against plain NumPy; the tests' own reference hand and grasp."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """How a held object answers the joints, and the load that their torques show, against `Grasp`."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

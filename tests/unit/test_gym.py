@@ -1,7 +1,5 @@
 """Gymnasium's environments: what its own checker says, seeds to the bit, and who gets what."""
 
-from __future__ import annotations
-
 import gymnasium
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """The simulated hand: where it balances, what its servos do, its scenes and its time."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Imports run one way, without circles; names and docstrings of modules, classes and exceptions."""
 
-from __future__ import annotations
-
 import ast
 import re
 from collections import Counter

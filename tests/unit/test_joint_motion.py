@@ -1,7 +1,5 @@
 """Angle, velocity and current of a joint, judged together: what is found, and what never is."""
 
-from __future__ import annotations
-
 import math
 import random
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """The kernel decorators and their records; which sources a compiled kernel may depend on."""
 
-from __future__ import annotations
-
 import importlib
 import math
 import pkgutil

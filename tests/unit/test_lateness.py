@@ -1,7 +1,5 @@
 """A machine that is late: what each clock, a simulated hand, a real one and a person get of it."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable, Iterator
 from typing import Any

@@ -1,7 +1,5 @@
 """What LeRobot's names are of a state and its frames; without LeRobot."""
 
-from __future__ import annotations
-
 import math
 import runpy
 from dataclasses import replace

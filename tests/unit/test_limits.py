@@ -1,7 +1,5 @@
 """The limits one by one, and when they are reported or latch."""
 
-from __future__ import annotations
-
 import math
 from copy import copy
 from typing import Any

@@ -1,7 +1,5 @@
 """The whole pipeline on the virtual clock: what the hand does when it is commanded."""
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import replace

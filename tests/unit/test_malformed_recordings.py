@@ -1,7 +1,5 @@
 """Recordings with messages that are none: told, left out, and never a traceback."""
 
-from __future__ import annotations
-
 import copy
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Stress-strain laws: Table I, measured points, what is refused, and the kernels' tables."""
 
-from __future__ import annotations
-
 import math
 from fractions import Fraction
 

@@ -1,7 +1,5 @@
 """A tip that fits no model: curves through presses, the table and the estimator that they make."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import asdict, replace

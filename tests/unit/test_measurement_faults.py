@@ -1,7 +1,5 @@
 """Faults in words; what sensors of the simulated hand read wrong, while the hand is as it was."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

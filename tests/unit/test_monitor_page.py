@@ -1,7 +1,5 @@
 """The page as text, without a terminal: sizes, hostile streams, states, keys, pressure maps."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """The soft tips in MuJoCo against the contact table, and the daemon's grip beside our own plant."""
 
-from __future__ import annotations
-
 import math
 import re
 from importlib.metadata import EntryPoint

@@ -1,7 +1,5 @@
 """The daemon on what is no block of parallel faces: wedges, discs, a sheet, nothing at all."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

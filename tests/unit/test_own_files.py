@@ -1,7 +1,5 @@
 """What others have put where this user's files are to be is neither followed nor written over."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from pathlib import Path

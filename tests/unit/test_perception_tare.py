@@ -1,7 +1,5 @@
 """A zero learnt while running: what cells read over it, at their full end and for subscribers."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

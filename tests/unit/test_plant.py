@@ -1,7 +1,5 @@
 """The plant's kernel: one energy that no step adds to, what it survives, and its speed."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The plant against an adaptive solver of SciPy, and its order, in every kind of contact."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

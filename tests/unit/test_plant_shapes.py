@@ -1,7 +1,5 @@
 """The simulated object's shapes, tips on each other, and the palm."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

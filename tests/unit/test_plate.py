@@ -1,7 +1,5 @@
 """The plate that presses an emulated tip: its words, its way, and what is refused."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

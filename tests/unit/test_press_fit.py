@@ -1,7 +1,5 @@
 """Presses at known depths and tilts: which tip made them, its modulus, its ν and its place."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Literal

@@ -1,7 +1,5 @@
 """The forward model: cell averages against plain integration, sums against the closed forms."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Finding servos, telling which is which, and setting them up, over a line without a port."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable, Iterator
 from typing import Any

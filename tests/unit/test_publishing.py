@@ -1,7 +1,5 @@
 """What goes out when; histograms of the loop's times: against plain NumPy, at no allocation."""
 
-from __future__ import annotations
-
 import math
 import tracemalloc
 from typing import Any

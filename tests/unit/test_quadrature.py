@@ -1,7 +1,5 @@
 """One tip's closed forms and reference integrals, against plain NumPy in other coordinates."""
 
-from __future__ import annotations
-
 import math
 from fractions import Fraction
 

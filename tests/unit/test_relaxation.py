@@ -1,7 +1,5 @@
 """Tips that relax: the plant against its Prony terms' integrals, and against its own energy."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any

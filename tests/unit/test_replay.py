@@ -1,7 +1,5 @@
 """Recordings in their files, and their replay on virtual time."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

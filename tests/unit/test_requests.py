@@ -1,7 +1,5 @@
 """The transition table: what is heard when, and how a request must look."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

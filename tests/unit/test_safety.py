@@ -1,7 +1,5 @@
 """Bounds on goals, whoever asks for them, and that nothing else writes one."""
 
-from __future__ import annotations
-
 import ast
 import math
 from pathlib import Path

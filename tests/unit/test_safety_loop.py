@@ -1,7 +1,5 @@
 """The limits at work in the whole pipeline, on the virtual clock."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

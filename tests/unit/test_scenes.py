@@ -1,7 +1,5 @@
 """Each kind of scene runs the whole pipeline, with what it has."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

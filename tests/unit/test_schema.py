@@ -1,7 +1,5 @@
 """The stream's schema: what is sent is what it says, to the byte; its page is what it writes."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math

@@ -1,7 +1,5 @@
 """What the simulated sensor does to the pressure: each operator against a plain twin."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Hands with cells as people have them: grasped, turned and held, judged by the plant."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

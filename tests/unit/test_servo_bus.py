@@ -1,7 +1,5 @@
 """The emulated servo bus: published exchanges byte for byte, who answers, faults on the line."""
 
-from __future__ import annotations
-
 import struct
 from typing import Any
 

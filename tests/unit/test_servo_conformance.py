@@ -3,8 +3,6 @@
 The same tests run over both; a backend that joins them is added to ``RIGS``.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from typing import Any, Protocol

@@ -1,8 +1,6 @@
 """The servos' heat: the filter against plain NumPy, its forecast against an ODE solver, and what
 the hand does with it on hidden constants."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

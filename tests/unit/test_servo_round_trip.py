@@ -1,7 +1,5 @@
 """Any instruction, through our packet handler and the emulated bus, equals direct table access."""
 
-from __future__ import annotations
-
 import dynamixel_sdk as sdk
 import numpy as np
 from hypothesis import given

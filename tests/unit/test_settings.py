@@ -1,7 +1,5 @@
 """Settings: profiles load, and whatever is wrong with one is told in one report."""
 
-from __future__ import annotations
-
 import tomllib
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """How stuck shear relaxes: creep against its exponential, micro-slip against its closed form."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The in-process servos and tactile sensors of the simulated hand, on a virtual clock."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The grip: loads from outside answered, without new frames, and of one finger alone."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

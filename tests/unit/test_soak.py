@@ -1,7 +1,5 @@
 """Some sequences of the soak: what must hold does, and the soak would see it if it did not."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 

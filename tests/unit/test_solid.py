@@ -1,7 +1,5 @@
 """A tip of solid rubber: its table, its frames, the estimator on them, a hand with such tips."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The solid tip's data file and its finite elements, against another finite element method."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -5,8 +5,6 @@ taken in stands in a list, of which the gateway reads little at a time. So a req
 connection, in the gateway, on the link, or in the loop's hands when a stop is carried out.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """The publisher on a real socket: what is on the wire, and subscribers of every kind."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

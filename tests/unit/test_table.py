@@ -1,7 +1,5 @@
 """Contact tables: accuracy over the whole domain, the bound of it, forms, files, odd input."""
 
-from __future__ import annotations
-
 import functools
 import math
 from fractions import Fraction

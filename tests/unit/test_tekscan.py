@@ -1,7 +1,5 @@
 """Tekscan-style exports: what they may look like, and what is told of those that are none."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

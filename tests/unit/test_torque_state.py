@@ -1,7 +1,5 @@
 """Torque on and off, whatever the servos answer, and who may ask for it."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A held object comes upright without a look at it: the closed form, and the law, on the plant."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

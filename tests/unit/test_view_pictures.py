@@ -1,7 +1,5 @@
 """What the viewer draws: footprints on frames, the planar hand, the landscape, by the model."""
 
-from __future__ import annotations
-
 import json
 import math
 

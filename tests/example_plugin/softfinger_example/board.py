@@ -1,7 +1,5 @@
 """A board whose cells all read the same, up and down in turn."""
 
-from __future__ import annotations
-
 import numpy as np
 from pydantic import Field
 

@@ -1,7 +1,5 @@
 """Joints that follow their goals at once while torque is on."""
 
-from __future__ import annotations
-
 from softfinger.daemon.clock import Clock
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import Goal, Reading

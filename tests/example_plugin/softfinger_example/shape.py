@@ -1,7 +1,5 @@
 """A hexagonal nut."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from softfinger.daemon.profile.settings import SimulationSettings
