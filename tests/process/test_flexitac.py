@@ -4,7 +4,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 
-import numpy as np
 import pytest
 import serial
 
@@ -119,15 +118,3 @@ def test_a_silent_port_is_told_with_its_name_and_the_timeout(own_threads, board)
     # And it can be opened once the board talks.
     board.stream(lambda k: frame(bytes(1024)))
     until(lambda: not why_not_open(tactile))
-
-
-def test_a_stream_that_turns_to_noise_gives_an_invalid_frame(board):
-    rng = np.random.default_rng(0)
-    board.stream(lambda k: frame(bytes(1024)) if k < 10 else rng.bytes(1000))
-    tactile = sensor(board.path)
-    tactile.open()
-    until(lambda: not tactile.latest().valid)
-    assert tactile.latest().data.shape == (32, 32)
-    assert tactile.counters()["resyncs"] >= 1
-    assert "AA 55" in tactile.error
-    tactile.close()

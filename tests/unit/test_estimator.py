@@ -113,22 +113,6 @@ def test_errors_are_at_the_cramer_rao_bound(
     )
 
 
-def test_the_bound_is_the_known_one():
-    # Published figures of this model: 44 × 44 cells on 58 mm, 0.2 % of E, gain free.
-    for d, degrees, sigma_d, sigma_tilt in [
-        (0.0005, 0, 16.9e-6, 0.191),
-        (0.002, 30, 5.9e-6, 0.036),
-        (0.004, 0, 4.7e-6, 0.021),
-        (0.008, 30, 2.4e-6, 0.008),
-    ]:
-        p = GRID.pressure(TIP, LINEAR, d, math.radians(degrees))
-        e = ContactEstimator(TIP, LINEAR, GRID, 608.0)(p)
-        assert e.d_std == pytest.approx(sigma_d, rel=0.03)
-        assert math.degrees(e.tilt_y_std) == pytest.approx(
-            sigma_tilt / math.cos(0.0), rel=0.08, abs=5e-4
-        )
-
-
 def test_a_turned_and_oblong_sensor_estimates_in_the_fingers_axes():
     grid = SensorGrid(30, 50, (0.0012, 0.0017), centre=(0.001, -0.002), rotation=0.7)
     truth = (0.003, 0.25, -0.15, 1.0)

@@ -13,13 +13,7 @@ from softfinger.daemon.simulation.physics.tip import touch_object
 from softfinger.kinematics.compiled.kernel import kernel
 from softfinger.kinematics.compiled.simd import address
 from tests.fuzz.plant import abuse, random_hand
-from tests.harness.plant import (
-    MODULUS,
-    PAPER,
-    TABLE_I,
-    make,
-    place,
-)
+from tests.harness.plant import MODULUS, PAPER, TABLE_I, make, place
 
 # One tip alone.
 
@@ -42,30 +36,20 @@ def tip_at(hand: SimulatedHand, finger: int, q, pose, shear: float) -> TipContac
     return TipContact(hand.plant.stages[0].on_object[finger].array.copy())
 
 
+GRADIENTS = {
+    "soft": ((0.001, 0.010), {}),
+    "softer along": ((0.001, 0.010), {"tip_shear_stiffness": 0.6}),
+    "rim": ((0.010, 0.019), {}),
+    "flat on the rim": ((0.0190, 0.0205), {}),
+    "corner": ((0.001, 0.015), {"object_height": 0.002}),
+    "wedge": ((0.001, 0.015), {"object_shape": "wedge", "object_taper": 0.4}),
+    "disc": ((0.001, 0.018), {"object_shape": "disc", "object_radius": 0.025}),
+    "disc on the rim": ((0.016, 0.022), {"object_shape": "disc", "object_radius": 0.012}),
+}
+
+
 @pytest.mark.parametrize("table", [PAPER, TABLE_I], ids=["constant", "table_i"])
-@pytest.mark.parametrize(
-    ("depth", "scene"),
-    [
-        ((0.001, 0.010), {}),
-        ((0.001, 0.010), {"tip_shear_stiffness": 0.6}),
-        ((0.010, 0.019), {}),
-        ((0.0190, 0.0205), {}),
-        ((0.001, 0.015), {"object_height": 0.002}),
-        ((0.001, 0.015), {"object_shape": "wedge", "object_taper": 0.4}),
-        ((0.001, 0.018), {"object_shape": "disc", "object_radius": 0.025}),
-        ((0.016, 0.022), {"object_shape": "disc", "object_radius": 0.012}),
-    ],
-    ids=[
-        "soft",
-        "softer along",
-        "rim",
-        "flat on the rim",
-        "corner",
-        "wedge",
-        "disc",
-        "disc on the rim",
-    ],
-)
+@pytest.mark.parametrize(("depth", "scene"), GRADIENTS.values(), ids=GRADIENTS)
 def test_tip_forces_are_the_gradient_of_one_energy(table, depth, scene):
     gradient_of_one_energy(table, depth, scene)
 
@@ -94,17 +78,11 @@ def gradient_of_one_energy(table, depth, scene):
             continue
         move = generator.normal(size=4) * [1, 0.05, 0.05, 1]
         rolled = tip.rows[2] @ move
-        energies = [
-            tip_at(
-                hand,
-                finger,
-                q + s * move[0],
-                pose + s * move[1:],
-                shear + s * rolled,
-            ).energy
+        ahead, behind = (
+            tip_at(hand, finger, q + s * move[0], pose + s * move[1:], shear + s * rolled).energy
             for s in (step, -step)
-        ]
-        slope = (energies[0] - energies[1]) / (2 * step)
+        )
+        slope = (ahead - behind) / (2 * step)
         forces = tip.forces
         assert -forces @ move == pytest.approx(
             slope, rel=1e-5, abs=1e-5 * np.abs(forces * move).sum()
