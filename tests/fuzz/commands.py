@@ -111,8 +111,7 @@ class CommandTarget:
         for _ in range(10_000):
             self.served.serve(self.loop.command)
             if self.client.poll(0):
-                reply: dict[str, Any] = msgpack.unpackb(self.client.recv_multipart()[-1])
-                return reply
+                return msgpack.unpackb(self.client.recv_multipart()[-1])
         raise AssertionError("no reply")
 
     def _directly(self, message: bytes) -> dict[str, Any]:

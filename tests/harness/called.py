@@ -1,14 +1,10 @@
 """Inner kernels as tests call them: from Python, which needs a wrapper that they don't have."""
 
-from typing import Any, TypeVar
+from typing import Any
 
 from softfinger.kinematics.compiled.kernel import kernel
 
-Function = TypeVar("Function")
 
-
-def called(inner: Function) -> Function:
+def called(inner: Any) -> Any:
     """The same source compiled as a kernel that Python may call."""
-    source: Any = inner
-    made: Function = kernel(source.py_func)
-    return made
+    return kernel(inner.py_func)

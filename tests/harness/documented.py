@@ -127,7 +127,6 @@ class Softfinger:
     def _emulate(self, words: list[str]) -> int:
         self.end()
         self._emulator = subprocess.Popen([*SOFTFINGER, *words], stdout=subprocess.PIPE, text=True)
-        assert self._emulator.stdout is not None
         return 0 if self._emulator.stdout.readline() == "ready\n" else 1
 
     def end(self) -> None:

@@ -58,13 +58,13 @@ def change_frames(daemon: Daemon, finger: int, change: Callable[[Frame], Frame |
     def latest() -> Frame | None:
         frame = really()
         if frame is not last[0] and frame is not None:
-            last[:] = frame, change(frame)  # type: ignore[call-overload]
+            last[:] = frame, change(frame)
         return last[1]
 
-    sensor.latest = latest  # type: ignore[method-assign]
+    sensor.latest = latest
 
 
 def silence(daemon: Daemon) -> None:
     """From now on no frame comes."""
     for perception in daemon.loop.perception.fingers:
-        perception.sensor.latest = lambda kept=perception.frame: kept  # type: ignore[method-assign]
+        perception.sensor.latest = lambda kept=perception.frame: kept

@@ -6,7 +6,7 @@ from tests.conftest import until
 from tests.harness.daemon_process import PATIENCE
 
 
-def test_ticks_over_ptys_and_their_exchanges_take_turns() -> None:
+def test_ticks_over_ptys_and_their_exchanges_take_turns():
     patient = [f"{key}={value}" for key, value in PATIENCE.items()]
     reports: list[Report] = []
 

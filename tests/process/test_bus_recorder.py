@@ -39,7 +39,7 @@ class Hand:
         return next(each for each in self.bus.report(self.t) if each["id"] == servo)
 
 
-def test_extremes_of_goals_refused_ones_too() -> None:
+def test_extremes_of_goals_refused_ones_too():
     hand = Hand()
     assert hand.report(1)["goal_q"] is None
     assert hand.report(1)["goal_current"] is None
@@ -63,7 +63,7 @@ def test_extremes_of_goals_refused_ones_too() -> None:
     assert hand.report(1)["goals_refused"] == 0
 
 
-def test_goals_through_group_writes_and_indirect_addresses() -> None:
+def test_goals_through_group_writes_and_indirect_addresses():
     hand = Hand()
     places = (reg.GOAL_CURRENT, reg.GOAL_CURRENT + 1, *range(116, 120))
     for servo in (1, 2):
@@ -76,7 +76,7 @@ def test_goals_through_group_writes_and_indirect_addresses() -> None:
     assert hand.report(2)["goal_current"] == pytest.approx([-10 * UNIT] * 2)
 
 
-def test_torque_on_far_from_the_goal() -> None:
+def test_torque_on_far_from_the_goal():
     hand = Hand()
     hand.write(1, reg.GOAL_POSITION, "i", 2048 + 10)
     hand.write(1, reg.GOAL_CURRENT, "h", 20)
@@ -98,7 +98,7 @@ def test_torque_on_far_from_the_goal() -> None:
     assert hand.report(2)["torque_on"]["count"] == 0
 
 
-def test_silence_and_the_watchdog() -> None:
+def test_silence_and_the_watchdog():
     hand = Hand()
     hand.later(3.0)
     assert hand.report(1)["quiet"] is None
@@ -123,7 +123,7 @@ def test_silence_and_the_watchdog() -> None:
     assert state["longest_quiet"] == pytest.approx(0.53)
 
 
-def test_a_report_through_the_control_socket(tmp_path, capsys) -> None:
+def test_a_report_through_the_control_socket(tmp_path, capsys):
     settings = Settings.model_validate({"tactile": {"backend": "none"}})
     with emulated(tmp_path, settings=settings):
         assert send(tmp_path, "undervoltage=2 report forget") == 0

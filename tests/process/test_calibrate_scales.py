@@ -39,7 +39,7 @@ def test_a_daemon_begins_with_what_grips_told(start, profile, addresses, tmp_pat
     for step, gain in zip(found, (0.6, 1.4), strict=True):
         assert step.gain[0] == pytest.approx(gain, rel=0.1)
         assert step.modulus[0] == pytest.approx(1.0, rel=0.1)
-    assert f"gain {found[0].gain[0]:.3f} ± " in capsys.readouterr().out  # type: ignore[union-attr]
+    assert f"gain {found[0].gain[0]:.3f} ± " in capsys.readouterr().out
 
     with Watched({"simulation": WRONG, "tactile": {"calibration": files}}) as after:
         first = grasped(after, 8.0).force

@@ -77,7 +77,7 @@ def test_the_same_from_asyncio(daemon):
 
             await insist(hand.arm)
             with pytest.raises(Refused, match="expected a number"):
-                await insist(lambda: hand.grasp(force="much"))  # type: ignore[arg-type]
+                await insist(lambda: hand.grasp(force="much"))
             await insist(lambda: hand.grasp(force=5.0))
             assert (await hand.status())["torque"] is True
             held = await hand.wait_for(lambda state: state.mode == "holding", 60.0)
@@ -140,7 +140,7 @@ def test_state_is_never_one_that_has_waited(fake, hand):
     assert hand.state().seq >= 5 * (latest - 1) > first.seq
 
 
-def test_gaps_are_counted_by_the_step_of_the_topic() -> None:
+def test_gaps_are_counted_by_the_step_of_the_topic():
     gaps = Gaps()
     for seq in (5, 10, 16, 30, 36):  # which one of five is up to the sender
         gaps.take({"seq": seq, "seq_step": 5})
@@ -195,7 +195,7 @@ def test_a_grid_that_is_not_what_it_says(changes):
         read(TactileFrame, message)
 
 
-def test_a_frame_tells_where_its_cells_are_and_what_they_mean() -> None:
+def test_a_frame_tells_where_its_cells_are_and_what_they_mean():
     told = {"pitch_y": 0.002, "centre_x": 1e-4, "unit": "Pa", "scale": 0.5, "calibrated": True}
     message = {**fake_daemon.frame(0.0, 1), **told, "calibration": "A17 2026"}
     frame = read(TactileFrame, message)
@@ -205,7 +205,7 @@ def test_a_frame_tells_where_its_cells_are_and_what_they_mean() -> None:
     assert np.array_equal(frame.pressure(), 0.5 * frame.counts)
 
 
-def test_missing_fields_are_not_a_number() -> None:
+def test_missing_fields_are_not_a_number():
     state = read(HandState, {"left": {"force": "much"}, "object": 3})
     assert math.isnan(state.left.force)
     assert math.isnan(state.object.width)
@@ -243,7 +243,7 @@ def _face(cls: type) -> dict[str, object]:
     }
 
 
-def test_both_hands_have_the_same_methods() -> None:
+def test_both_hands_have_the_same_methods():
     untyped = [re.sub(r"Async", "", repr(_face(cls))) for cls in (Hand, AsyncHand)]
     assert untyped[0] == untyped[1]
     assert _face(Subscription) == _face(AsyncSubscription)

@@ -33,7 +33,7 @@ def test_all_that_runs_below_a_test_is_ended(parent):
     assert not descendants.running() - before
 
 
-def test_what_a_killed_process_had_started_is_killed() -> None:
+def test_what_a_killed_process_had_started_is_killed():
     code = f"from tests.harness import descendants\ndescendants.end_with_this_process()\n{PARENT}"
     words = [sys.executable, "-c", code, "waits"]
     with descendants.ending(subprocess.Popen(words, stdout=subprocess.PIPE, text=True)) as process:

@@ -149,7 +149,7 @@ def test_boards_are_listened_to(hands, capsys):
     assert lines[-1].endswith(" 0 failed")
 
 
-def test_a_tip_of_another_law_than_its_presses_want_is_told(tmp_path: Path) -> None:
+def test_a_tip_of_another_law_than_its_presses_want_is_told(tmp_path):
     def tips(**tip: Any) -> Settings:
         tactile = {"calibration": (str(tmp_path / "left.json"), "")}
         return Settings.model_validate({"tip": tip, "tactile": tactile})

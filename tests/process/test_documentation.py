@@ -90,7 +90,6 @@ class Shell:
     def run(self, text: str) -> str:
         """The exit statuses that were not 0, and their commands."""
         (self._folder / "block.sh").write_text(text)
-        assert self._process.stdin is not None
         print(
             "failed=; trap 'failed+=\"$? $BASH_COMMAND; \"' ERR; "
             f'. ./block.sh </dev/null {self._tell}>&-; echo "$failed" >&{self._tell}',
@@ -168,9 +167,7 @@ def run_python(text: str, addresses: tuple[str, str]) -> None:
 
 @pytest.mark.waits
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_blocks(
-    page: Path, shared: Shared, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_blocks(page, shared, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("my.toml").write_text(find(Path("hil")).read_text(encoding="utf-8"))
     shell = Shell(tmp_path, shared.softfinger)

@@ -319,7 +319,7 @@ def test_close_turns_torque_off_on_a_bad_line(bus, connect):
     until(lambda: not bus.servo(0).torque_on and not bus.servo(1).torque_on)
 
 
-def test_nothing_works_before_connect() -> None:
+def test_nothing_works_before_connect():
     backend = DynamixelServos(backend_settings("/dev/does-not-exist"), RealClock())
     backend.write(Goal())
     backend.close()

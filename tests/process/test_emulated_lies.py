@@ -68,7 +68,7 @@ def watched(rig: Rig) -> Iterator[dict[str, Any]]:
 
 
 @pytest.mark.parametrize("lie", [GAIN, CURRENT, REFUSED])
-def test_a_lie_is_bounded_and_nothing_else_is_named(rig: Rig, lie: str) -> None:
+def test_a_lie_is_bounded_and_nothing_else_is_named(rig, lie):
     false = f"witness.{lie.split(':')[0]}_{'current' if lie == CURRENT else 'sensor'}"
     gripped(rig)
     before = len(rig.log())

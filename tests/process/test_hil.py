@@ -51,8 +51,7 @@ class Rig:
         return self.send("status")
 
     def report(self) -> dict[str, Any]:
-        report: dict[str, Any] = json.loads(send_words(self.folder, "report"))
-        return report
+        return json.loads(send_words(self.folder, "report"))
 
     def stopped(self) -> bool:
         return all(servo["stopped_by_watchdog"] for servo in self.report()["servos"])

@@ -201,7 +201,7 @@ def test_beside_another_commander_of_a_real_daemon(start, profile, addresses):
         page.shows("○ lost")
 
 
-def test_commands_without_a_daemon() -> None:
+def test_commands_without_a_daemon():
     where = ["--address", NOBODY]
     with TerminalProcess([*SOFTFINGER, "monitor", *where]) as page:
         page.shows("waiting for a daemon", "no stream yet", "—")

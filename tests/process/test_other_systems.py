@@ -76,7 +76,7 @@ def elsewhere(script: str, *arguments: str) -> None:
     assert done.returncode == 0, done.stderr
 
 
-def test_modules_without_a_tick_import_without_linux() -> None:
+def test_modules_without_a_tick_import_without_linux():
     imports = "".join(f"importlib.import_module({name!r})\n" for name in PORTABLE)
     elsewhere(imports + WORK, str(ROOT / "tests" / "golden" / "grasp_and_turn.mcap"))
 

@@ -48,7 +48,7 @@ def test_the_example_does_what_a_backend_has_to(caplog):
 
 
 @pytest.mark.usefixtures("here")
-def test_one_report_has_the_plugins_errors() -> None:
+def test_one_report_has_the_plugins_errors():
     wrong = (
         *METAL,
         "plugins.pulsing.height=-1",
@@ -88,7 +88,7 @@ def test_a_daemon_runs_on_them(installed, start, profile, addresses, monkeypatch
     assert running.end() == 0
 
 
-def test_the_ascii_board_of_the_page_reads_a_port() -> None:
+def test_the_ascii_board_of_the_page_reads_a_port():
     page = (Path(__file__).parents[2] / "docs" / "plugins.md").read_text(encoding="utf-8")
     names: dict[str, Any] = {}
     exec(page.split("```python\n")[-1].split("```")[0], names)

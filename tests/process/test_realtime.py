@@ -80,7 +80,7 @@ def run(script: str) -> Any:
     return json.loads(done.stdout)
 
 
-def test_what_is_allowed_is_held_and_given_back() -> None:
+def test_what_is_allowed_is_held_and_given_back():
     answer = run(HELD)
     before, during, after = answer["told"]
     had = answer["events"][0]
@@ -99,7 +99,7 @@ def test_what_is_allowed_is_held_and_given_back() -> None:
     assert after == before
 
 
-def test_what_is_refused_is_told_with_what_is_lost_and_what_grants_it() -> None:
+def test_what_is_refused_is_told_with_what_is_lost_and_what_grants_it():
     events = run(REFUSED)
     assert events[0][:2] == ["info", "realtime"]
     assert "timer slack 1 ns" in events[0][2]
@@ -116,7 +116,7 @@ def test_what_is_refused_is_told_with_what_is_lost_and_what_grants_it() -> None:
         assert any("/dev/cpu_dma_latency refused" in text and "udev" in text for text in refused)
 
 
-def test_what_is_not_wanted_is_not_asked_for() -> None:
+def test_what_is_not_wanted_is_not_asked_for():
     nothing = {
         "lock_memory": False,
         "hold_latency": False,
@@ -137,7 +137,7 @@ def test_what_is_not_wanted_is_not_asked_for() -> None:
         assert os.sched_getaffinity(0) == affinity
 
 
-def test_a_short_slice_is_had_where_the_kernel_knows_it_and_given_back() -> None:
+def test_a_short_slice_is_had_where_the_kernel_knows_it_and_given_back():
     calls = _ATTRIBUTE_CALLS.get(os.uname().machine)
     if calls is None or not _set_slice(calls, 0, 3_000_000):
         pytest.skip("this kernel takes no slices")

@@ -125,7 +125,7 @@ def test_every_topic_keeps_its_bytes_and_has_a_schema(tmp_path, topic):
         assert seconds == pytest.approx(golden["timestamp"])
 
 
-def test_the_layouts_name_only_fields_that_are_streamed() -> None:
+def test_the_layouts_name_only_fields_that_are_streamed():
     folder = Path(__file__).parents[2] / "tools" / "viewing"
     fields = {
         f"{topic.decode()}/{each.name.replace('.', '/')}"
@@ -223,7 +223,7 @@ def test_files_that_are_no_recording(tmp_path):
     with (tmp_path / "other.mcap").open("wb") as file:
         writer = Writer(file)
         writer.start(profile="ros2", library="x")
-        writer.finish()  # type: ignore[no-untyped-call]
+        writer.finish()
     with pytest.raises(RecordingError, match="profile 'ros2', expected 'softfinger'"):
         Recording(tmp_path / "other.mcap")
 

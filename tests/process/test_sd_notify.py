@@ -137,7 +137,7 @@ def test_the_running_daemon_is_ready_alive_silent_when_stopped_and_says_its_end(
     assert set(records[-1]["wake_s"]) == {"p50", "p99", "p999", "max"}
 
 
-def test_an_abstract_socket_and_anothers_watchdog() -> None:
+def test_an_abstract_socket_and_anothers_watchdog():
     name = f"softfinger-test-{os.getpid()}"
     watched = {"NOTIFY_SOCKET": f"@{name}", "WATCHDOG_USEC": "1000", "WATCHDOG_PID": "1"}
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:

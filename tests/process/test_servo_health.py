@@ -85,9 +85,9 @@ class Loaded:
         self.driven.append((joint, torque))
 
 
-def test_simulated_servos_warm_with_their_current_and_shut_down() -> None:
+def test_simulated_servos_warm_with_their_current_and_shut_down():
     clock, hand = VirtualClock(), Loaded()
-    servos = SimulatedServos(Settings(), hand, clock)  # type: ignore[arg-type]
+    servos = SimulatedServos(Settings(), hand, clock)
     servos.connect()
     reading = read(servos, Reading())
     assert reading.temperature == [25.0, 25.0]

@@ -86,7 +86,7 @@ def test_error_bytes_of_a_group_read_are_kept(bus, line):
         assert kind(*line, 660, 4, [1, 2]).exchange() != OK  # beyond the table
 
 
-def test_noise_before_a_reply_is_skipped_and_counted() -> None:
+def test_noise_before_a_reply_is_skipped_and_counted():
     class Script(SerialPort):
         def __init__(self, data: bytes) -> None:
             super().__init__("script", 2_000_000, 0.01)

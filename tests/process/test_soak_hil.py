@@ -26,7 +26,7 @@ def test_the_soak_in_real_time_judges_wire_memory_and_streams(monkeypatch):
     assert "subscribers' states, and lost" in str(account)
 
 
-def test_a_process_that_grows_is_told() -> None:
+def test_a_process_that_grows_is_told():
     account = hil.Account(seconds=30.0)
     account.looked = [(t, 0) for t in range(0, 30, 5)]
     account.memory = {"leaky": [10.0 + t for t in range(6)], "flat": [10.0] * 6}
@@ -36,7 +36,7 @@ def test_a_process_that_grows_is_told() -> None:
     assert [each.split()[0] for each in account.wrong] == ["leaky"]
 
 
-def test_a_hand_that_hardly_holds_is_told() -> None:
+def test_a_hand_that_hardly_holds_is_told():
     for held, told in (40, []), (20, ["20 of 100 grasps came to hold"]):
         account = hil.Account(seconds=30.0, held=held)
         account.looked, account.received, account.recorded = [(0.0, 0)], [(5, 0)], (5, 0)
@@ -64,7 +64,7 @@ def judged(*servos: dict[str, Any]) -> str:
     return judge_wire(rig)
 
 
-def test_the_wire_is_judged_by_its_record() -> None:
+def test_the_wire_is_judged_by_its_record():
     assert judged(servo(), servo(goal_q=None, goal_current=None)) == ""
     for changed, told in (
         ({"goal_q": [-0.5, 1.01]}, "goal angles"),

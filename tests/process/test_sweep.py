@@ -45,7 +45,7 @@ def test_results_are_the_same_in_any_number_of_processes_though_one_dies(tmp_pat
     assert (tmp_path / "died").exists()
 
 
-def test_a_case_that_kills_each_worker_ends_the_sweep() -> None:
+def test_a_case_that_kills_each_worker_ends_the_sweep():
     with pytest.raises(SweepError, match="each worker dies at 5"):
         list(Sweep("drawn", dies, CASES).run(2))
 

@@ -138,7 +138,7 @@ def test_folders_of_the_same_names_are_in_nobodys_way(wheel, tmp_path):
     assert run("-m", "softfinger", "config", "reference", "tip.radius") == "tip.radius = 0.02 # m\n"
 
 
-def test_each_pin_may_be_installed_on_the_oldest_python_that_is_promised() -> None:
+def test_each_pin_may_be_installed_on_the_oldest_python_that_is_promised():
     """By what is installed here of constraints.txt; patch versions count, as 3.11.2's."""
     oldest = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["requires-python"]
     assert oldest.startswith(">=")

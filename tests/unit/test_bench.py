@@ -5,7 +5,6 @@ import math
 import random
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from timeit import Timer
 
 import pytest
@@ -36,7 +35,7 @@ from softfinger.tools.benchmarks.witnesses import (
 )
 
 
-def test_turns_and_times(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_turns_and_times(monkeypatch):
     clock = [0.0]
     order: list[str] = []
     monkeypatch.setattr(measuring, "Timer", partial(Timer, timer=lambda: clock[0]))
@@ -63,7 +62,7 @@ def canned(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bench, "PAGE", ("tick",))
 
 
-def test_figures_are_kept(canned: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_figures_are_kept(canned, tmp_path, capsys):
     old = tmp_path / "old.json"
     assert cli.main(["bench", "tick", "--json", str(old)]) == 0
     rows = json.loads(old.read_text(encoding="utf-8"))["rows"]
@@ -74,11 +73,7 @@ def test_figures_are_kept(canned: None, tmp_path: Path, capsys: pytest.CaptureFi
     assert "tick: pipeline alone" in capsys.readouterr().out, "the page"
 
 
-def test_a_measurement_that_fails_leaves_the_others(
-    canned: None,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_measurement_that_fails_leaves_the_others(canned, monkeypatch, capsys):
     def let_go(brief: bool) -> list[Report]:
         raise Refused("the hand let go")
 
@@ -89,9 +84,7 @@ def test_a_measurement_that_fails_leaves_the_others(
     assert "pipeline alone" in printed.out
 
 
-def test_a_measurement_that_misses_its_aim_is_no_success(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_measurement_that_misses_its_aim_is_no_success(monkeypatch, capsys):
     asked: list[tuple[int | None, str]] = []
 
     def measure(brief: bool, trials: int | None, only: str, sweep: object) -> list[Report]:
@@ -114,23 +107,21 @@ def test_a_measurement_that_misses_its_aim_is_no_success(
         (["--trials", "3"], "--trials: witnesses alone has it"),
     ],
 )
-def test_refusals_come_before_the_measurements(
-    words: list[str], text: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_refusals_come_before_the_measurements(words, text, capsys):
     assert cli.main(["bench", *words]) == 2
     error = capsys.readouterr().err
     assert text in error
     assert "measuring" not in error
 
 
-def test_lookups_have_their_errors() -> None:
+def test_lookups_have_their_errors():
     rows = estimator.lookups(1, 32).rows
     errors = {row["name"]: row[estimator.LOOKUP_ERROR] for row in rows}
     assert 1e-12 < errors["table to 1e-09"] <= 1e-9
     assert errors["table to 1e-12, called"] <= 1e-12
 
 
-def test_estimates_stand_beside_the_bound() -> None:
+def test_estimates_stand_beside_the_bound():
     table = estimator.frames_to_contacts(1)
     error = {row["name"]: row.get(estimator.ERROR) for row in table.rows}
     limit = error["Cramér-Rao bound"]
@@ -139,15 +130,13 @@ def test_estimates_stand_beside_the_bound() -> None:
     assert error["decode: cobs"] is None
 
 
-def test_a_law_that_does_not_turn_the_object_leaves_it_askew(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_law_that_does_not_turn_the_object_leaves_it_askew(monkeypatch):
     monkeypatch.setattr(control, "WAYS", {"energy": control.WAYS["energy"]})
     (table,) = control.measure(brief=True)
     assert [4.0 < row["median"] < 5.0 for row in table.rows] == [True]
 
 
-def test_a_load_that_is_held_slides_and_one_that_is_lost_is_said() -> None:
+def test_a_load_that_is_held_slides_and_one_that_is_lost_is_said():
     held = reflex.overloaded({}, 0.0, 13.0, 1)
     assert 0.0 < held.answer < 0.022
     assert 0.0 < held.slid < 0.02
@@ -170,7 +159,7 @@ def holding(force: float = 8.0) -> VirtualGrip:
     return grip
 
 
-def test_a_true_hand_meets_its_aim() -> None:
+def test_a_true_hand_meets_its_aim():
     (table,) = measure(trials=2, only="6 N: honest")
     (row,) = table.rows
     assert (row["met"], row["trials"], table.failed) == (2, 2, False)
@@ -179,7 +168,7 @@ def test_a_true_hand_meets_its_aim() -> None:
     assert (row["named"], row["missed"], row["events"]) == ("", "", "")
 
 
-def test_a_watch_measures_forces_times_and_places() -> None:
+def test_a_watch_measures_forces_times_and_places():
     watch = Watch(10.0)
     for k, force in enumerate((10.0, 14.0, 15.0, 12.0, 13.5, 9.0, 9.0)):
         place = (0.0, 0.08 + (0.02 if k == 6 else 0.001 * k))
@@ -205,7 +194,7 @@ def test_a_watch_measures_forces_times_and_places() -> None:
         (BOUNDED, {"events": [(0.2, "hand.width")]}, ["not named"]),
     ],
 )
-def test_what_misses_an_aim(aim: str, changes: dict[str, object], missed: list[str]) -> None:
+def test_what_misses_an_aim(aim, changes, missed):
     case = WitnessCase("a case", aim, 6.0, "left:drift=0.2@0..2", ("left_sensor",), comes=2.0)
     met = GripTrial(("left_sensor",), settled=1.0, events=[(1.29, "witness.left_sensor")])
     assert met.missed(case) == []

@@ -9,10 +9,9 @@ import pytest
 
 from softfinger.daemon.profile.load import find, names
 from softfinger.tools.cli import SUBCOMMANDS, make_parser
-from tests.conftest import Inline
 
 
-def test_no_words_name_the_first_steps_and_help_all_subcommands(inline: Inline) -> None:
+def test_no_words_name_the_first_steps_and_help_all_subcommands(inline):
     first = inline()
     assert (first.returncode, first.stderr) == (0, "")
     assert "softfinger run --monitor" in first.stdout
@@ -31,7 +30,7 @@ def test_no_words_name_the_first_steps_and_help_all_subcommands(inline: Inline) 
         assert f"found {word!r}, expected a subcommand; {hint}" in wrong.stderr
 
 
-def test_the_nearest_word_is_named_for_one_that_is_not_known(inline: Inline) -> None:
+def test_the_nearest_word_is_named_for_one_that_is_not_known(inline):
     for words, word, near in (
         (("run", "--cofnig", "hil"), "--cofnig", "--config"),
         (("send", "grap", "force=3"), "grap", "grasp"),
@@ -55,7 +54,7 @@ def test_the_nearest_word_is_named_for_one_that_is_not_known(inline: Inline) -> 
         ("gasp", "found 'gasp', expected a known word; nearest: grasp"),
     ],
 )
-def test_what_is_no_number_of_its_kind_is_not_sent(inline: Inline, words: str, said: str) -> None:
+def test_what_is_no_number_of_its_kind_is_not_sent(inline, words, said):
     done = inline("send", *words.split(), "--timeout", "0.1")
     assert done.returncode == 2
     assert said in done.stderr
@@ -71,15 +70,13 @@ def test_what_is_no_number_of_its_kind_is_not_sent(inline: Inline, words: str, s
         (["force=2500mN"], {"force": 2.5}),
     ],
 )
-def test_numbers_may_carry_their_unit(words: list[str], numbers: dict[str, float]) -> None:
+def test_numbers_may_carry_their_unit(words, numbers):
     from softfinger.tools.terminal.send import si_numbers
 
     assert si_numbers(words) == pytest.approx(numbers)
 
 
-def test_profiles_and_keys_are_shown_from_any_folder(
-    inline: Inline, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_profiles_and_keys_are_shown_from_any_folder(inline, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "hil").mkdir()  # as a project may have one
     listed = inline("config", "list").stdout.splitlines()
@@ -106,7 +103,7 @@ def test_profiles_and_keys_are_shown_from_any_folder(
         ("tcp://10.0.0.7:1234", "tcp://10.0.0.7:1234", "tcp://10.0.0.7:1234"),
     ],
 )
-def test_one_address_serves_every_client(text: str, stream: str, commands: str) -> None:
+def test_one_address_serves_every_client(text, stream, commands):
     def parsed(*words: str) -> Any:
         return make_parser({words[0]})[0].parse_args([*words, "--address", text]).address
 

@@ -56,11 +56,10 @@ class Asking:
 
     def told(self) -> dict[str, Any]:
         until(lambda: [self._served.serve(echo), self.socket.poll(0)][1])
-        reply: dict[str, Any] = msgpack.unpackb(self.socket.recv())
-        return reply
+        return msgpack.unpackb(self.socket.recv())
 
 
-def test_a_plain_req_socket_gets_its_answer(server: Served, addresses: tuple[str, str]) -> None:
+def test_a_plain_req_socket_gets_its_answer(server, addresses):
     assert send(addresses[1], {"command": "arm"}, 60.0) == {"ok": True, "heard": "arm"}
     assert send(addresses[1], {"command": "no"}, 60.0) == {"ok": False, "error": "not now"}
 
@@ -79,9 +78,7 @@ def test_a_plain_req_socket_gets_its_answer(server: Served, addresses: tuple[str
         (msgpack.packb({"command": "arm", "client": [[[]]]}), "numbers and texts as values"),
     ],
 )
-def test_malformed_commands_are_refused_and_the_server_lives_on(
-    context: zmq.Context[Any], addresses: tuple[str, str], payload: bytes, error: str
-) -> None:
+def test_malformed_commands_are_refused_and_the_server_lives_on(context, addresses, payload, error):
     with Served(commands=addresses[1]) as served:
         reply = Asking(context, served, addresses[1], payload).told()
         assert reply["ok"] is False
@@ -89,9 +86,7 @@ def test_malformed_commands_are_refused_and_the_server_lives_on(
         assert Asking(context, served, addresses[1], "arm").told()["ok"] is True
 
 
-def test_multipart_nonsense_and_clients_that_go_away_change_nothing(
-    server: Served, context: zmq.Context[Any], addresses: tuple[str, str]
-) -> None:
+def test_multipart_nonsense_and_clients_that_go_away_change_nothing(server, context, addresses):
     socket = context.socket(zmq.DEALER)
     socket.connect(addresses[1])
     socket.send_multipart([b"", b"a", b"b", b"c"])  # no client's form: passed over
@@ -102,11 +97,8 @@ def test_multipart_nonsense_and_clients_that_go_away_change_nothing(
 
 @pytest.mark.parametrize("under_way", [1, 4])  # the second request waits in the queue, or the link
 def test_what_came_before_a_fence_is_refused_and_what_comes_after_is_not(
-    context: zmq.Context[Any],
-    addresses: tuple[str, str],
-    monkeypatch: pytest.MonkeyPatch,
-    under_way: int,
-) -> None:
+    context, addresses, monkeypatch, under_way
+):
     monkeypatch.setattr(bounds, "UNDER_WAY", under_way)
     with Served(commands=addresses[1]) as served:
         early = Asking(context, served, addresses[1], "arm")
@@ -137,12 +129,8 @@ def on_the_link(served: Served) -> None:
 
 @pytest.mark.parametrize("where", ["tick", "look", "gateway"])
 def test_what_came_before_the_end_of_a_pause_is_refused(
-    context: zmq.Context[Any],
-    addresses: tuple[str, str],
-    standing: VirtualClock,
-    where: str,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    context, addresses, standing, where, monkeypatch
+):
     with Served(commands=addresses[1]) as served:
         door = served.service._commands
         if where == "gateway":
@@ -169,9 +157,7 @@ def test_what_came_before_the_end_of_a_pause_is_refused(
         assert Asking(context, served, addresses[1], "arm").told()["ok"]
 
 
-def test_the_time_that_a_command_itself_takes_is_no_pause(
-    context: zmq.Context[Any], addresses: tuple[str, str], standing: VirtualClock
-) -> None:
+def test_the_time_that_a_command_itself_takes_is_no_pause(context, addresses, standing):
     def long(request: dict[str, Any]) -> dict[str, Any]:
         standing.sleep_until(standing.now() + 5.0)
         return echo(request)
@@ -188,7 +174,7 @@ def test_the_time_that_a_command_itself_takes_is_no_pause(
         assert clear.told()["ok"]
 
 
-def test_a_stop_is_one_whatever_it_holds_besides() -> None:
+def test_a_stop_is_one_whatever_it_holds_besides():
     more = {"client": "a", "how": ["now"], b"x": 4}
     assert decode(msgpack.packb({"command": "stop", **more})) == {"command": "stop", "client": "a"}
     with pytest.raises(Refused, match="numbers and texts as values"):
@@ -214,9 +200,7 @@ class Flood:
         return len(replies)
 
 
-def test_a_stop_goes_before_all_that_waits(
-    context: zmq.Context[Any], addresses: tuple[str, str]
-) -> None:
+def test_a_stop_goes_before_all_that_waits(context, addresses):
     clock = VirtualClock()  # what waits while clients come gets no older
     with Served(commands=addresses[1], clock=clock) as served:
         flood = Flood(context, addresses[1], clients=4, each=40)
@@ -249,9 +233,7 @@ def test_a_stop_goes_before_all_that_waits(
         assert sum(reply["ok"] for reply in replies) == carried_out
 
 
-def test_a_client_that_sends_too_much_is_refused_and_others_are_not(
-    context: zmq.Context[Any], addresses: tuple[str, str]
-) -> None:
+def test_a_client_that_sends_too_much_is_refused_and_others_are_not(context, addresses):
     clock = VirtualClock()
     with Served(commands=addresses[1], per_second=20.0, clock=clock) as served:
         flood = Flood(context, addresses[1], clients=1, each=60)
@@ -279,9 +261,7 @@ def test_a_client_that_sends_too_much_is_refused_and_others_are_not(
         until(lambda: [served.serve(echo), flood.collect(last), answer in last][2])
 
 
-def test_clients_that_flood_leave_others_a_place(
-    context: zmq.Context[Any], addresses: tuple[str, str]
-) -> None:
+def test_clients_that_flood_leave_others_a_place(context, addresses):
     heard = []
 
     def note(request: dict[str, Any]) -> dict[str, Any]:
@@ -300,9 +280,7 @@ def test_clients_that_flood_leave_others_a_place(
 
 
 @pytest.mark.parametrize("mode", [0o600, 0o660])
-def test_an_ipc_file_has_the_rights_that_were_set(
-    tmp_path_factory: pytest.TempPathFactory, mode: int
-) -> None:
+def test_an_ipc_file_has_the_rights_that_were_set(tmp_path_factory, mode):
     folder = tmp_path_factory.mktemp("s")
     with Served(f"ipc://{folder}/s", f"ipc://{folder}/c", ipc_mode=mode):
         for name in ("c", "s"):
@@ -310,9 +288,7 @@ def test_an_ipc_file_has_the_rights_that_were_set(
     assert list(folder.iterdir()) == []
 
 
-def test_a_signal_while_the_sockets_are_made_ends_the_start(
-    monkeypatch: pytest.MonkeyPatch, addresses: tuple[str, str]
-) -> None:
+def test_a_signal_while_the_sockets_are_made_ends_the_start(monkeypatch, addresses):
     made: list[Gateway] = []
 
     class Noted(Gateway):

@@ -32,7 +32,7 @@ ESTIMATE = ContactEstimate(
 )
 
 
-def test_what_frames_share_stays_however_many_come(contact_filter: ContactFilter) -> None:
+def test_what_frames_share_stays_however_many_come(contact_filter):
     contacts, pose = [Contact(), Contact()], ObjectPose()
     shared = np.diag([2e-5**2, 4e-3**2, 0.0, 0.0])
     estimate = replace(ESTIMATE, covariance=ESTIMATE.covariance + shared, systematic=shared)
@@ -54,7 +54,7 @@ def test_what_frames_share_stays_however_many_come(contact_filter: ContactFilter
 
 
 @pytest.mark.filterwarnings("ignore:the smooth law misses")
-def test_the_law_misfit_is_in_the_force(contact_filter: ContactFilter) -> None:
+def test_the_law_misfit_is_in_the_force(contact_filter):
     contacts, pose = [Contact(), Contact()], ObjectPose()
     strain = np.linspace(0.025, 1.0, 40)
     law = Material.from_points(strain, 1e5 * strain**0.7)
@@ -80,8 +80,8 @@ def frame(t: float) -> Frame:
 
 @pytest.mark.parametrize("read_first", [True, False])
 def test_a_tip_that_touches_at_the_start_is_felt_at_once_and_from_then_on(
-    contact_filter: ContactFilter, read_first: bool
-) -> None:
+    contact_filter, read_first
+):
     contacts, pose = [Contact(), Contact()], ObjectPose()
     if read_first:
         contact_filter.predict(Reading(t=5.0, q=[0.15, 0.15], valid=True))
@@ -106,7 +106,7 @@ def test_a_tip_that_touches_at_the_start_is_felt_at_once_and_from_then_on(
 
 
 @pytest.mark.parametrize("response", [0.04, 0.08])
-def test_what_slow_cells_show_late_the_joints_make_up_for(response: float) -> None:
+def test_what_slow_cells_show_late_the_joints_make_up_for(response):
     settings = Settings.model_validate({"tactile": {"response": response}})
     table = make_table(settings, make_material(settings.material))
     contact_filter = ContactFilter(settings, (table, table))

@@ -55,12 +55,7 @@ def settled(hand: Watched, angle: float) -> float:
     ],
     ids=["100 Hz", "25 Hz, light and stiff", "25 Hz, heavy and soft"],
 )
-def test_grasps_and_turns_also_with_mass_and_modulus_30_percent_off(
-    sections: dict[str, dict[str, Any]],
-    plant: dict[str, float],
-    known: float,
-    times: tuple[float, float, float],
-) -> None:
+def test_grasps_and_turns_also_with_mass_and_modulus_30_percent_off(sections, plant, known, times):
     with watched(sections, **plant) as hand:
         seen = grasped(hand)
         mean = seen.force.mean(axis=1)
@@ -73,9 +68,7 @@ def test_grasps_and_turns_also_with_mass_and_modulus_30_percent_off(
 
 
 @pytest.mark.parametrize("sections", [{}, PAPER], ids=["100 Hz", "25 Hz"])
-def test_a_held_object_withstands_pushes_of_a_fifth_of_the_grip(
-    sections: dict[str, dict[str, Any]],
-) -> None:
+def test_a_held_object_withstands_pushes_of_a_fifth_of_the_grip(sections):
     rng = np.random.default_rng(3)
     with watched(sections) as hand:
         grasped(hand)
@@ -94,7 +87,7 @@ def test_a_held_object_withstands_pushes_of_a_fifth_of_the_grip(
 
 
 @pytest.mark.parametrize("last", ["grasp", "rotate", "hold"])
-def test_an_object_that_is_taken_away_ends_the_grip(last: str) -> None:
+def test_an_object_that_is_taken_away_ends_the_grip(last):
     with watched({}) as hand:
         hand.grasp(6.0)
         while hand.contacts[0].force < 3.0:
@@ -121,9 +114,7 @@ def test_an_object_that_is_taken_away_ends_the_grip(last: str) -> None:
         (1.2, "", "rotate: angle: found 68.8° (1.2 rad), expected", "holding"),
     ],
 )
-def test_a_turn_asked_for_while_grasping_waits_for_the_grip_or_is_told(
-    angle: float, then: str, told: str, end: str
-) -> None:
+def test_a_turn_asked_for_while_grasping_waits_for_the_grip_or_is_told(angle, then, told, end):
     with watched({}) as hand:
         hand.grasp(8.0)
         reply = hand.command("rotate", angle=angle)
@@ -139,14 +130,14 @@ def test_a_turn_asked_for_while_grasping_waits_for_the_grip_or_is_told(
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_each_tip_by_itself_keeps_a_light_grip(seed: int) -> None:
+def test_each_tip_by_itself_keeps_a_light_grip(seed):
     off = (0.7, 1.3)
     with watched(PAPER, seed=seed, object_mass=0.1 * off[seed % 2]) as hand:
         seen = grasped(hand, force=5.0, seconds=3.5)
         assert np.abs(seen.force[500:] / 5.0 - 1.0).max() < 2.0 * KNOWN
 
 
-def test_targets_streamed_right_after_arm_move_the_hand_smoothly() -> None:
+def test_targets_streamed_right_after_arm_move_the_hand_smoothly():
     rng = np.random.default_rng(11)
     with watched({}) as hand:
         hand.run(0.3)
@@ -165,7 +156,7 @@ def test_targets_streamed_right_after_arm_move_the_hand_smoothly() -> None:
         assert np.ptp(way, axis=0).min() > 0.02, "a stream of targets must still move the joints"
 
 
-def test_compliance_lets_the_object_yield_and_is_bounded() -> None:
+def test_compliance_lets_the_object_yield_and_is_bounded():
     yielded = []
     for compliance in (0.02, 0.5):
         with watched({"control": {"rotate_bandwidth": 0.0}}, table_friction=0.0) as hand:
@@ -180,7 +171,7 @@ def test_compliance_lets_the_object_yield_and_is_bounded() -> None:
     assert yielded[1] > 1.5 * yielded[0]
 
 
-def test_turning_ends_where_the_tips_would_slip() -> None:
+def test_turning_ends_where_the_tips_would_slip():
     with watched({"control": {"tip_friction": 0.3}}) as hand:
         grasped(hand)
         hand.command("rotate", angle=0.3)
@@ -189,7 +180,7 @@ def test_turning_ends_where_the_tips_would_slip() -> None:
         assert 0.05 < hand.plant.object_pose[2] < 0.2
 
 
-def test_a_known_load_raises_the_grip_within_its_bound() -> None:
+def test_a_known_load_raises_the_grip_within_its_bound():
     for raised, expected in ((10.0, 12.5), (1.0, 9.0)):
         control = {"object_load": 12.0, "grip_raise_max": raised}
         with watched({"control": control}) as hand:
@@ -200,9 +191,7 @@ def test_a_known_load_raises_the_grip_within_its_bound() -> None:
 
 
 @pytest.mark.parametrize("sections", [{}, PAPER], ids=["100 Hz", "25 Hz"])
-def test_prediction_is_within_its_own_uncertainty_in_motion(
-    sections: dict[str, dict[str, Any]],
-) -> None:
+def test_prediction_is_within_its_own_uncertainty_in_motion(sections):
     tactile = sections.get("tactile", {}) | {"smooth_error": 0.0}  # of an ideal sensor
     with watched(sections | {"tactile": tactile}) as hand:
         hand.grasp(10.0)
@@ -230,7 +219,7 @@ def step(setpoint: Setpoint, rate: float) -> float:
     return setpoint.value
 
 
-def test_a_setpoint_keeps_its_bounds_whatever_the_targets() -> None:
+def test_a_setpoint_keeps_its_bounds_whatever_the_targets():
     rng = np.random.default_rng(2)
     dt, window, rate = 0.002, 0.1, 2.0
     setpoint = Setpoint(dt, window, SetpointState())
@@ -249,7 +238,7 @@ def test_a_setpoint_keeps_its_bounds_whatever_the_targets() -> None:
     assert setpoint.value == setpoint.target
 
 
-def test_a_step_of_the_setpoint_never_overshoots() -> None:
+def test_a_step_of_the_setpoint_never_overshoots():
     setpoint = Setpoint(0.002, 0.1, SetpointState())
     setpoint.target = 1.0
     way = [step(setpoint, 4.0) for _ in range(500)]
@@ -259,7 +248,7 @@ def test_a_step_of_the_setpoint_never_overshoots() -> None:
     assert arrival * 0.002 == pytest.approx(0.25 + 0.15, abs=0.006)
 
 
-def test_the_small_hand_grasps_and_turns() -> None:
+def test_the_small_hand_grasps_and_turns():
     profile = Path(__file__).parents[2] / "config" / "small.toml"
     with Watched(load(profile).model_dump()) as hand:
         seen = grasped(hand, force=1.0)
@@ -273,7 +262,7 @@ def test_the_small_hand_grasps_and_turns() -> None:
 
 
 @pytest.mark.parametrize("rate", [50.0, 100.0])
-def test_a_stream_of_setpoints_is_followed_in_force_and_angle(rate: float) -> None:
+def test_a_stream_of_setpoints_is_followed_in_force_and_angle(rate):
     with watched({}) as hand:
         hand.run(0.3)
         hand.command("arm")
@@ -301,7 +290,7 @@ def test_a_stream_of_setpoints_is_followed_in_force_and_angle(rate: float) -> No
         assert hand.plant.force.mean() > 15.0, "a sudden load is answered as ever"
 
 
-def test_setpoints_may_come_alone_and_are_bounded_or_refused() -> None:
+def test_setpoints_may_come_alone_and_are_bounded_or_refused():
     with watched({}) as hand:
         grasped(hand, 8.0)
         with pytest.raises(Refused, match="hold: force or angle is missing"):
@@ -327,9 +316,7 @@ def test_setpoints_may_come_alone_and_are_bounded_or_refused() -> None:
 @pytest.mark.parametrize(
     ("action", "mode"), [("hold", "holding"), ("release", "armed"), ("stop", "disarmed")]
 )
-def test_a_commander_that_falls_silent_leaves_the_hand_as_the_settings_say(
-    action: str, mode: str
-) -> None:
+def test_a_commander_that_falls_silent_leaves_the_hand_as_the_settings_say(action, mode):
     with watched({"commands": {"lease": 0.5, "on_silence": action}}) as hand:
         hand.run(0.3)
         hand.command("arm")
@@ -345,7 +332,7 @@ def test_a_commander_that_falls_silent_leaves_the_hand_as_the_settings_say(
         )
 
 
-def test_a_stream_beyond_what_the_tips_bear_is_told_once() -> None:
+def test_a_stream_beyond_what_the_tips_bear_is_told_once():
     with watched({"control": {"tip_friction": 0.25}}) as hand:
         hand.run(0.3)
         hand.command("arm")

@@ -19,8 +19,6 @@ LINK = re.compile(r"\]\((?!https?:)([^)#\s]*)(?:#([^)]*))?\)")
 def site() -> tuple[ModuleType, dict[str, str]]:
     """The module docs/pages.py, and the site's pages as MkDocs gets them."""
     spec = importlib.util.spec_from_file_location("pages", ROOT / "docs" / "pages.py")
-    assert spec is not None
-    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     texts = {name: make() for name, make in module.PAGES.items()}
@@ -42,7 +40,7 @@ def anchors(text: str) -> set[str]:
     return {re.sub(r"[^\w\- ]", "", each.lower()).replace(" ", "-") for each in headings}
 
 
-def test_every_page_is_made(site: tuple[ModuleType, dict[str, str]]) -> None:
+def test_every_page_is_made(site):
     _, pages = site
     for name, text in pages.items():
         assert text.startswith("# ") or "\n# " in text, name
@@ -52,7 +50,7 @@ def test_every_page_is_made(site: tuple[ModuleType, dict[str, str]]) -> None:
 
 
 @pytest.mark.parametrize("source", SOURCES, ids=lambda path: path.name)
-def test_links_in_the_repository(source: Path) -> None:
+def test_links_in_the_repository(source):
     for target, anchor in LINK.findall(written(source.read_text(encoding="utf-8"))):
         path = (source.parent / target).resolve() if target else source
         assert path.exists(), target
@@ -60,7 +58,7 @@ def test_links_in_the_repository(source: Path) -> None:
             assert anchor in anchors(path.read_text(encoding="utf-8")), f"{target}#{anchor}"
 
 
-def test_links_on_the_site(site: tuple[ModuleType, dict[str, str]]) -> None:
+def test_links_on_the_site(site):
     _, pages = site
     for name, text in pages.items():
         for target, anchor in LINK.findall(written(text)):
@@ -71,13 +69,13 @@ def test_links_on_the_site(site: tuple[ModuleType, dict[str, str]]) -> None:
                 assert anchor in anchors(pages[target or name]), f"{name}: {target}#{anchor}"
 
 
-def test_every_setting_says_what_it_is(site: tuple[ModuleType, dict[str, str]]) -> None:
+def test_every_setting_says_what_it_is(site):
     rows = re.findall(r"(?m)^\| `(\w+)` \|.*\| (.*?) ?\|$", site[1]["configuration.md"])
     assert len(rows) > 150
     assert [key for key, meaning in rows if not meaning] == []
 
 
-def test_every_erratum_is_told(site: tuple[ModuleType, dict[str, str]]) -> None:
+def test_every_erratum_is_told(site):
     from softfinger.tools.paper.figures import pages
 
     text = site[1]["model.md"].replace("\\|", "|")
@@ -102,11 +100,11 @@ def texts() -> set[str]:
                 found.add(node.value)
             elif isinstance(node, ast.JoinedStr):
                 parts = node.values
-                found.add("".join(p.value if isinstance(p, ast.Constant) else "…" for p in parts))  # type: ignore[misc]
+                found.add("".join(p.value if isinstance(p, ast.Constant) else "…" for p in parts))
     return found
 
 
-def test_every_message_is_the_programs_own() -> None:
+def test_every_message_is_the_programs_own():
     page = (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8")
     quoted = [text for row in ROW.findall(page) for text in re.findall(r"`([^`]+)`", row)]
     assert len(quoted) > 45

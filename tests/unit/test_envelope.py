@@ -1,6 +1,5 @@
 """What the hand holds: tried on virtual time, kept as a map, and asked by `grasp`."""
 
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -17,12 +16,12 @@ def settings(width: float = 0.040, **control: Any) -> Settings:
     return Settings.model_validate({"object": {"width": width}, "control": control})
 
 
-def test_what_it_is_asked_for_as_it_comes_is_inside_the_packaged_map() -> None:
+def test_what_it_is_asked_for_as_it_comes_is_inside_the_packaged_map():
     for width in (0.020, 0.040, 0.060, 0.090):
         assert Envelope(settings(width)).warning(10.0) == ""
 
 
-def test_outside_of_it_the_reply_says_what_and_why() -> None:
+def test_outside_of_it_the_reply_says_what_and_why():
     text = Envelope(settings(0.002)).warning(10.0)
     assert "2 mm (object.width) at friction 0.6 (control.tip_friction) and 0 kg" in text
     assert "no grip comes about" in text
@@ -38,7 +37,7 @@ def test_outside_of_it_the_reply_says_what_and_why() -> None:
     assert Envelope(other).warning(10.0) == ""
 
 
-def test_a_grasp_outside_is_warned_of_in_its_reply() -> None:
+def test_a_grasp_outside_is_warned_of_in_its_reply():
     for width, warned in ((0.002, True), (0.040, False)):
         with Watched({"object": {"width": width, "width_min": 0.0005}}) as hand:
             hand.run(0.3)
@@ -49,9 +48,7 @@ def test_a_grasp_outside_is_warned_of_in_its_reply() -> None:
             assert ("warning" in reply) == warned
 
 
-def test_a_map_is_found_printed_drawn_and_read_back(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_map_is_found_printed_drawn_and_read_back(tmp_path, capsys):
     kept, picture = tmp_path / "map.toml", tmp_path / "map.png"
     words = ["envelope", "--shape", "rectangle", "--size", "2", "40", "--mass", "1"]
     words += ["--friction", "0.2", "0.6"]

@@ -43,8 +43,8 @@ def clean(truth: tuple[float, float, float]) -> np.ndarray:
 @pytest.mark.usefixtures("exact_solid_data")
 @pytest.mark.parametrize(("d", "theta"), [(0.001, 0.0), (0.002, 0.4), (0.006, 0.2)])
 @pytest.mark.parametrize("physics", ["springs", "solid"])
-def test_correlated_noise_is_in_the_covariance(physics: str, d: float, theta: float) -> None:
-    tip, truth = Fingertip(0.020, physics), (d, theta, -0.5 * theta)  # type: ignore[arg-type]
+def test_correlated_noise_is_in_the_covariance(physics, d, theta):
+    tip, truth = Fingertip(0.020, physics), (d, theta, -0.5 * theta)
     frame, rng = GRID.pressure(tip, LINEAR, *truth), np.random.default_rng(12)
     frames = [frame + correlated_noise(rng) for _ in range(192 if tip == TIP else 96)]
     n = 4 if tip == TIP else 3  # with the gain
@@ -63,7 +63,7 @@ def test_correlated_noise_is_in_the_covariance(physics: str, d: float, theta: fl
     assert tip != TIP or nees(None)[0] > 5.0
 
 
-def test_what_frames_share_is_told_apart_and_nothing_known_adds_nothing() -> None:
+def test_what_frames_share_is_told_apart_and_nothing_known_adds_nothing():
     frame = clean((0.003, 0.2, 0.0))
     plain = ContactEstimator(TIP, LINEAR, GRID, NOISE)(frame)
     assert not plain.systematic.any()
@@ -74,7 +74,7 @@ def test_what_frames_share_is_told_apart_and_nothing_known_adds_nothing() -> Non
     assert math.sqrt(shifted.systematic[2, 2]) == pytest.approx(5e-4 / 0.019, rel=0.05)
 
 
-def test_correlated_noise_raises_no_alarm_and_no_misfit() -> None:
+def test_correlated_noise_raises_no_alarm_and_no_misfit():
     estimator = ContactEstimator(TIP, LINEAR, GRID, NOISE, known=KNOWN)
     rng = np.random.default_rng(2)
     for _ in range(300):
@@ -82,7 +82,7 @@ def test_correlated_noise_raises_no_alarm_and_no_misfit() -> None:
         assert not estimator.update(clean((0.003, 0.1, 0.0)) + correlated_noise(rng)).misfit
 
 
-def test_a_law_off_its_points_widens_what_it_says() -> None:
+def test_a_law_off_its_points_widens_what_it_says():
     strain = np.linspace(0.025, 1.0, 40)
     law = Material.from_points(strain, 1e5 * np.where(strain < 0.3, strain, 3.0 * strain - 0.6))
     frame = GRID.pressure(TIP, law, 0.004)
@@ -95,7 +95,7 @@ def test_a_law_off_its_points_widens_what_it_says() -> None:
 @pytest.mark.parametrize(
     "wrong", [{"baseline": -1.0}, {"centre": math.nan}, {"correlation": np.ones(3)}]
 )
-def test_refusals(wrong: dict[str, float]) -> None:
+def test_refusals(wrong):
     with pytest.raises(ValueError, match="must"):
         Uncertainty(**wrong)
 
@@ -196,11 +196,9 @@ def worst_nees(known: Uncertainty, tip: Fingertip, imperfect: Imperfection) -> f
 
 @pytest.mark.parametrize("physics", ["springs", "solid"])
 @pytest.mark.parametrize("name", IMPERFECTIONS)
-def test_imperfections_of_real_cells_are_covered_or_flagged(
-    name: str, physics: str, request: pytest.FixtureRequest
-) -> None:
+def test_imperfections_of_real_cells_are_covered_or_flagged(name, physics, request):
     known, imperfect = IMPERFECTIONS[name]
-    tip = Fingertip(0.020, physics)  # type: ignore[arg-type]
+    tip = Fingertip(0.020, physics)
     assert 0.7 < worst_nees(known, tip, imperfect) < 1.5
     request.getfixturevalue("exact_solid_data")
     if (name, physics) not in HARMLESS:
@@ -251,9 +249,7 @@ def smooth_error(
 
 @pytest.mark.parametrize("physics", ["springs", "solid"])
 @pytest.mark.parametrize("profile", SECTIONS)
-def test_with_all_that_a_profile_declares_errors_are_as_large_as_it_says(
-    profile: str, physics: str
-) -> None:
+def test_with_all_that_a_profile_declares_errors_are_as_large_as_it_says(profile, physics):
     settings = Settings.model_validate(
         merged(SECTIONS[profile], SOLID if physics == "solid" else {})
     )

@@ -20,7 +20,7 @@ def path() -> tuple[Sheet, ...]:
     return run_pages.tilt_and_roll()
 
 
-def test_compression_goes_to_8_mm_at_every_angle(compression: tuple[Sheet, ...]) -> None:
+def test_compression_goes_to_8_mm_at_every_angle(compression):
     for tilt, run in zip(TILTS, compression, strict=False):
         assert run["d"][0] == 0.0
         assert run["d"].max() == pytest.approx(8.0, abs=0.1)
@@ -31,7 +31,7 @@ def test_compression_goes_to_8_mm_at_every_angle(compression: tuple[Sheet, ...])
         np.testing.assert_allclose(run["F"], expected, rtol=1e-9, atol=1e-12)
 
 
-def test_compression_is_estimated(compression: tuple[Sheet, ...]) -> None:
+def test_compression_is_estimated(compression):
     errors = compression[-1]
     assert (errors["d at the first estimate"] < 0.45).all()
     assert (errors["RMS error of d"] < 20.0).all()  # µm
@@ -42,7 +42,7 @@ def test_compression_is_estimated(compression: tuple[Sheet, ...]) -> None:
     assert (errors["RMS error of U"] < 2.0).all()
 
 
-def test_the_path_is_the_papers(path: tuple[Sheet, ...]) -> None:
+def test_the_path_is_the_papers(path):
     rotation, rolling, _ = path
     assert rotation["theta"][0] == pytest.approx(0.0, abs=0.1)
     assert rotation["theta"][-1] == pytest.approx(-11.5, abs=0.15)
@@ -64,7 +64,7 @@ def sheets() -> tuple[Sheet, ...]:
     return found
 
 
-def test_forces_are_the_energys_slopes() -> None:
+def test_forces_are_the_energys_slopes():
     """The balance, from finite differences of the energy along motions that roll."""
     here = slow_turn.turned(np.radians([2.0, 4.0]), slow_turn.gripped())[-1]
     step = 1e-6
@@ -79,7 +79,7 @@ def test_forces_are_the_energys_slopes() -> None:
         assert slope == pytest.approx(expected, abs=1e-5)
 
 
-def test_the_path_lies_on_the_floor_of_the_valley(sheets: tuple[Sheet, ...]) -> None:
+def test_the_path_lies_on_the_floor_of_the_valley(sheets):
     equations, _, land = sheets
     for lean in slow_turn.LEANS:
         angle, v = land[f"angle at {lean} deg"], land[f"V at {lean} deg"]
@@ -91,7 +91,7 @@ def test_the_path_lies_on_the_floor_of_the_valley(sheets: tuple[Sheet, ...]) -> 
         assert floor == pytest.approx(path, abs=0.05)
 
 
-def test_the_simulated_hand_goes_the_equations_way(sheets: tuple[Sheet, ...]) -> None:
+def test_the_simulated_hand_goes_the_equations_way(sheets):
     equations, plant, _ = sheets
     order = np.argsort(equations["angle"])
     assert math.degrees(slow_turn.REACH) - 0.5 < np.max(plant["angle"])

@@ -67,9 +67,7 @@ def comments(path: Path) -> None:
 @pytest.mark.timeout(120)  # s, on a busy machine
 @pytest.mark.parametrize("make", [fifo, zeros, comments])
 @pytest.mark.parametrize("read", READERS.values(), ids=READERS)
-def test_a_name_that_leads_elsewhere_is_told(
-    tmp_path: Path, make: Callable[[Path], None], read: Callable[[Path], object]
-) -> None:
+def test_a_name_that_leads_elsewhere_is_told(tmp_path, make, read):
     path = tmp_path / "named"
     make(path)
     with pytest.raises(SoftfingerError) as caught:
@@ -90,7 +88,7 @@ PROFILES = {
 
 @pytest.mark.timeout(120)  # s, on a busy machine
 @pytest.mark.parametrize("text", PROFILES.values(), ids=PROFILES)
-def test_a_profile_without_sense_is_told_soon_and_briefly(tmp_path: Path, text: str) -> None:
+def test_a_profile_without_sense_is_told_soon_and_briefly(tmp_path, text):
     path = tmp_path / "my.toml"
     path.write_text(text)
     with pytest.raises(SettingsError) as caught:
@@ -142,9 +140,7 @@ FRAMES: dict[str, tuple[str, Callable[[Path], object]]] = {
 
 @pytest.mark.timeout(120)  # s, on a busy machine
 @pytest.mark.parametrize(("name", "make"), FRAMES.values(), ids=FRAMES)
-def test_frames_beyond_their_file_are_told(
-    tmp_path: Path, name: str, make: Callable[[Path], object]
-) -> None:
+def test_frames_beyond_their_file_are_told(tmp_path, name, make):
     make(tmp_path / name)
     with pytest.raises(RecordingError, match=r"more than|another compression|no line|expected 4"):
         load_recording(tmp_path / name, 1.0, 100.0)
@@ -243,7 +239,7 @@ def bomb(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
 
 
 @pytest.mark.timeout(300)
-def test_a_bomb_is_told_in_a_line(bomb: Path) -> None:
+def test_a_bomb_is_told_in_a_line(bomb):
     told: list[str] = []
     recording = Recording(bomb, told.append)
     export(recording, bomb.parent, recording.topics)

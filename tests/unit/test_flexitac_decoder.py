@@ -58,7 +58,6 @@ def test_a_clean_stream_gives_every_frame_as_soon_as_the_next_marker_confirms_it
     assert decode(decoder, [frame(image) for image in images]) == images[:4]
     assert decoder.pending
     last = decoder.settle()
-    assert last is not None
     assert last.data.astype(np.uint8).tobytes() == images[4]
     assert decoder.settle() is None
     assert decoder.counters() == {
@@ -78,7 +77,6 @@ def test_on_a_line_with_gaps_a_frame_comes_at_once_unless_it_may_be_spliced():
     assert decoder.settle() is not None
     for k in range(2, 5):
         decoded = decoder.feed(frame(images[k]), 0.01 * k)
-        assert decoded is not None
         assert decoded.data[0, 0] == k
         assert decoded.t == 0.01 * k
     # In two pieces within its time; then in two pieces with a gap between them.
@@ -91,7 +89,6 @@ def test_on_a_line_with_gaps_a_frame_comes_at_once_unless_it_may_be_spliced():
     assert decoder.feed(frame(bytes(spare)), 0.08) is None
     assert decoder.settle() is None
     decoded = decoder.feed(frame(images[7]), 0.09)
-    assert decoded is not None
     assert decoded.data[0, 0] == 7
     assert decoder.counters()["frames"] == 9
     # A line without gaps: bytes follow at once, and tell.

@@ -18,12 +18,12 @@ payloads = st.lists(st.sampled_from(PIECES), max_size=40).map(b"".join)
 
 
 @given(st.binary(max_size=300))
-def test_crc_equals_the_sdks(data: bytes) -> None:
+def test_crc_equals_the_sdks(data):
     assert crc16(data) == sdk_handler(2.0).updateCRC(0, data, len(data))
 
 
 @given(payloads)
-def test_stuffing_is_undone_and_leaves_no_header(body: bytes) -> None:
+def test_stuffing_is_undone_and_leaves_no_header(body):
     packet = frame(1, framing.WRITE, body)
     at = packet.find(b"\xff\xff\xfd", 7)
     while at >= 0:
@@ -37,9 +37,7 @@ def test_stuffing_is_undone_and_leaves_no_header(body: bytes) -> None:
     st.lists(st.tuples(st.integers(0, 252), st.integers(1, 255), payloads), min_size=1, max_size=5),
     st.data(),
 )
-def test_parser_finds_every_packet_however_the_bytes_come(
-    contents: list[tuple[int, int, bytes]], data: st.DataObject
-) -> None:
+def test_parser_finds_every_packet_however_the_bytes_come(contents, data):
     stream = b"".join(frame(*content) for content in contents)
     parser = PacketParser()
     found = []
@@ -54,34 +52,34 @@ def test_parser_finds_every_packet_however_the_bytes_come(
 
 
 @given(st.binary(max_size=60), payloads)
-def test_parser_recovers_after_any_noise(noise: bytes, body: bytes) -> None:
+def test_parser_recovers_after_any_noise(noise, body):
     parser = PacketParser(gap=0.0015)
     parser.feed(noise, 0.0)
     found = parser.feed(frame(7, framing.WRITE, body), 1.0)
     assert [(p.id, p.parameters, p.valid) for p in found] == [(7, body, True)]
 
 
-def test_a_cut_packet_does_not_swallow_the_next() -> None:
+def test_a_cut_packet_does_not_swallow_the_next():
     whole = frame(1, framing.WRITE, bytes(20))
     found = PacketParser().feed(whole[:15] + frame(2, framing.PING), 0.0)
     assert [(p.id, p.instruction) for p in found] == [(2, framing.PING)]
 
 
-def test_an_unstuffed_packet_is_not_obeyed() -> None:
+def test_an_unstuffed_packet_is_not_obeyed():
     goals = bytes.fromhex("6600 FFFF FDFFFFFF")
     raw = b"\xff\xff\xfd\x00\x01" + (len(goals) + 3).to_bytes(2, "little") + b"\x03" + goals
     raw += crc16(raw).to_bytes(2, "little")
     assert PacketParser().feed(raw, 0.0) == []
 
 
-def test_a_damaged_packet_is_told_apart() -> None:
+def test_a_damaged_packet_is_told_apart():
     damaged = bytearray(frame(1, framing.READ, bytes(4)))
     damaged[9] ^= 4
     (packet,) = PacketParser().feed(bytes(damaged), 0.0)
     assert not packet.valid
 
 
-def test_silence_within_a_packet_ends_it() -> None:
+def test_silence_within_a_packet_ends_it():
     packet = frame(1, framing.PING)
     parser = PacketParser(gap=0.0015)
     assert parser.feed(packet[:6], 0.0) == []
@@ -91,5 +89,5 @@ def test_silence_within_a_packet_ends_it() -> None:
 
 
 @pytest.mark.parametrize("bad_id", [0xFD, 0xFF])
-def test_ids_that_no_servo_may_have(bad_id: int) -> None:
+def test_ids_that_no_servo_may_have(bad_id):
     assert PacketParser().feed(frame(bad_id, framing.PING), 0.0) == []

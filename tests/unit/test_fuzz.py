@@ -9,7 +9,7 @@ from tests.fuzz.commands import fuzz
 @pytest.mark.parametrize(
     ("name", "count"), [("commands", 5000), ("settings", 800), ("calibration", 1200)]
 )
-def test_odd_input_is_refused_or_carried_out_and_nothing_else(name: str, count: int) -> None:
+def test_odd_input_is_refused_or_carried_out_and_nothing_else(name, count):
     counts = fuzz(name, count, seed=11)
     assert set(counts) == {"done", "refused"}
     assert sum(counts.values()) == count
@@ -17,7 +17,7 @@ def test_odd_input_is_refused_or_carried_out_and_nothing_else(name: str, count: 
 
 
 @pytest.mark.parametrize("target", tactile.TARGETS)
-def test_no_input_breaks_a_reader(target: str) -> None:
+def test_no_input_breaks_a_reader(target):
     report = tactile.fuzz(target, 4000, seed=7)
     assert report.wrong == []
     assert report.through > 300

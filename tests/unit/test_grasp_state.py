@@ -48,7 +48,7 @@ def motion_of(state: GraspState) -> tuple[float, ...]:
 
 
 @pytest.mark.parametrize("delta", [0.0, 0.06, -0.12])
-def test_levers_are_the_torques_that_balance_the_grasp(grasp: Grasp, delta: float) -> None:
+def test_levers_are_the_torques_that_balance_the_grasp(grasp, delta):
     state = grasp.symmetric(0.0035)
     if delta:
         state = grasp.steer(state, delta)
@@ -76,7 +76,7 @@ def faces(q, d, angle: float, taper: float):
 
 
 @pytest.mark.parametrize("taper", [-0.4, 0.0, 0.2])
-def test_a_tapering_object_moves_by_the_constraints_of_its_faces(taper: float) -> None:
+def test_a_tapering_object_moves_by_the_constraints_of_its_faces(taper):
     q, d, angle = (0.12, 0.21), (3e-3, 4e-3), -0.1
     n, t, tips, v, rolls = faces(q, d, angle, taper)
     a = HAND.tip_radius
@@ -107,7 +107,7 @@ def test_a_tapering_object_moves_by_the_constraints_of_its_faces(taper: float) -
 
 
 @pytest.mark.parametrize("taper", [-0.4, 0.2])
-def test_what_holds_a_tapering_object_balances_it(grasp: Grasp, taper: float) -> None:
+def test_what_holds_a_tapering_object_balances_it(grasp, taper):
     q, d, angle = (0.2, 0.16), (3.1e-3, 3e-3), 0.05
     n, t, tips, v, rolls = faces(q, d, angle, taper)
     a, data = HAND.tip_radius, grasp.table.data
@@ -136,7 +136,7 @@ def test_what_holds_a_tapering_object_balances_it(grasp: Grasp, taper: float) ->
     assert [lever1, lever2] == pytest.approx([torque1 / force, torque2 / force], rel=1e-4)
 
 
-def test_each_tip_has_its_own_table(grasp: Grasp) -> None:
+def test_each_tip_has_its_own_table(grasp):
     soft = grasp.table.data
     stiff = ContactTable.build(Fingertip(0.020), Material.constant(0.6e6)).data
     q1, q2, d1, d2, angle = 0.14, 0.22, 4.0e-3, 2.6e-3, 0.03
@@ -153,7 +153,7 @@ def test_each_tip_has_its_own_table(grasp: Grasp) -> None:
     assert here[:2] != pytest.approx(levers(soft, soft, q1, q2, d1, d2, angle)[:2], rel=1e-3)
 
 
-def test_total_tilt_is_the_angle_of_the_normal_with_the_axis() -> None:
+def test_total_tilt_is_the_angle_of_the_normal_with_the_axis():
     assert total_tilt(0.3, 0.0) == pytest.approx(0.3)
     x, y = math.sin(0.2), math.sin(-0.1)
     assert math.cos(total_tilt(0.2, -0.1)) == pytest.approx(math.sqrt(1.0 - x * x - y * y))
@@ -177,7 +177,7 @@ def found_load(
 
 @pytest.mark.parametrize("load", [0.0, 4.0, 8.0, -3.0, -6.0])
 @pytest.mark.parametrize("delta", [0.0, 0.06, -0.12])
-def test_load_is_what_the_tips_bear(table: ContactTable, load: float, delta: float) -> None:
+def test_load_is_what_the_tips_bear(table, load, delta):
     state = Grasp(HAND, table, WIDTH).symmetric(0.0035)
     if delta:
         state = Grasp(HAND, table, WIDTH).steer(state, delta)
@@ -194,7 +194,7 @@ def test_load_is_what_the_tips_bear(table: ContactTable, load: float, delta: flo
     assert again - found == pytest.approx(more / slope, rel=0.02)
 
 
-def test_without_two_contacts_there_are_no_levers_and_no_load(table: ContactTable) -> None:
+def test_without_two_contacts_there_are_no_levers_and_no_load(table):
     motion = held_motion((0.1, 0.1), (0.0, 1e-3), 0.0, 0.0, LENGTHS)
     data = table.data
     rolled = (0.0, 0.0)
@@ -203,7 +203,7 @@ def test_without_two_contacts_there_are_no_levers_and_no_load(table: ContactTabl
     assert holding_levers(data, data, (0.0, 1e-3), (0.1, -0.1), 0.0, motion) == (0.0,) * 5
 
 
-def test_torques_that_no_load_explains_give_a_finite_one(table: ContactTable) -> None:
+def test_torques_that_no_load_explains_give_a_finite_one(table):
     for torque in (-50.0, 50.0):
         for q in np.linspace(-0.5, 1.0, 7):
             motion = held_motion((q, 0.1), (1e-6, 1e-3), 0.1, 0.3, LENGTHS)
@@ -218,9 +218,7 @@ def test_torques_that_no_load_explains_give_a_finite_one(table: ContactTable) ->
 
 @pytest.mark.parametrize("load", [0.0, 3.0])
 @pytest.mark.parametrize("taper", [-0.3, 0.3])
-def test_load_on_a_tapering_object_is_told_from_what_presses_it_out(
-    table: ContactTable, taper: float, load: float
-) -> None:
+def test_load_on_a_tapering_object_is_told_from_what_presses_it_out(table, taper, load):
     q, d, angle = (0.2, 0.2), (3e-3, 3e-3), 0.0
     theta = (q[0] - 0.5 * taper, 0.5 * taper - q[1])
     data, lean = table.data, math.tan(0.5 * taper)

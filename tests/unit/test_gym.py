@@ -14,13 +14,13 @@ pytestmark = pytest.mark.filterwarnings("error")
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_gymnasiums_checker_has_nothing_to_say(task: str) -> None:
+def test_gymnasiums_checker_has_nothing_to_say(task):
     env = gymnasium.make(f"SoftFinger-{task.capitalize()}-v0")
     check_env(env.unwrapped, skip_render_check=True)
     env.close()
 
 
-def test_a_seed_gives_the_same_bits_and_another_one_others() -> None:
+def test_a_seed_gives_the_same_bits_and_another_one_others():
     env = SoftFingerEnv("push")
 
     def seen(seed: int) -> list[bytes]:
@@ -35,7 +35,7 @@ def test_a_seed_gives_the_same_bits_and_another_one_others() -> None:
     env.close()
 
 
-def test_the_built_in_law_turns_and_holds_and_a_random_agent_does_not() -> None:
+def test_the_built_in_law_turns_and_holds_and_a_random_agent_does_not():
     for task, least, most in (("rotate", 150.0, 150.0), ("grasp", 120.0, 20.0)):
         name = f"SoftFinger-{task.capitalize()}-v0"
         by_joints, law = gymnasium.make(name), gymnasium.make(name, control="law")
@@ -46,7 +46,7 @@ def test_the_built_in_law_turns_and_holds_and_a_random_agent_does_not() -> None:
         law.close()
 
 
-def test_shaping_adds_what_the_potential_has_grown_by() -> None:
+def test_shaping_adds_what_the_potential_has_grown_by():
     plain, shaped = SoftFingerEnv("grasp"), SoftFingerEnv("grasp", shaped=True)
     sums = []
     for env in (plain, shaped):
@@ -59,7 +59,7 @@ def test_shaping_adds_what_the_potential_has_grown_by() -> None:
     shaped.close()
 
 
-def test_images_are_of_eight_bits_channel_first() -> None:
+def test_images_are_of_eight_bits_channel_first():
     env = Images(gymnasium.make("SoftFinger-Push-v0", control="law"))
     observation, _ = env.reset(seed=1)
     assert env.observation_space.contains(observation)
@@ -69,7 +69,7 @@ def test_images_are_of_eight_bits_channel_first() -> None:
     env.close()
 
 
-def test_the_baseline_closes_each_finger_by_its_own_features() -> None:
+def test_the_baseline_closes_each_finger_by_its_own_features():
     def act(d: float, force: float) -> list[float]:
         contacts = np.array([d, 0.0, force, 0.0, 0.0, 0.0], np.float32)
         observed = {"contacts": contacts, "joints": np.zeros(6), "goal": np.array([6.0])}

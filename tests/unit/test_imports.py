@@ -83,30 +83,30 @@ def table_of_rooms() -> list[str]:
     return [line for line in after.partition("\n\n")[0].splitlines() if line.startswith("| `")]
 
 
-def test_circles_and_imports_are_found() -> None:
+def test_circles_and_imports_are_found():
     graph = {"a": {"b"}, "b": {"c"}, "c": {"a", "d"}, "d": {"e"}, "e": set[str]()}
     assert set(circle(graph)) == {"a", "b", "c"}
     assert len(modules()) > 100
     assert "kinematics.compiled.kernel" in imports()["kinematics.contact.lookup"]
 
 
-def test_tools_use_the_daemon_and_both_use_kinematics() -> None:
+def test_tools_use_the_daemon_and_both_use_kinematics():
     for name, others in imports().items():
         allowed = ORDER[: ORDER.index(name.split(".")[0]) + 1]
         wrong = [each for each in others if each.split(".")[0] not in allowed]
         assert not wrong, f"{name} imports {', '.join(sorted(wrong))}"
 
 
-def test_no_files_import_in_a_circle() -> None:
+def test_no_files_import_in_a_circle():
     assert circle(imports()) == []
 
 
-def test_no_rooms_import_in_a_circle() -> None:
+def test_no_rooms_import_in_a_circle():
     for top in ORDER:
         assert circle(rooms(top)) == [], top
 
 
-def test_the_daemons_rooms_import_downwards_in_the_table_of_the_architecture() -> None:
+def test_the_daemons_rooms_import_downwards_in_the_table_of_the_architecture():
     rows = (re.findall(r"`daemon/(\w+)", line.split("|")[1]) for line in table_of_rooms())
     place = {room: row for row, names in enumerate(rows) for room in names}
     graph = rooms("daemon")
@@ -116,12 +116,12 @@ def test_the_daemons_rooms_import_downwards_in_the_table_of_the_architecture() -
         assert not wrong, f"daemon/{room} imports {', '.join(wrong)}, not below it in the table"
 
 
-def test_clients_and_gateway_know_neither_loop_nor_profile() -> None:
+def test_clients_and_gateway_know_neither_loop_nor_profile():
     graph = rooms("daemon")
     assert not {"loop", "profile"} & (graph["client"] | graph["gateway"])
 
 
-def test_each_class_has_a_name_of_its_own() -> None:
+def test_each_class_has_a_name_of_its_own():
     names = Counter(
         node.name
         for file in modules().values()
@@ -131,7 +131,7 @@ def test_each_class_has_a_name_of_its_own() -> None:
     assert [name for name, count in names.items() if count > 1] == []
 
 
-def test_every_exception_derives_from_the_root() -> None:
+def test_every_exception_derives_from_the_root():
     alone = [
         f"{file}: {node.name}"
         for file in modules().values()
@@ -143,7 +143,7 @@ def test_every_exception_derives_from_the_root() -> None:
     assert alone == []
 
 
-def test_a_docstring_begins_with_a_verb_or_a_noun() -> None:
+def test_a_docstring_begins_with_a_verb_or_a_noun():
     begun = [
         f"{name}: {text.splitlines()[0]}"
         for name, file in modules().items()

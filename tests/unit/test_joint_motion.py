@@ -10,7 +10,7 @@ import pytest
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.safety.limits import JointMotion
 from softfinger.daemon.types import Reading
-from tests.harness.loop import Make, advance_to, command, grasped, refusal
+from tests.harness.loop import advance_to, command, grasped, refusal
 
 TICK = 0.002
 COUNT = 2.0 * math.pi / 4096
@@ -45,7 +45,7 @@ class Joint:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_what_joints_do_is_no_jump(seed: int) -> None:
+def test_what_joints_do_is_no_jump(seed):
     joint = Joint(seed)
     turn = 0.0
     for k in range(20_000):
@@ -55,7 +55,7 @@ def test_what_joints_do_is_no_jump(seed: int) -> None:
 
 
 @pytest.mark.parametrize("jump", [0.2, -0.2, 0.12])
-def test_an_angle_that_jumps_is_found_at_once(jump: float) -> None:
+def test_an_angle_that_jumps_is_found_at_once(jump):
     joint = Joint()
     for _ in range(100):
         joint.tick(0.3)
@@ -64,13 +64,13 @@ def test_an_angle_that_jumps_is_found_at_once(jump: float) -> None:
     assert not joint.tick(0.3), "it is a matter of that reading alone"
 
 
-def test_an_encoder_that_walks_while_the_velocity_rests_is_found() -> None:
+def test_an_encoder_that_walks_while_the_velocity_rests_is_found():
     joint = Joint()
     seconds = next(k * TICK for k in range(200) if joint.tick(2.0, lag=math.inf))
     assert seconds < 0.1
 
 
-def test_a_velocity_without_a_motion_is_found() -> None:
+def test_a_velocity_without_a_motion_is_found():
     joint = Joint()
     joint.dq = 2.5
     seconds = next(k * TICK for k in range(200) if joint.tick(0.0, lag=math.inf))
@@ -78,7 +78,7 @@ def test_a_velocity_without_a_motion_is_found() -> None:
 
 
 @pytest.mark.parametrize("seconds", [0.03, 0.06, 0.2])
-def test_a_machine_that_stood_still_while_a_joint_turned_is_no_jump(seconds: float) -> None:
+def test_a_machine_that_stood_still_while_a_joint_turned_is_no_jump(seconds):
     """Whether before the servo was asked, or between its answer and its being taken."""
     for at_answer in (False, True):
         joint = Joint()
@@ -92,7 +92,7 @@ def test_a_machine_that_stood_still_while_a_joint_turned_is_no_jump(seconds: flo
             assert not joint.tick(3.0)
 
 
-def test_a_jump_beside_lost_readings_is_found() -> None:
+def test_a_jump_beside_lost_readings_is_found():
     joint = Joint()
     for _ in range(10):
         joint.tick(0.0)
@@ -107,14 +107,13 @@ def test_a_jump_beside_lost_readings_is_found() -> None:
 def spoil(daemon: Daemon, how: Callable[[Reading], None]) -> None:
     """From now on readings are spoilt after they were taken."""
     servos = daemon.loop.torque.servos
-    assert servos is not None
     really = servos.read
 
     def read(reading: Reading) -> None:
         really(reading)
         how(reading)
 
-    servos.read = read  # type: ignore[method-assign]
+    servos.read = read
 
 
 def jumped(reading: Reading) -> None:
@@ -138,9 +137,7 @@ class Stuck:
     [(jumped, "joint.jump", 0.01), (Stuck(), "joint.dead", 0.12)],
     ids=["jumped", "stuck"],
 )
-def test_a_grip_ends_when_a_joint_can_not_be_believed(
-    make: Make, how: Callable[[Reading], None], name: str, within: float
-) -> None:
+def test_a_grip_ends_when_a_joint_can_not_be_believed(make, how, name, within):
     daemon = grasped(make(), 8.0)
     spoil(daemon, how)
     advance_to(daemon, "fault", within)
@@ -148,7 +145,7 @@ def test_a_grip_ends_when_a_joint_can_not_be_believed(
 
 
 @pytest.mark.parametrize("mode", ["current-based position", "current"])
-def test_grips_turns_rests_and_pushes_are_believed(make: Make, mode: str) -> None:
+def test_grips_turns_rests_and_pushes_are_believed(make, mode):
     """Holding still for long, at a joint's stop, on an object, and pushed off the goal."""
     daemon = make(servos={"mode": mode})
     hand: Any = daemon.hand
@@ -172,7 +169,7 @@ def test_grips_turns_rests_and_pushes_are_believed(make: Make, mode: str) -> Non
     assert daemon.loop.state.fault_name == ""
 
 
-def test_position_mode_moves_and_knows_nothing_of_the_current_it_should_take(make: Make) -> None:
+def test_position_mode_moves_and_knows_nothing_of_the_current_it_should_take(make):
     daemon = make(servos={"mode": "position", "model": "XL430-W250"})
     command(daemon, "arm")
     daemon.loop.advance(0.1)

@@ -29,7 +29,7 @@ def limit_twice(radius: float, d: float) -> float:
     return 2.0 * theta_limit(radius, d)
 
 
-def test_an_inner_kernel_works_in_kernels_and_refuses_python() -> None:
+def test_an_inner_kernel_works_in_kernels_and_refuses_python():
     assert limit_twice(0.02, 0.02) == 0.0
     assert limit_twice(0.02, 0.0) == pytest.approx(math.pi)
     with pytest.raises(TypeError, match=r"closed_form\.theta_limit is an inner kernel"):
@@ -54,15 +54,13 @@ def half(x: Any) -> Any:
     return _half(x)
 
 
-def test_which_inner_kernel_is_compiled_depends_on_the_first_arguments_type() -> None:
+def test_which_inner_kernel_is_compiled_depends_on_the_first_arguments_type():
     assert half(3.0) == 1.5
     assert half(None) == -1.0
 
 
 @pytest.mark.parametrize("why", ["99.0", "compiler"])
-def test_numba_alone_compiles_where_its_private_parts_are_not_known(
-    why: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_numba_alone_compiles_where_its_private_parts_are_not_known(why, monkeypatch):
     if why == "compiler":
         monkeypatch.setattr(numba, "__version__", "0.68.0")
         monkeypatch.delattr(compiled, "compiler", raising=False)
@@ -85,7 +83,7 @@ def kernels() -> Iterator[Any]:
                     yield function
 
 
-def test_the_caches_name_covers_all_that_kernels_are_made_of() -> None:
+def test_the_caches_name_covers_all_that_kernels_are_made_of():
     sources = set(kernel_sources())
     assert {
         Path(plain.__file__).with_name(f"{each}.py").resolve() for each in ("compiler", "plain")
@@ -97,7 +95,6 @@ def test_the_caches_name_covers_all_that_kernels_are_made_of() -> None:
         for name in function.__code__.co_names:
             used = function.__globals__.get(name)
             if isinstance(used, types.ModuleType) and used.__name__.startswith("softfinger."):
-                assert used.__file__ is not None
                 assert Path(used.__file__).resolve() in sources, f"{function}: {name}"
     assert count > 150
 
@@ -113,25 +110,25 @@ class Memory(Record):
     tip: Annotated[Records[Tip], 2]
 
 
-def test_a_record_is_a_view_of_its_array() -> None:
+def test_a_record_is_a_view_of_its_array():
     memory = Memory()
     memory.spread = [3.0, 4.0]
     memory.tip[1].d = 2.0
-    assert memory.array[0]["spread"][1] == 4.0  # type: ignore[index]
-    assert memory.array[0]["tip"]["d"].tolist() == [0.0, 2.0]  # type: ignore[index]
+    assert memory.array[0]["spread"][1] == 4.0
+    assert memory.array[0]["tip"]["d"].tolist() == [0.0, 2.0]
     with pytest.raises(TypeError, match="Tip: expected"):
         Tip(np.zeros(1, Memory.dtype))
 
 
-def test_what_is_no_field_is_an_error() -> None:
+def test_what_is_no_field_is_an_error():
     memory = Memory()
     with pytest.raises(AttributeError):
-        memory.spred = 1.0  # type: ignore[attr-defined]
+        memory.spred = 1.0
     with pytest.raises(AttributeError, match="newest is a record: set its fields"):
         memory.newest = Tip()
 
 
-def test_arrays_are_known_by_the_aliases_of_every_numpy() -> None:
+def test_arrays_are_known_by_the_aliases_of_every_numpy():
     of_2_5 = types.GenericAlias(np.ndarray, (np.float64,))  # NDArray[np.float64] there
     for alias in (NDArray[np.float64], of_2_5):
         assert _kind(Annotated[alias, 3]) == (None, np.float64, (3,))

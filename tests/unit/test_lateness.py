@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from softfinger.daemon.clock import HandClock, LoopClock, RealClock, VirtualClock, make_clock
+from softfinger.daemon.clock import HandClock, RealClock, VirtualClock, make_clock
 from softfinger.daemon.loop import build as build_module
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.loop.publishing import parts
@@ -32,7 +32,7 @@ def on_late_machine(monkeypatch: pytest.MonkeyPatch) -> Iterator[Build]:
     daemons = []
 
     def build(clock: str, **sections: Any) -> tuple[Daemon, LateMachine, list[Any]]:
-        machine, events = LateMachine(), []  # type: ignore[var-annotated]
+        machine, events = LateMachine(), []
         made = machine if clock == "real" else HandClock(machine)
         monkeypatch.setattr(build_module, "make_clock", lambda _: made)
         daemons.append(
@@ -75,9 +75,7 @@ def undisturbed() -> dict[str, Any]:
 
 @settings(max_examples=5)
 @given(late=st.lists(st.sampled_from([0.0, 0.0, 0.0, 1e-4, 0.0019, 0.01, 0.3, 5.0]), max_size=300))
-def test_what_a_simulated_hand_does_is_the_same_however_late_the_machine(
-    undisturbed: dict[str, Any], late: list[float]
-) -> None:
+def test_what_a_simulated_hand_does_is_the_same_however_late_the_machine(undisturbed, late):
     with pytest.MonkeyPatch.context() as patch:
         machine = LateMachine()
         patch.setattr(build_module, "make_clock", lambda _: HandClock(machine))
@@ -89,9 +87,7 @@ def test_what_a_simulated_hand_does_is_the_same_however_late_the_machine(
     assert undisturbed["object"]["valid"]
 
 
-def test_a_simulated_hand_waits_for_the_machine_and_says_so_now_and_then(
-    on_late_machine: Build,
-) -> None:
+def test_a_simulated_hand_waits_for_the_machine_and_says_so_now_and_then(on_late_machine):
     daemon, machine, events = on_late_machine("auto", task={"name": "demo"})
     machine.work(60.0)  # building everything is no lateness
     machine.late_by = [0.0] * 100 + [0.4] + [0.0] * 50 + [0.5]
@@ -107,7 +103,7 @@ def test_a_simulated_hand_waits_for_the_machine_and_says_so_now_and_then(
     assert told[1:] == ["this machine is busy: the hand waited 0.50 s, 0.9 s in all"]
 
 
-def test_a_duration_is_the_machines(on_late_machine: Build) -> None:
+def test_a_duration_is_the_machines(on_late_machine):
     daemon, machine, _ = on_late_machine("auto")
     begin = machine.now()
     machine.late_by = [0.0] * 100 + [3.0]
@@ -115,7 +111,7 @@ def test_a_duration_is_the_machines(on_late_machine: Build) -> None:
     assert machine.now() - begin == pytest.approx(5.0, abs=0.02)
 
 
-def test_a_fault_names_the_busy_machine_as_its_cause(on_late_machine: Build) -> None:
+def test_a_fault_names_the_busy_machine_as_its_cause(on_late_machine):
     daemon, machine, events = on_late_machine("real")
     daemon.loop.advance(0.3)
     grasped(daemon, 6.0)
@@ -130,17 +126,13 @@ def test_a_fault_names_the_busy_machine_as_its_cause(on_late_machine: Build) -> 
     ]
 
 
-def test_a_fault_of_another_kind_names_no_busy_machine(
-    on_late_machine: Build,
-) -> None:
+def test_a_fault_of_another_kind_names_no_busy_machine(on_late_machine):
     daemon, machine, _ = on_late_machine("real")
     daemon.loop.advance(0.3)
     grasped(daemon, 6.0)
     machine.late_by = [0.0, 0.08]
     daemon.loop.advance(0.1)
     assert daemon.loop.state.timing.busy_s == pytest.approx(0.08)
-    assert daemon.servos is not None
-    assert daemon.hand is not None
     daemon.hand.servo_heat[0].warm(75.0)
     advance_to(daemon, "fault", 3.0)
     assert daemon.loop.state.fault_name == "servos.temperature"
@@ -149,33 +141,30 @@ def test_a_fault_of_another_kind_names_no_busy_machine(
     assert daemon.loop.state.timing.busy_s == 0.0
 
 
-def test_work_that_takes_long_is_named_too_but_not_what_a_command_took(
-    on_late_machine: Build,
-) -> None:
+def test_work_that_takes_long_is_named_too_but_not_what_a_command_took(on_late_machine):
     daemon, machine, _ = on_late_machine("real", task={"name": "demo"})
     servos, state = daemon.loop.torque.servos, daemon.loop.state
-    assert servos is not None
     really = servos.torque_on
 
     def slowly() -> None:
         really()
         machine.work(0.3)  # a slow bus
 
-    servos.torque_on = slowly  # type: ignore[method-assign]
+    servos.torque_on = slowly
     advance_to(daemon, "fault", 2.0)  # the task arms
     assert (state.fault_name, state.timing.busy_s) == ("servos.bus", 0.0)
     assert state.fault.startswith("the bus watchdog")
-    servos.torque_on = really  # type: ignore[method-assign]
+    servos.torque_on = really
     advance_to(daemon, "grasping", 5.0)
     sensor = daemon.loop.perception.fingers[0].sensor
     latest = sensor.latest
 
     def held_up() -> Any:
-        sensor.latest = latest  # type: ignore[method-assign]
+        sensor.latest = latest
         machine.work(0.25)
         return latest()
 
-    sensor.latest = held_up  # type: ignore[method-assign]
+    sensor.latest = held_up
     advance_to(daemon, "fault", 0.5)
     assert state.fault.startswith("this machine was busy for 250 ms: the bus watchdog")
 
@@ -192,12 +181,12 @@ def looked(late: float, seconds: float) -> list[tuple[str, str, str]]:
     return [event for event in found if event is not None]
 
 
-def test_lateness_is_told_when_it_has_doubled() -> None:
+def test_lateness_is_told_when_it_has_doubled():
     told = [event for event in looked(0.06, 17.0 * EVERY) if event[1] == "late"]
     assert len(told) == 6  # at 0, 1, 2, 4, 8 and 16 times EVERY
 
 
-def test_virtual_time_moves_only_by_waiting_and_never_back() -> None:
+def test_virtual_time_moves_only_by_waiting_and_never_back():
     clock = VirtualClock(3.0)
     assert clock.now() == clock.wall() == clock.host() == 3.0
     assert clock.sleep_until(4.5) == 0.0
@@ -206,7 +195,7 @@ def test_virtual_time_moves_only_by_waiting_and_never_back() -> None:
     assert clock.now() == 4.5
 
 
-def test_a_hands_time_stands_between_sleeps_and_ends_them_at_their_deadline() -> None:
+def test_a_hands_time_stands_between_sleeps_and_ends_them_at_their_deadline():
     machine = LateMachine(100.0)
     clock = HandClock(machine)
     machine.work(0.001)
@@ -220,7 +209,7 @@ def test_a_hands_time_stands_between_sleeps_and_ends_them_at_their_deadline() ->
     assert clock.behind == 0.0
 
 
-def test_a_hands_time_leaves_out_what_the_machine_missed() -> None:
+def test_a_hands_time_leaves_out_what_the_machine_missed():
     machine = LateMachine(100.0)
     clock = HandClock(machine)
     machine.late_by = [5.0]  # it was stopped
@@ -249,7 +238,5 @@ def test_a_hands_time_leaves_out_what_the_machine_missed() -> None:
         ({"servos": {"backend": "none"}, "tactile": {"backend": "flexitac"}}, RealClock),
     ],
 )
-def test_only_a_hand_without_metal_has_a_time_of_its_own(
-    sections: dict[str, dict[str, str]], kind: type[LoopClock]
-) -> None:
+def test_only_a_hand_without_metal_has_a_time_of_its_own(sections, kind):
     assert type(make_clock(Settings.model_validate(sections))) is kind

@@ -26,7 +26,7 @@ def frame(counts: list[list[int]], t: float, scale: float = 1000.0) -> TactileFr
     return read(TactileFrame, given)
 
 
-def test_what_is_not_known_or_not_touched_is_zero() -> None:
+def test_what_is_not_known_or_not_touched_is_zero():
     state = read(HandState, sample(schema.STATE))
     left = replace(state.left, q=0.1, contact=True, d=1e-3, theta=math.nan, force=2.0)
     right = replace(state.right, q=-0.2, contact=False, d=2e-3, force=3.0)
@@ -52,7 +52,7 @@ def test_what_is_not_known_or_not_touched_is_zero() -> None:
     assert {name: found[name] for name in expected} == pytest.approx(expected)
 
 
-def test_an_image_is_linear_and_white_from_the_full_scale_on() -> None:
+def test_an_image_is_linear_and_white_from_the_full_scale_on():
     found = image(frame([[0, 1, 50], [100, 101, 65535]], 0.0), full_scale=100e3)
     assert found.dtype == np.uint8
     assert found.shape == (2, 3, 3)

@@ -70,7 +70,7 @@ def recording(path: Path, spoil: tuple[str, Any] | None) -> Path:
 
 
 @pytest.mark.parametrize("spoil", SPOILT.values(), ids=SPOILT)
-def test_a_frame_that_is_none_is_told_and_left_out(tmp_path: Path, spoil: tuple[str, Any]) -> None:
+def test_a_frame_that_is_none_is_told_and_left_out(tmp_path, spoil):
     path = recording(tmp_path / "a.mcap", spoil)
     told: list[str] = []
     found = list(Recording(path, told.append).messages([schema.TACTILE]))
@@ -84,7 +84,7 @@ def test_a_frame_that_is_none_is_told_and_left_out(tmp_path: Path, spoil: tuple[
 
 
 @pytest.mark.parametrize("name", ["settings", "calibration_left"])
-def test_settings_without_their_text_are_told(tmp_path: Path, name: str) -> None:
+def test_settings_without_their_text_are_told(tmp_path, name):
     path = tmp_path / "a.mcap"
     writer = RecordingWriter(path)
     message = settings_message()
@@ -95,7 +95,7 @@ def test_settings_without_their_text_are_told(tmp_path: Path, name: str) -> None
         recorded_settings(Recording(path))
 
 
-def test_recorded_settings_name_no_files(tmp_path: Path) -> None:
+def test_recorded_settings_name_no_files(tmp_path):
     named = Settings().model_dump()
     files = ("calibration", "recording", "envelope", "keys")
     for section in named.values():
@@ -110,7 +110,7 @@ def test_recorded_settings_name_no_files(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("spoilt", ["seq", "t", "reading", "left", "timestamp"])
-def test_inputs_that_are_none_are_told(tmp_path: Path, spoilt: str) -> None:
+def test_inputs_that_are_none_are_told(tmp_path, spoilt):
     writer = RecordingWriter(tmp_path / "a.mcap")
     for topic, message in Recording(GOLDEN).messages(end=0.1):
         if topic == schema.INPUT:

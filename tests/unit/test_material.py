@@ -33,7 +33,7 @@ def laws() -> list[Material]:
     ]
 
 
-def test_constant_modulus() -> None:
+def test_constant_modulus():
     material = Material.constant(0.304e6)
     np.testing.assert_allclose(material.stress(STRAIN), 0.304e6 * STRAIN, rtol=1e-15)
     np.testing.assert_allclose(material.energy_density(STRAIN), 0.152e6 * STRAIN**2, rtol=1e-15)
@@ -44,7 +44,7 @@ def test_constant_modulus() -> None:
             Material.constant(modulus)
 
 
-def test_table_i_has_the_papers_slopes() -> None:
+def test_table_i_has_the_papers_slopes():
     material = Material.table_i()
     assert material.reference_modulus == 0.135e6
     assert not material.is_linear
@@ -59,7 +59,7 @@ def test_table_i_has_the_papers_slopes() -> None:
 
 
 @pytest.mark.parametrize("index", range(4))
-def test_a_law_is_smooth_rising_and_consistent(index: int) -> None:
+def test_a_law_is_smooth_rising_and_consistent(index):
     material = laws()[index]
     stress, energy = material.stress(STRAIN), material.energy_density(STRAIN)
     assert stress[0] == energy[0] == 0.0
@@ -78,7 +78,7 @@ def test_a_law_is_smooth_rising_and_consistent(index: int) -> None:
 
 
 @pytest.mark.parametrize("index", range(4))
-def test_outside_zero_to_one(index: int) -> None:
+def test_outside_zero_to_one(index):
     material = laws()[index]
     for strain in (0.3, 1.0, 1.7):
         np.testing.assert_allclose(
@@ -101,7 +101,7 @@ def test_outside_zero_to_one(index: int) -> None:
     assert material.stress(np.float32(0.5)).shape == ()
 
 
-def test_points_of_a_law_give_the_law_back() -> None:
+def test_points_of_a_law_give_the_law_back():
     original = Material.table_i()
     for x in (np.linspace(0.0, 1.0, 12), np.linspace(0.04, 1.0, 25)):
         again = Material.from_points(x, original.stress(x))
@@ -112,7 +112,7 @@ def test_points_of_a_law_give_the_law_back() -> None:
     np.testing.assert_allclose(line.reference_modulus, 1e5, rtol=1e-12)
 
 
-def test_short_curves_go_on_with_their_last_slope() -> None:
+def test_short_curves_go_on_with_their_last_slope():
     x = np.linspace(0.0, 0.5, 20)
     material = Material.from_points(x, 1e5 * (x + x**2))
     np.testing.assert_allclose(material.stress(x[1:]), 1e5 * (x + x**2)[1:], rtol=5e-3)
@@ -125,7 +125,7 @@ def test_short_curves_go_on_with_their_last_slope() -> None:
     scale=st.floats(1.0, 1e9),
 )
 @settings(max_examples=60)
-def test_any_rising_points_give_a_rising_law_or_a_reason(steps: list[float], scale: float) -> None:
+def test_any_rising_points_give_a_rising_law_or_a_reason(steps, scale):
     x = np.linspace(0.0, 1.0, len(steps) + 1)
     y = scale * np.concatenate([[0.0], np.cumsum(steps)])
     try:
@@ -138,7 +138,7 @@ def test_any_rising_points_give_a_rising_law_or_a_reason(steps: list[float], sca
     assert material.fit_error <= 0.05 * y[-1]
 
 
-def test_the_force_error_is_what_the_misfit_makes_of_the_force() -> None:
+def test_the_force_error_is_what_the_misfit_makes_of_the_force():
     x = np.linspace(0.025, 1.0, 40)
     curve = 1e5 * x**0.7
     law = Material.from_points(x, curve)
@@ -170,19 +170,19 @@ def test_the_force_error_is_what_the_misfit_makes_of_the_force() -> None:
         ([0, 0.1, 0.2, 0.3, 0.31, 0.9], [0, 1, 2, 3, 90, 91], "no smooth monotone law"),
     ],
 )
-def test_refusals_say_what_is_wrong(strain: list[float], stress: list[float], words: str) -> None:
+def test_refusals_say_what_is_wrong(strain, stress, words):
     with pytest.raises(MaterialError, match=words):
         Material.from_points(strain, stress)
 
 
-def test_all_that_is_wrong_comes_in_one_report() -> None:
+def test_all_that_is_wrong_comes_in_one_report():
     with pytest.raises(MaterialError) as error:
         Material.from_points([0, 0.4, 0.2], [5, 2, 1])
     for words in ("too few", "strain must rise", "not monotone", "starts off zero"):
         assert words in str(error.value)
 
 
-def test_nonnegative_least_squares_meets_its_optimality_conditions() -> None:
+def test_nonnegative_least_squares_meets_its_optimality_conditions():
     from scipy.optimize import nnls
 
     rng = np.random.default_rng(3)

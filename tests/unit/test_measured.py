@@ -68,7 +68,7 @@ def law() -> TipCurves:
 
 
 @pytest.mark.parametrize("push", [0.5, 2.0, 5.0])
-def test_a_contact_that_is_not_felt_is_within_what_could_hide(law: TipCurves, push: float) -> None:
+def test_a_contact_that_is_not_felt_is_within_what_could_hide(law, push):
     placed = replace(GRID, centre=law.centre, rotation=law.rotation)
     known = Uncertainty(baseline=1e3)
     estimator = MeasuredEstimator(Fingertip(A, "measured", law=law), placed, known=known)
@@ -80,7 +80,7 @@ def test_a_contact_that_is_not_felt_is_within_what_could_hide(law: TipCurves, pu
 
 @pytest.mark.parametrize("name", ["gain", "slope"])
 @pytest.mark.parametrize("d", [1.5e-3, 4e-3])
-def test_what_is_known_of_the_cells_is_in_the_errors(law: TipCurves, name: str, d: float) -> None:
+def test_what_is_known_of_the_cells_is_in_the_errors(law, name, d):
     placed = replace(GRID, centre=law.centre, rotation=law.rotation)
     known = {"gain": Uncertainty(gain=0.12), "slope": Uncertainty(slope=500.0)}[name]
     estimator = MeasuredEstimator(Fingertip(A, "measured", law=law), placed, known=known)
@@ -96,12 +96,12 @@ def test_what_is_known_of_the_cells_is_in_the_errors(law: TipCurves, name: str, 
     assert 0.5 < np.max(off_by) < 1.5
 
 
-def test_the_estimator_of_a_model_names_that_of_a_measured_tip(law: TipCurves) -> None:
+def test_the_estimator_of_a_model_names_that_of_a_measured_tip(law):
     with pytest.raises(ValueError, match="MeasuredEstimator"):
         ContactEstimator(Fingertip(A, "measured", law=law), Material.constant(1.0), GRID, NOISE)
 
 
-def test_the_curves_are_those_of_the_tip(law: TipCurves) -> None:
+def test_the_curves_are_those_of_the_tip(law):
     assert (law.deepest, law.tilt, law.presses) == (0.006, pytest.approx(math.radians(25.0)), 11)
     assert law.centre == pytest.approx(TRUE.centre, abs=1e-4)
     assert law.rotation == pytest.approx(TRUE.rotation, abs=0.01)
@@ -125,9 +125,7 @@ def test_the_curves_are_those_of_the_tip(law: TipCurves) -> None:
 
 
 @pytest.mark.parametrize(("d", "degrees"), [(1e-3, 0.0), (2.5e-3, 14.0), (5.5e-3, -5.0)])
-def test_a_frame_is_read_by_them_and_its_errors_are_known(
-    law: TipCurves, d: float, degrees: float
-) -> None:
+def test_a_frame_is_read_by_them_and_its_errors_are_known(law, d, degrees):
     placed = replace(GRID, centre=law.centre, rotation=law.rotation)
     estimator = MeasuredEstimator(Fingertip(A, "measured", law=law), placed)
     rng, squares = np.random.default_rng(2), []
@@ -149,7 +147,7 @@ def test_a_frame_is_read_by_them_and_its_errors_are_known(
     assert estimator(frame).invalid == Invalid.NOT_FINITE
 
 
-def test_presses_that_make_no_law_are_refused() -> None:
+def test_presses_that_make_no_law_are_refused():
     with pytest.raises(CurvesError, match=r"found 5 presses of 5 depths, 0 of them tilted"):
         fit_measured(presses(count=5), A, GRID)
     falls = presses()
@@ -161,7 +159,7 @@ def test_presses_that_make_no_law_are_refused() -> None:
         fit_measured(single, A, GRID)
 
 
-def test_a_finger_takes_its_curves_from_its_file(law: TipCurves, tmp_path: Path) -> None:
+def test_a_finger_takes_its_curves_from_its_file(law, tmp_path):
     file, other = tmp_path / "left.json", tmp_path / "other.json"
     settings = load(HIL, tmp_path, [])
     empty = Calibration(sensor=sensor_of(settings, 0), date="")

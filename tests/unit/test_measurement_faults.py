@@ -68,7 +68,7 @@ def applied(*faults: tuple[str, float], t: float = 0.0) -> np.ndarray:
     return image
 
 
-def test_each_kind_does_to_the_image_what_its_name_says() -> None:
+def test_each_kind_does_to_the_image_what_its_name_says():
     image = signal()
     np.testing.assert_array_equal(applied(), image)
     np.testing.assert_array_equal(applied(("gain", 0.5)), 0.5 * image)
@@ -86,7 +86,7 @@ def test_each_kind_does_to_the_image_what_its_name_says() -> None:
     np.testing.assert_array_equal(applied(("gain", 2.0), ("gain", 1.0)), image)
 
 
-def test_they_come_evenly_in_their_time_and_end() -> None:
+def test_they_come_evenly_in_their_time_and_end():
     faults = MeasurementFaults()
     faults.begin("gain", 0.5, 3.0, 2.0)
     assert [faults("gain", t) for t in (0.0, 3.0, 4.0, 4.5, 5.0, 9.0)] == [
@@ -104,7 +104,7 @@ def test_they_come_evenly_in_their_time_and_end() -> None:
         faults.begin("smell", 1.0, 0.0)
 
 
-def test_a_sensor_lies_and_its_tip_feels_the_truth() -> None:
+def test_a_sensor_lies_and_its_tip_feels_the_truth():
     honest, lying = Press(), Press()
     lying.faults.begin("gain", 0.5, 1.45, 0.1)
     true, read = honest.pressed(30), lying.pressed(30)
@@ -116,7 +116,7 @@ def test_a_sensor_lies_and_its_tip_feels_the_truth() -> None:
     assert lying.hand.measurement_faults[1]("gain", 9.0) == 1.0
 
 
-def test_frames_are_repeated_with_new_numbers() -> None:
+def test_frames_are_repeated_with_new_numbers():
     press = Press()
     kept = press.pressed(20)
     assert len({each.tobytes() for each in kept}) == 20
@@ -131,7 +131,7 @@ def test_frames_are_repeated_with_new_numbers() -> None:
     assert press.frames(3)[-1].sum() > kept[-1].sum()
 
 
-def test_each_sensor_has_its_gain() -> None:
+def test_each_sensor_has_its_gain():
     total = []
     for gain in ([1.0, 1.0], [0.7, 1.0], [1.0, 0.7]):
         total.append(float(Press(tactile_gain=tuple(gain)).pressed(1)[0].sum()))
@@ -139,7 +139,7 @@ def test_each_sensor_has_its_gain() -> None:
     assert total[2] == total[0]
 
 
-def test_a_servo_reports_another_current_than_flows() -> None:
+def test_a_servo_reports_another_current_than_flows():
     settings = Settings()
     hand = SimulatedHand(settings)
     client = BusClient(ServoBus.from_settings(settings, hand))
@@ -163,7 +163,7 @@ def test_a_servo_reports_another_current_than_flows() -> None:
     np.testing.assert_allclose(hand.current, flows, rtol=0.02)  # the goal is carried out as it was
 
 
-def test_faults_in_words() -> None:
+def test_faults_in_words():
     words = [" silent=2@3 ", "silent", "left:torn=0.2", "right:frozen@1e1", "drop=0.1", "unplug@2"]
     assert parse_faults(words, (1, 2)) == [
         (0.0, "left", "silent", 1.0, 0.0),
@@ -226,6 +226,6 @@ def test_faults_in_words() -> None:
         ("reboot=1.5", "no servo has that ID"),
     ],
 )
-def test_faults_that_can_not_be_understood(text: str, told: str) -> None:
+def test_faults_that_can_not_be_understood(text, told):
     with pytest.raises(FaultError, match=told):
         parse_faults([text], (1, 2))

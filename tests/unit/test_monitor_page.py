@@ -50,26 +50,26 @@ def check(lines: Sequence[Text], width: int, height: int) -> str:
 
 
 @pytest.mark.parametrize("size", [(80, 24), (81, 25), (100, 30), (120, 40), (200, 24), (80, 90)])
-def test_fills_the_terminal_exactly(size: tuple[int, int]) -> None:
+def test_fills_the_terminal_exactly(size):
     text = shown(fed(), width=size[0], height=size[1])
     for part in ("HOLDING", "LEFT contact", "RIGHT", "joint", "overruns", "events", "q quit"):
         assert part in text
 
 
 @pytest.mark.parametrize("size", [(79, 24), (80, 23), (30, 8), (1, 1), (12, 3)])
-def test_too_small_says_so(size: tuple[int, int]) -> None:
+def test_too_small_says_so(size):
     text = shown(fed(), width=size[0], height=size[1])
     assert size[0] < 30 or f"this is {size[0]} × {size[1]}" in text
 
 
-def test_nothing_known_shows_dashes() -> None:
+def test_nothing_known_shows_dashes():
     text = shown(Feed())
     assert "waiting for a daemon" in text
     assert text.count("—") >= 22
     assert "nan" not in text
 
 
-def test_a_missing_finger_is_marked() -> None:
+def test_a_missing_finger_is_marked():
     feed = fed()
     state = fake_daemon.state(1.0, 100)
     state["right"] |= {"valid": False, "invalid": Invalid.ABOVE_ZERO.text}
@@ -80,7 +80,7 @@ def test_a_missing_finger_is_marked() -> None:
     assert "left —" not in text
 
 
-def test_numbers_of_any_size_keep_the_columns() -> None:
+def test_numbers_of_any_size_keep_the_columns():
     feed = fed()
     for value in (1e12, -1e12, 123456.0, -99.99, 1e-30, math.inf, math.nan):
         state = fake_daemon.state(1.0, 200)
@@ -95,7 +95,7 @@ def test_numbers_of_any_size_keep_the_columns() -> None:
         assert any(line[23:].startswith("energy  ") and line[54:57] == "mJ " for line in lines)
 
 
-def test_long_and_wide_texts_are_cut() -> None:
+def test_long_and_wide_texts_are_cut():
     feed = fed()
     give(feed, b"hand/event", fake_daemon.event(1, "kind" * 9, "手指 force ÷ " * 40, "error"))
     give(feed, b"hand/state", fake_daemon.state(1.0, 99) | {"fault": "過 " * 90, "mode": "m" * 99})
@@ -105,7 +105,7 @@ def test_long_and_wide_texts_are_cut() -> None:
     assert "c clears it" in text
 
 
-def test_status_follows_the_age() -> None:
+def test_status_follows_the_age():
     feed = fed()
     assert [feed.status(now) for now in (0.4, 0.6, 1.9, 2.1)] == ["live", "stale", "stale", "lost"]
     slow = Feed()
@@ -114,7 +114,7 @@ def test_status_follows_the_age() -> None:
     assert [slow.status(99 + age) for age in (2.0, 4.0, 11.0)] == ["live", "stale", "lost"]
 
 
-def test_the_rates_are_those_of_states_and_ticks() -> None:
+def test_the_rates_are_those_of_states_and_ticks():
     feed = Feed()
     assert math.isnan(feed.rate)
     give(feed, b"hand/stats", {"rates": {"tick": 400.0}}, 0.0)
@@ -125,7 +125,7 @@ def test_the_rates_are_those_of_states_and_ticks() -> None:
     assert feed.rate == pytest.approx(100.0)
 
 
-def test_a_busy_machine_is_told_while_a_simulated_hand_waits_for_it() -> None:
+def test_a_busy_machine_is_told_while_a_simulated_hand_waits_for_it():
     feed = Feed()
     states = [fake_daemon.state(1.0, seq) | {"mono_ns": 10**9 * (seq - 98)} for seq in (99, 100)]
     give(feed, b"hand/state", states[0] | {"behind_s": 1.55}, 10.0)
@@ -136,7 +136,7 @@ def test_a_busy_machine_is_told_while_a_simulated_hand_waits_for_it() -> None:
     assert "busy" not in shown(feed, 13.1)
 
 
-def test_a_new_daemon_begins_a_new_story() -> None:
+def test_a_new_daemon_begins_a_new_story():
     feed = Feed()
     for k in range(10):
         state = fake_daemon.state(0.0, 1000 + k) | {"mono_ns": (k + 1) * 10**7}
@@ -146,7 +146,7 @@ def test_a_new_daemon_begins_a_new_story() -> None:
     assert math.isnan(feed.rate)
 
 
-def test_temperature_of_a_servo() -> None:
+def test_temperature_of_a_servo():
     feed = fed()
     state = fake_daemon.state(1.0, 99)
     state["left"]["temperature"], state["right"]["temperature"] = 0.0, 71.5
@@ -173,7 +173,7 @@ def told(seq: int, when: float, text: str, again: bool = False) -> dict[str, Any
 TEXTS = ["first", "second", "third"]
 
 
-def test_events_told_again_are_shown_once_and_in_their_order() -> None:
+def test_events_told_again_are_shown_once_and_in_their_order():
     feed = Feed()
     give(feed, b"hand/event", told(3, 103.0, "third"))  # between subscription and telling again
     for seq in (1, 2, 3):
@@ -189,7 +189,7 @@ def test_events_told_again_are_shown_once_and_in_their_order() -> None:
     assert [event.text for event in feed.events][3:] == ["anew 1", "anew 2"]
 
 
-def test_who_commands_is_told_while_the_lease_lasts() -> None:
+def test_who_commands_is_told_while_the_lease_lasts():
     feed = fed()
     give(feed, b"hand/settings", {"settings": json.dumps({"commands": {"lease": 5.0}})})
     carried_out = {"command": "grasp", "client": "note\x1bbook", "ok": True, "error": ""}
@@ -206,7 +206,7 @@ def test_who_commands_is_told_while_the_lease_lasts() -> None:
 
 
 @pytest.mark.parametrize("keys", [True, False])
-def test_long_reasons_are_shown_in_full_at_the_least_size(keys: bool) -> None:
+def test_long_reasons_are_shown_in_full_at_the_least_size(keys):
     feed = fed()
     fault = "left: no sound tactile frame for 0.31 s while gripping, more than 0.3 s: torque is off"
     give(feed, b"hand/state", fake_daemon.state(1.0, 99) | {"mode": "fault", "fault": fault})
@@ -251,9 +251,7 @@ FIELDS += ["settings", "command", "client", "ok", "error", "again", "wake", "com
     ),
     st.lists(st.lists(st.binary(max_size=20), max_size=4), max_size=3),
 )
-def test_no_stream_breaks_the_page(
-    records: list[tuple[bytes, object]], garbage: list[list[bytes]]
-) -> None:
+def test_no_stream_breaks_the_page(records, garbage):
     feed = Feed()
     for topic, record in records:
         give(feed, topic, record)
@@ -264,7 +262,7 @@ def test_no_stream_breaks_the_page(
     assert "HOLDING" in shown(feed)
 
 
-def test_a_frame_that_lies_about_its_size_is_skipped() -> None:
+def test_a_frame_that_lies_about_its_size_is_skipped():
     feed = Feed()
     good = fake_daemon.frame(0.0, 0, size=8)
     for change in ({"rows": 9}, {"cols": -8, "rows": -8}, {"rows": True}, {"finger": "thumb"}):
@@ -274,7 +272,7 @@ def test_a_frame_that_lies_about_its_size_is_skipped() -> None:
     assert feed.frames["left"].grid.shape == (8, 8)
 
 
-def test_keys() -> None:
+def test_keys():
     keys = KeyDecoder()
     assert keys.decode(b"ag \x1b[C\x1bOD\x1b[A\x1b[1;5Cq\xc3\xa9\x07") == [
         *("a", "g", " "),
@@ -291,7 +289,7 @@ def test_keys() -> None:
     assert keys.decode(b"1~q") == ["q"]
 
 
-def test_resample_is_the_area_average() -> None:
+def test_resample_is_the_area_average():
     grid = np.random.default_rng(1).random((44, 44))
     blocks = grid.reshape(22, 2, 11, 4).mean(axis=(1, 3))
     assert resample(grid, 22, 11) == pytest.approx(blocks, abs=1e-12)
@@ -302,14 +300,13 @@ def test_resample_is_the_area_average() -> None:
     assert resample(grid, 17, 9) == pytest.approx(twin, abs=1e-12)
 
 
-def test_row_0_is_lowest_and_column_0_is_left() -> None:
+def test_row_0_is_lowest_and_column_0_is_left():
     grid = np.zeros((4, 4))
     grid[0, 0] = 1.0
     lines = picture(grid, 1.0, 2, 4, True)
     lowest = lines[-1].spans[0]
     assert (lowest.start, lowest.end) == (0, 1)
     assert isinstance(lowest.style, Style)
-    assert lowest.style.bgcolor is not None
     brightest = heatmap.colour_map()[-1]
     assert lowest.style.bgcolor.get_truecolor() == ColorTriplet(*brightest)
     assert [line.plain for line in picture(grid, 1.0, 4, 4, False)] == [

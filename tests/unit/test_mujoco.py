@@ -43,7 +43,7 @@ def scene(
 
 @pytest.mark.parametrize("force", [1.0, 12.0])
 @pytest.mark.parametrize("tilt", [0.0, 0.25])
-def test_a_press_at_rest_is_the_tables(force: float, tilt: float) -> None:
+def test_a_press_at_rest_is_the_tables(force, tilt):
     model, data = scene(tilt)
     with SoftTips(model, data, SETTINGS, ("tip",), ("wall",)) as tips:
         data.qfrc_applied[0] = force
@@ -57,7 +57,7 @@ def test_a_press_at_rest_is_the_tables(force: float, tilt: float) -> None:
 
 
 @pytest.mark.parametrize("used", [0.8, 1.1])
-def test_friction_is_a_cone_across_the_tilt_too(used: float) -> None:
+def test_friction_is_a_cone_across_the_tilt_too(used):
     model, data = scene(joints=FREE)
     press, push = 6.0, used * FRICTION * 6.0
     with SoftTips(model, data, SETTINGS, ("tip",), ("wall",)) as tips:
@@ -77,7 +77,7 @@ def test_friction_is_a_cone_across_the_tilt_too(used: float) -> None:
         assert math.hypot(*data.qvel[1:]) == pytest.approx(speed, rel=0.01)
 
 
-def test_what_it_can_not_do_is_refused() -> None:
+def test_what_it_can_not_do_is_refused():
     with pytest.raises(SettingsError, match="found RK4"):
         SoftTips(*scene(integrator="RK4"), SETTINGS, ("tip",), ("wall",))
     with pytest.raises(SettingsError, match=r"tip: expected a sphere of 0\.02 m"):
@@ -88,9 +88,7 @@ def test_what_it_can_not_do_is_refused() -> None:
 
 
 @pytest.mark.parametrize("timestep", [0.001, 0.002])
-def test_the_page_grasps_and_turns_as_our_plant_does(
-    monkeypatch: pytest.MonkeyPatch, timestep: float
-) -> None:
+def test_the_page_grasps_and_turns_as_our_plant_does(monkeypatch, timestep):
     entry = EntryPoint("mujoco", "softfinger.mujoco:MujocoServos", "softfinger.servos")
     monkeypatch.setattr(backends, "plugins", lambda kind: [entry] if kind == "servos" else [])
     backends._plugin.cache_clear()

@@ -45,9 +45,7 @@ def width_at_the_contacts(plant: Any) -> float:
 @pytest.mark.parametrize(
     ("taper", "told", "frames"), [(0.2, 0.2, {}), (0.2, 0.13, {}), (-0.3, -0.3, SLOW)]
 )
-def test_a_wedge_is_felt_and_turned_as_it_is(
-    taper: float, told: float, frames: dict[str, Any]
-) -> None:
+def test_a_wedge_is_felt_and_turned_as_it_is(taper, told, frames):
     sections = {
         "simulation": {"object_shape": "wedge", "object_taper": taper},
         "object": {"taper": told},
@@ -78,7 +76,7 @@ def test_a_wedge_is_felt_and_turned_as_it_is(
         assert rig.warnings() == []
 
 
-def test_a_taper_that_was_not_told_is_felt_as_it_is_but_told_of() -> None:
+def test_a_taper_that_was_not_told_is_felt_as_it_is_but_told_of():
     with Rig({"simulation": {"object_shape": "wedge", "object_taper": 0.17}}) as rig:
         rig.grasp(5.0)
         rig.plant.advance(rig.state.reading.t)
@@ -89,7 +87,7 @@ def test_a_taper_that_was_not_told_is_felt_as_it_is_but_told_of() -> None:
 
 
 @pytest.mark.parametrize(("force", "frames"), [(1.0, SLOW), (25.0, {})])
-def test_with_nothing_between_the_tips_the_hand_opens(force: float, frames: dict[str, Any]) -> None:
+def test_with_nothing_between_the_tips_the_hand_opens(force, frames):
     with Rig({"simulation": {"object_shape": "none"}, "tactile": frames}) as rig:
         rig.grasp(force, 1.0)
         worst = 0.0
@@ -106,7 +104,7 @@ def test_with_nothing_between_the_tips_the_hand_opens(force: float, frames: dict
         )
 
 
-def test_a_sheet_that_is_told_to_be_one_is_not_nothing() -> None:
+def test_a_sheet_that_is_told_to_be_one_is_not_nothing():
     sheet = {"simulation": {"object_width": 0.001}, "object": {"width_min": 0.0005}}
     with Rig(sheet) as rig:
         rig.grasp(1.0, 1.6)
@@ -114,7 +112,7 @@ def test_a_sheet_that_is_told_to_be_one_is_not_nothing() -> None:
         assert rig.control._gripping or rig.state.mode == "fault"
 
 
-def test_a_small_disc_is_no_other_tip() -> None:
+def test_a_small_disc_is_no_other_tip():
     """Its misfit hides more than half of d, and yet no uncertainty is known that would."""
     with Rig({"simulation": {"object_shape": "disc", "object_radius": 0.010}}) as rig:
         rig.grasp(8.0)
@@ -122,7 +120,7 @@ def test_a_small_disc_is_no_other_tip() -> None:
         assert rig.contacts[0].misfit
 
 
-def test_a_disc_is_held_and_turned_by_the_line_between_its_contacts() -> None:
+def test_a_disc_is_held_and_turned_by_the_line_between_its_contacts():
     with Rig({"simulation": {"object_shape": "disc"}}) as rig:
         rig.grasp(8.0)
         assert rig.plant.force == pytest.approx([8.0, 8.0], rel=0.12)

@@ -47,11 +47,8 @@ def shared(tmp_path: Path) -> Path:
 @pytest.mark.parametrize("write", [write_text, write_bytes, lambda path: EventLog(file=path)])
 @pytest.mark.parametrize("linked", [True, False])
 def test_anothers_link_is_not_followed_and_anothers_file_left_alone_where_all_may_write(
-    shared: Path,
-    strangers: Callable[[Path], None],
-    write: Callable[[Path], object],
-    linked: bool,
-) -> None:
+    shared, strangers, write, linked
+):
     named = shared / "run.csv"
     victim = shared.parent / "victim" if linked else named
     victim.write_text("precious")
@@ -65,7 +62,7 @@ def test_anothers_link_is_not_followed_and_anothers_file_left_alone_where_all_ma
     assert victim.read_text() == "precious"
 
 
-def test_own_files_and_links_are_written_as_ever(shared: Path) -> None:
+def test_own_files_and_links_are_written_as_ever(shared):
     file, link = shared / "run.csv", shared / "newest"
     link.symlink_to(file)
     with write_text(link) as made:
@@ -79,9 +76,7 @@ def test_own_files_and_links_are_written_as_ever(shared: Path) -> None:
         nothing.write(b"x")
 
 
-def test_a_file_appears_whole_or_not_at_all(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_appears_whole_or_not_at_all(tmp_path, monkeypatch):
     file = tmp_path / "kept"
     own_folder.write_whole(file, b"before")
 
@@ -104,8 +99,8 @@ def test_a_file_appears_whole_or_not_at_all(
     ],
 )
 def test_what_is_not_the_users_own_folder_is_not_the_stand_in_hands(
-    tmp_path: Path, strangers: Callable[[Path], None], mode: int | None, told: str
-) -> None:
+    tmp_path, strangers, mode, told
+):
     folder = tmp_path / "hand"
     if mode is None:
         folder.symlink_to(tmp_path)
@@ -118,7 +113,7 @@ def test_what_is_not_the_users_own_folder_is_not_the_stand_in_hands(
         LinkFolder(folder)
 
 
-def test_a_link_in_the_locks_place_is_not_followed(tmp_path: Path) -> None:
+def test_a_link_in_the_locks_place_is_not_followed(tmp_path):
     victim, folder = tmp_path / "victim", tmp_path / "hand"
     victim.write_text("precious")
     folder.mkdir(mode=0o700)
@@ -128,9 +123,7 @@ def test_a_link_in_the_locks_place_is_not_followed(tmp_path: Path) -> None:
     assert victim.read_text() == "precious"
 
 
-def test_the_runtime_folder_is_the_users_own(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_runtime_folder_is_the_users_own(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     assert runtime_folder() == tmp_path / "softfinger"
     monkeypatch.setenv("XDG_RUNTIME_DIR", "relative")
@@ -147,8 +140,8 @@ def test_the_runtime_folder_is_the_users_own(
 
 
 def test_a_runtime_folder_that_others_may_fill_is_refused_with_the_cure(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+    tmp_path, monkeypatch, capsys
+):
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     folder = tmp_path / "softfinger"
     assert check_runtime_folder() == Finding("pass", "runtime folder", str(folder))
@@ -163,9 +156,7 @@ def test_a_runtime_folder_that_others_may_fill_is_refused_with_the_cure(
         assert f"{folder}: may be written by others (0777): {cure}" in capsys.readouterr().err
 
 
-def test_the_local_stop_goes_on_at_home_and_says_so(
-    shared: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
-) -> None:
+def test_the_local_stop_goes_on_at_home_and_says_so(shared, monkeypatch, request):
     home = TemporaryDirectory(prefix="softfinger-")  # short enough for a socket's address
     request.addfinalizer(home.cleanup)
     for name in ("XDG_RUNTIME_DIR", "RUNTIME_DIRECTORY"):

@@ -78,7 +78,7 @@ class Bench:
 
 
 @pytest.mark.parametrize("with_file", [False, True], ids=["counts", "calibrated"])
-def test_cells_full_over_a_new_zero_are_known_to_be_full(with_file: bool, tmp_path: Path) -> None:
+def test_cells_full_over_a_new_zero_are_known_to_be_full(with_file, tmp_path):
     given = settings()
     if with_file:
         calibrated(tmp_path / "left.json", np.zeros((44, 44)))
@@ -97,7 +97,7 @@ def test_cells_full_over_a_new_zero_are_known_to_be_full(with_file: bool, tmp_pa
         assert abs(contact.d - 0.006) < 5.0 * contact.d_std < 2e-4
 
 
-def test_a_zero_below_the_calibrations_leaves_the_published_pressure_whole(tmp_path: Path) -> None:
+def test_a_zero_below_the_calibrations_leaves_the_published_pressure_whole(tmp_path):
     calibrated(tmp_path / "left.json", np.full((44, 44), 40.0))
     bench = Bench(settings(calibration=(str(tmp_path / "left.json"), "")))
     bench.tare(0.0)
@@ -109,9 +109,7 @@ def test_a_zero_below_the_calibrations_leaves_the_published_pressure_whole(tmp_p
 
 
 @pytest.mark.parametrize("stuck", [FULL - 5.0, float(FULL)])
-def test_a_cell_that_rests_all_but_full_does_not_make_the_others_full(
-    stuck: float, tmp_path: Path
-) -> None:
+def test_a_cell_that_rests_all_but_full_does_not_make_the_others_full(stuck, tmp_path):
     zero = np.full((44, 44), 3.0)
     zero[22, 30] = stuck
     calibration = calibrated(tmp_path / "left.json", zero)

@@ -158,7 +158,6 @@ def test_what_a_disc_or_the_other_tip_presses_on_a_sensor_is_its_force(shape):
     cell = settings.tactile.pitch**2 * settings.tactile.pascal_per_count
     for finger, sensor in enumerate(sensors):
         frame = sensor.latest()
-        assert frame is not None
         assert frame.data.sum() * cell == pytest.approx(hand.force[finger], rel=0.01)
         assert hand.force[finger] > 3
 

@@ -13,7 +13,7 @@ TABLE = ContactTable.build(TIP, Material.constant(0.3e6))
 FORCE = math.pi * 0.3e6 * 0.004**2  # N at 4 mm
 
 
-def test_presses_in_words() -> None:
+def test_presses_in_words():
     words = (
         "tip=left depth=4mm tilt=10deg speed=2mm/s hold=500ms, force=5N, tip=right pressure=2kPa"
     )
@@ -31,7 +31,7 @@ def test_presses_in_words() -> None:
     assert str(stiffer) == "4.000 mm at 0.00°, 19.604 N"
 
 
-def test_a_plate_goes_down_holds_lifts_off_and_begins_anew() -> None:
+def test_a_plate_goes_down_holds_lifts_off_and_begins_anew():
     plate = Plate()
     assert plate(5.0) == (-0.001, 0.0, 0.0)
     plate.go(parse_presses("depth=4mm tilt=-10deg speed=5mm/s hold=1s", TABLE, 1.0)["left"], 10.0)
@@ -41,7 +41,6 @@ def test_a_plate_goes_down_holds_lifts_off_and_begins_anew() -> None:
     assert plate.reached(10.99) is None
     assert plate(11.5) == pytest.approx((0.004, tilt, 0.0))
     reached = plate.reached(11.5)
-    assert reached is not None
     assert reached.d == 0.004
     assert plate.reached(11.9) is None  # the same
     assert plate(12.125) == pytest.approx((0.0015, tilt, 0.0))
@@ -52,7 +51,7 @@ def test_a_plate_goes_down_holds_lifts_off_and_begins_anew() -> None:
     assert plate.reached(again + 1.1) is not None
 
 
-def test_a_plate_lifts_off_before_it_tilts_and_the_last_press_stays() -> None:
+def test_a_plate_lifts_off_before_it_tilts_and_the_last_press_stays():
     plate = Plate()
     plate.go(parse_presses("depth=4mm", TABLE, 1.0)["left"], 0.0)
     assert plate(1e4) == (0.004, 0.0, 0.0)
@@ -80,6 +79,6 @@ def test_a_plate_lifts_off_before_it_tilts_and_the_last_press_stays() -> None:
         ("depth=1mm speed=0mm/s", "expected above 0"),
     ],
 )
-def test_what_no_plate_can_do(words: str, told: str) -> None:
+def test_what_no_plate_can_do(words, told):
     with pytest.raises(PlateError, match=told):
         parse_presses(words, TABLE, 1.0)

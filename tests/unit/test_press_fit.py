@@ -2,7 +2,6 @@
 
 import math
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import pytest
@@ -32,7 +31,7 @@ def frames(tip: Fingertip, grid: SensorGrid = GRID) -> np.ndarray:
 
 
 @pytest.mark.parametrize("tip", [STICKING, Fingertip(0.020)], ids=lambda tip: tip.physics)
-def test_the_tip_that_made_them_explains_them_best(tip: Fingertip) -> None:
+def test_the_tip_that_made_them_explains_them_best(tip):
     seen = frames(tip)
     presses = Presses(seen, D + LATE, THETA, NOISE, np.ones(seen.shape, np.bool_))
     best, *others = compare_tips(presses, 0.020, GRID, np.ones(GRID.shape, np.bool_))
@@ -50,7 +49,7 @@ def test_the_tip_that_made_them_explains_them_best(tip: Fingertip) -> None:
         assert best.tip.poisson == pytest.approx(0.48, abs=0.01)
 
 
-def test_a_solid_tips_place_and_rotation_are_found_by_its_whole_frames() -> None:
+def test_a_solid_tips_place_and_rotation_are_found_by_its_whole_frames():
     true = SensorGrid(32, 32, 0.058 / 32, centre=(1.3e-3, -0.8e-3), rotation=-2.0)
     found = fit_centre(frames(TIP, true), THETA, TIP, RUBBER, GRID, NOISE)
     assert found.centre == pytest.approx(true.centre, abs=6e-5)  # noise: some 2e-5
@@ -58,7 +57,7 @@ def test_a_solid_tips_place_and_rotation_are_found_by_its_whole_frames() -> None
     assert found.rotation == pytest.approx(-2.0, abs=0.03)
 
 
-def test_a_solid_tips_modulus_is_found_by_its_own_force_law() -> None:
+def test_a_solid_tips_modulus_is_found_by_its_own_force_law():
     force = frames(TIP).sum(axis=(1, 2)) * GRID.pitches[0] ** 2
     found = fit_modulus(D + LATE, THETA, force, tip=TIP)
     assert found.modulus == pytest.approx(0.25e6, rel=0.05)
@@ -67,7 +66,7 @@ def test_a_solid_tips_modulus_is_found_by_its_own_force_law() -> None:
 
 
 @pytest.mark.parametrize("base", ["bonded", "lying"])
-def test_deep_presses_of_other_elements_have_one_modulus(base: Literal["bonded", "lying"]) -> None:
+def test_deep_presses_of_other_elements_have_one_modulus(base):
     with np.load(Path(__file__).parents[1] / "golden" / "solid_frames.npz") as file:
         known = (file["base"] == base) & (file["theta"] == 0.0) & (file["d"] < 0.31)
         d, force = file["d"][known] * 0.020, file["force"][known] * 0.25e6 * 0.020**2
@@ -85,9 +84,7 @@ def test_deep_presses_of_other_elements_have_one_modulus(base: Literal["bonded",
         (Fingertip(0.020, "solid", 0.48, "lying"), TIP, -1),
     ],
 )
-def test_a_modulus_that_hides_another_law_drifts_over_depth(
-    made: Fingertip, fitted: Fingertip, sign: int
-) -> None:
+def test_a_modulus_that_hides_another_law_drifts_over_depth(made, fitted, sign):
     rng = np.random.default_rng(2)
     d = np.linspace(1e-3, 7e-3, 7)
     force = ContactTable.build(made, RUBBER)(d, 0.0).force * (1.0 + 0.01 * rng.standard_normal(7))
@@ -101,9 +98,7 @@ def test_a_modulus_that_hides_another_law_drifts_over_depth(
     assert found.trend.modulus == pytest.approx(force / one_pascal, rel=1e-9)
 
 
-def test_calibrate_law_says_which_tip_it_is(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_calibrate_law_says_which_tip_it_is(tmp_path, capsys):
     each = frames(TIP) / 20.0
     counts = np.clip(np.round(np.concatenate([1.1 * each[1:2], each])), 0, 4095).astype(np.uint16)
     d, theta = np.append(D[1], D) + LATE, np.append(THETA[1], THETA)
@@ -127,6 +122,5 @@ def test_calibrate_law_says_which_tip_it_is(
     )
     assert f"for the profile: {profile}" in told
     modulus = load_calibration(tmp_path / "left.json").modulus
-    assert modulus is not None
     assert load_calibration(tmp_path / "left.json").wants["physics"] == "solid"
     assert modulus.modulus == pytest.approx(0.25e6, rel=0.05)

@@ -88,7 +88,7 @@ OTHER_IDS = {**ONLY_LEFT, "servos": {"ids": (11, 12)}}
         ),
     ],
 )
-def test_which_servo_is_which(settings: dict, found: list, told: list[str]) -> None:
+def test_which_servo_is_which(settings, found, told):
     servos = tuple(each for each in found if isinstance(each, FoundServo))
     garbled = tuple(each for each in found if isinstance(each, Garbled))
     what = plan(Found(servos, garbled), Settings.model_validate(settings), MODEL, RATES)
@@ -147,7 +147,7 @@ def named(name: str, *changes: str) -> list[str]:
     return [f"{name}: {change}" for change in changes]
 
 
-def test_a_search_finds_servos_at_their_rate(wired: Callable[..., Bus]) -> None:
+def test_a_search_finds_servos_at_their_rate(wired):
     wired(baud=1_000_000)
     found = search("line", (-1, 57600, 1_000_000, 2_000_000))  # the port has no rate of -1
     assert found.servos == tuple(FoundServo(i, 1_000_000, 1020, 48) for i in (1, 2))
@@ -156,9 +156,7 @@ def test_a_search_finds_servos_at_their_rate(wired: Callable[..., Bus]) -> None:
         search("line", (-1,))
 
 
-def test_a_port_that_goes_away_ends_a_search(
-    wired: Callable[..., Bus], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_port_that_goes_away_ends_a_search(wired, monkeypatch):
     def gone(*_: object) -> None:
         raise PortGone("the port is gone")
 
@@ -168,7 +166,7 @@ def test_a_port_that_goes_away_ends_a_search(
         search("line")
 
 
-def test_two_factory_servos_are_set_up_one_after_the_other(wired: Callable[..., Bus]) -> None:
+def test_two_factory_servos_are_set_up_one_after_the_other(wired):
     bus = wired(baud=57600, ids=(1, 1), factory=True)
     bus.servos[1].silent = True
     assert bus.provision() == (
@@ -184,7 +182,7 @@ def test_two_factory_servos_are_set_up_one_after_the_other(wired: Callable[..., 
     assert not any(each.torque_on for each in bus.servos)
 
 
-def test_factory_servos_together_are_reported_and_not_changed(wired: Callable[..., Bus]) -> None:
+def test_factory_servos_together_are_reported_and_not_changed(wired):
     bus = wired(baud=57600, ids=(1, 1), factory=True)
     before = [bytes(each.table.memory[: reg.RAM]) for each in bus.servos]
     assert search("line", (57600, HOME)).garbled == (Garbled(1, 57600),)
@@ -203,9 +201,7 @@ def test_factory_servos_together_are_reported_and_not_changed(wired: Callable[..
         ("", reg.STATUS_RETURN_LEVEL, 0, ""),
     ],
 )
-def test_what_is_set_up(
-    wired: Callable[..., Bus], fault: str, register: int | None, value: int, done: str
-) -> None:
+def test_what_is_set_up(wired, fault, register, value, done):
     bus = wired()
     if fault:
         put_fault(bus.bus, fault, 0.0)
@@ -217,7 +213,7 @@ def test_what_is_set_up(
     assert bus.servos[0].table.get(reg.STATUS_RETURN_LEVEL) == 2
 
 
-def test_what_can_not_be_set_up_is_reported_beside_what_was(wired: Callable[..., Bus]) -> None:
+def test_what_can_not_be_set_up_is_reported_beside_what_was(wired):
     bus = wired(factory=True)
     put_fault(bus.bus, "silent=2", 0.0)
     missing = f"{RIGHT}: no answer at any rate: check its power and cable"

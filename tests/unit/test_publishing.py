@@ -44,18 +44,18 @@ def listened(seconds: float, **sections: Any) -> tuple[Listener, Daemon]:
     listener = Listener()
     with Daemon(settings, wire=False) as daemon:
         loop = daemon.loop
-        sending = Publishing(settings, listener, loop.perception.fingers, loop.statistics)  # type: ignore[arg-type]
+        sending = Publishing(settings, listener, loop.perception.fingers, loop.statistics)
 
         def publish(state: State) -> None:
             listener.seq = state.seq
             sending(state)
 
-        loop._publishing = publish  # type: ignore[assignment]
+        loop._publishing = publish
         loop.advance(seconds)
     return listener, daemon
 
 
-def test_each_topic_goes_out_on_exactly_every_nth_tick_or_frame() -> None:
+def test_each_topic_goes_out_on_exactly_every_nth_tick_or_frame():
     listener, _ = listened(4.0, stream={"tactile_rate": 25.0})
     ticks = listener.ticks
     assert ticks["state"] == list(range(5, 2001, 5))
@@ -66,7 +66,7 @@ def test_each_topic_goes_out_on_exactly_every_nth_tick_or_frame() -> None:
         assert len(frames) == pytest.approx(100, abs=1)
 
 
-def test_rates_are_what_really_happened_in_the_last_second() -> None:
+def test_rates_are_what_really_happened_in_the_last_second():
     stream = {"state_rate": 50.0, "tactile_rate": 20.0}
     listener, _ = listened(4.0, tactile={"rate": 80.0}, stream=stream)
     rates = listener.rates[-1]
@@ -81,9 +81,7 @@ def test_rates_are_what_really_happened_in_the_last_second() -> None:
     ("rate", "wanted", "ticks"), [(500.0, 100.0, 5), (1000.0, 100.0, 10), (500.0, 300.0, 2),
                                   (100.0, 400.0, 1), (10.0, 0.1, 100)]
 )  # fmt: skip
-def test_a_rate_is_the_nearest_whole_number_of_ticks(
-    rate: float, wanted: float, ticks: int
-) -> None:
+def test_a_rate_is_the_nearest_whole_number_of_ticks(rate, wanted, ticks):
     assert every(rate, wanted) == ticks
 
 
@@ -95,7 +93,7 @@ def fed(rows: np.ndarray) -> Statistics:
 
 
 @pytest.mark.parametrize("count", [1, 7, 1000, 20_000])
-def test_quantiles_are_those_of_the_samples_within_a_bin(count: int) -> None:
+def test_quantiles_are_those_of_the_samples_within_a_bin(count):
     generator = np.random.default_rng(count)
     rows = 10.0 ** generator.uniform(-8.5, 1.5, (count, 4)) * [1.0, 1e-1, 1e-2, 1e-3]
     spreads = fed(rows).spreads()
@@ -109,7 +107,7 @@ def test_quantiles_are_those_of_the_samples_within_a_bin(count: int) -> None:
         assert spreads[name].max == rows[:, j].max()
 
 
-def test_times_off_the_scale_are_counted() -> None:
+def test_times_off_the_scale_are_counted():
     statistics = fed(np.array([[0.0, -1.0, 1e-12, 1e9], [math.nan, 1e9, 0.0, 1e9]]))
     assert statistics.ticks == 2
     assert statistics.counts.sum() == 8
@@ -118,13 +116,13 @@ def test_times_off_the_scale_are_counted() -> None:
     assert spreads["compute"].p50 == pytest.approx(0.0, abs=2e-9)
 
 
-def test_nothing_counted_is_all_zero() -> None:
+def test_nothing_counted_is_all_zero():
     statistics = Statistics()
     assert statistics.ticks == 0
     assert all(spread == (0.0, 0.0, 0.0, 0.0) for spread in statistics.spreads().values())
 
 
-def test_keeping_them_allocates_nothing() -> None:
+def test_keeping_them_allocates_nothing():
     statistics = Statistics()
     counts, largest = statistics.counts, statistics.largest
     values = (1e-6, 2e-5, 1e-5, 3e-6)

@@ -52,7 +52,7 @@ def twin(
 @pytest.mark.parametrize(
     ("d", "share"), [(0.5e-3, 0.0), (2e-3, 0.7), (4e-3, -0.5), (8e-3, 0.8), (12e-3, 0.6)]
 )
-def test_values_and_partials_equal_the_twin(material: Material, d: float, share: float) -> None:
+def test_values_and_partials_equal_the_twin(material, d, share):
     theta = float(TIP.theta_limit(d)) * share
     c = integrate(TIP, material, d, theta)
     force, energy = twin(TIP, material, d, theta)
@@ -66,7 +66,7 @@ def test_values_and_partials_equal_the_twin(material: Material, d: float, share:
     np.testing.assert_allclose(c.energy_theta, u_t, rtol=2e-12, atol=scale * d)
 
 
-def test_a_constant_modulus_gives_the_closed_form() -> None:
+def test_a_constant_modulus_gives_the_closed_form():
     d = np.array([1e-11, 1e-6, 4e-3, 0.0199, 0.02])[:, None]
     theta = TIP.theta_limit(d) * np.array([-1.0, -0.3, 0.0, 1 - 1e-9])
     exact = closed_forms(0.304e6, d, theta)
@@ -81,7 +81,7 @@ def test_a_constant_modulus_gives_the_closed_form() -> None:
     ),
     share=st.one_of(st.floats(0.0, 1.0), st.floats(-12.0, -0.1).map(lambda e: 1 - 10**e)),
 )
-def test_more_nodes_change_nothing_anywhere(depth: float, share: float) -> None:
+def test_more_nodes_change_nothing_anywhere(depth, share):
     h = 1.0 - depth
     limit = math.atan2(h, math.sqrt(depth * (1 + h)))
     s, c = math.sin(limit * share), math.cos(limit * share)
@@ -103,9 +103,7 @@ def test_more_nodes_change_nothing_anywhere(depth: float, share: float) -> None:
     share=st.floats(-1.0, 1.0).map(lambda share: share * (1 - 1e-9)),
 )
 @settings(max_examples=60)
-def test_every_admissible_material_has_its_least_energy_upright(
-    slopes: list[float], depth: float, share: float
-) -> None:
+def test_every_admissible_material_has_its_least_energy_upright(slopes, depth, share):
     """Tangent moduli that are any positive Bernstein polynomial: laws of all curvatures."""
     n = len(slopes) - 1
     modulus = np.polynomial.Polynomial([0.0])
@@ -126,7 +124,7 @@ def test_every_admissible_material_has_its_least_energy_upright(
     assert deeper.force > c.force[0]
 
 
-def test_outside_the_domain() -> None:
+def test_outside_the_domain():
     assert integrate(TIP, TABLE_I, -1e-3, 0.1) == (0.0,) * 6
     for pair in [(0.021, 0.0), (8e-3, 0.7), (8e-3, 3.2), (math.nan, 0), (1e-3, math.nan)]:
         assert all(math.isnan(value) for value in integrate(TIP, TABLE_I, *pair))
@@ -141,15 +139,13 @@ shares = st.floats(-1.0, 1.0).map(lambda share: share if abs(share) > 1e-150 els
 
 
 @pytest.mark.parametrize(("d", "theta", "force", "energy"), CHECKPOINTS)
-def test_force_and_energy_meet_the_checkpoints(
-    d: float, theta: float, force: float, energy: float
-) -> None:
+def test_force_and_energy_meet_the_checkpoints(d, theta, force, energy):
     c = closed_forms(E, d * 1e-3, math.radians(theta))
     np.testing.assert_allclose(c.force, force, rtol=2e-13)
     np.testing.assert_allclose(c.energy * 1e3, energy, rtol=2e-13)
 
 
-def test_limit_of_the_tilt() -> None:
+def test_limit_of_the_tilt():
     limits = np.degrees(TIP.theta_limit(np.array([2, 4, 6, 8, 10, 12]) * 1e-3))
     np.testing.assert_allclose(limits, [64.158, 53.130, 44.427, 36.870, 30.000, 23.578], atol=5e-4)
     assert TIP.theta_limit(-1.0) == TIP.theta_limit(0.0) == math.pi / 2
@@ -172,9 +168,7 @@ def _complex(modulus: float, d: complex, theta: complex) -> tuple[complex, compl
 
 
 @given(radius=radii, modulus=moduli, part=fractions, share=shares)
-def test_partials_are_the_derivatives(
-    radius: float, modulus: float, part: float, share: float
-) -> None:
+def test_partials_are_the_derivatives(radius, modulus, part, share):
     d = radius * part
     theta = float(Fingertip(radius).theta_limit(d)) * share
     c = closed_forms(modulus, d, theta)
@@ -185,7 +179,7 @@ def test_partials_are_the_derivatives(
     np.testing.assert_allclose([c.force_theta, c.energy_theta], [f_t, u_t], rtol=1e-12)
 
 
-def test_shapes_types_and_odd_values() -> None:
+def test_shapes_types_and_odd_values():
     grid = closed_forms(E, np.full((3, 1), 0.004), np.zeros(4))
     assert grid.force.shape == (3, 4)
     for d in (-1e-3, 0.0, -math.inf):
@@ -196,11 +190,11 @@ def test_shapes_types_and_odd_values() -> None:
 
 
 @pytest.mark.parametrize("radius", [0.0, -0.02, math.nan, math.inf])
-def test_a_tip_needs_a_radius(radius: float) -> None:
+def test_a_tip_needs_a_radius(radius):
     with pytest.raises(ValueError, match="radius must be positive"):
         Fingertip(radius)
 
 
-def test_a_radius_in_millimetres_is_refused_with_the_metres_it_means() -> None:
+def test_a_radius_in_millimetres_is_refused_with_the_metres_it_means():
     with pytest.raises(ValueError, match=r"in metres, at most 1, not 20; 20 mm is 0\.02"):
         Fingertip(20.0)

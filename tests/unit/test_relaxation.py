@@ -44,7 +44,7 @@ def pressed(**more: Any) -> SimulatedHand:
     )
 
 
-def test_a_press_and_its_release_follow_the_prony_terms() -> None:
+def test_a_press_and_its_release_follow_the_prony_terms():
     hand = pressed()
     rows = []
     for k in range(1, 4000):
@@ -71,7 +71,7 @@ def test_a_press_and_its_release_follow_the_prony_terms() -> None:
     assert (force[falling] < lasting[falling]).any()
 
 
-def test_relaxing_tips_make_no_energy() -> None:
+def test_relaxing_tips_make_no_energy():
     """A free object between relaxing tips that bounce without other losses comes to rest."""
     settings = Settings.model_validate(
         {
@@ -98,7 +98,7 @@ def test_relaxing_tips_make_no_energy() -> None:
 
 
 @pytest.mark.parametrize("strengths", [(0.0, 0.15, 0.25), (0.0, 0.3, 0.0), (0.0, 0.0, 0.0)])
-def test_a_press_and_hold_tells_the_strengths(strengths: tuple[float, float, float]) -> None:
+def test_a_press_and_hold_tells_the_strengths(strengths):
     """Of frames at 100 Hz with noise, by an ODE of its own; 4 ms are too short for these."""
     t = np.arange(-1.0, 6.0, 0.01)
     lasting = 12.0 * np.clip(t / 0.1, 0.0, 1.0) ** 1.6
@@ -117,7 +117,7 @@ def test_a_press_and_hold_tells_the_strengths(strengths: tuple[float, float, flo
         assert found.elastic > 2.0 * found.residual
 
 
-def test_too_short_a_hold_is_refused() -> None:
+def test_too_short_a_hold_is_refused():
     t = np.arange(0.0, 1.0, 0.01)
     with pytest.raises(CalibrationError, match=r"found 1\.0 s .* 2 times .* 1\.4 s"):
         fit_relaxation(t, np.ones_like(t), TIMES)
@@ -139,22 +139,20 @@ def grip(aware: bool, tip: dict[str, Any]) -> tuple[float, float, list[str]]:
 
 
 @pytest.mark.parametrize("tip", [{}, SOLID])
-def test_a_hold_keeps_its_force_while_known_tips_relax(tip: dict[str, Any]) -> None:
+def test_a_hold_keeps_its_force_while_known_tips_relax(tip):
     first, last, warned = grip(True, tip)
     assert last == pytest.approx(first, abs=0.01)
     assert last == pytest.approx(1.0, abs=0.05)
     assert warned == []
 
 
-def test_relaxation_that_nobody_told_of_is_felt_as_a_load() -> None:
+def test_relaxation_that_nobody_told_of_is_felt_as_a_load():
     """What the setting is for: so the hand must not be better than it is."""
     _, last, warned = grip(False, {})
     assert last > 1.2 or "slip" in warned
 
 
-def test_calibrate_finds_it_in_a_run_of_frames(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_calibrate_finds_it_in_a_run_of_frames(tmp_path, capsys):
     profile = load(Path("sim"))
     grid = make_sensor_model(profile, 0).grid
     t = np.arange(0.0, 5.0, 0.01)

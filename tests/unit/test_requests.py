@@ -1,7 +1,5 @@
 """The transition table: what is heard when, and how a request must look."""
 
-from typing import Any
-
 import pytest
 
 from softfinger.daemon.control.modes import COMMANDS, Mode
@@ -13,16 +11,16 @@ def heard(mode: Mode) -> set[str]:
     return {name for name, (modes, _) in COMMANDS.items() if mode in modes}
 
 
-def test_stop_and_status_are_heard_in_every_mode() -> None:
+def test_stop_and_status_are_heard_in_every_mode():
     assert all({"stop", "status"} <= heard(mode) for mode in Mode)
 
 
-def test_nothing_moves_the_hand_before_it_is_armed_or_in_a_fault() -> None:
+def test_nothing_moves_the_hand_before_it_is_armed_or_in_a_fault():
     assert heard(Mode.DISARMED) == {"arm", "demo", "disarm", "tare", "stop", "status"}
     assert heard(Mode.FAULT) == {"clear", "stop", "status"}
 
 
-def test_a_good_request_is_parsed() -> None:
+def test_a_good_request_is_parsed():
     request = {"command": "grasp", "force": 5, "client": "notebook"}
     assert parse(request, Mode.ARMED) == Command("grasp", {"force": 5.0}, "notebook")
     assert parse({"command": "grasp"}, Mode.HOLDING) == Command("grasp", {}, "")
@@ -46,9 +44,7 @@ def test_a_good_request_is_parsed() -> None:
         ({"command": "arm", "client": "x" * 65}, Mode.DISARMED, "at most 64 characters"),
     ],
 )
-def test_a_bad_request_is_refused_with_found_and_expected(
-    request_: dict[str, Any], mode: Mode, text: str
-) -> None:
+def test_a_bad_request_is_refused_with_found_and_expected(request_, mode, text):
     with pytest.raises(Refused) as caught:
         parse(request_, mode)
     assert text in str(caught.value)
@@ -59,13 +55,13 @@ def take(lease: Lease, command: Command, now: float) -> None:
     lease.renew(command, now)
 
 
-def test_a_command_that_was_not_carried_out_takes_no_lease() -> None:
+def test_a_command_that_was_not_carried_out_takes_no_lease():
     lease = Lease(2.0)
     lease.check(Command("grasp", {}, "a"), 0.0)
     take(lease, Command("grasp", {}, "b"), 0.1)
 
 
-def test_one_commander_at_a_time() -> None:
+def test_one_commander_at_a_time():
     lease = Lease(2.0)
     take(lease, Command("arm", {}, "a"), 0.0)
     with pytest.raises(Refused, match=r"grasp: a commands the hand \(1\.0 s\)"):
@@ -78,7 +74,7 @@ def test_one_commander_at_a_time() -> None:
     take(lease, Command("grasp", {}, "b"), 3.0)
 
 
-def test_clients_without_a_name_share_one_lease() -> None:
+def test_clients_without_a_name_share_one_lease():
     lease = Lease(2.0)
     take(lease, Command("arm", {}, ""), 0.0)
     take(lease, Command("grasp", {}, ""), 0.1)

@@ -18,7 +18,7 @@ from tests.harness.safety import bounded as write_bounded
 ROOT = Path(__file__).parents[2]
 
 
-def test_a_sound_state_has_no_cause_and_no_warning() -> None:
+def test_a_sound_state_has_no_cause_and_no_warning():
     judge = safety(grasp=levers(0.08))
     state = sound()
     state.reading.current = [0.08 * 5.0 / SETTINGS.control.torque_constant] * 2
@@ -37,7 +37,7 @@ def bounded(judge: Safety, state: State, wanted: Goal) -> Goal:
     return state.goal
 
 
-def test_goals_are_bounded_by_joint_and_current_limits() -> None:
+def test_goals_are_bounded_by_joint_and_current_limits():
     judge, state = safety(), sound()
     for _ in range(1000):  # as long as the step and the slew take
         found = bounded(judge, state, goal((9.0, -9.0), (5.0, -0.2)))
@@ -48,16 +48,15 @@ def test_goals_are_bounded_by_joint_and_current_limits() -> None:
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
-def test_a_non_finite_goal_is_not_sent_and_is_a_fault(bad: float) -> None:
+def test_a_non_finite_goal_is_not_sent_and_is_a_fault(bad):
     for each in (goal((bad, 0.0), (0.1, 0.1)), goal((0.0, 0.0), (0.1, bad))):
         judge, state = safety(), sound()
         assert not bounded(judge, state, each).valid
         found = judge.judge(state)
-        assert found is not None
         assert found.name == "goal.number"
 
 
-def test_a_far_goal_goes_there_at_its_speed_and_a_near_one_at_once() -> None:
+def test_a_far_goal_goes_there_at_its_speed_and_a_near_one_at_once():
     judge, state = safety(), sound()
     limits, dt = SETTINGS.safety, 1.0 / SETTINGS.loop.rate
     assert bounded(judge, state, goal((0.4, -0.4), (0.0, 0.0))).q == [0.4, -0.4]
@@ -66,14 +65,14 @@ def test_a_far_goal_goes_there_at_its_speed_and_a_near_one_at_once() -> None:
     assert reached == pytest.approx([limits.goal_reach + (i + 1) * step for i in range(5)])
 
 
-def test_in_position_mode_no_goal_jumps() -> None:
+def test_in_position_mode_no_goal_jumps():
     settings = Settings.model_validate({"servos": {"mode": "position"}})
     judge, state = Safety(settings, True, True), sound()
     step = settings.safety.goal_speed / settings.loop.rate
     assert bounded(judge, state, goal((0.4, 0.0), (0.0, 0.0))).q[0] == pytest.approx(step)
 
 
-def test_a_goal_current_rises_slowly_from_nothing_and_falls_at_once() -> None:
+def test_a_goal_current_rises_slowly_from_nothing_and_falls_at_once():
     judge, state = safety(), sound()
     rise = SETTINGS.safety.current_rate / SETTINGS.loop.rate
     for k in (1, 2, 3):
@@ -85,7 +84,7 @@ def test_a_goal_current_rises_slowly_from_nothing_and_falls_at_once() -> None:
 
 @given(st.lists(st.tuples(*[st.floats(width=32) for _ in range(6)]), min_size=1, max_size=20))
 @hypothesis_settings(max_examples=200)
-def test_no_goal_leaves_its_limits_whatever_is_asked(asked: list[tuple[float, ...]]) -> None:
+def test_no_goal_leaves_its_limits_whatever_is_asked(asked):
     judge, state, hand, limits = safety(), sound(), SETTINGS.hand, SETTINGS.safety
     last = [0.0, 0.0]
     for a, b, c, d, q1, q2 in asked:
@@ -101,7 +100,7 @@ def test_no_goal_leaves_its_limits_whatever_is_asked(asked: list[tuple[float, ..
         last = list(found.current)
 
 
-def test_nothing_but_safety_writes_a_goal() -> None:
+def test_nothing_but_safety_writes_a_goal():
     callers = []
     for path in (ROOT / "daemon").rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):

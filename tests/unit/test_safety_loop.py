@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from tests.harness.loop import (
-    Make,
     advance_to,
     change_frames,
     command,
@@ -18,7 +17,7 @@ from tests.harness.loop import (
 )
 
 
-def test_a_long_sound_grip_says_nothing(make: Make) -> None:
+def test_a_long_sound_grip_says_nothing(make):
     daemon = make(task={"name": "demo"})
     events = heard(daemon)
     daemon.loop.advance(12.0)
@@ -29,7 +28,7 @@ def test_a_long_sound_grip_says_nothing(make: Make) -> None:
     assert limited["goal.slew"] < 40
 
 
-def test_a_sensor_that_shifts_in_the_grip_is_a_fault(make: Make) -> None:
+def test_a_sensor_that_shifts_in_the_grip_is_a_fault(make):
     daemon = make()
     events, state = heard(daemon), grasped(daemon, 8.0).loop.state
     change_frames(daemon, 1, lambda frame: replace(frame, data=np.roll(frame.data, 4, axis=1)))
@@ -42,10 +41,9 @@ def test_a_sensor_that_shifts_in_the_grip_is_a_fault(make: Make) -> None:
     assert ("error", state.fault_name, state.fault) in events
 
 
-def test_a_frozen_sensor_is_a_fault_until_it_lives_again(make: Make) -> None:
+def test_a_frozen_sensor_is_a_fault_until_it_lives_again(make):
     daemon = grasped(make(), 5.0)
     left = daemon.loop.perception.fingers[0]
-    assert left.frame is not None
     frozen = left.frame.data.copy()
     change_frames(daemon, 0, lambda frame: replace(frame, data=frozen))
     advance_to(daemon, "fault", 1.0)
@@ -58,7 +56,7 @@ def test_a_frozen_sensor_is_a_fault_until_it_lives_again(make: Make) -> None:
     command(daemon, "arm")
 
 
-def test_without_frames_the_hand_opens_before_the_fault_where_that_is_wanted(make: Make) -> None:
+def test_without_frames_the_hand_opens_before_the_fault_where_that_is_wanted(make):
     daemon = grasped(make(safety={"frame_age_action": "open"}), 5.0)
     events, state = heard(daemon), daemon.loop.state
     silence(daemon)
@@ -72,7 +70,7 @@ def test_without_frames_the_hand_opens_before_the_fault_where_that_is_wanted(mak
     assert [kind for level, kind, _ in events if level == "error"] == ["tactile.silent"] * 2
 
 
-def test_a_person_who_stops_the_opening_hand_finds_no_fault_later(make: Make) -> None:
+def test_a_person_who_stops_the_opening_hand_finds_no_fault_later(make):
     daemon = grasped(make(safety={"frame_age_action": "open"}), 5.0)
     silence(daemon)
     advance_to(daemon, "releasing", 0.3)
@@ -81,7 +79,7 @@ def test_a_person_who_stops_the_opening_hand_finds_no_fault_later(make: Make) ->
     assert (daemon.loop.state.mode, daemon.loop.state.fault) == ("disarmed", "")
 
 
-def test_a_joint_that_is_held_up_is_a_fault_and_can_be_cleared(make: Make) -> None:
+def test_a_joint_that_is_held_up_is_a_fault_and_can_be_cleared(make):
     daemon = make(tactile={"backend": "none"})
     command(daemon, "arm")
     command(daemon, "move", left=0.9, right=0.9)  # onto the object
@@ -93,9 +91,8 @@ def test_a_joint_that_is_held_up_is_a_fault_and_can_be_cleared(make: Make) -> No
     command(daemon, "arm")
 
 
-def test_a_servo_that_is_hot_is_a_fault_that_stands_until_it_is_cooler(make: Make) -> None:
+def test_a_servo_that_is_hot_is_a_fault_that_stands_until_it_is_cooler(make):
     daemon = grasped(make(), 5.0)
-    assert daemon.hand is not None
     heat = daemon.hand.servo_heat[1]
     heat.warm(70.6)
     advance_to(daemon, "fault", 1.0)
@@ -106,7 +103,7 @@ def test_a_servo_that_is_hot_is_a_fault_that_stands_until_it_is_cooler(make: Mak
     command(daemon, "clear")
 
 
-def test_stop_works_in_every_mode_within_one_tick(make: Make) -> None:
+def test_stop_works_in_every_mode_within_one_tick(make):
     daemon = make()
     loop, state = daemon.loop, daemon.loop.state
     steps: list[tuple[str, dict[str, float], str]] = [

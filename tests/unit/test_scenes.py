@@ -12,7 +12,7 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import Event, Reading
 from softfinger.daemon.wire.schema import STATE
 from tests.harness.golden_wire import message_maker
-from tests.harness.loop import Make, advance_to, command, grasped, heard, refusal
+from tests.harness.loop import advance_to, command, grasped, heard, refusal
 
 state_message = message_maker(STATE)
 
@@ -23,7 +23,7 @@ def holding_demo(daemon: Daemon) -> list[Event]:
     return heard(daemon)
 
 
-def test_a_simulated_hands_demo_goes_on_after_a_fault_and_says_so(make: Make) -> None:
+def test_a_simulated_hands_demo_goes_on_after_a_fault_and_says_so(make):
     daemon = make(task={"name": "demo"})
     events = holding_demo(daemon)
     daemon.loop._fail("made up")
@@ -43,39 +43,36 @@ def test_a_simulated_hands_demo_goes_on_after_a_fault_and_says_so(make: Make) ->
     assert daemon.loop.state.mode == "disarmed", "a person ends it for good"
 
 
-def test_a_demo_that_cannot_clear_its_fault_tries_again(make: Make) -> None:
+def test_a_demo_that_cannot_clear_its_fault_tries_again(make):
     daemon = make(task={"name": "demo"})
     events, servos = holding_demo(daemon), daemon.loop.torque.servos
-    assert servos is not None
     really = servos.read
 
     def alerting(reading: Reading) -> None:
         really(reading)
         reading.alert = 1
 
-    servos.read = alerting  # type: ignore[method-assign]
+    servos.read = alerting
     daemon.loop.advance(5.0)
     told = [text for _, kind, text in events if kind == "task"]
     assert len(told) == 3
     assert told[1].startswith("clear: servos: hardware error reported by left; the task clears it")
-    servos.read = really  # type: ignore[method-assign]
+    servos.read = really
     advance_to(daemon, "holding", 6.0)
 
 
-def test_a_demo_whose_step_never_ends_begins_again(make: Make) -> None:
+def test_a_demo_whose_step_never_ends_begins_again(make):
     daemon = make(task={"name": "demo"})
     events = holding_demo(daemon)
-    assert daemon.loop._task is not None
     daemon.loop._task._mode = "moving"  # which it never comes to
     advance_to(daemon, "disarmed", 13.0)
     assert events[0][2].startswith("still holding after 10 s; the task stops it and begins again")
     advance_to(daemon, "holding", 6.0)
 
 
-def test_metals_demo_ends_with_the_first_fault(make: Make) -> None:
+def test_metals_demo_ends_with_the_first_fault(make):
     metal = Settings.model_validate({"task": {"name": "demo"}, "servos": {"backend": "dynamixel"}})
     task = Task.named(metal)
-    assert task is not None
     assert not task.lasting
     daemon = make()
     daemon.loop._task = task
@@ -97,9 +94,7 @@ SCENES: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("sections", SCENES.values(), ids=SCENES.keys())
-def test_every_scene_runs_and_its_messages_have_one_shape(
-    make: Make, sections: dict[str, Any]
-) -> None:
+def test_every_scene_runs_and_its_messages_have_one_shape(make, sections):
     daemon = make(**sections)
     daemon.loop.advance(2.0)
     message = state_message(daemon.loop.state, parts(daemon.settings))
@@ -114,7 +109,7 @@ def test_every_scene_runs_and_its_messages_have_one_shape(
     assert message["right"]["valid"] is ("right" in fingers)
 
 
-def test_one_finger_presses_on_a_fixed_object(make: Make) -> None:
+def test_one_finger_presses_on_a_fixed_object(make):
     daemon = grasped(make(scene={"fingers": ("left",)}), 6.0)
     daemon.loop.advance(2.0)
     assert daemon.loop.state.contacts[0].force == pytest.approx(6.0, rel=0.05)
@@ -124,7 +119,7 @@ def test_one_finger_presses_on_a_fixed_object(make: Make) -> None:
         command(daemon, "rotate", angle=0.1)
 
 
-def test_watching_a_compression_needs_no_servos(make: Make) -> None:
+def test_watching_a_compression_needs_no_servos(make):
     daemon = make(servos={"backend": "none"})
     deepest = 0.0
     for _ in range(80):
@@ -135,7 +130,7 @@ def test_watching_a_compression_needs_no_servos(make: Make) -> None:
         command(daemon, "arm")
 
 
-def test_servos_without_sensors_move_but_do_not_grasp(make: Make) -> None:
+def test_servos_without_sensors_move_but_do_not_grasp(make):
     daemon = make(tactile={"backend": "none"})
     command(daemon, "arm")
     command(daemon, "move", left=-0.1)
@@ -144,7 +139,7 @@ def test_servos_without_sensors_move_but_do_not_grasp(make: Make) -> None:
         command(daemon, "grasp")
 
 
-def test_the_demo_task_grasps_turns_and_releases_by_itself(make: Make) -> None:
+def test_the_demo_task_grasps_turns_and_releases_by_itself(make):
     daemon = make(task={"name": "demo"})
     seen: list[str] = []
     turned: list[float] = []
@@ -162,7 +157,7 @@ def test_the_demo_task_grasps_turns_and_releases_by_itself(make: Make) -> None:
     assert min(turned) < -0.12
 
 
-def test_a_demo_that_a_command_ended_is_begun_again(make: Make) -> None:
+def test_a_demo_that_a_command_ended_is_begun_again(make):
     daemon = make(task={"name": "demo"})
     advance_to(daemon, "holding", 6.0)
     assert "demo: not while holding" in refusal(daemon, "demo")

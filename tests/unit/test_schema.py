@@ -19,7 +19,7 @@ KINDS = {"int": int, "float": float, "bool": bool, "str": str, "bin": bytes}
 
 
 @pytest.mark.parametrize("topic", schema.TOPICS)
-def test_what_is_sent_is_what_the_schema_says(topic: bytes) -> None:
+def test_what_is_sent_is_what_the_schema_says(topic):
     sent = flat(sample(topic))
     assert list(sent) == [field.name for field in schema.TOPICS[topic].fields]
     for field in schema.TOPICS[topic].fields:
@@ -28,7 +28,7 @@ def test_what_is_sent_is_what_the_schema_says(topic: bytes) -> None:
 
 
 @pytest.mark.parametrize("topic", schema.TOPICS)
-def test_golden_bytes(topic: bytes) -> None:
+def test_golden_bytes(topic):
     """What an analysis tool was written against must go on arriving, to the byte."""
     golden = golden_file(topic).read_bytes()
     assert packer(topic)(*arguments(topic)) == golden
@@ -36,13 +36,13 @@ def test_golden_bytes(topic: bytes) -> None:
 
 
 @pytest.mark.parametrize("topic", schema.TOPICS)
-def test_a_client_reads_what_was_sent(topic: bytes) -> None:
+def test_a_client_reads_what_was_sent(topic):
     sent = sample(topic)
     assert dataclasses.asdict(read(schema.TOPICS[topic].record, sent)) == sent
 
 
 @pytest.mark.parametrize("topic", schema.TOPICS)
-def test_the_json_schema_names_every_field(topic: bytes) -> None:
+def test_the_json_schema_names_every_field(topic):
     told = schema_docs.json_schema(topic)
     assert json.loads(json.dumps(told)) == told
     assert told["type"] == "object"
@@ -53,14 +53,14 @@ def test_the_json_schema_names_every_field(topic: bytes) -> None:
         assert place["description"]
 
 
-def test_what_is_no_number_yet_goes_out_as_it_is() -> None:
+def test_what_is_no_number_yet_goes_out_as_it_is():
     state = State()  # no reading yet: its time is −∞, and a grip's goal is no number
     assert message_maker(schema.INPUT)(state, (None, None))["reading"]["t"] == -math.inf
     sent = message_maker(schema.STATE)(state, Parts((True, True), True, True))
     assert math.isnan(sent["goal_force"])
 
 
-def test_messages_of_one_topic_are_of_one_length_while_their_texts_stay() -> None:
+def test_messages_of_one_topic_are_of_one_length_while_their_texts_stay():
     pack, scene, state = packer(schema.STATE), Parts((True, True), True, True), State()
     first = pack(state, scene)
     state.seq, state.timing.overruns, state.torque = 2**40, 2**33, True
@@ -69,7 +69,7 @@ def test_messages_of_one_topic_are_of_one_length_while_their_texts_stay() -> Non
     assert len(pack(state, scene)) == len(first) - 1
 
 
-def test_the_page_is_the_one_in_the_repository() -> None:
+def test_the_page_is_the_one_in_the_repository():
     assert PAGE.read_text(encoding="utf-8") == schema_docs.page(), (
         "run python -m softfinger.daemon.wire.schema_docs"
     )

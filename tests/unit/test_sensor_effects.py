@@ -292,9 +292,7 @@ def literal(d: float, tilt: float, radius: float, rotation: float, parts: int = 
 @pytest.mark.parametrize("rotation", [0.0, 0.4])
 @pytest.mark.parametrize(("d", "tilt"), [(0.001, -0.1), (0.004, 0.3), (0.006, -0.4)])
 @pytest.mark.parametrize("radius", [0.012, 0.04])
-def test_cells_read_the_springs_under_the_cylinder(
-    radius: float, d: float, tilt: float, rotation: float
-) -> None:
+def test_cells_read_the_springs_under_the_cylinder(radius, d, tilt, rotation):
     grid = SensorGrid(44, 44, PITCH, rotation=rotation)
     found = frame(grid, d, tilt, 1.0 / radius)
     expected = literal(d, tilt, radius, rotation)
@@ -302,7 +300,7 @@ def test_cells_read_the_springs_under_the_cylinder(
     assert found.sum() == pytest.approx(expected.sum(), rel=1e-3)
 
 
-def test_a_face_that_is_all_but_plane_reads_like_a_plane_one() -> None:
+def test_a_face_that_is_all_but_plane_reads_like_a_plane_one():
     grid = SensorGrid(44, 44, PITCH, rotation=0.2)
     plane, curved = frame(grid, 0.004, 0.25, 0.0), frame(grid, 0.004, 0.25, 1e-5)
     assert np.abs(plane - curved).max() < 6e-4 * MEASURED.reference_modulus

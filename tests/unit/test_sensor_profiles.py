@@ -16,8 +16,8 @@ FORCE = 8.0  # N
     ("profile", "off", "angle"), [("velostat", 0.06, 1.0), ("capacitive", 0.08, 0.5)]
 )
 def test_a_sensor_with_flaws_grasps_turns_and_holds_and_nothing_is_falsely_warned_of(
-    profile: str, off: float, angle: float
-) -> None:
+    profile, off, angle
+):
     with Watched(load(Path(profile)).model_dump()) as hand:
         hand.run(0.3)
         hand.command("tare")
@@ -37,7 +37,7 @@ def test_a_sensor_with_flaws_grasps_turns_and_holds_and_nothing_is_falsely_warne
         assert [event for event in hand.events if event[0] != "info"] == []
 
 
-def test_a_hand_that_does_not_know_of_its_cells_response_lets_go() -> None:
+def test_a_hand_that_does_not_know_of_its_cells_response_lets_go():
     sections = load(Path("velostat"), changes=["tactile.response=0"]).model_dump()
     with Watched(sections) as hand:
         hand.grasp(FORCE)

@@ -51,7 +51,6 @@ class SimulatedRig:
         self.clock: Clock = VirtualClock()
         self._hand = SimulatedHand(settings, table=PAPER)
         made = make_servos(settings, self.clock, self._hand)
-        assert made is not None
         self.servos = made
 
     def torque(self) -> list[bool]:

@@ -2,7 +2,6 @@
 the hand does with it on hidden constants."""
 
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -66,7 +65,7 @@ def jacobian(state: HeatState, x: Any, square: float) -> Any:
     return np.stack(columns, axis=1)
 
 
-def test_the_filter_is_a_kalman_filter_of_its_equations() -> None:
+def test_the_filter_is_a_kalman_filter_of_its_equations():
     chance, state = np.random.default_rng(3), law(HeatState())
     follow(state.array, 0.0, 0.5, 30.0)
     x, p = state.x.copy(), state.p.copy()
@@ -97,7 +96,7 @@ def test_the_filter_is_a_kalman_filter_of_its_equations() -> None:
 
 
 @pytest.mark.parametrize("square", [0.4, 1.0, 2.5])
-def test_the_time_to_the_limit_is_that_of_the_equations(square: float) -> None:
+def test_the_time_to_the_limit_is_that_of_the_equations(square):
     state = law(HeatState())
     follow(state.array, 0.0, 0.5, 30.0)
     state.x[:] = 45.0, 38.0, 28.0, 1.1
@@ -105,7 +104,7 @@ def test_the_time_to_the_limit_is_that_of_the_equations(square: float) -> None:
     def reached(_: float, x: Any) -> float:
         return float(x[1]) - LIMIT
 
-    reached.terminal = True  # type: ignore[attr-defined]
+    reached.terminal = True
     solved = solve_ivp(
         lambda _, x: derivative(state, x, square),
         (0.0, LONGEST),
@@ -116,7 +115,7 @@ def test_the_time_to_the_limit_is_that_of_the_equations(square: float) -> None:
     assert time_to_limit(state.array, square, LIMIT) == pytest.approx(solved.t[-1], rel=0.02)
 
 
-def test_the_lasting_current_settles_at_the_limit() -> None:
+def test_the_lasting_current_settles_at_the_limit():
     state = law(HeatState())
     follow(state.array, 0.0, 0.5, 30.0)
     square = lasting_square(state.array, LIMIT)
@@ -130,13 +129,13 @@ def test_the_lasting_current_settles_at_the_limit() -> None:
 
 
 @pytest.mark.parametrize("seed", [2, 7, 25, 37])
-def test_the_limit_of_hidden_constants_is_foreseen(seed: int) -> None:
+def test_the_limit_of_hidden_constants_is_foreseen(seed):
     run = foreseen(seed)
     assert run.warned >= 30.0
     assert run.told == pytest.approx(60.0, rel=0.15)
 
 
-def test_half_of_what_lasts_warns_nobody() -> None:
+def test_half_of_what_lasts_warns_nobody():
     assert least_at_half_load(1, 1800.0) > 600.0
 
 
@@ -152,9 +151,7 @@ def recorded(plant: ServoHeat) -> dict[str, Any]:
     return {"t": t, "left.current": np.ones_like(t), "left.temperature": np.array(shown)}
 
 
-def test_a_hold_tells_a_servos_own_constants(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_hold_tells_a_servos_own_constants(tmp_path, monkeypatch, capsys):
     plant = ServoHeat(by_name("XM430-W350"), 1.25, 0.8, 0.8)
     monkeypatch.setattr(calibrating, "read_recording", lambda _: recorded(plant))
     profile = tmp_path / "my.toml"
@@ -177,9 +174,7 @@ def test_a_hold_tells_a_servos_own_constants(
     assert abs(time_to_limit(state.array, 1.0, 60.0) / t - 1.0) > 0.2  # by the model's own
 
 
-def test_a_hold_that_hardly_warms_tells_nothing(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_hold_that_hardly_warms_tells_nothing(tmp_path, capsys):
     profile = tmp_path / "my.toml"
     profile.write_text("")
     assert main(["calibrate", "heat", str(profile), "--recording", str(RECORDING)]) == 1
@@ -203,7 +198,7 @@ def heat_events(hand: Watched) -> list[tuple[str, str]]:
     return [(level, text) for level, kind, text in hand.events if kind == "servos.heat"]
 
 
-def test_a_grip_that_gets_too_hot_is_eased_and_holds() -> None:
+def test_a_grip_that_gets_too_hot_is_eased_and_holds():
     with hot(24.0, 90.0) as hand:
         assert hand.mode == Mode.HOLDING
         assert max(heat.sensed for heat in hand.plant.servo_heat) < LIMIT

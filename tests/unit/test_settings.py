@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from softfinger.daemon.backends import BUILT_IN, Backend, known
+from softfinger.daemon.backends import BUILT_IN, known
 from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.profile.load import load, names
 from softfinger.daemon.profile.settings import Settings
@@ -23,12 +23,12 @@ def report(tmp_path: Path, text: str, directory: Path | None = None) -> list[str
     return [line.removeprefix(f"{path}: ") for line in lines]
 
 
-def test_no_file_is_the_built_in_simulated_hand() -> None:
+def test_no_file_is_the_built_in_simulated_hand():
     assert load() == Settings()
     assert load().servos.backend == "simulated"
 
 
-def test_sim_profile_equals_the_built_in_hand_and_names_every_key() -> None:
+def test_sim_profile_equals_the_built_in_hand_and_names_every_key():
     path = CONFIG / "sim.toml"
     assert load(path) == Settings()
     written = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -37,15 +37,13 @@ def test_sim_profile_equals_the_built_in_hand_and_names_every_key() -> None:
 
 
 @pytest.mark.parametrize("path", sorted(CONFIG.glob("*.toml")), ids=lambda path: path.name)
-def test_every_profile_loads(path: Path, tmp_path: Path) -> None:
+def test_every_profile_loads(path, tmp_path):
     settings = load(path, tmp_path)
     assert "{dir}" not in settings.servos.port + "".join(settings.tactile.port)
 
 
 @pytest.mark.parametrize("name", names())
-def test_a_bare_name_is_a_profile_of_the_package_wherever_that_is(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_bare_name_is_a_profile_of_the_package_wherever_that_is(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert load(Path(name), tmp_path) == load(CONFIG / f"{name}.toml", tmp_path)
     (tmp_path / name).write_text("loop.rate = 123.0\n")  # a file here goes before it
@@ -53,12 +51,12 @@ def test_a_bare_name_is_a_profile_of_the_package_wherever_that_is(
 
 
 @pytest.mark.parametrize("table", BUILT_IN.values(), ids=BUILT_IN)
-def test_every_backend_is_there(table: dict[str, Backend]) -> None:
+def test_every_backend_is_there(table):
     for name, backend in table.items():
         assert callable(backend.load()) or name == "none"
 
 
-def test_an_unknown_name_is_told_with_the_known_ones() -> None:
+def test_an_unknown_name_is_told_with_the_known_ones():
     with pytest.raises(SettingsError) as caught:
         load(Path("hill"))
     assert str(caught.value) == (
@@ -66,7 +64,7 @@ def test_an_unknown_name_is_told_with_the_known_ones() -> None:
     )
 
 
-def test_all_errors_stand_in_one_report_with_key_found_and_expected(tmp_path: Path) -> None:
+def test_all_errors_stand_in_one_report_with_key_found_and_expected(tmp_path):
     lines = report(
         tmp_path,
         """
@@ -108,7 +106,7 @@ def test_all_errors_stand_in_one_report_with_key_found_and_expected(tmp_path: Pa
     )
 
 
-def test_contradictions_between_keys_are_all_told(tmp_path: Path) -> None:
+def test_contradictions_between_keys_are_all_told(tmp_path):
     lines = report(
         tmp_path,
         """
@@ -143,7 +141,7 @@ def test_contradictions_between_keys_are_all_told(tmp_path: Path) -> None:
     ]
 
 
-def test_a_file_that_is_not_text_or_not_there_is_told(tmp_path: Path) -> None:
+def test_a_file_that_is_not_text_or_not_there_is_told(tmp_path):
     path = tmp_path / "profile.toml"
     path.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(SettingsError, match="not UTF-8 text"):
@@ -154,7 +152,7 @@ def test_a_file_that_is_not_text_or_not_there_is_told(tmp_path: Path) -> None:
         load(tmp_path / "config" / "hil.toml")
 
 
-def test_dir_fills_the_ports(tmp_path: Path) -> None:
+def test_dir_fills_the_ports(tmp_path):
     path = tmp_path / "profile.toml"
     path.write_text(
         '[servos]\nport = "{dir}/servos"\n[tactile]\nport = ["{dir}/a", "/dev/b"]\n',
@@ -165,7 +163,7 @@ def test_dir_fills_the_ports(tmp_path: Path) -> None:
     assert settings.tactile.port == ("/tmp/hand/a", "/dev/b")
 
 
-def test_an_unknown_model_is_told_beside_what_else_is_wrong(tmp_path: Path) -> None:
+def test_an_unknown_model_is_told_beside_what_else_is_wrong(tmp_path):
     lines = report(tmp_path, '[servos]\nmodel = "XM999"\nbaud = 1\n[loop]\nrate = 1.0')
     assert [line.split(":")[0] for line in lines] == ["servos.baud", "servos.model", "loop.rate"]
     assert 'found "XM999", expected one of XM430-W350, ' in lines[1]
@@ -229,13 +227,13 @@ def test_an_unknown_model_is_told_beside_what_else_is_wrong(tmp_path: Path) -> N
         ),
     ],
 )
-def test_absurd_settings_are_told_in_one_line(tmp_path: Path, text: str, line: str) -> None:
+def test_absurd_settings_are_told_in_one_line(tmp_path, text, line):
     lines = report(tmp_path, text)
     assert lines[0].startswith(line), lines
     assert all(len(each) < 300 for each in lines)
 
 
-def test_changes_go_over_the_file_and_are_checked_with_it(tmp_path: Path) -> None:
+def test_changes_go_over_the_file_and_are_checked_with_it(tmp_path):
     file = tmp_path / "my.toml"
     file.write_text("loop.rate = 250.0\n[tip]\nradius = 0.015\n")
     changes = ["loop.rate=1000", "tactile.backend=none", 'scene.fingers=["left"]']
@@ -252,12 +250,12 @@ def test_changes_go_over_the_file_and_are_checked_with_it(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("change", ["loop.rate", "rate=3", "=", ".=1", "loop.=1"])
-def test_a_change_that_names_no_key_is_told(change: str) -> None:
+def test_a_change_that_names_no_key_is_told(change):
     with pytest.raises(SettingsError, match=r"^--set: found .* expected section\.key=value"):
         load(changes=[change])
 
 
-def test_addresses_off_this_machine_need_keys(tmp_path: Path) -> None:
+def test_addresses_off_this_machine_need_keys(tmp_path):
     path = tmp_path / "far.toml"
     path.write_text('commands.address = "tcp://10.0.0.2:9873"\n', encoding="utf-8")
     with pytest.raises(SettingsError, match=r"need access\.keys"):

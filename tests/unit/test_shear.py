@@ -34,7 +34,7 @@ def sheared(hand: SimulatedHand, way: list[float]) -> list[float]:
     return found
 
 
-def test_creep_relaxes_a_stuck_shear_exponentially() -> None:
+def test_creep_relaxes_a_stuck_shear_exponentially():
     hand = pressed(tip_creep_time=0.5)
     hand.shear[0] = 0.2 * DEPTH * MU
     hand.refresh()

@@ -1,7 +1,6 @@
 """The grip: loads from outside answered, without new frames, and of one finger alone."""
 
 import math
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,9 +19,7 @@ BORNE = 2.0 * 0.6 * FORCE  # N, what both tips' friction bears at that grip
 
 @pytest.mark.parametrize("sections", [{}, PAPER], ids=["100 Hz", "25 Hz"])
 @pytest.mark.parametrize("way", [1.0, -1.0], ids=["outwards", "to the palm"])
-def test_a_push_beyond_the_margin_is_held_by_a_firmer_grip(
-    sections: dict[str, dict[str, Any]], way: float
-) -> None:
+def test_a_push_beyond_the_margin_is_held_by_a_firmer_grip(sections, way):
     seen, moved = {}, {}
     for raised in (0.0, 10.0):
         with Hand(sections | {"control": {"grip_raise_max": raised}}) as hand:
@@ -40,7 +37,7 @@ def test_a_push_beyond_the_margin_is_held_by_a_firmer_grip(
     assert moved[0.0] > 10e-3
 
 
-def test_the_grip_comes_back_when_the_load_has_gone() -> None:
+def test_the_grip_comes_back_when_the_load_has_gone():
     with Hand(PAPER) as hand:
         grasped(hand)
         push_along(hand, BORNE, rate=9.0)
@@ -52,7 +49,7 @@ def test_the_grip_comes_back_when_the_load_has_gone() -> None:
 
 
 @pytest.mark.parametrize(("force", "sections"), [(10.0, {}), (5.0, PAPER), (2.0, {}), (2.0, PAPER)])
-def test_turning_alone_raises_nothing(force: float, sections: dict[str, dict[str, Any]]) -> None:
+def test_turning_alone_raises_nothing(force, sections):
     with Hand(sections) as hand:
         grasped(hand, force)
         for angle in (0.17, -0.17, 0.0):
@@ -61,7 +58,7 @@ def test_turning_alone_raises_nothing(force: float, sections: dict[str, dict[str
             assert seen.force.mean(axis=1).max() < (1.1 + 2.0 * KNOWN) * force
 
 
-def test_an_object_that_turns_in_the_grip_is_gripped_more_firmly() -> None:
+def test_an_object_that_turns_in_the_grip_is_gripped_more_firmly():
     for raised, held in ((0.0, False), (10.0, True)):
         with Hand({"control": {"grip_raise_max": raised}}) as hand:
             grasped(hand)
@@ -111,7 +108,7 @@ class Watched:
         return self.grip.target
 
 
-def test_what_friction_may_be_is_not_a_load_and_what_it_can_not_is() -> None:
+def test_what_friction_may_be_is_not_a_load_and_what_it_can_not_is():
     watched = Watched(friction_speed=1e6)  # nothing is given for what closing takes
     watched.run(1.5, 500, holding=False)
     watched.grip.begin_holding()
@@ -138,7 +135,7 @@ def at_rest(asked: float = FORCE) -> Watched:
 GIVES_WAY = -0.024  # rad/s, a count
 
 
-def test_a_load_that_comes_at_once_raises_the_grip_at_once_by_all_it_may() -> None:
+def test_a_load_that_comes_at_once_raises_the_grip_at_once_by_all_it_may():
     watched = at_rest()
     friction = 0.05 / 0.03
     # What moves no joint is a frame's error, and so little that friction holds it is no danger.
@@ -158,7 +155,7 @@ def test_a_load_that_comes_at_once_raises_the_grip_at_once_by_all_it_may() -> No
     assert state.grip_force == pytest.approx(FORCE + 10.0, rel=0.03)
 
 
-def test_a_twist_that_comes_at_once_raises_the_grip_at_once() -> None:
+def test_a_twist_that_comes_at_once_raises_the_grip_at_once():
     friction = 0.05 / 0.03
     for speed, raised in ((0.0, 0.0), (-GIVES_WAY, 0.0), (GIVES_WAY, 10.0)):
         watched = at_rest()
@@ -167,7 +164,7 @@ def test_a_twist_that_comes_at_once_raises_the_grip_at_once() -> None:
     assert watched.run(0.8 * friction, 1, speed=GIVES_WAY, sense=-1.0) == FORCE
 
 
-def test_a_load_that_stands_leaves_less_to_come() -> None:
+def test_a_load_that_stands_leaves_less_to_come():
     """With 3 N on each tip, a third of what alone would be no danger is one."""
     friction = 0.05 / 0.03
     watched = at_rest()
@@ -177,7 +174,7 @@ def test_a_load_that_stands_leaves_less_to_come() -> None:
     assert watched.run(3.0 + 0.8 * friction, 1, speed=GIVES_WAY) == FORCE + 10.0
 
 
-def test_solid_tips_show_a_load_by_themselves() -> None:
+def test_solid_tips_show_a_load_by_themselves():
     watched = at_rest()
     watched.held.sheared = 1.0
     assert watched.run(0.0, 500) == FORCE
@@ -185,7 +182,7 @@ def test_solid_tips_show_a_load_by_themselves() -> None:
     assert watched.run(0.0, 1) == FORCE + 10.0
 
 
-def test_what_one_joint_alone_shows_is_no_sudden_load() -> None:
+def test_what_one_joint_alone_shows_is_no_sudden_load():
     """A current that is read wrongly, or a joint that is dead."""
     watched = at_rest()
     for torque in (0.3, -0.3, 0.3):
@@ -198,9 +195,7 @@ def test_what_one_joint_alone_shows_is_no_sudden_load() -> None:
 @pytest.mark.parametrize(
     ("shown", "raised"), [((0.3, 0.3), True), ((0.6, 0.0), False), ((0.6, -0.2), False)]
 )
-def test_a_turn_that_one_tip_alone_shows_is_not_believed(
-    shown: tuple[float, float], raised: bool
-) -> None:
+def test_a_turn_that_one_tip_alone_shows_is_not_believed(shown, raised):
     """Its image is mirrored or has shifted."""
     watched = at_rest()
     watched.held.unexplained_rotation = list(shown)
@@ -208,7 +203,7 @@ def test_a_turn_that_one_tip_alone_shows_is_not_believed(
 
 
 @pytest.mark.parametrize("force", [5.0, 10.0])
-def test_noise_of_the_currents_is_no_load_and_a_load_in_it_is(force: float) -> None:
+def test_noise_of_the_currents_is_no_load_and_a_load_in_it_is(force):
     """30 mA on each, for a minute; a load towards the palm is the hardest to see."""
     rng = np.random.default_rng(1)
     watched = at_rest(force)
@@ -223,7 +218,7 @@ def test_noise_of_the_currents_is_no_load_and_a_load_in_it_is(force: float) -> N
     assert watched.grip.slip.reflex
 
 
-def test_the_raise_is_bounded_by_its_setting_and_by_the_force_that_is_a_fault() -> None:
+def test_the_raise_is_bounded_by_its_setting_and_by_the_force_that_is_a_fault():
     for more, share, expected in (
         *((2.0, 10.0, 12.0), (100.0, 10.0, 27.0), (0.0, 10.0, 10.0)),
         (10.0, 0.5, 15.0),
@@ -233,14 +228,14 @@ def test_the_raise_is_bounded_by_its_setting_and_by_the_force_that_is_a_fault() 
         assert watched.run(50.0, 500) == pytest.approx(expected)
 
 
-def test_a_grip_weaker_than_what_friction_hides_is_not_raised_on_torques() -> None:
+def test_a_grip_weaker_than_what_friction_hides_is_not_raised_on_torques():
     watched = Watched(2.0)
     watched.held.normal = [2.0, 2.0]
     watched.grip.begin_holding()
     assert {watched.run(4.0, 1, normal=2.0) for _ in range(1000)} == {2.0}
 
 
-def test_no_load_shows_before_holding_begins() -> None:
+def test_no_load_shows_before_holding_begins():
     watched = Watched()
     assert {watched.run(20.0, 1, holding=False) for _ in range(500)} == {FORCE}
 
@@ -259,7 +254,7 @@ def some_held(generator: np.random.Generator, force: float) -> GraspState:
     return held
 
 
-def test_late_frames_leave_the_push_and_let_a_turn_come_to_rest() -> None:
+def test_late_frames_leave_the_push_and_let_a_turn_come_to_rest():
     generator = np.random.default_rng(6)
     held = some_held(generator, 8.0)
     grip = Grip(Settings(), [0, 1], held)
@@ -279,7 +274,7 @@ def test_late_frames_leave_the_push_and_let_a_turn_come_to_rest() -> None:
 
 
 @pytest.mark.parametrize("finger", [0, 1])
-def test_one_finger_presses_and_the_other_gets_nothing(finger: int) -> None:
+def test_one_finger_presses_and_the_other_gets_nothing(finger):
     settings = Settings.model_validate({"scene": {"fingers": (("left", "right")[finger],)}})
     held, reading = some_held(np.random.default_rng(7), 5.0), Reading()
     grip = Grip(settings, [finger], held)

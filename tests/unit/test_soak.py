@@ -20,15 +20,15 @@ def soak() -> Iterator[Soak]:
 
 
 def holding(soak: Soak) -> Soak:
-    soak._may_be_disturbed = lambda: False  # type: ignore[method-assign]
+    soak._may_be_disturbed = lambda: False
     while soak.daemon.loop.state.mode != "holding":
         soak.run(1)
         assert soak.count < 5000
-    soak._next_command = math.inf  # type: ignore[assignment]
+    soak._next_command = math.inf
     return soak
 
 
-def test_sequences_hold_and_break_nothing() -> None:
+def test_sequences_hold_and_break_nothing():
     account = Account()
     for seed in SEEDS:
         sequence(seed, 4000, account)
@@ -38,7 +38,7 @@ def test_sequences_hold_and_break_nothing() -> None:
     assert f"{4000 * len(SEEDS)} ticks" in "\n".join(account.lines())
 
 
-def test_a_sequence_is_the_same_again() -> None:
+def test_a_sequence_is_the_same_again():
     first, again = Account(), Account()
     sequence(5, 1500, first)
     sequence(5, 1500, again)
@@ -54,9 +54,7 @@ def test_a_sequence_is_the_same_again() -> None:
         ((0.0, math.nan), (0.0, 0.0)),
     ],
 )
-def test_a_goal_beyond_its_limits_is_seen(
-    soak: Soak, q: tuple[float, float], current: tuple[float, float]
-) -> None:
+def test_a_goal_beyond_its_limits_is_seen(soak, q, current):
     servos = soak.servos
     servos.torque_on()
     servos.armed = True
@@ -66,7 +64,7 @@ def test_a_goal_beyond_its_limits_is_seen(
     assert servos.torque_off(Reading())
 
 
-def test_torque_after_a_stop_is_seen(soak: Soak) -> None:
+def test_torque_after_a_stop_is_seen(soak):
     holding(soak)
     soak.daemon.loop.command({"command": "stop"})
     soak.daemon.loop._control.torque = True  # as if it had not been heard
@@ -77,7 +75,7 @@ def test_torque_after_a_stop_is_seen(soak: Soak) -> None:
         soak.servos.write(Goal(valid=True))
 
 
-def test_old_readings_and_frames_are_seen(soak: Soak) -> None:
+def test_old_readings_and_frames_are_seen(soak):
     holding(soak)
     soak.sensors[0].last_sent -= 0.2
     with pytest.raises(AssertionError, match="old frame"):
@@ -87,7 +85,7 @@ def test_old_readings_and_frames_are_seen(soak: Soak) -> None:
         soak._judge_ages("holding")
 
 
-def test_a_force_that_nothing_calls_for_is_seen(soak: Soak) -> None:
+def test_a_force_that_nothing_calls_for_is_seen(soak):
     holding(soak)
     t, asked = soak._asked[-1]
     soak._asked[-1] = t, 0.5 * asked
@@ -95,7 +93,7 @@ def test_a_force_that_nothing_calls_for_is_seen(soak: Soak) -> None:
         soak.run(300)
 
 
-def test_a_name_is_judged_by_what_was_made_wrong(soak: Soak) -> None:
+def test_a_name_is_judged_by_what_was_made_wrong(soak):
     holding(soak)
     soak.run(600)
     soak._false.add("left_sensor")

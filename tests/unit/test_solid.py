@@ -15,7 +15,7 @@ from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
 from softfinger.kinematics.estimation.estimator import Readings
 from softfinger.kinematics.sensing.solid_pressure import SolidPressure
-from tests.harness.loop import Make, command, grasped
+from tests.harness.loop import command, grasped
 
 TIPS = [
     Fingertip(0.020, "solid", 0.49, "bonded"),
@@ -31,7 +31,7 @@ every = pytest.mark.parametrize("tip", TIPS, ids=lambda tip: f"{tip.base}-{tip.f
 
 
 @every
-def test_the_partials_are_those_of_one_energy(tip: Fingertip) -> None:
+def test_the_partials_are_those_of_one_energy(tip):
     table = ContactTable.build(tip, RUBBER)
     d, theta = np.meshgrid([0.4e-3, 3e-3, 7.5e-3], [-0.6, -0.1, 0.0, 0.3])
     c, h = table(d, theta), 1e-6
@@ -58,7 +58,7 @@ def test_the_partials_are_those_of_one_energy(tip: Fingertip) -> None:
 
 
 @every
-def test_small_contacts_are_hertzs_and_large_ones_end_where_the_data_do(tip: Fingertip) -> None:
+def test_small_contacts_are_hertzs_and_large_ones_end_where_the_data_do(tip):
     table = ContactTable.build(tip, RUBBER)
     stiffness = 4.0 / 3.0 * 0.304e6 / (1.0 - tip.poisson**2) * math.sqrt(tip.radius)
     # What confines the rubber raises the force with the contact's radius over a, √(d/a).
@@ -76,7 +76,7 @@ def test_small_contacts_are_hertzs_and_large_ones_end_where_the_data_do(tip: Fin
     assert math.isnan(table(math.nan, 0.1).force)
 
 
-def test_the_cells_sum_to_the_force_whatever_the_grid_and_the_azimuth() -> None:
+def test_the_cells_sum_to_the_force_whatever_the_grid_and_the_azimuth():
     tip, d, theta = TIPS[0], 0.005, 0.35
     force = float(ContactTable.build(tip, RUBBER)(d, theta).force)
     shifted = SensorGrid(50, 40, (0.0014, 0.0011), centre=(7e-4, -3e-4))
@@ -98,7 +98,7 @@ def test_the_cells_sum_to_the_force_whatever_the_grid_and_the_azimuth() -> None:
 @pytest.mark.usefixtures("exact_solid_data")
 @every
 @pytest.mark.parametrize("counts", [False, True])
-def test_the_estimate_is_at_its_bound_whatever_the_shear(tip: Fingertip, counts: bool) -> None:
+def test_the_estimate_is_at_its_bound_whatever_the_shear(tip, counts):
     rng = np.random.default_rng(3)
     estimator = ContactEstimator(tip, RUBBER, GRID, NOISE)
     press, table = SolidPressure(tip, RUBBER, GRID.images(tip)), ContactTable.build(tip, RUBBER)
@@ -125,7 +125,7 @@ def test_the_estimate_is_at_its_bound_whatever_the_shear(tip: Fingertip, counts:
     assert 0.7 < np.mean(squares) < 1.4
 
 
-def test_frames_of_other_elements_are_estimated_as_what_they_are() -> None:
+def test_frames_of_other_elements_are_estimated_as_what_they_are():
     rng = np.random.default_rng(6)
     with np.load(Path(__file__).parents[1] / "golden" / "solid_frames.npz") as file:
         known = {name: file[name] for name in file.files}
@@ -156,7 +156,7 @@ def test_frames_of_other_elements_are_estimated_as_what_they_are() -> None:
     assert 0.6 < np.mean(upright) < 1.3
 
 
-def test_noise_at_the_data_s_end_takes_no_estimate_out_of_it() -> None:
+def test_noise_at_the_data_s_end_takes_no_estimate_out_of_it():
     rng = np.random.default_rng(9)
     for tip in TIPS:
         estimator = ContactEstimator(tip, RUBBER, GRID, NOISE)
@@ -169,7 +169,7 @@ def test_noise_at_the_data_s_end_takes_no_estimate_out_of_it() -> None:
                 assert found.d <= 0.008
 
 
-def test_noise_and_shifted_zeros_are_no_contact() -> None:
+def test_noise_and_shifted_zeros_are_no_contact():
     rng = np.random.default_rng(4)
     estimator = ContactEstimator(TIPS[0], RUBBER, GRID, NOISE)
     for _ in range(300):
@@ -180,7 +180,7 @@ def test_noise_and_shifted_zeros_are_no_contact() -> None:
     assert estimator(GRID.pressure(TIPS[0], RUBBER, 0.4e-3) + noise).contact
 
 
-def test_dead_full_and_lone_cells_are_left_out() -> None:
+def test_dead_full_and_lone_cells_are_left_out():
     rng = np.random.default_rng(5)
     active = rng.random(GRID.shape) > 0.1
     active[8, 20] = True
@@ -197,7 +197,7 @@ def test_dead_full_and_lone_cells_are_left_out() -> None:
     assert (np.abs(error) < 4.0 * np.sqrt(np.diag(found.covariance)[:3])).all()
 
 
-def test_another_tips_frame_is_a_misfit() -> None:
+def test_another_tips_frame_is_a_misfit():
     estimator = ContactEstimator(TIPS[0], RUBBER, GRID, NOISE)
     springs = GRID.pressure(Fingertip(0.020), RUBBER, 0.004, 0.2)
     found = estimator(springs)
@@ -205,7 +205,7 @@ def test_another_tips_frame_is_a_misfit() -> None:
     assert found.misfit or not found.valid
 
 
-def test_a_smooth_misfit_widens_what_it_says() -> None:
+def test_a_smooth_misfit_widens_what_it_says():
     rng, squares = np.random.default_rng(8), []
     estimator = ContactEstimator(TIPS[0], RUBBER, GRID, NOISE)
     frame = GRID.pressure(replace(TIPS[0], base="lying"), RUBBER, 0.006, 0.2)
@@ -218,13 +218,12 @@ def test_a_smooth_misfit_widens_what_it_says() -> None:
     assert 0.5 < np.mean(squares) < 2.0
 
 
-def test_a_hand_with_solid_tips_grasps_turns_and_releases(make: Make) -> None:
+def test_a_hand_with_solid_tips_grasps_turns_and_releases(make):
     profile = load(Path("solid")).model_dump(exclude={"loop"})
     daemon = make(**profile)
     grasped(daemon, 10.0)
     daemon.loop.advance(1.0)
     hand, state = daemon.hand, daemon.loop.state
-    assert hand is not None
     for angle in (0.1, -0.1):
         command(daemon, "rotate", angle=angle)
         daemon.loop.advance(3.0)
@@ -247,20 +246,19 @@ def test_a_hand_with_solid_tips_grasps_turns_and_releases(make: Make) -> None:
     assert not any(contact.contact for contact in state.contacts)
 
 
-def test_turning_to_and_fro_leaves_a_solid_tips_force_as_it_was(make: Make) -> None:
+def test_turning_to_and_fro_leaves_a_solid_tips_force_as_it_was(make):
     """Rolling moves d by what the joints don't tell well: it must not be taken for a gain."""
     daemon = make(**load(Path("solid")).model_dump(exclude={"loop"}))
     grasped(daemon, 10.0)
     daemon.loop.advance(1.0)
     hand = daemon.hand
-    assert hand is not None
     for angle in (0.1, -0.1) * 4:
         command(daemon, "rotate", angle=angle)
         daemon.loop.advance(2.0)
         assert float(np.mean(hand.force)) == pytest.approx(10.0, rel=0.04)
 
 
-def test_a_profile_that_no_solid_tip_has_is_refused() -> None:
+def test_a_profile_that_no_solid_tip_has_is_refused():
     from softfinger.daemon.profile.validation import problems
 
     def wrong(**sections: dict[str, object]) -> list[str]:

@@ -51,23 +51,21 @@ TAYLOR_HOOD = [  # d [mm], θ [°], N [N], tolerance
 
 
 @pytest.mark.parametrize(("d", "tilt", "force", "tolerance"), TAYLOR_HOOD)
-def test_forces_of_other_elements(
-    arrays: dict[str, np.ndarray], d: float, tilt: float, force: float, tolerance: float
-) -> None:
+def test_forces_of_other_elements(arrays, d, tilt, force, tolerance):
     tip = SolidTip(arrays, "bonded", 0.49)
     push = tip.press(d * MM, np.radians(tilt))[0]
     assert push * 0.304 * 20**2 == pytest.approx(force, rel=tolerance)
 
 
 @pytest.mark.parametrize("d", [1, 4, 6])
-def test_the_extent_hardly_tells_the_depth(arrays: dict[str, np.ndarray], d: float) -> None:
+def test_the_extent_hardly_tells_the_depth(arrays, d):
     tip = SolidTip(arrays, "bonded", 0.49)
     pressure = tip.press(d * MM, 0.0)[2]
     _, _, sigma = centroid_and_extent(tip.frame(pressure, PITCH, CELLS), PITCH)
     assert sigma == pytest.approx(9.5 * MM, abs=0.1 * MM)
 
 
-def test_frames_of_three_dimensional_elements(arrays: dict[str, np.ndarray]) -> None:
+def test_frames_of_three_dimensional_elements(arrays):
     """tests/harness/solid_reference.py: other meshes, and no fit."""
     with np.load(REFERENCE) as data:
         names = ("base", "nu", "d", "theta", "push", "energy", "force", "frame")
@@ -93,7 +91,7 @@ def test_frames_of_three_dimensional_elements(arrays: dict[str, np.ndarray]) -> 
 THETA, D = np.radians(20.0), 0.25
 
 
-def test_a_linear_press_is_in_balance_and_a_sticking_one_stiffer() -> None:
+def test_a_linear_press_is_in_balance_and_a_sticking_one_stiffer():
     from research.solid_tip.contact import TiltedPlane
     from research.solid_tip.fit import RING_EDGES, Samples
     from research.solid_tip.green import green
@@ -111,7 +109,7 @@ def test_a_linear_press_is_in_balance_and_a_sticking_one_stiffer() -> None:
     assert -0.1 < stuck.shear / stuck.push < -0.05
 
 
-def test_neo_hookean_elements_press_as_the_data_file_says() -> None:
+def test_neo_hookean_elements_press_as_the_data_file_says():
     pytest.importorskip("pypardiso")
     from research.solid_tip.rubber import MIDDLES, Body
 

@@ -92,7 +92,7 @@ def played() -> Iterator[Scene]:
 
 
 @given(st.lists(action, max_size=60))
-def test_nothing_that_arrived_before_a_stop_is_carried_out(actions: list[tuple[str, int]]) -> None:
+def test_nothing_that_arrived_before_a_stop_is_carried_out(actions):
     with played() as scene:
         for what, client in actions:
             scene.act(what, client)
@@ -109,7 +109,7 @@ def test_nothing_that_arrived_before_a_stop_is_carried_out(actions: list[tuple[s
         assert scene.replies[asked:] == [{"ok": True}]
 
 
-def test_a_backlog_that_libzmq_hands_on_bit_by_bit_dies_with_a_stop() -> None:
+def test_a_backlog_that_libzmq_hands_on_bit_by_bit_dies_with_a_stop():
     """Nothing waits at times, and still most of what arrived before is to come."""
     with played() as scene:
         scene.reading = 1e-5

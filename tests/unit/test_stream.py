@@ -40,16 +40,14 @@ def wanted(served: Served, topic: bytes = STATE) -> bool:
     return bool(served.publisher.wanted & bit(topic))
 
 
-def test_frame_age_counts_from_the_sample() -> None:
+def test_frame_age_counts_from_the_sample():
     state = State(t=3.0, contacts=[Contact(seq=4, t=2.96), Contact()])
     message = state_message(state, BOTH)
     assert message["left"]["frame_age_s"] == pytest.approx(0.04)
     assert message["right"]["frame_age_s"] == 0.0
 
 
-def test_tactile_data_is_little_endian_uint16_row_major(
-    context: zmq.Context[Any], addresses: tuple[str, str]
-) -> None:
+def test_tactile_data_is_little_endian_uint16_row_major(context, addresses):
     with Served(addresses[0], queue=10) as served:
         publisher = served.publisher
         socket = subscribe(context, addresses[0], b"hand/tactile")
@@ -65,9 +63,7 @@ def test_tactile_data_is_little_endian_uint16_row_major(
         assert (message["finger"], message["rows"], message["cols"]) == ("right", 3, 4)
 
 
-def test_topics_nobody_subscribes_to_are_not_wanted(
-    context: zmq.Context[Any], addresses: tuple[str, str]
-) -> None:
+def test_topics_nobody_subscribes_to_are_not_wanted(context, addresses):
     with Served(addresses[0], queue=10) as served:
         publisher = served.publisher
         served.settle()
@@ -79,9 +75,7 @@ def test_topics_nobody_subscribes_to_are_not_wanted(
         until(lambda: not wanted(served))
 
 
-def test_what_is_no_subscription_takes_none_from_others(
-    context: zmq.Context[Any], addresses: tuple[str, str]
-) -> None:
+def test_what_is_no_subscription_takes_none_from_others(context, addresses):
     with Served(addresses[0]) as served:
         listener = subscribe(context, addresses[0])
         until(lambda: wanted(served))
@@ -98,9 +92,7 @@ def test_what_is_no_subscription_takes_none_from_others(
         until(lambda: not wanted(served, EVENT))
 
 
-def test_a_stuck_subscriber_holds_up_nobody_and_its_queue_is_bounded(
-    context: zmq.Context[Any], addresses: tuple[str, str]
-) -> None:
+def test_a_stuck_subscriber_holds_up_nobody_and_its_queue_is_bounded(context, addresses):
     with Served(addresses[0], queue=50) as served:
         publisher = served.publisher
         stuck = context.socket(zmq.SUB)
@@ -124,9 +116,7 @@ def test_a_stuck_subscriber_holds_up_nobody_and_its_queue_is_bounded(
         assert kept < 20_000, "the stuck subscriber's queue has no bound"
 
 
-def test_who_comes_late_is_told_settings_and_events_again(
-    context: zmq.Context[Any], addresses: tuple[str, str]
-) -> None:
+def test_who_comes_late_is_told_settings_and_events_again(context, addresses):
     with Served(addresses[0], queue=200) as served:
         publisher = served.publisher
         publisher.settings(98.0, 0.5, HandFacts("0.1.0", "{}", "", "", "{}", "{}"))
@@ -161,9 +151,7 @@ def test_who_comes_late_is_told_settings_and_events_again(
         assert {topic for topic, _ in told} == {b"hand/event"}
 
 
-def test_a_long_message_comes_in_pieces_and_whole(
-    context: zmq.Context[Any], addresses: tuple[str, str]
-) -> None:
+def test_a_long_message_comes_in_pieces_and_whole(context, addresses):
     facts = HandFacts("0.1.0", "x" * 150_000, "", "", "{}", "{}")
     grid = np.arange(256 * 256, dtype=np.uint16).reshape(256, 256)
     sensor = SensorFacts(0.002, 0.003, 0.0, 0.0, 0.0, "count", 4.0, False, "")
@@ -176,9 +164,7 @@ def test_a_long_message_comes_in_pieces_and_whole(
         assert receive(socket, served)[1]["data"] == grid.tobytes()
 
 
-def test_commands_are_told_to_those_who_ask(
-    context: zmq.Context[Any], addresses: tuple[str, str]
-) -> None:
+def test_commands_are_told_to_those_who_ask(context, addresses):
     with Served(addresses[0], queue=10) as served:
         publisher = served.publisher
         publisher.command(99.0, 1.0, 500, {"command": "arm"}, "")  # nobody listens: no count either

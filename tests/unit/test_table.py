@@ -94,7 +94,7 @@ def hard_points(
 
 @pytest.mark.parametrize("tolerance", [1e-3, 1e-6, 1e-9, 1e-12])
 @pytest.mark.parametrize("material", [CONSTANT, TABLE_I], ids=["constant", "table_i"])
-def test_tolerance_holds_over_the_whole_domain(material: Material, tolerance: float) -> None:
+def test_tolerance_holds_over_the_whole_domain(material, tolerance):
     table = ContactTable.build(TIP, material, tolerance)
     d, theta = hard_points(TIP.radius, 4000, np.random.default_rng(99))
     assert worst(table, material, d, theta) <= table.max_error <= tolerance
@@ -103,12 +103,12 @@ def test_tolerance_holds_over_the_whole_domain(material: Material, tolerance: fl
 
 
 @pytest.mark.parametrize("name", HARD)
-def test_tolerance_holds_for_laws_from_points(name: str) -> None:
+def test_tolerance_holds_for_laws_from_points(name):
     test_tolerance_holds_over_the_whole_domain(HARD[name], 1e-9)
 
 
 @pytest.mark.parametrize("form", SLABS)
-def test_no_slab_errs_more_than_its_certificate_says_nor_much_less(form: str) -> None:
+def test_no_slab_errs_more_than_its_certificate_says_nor_much_less(form):
     table, (material, _) = slab(form), SLABS[form]
     assert table.form == form
     certificate = table.certificate
@@ -121,7 +121,7 @@ def test_no_slab_errs_more_than_its_certificate_says_nor_much_less(form: str) ->
     assert at >= (0.5 if error > 1e-13 else 0.0) * error
 
 
-def test_constant_modulus_is_the_closed_form() -> None:
+def test_constant_modulus_is_the_closed_form():
     table = ContactTable.build(TIP, CONSTANT, 4e-15)
     assert table.form == "closed"
     d, theta = hard_points(TIP.radius, 4000, np.random.default_rng(1))
@@ -134,7 +134,7 @@ def test_constant_modulus_is_the_closed_form() -> None:
 
 
 @given(depth=st.floats(5e-8, 0.875), share=st.floats(-1.0, 1.0))
-def test_properties(table: ContactTable, depth: float, share: float) -> None:
+def test_properties(table, depth, share):
     d = depth * TIP.radius
     theta = float(TIP.theta_limit(d)) * share
     c = table(d, theta)
@@ -151,7 +151,7 @@ def test_properties(table: ContactTable, depth: float, share: float) -> None:
 
 @pytest.mark.parametrize("modulus", [1.0, 1e9])
 @pytest.mark.parametrize("radius", [1e-4, 1.0])
-def test_other_radii_and_moduli_scale(table: ContactTable, radius: float, modulus: float) -> None:
+def test_other_radii_and_moduli_scale(table, radius, modulus):
     """From 0.1 mm to 1 m and from 1 Pa to 1 GPa at zero strain."""
     scale, share = radius / TIP.radius, Fraction(modulus) / TABLE_I.coefficients[0]
     other = Material(tuple(value * share for value in TABLE_I.coefficients))
@@ -165,7 +165,7 @@ def test_other_radii_and_moduli_scale(table: ContactTable, radius: float, modulu
         np.testing.assert_allclose(value, ratio * scale**power * expected, rtol=3e-12)
 
 
-def test_the_edges_of_pieces_are_seamless(table: ContactTable) -> None:
+def test_the_edges_of_pieces_are_seamless(table):
     edges = [*(0.125 * 2.0 ** (np.arange(13) / 4)), 0.15625, 0.1875, 0.25, 0.5, 0.75]
     for h in edges:
         d = TIP.radius * (1 - h * (1 + np.array([-1e-12, 0.0, 1e-12])))
@@ -174,7 +174,7 @@ def test_the_edges_of_pieces_are_seamless(table: ContactTable) -> None:
         assert worst(table, TABLE_I, d[keep], theta[keep]) < 1e-9
 
 
-def test_who_asks_outside_the_domain_is_warned(table: ContactTable) -> None:
+def test_who_asks_outside_the_domain_is_warned(table):
     d = np.array([-1e-3, 0.0, math.nan, 0.004, 0.018, 0.0175, 0.004])
     theta = np.array([0.0, 9.0, 0.0, 1.5, 0.0, 0.0, math.nan])
     with pytest.warns(RuntimeWarning, match=r"2 of 7 points .* at d = 4 mm, θ = 85.9°") as caught:
@@ -186,7 +186,7 @@ def test_who_asks_outside_the_domain_is_warned(table: ContactTable) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:.* outside the contact table")
-def test_outside_the_domain_is_clamped_and_flagged(table: ContactTable) -> None:
+def test_outside_the_domain_is_clamped_and_flagged(table):
     limit = float(TIP.theta_limit(0.008))
     edge = table(0.008, limit)
     assert edge.inside
@@ -239,7 +239,7 @@ def test_lookup_never_reads_outside_its_array(form: str) -> None:
         assert all(math.isfinite(value) for value in lookup(inner, one, tilt)[:6])
 
 
-def test_shapes_and_types(table: ContactTable) -> None:
+def test_shapes_and_types(table):
     halves = np.linspace(-1e-3, 8e-3, 9, dtype=np.float32)
     np.testing.assert_array_equal(
         table(halves, np.float32(0.25)).force, table(halves.astype(float), 0.25).force
@@ -249,14 +249,14 @@ def test_shapes_and_types(table: ContactTable) -> None:
 
 
 @pytest.mark.parametrize("wrong", [None, "0.004", True, 0.004 + 0j, [None, 0.1], [True], ["a"]])
-def test_what_is_no_real_number_is_refused(table: ContactTable, wrong: object) -> None:
+def test_what_is_no_real_number_is_refused(table, wrong):
     for pair in ((wrong, 0.1), (0.004, wrong)):
         with pytest.raises(TypeError, match="d and θ must be real numbers"):
             table(*pair)
 
 
 @pytest.mark.filterwarnings("ignore:.* outside the contact table")
-def test_numbers_are_answered_as_arrays_are(forms: list[ContactTable]) -> None:
+def test_numbers_are_answered_as_arrays_are(forms):
     d, theta = hard_points(TIP.radius, 100, np.random.default_rng(11))
     odd = [-1.0, 0.0, 0.02, 0.03, math.inf, math.nan, 0.004, 0.004, 0.004, 1e-9, 0.0174]
     tilts = [0.3, 0.3, 0.0, 0.1, 0.2, 0.1, math.nan, -math.inf, 1.4, -1.57, 0.001]
@@ -270,12 +270,12 @@ def test_numbers_are_answered_as_arrays_are(forms: list[ContactTable]) -> None:
             np.testing.assert_array_equal(one, [v[i] for v in many[:7]] + [many.max_error])
 
 
-def test_a_law_off_its_points_is_warned_of() -> None:
+def test_a_law_off_its_points_is_warned_of():
     with pytest.warns(RuntimeWarning, match=r"makes 11\.0% of F; expected 5% at most"):
         ContactTable.build(Fingertip(0.02), HARD["root"], 1e-6)
 
 
-def test_refusals() -> None:
+def test_refusals():
     with pytest.raises(TableError, match="reaches 1e-17; the best reached"):
         ContactTable.build(TIP, CONSTANT, 1e-17)
     with pytest.raises(TableError, match="the best reached") as error:
@@ -287,7 +287,7 @@ def test_refusals() -> None:
             ContactTable.build(TIP, TABLE_I, tolerance)
 
 
-def test_hands_of_one_process_share_their_table() -> None:
+def test_hands_of_one_process_share_their_table():
     assert make_table(Settings(), TABLE_I) is make_table(Settings(), TABLE_I)
     finer = make_table(Settings.model_validate({"table": {"tolerance": 1e-12}}), TABLE_I)
     assert finer.max_error <= 1e-12 < make_table(Settings(), TABLE_I).max_error

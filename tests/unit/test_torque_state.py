@@ -1,7 +1,6 @@
 """Torque on and off, whatever the servos answer, and who may ask for it."""
 
 import math
-from typing import Any
 
 import msgpack
 import pytest
@@ -12,13 +11,11 @@ from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.types import Reading
 from tests.conftest import until
 from tests.harness.gateway import Served
-from tests.harness.loop import Make, advance_to, command, grasped, heard, refusal, torque_of
+from tests.harness.loop import advance_to, command, grasped, heard, refusal, torque_of
 from tests.harness.safety import bounded
 
 
-def test_a_non_finite_goal_is_a_fault_though_a_command_was_refused_for_it(
-    make: Make,
-) -> None:
+def test_a_non_finite_goal_is_a_fault_though_a_command_was_refused_for_it(make):
     daemon = make()
     command(daemon, "arm")
     daemon.loop.advance(0.1)
@@ -30,7 +27,7 @@ def test_a_non_finite_goal_is_a_fault_though_a_command_was_refused_for_it(
     command(daemon, "clear")
 
 
-def test_joints_are_held_where_they_are_once_torque_is_on(make: Make) -> None:
+def test_joints_are_held_where_they_are_once_torque_is_on(make):
     """Switching it on takes the servos a while, in which a limp joint goes on."""
     daemon = make()
     daemon.loop.advance(daemon.loop.period)
@@ -42,9 +39,7 @@ def test_joints_are_held_where_they_are_once_torque_is_on(make: Make) -> None:
         assert daemon.loop.state.goal.q == pytest.approx(list(daemon.hand.q), abs=2e-3)
 
 
-def test_torque_off_that_is_not_confirmed_is_tried_again_and_then_the_bus_falls_silent(
-    make: Make,
-) -> None:
+def test_torque_off_that_is_not_confirmed_is_tried_again_and_then_the_bus_falls_silent(make):
     """Writes get lost and readings come, which keep the servos' watchdogs from acting."""
     daemon = make()
     events = heard(daemon)
@@ -70,7 +65,7 @@ def test_torque_off_that_is_not_confirmed_is_tried_again_and_then_the_bus_falls_
     assert command(daemon, "stop")["torque_off"] == "confirmed"
 
 
-def test_without_a_watchdog_nothing_is_gained_by_silence(make: Make) -> None:
+def test_without_a_watchdog_nothing_is_gained_by_silence(make):
     daemon = make(servos={"watchdog": 0.0})
     command(daemon, "arm")
     daemon.loop.advance(0.1)
@@ -84,7 +79,7 @@ def test_without_a_watchdog_nothing_is_gained_by_silence(make: Make) -> None:
     assert not torque_of(daemon).any()
 
 
-def test_the_end_tries_to_turn_torque_off_more_than_once(make: Make) -> None:
+def test_the_end_tries_to_turn_torque_off_more_than_once(make):
     daemon = make()
     command(daemon, "arm")
     daemon.loop.advance(0.1)
@@ -99,13 +94,12 @@ class Deaf:
     """Servos that answer, and hear nothing of what is written: so many tries, or until mended."""
 
     def __init__(self, daemon: Daemon, tries: float = math.inf) -> None:
-        assert daemon.loop.torque.servos is not None
         self._servos = daemon.loop.torque.servos
         self._really = self._servos.torque_off
         self._most = tries
         self.tries = 0
-        self._servos.torque_off = self._try  # type: ignore[method-assign]
-        self._servos.write = lambda goal: None  # type: ignore[method-assign]
+        self._servos.torque_off = self._try
+        self._servos.write = lambda goal: None
 
     def _try(self, reading: Reading) -> bool:
         self.tries += 1
@@ -118,17 +112,16 @@ class Deaf:
         self._most = 0
 
 
-def test_arming_that_fails_is_a_fault_with_torque_off(make: Make) -> None:
+def test_arming_that_fails_is_a_fault_with_torque_off(make):
     daemon = make()
     servos = daemon.loop.torque.servos
-    assert servos is not None
     really = servos.torque_on
 
     def failing() -> None:
         really()
         raise ServoError("overload")
 
-    servos.torque_on = failing  # type: ignore[method-assign]
+    servos.torque_on = failing
     command(daemon, "arm")
     daemon.loop.advance(daemon.loop.period)
     assert (daemon.loop.state.mode, daemon.loop.state.fault) == ("fault", "overload")
@@ -136,7 +129,7 @@ def test_arming_that_fails_is_a_fault_with_torque_off(make: Make) -> None:
     assert not torque_of(daemon).any()
 
 
-def test_a_stall_that_trips_the_servos_watchdog_is_a_fault_and_not_an_idle_hand(make: Make) -> None:
+def test_a_stall_that_trips_the_servos_watchdog_is_a_fault_and_not_an_idle_hand(make):
     daemon = grasped(make(), 6.0)
     daemon.clock.sleep_until(daemon.clock.now() + 0.5)  # the process stood still
     advance_to(daemon, "fault", 0.1)
@@ -146,25 +139,22 @@ def test_a_stall_that_trips_the_servos_watchdog_is_a_fault_and_not_an_idle_hand(
     command(daemon, "arm")
     command(daemon, "move", left=-0.1, right=-0.1)
     advance_to(daemon, "armed", 3.0)
-    assert daemon.hand is not None
     assert daemon.hand.q.tolist() == pytest.approx([-0.1, -0.1], abs=0.04)
 
 
-def test_stop_and_disarm_turn_torque_off_whatever_the_state_and_a_stop_say(make: Make) -> None:
+def test_stop_and_disarm_turn_torque_off_whatever_the_state_and_a_stop_say(make):
     daemon = make()
-    assert daemon.loop.torque.servos is not None
     for name, more in (("stop", {}), ("disarm", {}), ("stop", {"client": 5, "why": "smoke"})):
         daemon.loop.torque.servos.torque_on()  # as another program may have done
         assert command(daemon, name, **more)["torque_off"] == "confirmed"
         daemon.loop.advance(daemon.loop.period)
-        assert daemon.hand is not None
         assert not torque_of(daemon).any()
         assert not daemon.loop.state.torque
 
 
 def test_a_stop_by_signal_goes_before_what_waits_and_lets_none_of_it_arm_the_hand(
-    make: Make, context: zmq.Context[Any], addresses: tuple[str, str]
-) -> None:
+    make, context, addresses
+):
     daemon = make()
     with Served(commands=addresses[1]) as served:
         daemon.loop._server = served.server
@@ -193,7 +183,7 @@ def test_a_stop_by_signal_goes_before_what_waits_and_lets_none_of_it_arm_the_han
         assert daemon.loop.state.mode == "armed"
 
 
-def test_arm_waits_until_torque_off_is_confirmed(make: Make) -> None:
+def test_arm_waits_until_torque_off_is_confirmed(make):
     daemon = make()
     command(daemon, "arm")
     daemon.loop.advance(0.1)

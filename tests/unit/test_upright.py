@@ -15,7 +15,7 @@ from tests.harness.plant import CONSTANT, CURRENT, PAPER, WIDTH, make, push_alon
 LENGTHS = (0.05, 0.08, 0.0, 0.02)  # half the pivots' separation, finger, its offset, radius
 START = math.radians(5.0)
 DEPTH, FORCE = 0.0032, 10.0  # where the paper's tip has this force
-spring_of = upright_spring.py_func  # type: ignore[attr-defined]
+spring_of = upright_spring.py_func
 
 
 def resting_ratio(spring: float) -> float:
@@ -46,7 +46,7 @@ def at_rest(spring: float) -> SimulatedHand:
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5, 1.0, 4.0])
-def test_stuck_tips_leave_the_object_where_the_closed_form_says(share: float) -> None:
+def test_stuck_tips_leave_the_object_where_the_closed_form_says(share):
     q = math.asin((LENGTHS[0] - LENGTHS[3] + DEPTH - 0.5 * WIDTH) / LENGTHS[1])
     spring = share * spring_of(q, DEPTH, FORCE, 2.0 / 3.0, LENGTHS)
     hand = at_rest(spring)
@@ -69,9 +69,7 @@ def test_stuck_tips_leave_the_object_where_the_closed_form_says(share: float) ->
     ],
     ids=["as assumed", "slippery, heavy, soft", "rough, light, hard", "relaxing"],
 )
-def test_the_upright_law_needs_no_angle(
-    sense: float, angle_known: bool, simulation: dict[str, float]
-) -> None:
+def test_the_upright_law_needs_no_angle(sense, angle_known, simulation):
     sections = {
         "control": {"law": "upright"},
         "scene": {"object_model": angle_known},
@@ -115,7 +113,7 @@ def test_ticks_that_come_late_do_not_make_the_dither_slow() -> None:
         assert abs(math.degrees(hand.plant.object_pose[2])) < 0.3
 
 
-def test_a_raised_grip_that_comes_back_does_not_hold_the_dither_at_one_side() -> None:
+def test_a_raised_grip_that_comes_back_does_not_hold_the_dither_at_one_side():
     with Watched({"control": {"law": "upright"}}) as hand:
         hand.grasp(FORCE)
         hand.run(4.5)
@@ -131,7 +129,7 @@ def test_a_raised_grip_that_comes_back_does_not_hold_the_dither_at_one_side() ->
         assert turned < math.radians(10.0), math.degrees(turned)
 
 
-def test_a_small_hand_brings_its_object_upright() -> None:
+def test_a_small_hand_brings_its_object_upright():
     sections = load(Path("small")).model_dump(exclude_unset=True)
     sections["control"]["law"] = "upright"
     sections["simulation"]["object_angle"] = START
