@@ -13,6 +13,7 @@ import select
 import signal
 import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from dataclasses import replace
 from multiprocessing import resource_tracker
 from pathlib import Path
@@ -123,15 +124,14 @@ def profile(tmp_path: Path, addresses: tuple[str, str]) -> Profile:
 @pytest.fixture
 def start() -> Iterator[Start]:
     """Starts daemons that are killed when the test ends before them."""
-    started: list[Running] = []
 
     def run(*words: str) -> Running:
-        started.append(Running(*words))
-        return started[-1]
+        running = Running(*words)
+        stack.callback(running.kill)
+        return running
 
-    yield run
-    for each in started:
-        each.kill()
+    with ExitStack() as stack:
+        yield run
 
 
 class Told(NamedTuple):
@@ -180,19 +180,16 @@ def until(condition: Callable[[], object], seconds: float = 150.0) -> None:
 @pytest.fixture
 def make() -> Iterator[Make]:
     """Daemons on virtual time without sockets; sections are given as keyword arguments."""
-    daemons = []
 
     def build(**sections: Any) -> Daemon:
         loop = {"clock": "virtual"} | sections.pop("loop", {})
         settings = Settings.model_validate({"loop": loop, **sections})
-        daemon = Daemon(settings, wire=False)
-        daemons.append(daemon)
+        daemon = stack.enter_context(Daemon(settings, wire=False))
         daemon.loop.advance(0.3)
         return daemon
 
-    yield build
-    for daemon in daemons:
-        daemon.close()
+    with ExitStack() as stack:
+        yield build
 
 
 @pytest.fixture

@@ -1,13 +1,13 @@
 """What several of these tests share: buses, backends on them, a daemon, and a made-up one."""
 
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import pytest
 
 from softfinger.daemon.servos.dynamixel import DynamixelServos
-from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 from tests.conftest import own_addresses
 from tests.harness.daemon_process import Running, ask
 from tests.harness.fake_daemon import FakeDaemon
@@ -20,15 +20,8 @@ Connect = Callable[..., DynamixelServos]
 @pytest.fixture
 def running() -> Iterator[Run]:
     """Starts buses that end with the test: a given one, or the settings' servos."""
-    buses: list[RunningBus] = []
-
-    def start(bus: ServoBus | None = None, **options: Any) -> RunningBus:
-        buses.append(RunningBus(bus, **options))
-        return buses[-1]
-
-    yield start
-    for each in buses:
-        each.close()
+    with ExitStack() as stack:
+        yield lambda *bus, **options: stack.enter_context(closing(RunningBus(*bus, **options)))
 
 
 @pytest.fixture
@@ -40,15 +33,8 @@ def bus(running: Run) -> RunningBus:
 @pytest.fixture
 def connect(running: Run) -> Iterator[Connect]:
     """Connects backends, which close before their buses end."""
-    made: list[DynamixelServos] = []
-
-    def start(bus: RunningBus, **servos: Any) -> DynamixelServos:
-        made.append(connected(bus, **servos))
-        return made[-1]
-
-    yield start
-    for each in made:
-        each.close()
+    with ExitStack() as stack:
+        yield lambda bus, **servos: stack.enter_context(closing(connected(bus, **servos)))
 
 
 @pytest.fixture

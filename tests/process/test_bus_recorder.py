@@ -10,30 +10,18 @@ from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.control_table import by_name
 from softfinger.daemon.simulation.servo_model import framing
 from softfinger.daemon.simulation.servo_model.framing import BROADCAST, frame
-from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 from tests.harness.emulated import emulated, send
-from tests.harness.free_joints import FreeJoints
-from tests.harness.servos import RADIAN
+from tests.harness.servos import RADIAN, BusClient, hand_bus
 
 UNIT = by_name("XM430-W350").current_unit
 
 
-class Hand:
+class Hand(BusClient):
     """The settings' servos: left closes with rising counts, right with falling ones."""
 
     def __init__(self) -> None:
+        super().__init__(hand_bus(10.0))
         self.t = 10.0
-        self.plant = FreeJoints(2, self.t)
-        self.bus = ServoBus.from_settings(Settings(), self.plant, t=self.t)
-
-    def later(self, seconds: float) -> None:
-        self.t += seconds
-        self.bus.advance(self.t)
-
-    def write(self, servo: int, address: int, form: str, *values: int) -> int:
-        """The error of the reply."""
-        data = struct.pack("<H" + form, address, *values)
-        return self.bus.feed(frame(servo, framing.WRITE, data), self.t)[8]
 
     def report(self, servo: int) -> dict:
         return next(each for each in self.bus.report(self.t) if each["id"] == servo)
@@ -44,18 +32,18 @@ def test_extremes_of_goals_refused_ones_too():
     assert hand.report(1)["goal_q"] is None
     assert hand.report(1)["goal_current"] is None
     for current, counts in ((100, 2048), (50, 2148), (70, 1998)):
-        assert hand.write(1, reg.GOAL_CURRENT, "h", current) == 0
-        assert hand.write(1, reg.GOAL_POSITION, "i", counts) == 0
+        assert hand.write(reg.GOAL_CURRENT, current, 2) == 0
+        assert hand.write(reg.GOAL_POSITION, counts, 4) == 0
     left = hand.report(1)
     assert left["goal_current"] == pytest.approx([50 * UNIT, 100 * UNIT])
     assert left["goal_q"] == pytest.approx([-50 * RADIAN, 100 * RADIAN])
     assert left["goals_refused"] == 0
     assert hand.report(2)["goal_q"] is None
     # Beyond the model's range, beyond the configured limit, and with torque stopped.
-    assert hand.write(1, reg.GOAL_CURRENT, "h", 5000) == framing.DATA_RANGE
+    assert hand.write(reg.GOAL_CURRENT, 5000, 2) == framing.DATA_RANGE
     assert hand.report(1)["goal_current"][1] == pytest.approx(5000 * UNIT)
-    hand.write(1, reg.CURRENT_LIMIT, "H", 200)
-    assert hand.write(1, reg.GOAL_CURRENT, "h", -300) == framing.DATA_LIMIT
+    hand.write(reg.CURRENT_LIMIT, 200, 2)
+    assert hand.write(reg.GOAL_CURRENT, -300, 2) == framing.DATA_LIMIT
     assert hand.report(1)["goal_current"][0] == pytest.approx(-300 * UNIT)
     assert hand.report(1)["goals_refused"] == 2
     hand.bus.forget(hand.t)
@@ -67,7 +55,10 @@ def test_goals_through_group_writes_and_indirect_addresses():
     hand = Hand()
     places = (reg.GOAL_CURRENT, reg.GOAL_CURRENT + 1, *range(116, 120))
     for servo in (1, 2):
-        assert hand.write(servo, reg.INDIRECT_ADDRESS, "6H", *places) == 0
+        assert (
+            hand.ask(framing.WRITE, struct.pack("<7H", reg.INDIRECT_ADDRESS, *places), servo)[0]
+            == 0
+        )
     goal = struct.pack("<hi", 10, 2048 + 40)
     data = struct.pack("<HHB", 224, 6, 1) + goal + b"\x02" + goal
     hand.bus.feed(frame(BROADCAST, framing.SYNC_WRITE, data), hand.t)
@@ -78,20 +69,20 @@ def test_goals_through_group_writes_and_indirect_addresses():
 
 def test_torque_on_far_from_the_goal():
     hand = Hand()
-    hand.write(1, reg.GOAL_POSITION, "i", 2048 + 10)
-    hand.write(1, reg.GOAL_CURRENT, "h", 20)
+    hand.write(reg.GOAL_POSITION, 2048 + 10, 4)
+    hand.write(reg.GOAL_CURRENT, 20, 2)
     assert hand.report(1)["goal_q"] is None, "the angle that a limp joint has is no way to go"
-    hand.write(1, reg.TORQUE_ENABLE, "B", 1)
-    hand.write(1, reg.TORQUE_ENABLE, "B", 1)  # it was on
+    hand.write(reg.TORQUE_ENABLE, 1, 1)
+    hand.write(reg.TORQUE_ENABLE, 1, 1)  # it was on
     on = hand.report(1)["torque_on"]
     assert hand.report(1)["torque"]
     assert (on["count"], on["far"], on["t"]) == (1, 0, hand.t)
     assert on["farthest"] == pytest.approx(10 * RADIAN)
-    hand.write(1, reg.GOAL_POSITION, "i", 2048 + 10)
+    hand.write(reg.GOAL_POSITION, 2048 + 10, 4)
     assert hand.report(1)["goal_q"] == pytest.approx([10 * RADIAN] * 2)
-    hand.write(1, reg.TORQUE_ENABLE, "B", 0)
-    hand.write(1, reg.GOAL_POSITION, "i", 2048 + 500)
-    hand.write(1, reg.TORQUE_ENABLE, "B", 1)
+    hand.write(reg.TORQUE_ENABLE, 0, 1)
+    hand.write(reg.GOAL_POSITION, 2048 + 500, 4)
+    hand.write(reg.TORQUE_ENABLE, 1, 1)
     on = hand.report(1)["torque_on"]
     assert (on["count"], on["far"]) == (2, 1)
     assert on["farthest"] == pytest.approx(500 * RADIAN, rel=0.1)
@@ -103,8 +94,8 @@ def test_silence_and_the_watchdog():
     hand.later(3.0)
     assert hand.report(1)["quiet"] is None
     assert hand.report(1)["longest_quiet"] == 0.0
-    hand.write(1, reg.TORQUE_ENABLE, "B", 1)
-    hand.write(1, reg.BUS_WATCHDOG, "B", 5)
+    hand.write(reg.TORQUE_ENABLE, 1, 1)
+    hand.write(reg.BUS_WATCHDOG, 5, 1)
     hand.later(0.04)
     hand.bus.feed(frame(2, framing.PING), hand.t)
     hand.later(0.03)

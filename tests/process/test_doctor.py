@@ -7,6 +7,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -69,15 +70,9 @@ class Hand:
 
 @pytest.fixture
 def hands(tmp_path: Path) -> Iterator[Callable[..., Hand]]:
-    made: list[Hand] = []
-
-    def start(**options: Any) -> Hand:
-        made.append(Hand(tmp_path, **options))
-        return made[-1]
-
-    yield start
-    for each in made:
-        each.close()
+    with contextlib.ExitStack() as stack:
+        made = partial(Hand, tmp_path)
+        yield lambda **options: stack.enter_context(contextlib.closing(made(**options)))
 
 
 @pytest.fixture(autouse=True)

@@ -5,6 +5,7 @@ The same tests run over both; a backend that joins them is added to ``RIGS``.
 
 import math
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
 from typing import Any, Protocol
 
 import pytest
@@ -94,16 +95,14 @@ def make(
     request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[Callable[..., Rig]]:
     """Makes rigs of one backend, which end with the test."""
-    made: list[Rig] = []
 
     def start(mode: str = MODES[0], **sections: Any) -> Rig:
         servos = {"mode": mode, "watchdog": 0.5, **sections.pop("servos", {})}
-        made.append(RIGS[request.param](monkeypatch, servos=servos, **sections))
-        return made[-1]
+        rig = RIGS[request.param](monkeypatch, servos=servos, **sections)
+        return stack.enter_context(closing(rig))
 
-    yield start
-    for each in made:
-        each.close()
+    with ExitStack() as stack:
+        yield start
 
 
 def ticks(rig: Rig, goal: Goal, seconds: float) -> list[Reading]:
