@@ -12,11 +12,7 @@ from softfinger.daemon.errors import SoftfingerError
 _EXTRAS = {  # what the message says, and the modules
     "plot": ("pictures need matplotlib", ("matplotlib",)),
     "record": ("recordings need mcap, orjson and zstandard", ("mcap", "orjson", "zstandard")),
-    "view": (
-        "the page needs starlette, uvicorn, websockets and orjson",
-        ("starlette", "uvicorn", "websockets", "orjson"),
-    ),
-    "foxglove": ("Foxglove's server needs foxglove-sdk and orjson", ("foxglove", "orjson")),
+    "view": ("the page needs websockets and orjson", ("websockets", "orjson")),
     "cluster": ("a cluster's workers need dask and distributed", ("distributed",)),
     "gym": ("the environments need gymnasium", ("gymnasium",)),
 }

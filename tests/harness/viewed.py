@@ -58,18 +58,10 @@ class Watcher:
         """The next picture."""
         self.socket.send("")
         while True:
-            message = json.loads(self.socket.recv(timeout=WAIT))
-            if "columns" in message:
-                return dict(message)
+            message: dict[str, Any] = json.loads(self.socket.recv(timeout=WAIT))
+            if "palette" not in message:
+                return message
             self.scene = message
-
-    def lines(self, picture: dict[str, Any]) -> dict[str, list[Any]]:
-        """The newest column by plot's title and line's name: value, and its deviation if any."""
-        return {
-            f"{plot['title']} {line['name']}": [picture["columns"][-1][k] for k in line["columns"]]
-            for plot in self.scene["plots"]
-            for line in plot["lines"]
-        }
 
     def __enter__(self) -> Self:
         self.socket = self._connection.__enter__()

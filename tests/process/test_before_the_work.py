@@ -14,8 +14,7 @@ from tests.process.test_record import written
     [
         ("matplotlib", "plot run.mcap", "pip install 'softfinger[plot]'"),
         ("mcap", "record new.mcap", "pip install 'softfinger[record]'"),
-        ("starlette", "view", "pip install 'softfinger[view]'"),
-        ("foxglove", "view --foxglove", "pip install 'softfinger[foxglove]'"),
+        ("websockets", "view", "pip install 'softfinger[view]'"),
         ("numba", "replay --recompute run.mcap", "no hand/settings in it"),
         ("numba", "analyse run.mcap", "no hand/settings in it"),
         ("numba", "plot none.mcap", "none.mcap: No such file"),

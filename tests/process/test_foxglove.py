@@ -1,22 +1,28 @@
-"""``softfinger view --foxglove``: what a client of Foxglove's protocol reads from it."""
+"""``softfinger view --foxglove``: what a client reads from it, and who may be one."""
 
+import base64
 import json
+import socket
 import struct
-import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 import msgpack
 import numpy as np
-import psutil
 import pytest
+from websockets import Subprotocol
+from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from softfinger.daemon.client.stream import read
+from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.wire import schema
 from softfinger.tools import cli
-from softfinger.tools.viewing.known import ShownHand
-from softfinger.tools.viewing.planar import SPRINGS, hand_parts
+from softfinger.tools.viewing.foxglove_server import CLIENTS, PROTOCOLS
+from softfinger.tools.viewing.planar import hand_parts
+from tests.conftest import until
 from tests.harness.daemon_process import started
 from tests.harness.fake_daemon import FakeDaemon, event, frame, state
 
@@ -32,92 +38,80 @@ TOPICS = {
 WAIT = 60.0  # s for one message
 
 
-def fields(message: bytes) -> dict[int, list[Any]]:
-    """A protobuf message's fields by their numbers: integers, doubles, or bytes."""
-    found: dict[int, list[Any]] = {}
-    place = 0
-
-    def varint() -> int:
-        nonlocal place
-        value = shift = 0
-        while True:
-            byte = message[place]
-            place += 1
-            value |= (byte & 0x7F) << shift
-            shift += 7
-            if byte < 0x80:
-                return value
-
-    while place < len(message):
-        key = varint()
-        if key & 7 == 0:
-            found.setdefault(key >> 3, []).append(varint())
-            continue
-        size = {1: 8, 5: 4}.get(key & 7) or varint()
-        part = message[place : place + size]
-        place += size
-        code = {1: "<d", 5: "<I"}.get(key & 7)
-        found.setdefault(key >> 3, []).append(struct.unpack(code, part)[0] if code else part)
-    return found
-
-
 class Client:
     """Subscribes to channels; ``next`` is a channel's next message, with its log time [s]."""
 
     def __init__(self, socket: ClientConnection) -> None:
         self.socket = socket
-        self.channels: dict[str, dict[str, Any]] = {}
-        while len(self.channels) < len(TOPICS):
-            message = json.loads(self.socket.recv(timeout=WAIT))
-            for channel in message.get("channels", ()):
-                self.channels[channel["topic"]] = channel
-        self._topics = {channel["id"]: topic for topic, channel in self.channels.items()}
+        welcome, advertised = (json.loads(socket.recv(timeout=WAIT)) for _ in range(2))
+        assert (welcome["op"], advertised["op"]) == ("serverInfo", "advertise")
+        self.channels = {channel["topic"]: channel for channel in advertised["channels"]}
+        self._topics = {channel["id"] + 70: topic for topic, channel in self.channels.items()}
 
     def subscribe(self, *topics: str) -> None:
         numbers = [self.channels[topic]["id"] for topic in topics]
-        wanted = [{"id": number, "channelId": number} for number in numbers]
+        wanted = [{"id": number + 70, "channelId": number} for number in numbers]
         self.socket.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
 
-    def next(self, topic: str) -> tuple[float, bytes]:
+    def unsubscribe(self, topic: str) -> None:
+        ended = [self.channels[topic]["id"] + 70]
+        self.socket.send(json.dumps({"op": "unsubscribe", "subscriptionIds": ended}))
+
+    def next(self, topic: str = "") -> tuple[str, float, dict[str, Any]]:
+        """The next message, of this topic if one is named: its topic, log time [s] and content."""
         while True:
             message = self.socket.recv(timeout=WAIT)
-            if isinstance(message, bytes) and message[0] == 1:
-                number, stamp = struct.unpack_from("<IQ", message, 1)
-                if self._topics[number] == topic:
-                    return 1e-9 * stamp, message[13:]
+            assert isinstance(message, bytes)
+            kind, number, stamp = struct.unpack_from("<BIQ", message)
+            assert kind == 1
+            if self._topics[number] == topic or not topic:
+                return self._topics[number], 1e-9 * stamp, json.loads(message[13:])
+
+
+@contextmanager
+def served(fake: FakeDaemon) -> Iterator[tuple[str, Path]]:
+    """Foxglove's server of that stream: its address, and the layout."""
+    process = started("view", "--foxglove", "0", "--address", fake.state_address, stderr=None)
+    try:
+        line = process.stdout.readline()
+        yield line.split()[1], Path(line.split("layout: ")[1].strip())
+    finally:
+        process.terminate()
+        process.communicate(timeout=300)
+    assert process.returncode == 0
+
+
+def connected(address: str, **more: Any) -> ClientConnection:
+    waits: Any = {"open_timeout": WAIT, "ping_timeout": None, "proxy": None}
+    return connect(address, subprotocols=[Subprotocol("foxglove.sdk.v1")], **waits, **more)
 
 
 def test_a_client_reads_every_channel_of_the_running_hand() -> None:
-    with FakeDaemon() as fake:
-        words = ["view", "--foxglove", "0", "--address", fake.state_address]
-        process = started(*words, stderr=None)
-        try:
-            line = process.stdout.readline()
-            address, layout = line.split()[1], Path(line.split("layout: ")[1].strip())
-            assert used_topics(json.loads(layout.read_text())) <= set(TOPICS)
-            listening = psutil.Process(process.pid).net_connections()
-            hosts = [each.laddr.ip for each in listening if each.status == "LISTEN"]
-            assert "127.0.0.1" in hosts
-            assert all(host.startswith("127.") for host in hosts)
-            fake.changes = {"goal_force": float("nan")}
-            waits: Any = {"open_timeout": WAIT, "ping_timeout": None}
-            with connect(address, subprotocols=["foxglove.sdk.v1"], proxy=None, **waits) as socket:
-                client = Client(socket)
-                client.subscribe(*(topic for topic in TOPICS if topic != "hand/event"))
-                check_numbers(client)
-                check_pictures(client)
-                check_scene(client)
-                early = event(1, "start", "before anybody looked", "warning")
-                fake.send(schema.EVENT, msgpack.packb(early))
-                sent, newer = time.time(), 0
-                while newer < 2:  # the second of these was published after it, so taken after it
-                    newer += client.next("hand/state")[0] > sent
-                client.subscribe("hand/event")
-                check_events(client, early)
-        finally:
-            process.terminate()
-            process.communicate(timeout=300)
-    assert process.returncode == 0
+    with FakeDaemon() as fake, served(fake) as (address, layout):
+        assert used_topics(json.loads(layout.read_text())) <= set(TOPICS)
+        fake.changes = {"goal_force": float("nan")}
+        with connected(address) as line:
+            assert line.subprotocol == PROTOCOLS[0]
+            client = Client(line)
+            client.subscribe(*(topic for topic in TOPICS if topic != "hand/event"))
+            check_numbers(client)
+            check_pictures(client)
+            check_scene(client)
+            early = event(1, "start", "before anybody looked", "warning")
+            fake.send(schema.EVENT, msgpack.packb(early))
+            published = fake.published
+            until(lambda: client.next("hand/state")[2]["seq"] > 5 * published + 100)
+            client.subscribe("hand/event")
+            check_events(client, early)
+            client.unsubscribe("hand/state")
+            client.subscribe("hand/event")  # which is answered once that is carried out
+            client.next("hand/event")
+            rest = {client.next()[0] for _ in range(30)}
+            assert rest == {
+                "hand/scene",
+                "hand/tactile/left",
+                "hand/tactile/right",
+            }
 
 
 def used_topics(layout: Any) -> set[str]:
@@ -135,8 +129,7 @@ def check_numbers(client: Client) -> None:
     channel = client.channels["hand/state"]
     described = json.loads(channel["schema"])["properties"]
     assert (channel["encoding"], channel["schemaEncoding"]) == ("json", "jsonschema")
-    stamp, payload = client.next("hand/state")
-    message = json.loads(payload)
+    _, stamp, message = client.next("hand/state")
     expected = state(0.0, 0)
     assert message.keys() == expected.keys() == described.keys()
     assert message["left"].keys() == expected["left"].keys()
@@ -147,39 +140,124 @@ def check_numbers(client: Client) -> None:
 
 def check_pictures(client: Client) -> None:
     for side, finger in enumerate(("left", "right")):
-        stamp, payload = client.next(f"hand/tactile/{finger}")
-        image = fields(payload)
-        (width,), (height,), (encoding,), (step,), (data,) = (image[k] for k in (2, 3, 4, 5, 6))
-        assert (width, height, encoding, step) == (44, 44, b"mono16", 88)
-        seconds = fields(image[1][0])
-        assert seconds[1][0] + 1e-9 * seconds[2][0] == pytest.approx(stamp, abs=1e-6)
-        counts = np.frombuffer(data, "<u2")
+        _, stamp, image = client.next(f"hand/tactile/{finger}")
+        described = json.loads(client.channels[f"hand/tactile/{finger}"]["schema"])["properties"]
+        assert described["data"]["contentEncoding"] == "base64"
+        assert (image["width"], image["height"], image["step"]) == (44, 44, 88)
+        assert image["encoding"] == "mono16"
+        when = image["timestamp"]["sec"] + 1e-9 * image["timestamp"]["nsec"]
+        assert when == pytest.approx(stamp, abs=1e-6)
+        counts = np.frombuffer(base64.b64decode(image["data"]), "<u2")
         like = np.frombuffer(frame(0.0, side)["data"], "<u2")
         assert int(counts.max()) == pytest.approx(int(like.max()), rel=0.3)
 
 
 def check_scene(client: Client) -> None:
-    _, payload = client.next("hand/scene")
-    entities = [fields(each) for each in fields(payload)[2]]
-    named = {each[3][0].decode(): each for each in entities}
+    _, _, scene = client.next("hand/scene")
+    named = {entity["id"]: entity for entity in scene["entities"]}
     assert list(named) == ["palm", "left", "right", "object", "simulated"]
     for finger in ("left", "right"):
-        assert len(named[finger][11]) == 5 + SPRINGS  # link, base, skin, springs, face, normal
-        (label,) = (fields(text)[6][0].decode() for text in named[finger][13])
+        assert len(named[finger]["lines"]) == 5  # link, base, skin, face, force
+        (label,) = (text["text"] for text in named[finger]["texts"])
         assert 8.0 <= float(label.removesuffix(" N")) <= 12.0
-        (arrow,) = map(fields, named[finger][7])
-        assert 0.0 < arrow[2][0] < 0.045
-    (outline,) = map(fields, named["object"][11])
-    points = np.array([[fields(each).get(k, [0.0])[0] for k in (1, 2)] for each in outline[5]])
-    expected = hand_parts(ShownHand(), read(schema.HandState, state(0.0, 0)))["object"]
-    assert points == pytest.approx(expected.strips[0].points, abs=6e-3)  # it turns by 5° at most
+    (outline,) = named["object"]["lines"]
+    points = np.array([[each["x"], each["y"]] for each in outline["points"]])
+    (expected,) = hand_parts(Settings(), read(schema.HandState, state(0.0, 0)))["object"].lines
+    assert points == pytest.approx(expected[2], abs=6e-3)  # it turns by 5° at most
 
 
 def check_events(client: Client, early: dict[str, Any]) -> None:
-    _, payload = client.next("hand/event")
-    line = fields(payload)
-    assert (line[2], line[3], line[4]) == ([3], [early["text"].encode()], [b"start"])
-    assert fields(line[1][0])[1] == [int(early["timestamp"])]
+    _, _, line = client.next("hand/event")
+    assert (line["level"], line["message"], line["name"]) == (3, early["text"], "start")
+    assert line["timestamp"]["sec"] == int(early["timestamp"])
+
+
+@pytest.fixture(scope="module")
+def stranger() -> Iterator[tuple[FakeDaemon, str]]:
+    """A made-up daemon whose states fill a buffer soon, and where its server is."""
+    with FakeDaemon() as fake, served(fake) as (address, _):
+        fake.changes = {"fault": "x" * 30_000}
+        yield fake, address
+
+
+@pytest.mark.parametrize(
+    "fields", [{"origin": "https://app.foxglove.dev"}, {"origin": "file://"}, {}]
+)
+def test_this_machine_and_foxglove_are_let_in(stranger, fields):
+    with connected(stranger[1], **fields) as line:
+        assert Client(line).channels.keys() == TOPICS.keys()
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"origin": "https://evil.example"},
+        {"origin": "null"},
+        {"origin": "file://", "additional_headers": {"Origin": "https://evil.example"}},
+        {"additional_headers": {"Host": "rebound.example"}},
+    ],
+)
+def test_no_other_page_is_let_in(stranger, fields):
+    with pytest.raises(InvalidStatus, match="403"):
+        connected(stranger[1], **fields)
+
+
+def test_a_client_that_takes_nothing_makes_room_for_another(stranger):
+    _, address = stranger
+    with ExitStack() as stack:
+        lazy = []
+        for _ in range(CLIENTS):
+            client = stack.enter_context(socket.create_connection(local(address), timeout=WAIT))
+            client.sendall(REQUEST)
+            answer = b""
+            while b'"advertise"' not in answer:
+                answer += client.recv(65536)
+            lazy.append(client)
+        with connected(address) as late, pytest.raises(ConnectionClosed):
+            late.recv(timeout=WAIT)
+        for client in lazy:
+            for channel in range(len(TOPICS)):
+                client.sendall(masked({"subscriptions": [{"id": 1, "channelId": channel}]}))
+        until(lambda: welcomed(address))
+
+
+def test_what_asks_for_nothing_or_what_isnt_is_ended(stranger):
+    _, address = stranger
+    with socket.create_connection(local(address), timeout=WAIT) as client:
+        client.sendall(b"GET / HTTP/1.1\r\n")  # its head has no end
+        assert client.recv(100) == b""
+    for odd in (b"{", b"[]", b'{"subscriptions": [{"id": 1, "channelId": 99}]}', b'{"op": 3}x'):
+        with connected(address) as line:
+            Client(line)
+            line.send(odd.decode())
+            with pytest.raises(ConnectionClosed):
+                line.recv(timeout=WAIT)
+
+
+REQUEST = (
+    b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+    b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: MDEyMzQ1Njc4OWFiY2RlZg==\r\n\r\n"
+)
+
+
+def masked(message: dict[str, Any]) -> bytes:
+    """A client's text frame, masked by zeros."""
+    text = json.dumps(message).encode()
+    assert len(text) < 126
+    return bytes([0x81, 0x80 | len(text), 0, 0, 0, 0]) + text
+
+
+def local(address: str) -> tuple[str, int]:
+    host, _, port = address.removeprefix("ws://").partition(":")
+    return host, int(port)
+
+
+def welcomed(address: str) -> bool:
+    with connected(address) as line:
+        try:
+            return b"serverInfo" in str(line.recv(timeout=WAIT)).encode()
+        except ConnectionClosed:
+            return False
 
 
 def test_foxglove_is_for_the_stream_alone(capsys):

@@ -1,5 +1,6 @@
 """``softfinger view``: its pictures are the stream's, and who may have them; what can go wrong."""
 
+import argparse
 import base64
 import http.client
 import math
@@ -18,18 +19,20 @@ import psutil
 import pytest
 import zmq
 from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
 
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.publisher import pack
 from softfinger.tools.ending import Ending
 from softfinger.tools.recordings.reader import Recording
-from softfinger.tools.viewing.live_stream import TOPICS, ViewError, live_stream
-from softfinger.tools.viewing.page import Playback, listen
-from softfinger.tools.viewing.pictures import Pictures
+from softfinger.tools.viewing.page import listen
+from softfinger.tools.viewing.pictures import TOPICS, Pictures
+from softfinger.tools.viewing.planar import COLOURS
+from softfinger.tools.viewing.sources import Playback, ViewError, follow
 from tests.conftest import until
 from tests.harness.fake_daemon import FakeDaemon, event, finger, frame, state
 from tests.harness.recorded_hand import record_hand
-from tests.harness.viewed import Viewed, Watcher
+from tests.harness.viewed import WAIT, Viewed, Watcher
 
 GRASP = {
     30: {"command": "arm"},
@@ -66,15 +69,25 @@ def view(fake: FakeDaemon, *words: str) -> Viewed:
     return Viewed(*where, *words)
 
 
-def got(
-    host: str, path: str, method: str = "GET", body: Any = None, **headers: str
-) -> tuple[int, str]:
+def got(host: str, path: str, **headers: str) -> tuple[int, str]:
     connection = http.client.HTTPConnection(host, timeout=60)
-    connection.request(method, path, body and orjson.dumps(body), headers)
+    connection.request("GET", path, headers=headers)
     answer = connection.getresponse()
     body = answer.read().decode()
     connection.close()
     return answer.status, body
+
+
+def ask(host: str, query: str, asked: Any, **more: Any) -> str:
+    """Send a command, or what is none, as a page does; its answer."""
+    with connect(f"ws://{host}/command{query}", proxy=None, open_timeout=WAIT, **more) as line:
+        line.send(orjson.dumps(asked).decode())
+        return str(line.recv(timeout=WAIT))
+
+
+def told(picture: dict[str, Any], panel: str) -> list[list[Any]]:
+    """A panel's texts: colour, place, words."""
+    return list(picture["panels"][panel]["texts"])
 
 
 # What is shown
@@ -86,24 +99,28 @@ def test_a_picture_has_the_streams_values() -> None:
         fake.changes = {"left": left, "schema": 2, "news": 1.5, **GOALS}
         with view(fake) as viewed, Watcher(viewed.host) as page:
             pictures = [page.next() for _ in range(5)]
-            told = event(7, "slip", "the object slips", "warning")
-            fake.send(schema.EVENT, msgpack.packb(told))
+            slip = event(7, "slip", "the object slips", "warning")
+            fake.send(schema.EVENT, msgpack.packb(slip))
             until(lambda: page.next()["events"])
             picture = page.next()
             said = viewed.end()
     seqs = [each["seq"] for each in pictures]
     assert seqs == sorted(set(seqs))
-    shown = page.lines(picture)
-    assert shown["Force [N] left"] == [7.5, 0.05]
-    assert shown["Force [N] goal"] == [9.0]
-    assert shown["Displacement d [mm] right"] == pytest.approx([3.31, 0.02])
-    assert shown["Tilt θ [°] left"][1] == pytest.approx(0.1)
-    assert shown["Object's angle [°] object"] == pytest.approx([4.98])
-    assert shown["Object's angle [°] goal"] == pytest.approx([math.degrees(0.1)], rel=1e-4)
-    assert shown["Energy [mJ] right"] == pytest.approx([12.34])
-    assert shown["Joints [°] left goal"] == pytest.approx([math.degrees(0.44)], rel=1e-4)
-    assert shown["Currents [A] right"] == [0.213]
-    assert shown["Tick [µs] work"] == pytest.approx([11.0])
+    expected = {
+        "Force [N]": {"left 7.5 ± 0.05", "goal 9"},
+        "Displacement d [mm]": {"right 3.31 ± 0.02"},
+        "Object's angle [°]": {"object 4.98", f"goal {math.degrees(0.1):.3g}"},
+        "Energy [mJ]": {"right 12.3"},
+        "Joints [°]": {f"right {math.degrees(0.44):.3g}"},
+        "Currents [A]": {"right 0.213"},
+        "Tick [µs]": {"work 11"},
+    }
+    shown = {name: {text[3] for text in told(picture, name)} for name in expected}
+    assert {name: expected[name] - words for name, words in shown.items()} == {
+        name: set() for name in expected
+    }
+    tilts = [text[3].split(" ± ")[1] for text in told(picture, "Tilt θ [°]") if "±" in text[3]]
+    assert tilts == ["0.1", "0.1"]
     assert (picture["mode"], picture["status"], picture["fault"]) == ("holding", "live", "")
     assert picture["events"][-1][1:] == ["warning", "slip", "the object slips"]
     assert "the object slips · grip: goal 9.0 N" in picture["limits"]
@@ -119,9 +136,9 @@ def test_a_picture_has_the_streams_values() -> None:
         assert levels[:8].max() < 6  # noise
         assert len(picture["panels"][name]["lines"]) == 2  # the rim and the footprint
     assert len(picture["panels"]["landscape"]["dots"]) == 2
-    assert picture["panels"]["hand"]["texts"][0][3] == "7.5 N"
+    assert told(picture, "hand")[0][3] == "7.5 N"
+    assert "schema 2, this page knows 1" in picture["facts"]
     assert "0 messages could not be read" in said
-    assert said.count("the stream is of schema 2, this viewer knows 1") == 1
 
 
 def test_pages_share_one_subscription_and_a_slow_one_is_sent_nothing_that_it_did_not_ask_for() -> (
@@ -169,14 +186,8 @@ def test_what_the_scene_lacks_has_no_place(tmp_path, changes, gone, there):
         kept.pictures.take(topic, message)
     kept.pictures.draw()
     names = {each["name"] for each in kept.scene["panels"]}
-    names |= {each["title"] for each in kept.scene["plots"]}
     assert there in names
     assert not gone & names
-    width = {len(row) for row in kept.newest["columns"]}
-    assert width == {
-        1
-        + max(k for plot in kept.scene["plots"] for line in plot["lines"] for k in line["columns"])
-    }
 
 
 # Who may look and command
@@ -216,50 +227,46 @@ def test_other_hosts_and_origins_are_refused_and_nothing_else_listens(served):
 
 def test_only_the_token_brings_what_commands(served):
     fake, viewed = served
-    assert "STOP" in got(viewed.host, viewed.commanding.removeprefix(viewed.address[:-1]))[1]
-    for path in ("/", "/?token=", "/?token=None", "/?token=%C3%A9", "/?token=abc"):
-        status, body = got(viewed.host, path)
+    token, stop = viewed.commanding.removeprefix(viewed.address), {"command": "stop"}
+    assert "STOP" in got(viewed.host, f"/{token}")[1]
+    for query in ("", "?token=", "?token=None", "?token=%C3%A9", "?token=abc"):
+        status, body = got(viewed.host, f"/{query}")
         assert status == 200
         assert "STOP" not in body
         assert "Watching" in body
-        for action in ("/stop", "/command"):
-            answer = got(viewed.host, path.replace("/", action), "POST")
-            assert answer == (403, "✗ needs the token that the terminal prints")
+        assert ask(viewed.host, query, stop) == "✗ needs the token that the terminal prints"
+    with pytest.raises(InvalidStatus, match="403"):
+        ask(viewed.host, token, stop, origin="http://evil.example")
     assert not fake.requests
-    stop = "/stop" + viewed.commanding.removeprefix(viewed.address)
-    assert got(viewed.host, stop, "POST", Origin="http://evil.example")[0] == 403
-    assert got(viewed.host, stop, "POST") == (200, "✓ stop: ok")
-    assert fake.requests == [{"command": "stop"}]
+    assert ask(viewed.host, token, stop) == "✓ stop: ok"
+    assert fake.requests == [stop]
     fake.replies["stop"] = {"ok": True, "torque_off": "unconfirmed"}
-    status, said = got(viewed.host, stop, "POST")
-    assert (status, said[:7]) == (409, "✗ stop:")
+    assert ask(viewed.host, token, stop)[:7] == "✗ stop:"
 
 
 def test_a_command_is_sent_once_and_not_long_after_its_picture() -> None:
     grasp = {"command": "grasp", "force": 5.0, "client": "page 1"}
     with FakeDaemon() as fake, view(fake) as viewed, Watcher(viewed.host) as page:
-        path = "/command" + viewed.commanding.removeprefix(viewed.address)
+        token = viewed.commanding.removeprefix(viewed.address)
 
-        def press() -> tuple[int, str]:
+        def press() -> str:
             """Command by a picture of now: a busy machine may take too long for it."""
             while True:
-                told = got(viewed.host, path, "POST", {**grasp, "seen": page.next()["now"]})
-                if "s behind" not in told[1]:
+                told = ask(viewed.host, token, {**grasp, "seen": page.next()["now"]})
+                if "s behind" not in told:
                     return told
 
-        assert press() == (200, "✓ grasp: ok")
+        assert press() == "✓ grasp: ok"
         fake.replies["grasp"] = {"ok": False, "error": "grasp: not while disarmed; arm first"}
-        assert press() == (409, "✗ grasp: not while disarmed; arm first")
+        assert press() == "✗ grasp: not while disarmed; arm first"
         assert fake.requests == [grasp, grasp]
-        for late in (page.next()["now"] - 3.0, math.nan):  # which JSON has as null
-            answer = got(viewed.host, path, "POST", {**grasp, "seen": late})
-            assert answer[0] in (400, 409)
-        for odd in (None, "grasp", [], {"command": "grasp"}, {"seen": 1.0}):
-            assert got(viewed.host, path, "POST", odd)[0] == 400
+        late = {"seen": page.next()["now"] - 3.0}
+        for odd in (late, {}):
+            assert ask(viewed.host, token, {**grasp, **odd}).endswith("s behind")
+        for odd in (None, "grasp", [], {"seen": 1.0}, {**grasp, "seen": None}):
+            assert ask(viewed.host, token, odd).startswith("✗ no command")
         fake.close()
-        status, said = press()
-        assert status == 504
-        assert "✗ grasp: no answer" in said
+        assert "✗ grasp: no answer" in press()
         assert len(fake.requests) == 2
 
 
@@ -276,29 +283,31 @@ def test_a_recording_is_shown_from_any_place(recorded):
         thread.start()
         try:
             until(lambda: playback.position > 0.3)  # it plays
-            playback.playing = False
+            playback.ask("pause")
             for place in (2.0, 0.5, 1.5):
-                playback.seek(place)
+                playback.ask(str(place))
                 when = recording.start + place
                 until(lambda: abs(kept.newest["time"] - when) < 0.02)  # noqa: B023
                 picture = kept.newest
                 at = next(each for each in states if each["timestamp"] == picture["time"])
                 assert (picture["mode"], picture["status"]) == (at["mode"], "recording")
-                column = kept.scene["plots"][0]["lines"][0]["columns"][0]
                 past = {each["timestamp"]: each["left"]["force"] for each in states}
-                for row in picture["columns"]:
-                    force = past[row[0]]
-                    assert row[column] == (
-                        pytest.approx(force, rel=1e-4) if math.isfinite(force) else None
+                blue = [*COLOURS["left"]]
+                lines = picture["panels"]["Force [N]"]["lines"]
+                (points,) = (points for colour, _, points in lines if colour == blue)
+                assert len(points) == pytest.approx(20 * place, abs=4)
+                for time, force in zip(points[::2], points[1::2], strict=True):
+                    was = min(past, key=lambda stamp: abs(stamp - picture["time"] - time))
+                    assert force == (
+                        pytest.approx(past[was], abs=1e-4) if math.isfinite(past[was]) else None
                     )
-                assert len(picture["columns"]) == pytest.approx(10 * place, abs=2)
             assert playback.position == 1.5
-            playback.playing = True
+            playback.ask("play")
             until(lambda: not playback.playing)  # at its end
             assert playback.position == pytest.approx(recording.duration)
             drawn = kept.newest
             until(lambda: kept.newest is not drawn)  # and stays there
-            playback.playing = True
+            playback.ask("play")
             until(lambda: 0.0 < playback.position < 1.0)  # and plays again
         finally:
             ending.end()
@@ -327,21 +336,29 @@ def test_messages_of_any_kind_are_survived() -> None:
     assert kept.newest["mode"] == "holding"
 
 
-def test_while_nothing_is_read_states_wait(context, addresses):
-    """As while a busy machine draws for seconds."""
+def test_while_a_picture_is_drawn_states_wait(context, addresses):
     publisher = context.socket(zmq.XPUB)
     publisher.setsockopt(zmq.SNDHWM, 2000)  # as the daemon's
     publisher.bind(addresses[0])
-    kept = Kept(live=True)
-    with live_stream(addresses[0]) as drain:
-        until(lambda: {publisher.recv()[1:] for _ in TOPICS} == set(TOPICS))
-        for k in range(1, 10_001):
-            publisher.send_multipart([schema.STATE, pack({**state(0.0, k), "seq_step": 1})])
-            if k % 100 == 0:
-                select.select([], [], [], 0.005)  # as fast as libzmq's own thread takes them
-        until(lambda: drain(kept.pictures, 0.0) == 0)
-    kept.pictures.draw()
-    assert kept.pictures.states == 10_000
+    kept, drawn = Kept(live=True), threading.Event()
+    kept.pictures.draw, draw = drawn.wait, kept.pictures.draw
+    arguments = argparse.Namespace(address=addresses[0], keys=None, rate=100.0, no_wait=False)
+    with Ending() as ending:
+        words = arguments, None, kept.pictures, ending, kept.said.append
+        thread = threading.Thread(target=follow, args=words)
+        thread.start()
+        try:
+            until(lambda: {publisher.recv()[1:] for _ in TOPICS} == set(TOPICS))
+            for k in range(1, 5001):
+                publisher.send_multipart([schema.STATE, pack({**state(0.0, k), "seq_step": 1})])
+                if k % 100 == 0:
+                    select.select([], [], [], 0.005)  # as fast as libzmq's own thread takes them
+            drawn.set()
+            until(lambda: kept.pictures.states == 5000)
+        finally:
+            ending.end()
+            thread.join()
+    draw()
     assert "0 lost, 0 unreadable" in kept.newest["facts"]
 
 

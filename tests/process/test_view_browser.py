@@ -133,9 +133,9 @@ def test_the_page_keeps_up_survives_sleep_and_reload_and_asks_nobody_else(page, 
     with Viewed(*where) as viewed:
         page.open(viewed.address)  # fills the browser's cache, as a second visit finds it
         assert "Watching" in page.text("footer")
-        assert page.text(".fault") == "<b>tip.force</b>: 31 N"
+        until(lambda: page.text(".fault") == "<b>tip.force</b>: 31 N")
         page.space()
-        page("stop()")
+        page("send('stop')")
         page.open(viewed.commanding)
         page.click("[name=clear]")
         until(lambda: page.text(".reply") == "✓ clear: ok")

@@ -1,201 +1,192 @@
-"""The stream for Foxglove: its WebSocket server, by the ``foxglove-sdk``, behind a `Door`.
+"""The stream for Foxglove, by its WebSocket protocol (foxglove/ws-protocol, version 1).
 
-Channels have the names and fields of recordings (`tools.recordings.channels`), so that one layout
-shows both; ``hand/scene``, the moving hand, is made here. What nobody subscribes to isn't packed.
+Channels have the names, schemas and messages of recordings (`tools.recordings.channels`), so that
+one layout shows both; ``hand/scene``, the moving hand, is made here. What nobody subscribes to
+isn't packed.
 """
 
 from __future__ import annotations
 
-import argparse
-import math
-import os
+import asyncio
+import json
+import struct
 from collections import deque
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-import foxglove
-import foxglove.messages as fm
 import orjson
-from foxglove.channels import LogChannel, RawImageChannel, SceneUpdateChannel
+from websockets import Subprotocol
+from websockets.asyncio.server import ServerConnection
+from websockets.exceptions import ConnectionClosed
 
-from softfinger.daemon.client.stream import read
+from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS
 from softfinger.daemon.wire import schema
-from softfinger.tools.arguments import client_keys, to_stderr
-from softfinger.tools.ending import Ending
-from softfinger.tools.recordings.channels import schema_of
-from softfinger.tools.terminal.feed import number, text
-from softfinger.tools.viewing import planar
-from softfinger.tools.viewing.door import Door, hidden_host
-from softfinger.tools.viewing.live_stream import LOOPBACK, NICE, Viewer, ViewError, follow
-from softfinger.tools.viewing.planar import Colour
+from softfinger.daemon.wire.schema import HandState
+from softfinger.tools.recordings import channels
+from softfinger.tools.terminal.feed import number
+from softfinger.tools.viewing.planar import Colour, Drawn, hand_parts
 
 LAYOUT = Path(__file__).with_name("foxglove_layout.json")
+ORIGINS = ("https://app.foxglove.dev", "file://")  # of Foxglove in the browser and on the desktop
+PROTOCOLS = (Subprotocol("foxglove.sdk.v1"), Subprotocol("foxglove.websocket.v1"))
+CLIENTS = 8
 SCENE = "hand/scene"
-_NUMBERS = (schema.STATE, schema.TRUTH, schema.STATS)  # sent whole, as JSON
 _FRAME = "hand"  # x from the left pivot to the right one, y away from the palm [m]
-_EVENTS = 50  # kept for the first who looks at them, as many as the daemon repeats
-_LEVELS = {"info": fm.LogLevel.Info, "warning": fm.LogLevel.Warning, "error": fm.LogLevel.Error}
+_LIST = {"type": "array", "items": {"type": "object", "properties": {}}}
+_ENTITIES = {"type": "object", "properties": {"deletions": _LIST, "entities": _LIST}}
+_HEAD = struct.Struct("<BIQ")  # before a message: its kind, the subscription, the time [ns]
+_EVENTS = 50  # kept for who begins to look at them, as many as the daemon repeats
+_QUEUE = 500  # messages that wait for a client; more are lost
+_PATIENCE = 2.0  # s for a client to take one
 
 
-class FoxgloveServer(Viewer):
-    """Takes messages and serves them on ``port``, 0 for a free one. Raises ViewError."""
+class _Client:
+    """Its subscriptions by channel, and the messages on their way to it."""
 
-    def __init__(self, port: int, say: Callable[[str], None]) -> None:
-        super().__init__(say)
-        context = self._context = foxglove.Context()  # its end closes the channels
-        self._numbers = {topic: _channel(topic, context) for topic in _NUMBERS}
-        self._log = LogChannel(schema.EVENT.decode(), context=context)
-        self._scene = SceneUpdateChannel(SCENE, context=context)
-        self._images = {
-            name: RawImageChannel(f"{schema.TACTILE.decode()}/{name}", context=context)
-            for name in FINGERS
-        }
-        self._frames: dict[str, dict[str, Any]] = {}  # by finger
-        self._events: deque[dict[str, Any]] = deque(maxlen=_EVENTS)
-        host = hidden_host()
+    def __init__(self) -> None:
+        self.subscribed: dict[str, int] = {}
+        self.queue: asyncio.Queue[bytes] = asyncio.Queue(_QUEUE)
+
+    def give(self, channel: str, stamp: float, data: bytes) -> None:
+        """Put a message on its way, if it is subscribed to and there is room."""
+        if channel in self.subscribed and not self.queue.full():
+            head = _HEAD.pack(1, self.subscribed[channel], int(stamp * 1e9))
+            self.queue.put_nowait(head + data)
+
+    async def send(self, socket: ServerConnection) -> None:
+        """Send all that comes; end the connection where it isn't taken."""
         try:
-            self._server = foxglove.start_server(
-                name="softfinger", host=host, port=0, context=context
-            )
-        except RuntimeError as error:
-            raise ViewError(f"Foxglove's server: {error}") from None
+            while True:
+                message = await self.queue.get()
+                async with asyncio.timeout(_PATIENCE):
+                    await socket.send(message)
+        except (TimeoutError, ConnectionClosed):
+            socket.transport.abort()
+
+
+class Foxglove:
+    """Serves in ``loop``; messages and scenes come from another thread."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        self._loop = loop
+        self._clients: list[_Client] = []
+        self._events: deque[tuple[float, bytes]] = deque(maxlen=_EVENTS)
+        self._frames: dict[str, dict[str, Any]] = {}  # the newest, by channel
+        tactile = schema.TACTILE.decode()
+        described = {SCENE: ("foxglove.SceneUpdate", _ENTITIES)}
+        described |= {f"{tactile}/{name}": channels.schema_of(schema.TACTILE) for name in FINGERS}
+        for topic in (schema.STATE, schema.TRUTH, schema.STATS, schema.EVENT):
+            described[topic.decode()] = channels.schema_of(topic)
+        self._channels = list(described)  # by their number
+        coded = {"encoding": channels.ENCODING, "schemaEncoding": channels.SCHEMA_ENCODING}
+        advertised = [
+            {"id": number, "topic": topic, "schemaName": name, "schema": json.dumps(form)} | coded
+            for number, (topic, (name, form)) in enumerate(described.items())
+        ]
+        self._welcome = [
+            json.dumps({"op": "serverInfo", "name": "softfinger", "capabilities": []}),
+            json.dumps({"op": "advertise", "channels": advertised}),
+        ]
+
+    async def serve(self, socket: ServerConnection) -> None:
+        """Serve one client until it goes, takes nothing for a while, or asks for what isn't."""
+        if len(self._clients) == CLIENTS:
+            return
+        client = _Client()
+        self._clients.append(client)
+        sending = asyncio.create_task(client.send(socket))
         try:
-            self._door = Door(port, (host, self._server.port))
-        except OSError as error:
-            self._server.stop()
-            raise ViewError(f"port {port}: {error.strerror}") from None
-        self.address = f"ws://{LOOPBACK}:{self._door.port}"
+            for text in self._welcome:
+                await socket.send(text)
+            async for request in socket:
+                self._subscribe(client, json.loads(request))
+        except (ValueError, LookupError, TypeError, AttributeError):
+            pass
+        finally:
+            sending.cancel()
+            self._clients.remove(client)
 
-    def close(self) -> None:
-        self._door.close()
-        self._server.stop()
+    def _subscribe(self, client: _Client, asked: dict[str, Any]) -> None:
+        for each in asked.get("subscriptions", ()):
+            channel = self._channels[each["channelId"]]
+            client.subscribed[channel] = each["id"] % 2**32
+            if channel == schema.EVENT.decode():
+                for event in self._events:
+                    client.give(channel, *event)
+        ended = asked.get("subscriptionIds", ())
+        kept = {name: each for name, each in client.subscribed.items() if each not in ended}
+        client.subscribed = kept
 
-    def take(self, topic: bytes, message: Any) -> bool:
-        """Take one message of any content."""
-        if not super().take(topic, message):
-            return False
+    def take(self, topic: bytes, message: dict[str, Any]) -> None:
+        """Take one message of the stream; frames wait for `draw`."""
+        channel = channels.channel_name(topic, message)
         if topic == schema.TACTILE:
-            self._frames[text(message, "finger")] = message
-        elif topic == schema.EVENT:
-            self._events.append(message)
-        elif topic in self._numbers and self._numbers[topic].has_sinks():
-            try:
-                data = orjson.dumps(message)  # null for NaN
-                self._numbers[topic].log(data, log_time=_ns(number(message, "timestamp")))
-            except TypeError:  # orjson's error, too: JSON can't hold it
-                self.unreadable += 1
-        return True
+            self._frames[channel] = message
+        else:
+            self._send(channel, number(message, "timestamp"), message, topic)
 
-    def draw(self) -> None:
-        """Send the newest frames, the scene, and events if somebody looks at them."""
-        for message in self._frames.values():
-            try:
-                self._image(read(schema.TactileFrame, message))
-            except (ValueError, KeyError):
-                self.unreadable += 1
+    def draw(self, settings: Settings, state: HandState, truth: dict[str, Any] | None) -> None:
+        """Send the newest frames, and the hand as it is now."""
+        for channel, frame in self._frames.items():
+            self._send(channel, number(frame, "timestamp"), frame, schema.TACTILE)
         self._frames.clear()
-        state, truth = self.newest.pop(schema.STATE, None), self.newest.get(schema.TRUTH)
-        if state is not None and self._scene.has_sinks():
-            parts = planar.hand_parts(self.hand, read(schema.HandState, state), truth)
-            entities = [_entity(name, part) for name, part in parts.items()]
-            self._scene.log(fm.SceneUpdate(entities=entities), log_time=_ns(self.time))
-        while self._log.has_sinks() and self._events:
-            self._event(self._events.popleft())
+        if self._wanted(SCENE):
+            parts = hand_parts(settings, state, truth).items()
+            entities = [_entity(name, part, state.timestamp) for name, part in parts]
+            self._send(SCENE, state.timestamp, {"deletions": [], "entities": entities})
 
-    def _image(self, frame: schema.TactileFrame) -> None:
-        self._images[frame.finger].log(
-            fm.RawImage(
-                timestamp=fm.Timestamp.from_epoch_secs(frame.timestamp),
-                frame_id=frame.finger,
-                width=frame.cols,
-                height=frame.rows,
-                encoding="mono16",
-                step=2 * frame.cols,
-                data=frame.data,
-            ),
-            log_time=_ns(frame.timestamp),
-        )
+    def _wanted(self, channel: str) -> bool:
+        return any(channel in client.subscribed for client in self._clients)
 
-    def _event(self, event: dict[str, Any]) -> None:
-        stamp = number(event, "timestamp")
-        line = fm.Log(
-            timestamp=fm.Timestamp.from_epoch_secs(stamp),
-            level=_LEVELS.get(text(event, "level"), fm.LogLevel.Unknown),
-            message=text(event, "text"),
-            name=text(event, "kind"),
-        )
-        now = stamp if math.isnan(self.time) else max(stamp, self.time)
-        self._log.log(line, log_time=_ns(now))
+    def _send(
+        self, channel: str, stamp: float, message: dict[str, Any], topic: bytes = b""
+    ) -> None:
+        keeps = topic == schema.EVENT
+        if not keeps and not self._wanted(channel):
+            return
+        try:
+            data = orjson.dumps(channels.to_json(topic)(dict(message)))  # null for NaN
+        except TypeError:  # orjson's error, too: JSON can't hold it
+            return
+        self._loop.call_soon_threadsafe(partial(self._give, channel, stamp, data, keeps))
+
+    def _give(self, channel: str, stamp: float, data: bytes, keeps: bool) -> None:
+        for client in self._clients:
+            client.give(channel, stamp, data)
+        if keeps:
+            self._events.append((stamp, data))
 
 
-def _entity(name: str, part: planar.HandPart) -> fm.SceneEntity:
+def _entity(name: str, part: Drawn, stamp: float) -> dict[str, Any]:
     lines = [
-        fm.LinePrimitive(
-            type=fm.LinePrimitiveLineType.LineStrip,
-            thickness=1e-3 * strip.width,
-            points=[fm.Point3(x=float(x), y=float(y)) for x, y in strip.points],
-            color=_colour(strip.colour),
-        )
-        for strip in part.strips
+        {"type": 0, "pose": _pose(0.0, 0.0), "thickness": width, "scale_invariant": False}
+        | {"points": [_point(x, y) for x, y in points.tolist()], "color": _colour(colour)}
+        | {"colors": [], "indices": []}
+        for colour, width, points in part.lines
     ]
-    arrows, texts = [], []
-    for push in part.pushes:
-        length, half = math.hypot(*push.way), 0.5 * math.atan2(push.way[1], push.way[0])
-        arrows.append(
-            fm.ArrowPrimitive(
-                pose=_pose(push.at, fm.Quaternion(z=math.sin(half), w=math.cos(half))),
-                shaft_length=0.75 * length,
-                shaft_diameter=1.8e-3,
-                head_length=0.25 * length,
-                head_diameter=4e-3,
-                color=_colour(push.colour),
-            )
-        )
-        texts.append(
-            fm.TextPrimitive(
-                pose=_pose(push.at + push.way, fm.Quaternion(w=1.0)),
-                billboard=True,
-                font_size=12.0,
-                scale_invariant=True,
-                color=_colour(push.colour),
-                text=push.text,
-            )
-        )
-    return fm.SceneEntity(id=name, frame_id=_FRAME, lines=lines, arrows=arrows, texts=texts)
+    texts = [
+        {"pose": _pose(*place.tolist()), "billboard": True, "font_size": 12.0}
+        | {"scale_invariant": True, "color": _colour(colour), "text": words}
+        for colour, place, words in part.texts
+    ]
+    time = {"sec": int(stamp), "nsec": int(stamp % 1.0 * 1e9)}
+    others = ("metadata", "arrows", "cubes", "spheres", "cylinders", "triangles", "models")
+    return (
+        {"timestamp": time, "frame_id": _FRAME, "id": name, "frame_locked": False}
+        | {"lifetime": {"sec": 0, "nsec": 0}, "lines": lines, "texts": texts}
+        | {other: [] for other in others}
+    )
 
 
-def _pose(place: planar.FloatArray, turn: fm.Quaternion) -> fm.Pose:
-    return fm.Pose(position=fm.Vector3(x=float(place[0]), y=float(place[1])), orientation=turn)
+def _point(x: float, y: float) -> dict[str, float]:
+    return {"x": x, "y": y, "z": 0.0}
 
 
-def _colour(colour: Colour) -> fm.Color:
-    red, green, blue = (part / 255.0 for part in colour)
-    return fm.Color(r=red, g=green, b=blue, a=1.0)
+def _pose(x: float, y: float) -> dict[str, Any]:
+    return {"position": _point(x, y), "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}}
 
 
-def _channel(topic: bytes, context: foxglove.Context) -> foxglove.Channel:
-    name, described = schema_of(topic)
-    form = foxglove.Schema(name=name, encoding="jsonschema", data=orjson.dumps(described))
-    return foxglove.Channel(topic.decode(), message_encoding="json", schema=form, context=context)
-
-
-def _ns(stamp: float) -> int:
-    return int(stamp * 1e9)
-
-
-def serve(arguments: argparse.Namespace, ending: Ending) -> None:
-    """Serve the stream until the end. Raises SoftfingerError."""
-    keys = client_keys(arguments.keys)
-    say = to_stderr("view")
-    server = FoxgloveServer(arguments.foxglove, say)
-    os.nice(NICE)
-    try:
-        print(f"view: {server.address} for Foxglove; layout: {LAYOUT}", flush=True)
-        ending.begin()
-        follow(arguments, keys, server, ending, say)
-    finally:
-        server.close()
-    if server.states == 0:
-        raise ViewError(f"{arguments.address}: nothing came that can be shown")
+def _colour(colour: Colour) -> dict[str, float]:
+    return dict(zip("rgb", (part / 255.0 for part in colour), strict=True)) | {"a": 1.0}

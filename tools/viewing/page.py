@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import contextlib
-import math
+import json
+import logging
 import os
 import re
 import secrets
@@ -18,262 +18,239 @@ import socket
 import threading
 import time
 import webbrowser
+from collections.abc import Awaitable, Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any
+from urllib.parse import parse_qs, urlsplit
 
-import uvicorn
-from starlette.applications import Starlette
-from starlette.concurrency import run_in_threadpool
-from starlette.datastructures import Headers
-from starlette.requests import Request
-from starlette.responses import HTMLResponse, PlainTextResponse
-from starlette.routing import Route, WebSocketRoute
-from starlette.types import ASGIApp, Receive, Scope, Send
-from starlette.websockets import WebSocket, WebSocketDisconnect
+from websockets.asyncio.server import ServerConnection, serve
+from websockets.http11 import Request, Response
 
 from softfinger.daemon.client.command_client import NoAnswer, send
 from softfinger.daemon.loop.warm_up import LANDSCAPE
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.wire import schema
-from softfinger.daemon.wire.keys import ClientKeys
 from softfinger.tools.arguments import client_keys, to_stderr
 from softfinger.tools.ending import Ending
 from softfinger.tools.processes.compile import build_kernels
 from softfinger.tools.recordings.reader import Recording
-from softfinger.tools.terminal.feed import judge, number
-from softfinger.tools.viewing.live_stream import LOOPBACK, NICE, TOPICS, ViewError, follow
-from softfinger.tools.viewing.pictures import SECONDS, Pictures
+from softfinger.tools.terminal.feed import judge
+from softfinger.tools.viewing.foxglove_server import LAYOUT, ORIGINS, PROTOCOLS, Foxglove
+from softfinger.tools.viewing.pictures import Pictures
+from softfinger.tools.viewing.sources import Playback, ViewError, follow
 
 _PAGE = Path(__file__).with_name("page.html").read_text(encoding="utf-8")
-_HOSTS = (LOOPBACK, "localhost")
+_LOOPBACK = "127.0.0.1"
 _PORT = 9090  # where nobody says another
+_NICE = 5  # everything real-time goes first
 _STALE = 3.0  # s from a picture to a command that is for it; also to the command's answer
+_AT_ONCE = 40  # commands that wait for their answers, of all pages
+_PATIENCE = 2.0  # s for a request's head
+_BUFFER = 256 << 10  # bytes that wait for a page or a client of Foxglove
+_LARGEST = 65536  # bytes of what a page or a client of Foxglove sends
 _say = to_stderr("view")
 
 
-class SameOrigin:
-    """Lets in what names this machine as its host, and pages of this very server.
+class Site:
+    """The page, the pictures and commands of all pages, and what Foxglove connects to.
 
-    A name that an attacker's DNS leads here is another host; a foreign page's requests and
-    WebSockets carry its own origin.
+    Lets in what names this machine as its host, and pages of this very server: a name that an
+    attacker's DNS leads here is another host; a foreign page's requests carry its own origin.
+    Pages with the ``token`` may command, by ``send``; None: they play a recording, by ``wish``.
     """
 
-    def __init__(self, app: ASGIApp) -> None:
-        self._app = app
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        headers = Headers(scope=scope)
-        host, origin = headers.get("host", ""), headers.get("origin", "")
-        here = host.partition(":")[0] in _HOSTS and origin in ("", f"http://{host}")
-        refused = PlainTextResponse("only for pages of this machine", 403)
-        await (self._app if here else refused)(scope, receive, send)
-
-
-class Newest:
-    """The next scene and picture, for the pages that are ``waiting`` for them in ``loop``."""
-
-    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
-        self.waiting: list[asyncio.Future[tuple[str, str]]] = []
+    def __init__(
+        self,
+        loop: asyncio.AbstractEventLoop,
+        token: str | None,
+        send: Callable[[dict[str, Any]], dict[str, Any]],
+        foxglove: Foxglove | None,
+    ) -> None:
         self._loop = loop
+        self._token = token
+        self._send = send
+        self._ended = asyncio.Event()
+        self._waiting: list[asyncio.Future[tuple[str, str]]] = []
+        self.wish: Callable[[str], None] = lambda _: None  # what pages ask with each picture
+        self._routes: dict[str, Callable[[ServerConnection], Awaitable[None]]] = {
+            "/pictures": self._show,
+            "/command": self._command,
+        }
+        if foxglove is not None:
+            self._routes["/"] = foxglove.serve
 
-    def publish(self, scene: bytes, picture: bytes) -> None:
-        """Give both to the pages, from another thread."""
-        self._loop.call_soon_threadsafe(self._give, (scene.decode(), picture.decode()))
+    def publish(self, scene: str, picture: str) -> None:
+        """Give both to the pages that wait, from another thread."""
+        self._loop.call_soon_threadsafe(self._give, (scene, picture))
+
+    def watched(self) -> bool:
+        """Return whether a page waits for a picture."""
+        return bool(self._waiting)
+
+    def end(self) -> None:
+        """End `run`, from another thread."""
+        self._loop.call_soon_threadsafe(self._ended.set)
+
+    async def run(self, listener: socket.socket) -> None:
+        """Serve on ``listener`` until the end."""
+        quiet = logging.getLogger("softfinger.view")
+        quiet.disabled = True  # what strangers do wrong is nobody's business here
+        await serve(
+            self._serve,
+            sock=listener,
+            process_request=self._admit,
+            subprotocols=PROTOCOLS,
+            select_subprotocol=lambda _, offered: next(
+                (each for each in offered if each in PROTOCOLS), None
+            ),
+            compression=None,  # nothing is gained on this machine
+            open_timeout=_PATIENCE,
+            max_size=_LARGEST,
+            logger=quiet,
+        )
+        await self._ended.wait()
+        others = asyncio.all_tasks() - {asyncio.current_task()}
+        for each in others:
+            each.cancel()
+        await asyncio.gather(*others, return_exceptions=True)
+
+    def _admit(self, connection: ServerConnection, request: Request) -> Response | None:
+        """Return the page, or why not; None lets a WebSocket in."""
+        hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
+        path, upgrade = urlsplit(request.path).path, "Upgrade" in request.headers
+        known = [[], *([f"http://{host}"] for host in hosts)]
+        if upgrade and path == "/":
+            known += [[origin] for origin in ORIGINS]
+        here = [host.partition(":")[0] in (_LOOPBACK, "localhost") for host in hosts]
+        if here != [True] or origins not in known:
+            return connection.respond(403, "only for pages of this machine")
+        if upgrade and path in self._routes:
+            return None
+        if upgrade or path != "/":
+            return connection.respond(404, "nothing here")
+        watched = "command" if self._allows(request) else "watch"
+        shown = "play" if self._token is None else watched
+        others = rf'<section class="(?!{shown}).*?</section>'
+        response = connection.respond(200, re.sub(others, "", _PAGE, flags=re.S))
+        del response.headers["Content-Type"]
+        response.headers["Content-Type"] = "text/html; charset=utf-8"
+        return response
+
+    def _allows(self, request: Request) -> bool:
+        """Return whether it has the token."""
+        given = parse_qs(urlsplit(request.path).query).get("token", [""])[0]
+        token = self._token
+        return token is not None and secrets.compare_digest(given.encode(), token.encode())
+
+    async def _serve(self, connection: ServerConnection) -> None:
+        assert connection.request is not None
+        await self._routes[urlsplit(connection.request.path).path](connection)
 
     def _give(self, pair: tuple[str, str]) -> None:
-        for each in self.waiting:
-            if not each.done():  # the page has gone
+        for each in self._waiting:
+            if not each.done():
                 each.set_result(pair)
-        self.waiting = []
+        self._waiting = []
 
-    async def serve(self, playback: Playback | None, page: WebSocket) -> None:
+    async def _show(self, page: ServerConnection) -> None:
         """Send a page the next picture each time it asks, and the scene where it is another."""
-        await page.accept()
         known = ""
-        with contextlib.suppress(WebSocketDisconnect):
-            while True:
-                wish = await page.receive_text()
-                if playback is not None:
-                    playback.ask(wish)
-                self.waiting.append(self._loop.create_future())
-                scene, picture = await self.waiting[-1]
-                if scene != known:
-                    await page.send_text(scene)
-                known = scene
-                await page.send_text(picture)
+        async for wish in page:
+            self.wish(str(wish))
+            self._waiting.append(self._loop.create_future())
+            scene, picture = await self._waiting[-1]
+            if scene != known:
+                await page.send(scene)
+            known = scene
+            await page.send(picture)
 
+    async def _command(self, page: ServerConnection) -> None:
+        """Carry out what a page with the token asks of the daemon, once, and tell it the answer."""
+        assert page.request is not None
+        allowed = self._allows(page.request)
+        async for text in page:
+            answer = "✗ needs the token that the terminal prints"
+            if allowed:
+                answer = await self._loop.run_in_executor(None, self._answer, text)
+            await page.send(answer)
 
-class Playback:
-    """A recording's place, and that it is ``playing``. ``run`` is for its own thread."""
+    def _answer(self, text: str | bytes) -> str:
+        """Carry out the daemon's request ``text``, which it checks; what is said of it.
 
-    def __init__(self, recording: Recording, pictures: Pictures, period: float) -> None:
-        self._recording = recording
-        self._pictures = pictures
-        self._period = period  # s between two pictures
-        self._target: float | None = None  # where to go, from another thread
-        self.playing = True
-        self.position = 0.0  # s from the first message on
-        self.duration = recording.duration
-
-    def seek(self, position: float) -> None:
-        """Go to ``position`` [s], from any thread."""
-        self._target = min(max(position, 0.0), self.duration)
-
-    def ask(self, wish: str) -> None:
-        """Carry out a page's wish: ``play``, ``pause`` or a position; others are ignored."""
-        with contextlib.suppress(ValueError):
-            if wish in ("play", "pause"):
-                self.playing = wish == "play"
-            elif math.isfinite(place := float(wish)):
-                self.seek(place)
-
-    def run(self, ending: Ending) -> None:
-        """Play until the end is asked for."""
-        if self._recording.count(schema.SETTINGS):  # which may come once, at the beginning
-            self._pictures.take(*next(self._recording.messages([schema.SETTINGS])))
-        while not ending.over:
-            if self._target is None and not self.playing:
-                self._stand(ending)
-            else:  # without a place, again from the beginning
-                target, self._target = self._target or 0.0, None
-                self._play_from(target, ending)
-
-    def _play_from(self, target: float, ending: Ending) -> None:
-        """Take the seconds before ``target`` at once, for the plots, then go on in time."""
-        self._pictures.clear()
-        self.position = target
-        for topic, message in self._recording.messages(TOPICS, target - SECONDS):
-            at = min(number(message, "timestamp") - self._recording.start, self.duration)
-            while at > self.position and self._pictures.newest.get(schema.STATE):
-                self._stand(ending)
-                if self._target is not None or ending.over:
-                    return
-            self._pictures.take(topic, message)
-        self.position = max(self.position, target)
-        self.playing = False
-
-    def _stand(self, ending: Ending) -> None:
-        """Show this place for one picture; the next is later where it plays."""
-        begun = time.monotonic()
-        self._pictures.draw((self.position, self.duration, self.playing))
-        ending.wait(self._period)
-        if self.playing:
-            self.position = min(self.position + time.monotonic() - begun, self.duration)
-
-
-class PageCommands:
-    """Hands on, once, what pages with the ``token`` ask of the daemon. None: nobody may."""
-
-    def __init__(self, address: str, keys: ClientKeys | None, token: str | None) -> None:
-        self._address = address
-        self._keys = keys
-        self._token = token
-
-    def allows(self, request: Request) -> bool:
-        """Return whether it has the token."""
-        given = request.query_params.get("token", "").encode()
-        return self._token is not None and secrets.compare_digest(given, self._token.encode())
-
-    async def carry_out(self, request: Request) -> PlainTextResponse:
-        """Carry out a stop, or the body, unless its picture (``seen``, monotonic s) is long past.
-
-        The body is the daemon's request, which the daemon checks.
+        All but a stop is dropped when its picture (``seen``, monotonic s) is long past.
         """
-        if not self.allows(request):
-            return PlainTextResponse("✗ needs the token that the terminal prints", 403)
-        asked: dict[str, Any] = {"command": "stop"}
-        if request.url.path != "/stop":
-            try:
-                asked = await request.json()
-                age = time.monotonic() - float(asked.pop("seen"))
-                name = asked["command"]
-            except (ValueError, TypeError, LookupError, AttributeError) as error:
-                return PlainTextResponse(f"✗ no command: {error!r}", 400)
-            if not age < _STALE:
-                return PlainTextResponse(f"✗ {name}: dropped, the page is {age:.0f} s behind", 409)
         try:
-            record = await run_in_threadpool(send, self._address, asked, _STALE, self._keys)
+            asked = json.loads(text)
+            name = str(asked["command"])
+            age = time.monotonic() - float(asked.pop("seen", "nan"))
+        except (ValueError, TypeError, LookupError, AttributeError) as error:
+            return f"✗ no command: {error!r}"
+        if name != "stop" and not age < _STALE:
+            return f"✗ {name}: dropped, the page is {age:.0f} s behind"
+        try:
+            reply = judge(time.monotonic(), name, self._send(asked))
         except NoAnswer as error:
-            return PlainTextResponse(f"✗ {asked['command']}: {error}", 504)
-        reply = judge(time.monotonic(), str(asked["command"]), record)
-        sign, status = ("✓", 200) if reply.ok else ("✗", 409)
-        return PlainTextResponse(f"{sign} {reply.text}", status)
+            return f"✗ {name}: {error}"
+        return f"{'✓' if reply.ok else '✗'} {reply.text}"
 
 
 def listen(port: int | None) -> socket.socket:
     """A socket on ``port``; None: 9090 or, where that is taken, any. Raises ViewError."""
     try:
-        return socket.create_server((LOOPBACK, _PORT if port is None else port))
+        listener = socket.create_server((_LOOPBACK, _PORT if port is None else port))
     except OSError as error:
         if port is not None:
             raise ViewError(f"port {port} can't be used: {error.strerror}") from None
-        return socket.create_server((LOOPBACK, 0))
+        return listen(0)
+    # What waits in the system's buffer is what a client takes without reading.
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER)
+    return listener
 
 
 def show(arguments: argparse.Namespace, ending: Ending) -> None:
     """Serve the page until the end. Raises SoftfingerError when nothing can be shown."""
-    os.nice(NICE)
+    os.nice(_NICE)
     recording = None if arguments.file is None else Recording(arguments.file, _say)
     build_kernels(Settings(), lambda _level, _kind, text: _say(text), LANDSCAPE)
     keys = client_keys(arguments.keys)
     loop = asyncio.new_event_loop()
-    newest = Newest(loop)
-    pictures = Pictures(newest.publish, lambda: bool(newest.waiting), _say, live=recording is None)
-    token = playback = None
-    if recording is None:
-        token, role = secrets.token_urlsafe(16), "command"
-        source = partial(follow, arguments, keys, pictures, ending, _say)
-    else:
-        role = "play"
+    loop.set_default_executor(ThreadPoolExecutor(_AT_ONCE))
+    foxglove = Foxglove(loop) if arguments.foxglove is not None else None
+    live = recording is None
+    token = secrets.token_urlsafe(16) if live else None
+    hand_on = partial(send, arguments.commands, timeout=_STALE, keys=keys)
+    site = Site(loop, token, hand_on, foxglove)
+    pictures = Pictures(site.publish, site.watched, _say, live=live, foxglove=foxglove)
+    source = partial(follow, arguments, keys, pictures, ending, _say)
+    if recording is not None:
         playback = Playback(recording, pictures, 1.0 / arguments.rate)
-        source = partial(playback.run, ending)
-    commands = PageCommands(arguments.commands, keys, token)
+        site.wish, source = playback.ask, partial(playback.run, ending)
 
-    def page(request: Request) -> HTMLResponse:
-        shown = role if token is None or commands.allows(request) else "watch"
-        others = rf'<section class="(?!{shown}).*?</section>'
-        return HTMLResponse(re.sub(others, "", _PAGE, flags=re.S))
-
-    posts = [
-        Route(f"/{path}", commands.carry_out, methods=["POST"]) for path in ("stop", "command")
-    ]
-    pages = WebSocketRoute("/pictures", partial(newest.serve, playback))
-    site = Starlette(routes=[Route("/", page), *posts, pages])
-    config = uvicorn.Config(
-        SameOrigin(site),
-        lifespan="off",
-        log_level="error",
-        access_log=False,
-        proxy_headers=False,
-        ws_per_message_deflate=False,  # nothing is gained on this machine
-        timeout_graceful_shutdown=1,
-    )
-    server = uvicorn.Server(config)
-
-    def serve() -> None:
+    def run(listener: socket.socket) -> None:
         try:
-            loop.run_until_complete(server.serve([listener]))
+            loop.run_until_complete(site.run(listener))
         finally:
             ending.end()
 
-    with listen(arguments.port) as listener:
-        serving = threading.Thread(target=serve)
+    with listen(arguments.port if foxglove is None else arguments.foxglove) as listener:
+        serving = threading.Thread(target=run, args=(listener,))
         serving.start()
-        address = f"http://{LOOPBACK}:{listener.getsockname()[1]}/"
+        host = f"{_LOOPBACK}:{listener.getsockname()[1]}"
         try:
+            if foxglove is not None:
+                print(f"view: ws://{host} for Foxglove; layout: {LAYOUT}")
             if token is not None:
-                print(f"view: {address}?token={token} to see and command the hand", flush=True)
-            print(f"view: {address} to see it", flush=True)
-            if not arguments.no_browser:
+                print(f"view: http://{host}/?token={token} to see and command the hand")
+            print(f"view: http://{host}/ to see it", flush=True)
+            if foxglove is None and not arguments.no_browser:
                 # Without the token: other users of this machine may read a browser's command line.
-                webbrowser.open(address)
+                webbrowser.open(f"http://{host}/")
             ending.begin()
             source()
         finally:
-            server.should_exit = True
+            site.end()
             serving.join()
-    _say(f"{pictures.states} states seen, {pictures.unreadable} messages could not be read")
-    if pictures.states == 0:
-        where = arguments.address if recording is None else arguments.file
-        raise ViewError(f"{where}: nothing came that can be shown")
+    _say(f"{pictures.seen} states seen, {pictures.unreadable} messages could not be read")
+    if pictures.seen == 0:
+        raise ViewError(f"{arguments.file or arguments.address}: nothing came that can be shown")

@@ -2,7 +2,7 @@
 
 A picture is JSON: lines, dots, texts and images of each panel, and the last seconds of the plots.
 Nothing in it refers to an earlier one, so that a page may miss as many as it likes. What stands
-still, as the energy landscape, is the scene, which has a number.
+still, as the energy landscape, is the scene.
 """
 
 from __future__ import annotations
@@ -12,31 +12,53 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable
+from dataclasses import fields
+from itertools import groupby, takewhile
 from operator import attrgetter
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import orjson
 from numpy.typing import NDArray
 
+from softfinger.daemon.client.stream import Gaps
 from softfinger.daemon.control.modes import COMMANDS
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.simulation.physics.simulated_hand import geometry_of
 from softfinger.daemon.types import FINGERS
 from softfinger.daemon.wire import schema
+from softfinger.daemon.wire.schema import FingerState, HandState
 from softfinger.tools.terminal import heatmap
-from softfinger.tools.terminal.feed import Feed, number
+from softfinger.tools.terminal.feed import Feed, number, printable, text
 from softfinger.tools.terminal.typeset import micro, short
 from softfinger.tools.viewing import planar
-from softfinger.tools.viewing.known import HEIGHT, WIDTH, ShownHand
-from softfinger.tools.viewing.live_stream import Viewer
-from softfinger.tools.viewing.planar import COLOURS, GOAL, LATE, LEVELS, OBJECT, touches
+from softfinger.tools.viewing.known import THETA_END, fingers_of, landscape, read_settings
+from softfinger.tools.viewing.planar import COLOURS, GOAL, OBJECT, Colour, FloatArray, touches
 
+if TYPE_CHECKING:
+    from softfinger.tools.viewing.foxglove_server import Foxglove
+
+TOPICS = (
+    schema.SETTINGS,
+    schema.EVENT,
+    schema.STATE,
+    schema.TRUTH,
+    schema.TACTILE,
+    schema.STATS,
+    schema.COMMAND,
+)
 SECONDS = 12.0  # of the past in the plots
 _STEP = 0.1  # s from one column of the plots to the next
+_TRAIL = 60  # of these columns on the landscape
 _EVENTS = 30  # shown
 _LATELY = 5.0  # s for which a warning counts as present
+_LATE = (204, 96, 150)
 _WHITE = (255, 255, 255)
+_GRID = (44, 48, 64)
 _OUTSIDE = (112, 112, 116)  # where no such contact can be
+_MOST = 1e6  # of what is drawn; a stranger's numbers are of any size
 _DEGREE = math.degrees(1.0)
+_LEVELS = {"info": (120, 120, 120), "warning": (214, 140, 0), "error": (214, 54, 40)}
 _MODES = {
     "disarmed": (120, 120, 120),
     "armed": (86, 140, 190),
@@ -47,7 +69,7 @@ _MODES = {
     "releasing": (190, 150, 90),
     "fault": (214, 54, 40),
 }
-_PLOTS = {  # title: factor, fields of `hand/state`; {}_std is a deviation, where there is one
+_PLOTS = {  # title: factor, fields of `hand/state`
     "Force [N]": (1.0, "left.force right.force goal_force"),
     "Displacement d [mm]": (1e3, "left.d right.d"),
     "Object's angle [°]": (_DEGREE, "object.angle goal_angle"),
@@ -57,132 +79,140 @@ _PLOTS = {  # title: factor, fields of `hand/state`; {}_std is a deviation, wher
     "Currents [A]": (1.0, "left.current right.current left.goal_current right.goal_current"),
     "Tick [µs]": (1e6, "compute_s wake_late_s"),
 }
-_SERVOS = ("q", "goal_q", "current", "goal_current")  # what a hand without servos lacks
+_SERVOS = ("q", "current")  # what a hand without servos lacks
+_DEVIATIONS = {field.name for field in fields(FingerState) if field.name.endswith("_std")}
 _OTHERS = {  # names and colours of lines that are no finger's
     "object.angle": ("object", OBJECT),
     "compute_s": ("work", OBJECT),
-    "wake_late_s": ("late", LATE),
+    "wake_late_s": ("late", _LATE),
 }
 _BOUNDED = ("force", "d", "current", "temperature")  # of a finger, each by `safety.…_max`
 
 
-class Pictures(Viewer):
-    """Gives ``publish`` the scene and each picture, where it is ``watched``.
+class Pictures:
+    """Takes messages of any content, and gives ``publish`` the scene and each picture.
 
-    Times are the machine's of a ``live`` stream, the messages' of a recording.
+    ``watched``: whether anybody looks. ``say`` is told what can't be read. Times are the machine's
+    of a ``live`` stream, the messages' of a recording. ``foxglove`` is given what is taken, too.
     """
 
     def __init__(
         self,
-        publish: Callable[[bytes, bytes], None],
+        publish: Callable[[str, str], None],
         watched: Callable[[], bool],
         say: Callable[[str], None],
         *,
         live: bool = True,
+        foxglove: Foxglove | None = None,
     ) -> None:
         self._publish = publish
         self._watched = watched
+        self._say = say
         self._live = live
-        super().__init__(say)
+        self._foxglove = foxglove
+        self._settings_text = ""  # as they came
+        self.seen = self.unreadable = 0  # states; messages
+        self.clear()
+        self._know(Settings())
 
     def clear(self) -> None:
         """Forget all but the hand: what comes next is of another time."""
         self.feed = Feed()
-        self._columns: deque[list[Any]] = deque(maxlen=round(SECONDS / _STEP))
-        self._trails = {name: deque[tuple[float, float]](maxlen=60) for name in FINGERS}
+        self.states = 0  # since then
+        self.time = math.nan  # of the newest state [Unix s]
+        self._truth: dict[str, Any] | None = None
+        self._gaps = {topic: Gaps() for topic in TOPICS}
+        self._past: deque[HandState] = deque(maxlen=round(SECONDS / _STEP))
         self._pressure = heatmap.FullScale(5e3)
-        super().clear()
 
     def _moment(self) -> float:
         return time.monotonic() if self._live else self.time
 
-    def take(self, topic: bytes, message: Any) -> bool:
+    def take(self, topic: bytes, message: Any) -> None:
         """Take one message of any content."""
-        state, when = self.feed.state, self.time
-        if not super().take(topic, message):
-            return False
-        if topic == schema.STATE and number(message, "seq") < state.seq:
-            self._columns.clear()  # they are another daemon's
-            for trail in self._trails.values():
-                trail.clear()
-        elif topic == schema.STATE and 0.0 <= when // _STEP != self.time // _STEP:
-            self._columns.append(self._column(when))  # the last state of a step stays
-            for name, trail in self._trails.items():
-                finger = state.finger(name)
-                if touches(finger):
-                    trail.append((finger.d, finger.theta))
-                else:
-                    trail.clear()
+        stamp = number(message, "timestamp")
+        if topic not in self._gaps or not 0.0 <= stamp < 2.0**32:
+            self.unreadable += 1
+            return
+        if not self._gaps[topic].take(message):
+            return
+        if topic == schema.STATE:
+            if number(message, "seq") < self.feed.state.seq:
+                self._past.clear()  # another daemon's
+            elif self.states and self.time // _STEP != stamp // _STEP:
+                self._past.append(self.feed.state)  # the step's last state
+            self.time = stamp
+            self.states += 1
+            self.seen += 1
+        elif topic == schema.TRUTH:
+            self._truth = message
+        elif topic == schema.SETTINGS and text(message, "settings") != self._settings_text:
+            self._settings_text = text(message, "settings")
+            settings, unknown = read_settings(message)
+            if unknown:
+                self._say(f"settings not known here: {printable(', '.join(unknown))}")
+            self._know(settings)
         self.feed.sort_in(topic, message, self._moment())
-        return True
+        if self._foxglove is not None:
+            self._foxglove.take(topic, message)
 
-    def know(self, hand: ShownHand) -> None:
+    def _know(self, settings: Settings) -> None:
         """Lay out the scene of a hand: panels and plots of what it has, and no others."""
-        super().know(hand)
-        self._columns.clear()
-        self._fields: list[tuple[str, float]] = []  # what the plots' columns hold, and its factor
-        a = hand.geometry.tip_radius
-        half, top = hand.geometry.half_separation + 1.3 * a, hand.geometry.reach + 1.9 * a
-        panels = [_panel("hand", "Hand", -half, half, top, -0.4 * a, scaled=True)]
-        if hand.sensors:
-            box = 0, hand.settings.tactile.cols, 0, hand.settings.tactile.rows
-            maps = [_panel(name, f"Pressure, {name} tip", *box) for name in hand.fingers]
+        self._settings, self._fingers = settings, fingers_of(settings)
+        hand, rows, cols = geometry_of(settings), settings.tactile.rows, settings.tactile.cols
+        a = hand.tip_radius
+        half, top = hand.half_separation + 1.3 * a, hand.reach + 1.9 * a
+        panels = [_panel("hand", "Hand", -half, half, top, -0.4 * a, equal=True, scaled=True)]
+        if settings.tactile.backend != "none":
+            maps = [
+                _panel(name, f"Pressure, {name} tip", 0, cols, 0, rows, equal=True)
+                for name in self._fingers
+            ]
             panels = [*maps[:1], *panels, *maps[1:]]
-        self._landscape = landscape = hand.landscape()
-        if landscape is not None:
-            texts = [(GOAL, *_flat(place), words) for place, words in landscape.ticks()]
-            still = {"image": _image(landscape.picture()), "texts": texts}
-            box = -30, WIDTH + 8, -6, HEIGHT + 14
-            panels.append(_panel("landscape", "Energy landscape U(d, θ)", *box, still=still))
-        plots = [{"title": name, "lines": self._lines(*of)} for name, of in _PLOTS.items()]
+        if (energy := landscape(settings)) is not None:
+            end = 1e3 * energy.d_end  # mm; θ in degrees
+            depths = range(0, int(end) + 1, math.ceil(end / 6.0))
+            angles = (-40.0, -20.0, 0.0, 20.0, 40.0)
+            texts = [(GOAL, each, -0.06 * end, f"{each:g}°") for each in angles]
+            texts += [(GOAL, -1.15 * THETA_END, 1.0 * each, f"{each} mm") for each in depths]
+            image = _image(energy.levels, -THETA_END, THETA_END, end, 0.0)
+            still = {"image": image, "texts": texts}
+            box = -1.3 * THETA_END, 1.05 * THETA_END, end, -0.1 * end
+            title = f"Energy U(d, θ) to {1e3 * energy.highest:.0f} mJ, ∝ ∛U"
+            panels.append(_panel("landscape", title, *box, still=still))
+        every = {
+            title: (by, [*filter(self._has, of.split())]) for title, (by, of) in _PLOTS.items()
+        }
+        self._plots = {title: (by, paths) for title, (by, paths) in every.items() if paths}
         scene = {
-            "seconds": SECONDS,
-            "panels": panels,
-            "plots": [plot for plot in plots if plot["lines"]],
+            "panels": [*panels, *(_panel(title, title) for title in self._plots)],
             "modes": _MODES,
-            "levels": LEVELS,
+            "levels": _LEVELS,
             "palette": [*heatmap.colour_map(), _OUTSIDE],
             "commands": {name: list(modes) for name, (modes, _) in COMMANDS.items()},
         }
-        self._scene = orjson.dumps(scene)
+        self._scene = _packed(scene)
 
-    def _lines(self, factor: float, fields: str) -> list[dict[str, Any]]:
-        """A plot's lines: name, colour, and the columns of values and of their deviations."""
-        lines = []
-        hand = self.hand
-        for path in fields.split():
-            finger, _, key = path.rpartition(".")
-            if (
-                (finger in FINGERS and finger not in hand.fingers)
-                or (key in _SERVOS and not hand.servos)
-                or (path in ("object.angle", "goal_angle") and len(hand.fingers) < 2)
-            ):
-                continue
-            goal = " goal" if key.startswith("goal") else ""
-            name, colour = _OTHERS.get(path, ((finger + goal).strip(), COLOURS.get(finger, GOAL)))
-            std = [f"{path}_std"] if hasattr(self.feed.state.left, f"{key}_std") else []
-            columns = [len(self._fields) + 2 + k for k in range(1 + len(std))]  # after time, mode
-            self._fields += [(each, factor) for each in (path, *std)]
-            lines.append({"name": name, "colour": colour, "goal": goal, "columns": columns})
-        return lines
-
-    def _column(self, when: float) -> list[Any]:
-        state = self.feed.state
-        row: list[Any] = [when, self.feed.mode]
-        for path, factor in self._fields:
-            known = path != "object.angle" or state.object.valid
-            value = attrgetter(path)(state) if known else math.nan
-            row.append(float(f"{factor * value:.5g}"))
-        return row
+    def _has(self, path: str) -> bool:
+        """Return whether the hand has what is at this path of the state."""
+        finger, _, key = path.rpartition(".")
+        no_servos = self._settings.servos.backend == "none"
+        return not (
+            (finger in FINGERS and finger not in self._fingers)
+            or (no_servos and key.removeprefix("goal_") in _SERVOS)
+            or (path in ("object.angle", "goal_angle") and len(self._fingers) < 2)
+        )
 
     def draw(self, place: tuple[float, float, bool] | None = None) -> None:
         """Publish a picture of what has come so far, where anybody looks.
 
         ``place``: of a recording the position and duration [s], and whether it plays.
         """
+        now, feed, state = self._moment(), self.feed, self.feed.state
+        if self._foxglove is not None and self.states:
+            self._foxglove.draw(self._settings, state, self._truth)
         if not self._watched():
             return
-        now, feed, state = self._moment(), self.feed, self.feed.state
         angle = state.goal_angle if math.isfinite(state.goal_angle) else state.object.angle
         picture = {
             "now": time.monotonic(),
@@ -196,47 +226,38 @@ class Pictures(Viewer):
             "force_max": feed.force_limit,
             "limits": self._limits(),
             "facts": self._facts(now),
-            "panels": {"hand": self._hand(), "landscape": self._contacts(), **self._maps(now)},
-            "columns": [*self._columns, self._column(self.time)],
+            "panels": self._maps(now)
+            | {"hand": self._planar(), "landscape": self._contacts()}
+            | self._graphs(),
             "events": [(each.clock(), *each[1:]) for each in feed.events[-_EVENTS:]],
         }
-        self._publish(self._scene, orjson.dumps(picture))
+        self._publish(self._scene, _packed(picture))
 
-    def _hand(self) -> dict[str, Any]:
-        truth = self.newest.get(schema.TRUTH)
-        every = planar.hand_parts(self.hand, self.feed.state, truth).values()
-        strips = [strip for part in every for strip in part.strips]
-        lines = [(strip.colour, 1e-3 * strip.width, _flat(strip.points)) for strip in strips]
-        texts = []
-        for push in (push for part in every for push in part.pushes):
-            end, back = push.at + push.way, -0.2 * push.way
-            side = 0.6 * np.array([-back[1], back[0]])
-            arrow = np.array([push.at, end, end + back + side, end, end + back - side])
-            lines.append((push.colour, 1.8e-3, _flat(arrow)))
-            texts.append((push.colour, *_flat(push.at - (0.0, 0.02)), push.text))
+    def _planar(self) -> dict[str, Any]:
+        parts = planar.hand_parts(self._settings, self.feed.state, self._truth).values()
+        lines = [(colour, wide, _flat(each)) for part in parts for colour, wide, each in part.lines]
+        texts = [(colour, *_flat(at), words) for part in parts for colour, at, words in part.texts]
         return {"lines": lines, "texts": texts}
 
     def _maps(self, now: float) -> dict[str, Any]:
         """Each tip's frame with its rim, and footprint and centroid of the contact."""
-        frames = self.feed.frames
+        frames, radius = self.feed.frames, self._settings.tip.radius
         peak = max((float(frame.grid.max()) for frame in frames.values()), default=0.0)
         full = self._pressure.follow(peak, now)
         maps = {}
         for name, frame in frames.items():
             unit, factor = ("counts", 1.0) if math.isnan(frame.scale) else ("kPa", 1e-3)
-            lines, dots = [], []
-            grid, radius = planar.grid_of(frame.source), self.hand.settings.tip.radius
+            lines, dots, (rows, cols) = [], [], frame.grid.shape
+            grid, contact = planar.grid_of(frame.source), self.feed.state.finger(name)
             if grid is not None:
                 lines.append((COLOURS[name], 1.0, _flat(planar.tip_circle(grid, radius))))
-            contact = self.feed.state.finger(name)
             if grid is not None and touches(contact):
                 tilts = contact.theta, contact.tilt_y if math.isfinite(contact.tilt_y) else 0.0
-                place = planar.footprint(grid, radius, contact.d, *tilts)
-                if place is not None:
-                    lines.append((_WHITE, 1.5, _flat(place.outline)))
-                    dots.append((COLOURS[name], *_flat(place.centroid)))
+                if place := planar.footprint(grid, radius, contact.d, *tilts):
+                    lines.append((_WHITE, 1.5, _flat(place[0])))
+                    dots.append((COLOURS[name], *_flat(place[1])))
             maps[name] = {
-                "image": _image(heatmap.levels_of(frame.grid, full).astype(np.uint8)),
+                "image": _image(heatmap.levels_of(frame.grid, full), 0, cols, 0, rows),
                 "lines": lines,
                 "dots": dots,
                 "note": f"peak {factor * frame.grid.max():.1f} of {factor * full:g} {unit}",
@@ -244,21 +265,34 @@ class Pictures(Viewer):
         return maps
 
     def _contacts(self) -> dict[str, Any]:
-        """Each contact on the landscape, with its trail."""
+        """Each contact on the landscape, in mm and degrees, with its trail."""
         lines, dots = [], []
-        for name in self.hand.fingers:
-            contact = self.feed.state.finger(name)
-            if touches(contact) and self._landscape is not None:
-                trail = np.array([*self._trails[name], (contact.d, contact.theta)])
-                places = self._landscape.place(*trail.T)
-                lines.append((COLOURS[name], 2.0, _flat(places)))
-                dots.append((COLOURS[name], *_flat(places[-1])))
-        highest = math.nan if self._landscape is None else 1e3 * self._landscape.highest
-        return {"lines": lines, "dots": dots, "note": f"0 to {short(highest, 0)} mJ, ∝ ∛U"}
+        states = [self.feed.state, *reversed(self._past)][: 1 + _TRAIL]
+        for name in self._fingers:
+            tips = takewhile(touches, (state.finger(name) for state in states))
+            if trail := [(_DEGREE * tip.theta, 1e3 * tip.d) for tip in tips]:
+                lines.append((COLOURS[name], 2.0, _flat(np.array(trail))))
+                dots.append((COLOURS[name], *trail[0]))
+        return {"lines": lines, "dots": dots}
+
+    def _graphs(self) -> dict[str, Any]:
+        """The plots over the last seconds, with a deviation to both sides, and the mode below."""
+        past = [state for state in self._past if state.timestamp > self.time - SECONDS]
+        states = [*past, self.feed.state]
+        times = np.array([state.timestamp for state in states]) - self.time
+        modes, k = [], 0
+        for mode, run in groupby(states, attrgetter("mode")):
+            begin, k = k, k + len(list(run))
+            modes.append((_MODES.get(mode, GOAL), times[begin], times[min(k, len(times) - 1)]))
+        graphs = {}
+        for title, (factor, paths) in self._plots.items():
+            series = [(path, *_series(path, factor, states)) for path in paths]
+            graphs[title] = _graph(series, times, modes)
+        return graphs
 
     def _limits(self) -> str:
         """Return what holds the hand back: a recent warning, the grip's goal, the nearest limit."""
-        state, safety = self.feed.state, self.hand.settings.safety
+        state, safety = self.feed.state, self._settings.safety
         last = [each for each in self.feed.events[-1:] if each.level == "warning"]
         parts = [each.text for each in last if self.time - each.timestamp < _LATELY]
         if math.isfinite(state.goal_force):
@@ -267,40 +301,85 @@ class Pictures(Viewer):
             parts.append(f"grip: goal {state.goal_force:.1f} N{raised}")
         used = [
             (value / getattr(safety, f"{key}_max"), name, key)
-            for name in self.hand.fingers
+            for name in self._fingers
             for key in _BOUNDED
-            if math.isfinite(value := abs(getattr(getattr(state, name), key)))
+            if math.isfinite(value := abs(getattr(state.finger(name), key)))
         ]
         for ratio, name, key in sorted(used)[-1:]:
             parts.append(f"nearest limit: {name} {key} at {ratio:.0%} of safety.{key}_max")
         return " · ".join(parts)
 
     def _facts(self, now: float) -> list[str]:
-        """Small facts, one cell each: tick and its times, frames, servos, losses, commander."""
-        feed, state = self.feed, self.feed.state
-        fingers = [getattr(state, name) for name in self.hand.fingers]
+        """Small facts: tick and its times, frames, servos, object, losses, commander."""
+        feed, state, times = self.feed, self.feed.state, self.feed.times
+        fingers = [state.finger(name) for name in self._fingers]
 
         def each(key: str, factor: float, decimals: int) -> str:
             return " / ".join(short(factor * getattr(finger, key), decimals) for finger in fingers)
 
-        facts = [f"overruns {state.overruns}"]
-        if (times := feed.times) is not None:
-            stages = {"work": times.compute, "late": times.wake}
-            for name, of in {**stages, "bus": times.bus, "publish": times.publish}.items():
-                spread = ", ".join(micro(value) for value in (of.p50, of.p99, of.p999, of.max))
-                facts.append(f"{name} [µs] p50, 99, 99.9, max: {spread}")
-            rates = times.rates
-            facts.insert(0, f"tick {short(rates.tick, 0)} Hz")
-            facts.append(f"frames {short(rates.left, 0)} / {short(rates.right, 0)} Hz")
-        who = feed.commander(now)
-        return [
-            *facts,
+        facts = [
             f"frames {each('frame_age_s', 1e3, 0)} ms old",
             f"servos {each('temperature', 1.0, 0)} °C, {each('voltage', 1.0, 1)} V",
             f"object {short(1e3 * state.object.width, 1)} mm wide",
-            f"{sum(gaps.lost for gaps in self.gaps.values())} lost, {feed.skipped} unreadable",
-            *([f"{who} commands"] if who else []),
+            f"{sum(gaps.lost for gaps in self._gaps.values())} lost, {feed.skipped} unreadable",
+            f"{state.overruns} overruns",
         ]
+        if times is not None:
+            facts.append(f"tick {short(times.rates.tick, 0)} Hz")
+            for name, of in {"work": times.compute, "late": times.wake, "bus": times.bus}.items():
+                facts.append(f"{name} {micro(of.p50)}, p99 {micro(of.p99)}, max {micro(of.max)} µs")
+        if self.states and state.schema != schema.SCHEMA:
+            facts.append(f"schema {state.schema}, this page knows {schema.SCHEMA}")
+        if who := feed.commander(now):
+            facts.append(f"{who} commands")
+        return facts
+
+
+def _series(path: str, factor: float, states: list[HandState]) -> tuple[FloatArray, FloatArray]:
+    """Return a field's values and their deviations, 0 where it has none."""
+    values = np.array([attrgetter(path)(state) for state in states])
+    if path == "object.angle":
+        values[[not state.object.valid for state in states]] = np.nan
+    std = np.zeros(len(states))
+    if path.rpartition(".")[2] + "_std" in _DEVIATIONS:
+        std = np.array([attrgetter(f"{path}_std")(state) for state in states])
+    return factor * np.clip(values, -_MOST, _MOST), factor * np.clip(np.nan_to_num(std), 0.0, _MOST)
+
+
+def _graph(
+    series: list[tuple[str, FloatArray, FloatArray]],
+    times: FloatArray,
+    modes: list[tuple[Colour, float, float]],
+) -> dict[str, Any]:
+    """A plot over ``times`` [s], with ``modes`` from and to; series: path, values, deviations."""
+    ends = np.array([(value - std, value + std) for _, value, std in series])
+    known = ends[np.isfinite(ends)]
+    low, high = (known.min(), known.max()) if known.size else (0.0, 1.0)
+    slack = max(0.08 * (high - low), 0.02 * max(abs(low), abs(high)), 0.01)
+    low, high = low - slack, high + slack
+    step, foot = heatmap.round_up(0.25 * (high - low)), low - 0.05 * (high - low)
+    lines: list[Any] = [(colour, 4, [begin, foot, end, foot]) for colour, begin, end in modes]
+    texts: list[Any] = []
+    for tick in step * np.arange(math.ceil(low / step), math.floor(high / step) + 1):
+        lines.append((_GRID, 1, [-SECONDS, tick, 0.0, tick]))
+        texts.append((GOAL, -1.07 * SECONDS, tick, f"{tick:.6g}"))
+    for k, (path, value, std) in enumerate(series):
+        finger, _, key = path.rpartition(".")
+        goal = " goal" * key.startswith("goal")
+        name, colour = _OTHERS.get(path, ((finger + goal).strip(), COLOURS.get(finger, GOAL)))
+        spread = ""
+        if std.any():
+            bars = (times, value - std, times, value + std, times, times * np.nan)
+            lines.append(((*colour, 0.25), 4, _flat(np.column_stack(bars))))
+            spread = f" ± {std[-1]:.2g}"
+        lines.append((colour, 0.8 if goal else 1.8, _flat(np.column_stack((times, value)))))
+        if math.isfinite(value[-1]) and not (goal and finger):
+            place = (k + 0.5) / len(series) * SECONDS - SECONDS
+            texts.append(
+                (colour, place, low - 0.15 * (high - low), f"{name} {value[-1]:.3g}{spread}")
+            )
+    box = -1.15 * SECONDS, 0.0, high, low - 0.22 * (high - low)
+    return {"box": box, "lines": lines, "texts": texts}
 
 
 def _panel(name: str, title: str, *box: float, **more: Any) -> dict[str, Any]:
@@ -308,12 +387,15 @@ def _panel(name: str, title: str, *box: float, **more: Any) -> dict[str, Any]:
     return {"name": name, "title": title, "box": box, **more}
 
 
-def _flat(points: NDArray[np.float64]) -> list[float]:
+def _flat(points: FloatArray) -> FloatArray:
     """x and y in turn; four decimals are a tenth of a pixel or less, in metres, too."""
-    flat: list[float] = np.clip(points, -1e6, 1e6).round(4).ravel().tolist()
-    return flat
+    return np.clip(points, -_MOST, _MOST).round(4).ravel()
 
 
-def _image(levels: NDArray[np.uint8]) -> dict[str, Any]:
-    rows, cols = levels.shape
-    return {"rows": rows, "cols": cols, "data": base64.b64encode(levels.tobytes()).decode()}
+def _packed(shown: dict[str, Any]) -> str:
+    return orjson.dumps(shown, option=orjson.OPT_SERIALIZE_NUMPY).decode()
+
+
+def _image(levels: NDArray[np.integer[Any]], *box: float) -> dict[str, Any]:
+    data = base64.b64encode(levels.astype(np.uint8).tobytes()).decode()
+    return {"rows": len(levels), "cols": len(levels[0]), "data": data, "box": box}

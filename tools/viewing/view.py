@@ -13,7 +13,7 @@ from softfinger.tools.extras import require
 _EPILOG = """\
 Serves a page on this machine alone. Whoever opens the address with the token, which is printed,
 gets buttons and sliders, and stop on the space key; the one without it only watches.
-With --foxglove: a WebSocket server for Foxglove on this machine, by default at ws://127.0.0.1:8765;
+With --foxglove the page's port speaks Foxglove's protocol, too, by default at ws://127.0.0.1:8765;
 the line it prints says where the layout file is. A recording is opened in Foxglove itself.
 Ends with Ctrl-C, or after --duration.
 From another machine: ssh -L 9090:127.0.0.1:9090, with the port printed.
@@ -61,15 +61,9 @@ def run(arguments: argparse.Namespace) -> int:
         print("view: --foxglove serves the stream alone, found FILE.mcap, too", file=sys.stderr)
         return 2
     arguments.address, arguments.commands = arguments.address
+    require("view")
+    from softfinger.tools.viewing.page import show
+
     with Ending(arguments.duration) as ending:
-        if arguments.foxglove is None:
-            require("view")
-            from softfinger.tools.viewing.page import show
-
-            show(arguments, ending)
-        else:
-            require("foxglove")
-            from softfinger.tools.viewing.foxglove_server import serve
-
-            serve(arguments, ending)
+        show(arguments, ending)
     return 0

@@ -1,0 +1,117 @@
+"""What is shown, live or recorded: its messages in time, and pictures of them at a rate."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import math
+import time
+from collections.abc import Callable
+from typing import Any
+
+import zmq
+
+from softfinger.daemon.client.connection import drain, subscribe, unpack
+from softfinger.daemon.errors import SoftfingerError
+from softfinger.daemon.wire import schema
+from softfinger.daemon.wire.keys import ClientKeys
+from softfinger.tools.arguments import PATIENCE, no_stream, waiting
+from softfinger.tools.ending import Ending
+from softfinger.tools.recordings.reader import Recording
+from softfinger.tools.terminal.feed import number
+from softfinger.tools.viewing.pictures import SECONDS, TOPICS, Pictures
+
+_SILENCE = 2.0  # s without a message after which a line says so
+_REST = 1.0  # s between two pictures at most, where drawing is slow
+_QUEUE = 5_000  # messages that wait meanwhile: 2 s of state and truth at 1 kHz with their frames
+
+
+class ViewError(SoftfingerError):
+    """Nothing can be shown. The message says why, and what to do."""
+
+
+def follow(
+    arguments: argparse.Namespace,
+    keys: ClientKeys | None,
+    pictures: Pictures,
+    ending: Ending,
+    say: Callable[[str], None],
+) -> None:
+    """Show the stream that ``arguments`` name until the end. Raises ViewError."""
+    context: zmq.Context[Any] = zmq.Context()
+    try:
+        if keys is not None:
+            keys.guard(context)
+        socket = subscribe(context, arguments.address, *TOPICS, queue=_QUEUE)
+        begun = last = time.monotonic()
+        silent, rest = False, 1.0 / arguments.rate
+        while not ending.wait(rest):
+            began = time.monotonic()
+            for message in drain(socket, _QUEUE):
+                last = began
+                try:
+                    pictures.take(*unpack(message))
+                except ValueError:
+                    pictures.unreadable += 1
+            if arguments.no_wait and last == begun and began - begun > PATIENCE:
+                raise ViewError(no_stream(arguments.address, arguments.keys))
+            if silent != (began - last > _SILENCE):
+                silent = not silent
+                where = waiting(arguments.address, arguments.keys)
+                say(where if silent else "the stream has begun")
+            pictures.draw()
+            # Never busy for more than half of its time, however slow the machine is.
+            busy = time.monotonic() - began
+            rest = max(1.0 / arguments.rate - busy, min(busy, _REST))
+    except zmq.ZMQError as error:
+        raise ViewError(f"{arguments.address}: {error}") from None
+    finally:
+        context.destroy(linger=0)
+
+
+class Playback:
+    """A recording's place, and that it is ``playing``. ``run`` is for its own thread."""
+
+    def __init__(self, recording: Recording, pictures: Pictures, period: float) -> None:
+        self._recording = recording
+        self._pictures = pictures
+        self._period = period  # s between two pictures
+        self._target: float | None = 0.0  # where to go, from another thread
+        self.playing = True
+        self.position = 0.0  # s from the first message on
+
+    def ask(self, wish: str) -> None:
+        """Carry out a page's wish: ``play``, ``pause`` or a position [s]; ignore others."""
+        with contextlib.suppress(ValueError):
+            if wish in ("play", "pause"):
+                self.playing = wish == "play"
+                if self.playing and self.position == self._recording.duration:
+                    self._target = 0.0
+            elif math.isfinite(place := float(wish)):
+                self._target = min(max(place, 0.0), self._recording.duration)
+
+    def run(self, ending: Ending) -> None:
+        """Play until the end is asked for."""
+        recording, pictures = self._recording, self._pictures
+        if recording.count(schema.SETTINGS):  # which may come once, at the beginning
+            pictures.take(*next(recording.messages([schema.SETTINGS])))
+        while not ending.over:
+            begun = time.monotonic()
+            if (target := self._target) is not None:
+                self._target, self.position = None, target
+                pictures.clear()
+                messages = recording.messages(TOPICS, target - SECONDS)  # the plots' past
+                ahead = next(messages, None)
+            while ahead is not None and (self._is_past(ahead[1]) or not pictures.states):
+                pictures.take(*ahead)
+                ahead = next(messages, None)
+            self.playing &= ahead is not None
+            pictures.draw((self.position, recording.duration, self.playing))
+            ending.wait(self._period)
+            if self.playing:
+                elapsed = time.monotonic() - begun
+                self.position = min(self.position + elapsed, recording.duration)
+
+    def _is_past(self, message: dict[str, Any]) -> bool:
+        at = number(message, "timestamp") - self._recording.start
+        return not min(at, self._recording.duration) > self.position
