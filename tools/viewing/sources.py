@@ -1,4 +1,4 @@
-"""What is shown, live or recorded: its messages in time, and pictures of them at a rate."""
+"""The sources of messages, live or recorded: taken in time, with pictures of them at a rate."""
 
 from __future__ import annotations
 
