@@ -23,11 +23,11 @@ from softfinger.kinematics.calibration.press_fit import (
     depth_of_force,
     fit_place,
     golden_section,
-    modulus_by_force,
     trend,
 )
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.contact.table import ContactTable
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
 FloatArray = NDArray[np.float64]
@@ -299,8 +299,8 @@ class Modulus:
 def fit_modulus(d: ArrayLike, theta: ArrayLike, force: ArrayLike, tip: Fingertip) -> Modulus:
     """Fit a constant modulus of ``tip``, and the run's own zero of d, to a compression run.
 
-    ``d`` [m], ``theta`` [rad], ``force`` [N] by the sensor, all [n]. Raises CalibrationError for
-    too few points, and for a force that does not rise with d.
+    By least relative squares. ``d`` [m], ``theta`` [rad], ``force`` [N] by the sensor, all [n].
+    Raises CalibrationError for too few points, and for a force that does not rise with d.
     """
     depth, tilt, load = (np.asarray(each, np.float64) for each in (d, theta, force))
     if not depth.shape == tilt.shape == load.shape:
@@ -311,7 +311,16 @@ def fit_modulus(d: ArrayLike, theta: ArrayLike, force: ArrayLike, tip: Fingertip
     depth, tilt, load = depth[used], tilt[used], load[used]
     if not np.polyfit(depth, load, 1)[0] > 0.0:
         raise CalibrationError("modulus: the force does not rise with d")
-    modulus, offset, fitted = modulus_by_force(depth, tilt, load, tip)
+    unit, offset, modulus = ContactTable.build(tip, Material.constant(1.0)), 0.0, 0.0
+    for _ in range(30):
+        c = unit(np.maximum(depth - offset, 1e-9), tilt)
+        columns = np.stack([c.force, -c.force_d], axis=1) / load[:, None]
+        modulus, shift = np.linalg.lstsq(columns, np.ones(len(load)), rcond=None)[0].tolist()
+        step = float(np.clip(shift / modulus, -5e-4, 5e-4))
+        offset += step
+        if abs(step) < 1e-9:
+            break
+    fitted = modulus * unit(np.maximum(depth - offset, 1e-9), tilt).force
     alone = trend(depth, modulus * load / fitted, load)
     return Modulus(modulus, offset, _rms(fitted / load - 1.0), alone)
 

@@ -305,19 +305,3 @@ def depth_of_force(tip: Fingertip, material: Material, force: FloatArray) -> Flo
     """Return d [m] of an upright tip by its ``force`` [N], from the table."""
     d = np.linspace(0.0, 0.4 * tip.radius, 401)
     return np.interp(force, ContactTable.build(tip, material)(d, 0.0).force, d)
-
-
-def modulus_by_force(
-    d: FloatArray, theta: FloatArray, force: FloatArray, tip: Fingertip
-) -> tuple[float, float, FloatArray]:
-    """Fit E [Pa] and the zero of d [m] by least relative squares; return the forces [n], too."""
-    unit, offset, modulus = ContactTable.build(tip, _UNIT), 0.0, 0.0
-    for _ in range(30):
-        c = unit(np.maximum(d - offset, 1e-9), theta)
-        columns = np.stack([c.force, -c.force_d], axis=1) / force[:, None]
-        modulus, shift = np.linalg.lstsq(columns, np.ones(len(force)), rcond=None)[0].tolist()
-        step = float(np.clip(shift / modulus, -5e-4, 5e-4))
-        offset += step
-        if abs(step) < 1e-9:
-            break
-    return modulus, offset, modulus * unit(np.maximum(d - offset, 1e-9), theta).force

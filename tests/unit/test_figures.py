@@ -13,7 +13,7 @@ from matplotlib.image import imread
 from numpy.typing import NDArray
 
 from softfinger.tools import cli, style
-from softfinger.tools.paper import appendix, figures, validate
+from softfinger.tools.paper import experiment_pages, figures, validate
 from softfinger.tools.paper.model_pages import double_integrals
 from softfinger.tools.paper.validate import Beside
 from tests.harness.paper_tip import CHECKPOINTS
@@ -128,12 +128,12 @@ def test_path_of_tilt_and_roll(folder: Path) -> None:
         assert rotation[f"d up to {d} mm [mm]"][-1] == pytest.approx(d, rel=1e-12)
 
 
-@pytest.mark.parametrize("of", [appendix.printed_terms, appendix.integrated_terms])
-def test_checkpoints_of_the_appendix(of: Callable[..., appendix.Terms]) -> None:
+@pytest.mark.parametrize("of", [experiment_pages.printed_terms, experiment_pages.integrated_terms])
+def test_checkpoints_of_the_appendix(of: Callable[..., experiment_pages.Terms]) -> None:
     a, d = 20.0, np.array(4.0)  # mm
     expected = (31.939525311496, 1.7671458676443, 0.098174770424681)  # eqs. 16, 18 and 19
     np.testing.assert_allclose(of(a, d), expected, rtol=1e-13)
-    assert appendix.limits(a, d)[1] == pytest.approx(0.92729521800161, rel=1e-14)  # eq. 17
+    assert experiment_pages.limits(a, d)[1] == pytest.approx(0.92729521800161, rel=1e-14)  # eq. 17
     assert of(a, d).energy(a, 0.304, d) == pytest.approx(20.374275556081, rel=1e-12)
 
 

@@ -36,32 +36,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def pages() -> dict[str, FigurePage]:
     """Return all figures by name."""
-    from softfinger.tools.paper import (
-        appendix,
-        experiment_pages,
-        model_pages,
-        run_pages,
-        slow_turn,
-    )
+    from softfinger.tools.paper import experiment_pages, model_pages, run_pages, slow_turn
 
-    modules = (model_pages, experiment_pages, run_pages, appendix, slow_turn)
+    modules = (model_pages, experiment_pages, run_pages, slow_turn)
     found = {name: page for each in modules for name, page in each.PAGES.items()}
     return {name: found[name] for name in (*NAMES, *BY_NAME)}
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Write the numbers, then the pictures where matplotlib is installed."""
+    """Write the numbers, then the pictures where matplotlib is installed. Raises OSError."""
     known = (*NAMES, *BY_NAME)
     unknown = [name for name in arguments.names if name not in known]
     if unknown:
         print(f"figures: found {unknown[0]!r}, expected one of {', '.join(known)}", file=sys.stderr)
         return 2
-    try:
-        arguments.out.mkdir(parents=True, exist_ok=True)
-        write({name: pages()[name] for name in arguments.names or NAMES}, arguments.out)
-    except OSError as error:
-        print(f"figures: {error}", file=sys.stderr)
-        return 1
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    write({name: pages()[name] for name in arguments.names or NAMES}, arguments.out)
     return 0
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from softfinger.daemon.client.stream import read
@@ -78,7 +79,7 @@ def from_json(topic: bytes) -> Converter:
     """Return the converter of a channel's JSON to the map of the wire."""
     fields = schema.TOPICS[topic].fields if topic in schema.TOPICS else ()
     floats = [field.name.split(".") for field in fields if field.kind == "float"]
-    return _Restored(topic, floats)
+    return partial(_restored, topic, floats, [field.name for field in fields])
 
 
 def _stamp(unix: object) -> dict[str, int]:
@@ -120,40 +121,32 @@ def _log(message: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-class _Restored:
-    """Nulls are NaN again, bytes are bytes, and an image or a log line is the topic's own map.
+def _restored(
+    topic: bytes, floats: list[list[str]], names: list[str], message: dict[str, Any]
+) -> dict[str, Any]:
+    """Return the topic's own map: nulls are NaN again, bytes are bytes, and no image or log line.
 
     Raises ValueError, TypeError or AttributeError for what is no message of the topic.
     """
-
-    def __init__(self, topic: bytes, floats: list[list[str]]) -> None:
-        self._floats = floats
-        self._foxglove = _FOXGLOVE.get(topic, ("", {}))[1]
-        self._image = topic == schema.TACTILE
-        self._names = (
-            [field.name for field in schema.TOPICS[topic].fields] if self._foxglove else []
-        )
-
-    def __call__(self, message: dict[str, Any]) -> dict[str, Any]:
-        if self._foxglove and _STORED_AS["timestamp"] in message:
-            for name in self._foxglove:
-                message.pop(name, None)
-            for name, stored in _STORED_AS.items():
-                if stored in message:
-                    message[name] = message.pop(stored)
-            message = {name: message[name] for name in self._names if name in message} | message
-        if self._image:
-            message["data"] = base64.b64decode(message.get("data") or "")
-            frame = read(schema.TactileFrame, message)
-            if frame.finger not in FINGERS or not math.isfinite(frame.timestamp):
-                raise ValueError("a tactile frame without its finger or time")
-        for path in self._floats:
-            place: Any = message
-            for part in path[:-1]:
-                place = place.get(part)
-                if not isinstance(place, dict):
-                    break
-            else:
-                if path[-1] in place and place[path[-1]] is None:
-                    place[path[-1]] = math.nan
-        return message
+    if topic in _FOXGLOVE and _STORED_AS["timestamp"] in message:
+        for name in _FOXGLOVE[topic][1]:
+            message.pop(name, None)
+        for name, stored in _STORED_AS.items():
+            if stored in message:
+                message[name] = message.pop(stored)
+        message = {name: message[name] for name in names if name in message} | message
+    if topic == schema.TACTILE:
+        message["data"] = base64.b64decode(message.get("data") or "")
+        frame = read(schema.TactileFrame, message)
+        if frame.finger not in FINGERS or not math.isfinite(frame.timestamp):
+            raise ValueError("a tactile frame without its finger or time")
+    for path in floats:
+        place: Any = message
+        for part in path[:-1]:
+            place = place.get(part)
+            if not isinstance(place, dict):
+                break
+        else:
+            if path[-1] in place and place[path[-1]] is None:
+                place[path[-1]] = math.nan
+    return message

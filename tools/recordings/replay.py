@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import json
 import time
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from softfinger.daemon.errors import AddressError, RecordingError
 from softfinger.daemon.gateway.bounds import Config
 from softfinger.daemon.gateway.supervisor import Gateway
-from softfinger.daemon.own_files import write_text
 from softfinger.daemon.profile.settings import StreamSettings
 from softfinger.daemon.profile.validation import address_problem
 from softfinger.daemon.wire import schema
@@ -67,9 +64,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         metavar="FILE",
         help="with --recompute: other settings than the recorded",
-    )
-    parser.add_argument(
-        "--json", type=Path, metavar="OUT", help="with --recompute: write the comparison to a file"
     )
 
 
@@ -134,9 +128,6 @@ def _recompute(arguments: argparse.Namespace, recording: Recording) -> int:
     for count, what in ((result.missing_ticks, "ticks"), (result.missing_frames, "frames")):
         if count:
             print(f"{count} {what} are missing in the recording")
-    if arguments.json is not None:
-        with write_text(arguments.json) as file:
-            file.write(json.dumps(asdict(result), indent=1) + "\n")
     if not result.differences:
         print("identical to the last bit")
         return 0

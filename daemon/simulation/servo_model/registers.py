@@ -169,16 +169,13 @@ class ControlTable:
         mask = (1 << 8 * item.size) - 1
         self.memory[address : address + item.size] = (value & mask).to_bytes(item.size, "little")
 
-    def reset(self, keep: tuple[int, ...] = ()) -> None:
-        """Restore factory defaults everywhere but in the items at the addresses ``keep``."""
-        for item in self.items:
-            if item.address not in keep:
-                self.set(item.address, item.default)
+    def reset(self, keep: tuple[int, ...] = (), first: int = 0) -> None:
+        """Restore factory defaults from address ``first`` on but in the items at ``keep``.
 
-    def reset_ram(self) -> None:
-        """Restore the RAM as after a power-up."""
+        From `control_table.RAM` on it is what a power-up does.
+        """
         for item in self.items:
-            if not item.saved:
+            if item.address >= first and item.address not in keep:
                 self.set(item.address, item.default)
 
     # --- reading ---------------------------------------------------------------------------------

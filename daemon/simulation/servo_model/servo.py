@@ -95,11 +95,6 @@ class EmulatedServo:
         """Seconds between an instruction and its reply."""
         return self._memory[reg.RETURN_DELAY_TIME] * reg.RETURN_DELAY_UNIT
 
-    @property
-    def status_return_level(self) -> int:
-        """0 answers pings only, 1 reads too, 2 everything."""
-        return self._memory[reg.STATUS_RETURN_LEVEL]
-
     def answers_reads(self, servo_id: int, fast: bool) -> bool:
         """Return whether it answers group reads from ``servo_id``."""
         memory = self._memory
@@ -319,7 +314,7 @@ class EmulatedServo:
     def _start(self, t: float) -> None:
         """Power-up, or the end of a reboot."""
         table = self.table
-        table.reset_ram()
+        table.reset(first=reg.RAM)
         self.health.restart()
         self._booted = self._watched = t
         self._joint.forget_turns()

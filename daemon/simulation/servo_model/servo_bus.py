@@ -190,12 +190,14 @@ class ServoBus:
             return self._broadcast(packet, servos, t)
         if instruction == framing.STATUS:
             return []  # another servo's answer, or our own echo
+        # A status return level of 0 answers pings only, 1 reads too, 2 everything.
         needed = {framing.PING: 0, framing.READ: 1}.get(instruction, 2)
         replies = []
         for servo in servos:
             if servo.id == packet.id:
                 # Level, delay and ID as they were when the instruction came.
-                level, delay, name = servo.status_return_level, servo.return_delay, servo.id
+                level = servo.table.get(reg.STATUS_RETURN_LEVEL)
+                delay, name = servo.return_delay, servo.id
                 error, data = _execute(servo, instruction, packet.parameters, t)
                 if level >= needed:
                     # The alert bit is taken after the instruction was done.
