@@ -12,7 +12,10 @@ import pytest
 from softfinger.daemon.clock import RealClock
 from softfinger.daemon.loop.realtime import _ATTRIBUTE_CALLS, RealTime, _set_slice
 from softfinger.daemon.profile.settings import Settings
-from tests.harness.daemon_process import python
+from softfinger.tools.benchmarks import tick
+from softfinger.tools.benchmarks.measuring import Report
+from tests.conftest import until
+from tests.harness.daemon_process import PATIENCE, python
 
 # What the system says of a process that asked for everything: before, during and after.
 HELD = """
@@ -165,3 +168,17 @@ def test_a_sleep_never_ends_early_and_the_spin_is_within_it(spin):
         clock.sleep_until(deadline)
         assert clock.now() >= deadline
     assert time.thread_time() - before < 20 * 9e-4, "the whole sleep was spent awake"
+
+
+def test_ticks_over_ptys_and_their_exchanges_take_turns():
+    patient = [f"{key}={value}" for key, value in PATIENCE.items()]
+    reports: list[Report] = []
+
+    def measured() -> bool:
+        """It fails where the hand does not hold in time, as on a machine that is busy."""
+        reports.append(tick.in_the_loop(2, 2_000_000, patient))
+        return not reports[-1].failed
+
+    until(measured, 400.0)
+    assert [row["n"] for row in reports[-1].rows] == [40] * 3
+    assert all(row["median"] > 0.0 for row in reports[-1].rows)

@@ -1,16 +1,48 @@
-"""The estimator's kernels against plain NumPy twins."""
+"""The estimator's kernels against plain NumPy; counts that end at zero, thresholds, misfits."""
 
 import math
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
+from softfinger.kinematics.compiled.kernel import kernel
+from softfinger.kinematics.compiled.layout import Records
+from softfinger.kinematics.compiled.simd import address
 from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.estimation import detection, likelihood
 from softfinger.kinematics.estimation.cell_centres import cell_centres
-from softfinger.kinematics.estimation.likelihood import set_law
-from softfinger.kinematics.estimation.state import EstimatorState, Law
-from tests.harness.estimator_kernels import activity
-from tests.harness.paper_tip import LINEAR, MEASURED
+from softfinger.kinematics.estimation.estimator import ContactEstimator, Readings
+from softfinger.kinematics.estimation.gauss_newton import free_noise
+from softfinger.kinematics.estimation.likelihood import CLIP_BELOW, set_law
+from softfinger.kinematics.estimation.state import PLANES, EstimatorState, Law
+from softfinger.kinematics.sensing.pressure_grid import SensorGrid
+from tests.harness.called import called
+from tests.harness.paper_tip import LINEAR, MEASURED, PITCH, TIP, E
+
+FloatArray = NDArray[np.float64]
+
+
+def state_for(packed: FloatArray) -> EstimatorState:
+    """A state whose model has as many cells as ``packed`` [PLANES, n], all of them packed."""
+    assert len(packed) == PLANES
+    state = EstimatorState()
+    state.model.rows, state.model.cols = 1, packed.shape[1]
+    state.fit.count = packed.shape[1]
+    return state
+
+
+@kernel
+def activity(states: Records[EstimatorState], frame: FloatArray, centres: FloatArray) -> None:
+    """:func:`detection.activity`."""
+    detection.activity(states[0], address(frame), address(centres))
+
+
+@kernel
+def press_and_accumulate(states: Records[EstimatorState], packed: FloatArray) -> None:
+    """:func:`likelihood.compress`, then :func:`likelihood.accumulate`."""
+    likelihood.compress(states[0], address(packed))
+    likelihood.accumulate(states[0], address(packed))
 
 
 def test_activity_matches_its_plain_twin():
@@ -65,3 +97,153 @@ def test_the_estimators_law_follows_any_material():
             value, material.stress(strain), atol=1e-12 * material.reference_modulus
         )
         assert law.bent == (material is not LINEAR)
+
+
+# An inner kernel, made callable.
+free_noise = called(free_noise)
+
+erfc = np.vectorize(math.erfc)
+
+
+def mean_of(model, floor, noise):
+    """E[max(model + noise · e, floor)] of a standard normal e, and its slope by the model."""
+    z = (model - floor) / noise
+    above = 0.5 * erfc(-z / math.sqrt(2.0))
+    density = np.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)
+    return floor + (model - floor) * above + noise * density, above
+
+
+@pytest.mark.parametrize("floor", [0.0, 2000.0, 3250.0])
+def test_cells_near_the_floor_are_compared_with_what_they_read_on_average(floor):
+    noise, gain, g = 1500.0, 1.1, 40.0
+    for model in np.linspace(max(floor - 1.9 * noise, 20.0), floor + 6.0 * noise, 9):
+        packed = np.zeros((PLANES, 1))
+        packed[0], packed[1], packed[6] = 1.0, g, 1.0
+        packed[5] = 3300.0
+        u = (1.0 - model / gain / E) / g
+        state = state_for(packed)
+        set_law(state.law, LINEAR)
+        state.signal.saturation, state.signal.floor = math.inf, floor
+        state.fit.face.u, state.fit.gain, state.fit.clip = u, gain, noise
+        press_and_accumulate(state.array, packed.copy())
+        sums = state.fit.sums
+        mean, response = mean_of(np.array(model), floor, noise)
+        residual = 3300.0 - mean
+        assert sums.misfit == pytest.approx(residual**2, abs=2 * abs(residual) * 1e-3 * noise)
+        # The Jacobian's column by (u, …) is σ' g times the response.
+        assert math.sqrt(sums.normal[4]) == pytest.approx(E * g * response, abs=5e-3 * E * g)
+        assert sums.weight == 1.0
+    far = np.array([[1.0], [g], [0.0], [0.0], [0.0], [0.0], [1.0]])
+    packed[: len(far)] = far
+    below = floor - (CLIP_BELOW + 0.1) * noise
+    if below > 0.0:
+        u = (1.0 - below / gain / E) / g
+        state.fit.face.u = u
+        press_and_accumulate(state.array, packed.copy())
+        assert sums.weight == 0.0
+
+
+@pytest.mark.parametrize("ratio", [0.0, 0.3, 1.0, 2.0, 2.8])
+def test_free_cells_tell_the_noise(ratio):
+    noise = 900.0
+    floor = ratio * noise
+    readings = noise * np.random.default_rng(1).standard_normal(2_000_000)
+    readings[readings < floor] = 0.0
+    assert free_noise(float(np.mean(readings**2)), floor) == pytest.approx(noise, rel=0.03)
+    # Nothing above the floor: the noise is well below it.
+    assert free_noise(0.0, floor) == pytest.approx(floor / 3.2, rel=0.02)
+
+
+@pytest.mark.parametrize("free_gain", [True, False])
+@pytest.mark.parametrize(("d", "percent"), [(0.001, 0.1), (0.001, 0.5), (0.002, 1.0), (0.004, 2.0)])
+def test_a_threshold_of_three_counts_of_eight_bits_leaves_d_unbiased(d, percent, free_gain):
+    # Full scale 204 kPa; the envelope's largest pressure is 188 kPa.
+    scale, noise = 800.0, percent / 100.0 * E
+    rng = np.random.default_rng(9)
+    frames, ratios, deviations = 60, [], []
+    for k in range(6):
+        grid = SensorGrid(44, 44, PITCH, tuple(rng.uniform(-0.5, 0.5, 2) * PITCH))
+        estimator = ContactEstimator(
+            TIP, LINEAR, grid, noise, free_gain=free_gain, readings=Readings(255.0, 3)
+        )
+        clean = grid.pressure(TIP, LINEAR, d, 0.1 * k, 0.05 * k)
+        for _ in range(frames):
+            counts = np.clip(np.round((clean + rng.normal(0.0, noise, grid.shape)) / scale), 0, 255)
+            counts[counts < 3] = 0
+            e = estimator.update(counts.astype(np.uint8), scale)
+            assert e.valid
+            ratios.append(e.d / d - 1.0)
+            deviations.append(e.d_std / d)
+    scatter = 3.0 * float(np.mean(deviations)) / math.sqrt(len(ratios))
+    assert abs(np.mean(ratios)) < 0.003 + scatter
+    assert np.std(ratios) < 1.3 * np.mean(deviations)
+
+
+def test_a_board_without_any_noise_is_not_corrected_for_it():
+    grid = SensorGrid(44, 44, PITCH)
+    estimator = ContactEstimator(TIP, LINEAR, grid, 1500.0, readings=Readings(threshold=3))
+    for d in (0.001, 0.003):
+        counts = np.round(grid.pressure(TIP, LINEAR, d, 0.1, 0.2) / 500.0)
+        counts[counts < 3] = 0
+        assert estimator(counts.astype(np.uint8), 500.0).d == pytest.approx(d, rel=0.015)
+
+
+def test_noise_that_ends_at_zero_takes_more_to_be_a_contact():
+    # One strong cell and neighbours that stand 5.1 deviations above 0 together.
+    frame = np.zeros((44, 44))
+    weights = np.outer((1, 2, 2, 2, 1), (1, 2, 2, 2, 1)).astype(float)
+    weights[2, 2] = 0.0
+    root = math.sqrt((weights**2).sum())
+    grid = SensorGrid(44, 44, PITCH)
+    for height, floats, counts in ((5.3, True, False), (5.6, True, True), (4.7, False, False)):
+        frame[20:25, 18:23] = height * root / weights.sum()
+        frame[22, 20] = 3.5
+        for scale, kind, expected in ((1.0, np.float64, floats), (0.001, np.uint16, counts)):
+            estimator = ContactEstimator(TIP, LINEAR, grid, 1.0)
+            assert estimator((frame / scale).astype(kind), scale).contact == expected
+
+
+def test_the_covariance_grows_where_d_and_gain_can_hardly_be_told_apart():
+    grid = SensorGrid(44, 44, PITCH, (2e-4, 3e-4))
+    rng = np.random.default_rng(2)
+    truth = np.array([0.0006, 0.1, -0.1, 1.0])
+    clean = grid.pressure(TIP, LINEAR, *truth[:3])
+    noise = 0.01 * E
+    estimator = ContactEstimator(TIP, LINEAR, grid, noise)
+    nees = []
+    for _ in range(1500):
+        e = estimator.update(clean + rng.normal(0.0, noise, grid.shape))
+        if e.contact and e.valid:
+            error = np.array([e.d, e.tilt_x, e.tilt_y, e.gain]) - truth
+            nees.append(error @ np.linalg.solve(e.covariance, error))
+    assert len(nees) > 1450
+    assert np.mean(nees) / 4.0 == pytest.approx(1.0, abs=0.08)
+
+
+def test_a_misfit_is_flagged_and_good_frames_are_not():
+    grid = SensorGrid(44, 44, PITCH, (3e-4, -2e-4))
+    rng = np.random.default_rng(5)
+    noise = 0.002 * E
+    x = (np.arange(44) - 21.5) * PITCH
+    # Hertz pressure of the same force over r² ≤ a d, where the linear model has 2 a d − d².
+    r2 = (x[None, :] - 3e-4) ** 2 + (x[:, None] + 2e-4) ** 2
+    hertz = np.sqrt(np.maximum(1.0 - r2 / (0.020 * 0.003), 0.0))
+    good = grid.pressure(TIP, LINEAR, 0.003)
+    hertz *= good.sum() / hertz.sum()
+    estimator = ContactEstimator(TIP, LINEAR, grid, noise)
+    for clean, expected in ((good, False), (hertz, True)):
+        for _ in range(100):
+            frame = clean + rng.normal(0.0, noise, grid.shape)
+            e = estimator.update(frame)
+            assert e.contact
+            assert e.misfit is expected
+            # Such a pressure hides 38 % of d; smoothly, as cells that read unequally don't.
+            assert e.valid is not expected
+    unequal = good * rng.normal(1.0, 0.1, grid.shape)
+    e = estimator(unequal)
+    assert e.misfit
+    assert e.valid
+    assert abs(e.d / 0.003 - 1.0) < 0.05
+    counts = np.clip(np.round((good + rng.normal(0.0, noise, grid.shape)) / 800.0), 0, 255)
+    assert not estimator(counts.astype(np.uint8), 800.0).misfit
+    assert not estimator(np.zeros(grid.shape)).misfit

@@ -1,13 +1,191 @@
-"""The plant against an adaptive solver of SciPy, and its order, in every kind of contact."""
+"""The plant against an adaptive solver of SciPy, and its order, in every kind of contact.
 
+The smooth equations of motion are written a second time here, in plain NumPy: for a constant
+modulus, tips that stick, and no friction but the tips' and the palm's own losses. Contacts are
+geometric functions of the coordinates (q1, q2, x, y, φ), differentiated by complex steps; forces
+come from the closed form of the tips' energy.
+"""
+
+import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from tests.harness import plant_reference as reference
-from tests.harness.plant import LOSSLESS, hold_with, make, place
+from softfinger.kinematics.hand.geometry import HandGeometry
+from tests.harness.plant import CONSTANT, LOSSLESS, MODULUS, hold_with, make, place
+
+HAND = HandGeometry()
+PALM_STIFFNESS, PALM_LOSS = 1e5, 1e-3
+
+
+def tips(x):
+    """Both centres, analytic in complex coordinates."""
+    length, half = HAND.finger_length, HAND.half_separation
+    return (
+        np.array([-half + length * np.sin(x[0]), length * np.cos(x[0])]),
+        np.array([half - length * np.sin(x[1]), length * np.cos(x[1])]),
+    )
+
+
+def turned(angle, vector):
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([c * vector[0] - s * vector[1], s * vector[0] + c * vector[1]])
+
+
+def length_of(vector):
+    return np.sqrt(vector[0] ** 2 + vector[1] ** 2)
+
+
+@dataclass
+class Contact:
+    """One tip's contact: way to the nearest point, κ, and the bodies that meet there."""
+
+    finger: int
+    way: Callable  # x → vector from the tip's centre to the point
+    normal: Callable  # x → unit vector into what is touched
+    share: float = 1.0
+    mutual: bool = False
+
+    def variables(self, x):
+        m = self.normal(x)
+        d = HAND.tip_radius - (self.way(x) @ m)
+        # The tips' axes stand at −q1 and at π + q2.
+        return np.array([d, np.arctan(m[1] / m[0]) + (x[0] if self.finger == 0 else -x[1])])
+
+    def jacobian(self, x):
+        columns = []
+        for j in range(5):
+            moved = x.astype(complex)
+            moved[j] += 1e-30j
+            columns.append(self.variables(moved).imag / 1e-30)
+        return np.array(columns).T
+
+    def slide(self, x):
+        """Row of what is touched less the tip, at the contact, along t."""
+        m = self.normal(x)
+        t = np.array([-m[1], m[0]])
+        point = tips(x)[self.finger] + self.way(x)
+        own = material(x, self.finger, point) @ np.eye(5)
+        if self.mutual:
+            touched = 0.5 * (own + material(x, 1 - self.finger, point))
+        else:
+            touched = np.zeros((2, 5))
+            touched[:, 2:4] = np.eye(2)
+            touched[:, 4] = [-(point[1] - x[3]), point[0] - x[2]]
+        return t @ (touched - own)
+
+
+def material(x, finger, point):
+    """Velocity (2, 5) of a finger's material at ``point``: it turns about its pivot."""
+    pivot = np.array([-HAND.half_separation, 0.0]) * (1 - 2 * finger)
+    lever = point - pivot
+    out = np.zeros((2, 5))
+    out[:, finger] = np.array([-lever[1], lever[0]]) * (-1.0 if finger == 0 else 1.0)
+    return out
+
+
+def on_face(finger, point, angle):
+    """A plane face through ``point`` of the object's frame, inward normal at ``angle`` there."""
+
+    def normal(x):
+        return np.array([np.cos(x[4] + angle), np.sin(x[4] + angle)])
+
+    def way(x):
+        m = normal(x)
+        reach = (np.array([x[2], x[3]]) + turned(x[4], point) - tips(x)[finger]) @ m
+        return reach * m
+
+    return Contact(finger, way, normal)
+
+
+def wedge(width, taper=0.0, height=0.060):
+    """Its width stands at half the height, from where a trapezoid's centre of mass is off."""
+    lean = 0.5 * taper
+    slope = height * math.tan(lean)  # of the two parallel faces, half the difference
+    middle = height * slope / (6.0 * width)
+    return [
+        on_face(0, np.array([-0.5 * width, middle]), -lean),
+        on_face(1, np.array([0.5 * width, middle]), math.pi + lean),
+    ]
+
+
+def disc(radius):
+    def contact(finger):
+        def normal(x):
+            away = np.array([x[2], x[3]]) - tips(x)[finger]
+            return away / length_of(away)
+
+        def way(x):
+            return (length_of(np.array([x[2], x[3]]) - tips(x)[finger]) - radius) * normal(x)
+
+        return Contact(finger, way, normal, math.sqrt(radius / (radius + HAND.tip_radius)))
+
+    return [contact(0), contact(1)]
+
+
+def each_other():
+    def contact(finger):
+        def way(x):
+            return 0.5 * (tips(x)[1 - finger] - tips(x)[finger])
+
+        def normal(x):
+            return way(x) / length_of(way(x))
+
+        return Contact(finger, way, normal, mutual=True)
+
+    return [contact(0), contact(1)]
+
+
+@dataclass
+class Equations:
+    """State: five coordinates, their rates, a shear for each contact, then for each palm point."""
+
+    contacts: list
+    inertias: np.ndarray
+    currents: np.ndarray
+    loss: float
+    weight: np.ndarray
+    corners: np.ndarray | None = None  # of the object's frame; on a palm at y = ``palm``
+    palm: float = 0.0
+
+    def __call__(self, _t, y):
+        x, v = y[:5], y[5:10]
+        shears = y[10:]
+        forces = np.zeros(5)
+        forces[:2] = CONSTANT * self.currents
+        forces[2:4] = self.weight
+        rates = []
+        for contact, u in zip(self.contacts, shears, strict=False):
+            d, theta = contact.variables(x)
+            jacobian = contact.jacobian(x)
+            cos, sin, tan = np.cos(theta), np.sin(theta), np.tan(theta)
+            row = contact.slide(x) - tan * jacobian[0]
+            k = math.pi * MODULUS * contact.share
+            by_d = k * (d * d / cos**2 + 2 * d * u * tan + u * u)
+            by_theta = k * (2 * d**3 * sin / (3 * cos**3) + d * d * u / cos**2)
+            by_shear = k * (d * d * tan + 2 * d * u)
+            by_d += self.loss * 2 * k * d / cos**2 * (jacobian[0] @ v)
+            by_theta += self.loss * k * d**3 / (1.5 * cos**3) * (jacobian[1] @ v)
+            by_shear += self.loss * 2 * k * d * (row @ v)
+            forces -= jacobian[0] * by_d + jacobian[1] * by_theta + row * by_shear
+            rates.append(row @ v)
+        for k, corner in enumerate(() if self.corners is None else self.corners):
+            lever = turned(x[4], corner)
+            depth = self.palm - (x[3] + lever[1])
+            if depth <= 0.0:
+                rates.append(0.0)
+                continue
+            up = np.array([0.0, 0.0, 0.0, 1.0, lever[0]])
+            along = np.array([0.0, 0.0, 1.0, 0.0, -lever[1]])
+            push = PALM_STIFFNESS * (depth - PALM_LOSS * (up @ v))
+            drag = PALM_STIFFNESS * (shears[len(self.contacts) + k] + PALM_LOSS * (along @ v))
+            forces += max(push, 0.0) * up - drag * along
+            rates.append(along @ v)
+        return np.concatenate((v, forces / self.inertias, rates))
+
 
 SECONDS = 0.02
 RATES = (0.3, -0.2)
@@ -28,13 +206,11 @@ class Scene:
 
 
 SCENES = {
-    "rectangle": Scene(reference.wedge(0.040)),
-    "wedge": Scene(reference.wedge(0.040, 0.2), {"object_shape": "wedge", "object_taper": 0.2}),
-    "disc": Scene(
-        reference.disc(0.018), {"object_shape": "disc", "object_radius": 0.018}, q=(0.21, 0.20)
-    ),
+    "rectangle": Scene(wedge(0.040)),
+    "wedge": Scene(wedge(0.040, 0.2), {"object_shape": "wedge", "object_taper": 0.2}),
+    "disc": Scene(disc(0.018), {"object_shape": "disc", "object_radius": 0.018}, q=(0.21, 0.20)),
     "tips": Scene(
-        reference.each_other(),
+        each_other(),
         {"object_shape": "none"},
         q=(0.46, 0.44),
         pose=(0.0, 0.08, 0.0),
@@ -42,7 +218,7 @@ SCENES = {
         currents=(0.50, 0.45),
     ),
     "palm": Scene(
-        reference.wedge(0.040),
+        wedge(0.040),
         {"palm": 0.05, "palm_friction": 50.0, "gravity": (0.0, -60.0), "object_mass": 0.5},
         pose=(0.0005, 0.07985, 0.0),
         velocity=(0.02, 0.0, 0.0),
@@ -73,7 +249,7 @@ def test_agreement_with_an_adaptive_solver_and_order_two(name, loss):
     hand = start(scene, loss, 10)
     p = hand.plant.parameters
     bodies = np.full(3, np.inf) if p.object_held else np.array([p.mass, p.mass, p.inertia])
-    equations = reference.Equations(
+    equations = Equations(
         scene.contacts,
         np.array([p.joint_inertia, p.joint_inertia, *bodies]),
         np.array(scene.currents),
