@@ -65,7 +65,7 @@ $(TO_RUN): pyproject.toml constraints.txt
 	@touch $@
 
 $(TO_TEST): $(TO_RUN)
-	@echo "Adding what the tests need to $(VENV) once: scipy, mypy and others."
+	@echo "Adding what the tests need to $(VENV) once: pyarrow, scipy and others."
 	@$(INSTALL) --editable '.[dev]'
 	@touch $@
 

@@ -39,7 +39,7 @@ GROUPS = {  # subcommands: the room of tools/ that its module is in, and what it
         "replay": ("recordings", "publish a recording again, or compare it with today's code"),
         "analyse": ("analysis", "compute contact, force and energy over time from frames"),
         "plot": ("analysis", "draw a recording beside the model: forces, energy landscape, errors"),
-        "export": ("recordings", "export a recording's topics as CSV, its frames as arrays"),
+        "export": ("recordings", "export a recording's topics as CSV or Parquet"),
     },
     "machine": {
         "doctor": ("setup", "check ports, servos, boards and this machine; say what mends them"),

@@ -13,6 +13,7 @@ _EXTRAS = {  # what the message says, and the modules
     "plot": ("pictures need matplotlib", ("matplotlib",)),
     "record": ("recordings need mcap, orjson and zstandard", ("mcap", "orjson", "zstandard")),
     "view": ("the page needs websockets and orjson", ("websockets", "orjson")),
+    "parquet": ("Parquet files need pyarrow", ("pyarrow",)),
     "cluster": ("a cluster's workers need dask and distributed", ("distributed",)),
     "gym": ("the environments need gymnasium", ("gymnasium",)),
 }

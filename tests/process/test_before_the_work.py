@@ -15,6 +15,7 @@ from tests.process.test_record import written
         ("matplotlib", "plot run.mcap", "pip install 'softfinger[plot]'"),
         ("mcap", "record new.mcap", "pip install 'softfinger[record]'"),
         ("websockets", "view", "pip install 'softfinger[view]'"),
+        ("pyarrow", "export run.mcap --format parquet", "pip install 'softfinger[parquet]'"),
         ("numba", "replay --recompute run.mcap", "no hand/settings in it"),
         ("numba", "analyse run.mcap", "no hand/settings in it"),
         ("numba", "plot none.mcap", "none.mcap: No such file"),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from softfinger.daemon.wire import schema
-from softfinger.tools.recordings.export import export
+from softfinger.tools.recordings.export import CsvTable, ParquetTable, export
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.record import RecordingWriter
 from tests.harness.golden_wire import flat, sample
@@ -25,7 +25,7 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_csv_has_every_field_with_all_its_digits(path, tmp_path):
-    export(Recording(path), tmp_path, [schema.STATE])
+    export(Recording(path), tmp_path, CsvTable, [schema.STATE])
     with (tmp_path / "hand-state.csv").open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == STATES
@@ -38,22 +38,28 @@ def test_csv_has_every_field_with_all_its_digits(path, tmp_path):
     assert [int(row["seq"]) for row in rows] == list(range(STATES))
 
 
-def test_frames_are_arrays(path, tmp_path):
-    files = export(Recording(path), tmp_path, [schema.TACTILE])
+def test_parquet_keeps_types_and_frames(path, tmp_path):
+    import pyarrow.parquet
+
+    topics = [schema.STATE, schema.TACTILE]
+    files = export(Recording(path), tmp_path, ParquetTable, topics)
     assert {file.name for file in files} == {
-        "hand-tactile.csv",
+        "hand-state.parquet",
+        "hand-tactile.parquet",
         "tactile-left.npz",
         "tactile-right.npz",
     }
+    table = pyarrow.parquet.read_table(tmp_path / "hand-state.parquet")
+    assert table.num_rows == STATES
+    kinds = {"seq": "int64", "left.force": "double", "torque": "bool", "mode": "string"}
+    assert {name: str(table.schema.field(name).type) for name in kinds} == kinds
+    assert table["left.force"][0].as_py() == sample(schema.STATE)["left"]["force"]
+    frames = pyarrow.parquet.read_table(tmp_path / "hand-tactile.parquet")
     raw = np.load(tmp_path / "tactile-left.npz")
     assert raw["frames"].shape == (103, 44, 44)
     assert raw["t"][0] == 0.0
-    recorded = [m for _, m in Recording(path).messages([schema.TACTILE]) if m["finger"] == "left"]
-    assert recorded[5]["data"] == raw["frames"][5].tobytes()
-    with (tmp_path / "hand-tactile.csv").open(newline="", encoding="utf-8") as file:
-        [row, *_] = csv.DictReader(file)
-    assert "data" not in row
-    assert row["rows"] == "44"
+    left = [k for k, name in enumerate(frames["finger"].to_pylist()) if name == "left"]
+    assert frames["data"][left[5]].as_py() == raw["frames"][5].tobytes()
 
 
 def test_numbers_that_are_none_are_empty_cells(tmp_path):
@@ -63,7 +69,7 @@ def test_numbers_that_are_none_are_empty_cells(tmp_path):
     message["news"] = 3.5  # of a newer daemon
     writer.add(schema.STATE, message)
     writer.close()
-    export(Recording(tmp_path / "a.mcap"), tmp_path, [schema.STATE])
+    export(Recording(tmp_path / "a.mcap"), tmp_path, CsvTable, [schema.STATE])
     with (tmp_path / "hand-state.csv").open(newline="", encoding="utf-8") as file:
         [row] = csv.DictReader(file)
     assert (row["left.force"], row["news"]) == ("", "3.5")
@@ -75,7 +81,7 @@ def test_files_have_plain_names_whatever_the_topics_are_called(tmp_path):
         writer.add(topic, {"timestamp": 1e9, "a": 1})
     writer.close()
     recording = Recording(tmp_path / "a.mcap")
-    files = export(recording, tmp_path, recording.topics)
+    files = export(recording, tmp_path, CsvTable, recording.topics)
     names = {file.name for file in files}
     assert names == {"hidden.csv", "-[2Jhand-..-..-x.csv".replace("[", "-"), "nul-.csv", "-.csv"}
     assert {file.name for file in tmp_path.iterdir()} == names | {"a.mcap"}

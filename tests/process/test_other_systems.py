@@ -31,7 +31,7 @@ PORTABLE = (
 # Neither stands on Windows; macOS lacks `sched_*`, epoll and some of the flags.
 ELSEWHERE = """
 import importlib, os, select, signal, sys
-import dynamixel_sdk, numba, zmq  # theirs is their own business
+import dynamixel_sdk, numba, pyarrow, zmq  # theirs is their own business
 
 MODULES = {"fcntl", "termios", "resource", "grp", "pwd", "pty", "tty"}
 

@@ -22,7 +22,7 @@ from softfinger.daemon.perception.calibration_file import load_calibration
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.tactile.replay import load_recording
-from softfinger.tools.recordings.export import export
+from softfinger.tools.recordings.export import CsvTable, export
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.record import recover
 
@@ -242,7 +242,7 @@ def bomb(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
 def test_a_bomb_is_told_in_a_line(bomb):
     told: list[str] = []
     recording = Recording(bomb, told.append)
-    export(recording, bomb.parent, recording.topics)
+    export(recording, bomb.parent, CsvTable, recording.topics)
     assert len(told) == 1
     assert recording.total < 30_000, "messages, which take time"
     assert not told[0].count("\n")

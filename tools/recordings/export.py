@@ -1,4 +1,4 @@
-"""``softfinger export FILE.mcap``: topics as CSV, frames as arrays."""
+"""``softfinger export FILE.mcap``: topics as CSV or Parquet, frames as arrays."""
 
 from __future__ import annotations
 
@@ -16,13 +16,15 @@ import numpy as np
 from softfinger.daemon.errors import RecordingError
 from softfinger.daemon.own_files import write_bytes, write_text
 from softfinger.daemon.wire import schema
+from softfinger.daemon.wire.fields import KINDS
 from softfinger.tools.arguments import add_range, to_stderr
+from softfinger.tools.extras import require
 from softfinger.tools.recordings.reader import Recording
 
 _EPILOG = """\
 Writes one table a topic, hand-state.csv and so on, with a column for each field (left.force). A
 sensor's frames also go into tactile-left.npz or -right.npz: frames [n, rows, cols] and t [n],
-which `softfinger analyse` and numpy.load read."""
+which `softfinger analyse` and numpy.load read. Parquet keeps the frames' bytes in the table too."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -31,6 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", type=Path, metavar="DIR", help="output folder (default: FILE.export)"
     )
+    parser.add_argument("--format", choices=("csv", "parquet"), default="csv")
     parser.add_argument(
         "--topics", nargs="+", metavar="TOPIC", help="as state or hand/state (default: all)"
     )
@@ -38,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Export; 1 when there is nothing to export. Raises RecordingError or OSError."""
+    """Export; 1 when there is nothing to export. Raises RecordingError, MissingExtra, OSError."""
     from softfinger.tools.sweep import Progress
 
     path: Path = arguments.file
@@ -47,7 +50,8 @@ def run(arguments: argparse.Namespace) -> int:
     topics = _topics(arguments.topics, recording.topics)
     folder.mkdir(parents=True, exist_ok=True)
     with Progress("export", recording.size) as progress:
-        files = export(recording, folder, topics, arguments.start, arguments.end, progress)
+        span = arguments.start, arguments.end
+        files = export(recording, folder, TABLES[arguments.format], topics, *span, progress)
     for each in files:
         print(each)
     if not files:
@@ -67,11 +71,74 @@ def _topics(words: list[str] | None, recorded: list[bytes]) -> list[bytes]:
 
 
 Row = dict[str, Any]
+_BLOCK = 2000  # rows
+
+
+class CsvTable:
+    """A CSV file; floats with all their digits, NaN as an empty cell, no bytes."""
+
+    suffix = ".csv"
+
+    def __init__(self, path: Path, columns: dict[str, str]) -> None:
+        names = [name for name, kind in columns.items() if kind != "bin"]
+        self._file = write_text(path, newline="")
+        self._writer = csv.DictWriter(self._file, names, extrasaction="ignore", lineterminator="\n")
+        self._writer.writeheader()
+
+    def add(self, row: Row) -> None:
+        self._writer.writerow({name: _cell(value) for name, value in row.items()})
+
+    def close(self) -> None:
+        self._file.close()
+
+
+class ParquetTable:
+    """A Parquet file with the schema's types."""
+
+    suffix = ".parquet"
+
+    def __init__(self, path: Path, columns: dict[str, str]) -> None:
+        """Raises MissingExtra."""
+        require("parquet")
+        import pyarrow
+        import pyarrow.parquet
+
+        types = {
+            "int": pyarrow.int64(),
+            "float": pyarrow.float64(),
+            "bool": pyarrow.bool_(),
+            "str": pyarrow.string(),
+            "bin": pyarrow.binary(),
+        }
+        known = [(name, types[kind]) for name, kind in columns.items() if kind]
+        self._schema = pyarrow.schema(known)
+        self._arrow, self._rows = pyarrow, list[Row]()
+        self._file = write_bytes(path)
+        self._writer = pyarrow.parquet.ParquetWriter(self._file, self._schema)
+
+    def add(self, row: Row) -> None:
+        self._rows.append(row)
+        if len(self._rows) == _BLOCK:
+            self._flush()
+
+    def _flush(self) -> None:
+        self._writer.write_table(self._arrow.Table.from_pylist(self._rows, self._schema))
+        self._rows.clear()
+
+    def close(self) -> None:
+        self._flush()
+        self._writer.close()
+        self._file.close()
+
+
+Table = CsvTable | ParquetTable
+TABLES: dict[str, type[Table]] = {"csv": CsvTable, "parquet": ParquetTable}
 
 
 def export(
     recording: Recording,
     folder: Path,
+    kind: type[Table],
     topics: list[bytes],
     start: float = -math.inf,
     end: float = math.inf,
@@ -79,11 +146,10 @@ def export(
 ) -> list[Path]:
     """Write each topic's table into ``folder``, and frames into one ``.npz`` file a sensor.
 
-    Floats have all their digits, NaN is an empty cell; columns are the schema's and what the first
-    message has besides, without bytes. The column ``t`` counts in s from the recording's first
-    message. Returns the files. Raises OSError.
+    Columns are the schema's and what the first message has besides; ``t`` counts in s from the
+    recording's first message. Returns the files. Raises OSError, and MissingExtra.
     """
-    tables: dict[bytes, csv.DictWriter[str]] = {}
+    tables: dict[bytes, Table] = {}
     grids: dict[str, tuple[list[float], list[Any]]] = {}  # times and counts by finger
     files: list[Path] = []
     with contextlib.ExitStack() as opened:
@@ -95,18 +161,15 @@ def export(
                 name = _file_name(topic)
                 if any(each.stem == name for each in files):
                     raise RecordingError(f"{recording.path}: two topics would be {name}")
-                files.append(folder / f"{name}.csv")
-                file = opened.enter_context(write_text(files[-1], newline=""))
-                tables[topic] = csv.DictWriter(
-                    file, _columns(topic, row), extrasaction="ignore", lineterminator="\n"
-                )
-                tables[topic].writeheader()
+                files.append(folder / f"{name}{kind.suffix}")
+                tables[topic] = kind(files[-1], _columns(topic, row))
+                opened.callback(tables[topic].close)
             if topic == schema.TACTILE:
                 times, frames = grids.setdefault(message["finger"], ([], []))
                 shape = message["rows"], message["cols"]
                 times.append(message["timestamp"])
                 frames.append(np.frombuffer(message["data"], "<u2").reshape(shape))
-            tables[topic].writerow({name: _cell(value) for name, value in row.items()})
+            tables[topic].add(row)
     for finger, (times, frames) in sorted(grids.items()):
         files.append(folder / f"tactile-{finger}.npz")
         with write_bytes(files[-1]) as packed:
@@ -131,10 +194,11 @@ def _flat(message: Row, outer: str = "") -> Row:
     return row
 
 
-def _columns(topic: bytes, first: Row) -> list[str]:
+def _columns(topic: bytes, first: Row) -> dict[str, str]:
     fields = schema.TOPICS[topic].fields if topic in schema.TOPICS else ()
-    known = [field.name for field in fields if field.kind != "bin"]
-    return [*dict.fromkeys(known + [k for k, v in first.items() if not isinstance(v, bytes)])]
+    known = {field.name: field.kind for field in fields}
+    more = {name: KINDS.get(type(value), "") for name, value in first.items() if name not in known}
+    return known | more
 
 
 def _cell(value: Any) -> Any:
