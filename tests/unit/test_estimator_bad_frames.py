@@ -67,78 +67,80 @@ def test_without_contact_d_std_is_the_d_that_is_just_felt(physics, baseline):
         assert least <= np.mean(felt) <= most
 
 
-@pytest.mark.parametrize("free_gain", [True, False])
-class TestBadFrames:
-    def estimator(self, free_gain, grid=GRID):
-        return ContactEstimator(TIP, MEASURED, grid, 600.0, free_gain=free_gain)
+@pytest.fixture(params=[True, False], ids=["free gain", "known gain"])
+def estimator(request):
+    return ContactEstimator(TIP, MEASURED, GRID, 600.0, free_gain=request.param)
 
-    def test_all_zero_is_no_contact_and_valid(self, free_gain):
-        for kind in (np.uint8, np.uint16, np.float32, np.float64):
-            e = self.estimator(free_gain)(EMPTY.astype(kind))
-            assert (e.contact, e.valid, e.d) == (False, True, 0.0)
 
-    @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-    def test_one_cell_that_is_no_number_invalidates(self, free_gain, bad):
-        estimator = self.estimator(free_gain)
-        for frame in (EMPTY.copy(), GRID.pressure(TIP, MEASURED, 0.003, 0.1)):
-            frame[22, 20] = bad
-            e = estimator.update(frame)
-            assert not e.valid
-            assert not e.contact
-            assert (e.d, e.tilt_x) == (0.0, 0.0)
-        # And leaves no trace.
-        assert estimator.update(GRID.pressure(TIP, MEASURED, 0.003, 0.1)).valid
+def test_all_zero_is_no_contact_and_valid(estimator):
+    for kind in (np.uint8, np.uint16, np.float32, np.float64):
+        e = estimator(EMPTY.astype(kind))
+        assert (e.contact, e.valid, e.d) == (False, True, 0.0)
 
-    def test_a_number_outside_the_disc_is_not_looked_at(self, free_gain):
-        frame = GRID.pressure(TIP, MEASURED, 0.003, 0.1)
-        frame[0, 0] = math.nan
-        assert self.estimator(free_gain)(frame).valid
 
-    def test_all_saturated_is_not_valid(self, free_gain):
-        estimator = self.estimator(free_gain)
-        for frame, scale in (
-            (np.full((44, 44), 65535, np.uint16), 4.0),
-            (np.full((44, 44), 255, np.uint8), 500.0),
-            (np.full((44, 44), 1e5), 1.0),
-        ):
-            e = estimator(frame, scale)
-            assert e.contact
-            assert e.invalid == (Invalid.SATURATED if frame.dtype != float else Invalid.ABOVE_ZERO)
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_one_cell_that_is_no_number_invalidates(estimator, bad):
+    for frame in (EMPTY.copy(), GRID.pressure(TIP, MEASURED, 0.003, 0.1)):
+        frame[22, 20] = bad
+        e = estimator.update(frame)
+        assert not e.valid
+        assert not e.contact
+        assert (e.d, e.tilt_x) == (0.0, 0.0)
+    # And leaves no trace.
+    assert estimator.update(GRID.pressure(TIP, MEASURED, 0.003, 0.1)).valid
 
-    def test_a_sensor_without_a_tare_is_named(self, free_gain):
-        estimator = self.estimator(free_gain)
-        rng = np.random.default_rng(8)
-        for _ in range(20):
-            zero = 20e3 + 3e3 * rng.standard_normal((44, 44))
-            e = estimator(zero + rng.normal(0.0, 600.0, (44, 44)))
-            assert (e.valid, e.invalid) == (False, Invalid.ABOVE_ZERO)
 
-    def test_a_baseline_far_below_zero_is_not_valid(self, free_gain):
-        estimator = self.estimator(free_gain)
-        assert estimator(EMPTY - 5000.0).invalid == Invalid.BELOW_ZERO
-        assert not estimator(-GRID.pressure(TIP, MEASURED, 0.004) - 2000.0).valid
+def test_a_number_outside_the_disc_is_not_looked_at(estimator):
+    frame = GRID.pressure(TIP, MEASURED, 0.003, 0.1)
+    frame[0, 0] = math.nan
+    assert estimator(frame).valid
 
-    def test_one_hot_cell_is_no_contact(self, free_gain):
-        rng = np.random.default_rng(1)
-        frame = rng.normal(0.0, 600.0, (44, 44))
-        frame[25, 20] = 1e5
-        e = self.estimator(free_gain)(frame)
-        assert (e.contact, e.d, e.rejected) == (False, 0.0, 1)
 
-    def test_one_hot_cell_beside_or_in_a_contact_changes_nothing(self, free_gain):
-        rng = np.random.default_rng(2)
-        for d in (0.001, 0.004):
-            clean = GRID.pressure(TIP, MEASURED, d, 0.2, 0.1)
-            clean += rng.normal(0.0, 600.0, (44, 44))
-            estimator = self.estimator(free_gain)
-            without = estimator(clean)
-            for cell in ((12, 30), (24, 24)):
-                frame = clean.copy()
-                frame[cell] = 1.2e5
-                e = estimator(frame)
-                assert e.valid
-                assert e.rejected == 1
-                assert abs(e.d - without.d) < 1.5 * without.d_std
+def test_all_saturated_is_not_valid(estimator):
+    for frame, scale in (
+        (np.full((44, 44), 65535, np.uint16), 4.0),
+        (np.full((44, 44), 255, np.uint8), 500.0),
+        (np.full((44, 44), 1e5), 1.0),
+    ):
+        e = estimator(frame, scale)
+        assert e.contact
+        assert e.invalid == (Invalid.SATURATED if frame.dtype != float else Invalid.ABOVE_ZERO)
+
+
+def test_a_sensor_without_a_tare_is_named(estimator):
+    rng = np.random.default_rng(8)
+    for _ in range(20):
+        zero = 20e3 + 3e3 * rng.standard_normal((44, 44))
+        e = estimator(zero + rng.normal(0.0, 600.0, (44, 44)))
+        assert (e.valid, e.invalid) == (False, Invalid.ABOVE_ZERO)
+
+
+def test_a_baseline_far_below_zero_is_not_valid(estimator):
+    assert estimator(EMPTY - 5000.0).invalid == Invalid.BELOW_ZERO
+    assert not estimator(-GRID.pressure(TIP, MEASURED, 0.004) - 2000.0).valid
+
+
+def test_one_hot_cell_is_no_contact(estimator):
+    rng = np.random.default_rng(1)
+    frame = rng.normal(0.0, 600.0, (44, 44))
+    frame[25, 20] = 1e5
+    e = estimator(frame)
+    assert (e.contact, e.d, e.rejected) == (False, 0.0, 1)
+
+
+def test_one_hot_cell_beside_or_in_a_contact_changes_nothing(estimator):
+    rng = np.random.default_rng(2)
+    for d in (0.001, 0.004):
+        clean = GRID.pressure(TIP, MEASURED, d, 0.2, 0.1)
+        clean += rng.normal(0.0, 600.0, (44, 44))
+        without = estimator(clean)
+        for cell in ((12, 30), (24, 24)):
+            frame = clean.copy()
+            frame[cell] = 1.2e5
+            e = estimator(frame)
+            assert e.valid
+            assert e.rejected == 1
+            assert abs(e.d - without.d) < 1.5 * without.d_std
 
 
 @pytest.mark.parametrize(
@@ -156,9 +158,7 @@ def test_what_is_no_frame_is_refused(frame, scale, told):
         ContactEstimator(TIP, MEASURED, GRID, 600.0).update(frame, scale)
 
 
-@pytest.mark.parametrize("free_gain", [True, False])
-def test_what_is_not_one_contact_is_not_valid(free_gain):
-    estimator = ContactEstimator(TIP, MEASURED, GRID, 600.0, free_gain=free_gain)
+def test_what_is_not_one_contact_is_not_valid(estimator):
     rng = np.random.default_rng(3)
     press = [GRID.pressure(TIP, MEASURED, 0.002, side * 0.5) for side in (1.0, -1.0)]
     small = GRID.pressure(TIP, MEASURED, 0.001, -0.5)
@@ -190,9 +190,6 @@ def test_what_is_not_one_contact_is_not_valid(free_gain):
 def test_wrong_arguments_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         ContactEstimator(TIP, LINEAR, GRID, **{"noise": 600.0, **options})
-
-
-def test_readings_below_nothing_are_refused():
     with pytest.raises(ValueError, match="threshold"):
         Readings(threshold=-1.0)
 

@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from typing import Any
 
 import pytest
@@ -29,24 +30,17 @@ Build = Callable[..., tuple[Daemon, LateMachine, list[tuple[str, str, str]]]]
 @pytest.fixture
 def on_late_machine(monkeypatch: pytest.MonkeyPatch) -> Iterator[Build]:
     """Daemons on a machine whose lateness the test chooses, with their events."""
-    daemons = []
 
     def build(clock: str, **sections: Any) -> tuple[Daemon, LateMachine, list[Any]]:
         machine, events = LateMachine(), []
         made = machine if clock == "real" else HandClock(machine)
         monkeypatch.setattr(build_module, "make_clock", lambda _: made)
-        daemons.append(
-            Daemon(
-                Settings.model_validate({"loop": {"clock": clock}, **sections}),
-                wire=False,
-                on_event=lambda *event: events.append(event),
-            )
-        )
-        return daemons[-1], machine, events
+        chosen = Settings.model_validate({"loop": {"clock": clock}, **sections})
+        daemon = Daemon(chosen, wire=False, on_event=lambda *event: events.append(event))
+        return stack.enter_context(daemon), machine, events
 
-    yield build
-    for each in daemons:
-        each.close()
+    with ExitStack() as stack:
+        yield build
 
 
 def ticked(daemon: Daemon, count: int) -> dict[str, Any]:

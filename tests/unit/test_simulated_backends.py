@@ -17,7 +17,6 @@ from tests.harness.plant import PAPER
 
 COUNT = 2 * math.pi / 4096
 CURRENT_UNIT = 2.69e-3
-SPEED_UNIT = 0.229 * 2 * math.pi / 60
 
 
 class Bench:

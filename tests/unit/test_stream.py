@@ -1,6 +1,7 @@
 """The publisher on a real socket: what is on the wire, and subscribers of every kind."""
 
 import json
+from collections.abc import Iterator
 from typing import Any
 
 import msgpack
@@ -40,6 +41,12 @@ def wanted(served: Served, topic: bytes = STATE) -> bool:
     return bool(served.publisher.wanted & bit(topic))
 
 
+@pytest.fixture
+def served(addresses: tuple[str, str]) -> Iterator[Served]:
+    with Served(addresses[0]) as served:
+        yield served
+
+
 def test_frame_age_counts_from_the_sample():
     state = State(t=3.0, contacts=[Contact(seq=4, t=2.96), Contact()])
     message = state_message(state, BOTH)
@@ -47,49 +54,46 @@ def test_frame_age_counts_from_the_sample():
     assert message["right"]["frame_age_s"] == 0.0
 
 
-def test_tactile_data_is_little_endian_uint16_row_major(context, addresses):
-    with Served(addresses[0], queue=10) as served:
-        publisher = served.publisher
-        socket = subscribe(context, addresses[0], b"hand/tactile")
-        until(lambda: wanted(served, TACTILE))
-        assert not publisher.wanted & bit(STATE)
-        data = np.arange(12, dtype=np.uint16).reshape(3, 4) * 1000
-        facts = SensorFacts(0.002, 0.003, 1e-4, -2e-4, 0.1, "count", 4.0, False, "A17 2026-01-02")
-        publisher.send(TACTILE, Frame(7, 1.0, 1.25, True, data), data, 1, facts, 99.0)
-        topic, message = receive(socket, served)
-        assert topic == b"hand/tactile"
-        assert np.array_equal(np.frombuffer(message.pop("data"), "<u2").reshape(3, 4), data)
-        assert (message["seq"], message["mono_ns"], message["delay_s"]) == (7, 1_000_000_000, 0.25)
-        assert (message["finger"], message["rows"], message["cols"]) == ("right", 3, 4)
+def test_tactile_data_is_little_endian_uint16_row_major(context, addresses, served):
+    publisher = served.publisher
+    socket = subscribe(context, addresses[0], b"hand/tactile")
+    until(lambda: wanted(served, TACTILE))
+    assert not publisher.wanted & bit(STATE)
+    data = np.arange(12, dtype=np.uint16).reshape(3, 4) * 1000
+    facts = SensorFacts(0.002, 0.003, 1e-4, -2e-4, 0.1, "count", 4.0, False, "A17 2026-01-02")
+    publisher.send(TACTILE, Frame(7, 1.0, 1.25, True, data), data, 1, facts, 99.0)
+    topic, message = receive(socket, served)
+    assert topic == b"hand/tactile"
+    assert np.array_equal(np.frombuffer(message.pop("data"), "<u2").reshape(3, 4), data)
+    assert (message["seq"], message["mono_ns"], message["delay_s"]) == (7, 1_000_000_000, 0.25)
+    assert (message["finger"], message["rows"], message["cols"]) == ("right", 3, 4)
 
 
-def test_topics_nobody_subscribes_to_are_not_wanted(context, addresses):
-    with Served(addresses[0], queue=10) as served:
-        publisher = served.publisher
-        served.settle()
-        assert not publisher.wanted & bit(STATE)
-        socket = subscribe(context, addresses[0], b"hand")
-        until(lambda: wanted(served))
-        assert publisher.wanted & bit(TACTILE)
-        socket.close()
-        until(lambda: not wanted(served))
+def test_topics_nobody_subscribes_to_are_not_wanted(context, addresses, served):
+    publisher = served.publisher
+    served.settle()
+    assert not publisher.wanted & bit(STATE)
+    socket = subscribe(context, addresses[0], b"hand")
+    until(lambda: wanted(served))
+    assert publisher.wanted & bit(TACTILE)
+    socket.close()
+    until(lambda: not wanted(served))
 
 
-def test_what_is_no_subscription_takes_none_from_others(context, addresses):
-    with Served(addresses[0]) as served:
-        listener = subscribe(context, addresses[0])
-        until(lambda: wanted(served))
-        other = context.socket(zmq.XSUB)
-        other.connect(addresses[0])
-        for message in (b"", b"\x05", b"\x05hand/state", b"\x01hand/nothing", b"\x01hand/event"):
-            other.send(message)
-        served.publisher.event(1.0, 1.0, "info", "test", "all has come")
-        until(lambda: [served.settle(), other.poll(0)][1])
-        listener.close()
-        until(lambda: not wanted(served))
-        assert wanted(served, EVENT), "the other's own"
-        other.close()
-        until(lambda: not wanted(served, EVENT))
+def test_what_is_no_subscription_takes_none_from_others(context, addresses, served):
+    listener = subscribe(context, addresses[0])
+    until(lambda: wanted(served))
+    other = context.socket(zmq.XSUB)
+    other.connect(addresses[0])
+    for message in (b"", b"\x05", b"\x05hand/state", b"\x01hand/nothing", b"\x01hand/event"):
+        other.send(message)
+    served.publisher.event(1.0, 1.0, "info", "test", "all has come")
+    until(lambda: [served.settle(), other.poll(0)][1])
+    listener.close()
+    until(lambda: not wanted(served))
+    assert wanted(served, EVENT), "the other's own"
+    other.close()
+    until(lambda: not wanted(served, EVENT))
 
 
 def test_a_stuck_subscriber_holds_up_nobody_and_its_queue_is_bounded(context, addresses):
@@ -116,63 +120,60 @@ def test_a_stuck_subscriber_holds_up_nobody_and_its_queue_is_bounded(context, ad
         assert kept < 20_000, "the stuck subscriber's queue has no bound"
 
 
-def test_who_comes_late_is_told_settings_and_events_again(context, addresses):
-    with Served(addresses[0], queue=200) as served:
-        publisher = served.publisher
-        publisher.settings(98.0, 0.5, HandFacts("0.1.0", "{}", "", "", "{}", "{}"))
-        for k in range(60):
-            publisher.event(99.0 + k, 1.0 + k, "info", "mode", f"event {k + 1}")
-        served.settle()  # before anybody subscribes: that may be quicker
-        early = subscribe(context, addresses[0])
-        told: list[tuple[bytes, dict[str, Any]]] = []
+def test_who_comes_late_is_told_settings_and_events_again(context, addresses, served):
+    publisher = served.publisher
+    publisher.settings(98.0, 0.5, HandFacts("0.1.0", "{}", "", "", "{}", "{}"))
+    for k in range(60):
+        publisher.event(99.0 + k, 1.0 + k, "info", "mode", f"event {k + 1}")
+    served.settle()  # before anybody subscribes: that may be quicker
+    early = subscribe(context, addresses[0])
+    told: list[tuple[bytes, dict[str, Any]]] = []
 
-        def tick(socket: zmq.Socket[Any]) -> int:
-            served.settle()
-            while socket.poll(0):
-                told.append(receive(socket))
-            return len(told)
+    def tick(socket: zmq.Socket[Any]) -> int:
+        served.settle()
+        while socket.poll(0):
+            told.append(receive(socket))
+        return len(told)
 
-        until(lambda: tick(early) == 51)
-        assert told[0][0] == b"hand/settings"
-        assert told[0][1]["version"] == "0.1.0"
-        assert [message["seq"] for _, message in told[1:]] == list(range(11, 61))
-        assert all(message["again"] for _, message in told)
-        last = told[-1][1]  # with its own times, not those of the repetition
-        assert (last["timestamp"], last["mono_ns"]) == (158.0, 60_000_000_000)
-        assert (last["level"], last["kind"], last["text"]) == ("info", "mode", "event 60")
-        told.clear()
-        publisher.event(200.0, 100.0, "info", "mode", "new")
-        until(lambda: tick(early) == 1)
-        assert not told[0][1]["again"]
-        # A second subscriber, of one topic alone, is told that topic's.
-        told.clear()
-        late = subscribe(context, addresses[0], b"hand/event")
-        until(lambda: tick(late) == 50)
-        assert {topic for topic, _ in told} == {b"hand/event"}
+    until(lambda: tick(early) == 51)
+    assert told[0][0] == b"hand/settings"
+    assert told[0][1]["version"] == "0.1.0"
+    assert [message["seq"] for _, message in told[1:]] == list(range(11, 61))
+    assert all(message["again"] for _, message in told)
+    last = told[-1][1]  # with its own times, not those of the repetition
+    assert (last["timestamp"], last["mono_ns"]) == (158.0, 60_000_000_000)
+    assert (last["level"], last["kind"], last["text"]) == ("info", "mode", "event 60")
+    told.clear()
+    publisher.event(200.0, 100.0, "info", "mode", "new")
+    until(lambda: tick(early) == 1)
+    assert not told[0][1]["again"]
+    # A second subscriber, of one topic alone, is told that topic's.
+    told.clear()
+    late = subscribe(context, addresses[0], b"hand/event")
+    until(lambda: tick(late) == 50)
+    assert {topic for topic, _ in told} == {b"hand/event"}
 
 
-def test_a_long_message_comes_in_pieces_and_whole(context, addresses):
+def test_a_long_message_comes_in_pieces_and_whole(context, addresses, served):
     facts = HandFacts("0.1.0", "x" * 150_000, "", "", "{}", "{}")
     grid = np.arange(256 * 256, dtype=np.uint16).reshape(256, 256)
     sensor = SensorFacts(0.002, 0.003, 0.0, 0.0, 0.0, "count", 4.0, False, "")
-    with Served(addresses[0]) as served:
-        served.publisher.settings(98.0, 0.5, facts)
-        served.settle()  # before anybody subscribes: else it comes twice
-        socket = subscribe(context, addresses[0])
-        assert receive(socket, served)[1]["settings"] == facts.settings
-        served.publisher.send(TACTILE, Frame(7, 1.0, 1.25, True, grid), grid, 1, sensor, 99.0)
-        assert receive(socket, served)[1]["data"] == grid.tobytes()
+    served.publisher.settings(98.0, 0.5, facts)
+    served.settle()  # before anybody subscribes: else it comes twice
+    socket = subscribe(context, addresses[0])
+    assert receive(socket, served)[1]["settings"] == facts.settings
+    served.publisher.send(TACTILE, Frame(7, 1.0, 1.25, True, grid), grid, 1, sensor, 99.0)
+    assert receive(socket, served)[1]["data"] == grid.tobytes()
 
 
-def test_commands_are_told_to_those_who_ask(context, addresses):
-    with Served(addresses[0], queue=10) as served:
-        publisher = served.publisher
-        publisher.command(99.0, 1.0, 500, {"command": "arm"}, "")  # nobody listens: no count either
-        socket = subscribe(context, addresses[0], b"hand/command")
-        until(lambda: wanted(served, COMMAND))
-        publisher.command(99.0, 1.0, 501, {"command": "grasp", "force": 5.0, "client": "me"}, "no")
-        topic, message = receive(socket, served)
-        assert topic == b"hand/command"
-        assert (message["seq"], message["tick"], message["client"]) == (1, 501, "me")
-        assert (message["ok"], message["error"]) == (False, "no")
-        assert json.loads(message["request"]) == {"command": "grasp", "force": 5.0, "client": "me"}
+def test_commands_are_told_to_those_who_ask(context, addresses, served):
+    publisher = served.publisher
+    publisher.command(99.0, 1.0, 500, {"command": "arm"}, "")  # nobody listens: no count either
+    socket = subscribe(context, addresses[0], b"hand/command")
+    until(lambda: wanted(served, COMMAND))
+    publisher.command(99.0, 1.0, 501, {"command": "grasp", "force": 5.0, "client": "me"}, "no")
+    topic, message = receive(socket, served)
+    assert topic == b"hand/command"
+    assert (message["seq"], message["tick"], message["client"]) == (1, 501, "me")
+    assert (message["ok"], message["error"]) == (False, "no")
+    assert json.loads(message["request"]) == {"command": "grasp", "force": 5.0, "client": "me"}
