@@ -204,5 +204,5 @@ def parse_only(block: Block, at: str) -> None:
         compile(block.text, at, "exec")
     for line in block.text.replace("\\\n", "").splitlines():
         if line.startswith("softfinger "):
-            words = shlex.split(line, comments=True)[1:]
+            words = shlex.split(line.partition(" | ")[0], comments=True)[1:]
             parse([word for word in words if not re.fullmatch(r"\$\w+", word)])
