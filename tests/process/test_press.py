@@ -1,4 +1,4 @@
-"""Calibration without metal: `emulate --press` and `calibrate` on a tip of solid rubber."""
+"""Calibration without metal: `emulate --send press` and `calibrate` on a tip of solid rubber."""
 
 import json
 import math

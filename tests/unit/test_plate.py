@@ -31,7 +31,7 @@ def test_presses_in_words():
     assert str(stiffer) == "4.000 mm at 0.00°, 19.604 N"
 
 
-def test_a_plate_goes_down_holds_lifts_off_and_begins_anew():
+def test_a_plate_goes_down_holds_and_lifts_off():
     plate = Plate()
     assert plate(5.0) == (-0.001, 0.0, 0.0)
     plate.go(parse_presses("depth=4mm tilt=-10deg speed=5mm/s hold=1s", TABLE, 1.0)["left"], 10.0)
@@ -45,10 +45,8 @@ def test_a_plate_goes_down_holds_lifts_off_and_begins_anew():
     assert plate.reached(11.9) is None  # the same
     assert plate(12.125) == pytest.approx((0.0015, tilt, 0.0))
     assert plate(12.5).d == -0.001
-    again = 13.25  # 1 s clear, then the next round
-    assert plate(again + 0.5) == pytest.approx((0.0015, tilt, 0.0))
-    assert plate.reached(again + 0.5) is None
-    assert plate.reached(again + 1.1) is not None
+    assert plate(1e4) == (-0.001, 0.0, 0.0)
+    assert plate.reached(1e4) is None
 
 
 def test_a_plate_lifts_off_before_it_tilts_and_the_last_press_stays():

@@ -19,7 +19,6 @@ from softfinger.tools.ending import Interrupted, Signals
 if TYPE_CHECKING:
     from softfinger.daemon.profile.settings import Settings
 
-_CYCLE = "depth=4mm speed=4mm/s hold=1s"  # of a bare --press: what `calibrate modulus` asks for
 _LOOK = 0.1  # s between two looks at a plate's way
 _FAULTS = """\
 faults, each KIND[=VALUE][@START], given as often as needed:
@@ -44,13 +43,12 @@ faults, each KIND[=VALUE][@START], given as often as needed:
 softfinger emulate --send "drop=0.01 left:frozen@2" changes a running one, by DIR/control.
 
 a plate on a stage, which presses a tip instead of the object, so that `calibrate` can be tried:
-  --press [PRESSES], or --send "press PRESSES" while it runs, which returns when the plate is there
+  --send "press PRESSES", which returns when the plate is there
   PRESSES are separated by commas, each some of these words:
     depth=4mm      or force=5N; or pressure=10kPa on all cells, as by a bladder; depth=0mm lifts off
     tilt=10deg     of the plate (0)
     speed=2mm/s    of the way there (5)
-    hold=1s        then it lifts off; a last press without it stays, others rest for 1 s. Where the
-                   last one ends, all begin again
+    hold=1s        then it lifts off; a last press without it stays, others rest for 1 s
     tip=left       or right (both)
   The log says what a tip feels where a plate has come to rest. The joints don't feel it.
 
@@ -118,13 +116,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "report; then end",
     )
     parser.add_argument(
-        "--press",
-        nargs="?",
-        const=_CYCLE,
-        metavar="PRESSES",
-        help="a plate presses the tips, round after round; see below",
-    )
-    parser.add_argument(
         "--fault", action="append", default=[], metavar="FAULT", help="what goes wrong; see below"
     )
 
@@ -187,11 +178,6 @@ def _serve(settings: Settings, arguments: argparse.Namespace, signals: Signals) 
                 return 1
             made.callback(emulator.close)
         signals.hand_over(emulator.end)
-        if arguments.press is not None:
-            problem = emulator.press(arguments.press)
-            if problem.startswith("error: "):
-                print(f"softfinger: {problem.removeprefix('error: ')}", file=sys.stderr)
-                return 1
         with RealTime(_unhurried(settings, arguments.baud > 0)):
             emulator.run(lambda: print("ready", flush=True))
     return 0

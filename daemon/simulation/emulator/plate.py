@@ -138,16 +138,14 @@ class Plate:
         self._doing: list[tuple[PlatePress | None, bool]] = [
             (None, False)
         ]  # from a knot on; if at rest
-        self._round = math.inf, 1.0  # where rounds begin, and their length
         self._reported = -1
-        self.arrives = 0.0  # when a sequence's last press is reached for the first time
+        self.arrives = 0.0  # when a sequence's last press is reached
 
     def go(self, presses: Sequence[PlatePress], t: float) -> None:
-        """Lift off and do ``presses`` from ``t`` on: round after round if the last one ends."""
+        """Lift off and do ``presses`` from ``t`` on."""
         d, (press, _) = max(self(t).d, -_CLEAR), self._doing[self._leg(t)]
         self._t, self._d, self._doing, self._reported = [t], [d], [], -1
         self._add((d + _CLEAR) / _LIFT, -_CLEAR, press)
-        begin = self._t[-1]
         for press in presses:
             d = press.d if press.d > 0.0 else -_CLEAR
             travel = (d + _CLEAR) / press.speed + (_FILL if press.pressure > 0.0 else 0.0)
@@ -157,9 +155,8 @@ class Plate:
                 self._add(press.hold, d, press, rests=True)
                 self._add((d + _CLEAR) / _LIFT, -_CLEAR, press)
                 self._add(_BETWEEN, -_CLEAR, None)
-        self._doing.append((presses[-1], True))
-        ends = presses[-1].hold < math.inf
-        self._round = (begin, self._t[-1] - begin) if ends else (math.inf, 1.0)
+        stays = presses[-1].hold == math.inf
+        self._doing.append((presses[-1], True) if stays else (None, False))
 
     def _add(
         self, duration: float, d: float, press: PlatePress | None, rests: bool = False
@@ -171,7 +168,7 @@ class Plate:
     def __call__(self, t: float) -> StageTouch:
         """Return the tip's touch at ``t``."""
         press, rests = self._doing[self._leg(t)]
-        d = float(np.interp(self._within(t), self._t, self._d))
+        d = float(np.interp(t, self._t, self._d))
         if press is None:
             return StageTouch(d, 0.0, 0.0)
         return StageTouch(d, press.theta, press.pressure if rests else 0.0)
@@ -184,9 +181,5 @@ class Plate:
         self._reported = leg if rests else -1
         return press if fresh else None
 
-    def _within(self, t: float) -> float:
-        begin, length = self._round
-        return t if t < begin else begin + (t - begin) % length
-
     def _leg(self, t: float) -> int:
-        return max(int(np.searchsorted(self._t, self._within(t), side="right")) - 1, 0)
+        return max(int(np.searchsorted(self._t, t, side="right")) - 1, 0)
