@@ -295,7 +295,7 @@ def test_a_recording_is_shown_from_any_place(recorded):
                 blue = [*COLOURS["left"]]
                 lines = picture["panels"]["Force [N]"]["lines"]
                 (points,) = (points for colour, _, points in lines if colour == blue)
-                assert len(points) == pytest.approx(20 * place, abs=4)
+                assert len(points) == pytest.approx(10 * place, abs=4)
                 for time, force in zip(points[::2], points[1::2], strict=True):
                     was = min(past, key=lambda stamp: abs(stamp - picture["time"] - time))
                     assert force == (

@@ -12,7 +12,6 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import fields
 from itertools import groupby, takewhile
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
@@ -27,7 +26,7 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.physics.simulated_hand import geometry_of
 from softfinger.daemon.types import FINGERS
 from softfinger.daemon.wire import schema
-from softfinger.daemon.wire.schema import FingerState, HandState
+from softfinger.daemon.wire.schema import HandState
 from softfinger.tools.terminal import heatmap
 from softfinger.tools.terminal.feed import Feed, number, printable, text
 from softfinger.tools.terminal.typeset import micro, short
@@ -48,8 +47,8 @@ TOPICS = (
     schema.COMMAND,
 )
 SECONDS = 12.0  # of the past in the plots
-_STEP = 0.1  # s from one column of the plots to the next
-_TRAIL = 60  # of these columns on the landscape
+_STEP = 0.2  # s from one column of the plots to the next
+_TRAIL = 30  # of these columns on the landscape
 _EVENTS = 30  # shown
 _LATELY = 5.0  # s for which a warning counts as present
 _LATE = (204, 96, 150)
@@ -80,13 +79,16 @@ _PLOTS = {  # title: factor, fields of `hand/state`
     "Tick [µs]": (1e6, "compute_s wake_late_s"),
 }
 _SERVOS = ("q", "current")  # what a hand without servos lacks
-_DEVIATIONS = {field.name for field in fields(FingerState) if field.name.endswith("_std")}
+_DEVIATED = ("force", "d", "theta")  # fields of a finger whose {}_std is drawn, too
 _OTHERS = {  # names and colours of lines that are no finger's
     "object.angle": ("object", OBJECT),
     "compute_s": ("work", OBJECT),
     "wake_late_s": ("late", _LATE),
 }
 _BOUNDED = ("force", "d", "current", "temperature")  # of a finger, each by `safety.…_max`
+_PATHS = [path for _, paths in _PLOTS.values() for path in paths.split()]
+_PATHS += [f"{side}.{key}_std" for side in FINGERS for key in _DEVIATED]
+_row = attrgetter("timestamp", "object.valid", *_PATHS)
 
 
 class Pictures:
@@ -122,7 +124,9 @@ class Pictures:
         self.time = math.nan  # of the newest state [Unix s]
         self._truth: dict[str, Any] | None = None
         self._gaps = {topic: Gaps() for topic in TOPICS}
-        self._past: deque[HandState] = deque(maxlen=round(SECONDS / _STEP))
+        self._past: deque[tuple[HandState, tuple[float, ...]]] = deque(
+            maxlen=round(SECONDS / _STEP)
+        )
         self._pressure = heatmap.FullScale(5e3)
 
     def _moment(self) -> float:
@@ -140,7 +144,7 @@ class Pictures:
             if number(message, "seq") < self.feed.state.seq:
                 self._past.clear()  # another daemon's
             elif self.states and self.time // _STEP != stamp // _STEP:
-                self._past.append(self.feed.state)  # the step's last state
+                self._past.append((self.feed.state, _row(self.feed.state)))  # the step's last
             self.time = stamp
             self.states += 1
             self.seen += 1
@@ -267,7 +271,7 @@ class Pictures:
     def _contacts(self) -> dict[str, Any]:
         """Each contact on the landscape, in mm and degrees, with its trail."""
         lines, dots = [], []
-        states = [self.feed.state, *reversed(self._past)][: 1 + _TRAIL]
+        states = [self.feed.state, *(state for state, _ in reversed(self._past))][: 1 + _TRAIL]
         for name in self._fingers:
             tips = takewhile(touches, (state.finger(name) for state in states))
             if trail := [(_DEGREE * tip.theta, 1e3 * tip.d) for tip in tips]:
@@ -277,18 +281,20 @@ class Pictures:
 
     def _graphs(self) -> dict[str, Any]:
         """The plots over the last seconds, with a deviation to both sides, and the mode below."""
-        past = [state for state in self._past if state.timestamp > self.time - SECONDS]
-        states = [*past, self.feed.state]
-        times = np.array([state.timestamp for state in states]) - self.time
+        now = self.feed.state, _row(self.feed.state)
+        shown = [each for each in self._past if each[1][0] > self.time - SECONDS] + [now]
+        table = np.array([row for _, row in shown]).T
+        times, valid = table[0] - self.time, table[1] > 0.0
+        columns = dict(zip(_PATHS, np.clip(table[2:], -_MOST, _MOST), strict=True))
+        columns["object.angle"][~valid] = np.nan
         modes, k = [], 0
-        for mode, run in groupby(states, attrgetter("mode")):
+        for mode, run in groupby(state.mode for state, _ in shown):
             begin, k = k, k + len(list(run))
             modes.append((_MODES.get(mode, GOAL), times[begin], times[min(k, len(times) - 1)]))
-        graphs = {}
-        for title, (factor, paths) in self._plots.items():
-            series = [(path, *_series(path, factor, states)) for path in paths]
-            graphs[title] = _graph(series, times, modes)
-        return graphs
+        return {
+            title: _graph(paths, factor, columns, times, modes)
+            for title, (factor, paths) in self._plots.items()
+        }
 
     def _limits(self) -> str:
         """Return what holds the hand back: a recent warning, the grip's goal, the nearest limit."""
@@ -335,24 +341,17 @@ class Pictures:
         return facts
 
 
-def _series(path: str, factor: float, states: list[HandState]) -> tuple[FloatArray, FloatArray]:
-    """Return a field's values and their deviations, 0 where it has none."""
-    values = np.array([attrgetter(path)(state) for state in states])
-    if path == "object.angle":
-        values[[not state.object.valid for state in states]] = np.nan
-    std = np.zeros(len(states))
-    if path.rpartition(".")[2] + "_std" in _DEVIATIONS:
-        std = np.array([attrgetter(f"{path}_std")(state) for state in states])
-    return factor * np.clip(values, -_MOST, _MOST), factor * np.clip(np.nan_to_num(std), 0.0, _MOST)
-
-
 def _graph(
-    series: list[tuple[str, FloatArray, FloatArray]],
+    paths: list[str],
+    factor: float,
+    columns: dict[str, FloatArray],
     times: FloatArray,
     modes: list[tuple[Colour, float, float]],
 ) -> dict[str, Any]:
-    """A plot over ``times`` [s], with ``modes`` from and to; series: path, values, deviations."""
-    ends = np.array([(value - std, value + std) for _, value, std in series])
+    """A plot of the columns at ``paths`` over ``times`` [s], with the modes from and to."""
+    values = [factor * columns[path] for path in paths]
+    spreads = [factor * np.nan_to_num(columns.get(f"{path}_std", 0.0 * times)) for path in paths]
+    ends = np.array([np.subtract(values, spreads), np.add(values, spreads)])
     known = ends[np.isfinite(ends)]
     low, high = (known.min(), known.max()) if known.size else (0.0, 1.0)
     slack = max(0.08 * (high - low), 0.02 * max(abs(low), abs(high)), 0.01)
@@ -363,7 +362,7 @@ def _graph(
     for tick in step * np.arange(math.ceil(low / step), math.floor(high / step) + 1):
         lines.append((_GRID, 1, [-SECONDS, tick, 0.0, tick]))
         texts.append((GOAL, -1.07 * SECONDS, tick, f"{tick:.6g}"))
-    for k, (path, value, std) in enumerate(series):
+    for k, (path, value, std) in enumerate(zip(paths, values, spreads, strict=True)):
         finger, _, key = path.rpartition(".")
         goal = " goal" * key.startswith("goal")
         name, colour = _OTHERS.get(path, ((finger + goal).strip(), COLOURS.get(finger, GOAL)))
@@ -374,7 +373,7 @@ def _graph(
             spread = f" ± {std[-1]:.2g}"
         lines.append((colour, 0.8 if goal else 1.8, _flat(np.column_stack((times, value)))))
         if math.isfinite(value[-1]) and not (goal and finger):
-            place = (k + 0.5) / len(series) * SECONDS - SECONDS
+            place = (k + 0.5) / len(paths) * SECONDS - SECONDS
             texts.append(
                 (colour, place, low - 0.15 * (high - low), f"{name} {value[-1]:.3g}{spread}")
             )

@@ -46,7 +46,7 @@ def follow(
         begun = last = time.monotonic()
         silent, rest = False, 1.0 / arguments.rate
         while not ending.wait(rest):
-            began = time.monotonic()
+            began, worked = time.monotonic(), time.thread_time()
             for message in drain(socket, _QUEUE):
                 last = began
                 try:
@@ -60,9 +60,9 @@ def follow(
                 where = waiting(arguments.address, arguments.keys)
                 say(where if silent else "the stream has begun")
             pictures.draw()
-            # Never busy for more than half of its time, however slow the machine is.
-            busy = time.monotonic() - began
-            rest = max(1.0 / arguments.rate - busy, min(busy, _REST))
+            # Never works for more than half of its time, however slow the machine is.
+            worked = time.thread_time() - worked
+            rest = max(1.0 / arguments.rate - (time.monotonic() - began), min(worked, _REST))
     except zmq.ZMQError as error:
         raise ViewError(f"{arguments.address}: {error}") from None
     finally:
