@@ -189,7 +189,7 @@ class TactileSettings(Section):
     open_timeout: Seconds = 2.0  # s to wait for a first good frame
     sensor: tuple[str, str] = ("", "")  # identifies the sensors, as a serial number
     calibration: tuple[str, str] = ("", "")  # files of `softfinger calibrate`; replace what's above
-    recording: tuple[str, str] = ("", "")  # backend = "replay": .npz, .npy, ASCII export
+    recording: tuple[str, str] = ("", "")  # backend = "replay": .npz, folder of .npy, ASCII export
     replay_again: bool = True  # backend = "replay": from the start at the end, else it ends
 
 

@@ -4,7 +4,8 @@ Files:
 - ``.npz`` with ``frames`` [n, rows, cols] and optionally ``t`` [n] s, ``live`` [rows, cols] bool,
   and the true contact at each frame, where known: ``d`` [m], ``theta`` [rad], ``force`` [N], each
   [n].
-- ``.npy``, one frame [rows, cols] or several [n, rows, cols].
+- ``.npy``, one frame [rows, cols] or several [n, rows, cols]; or a folder of such files, in the
+  order of their names with numbers read as numbers, and ``t.npy`` [n] s among them.
 - a Tekscan-style ASCII export, any other file.
 
 Frames of whole numbers are counts; others are Pa, and become counts by ``pascal_per_count``.
@@ -14,6 +15,7 @@ from __future__ import annotations
 
 import bisect
 import math
+import re
 import zipfile
 import zlib
 from dataclasses import dataclass, field, replace
@@ -52,17 +54,43 @@ class FrameRecording:
 def load_recording(path: Path, pascal_per_count: float, rate: float) -> FrameRecording:
     """Read a recording; without times its frames come at ``rate`` [Hz]. Raises RecordingError."""
     try:
+        if path.is_dir():
+            return _folder(path, pascal_per_count, rate)
         if path.suffix == ".npz":
             return _checked(_archive(path), pascal_per_count, rate)
         if path.suffix == ".npy":
-            with open_regular(path) as file:
-                frames = _read_array(file, min(path.stat().st_size, unpacked_most(file)))
-            alone = frames[None] if frames.ndim == 2 else frames
-            return _checked({"frames": alone}, pascal_per_count, rate)
+            return _checked({"frames": _frames(path)}, pascal_per_count, rate)
         return _export(path, pascal_per_count, rate)
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else error
         raise RecordingError(f"{path}: {reason}") from None
+
+
+def _folder(path: Path, scale: float, rate: float) -> FrameRecording:
+    def order(file: Path) -> list[tuple[int, str]]:
+        parts = re.findall(r"\d+|\D+", file.stem)
+        return [(int(part), "") if part.isdigit() else (-1, part) for part in parts]
+
+    parts = []
+    arrays: dict[str, NDArray[Any]] = {}
+    for file in sorted(path.glob("*.npy"), key=order):
+        if file.stem in ("t", "live", *TRUTHS):
+            arrays[file.stem] = _array(file)
+        else:
+            parts.append(_frames(file))
+    if not parts:
+        raise ValueError("no .npy file with a frame in this folder")
+    if len({part.shape[1:] for part in parts}) > 1:
+        raise ValueError("frames of different shapes in this folder")
+    return _checked({"frames": np.concatenate(parts), **arrays}, scale, rate)
+
+
+def _frames(path: Path) -> NDArray[Any]:
+    """The frames of one .npy file, [n, rows, cols]."""
+    array = _array(path)
+    if array.ndim not in (2, 3):
+        raise ValueError(f"{path.name}: found shape {array.shape}, expected [n, rows, cols]")
+    return array.reshape(-1, *array.shape[-2:])
 
 
 def _archive(path: Path) -> dict[str, NDArray[Any]]:
@@ -82,6 +110,11 @@ def _archive(path: Path) -> dict[str, NDArray[Any]]:
                 with archive.open(part) as unpacked:
                     held[name] = _read_array(unpacked, part.file_size)
     return held
+
+
+def _array(path: Path) -> NDArray[Any]:
+    with open_regular(path) as file:
+        return _read_array(file, min(path.stat().st_size, unpacked_most(file)))
 
 
 def _read_array(file: IO[bytes], size: int) -> NDArray[Any]:

@@ -12,6 +12,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -31,6 +32,7 @@ from softfinger.kinematics.contact.table import ContactTable
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
 FloatArray = NDArray[np.float64]
+Kind = Literal["power", "cubic"]
 
 DEAD = 0.2  # of the median response: cells below are dead
 _EXPONENTS = (0.3, 3.0)
@@ -158,45 +160,83 @@ def equilibrate(loads: Sequence[ArrayLike], zero: FloatArray) -> Equilibration:
 
 @dataclass(frozen=True)
 class SensorCurve:
-    """``power`` (b, c) of p = c x^b [Pa]; ``residual``: rms of the forces' relative errors."""
+    """``coefficients`` (exponent b, c_1, c_2, c_3) of p = c_1 x^b + c_2 x² + c_3 x³ [Pa].
 
-    power: tuple[float, float]
+    ``errors`` [n]: relative error of each known force; ``residual`` their rms.
+    """
+
+    kind: Kind
+    coefficients: tuple[float, float, float, float]
+    errors: FloatArray
     residual: float
 
 
-def fit_curve(readings: ArrayLike, force: ArrayLike, area: float, full: float) -> SensorCurve:
+def fit_curve(
+    kind: Kind, readings: ArrayLike, force: ArrayLike, area: float, full: float
+) -> SensorCurve:
     """Return the curve whose pressure over all cells makes the known forces.
 
     ``readings`` float64 [n, rows, cols]: x = (counts − zero)·gain, ≥ 0 and free of noise far from
     the contact (see :func:`cleared`); ``force`` [n] N; ``area`` of a cell [m²]; ``full`` the
-    largest x there is. Least squares of the relative errors. Raises CalibrationError for too few
-    forces, or an exponent far from 1.
+    largest x there is, up to which a cubic has to rise. Least squares of the relative errors.
+    Raises CalibrationError for too few forces or a curve that falls.
     """
     x = _stack(readings, "curve")
     x = x.reshape(len(x), -1)
     known = np.asarray(force, np.float64)
     if known.shape != (len(x),) or not (np.isfinite(known).all() and (known > 0.0).all()):
         raise CalibrationError("curve: each load needs its force, above 0")
-    if len(np.unique(known)) < 2:
-        raise CalibrationError("curve: expected at least 2 different forces")
+    need = 2 if kind == "power" else 3
+    if len(np.unique(known)) < need:
+        raise CalibrationError(f"curve: a {kind} needs at least {need} different forces")
     if (x.max(axis=1) <= 0.0).any():
         raise CalibrationError("curve: a load reads nothing above the zero")
-    u = np.maximum(x / full, 0.0)
+    if kind == "power":
+        coefficients, errors = _power(x, known, area, full)
+    else:
+        coefficients, errors = _cubic(x, known, area, full)
+    return SensorCurve(kind, coefficients, errors, _rms(errors))
 
-    def fit(exponent: float) -> tuple[float, float]:
-        ratio = (u**exponent).sum(axis=1) * area / known
+
+def _cubic(
+    x: FloatArray, force: FloatArray, area: float, full: float
+) -> tuple[tuple[float, float, float, float], FloatArray]:
+    u = x / full
+    rows = np.stack([(u**j).sum(axis=1) * area / force for j in (1, 2, 3)], axis=1)
+    c, _, rank, _ = np.linalg.lstsq(rows, np.ones(len(force)), rcond=1e-10)
+    if rank < 3:
+        raise CalibrationError("curve: the loads are too alike for a cubic; try a power")
+    at = np.linspace(0.0, 1.0, 201)
+    if (c[0] + 2 * c[1] * at + 3 * c[2] * at**2 <= 0.0).any():
+        raise CalibrationError("curve: the cubic through these loads falls; try a power")
+    scaled = (1.0, float(c[0] / full), float(c[1] / full**2), float(c[2] / full**3))
+    return scaled, rows @ c - 1.0
+
+
+def _power(
+    x: FloatArray, force: FloatArray, area: float, full: float
+) -> tuple[tuple[float, float, float, float], FloatArray]:
+    u = x / full
+
+    def fit(exponent: float) -> tuple[float, FloatArray]:
+        row = np.where(u > 0.0, u, 0.0) ** exponent
+        ratio = row.sum(axis=1) * area / force
         factor = float(ratio.sum() / (ratio @ ratio))
-        return factor, _rms(factor * ratio - 1.0)
+        return factor, factor * ratio - 1.0
+
+    def cost(exponent: float) -> float:
+        errors = fit(exponent)[1]
+        return float(errors @ errors)
 
     # The best of a coarse grid, then golden section round it.
     grid = np.linspace(*_EXPONENTS, 28)
-    best = int(np.argmin([fit(float(b))[1] for b in grid]))
+    best = int(np.argmin([cost(float(b)) for b in grid]))
     low, high = float(grid[max(best - 1, 0)]), float(grid[min(best + 1, len(grid) - 1)])
-    exponent = golden_section(lambda b: fit(b)[1], low, high, 1e-9)
+    exponent = golden_section(cost, low, high, 1e-9)
     if not _EXPONENTS[0] + 0.02 < exponent < _EXPONENTS[1] - 0.02:
         raise CalibrationError(f"curve: these loads want an exponent beyond {_EXPONENTS}")
-    factor, residual = fit(exponent)
-    return SensorCurve((exponent, factor / full**exponent), residual)
+    factor, errors = fit(exponent)
+    return (exponent, factor / full**exponent, 0.0, 0.0), errors
 
 
 def cleared(readings: FloatArray, noise: FloatArray, frames: int) -> FloatArray:
@@ -285,13 +325,14 @@ def fit_centre(
 
 @dataclass(frozen=True)
 class Modulus:
-    """E [Pa] of the tip's F(d − d₀, θ); ``offset`` d₀ [m].
+    """E [Pa] of the tip's F(d − d₀, θ); ``offset`` d₀ [m]; ``errors`` [n] relative, of the force.
 
-    ``residual``: rms of F's relative errors; ``trend``: E of each load alone.
+    ``trend``: E of each load alone.
     """
 
     modulus: float
     offset: float
+    errors: FloatArray
     residual: float
     trend: Trend
 
@@ -321,8 +362,9 @@ def fit_modulus(d: ArrayLike, theta: ArrayLike, force: ArrayLike, tip: Fingertip
         if abs(step) < 1e-9:
             break
     fitted = modulus * unit(np.maximum(depth - offset, 1e-9), tilt).force
-    alone = trend(depth, modulus * load / fitted, load)
-    return Modulus(modulus, offset, _rms(fitted / load - 1.0), alone)
+    errors = fitted / load - 1.0
+    alone = trend(depth, modulus / (1.0 + errors), load)
+    return Modulus(modulus, offset, errors, _rms(errors), alone)
 
 
 @dataclass(frozen=True, eq=False)
@@ -335,6 +377,7 @@ class Relaxation:
     strengths: tuple[float, ...]
     residual: float
     elastic: float
+    model: FloatArray  # F by the fit [N], in the press as measured
 
 
 def follow(t: FloatArray, lasting: FloatArray, time: float) -> FloatArray:
@@ -380,14 +423,14 @@ def fit_relaxation(t: ArrayLike, force: ArrayLike, times: tuple[float, ...]) -> 
             if (found >= 0.0).all():
                 strengths = np.zeros(len(told))
                 strengths[used[1:] - 1] = found[1:] / found[0]
-                error = _rms(columns[:, used] @ found / load[held:] - 1.0)
-                fits.append((error, found[0], strengths))
-        error, scale, strengths = min(fits, key=lambda fit: fit[0])
+                model = columns[:, used] @ found
+                fits.append((_rms(model / load[held:] - 1.0), found[0], strengths, model))
+        error, scale, strengths, model = min(fits, key=lambda fit: fit[0])
         passed = np.maximum(load, 0.0) / scale + strengths @ memory
         lasting[:held] = (passed / (1.0 + strengths.sum()))[:held]
     whole = np.zeros(len(times))
     whole[told] = strengths
-    return Relaxation(tuple(whole.tolist()), error, fits[0][0])
+    return Relaxation(tuple(whole.tolist()), error, fits[0][0], np.append(load[:held], model))
 
 
 def _stack(frames: ArrayLike, step: str) -> FloatArray:

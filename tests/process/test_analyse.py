@@ -68,6 +68,10 @@ def test_frames_that_can_not_be_used_are_counted_by_their_reason(counts, tmp_pat
 
 def test_every_kind_of_file_gives_the_same_contacts(counts, tmp_path):
     np.savez(tmp_path / "press.npz", frames=counts, t=np.arange(len(counts)) / 100, d=DEPTHS)
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    for k, frame in enumerate(counts):
+        np.save(folder / f"frame{k}.npy", frame)
     lines = ["ROWS 44", "COLS 44", f"ROW_SPACING {PITCH * 1e3} mm", f"COL_SPACING {PITCH * 1e3} mm"]
     lines += ["SECONDS_PER_FRAME 0.01", "UNITS RAW", "ASCII_DATA @@"]
     for k, frame in enumerate(counts):
@@ -75,7 +79,7 @@ def test_every_kind_of_file_gives_the_same_contacts(counts, tmp_path):
     (tmp_path / "export.asf").write_text("\n".join(lines))
     save_stream(tmp_path / "run.mcap", counts, Settings())
     np.save(tmp_path / "press.npy", counts)
-    for name in ("press.npz", "press.npy", "export.asf", "run.mcap"):
+    for name in ("press.npz", "press.npy", "frames", "export.asf", "run.mcap"):
         # The export tells its pitch: a wrong one in the settings must not matter there.
         wrong = {"rows": 10, "cols": 10, "pitch": 0.002} if name == "export.asf" else {}
         tactile = Settings().tactile.model_copy(update=wrong)

@@ -67,15 +67,15 @@ def live(tmp_path_factory):
         return bench.sensor.grid.pressure(TIP, MATERIAL, d, math.radians(theta))
 
     step("tare", [])
-    step("equilibrate", [np.full((N, N), p) for p in (3e3, 15e3)], "--loads", "2")
+    step("equilibrate", [np.full((N, N), p) for p in (3e3, 15e3)], "--loads", "2", "--no-plot")
     depths = (0.002, 0.003, 0.004)
     forces = [f"{math.pi * E * d * d:.6f}" for d in depths]
-    step("curve", [pressed(d) for d in depths], "--force", *forces)
+    step("curve", [pressed(d) for d in depths], "--no-plot", "--force", *forces)
     tilts = (-12.0, 0.0, 12.0)
     presses = [pressed(0.003, t) for t in tilts]
-    step("centre", presses, "--theta", *map(str, tilts))
+    step("centre", presses, "--no-plot", "--theta", *map(str, tilts))
     with contextlib.redirect_stdout(io.StringIO()) as said:
-        step("relaxation", [pressed(0.003)], "--d", "3", "--frames", "320")
+        step("relaxation", [pressed(0.003)], "--no-plot", "--d", "3", "--frames", "320")
     patch.undo()
     rig.__exit__()
     (folder / "relaxation").write_text(said.getvalue())
@@ -95,6 +95,10 @@ def test_load_by_load_from_a_board(live):
     steps = (found.tare, found.equilibrate, found.curve, found.centre)
     assert all(found.date >= step.date > "2020" for step in steps)
     assert max(step.residual for step in steps[1:]) < 0.02
+    assert sorted(each.name for each in live.iterdir()) == [
+        "profile.toml", "relaxation", "sensor.json", "sensor.tare.png"
+    ]  # fmt: skip
+    assert (live / "sensor.tare.png").stat().st_size > 5000
 
 
 def test_a_tip_without_memory_is_found_to_have_none(live):
@@ -110,6 +114,20 @@ def test_loads_that_never_come_change_nothing(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(calibration_frames, "RealClock", VirtualClock)
     file = tmp_path / "a.json"
     words = ["calibrate", "centre", str(file), "--theta", "0", "5", "--config", str(profile)]
-    assert main([*words, "--frames", "8"]) == 1
+    assert main([*words, "--no-plot", "--frames", "8"]) == 1
     assert "ended before all loads were on" in capsys.readouterr().err
     assert not file.exists()
+
+
+def test_without_matplotlib_the_step_is_done_and_the_missing_picture_told(
+    live, tmp_path, capsys, monkeypatch
+):
+    for name in [each for each in sys.modules if each.split(".")[0] == "matplotlib"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    frames = tmp_path / "rest.npz"
+    np.savez(frames, frames=MadeUp().counts(np.zeros((N, N)), 10))
+    words = ["--config", str(live / "profile.toml"), "--recording", str(frames)]
+    assert main(["calibrate", "tare", str(tmp_path / "a.json"), *words]) == 0
+    assert "no picture is drawn: pictures need matplotlib" in capsys.readouterr().err
+    assert load_calibration(tmp_path / "a.json").tare.frames == 10

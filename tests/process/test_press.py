@@ -43,7 +43,7 @@ def rubber(tmp_path_factory):
 
 def calibrate(folder, step, *words):
     arguments = ["calibrate", step, str(folder / "left.json"), "--config", "hil", *LINEAR]
-    return main([*arguments, "--dir", str(folder), "--frames", "40", *words])
+    return main([*arguments, "--dir", str(folder), "--no-plot", "--frames", "40", *words])
 
 
 def test_a_tip_of_rubber_is_told_from_springs(rubber, monkeypatch, capsys):

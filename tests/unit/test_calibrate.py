@@ -123,6 +123,9 @@ def test_each_step_finds_what_the_sensor_was_made_with(bench):
     assert found.modulus.modulus == pytest.approx(E, rel=0.02)
     assert found.modulus.offset == pytest.approx(1e-4, abs=2e-5)
     assert found.modulus.material().stress(0.2) == pytest.approx(0.2 * E, rel=0.02)
+    assert all(
+        (folder / f"sensor.{step}.png").stat().st_size > 5000 for step in ("tare", "modulus")
+    )
 
 
 def test_counts_become_the_pressure_that_made_them(bench):
@@ -277,6 +280,6 @@ def test_what_no_press_can_be_is_refused_in_a_line(step, known, told, tmp_path, 
     np.savez(path, frames=MadeUp().press(0.003, frames=2), **known)
     file = tmp_path / "sensor.json"
     given = ["--config", str(tmp_path / "profile.toml"), "--recording", str(path), *words]
-    assert main(["calibrate", step, str(file), *given]) == 1
+    assert main(["calibrate", step, str(file), *given, "--no-plot"]) == 1
     assert told in capsys.readouterr().err
     assert not file.exists()

@@ -170,3 +170,4 @@ def test_calibrate_finds_it_in_a_run_of_frames(tmp_path, capsys):
     said = capsys.readouterr().out
     found = [float(each) for each in re.findall(r"\d\.\d{3}", said.partition("[")[2])]
     assert found == pytest.approx([0.0, 0.2, 0.3], abs=0.02)
+    assert (tmp_path / "left.relaxation.png").stat().st_size > 1000

@@ -1,7 +1,7 @@
 """``softfinger analyse FILE``: d, θ, force and energy over time from recorded pressure frames.
 
 By the daemon's own perception. A recording of the stream (.mcap) has its own settings and
-calibrations. A file of frames alone (.npz, .npy, a Tekscan-style export) is
+calibrations. A file of frames alone (.npz, .npy or a folder of these, a Tekscan-style export) is
 the profile's left sensor, with its own number of cells, and its own pitch where the file has it.
 """
 
@@ -37,9 +37,9 @@ if TYPE_CHECKING:
     from softfinger.daemon.perception.finger_model import FingerModel
 
 _EPILOG = """\
-FILE is a recording (.mcap), .npz with frames [n, rows, cols] and t, .npy frames, or a
-Tekscan-style ASCII export. A recording has its settings in it. For the others, name a profile by
---config, or what the file doesn't have, for instance
+FILE is a recording (.mcap), .npz with frames [n, rows, cols] and t, .npy frames or a folder of
+them, or a Tekscan-style ASCII export. A recording has its settings in it. For the others, name a
+profile by --config, or what the file doesn't have, for instance
   --set tip.radius=0.02 --set tactile.pitch=0.0013 --set tactile.pascal_per_count=4
   --set tactile.noise=500 --set material.law=constant --set material.modulus=3e5
 Writes FILE.contacts.csv beside it, which PlotJuggler draws. Several files are analysed side by

@@ -1,1 +1,1 @@
-"""`calibrate`: its frames and steps."""
+"""`calibrate`: its frames, steps and pictures."""

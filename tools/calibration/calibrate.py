@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections import deque
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,6 +12,7 @@ from softfinger.daemon.client.hand import Hand
 from softfinger.daemon.client.stream import read
 from softfinger.daemon.wire.schema import STATE, HandState
 from softfinger.tools.arguments import add_daemon, add_profile, number, profile, stream_address
+from softfinger.tools.extras import MissingExtra
 from softfinger.tools.recordings.reader import Recording
 
 if TYPE_CHECKING:
@@ -55,6 +57,7 @@ load, or one .npz of the whole run with its own d [m], theta [rad], force [N] fo
 Without a stage, try the steps on `softfinger emulate`:
   --move "softfinger emulate --send 'press depth={d}mm tilt={theta}deg'"
   --move "softfinger emulate --send 'turn {finger}={pose}'"     for joints
+Each step but law draws its result and residuals as FILE.STEP.png, where matplotlib is installed.
 A new equilibrate removes curve and modulus, a new curve removes modulus, and each of these removes
 scales: they depend on it.
 """
@@ -90,12 +93,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             help=f"known {name} of each load [{unit}]",
         )
     parser.add_argument(
+        "--kind",
+        choices=("power", "cubic"),
+        default="power",
+        help="form of the curve (default power)",
+    )
+    parser.add_argument(
         "--move",
         metavar="COMMAND",
         help="live: a program that brings each load on and ends when it is there, as of a stage, "
         "instead of Enter; {force}, {d} and {theta} stand for the load's, {finger} and {pose} "
         "(closed, open, zero) for a joint's",
     )
+    parser.add_argument("--no-plot", action="store_true", help="draw no picture")
     add_daemon(parser, stream_address)  # of scales
 
 
@@ -120,12 +130,19 @@ def run(arguments: argparse.Namespace) -> int:
 def _calibrate_tip(arguments: argparse.Namespace, settings: Settings) -> str:
     from softfinger.daemon.perception.calibration_file import save_calibration
     from softfinger.tools.calibration.calibration_frames import gather
+    from softfinger.tools.calibration.calibration_plot import draw
     from softfinger.tools.calibration.steps import Step, begin, done
 
+    file = arguments.file
     calibration = begin(arguments, settings)
     loads = gather(arguments, settings, calibration)
-    calibration, line = done(Step(arguments, settings, calibration, loads))
-    save_calibration(arguments.file, calibration)
+    calibration, line, panels = done(Step(arguments, settings, calibration, loads))
+    save_calibration(file, calibration)
+    if panels and not arguments.no_plot:
+        try:
+            draw(arguments.step, panels, file.with_name(f"{file.stem}.{arguments.step}.png"))
+        except MissingExtra as error:
+            print(f"calibrate: no picture is drawn: {error}", file=sys.stderr)
     return line
 
 

@@ -54,15 +54,18 @@ from softfinger.kinematics.calibration.press_fit import (
     first_cycle,
 )
 from softfinger.kinematics.contact.closed_form import Fingertip
+from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.contact.table import ContactTable
 from softfinger.kinematics.contact.tip_curves import TipCurves
 from softfinger.kinematics.estimation.measured import MeasuredEstimator
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from softfinger.tools.calibration.calibration_frames import Loads
+from softfinger.tools.calibration.calibration_plot import Map, Panel, Points
 
 FloatArray = NDArray[np.float64]
 _UNDONE: dict[str, Any] = {"modulus": None, "law": None, "scales": None, "wants": {}}
 _SOFTENS = 0.03  # by which a first press may be firmer: plates and noise are no better
-Done = tuple[Calibration, str]  # with the line to print
+Done = tuple[Calibration, str, tuple[Panel, ...]]  # with the line to print and the picture
 
 
 def begin(arguments: argparse.Namespace, settings: Settings) -> Calibration:
@@ -162,7 +165,7 @@ def done(step: Step) -> Done:
     return _STEPS[step.arguments.step](step)
 
 
-def _kept(kind: type[Any], found: object, /, **more: Any) -> Any:
+def _kept(kind: type[Any], found: object, **more: Any) -> Any:
     """Return the file's step of this ``kind``: its fields by name from ``found``, or ``more``."""
     values = {name: getattr(found, name) for name in kind.model_fields if hasattr(found, name)}
     lists = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in values.items()}
@@ -181,7 +184,8 @@ def _tare(step: Step) -> Done:
         line += f", correlated {beside:.2f} between neighbours"
     if found.drift > 0.0:
         line += f", all cells drift by {found.drift:.2f} counts"
-    return step.result(tare=result), line
+    spread = Map("noise, standard deviation [counts]", found.noise)
+    return step.result(tare=result), line, (Map("zero [counts]", found.zero), spread)
 
 
 def _equilibrate(step: Step) -> Done:
@@ -192,7 +196,8 @@ def _equilibrate(step: Step) -> Done:
         f"{len(step.loads.frames)} pressures, cells differ by {found.spread:.2%} rms before and "
         f"{found.residual:.2%} after; {dead} dead"
     )
-    return step.result(equilibrate=result, curve=None, **_UNDONE), line
+    calibration = step.result(equilibrate=result, curve=None, **_UNDONE)
+    return calibration, line, (Map("gain of each cell, 0: dead", found.gain),)
 
 
 def _curve(step: Step) -> Done:
@@ -214,10 +219,11 @@ def _curve(step: Step) -> Done:
             raise CalibrationError(f"curve: load {k + 1} saturates a cell, which hides its force")
     gains = step.calibration.equilibrate
     full = float(sensor.full_count) * max(map(max, gains.gain) if gains else [1.0])
-    found = fit_curve(step.readings, force, step.cell_area, full)
-    result = _kept(CurveStep, found, kind="power", coefficients=(*found.power, 0.0, 0.0))
-    line = f"power from {len(force)} loads, forces within {found.residual:.2%} rms"
-    return step.result(curve=result, **_UNDONE), line
+    found = fit_curve(step.arguments.kind, step.readings, force, step.cell_area, full)
+    result = _kept(CurveStep, found)
+    line = f"{found.kind} from {len(force)} loads, forces within {found.residual:.2%} rms"
+    left = Points("residuals", "known [N]", "relative error [%]", force, 100.0 * found.errors)
+    return step.result(curve=result, **_UNDONE), line, (left,)
 
 
 def _centre(step: Step) -> Done:
@@ -241,7 +247,7 @@ def _centre(step: Step) -> Done:
         f"tip at ({x * 1e3:.3f}, {y * 1e3:.3f}) ± {found.std * 1e3:.3f} mm; {rotation}; "
         f"{found.residual * 1e6:.0f} µm rms"
     )
-    return step.result(centre=result), line
+    return step.result(centre=result), line, (Map("last press [Pa]", step.pressures[-1]),)
 
 
 def _modulus(step: Step) -> Done:
@@ -252,7 +258,8 @@ def _modulus(step: Step) -> Done:
     force = np.array([each[reading > 0.0].sum() for each, reading in pressed]) * step.cell_area
     full = np.stack([(each >= sensor.full_count).any(axis=0) for each in step.loads.frames])
     whole = ~full.any(axis=(1, 2))  # a saturated cell hides a part of the force
-    found = fit_modulus(d[whole], theta[whole], force[whole], make_tip(step.settings))
+    tip = make_tip(step.settings)
+    found = fit_modulus(d[whole], theta[whole], force[whole], tip=tip)
     line = (
         f"E = {found.modulus / 1e6:.4f} MPa from {np.count_nonzero(whole)} loads, zero of d at "
         f"{found.offset * 1e3:.3f} mm, force within {found.residual:.2%} rms"
@@ -260,7 +267,14 @@ def _modulus(step: Step) -> Done:
     line += f"; {_over_d(found.trend)}"
     if not whole.all():
         line += f"; {np.count_nonzero(~whole)} frames left out, saturated"
-    return step.result(modulus=_kept(ModulusStep, found), scales=None), line
+    result = _kept(ModulusStep, found)
+    d, theta, force = d[whole], theta[whole], force[whole]
+    table = ContactTable.build(tip, Material.constant(found.modulus))
+    model = table(d - found.offset, theta).force
+    shown = Points("constant E", "d [mm]", "F [N]", d * 1e3, force, model)
+    alone = found.trend.modulus / 1e6
+    each = Points("E of each load", "d [mm]", "E [MPa]", found.trend.d * 1e3, alone)
+    return step.result(modulus=result, scales=None), line, (shown, each)
 
 
 def _law(step: Step) -> Done:
@@ -311,7 +325,7 @@ def _law(step: Step) -> Done:
             lines[1] += ": the rubber SOFTENS; press it some times to the full depth, then again"
     told = (f"tip.{name} = {json.dumps(value)}" for name, value in wants.items())
     lines.append(f"for the profile: {', '.join(told)}")
-    return step.result(**steps, wants=wants), "\n  ".join(lines)
+    return step.result(**steps, wants=wants), "\n  ".join(lines), ()
 
 
 def _measured(step: Step, live: NDArray[np.bool_]) -> tuple[TipCurves, FloatArray]:
@@ -393,7 +407,9 @@ def _relaxation(step: Step) -> Done:
         f"force within {found.residual:.2%} rms, {found.elastic:.2%} if the tip were elastic; for "
         f"the profile: tip.relaxation = [{strengths}]"
     )
-    return step.calibration, line
+    shown = Points("hold", "t [s]", "F [N]", t, force, found.model)
+    left = Points("residuals", "t [s]", "measured − fit [N]", t, force - found.model)
+    return step.calibration, line, (shown, left)
 
 
 _STEPS = {
