@@ -103,22 +103,20 @@ def addresses() -> tuple[str, str]:
     return own_addresses()
 
 
+def write_profile(path: Path, addresses: tuple[str, str], text: str = "") -> Path:
+    """Write a profile on these addresses, with ``text`` added to it; of 100 ticks a second, where
+    it names no other rate: daemons of several tests share the processors."""
+    stream, commands = addresses
+    rate = "" if "loop.rate" in text else "loop.rate = 100.0\n"
+    head = f'stream.address = "{stream}"\ncommands.address = "{commands}"\n'
+    path.write_text(head + rate + text, encoding="utf-8")
+    return path
+
+
 @pytest.fixture
 def profile(tmp_path: Path, addresses: tuple[str, str]) -> Profile:
-    """Writes a profile on the test's addresses, with ``text`` added to it; of 100 ticks a second,
-    where it names no other rate: daemons of several tests share the processors."""
-
-    def write(text: str = "", name: str = "profile.toml") -> Path:
-        path = tmp_path / name
-        stream, commands = addresses
-        rate = "" if "loop.rate" in text else "loop.rate = 100.0\n"
-        path.write_text(
-            f'stream.address = "{stream}"\ncommands.address = "{commands}"\n{rate}{text}',
-            encoding="utf-8",
-        )
-        return path
-
-    return write
+    """Writes a profile on the test's addresses, with a text added to it."""
+    return lambda text="", name="profile.toml": write_profile(tmp_path / name, addresses, text)
 
 
 @pytest.fixture

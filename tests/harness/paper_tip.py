@@ -4,7 +4,6 @@ import math
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import gaussian_filter
 
 from softfinger.daemon.profile.settings import SimulationSettings, TactileSettings
 from softfinger.kinematics.contact.closed_form import Fingertip
@@ -48,6 +47,8 @@ def dense(
     grid: SensorGrid, material: Material, contact: Any, pieces: int = 16, margin: int = 6
 ) -> np.ndarray[Any, Any]:
     """Pressure sampled ``pieces`` times a cell's side, blurred by SciPy, averaged over cells."""
+    from scipy.ndimage import gaussian_filter  # not at each start of the tests
+
     d, tilt_x, tilt_y = contact
     axes = []
     for cells, pitch, centre in zip((grid.cols, grid.rows), grid.pitches, grid.centre, strict=True):

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import pytest
 
 from softfinger.daemon.servos.dynamixel import DynamixelServos
-from tests.conftest import own_addresses
+from tests.conftest import own_addresses, write_profile
 from tests.harness.daemon_process import Running, ask
 from tests.harness.fake_daemon import FakeDaemon
 from tests.harness.servos import RunningBus, connected
@@ -58,12 +58,10 @@ class Shared(NamedTuple):
 
 @pytest.fixture(scope="module")
 def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Shared]:
-    stream, commands = own_addresses()
-    path = tmp_path_factory.mktemp("shared") / "profile.toml"
-    text = f'stream.address = "{stream}"\ncommands.address = "{commands}"\n'
-    path.write_text(text + "loop.rate = 100.0\n", encoding="utf-8")
+    addresses = own_addresses()
+    path = write_profile(tmp_path_factory.mktemp("shared") / "profile.toml", addresses)
     running = Running("--config", str(path))
-    yield Shared(running, path, (stream, commands))
+    yield Shared(running, path, addresses)
     running.kill()
 
 

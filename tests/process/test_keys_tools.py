@@ -16,7 +16,7 @@ from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.keys import make_keys
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.replay import Wire
-from tests.conftest import Addresses, own_addresses, until
+from tests.conftest import Addresses, own_addresses, until, write_profile
 from tests.harness.daemon_process import (
     Running,
     ask,
@@ -41,15 +41,11 @@ class Guarded(NamedTuple):
 def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Guarded]:
     place = tmp_path_factory.mktemp("guarded")
     make_keys(place / "keys", ["alice"])
-    stream, commands = own_addresses()
-    (place / "profile.toml").write_text(
-        f'stream.address = "{stream}"\ncommands.address = "{commands}"\n'
-        f'access.keys = "{place / "keys"}"\nloop.rate = 50.0\nservos.watchdog = 0.0\n',
-        encoding="utf-8",
-    )
-    own = place / "own.mcap"
-    daemon = Running("--config", str(place / "profile.toml"), "--record", str(own))
-    yield Guarded(place / "keys", (stream, commands), own)
+    addresses, own = own_addresses(), place / "own.mcap"
+    text = f'access.keys = "{place / "keys"}"\nloop.rate = 50.0\nservos.watchdog = 0.0\n'
+    path = write_profile(place / "profile.toml", addresses, text)
+    daemon = Running("--config", str(path), "--record", str(own))
+    yield Guarded(place / "keys", addresses, own)
     try:
         assert daemon.end() == 0
     finally:
