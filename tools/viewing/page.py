@@ -71,7 +71,7 @@ class Site:
         self._token = token
         self._send = send
         self._ended = asyncio.Event()
-        self._waiting: list[asyncio.Future[tuple[str, str]]] = []
+        self.waiting: list[asyncio.Future[tuple[str, str]]] = []  # pages, for the next picture
         self.wish: Callable[[str], None] = lambda _: None  # what pages ask with each picture
         self._routes: dict[str, Callable[[ServerConnection], Awaitable[None]]] = {
             "/pictures": self._show,
@@ -83,10 +83,6 @@ class Site:
     def publish(self, scene: str, picture: str) -> None:
         """Give both to the pages that wait, from another thread."""
         self._loop.call_soon_threadsafe(self._give, (scene, picture))
-
-    def watched(self) -> bool:
-        """Return whether a page waits for a picture."""
-        return bool(self._waiting)
 
     def end(self) -> None:
         """End `run`, from another thread."""
@@ -148,18 +144,18 @@ class Site:
         await self._routes[urlsplit(connection.request.path).path](connection)
 
     def _give(self, pair: tuple[str, str]) -> None:
-        for each in self._waiting:
+        for each in self.waiting:
             if not each.done():
                 each.set_result(pair)
-        self._waiting = []
+        self.waiting = []
 
     async def _show(self, page: ServerConnection) -> None:
         """Send a page the next picture each time it asks, and the scene where it is another."""
         known = ""
         async for wish in page:
             self.wish(str(wish))
-            self._waiting.append(self._loop.create_future())
-            scene, picture = await self._waiting[-1]
+            self.waiting.append(self._loop.create_future())
+            scene, picture = await self.waiting[-1]
             if scene != known:
                 await page.send(scene)
             known = scene
@@ -221,7 +217,9 @@ def show(arguments: argparse.Namespace, ending: Ending) -> None:
     token = secrets.token_urlsafe(16) if live else None
     hand_on = partial(send, arguments.commands, timeout=_STALE, keys=keys)
     site = Site(loop, token, hand_on, foxglove)
-    pictures = Pictures(site.publish, site.watched, _say, live=live, foxglove=foxglove)
+    pictures = Pictures(
+        site.publish, lambda: bool(site.waiting), _say, live=live, foxglove=foxglove
+    )
     source = partial(follow, arguments, keys, pictures, ending, _say)
     if recording is not None:
         playback = Playback(recording, pictures, 1.0 / arguments.rate)

@@ -181,7 +181,7 @@ class Pictures:
             texts += [(GOAL, -1.15 * THETA_END, 1.0 * each, f"{each} mm") for each in depths]
             image = _image(energy.levels, -THETA_END, THETA_END, end, 0.0)
             still = {"image": image, "texts": texts}
-            box = -1.3 * THETA_END, 1.05 * THETA_END, end, -0.1 * end
+            box = -1.3 * THETA_END, 1.05 * THETA_END, 1.05 * end, -0.1 * end
             title = f"Energy U(d, θ) to {1e3 * energy.highest:.0f} mJ, ∝ ∛U"
             panels.append(_panel("landscape", title, *box, still=still))
         every = {
@@ -189,6 +189,7 @@ class Pictures:
         }
         self._plots = {title: (by, paths) for title, (by, paths) in every.items() if paths}
         scene = {
+            "step": _STEP,
             "panels": [*panels, *(_panel(title, title) for title in self._plots)],
             "modes": _MODES,
             "levels": _LEVELS,
@@ -333,7 +334,9 @@ class Pictures:
         if times is not None:
             facts.append(f"tick {short(times.rates.tick, 0)} Hz")
             for name, of in {"work": times.compute, "late": times.wake, "bus": times.bus}.items():
-                facts.append(f"{name} {micro(of.p50)}, p99 {micro(of.p99)}, max {micro(of.max)} µs")
+                facts.append(
+                    f"{name} [µs] {micro(of.p50)}, p99 {micro(of.p99)}, max {micro(of.max)}"
+                )
         if self.states and state.schema != schema.SCHEMA:
             facts.append(f"schema {state.schema}, this page knows {schema.SCHEMA}")
         if who := feed.commander(now):
@@ -369,7 +372,7 @@ def _graph(
         spread = ""
         if std.any():
             bars = (times, value - std, times, value + std, times, times * np.nan)
-            lines.append(((*colour, 0.25), 4, _flat(np.column_stack(bars))))
+            lines.append(((*colour, 0.25), 7, _flat(np.column_stack(bars))))
             spread = f" ± {std[-1]:.2g}"
         lines.append((colour, 0.8 if goal else 1.8, _flat(np.column_stack((times, value)))))
         if math.isfinite(value[-1]) and not (goal and finger):
