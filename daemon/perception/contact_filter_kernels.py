@@ -72,6 +72,10 @@ _MOTION_ERROR = 0.05  # of a predicted motion, relative
 _GATE = 9.0  # squared Mahalanobis distance
 _BY_TURNING = 0.8  # of such an angle's variance: the object turned, rather than tapers otherwise
 _FIRM = 1.0  # N of both tips, from which on an object does not rock between them
+_FOLLOWED = 1.0  # responses of the cells after a touch, in which each frame begins anew
+# A footprint that grows within the cells' response looks wider and flatter, by so much times the
+# variance of the d that it is a mean of, over d²: by the fit of a mean of paraboloids.
+_WIDER, _FLATTER, _SPREAD_MAX = 1.4, 2.0, 0.1
 _STEP_VARIANCE = 1.0 / 12.0  # of a count
 LAW_POINTS = 17  # over d from 0 to the radius
 
@@ -94,6 +98,7 @@ class TrackedTip(Record):
     d_gain: float  # covariance of d and gain [m]
     before: float  # 1/variance of the gain's logarithm by the scales; 0: frames tell it, ∞: known
     power: float  # of d by F, where a frame has one amplitude for d and gain
+    touched: float  # when the contact began [s]
     fresh: bool  # a frame has come that the scales have not taken in yet
     tilt_y: float
     shear: float  # along the face in the hand's plane, by a solid tip's newest frame [N]
@@ -139,6 +144,7 @@ class Past(Record):
 
     t: float
     d: Pair
+    spread: Pair  # variance of the d that cells show at once [m²]
     angle: float
     q: Pair
     firmness: Pair
@@ -305,6 +311,8 @@ def predict(
     row.angle = _between(f.angle.displacement, last.angle, kept)
     for k in range(2):
         row.d[k] = _between(f.tip[k].d.displacement, last.d[k], kept)
+        behind = f.tip[k].d.displacement - last.d[k]
+        row.spread[k] = kept * (last.spread[k] + (1.0 - kept) * behind * behind)
         row.q[k] = _between(f.tip[k].q, last.q[k], kept)
         row.firmness[k] = _between(f.tip[k].firmness, last.firmness[k], kept)
 
@@ -501,8 +509,10 @@ def update(
     firmness = _between(before.firmness[finger], after.firmness[finger], fraction)
     free = covariance[3, 3] > 0.0 or f.gain_known
     power = 0.0  # of d by F, where the frame has one amplitude for d and gain
+    spread = _between(before.spread[finger], after.spread[finger], fraction) / (d * d)
     if covariance[3, 3] > 0.0:
-        gain /= firmness
+        gain /= firmness * (1.0 - _FLATTER * min(spread, _SPREAD_MAX))
+        d /= 1.0 + _WIDER * min(spread, _SPREAD_MAX)
     else:
         force, _, stiffness, _, _, _, _ = lookup(table, d, total_tilt(theta, tilt_y))
         power = force / (stiffness * d)
@@ -530,15 +540,20 @@ def update(
     if not free:  # the gain's part is the filter's own
         of_gain = power * d * f.grasp.scales.prior[scales.GAIN + finger] ** 0.5
         tip.shared[0] = max(systematic[0, 0] - of_gain * of_gain, 0.0)
-    tip.fresh = True
+    if not tip.in_contact:
+        tip.touched = f.t
+    # Cells that still follow the touch show motion of before it, which no history has.
+    early = f.t - tip.touched < _FOLLOWED * f.response
+    tip.fresh = not early
+    if free and (early or not tip.in_contact):
+        tip.gain = gain
+        tip.d.mean = d + d_since
+        tip.d.variance, tip.d_gain, tip.gain_variance = noise
+        tip.d.path_length = abs(d_since)
     if not tip.in_contact:
         tip.in_contact = True
         tip.before = math.inf if covariance[3, 3] == 0.0 else 0.0
-        if free:
-            tip.gain = gain
-            tip.d.mean = d + d_since
-            tip.d.variance, tip.d_gain, tip.gain_variance = noise
-        else:
+        if not free:
             tip.gain, relative = scales.height(f.grasp.scales, finger)
             tip.gain_variance = relative * tip.gain * tip.gain
             tip.before = 1.0 / relative
@@ -559,9 +574,9 @@ def update(
             _update_angle(f, sense, angle_since, angle, angle_variance)
         return True
     before_it = tip.d.mean
-    if free:
+    if free and not early:
         _update_tip(tip, f.count * f.length, d_since, d, gain, noise)
-    else:
+    elif not free:
         _update_product(
             tip,
             f.count * f.length,

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.optimize import curve_fit
 
 from softfinger.daemon.perception.contact_filter import ContactFilter
 from softfinger.daemon.profile.factory import make_material, make_table
@@ -112,18 +113,26 @@ def test_what_slow_cells_show_late_the_joints_make_up_for(response):
     contact_filter = ContactFilter(settings, (table, table))
     contacts, pose = [Contact(), Contact()], ObjectPose()
     d, q = 0.003, 0.15
-    shown = np.array([d, q])
+    below = np.linspace(0.0, 0.01, 400)  # m of the tip from its top, in even steps of area
+    pressure, shown, fitted = np.maximum(d - below, 0.0), q, (d, 1.0)
+    follows = -math.expm1(-0.002 / response)
     off = []
+
+    def model(at: np.ndarray, d: float, gain: float) -> np.ndarray:
+        return np.asarray(gain * np.maximum(d - at, 0.0))
+
     for k in range(300):
         t = 1.0 + 0.002 * k
         dq = 0.2 if 100 <= k < 200 else 0.0
         d += 0.002 * dq * float(np.mean(contact_filter.grasp.moment_arm))
         q += 0.002 * dq
-        shown += (np.array([d, q]) - shown) * -math.expm1(-0.002 / response)
+        pressure += (model(below, d, 1.0) - pressure) * follows
+        shown += (q - shown) * follows
         contact_filter.predict(Reading(t=t, q=[q] * 2, dq=[dq] * 2, valid=True))
         if k % 5 == 0:
+            fitted = curve_fit(model, below, pressure, fitted)[0]
             for finger, sense in enumerate((1.0, -1.0)):
-                estimate = replace(ESTIMATE, d=shown[0], tilt_x=sense * shown[1])
+                estimate = replace(ESTIMATE, d=fitted[0], gain=fitted[1], tilt_x=sense * shown)
                 contact_filter.update(finger, frame(t), estimate, contacts[finger])
         contact_filter.write_contacts(t, contacts, pose)
         off.append(contacts[0].d - d)
