@@ -38,7 +38,6 @@ from softfinger.daemon.perception.scales import (
     UNKNOWN,
     Prior,
     Scales,
-    begin_touch,
     end_touch,
     set_prior,
 )
@@ -197,9 +196,7 @@ class ContactFilter:
         """Note whether a finger's tip touches; what scales learn of a touch may end with it."""
         touching = any(self._in_contact)
         self._in_contact[finger] = in_contact
-        if not touching and in_contact:
-            begin_touch(self.grasp.scales)
-        elif touching and not any(self._in_contact):
+        if touching and not any(self._in_contact):
             end_touch(self.grasp.scales)
 
     def write_contacts(

@@ -408,8 +408,9 @@ def _update_product(
     """Update d and gain by a frame whose fit had a fixed gain: it shows d gain^(1/n), as F ∝ dⁿ.
 
     ``power``: 1/n. What joints and closing don't explain is d's, and when ``turning`` all is, as
-    rolling is no closing; when ``holding``, no more of it than a count of the joints hides, of
-    which frames have ``corrected`` some lately: all else is the sensor's.
+    rolling is no closing, nor is what moves the object before it; when ``holding``, no more of it
+    than a count of the joints hides, of which frames have ``corrected`` some lately: all else is
+    the sensor's.
     """
     before = max(tip.d.mean - d_since, _D_MIN)
     gain = tip.gain
@@ -584,7 +585,7 @@ def update(
             d,
             power,
             noise[0],
-            both and f.phase == OTHER,
+            f.phase == OTHER if both else not f.alone,
             both and f.phase == HOLDING,
             f.grasp.witnesses.corrected[finger],
         )
@@ -644,8 +645,12 @@ def _learn_scales(f: FilterState, ramping: bool) -> None:
     s = f.grasp.scales
     grasp = f.grasp
     both = f.tip[0].in_contact and f.tip[1].in_contact
+    s.doubted = s.doubted or witnesses.doubts(grasp.witnesses)
     if both and not s.gripping:
         scales.begin_grip(s)
+        for k in range(2):  # or else it would count for evidence how far back the scales have gone
+            if 0.0 < f.tip[k].before < math.inf:
+                _take_height(f.tip[k], s, k)
     news = False
     for k in range(2):
         tip = f.tip[k]
@@ -746,7 +751,10 @@ def write_grasp(
     grasp.torque_residual[1] = modulus2 * remaining2
     grasp.load_curvature = 2.0 * curvature / (modulus1 + modulus2)
     _learn_scales(f, phase == RAMPING)
-    grasp.scales.proven = grasp.scales.proven or phase == HOLDING
+    if phase == HOLDING:
+        scales.keep(grasp.scales)
+    elif phase == RAMPING:
+        grasp.scales.proven = False
     if grasp.load_arm > 0.0:
         dt = f.t - f.checked
         if phase == HOLDING and f.phase != HOLDING:

@@ -16,8 +16,9 @@ gain changes by 5-32 % when it is mounted again (DTIC ADP011007), a torque const
 Torques, as they arrive through gears that close, are taken in only while a grip's force ramps: a
 wrong scale grows with it, a load along the faces doesn't. Of those that have fallen again gears may
 hold the rest. The height is taken in with each frame; what changes of it in a lasting
-grip is the sensor's, for a modulus doesn't jump. What was found in a grip that came to hold stays
-for later ones, 5 % less with each; `softfinger calibrate scales` keeps it.
+grip is the sensor's, for a modulus doesn't jump. What was found in a grip that came to hold, and
+no witness of which was refused, stays for later ones, 5 % less with each; `softfinger calibrate
+scales` keeps it.
 """
 
 from __future__ import annotations
@@ -87,9 +88,10 @@ class Scales(Record):
     slopes: Annotated[FloatArray, STATES]  # scratch: of a measurement by the states
     cross: Annotated[FloatArray, STATES]  # scratch
     gripping: bool  # both tips touch, and have since `begin_grip`
-    kept_mean: Annotated[FloatArray, STATES]  # as they were before this touch, and …
+    kept_mean: Annotated[FloatArray, STATES]  # as they were before this touch, or as it held
     kept_covariance: Annotated[FloatArray, STATES, STATES]
-    proven: bool  # … what it taught came to hold
+    doubted: bool  # a witness has been, since something touches
+    proven: bool  # it held, undoubted, and no force has been on its way since
 
 
 def set_prior(
@@ -112,20 +114,18 @@ def set_prior(
         scales.prior[OFFSET + k] = friction**2 + _LOAD_ERROR**2
     scales.mean[:] = scales.expected
     scales.covariance[:] = np.diag(scales.prior)
-    scales.modulus[:] = np.exp(scales.mean[MODULUS : MODULUS + 2])
-
-
-def begin_touch(scales: Scales) -> None:
-    """Keep what is known before anything touches a tip."""
     scales.kept_mean[:], scales.kept_covariance[:] = scales.mean, scales.covariance
-    scales.proven = False
+    end_touch(scales)
 
 
 def end_touch(scales: Scales) -> None:
-    """Forget what a touch taught that came to no hold: tips that pressed each other, a fault."""
-    if not scales.proven:
+    """Forget what is not proven: of tips that pressed each other, of a fault, a false witness."""
+    if scales.proven:
+        scales.kept_mean[:], scales.kept_covariance[:] = scales.mean, scales.covariance
+    else:
         scales.mean[:], scales.covariance[:] = scales.kept_mean, scales.kept_covariance
-        scales.modulus[:] = np.exp(scales.mean[MODULUS : MODULUS + 2])
+    scales.modulus[:] = np.exp(scales.mean[MODULUS : MODULUS + 2])
+    scales.doubted = scales.proven = False
 
 
 @inner_kernel
@@ -145,6 +145,17 @@ def begin_grip(s: Scales) -> None:
                 s.covariance[i, j] *= 1.0 - _FORGET
         s.covariance[i, i] += s.prior[i] * (1.0 if i >= OFFSET else _FORGET)
     s.mean[OFFSET] = s.mean[OFFSET + 1] = s.most = 0.0
+
+
+@inner_kernel
+def keep(s: Scales) -> None:
+    """Keep what was learnt beyond this touch, where no witness was doubted that taught it."""
+    for k in range(TORQUE, OFFSET):
+        s.doubted = s.doubted or abs(s.mean[k] - s.expected[k]) >= _TORQUE_MOST
+    s.proven = not s.doubted
+    if s.proven:
+        s.kept_mean[:] = s.mean
+        s.kept_covariance[:] = s.covariance
 
 
 @inner_kernel

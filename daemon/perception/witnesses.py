@@ -70,6 +70,16 @@ def forget(w: WitnessState) -> None:
 
 
 @inner_kernel
+def doubts(w: WitnessState) -> bool:
+    """Return whether a witness is to be named."""
+    for k in range(2):
+        frames = w.jumps[k] > JUMPS_MAX or w.drifted[k] > DRIFT_TIME
+        if frames or w.off_goal[k] > CURRENT_TIME:
+            return True
+    return False
+
+
+@inner_kernel
 def refuses(
     w: WitnessState,
     finger: int,

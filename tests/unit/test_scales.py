@@ -33,6 +33,11 @@ def begin(records: Records[Scales]) -> None:
 
 
 @kernel
+def keep(records: Records[Scales]) -> None:
+    scales.keep(records[0])
+
+
+@kernel
 def height(
     records: Records[Scales], finger: int, value: float, variance: float, known: float
 ) -> None:
@@ -235,6 +240,60 @@ def test_no_torque_constant_is_learnt_that_no_servo_has() -> None:
             begin(record.array)
         torques(record.array, -moment, moment, 0.0, 0.01 * k)
     np.testing.assert_allclose(record.mean[scales.TORQUE : scales.OFFSET], -0.3)
+    keep(record.array)
+    scales.end_touch(record)  # nor is it kept, or what came with it
+    np.testing.assert_array_equal(record.mean, record.expected)
+
+
+def test_honest_grips_of_solid_tips_go_on_as_they_began() -> None:
+    with Hand(SOLID) as hand:
+        hand.run(0.3)
+        hand.command("arm")
+        for _ in range(12):
+            hand.command("grasp", force=8.0)
+            hand.run(1.2)
+            assert hand.plant.normal.mean() == pytest.approx(8.0, rel=0.06)
+            hand.command("release")
+            hand.run(0.5)
+        assert not [event for event in hand.events if event[1].startswith("witness")]
+
+
+@pytest.mark.parametrize(
+    ("kind", "value", "fingers", "forces"),
+    [
+        ("gain", 0.3, (0, 1), (3.0,)),  # does not come to hold
+        ("replay", 0.3, (1,), (15.0, 20.0)),  # ends in a fault, the sensor named
+    ],
+)
+def test_what_a_grip_taught_that_did_not_hold_is_not_kept(
+    kind: str, value: float, fingers: tuple[int, ...], forces: tuple[float, ...]
+) -> None:
+    with Hand({}) as hand:
+        hand.grasp(forces[0])
+        while hand.plant.normal.min() < 0.05:
+            hand.run(0.002)
+        if len(forces) > 1:
+            hand.run(1.5)
+            hand.command("grasp", force=forces[1])
+            hand.run(0.1)
+        for finger in fingers:
+            hand.plant.measurement_faults[finger].begin(kind, value, hand.now)
+        learnt, taught = hand.contact_filter.grasp.scales.mean[: scales.OFFSET], 0.0
+        for _ in range(30):
+            hand.run(0.01)
+            taught = max(taught, np.abs(learnt).max())
+        assert taught > 0.2
+        for each in hand.plant.measurement_faults:
+            each.clear()
+        hand.run(0.9)
+        hand.command("stop")
+        hand.command("clear" if hand.mode == "fault" else "status")
+        hand.run(0.5)
+        hand.plant.place_object()
+        grasped(hand, forces[0])
+        assert hand.mode == "holding"
+        assert hand.plant.normal.mean() == pytest.approx(forces[0], rel=0.12)
+        np.testing.assert_allclose(learnt, 0.0, atol=0.15)
 
 
 def test_a_sensor_that_freezes_in_the_ramp_teaches_nothing() -> None:
