@@ -9,7 +9,6 @@ cells are integrated (packing.py). The outline adds no derivative of its own, as
 
 from __future__ import annotations
 
-import math
 from typing import TypeAlias
 
 from softfinger.kinematics.compiled.kernel import fast_inner_kernel, inlined_kernel
@@ -40,7 +39,6 @@ Terms: TypeAlias = tuple[Two, Two, Two, Two, Two, Two]  # in pairs
 # the same number. Cells more than CLIP_BELOW below the floor carry next to no information.
 CLIP_END = 3.5
 CLIP_BELOW = 2.0
-_CLIPPED_VARIANCE_MIN = 0.34  # of the cell's: at the floor; below, noise is no normal one
 CLIP = (0.399207, -0.275277, 0.0188358, 0.0260713, -0.00538491)
 
 
@@ -82,10 +80,7 @@ def _compared(
     clip: float,
     clipped: bool,
 ) -> tuple[float, float, float]:
-    """(reading − model, the model's response to pressure, 1 for a cell that counts).
-
-    Near the floor the noise is less: both are over its deviation there, relative to the cell's.
-    """
+    """(reading − model, the model's response to pressure, 1 for a cell that counts)."""
     model = gain * stress
     residual = max(reading, floor) - model
     response = 1.0
@@ -100,11 +95,6 @@ def _compared(
         rise = above * (above * rise - (2.0 / CLIP_END) * base)
         residual = max(reading, floor) - max(model, floor) - clip * above * above * base
         response = 1.0 + rise if depth >= 0.0 else -rise
-        excess = above * above * base
-        variance = max(response - excess * (abs(depth) + excess), _CLIPPED_VARIANCE_MIN)
-        per_deviation = 1.0 / math.sqrt(variance)
-        residual *= per_deviation
-        response *= per_deviation
         lower = floor - CLIP_BELOW * clip
     counts = ((reading < saturation) | (model < saturation)) & (model >= lower)
     return residual, response, 1.0 if counts else 0.0
