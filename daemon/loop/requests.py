@@ -124,7 +124,7 @@ class Requests:
         self._handlers: dict[str, Callable[..., float | None]] = {
             "arm": control.arm,
             "disarm": control.disarm,
-            "tare": self._tare,
+            "tare": perception.tare,
             "move": control.move,
             "grasp": control.grasp,
             "rotate": control.rotate,
@@ -254,10 +254,6 @@ class Requests:
             if not low <= q <= high:
                 return f"{name}: {off_range(q, low, high)}"
         return ""
-
-    def _tare(self) -> None:
-        for perception in self._perception.fingers:
-            perception.tare()
 
     def _reconnect(self) -> None:
         """Connect servos that have gone silent anew: only on command.

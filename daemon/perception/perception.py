@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from softfinger.daemon.perception.calibration_file import Converter, least_end
 from softfinger.daemon.perception.contact_filter import ContactFilter
 from softfinger.daemon.perception.finger_model import FingerModel, make_estimator
+from softfinger.daemon.perception.scales import forget
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.tactile.base import TactileSensor
 from softfinger.daemon.types import FINGERS, Event, Frame, SensorFacts, State
@@ -50,6 +51,12 @@ class Perception:
             (models[0].material, models[1].material),
             (models[0].scales, models[1].scales),
         )
+
+    def tare(self) -> None:
+        """Take the mean of the next frames as zero, cell by cell; forget the scales of the old."""
+        forget(self.filter.grasp.scales, 1.0)
+        for each in self.fingers:
+            each.tare()
 
     def update(self, state: State) -> None:
         """Take in new frames; write the contacts and the object's pose of this tick."""

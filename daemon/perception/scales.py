@@ -112,20 +112,27 @@ def set_prior(
         scales.expected[TORQUE + k] = prior.torque[0] - 1.0
         scales.prior[[MODULUS + k, GAIN + k, TORQUE + k]] = np.square([each[1] for each in prior])
         scales.prior[OFFSET + k] = friction**2 + _LOAD_ERROR**2
-    scales.mean[:] = scales.expected
-    scales.covariance[:] = np.diag(scales.prior)
-    scales.kept_mean[:], scales.kept_covariance[:] = scales.mean, scales.covariance
-    end_touch(scales)
+    forget(scales, 1.0)
 
 
 def end_touch(scales: Scales) -> None:
-    """Forget what is not proven: of tips that pressed each other, of a fault, a false witness."""
-    if scales.proven:
-        scales.kept_mean[:], scales.kept_covariance[:] = scales.mean, scales.covariance
-    else:
+    """Forget what is not proven: of tips that pressed each other, of a fault, a false witness.
+
+    A grip that came to no hold takes half of what was known before with it, which may be why.
+    """
+    if not scales.proven:
         scales.mean[:], scales.covariance[:] = scales.kept_mean, scales.kept_covariance
+    forget(scales, 0.5 if scales.gripping and not scales.proven else 0.0)
+    scales.doubted = scales.proven = scales.gripping = False
+
+
+def forget(scales: Scales, fraction: float) -> None:
+    """Go back towards what is set by a ``fraction``, and keep it so."""
+    scales.mean += fraction * (scales.expected - scales.mean)
+    scales.covariance *= 1.0 - fraction
+    scales.covariance += fraction * np.diag(scales.prior)
+    scales.kept_mean[:], scales.kept_covariance[:] = scales.mean, scales.covariance
     scales.modulus[:] = np.exp(scales.mean[MODULUS : MODULUS + 2])
-    scales.doubted = scales.proven = False
 
 
 @inner_kernel

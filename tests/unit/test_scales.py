@@ -313,6 +313,22 @@ def test_a_sensor_that_freezes_in_the_ramp_teaches_nothing() -> None:
         assert hand.plant.normal.mean() == pytest.approx(8.0, rel=0.1)
 
 
+def test_grips_that_come_to_no_hold_and_a_tare_lead_back_to_what_is_set() -> None:
+    """What was once kept wrongly can't make each later grip fail for ever."""
+    with Hand({}) as hand:
+        found = hand.contact_filter.grasp.scales
+        found.kept_mean[:6] += (0.5, -0.3, 0.4, 0.2, -0.3, 0.3)
+        for _ in range(8):
+            begin(found.array)
+            scales.end_touch(found)
+        np.testing.assert_allclose(found.mean, 0.0, atol=0.003)
+        np.testing.assert_allclose(np.diag(found.covariance), found.prior, rtol=0.01)
+        found.mean[:6] += 0.3
+        hand.command("tare")
+        np.testing.assert_array_equal(found.mean, 0.0)
+        np.testing.assert_array_equal(found.covariance, np.diag(found.prior))
+
+
 def test_tips_that_close_on_nothing_teach_nothing() -> None:
     with Hand({}) as hand:
         hand.run(0.3)
