@@ -116,12 +116,11 @@ def set_prior(
 
 
 def end_touch(scales: Scales) -> None:
-    """Forget what is not proven: of tips that pressed each other, of a fault, a false witness.
+    """Forget what no hold has proven: of tips that pressed each other, of a fault, of a release.
 
     A grip that came to no hold takes half of what was known before with it, which may be why.
     """
-    if not scales.proven:
-        scales.mean[:], scales.covariance[:] = scales.kept_mean, scales.kept_covariance
+    scales.mean[:], scales.covariance[:] = scales.kept_mean, scales.kept_covariance
     forget(scales, 0.5 if scales.gripping and not scales.proven else 0.0)
     scales.doubted = scales.proven = scales.gripping = False
 

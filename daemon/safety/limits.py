@@ -21,7 +21,7 @@ import numpy as np
 
 from softfinger.daemon.control.modes import GRIPPING, HELD
 from softfinger.daemon.perception import witnesses
-from softfinger.daemon.perception.contact_filter_kernels import GraspState
+from softfinger.daemon.perception.contact_filter_kernels import OTHER, GraspState
 from softfinger.daemon.perception.perception import FingerPerception
 from softfinger.daemon.perception.scales import GAIN, GAIN_DOUBTED
 from softfinger.daemon.profile.settings import Settings
@@ -506,7 +506,8 @@ def _enter_witnesses(finger: int, side: str) -> None:
     def _sensor(view: View, state: State, _: float) -> str:
         if finger not in view.fingers:
             return ""
-        return _doubt(view, finger) or _gain_doubt(view, finger)
+        # The cells of a tip that is let go may follow more slowly than their shape says.
+        return _doubt(view, finger) or ("" if state.phase == OTHER else _gain_doubt(view, finger))
 
     @Limit(f"witness.{side}_current", "a joint's current in a grip, by its goal", "warn",
         (), "servos", in_turn=True)  # fmt: skip

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from softfinger.daemon.control.modes import Mode
-from softfinger.daemon.perception.contact_filter_kernels import GraspState
+from softfinger.daemon.perception.contact_filter_kernels import HOLDING, GraspState
 from softfinger.daemon.perception.scales import GAIN, UNKNOWN, set_prior
 from softfinger.daemon.profile.settings import SafetySettings as Limits
 from softfinger.daemon.safety.limits import LIMITS, View
@@ -225,6 +225,10 @@ def test_each_witness_that_is_doubted_is_named():
     judged(judge, state, 0.5)
     assert judge.warnings == []
     grasp.scales.mean[GAIN + 1] = math.log(0.5)
+    grasp.scales.covariance[GAIN + 1, GAIN + 1] = 0.1**2
+    judged(judge, state, 0.5)
+    assert judge.warnings == [], "cells follow more slowly than a tip is let go"
+    state.phase = HOLDING
     grasp.scales.covariance[GAIN + 1, GAIN + 1] = 0.4**2
     judged(judge, state, 0.5)
     assert judge.warnings == [], "that is not known well"
