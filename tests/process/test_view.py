@@ -141,9 +141,7 @@ def test_a_picture_has_the_streams_values() -> None:
     assert "0 messages could not be read" in said
 
 
-def test_pages_share_one_subscription_and_a_slow_one_is_sent_nothing_that_it_did_not_ask_for() -> (
-    None
-):
+def test_pages_share_one_subscription_and_a_slow_one_is_sent_nothing_that_it_did_not_ask_for():
     with FakeDaemon() as fake, view(fake) as viewed:
         with Watcher(viewed.host) as slow, ExitStack() as stack:
             begun = slow.next()["seq"]

@@ -7,8 +7,6 @@ and a current with 3 % of noise; the plant is `servo_model.servo_joint`. ``--gri
 hands on virtual time that grip too hard for too long.
 """
 
-from __future__ import annotations
-
 import argparse
 import random
 import sys

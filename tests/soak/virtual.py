@@ -10,8 +10,6 @@ Tests run a few sequences.
 recorded and read: it counts what breaks, goes on, and fails when memory grows.
 """
 
-from __future__ import annotations
-
 import argparse
 import gc
 import math

@@ -343,8 +343,8 @@ def test_a_broadcast_factory_reset_of_everything_is_ignored() -> None:
     acceleration=st.floats(500, 1e5),
 )
 def test_a_profile_arrives_without_passing_and_within_its_limits(
-    start: float, target: float, speed: float, acceleration: float
-) -> None:
+    start, target, speed, acceleration
+):
     profile = Profile()
     profile.hold(start)
     profile.aim(target, speed, acceleration)

@@ -45,9 +45,7 @@ def folder(drawn: tuple[Path, list[Figure]]) -> Path:
 
 
 @pytest.mark.parametrize(("d", "theta", "force", "energy"), CHECKPOINTS)
-def test_checkpoints_over_displacement(
-    folder: Path, d: int, theta: int, force: float, energy: float
-) -> None:
+def test_checkpoints_over_displacement(folder, d, theta, force, energy):
     for name, equation, unit, value in (("4b", 3, "N", force), ("5b", 10, "mJ", energy)):
         columns = read(folder / f"fig{name}.csv")
         (row,) = np.flatnonzero(columns["d [mm]"] == d)
@@ -169,9 +167,7 @@ def test_named_figures_only(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert {Path(line).name for line in capsys.readouterr().out.splitlines()} == written
 
 
-def test_without_matplotlib_the_numbers_are_written(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_matplotlib_the_numbers_are_written(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     assert cli.main(["figures", "fig4a", "--out", str(tmp_path)]) == 0
     assert {path.name for path in tmp_path.iterdir()} == {"fig4a.csv", "errata.csv"}
@@ -185,9 +181,7 @@ def rows() -> dict[str, Beside]:
     return {each.quantity: each for each in validate.comparisons()}
 
 
-def test_every_row_has_its_source_and_a_verdict_and_every_disagreement_a_reason(
-    rows: dict[str, Beside],
-) -> None:
+def test_every_row_has_its_source_and_a_verdict_and_every_disagreement_a_reason(rows):
     assert len(rows) >= 15
     for each in rows.values():
         assert each.source
@@ -211,11 +205,7 @@ def test_a_figure_agrees_within_the_published_digits(ours: float, verdict: str) 
     assert validate.between("ζ", 1.46, 1.88, "a book", ours).verdict == verdict
 
 
-def test_the_command_prints_each_row_and_counts(
-    rows: dict[str, Beside],
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_the_command_prints_each_row_and_counts(rows, monkeypatch, capsys):
     monkeypatch.setattr(validate, "comparisons", lambda: iter(rows.values()))
     assert validate.run(argparse.Namespace()) == 0
     printed = capsys.readouterr().out

@@ -1,7 +1,5 @@
 """A witness that begins to lie in a grip: named, refused, never obeyed; by the plant's truth."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np
@@ -52,9 +50,7 @@ def test_a_lie_is_named_and_never_obeyed(lie: str) -> None:
     ("kind", "value", "force"),
     [("drift", -0.06, 5.0), ("replay", 0.41, 5.0), ("replay", 0.41, 8.0)],
 )
-def test_a_tip_that_seems_to_let_go_is_no_sudden_load(
-    kind: str, value: float, force: float
-) -> None:
+def test_a_tip_that_seems_to_let_go_is_no_sudden_load(kind, value, force):
     with Hand({}) as hand:
         hand.grasp(force)
         while hand.mode != "holding":

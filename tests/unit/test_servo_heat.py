@@ -216,9 +216,7 @@ def test_a_grip_that_gets_too_hot_is_eased_and_holds():
 @pytest.mark.parametrize(
     ("action", "mode"), [("hold", Mode.FAULT), ("release", Mode.ARMED), ("stop", Mode.DISARMED)]
 )
-def test_where_the_load_needs_the_grip_it_is_said_and_the_action_done(
-    action: str, mode: Mode
-) -> None:
+def test_where_the_load_needs_the_grip_it_is_said_and_the_action_done(action, mode):
     # What friction bears of the load is all that 24 N have: easing would let it fall.
     control = {"object_load": 23.5}
     with hot(24.0, 0.0, control=control, safety={"heat_action": action}) as hand:

@@ -40,9 +40,7 @@ def area(outline: NDArray[np.float64]) -> float:
 
 @pytest.mark.parametrize("grid", GRIDS)
 @pytest.mark.parametrize("contact", [(0.004, 0.3, 0.0), (0.002, -0.2, 0.35), (0.006, 0.0, 0.0)])
-def test_the_footprint_is_where_the_forward_model_presses(
-    grid: SensorGrid, contact: tuple[float, float, float]
-) -> None:
+def test_the_footprint_is_where_the_forward_model_presses(grid, contact):
     pressure = grid.pressure(TIP, Material.constant(0.304e6), *contact)
     shown = footprint(grid, TIP.radius, *contact)
     assert shown is not None
