@@ -107,11 +107,7 @@ def test_a_client_reads_every_channel_of_the_running_hand() -> None:
             client.subscribe("hand/event")  # which is answered once that is carried out
             client.next("hand/event")
             rest = {client.next()[0] for _ in range(30)}
-            assert rest == {
-                "hand/scene",
-                "hand/tactile/left",
-                "hand/tactile/right",
-            }
+            assert rest == {"hand/scene", "hand/tactile/left", "hand/tactile/right"}
 
 
 def used_topics(layout: Any) -> set[str]:
@@ -176,6 +172,10 @@ def check_events(client: Client, early: dict[str, Any]) -> None:
 def stranger() -> Iterator[tuple[FakeDaemon, str]]:
     """A made-up daemon whose states fill a buffer soon, and where its server is."""
     with FakeDaemon() as fake, served(fake) as (address, _):
+        with connected(address) as line:  # a server that saw no state says so as it ends
+            client = Client(line)
+            client.subscribe("hand/state")
+            client.next("hand/state")
         fake.changes = {"fault": "x" * 30_000}
         yield fake, address
 
