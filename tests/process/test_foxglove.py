@@ -226,10 +226,10 @@ def test_what_asks_for_nothing_or_what_isnt_is_ended(stranger):
     with socket.create_connection(local(address), timeout=WAIT) as client:
         client.sendall(b"GET / HTTP/1.1\r\n")  # its head has no end
         assert client.recv(100) == b""
-    for odd in (b"{", b"[]", b'{"subscriptions": [{"id": 1, "channelId": 99}]}', b'{"op": 3}x'):
+    for odd in ("{", "[]", '{"op": 3}x', '"id": 1, "channelId": 99', '"id": NaN, "channelId": 0'):
         with connected(address) as line:
             Client(line)
-            line.send(odd.decode())
+            line.send(f'{{"subscriptions": [{{{odd}}}]}}' if odd[0] == '"' else odd)
             with pytest.raises(ConnectionClosed):
                 line.recv(timeout=WAIT)
 

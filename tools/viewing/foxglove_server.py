@@ -111,7 +111,7 @@ class Foxglove:
     def _subscribe(self, client: _Client, asked: dict[str, Any]) -> None:
         for each in asked.get("subscriptions", ()):
             channel = self._channels[each["channelId"]]
-            client.subscribed[channel] = each["id"] % 2**32
+            client.subscribed[channel] = int(each["id"] % 2**32)
             if channel == schema.EVENT.decode():
                 for event in self._events:
                     client.give(channel, *event)
