@@ -28,6 +28,7 @@ import numpy as np
 
 from softfinger.daemon.client.command_client import NoAnswer
 from softfinger.daemon.client.hand import Hand
+from softfinger.daemon.errors import NoStream
 from softfinger.tools.benchmarks.rigs import SOFTFINGER, RigError
 from softfinger.tools.ending import Ending
 from softfinger.tools.recordings.reader import Recording
@@ -279,11 +280,12 @@ def _judge(rig: Rig, account: Account, processes: dict[str, int], now: float) ->
     rig.report("forget")
     if wrong:
         account.wrong.append(wrong)
-    for name, pid in processes.items():
+    for name, pid in list(processes.items()):
         try:
             status = Path(f"/proc/{pid}/status").read_text().split("RssAnon:")[1]
         except (OSError, IndexError):
             account.wrong.append(f"{name} has ended")
+            del processes[name]
             continue
         account.memory.setdefault(name, []).append(int(status.split()[0]) / 1e3)
     account.looked.append((now, len(account.late)))
@@ -304,13 +306,14 @@ def _conclude(account: Account) -> None:
 def subscribe(address: str) -> None:
     """Print "ready" with the first state; at the end how many came, and how many were lost."""
     received = 0
-    with Ending() as ending, Hand(address, timeout=60.0) as hand, hand.stream() as states:
+    with Ending() as ending, Hand(address, timeout=60.0) as hand, hand.stream(1.0) as states:
         ending.begin()
         while not ending.over:
-            next(states)
-            received += 1
-            if received == 1:
-                print("ready", flush=True)
+            with suppress(NoStream):  # a daemon that is gone keeps nobody from ending
+                next(states)
+                received += 1
+                if received == 1:
+                    print("ready", flush=True)
         print(json.dumps([received, states.lost]))
 
 
