@@ -51,10 +51,9 @@ Work = tuple[FloatArray, FloatArray, FloatArray]
 
 _ROWS = 4  # of a tip: d, θ, shear along the tilt and across it
 _NEAR = 0.005  # m from a tip within which a step may bring a touch
-_LEAST = 1e-9  # m of a touch; sin θ of a tilt, below it any direction on the face is along it
+_LEAST = 1e-9  # m of a touch, N; sin θ of a tilt, below it any direction on the face is along it
 _SHEAR = 2  # the row of the shear along the tilt
 _LEFT_OUT = ("tip_relaxation", "tip_micro_slip", "tip_creep_time", "joint_load_friction")
-_AFTER_FORCES = int(mujoco.mjtStage.mjSTAGE_VEL)
 
 
 class Touch(Record):
@@ -134,8 +133,7 @@ def press(
                 rows[first + 1] += touch.across[i] * (of[3, i] - of[1, i])
                 rows[first + 2] += touch.along[i] * slide
                 rows[first + 3] += touch.across[i] * slide
-            for i in range(_ROWS):
-                rates[i] = (rows[first + i] * velocity).sum()
+            rates[:] = (rows[first : first + _ROWS] * velocity).sum(axis=1)
             tip.travel = max(p.step * rates[0], 0.0)
         if tip.d + tip.travel <= _LEAST:
             clear_contact(tip)
@@ -146,8 +144,7 @@ def press(
         along, across = (touch.shear * touch.along).sum(), (touch.shear * touch.across).sum()
         within = along * along + across * across
         scale = math.sqrt((touch.shear**2).sum() / within) if within > 0.0 else 0.0
-        tangent = tip.sine / tip.cosine if tip.cosine > 0.0 else 0.0
-        tip.shear = scale * along + dt * (rates[2] - tangent * rates[0])
+        tip.shear = scale * along + dt * (rates[2] - math.tan(tip.theta) * rates[0])
         touch.shear_across = scale * across + dt * rates[3]
         rim = rim_on_plane(p, tip)
         tip.rim = max(rim, 0.0)
@@ -156,12 +153,11 @@ def press(
             stiffen_by_rim(p, tip)
         rates[2] = tip.shear_rate
         rows[first + 2] -= tip.tangent * rows[first]
+        force[first : first + _ROWS - 1] = tip.along
         for i in range(_ROWS):
             row = min(i, _SHEAR)
             implicit[first + i] = tip.damping[row] + p.step * tip.stiffness[row]
             force[first + i] += p.step * tip.stiffness[row] * rates[i]
-            if i < _ROWS - 1:
-                force[first + i] += tip.along[i]
 
 
 @kernel
@@ -177,31 +173,25 @@ def solve(
     p = parameters[0]
     rows, force, implicit = work
     n = len(force)
-    matrix = np.eye(n)
+    matrix = np.eye(n, n + 1)  # the last column is the right-hand side
     for i in range(n):
         push = p.step * implicit[i] * rows[i]
-        force[i] += (push * (acceleration - own)).sum()
-        for k in range(n):
-            matrix[i, k] += (push * inertial[k]).sum()
+        matrix[i, :n] += (push * inertial).sum(axis=1)
+        matrix[i, n] = force[i] + (push * (acceleration - own)).sum()
     # No pivoting: B ≥ 0 is diagonal and A positive, so that all leading minors are above 0.
     for i in range(n):
+        matrix[i] /= matrix[i, i]
         for k in range(n):
             if k != i and matrix[k, i] != 0.0:
-                factor = matrix[k, i] / matrix[i, i]
-                force[k] -= factor * force[i]
-                matrix[k] -= factor * matrix[i]
-    force /= np.diag(matrix)
-    own[:] = 0.0
+                matrix[k] -= matrix[k, i] * matrix[i]
+    force[:] = matrix[:, n]
     for k in range(len(touches)):
         f, tangent = force[_ROWS * k : _ROWS * (k + 1)], touches[k].contact.tangent
         normal = max(f[0] - tangent * f[2], 0.0)
-        total = math.hypot(f[2], f[3])
-        if total > p.friction * normal:
-            f[2:] *= p.friction * normal / total
+        f[2:] *= min(p.friction * normal / max(math.hypot(f[2], f[3]), _LEAST), 1.0)
         f[0] = normal + tangent * f[2]
-    for i in range(n):
-        passive -= force[i] * rows[i]
-        own -= force[i] * inertial[i]
+    passive -= (force.reshape(n, 1) * rows).sum(axis=0)
+    own[:] = -(force.reshape(n, 1) * inertial).sum(axis=0)
 
 
 class SoftTips:
@@ -240,7 +230,6 @@ class SoftTips:
         self._geometry, self._jacobians = np.zeros((n, 10)), np.zeros((n, 4, 3, nv))
         self._work = np.zeros((_ROWS * n, nv)), np.zeros(_ROWS * n), np.zeros(_ROWS * n)
         self._inertial, self._own = np.zeros((_ROWS * n, nv)), np.zeros(nv)
-        self._fromto, self._t = np.zeros(6), data.time
         self._law, self._scale = (make_tip(settings), material), simulation.modulus_scale
         self._grids = [make_grid(settings, k % 2) for k in range(n)]
         self._sensors: list[tuple[int, FloatArray, FloatArray]] = []
@@ -248,7 +237,7 @@ class SoftTips:
             with suppress(KeyError):  # there is none
                 cells = data.sensor(f"{name}_pressure").data.reshape(self._grids[k].shape)
                 self._sensors.append((k, cells, np.zeros(cells.shape)))
-        self._period, self._due = 1.0 / settings.tactile.rate, -math.inf
+        self._t, self._period, self._due = data.time, 1.0 / settings.tactile.rate, -math.inf
 
     def __enter__(self) -> Self:
         mujoco.set_mjcb_passive(self.add_forces)
@@ -263,35 +252,28 @@ class SoftTips:
         """Return the pressure [Pa] on tip ``k``'s cells, float64 [rows, cols]."""
         touch, tip = self.touches[k], self.touches[k].contact
         frame = self.data.geom_xmat[self._tips[k]].reshape(3, 3)
-        felt = tip.d > 0.0 and tip.cosine > 0.0
-        d = min(tip.d, self._parameters.deepest) if felt else 0.0
-        x, y = np.arcsin(np.clip(touch.normal @ frame[:, :2], -1.0, 1.0)) if felt else (0.0, 0.0)
-        scale = self._scale * tip.gain if felt else 0.0
-        return self._grids[k].pressure(*self._law, d, float(x), float(y), scale, out)
+        d = min(max(tip.d, 0.0), self._parameters.deepest)
+        x, y = np.arcsin(np.clip(touch.normal @ frame[:, :2], -1.0, 1.0)).tolist()
+        return self._grids[k].pressure(*self._law, d, x, y, self._scale * tip.gain, out)
 
     def add_forces(self, model: Any, data: Any) -> None:
         """Add the tips' forces to ``qfrc_passive``: `mjcb_passive`."""
         if data is not self.data:
             return
-        geometry = self._geometry
-        fromto, dt, self._t = self._fromto, data.time - self._t, data.time
+        geometry, touching, fromto = self._geometry, self._touching, np.zeros(6)
+        dt, self._t = data.time - self._t, data.time
         if dt < 0.0:  # it was reset
             self._all["shear"] = self._own[:] = dt = 0.0
             self._due = -math.inf
         for k, tip in enumerate(self._tips):
-            gap = _NEAR
-            for geom in self._touching:
-                found = mujoco.mj_geomDistance(model, data, tip, geom, gap, fromto)
-                if found < gap:
-                    gap, touched, point = found, geom, fromto[3:].copy()
-                    geometry[k, 7:] = fromto[:3]
-            geometry[k, 0] = -gap
-            if gap < _NEAR:
-                geometry[k, 1:4] = data.geom_xpos[tip]
-                geometry[k, 4:7] = data.geom_xmat[tip, 2::3]
-                for i, geom in ((0, tip), (2, touched)):
-                    place, turn = self._jacobians[k, i : i + 2]
-                    mujoco.mj_jac(model, data, place, turn, point, model.geom_bodyid[geom])
+            away = [mujoco.mj_geomDistance(model, data, tip, g, _NEAR, None) for g in touching]
+            touched = touching[away.index(min(away))]
+            gap = mujoco.mj_geomDistance(model, data, tip, touched, _NEAR, fromto)
+            geometry[k, 0], geometry[k, 7:] = -gap, fromto[:3]
+            geometry[k, 1:4], geometry[k, 4:7] = data.geom_xpos[tip], data.geom_xmat[tip, 2::3]
+            for i, geom in ((0, tip), (2, touched)) if gap < _NEAR else ():
+                place, turn = self._jacobians[k, i : i + 2]
+                mujoco.mj_jac(model, data, place, turn, fromto[3:], model.geom_bodyid[geom])
         law, work = (self._all, self._parameters.array), self._work
         press(*law, self.table.data, geometry, self._jacobians, data.qvel, dt, work)
         mujoco.mj_solveM(model, data, self._inertial, work[0])
@@ -299,7 +281,7 @@ class SoftTips:
 
     def fill_sensors(self, _: Any, data: Any, stage: int) -> None:
         """Fill the pressure sensors, which MuJoCo clears in each step: `mjcb_sensor`."""
-        if data is self.data and stage == _AFTER_FORCES:
+        if data is self.data and stage == mujoco.mjtStage.mjSTAGE_VEL:
             is_due = data.time >= self._due
             self._due = data.time + self._period - 1e-9 if is_due else self._due
             for k, cells, frame in self._sensors:
@@ -313,9 +295,7 @@ def hand_mjcf(settings: Settings, p: Parameters) -> str:
     """
     shape, count = settings.simulation.object_shape, len(settings.scene.fingers)
     if shape != "rectangle" or count != 2:
-        raise SettingsError(
-            f"object_shape: found {shape} and {count} fingers, expected rectangle and 2"
-        )
+        raise SettingsError(f"object_shape: found {shape}, {count} fingers; expected rectangle, 2")
     fingers = sensors = ""
     for k, (name, side) in enumerate((("left", 1), ("right", -1))):
         end = f"{side * p.offset:.9g} {p.length:.9g} 0"
@@ -325,37 +305,35 @@ def hand_mjcf(settings: Settings, p: Parameters) -> str:
 <body pos="{-side * p.half_separation:.9g} 0 0">
 <joint name="{name}" axis="0 0 {-side}" range="{p.stop_low[k]:.9g} {p.stop_high[k]:.9g}"
  armature="{p.joint_inertia}" damping="{p.joint_damping}" frictionloss="{p.joint_friction}"/>
-<inertial pos="0 0 0" mass="1e-6" diaginertia="1e-9 1e-9 1e-9"/>
 <geom type="capsule" size="{0.3 * p.radius:.9g}" fromto="0 0 0 {end}"/>
 <geom name="{name}_tip" size="{p.radius:.9g}" pos="{end}" xyaxes="0 {side} 0 0 0 1"/>
 </body>"""
         cells = settings.tactile.rows * settings.tactile.cols
         sensors += f'<user name="{name}_tip_pressure" dim="{cells}" needstage="vel"/>'
     x, y = settings.simulation.object_position
-    size, inertia = f"{p.half_width:.9g} {p.half_height:.9g} 0.03", (f"{p.inertia} " * 3).strip()
-    return f"""<mujoco model="softfinger"><compiler angle="radian" autolimits="true"/>
+    return f"""<mujoco model="softfinger"><compiler angle="radian" boundmass="1e-6"
+ boundinertia="1e-9"/>
 <option timestep="{p.step}" integrator="implicitfast" gravity="{p.gravity[0]} {p.gravity[1]} 0"/>
-<default><geom contype="0" conaffinity="0" mass="0"/></default>
+<default><geom contype="0" conaffinity="0" mass="0"/><general dyntype="filterexact"
+ dynprm="{p.electric_time}" gainprm="{p.torque_constant}" actearly="true"/></default>
 <worldbody>{fingers}
 <body pos="{x:.9g} {y:.9g} 0">
-<joint name="x" type="slide" axis="1 0 0" frictionloss="{p.table_force:.9g}"/>
-<joint name="y" type="slide" axis="0 1 0" frictionloss="{p.table_force:.9g}"/>
+<joint name="x" type="slide" axis="1 0 0" ref="{x:.9g}" frictionloss="{p.table_force:.9g}"/>
+<joint name="y" type="slide" axis="0 1 0" ref="{y:.9g}" frictionloss="{p.table_force:.9g}"/>
 <joint name="angle" axis="0 0 1" frictionloss="{p.table_torque:.9g}"/>
-<inertial pos="0 0 0" mass="{p.mass}" diaginertia="{inertia}"/>
-<geom name="object" type="box" size="{size}"/>
+<inertial pos="0 0 0" mass="{p.mass}" diaginertia="{p.inertia} {p.inertia} {p.inertia}"/>
+<geom name="object" type="box" size="{p.half_width:.9g} {p.half_height:.9g} 0.03"/>
 </body></worldbody>
-<actuator><motor joint="left"/><motor joint="right"/></actuator>
+<actuator><general joint="left"/><general joint="right"/></actuator>
 <sensor>{sensors}</sensor></mujoco>"""
 
 
 @kernel
-def drive_motors(plants: Records[Plant], share: float, torque: FloatArray) -> None:
-    """Let both motors' currents follow their references by ``share``; ``torque`` [N·m] of each."""
-    plant, state = plants[0], plants[0].state
+def set_currents(plants: Records[Plant], control: FloatArray) -> None:
+    """Set the currents [A] that both servos ask of their motors, which follow with a lag."""
+    state = plants[0].state
     for j in range(2):
-        reference = current_reference(plant, j, state.position[j], state.velocity[j])
-        state.current[j] += share * (reference - state.current[j])
-        torque[j] = plant.parameters.torque_constant * state.current[j]
+        control[j] = current_reference(plants[0], j, state.position[j], state.velocity[j])
 
 
 @kernel
@@ -390,24 +368,23 @@ class MujocoHand(SimulatedHand):
         set_parameters(parameters, settings, table, step)
         self.model = mujoco.MjModel.from_xml_string(hand_mjcf(settings, parameters))
         self.data = mujoco.MjData(self.model)
-        self._origin = np.array([0.0, 0.0, *settings.simulation.object_position, 0.0])
         self.tips = SoftTips(self.model, self.data, settings, table=table)
         super().__init__(settings, start, table, step)
 
     def _run(self, count: int) -> None:
         plant, data, state = self.plant, self.data, self.plant.state
-        data.qpos[:], data.qvel[:] = state.position - self._origin, state.velocity
-        share = -math.expm1(-self.step / plant.parameters.electric_time)
+        data.qpos[:], data.qvel[:], data.act[:] = state.position, state.velocity, state.current
         with self.tips:
             if count == 0:
                 mujoco.mj_step1(self.model, data)
                 feel(plant.array, self.tips._all, self._ring)
             for _ in range(count):
-                drive_motors(plant.array, share, data.ctrl)
+                set_currents(plant.array, data.ctrl)
                 data.qfrc_applied[2:] = plant.goals.load
                 mujoco.mj_step2(self.model, data)
                 mujoco.mj_step1(self.model, data)  # last, so that what the tips feel is current
-                state.position[:], state.velocity[:] = data.qpos + self._origin, data.qvel
+                state.position[:], state.velocity[:] = data.qpos, data.qvel
+                state.current[:] = data.act
                 self._done = plant.steps = self._done + 1
                 feel(plant.array, self.tips._all, self._ring)
 
