@@ -42,8 +42,8 @@ def browser_path() -> str | None:
 class Browser:
     """One page of one browser. ``requests`` are the addresses that the page asked for."""
 
-    def __init__(self, path: str, folder: Path, width: int = 1600, height: int = 1000) -> None:
-        words = [*_FLAGS, f"--user-data-dir={folder}", f"--window-size={width},{height}"]
+    def __init__(self, path: str, folder: Path) -> None:
+        words = [*_FLAGS, f"--user-data-dir={folder}"]
         quiet: Any = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
         self.process = subprocess.Popen(
             [path, *words, "about:blank"], start_new_session=True, **quiet
@@ -59,12 +59,16 @@ class Browser:
         self.requests: list[str] = []
         for domain in ("Page", "Network"):
             self.ask(f"{domain}.enable")
-        size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
-        self.ask("Emulation.setDeviceMetricsOverride", **size)
+        self.resize(1400, 900)
 
     def open(self, url: str) -> None:
         """Go to a page."""
         self.ask("Page.navigate", url=url)
+
+    def resize(self, width: int, height: int, ratio: int = 1) -> None:
+        """Set the page's size; with more pixels for each of these a phone's."""
+        size = {"width": width, "height": height, "deviceScaleFactor": ratio, "mobile": ratio > 1}
+        self.ask("Emulation.setDeviceMetricsOverride", **size)
 
     def evaluate(self, script: str) -> Any:
         """The value of a JavaScript expression in the page."""

@@ -46,13 +46,12 @@ class Viewed:
 
 
 class Watcher:
-    """A page's connection: asks for pictures. ``scene`` is the newest that came before one."""
+    """A page's connection: asks for pictures."""
 
     def __init__(self, host: str, **more: Any) -> None:
         waits: Any = {"open_timeout": WAIT, "ping_timeout": None}
         url = f"ws://{host}/pictures"
         self._connection = connect(url, proxy=None, max_size=None, **waits, **more)
-        self.scene: dict[str, Any] = {}
 
     def next(self) -> dict[str, Any]:
         """The next picture."""
@@ -61,7 +60,6 @@ class Watcher:
             message: dict[str, Any] = json.loads(self.socket.recv(timeout=WAIT))
             if "palette" not in message:
                 return message
-            self.scene = message
 
     def __enter__(self) -> Self:
         self.socket = self._connection.__enter__()

@@ -78,7 +78,7 @@ def test_lerobot_drives_and_records_the_simulated_hand(make, start, profile, tmp
         robot, goal, lambda found: all(abs(found[name] - goal[name]) < 5e-3 for name in goal)
     )
     record(LeRobotDataset, robot, first, goal, moved, tmp_path / "dataset")
-    with pytest.raises(Refused, match=r"left: found 9 rad, expected"):
+    with pytest.raises(Refused, match=r"left: found 515.7° \(9 rad\), expected"):
         robot.send_action({"left.pos": 9.0, "right.pos": 0.0})
     robot._hand.disarm()
     with pytest.raises(Refused, match="arm first"):  # who disarmed it is not overruled
@@ -121,8 +121,10 @@ def record(
     root: Path,
 ) -> None:
     """Two observations as LeRobot's own recorder writes them, and read again."""
-    from lerobot.datasets.utils import build_dataset_frame, hw_to_dataset_features
-
+    try:
+        from lerobot.utils.feature_utils import build_dataset_frame, hw_to_dataset_features
+    except ImportError:  # of 0.4
+        from lerobot.datasets.utils import build_dataset_frame, hw_to_dataset_features
     features = hw_to_dataset_features(robot.action_features, "action", False)
     features |= hw_to_dataset_features(robot.observation_features, "observation", False)
     dataset = kind.create("a/b", 10, features, root=root, robot_type=robot.name, use_videos=False)
@@ -142,7 +144,6 @@ def record(
     np.testing.assert_allclose(picture, moved["left_touch"][:, :, 0], atol=1e-3)
 
 
-PACKAGE = Path(__file__).parents[2] / "lerobot_robot_softfinger"
 # Alone: the package itself imports LeRobot.
 features = runpy.run_path(str(PACKAGE / "lerobot_robot_softfinger" / "features.py"))
 STATE, image, observation = (features[name] for name in ("STATE", "image", "observation"))

@@ -11,6 +11,7 @@ import pytest
 
 from softfinger import Hand
 from softfinger.daemon.client.command_client import send
+from softfinger.tools.terminal.feed import MEANINGS
 from softfinger.tools.viewing.planar import COLOURS
 from tests.conftest import until
 from tests.harness.daemon_process import PATIENCE
@@ -55,9 +56,9 @@ class Page:
         until(lambda: self(f"!!{button} && !{button}.disabled"))
         self(f"{button}.click()")
 
-    def space(self) -> None:
+    def key(self, code: str, **named: Any) -> None:
         for kind in ("keyDown", "keyUp"):
-            self.browser.ask("Input.dispatchKeyEvent", type=kind, code="Space", key=" ", text=" ")
+            self.browser.ask("Input.dispatchKeyEvent", type=kind, code=code, **named)
 
     def fraction(self, panel: str, colour: tuple[int, int, int]) -> float:
         return float(self(f"{FRACTION}('{panel}', {list(colour)})"))
@@ -70,7 +71,7 @@ class Page:
 @pytest.fixture
 def page(tmp_path: Path) -> Iterator[Page]:
     path = browser_path()
-    browser = Browser(path, tmp_path / "profile", 1400, 900)
+    browser = Browser(path, tmp_path / "profile")
     yield Page(browser)
     browser.close()
 
@@ -110,15 +111,19 @@ def test_every_button_brings_its_mode_and_a_lost_page_gives_the_hand_back(
         page.click("[name=rotate]:last-of-type")
         hand.wait_for(lambda state: abs(state.goal_angle - math.radians(5.0)) < 0.02, 60.0)
         hand.wait_for(lambda state: state.mode == "holding", 60.0)
+        page.click("[name=disarm]")
+        until(lambda: "lets the object fall" in page.text(".reply"))
         press("[name=release]", "armed")
         page("document.querySelector('[name=grasp]').focus()")
-        page.space()
+        page.key("Space", key=" ", text=" ")
         hand.wait_for(lambda state: state.mode == "disarmed", 60.0)
         until(lambda: page.text(".reply") == "✓ stop: ok")  # and grasp was not pressed
         page.click("[name=tare]")
         until(lambda: page.text(".reply") == "✓ tare: ok")
         press("[name=arm]", "armed")
-        press("[name=disarm]", "disarmed")
+        press("[name=grasp]", "holding")
+        until(lambda: page.click("[name=disarm]") or hand.state().mode == "disarmed")
+        until(lambda: page.text(".mode") == "disarmed")
         press("[name=arm]", "armed")
         press("[name=stop]", "disarmed")
         press("[name=arm]", "armed")
@@ -133,8 +138,11 @@ def test_the_page_keeps_up_survives_sleep_and_reload_and_asks_nobody_else(page, 
     with Viewed(*where) as viewed:
         page.open(viewed.address)  # fills the browser's cache, as a second visit finds it
         assert "Watching" in page.text("footer")
+        page("document.querySelector('summary').click()")
+        explained = page("document.querySelector('details').innerText")
+        assert not [each for each in sum(MEANINGS, ()) if each not in explained]
         until(lambda: page.text(".fault") == "<b>tip.force</b>: 31 N")
-        page.space()
+        page.key("Space", key=" ", text=" ")
         page("send('stop')")
         page.open(viewed.commanding)
         page.click("[name=clear]")
@@ -162,13 +170,7 @@ def test_the_page_keeps_up_survives_sleep_and_reload_and_asks_nobody_else(page, 
         until(lambda: fake.requests[-1]["command"] == "clear")
         assert fake.requests[0]["client"] != fake.requests[-1]["client"]
 
-        page.browser.ask(
-            "Emulation.setDeviceMetricsOverride",
-            width=390,
-            height=844,
-            deviceScaleFactor=2,
-            mobile=True,
-        )
+        page.browser.resize(390, 844, 2)
         until(lambda: page("document.documentElement.scrollWidth") <= 390)
         edges = page(
             "(({left, right, bottom}) => [left, right, bottom])"
@@ -201,18 +203,7 @@ def test_a_recordings_slider_goes_to_its_place(page, tmp_path):
         until(lambda: page.text(".reply").startswith("2.0 of 2.0"))
         assert page("document.querySelector('[name=stop]')") is None
         assert page.text(".mode") == "holding"
-        box = page(
-            "(({left, top, height}) => [left, top + height / 2])"
-            "(document.querySelector('#place').getBoundingClientRect())"
-        )
-        for kind in ("mousePressed", "mouseReleased"):
-            page.browser.ask(
-                "Input.dispatchMouseEvent",
-                type=kind,
-                x=box[0] + 2,
-                y=box[1],
-                button="left",
-                clickCount=1,
-            )
+        page("document.querySelector('#place').focus()")
+        page.key("Home", key="Home", windowsVirtualKeyCode=36)
         until(lambda: page.text(".mode") == "disarmed")
         viewed.end()

@@ -39,6 +39,7 @@ def test_the_nearest_word_is_named_for_one_that_is_not_known(inline):
         wrong = inline(*words)
         assert wrong.returncode == 2
         assert f"found {word!r}, expected a known word; nearest: {near}" in wrong.stderr
+    assert max(map(len, inline("limits").stdout.splitlines())) <= 120
     assert "unrecognized arguments: --zzz" in inline("run", "--zzz").stderr
     assert inline("send").stderr.endswith("required: COMMAND\n")  # and not what it may lack
 

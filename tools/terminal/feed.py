@@ -30,6 +30,18 @@ from softfinger.daemon.wire.local_stop import stop_locally
 
 LATELY = 3.0  # s in which waiting for a busy machine is shown
 EVENTS = 200  # kept
+MEANINGS = (  # of the words on the pages
+    ("d", "how deep the object presses the tip in"),
+    ("θ", "tilt of the object's face against the tip"),
+    ("force", "F(d, θ), what presses the tip, normal to the face"),
+    ("energy", "U(d, θ), elastic energy in the tip"),
+    ("±", "one standard deviation"),
+    ("map age", "time since the newest pressure map was measured"),
+    ("joint, goal", "angles now and asked for; positive closes"),
+    ("current, bound", "of the motor, and the most that its goal allows"),
+    ("object", "its angle and width between the tips"),
+)
+_RAISED = 1.01  # share of the requested force above which the grip is reported as raised
 _DRAIN_LIMIT = 4000  # messages taken at once, so that a flood can't keep the page from drawing
 _MESSAGE_LIMIT = 4_000_000  # bytes; the largest grid is 131 kB
 
@@ -224,6 +236,15 @@ class Feed:
         """Return client that has the commander's lease; empty: nobody, or one without a name."""
         client, until = self._commanding
         return client if now < until else ""
+
+    def grip(self) -> str:
+        """Return the grip's goal in words; empty without a grip."""
+        force, angle = self.state.goal_force, math.degrees(self.state.goal_angle)
+        if not math.isfinite(force):
+            return ""
+        raised = f", raised from {self.commanded:.1f} N" if force > _RAISED * self.commanded else ""
+        turned = f", object to {angle:.1f}°" if math.isfinite(angle) else ""
+        return f"grip: goal {force:.1f} N{raised}{turned}"
 
     def age(self, now: float) -> float:
         """Return seconds since the last state, infinite before the first."""

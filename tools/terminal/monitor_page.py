@@ -15,7 +15,7 @@ from rich.text import Text
 from softfinger.daemon.types import FINGERS
 from softfinger.daemon.wire.schema import SCHEMA
 from softfinger.tools.terminal import heatmap
-from softfinger.tools.terminal.feed import Feed, ShownReply
+from softfinger.tools.terminal.feed import MEANINGS, Feed, ShownReply
 from softfinger.tools.terminal.status import why_invalid
 from softfinger.tools.terminal.typeset import (
     DIM,
@@ -37,7 +37,6 @@ MAP_LINES = 11  # of each map at the least size
 OLD = 1.0  # s after which a frame is marked as old
 REPLY_TIME = 12.0  # s a reply stays
 LATE = 0.05  # s behind from which a line says so
-_RAISED = 1.01  # share of the requested force above which the grip is reported as raised
 
 GOOD, WARN, BAD = "#1fa883", "#e69f00", "bold #ff6a3d"
 KEY = "bold #56b4e9"
@@ -63,16 +62,7 @@ _KEYS = {
     "?": "",
     "q": "quit",
 }
-_MEANINGS = (
-    ("d", "how deep the object presses the tip in"),
-    ("θ", "tilt of the object's face against the tip"),
-    ("force", "F(d, θ), what presses the tip, normal to the face"),
-    ("energy", "U(d, θ), elastic energy in the tip"),
-    ("±", "one standard deviation"),
-    ("map age", "time since the newest pressure map was measured"),
-    ("joint, goal", "angles now and asked for; positive closes"),
-    ("current, bound", "of the motor, and the most that its goal allows"),
-    ("object", "its angle and width between the tips"),
+_KEYS_EXPLAINED = (
     ("w", "begins the profile's task again, while disarmed"),
     ("+ -", "more or less force; a grip follows at once"),
 )
@@ -121,7 +111,7 @@ class MonitorPage:
         maps, events = _heights(width, height)
         numbers = [
             *(_meanings(width, maps + 2) if self.explains else self._body(width, maps, now)),
-            rule(width, Text(self._goal())),
+            rule(width, Text(self.feed.grip())),
             self._ticks(),
         ]
         if status in ("stale", "lost"):
@@ -259,18 +249,6 @@ class MonitorPage:
             (" mm wide", DIM),
         )
 
-    def _goal(self) -> str:
-        """The grip's goal in words; empty without a grip."""
-        force = self.feed.state.goal_force
-        angle = math.degrees(self.feed.state.goal_angle)
-        if not math.isfinite(force):
-            return ""
-        text = f"grip: goal {force:.1f} N"
-        commanded = self.feed.commanded
-        if force > _RAISED * commanded:
-            text += f", raised from {commanded:.1f} N"
-        return text + (f", object to {angle:.1f}°" if math.isfinite(angle) else "")
-
     def _ticks(self) -> Text:
         """Rate and overruns, then median, tail and largest times of all ticks."""
         times, overruns = self.feed.times, self.feed.state.overruns
@@ -330,7 +308,8 @@ class MonitorPage:
 
 
 def _meanings(width: int, lines: int) -> list[Text]:
-    named = [cut(Text.assemble((f" {name:>15}  ", KEY), text), width) for name, text in _MEANINGS]
+    explained = MEANINGS + _KEYS_EXPLAINED
+    named = [cut(Text.assemble((f" {name:>15}  ", KEY), text), width) for name, text in explained]
     return named + [Text() for _ in range(lines - len(named))]
 
 

@@ -35,12 +35,13 @@ from softfinger.tools.arguments import client_keys, to_stderr
 from softfinger.tools.ending import Ending
 from softfinger.tools.processes.compile import build_kernels
 from softfinger.tools.recordings.reader import Recording
-from softfinger.tools.terminal.feed import judge
+from softfinger.tools.terminal.feed import MEANINGS, judge
 from softfinger.tools.viewing.foxglove_server import LAYOUT, ORIGINS, PROTOCOLS, Foxglove
 from softfinger.tools.viewing.pictures import Pictures
 from softfinger.tools.viewing.sources import Playback, ViewError, follow
 
-_PAGE = Path(__file__).with_name("page.html").read_text(encoding="utf-8")
+_HELP = "".join(f"<dt><b>{words}</b><dd>{meaning}" for words, meaning in MEANINGS)
+_PAGE = Path(__file__).with_name("page.html").read_text("utf-8").replace("MEANINGS", _HELP)
 _LOOPBACK = "127.0.0.1"
 _PORT = 9090  # where nobody says another
 _NICE = 5  # everything real-time goes first

@@ -37,15 +37,7 @@ from softfinger.tools.viewing.planar import COLOURS, GOAL, OBJECT, Colour, Float
 if TYPE_CHECKING:
     from softfinger.tools.viewing.foxglove_server import Foxglove
 
-TOPICS = (
-    schema.SETTINGS,
-    schema.EVENT,
-    schema.STATE,
-    schema.TRUTH,
-    schema.TACTILE,
-    schema.STATS,
-    schema.COMMAND,
-)
+TOPICS = (*Feed().topics, schema.TRUTH)
 SECONDS = 12.0  # of the past in the plots
 _STEP = 0.2  # s from one column of the plots to the next
 _TRAIL = 30  # of these columns on the landscape
@@ -302,10 +294,7 @@ class Pictures:
         state, safety = self.feed.state, self._settings.safety
         last = [each for each in self.feed.events[-1:] if each.level == "warning"]
         parts = [each.text for each in last if self.time - each.timestamp < _LATELY]
-        if math.isfinite(state.goal_force):
-            asked = self.feed.commanded
-            raised = f", raised from {asked:.1f} N" if state.goal_force > 1.01 * asked else ""
-            parts.append(f"grip: goal {state.goal_force:.1f} N{raised}")
+        parts += filter(None, [self.feed.grip()])
         used = [
             (value / getattr(safety, f"{key}_max"), name, key)
             for name in self._fingers
@@ -325,7 +314,7 @@ class Pictures:
             return " / ".join(short(factor * getattr(finger, key), decimals) for finger in fingers)
 
         facts = [
-            f"frames {each('frame_age_s', 1e3, 0)} ms old",
+            f"map age {each('frame_age_s', 1e3, 0)} ms",
             f"servos {each('temperature', 1.0, 0)} °C, {each('voltage', 1.0, 1)} V",
             f"object {short(1e3 * state.object.width, 1)} mm wide",
             f"{sum(gaps.lost for gaps in self._gaps.values())} lost, {feed.skipped} unreadable",
