@@ -243,7 +243,7 @@ class Feed:
         if not math.isfinite(force):
             return ""
         raised = f", raised from {self.commanded:.1f} N" if force > _RAISED * self.commanded else ""
-        turned = f", object to {angle:.1f}°" if math.isfinite(angle) else ""
+        turned = f", object to {angle:z.1f}°" if math.isfinite(angle) else ""
         return f"grip: goal {force:.1f} N{raised}{turned}"
 
     def age(self, now: float) -> float:

@@ -44,7 +44,7 @@ def told(state: HandState) -> str:
         tips = ", ".join(f"{finger.force:.1f} ± {finger.force_std:.1f}" for finger in touching)
         parts.append(f"{force:.1f} N ({tips})")
     if state.object.valid:
-        parts.append(f"{math.degrees(state.object.angle):.1f}°")
+        parts.append(f"{math.degrees(state.object.angle):z.1f}°")
         parts.append(f"{state.object.width * 1e3:.1f} mm")
     parts += [why_invalid(state)] if why_invalid(state) else []
     return " ".join(parts[:1]) + (" " + ", ".join(parts[1:]) if parts[1:] else "")
