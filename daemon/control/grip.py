@@ -140,8 +140,11 @@ class Grip:
         self._state.steering = True
 
     def set_joint_stiffness(self, joint_stiffness: float) -> None:
-        """Keep the joints to their lean with so many N·m/rad."""
-        self._state.joint_stiffness = joint_stiffness
+        """Keep the joints to their lean with so many N·m/rad; torques go on as they are."""
+        state, (q1, q2) = self._state, self._grasp.q
+        lean = 0.5 * (q1 - q2)
+        state.offset = lean + (state.offset - lean) * state.joint_stiffness / joint_stiffness
+        state.joint_stiffness = joint_stiffness
 
     def begin_holding(self) -> None:
         """Mark the grip as settled: from now on loads from outside show."""

@@ -3,10 +3,11 @@
 With the names of `SlipLaw`, `SlipState` and `GraspState`, at each tick:
 
     standing torque    mean(torque_residual) − closing · joint_friction, averaged: smooth
-    load L of a tip    smooth − still = load_arm L + load_curvature L²        (`load_of`)
+    load L of a tip    smooth − still, between 0 and smooth
+                       = load_arm L + load_curvature L²                       (`load_of`)
     s.friction         joint_friction + load_friction · mean normal force · its lever
     sure               |L| − (1/2 … 3/2) s.friction/load_arm
-    s.load             min(max(4 sure, 0), |L| + s.friction/slope)
+    s.load             min(max(4 sure, 0), |L| + s.friction/slope, friction force_limit)
     spare              friction (1 − margin) − shear         of the normal force, for a load
     needed             max(s.load, felt, object_load/2)/spare
     force              min(max(commanded, needed), force_limit)
@@ -174,12 +175,13 @@ def update(
     else:
         s.unexplained_rotation[:] = grasp.unexplained_rotation
     # A grip that bears less than the joints' friction hides is not judged by their torques.
-    seen = s.load if law.friction * commanded * grasp.load_arm > s.friction else 0.0
+    if law.friction * commanded * grasp.load_arm <= s.friction:
+        s.load = 0.0
     felt = max(abs(grasp.sheared) - grasp.shear * mean(grasp.normal), 0.0)
     if law.shear_shows:  # what torques say beyond that is a force that is not known well
-        seen = min(seen, felt + _SHEAR_JUMP)
+        s.load = min(s.load, felt + _SHEAR_JUMP)
     sudden = _shear_jumps(s, felt, spare * mean(grasp.normal), monitored) or sudden
-    load = max(seen, felt, 0.5 * law.object_load)
+    load = max(s.load, felt, 0.5 * law.object_load)
     needed = 0.0
     if load > 0.0:
         needed = load / max(spare, _SPARE_MIN * law.friction)
@@ -259,20 +261,23 @@ def _shear_jumps(s: SlipState, felt: float, bears: float, monitored: bool) -> bo
 def _estimate_load(s: SlipState, grasp: GraspState) -> None:
     """Tell the load from the joints' friction."""
     law = s.law
-    off = _alike(s) - s.still
-    load, slope = load_of(off, grasp.load_arm, grasp.load_curvature)
-    load = abs(load)
+    both = _alike(s)
+    off = both - s.still
     friction = s.friction / grasp.load_arm
     s.age = min(s.age + law.dt, _LEARN)
-    if load < friction:
+    if abs(load_of(off, grasp.load_arm, grasp.load_curvature)[0]) < friction:
         # So little may as well be friction that gives way; what comes slower stays hidden.
         still = s.still + off * law.dt / s.age
         s.still = min(max(still, -s.friction), s.friction)
+    # Friction that lets go, or turns round, is no load.
+    off = min(max(off, min(both, 0.0)), max(both, 0.0))
+    load, slope = load_of(off, grasp.load_arm, grasp.load_curvature)
+    load = abs(load)
     # Half the friction is no sign yet, and after a motion it may turn round; from all of it on
-    # as much may be hidden.
+    # as much may be hidden. What no raised grip bears need not be told apart.
     sure = load - (0.5 + max(1.0 - s.age / _LEARN, 0.0)) * friction
     undetected = s.friction / max(slope, _ARM_MIN * law.width)
-    s.load = min(max(4.0 * sure, 0.0), load + undetected)
+    s.load = min(max(4.0 * sure, 0.0), load + undetected, law.friction * s.force_limit)
 
 
 @inner_kernel

@@ -104,10 +104,10 @@ def refuses(
     if moved:
         moved = speed < _TURNING and abs(w.deeper[1 - finger]) < _ALIKE * abs(deeper)
     if turned:
-        again = w.jumps[finger] > 0.0
-        goes_on = speed > _TURNING or (again and abs(innovation - before) > _GOES_ON)
+        again = w.jumps[finger] > 0.0 and abs(innovation - before) > _GOES_ON
+        goes_on = speed > _TURNING or again
         alike = innovation * other > _ALIKE * innovation * innovation
-        turned = not (alike and goes_on and (again or w.jumps[1 - finger] > 0.0))
+        turned = not (alike and goes_on)
     if w.jumps[finger] >= _GIVE_UP or not (turned or moved):
         w.jumps[finger] = 0.0
         return False

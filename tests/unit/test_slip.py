@@ -233,6 +233,15 @@ def test_a_grip_weaker_than_what_friction_hides_is_not_raised_on_torques():
     watched.held.normal = [2.0, 2.0]
     watched.grip.begin_holding()
     assert {watched.run(4.0, 1, normal=2.0) for _ in range(1000)} == {2.0}
+    watched.grip.retarget(12.0)
+    assert watched.run(4.0, 1, holding=False, normal=2.0) == 12.0
+
+
+def test_friction_that_turns_round_is_no_load():
+    watched = Watched()
+    watched.run(2.0, 500, holding=False)
+    watched.grip.begin_holding()
+    assert {watched.run(-1.5, 1) for _ in range(500)} == {FORCE}
 
 
 def test_no_load_shows_before_holding_begins():
