@@ -171,7 +171,8 @@ def check_board(settings: Settings, finger: int) -> Finding:
     # One frame more or less falls into the time that was listened for.
     if abs(frames - tactile.rate * spent) > max(_OFF_RATE * tactile.rate * spent, 1.5):
         text = f"{found}, not {tactile.rate:g}"
-        return Finding("warn", name, text, f"set tactile.rate = {rate:.0f}")
+        fix = f"set tactile.rate = {rate:.0f}, unless this machine is busy"
+        return Finding("warn", name, text, fix)
     return Finding("pass", name, found)
 
 
