@@ -112,14 +112,7 @@ def test_lerobot_drives_and_records_the_simulated_hand(make, start, profile, tmp
     again.disconnect()
 
 
-def record(
-    kind: Any,
-    robot: Any,
-    first: dict[str, Any],
-    action: dict[str, float],
-    moved: dict[str, Any],
-    root: Path,
-) -> None:
+def record(kind, robot, first, action, moved, root):
     """Two observations as LeRobot's own recorder writes them, and read again."""
     try:
         from lerobot.utils.feature_utils import build_dataset_frame, hw_to_dataset_features
