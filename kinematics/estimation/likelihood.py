@@ -199,21 +199,11 @@ def accumulate(state: EstimatorState, packed: Pointer) -> None:
         ww += weight
     sums = state.fit.sums
     normal = address(sums.normal)
-    normal[0] = s00
-    normal[1] = s01
-    normal[2] = s02
-    normal[3] = s03
-    normal[4] = s11
-    normal[5] = s12
-    normal[6] = s13
-    normal[7] = s22
-    normal[8] = s23
-    normal[9] = s33
+    for k, value in enumerate((s00, s01, s02, s03, s11, s12, s13, s22, s23, s33)):
+        normal[k] = value
     right = address(sums.right)
-    right[0] = r0
-    right[1] = r1
-    right[2] = r2
-    right[3] = r3
+    for k, value in enumerate((r0, r1, r2, r3)):
+        right[k] = value
     sums.misfit = rr
     sums.readings = yy
     sums.weight = ww
