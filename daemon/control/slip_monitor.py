@@ -106,6 +106,7 @@ class SlipState(Record):
     variance: Pair  # of both joints' mean about that, and of half their difference [N²·m²]
     speed: Pair  # of the joints, averaged [rad/s]
     felt: float  # the load that solid tips feel, averaged [N]
+    twisted: float  # a twist's shear that they feel, averaged [N]
     age: float  # since holding began, up to `_LEARN` [s]
     unexplained_rotation: Pair  # sums of unexplained turning that have been looked at [rad]
     away: Pair  # unexplained turning that is not forgotten yet, as each tip shows it [rad]
@@ -132,7 +133,7 @@ def set_law(law: SlipLaw, settings: Settings) -> None:
 def forget(s: SlipState) -> None:
     """Forget the object: nothing is held any more, or something else."""
     s.turned = s.known = s.reflex = False
-    s.load = s.felt = s.still = s.age = s.friction = 0.0
+    s.load = s.felt = s.twisted = s.still = s.age = s.friction = 0.0
     s.smooth[:] = s.variance[:] = s.speed[:] = 0.0
     s.unexplained_rotation[:] = s.away[:] = 0.0
     s.needed = s.force_limit = s.idle = 0.0
@@ -180,7 +181,8 @@ def update(
     felt = max(abs(grasp.sheared) - grasp.shear * mean(grasp.normal), 0.0)
     if law.shear_shows:  # what torques say beyond that is a force that is not known well
         s.load = min(s.load, felt + _SHEAR_JUMP)
-    sudden = _shear_jumps(s, felt, spare * mean(grasp.normal), monitored) or sudden
+    bears = spare * mean(grasp.normal)
+    sudden = _shear_jumps(s, felt, grasp.twisted, bears, monitored) or sudden
     load = max(s.load, felt, 0.5 * law.object_load)
     needed = 0.0
     if load > 0.0:
@@ -247,14 +249,16 @@ def _average(
 
 
 @inner_kernel
-def _shear_jumps(s: SlipState, felt: float, bears: float, monitored: bool) -> bool:
-    """Take in the load that solid tips feel [N]; whether one has come at once, as with torques.
+def _shear_jumps(s: SlipState, felt: float, twisted: float, bears: float, monitored: bool) -> bool:
+    """Take in the load and the twist that solid tips feel [N]; whether one has come at once.
 
     ``bears`` [N]: what friction does with its margin.
     """
-    jump = felt - s.felt
+    jump, turn = felt - s.felt, abs(twisted - s.twisted)
     s.felt += jump * s.law.dt / _SMOOTH
-    return monitored and jump > _SHEAR_JUMP and felt > _SUDDEN * bears
+    s.twisted += (twisted - s.twisted) * s.law.dt / _SMOOTH
+    pulled = jump > _SHEAR_JUMP and felt > _SUDDEN * bears
+    return monitored and (pulled or (turn > _SHEAR_JUMP and abs(twisted) > _SUDDEN * bears))
 
 
 @inner_kernel

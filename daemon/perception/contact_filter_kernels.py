@@ -132,6 +132,7 @@ class GraspState(Record):
     normal: Pair  # normal forces [N]
     shear: float  # shear over normal force, by the object's balance, unloaded
     sheared: float  # along the faces, as solid tips' newest frames show it [N]
+    twisted: float  # likewise, of a twist: alike on both faces [N]
     torque_residual: Pair  # what only a load along the faces explains of the joints' torques [N·m]
     load_arm: float  # a load L makes them arm L + curvature L²; 0: none shows [m]
     load_curvature: float  # [m/N]
@@ -743,10 +744,10 @@ def write_grasp(
     remaining1, remaining2, grasp.load_arm, curvature = load_torques(
         table1, table2, d, theta, taper, motion, rolled, torques
     )
-    # Forces on the two faces are opposite; only what both show alike bears a load.
-    grasp.sheared = 0.0
-    if left.shear * right.shear < 0.0:
-        grasp.sheared = math.copysign(min(abs(left.shear), abs(right.shear)), left.shear)
+    # A pull's forces on the two faces are opposite, a twist's alike; both must show them.
+    both = math.copysign(min(abs(left.shear), abs(right.shear)), left.shear)
+    grasp.sheared = both if left.shear * right.shear < 0.0 else 0.0
+    grasp.twisted = both - grasp.sheared
     grasp.torque_residual[0] = modulus1 * remaining1
     grasp.torque_residual[1] = modulus2 * remaining2
     grasp.load_curvature = 2.0 * curvature / (modulus1 + modulus2)

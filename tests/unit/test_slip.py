@@ -174,11 +174,12 @@ def test_a_load_that_stands_leaves_less_to_come():
     assert watched.run(3.0 + 0.8 * friction, 1, speed=GIVES_WAY) == FORCE + 10.0
 
 
-def test_solid_tips_show_a_load_by_themselves():
+@pytest.mark.parametrize("kind", ["sheared", "twisted"])
+def test_solid_tips_show_a_load_by_themselves(kind):
     watched = at_rest()
-    watched.held.sheared = 1.0
+    setattr(watched.held, kind, -1.0)
     assert watched.run(0.0, 500) == FORCE
-    watched.held.sheared = 3.5  # and one that comes at once is more than half of what is borne
+    setattr(watched.held, kind, -3.5)  # one that comes at once is more than half of what is borne
     assert watched.run(0.0, 1) == FORCE + 10.0
 
 
