@@ -69,6 +69,7 @@ _DRIFT_ANGLE = 4e-3  # rad/√s, likewise
 _DRIFT_TAPER = 1e-3  # rad/√s, what the taper does: tips come to other parts of the faces
 _TAPER_ERROR = 0.1  # rad that `object.taper` may be off
 _MOTION_ERROR = 0.05  # of a predicted motion, relative
+_TURN_MOST = 1.0  # rad from reading to reading
 _GATE = 9.0  # squared Mahalanobis distance
 _BY_TURNING = 0.8  # of such an angle's variance: the object turned, rather than tapers otherwise
 _FIRM = 1.0  # N of both tips, from which on an object does not rock between them
@@ -283,16 +284,18 @@ def predict(
             turn = 0.0
             deeper1 = arm1 * seen1 if left.in_contact else 0.0
             deeper2 = arm2 * seen2 if right.in_contact else 0.0
-        _move(left.d, deeper1)
-        _move(right.d, deeper2)
-        _move(f.angle, turn)
-        if both:  # what frames have shown before its count came
-            shown1 = displacement1 - seen1
-            shown2 = displacement2 - seen2
-            turn = turn1 * shown1 - turn2 * shown2
-            shown = 0.5 * (arm1 * shown1 + arm2 * shown2 + jacobian_slide * turn)
-            f.grasp.witnesses.corrected[0] -= shown
-            f.grasp.witnesses.corrected[1] -= shown
+        # What no hand can do, as by a taper of half a turn, tells nothing, and would stay for ever.
+        if abs(deeper1) + abs(deeper2) < f.radius and abs(turn) < _TURN_MOST:
+            _move(left.d, deeper1)
+            _move(right.d, deeper2)
+            _move(f.angle, turn)
+            if both:  # what frames have shown before its count came
+                shown1 = displacement1 - seen1
+                shown2 = displacement2 - seen2
+                turn = turn1 * shown1 - turn2 * shown2
+                shown = 0.5 * (arm1 * shown1 + arm2 * shown2 + jacobian_slide * turn)
+                f.grasp.witnesses.corrected[0] -= shown
+                f.grasp.witnesses.corrected[1] -= shown
     left.q += displacement1
     right.q += displacement2
     left.d.variance += _DRIFT_D * _DRIFT_D * dt
@@ -323,6 +326,8 @@ def _relax(f: FilterState, finger: int, dt: float) -> None:
     """Let ``dt`` s pass in a tip that relaxes; set its firmness."""
     tip = f.tip[finger]
     lasting = f.grasp.force[finger] / tip.firmness if tip.in_contact else 0.0
+    if not lasting < math.inf:  # beyond the tip's law
+        lasting = 0.0
     firmness = 1.0
     for k in range(3):
         strength = f.relaxation[k]
@@ -492,6 +497,10 @@ def update(
     tip = f.tip[finger]
     other = f.tip[1 - finger]
     d, theta, tilt_y, gain, shear = found
+    known = tip.d.mean + tip.gain + f.angle.mean + f.taper + f.unexplained_rotation[finger]
+    if not abs(known) < math.inf:  # begin anew
+        tip.in_contact = other.in_contact = False
+        f.unexplained_rotation[:] = 0.0
     theta_variance = covariance[1, 1] - systematic[1, 1]
     noise = (
         covariance[0, 0] - systematic[0, 0],

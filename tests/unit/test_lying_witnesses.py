@@ -1,5 +1,6 @@
 """A witness that begins to lie in a grip: named, refused, never obeyed; by the plant's truth."""
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -86,6 +87,18 @@ def test_a_sensor_that_was_blind_for_a_moment_raises_no_grip() -> None:
         assert seen.force.max() < 1.1 * FORCE
         assert seen.force[-1].mean() == pytest.approx(FORCE, rel=0.05)
         assert not [text for _, kind, text in hand.events if kind == "slip"]
+
+
+def test_an_estimate_that_is_no_number_or_no_hands_begins_anew():
+    with Hand({}) as hand:
+        grasped(hand, FORCE)
+        state = hand.contact_filter._state
+        state.angle.mean = math.nan
+        assert hand.watch(0.5).force.max() < 1.1 * FORCE
+        assert hand.mode == "holding"
+        state.taper = math.pi
+        hand.watch(0.1)
+        assert abs(state.angle.displacement) < 1.0
 
 
 def test_a_sensor_that_is_honest_again_is_believed_again() -> None:
