@@ -54,9 +54,6 @@ def manager(tmp_path: Path) -> Iterator[Manager]:
     manager.close()
 
 
-# --- signs of life ----------------------------------------------------------------------------
-
-
 def test_ready_comes_first_and_signs_of_life_four_times_in_the_watchdogs_time(manager):
     service = Service(str(manager.path), watchdog=2.0)
     for tick in range(1000):  # 2 s
@@ -150,9 +147,6 @@ def test_an_abstract_socket_and_anothers_watchdog():
         service.close()
 
 
-# --- the unit and the rules -------------------------------------------------------------------
-
-
 def test_the_unit_says_what_a_control_daemon_needs(tmp_path, inline):
     config = tmp_path / "my hand 100%.toml"
     config.write_text("", encoding="utf-8")
@@ -206,9 +200,6 @@ def test_what_can_not_be_installed_is_told(inline, words):
     assert done.returncode == 2
     assert done.stdout == ""
     assert done.stderr.startswith("install-service: ")
-
-
-# --- logs -------------------------------------------------------------------------------------
 
 
 def test_plain_lines_and_json_lines_say_the_same(tmp_path):

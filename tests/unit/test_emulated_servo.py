@@ -23,9 +23,6 @@ def client(**options: Any) -> BusClient:
     return BusClient(make_bus(**options))
 
 
-# --- access rights and limits ----------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("address", "value", "size", "error"),
     [
@@ -94,9 +91,6 @@ def test_instructions_that_it_does_not_know(instruction: int, parameters: bytes)
     assert bytes(c.bus.servos[0].table.memory) == before
 
 
-# --- indirect addresses ----------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("model", "firmware"), [("XM430-W210", 48), ("XL330-M288", 52), ("XL330-M288", 53)]
 )
@@ -110,9 +104,6 @@ def test_indirect_data_stands_for_what_it_points_to(model: str, firmware: int) -
     assert c.ask(framing.READ, struct.pack("<HH", data, 5)) == (0, bytes.fromhex("01 A6000000"))
     assert c.write(data + 1, 5, 4) == framing.ACCESS  # present position is read-only
     assert c.write(address, 20, 2) == framing.DATA_RANGE  # EEPROM can't be pointed to
-
-
-# --- torque, modes, motion -------------------------------------------------------------------
 
 
 def test_velocity_mode_keeps_its_speed() -> None:
@@ -199,9 +190,6 @@ def test_realtime_tick_wraps() -> None:
     assert c.read(reg.REALTIME_TICK, 2) == 1
 
 
-# --- bus watchdog ----------------------------------------------------------------------------
-
-
 def test_bus_watchdog_stops_and_locks_the_goals_until_zero_is_written() -> None:
     c = client(prepared=True)
     c.write(reg.TORQUE_ENABLE, 1, 1)
@@ -226,9 +214,6 @@ def test_bus_watchdog_stops_and_locks_the_goals_until_zero_is_written() -> None:
     c.write(reg.BUS_WATCHDOG, 1, 1)  # which sleeps then
     c.later(5.0)
     assert c.read(reg.BUS_WATCHDOG, 1) == 1
-
-
-# --- hardware errors -------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -272,9 +257,6 @@ def test_overload_after_its_time_at_the_current_limit() -> None:
     c.later(0.3)
     assert c.bus.servos[0].table.memory[reg.HARDWARE_ERROR_STATUS] == 1 << 5
     assert c.bus.servos[0].torque_on is False
-
-
-# --- reboot, reset, backup -------------------------------------------------------------------
 
 
 def test_reboot_resets_ram_and_keeps_eeprom() -> None:

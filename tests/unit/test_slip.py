@@ -238,16 +238,12 @@ def test_a_grip_weaker_than_what_friction_hides_is_not_raised_on_torques():
     assert watched.run(4.0, 1, holding=False, normal=2.0) == 12.0
 
 
-def test_friction_that_turns_round_is_no_load():
+def test_no_load_shows_before_holding_begins_and_friction_that_turns_round_is_none():
     watched = Watched()
+    assert {watched.run(20.0, 1, holding=False) for _ in range(500)} == {FORCE}
     watched.run(2.0, 500, holding=False)
     watched.grip.begin_holding()
     assert {watched.run(-1.5, 1) for _ in range(500)} == {FORCE}
-
-
-def test_no_load_shows_before_holding_begins():
-    watched = Watched()
-    assert {watched.run(20.0, 1, holding=False) for _ in range(500)} == {FORCE}
 
 
 def some_held(generator: np.random.Generator, force: float) -> GraspState:
