@@ -292,15 +292,15 @@ class _Recorder:
         return count
 
     def _read_remaining(self, socket: zmq.Socket[bytes], quiet: float) -> None:
-        """Take the messages that wait, and those that arrive within ``quiet`` s."""
-        began = time.monotonic()
-        while True:
-            behind = self._take_batch(socket) == _BATCH
-            age = time.monotonic() - began
-            if behind and age < _BACKLOG:
-                continue
-            if age >= quiet or not socket.poll(int((quiet - age) * 1e3)):
-                return
+        """Take the messages that wait, and those for which ``quiet`` s of waiting are enough."""
+        end = time.monotonic() + _BACKLOG
+        while time.monotonic() < end:
+            if self._take_batch(socket) < _BATCH:
+                if quiet <= 0.0:
+                    return
+                began = time.monotonic()
+                socket.poll(int(_STEP * 1e3))
+                quiet -= min(time.monotonic() - began, _STEP)  # a standstill is one step of it
 
     def _take(self, frames: list[bytes]) -> None:
         try:
