@@ -31,11 +31,6 @@ _LOOK = 0.005  # s until a bus looks for what was done to it
 RADIAN = 2.0 * math.pi / COUNTS_PER_TURN
 
 
-def plain_scale(model: str, zero: int = 0) -> JointScale:
-    """Joint angle and servo counts with one sign and the given zero."""
-    return JointScale(1, zero, RADIAN, VELOCITY_UNIT, by_name(model).current_unit)
-
-
 def make_bus(
     model: str = "XM430-W210",
     ids: Sequence[int] = (1, 2),
@@ -56,7 +51,7 @@ def make_bus(
             chosen,
             plant,
             joint,
-            plain_scale(model),
+            JointScale(1, 0, RADIAN, VELOCITY_UNIT, chosen.current_unit),
             eeprom | {reg.ID: servo_id},
             firmware=firmware,
             t=t,
@@ -164,21 +159,19 @@ class DirectPort(SerialPort):
 
 
 class RunningBus:
-    """A bus on a pty, served by a thread until :meth:`close`; its time is that of ``clock``."""
+    """A bus on a pty, served by a thread until :meth:`close`, in monotonic time."""
 
     def __init__(
         self,
         bus: ServoBus | None = None,
         baud: int = 0,
-        clock: Callable[[], float] = time.monotonic,
         **options: Any,
     ) -> None:
+        self._looked, self._stood = time.monotonic(), 0.0
         if bus is None:
-            now = clock()
-            bus = hand_bus(t=now, baud=baud, **options)
+            bus = hand_bus(t=self._now(), baud=baud, **options)
         self.bus = bus
-        self.port = PtyServoBus(bus, baud=baud, clock=clock)
-        self._clock = clock
+        self.port = PtyServoBus(bus, baud=baud, clock=self._now)
         self._between_packets = threading.Lock()
         self._running = True
         self._thread = threading.Thread(target=self._serve, daemon=True)
@@ -201,7 +194,7 @@ class RunningBus:
             return job()
 
     def fault(self, text: str) -> None:
-        self.call(lambda: put_fault(self.bus, text, self._clock()))
+        self.call(lambda: put_fault(self.bus, text, self._now()))
 
     def close(self) -> None:
         self._running = False
@@ -210,7 +203,13 @@ class RunningBus:
 
     def _serve(self) -> None:
         while self._running:
-            wait = min(max(0.0, self.port.next_event() - self._clock()), _LOOK)
+            wait = min(max(0.0, self.port.next_event() - self._now()), _LOOK)
             select.select([self.port], [], [], wait)
             with self._between_packets:
-                self.port.service(self._clock())
+                self.port.service(self._now())
+
+    def _now(self) -> float:
+        """Monotonic time less this process's standstills, of which the servos must not know."""
+        looked, self._looked = self._looked, time.monotonic()
+        self._stood += max(self._looked - looked - 0.5, 0.0)
+        return self._looked - self._stood

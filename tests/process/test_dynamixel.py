@@ -199,7 +199,8 @@ def test_a_late_reply_is_not_taken_for_the_next_questions(running, firmware, con
             assert reading.q == pytest.approx([count * RADIAN, -count * RADIAN])
 
     bus.fault("late=1")
-    until(lambda: at_another_place(reading.seq) or backend.counters()["late"] > 20)
+    while backend.counters()["late"] <= 20 and reading.seq < 1000:  # a busy machine hears few
+        at_another_place(reading.seq)
     bus.fault("late=0")
     until(lambda: at_another_place(reading.seq) or reading.valid)
 
