@@ -16,6 +16,7 @@ LOOK, SETTLED = 3.5, 0.5  # s of the emulated hand's time, in all and in the end
 GAIN = "left:gain=0.6@0..2"
 CURRENT = "left:current=2"
 REFUSED = "left:shift-x=3"  # the hand lets go
+STOOD = "servos.silent"  # the fault of an emulated hand that stood still on a busy machine
 
 
 @pytest.fixture(scope="module")
@@ -70,10 +71,13 @@ def watched(rig: Rig) -> Iterator[dict[str, Any]]:
 @pytest.mark.parametrize("lie", [GAIN, CURRENT, REFUSED])
 def test_a_lie_is_bounded_and_nothing_else_is_named(rig, lie):
     false = f"witness.{lie.split(':')[0]}_{'current' if lie == CURRENT else 'sensor'}"
-    gripped(rig)
-    before = len(rig.log())
-    rig.send(lie)
-    reports = list(watched(rig))
+    fault = STOOD
+    while fault == STOOD:
+        gripped(rig)
+        before = len(rig.log())
+        rig.send(lie)
+        reports = list(watched(rig))
+        fault = rig.status(60.0)["fault_name"]
     assert max(max(report["force"]) for report in reports) < 1.3 * FORCE
     if lie != GAIN:  # which may be believed in part, and need not be named
         until(lambda: any(false in line for line in rig.log()[before:]))

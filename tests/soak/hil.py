@@ -133,7 +133,7 @@ def soak(seconds: float, seed: int = 1) -> Account:
         while (now := time.monotonic()) < begin + seconds:
             try:
                 _listen(rig, account, chance.uniform(0.01, 0.1))
-                status = rig.status(5.0)
+                status = rig.status(60.0)
                 if status is None:
                     account.wrong.append(f"no answer; the daemon lives: {rig.alive}")
                     break
@@ -176,7 +176,7 @@ def soak(seconds: float, seed: int = 1) -> Account:
         if end_fault is not None:
             end_fault()
         account.seconds = time.monotonic() - begin
-        rig.ask({"command": "stop"}, 5.0)
+        rig.ask({"command": "stop"}, 60.0)
         others.close()
         if rig.end_daemon() not in (0, 1):
             account.wrong.append("the daemon did not end as it should")

@@ -90,7 +90,7 @@ class Rig:
             return 0
         daemon.send_signal(number)
         try:
-            return daemon.wait(timeout=10.0)
+            return daemon.wait(timeout=60.0)
         except subprocess.TimeoutExpired:
             daemon.kill()
             daemon.wait()

@@ -25,7 +25,7 @@ _CONTROL = "control"
 _LONGEST = 4096  # bytes of a message
 _LONGEST_REPLY = 1 << 17
 _CLIENTS = 8  # at a time
-_PATIENCE = 2.0  # s that a client waits for its reply
+_PATIENCE = 10.0  # s that a client waits for its reply, of a busy machine, too
 
 
 class FolderError(SoftfingerError):
