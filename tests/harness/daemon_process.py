@@ -4,7 +4,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -52,7 +52,7 @@ def started(*words: object, **options: Any) -> subprocess.Popen[str]:
     return subprocess.Popen([*SOFTFINGER, *map(str, words)], **pipes | options)
 
 
-def _held_up(error: str) -> bool:
+def held_up(error: str) -> bool:
     """Whether a command was refused for what a busy machine does."""
     return "send it again" in error or "were not read at this tick" in error
 
@@ -61,7 +61,7 @@ def ask(address: str, name: str, **numbers: float) -> dict[str, Any]:
     """The reply to a command, sent again where the daemon was held up and says so."""
     while True:
         reply = send(address, {"command": name, **numbers}, timeout=120.0)
-        if reply["ok"] or not _held_up(reply["error"]):
+        if reply["ok"] or not held_up(reply["error"]):
             return reply
 
 
@@ -74,16 +74,24 @@ def until_it_says(words: Sequence[str | Path], text: str) -> None:
     assert process.returncode == 0
 
 
-def insist(command: Callable[[], object]) -> None:
+def insist(command: Callable[[], Any]) -> Any:
     """Give a client's command, again where the daemon was held up and says so."""
     while True:
         try:
-            command()
+            return command()
         except Refused as refused:
-            if not _held_up(str(refused)):
+            if not held_up(str(refused)):
                 raise
-        else:
-            return
+
+
+async def insist_async(command: Callable[[], Awaitable[Any]]) -> Any:
+    """Give an asynchronous client's."""
+    while True:
+        try:
+            return await command()
+        except Refused as refused:
+            if not held_up(str(refused)):
+                raise
 
 
 class Running:

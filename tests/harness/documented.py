@@ -22,7 +22,7 @@ from softfinger.daemon.errors import SettingsError
 from softfinger.tools.arguments import profile
 from softfinger.tools.cli import main, make_parser
 from softfinger.tools.terminal.status import told
-from tests.harness.daemon_process import SOFTFINGER, Running
+from tests.harness.daemon_process import SOFTFINGER, Running, held_up
 
 _BUSY = "DOCUMENTED_BUSY"  # set for what a command starts: that runs on its own
 _ENDLESS = {"run", "monitor", "view", "replay", "envelope", "bench"}
@@ -71,7 +71,7 @@ class Softfinger:
         with client, client.makefile("rw") as stream:
             words = json.loads(stream.readline())
             status, told, error = self._answer(words)
-            while "send it again" in told:  # a busy machine held the daemon up
+            while held_up(told):
                 status, told, error = self._answer(words)
             print(json.dumps((status, told, error)), file=stream, flush=True)
 

@@ -50,10 +50,12 @@ class Browser:
         )
         told = folder / "DevToolsActivePort"  # written once somebody listens there
         until(lambda: told.exists() and "/" in told.read_text())
-        with urlopen(f"http://127.0.0.1:{told.read_text().split()[0]}/json") as answer:
-            page = next(each for each in json.load(answer) if each["type"] == "page")
+        pages: list[dict[str, Any]] = []
+        while not pages:  # a slow machine's browser may have none yet
+            with urlopen(f"http://127.0.0.1:{told.read_text().split()[0]}/json") as answer:
+                pages = [each for each in json.load(answer) if each["type"] == "page"]
         waits: Any = {"open_timeout": WAIT, "ping_interval": None}
-        url = page["webSocketDebuggerUrl"]
+        url = pages[0]["webSocketDebuggerUrl"]
         self._socket = connect(url, proxy=None, max_size=None, **waits).__enter__()
         self._number = 0
         self.requests: list[str] = []

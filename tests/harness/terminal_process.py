@@ -80,6 +80,13 @@ class TerminalProcess:
     def type(self, keys: bytes) -> None:
         os.write(self.master, keys)
 
+    def press(self, key: bytes, text: str) -> None:
+        """Until ``text`` is shown: a busy machine's daemon or page may not have heard the first."""
+        while text not in self.text():
+            self.type(key)
+            later = time.monotonic() + 1.0
+            self.wait(lambda later=later: text in self.text() or time.monotonic() > later)
+
     def ended(self) -> int:
         """Wait for its end; the exit code."""
         self.wait(lambda: self.process.poll() is not None)

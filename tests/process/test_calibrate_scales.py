@@ -15,8 +15,6 @@ from tests.harness.daemon_process import insist
 from tests.harness.recorded_hand import record_hand
 from tests.unit.test_control import grasped
 
-WRONG = {"tactile_gain": (0.6, 1.4)}
-
 
 def test_a_daemon_begins_with_what_grips_told(start, profile, addresses, tmp_path, capsys):
     start("--config", str(profile("loop.rate = 500.0\nsimulation.tactile_gain = [0.6, 1.4]\n")))
@@ -41,7 +39,8 @@ def test_a_daemon_begins_with_what_grips_told(start, profile, addresses, tmp_pat
         assert step.modulus[0] == pytest.approx(1.0, rel=0.1)
     assert f"gain {found[0].gain[0]:.3f} ± " in capsys.readouterr().out
 
-    with Watched({"simulation": WRONG, "tactile": {"calibration": files}}) as after:
+    wrong = {"simulation": {"tactile_gain": (0.6, 1.4)}, "tactile": {"calibration": files}}
+    with Watched(wrong) as after:
         first = grasped(after, 8.0).force
         assert first[-250:].mean() == pytest.approx(8.0, rel=0.05)
         assert first.max() < 1.12 * 8.0

@@ -10,14 +10,14 @@ import pytest
 import zmq
 
 from tests.conftest import until
-from tests.harness.daemon_process import ask, softfinger, started
+from tests.harness.daemon_process import ask, held_up, softfinger, started
 
 
 def test_arm_grasp_and_stop_from_the_command_line(daemon, inline):
     def send(*words: str) -> tuple[int, dict[str, Any]]:
         while True:
             done = inline("send", *words, "--address", daemon.commands, "--timeout", "60")
-            if "send it again" not in done.stdout:
+            if not held_up(done.stdout):
                 return done.returncode, json.loads(done.stdout)
 
     refused = softfinger(
@@ -131,8 +131,7 @@ def test_commands_that_waited_through_a_stall_are_refused_but_stop_stops(daemon,
     for _ in range(2):
         assert socket.poll(60_000)
         replies.append(msgpack.unpackb(socket.recv_multipart()[-1]))
-    stop, move = replies  # a stop goes first
-    assert not move["ok"]
+    move, stop = sorted(replies, key=lambda reply: reply["ok"])  # a busy gateway may refuse first
     assert "send it again" in move["error"]
     assert stop["ok"]
 

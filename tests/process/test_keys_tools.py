@@ -3,7 +3,6 @@
 import asyncio
 import json
 import re
-import signal
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -21,11 +20,12 @@ from tests.harness.daemon_process import (
     Running,
     ask,
     insist,
+    insist_async,
     started,
     until_it_says,
 )
 from tests.harness.viewed import Viewed, Watcher
-from tests.process.test_record import written
+from tests.process.test_record import interrupted, is_filled, record, written
 from tests.unit.test_schema import sample
 
 
@@ -52,20 +52,15 @@ def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Guarded]:
         daemon.kill()
 
 
-def record(path: Path, *words: str) -> None:
-    """Record until something was recorded."""
-    process = started("record", path, *words)
-    until(lambda: path.exists() and path.stat().st_size > 3000)
-    process.send_signal(signal.SIGINT)
-    assert process.wait(300) == 0
-    assert Recording(path).counts["hand/state"] > 0
-
-
 def test_tools_with_keys_see_and_command_the_hand(guarded, tmp_path, inline):
     folder, addresses, _ = guarded
     stream, commands = addresses
     alice = ("--keys", str(folder / "alice"))
-    record(tmp_path / "a.mcap", "--address", stream, *alice)
+    path = tmp_path / "a.mcap"
+    recorder = record(path, "--address", stream, *alice)
+    until(lambda: is_filled(path))
+    assert interrupted(recorder)[0] == 0
+    assert Recording(path).counts["hand/state"] > 0
     with Viewed("--address", stream, *alice) as viewed, Watcher(viewed.host) as page:
         until(lambda: page.next()["mode"] == "disarmed")
         viewed.end()
@@ -79,7 +74,7 @@ def test_tools_with_keys_see_and_command_the_hand(guarded, tmp_path, inline):
 
     async def session() -> str:
         async with AsyncHand(*addresses, keys=folder / "alice", timeout=60.0) as hand:
-            await hand.command("disarm")
+            await insist_async(lambda: hand.command("disarm"))
             return (await hand.wait_for(lambda state: not state.torque, 60.0)).mode
 
     assert asyncio.run(session()) == "disarmed"

@@ -99,13 +99,13 @@ def test_a_picture_has_the_streams_values() -> None:
         fake.changes = {"left": left, "schema": 2, "news": 1.5, **GOALS}
         with view(fake) as viewed, Watcher(viewed.host) as page:
             pictures = [page.next() for _ in range(5)]
-            slip = event(7, "slip", "the object slips", "warning")
-            fake.send(schema.EVENT, msgpack.packb(slip))
-            until(lambda: page.next()["events"])
-            picture = page.next()
+            fake.send(schema.EVENT, msgpack.packb(event(7, "slip", "the object slips", "warning")))
+            while not ((picture := page.next())["events"] and picture["status"] == "live"):
+                pictures.append(picture)
             said = viewed.end()
     seqs = [each["seq"] for each in pictures]
-    assert seqs == sorted(set(seqs))
+    assert seqs == sorted(seqs)
+    assert seqs[0] < picture["seq"]
     expected = {
         "Force [N]": {"left 7.5 ± 0.05", "goal 9"},
         "Displacement d [mm]": {"right 3.31 ± 0.02"},

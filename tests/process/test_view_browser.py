@@ -10,11 +10,11 @@ from typing import Any
 import pytest
 
 from softfinger import Hand
-from softfinger.daemon.client.command_client import send
 from softfinger.tools.terminal.feed import MEANINGS
 from softfinger.tools.viewing.planar import COLOURS
 from tests.conftest import until
 from tests.harness.daemon_process import PATIENCE
+from tests.harness.daemon_process import ask as command
 from tests.harness.headless_browser import Browser, browser_path
 from tests.harness.recorded_hand import record_hand
 from tests.harness.viewed import Viewed
@@ -56,6 +56,11 @@ class Page:
         until(lambda: self(f"!!{button} && !{button}.disabled"))
         self(f"{button}.click()")
 
+    def ask(self, selector: str, done: Callable[[], object]) -> None:
+        """Press, and again where a busy machine's page was too late and says so."""
+        self.click(selector)
+        until(lambda: done() or (self.text(".reply").startswith("✗") and self.click(selector)))
+
     def key(self, code: str, **named: Any) -> None:
         for kind in ("keyDown", "keyUp"):
             self.browser.ask("Input.dispatchKeyEvent", type=kind, code=code, **named)
@@ -87,19 +92,12 @@ def test_every_button_brings_its_mode_and_a_lost_page_gives_the_hand_back(
     ):
         page.open(viewed.commanding)
 
-        def ask(button: str, done: Callable[[], object]) -> None:
-            """Press, and again where a busy machine's page was too late and says so."""
-            page.click(button)
-            until(lambda: done() or (page.text(".reply").startswith("✗") and page.click(button)))
-
         def press(button: str, mode: str) -> None:
-            ask(button, lambda: page.text(".mode") == mode)
+            page.ask(button, lambda: page.text(".mode") == mode)
             assert hand.state().mode == mode
 
         press("[name=arm]", "armed")
-        other = {"command": "release", "client": "another"}
-        refused = send(commands, other, 60.0)
-        assert "page" in refused["error"]  # it commands the hand
+        assert "page" in command(commands, "release", client="another")["error"]  # it commands
         press("[name=grasp]", "holding")
         assert hand.state().goal_force == pytest.approx(5.0)
         for name, colour in COLOURS.items():
@@ -112,7 +110,7 @@ def test_every_button_brings_its_mode_and_a_lost_page_gives_the_hand_back(
             ):
                 until(lambda: page.fraction(panel, seen) > least)  # noqa: B023
         until(lambda: page.fraction("hand", (0, 158, 115)) > 0.001)  # the object
-        ask("[name=rotate]:last-of-type", lambda: hand.state().goal_angle > math.radians(4.0))
+        page.ask("[name=rotate]:last-of-type", lambda: hand.state().goal_angle > math.radians(4.0))
         hand.wait_for(lambda state: state.mode == "holding", 60.0)
         page.click("[name=disarm]")
         until(lambda: "lets the object fall" in page.text(".reply"))
@@ -121,7 +119,7 @@ def test_every_button_brings_its_mode_and_a_lost_page_gives_the_hand_back(
         page.key("Space", key=" ", text=" ")
         hand.wait_for(lambda state: state.mode == "disarmed", 60.0)
         until(lambda: page.text(".reply") == "✓ stop: ok")  # and grasp was not pressed
-        ask("[name=tare]", lambda: page.text(".reply") == "✓ tare: ok")
+        page.ask("[name=tare]", lambda: page.text(".reply") == "✓ tare: ok")
         press("[name=arm]", "armed")
         press("[name=grasp]", "holding")
         until(lambda: page.click("[name=disarm]") or hand.state().mode == "disarmed")
@@ -130,7 +128,7 @@ def test_every_button_brings_its_mode_and_a_lost_page_gives_the_hand_back(
         press("[name=stop]", "disarmed")
         press("[name=arm]", "armed")
         page.browser.open("about:blank")
-        until(lambda: send(commands, other, 60.0)["ok"])
+        until(lambda: command(commands, "release", client="another")["ok"])
         viewed.end()
 
 
@@ -147,8 +145,7 @@ def test_the_page_keeps_up_survives_sleep_and_reload_and_asks_nobody_else(page, 
         page.key("Space", key=" ", text=" ")
         page("send('stop')")
         page.open(viewed.commanding)
-        page.click("[name=clear]")
-        until(lambda: page.text(".reply") == "✓ clear: ok")
+        page.ask("[name=clear]", lambda: page.text(".reply") == "✓ clear: ok")
         assert [each["command"] for each in fake.requests] == ["clear"]  # no stop without it
         until(lambda: page.lag() < 0.5)
 
@@ -168,8 +165,7 @@ def test_the_page_keeps_up_survives_sleep_and_reload_and_asks_nobody_else(page, 
         page("location.reload()")
         until(lambda: page("performance.getEntriesByType('navigation')[0].type") == "reload")
         until(lambda: page("document.body?.dataset.seq"))
-        page.click("[name=clear]")
-        until(lambda: fake.requests[-1]["command"] == "clear")
+        page.ask("[name=clear]", lambda: fake.requests[-1]["command"] == "clear")
         assert fake.requests[0]["client"] != fake.requests[-1]["client"]
 
         page.browser.resize(390, 844, 2)

@@ -108,6 +108,7 @@ def test_long_and_wide_texts_are_cut():
 def test_status_follows_the_age():
     feed = fed()
     assert [feed.status(now) for now in (0.4, 0.6, 1.9, 2.1)] == ["live", "stale", "stale", "lost"]
+    assert "◐ stale" in shown(feed, 0.6)
     slow = Feed()
     for k in range(100):  # one state a second: a pause of 2 s is no loss
         give(slow, b"hand/state", fake_daemon.state(k, k) | {"mono_ns": k * 10**9}, float(k))
