@@ -657,7 +657,7 @@ def _learn_scales(f: FilterState, ramping: bool) -> None:
     both = f.tip[0].in_contact and f.tip[1].in_contact
     s.doubted = s.doubted or witnesses.doubts(grasp.witnesses)
     if both and not s.gripping:
-        scales.begin_grip(s)
+        scales.begin_grip(s, f.response > 0.0)
         for k in range(2):  # or else it would count for evidence how far back the scales have gone
             if 0.0 < f.tip[k].before < math.inf:
                 _take_height(f.tip[k], s, k)

@@ -44,6 +44,7 @@ _LOAD_ERROR = 0.05  # N·m, standard deviation of what stands in a joint beside 
 _GAIN_WALK = 0.05  # 1/√s, what a sensor's gain does in a grip: warmth, creep
 _OFFSET_WALK = 0.05  # N·m/√s, what friction does while the force ramps
 _FORGET = 0.1  # fraction of what was learnt, with each new grip
+_RELOADED = 0.4  # of the way from a slow cell's gain variance to its prior, with each loading
 _HEIGHT_ERROR = 0.02  # of a frame's height, by all that the model leaves out
 _TORQUE_NOISE = 0.02  # N·m of a joint that stands
 _MOVING_NOISE = 0.05  # N·m of one that moves: inertia, damping
@@ -135,11 +136,12 @@ def forget(scales: Scales, fraction: float) -> None:
 
 
 @inner_kernel
-def begin_grip(s: Scales) -> None:
+def begin_grip(s: Scales, slow: bool) -> None:
     """Begin a new grip: offsets are unknown again, and the rest becomes a little less certain.
 
     Means go back towards what is set as standard deviations do. Nothing measured tells a stiffer
-    tip from a smaller torque constant: without that, both would drift from grip to grip.
+    tip from a smaller torque constant: without that, both would drift from grip to grip. ``slow``
+    cells read low early in each ramp: with a gain still sure, that would soften the tip each time.
     """
     s.gripping = True
     for i in range(STATES):
@@ -150,6 +152,8 @@ def begin_grip(s: Scales) -> None:
             else:
                 s.covariance[i, j] *= 1.0 - _FORGET
         s.covariance[i, i] += s.prior[i] * (1.0 if i >= OFFSET else _FORGET)
+        if slow and GAIN <= i < TORQUE:
+            s.covariance[i, i] += _RELOADED * max(s.prior[i] - s.covariance[i, i], 0.0)
     s.mean[OFFSET] = s.mean[OFFSET + 1] = s.most = 0.0
 
 
@@ -216,15 +220,13 @@ def update_height(s: Scales, finger: int, height: float, variance: float, known:
 
     Of its inverse ``variance`` so much was ``known`` here before, and went into it.
     """
-    slopes = s.slopes
-    slopes[MODULUS + finger] = slopes[GAIN + finger] = 1.0
-    found = math.log(min(max(height, _HEIGHTS[0]), _HEIGHTS[1]))
-    innovation = found - s.mean[MODULUS + finger] - s.mean[GAIN + finger]
     new = 1.0 - known * variance
     if new > 0.0:
+        s.slopes[MODULUS + finger] = s.slopes[GAIN + finger] = 1.0
+        found = math.log(min(max(height, _HEIGHTS[0]), _HEIGHTS[1]))
+        innovation = found - s.mean[MODULUS + finger] - s.mean[GAIN + finger]
         noise = variance / new + _HEIGHT_ERROR * _HEIGHT_ERROR
         _update(s, innovation / new, noise, math.inf)
-    slopes[:] = 0.0
 
 
 @inner_kernel
@@ -256,9 +258,7 @@ def update_torque(s: Scales, torque: Pair, moment: Pair, speed: float, t: float)
         slopes[TORQUE + k] = 0.5 * moment[k]
         slopes[OFFSET + k] = 0.5
     innovation -= s.friction * min(max(speed / _MOVING, -1.0), 1.0) + s.inertia * faster / since
-    noise = _TORQUE_NOISE
-    if abs(speed) > _MOVING:
-        noise = _MOVING_NOISE
+    noise = _MOVING_NOISE if abs(speed) > _MOVING else _TORQUE_NOISE
     # Where torques have gone back, the gears hold something between nothing and all of it.
     given = 0.5 * (torque[0] + torque[1])
     s.most = max(s.most, given)

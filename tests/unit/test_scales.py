@@ -9,7 +9,7 @@ from softfinger.daemon.perception import scales
 from softfinger.daemon.perception.scales import UNKNOWN, Prior, Scales, set_prior
 from softfinger.kinematics.compiled.kernel import kernel
 from softfinger.kinematics.compiled.layout import Pair, Records
-from softfinger.tools.benchmarks.rigs import SOLID, Sections, merged
+from softfinger.tools.benchmarks.rigs import SENSORS, SOLID, Sections, merged
 from softfinger.tools.watched import Watched as Hand
 from tests.unit.test_control import grasped
 
@@ -26,8 +26,8 @@ FRICTION = ("friction", "stribeck", "load_friction", "stribeck_speed", "damping"
 
 
 @kernel
-def begin(records: Records[Scales]) -> None:
-    scales.begin_grip(records[0])
+def begin(records: Records[Scales], slow: bool) -> None:
+    scales.begin_grip(records[0], slow)
 
 
 @kernel
@@ -63,9 +63,10 @@ class Reference:
         self.p = np.diag(self.prior)
         self.most = 0.0  # torque [N·m]
 
-    def begin(self) -> None:
-        kept, forgotten = self.p * 0.9, np.diag(self.prior) * 0.1
-        self.p = kept + forgotten
+    def begin(self, slow: bool) -> None:
+        self.p = 0.9 * self.p + 0.1 * np.diag(self.prior)
+        gains = [2, 3] if slow else []
+        self.p[gains, gains] += 0.4 * np.maximum(self.prior - np.diag(self.p), 0.0)[gains]
         self.x += 0.05 * (self.expected - self.x)
         self.p[6:, :] = self.p[:, 6:] = 0.0
         self.p[6:, 6:] = np.diag(self.prior[6:])
@@ -86,8 +87,8 @@ def test_the_filter_is_kalmans(product: bool) -> None:
     found, wanted = Scales(), Reference()
     set_prior(found, PRIORS, friction=0.05, inertia=0.01, held=HELD)
     found.product[:] = float(product)
-    begin(found.array)
-    wanted.begin()
+    begin(found.array, product)
+    wanted.begin(product)
     t = 1.0
     torques(found.array, np.zeros(2), np.zeros(2), 0.0, t)  # the first only says how fast
     for k in range(200):
@@ -119,8 +120,8 @@ def test_the_filter_is_kalmans(product: bool) -> None:
         h = np.array([0, 0, -1.0, 1.0, 0, 0, 0, 0] if product else [1.0, -1.0, 0, 0, 0, 0, 0, 0])
         wanted.take(h, np.log(forces[1] / forces[0]), (0.05 + 0.4 / forces.min()) ** 2)
         if k == 100:
-            begin(found.array)
-            wanted.begin()
+            begin(found.array, product)
+            wanted.begin(product)
     np.testing.assert_allclose(found.mean, wanted.x, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(found.covariance, wanted.p, rtol=1e-7, atol=1e-14)
 
@@ -139,7 +140,7 @@ def test_no_measurement_however_wild_leaves_it_surer_than_numbers_can_be() -> No
         found = Scales()
         set_prior(found, PRIORS, friction=0.05, inertia=0.01, held=HELD)
         found.product[:] = rng.integers(0, 2, 2)
-        begin(found.array)
+        begin(found.array, False)
         for k in range(60):
             height(found.array, int(rng.integers(0, 2)), one(1.0), max(one(1e-2), 1e-12), one(0.0))
             moments = (one(0.2), one(0.2)), (one(0.2), one(0.2))
@@ -224,7 +225,7 @@ def test_no_torque_constant_is_learnt_that_no_servo_has() -> None:
     moment = np.full(2, 0.3)
     for k in range(1000):
         if k % 100 == 0:
-            begin(record.array)
+            begin(record.array, False)
         torques(record.array, -moment, moment, 0.0, 0.01 * k)
     np.testing.assert_allclose(record.mean[scales.TORQUE : scales.OFFSET], -0.3)
     keep(record.array)
@@ -232,11 +233,12 @@ def test_no_torque_constant_is_learnt_that_no_servo_has() -> None:
     np.testing.assert_array_equal(record.mean, record.expected)
 
 
-def test_honest_grips_of_solid_tips_go_on_as_they_began() -> None:
-    with Hand(SOLID) as hand:
+@pytest.mark.parametrize(("sections", "seconds"), [(SOLID, 1.2), (SENSORS["velostat"], 3.0)])
+def test_honest_grips_go_on_as_they_began(sections: Sections, seconds: float) -> None:
+    with Hand(sections) as hand:
         hand.grasp(8.0)
         for _ in range(12):
-            hand.run(1.2)
+            hand.run(seconds)
             assert hand.plant.normal.mean() == pytest.approx(8.0, rel=0.06)
             hand.command("release")
             hand.run(0.5)
@@ -303,7 +305,7 @@ def test_grips_that_come_to_no_hold_and_a_tare_lead_back_to_what_is_set() -> Non
         found = hand.contact_filter.grasp.scales
         found.kept_mean[:6] += (0.5, -0.3, 0.4, 0.2, -0.3, 0.3)
         for _ in range(8):
-            begin(found.array)
+            begin(found.array, False)
             scales.end_touch(found)
         np.testing.assert_allclose(found.mean, 0.0, atol=0.003)
         np.testing.assert_allclose(np.diag(found.covariance), found.prior, rtol=0.01)
