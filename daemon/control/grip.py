@@ -126,7 +126,7 @@ class Grip:
     def load_needs(self) -> float:
         """Return the force [N] that the load needs with its margin, what may be hidden included."""
         law, grasp = self.slip.law, self._grasp
-        load = max(self.slip.load, self.slip.felt, 0.5 * law.object_load)
+        load = self.slip.guarded
         if not law.shear_shows and law.object_load == 0.0:  # nothing says that there is none
             load = max(load, law.joint_friction / max(grasp.load_arm, 0.5 * law.width))
         spare = law.friction * (1.0 - law.margin) - grasp.shear

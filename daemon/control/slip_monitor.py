@@ -98,6 +98,7 @@ class SlipState(Record):
     law: SlipLaw
     friction: float  # of a joint, what gears hold of this tick's force included [N·m]
     load: float  # that each tip may bear along its face, hidden part included [N]
+    guarded: float  # likewise, as tips feel it and as declared included: the force is for that [N]
     turned: bool  # the object has turned in the grip, at this tick
     reflex: bool  # it has, or a load came at once: the grip is to be raised at once
     known: bool  # what stood of the joints' torques when holding began:
@@ -133,7 +134,7 @@ def set_law(law: SlipLaw, settings: Settings) -> None:
 def forget(s: SlipState) -> None:
     """Forget the object: nothing is held any more, or something else."""
     s.turned = s.known = s.reflex = False
-    s.load = s.felt = s.twisted = s.still = s.age = s.friction = 0.0
+    s.load = s.guarded = s.felt = s.twisted = s.still = s.age = s.friction = 0.0
     s.smooth[:] = s.variance[:] = s.speed[:] = 0.0
     s.unexplained_rotation[:] = s.away[:] = 0.0
     s.needed = s.force_limit = s.idle = 0.0
@@ -183,10 +184,8 @@ def update(
         s.load = min(s.load, felt + _SHEAR_JUMP)
     bears = spare * mean(grasp.normal)
     sudden = _shear_jumps(s, felt, grasp.twisted, bears, monitored) or sudden
-    load = max(s.load, felt, 0.5 * law.object_load)
-    needed = 0.0
-    if load > 0.0:
-        needed = load / max(spare, _SPARE_MIN * law.friction)
+    s.guarded = max(s.load, felt, 0.5 * law.object_load)
+    needed = s.guarded / max(spare, _SPARE_MIN * law.friction)
     if s.turned:
         needed = max(needed, (1.0 + _TURNED_MORE) * max(commanded, s.needed))
     s.reflex = s.turned or sudden

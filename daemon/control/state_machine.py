@@ -342,11 +342,9 @@ class Control:
         if self._lost > 0.0:
             self._still = False  # the force is built up again: what moves joints is no load
             self._waiting = self._lost = 0.0
-        if self._pose.width < self._settings.object.width_min or self._empty > 0.0:
-            self._is_empty(dt)
+        self._is_empty(dt)
         self._pull(self._grip.torques(self._reading, self._pose, self._still), goal)
-        if self._grip.slipped or self._raised or self._grip.target != self._grip.commanded:
-            self._watch_slip()
+        self._watch_slip()
         if not self._still:
             if self.mode is not Mode.GRASPING:
                 self._watch_turning()
@@ -402,8 +400,10 @@ class Control:
             self._raised = False
         elif grip.target > _RAISED * grip.commanded and not self._raised:
             self._raised = True
-            load = f"each tip may bear {grip.slip.load:.1f} N along its face"
-            text = f"grip raised above {grip.commanded:.1f} N: {load}"
+            why = "the object turns in it" if grip.slipped else "a load came at once"
+            if grip.slip.guarded > 0.0:
+                why = f"each tip may bear {grip.slip.guarded:.1f} N along its face"
+            text = f"grip raised above {grip.commanded:.1f} N: {why}"
             self.events.append(("warning", "slip", text))
 
     def _watch_turning(self) -> None:

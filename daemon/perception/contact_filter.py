@@ -144,8 +144,8 @@ class ContactFilter:
     ) -> None:
         """Update by a finger's new ``frame`` and its ``estimate``; write both into ``contact``.
 
-        In a contact a frame that ``changes`` nothing, bit by bit, tells nothing new: a frozen
-        sensor sends it while the joints close.
+        In a contact a frame that ``changes`` nothing, bit by bit, tells nothing new: a board that
+        has frozen, or repeats its last second, sends it while the joints close.
         """
         contact.seq, contact.t, contact.t_arrival = frame.seq, frame.t_sample, frame.t_arrival
         self._invalid[finger] = estimate.invalid if frame.valid else Invalid.FRAME

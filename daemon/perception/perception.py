@@ -28,6 +28,7 @@ _STEPS = 65535  # of a published pressure
 _REMEMBERED = 2.0  # s of frames that are known again
 _REPEATED = 0.1  # s of frames that come again, from which on that is no chance …
 _DISTINCT = 5  # … and how many they are at least
+_CELLS = 4  # that change from each to the next: one or two that flicker come again by chance
 
 
 class Perception:
@@ -75,8 +76,8 @@ class Perception:
 class Repeats:
     """Notices frames that come again in the order in which they came before.
 
-    A sensor with noise never repeats one. One without, at rest, sends the same frame for long: that
-    is no repetition, and judged as a frozen sensor.
+    A sensor with noise never repeats one. One without, at rest, sends the same frame for long, or
+    one of two: that is no repetition; what stays the same is judged as a frozen sensor.
     """
 
     def __init__(self, rate: float, enabled: bool = True) -> None:
@@ -85,27 +86,28 @@ class Repeats:
         self.lag = 0  # frames after which they come again, 0: they don't
         self._run = 0  # frames in a row that did so
         self._enough = max(round(_REPEATED * rate), _DISTINCT)
-        self._digests: deque[int] = deque(maxlen=round(_REMEMBERED * rate))
-        self._seen: dict[int, int] = {}  # digest → number of the last such frame
-        self._number = 0
+        self._digests: deque[int] = deque(maxlen=round(_REMEMBERED * rate))  # newest first
+        self._last: NDArray[np.uint16] | None = None  # frame
+
+    @property
+    def again(self) -> bool:
+        """True if the last two frames came in this order before."""
+        return self._enabled and self._run > 1
 
     @property
     def long(self) -> bool:
         """True if the frames have repeated for long enough to be sure."""
-        return self._enabled and self._run >= self._enough
+        return self.again and self._run >= self._enough
 
     def differs(self, data: NDArray[np.uint16]) -> bool:
         """Take in a frame; return whether it differs from the last."""
-        digest = hash(data.tobytes())
-        number, digests = self._number + 1, self._digests
-        before = self._seen.get(digest)
-        if before == self._number and digests:
+        last, self._last = self._last, data.copy()
+        changed = np.count_nonzero(data != last)
+        if not changed:
             return False
-        if len(digests) == digests.maxlen and self._seen[digests[0]] == number - len(digests):
-            del self._seen[digests[0]]
-        digests.append(digest)
-        self._number = self._seen[digest] = number
-        lag = 0 if before is None else number - before
+        digest, digests = hash(data.tobytes()), self._digests
+        lag = digests.index(digest) + 1 if changed >= _CELLS and digest in digests else 0
+        digests.appendleft(digest)
         self._run = self._run + 1 if lag and lag == self.lag else min(lag, 1)
         self.lag = lag
         return True
@@ -123,8 +125,8 @@ class FingerPerception:
         self.sensor = sensor
         self.frame: Frame | None = None
         self.frames = 0  # that came
-        self.changes = True  # the newest differs from the last
-        self.changed = 0.0  # when one that does arrived [s]
+        self.changes = True  # the newest tells anything new
+        self.changed = 0.0  # when one that differs from its last arrived [s]
         # A recording that plays from its start again repeats itself.
         self.repeats = Repeats(settings.tactile.rate, tactile.backend != "replay")
         self.estimate = ContactEstimate()  # of the last valid frame
@@ -161,8 +163,9 @@ class FingerPerception:
         frame, last = self.sensor.latest(), self.frame
         if frame is None or frame is last:
             return None
-        self.changes = self.repeats.differs(frame.data)
-        if self.changes:
+        differs = self.repeats.differs(frame.data)
+        self.changes = differs and not self.repeats.again
+        if differs:
             self.changed = frame.t_arrival
         self.frame = frame
         self.frames += 1

@@ -97,17 +97,12 @@ class HeatWatch:
             for _ in range(max(round(passed / _EVERY), 1)):
                 step = min(passed, _EVERY)
                 follow(self._states[i].array, square, step, self._state.reading.temperature[i])
-            self._publish(i)
-
-    def _publish(self, i: int) -> None:
-        heat, told = self._states[i], self._state.heat[i]
-        told.winding, told.case, told.ambient = (
-            heat.x.item(which) for which in (WINDING, CASE, AMBIENT)
-        )
-        told.winding_std = winding_std(heat.array)
-        told.case_std = math.sqrt(heat.p.item(CASE, CASE))
-        limit = self._limits.temperature_max - _STEP
-        told.time_to_limit = time_to_limit(heat.array, self._square[i], limit)
+            heat, told = self._states[i], self._state.heat[i]
+            told.winding, told.case, told.ambient = heat.x[[WINDING, CASE, AMBIENT]].tolist()
+            told.winding_std = winding_std(heat.array)
+            told.case_std = math.sqrt(heat.p.item(CASE, CASE))
+            limit = self._limits.temperature_max - _STEP
+            told.time_to_limit = time_to_limit(heat.array, self._square[i], limit)
 
     def act(self, control: Control, events: list[Event]) -> str:
         """Ease a grip that gets too hot; return what `heat_action` wants done now, else ''."""

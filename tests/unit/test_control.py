@@ -188,6 +188,7 @@ def test_a_known_load_raises_the_grip_within_its_bound():
             # 12 N on two tips at 80 % of μ = 0.6
             assert hand.mode == "holding"
             assert seen.force[-200:].mean() == pytest.approx(expected, rel=KNOWN)
+            assert any("each tip may bear 6.0 N along" in text for _, _, text in hand.events)
 
 
 @pytest.mark.parametrize("sections", [{}, PAPER], ids=["100 Hz", "25 Hz"])

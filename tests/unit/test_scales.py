@@ -250,7 +250,7 @@ def test_honest_grips_go_on_as_they_began(sections: Sections, seconds: float) ->
     ("kind", "value", "fingers", "forces"),
     [
         ("gain", 0.3, (0, 1), (3.0,)),  # does not come to hold
-        ("replay", 0.3, (1,), (15.0, 20.0)),  # ends in a fault, the sensor named
+        ("replay", 0.3, (1,), (15.0, 20.0)),  # teaches little, and ends in a fault
     ],
 )
 def test_what_a_grip_taught_that_did_not_hold_is_not_kept(kind, value, fingers, forces):
@@ -268,7 +268,7 @@ def test_what_a_grip_taught_that_did_not_hold_is_not_kept(kind, value, fingers, 
         for _ in range(30):
             hand.run(0.01)
             taught = max(taught, np.abs(learnt).max())
-        assert taught > 0.2
+        assert (taught > 0.2) == (kind == "gain")
         for each in hand.plant.measurement_faults:
             each.clear()
         hand.run(0.9)

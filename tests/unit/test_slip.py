@@ -15,6 +15,7 @@ from tests.unit.test_control import KNOWN, PAPER, grasped
 
 FORCE = 10.0
 BORNE = 2.0 * 0.6 * FORCE  # N, what both tips' friction bears at that grip
+FRICTION = 0.05 / 0.03  # N of a load, what a joint's friction may hide of it by 30 mm
 
 
 @pytest.mark.parametrize("sections", [{}, PAPER], ids=["100 Hz", "25 Hz"])
@@ -70,6 +71,7 @@ def test_an_object_that_turns_in_the_grip_is_gripped_more_firmly():
             turned = abs(hand.plant.object_pose[2] - start)
             assert (turned < math.radians(5.0)) == held
             assert (hand.plant.force.mean() > 1.2 * FORCE) == held
+            assert any("N: the object turns in it" in text for _, _, text in hand.events) == held
 
 
 class Watched:
@@ -114,12 +116,11 @@ def test_what_friction_may_be_is_not_a_load_and_what_it_can_not_is():
     watched.grip.begin_holding()
     assert watched.run(1.5, 500) == FORCE
     assert watched.grip.slip.load == 0.0
-    # As much more as friction may hide of it: 0.05 N·m over 30 mm.
-    hidden = 0.05 / 0.03
+    # As much more as friction may hide of it.
     for load in np.linspace(1.5, 6.0, 500):
         watched.run(load, 1)
     found = watched.run(6.0, 500)
-    expected = (6.0 - watched.grip.slip.still / 0.03 + hidden) / (0.6 * 0.8)
+    expected = (6.0 - watched.grip.slip.still / 0.03 + FRICTION) / (0.6 * 0.8)
     assert found == pytest.approx(expected, rel=0.01)
 
 
@@ -137,13 +138,12 @@ GIVES_WAY = -0.024  # rad/s, a count
 
 def test_a_load_that_comes_at_once_raises_the_grip_at_once_by_all_it_may():
     watched = at_rest()
-    friction = 0.05 / 0.03
     # What moves no joint is a frame's error, and so little that friction holds it is no danger.
-    assert watched.run(3.0 * friction, 1) == FORCE
+    assert watched.run(3.0 * FRICTION, 1) == FORCE
     watched = at_rest()
-    assert watched.run(0.8 * friction, 1, speed=GIVES_WAY) == FORCE
+    assert watched.run(0.8 * FRICTION, 1, speed=GIVES_WAY) == FORCE
     watched = at_rest()
-    assert watched.run(2.0 * friction, 1, speed=GIVES_WAY) == FORCE + 10.0
+    assert watched.run(2.0 * FRICTION, 1, speed=GIVES_WAY) == FORCE + 10.0
     state = watched.grip._state
     assert state.grip_force > 1.15 * (FORCE + 10.0), "at the same tick"
     # As much as the torque constants' error, friction and the load may take, and no more.
@@ -151,27 +151,25 @@ def test_a_load_that_comes_at_once_raises_the_grip_at_once_by_all_it_may():
     assert state.grip_force <= most + 1e-9
     # The force felt comes up: the controller holds what the reflex gave.
     watched.held.force = [FORCE + 10.0] * 2
-    watched.run(2.0 * friction, 1)
+    watched.run(2.0 * FRICTION, 1)
     assert state.grip_force == pytest.approx(FORCE + 10.0, rel=0.03)
 
 
 def test_a_twist_that_comes_at_once_raises_the_grip_at_once():
-    friction = 0.05 / 0.03
     for speed, raised in ((0.0, 0.0), (-GIVES_WAY, 0.0), (GIVES_WAY, 10.0)):
         watched = at_rest()
-        assert watched.run(2.0 * friction, 1, speed=speed, sense=-1.0) == FORCE + raised
+        assert watched.run(2.0 * FRICTION, 1, speed=speed, sense=-1.0) == FORCE + raised
     watched = at_rest()
-    assert watched.run(0.8 * friction, 1, speed=GIVES_WAY, sense=-1.0) == FORCE
+    assert watched.run(0.8 * FRICTION, 1, speed=GIVES_WAY, sense=-1.0) == FORCE
 
 
 def test_a_load_that_stands_leaves_less_to_come():
     """With 3 N on each tip, a third of what alone would be no danger is one."""
-    friction = 0.05 / 0.03
     watched = at_rest()
     for load in np.linspace(0.0, 3.0, 500):
         watched.run(load, 1)
     assert watched.run(3.0, 1000) == FORCE
-    assert watched.run(3.0 + 0.8 * friction, 1, speed=GIVES_WAY) == FORCE + 10.0
+    assert watched.run(3.0 + 0.8 * FRICTION, 1, speed=GIVES_WAY) == FORCE + 10.0
 
 
 @pytest.mark.parametrize("kind", ["sheared", "twisted"])
@@ -265,14 +263,13 @@ def test_late_frames_leave_the_push_and_let_a_turn_come_to_rest():
     held = some_held(generator, 8.0)
     grip = Grip(Settings(), [0, 1], held)
     held.jacobian_slide, held.moment_arm = 0.0, [0.08, 0.08]
-    reading = Reading()
     grip.start(8.0, 8.0)
     grip.steer(0.0, 0.3)
     for _ in range(100):
-        grip.torques(reading, ObjectPose(True, 0.0, 0.03), False)
+        grip.torques(Reading(), ObjectPose(True, 0.0, 0.03), False)
     pushes, leans = [], []
     for _ in range(400):
-        left, right = grip.hold_goal(reading)
+        left, right = grip.hold_goal(Reading())
         pushes.append(left / held.moment_arm[0] + right / held.moment_arm[1])
         leans.append(left - right)
     assert np.ptp(pushes) < 1e-6 * pushes[0]

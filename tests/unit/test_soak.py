@@ -9,7 +9,7 @@ from softfinger.daemon.types import Goal, Reading
 from tests.soak import virtual
 from tests.soak.virtual import Account, Soak, sequence
 
-SEEDS = (24, 26, 27, 4030, 4035, 4144, 4233)
+SEEDS = (24, 26, 27, 4030, 4035, 4044, 4144, 4233)
 
 
 @pytest.fixture
