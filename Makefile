@@ -23,7 +23,7 @@ TO_DOCUMENT := $(VENV)/.ready-docs
 # Byte code is kept whatever the environment says: a test run starts hundreds of processes.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: run test docs lowest lint format clean
+.PHONY: run test warm docs lowest lint format clean
 
 run: $(TO_RUN)
 	@echo "Starting the simulated hand at work; q ends it."
@@ -32,6 +32,11 @@ run: $(TO_RUN)
 test: $(TO_TEST)
 	@$(BIN)/softfinger compile --all
 	$(BIN)/python -m pytest --numprocesses $(WORKERS) --dist worksteal $(COVERAGE) $(ARGS)
+
+# Else each test process makes its own at the same time: byte code, kernels of solid tips.
+warm: $(TO_TEST)
+	-@$(BIN)/python -m pytest --collect-only --quiet >/dev/null
+	@$(BIN)/softfinger compile --all --config solid
 
 docs: $(TO_DOCUMENT)
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict
