@@ -21,7 +21,7 @@ were at the height a: its moment about the base's middle is T a.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -109,11 +109,15 @@ def with_partials(energy: FloatArray, root: float, square: float) -> FloatArray:
 
 def powers(terms: FloatArray) -> FloatArray:
     """Return Chebyshev coefficients [i, j] as those of powers."""
-    left, right = (
-        np.array([np.pad(chebyshev.cheb2poly(row), (0, n))[:n] for row in np.eye(n)])
-        for n in terms.shape
-    )
-    return np.asarray(left.T @ terms @ right)
+    in_t, in_square = (to_powers(count) for count in terms.shape)
+    return np.asarray(in_t @ terms @ in_square.T)
+
+
+@cache
+def to_powers(count: int) -> FloatArray:
+    """Return the matrix from ``count`` Chebyshev coefficients to those of rising powers."""
+    columns = [chebyshev.cheb2poly(row) for row in np.eye(count)]
+    return np.stack([np.pad(column, (0, count - len(column))) for column in columns], axis=1)
 
 
 def _slope(rising: FloatArray) -> FloatArray:

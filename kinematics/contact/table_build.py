@@ -39,6 +39,7 @@ from softfinger.kinematics.contact.quadrature import (
     nodes_for,
     ratios_at,
 )
+from softfinger.kinematics.contact.solid_data import to_powers
 
 FloatArray = NDArray[np.float64]
 
@@ -171,7 +172,7 @@ def _rounding(terms: FloatArray, steep: float, low: float) -> FloatArray:
     """
     i, j = np.arange(terms.shape[1])[:, None], np.arange(terms.shape[2])
     size = np.abs(terms)
-    powers = np.abs(_to_powers(len(i))), np.abs(_to_powers(len(j)))
+    powers = np.abs(to_powers(len(i))), np.abs(to_powers(len(j)))
     sums = 32.0 * np.einsum("ai,bj,kij->k", *powers, size, optimize=True)
     by_h = 2.0 * (steep + 1.0) * (i**2 * size).sum(axis=(1, 2))
     second = 4.0 * (j**2 * (j**2 - 1.0) / 3.0 * size).sum(axis=(1, 2))
@@ -203,8 +204,8 @@ def _powers(terms: FloatArray, columns: tuple[int, ...]) -> FloatArray:
     """Chebyshev coefficients [5, x, y] as the numbers that `compiled.simd` evaluates."""
     rising = np.einsum(
         "ai,bj,kij->kab",
-        _to_powers(terms.shape[1]),
-        _to_powers(terms.shape[2]),
+        to_powers(terms.shape[1]),
+        to_powers(terms.shape[2]),
         terms,
         optimize=True,
     )
@@ -235,10 +236,3 @@ def _ratios_at(law: LawTerms, h: FloatArray, y: FloatArray) -> FloatArray:
         law.gauss, law.circle, law.polynomials, delta.ravel(), h.ravel(), s.ravel(), c.ravel(), out
     )
     return out.reshape(LANES, *h.shape)
-
-
-@cache
-def _to_powers(count: int) -> FloatArray:
-    """Matrix from ``count`` Chebyshev coefficients to those of rising powers."""
-    columns = [chebyshev.cheb2poly(row) for row in np.eye(count)]
-    return np.stack([np.pad(column, (0, count - len(column))) for column in columns], axis=1)

@@ -102,13 +102,14 @@ def _means(tip: Fingertip, z: NDArray[np.complex128]) -> FloatArray:
     phase = z / np.maximum(r, 1e-12)
     found: list[FloatArray] = []
     modes = zip([*data.harmonics.tolist(), 1], [*data.modes, data.shear], strict=True)
+    powers = {m: phase**m for m in {*data.harmonics.tolist(), 1}}
     for m, mode in modes:
         # Where m > 0 a mode goes to 0 at the middle.
         start = 0.0 if m else 1.5 * mode[0] - 0.5 * mode[1]
         value = np.interp(r, [0.0, *middle], [start, *mode]) * inside
-        found.append((value * (phase**m).real).sum(axis=1))
+        found.append((value * powers[m].real).sum(axis=1))
         if m:
-            found.append((value * (phase**m).imag).sum(axis=1))
+            found.append((value * powers[m].imag).sum(axis=1))
     return np.stack(found)
 
 

@@ -182,8 +182,8 @@ def test_a_hold_that_hardly_warms_tells_nothing(tmp_path, capsys):
 
 
 def hot(force: float, seconds: float, **sections: dict[str, Any]) -> Watched:
-    """A grip on servos that soon get too hot."""
-    sections["simulation"] = {"servo_heat": FAST, "ambient": 35.0}
+    """A grip on servos that soon get too hot: half the frames a hand has."""
+    sections |= {"simulation": {"servo_heat": FAST, "ambient": 35.0}, "tactile": {"rate": 50.0}}
     hand = Watched(sections)
     hand.grasp(force)
     hand.run(2.0)
