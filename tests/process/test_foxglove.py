@@ -25,6 +25,7 @@ from softfinger.tools.viewing.planar import hand_parts
 from tests.conftest import until
 from tests.harness.daemon_process import started
 from tests.harness.fake_daemon import FakeDaemon, event, frame, state
+from tests.process.test_strangers import place
 
 TOPICS = {
     "hand/state": "hand.state",
@@ -205,7 +206,9 @@ def test_a_client_that_takes_nothing_makes_room_for_another(stranger):
     with ExitStack() as stack:
         lazy = []
         for _ in range(CLIENTS):
-            client = stack.enter_context(socket.create_connection(local(address), timeout=WAIT))
+            client = stack.enter_context(
+                socket.create_connection(place(address.removeprefix("ws://")), timeout=WAIT)
+            )
             client.sendall(REQUEST)
             answer = b""
             while b'"advertise"' not in answer:
@@ -221,7 +224,7 @@ def test_a_client_that_takes_nothing_makes_room_for_another(stranger):
 
 def test_what_asks_for_nothing_or_what_isnt_is_ended(stranger):
     _, address = stranger
-    with socket.create_connection(local(address), timeout=WAIT) as client:
+    with socket.create_connection(place(address.removeprefix("ws://")), timeout=WAIT) as client:
         client.sendall(b"GET / HTTP/1.1\r\n")  # its head has no end
         assert client.recv(100) == b""
     for odd in ("{", "[]", '{"op": 3}x', '"id": 1, "channelId": 99', '"id": NaN, "channelId": 0'):
@@ -243,11 +246,6 @@ def masked(message: dict[str, Any]) -> bytes:
     text = json.dumps(message).encode()
     assert len(text) < 126
     return bytes([0x81, 0x80 | len(text), 0, 0, 0, 0]) + text
-
-
-def local(address: str) -> tuple[str, int]:
-    host, _, port = address.removeprefix("ws://").partition(":")
-    return host, int(port)
 
 
 def welcomed(address: str) -> bool:
