@@ -51,7 +51,7 @@ def test_a_grasp_outside_is_warned_of_in_its_reply():
 def test_a_map_is_found_printed_drawn_and_read_back(tmp_path, capsys):
     kept, picture = tmp_path / "map.toml", tmp_path / "map.png"
     words = ["envelope", "--shape", "rectangle", "--size", "2", "40", "--mass", "1"]
-    words += ["--friction", "0.2", "0.6"]
+    words += ["--friction", "0.2", "0.6", "--processes", "1"]
     assert main([*words, "--keep", str(kept), "--plot", str(picture)]) == 0
     rows = [line.split()[-2:] for line in capsys.readouterr().out.splitlines()[3:]]
     assert rows == [["r", "l"], ["r", "h"]]

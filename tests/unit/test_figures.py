@@ -21,8 +21,7 @@ from tests.harness.paper_tip import CHECKPOINTS
 
 def read(path: Path) -> dict[str, NDArray[np.float64]]:
     """Columns of a CSV of numbers by their header; an empty cell is NaN."""
-    with path.open(encoding="utf-8") as file:
-        rows = list(csv.reader(file))
+    rows = list(csv.reader(path.read_text(encoding="utf-8").splitlines()))
     numbers = np.array([[float(cell or "nan") for cell in row] for row in rows[1:]])
     return dict(zip(rows[0], numbers.T, strict=True))
 
@@ -31,8 +30,7 @@ def read(path: Path) -> dict[str, NDArray[np.float64]]:
 def drawn(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Figure]]:
     """All figures, written by the command itself into a folder that it has to make; as drawn."""
     path = tmp_path_factory.mktemp("figures") / "new" / "folder"
-    kept = []
-    new = style.new_figure
+    kept, new = [], style.new_figure
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(style, "new_figure", lambda *size: (kept.append(new(*size)), kept[-1])[1])
         assert cli.main(["figures", "--out", str(path)]) == 0
@@ -178,7 +176,9 @@ def test_without_matplotlib_the_numbers_are_written(tmp_path, capsys, monkeypatc
 
 @pytest.fixture(scope="module")
 def rows() -> dict[str, Beside]:
-    return {each.quantity: each for each in validate.comparisons()}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(validate, "_TRIALS", 1)  # each takes a second
+        return {each.quantity: each for each in validate.comparisons()}
 
 
 def test_every_row_has_its_source_and_a_verdict_and_every_disagreement_a_reason(rows):
