@@ -196,9 +196,9 @@ def _without_memory(rig: Rig, chance: random.Random) -> End:
     _, hard = resource.prlimit(process, resource.RLIMIT_AS)
     size = int(Path(f"/proc/{process}/statm").read_text().split()[0]) * resource.getpagesize()
     resource.prlimit(process, resource.RLIMIT_AS, (size + _ROOM, hard))
-    for _ in range(5):
-        rig.status()
-        time.sleep(chance.uniform(0.0, 0.02))
+    for _ in range(chance.randint(5, 50)):
+        if rig.status() is None:
+            break
     return lambda: rig.alive and resource.prlimit(process, resource.RLIMIT_AS, (hard, hard))
 
 
