@@ -33,7 +33,7 @@ _EDGES = np.ldexp(
 _UPPER = np.append(_EDGES.ravel()[:-1], np.inf)  # edge of each bin; the last one has none
 
 LATE = 0.05  # s of lateness that is reported
-EVERY = 5.0  # s between two reports, of which each is of twice as much
+EVERY = 60.0  # s between two reports, of which each is of twice as much
 RECENT = 0.25  # s after a late tick in which it may be a fault's cause
 # Limits that a late tick alone can break.
 _BY_TIME = frozenset({"servos.bus", "servos.silent", "tactile.silent", "loop.overruns"})

@@ -92,7 +92,7 @@ def test_a_simulated_hand_waits_for_the_machine_and_says_so_now_and_then(on_late
     assert state.timing.late_in_row == 0
     told = [text for level, kind, text in events if kind == "late"]
     assert told == ["this machine is busy: the hand waited 0.40 s, 0.4 s in all"]
-    daemon.loop.advance(2.0)
+    daemon.loop.advance(EVERY)
     told = [text for level, kind, text in events if kind == "late"]
     assert told[1:] == ["this machine is busy: the hand waited 0.50 s, 0.9 s in all"]
 
