@@ -45,7 +45,6 @@ _PAGE = Path(__file__).with_name("page.html").read_text("utf-8").replace("MEANIN
 _LOOPBACK = "127.0.0.1"
 _PORT = 9090  # where nobody says another
 _NICE = 5  # everything real-time goes first
-_STALE = 3.0  # s from a picture to a command that is for it; also to the command's answer
 _AT_ONCE = 40  # commands that wait for their answers, of all pages
 _PATIENCE = 5.0  # s for a request's head, of a busy browser, too
 _BUFFER = 256 << 10  # bytes that wait for a page or a client of Foxglove
@@ -67,10 +66,13 @@ class Site:
         token: str | None,
         send: Callable[[dict[str, Any]], dict[str, Any]],
         foxglove: Foxglove | None,
+        stale: float,
     ) -> None:
+        """``stale`` [s] after its picture a command is dropped."""
         self._loop = loop
         self._token = token
         self._send = send
+        self._stale = stale
         self._ended = asyncio.Event()
         self.waiting: list[asyncio.Future[tuple[str, str]]] = []  # pages, for the next picture
         self.wish: Callable[[str], None] = lambda _: None  # what pages ask with each picture
@@ -183,7 +185,7 @@ class Site:
             age = time.monotonic() - float(asked.pop("seen", "nan"))
         except (ValueError, TypeError, LookupError, AttributeError) as error:
             return f"✗ no command: {error!r}"
-        if name != "stop" and not age < _STALE:
+        if name != "stop" and not age < self._stale:
             return f"✗ {name}: dropped, the page is {age:.0f} s behind"
         try:
             reply = judge(time.monotonic(), name, self._send(asked))
@@ -216,8 +218,8 @@ def show(arguments: argparse.Namespace, ending: Ending) -> None:
     foxglove = Foxglove(loop) if arguments.foxglove is not None else None
     live = recording is None
     token = secrets.token_urlsafe(16) if live else None
-    hand_on = partial(send, arguments.commands, timeout=_STALE, keys=keys)
-    site = Site(loop, token, hand_on, foxglove)
+    hand_on = partial(send, arguments.commands, timeout=arguments.timeout, keys=keys)
+    site = Site(loop, token, hand_on, foxglove, arguments.timeout)
     pictures = Pictures(
         site.publish, lambda: bool(site.waiting), _say, live=live, foxglove=foxglove
     )

@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from softfinger.tools.arguments import add_stream, addresses, number
+from softfinger.tools.arguments import add_stream, addresses, number, seconds
 from softfinger.tools.ending import Ending
 from softfinger.tools.extras import require
 
@@ -37,6 +37,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--no-browser", action="store_true", help="only print the page's address")
     parser.add_argument(
         "--port", type=_any_port, metavar="N", help="the page's port (default: 9090 or a free one)"
+    )
+    parser.add_argument(
+        "--timeout",
+        type=seconds,
+        default=3.0,
+        metavar="S",
+        help="drop a command this long after its picture, wait this long for the daemon's reply "
+        "(default 3)",
     )
     parser.add_argument(
         "--rate",
