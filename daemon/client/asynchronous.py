@@ -9,7 +9,14 @@ from typing import Any, TypeVar
 import zmq
 import zmq.asyncio
 
-from softfinger.daemon.client.command_client import HandClient, accepted, is_done, send
+from softfinger.daemon.client.command_client import (
+    AGAIN_AFTER,
+    Attempts,
+    HandClient,
+    accepted,
+    is_done,
+    send_once,
+)
 from softfinger.daemon.client.stream import Subscriber, Wait, no_stream
 from softfinger.daemon.errors import NoStream, Refused
 from softfinger.daemon.wire.schema import EVENT, STATE, TACTILE, Event, HandState, TactileFrame
@@ -117,11 +124,14 @@ class AsyncHand(HandClient[Coroutine[Any, Any, None]]):
 
         Raises Refused with the reason, and NoAnswer.
         """
-        request = self._request(name, numbers)
-        reply = await asyncio.to_thread(
-            send, self.command_address, request, self.timeout, self._keys
-        )
-        return accepted(reply)
+        attempts = Attempts(self._request(name, numbers), self.timeout)
+        where, keys = self.command_address, self._keys
+        while True:
+            remaining = attempts.remaining()
+            reply = await asyncio.to_thread(send_once, where, attempts.request, remaining, keys)
+            if not attempts.again(reply):
+                return accepted(reply)
+            await asyncio.sleep(AGAIN_AFTER)
 
     async def _carry_out(self, command: str, **numbers: float | None) -> None:
         try:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 import math
+import secrets
+import time
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -19,7 +21,7 @@ from softfinger.daemon.client.connection import (
     is_host,
     still_waiting,
 )
-from softfinger.daemon.errors import HandClosed, Refused
+from softfinger.daemon.errors import HandClosed, Reason, Refused
 from softfinger.daemon.wire.keys import ClientKeys, load_client
 from softfinger.daemon.wire.local_stop import stop_locally
 
@@ -27,6 +29,7 @@ _Done = TypeVar("_Done")
 
 _log = logging.getLogger(__name__)
 
+AGAIN_AFTER = 0.05  # s until a command that was late is sent again
 LOCALLY = 0.5  # s for a daemon to answer past all other clients
 UNCONFIRMED = "the servos have not confirmed torque off yet"  # to ``torque_off``: ``unconfirmed``
 
@@ -35,14 +38,47 @@ class NoAnswer(SoftfingerError):
     """The daemon did not answer in time."""
 
 
+class Attempts:
+    """Decides whether a command is sent again, within the time that its caller waits for a reply.
+
+    A daemon that stalled refuses what became too old meanwhile, as ``late``, and without effect.
+    Every attempt carries the same key, so that the daemon carries the command out once at most, and
+    not after a stop that came in between.
+    """
+
+    def __init__(self, request: dict[str, Any], timeout: float) -> None:
+        """``timeout`` [s] bounds all attempts together."""
+        self.request = {**request, "key": secrets.token_hex(8)}
+        self._end = time.monotonic() + timeout
+
+    def remaining(self) -> float:
+        """Return the time [s] that is left."""
+        return max(self._end - time.monotonic(), 0.0)
+
+    def again(self, reply: dict[str, Any]) -> bool:
+        """Return True if the command is to be sent again, after `AGAIN_AFTER` s."""
+        return reply.get("reason") == Reason.LATE and self.remaining() > AGAIN_AFTER
+
+
 def send(
     address: str, request: dict[str, Any], timeout: float = PATIENCE, keys: ClientKeys | None = None
 ) -> dict[str, Any]:
     """Send one command and return the reply. Raises NoAnswer after ``timeout`` s.
 
-    A warning is logged when that takes long, which without handlers goes to standard error.
+    A command that the daemon refuses as late is sent again, within ``timeout``. A warning is logged
+    when the reply takes long, which without handlers goes to standard error.
     A ``stop`` to a daemon of this user on this machine goes past all other clients.
     """
+    attempts = Attempts(request, timeout)
+    while attempts.again(reply := send_once(address, attempts.request, attempts.remaining(), keys)):
+        time.sleep(AGAIN_AFTER)
+    return reply
+
+
+def send_once(
+    address: str, request: dict[str, Any], timeout: float, keys: ClientKeys | None = None
+) -> dict[str, Any]:
+    """Send one command as it is, and return the reply; see `send`."""
     if request.get("command") == "stop":
         stopped = stop_locally(address, min(timeout, LOCALLY))
         if stopped is not None:
@@ -67,7 +103,7 @@ def send(
         if not answered:
             hint = " (with access.keys it needs keys: --keys, keys=)" if keys is None else ""
             raise NoAnswer(
-                f"no {answer} within {timeout:g} s; is softfinger running, or still starting?{hint}"
+                f"no {answer} within {timeout:.3g} s; is softfinger running, or still starting?{hint}"
             )
         reply = msgpack.unpackb(socket.recv(), raw=False)
     finally:
@@ -84,7 +120,8 @@ def accepted(reply: dict[str, Any]) -> dict[str, Any]:
     A warning is logged when the servos have not confirmed that torque is off.
     """
     if reply.get("ok") is not True:
-        raise Refused(str(reply.get("error", "refused without a reason")))
+        text = str(reply.get("error", "refused without a reason"))
+        raise Refused(text, str(reply.get("reason", "")))
     if reply.get("torque_off") == "unconfirmed":
         _log.warning(UNCONFIRMED)
     return {key: value for key, value in reply.items() if key != "ok"}
@@ -103,8 +140,9 @@ def is_done(command: str, status: dict[str, Any]) -> bool:
 class HandClient(Generic[_Done]):
     """Shared by `Hand` and `AsyncHand`: the addresses, and the commands by name.
 
-    Commands raise Refused with the daemon's reason, and NoAnswer. ``arm``, ``disarm``, ``clear``
-    and ``release`` may be repeated: a hand that is armed stays armed.
+    Commands raise Refused with the daemon's reason, and NoAnswer. A command that the daemon
+    refuses as late is sent again, within ``timeout``. ``arm``, ``disarm``, ``clear`` and
+    ``release`` may be repeated: a hand that is armed stays armed.
     """
 
     _CONTEXT: type[zmq.Context[Any]] = zmq.Context

@@ -47,4 +47,6 @@ COMMANDS: dict[str, tuple[frozenset[Mode], dict[str, bool]]] = {
     "status": (_ANY, {}),
 }
 
+# Neither stiffens nor moves the hand, so it may be carried out although it is some time old.
+HARMLESS = frozenset({"disarm", "tare", "clear"})
 UNLEASED = frozenset({"stop", "disarm", "status"})  # can only make the hand safer

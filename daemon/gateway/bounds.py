@@ -17,7 +17,7 @@ DESCRIPTORS = 64  # that are not clients'
 CLIENTS = 256  # connections, of commands and stream together
 STALLED = 3.0  # s of processor time within one step after which the process is ended, …
 BLOCKED = 30.0  # … and of any time; a machine that is busy or stops it takes only such time
-PAUSE = 0.2  # s in which it read no requests, after which those that have come are too old
+GAP = 0.05  # s between two looks at requests, after which those found are dated by the earlier look
 
 # A connection
 HANDSHAKE = 2.0  # s in which a client has to have finished its handshake
@@ -29,9 +29,9 @@ SUBSCRIPTIONS = 64  # read at a time
 TELL_AGAIN = 0.1  # s between two times at which late subscribers are told what they missed
 KEYS_CHECKED = 0.5  # s between looks at the folder of keys
 
-# A stop, or another fence
+# A stop
 PURGE = 0.02  # s after it in which all requests but a status are refused, and on while they flood
-LONGEST_HELD = 0.25  # s that the stop's answer waits for that
+PURGES_HELD = 12  # such times that the stop's answer waits for the end of a flood
 
 # Requests
 UNDER_WAY = 4  # that the loop has and hasn't answered; a stop goes beside them
@@ -39,7 +39,6 @@ WAITING_EACH = 64  # of one client that wait here …
 WAITING = 2048  # … and of all, beyond one of each
 ALL_RATE = 2000.0  # a second of all clients together …
 LEAST_RATE = 2.0  # … but each may send so many
-OLDEST = 1.0  # s after which one that waits is too old to act upon
 LATE = 2.0  # s after which others need not wait for an answer of the loop, …
 LATE_ANSWERS = 64  # … of which the newest are still handed on when they come
 REST = 0.05  # s without a request after which a client that sent too many is heard again

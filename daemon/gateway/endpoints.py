@@ -2,7 +2,8 @@
 
 libzmq's own thread reads ahead of us, so what arrived before a stop is known by time alone. After
 it all requests are refused for a moment, and on while they come thicker than clients may send them,
-as those do that have waited. The stop's own answer waits as long, within a bound.
+as those do that have waited. The stop's own answer waits as long, within a bound. Likewise, after
+a gap between two looks at the socket, requests are dated by the look before the gap.
 
 Without keys everybody is let in, but libzmq hangs up on all who don't greet it as ZMTP 3 does: web
 pages among them, whose POST older versions take for messages.
@@ -201,10 +202,13 @@ class CommandEndpoint(Endpoint):
         self._clients: OrderedDict[bytes, Client] = OrderedDict()
         self.past = -math.inf
         self._empty = True  # at the last poll
+        self._looked = clock()  # at the socket; nothing came before it was bound
+        self._gap_began: float | None = None  # while requests may be left of a gap between looks …
+        self._gap_ended = 0.0  # … which ended then
         self._since = 0.0  # a fence was raised, or last looked at; since then …
         self._came = 0  # … so many requests came that change something
-        self._replies: list[list[bytes]] = []  # held back since …
-        self._held_since = 0.0
+        self._purges = 0  # and so often they still came too fast
+        self._replies: list[list[bytes]] = []  # held back
         limit = bounds.FRAMES * config.max_bytes
         super().__init__(admission, zmq.ROUTER, config.commands, "commands.address", config, limit)
 
@@ -212,29 +216,38 @@ class CommandEndpoint(Endpoint):
         """Refuse what has arrived until now: it takes a moment to read that."""
         self.past = self._requests.past = math.inf
         self._since = self._clock()
-        self._came = 0
+        self._came = self._purges = 0
 
     def read(self) -> None:
         """Take in requests, for as long as others may wait."""
         began = self._clock()
+        if began - self._looked > bounds.GAP:
+            if self._gap_began is None:
+                self._gap_began = self._looked
+            self._gap_ended = began
+        self._looked = began
         if self.past == math.inf and began - self._since > bounds.PURGE:
             if self._empty and self._came <= bounds.ALL_RATE * bounds.PURGE:
                 self.past = self._requests.past = began
             self._since = began
             self._came = 0
-        if self.past < math.inf or began - self._held_since > bounds.LONGEST_HELD:
+            self._purges += 1
+        if self.past < math.inf or self._purges > bounds.PURGES_HELD:
             self._answer_held()
         self._empty = False
         while (now := self._clock()) < began + bounds.TURN:
             parts = self._parts()
             if parts is None:
                 self._empty = True
+                if now - self._gap_ended > bounds.PURGE:
+                    self._gap_began = None
                 return
             *route, payload = (part.bytes for part in parts)
             self._came += b"status" not in payload
             if len(route) < _PARTS:
+                came = now if self._gap_began is None else self._gap_began
                 client = self._client(route[0], self._admission.name(parts[-1]), now)
-                self._requests.take(client, route, payload, now)
+                self._requests.take(client, route, payload, now, came)
 
     def _client(self, identity: bytes, name: str, now: float) -> Client:
         client = self._clients.get(identity)
@@ -249,10 +262,8 @@ class CommandEndpoint(Endpoint):
         message = [*route, reply]
         if self.past < math.inf:
             self._send(message)
-            return
-        if not self._replies:
-            self._held_since = self._clock()
-        self._replies.append(message)
+        else:
+            self._replies.append(message)
 
     def _answer_held(self) -> None:
         replies, self._replies = self._replies, []

@@ -5,10 +5,10 @@ else few are on their way to the loop at a time; the rest waits here, where ever
 and none more than its share. A client that sends more than it may a second is refused until it
 pauses. Nothing here reads or sends.
 
-Each request carries the time at which it came. The loop raises a fence with every stop, and
-whenever it could not act for a while. What came before `RequestQueue.past` is refused: the time at
-which all had been read that may have come before the fence. A ``status`` changes nothing, and is
-answered whenever it came.
+Each request carries the time at which it came, by which the loop judges its age. The loop raises a
+fence with every stop. What came before `RequestQueue.past` is refused: the time at which all had
+been read that may have come before the fence. A ``status`` changes nothing, and is answered
+whenever it came. Of the setpoints (``hold``) of one connection only the newest waits.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from typing import NamedTuple
 
 import msgpack
 
-from softfinger.daemon.errors import Refused
+from softfinger.daemon.errors import Reason, Refused
 from softfinger.daemon.gateway import bounds
-from softfinger.daemon.wire.command_server import PASSED, decode
+from softfinger.daemon.wire.command_server import decode, refusal, stopped
 from softfinger.daemon.wire.loop_link import ALWAYS
 
 Route = list[bytes]  # to a client: what ROUTER put before its request
 
 _NUMBERS = 1 << 30  # that requests are distinguished by
 _FULL = "too many commands wait already"
-_OLD = "waited too long for its turn; send it again"
+_SUPERSEDED = "hold: a newer one of this connection replaced it"
 
 
 class Client:
@@ -59,6 +59,7 @@ class _Request(NamedTuple):
     route: Route
     came: float
     packed: bytes
+    is_hold: bool
 
 
 class RequestQueue:
@@ -94,18 +95,22 @@ class RequestQueue:
     def new_client(self, name: str, now: float) -> Client:
         return Client(name, self._per_second, now)
 
-    def take(self, client: Client, route: Route, payload: bytes, now: float) -> None:
-        """One message of a client: it waits for its turn, or is refused."""
+    def take(self, client: Client, route: Route, payload: bytes, now: float, came: float) -> None:
+        """One message of a client, read ``now``: it waits for its turn, or is refused.
+
+        It came at ``came`` or later.
+        """
         flood = client.floods(self._shared(client, now), now)
         if flood and (client.stops or b"stop" not in payload):
             self._refuse_flood(route)
             return
         try:
             if len(payload) > self._max_bytes:
-                raise Refused(f"message of {len(payload)} bytes; at most {self._max_bytes}")
+                text = f"message of {len(payload)} bytes; at most {self._max_bytes}"
+                raise Refused(text, Reason.REQUEST)
             request = decode(payload)
-        except Refused as refusal:
-            self._refuse(route, str(refusal))
+        except Refused as refused:
+            self._refuse(route, refused)
             return
         if client.name:
             request["client"] = client.name
@@ -115,8 +120,9 @@ class RequestQueue:
         elif flood:
             self._refuse_flood(route)
         else:
-            came = ALWAYS if request["command"] == "status" else now
-            self._queue(client, _Request(route, came, msgpack.packb(request)))
+            name = request["command"]
+            came = ALWAYS if name == "status" else came
+            self._queue(client, _Request(route, came, msgpack.packb(request), name == "hold"))
 
     def _shared(self, client: Client, now: float) -> float:
         """Return what each client may send in a second: less when many send."""
@@ -126,20 +132,24 @@ class RequestQueue:
         self._active.add(client)
         return min(self._per_second, max(bounds.ALL_RATE / len(self._active), bounds.LEAST_RATE))
 
-    def _refuse(self, route: Route, error: str) -> None:
-        self._answer(route, msgpack.packb({"ok": False, "error": error}))
+    def _refuse(self, route: Route, refused: Refused) -> None:
+        self._answer(route, refusal(refused))
 
     def _refuse_flood(self, route: Route) -> None:
         self.refused += 1
-        self._refuse(route, f"too many commands: at most {self._per_second:g} a second")
+        text = f"too many commands: at most {self._per_second:g} a second"
+        self._refuse(route, Refused(text, Reason.BUSY))
 
     def _queue(self, client: Client, request: _Request) -> None:
         queued = self._waiting.get(client)
         if queued is None:
             self._waiting[client] = queued = deque()
+        elif request.is_hold and queued[-1].is_hold:
+            self._refuse(queued.pop().route, Refused(_SUPERSEDED, Reason.SUPERSEDED))
+            self._count -= 1
         elif len(queued) >= bounds.WAITING_EACH or self._count >= bounds.WAITING:
             self.refused += 1
-            self._refuse(request.route, _FULL)
+            self._refuse(request.route, Refused(_FULL, Reason.BUSY))
             return
         queued.append(request)
         self._count += 1
@@ -160,11 +170,9 @@ class RequestQueue:
                 self._stops = []
         while self._waiting and len(self._asked) < bounds.UNDER_WAY + bool(self._stop):
             client, queued = next(iter(self._waiting.items()))
-            route, came, packed = queued[0]
+            route, came, packed, _ = queued[0]
             if came < self.past:
-                self._refuse(route, PASSED)
-            elif now - came > bounds.OLDEST:
-                self._refuse(route, _OLD)
+                self._refuse(route, stopped())
             elif not self._ask([route], came, packed, now):
                 return
             queued.popleft()

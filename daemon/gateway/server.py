@@ -32,7 +32,6 @@ from softfinger.daemon.gateway.endpoints import (
 )
 from softfinger.daemon.gateway.request_queue import RequestQueue, Route
 from softfinger.daemon.wire import loop_link
-from softfinger.daemon.wire.command_server import Pauses
 from softfinger.daemon.wire.loop_link import Topics
 
 _STEPS = 0.5  # s between two words that it lives
@@ -76,17 +75,13 @@ class Server:
         self,
         end: socket.socket,
         config: Config,
-        clock: Callable[[], float] = time.monotonic,
-        longest_pause: float = math.inf,
+        clock: Callable[[], float] = loop_link.machine_time,
     ) -> None:
         """Bind what ``config`` names; ``end`` is this end of the link.
-
-        After more than ``longest_pause`` [s] between two steps, what came meanwhile is refused.
 
         Raises AddressError, and KeyFileError where there are keys.
         """
         self._clock = clock
-        self._pauses = Pauses(longest_pause)
         self._end = end
         self.requests = RequestQueue(
             config.max_bytes, config.per_second, self._forward, self._answer
@@ -128,8 +123,6 @@ class Server:
             self._stream.read(now)
             wanted = self._stream.wanted
         if self._commands is not None:
-            if self._pauses.look():
-                self._commands.raise_fence()
             self._commands.read()
             self.requests.pump(self._clock())
             self._tell_past(self._commands.past)
@@ -242,7 +235,7 @@ def main(words: list[str]) -> int:
 def _serve(end: socket.socket, config: Config) -> int:
     try:
         _be_bounded()
-        server = Server(end, config, longest_pause=bounds.PAUSE)
+        server = Server(end, config)
     except (AddressError, KeyFileError) as error:
         end.send(loop_link.FAILED + str(error).encode()[: loop_link.LARGEST // 2])
         return 1

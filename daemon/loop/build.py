@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import json
 import logging
+import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from softfinger import __version__
 from softfinger.daemon.backends import backend, needs_hand
 from softfinger.daemon.clock import LoopClock, make_clock
+from softfinger.daemon.errors import ServosSilent
 from softfinger.daemon.gateway.bounds import Config
 from softfinger.daemon.gateway.supervisor import Gateway
 from softfinger.daemon.loop.loop import EventSink, Loop
@@ -22,7 +24,7 @@ from softfinger.daemon.perception.finger_model import FingerModel
 from softfinger.daemon.perception.perception import Perception
 from softfinger.daemon.profile.factory import make_material, make_table
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.servos.base import make_servos
+from softfinger.daemon.servos.base import Servos, make_servos
 from softfinger.daemon.tactile.base import TactileSensor, make_sensor
 from softfinger.daemon.types import FINGERS, HandFacts
 from softfinger.daemon.wire.command_server import CommandServer
@@ -30,10 +32,10 @@ from softfinger.daemon.wire.local_stop import LocalStop
 from softfinger.daemon.wire.publisher import GATEWAY_TOPICS, Publisher
 from softfinger.kinematics.contact.table import ContactTable
 
+_LOOK_AGAIN = 0.2  # s between two looks for servos that do not answer yet
+
 if TYPE_CHECKING:
     from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
-
-_PAUSE = 0.2  # s in which the loop took no commands, after which those that wait are too old
 
 
 class Daemon:
@@ -74,7 +76,7 @@ class Daemon:
             self.gateway.wait()  # a second daemon touches no hardware
         if self.servos is not None:
             self._closers.append(self.servos.close)
-            self.servos.connect()
+            self._connect(self.servos, on_event)
         for each in perception.fingers:
             self._closers.append(each.sensor.close)
             each.sensor.open()
@@ -82,6 +84,23 @@ class Daemon:
         self.loop.publish_truth(self.hand)
         if publisher is not None:
             publisher.settings(self.clock.wall(), self.clock.now(), facts(settings, self.models))
+
+    def _connect(self, servos: Servos, on_event: EventSink | None) -> None:
+        """Connect, and wait up to ``servos.open_timeout`` for servos that do not answer yet."""
+        patience = self.settings.servos.open_timeout
+        began = time.monotonic()
+        told = False
+        while True:
+            try:
+                return servos.connect()
+            except ServosSilent as silent:
+                if time.monotonic() - began >= patience:
+                    raise
+                if on_event is not None and not told:
+                    text = f"{silent}; waiting up to servos.open_timeout = {patience:g} s"
+                    on_event("warning", "servos", text)
+                    told = True
+            time.sleep(_LOOK_AGAIN)
 
     def _bind(self) -> tuple[Publisher, CommandServer]:
         stream, commands = self.settings.stream, self.settings.commands
@@ -103,11 +122,7 @@ class Daemon:
         self._closers.append(local.close)
         if local.notice:
             gateway.link.notices.append(local.notice)
-        # Servos that their own watchdog has stopped are another hand than the one commanded.
-        own_time = self.settings.simulated or self.clock.waits
-        watchdog = 0.0 if own_time else self.settings.servos.watchdog
-        server = CommandServer(gateway.link, local, min(_PAUSE, watchdog or _PAUSE))
-        return Publisher(gateway.link), server
+        return Publisher(gateway.link), CommandServer(gateway.link, local)
 
     def _make_hand(self) -> SimulatedHand | None:
         """The simulated hand, where a backend wants one.

@@ -31,6 +31,18 @@ from softfinger.daemon.wire.publisher import Publisher
 
 EventSink = Callable[[str, str, str], None]
 
+_START_AGE = 0.2  # s; an older command no longer stiffens or moves the hand
+
+
+def start_age(settings: Settings, waits: bool) -> float:
+    """Return the age [s] up to which a command that stiffens or moves the hand is carried out.
+
+    Servos that their own watchdog stopped are not as the client of an older command saw them.
+    ``waits``: the servos' time stands still while this machine is late, and with it the watchdog.
+    """
+    watchdog = 0.0 if settings.simulated or waits else settings.servos.watchdog
+    return min(_START_AGE, watchdog or _START_AGE)
+
 
 class Commands(Protocol):
     """A source of commands: `wire.command_server.CommandServer`, or a recording."""
@@ -45,10 +57,10 @@ class Commands(Protocol):
         """Carry out through ``handler`` what is due at this tick."""
 
     def start(self) -> None:
-        """Refuse all that has arrived until now; what comes from then on is carried out."""
+        """Wait until commands are accepted."""
 
     def raise_fence(self) -> None:
-        """Refuse all that has arrived until now, but for a stop."""
+        """Refuse all commands that arrived before now, except stop and status: the hand stopped."""
 
 
 class Loop:
@@ -81,7 +93,14 @@ class Loop:
             servos, settings.servos, self.state, self._safety, self._fail, self.emit
         )
         self._requests = Requests(
-            settings, self.state, self._control, self._safety, self.torque, perception, self.emit
+            settings,
+            self.state,
+            self._control,
+            self._safety,
+            self.torque,
+            perception,
+            self.emit,
+            start_age(settings, clock.waits),
         )
         self._after_opening: Breach | None = None  # a fault for when the hand is open
         self.statistics = Statistics()
@@ -276,10 +295,12 @@ class Loop:
 
     # Commands, events and faults
 
-    def command(self, request: dict[str, Any], by_task: bool = False) -> dict[str, Any]:
+    def command(
+        self, request: dict[str, Any], age: float = 0.0, by_task: bool = False
+    ) -> dict[str, Any]:
         """Carry out one request at the present tick. Raises Refused with the reason.
 
-        One that is not the task's own ends the task.
+        ``age`` [s] is how long ago it arrived. A request that is not the task's own ends the task.
         """
         name = request["command"]
         if name == "status":
@@ -287,7 +308,7 @@ class Loop:
                 self._safety.limited["commands.pace"] = self._server.refused_by_pace
             return self._requests.carry_out(request)
         try:
-            reply = self._requests.carry_out(request)
+            reply = self._requests.carry_out(request, age)
         except Refused as refusal:
             self._publish_command(request, str(refusal))
             raise

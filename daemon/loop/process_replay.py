@@ -165,7 +165,7 @@ class _Commands:
     def serve(self, handler: Handler) -> None:
         for request in self.waiting:
             try:
-                handler(request)
+                handler(request, 0.0)
             except Refused:
                 pass  # carried out when it was recorded: the comparison will show it
         self.waiting = []

@@ -12,15 +12,16 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from softfinger.daemon.control.envelope import Envelope
-from softfinger.daemon.control.modes import COMMANDS, GRIPPING, HELD, UNLEASED, Mode
+from softfinger.daemon.control.modes import COMMANDS, GRIPPING, HARMLESS, HELD, UNLEASED, Mode
 from softfinger.daemon.control.state_machine import Control, off_range
-from softfinger.daemon.errors import Refused, ServoError, TactileError
+from softfinger.daemon.errors import Reason, Refused, ServoError, TactileError
 from softfinger.daemon.perception.perception import Perception
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.safety.safety import Safety
 from softfinger.daemon.safety.torque_state import TorqueState
 from softfinger.daemon.types import FINGERS, GRIP_FRACTION, State
 
+LONGEST_AGE = 1.0  # s; an older command is not carried out, except status
 _COMPLIANCE = (0.01, 1.0)  # rad/(N·m)
 _ENVELOPE = frozenset({"command", "client"})
 _FIRST = {Mode.DISARMED: "arm first", Mode.FAULT: "clear the fault first"}
@@ -38,33 +39,37 @@ def parse(request: dict[str, Any], mode: Mode) -> Command:
     """Check a request against the table of commands. Raises Refused with found and expected."""
     name = request["command"]
     if name not in COMMANDS:
-        raise Refused(f"unknown command {name[:40]!r}; known: {', '.join(COMMANDS)}")
+        raise _malformed(f"unknown command {name[:40]!r}; known: {', '.join(COMMANDS)}")
     client = request.get("client", "")
     if not isinstance(client, str) or len(client) > 64:
-        raise Refused("client: expected a text of at most 64 characters")
+        raise _malformed("client: expected a text of at most 64 characters")
     heard, parameters = COMMANDS[name]
     unknown = sorted(set(request) - _ENVELOPE - set(parameters))
     if unknown:
         known = ", ".join(parameters) or "no parameters"
-        raise Refused(f"{name}: unknown parameter {unknown[0][:40]!r}; expected {known}")
+        raise _malformed(f"{name}: unknown parameter {unknown[0][:40]!r}; expected {known}")
     numbers = {}
     for key, required in parameters.items():
         if key not in request:
             if required:
-                raise Refused(f"{name}: {key} is missing")
+                raise _malformed(f"{name}: {key} is missing")
             continue
         value = request[key]
         if isinstance(value, bool) or not isinstance(value, int | float):
-            raise Refused(f"{name}: {key}: expected a number, found {type(value).__name__}")
+            raise _malformed(f"{name}: {key}: expected a number, found {type(value).__name__}")
         if not math.isfinite(value):
-            raise Refused(f"{name}: {key}: expected a finite number, found {value}")
+            raise _malformed(f"{name}: {key}: expected a finite number, found {value}")
         numbers[key] = float(value)
     if mode not in heard:
         hint = _FIRST.get(mode) or f"possible while {', '.join(sorted(heard))}"
         if name == "clear":
             hint = "there is no fault"
-        raise Refused(f"{name}: not while {mode.value}; {hint}")
+        raise Refused(f"{name}: not while {mode.value}; {hint}", Reason.MODE)
     return Command(name, numbers, client)
+
+
+def _malformed(text: str) -> Refused:
+    return Refused(text, Reason.REQUEST)
 
 
 class Lease:
@@ -84,7 +89,8 @@ class Lease:
             return
         if now < self._until and command.client != self._owner:
             owner = self._owner or "an unnamed client"
-            raise Refused(f"{command.name}: {owner} commands the hand ({self._until - now:.1f} s)")
+            text = f"{command.name}: {owner} commands the hand ({self._until - now:.1f} s)"
+            raise Refused(text, Reason.LEASE)
 
     def lapses(self, now: float) -> str:
         """Return, once, who has been silent for the whole lease; empty where nobody has."""
@@ -112,8 +118,16 @@ class Requests:
         torque: TorqueState,
         perception: Perception,
         emit: Callable[[str, str, str], None],
+        start_age: float = math.inf,
     ) -> None:
-        """``emit`` sends an event."""
+        """Prepare to carry out requests.
+
+        Parameters
+        ----------
+        emit : sends an event
+        start_age : age [s] up to which a command that can stiffen or move the hand is carried out
+        """
+        self._start_age = start_age
         self._settings = settings
         self._state = state
         self._control = control
@@ -138,20 +152,23 @@ class Requests:
         self._lease = Lease(settings.commands.lease)
         self._envelope = Envelope(settings)
 
-    def carry_out(self, request: dict[str, Any]) -> dict[str, Any]:
-        """Do what is asked at the present tick; the reply. Raises Refused with the reason."""
+    def carry_out(self, request: dict[str, Any], age: float = 0.0) -> dict[str, Any]:
+        """Do what is asked at the present tick, and return the reply.
+
+        ``age`` [s] is how long ago the request arrived. Raises Refused with the reason.
+        """
         state, control = self._state, self._control
         if request["command"] == "stop":  # in every mode, from everyone, whatever else it says
             control.stop()
             return {"mode": control.mode.value, "torque_off": self._torque.off()}
         command = name, numbers, _ = parse(request, control.mode)
+        self._check_age(name, age)
         self._lease.check(command, state.t)
         if name == "clear":
             self._reconnect()
         if name in ("clear", "arm"):
             self._reopen(name)
-        if reason := self._against(name, numbers):
-            raise Refused(f"{name}: {reason}")
+        self._check(name, numbers)
         begins = control.mode not in GRIPPING
         angle = self._handlers[name](**numbers)
         self._lease.renew(command, state.t)
@@ -191,69 +208,88 @@ class Requests:
             return False
         return True
 
-    def _against(self, name: str, numbers: dict[str, float]) -> str:
-        """Return what the state, the scene or the limits have against a command that is heard."""
-        state, settings = self._state, self._settings
-        if name in ("arm", "clear") and state.torque and not self._control.torque:
-            return "the servos have not confirmed torque off yet: check their cable and their power"
-        begins = name == "hold" and self._control.mode not in GRIPPING
-        judged = name in ("arm", "clear", "grasp") or begins
-        if judged and (cause := self._safety.cause(state, gripping=name != "arm")):
-            return cause
+    def _check_age(self, name: str, age: float) -> None:
+        """Raise Refused for a command that is too old.
+
+        A client whose command waited out a stall of the machine may no longer want the hand to
+        start. Setpoints of a stream and what is harmless are carried out a little longer.
+        """
+        if name == "status":
+            return
+        streamed = name == "hold" and self._control.mode in GRIPPING
+        longest = LONGEST_AGE if streamed or name in HARMLESS else self._start_age
+        if age > longest:
+            text = f"{name}: {age:.2f} s old when its turn came, at most {longest:g} s is allowed"
+            raise Refused(f"{text}; send it again", Reason.LATE)
+
+    def _check(self, name: str, numbers: dict[str, float]) -> None:
+        """Raise Refused if the state, the scene or the limits prevent an accepted command."""
+
+        def refuse_if(condition: object, reason: Reason, text: str) -> None:
+            if condition:
+                raise Refused(f"{name}: {text}", reason)
+
+        state, settings, fingers = self._state, self._settings, self._perception.fingers
+        if name in ("arm", "clear"):
+            refuse_if(
+                state.torque and not self._control.torque,
+                Reason.STATE,
+                "the servos have not confirmed torque off yet: check their cable and their power",
+            )
+        begins = name == "grasp" or (name == "hold" and self._control.mode not in GRIPPING)
+        if begins or name in ("arm", "clear"):
+            cause = self._safety.cause(state, gripping=name != "arm")
+            refuse_if(cause, Reason.STATE, cause)
         if name == "arm":
-            if self._torque.servos is None:
-                return "this scene has no servos"
-            elif not state.reading.valid:
-                return "the servos were not read at this tick"
+            refuse_if(self._torque.servos is None, Reason.SCENE, "this scene has no servos")
+            text = "the servos did not answer at this tick; send it again"
+            refuse_if(not state.reading.valid, Reason.LATE, text)
         elif name == "tare":
-            if not self._perception.fingers:
-                return "this scene has no tactile sensors"
-            if any(contact.contact for contact in state.contacts):
-                return "something touches a tip"
+            refuse_if(not fingers, Reason.SCENE, "this scene has no tactile sensors")
+            touched = any(contact.contact for contact in state.contacts)
+            refuse_if(touched, Reason.STATE, "something touches a tip")
         elif name == "move":
-            return self._against_move(numbers)
-        elif name == "demo" and settings.task.name == "none":
-            return "the profile names no task; softfinger run --config demo has one"
-        elif name == "hold" and not numbers:
-            return "force or angle is missing"
-        if name == "grasp" or begins:
-            for perception in self._perception.fingers:
-                if perception.taring:
-                    return "tare is still at work"
-            if not self._perception.fingers:
-                return "each finger needs a tactile sensor in this scene"
-            if settings.servos.mode == "position":
-                return 'nothing bounds the current while servos.mode is "position"'
+            self._check_move(numbers)
+        elif name == "demo":
+            text = "the profile names no task; softfinger run --config demo has one"
+            refuse_if(settings.task.name == "none", Reason.SCENE, text)
+        elif name == "hold":
+            refuse_if(not numbers, Reason.REQUEST, "force or angle is missing")
+        if begins:
+            taring = any(perception.taring for perception in fingers)
+            refuse_if(taring, Reason.STATE, "tare is still at work")
+            text = "each finger needs a tactile sensor in this scene"
+            refuse_if(not fingers, Reason.SCENE, text)
+            text = 'nothing bounds the current while servos.mode is "position"'
+            refuse_if(settings.servos.mode == "position", Reason.SCENE, text)
             numbers.setdefault("force", settings.control.force_default)
         if "force" in numbers:
             force = numbers["force"]
             low, high = settings.control.contact_force, GRIP_FRACTION * settings.safety.force_max
-            if not low < force <= high:
-                return f"force: found {force:g} N, expected above {low:g} to {high:g}"
+            text = f"force: found {force:g} N, expected above {low:g} to {high:g}"
+            refuse_if(not low < force <= high, Reason.BOUNDS, text)
         if "angle" in numbers:
-            if len(settings.scene.fingers) < 2 or not settings.scene.object_model:
-                return "needs both fingers and the object model in the scene"
-            if self._control.mode in HELD:
-                reason = self._control.why_not_turn(numbers["angle"])
-                if name == "rotate" or not state.object.valid:
-                    return reason
+            turns = len(settings.scene.fingers) == 2 and settings.scene.object_model
+            text = "needs both fingers and the object model in the scene"
+            refuse_if(not turns, Reason.SCENE, text)
+            if self._control.mode in HELD and (name == "rotate" or not state.object.valid):
+                text = self._control.why_not_turn(numbers["angle"])
+                refuse_if(text, Reason.BOUNDS if state.object.valid else Reason.STATE, text)
         if name == "set":
             compliance, (low, high) = numbers["compliance"], _COMPLIANCE
-            if not low <= compliance <= high:
-                return f"compliance: found {compliance:g} rad/(N·m), expected {low:g} to {high:g}"
-        return ""
+            text = f"compliance: found {compliance:g} rad/(N·m), expected {low:g} to {high:g}"
+            refuse_if(not low <= compliance <= high, Reason.BOUNDS, text)
 
-    def _against_move(self, numbers: dict[str, float]) -> str:
+    def _check_move(self, numbers: dict[str, float]) -> None:
         if not numbers:
-            return "left or right is missing"
+            raise _malformed("move: left or right is missing")
         for name, q in numbers.items():
             hand, index = self._settings.hand, FINGERS.index(name)
             if name not in self._settings.scene.fingers:
-                return f"this scene has no {name} finger"
+                raise Refused(f"move: this scene has no {name} finger", Reason.SCENE)
             low, high = hand.q_min[index], hand.q_max[index]
             if not low <= q <= high:
-                return f"{name}: {off_range(q, low, high)}"
-        return ""
+                raise Refused(f"move: {name}: {off_range(q, low, high)}", Reason.BOUNDS)
 
     def _reconnect(self) -> None:
         """Connect servos that have gone silent anew: only on command.

@@ -149,6 +149,7 @@ class ServoSettings(Section):
     stiffness: Positive = 8.0  # A/rad of the daemon's position loop, in current mode alone
     damping: NonNegative = 0.4  # A·s/rad, likewise
     reply_timeout: Annotated[float, Field(gt=0, le=1)] = 0.004  # s, a missing reply costs no more
+    open_timeout: Seconds = 5.0  # s to wait at the start for servos that do not answer yet
     fault_after: Seconds = 0.05  # s without a good reading → fault
     watchdog: Annotated[float, Field(ge=0, le=2.54)] = 0.1  # s, the servo's own; 0 leaves it off
     heat_rise: NonNegative = 0.0  # K/A² that its case warms by in the end; 0: the model's own

@@ -21,7 +21,7 @@ from dataclasses import replace
 from dynamixel_sdk.robotis_def import COMM_RX_CORRUPT, COMM_SUCCESS
 
 from softfinger.daemon.clock import Clock
-from softfinger.daemon.errors import ServoError
+from softfinger.daemon.errors import ServoError, ServosSilent
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.base import Finding
@@ -91,6 +91,7 @@ class DynamixelServos:
 
         Raises:
             ServoError: all that is wrong, one line each. The port is closed again.
+            ServosSilent: servos do not answer, and nothing else is wrong.
         """
         self.close()
         servos, profile = self._settings, self._profile
@@ -134,7 +135,7 @@ class DynamixelServos:
         finally:
             port.reply_timeout = allowed
         if not any(each.replies for each in found):
-            raise ServoError(
+            raise ServosSilent(
                 f"{port.port_name}: no servo answers at {port.baudrate} baud (IDs "
                 f"{', '.join(str(each.id) for each in found)}): check power and wiring; "
                 "`softfinger doctor` looks for them at every rate"
@@ -149,7 +150,9 @@ class DynamixelServos:
                 fix = "check its cable and ID; `softfinger doctor` looks for it at every rate"
                 errors.append(Finding("FAIL", each.name, f"no answer at {port.baudrate} baud", fix))
         if errors:
-            raise ServoError("\n".join(map(str, errors)))
+            silent = sum(not each.replies for each in found)
+            kind = ServosSilent if len(errors) == silent else ServoError
+            raise kind("\n".join(map(str, errors)))
         for joint, each in zip(self._joints, found, strict=True):
             limit = self._settings.current_limit[joint.finger]
             joint.bound = min(each.table.word(reg.CURRENT_LIMIT), joint.scale.bound_counts(limit))

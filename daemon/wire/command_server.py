@@ -2,67 +2,60 @@
 
 It runs in the loop's thread, once a tick, without a lock. A ``stop`` goes first; what came before
 one is refused, wherever it waits (see `gateway.request_queue`), but for a ``status``.
+
+A client may give a request a ``key`` of its own choice and send it again, with the same key, when
+it was refused as late. The command is then carried out once at most, and never after a ``stop``
+that came after the first sending.
 """
 
 from __future__ import annotations
 
 import math
 import time
+from collections import OrderedDict
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgpack
 
-from softfinger.daemon.errors import Refused
-from softfinger.daemon.wire.loop_link import ALWAYS, Link
+from softfinger.daemon.errors import Reason, Refused
+from softfinger.daemon.wire.loop_link import Ask, Link, machine_time
 
 if TYPE_CHECKING:  # the gateway has no use for it
     from softfinger.daemon.wire.local_stop import LocalStop
 
-Handler = Callable[[dict[str, Any]], dict[str, Any]]
+Handler = Callable[[dict[str, Any], float], dict[str, Any]]  # request, its age [s]
 
-PASSED = "came while the daemon stood still or was starting, or before a stop; send it again"
-
-_PAST_WITHIN = 0.1  # s that a local stop's answer waits for a gateway that may have died
-_ARMING = 0.2  # s that torque on may take in the rest of a tick
+_PAST_WITHIN = 0.4  # s that a local stop's answer waits for a gateway that may have died
 _A_TICK = 2  # commands carried out at one, a stop not counted
+_KEYS = 256  # requests whose outcome is kept
+_KEY_LENGTH = 64
 _VALUES = (str, int, float)  # and bool, which is an int
 
 
-class Pauses:
-    """Notices a standstill: a process that was stopped or starved, a machine that slept."""
+class _Outcome(NamedTuple):
+    """Reply to a request that has a key."""
 
-    def __init__(self, longest: float) -> None:
-        """``longest`` [s] between two looks is no pause."""
-        self._longest = longest
-        self._looked = -math.inf
-
-    def look(self, own_work: float = 0.0) -> bool:
-        """Return whether there was one since the last look, or this is the first.
-
-        ``own_work`` [s] may have been spent at work meanwhile.
-        """
-        now = time.clock_gettime(time.CLOCK_BOOTTIME)  # goes on while the machine sleeps
-        paused = now - self._looked > self._longest + own_work
-        self._looked = now
-        return paused
+    stops: int  # how many the hand had been given until then
+    reply: bytes  # empty when the request was late, and may be sent again
 
 
 class CommandServer:
     """Answers requests that come over a link, and a stop that comes past it."""
 
     def __init__(
-        self, link: Link, local: LocalStop | None = None, longest_pause: float = math.inf
+        self,
+        link: Link,
+        local: LocalStop | None = None,
+        clock: Callable[[], float] = machine_time,
     ) -> None:
-        """``longest_pause`` [s] between two calls of `serve` leaves what waits to be carried out.
-
-        After a longer one it is refused: nobody who sent it knows any more what it would do.
-        """
+        """``clock`` is the gateway's, by which it notes when a request came."""
         self._link = link
         self.notices = link.notices  # the gateway's warnings, to be published as events
         self._local = local
-        self._pauses = Pauses(longest_pause)
-        self._worked = False  # a command that changes something was carried out at the last tick
+        self._clock = clock
+        self._stops = 0
+        self._outcomes: OrderedDict[str, _Outcome] = OrderedDict()  # by key, the oldest first
         self._stopped: bytes | None = None  # answer to a local stop, until the gateway knows it
         self._answer_by = 0.0
         if local is not None:
@@ -79,50 +72,58 @@ class CommandServer:
         It raises Refused with the reason.
         """
         link = self._link
-        self._notice_pause(_ARMING if self._worked else 0.0)
-        self._worked = False
         link.look()
         if self._local is not None and (link.called or self._stopped is not None):
             self._serve_local(self._local, handler)
         while link.stops:
             stop = link.stops.popleft()
-            reply = _carry_out(msgpack.unpackb(stop.packed), handler)
-            link.raise_fence()  # before the answer, after which its client may go on
+            reply = _accepted(handler(msgpack.unpackb(stop.packed), 0.0))
+            self.raise_fence()  # before the answer, after which its client may go on
             link.reply(stop.number, reply)
         for _ in range(_A_TICK):
-            self._notice_pause()  # it may have been since the link was looked at
             while link.asked and link.asked[0].came < link.past:
-                link.reply(link.asked.popleft().number, _refusal(PASSED))
+                link.reply(link.asked.popleft().number, refusal(stopped()))
             if not link.asked:
                 return
             ask = link.asked.popleft()
-            reply = _carry_out(msgpack.unpackb(ask.packed), handler)
-            self._pauses.look()  # to reconnect the servos may take long, and is no pause
-            self._worked |= ask.came < ALWAYS
-            link.reply(ask.number, reply)
+            link.reply(ask.number, self._answer(ask, handler))
 
     def start(self) -> None:
-        """Refuse what has arrived until now, and be ready for what comes: waits, not for a tick."""
-        self._pauses.look()
-        self._link.look()
-        self._link.raise_fence()
+        """Wait until commands are accepted: not for a tick."""
         ready_by = time.monotonic() + _PAST_WITHIN
+        self._link.look()
         while self._link.past == math.inf and time.monotonic() < ready_by:
             self._link.wait(_PAST_WITHIN)
 
     def raise_fence(self) -> None:
-        """Refuse what has arrived until now, but for a stop."""
+        """Refuse all commands that arrived before now, except stop and status: the hand stopped."""
+        self._stops += 1
         self._link.raise_fence()
 
-    def _notice_pause(self, own_work: float = 0.0) -> None:
-        if self._pauses.look(own_work):
-            self._link.raise_fence()
+    def _answer(self, ask: Ask, handler: Handler) -> bytes:
+        """Return the reply to a request; one that has a key is carried out once at most."""
+        request = msgpack.unpackb(ask.packed)
+        key = request.pop("key", None)
+        stops, reply = self._outcomes.pop(key, _Outcome(self._stops, b""))
+        late = False
+        if not reply:
+            try:
+                if stops != self._stops:
+                    raise stopped()
+                reply = _accepted(handler(request, self._clock() - ask.came))
+            except Refused as refused:
+                reply, late = refusal(refused), refused.reason == Reason.LATE
+        if key is not None:
+            self._outcomes[key] = _Outcome(stops, b"" if late else reply)
+            if len(self._outcomes) > _KEYS:
+                self._outcomes.popitem(last=False)
+        return reply
 
     def _serve_local(self, local: LocalStop, handler: Handler) -> None:
         self._link.called = False
         if local.take():
-            self._stopped = _carry_out({"command": "stop"}, handler)
-            self._link.raise_fence()
+            self._stopped = _accepted(handler({"command": "stop"}, 0.0))
+            self.raise_fence()
             self._answer_by = time.monotonic() + _PAST_WITHIN
         if self._stopped is not None and (
             self._link.past < math.inf or time.monotonic() > self._answer_by
@@ -131,17 +132,20 @@ class CommandServer:
             self._stopped = None
 
 
-def _carry_out(request: dict[str, Any], handler: Handler) -> bytes:
-    """The packed reply."""
-    try:
-        reply: bytes = msgpack.packb({"ok": True, **handler(request)})
-    except Refused as refusal:
-        return _refusal(str(refusal))
-    return reply
+def _accepted(reply: dict[str, Any]) -> bytes:
+    packed: bytes = msgpack.packb({"ok": True, **reply})
+    return packed
 
 
-def _refusal(error: str) -> bytes:
-    packed: bytes = msgpack.packb({"ok": False, "error": error})
+def stopped() -> Refused:
+    """Return the refusal of a command that may have been sent before a stop."""
+    return Refused("not carried out: it came before a stop, or too soon after it", Reason.STOPPED)
+
+
+def refusal(refused: Refused) -> bytes:
+    """Return the packed reply to a command that is not carried out."""
+    reply = {"ok": False, "error": str(refused), "reason": str(refused.reason)}
+    packed: bytes = msgpack.packb(reply)
     return packed
 
 
@@ -153,17 +157,26 @@ def decode(payload: bytes) -> dict[str, Any]:
     try:
         request = msgpack.unpackb(payload, raw=False, max_map_len=64, max_array_len=64)
     except Exception as error:  # msgpack raises many kinds, ValueError and its own among them
-        raise Refused(f"not msgpack: {error}") from None
+        raise _malformed(f"not msgpack: {error}") from None
     if not isinstance(request, dict):
-        raise Refused(f"expected a map, found {type(request).__name__}")
+        raise _malformed(f"expected a map, found {type(request).__name__}")
     if not isinstance(request.get("command"), str):
-        raise Refused('expected a text under "command"')
+        raise _malformed('expected a text under "command"')
     # Nothing nested: requests are published as they came.
     plain = {
         key: value
         for key, value in request.items()
         if isinstance(key, str) and (value is None or isinstance(value, _VALUES))
     }
-    if len(plain) < len(request) and request["command"] != "stop":
-        raise Refused("expected texts as keys, and numbers and texts as values")
+    if request["command"] == "stop":
+        return plain
+    if len(plain) < len(request):
+        raise _malformed("expected texts as keys, and numbers and texts as values")
+    key = plain.get("key", "-")
+    if not isinstance(key, str) or not 0 < len(key) <= _KEY_LENGTH:
+        raise _malformed(f"key: expected a text of 1 to {_KEY_LENGTH} characters")
     return plain
+
+
+def _malformed(text: str) -> Refused:
+    return Refused(text, Reason.REQUEST)

@@ -12,6 +12,7 @@ import math
 import select
 import socket
 import struct
+import time
 from collections import deque
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -66,11 +67,16 @@ class Topics:
 
 
 class Ask(NamedTuple):
-    """A request that the gateway has checked. ``came`` is the machine's monotonic time [s]."""
+    """A request that the gateway has checked. ``came`` is by `machine_time`, or `ALWAYS`."""
 
     came: float
     number: int
     packed: bytes
+
+
+def machine_time() -> float:
+    """Return monotonic time [s] that goes on while the machine sleeps."""
+    return time.clock_gettime(time.CLOCK_BOOTTIME)
 
 
 def pair() -> tuple[socket.socket, socket.socket]:
@@ -181,14 +187,17 @@ class Link:
             self.wanted, self.refused = WANTS.unpack_from(packet, 1)
 
     def _adopt(self) -> None:
-        """Use a new gateway's socket, and give it a fence and the last events."""
+        """Use a new gateway's socket, and give it the last fence and the last events."""
         self._disconnect()
         self._socket, self._offered = self._offered, None
         assert self._socket is not None
         self._poll.register(self._socket, select.POLLIN)
         for packet in self._last_events:
             self._send(packet)
-        self.raise_fence()
+        if self._fence:
+            self.raise_fence()
+        else:
+            self.past = -math.inf
 
     def _disconnect(self) -> None:
         if self._socket is not None:
@@ -201,7 +210,7 @@ class Link:
         self._waiting.clear()
 
     def raise_fence(self) -> None:
-        """Refuse from now on the requests that came before."""
+        """Refuse from now on the requests that came before: the hand was stopped."""
         self._fence = (self._fence + 1) % _FENCES
         self.past = math.inf
         self._waiting.append(FENCE + NUMBER.pack(self._fence))

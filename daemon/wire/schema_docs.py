@@ -8,6 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from softfinger.daemon.errors import Reason
 from softfinger.daemon.wire.schema import SCHEMA, TOPICS
 
 _JSON: dict[str, dict[str, Any]] = {
@@ -36,6 +37,32 @@ in the machine's time.
 """
 
 
+_COMMANDS = """\
+## Commands
+
+A command is one msgpack map, `{"command": "grasp", "force": 5.0}`, and so is its reply:
+`{"ok": true, …}` or `{"ok": false, "error": …, "reason": …}`. `error` is for people. `reason` is
+one of these texts:
+
+| reason | meaning |
+|---|---|
+"""
+
+_KEYS = """\
+
+After a stall of the daemon, the commands that waited are older than their clients expected. `arm`
+and all commands that move the hand or change its grip are then refused as `late` if they are older
+than 0.2 s (or `servos.watchdog`, where that is shorter). `disarm`, `tare`, `clear`, and a `hold`
+while the hand grips, are carried out up to an age of 1 s, `status` and `stop` always.
+
+To send a late command again safely, give it a `key`: a text of 1 to 64 characters that no other
+command has, for example a random number. Send the same map again with the same key. The daemon
+carries out a key at most once, answers a repetition with the first reply, and refuses it as
+`stopped` if the hand was stopped in between. `Hand`, `AsyncHand`, `softfinger send`, `monitor` and
+`view` do this by themselves.
+"""
+
+
 def json_schema(topic: bytes) -> dict[str, Any]:
     """Return a topic's map as JSON Schema. Bytes are base64, a float that is no number null."""
     schema: dict[str, Any] = {
@@ -56,7 +83,8 @@ def json_schema(topic: bytes) -> dict[str, Any]:
 
 def page() -> str:
     """Return the page for people, in Markdown."""
-    parts = [_INTRODUCTION]
+    reasons = "".join(f"| `{reason}` | {reason.meaning} |\n" for reason in Reason)
+    parts = [_INTRODUCTION, _COMMANDS + reasons + _KEYS]
     for name, topic in TOPICS.items():
         rows = [f"| `{f.name}` | {f.kind} | {f.unit} | {f.meaning} |" for f in topic.fields]
         table = "\n".join(["| field | type | unit | meaning |", "|---|---|---|---|", *rows])

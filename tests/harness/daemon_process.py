@@ -4,16 +4,16 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from softfinger import Refused
 from softfinger.daemon.client.command_client import send
 
 SOFTFINGER = [sys.executable, "-m", "softfinger"]
 # A hand that sits out a busy machine's stalls, for tests that are not about its time-outs.
 PATIENCE = {
+    "servos.open_timeout": 60.0,
     "servos.reply_timeout": 0.1,
     "servos.watchdog": 0.0,
     "servos.fault_after": 60.0,
@@ -52,17 +52,9 @@ def started(*words: object, **options: Any) -> subprocess.Popen[str]:
     return subprocess.Popen([*SOFTFINGER, *map(str, words)], **pipes | options)
 
 
-def held_up(error: str) -> bool:
-    """Whether a command was refused for what a busy machine does."""
-    return "send it again" in error or "were not read at this tick" in error
-
-
 def ask(address: str, name: str, **numbers: float) -> dict[str, Any]:
-    """The reply to a command, sent again where the daemon was held up and says so."""
-    while True:
-        reply = send(address, {"command": name, **numbers}, timeout=120.0)
-        if reply["ok"] or not held_up(reply["error"]):
-            return reply
+    """The reply to a command."""
+    return send(address, {"command": name, **numbers}, timeout=120.0)
 
 
 def until_it_says(words: Sequence[str | Path], text: str) -> None:
@@ -74,37 +66,16 @@ def until_it_says(words: Sequence[str | Path], text: str) -> None:
     assert process.returncode == 0
 
 
-def insist(command: Callable[[], Any]) -> Any:
-    """Give a client's command, again where the daemon was held up and says so."""
-    while True:
-        try:
-            return command()
-        except Refused as refused:
-            if not held_up(str(refused)):
-                raise
-
-
-async def insist_async(command: Callable[[], Awaitable[Any]]) -> Any:
-    """Give an asynchronous client's."""
-    while True:
-        try:
-            return await command()
-        except Refused as refused:
-            if not held_up(str(refused)):
-                raise
-
-
 class Running:
     """A ``softfinger run`` in a process of its own, ready when constructed."""
 
     def __init__(self, *words: str) -> None:
         self.lines: list[str] = []
-        while not self.lines or "answer" in self.lines[-1]:  # none of a hand that stood still
-            self.process = started("run", *words, stdout=None)
-            for line in self.process.stderr:
-                self.lines.append(line)
-                if "running, disarmed" in line:
-                    return
+        self.process = started("run", *words, stdout=None)
+        for line in self.process.stderr:
+            self.lines.append(line)
+            if "running, disarmed" in line:
+                return
         raise AssertionError("".join(self.lines))
 
     def end(self, number: int = signal.SIGTERM) -> int:

@@ -22,7 +22,7 @@ from softfinger.daemon.errors import SettingsError
 from softfinger.tools.arguments import profile
 from softfinger.tools.cli import main, make_parser
 from softfinger.tools.terminal.status import told
-from tests.harness.daemon_process import SOFTFINGER, Running, held_up
+from tests.harness.daemon_process import SOFTFINGER, Running
 
 _BUSY = "DOCUMENTED_BUSY"  # set for what a command starts: that runs on its own
 _ENDLESS = {"run", "monitor", "view", "replay", "envelope", "bench"}
@@ -71,8 +71,6 @@ class Softfinger:
         with client, client.makefile("rw") as stream:
             words = json.loads(stream.readline())
             status, told, error = self._answer(words)
-            while held_up(told):
-                status, told, error = self._answer(words)
             print(json.dumps((status, told, error)), file=stream, flush=True)
 
     def _answer(self, words: list[str]) -> tuple[int, str, str]:
@@ -113,7 +111,7 @@ class Softfinger:
         self._end_daemon()
         stream, commands = (f"ipc://{Path.cwd()}/{each}" for each in ("stream", "commands"))
         own = ("--set", f"stream.address={stream}", "--set", f"commands.address={commands}")
-        self._daemon = Running(*words[1:], *own)
+        self._daemon = Running(*words[1:], *own, "--set", "servos.open_timeout=60")
         self._usual = os.environ["SOFTFINGER_ADDRESS"]
         os.environ["SOFTFINGER_ADDRESS"] = f"{stream},{commands}"
         return 0

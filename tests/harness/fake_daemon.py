@@ -81,13 +81,15 @@ def event(seq: int, kind: str, text: str, level: str = "info") -> dict[str, Any]
 class FakeDaemon:
     """Publishes at 100 Hz (frames at 25 Hz) until closed. ``changes`` go into every state.
 
-    ``requests`` holds what the command socket was sent; ``replies`` maps a command to its reply.
+    ``requests`` holds what the command socket was sent, ``keys`` the key of each; ``replies`` maps
+    a command to its reply, or to a list of replies to one after the other.
     """
 
     def __init__(self) -> None:
         self.changes: dict[str, Any] = {}
         self.replies: dict[str, Any] = {}
         self.requests: list[dict[str, Any]] = []
+        self.keys: list[str] = []
         self.silent = threading.Event()
         self.published = 0  # states so far
         self._extra: list[list[bytes]] = []
@@ -118,8 +120,11 @@ class FakeDaemon:
         while not self._over.wait(0.01):
             while self._server.poll(0):
                 request = msgpack.unpackb(self._server.recv())
+                self.keys.append(request.pop("key", ""))
                 self.requests.append(request)
                 reply = self.replies.get(request["command"], {"ok": True})
+                if isinstance(reply, list):
+                    reply = reply.pop(0)
                 self._server.send(msgpack.packb(reply))
             while self._extra:
                 self._publisher.send_multipart(self._extra.pop(0))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -40,14 +39,15 @@ class Served:
             stream, commands, GATEWAY_TOPICS, queue, max_bytes, per_second, ipc_mode, keys
         )
         try:
-            self.service = Server(theirs, config, time.monotonic if clock is None else clock.now)
+            now = loop_link.machine_time if clock is None else clock.now
+            self.service = Server(theirs, config, now)
         except BaseException:
             ours.close()
             theirs.close()
             raise
         self.link.offer(ours)
         self.publisher = Publisher(self.link)
-        self.server = CommandServer(self.link)
+        self.server = CommandServer(self.link, clock=now)
         self._clock = clock
         self.settle()
         until(lambda: not commands or self._is_open())

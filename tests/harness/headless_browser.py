@@ -51,9 +51,13 @@ class Browser:
         told = folder / "DevToolsActivePort"  # written once somebody listens there
         until(lambda: told.exists() and "/" in told.read_text())
         pages: list[dict[str, Any]] = []
-        while not pages:  # a slow machine's browser may have none yet
+
+        def listed() -> bool:
             with urlopen(f"http://127.0.0.1:{told.read_text().split()[0]}/json") as answer:
-                pages = [each for each in json.load(answer) if each["type"] == "page"]
+                pages[:] = [each for each in json.load(answer) if each["type"] == "page"]
+            return bool(pages)
+
+        until(listed)  # the browser opens its first page after it listens
         waits: Any = {"open_timeout": WAIT, "ping_interval": None}
         url = pages[0]["webSocketDebuggerUrl"]
         self._socket = connect(url, proxy=None, max_size=None, **waits).__enter__()

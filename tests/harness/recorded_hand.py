@@ -60,17 +60,22 @@ class Keeping(Link):
 
 
 def published(
-    folder: Path, script: Script, seconds: float, changes: tuple[str, ...] = ()
+    folder: Path,
+    script: Script,
+    seconds: float,
+    changes: tuple[str, ...] = (),
+    profile: str | None = None,
 ) -> Messages:
     """All that the hand publishes under ``script``; ``folder`` is for its sockets."""
     settings = load(
+        None if profile is None else Path(profile),
         changes=[
             "loop.clock=virtual",
             "stream.state_rate=100",
             f"stream.address=ipc://{folder}/stream",
             f"commands.address=ipc://{folder}/commands",
             *changes,
-        ]
+        ],
     )
     taken: Messages = []
     with Daemon(settings) as daemon:
@@ -88,11 +93,12 @@ def record_hand(
     seconds: float,
     changes: tuple[str, ...] = (),
     without: tuple[bytes, ...] = (),
+    profile: str | None = None,
 ) -> None:
     """The commands in ``due`` at their ticks (500 a second); topics ``without`` are left out."""
     writer = RecordingWriter(path)
     with TemporaryDirectory() as folder:
-        for topic, message in published(Path(folder), Script(due), seconds, changes):
+        for topic, message in published(Path(folder), Script(due), seconds, changes, profile):
             if topic not in without:
                 writer.add(topic, message)
     writer.close()

@@ -11,7 +11,6 @@ from softfinger.daemon.wire.schema import STATE
 from softfinger.tools.cli import main
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.watched import Watched
-from tests.harness.daemon_process import insist
 from tests.harness.recorded_hand import record_hand
 from tests.unit.test_control import grasped
 
@@ -29,8 +28,8 @@ def test_a_daemon_begins_with_what_grips_told(start, profile, addresses, tmp_pat
         assert calibrate(0) == 1
         assert "grasp something firmly first" in capsys.readouterr().err
         assert not Path(files[0]).exists()
-        insist(hand.arm)
-        insist(lambda: hand.grasp(force=10.0))
+        hand.arm()
+        hand.grasp(force=10.0)
         hand.wait_for(lambda state: state.mode == "holding", 60.0)
         assert [calibrate(0), calibrate(1)] == [0, 0]
         found = [load_calibration(Path(file)).scales for file in files]

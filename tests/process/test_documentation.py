@@ -19,18 +19,17 @@ import select
 import shlex
 import subprocess
 import textwrap
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 from unittest import mock
 
 import pytest
 
-from softfinger import AsyncHand, Hand
 from softfinger.daemon.client.command_client import HandClient, send
 from softfinger.daemon.profile.load import find, load
 from tests.conftest import own_addresses
-from tests.harness.daemon_process import Running, insist, insist_async
+from tests.harness.daemon_process import Running
 from tests.harness.documented import Softfinger, parse
 
 ROOT = Path(__file__).parents[2]
@@ -151,16 +150,8 @@ def run_python(text: str, addresses: tuple[str, str]) -> None:
         if next(lines, None) is None:
             raise Enough
 
-    def insisting(hand: type, insist: Callable[..., Any]) -> Any:
-        command = hand.command
-        return mock.patch.object(
-            hand, "command", lambda *words, **numbers: insist(lambda: command(*words, **numbers))
-        )
-
     with (
         contextlib.suppress(Enough),
-        insisting(Hand, insist),
-        insisting(AsyncHand, insist_async),
         mock.patch.dict(HandClient.__init__.__kwdefaults__, timeout=PATIENCE),
     ):
         exec(compile(text, "block", "exec"), {"__name__": "__main__", "print": show})

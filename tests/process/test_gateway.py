@@ -33,7 +33,7 @@ from softfinger.daemon.wire import loop_link
 from softfinger.daemon.wire.local_stop import LocalStop, stop_locally
 from softfinger.daemon.wire.publisher import GATEWAY_TOPICS, Publisher
 from tests.conftest import Addresses, until
-from tests.harness.daemon_process import SOFTFINGER, ask, insist, python
+from tests.harness.daemon_process import SOFTFINGER, ask, python
 from tests.harness.terminal_process import TerminalProcess
 from tests.process.test_strangers import place
 
@@ -69,7 +69,7 @@ def ticking(addresses: Addresses, own_folder: Path) -> Iterator[Daemon]:
 def test_a_gateway_that_dies_is_started_again_while_the_loop_goes_on(ticking, addresses, number):
     gateway, loop = ticking.gateway, ticking.loop
     with Hand(*addresses, timeout=60.0) as hand:
-        insist(hand.arm)
+        hand.arm()
         stream = hand.stream(timeout=60.0)
         next(stream)
         first, ticks = gateway.process, loop.state.seq
@@ -213,7 +213,7 @@ def test_a_stop_on_this_machine_needs_no_place_among_the_clients(
         Hand(*addresses, timeout=60.0) as hand,
         TerminalProcess([*SOFTFINGER, "monitor", *where]) as page,
     ):
-        insist(hand.arm)
+        hand.arm()
         page.shows("ARMED")
         os.kill(ticking.gateway.process, signal.SIGSTOP)  # nobody is served
         try:
@@ -234,7 +234,7 @@ def test_a_stop_on_this_machine_needs_no_place_among_the_clients(
             os.kill(ticking.gateway.process, signal.SIGCONT)
         assert hand.wait_for(lambda state: not state.torque, 60.0).mode == "disarmed"
         hand.stop()
-        insist(hand.arm)  # what comes after its answer is heard
+        hand.arm()  # what comes after its answer is heard
         hand.stop()
 
 

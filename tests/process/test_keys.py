@@ -147,7 +147,7 @@ class Guarded:
         self.served.publisher.event(0.0, 0.0, "info", "test", "told")
         self.served.serve(self._hear)
 
-    def _hear(self, request: dict[str, Any]) -> dict[str, Any]:
+    def _hear(self, request: dict[str, Any], _: float) -> dict[str, Any]:
         self.heard.append(request)
         return {}
 

@@ -19,8 +19,6 @@ from tests.conftest import Addresses, own_addresses, until, write_profile
 from tests.harness.daemon_process import (
     Running,
     ask,
-    insist,
-    insist_async,
     started,
     until_it_says,
 )
@@ -65,7 +63,7 @@ def test_tools_with_keys_see_and_command_the_hand(guarded, tmp_path, inline):
         until(lambda: page.next()["mode"] == "disarmed")
         viewed.end()
     with Hand(*addresses, keys=folder / "alice", timeout=60.0) as hand:
-        insist(hand.arm)
+        hand.arm()
         assert hand.wait_for(lambda state: state.torque, 60.0).mode == "armed"
         told = inline("send", "status", "--address", commands, *alice, "--timeout", "60")
         assert json.loads(told.stdout)["torque"] is True
@@ -74,7 +72,7 @@ def test_tools_with_keys_see_and_command_the_hand(guarded, tmp_path, inline):
 
     async def session() -> str:
         async with AsyncHand(*addresses, keys=folder / "alice", timeout=60.0) as hand:
-            await insist_async(lambda: hand.command("disarm"))
+            await hand.command("disarm")
             return (await hand.wait_for(lambda state: not state.torque, 60.0)).mode
 
     assert asyncio.run(session()) == "disarmed"

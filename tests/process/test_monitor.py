@@ -13,7 +13,7 @@ import pytest
 
 from softfinger import Hand
 from tests.conftest import until
-from tests.harness.daemon_process import SOFTFINGER, insist, started
+from tests.harness.daemon_process import SOFTFINGER, started
 from tests.harness.descendants import ending
 from tests.harness.fake_daemon import FakeDaemon, finger
 from tests.harness.terminal_process import TerminalProcess
@@ -181,6 +181,17 @@ def test_the_force_to_grasp_with_is_chosen_and_a_grip_follows(fake):
         assert asked() == [4.0, 6.0, 5.0]
 
 
+def test_a_late_command_is_sent_again_with_its_key(fake):
+    late = {"ok": False, "error": "arm: 0.40 s old when its turn came", "reason": "late"}
+    fake.replies["arm"] = [late, late, {"ok": True}]
+    fake.changes = {"mode": "disarmed"}
+    with TerminalProcess(command(fake)) as page:
+        page.shows("DISARMED")
+        page.press(b"a", "✓ arm: ok")
+    assert [each["command"] for each in fake.requests] == ["arm"] * 3
+    assert len(set(fake.keys)) == 1
+
+
 def test_beside_another_commander_of_a_real_daemon(start, profile, addresses):
     stream, commands = addresses
     daemon = start("--config", str(profile("commands.lease = 60.0\n")))
@@ -189,7 +200,7 @@ def test_beside_another_commander_of_a_real_daemon(start, profile, addresses):
         page.shows("DISARMED", "running, disarmed")  # told before the page was there
         page.shows("compute", "late", "25.0", "°C")
         with Hand(stream, commands, client="notebook", timeout=60.0) as hand:
-            insist(hand.arm)
+            hand.arm()
             page.shows("ARMED", "notebook commands the hand")
             page.press(b"g", "✗ grasp: notebook commands the hand (")
             page.type(b" ")  # stop needs no lease

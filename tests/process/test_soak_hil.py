@@ -8,7 +8,6 @@ from typing import Any
 
 from softfinger.daemon.profile.load import load
 from softfinger.tools.benchmarks.rigs import HIL
-from tests.conftest import until
 from tests.soak import hil
 from tests.soak.rig import judge_wire
 
@@ -16,9 +15,7 @@ from tests.soak.rig import judge_wire
 def test_the_soak_in_real_time_judges_wire_memory_and_streams(monkeypatch):
     monkeypatch.setattr(hil, "_LOOK", 0.5)
     monkeypatch.setattr(hil, "_FLAT", 30.0)  # MB: all of them are still warming up
-    accounts: list[hil.Account] = []  # more than one where a busy machine stood still
-    until(lambda: accounts.append(hil.soak(4.0)) or accounts[-1].done["arm"])
-    account = accounts[-1]
+    account = hil.soak(4.0)
     # A busy machine may hold up the emulated hand itself, whose watchdog then comes late.
     assert [each for each in account.wrong if "without a packet" not in each] == []
     assert account.ticks > 0

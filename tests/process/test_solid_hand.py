@@ -1,4 +1,4 @@
-"""A hand with solid tips, recorded by a real daemon: what the tools make of the recording."""
+"""A hand with solid tips, recorded on the virtual clock: what the tools make of it."""
 
 from pathlib import Path
 
@@ -7,32 +7,15 @@ import pytest
 from softfinger.daemon.wire import schema
 from softfinger.tools.cli import main
 from softfinger.tools.recordings.reader import Recording
-from tests.conftest import own_addresses
-from tests.harness.daemon_process import softfinger
+from tests.harness.recorded_hand import record_hand
 
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Four virtual seconds of the demo: grasped, held, and turned.
-
-    Virtual time waits for nobody: where the recorder of a busy machine falls behind, once more.
-    """
+    """Four virtual seconds of the demo: grasped, held, and turned."""
     path = tmp_path_factory.mktemp("solid") / "hand.mcap"
-    stream, commands = own_addresses()
-    changes = {
-        "loop.clock": "virtual",
-        "task.name": "demo",
-        "stream.address": stream,
-        "commands.address": commands,
-    }
-    words = [word for key, value in changes.items() for word in ("--set", f"{key}={value}")]
-    seconds = ("--duration", "4", "--record", str(path))
-    while True:
-        done = softfinger("run", "--config", "solid", *words, *seconds, timeout=600.0)
-        assert done.returncode == 0, done.stderr
-        if "lost on the way: none" in done.stderr:
-            return path
-        path.unlink()
+    record_hand(path, {}, 4.0, ("task.name=demo",), profile="solid")
+    return path
 
 
 def test_its_recording_recomputes_to_the_last_bit(recorded, capsys):

@@ -60,17 +60,17 @@ class Rig:
         self.daemon: subprocess.Popen[bytes] | None = None
         self._states: zmq.Socket[bytes] | None = None
 
-    def start(self) -> None:
-        """Start whatever does not run. Raises RigError."""
+    def start(self, *words: str) -> None:
+        """Start whatever does not run, the daemon with these ``words`` too. Raises RigError."""
         if self.hand is None or self.hand.poll() is not None:
             self.hand = self._running.enter_context(emulator(self.ports, self.config))
         if not self.alive:
-            self.start_daemon()
+            self.start_daemon(*words)
 
-    def start_daemon(self) -> None:
+    def start_daemon(self, *more: str) -> None:
         """Start the daemon, and wait for its first answer. Raises RigError."""
         end = time.monotonic() + _PATIENCE
-        words = ["run", "--config", str(self.config), "--dir", str(self.ports)]
+        words = ["run", "--config", str(self.config), "--dir", str(self.ports), *more]
         log = str(self.folder / "daemon.log")
         self.daemon = subprocess.Popen([*SOFTFINGER, *words, "--log-file", log])
         if self._states is not None:

@@ -47,17 +47,14 @@ def test_an_answer_that_the_loop_is_long_about_comes_and_holds_up_nobody(
     clients = [Asking(context, served, addresses[1], "arm") for _ in range(2 * bounds.UNDER_WAY)]
     until(lambda: served.settle() or len(served.link.asked) == bounds.UNDER_WAY)
     until(lambda: served.settle() or served.service.requests._count == bounds.UNDER_WAY)
-    clock.sleep_until(clock.now() + 0.9 * bounds.OLDEST)  # a machine that is busy
+    clock.sleep_until(clock.now() + 0.9 * bounds.LATE)  # a machine that is busy
     served.settle()
     assert len(served.link.asked) == bounds.UNDER_WAY
     clock.sleep_until(clock.now() + bounds.LATE)
     served.settle()
     assert is_served(served, context, addresses[1])
     told = [client.told() for client in clients]
-    assert sum(reply.get("heard") == "arm" for reply in told) == bounds.UNDER_WAY
-    late = [reply["error"] for reply in told if not reply["ok"]]
-    assert all("waited too long" in error for error in late)
-    assert len(late) == bounds.UNDER_WAY
+    assert [reply.get("heard") for reply in told] == ["arm"] * len(clients)
 
 
 @pytest.mark.parametrize(
@@ -130,7 +127,7 @@ def test_answers_that_are_not_read_are_dropped(served, context, addresses):
     while asked < most:
         client.send(msgpack.packb({"command": "status"}))
         asked += 1
-        served.serve(lambda _: long)
+        served.serve(lambda *_: long)
     assert is_served(served, context, addresses[1])
     read = 0
     while client.poll(200):

@@ -18,18 +18,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from softfinger.daemon.clock import VirtualClock
+from softfinger.daemon.errors import Reason, Refused
 from softfinger.daemon.gateway import bounds
 from softfinger.daemon.gateway.endpoints import CommandEndpoint
 from tests.harness.gateway import Served
 
 action = st.one_of(
-    st.tuples(st.sampled_from(["arm", "stop"]), st.integers(0, 3)),
-    st.tuples(st.sampled_from(["gateway", "loop", "signal", "time"]), st.just(0)),
+    st.tuples(st.sampled_from(["arm", "stop", "repeat"]), st.integers(0, 3)),
+    st.tuples(st.sampled_from(["gateway", "loop", "busy loop", "signal", "time"]), st.just(0)),
 )
 
 
 class Scene:
-    """Counts what happens; an ``arm`` is told apart by the count at its arrival."""
+    """Counts what happens; an ``arm`` is told apart by the count when it was first sent."""
 
     def __init__(self, folder: str) -> None:
         self.clock = VirtualClock()
@@ -39,6 +40,10 @@ class Scene:
         self.reading = 0.4 * bounds.TURN  # s that a message takes: few at a look
         self.now = 0
         self.stopped_at = 0
+        self.asked = 0
+        self.last: dict[int, float] = {}  # each client's last arm, which it may send again
+        self.carried_out: set[float] = set()
+        self.busy = False
 
     def read(self) -> list[zmq.Frame] | None:
         """In the place of libzmq's socket."""
@@ -54,15 +59,23 @@ class Scene:
     def ask(self, client: int, **request: Any) -> None:
         parts = (b"client %d" % client, b"", msgpack.packb(request))
         self.arrived.append([zmq.Frame(part) for part in parts])
+        self.asked += 1
 
     def act(self, what: str, client: int = 0) -> None:
         self.now += 1
         self.pass_time(1e-6)
-        if what in ("arm", "stop"):
-            self.ask(client, command=what, force=float(self.now))
+        if what == "stop":
+            self.ask(client, command="stop")
+        elif what in ("arm", "repeat"):
+            if what == "arm":
+                self.last[client] = float(self.now)
+            if client in self.last:
+                first = self.last[client]
+                self.ask(client, command="arm", force=first, key=f"{first}")
         elif what == "gateway":
             self.served.service.step(0.0)
-        elif what == "loop":
+        elif what in ("loop", "busy loop"):
+            self.busy = what == "busy loop"
             self.served.server.serve(self._carry_out)
         elif what == "time":
             self.pass_time(bounds.PURGE)
@@ -70,11 +83,15 @@ class Scene:
             self.served.server.raise_fence()
             self.stopped_at = self.now
 
-    def _carry_out(self, request: dict[str, Any]) -> dict[str, Any]:
+    def _carry_out(self, request: dict[str, Any], age: float) -> dict[str, Any]:
         if request["command"] == "stop":
             self.stopped_at = self.now
-        else:
-            assert request["force"] > self.stopped_at, "it arrived before a stop"
+            return {}
+        if self.busy:
+            raise Refused("the loop stood still", Reason.LATE)
+        assert request["force"] > self.stopped_at, "it was first sent before a stop"
+        assert request["force"] not in self.carried_out, "it was carried out before"
+        self.carried_out.add(request["force"])
         return {}
 
 
@@ -99,7 +116,7 @@ def test_nothing_that_arrived_before_a_stop_is_carried_out(actions):
         for _ in range(100):  # all that was sent has been read, stops included
             scene.act("gateway")
             scene.act("loop")
-        asked = sum(what in ("arm", "stop") for what, _ in actions)
+        asked = scene.asked
         assert len(scene.replies) == asked, "every request is answered, and once"
         # And what arrives after it is carried out.
         scene.ask(0, command="arm", force=1e9)

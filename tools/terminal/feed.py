@@ -20,7 +20,7 @@ import numpy as np
 import zmq
 from numpy.typing import NDArray
 
-from softfinger.daemon.client.command_client import LOCALLY, UNCONFIRMED
+from softfinger.daemon.client.command_client import AGAIN_AFTER, LOCALLY, UNCONFIRMED, Attempts
 from softfinger.daemon.client.connection import PATIENCE, SILENCE, drain, subscribe, unpack
 from softfinger.daemon.client.stream import read
 from softfinger.daemon.control.modes import UNLEASED
@@ -297,7 +297,9 @@ class _Pending:
 
     label: str
     socket: zmq.Socket[bytes]
+    attempts: Attempts
     sent: float
+    again_at: float = math.inf  # when it is sent again, after it was late
     warned: bool = False  # that it takes long
 
 
@@ -326,12 +328,13 @@ class Commander:
         if command == "stop" and (stopped := stop_locally(self._address, LOCALLY)) is not None:
             self.reply = judge(now, label, stopped)
             return
+        attempts = Attempts({"command": command, **self._envelope, **fields}, PATIENCE)
         request = self._context.socket(zmq.REQ)
         request.setsockopt(zmq.LINGER, 0)
         request.setsockopt(zmq.MAXMSGSIZE, _MESSAGE_LIMIT)
         request.connect(self._address)
-        request.send(msgpack.packb({"command": command, **self._envelope, **fields}), zmq.NOBLOCK)
-        self._pending.append(_Pending(label, request, now))
+        request.send(msgpack.packb(attempts.request), zmq.NOBLOCK)
+        self._pending.append(_Pending(label, request, attempts, now))
 
     def refuse(self, now: float, why: str) -> None:
         """Say why something was not done."""
@@ -340,6 +343,9 @@ class Commander:
     def collect(self, now: float) -> None:
         """Take the replies that came, give up on those that are overdue."""
         for each in list(self._pending):
+            if now >= each.again_at:
+                each.again_at = math.inf
+                each.socket.send(msgpack.packb(each.attempts.request), zmq.NOBLOCK)
             try:
                 payload = each.socket.recv(zmq.NOBLOCK)
             except zmq.Again:
@@ -355,6 +361,9 @@ class Commander:
                     record = msgpack.unpackb(payload)
                 except (ValueError, RecursionError, msgpack.UnpackException):
                     record = None
+                if isinstance(record, dict) and each.attempts.again(record):
+                    each.again_at = now + AGAIN_AFTER
+                    continue
                 self.reply = judge(now, each.label, record)
             each.socket.close()
             self._pending.remove(each)
