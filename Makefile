@@ -1,5 +1,7 @@
-# make run: the simulated hand with its live page.  make test: the tests, on every processor.
-# make test ARGS=tests/unit: some of them, or options of pytest; ARGS=-n0: in one process.
+# make run: the simulated hand with its live page.
+# make test: the first tier of the tests, on every processor.  make test-extended: the second tier, the tests marked
+# `extended`.  make test-all: both.  ARGS=tests/unit selects tests or gives pytest options; ARGS=-n0: in one process.
+# A test file that ARGS names runs with its extended tests.
 # make lowest: the tests of servos, settings and wire with the oldest packages that pyproject.toml allows.
 # make docs: the documentation site, in build/site.
 # Each sets up in .venv what it needs and no more; PYTHON chooses the interpreter (3.11 or later).
@@ -13,6 +15,7 @@ INSTALL := $(BIN)/python $(PIP_INSTALL) --constraint constraints.txt
 WORKERS := $(shell expr $$(nproc) + 2) # some wait for something while the others compute
 # Which lines no test ran is told where Python can count them for next to nothing (3.12 and later).
 COVERAGE = $(shell $(BIN)/python -c "import sys; print('--cov' * (sys.version_info >= (3, 12)))")
+PYTEST = $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist worksteal
 LOWEST_PIP := build/lowest/bin/python $(PIP_INSTALL) --quiet
 SERVO_TESTS := tests/process/test_servo_sdk.py tests/unit/test_servo_round_trip.py
 LOWEST_TESTS := tests/process/test_servo_checks.py $(addprefix tests/unit/test_,settings.py schema.py)
@@ -23,7 +26,7 @@ TO_DOCUMENT := $(VENV)/.ready-docs
 # Byte code is kept whatever the environment says: a test run starts hundreds of processes.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: run test warm docs lowest lint format clean
+.PHONY: run test test-extended test-all warm docs lowest lint format clean
 
 run: $(TO_RUN)
 	@echo "Starting the simulated hand at work; q ends it."
@@ -31,7 +34,13 @@ run: $(TO_RUN)
 
 test: $(TO_TEST)
 	@$(BIN)/softfinger compile --all
-	$(BIN)/python -m pytest --numprocesses $(WORKERS) --dist worksteal $(COVERAGE) $(ARGS)
+	$(PYTEST) $(COVERAGE) $(ARGS)
+
+test-extended: $(TO_TEST)
+	@$(BIN)/softfinger compile --all
+	$(PYTEST) -m extended $(ARGS)
+
+test-all: test-extended test
 
 # Else each test process makes its own at the same time: byte code, kernels of solid tips.
 warm: $(TO_TEST)

@@ -51,8 +51,18 @@ def pytest_configure(config: pytest.Config) -> None:
         descendants.end_with_this_process()
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Begin with what waits longest, while others compute; at the end nobody would be left to."""
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out extended tests, unless ``-m`` selects tests or the command line names their file.
+
+    Begin with those that wait longest, so that the others compute meanwhile.
+    """
+    if not config.option.markexpr:
+        named = {Path(each.partition("::")[0]).resolve() for each in config.args}
+        left_out = {
+            item for item in items if item.get_closest_marker("extended") and item.path not in named
+        }
+        config.hook.pytest_deselected(items=list(left_out))
+        items[:] = [item for item in items if item not in left_out]
     items.sort(key=lambda item: item.get_closest_marker("waits") is None)
 
 

@@ -36,6 +36,7 @@ ROOT = Path(__file__).parents[2]
 SOURCES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("docs/*.md"))]
 PAGES = [page for page in SOURCES if re.search(r"(?m)^ *(```\w|<!--)", page.read_text("utf-8"))]
 USUAL = ("tcp://127.0.0.1:9872", "tcp://127.0.0.1:9873")
+LONG = ("tutorial.md", "recordings.md")  # pages that wait for most of a minute
 MARK = re.compile(r"^ *<!-- (?:not run|exits)\b.*-->$", re.M)
 REASON = re.compile(r"not run: \S.*|not run without \w+|exits 1: \S.*")
 FENCE = re.compile(r"(?ms)^(?P<indent> *)```(?P<language>\w*)[^\n]*\n(?P<text>.*?)^(?P=indent)```$")
@@ -158,7 +159,11 @@ def run_python(text: str, addresses: tuple[str, str]) -> None:
 
 
 @pytest.mark.waits
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize(
+    "page",
+    [pytest.param(page, marks=[pytest.mark.extended] * (page.name in LONG)) for page in PAGES],
+    ids=lambda page: page.name,
+)
 def test_blocks(page, shared, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("my.toml").write_text(find(Path("hil")).read_text(encoding="utf-8"))

@@ -57,6 +57,7 @@ def act_until(robot: Any, action: dict[str, float], done: Callable[[dict[str, An
     raise AssertionError(f"not by {action}; the last: {found}")
 
 
+@pytest.mark.extended
 def test_lerobot_drives_and_records_the_simulated_hand(make, start, profile, tmp_path):
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
     from lerobot.utils.errors import DeviceNotConnectedError

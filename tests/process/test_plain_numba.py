@@ -4,6 +4,7 @@ import os
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from softfinger import ContactTable
 from tests.harness.daemon_process import python
@@ -40,6 +41,7 @@ def figures() -> str:
     return np.array(found[:6]).tobytes().hex()
 
 
+@pytest.mark.extended
 def test_tests_of_each_kind_of_kernel_pass_with_numba_alone_and_the_bits_are_the_same(request):
     kept = str(request.config.cache.mkdir("plain-numba"))  # apart: those of others are in use
     environment = os.environ | {"NUMBA_CACHE_DIR": kept}

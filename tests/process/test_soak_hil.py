@@ -6,12 +6,15 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import pytest
+
 from softfinger.daemon.profile.load import load
 from softfinger.tools.benchmarks.rigs import HIL
 from tests.soak import hil
 from tests.soak.rig import judge_wire
 
 
+@pytest.mark.extended
 def test_the_soak_in_real_time_judges_wire_memory_and_streams(monkeypatch):
     monkeypatch.setattr(hil, "_LOOK", 0.5)
     monkeypatch.setattr(hil, "_FLAT", 30.0)  # MB: all of them are still warming up

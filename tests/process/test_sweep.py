@@ -50,6 +50,7 @@ def test_a_case_that_kills_each_worker_ends_the_sweep():
         list(Sweep("drawn", dies, CASES).run(2))
 
 
+@pytest.mark.extended
 def test_a_cluster_gives_the_same_and_outlives_a_worker(tmp_path):
     distributed = pytest.importorskip("distributed")
     with distributed.LocalCluster(

@@ -19,7 +19,10 @@ from tests.harness.headless_browser import Browser, browser_path
 from tests.harness.recorded_hand import record_hand
 from tests.harness.viewed import Viewed
 
-pytestmark = pytest.mark.skipif(browser_path() is None, reason="no Chromium on this machine")
+pytestmark = [
+    pytest.mark.extended,
+    pytest.mark.skipif(browser_path() is None, reason="no Chromium on this machine"),
+]
 
 PATIENT = "\n".join(f"{key} = {value}" for key, value in PATIENCE.items())
 # The fraction of a canvas's pixels that nearly have a colour.

@@ -68,6 +68,7 @@ def wheel(sdist: Path) -> Path:
     return packed
 
 
+@pytest.mark.extended
 def test_the_sdist_carries_what_its_tests_and_pages_need(sdist):
     assert all((sdist / name).is_file() for name in _SOURCES)
     for folder in ("docs", "tests"):
@@ -76,6 +77,7 @@ def test_the_sdist_carries_what_its_tests_and_pages_need(sdist):
         assert not [each for each in missing if each.suffix != ".pyc"]
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("found", ["a file", "nothing"])
 def test_a_clone_without_links_is_not_built(found, tmp_path):
     source = copied(tmp_path / "source")
@@ -91,6 +93,7 @@ def test_a_clone_without_links_is_not_built(found, tmp_path):
     assert not list(tmp_path.glob("*.whl"))
 
 
+@pytest.mark.extended
 def test_it_holds_one_package_with_all_its_data(wheel):
     names = set(zipfile.ZipFile(wheel).namelist())
     assert {name.split("/")[0].split("-")[0] for name in names} == {"softfinger"}
@@ -104,6 +107,7 @@ def test_it_holds_one_package_with_all_its_data(wheel):
     assert not any(name.startswith("softfinger/tests") for name in names)
 
 
+@pytest.mark.extended
 def test_a_script_beside_an_editable_clone_finds_the_package(tmp_path):
     """The clone's folder has the package's name, and stands before what is installed."""
     source = copied(tmp_path / "softfinger")
@@ -118,6 +122,7 @@ def test_a_script_beside_an_editable_clone_finds_the_package(tmp_path):
     assert told.stdout.strip() == str(source / "softfinger" / "__init__.py"), told.stderr
 
 
+@pytest.mark.extended
 def test_folders_of_the_same_names_are_in_nobodys_way(wheel, tmp_path):
     site, here = tmp_path / "site", tmp_path / "here"
     zipfile.ZipFile(wheel).extractall(site)

@@ -17,6 +17,7 @@ mujoco = pytest.importorskip("mujoco", reason="the extra 'mujoco' is not install
 
 from softfinger.mujoco import MujocoHand, SoftTips  # noqa: E402
 
+pytestmark = pytest.mark.extended
 PAGE = Path(__file__).parents[2] / "docs" / "mujoco.md"
 SETTINGS = checked({"loop": {"clock": "virtual"}})
 RADIUS, FRICTION = SETTINGS.tip.radius, SETTINGS.simulation.tip_friction
