@@ -47,6 +47,7 @@ def steep(folder: Path) -> Path:
     return file
 
 
+@pytest.mark.extended
 def test_a_part_is_compiled_once_and_its_kernels_are_as_many_as_the_bar_says(tmp_path):
     table = named("contact table")
     settings = Settings().model_dump_json()

@@ -194,6 +194,7 @@ def test_servos_at_another_rate_are_found(hands, capsys):
 
 
 @pytest.mark.waits
+@pytest.mark.extended
 def test_a_servo_with_another_id_is_found_and_changed_only_when_asked(hands, capsys):
     hand = hands(ids=(1, 7), baud=2_000_000)
     servo = hand.emulator._servos.bus.servos[1]

@@ -65,7 +65,14 @@ def watched(rig: Rig) -> Iterator[dict[str, Any]]:
         select.select([], [], [], 0.005)  # the processor is for those who grip
 
 
-@pytest.mark.parametrize("lie", [GAIN, CURRENT, REFUSED])
+@pytest.mark.parametrize(
+    "lie",
+    [
+        pytest.param(GAIN, marks=pytest.mark.extended),
+        pytest.param(CURRENT, marks=pytest.mark.extended),
+        REFUSED,
+    ],
+)
 def test_a_lie_is_bounded_and_nothing_else_is_named(rig, lie):
     false = f"witness.{lie.split(':')[0]}_{'current' if lie == CURRENT else 'sensor'}"
     gripped(rig)

@@ -9,6 +9,7 @@ from softfinger import Hand
 from tests.harness.daemon_process import python
 
 
+@pytest.mark.extended
 def test_grasp_and_turn(start, profile, addresses, tmp_path):
     daemon = start("--config", str(profile("")))
     stream, commands = addresses
@@ -32,6 +33,7 @@ def test_grasp_and_turn(start, profile, addresses, tmp_path):
     assert daemon.end() == 0
 
 
+@pytest.mark.extended
 def test_the_gyms_table_comes_from_several_processes():
     done = python("-m", "softfinger.gym", "1", "--processes", "2")
     assert done.returncode == 0, done.stderr

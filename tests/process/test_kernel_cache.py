@@ -94,7 +94,10 @@ def package(tmp_path: Path) -> Package:
     return Package(tmp_path)
 
 
-@pytest.mark.parametrize("first", ["", "import numba\nnumba.__version__ = '99.0'\n"])
+@pytest.mark.parametrize(
+    "first",
+    ["", pytest.param("import numba\nnumba.__version__ = '99.0'\n", marks=pytest.mark.extended)],
+)
 def test_a_changed_callee_or_constant_is_compiled_anew(package, first):
     package.first = first
     assert package.run() == (["3.0", "0"], "")
@@ -110,6 +113,7 @@ def test_a_changed_callee_or_constant_is_compiled_anew(package, first):
     assert found == (["6.0", "1"], ""), "the folder of these sources is still there"
 
 
+@pytest.mark.extended
 def test_a_kept_kernel_runs_without_what_compiles_and_is_compiled_into_others(package):
     assert package.run(KEPT) == (["9.0", "0", "True"], "")
     assert package.run(KEPT) == (["9.0", "1", "False"], "")

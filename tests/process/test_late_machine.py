@@ -52,6 +52,7 @@ def test_a_simulated_hand_outlives_a_machine_that_stands_still(start, profile, h
     assert running.end() == 0
 
 
+@pytest.mark.extended
 def test_on_real_time_it_faults_names_the_busy_machine_and_begins_again(start, profile, hand):
     running = start("--config", str(profile('task.name = "demo"\nloop.clock = "real"\n')))
     with hand.stream(PATIENCE) as states, hand.events(PATIENCE) as events:

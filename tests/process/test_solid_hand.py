@@ -26,6 +26,7 @@ def test_its_recording_recomputes_to_the_last_bit(recorded, capsys):
     assert max(abs(each["left"]["shear_x"]) for each in states) > 0.2
 
 
+@pytest.mark.extended
 def test_analyse_and_plot_read_it(recorded, capsys):
     assert main(["analyse", str(recorded)]) == 0
     assert ", 0 not usable" in capsys.readouterr().out

@@ -102,7 +102,11 @@ ENVELOPE = "envelope --shape rectangle --size 3 40 --mass 1 --friction 0.6 --kee
 CAMPAIGN = "bench witnesses --only '6 N: honest' --trials 2 --json"
 
 
-@pytest.mark.parametrize("words", [ENVELOPE, CAMPAIGN], ids=["envelope", "campaign"])
+@pytest.mark.parametrize(
+    "words",
+    [ENVELOPE, pytest.param(CAMPAIGN, marks=pytest.mark.extended)],
+    ids=["envelope", "campaign"],
+)
 def test_a_tool_gives_the_same_in_one_process_and_in_two(tmp_path, words):
     for processes in ("1", "2"):
         assert main([*shlex.split(words), str(tmp_path / processes), "--processes", processes]) == 0

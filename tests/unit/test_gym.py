@@ -13,7 +13,10 @@ from softfinger.gym.environment import Images, SoftFingerEnv
 pytestmark = pytest.mark.filterwarnings("error")
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize(
+    "task",
+    [pytest.param(task, marks=[pytest.mark.extended] * (task != "grasp")) for task in TASKS],
+)
 def test_gymnasiums_checker_has_nothing_to_say(task):
     env = gymnasium.make(f"SoftFinger-{task.capitalize()}-v0")
     check_env(env.unwrapped, skip_render_check=True)
@@ -35,6 +38,7 @@ def test_a_seed_gives_the_same_bits_and_another_one_others():
     env.close()
 
 
+@pytest.mark.extended
 def test_the_built_in_law_turns_and_holds_and_a_random_agent_does_not():
     for task, least, most in (("rotate", 150.0, 150.0), ("grasp", 120.0, 20.0)):
         name = f"SoftFinger-{task.capitalize()}-v0"

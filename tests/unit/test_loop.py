@@ -41,7 +41,9 @@ def test_starts_disarmed_with_torque_off_and_arming_moves_nothing(make):
     assert state.reading.q == pytest.approx(before, abs=0.005)
 
 
-@pytest.mark.parametrize("profile", [{}, {"material": {"law": "constant"}}])
+@pytest.mark.parametrize(
+    "profile", [{}, pytest.param({"material": {"law": "constant"}}, marks=pytest.mark.extended)]
+)
 def test_grasp_reaches_10_n_within_3_s_and_holds_it_10_s(make, profile):
     daemon = grasped(make(**profile), 10.0)
     state = daemon.loop.state

@@ -62,7 +62,14 @@ def test_a_tip_that_seems_to_let_go_is_no_sudden_load(kind, value, force):
         assert not [text for _, kind, text in hand.events if kind == "slip"]
 
 
-@pytest.mark.parametrize(("gain", "over"), [(0.5, 0.0), (1.6, 0.0), (0.6, 2.0)])
+@pytest.mark.parametrize(
+    ("gain", "over"),
+    [
+        (0.5, 0.0),
+        pytest.param(1.6, 0.0, marks=pytest.mark.extended),
+        pytest.param(0.6, 2.0, marks=pytest.mark.extended),
+    ],
+)
 def test_a_gain_that_changes_leaves_a_solid_tips_force(gain: float, over: float) -> None:
     with Hand(SOLID) as hand:
         grasped(hand, FORCE)

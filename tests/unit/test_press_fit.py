@@ -49,6 +49,7 @@ def test_the_tip_that_made_them_explains_them_best(tip):
         assert best.tip.poisson == pytest.approx(0.48, abs=0.01)
 
 
+@pytest.mark.extended
 def test_a_solid_tips_place_and_rotation_are_found_by_its_whole_frames():
     true = SensorGrid(32, 32, 0.058 / 32, centre=(1.3e-3, -0.8e-3), rotation=-2.0)
     found = fit_centre(frames(TIP, true), THETA, TIP, RUBBER, GRID, NOISE)

@@ -246,6 +246,7 @@ def test_a_hand_with_solid_tips_grasps_turns_and_releases(make):
     assert not any(contact.contact for contact in state.contacts)
 
 
+@pytest.mark.extended
 def test_turning_to_and_fro_leaves_a_solid_tips_force_as_it_was(make):
     """Rolling moves d by what the joints don't tell well: it must not be taken for a gain."""
     daemon = make(**load(Path("solid")).model_dump(exclude={"loop"}))

@@ -65,6 +65,7 @@ def test_the_extent_hardly_tells_the_depth(arrays, d):
     assert sigma == pytest.approx(9.5 * MM, abs=0.1 * MM)
 
 
+@pytest.mark.extended
 def test_frames_of_three_dimensional_elements(arrays):
     """tests/harness/solid_reference.py: other meshes, and no fit."""
     with np.load(REFERENCE) as data:
@@ -91,6 +92,7 @@ def test_frames_of_three_dimensional_elements(arrays):
 THETA, D = np.radians(20.0), 0.25
 
 
+@pytest.mark.extended
 def test_a_linear_press_is_in_balance_and_a_sticking_one_stiffer():
     from research.solid_tip.contact import TiltedPlane
     from research.solid_tip.fit import RING_EDGES, Samples
