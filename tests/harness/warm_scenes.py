@@ -1,7 +1,7 @@
 """A process that runs many kinds of scene and tells which kernels were compiled or loaded in them.
 
-``python -m tests.harness.warm_scenes FOLDER`` prints one JSON line a scene. FOLDER takes a
-calibration file, and where a stand-in hand's ports are in it, the daemon runs on that, too. Each
+``python -m tests.harness.warm_scenes FOLDER SCENE…`` prints one JSON line a scene. FOLDER takes a
+calibration file; a stand-in hand's ports must be in it for the scene that runs on them. Each
 scene runs in a fork of a process that has called no kernel yet, so that none is warm through
 another scene.
 """
@@ -29,6 +29,7 @@ from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
 from tests.harness.daemon_process import PATIENCE
 
+CALIBRATED, STAND_IN = "calibrated sensor", "stand-in hand"
 HIL = Path(__file__).parents[2] / "config" / "hil.toml"
 SCENES: dict[str, dict[str, Any]] = {
     "two fingers": {},
@@ -118,24 +119,24 @@ def calibrated(folder: Path) -> dict[str, Any]:
     return {"tactile": {"calibration": (str(path), "")}}
 
 
-def main(folder: Path) -> None:
-    """Run each scene in a fork, then, on ``folder``'s stand-in hand, the daemon over bytes."""
-    sections = {**SCENES, "calibrated sensor": calibrated(folder)}
+def main(folder: Path, names: list[str]) -> None:
+    """Run each of the named scenes in a fork."""
+    sections = {**SCENES, CALIBRATED: calibrated(folder)}
     scenes = {
         name: Settings.model_validate({"loop": {"clock": "virtual"}, **scene})
         for name, scene in sections.items()
     }
-    if (folder / "servos").exists():
+    if STAND_IN in names:
         changes = [f"{key}={value}" for key, value in PATIENCE.items()]
-        scenes["stand-in hand"] = load(HIL, folder, changes)
-    for name, settings in scenes.items():
+        scenes[STAND_IN] = load(HIL, folder, changes)
+    for name in names:
         child = os.fork()
         if child == 0:
-            print(json.dumps({"scene": name, **run(settings)}), flush=True)
+            print(json.dumps({"scene": name, **run(scenes[name])}), flush=True)
             os._exit(0)
         if os.waitpid(child, 0)[1]:
             sys.exit(f"{name}: failed")  # what of is printed already
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    main(Path(sys.argv[1]), sys.argv[2:])

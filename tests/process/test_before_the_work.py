@@ -14,11 +14,20 @@ from tests.process.test_record import written
     [
         ("matplotlib", "plot run.mcap", "pip install 'softfinger[plot]'"),
         ("mcap", "record new.mcap", "pip install 'softfinger[record]'"),
-        ("websockets", "view", "pip install 'softfinger[view]'"),
-        ("pyarrow", "export run.mcap --format parquet", "pip install 'softfinger[parquet]'"),
         ("numba", "replay --recompute run.mcap", "no hand/settings in it"),
-        ("numba", "analyse run.mcap", "no hand/settings in it"),
-        ("numba", "plot none.mcap", "none.mcap: No such file"),
+        *(
+            pytest.param(*each, marks=pytest.mark.extended)
+            for each in (
+                ("websockets", "view", "pip install 'softfinger[view]'"),
+                (
+                    "pyarrow",
+                    "export run.mcap --format parquet",
+                    "pip install 'softfinger[parquet]'",
+                ),
+                ("numba", "analyse run.mcap", "no hand/settings in it"),
+                ("numba", "plot none.mcap", "none.mcap: No such file"),
+            )
+        ),
     ],
 )
 def test_a_missing_package_is_named_if_it_is_needed(tmp_path, missing, words, told):

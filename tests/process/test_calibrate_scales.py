@@ -15,6 +15,7 @@ from tests.harness.recorded_hand import record_hand
 from tests.unit.test_control import grasped
 
 
+@pytest.mark.extended
 def test_a_daemon_begins_with_what_grips_told(start, profile, addresses, tmp_path, capsys):
     start("--config", str(profile("loop.rate = 500.0\nsimulation.tactile_gain = [0.6, 1.4]\n")))
     files = tuple(str(tmp_path / f"{name}.json") for name in ("left", "right"))

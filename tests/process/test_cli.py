@@ -84,7 +84,9 @@ def test_send_without_a_daemon_or_with_nonsense(addresses, inline):
     assert "found 'force:5', expected key=number" in done.stderr
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    "number", [pytest.param(signal.SIGINT, marks=pytest.mark.extended), signal.SIGTERM]
+)
 def test_a_signal_during_start_up_ends_it_without_a_trace(profile, number):
     process = started("run", "--config", profile(""))
     first = process.stderr.readline()  # said once the handlers are there, before the kernels
@@ -95,7 +97,14 @@ def test_a_signal_during_start_up_ends_it_without_a_trace(profile, number):
     assert "ended" in said.splitlines()[-1]
 
 
-@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGQUIT, signal.SIGALRM])
+@pytest.mark.parametrize(
+    "number",
+    [
+        signal.SIGHUP,
+        pytest.param(signal.SIGQUIT, marks=pytest.mark.extended),
+        pytest.param(signal.SIGALRM, marks=pytest.mark.extended),
+    ],
+)
 def test_signals_that_would_end_a_process_at_once_turn_torque_off_first(profile, addresses, number):
     process = started("run", "--config", profile(""))
     assert ask(addresses[1], "arm")["ok"]
@@ -105,6 +114,7 @@ def test_signals_that_would_end_a_process_at_once_turn_torque_off_first(profile,
     assert "ended, torque off" in said
 
 
+@pytest.mark.extended
 def test_a_reader_of_the_log_that_stops_reading_stops_nothing(profile, addresses):
     process = started("run", "--config", profile(""))
     process.stderr.close()  # from now on each line written to it fails

@@ -1,5 +1,6 @@
 """Kernels compiled ahead: `softfinger compile`, its processes, what is said; none in the loop."""
 
+import contextlib
 import json
 import math
 import os
@@ -19,7 +20,7 @@ from tests.conftest import until
 from tests.harness.daemon_process import python, softfinger, started
 from tests.harness.descendants import ending
 from tests.harness.emulated import EmulatorProcess
-from tests.harness.warm_scenes import HIL, SCENES
+from tests.harness.warm_scenes import CALIBRATED, HIL, SCENES, STAND_IN
 
 BARE = ["--set", "servos.backend=dynamixel", "--set", "tactile.backend=none"]
 
@@ -107,15 +108,25 @@ def test_ctrl_c_ends_every_process(tmp_path):
         assert psutil.wait_procs(compilers, timeout=300.0)[1] == []
 
 
-def test_no_kernel_is_compiled_or_loaded_in_a_running_loop(tmp_path):
-    with EmulatorProcess("--dir", tmp_path, "--config", HIL) as hand:
-        hand.ready()
-        done = python("-m", "tests.harness.warm_scenes", tmp_path)
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["two fingers", CALIBRATED],
+        pytest.param([*SCENES, CALIBRATED, STAND_IN], marks=pytest.mark.extended),
+    ],
+    ids=["two", "all"],
+)
+def test_no_kernel_is_compiled_or_loaded_in_a_running_loop(tmp_path, names):
+    with contextlib.ExitStack() as stack:
+        if STAND_IN in names:
+            hand = stack.enter_context(EmulatorProcess("--dir", tmp_path, "--config", HIL))
+            hand.ready()
+        done = python("-m", "tests.harness.warm_scenes", tmp_path, *names)
     told: dict[str, dict[str, Any]] = {}
     for line in done.stdout.splitlines():
         scene = json.loads(line)
         told[scene["scene"]] = scene
-    assert set(told) == {*SCENES, "calibrated sensor", "stand-in hand"}
+    assert set(told) == set(names)
     for name, scene in told.items():
         assert scene["before"] >= 5, f"{name}: the watch heard nothing of the warm-up"
         assert scene["in no part"] == [], f"{name}: the daemon itself would compile these"
@@ -125,7 +136,7 @@ def test_no_kernel_is_compiled_or_loaded_in_a_running_loop(tmp_path):
         wanted = {"disarmed"} | ({"armed"} if servos else set())
         wanted |= {"grasping"} if servos and not blind else set()
         # A machine that is too busy for the real-time scene is no fault of its kernels.
-        timely = name != "stand-in hand"
+        timely = name != STAND_IN
         wanted |= {"holding", "releasing"} if servos and not blind and timely else set()
         assert wanted <= set(scene["modes"]), (name, scene["faults"])
         assert not (scene["faults"] and timely), (name, scene["faults"])

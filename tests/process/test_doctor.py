@@ -173,6 +173,7 @@ def test_a_missing_port_and_a_missing_servo(hands, capsys):
 
 
 @pytest.mark.waits
+@pytest.mark.extended
 def test_servos_at_another_rate_are_found(hands, capsys):
     hand = hands(baud=1_000_000)
     found = "note   found: ID 1 at 1000000 baud: XM430-W350, firmware 48"

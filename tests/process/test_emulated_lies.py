@@ -11,6 +11,7 @@ from tests.conftest import until
 from tests.harness.daemon_process import PATIENT
 from tests.soak.rig import Rig
 
+pytestmark = pytest.mark.extended
 FORCE = 6.0  # N
 LOOK, SETTLED = 3.5, 0.5  # s of the emulated hand's time, in all and in the end
 
@@ -65,14 +66,7 @@ def watched(rig: Rig) -> Iterator[dict[str, Any]]:
         select.select([], [], [], 0.005)  # the processor is for those who grip
 
 
-@pytest.mark.parametrize(
-    "lie",
-    [
-        pytest.param(GAIN, marks=pytest.mark.extended),
-        pytest.param(CURRENT, marks=pytest.mark.extended),
-        REFUSED,
-    ],
-)
+@pytest.mark.parametrize("lie", [GAIN, CURRENT, REFUSED])
 def test_a_lie_is_bounded_and_nothing_else_is_named(rig, lie):
     false = f"witness.{lie.split(':')[0]}_{'current' if lie == CURRENT else 'sensor'}"
     gripped(rig)

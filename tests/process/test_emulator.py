@@ -82,7 +82,9 @@ def test_a_folder_in_use_is_refused_and_the_first_lives_on(hand, servos, inline)
     assert servos.ping(1) == 1020
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    "number", [pytest.param(signal.SIGINT, marks=pytest.mark.extended), signal.SIGTERM]
+)
 def test_a_signal_ends_it_cleanly_while_it_starts(tmp_path, number):
     with EmulatorProcess("--dir", tmp_path / "new", "--config", HIL) as process:
         # The folder is taken as the first thing, long before anything answers.

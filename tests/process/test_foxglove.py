@@ -214,6 +214,7 @@ def connections(address: str) -> int:
     return sum(each.laddr.port == port and each.status != psutil.CONN_LISTEN for each in held)
 
 
+@pytest.mark.extended
 def test_a_client_that_takes_nothing_makes_room_for_another(stranger):
     _, address = stranger
     with ExitStack() as stack:

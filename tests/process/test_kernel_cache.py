@@ -135,6 +135,7 @@ def test_own_folder_refuses_links_files_and_other_users(tmp_path, monkeypatch):
         OwnFolder(tmp_path / "new")
 
 
+@pytest.mark.extended
 def test_the_folder_is_the_users_own_and_those_not_used_for_longest_go(package):
     base = package.cache / "softfinger"
     for age in range(7):

@@ -80,6 +80,7 @@ def test_tools_with_keys_see_and_command_the_hand(guarded, tmp_path, inline):
     assert ask(commands, "stop")["ok"]
 
 
+@pytest.mark.extended
 def test_tools_without_keys_see_nothing_and_say_what_may_be_missing(guarded, tmp_path, inline):
     stream, commands = guarded.addresses
     path = tmp_path / "b.mcap"

@@ -192,6 +192,7 @@ def test_a_late_command_is_sent_again_with_its_key(fake):
     assert len(set(fake.keys)) == 1
 
 
+@pytest.mark.extended
 def test_beside_another_commander_of_a_real_daemon(start, profile, addresses):
     stream, commands = addresses
     daemon = start("--config", str(profile("commands.lease = 60.0\n")))
@@ -276,6 +277,7 @@ def test_plain_lines_through_a_pipe(fake):
         assert plain.stderr.read() == ""
 
 
+@pytest.mark.extended
 def test_no_wait_ends_without_a_stream_and_with_it(fake):
     where = ["--address", NOBODY, "--no-wait"]
     with TerminalProcess([*SOFTFINGER, "monitor", *where]) as page:

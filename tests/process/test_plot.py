@@ -112,6 +112,7 @@ def test_landscape_shows_the_local_minimum_and_the_path(run):
     assert angle[known].max() > 5.0
 
 
+@pytest.mark.extended
 def test_pages_as_svg_or_one_line(path, tmp_path, call):
     words = ("--format", "svg", "--from", 1, "--to", 2)
     assert call(path, *words, "--out", tmp_path / "a" / "b") == (0, "")
@@ -134,6 +135,7 @@ def test_without_settings_there_is_no_model(path, run):
             plot.PAGES[page](bare)
 
 
+@pytest.mark.extended
 def test_one_finger_alone(tmp_path):
     path = tmp_path / "one.mcap"
     due = {50: {"command": "arm"}, 60: {"command": "grasp", "force": 2.0}}
@@ -146,6 +148,7 @@ def test_one_finger_alone(tmp_path):
         assert "right" not in texts(figure).split("\n"), page
 
 
+@pytest.mark.extended
 def test_a_recording_that_was_cut_short_is_drawn(tmp_path, path, call):
     whole = path.read_bytes()
     (tmp_path / "cut.mcap").write_bytes(whole[: len(whole) * 2 // 3])

@@ -74,6 +74,7 @@ def test_one_report_has_the_plugins_errors():
         load(changes=["simulation.object_shape=hexagonal"])
 
 
+@pytest.mark.extended
 def test_a_daemon_runs_on_them(installed, start, profile, addresses, monkeypatch):
     path = os.pathsep.join((str(installed), os.environ.get("PYTHONPATH", "")))
     monkeypatch.setenv("PYTHONPATH", path)

@@ -46,6 +46,7 @@ def calibrate(folder, step, *words):
     return main([*arguments, "--dir", str(folder), "--no-plot", "--frames", "40", *words])
 
 
+@pytest.mark.extended
 def test_a_tip_of_rubber_is_told_from_springs(rubber, monkeypatch, capsys):
     folder, log = rubber
     assert calibrate(folder, "tare") == 0

@@ -155,6 +155,7 @@ def test_numbers_that_are_none_come_back_as_such(tmp_path):
     assert math.isnan(read["tick_s"])  # JSON has no infinity either
 
 
+@pytest.mark.extended
 def test_a_part_in_time_and_by_topic(tmp_path):
     sent = written(tmp_path / "a.mcap", 2000)  # several chunks
     recording = Recording(tmp_path / "a.mcap")
@@ -357,6 +358,7 @@ def test_what_was_told_again_does_not_stretch_the_recordings_time(tmp_path):
     assert Recording(tmp_path / "b.mcap").count(b"hand/settings") == 1
 
 
+@pytest.mark.extended
 def test_a_damaged_chunk_is_told_and_left_out_and_recovered(tmp_path, addresses, inline):
     path = tmp_path / "bent.mcap"
     sent = written(path, 2000)
@@ -411,7 +413,11 @@ def disk_full(recorder: psutil.Process, path: Path) -> None:
 @pytest.mark.parametrize(
     ("end", "why"),
     [
-        (killed, "ended by SIGKILL; `softfinger record --recover"),
+        pytest.param(
+            killed,
+            "ended by SIGKILL; `softfinger record --recover",
+            marks=pytest.mark.extended,
+        ),
         (disk_full, "File too large; what was written until then can be read"),
     ],
     ids=["killed", "disk full"],

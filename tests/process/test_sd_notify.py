@@ -249,6 +249,7 @@ def test_a_log_file_that_can_not_be_opened_is_told(profile, inline):
     assert "--log-file /absent/log: No such file or directory" in done.stderr
 
 
+@pytest.mark.extended
 def test_the_daemon_runs_with_every_standard_stream_closed(profile):
     command = shlex.join(
         [*SOFTFINGER, "run", "--monitor", "--duration", "0.5", "--config", str(profile())]

@@ -18,6 +18,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.extended
 def test_its_recording_recomputes_to_the_last_bit(recorded, capsys):
     assert main(["replay", "--recompute", str(recorded)]) == 0
     assert "identical to the last bit" in capsys.readouterr().out

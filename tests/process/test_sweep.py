@@ -45,6 +45,7 @@ def test_results_are_the_same_in_any_number_of_processes_though_one_dies(tmp_pat
     assert (tmp_path / "died").exists()
 
 
+@pytest.mark.extended
 def test_a_case_that_kills_each_worker_ends_the_sweep():
     with pytest.raises(SweepError, match="each worker dies at 5"):
         list(Sweep("drawn", dies, CASES).run(2))
@@ -102,11 +103,8 @@ ENVELOPE = "envelope --shape rectangle --size 3 40 --mass 1 --friction 0.6 --kee
 CAMPAIGN = "bench witnesses --only '6 N: honest' --trials 2 --json"
 
 
-@pytest.mark.parametrize(
-    "words",
-    [ENVELOPE, pytest.param(CAMPAIGN, marks=pytest.mark.extended)],
-    ids=["envelope", "campaign"],
-)
+@pytest.mark.extended
+@pytest.mark.parametrize("words", [ENVELOPE, CAMPAIGN], ids=["envelope", "campaign"])
 def test_a_tool_gives_the_same_in_one_process_and_in_two(tmp_path, words):
     for processes in ("1", "2"):
         assert main([*shlex.split(words), str(tmp_path / processes), "--processes", processes]) == 0

@@ -130,12 +130,14 @@ def test_estimates_stand_beside_the_bound():
     assert error["decode: cobs"] is None
 
 
+@pytest.mark.extended
 def test_a_law_that_does_not_turn_the_object_leaves_it_askew(monkeypatch):
     monkeypatch.setattr(control, "WAYS", {"energy": control.WAYS["energy"]})
     (table,) = control.measure(brief=True)
     assert [4.0 < row["median"] < 5.0 for row in table.rows] == [True]
 
 
+@pytest.mark.extended
 def test_a_load_that_is_held_slides_and_one_that_is_lost_is_said():
     held = reflex.overloaded({}, 0.0, 13.0, 1)
     assert 0.0 < held.answer < 0.022
@@ -159,6 +161,7 @@ def holding(force: float = 8.0) -> VirtualGrip:
     return grip
 
 
+@pytest.mark.extended
 def test_a_true_hand_meets_its_aim():
     (table,) = measure(trials=2, only="6 N: honest")
     (row,) = table.rows

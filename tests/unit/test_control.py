@@ -67,7 +67,9 @@ def test_grasps_and_turns_also_with_mass_and_modulus_30_percent_off(sections, pl
         assert settled(hand, -ANGLE) < times[2]
 
 
-@pytest.mark.parametrize("sections", [{}, PAPER], ids=["100 Hz", "25 Hz"])
+@pytest.mark.parametrize(
+    "sections", [{}, pytest.param(PAPER, marks=pytest.mark.extended)], ids=["100 Hz", "25 Hz"]
+)
 def test_a_held_object_withstands_pushes_of_a_fifth_of_the_grip(sections):
     rng = np.random.default_rng(3)
     with watched(sections) as hand:
@@ -262,7 +264,7 @@ def test_the_small_hand_grasps_and_turns():
         assert hand.mode == "holding"
 
 
-@pytest.mark.parametrize("rate", [50.0, 100.0])
+@pytest.mark.parametrize("rate", [50.0, pytest.param(100.0, marks=pytest.mark.extended)])
 def test_a_stream_of_setpoints_is_followed_in_force_and_angle(rate):
     with watched({}) as hand:
         hand.run(0.3)
@@ -373,6 +375,7 @@ def test_a_sensor_with_flaws_grasps_turns_and_holds_and_nothing_is_falsely_warne
         assert [event for event in hand.events if event[0] != "info"] == []
 
 
+@pytest.mark.extended
 def test_a_hand_that_does_not_know_of_its_cells_response_lets_go():
     sections = load(Path("velostat"), changes=["tactile.response=0"]).model_dump()
     with Watched(sections) as hand:

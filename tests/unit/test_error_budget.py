@@ -189,7 +189,7 @@ def worst_nees(known, tip, imperfect, grid=FLAT, noise=NOISE):
     return worst
 
 
-@pytest.mark.parametrize("physics", ["springs", "solid"])
+@pytest.mark.parametrize("physics", ["springs", pytest.param("solid", marks=pytest.mark.extended)])
 @pytest.mark.parametrize("name", IMPERFECTIONS)
 def test_imperfections_of_real_cells_are_covered_or_flagged(name, physics, request):
     known, imperfect = IMPERFECTIONS[name]

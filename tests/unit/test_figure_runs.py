@@ -79,6 +79,7 @@ def test_forces_are_the_energys_slopes():
         assert slope == pytest.approx(expected, abs=1e-5)
 
 
+@pytest.mark.extended
 def test_the_path_lies_on_the_floor_of_the_valley(sheets):
     equations, _, land = sheets
     for lean in slow_turn.LEANS:
@@ -91,6 +92,7 @@ def test_the_path_lies_on_the_floor_of_the_valley(sheets):
         assert floor == pytest.approx(path, abs=0.05)
 
 
+@pytest.mark.extended
 def test_the_simulated_hand_goes_the_equations_way(sheets):
     equations, plant, _ = sheets
     order = np.argsort(equations["angle"])

@@ -18,6 +18,8 @@ from softfinger.tools.paper.model_pages import double_integrals
 from softfinger.tools.paper.validate import Beside
 from tests.harness.paper_tip import CHECKPOINTS
 
+NUMBERS = ("fig3", "fig4b", "fig5b", "fig7", "fig10")
+
 
 def read(path: Path) -> dict[str, NDArray[np.float64]]:
     """Columns of a CSV of numbers by their header; an empty cell is NaN."""
@@ -37,9 +39,14 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Figure]]
     return path, kept
 
 
-@pytest.fixture
-def folder(drawn: tuple[Path, list[Figure]]) -> Path:
-    return drawn[0]
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The numbers of the pages that are checked, written by the command without Matplotlib."""
+    path = tmp_path_factory.mktemp("numbers")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(sys.modules, "matplotlib", None)
+        assert cli.main(["figures", *NUMBERS, "--out", str(path)]) == 0
+    return path
 
 
 @pytest.mark.parametrize(("d", "theta", "force", "energy"), CHECKPOINTS)
@@ -133,6 +140,7 @@ def test_checkpoints_of_the_appendix(of: Callable[..., experiment_pages.Terms]) 
     assert of(a, d).energy(a, 0.304, d) == pytest.approx(20.374275556081, rel=1e-12)
 
 
+@pytest.mark.extended
 def test_every_picture_is_drawn_whole_with_its_errata(drawn: tuple[Path, list[Figure]]) -> None:
     folder, kept = drawn
     with (folder / "errata.csv").open(encoding="utf-8") as file:

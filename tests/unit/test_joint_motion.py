@@ -144,7 +144,9 @@ def test_a_grip_ends_when_a_joint_can_not_be_believed(make, how, name, within):
     assert daemon.loop.state.fault_name == name
 
 
-@pytest.mark.parametrize("mode", ["current-based position", "current"])
+@pytest.mark.parametrize(
+    "mode", ["current-based position", pytest.param("current", marks=pytest.mark.extended)]
+)
 def test_grips_turns_rests_and_pushes_are_believed(make, mode):
     """Holding still for long, at a joint's stop, on an object, and pushed off the goal."""
     daemon = make(servos={"mode": mode})

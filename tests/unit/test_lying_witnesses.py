@@ -27,7 +27,10 @@ LIES: dict[str, tuple[str, float, float, tuple[int, ...], set[str]]] = {
 }
 
 
-@pytest.mark.parametrize("lie", LIES)
+@pytest.mark.parametrize(
+    "lie",
+    [pytest.param(lie, marks=[pytest.mark.extended] * lie.startswith("both")) for lie in LIES],
+)
 def test_a_lie_is_named_and_never_obeyed(lie: str) -> None:
     kind, value, over, fingers, named = LIES[lie]
     with Hand({}) as hand:
@@ -165,7 +168,10 @@ def test_frames_that_come_again_are_refused_and_a_new_force_is_not_built_up_on_t
         assert found == BOTH
 
 
-@pytest.mark.parametrize("load", [(0.0, 5.0, 0.0), (3.0, 0.0, 0.0), (0.0, 0.0, 0.2)])
+@pytest.mark.parametrize(
+    "load",
+    [(0.0, 5.0, 0.0), pytest.param((3.0, 0.0, 0.0), marks=pytest.mark.extended), (0.0, 0.0, 0.2)],
+)
 def test_a_real_load_and_a_real_turn_are_no_lie(load: tuple[float, float, float]) -> None:
     with Hand({}) as hand:
         grasped(hand, 10.0)

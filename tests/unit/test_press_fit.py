@@ -30,7 +30,11 @@ def frames(tip: Fingertip, grid: SensorGrid = GRID) -> np.ndarray:
     return np.stack(pressed) + NOISE * rng.standard_normal((len(D), *grid.shape))
 
 
-@pytest.mark.parametrize("tip", [STICKING, Fingertip(0.020)], ids=lambda tip: tip.physics)
+@pytest.mark.parametrize(
+    "tip",
+    [STICKING, pytest.param(Fingertip(0.020), marks=pytest.mark.extended)],
+    ids=lambda tip: tip.physics,
+)
 def test_the_tip_that_made_them_explains_them_best(tip):
     seen = frames(tip)
     presses = Presses(seen, D + LATE, THETA, NOISE, np.ones(seen.shape, np.bool_))

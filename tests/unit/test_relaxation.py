@@ -138,7 +138,7 @@ def grip(aware: bool, tip: dict[str, Any]) -> tuple[float, float, list[str]]:
         return first, float(np.mean(hand.plant.force)) / 8.0, warned
 
 
-@pytest.mark.parametrize("tip", [{}, SOLID])
+@pytest.mark.parametrize("tip", [{}, pytest.param(SOLID, marks=pytest.mark.extended)])
 def test_a_hold_keeps_its_force_while_known_tips_relax(tip):
     first, last, warned = grip(True, tip)
     assert last == pytest.approx(first, abs=0.01)

@@ -18,8 +18,12 @@ BORNE = 2.0 * 0.6 * FORCE  # N, what both tips' friction bears at that grip
 FRICTION = 0.05 / 0.03  # N of a load, what a joint's friction may hide of it by 30 mm
 
 
-@pytest.mark.parametrize("sections", [{}, PAPER], ids=["100 Hz", "25 Hz"])
-@pytest.mark.parametrize("way", [1.0, -1.0], ids=["outwards", "to the palm"])
+@pytest.mark.parametrize(
+    "sections", [{}, pytest.param(PAPER, marks=pytest.mark.extended)], ids=["100 Hz", "25 Hz"]
+)
+@pytest.mark.parametrize(
+    "way", [1.0, pytest.param(-1.0, marks=pytest.mark.extended)], ids=["outwards", "to the palm"]
+)
 def test_a_push_beyond_the_margin_is_held_by_a_firmer_grip(sections, way):
     seen, moved = {}, {}
     for raised in (0.0, 10.0):
@@ -49,7 +53,15 @@ def test_the_grip_comes_back_when_the_load_has_gone():
         assert hand.plant.force.mean() == pytest.approx(FORCE, rel=KNOWN)
 
 
-@pytest.mark.parametrize(("force", "sections"), [(10.0, {}), (5.0, PAPER), (2.0, {}), (2.0, PAPER)])
+@pytest.mark.parametrize(
+    ("force", "sections"),
+    [
+        (10.0, {}),
+        (2.0, PAPER),
+        pytest.param(5.0, PAPER, marks=pytest.mark.extended),
+        pytest.param(2.0, {}, marks=pytest.mark.extended),
+    ],
+)
 def test_turning_alone_raises_nothing(force, sections):
     with Hand(sections) as hand:
         grasped(hand, force)
