@@ -16,6 +16,8 @@ WORKERS := $(shell expr $$(nproc) + 2) # some wait for something while the other
 # Which lines no test ran is told where Python can count them for next to nothing (3.12 and later).
 COVERAGE = $(shell $(BIN)/python -c "import sys; print('--cov' * (sys.version_info >= (3, 12)))")
 PYTEST = $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist worksteal
+# Otherwise each test process compiles the kernels of both kinds of tips at the same time.
+COMPILE = $(BIN)/softfinger compile --all && $(BIN)/softfinger compile --all --config solid
 LOWEST_PIP := build/lowest/bin/python $(PIP_INSTALL) --quiet
 SERVO_TESTS := tests/process/test_servo_sdk.py tests/unit/test_servo_round_trip.py
 LOWEST_TESTS := tests/process/test_servo_checks.py $(addprefix tests/unit/test_,settings.py schema.py)
@@ -33,19 +35,18 @@ run: $(TO_RUN)
 	@$(BIN)/softfinger run --config demo --monitor $(ARGS)
 
 test: $(TO_TEST)
-	@$(BIN)/softfinger compile --all
+	@$(COMPILE)
 	$(PYTEST) $(COVERAGE) $(ARGS)
 
 test-extended: $(TO_TEST)
-	@$(BIN)/softfinger compile --all
+	@$(COMPILE)
 	$(PYTEST) -m extended $(ARGS)
 
 test-all: test-extended test
 
-# Else each test process makes its own at the same time: byte code, kernels of solid tips.
+# Otherwise each test process makes its own byte code at the same time.
 warm: $(TO_TEST)
 	-@$(BIN)/python -m pytest --collect-only --quiet >/dev/null
-	@$(BIN)/softfinger compile --all --config solid
 
 docs: $(TO_DOCUMENT)
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict
@@ -81,6 +82,7 @@ $(TO_RUN): pyproject.toml constraints.txt
 $(TO_TEST): $(TO_RUN)
 	@echo "Adding what the tests need to $(VENV) once: pyarrow, scipy and others."
 	@$(INSTALL) --editable '.[dev]'
+	@$(COMPILE)
 	@touch $@
 
 $(TO_DOCUMENT): $(TO_RUN)
