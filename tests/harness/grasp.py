@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import root
 
 from softfinger import SoftfingerError
 from softfinger.kinematics.contact.table import ContactTable
@@ -24,7 +23,8 @@ from tests.harness.reference_hand import ReferenceHand
 
 FloatArray = NDArray[np.float64]
 
-_TOLERANCE = 1e-9  # of the contact forces, for balance
+_TOLERANCE = 1e-11  # of the contact forces, for balance: rounding leaves some 1e-14 of them
+_STEP = 1e-6  # of a turn [rad], and of a way in tip radii: for differences of forces
 
 
 class GraspError(SoftfingerError, ValueError):
@@ -124,17 +124,25 @@ class Grasp:
         x = state.coordinates
         if q is not None:
             x[:2] = q
-        per_force = np.array([1.0, 1.0, 1.0 / self.hand.tip_radius])
+        # Ways in tip radii and moments over them, so that no row or column outweighs another.
+        unit = np.array([self.hand.tip_radius, self.hand.tip_radius, 1.0])
 
         def residual(pose: FloatArray) -> FloatArray:
-            return self._evaluate(np.concatenate((x[:2], pose)), state)[0][2:] * per_force
+            gradient = self._evaluate(np.concatenate((x[:2], pose)), state)[0]
+            return gradient[2:] * unit / self.hand.tip_radius
 
-        x[2:] = root(residual, x[2:], tol=1e-14).x
-        gradient, shear, sound = self._evaluate(x, state)
-        self._check(sound)
-        scale = np.abs(gradient[:2]).sum() / self.hand.reach + np.abs(self._weight).sum()
-        if np.abs(residual(x[2:])).max() > _TOLERANCE * scale:
+        for _ in range(20):
+            gradient, shear, sound = self._evaluate(x, state)
+            force = np.abs(gradient[:2]).sum() / self.hand.reach + np.abs(self._weight).sum()
+            missing = residual(x[2:])
+            if np.abs(missing).max() <= _TOLERANCE * force:
+                break
+            steps = _STEP * np.diag(unit)
+            slopes = [residual(x[2:] + each) - residual(x[2:] - each) for each in steps]
+            x[2:] -= unit * np.linalg.solve(np.array(slopes).T / (2.0 * _STEP), missing)
+        else:
             raise GraspError("no balance found along the rolling increments")
+        self._check(sound)
         return GraspState(x[:2].copy(), x[2:].copy(), shear)
 
     def steer(self, state: GraspState, delta: float) -> GraspState:
