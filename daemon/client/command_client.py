@@ -102,9 +102,8 @@ def send_once(
             answered = socket.poll(math.ceil((timeout - silence) * 1e3))
         if not answered:
             hint = " (with access.keys it needs keys: --keys, keys=)" if keys is None else ""
-            raise NoAnswer(
-                f"no {answer} within {timeout:.3g} s; is softfinger running, or still starting?{hint}"
-            )
+            text = f"no {answer} within {timeout:.3g} s; is softfinger running, or still starting?"
+            raise NoAnswer(f"{text}{hint}")
         reply = msgpack.unpackb(socket.recv(), raw=False)
     finally:
         socket.close()
