@@ -31,7 +31,7 @@ KEYS_CHECKED = 0.5  # s between looks at the folder of keys
 
 # A stop
 PURGE = 0.02  # s after it in which all requests but a status are refused, and on while they flood
-PURGES_HELD = 12  # such times that the stop's answer waits for the end of a flood
+LONGEST_HELD = 0.25  # s that the stop's answer waits for that
 
 # Requests
 UNDER_WAY = 4  # that the loop has and hasn't answered; a stop goes beside them

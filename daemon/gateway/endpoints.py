@@ -207,8 +207,8 @@ class CommandEndpoint(Endpoint):
         self._gap_ended = 0.0  # … which ended then
         self._since = 0.0  # a fence was raised, or last looked at; since then …
         self._came = 0  # … so many requests came that change something
-        self._purges = 0  # and so often they still came too fast
-        self._replies: list[list[bytes]] = []  # held back
+        self._replies: list[list[bytes]] = []  # held back …
+        self._held = 0.0  # … for so long, of which a stall counts little
         limit = bounds.FRAMES * config.max_bytes
         super().__init__(admission, zmq.ROUTER, config.commands, "commands.address", config, limit)
 
@@ -216,7 +216,7 @@ class CommandEndpoint(Endpoint):
         """Refuse what has arrived until now: it takes a moment to read that."""
         self.past = self._requests.past = math.inf
         self._since = self._clock()
-        self._came = self._purges = 0
+        self._came = 0
 
     def read(self) -> None:
         """Take in requests, for as long as others may wait."""
@@ -225,14 +225,14 @@ class CommandEndpoint(Endpoint):
             if self._gap_began is None:
                 self._gap_began = self._looked
             self._gap_ended = began
+        self._held += min(began - self._looked, bounds.PURGE)
         self._looked = began
         if self.past == math.inf and began - self._since > bounds.PURGE:
             if self._empty and self._came <= bounds.ALL_RATE * bounds.PURGE:
                 self.past = self._requests.past = began
             self._since = began
             self._came = 0
-            self._purges += 1
-        if self.past < math.inf or self._purges > bounds.PURGES_HELD:
+        if self.past < math.inf or self._held > bounds.LONGEST_HELD:
             self._answer_held()
         self._empty = False
         while (now := self._clock()) < began + bounds.TURN:
@@ -262,8 +262,10 @@ class CommandEndpoint(Endpoint):
         message = [*route, reply]
         if self.past < math.inf:
             self._send(message)
-        else:
-            self._replies.append(message)
+            return
+        if not self._replies:
+            self._held = 0.0
+        self._replies.append(message)
 
     def _answer_held(self) -> None:
         replies, self._replies = self._replies, []

@@ -7,7 +7,6 @@ import json
 import random
 import struct
 import sys
-import time
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -24,6 +23,7 @@ from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.perception.calibration_file import CalibrationFileError, load_calibration
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.wire.loop_link import machine_time
 from tests.fuzz import mutated
 from tests.harness.gateway import Served
 
@@ -49,6 +49,8 @@ def some_request(rng: random.Random) -> Any:
             request[key] = rng.choice((rng.uniform(-2, 12), rng.choice(_ODD)))
     if rng.random() < 0.3:
         request["client"] = rng.choice(("", "me", "you", rng.choice(_ODD)))
+    if rng.random() < 0.3:
+        request["key"] = rng.choice(("a", f"{rng.random()}", rng.choice(_ODD)))
     if rng.random() < 0.2:
         request[rng.choice(("force", "left", "junk", 3, b"x"))] = rng.choice(_ODD)
     return request if rng.random() < 0.97 else rng.choice((request["command"], [request], None))
@@ -119,8 +121,8 @@ class CommandTarget:
         with patch.object(
             queue, "_answer", lambda _, reply: replies.append(msgpack.unpackb(reply))
         ):
-            now = time.monotonic()
-            queue.take(queue.new_client("", now), [], message, now)
+            now = machine_time()
+            queue.take(queue.new_client("", now), [], message, now, now)
             for _ in range(3):
                 self.served.serve(self.loop.command)
                 if replies:

@@ -95,11 +95,9 @@ def run(settings: Settings) -> dict[str, Any]:
                 if hand.loop.state.mode not in ("grasping", "rotating"):
                     break
                 hand.loop.advance(0.1)
-            again = [{"command": "clear"}, {"command": "arm"}]
             fault = hand.loop.state.fault_name
-            for each in (*(again if fault else ()), request):
-                with contextlib.suppress(Refused):
-                    hand.loop.command(each)
+            with contextlib.suppress(Refused):  # not every scene has what each command needs
+                hand.loop.command(request)
             hand.loop.advance(hand.loop.period)
             modes.append(hand.loop.state.mode)
             faults += [fault] if fault else []

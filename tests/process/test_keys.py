@@ -263,7 +263,7 @@ def test_a_client_is_shut_out_while_the_daemon_runs_and_another_is_let_in(
         except NoAnswer:
             return False
 
-    until(bob_is_let_in)
+    until(bob_is_let_in)  # the daemon looks for new keys now and then
     with Hand(*addresses, keys=folder, timeout=60.0) as local:
         assert local.state().mode == "disarmed"
     assert running.end() == 0

@@ -41,28 +41,14 @@ class Rig:
         until(lambda: self.loop.advance(0.1) or condition())
 
     def does(self, name: str) -> dict[str, Any]:
-        """Give a command until it is carried out: a busy machine's readings may be too old."""
-        replies: list[dict[str, Any]] = []
-
-        def done() -> bool:
-            try:
-                replies.append(self.loop.command({"command": name}))
-            except Refused:
-                return False
-            return True
-
-        self.until(done)
-        return replies[0]
+        """Give a command that is to be carried out, at a tick at which the servos answered."""
+        if name != "clear":
+            self.until(lambda: self.loop.state.reading.valid)
+        return self.loop.command({"command": name})
 
     def refuses(self, name: str, reason: str) -> None:
-        """Give a command until it is refused for ``reason``."""
-
-        def refused() -> bool:
-            with pytest.raises(Refused) as caught:
-                self.loop.command({"command": name})
-            return reason in str(caught.value)
-
-        self.until(refused)
+        with pytest.raises(Refused, match=reason):
+            self.loop.command({"command": name})
 
     def torque(self) -> list[int]:
         bus = self.emulator._servos.bus
@@ -96,6 +82,8 @@ def test_an_unplugged_bus_comes_back_on_command_and_limp(rig):
     rig.until(lambda: loop.state.mode == "fault")
     assert "the port is gone" in loop.state.fault
     assert rig.torque() == [1, 1]  # nobody could tell them
+    # From then on `clear` opens the port anew.
+    rig.until(lambda: loop.state.t - loop.state.reading.t > rig.settings.servos.fault_after)
     rig.refuses("clear", "no such port")
     rig.plug()
     seq = loop.state.reading.seq

@@ -27,6 +27,8 @@ from softfinger.tools.benchmarks.rigs import HIL, SOFTFINGER, RigError, emulator
 
 _PATIENCE = 300.0  # s for a process to be ready: kernels may be new
 _STATE_RATE = 250.0  # Hz
+# At the start alone: a busy machine may hold up the emulated hand's first bytes.
+_PATIENT = [word for key in ("servos", "tactile") for word in ("--set", f"{key}.open_timeout=60")]
 _POLL = 0.003  # s between two polls of the stream
 _SLACK = 0.05  # s by which a process may be late
 _RESOLUTION = 0.0016  # rad, a count of the servo's
@@ -70,7 +72,7 @@ class Rig:
     def start_daemon(self, *more: str) -> None:
         """Start the daemon, and wait for its first answer. Raises RigError."""
         end = time.monotonic() + _PATIENCE
-        words = ["run", "--config", str(self.config), "--dir", str(self.ports), *more]
+        words = ["run", "--config", str(self.config), "--dir", str(self.ports), *_PATIENT, *more]
         log = str(self.folder / "daemon.log")
         self.daemon = subprocess.Popen([*SOFTFINGER, *words, "--log-file", log])
         if self._states is not None:
