@@ -170,13 +170,12 @@ def check_scene(client: Client) -> None:
 
 @pytest.fixture(scope="module")
 def stranger() -> Iterator[tuple[FakeDaemon, str]]:
-    """A made-up daemon whose states fill a buffer soon, and where its server is."""
+    """A made-up daemon, and where its server is."""
     with FakeDaemon() as fake, served(fake) as (address, _):
         with connected(address) as line:  # a server that saw no state says so as it ends
             client = Client(line)
             client.subscribe("hand/state")
             client.next("hand/state")
-        fake.changes = {"fault": "x" * 30_000}
         yield fake, address
 
 
@@ -216,7 +215,8 @@ def connections(address: str) -> int:
 
 @pytest.mark.extended
 def test_a_client_that_takes_nothing_makes_room_for_another(stranger):
-    _, address = stranger
+    fake, address = stranger
+    fake.changes = {"fault": "x" * 30_000}  # states that fill a buffer soon
     with ExitStack() as stack:
         lazy = []
         for _ in range(CLIENTS):

@@ -73,6 +73,7 @@ def call(inline: Inline) -> Call:
     return plotted
 
 
+@pytest.mark.extended
 def test_command_line_writes_every_page_in_print_quality(path, inline):
     done = inline("plot", path)
     assert (done.returncode, done.stderr) == (0, "")

@@ -174,7 +174,7 @@ def test_a_recording_cut_anywhere_is_read_up_to_there_and_closed(tmp_path):
     path = tmp_path / "cut.mcap"
     rng = np.random.default_rng(1)
     longest = 0
-    for cut in [9, 40, len(whole) - 1, *rng.integers(50, len(whole), 6)]:
+    for cut in [9, 40, len(whole) - 1, *rng.integers(50, len(whole), 3)]:
         path.write_bytes(whole[:cut])
         recording = Recording(path)
         assert recording.truncated
@@ -197,7 +197,7 @@ def test_a_recording_with_flipped_bits_never_raises_more_than_its_error(tmp_path
     path = tmp_path / "bent.mcap"
     rng = np.random.default_rng(2)
     whole_again = 0
-    for _ in range(100):
+    for _ in range(50):
         bent = bytearray(whole)
         for place in rng.integers(0, len(whole), 3):
             bent[place] ^= 1 << int(rng.integers(8))
@@ -206,7 +206,7 @@ def test_a_recording_with_flipped_bits_never_raises_more_than_its_error(tmp_path
             recording = Recording(path)
             read = list(recording.messages())
             whole_again += len(read) == 330 and not recording.truncated
-    assert whole_again < 50
+    assert whole_again < 25
 
 
 def test_files_that_are_no_recording(tmp_path):

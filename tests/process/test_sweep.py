@@ -113,6 +113,7 @@ def test_a_tool_gives_the_same_in_one_process_and_in_two(tmp_path, words):
     assert sorted(each.name for each in tmp_path.iterdir()) == ["1", "2"]
 
 
+@pytest.mark.extended
 def test_many_recordings_are_analysed_as_each_alone(tmp_path, capsys):
     files = [tmp_path / f"{name}.npy" for name in "abc"]
     rng = np.random.default_rng(1)

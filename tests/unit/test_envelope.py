@@ -48,6 +48,7 @@ def test_a_grasp_outside_is_warned_of_in_its_reply():
             assert ("warning" in reply) == warned
 
 
+@pytest.mark.extended
 def test_a_map_is_found_printed_drawn_and_read_back(tmp_path, capsys):
     kept, picture = tmp_path / "map.toml", tmp_path / "map.png"
     words = ["envelope", "--shape", "rectangle", "--size", "2", "40", "--mass", "1"]

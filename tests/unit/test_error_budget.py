@@ -1,5 +1,6 @@
 """The covariance carries what frames don't show: errors are as large as it says, in each case."""
 
+import itertools
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -248,8 +249,13 @@ def smooth_error(pressure, width, kind, rng):
     return rng.normal() * error * math.sqrt((pressure**2).sum() / (error**2).sum())
 
 
-@pytest.mark.parametrize("physics", ["springs", "solid"])
-@pytest.mark.parametrize("profile", SECTIONS)
+@pytest.mark.parametrize(
+    ("profile", "physics"),
+    [
+        pytest.param(*case, marks=[pytest.mark.extended] * (case == ("all", "solid")))
+        for case in itertools.product(SECTIONS, ("springs", "solid"))
+    ],
+)
 def test_with_all_that_a_profile_declares_errors_are_as_large_as_it_says(profile, physics):
     settings = Settings.model_validate(
         merged(SECTIONS[profile], SOLID if physics == "solid" else {})

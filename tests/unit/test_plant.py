@@ -123,6 +123,7 @@ def test_energy_never_rises_without_input(trial):
 # Abuse.
 
 
+@pytest.mark.extended
 def test_random_commands_and_extreme_parameters_stay_sound():
     # With the steps that the plant chooses and, one time in three, steps ten times too long.
     assert [wrong for wrong in map(abuse, range(12)) if wrong] == []
