@@ -27,9 +27,10 @@ from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.settings import Settings
 from softfinger.tools.cli import main
 from softfinger.tools.processes import compile as kernels
-from tests.harness import descendants
+from tests.harness import arithmetic, descendants
 from tests.harness.daemon_process import Running
 from tests.harness.loop import Make
+from tests.harness.perturbed import Perturbation
 
 # The same examples on every machine, however slow; --hypothesis-profile=search looks for others.
 hypothesis.settings.register_profile("same", deadline=None, derandomize=True, max_examples=50)
@@ -38,7 +39,19 @@ hypothesis.settings.load_profile("same")
 
 _PORTS = itertools.count(9872)
 _OUR_OWN: set[int] = set()  # processes that no test started
+PERTURBATION = pytest.StashKey[Perturbation]()
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the option of `tests.harness.perturbed`."""
+    help_text = "move results by a unit in the last place, to find tests that depend on rounding"
+    parser.addoption("--perturb", type=int, metavar="SEED", help=help_text)
+
+
+def pytest_report_header() -> str:
+    """The arithmetic, for whoever reads of a test that failed on one machine alone."""
+    return f"arithmetic: {arithmetic.described()}"
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -49,6 +62,10 @@ def pytest_configure(config: pytest.Config) -> None:
     _OUR_OWN.update(descendants.running())
     if not hasattr(config, "workerinput"):
         descendants.end_with_this_process()
+    seed = config.getoption("--perturb")
+    if seed is not None:
+        config.stash[PERTURBATION] = Perturbation(seed)
+        config.stash[PERTURBATION].start()
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -66,8 +83,10 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     items.sort(key=lambda item: item.get_closest_marker("waits") is None)
 
 
-def pytest_collection_finish() -> None:
+def pytest_collection_finish(session: pytest.Session) -> None:
     """Spare the garbage collector the million objects of all modules, which are there to stay."""
+    if session.config.stash.get(PERTURBATION, None) is not None:
+        session.config.stash[PERTURBATION].enter_modules()
     gc.collect()
     gc.freeze()
 

@@ -5,6 +5,7 @@ the hand does; the file beside it names the machine and packages that made it.
 """
 
 import json
+import os
 import platform
 from pathlib import Path
 
@@ -13,6 +14,7 @@ import llvmlite.binding
 import numba
 import numpy as np
 
+from tests.harness import arithmetic
 from tests.harness.recorded_hand import record_hand
 
 GOLDEN = Path(__file__).parents[1] / "golden"
@@ -31,9 +33,10 @@ _SMALL_GRID = ("tactile.rows=20", "tactile.cols=20", "tactile.pitch=0.0029")
 
 
 def machine_class() -> dict[str, str]:
-    """What decides the last bit of a compiled kernel's result."""
+    """What decides the last bits of the hand's numbers."""
     return {
-        "processor": llvmlite.binding.get_host_cpu_name(),
+        "processor": os.environ.get("NUMBA_CPU_NAME") or llvmlite.binding.get_host_cpu_name(),
+        "chosen": " ".join(f"{name}={value}" for name, value in arithmetic.chosen().items()),
         "system": f"{platform.system()} {platform.machine()}",
         "llvmlite": llvmlite.__version__,
         "numba": numba.__version__,
