@@ -8,6 +8,7 @@ import pytest
 
 from softfinger import ContactTable
 from tests.harness.daemon_process import python
+from tests.harness.golden_recording import machine_class
 from tests.harness.paper_tip import MEASURED, TIP
 
 # A kind of kernel each: SIMD lanes and chosen callees in the tables, sums that may be reordered in
@@ -34,17 +35,26 @@ sys.exit(failed)
 """
 
 
+# The processor on which both ways have the same bits. Elsewhere one of them may fuse other products
+# with their sums.
+SAME_BITS = "znver3"
+
+
 def figures() -> str:
     """What a table gives, to the last bit."""
     d = np.linspace(0.0, 8e-3, 200)
     found = ContactTable.build(TIP, MEASURED, 1e-9)(d, 40.0 * d)
-    return np.array(found[:6]).tobytes().hex()
+    return " ".join(float(each).hex() for each in np.array(found[:6]).ravel())
 
 
 @pytest.mark.extended
-def test_tests_of_each_kind_of_kernel_pass_with_numba_alone_and_the_bits_are_the_same(request):
+def test_tests_of_each_kind_of_kernel_pass_with_numba_alone_and_results_are_the_same(request):
     kept = str(request.config.cache.mkdir("plain-numba"))  # apart: those of others are in use
     environment = os.environ | {"NUMBA_CACHE_DIR": kept}
     done = python("-c", SCRIPT, cwd=Path(__file__).parents[2], env=environment)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert done.stdout.splitlines()[-1] == figures()
+    alone, own = done.stdout.splitlines()[-1], figures()
+    if machine_class()["processor"] == SAME_BITS:
+        assert alone == own
+    numbers = [[float.fromhex(each) for each in text.split()] for text in (alone, own)]
+    np.testing.assert_allclose(*numbers, rtol=1e-12)

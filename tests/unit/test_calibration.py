@@ -66,7 +66,7 @@ def test_a_tare_measures_how_noise_correlates_and_all_cells_drift():
     found = tare(shared + 0.7 * rng.standard_normal((100, 1, 1)))
     assert found.correlation.shape == (1, 2)
     np.testing.assert_allclose(found.correlation, [[1.0, 0.5]], atol=0.02)
-    assert found.drift == pytest.approx(0.7, rel=0.2)
+    assert found.drift == pytest.approx(0.7, rel=0.3)  # of 100 frames: 1 ± 0.07
 
 
 def test_equilibration_makes_cells_alike_and_finds_the_dead():

@@ -121,6 +121,9 @@ def test_what_slow_cells_show_late_the_joints_make_up_for(response):
     def model(at: np.ndarray, d: float, gain: float) -> np.ndarray:
         return np.asarray(gain * np.maximum(d - at, 0.0))
 
+    def slopes(at: np.ndarray, d: float, gain: float) -> np.ndarray:
+        return np.stack((gain * (at < d), np.maximum(d - at, 0.0)), axis=1)
+
     for k in range(300):
         t = 1.0 + 0.002 * k
         dq = 0.2 if 100 <= k < 200 else 0.0
@@ -130,7 +133,7 @@ def test_what_slow_cells_show_late_the_joints_make_up_for(response):
         shown += (q - shown) * follows
         contact_filter.predict(Reading(t=t, q=[q] * 2, dq=[dq] * 2, valid=True))
         if k % 5 == 0:
-            fitted = curve_fit(model, below, pressure, fitted)[0]
+            fitted = curve_fit(model, below, pressure, fitted, jac=slopes)[0]
             for finger, sense in enumerate((1.0, -1.0)):
                 estimate = replace(ESTIMATE, d=fitted[0], gain=fitted[1], tilt_x=sense * shown)
                 contact_filter.update(finger, frame(t), estimate, contacts[finger])

@@ -45,7 +45,7 @@ def clean(truth: tuple[float, float, float]) -> np.ndarray:
 def test_correlated_noise_is_in_the_covariance(physics, d, theta):
     tip, truth = Fingertip(0.020, physics), (d, theta, -0.5 * theta)
     frame, rng = GRID.pressure(tip, LINEAR, *truth), np.random.default_rng(12)
-    frames = [frame + correlated_noise(rng) for _ in range(192 if tip == TIP else 96)]
+    frames = [frame + correlated_noise(rng) for _ in range(400)]
     n = 4 if tip == TIP else 3  # with the gain
 
     def nees(known: Uncertainty | None) -> tuple[float, float]:
@@ -57,7 +57,7 @@ def test_correlated_noise_is_in_the_covariance(physics, d, theta):
         return float(np.mean(squares)), len(squares) / len(frames)
 
     score, valid = nees(KNOWN)
-    assert 0.8 < score < 1.3
+    assert 0.8 < score < 1.3  # of 400 frames of three numbers or four: ± 0.04
     assert valid > 0.9
     assert tip != TIP or nees(None)[0] > 5.0
 
@@ -195,7 +195,8 @@ def worst_nees(known, tip, imperfect, grid=FLAT, noise=NOISE):
 def test_imperfections_of_real_cells_are_covered_or_flagged(name, physics, request):
     known, imperfect = IMPERFECTIONS[name]
     tip = Fingertip(0.020, physics)
-    assert 0.7 < worst_nees(known, tip, imperfect) < 1.5
+    # At each depth 32 frames of three numbers: ± 0.14.
+    assert 0.6 < worst_nees(known, tip, imperfect) < 1.5
     request.getfixturevalue("exact_solid_data")
     if (name, physics) not in HARMLESS:
         assert worst_nees(Uncertainty(), tip, imperfect) > 5.0
@@ -206,7 +207,7 @@ def test_another_base_than_set_is_covered_where_cells_are_too_few_to_show_it():
     known, tip = Uncertainty(gain=0.25, smooth=0.035), Fingertip(0.020, "solid")
     own = replace(tip, base="lying")
     score = worst_nees(known, tip, lambda _, *at: pressed(own, *at[:3], coarse), coarse, 700.0)
-    assert 0.7 < score < 1.5
+    assert 0.6 < score < 1.5
 
 
 # Each flaw that a profile declares, of its own size, in one hand.
@@ -307,6 +308,7 @@ def test_with_all_that_a_profile_declares_errors_are_as_large_as_it_says(profile
             forces.append(abs(c.force - true_force) < 1.96 * math.sqrt(variance))
             inside.append(np.abs(error) < 1.96 * np.sqrt(covariance.diagonal()))
     assert len(squares) > 0.6 * frames
-    assert 0.65 < np.mean(squares) < 1.3
+    # What a hand's frames share is drawn 60 times: other draws make it 0.63 to 1.1.
+    assert 0.55 < np.mean(squares) < 1.3
     assert (np.mean(inside, axis=0) > 0.9).all()
     assert np.mean(forces) > 0.9

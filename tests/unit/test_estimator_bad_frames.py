@@ -40,13 +40,13 @@ def test_dead_cells_are_masked_whatever_they_hold():
     clean = GRID.pressure(TIP, LINEAR, *truth[:3])
     estimator = ContactEstimator(TIP, LINEAR, GRID, NOISE, active=active)
     score = []
-    for _ in range(150):
+    for _ in range(300):
         frame = clean + rng.normal(0.0, NOISE, GRID.shape)
         frame[~active] = rng.choice([np.nan, np.inf, -np.inf, 1e9, 0.0], (~active).sum())
         e = estimator.update(frame)
         assert e.valid
         score.append(errors(e, truth) / np.sqrt(np.diag(e.covariance)))
-    assert np.all(np.sqrt(np.mean(np.square(score), axis=0)) < 1.2)
+    assert np.all(np.sqrt(np.mean(np.square(score), axis=0)) < 1.2)  # of 300 frames: 1 ± 0.04
 
 
 EMPTY = np.zeros((44, 44))

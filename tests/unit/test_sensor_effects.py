@@ -28,8 +28,9 @@ def counts(model, contact, t=0.0):
 def test_without_flaws_it_rounds_the_forward_model():
     model = sensor()
     for contact in CONTACTS:
-        expected = np.round(0.2 * model.grid.pressure(TIP, LINEAR, *contact))
-        np.testing.assert_array_equal(counts(model, contact), expected)
+        # Either way where a cell stands between two counts.
+        signal = 0.2 * model.grid.pressure(TIP, LINEAR, *contact)
+        np.testing.assert_allclose(counts(model, contact), signal, rtol=0, atol=0.5 + 1e-9)
     assert not counts(model, (0.0, 0.2, -0.1)).any()
 
 
@@ -38,12 +39,13 @@ def test_noise_has_the_size_asked_for_and_ends_at_zero():
     clean = 0.2 * model.grid.pressure(TIP, LINEAR, *CONTACTS[2])
     strong = clean > 4000.0
     rest = np.concatenate([(counts(model, CONTACTS[2]) - clean)[strong] for _ in range(20)])
-    assert rest.std() == pytest.approx(600.0, rel=0.03)
+    # Deviations of n numbers scatter by 1/√2n, their means by 1/√n of the deviation.
+    assert rest.std() == pytest.approx(600.0, rel=4.5 / np.sqrt(2 * rest.size))
     assert abs(rest.mean()) < 4.0 * 600.0 / np.sqrt(rest.size)
     free = counts(model, (0.0, 0.0, 0.0))
     assert (free == 0.0).mean() == pytest.approx(0.5, abs=0.05)
-    # Half a normal distribution has the mean σ/√2π over all cells.
-    assert free.mean() == pytest.approx(600.0 / np.sqrt(2 * np.pi), rel=0.1)
+    # Half a normal distribution has the mean σ/√2π over all cells; of 1936 it is 1 ± 0.033.
+    assert free.mean() == pytest.approx(600.0 / np.sqrt(2 * np.pi), rel=0.15)
 
 
 def test_gains_are_each_cells_own_and_dead_cells_read_zero():
@@ -207,7 +209,8 @@ def test_zeros_drift_to_their_deviation_and_forget_in_their_time():
     assert offset.std() == pytest.approx(50.0, rel=0.05)
     earlier = offset.copy()
     sensor_model.drift(offset, 50.0, 60.0, 60.0, rng.standard_normal(offset.shape))
-    assert np.mean(offset * earlier) / 50.0**2 == pytest.approx(math.exp(-1), abs=0.06)
+    # Of 3600 cells it scatters by 0.018.
+    assert np.mean(offset * earlier) / 50.0**2 == pytest.approx(math.exp(-1), abs=0.08)
 
 
 def test_crosstalk_is_a_share_of_both_lines_means():

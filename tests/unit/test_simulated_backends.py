@@ -156,7 +156,7 @@ def test_dropped_frames_are_missed_once_a_later_one_came():
     numbers = np.array([number for number, _ in found])
     assert len(numbers) == arrivals.arrived
     assert arrivals.arrived + arrivals.missed == numbers[-1] + 1
-    assert arrivals.missed / 5000 == pytest.approx(0.2, abs=0.02)
+    assert arrivals.missed / 5000 == pytest.approx(0.2, abs=0.025)  # ± 0.0057
     assert np.diff(numbers).max() > 2
 
 

@@ -54,7 +54,8 @@ def test_the_partials_are_those_of_one_energy(tip):
             size = np.abs(slope).max()
             assert getattr(c, f"{name}_{field}") == pytest.approx(slope, rel=1e-5, abs=1e-6 * size)
     one = table(float(d[1, 1]), float(theta[1, 1]))
-    assert [float(each) for each in one[:6]] == [float(each[1, 1]) for each in c[:6]]
+    # In a loop a compiler may fuse other products with their sums.
+    assert one[:6] == pytest.approx([float(each[1, 1]) for each in c[:6]], rel=1e-12)
 
 
 @every
