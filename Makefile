@@ -2,6 +2,7 @@
 # make test: the first tier of the tests, on every processor.  make test-extended: the second tier, the tests marked
 # `extended`.  make test-all: both.  ARGS=tests/unit selects tests or gives pytest options; ARGS=-n0: in one process.
 # A test file that ARGS names runs with its extended tests.
+# make test-arithmetic: the tests that compare computed numbers, under another arithmetic.
 # make lowest: the tests of servos, settings and wire with the oldest packages that pyproject.toml allows.
 # make docs: the documentation site, in build/site.
 # Each sets up in .venv what it needs and no more; PYTHON chooses the interpreter (3.11 or later).
@@ -21,6 +22,14 @@ COMPILE = $(BIN)/softfinger compile --all && $(BIN)/softfinger compile --all --c
 LOWEST_PIP := build/lowest/bin/python $(PIP_INSTALL) --quiet
 SERVO_TESTS := tests/process/test_servo_sdk.py tests/unit/test_servo_round_trip.py
 LOWEST_TESTS := tests/process/test_servo_checks.py $(addprefix tests/unit/test_,settings.py schema.py)
+# The tests that compare what BLAS, NumPy's loops and compiled kernels compute: no processes, no
+# pictures, and of the whole hand's work hardly more than the recorded one.
+NUMERICAL := blur calibrate calibrated_hand calibration contact_filter error_budget estimator \
+	estimator_bad_frames estimator_kernels figure_runs grasp_state hand material measured \
+	measurement_faults plant plant_agreement plant_shapes press_fit pressure_grid quadrature \
+	sensor_effects simulated_backends solid solid_tip_data table view_pictures
+NUMERICAL_TESTS := tests/process/test_replay_recording.py::test_the_golden_recording_gives_the_same_states \
+	$(NUMERICAL:%=tests/unit/test_%.py)
 TO_RUN := $(VENV)/.ready-run
 TO_TEST := $(VENV)/.ready-test
 TO_DOCUMENT := $(VENV)/.ready-docs
@@ -28,7 +37,7 @@ TO_DOCUMENT := $(VENV)/.ready-docs
 # Byte code is kept whatever the environment says: a test run starts hundreds of processes.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: run test test-extended test-all warm docs lowest lint format clean
+.PHONY: run test test-extended test-all test-arithmetic warm docs lowest lint format clean
 
 run: $(TO_RUN)
 	@echo "Starting the simulated hand at work; q ends it."
@@ -43,6 +52,11 @@ test-extended: $(TO_TEST)
 	$(PYTEST) -m extended $(ARGS)
 
 test-all: test-extended test
+
+test-arithmetic: $(TO_TEST)
+	@$(BIN)/python -m tests.harness.arithmetic softfinger compile --all
+	$(BIN)/python -m tests.harness.arithmetic pytest --numprocesses $$(nproc) --dist worksteal \
+		-m 'not extended' $(NUMERICAL_TESTS) $(ARGS)
 
 # Otherwise each test process makes its own byte code at the same time.
 warm: $(TO_TEST)
