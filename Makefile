@@ -5,10 +5,16 @@
 # make test-arithmetic: the tests that compare computed numbers, under another arithmetic.
 # make lowest: the tests of servos, settings and wire with the oldest packages that pyproject.toml allows.
 # make docs: the documentation site, in build/site.
-# Each sets up in .venv what it needs and no more; PYTHON chooses the interpreter (3.11 or later).
+# make newest: a fast part of the tests with the newest Python on this machine.
+# Each sets up in .venv what it needs and no more. PYTHON=python3.13 chooses the interpreter (3.11 or later), which then
+# has an environment of its own, as .venv-3.13.
 
 PYTHON ?= python3
+ifeq ($(origin PYTHON),command line)
+VENV := .venv-$(shell $(PYTHON) -c 'import sys; print("%d.%d" % sys.version_info[:2])')
+else
 VENV := .venv
+endif
 BIN := $(VENV)/bin
 # Byte code is then made of what is imported; most of the packages' modules never are.
 PIP_INSTALL := -m pip --disable-pip-version-check install --no-compile
@@ -20,8 +26,10 @@ PYTEST = $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist worksteal
 # Otherwise each test process compiles the kernels of both kinds of tips at the same time.
 COMPILE = $(BIN)/softfinger compile --all && $(BIN)/softfinger compile --all --config solid
 LOWEST_PIP := build/lowest/bin/python $(PIP_INSTALL) --quiet
+NEWEST_PIP := build/newest/bin/python $(PIP_INSTALL) --quiet --constraint constraints.txt
 SERVO_TESTS := tests/process/test_servo_sdk.py tests/unit/test_servo_round_trip.py
 LOWEST_TESTS := tests/process/test_servo_checks.py $(addprefix tests/unit/test_,settings.py schema.py)
+NEWEST_TESTS := $(addprefix tests/unit/test_,commands.py hand.py loop.py) tests/process/test_client.py
 # The tests that compare what BLAS, NumPy's loops and compiled kernels compute: no processes, no
 # pictures, and of the whole hand's work hardly more than the recorded one.
 NUMERICAL := blur calibrate calibrated_hand calibration contact_filter error_budget estimator \
@@ -37,7 +45,7 @@ TO_DOCUMENT := $(VENV)/.ready-docs
 # Byte code is kept whatever the environment says: a test run starts hundreds of processes.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: run test test-extended test-all test-arithmetic warm docs lowest lint format clean
+.PHONY: run test test-extended test-all test-arithmetic warm docs lowest newest lint format clean
 
 run: $(TO_RUN)
 	@echo "Starting the simulated hand at work; q ends it."
@@ -75,6 +83,12 @@ lowest:
 	$(LOWEST_PIP) dynamixel-sdk==3.8.4
 	build/lowest/bin/python -m pytest $(SERVO_TESTS)
 
+newest:
+	"$$($(PYTHON) -m tests.harness.newest_python)" -m venv --clear build/newest
+	$(NEWEST_PIP) --editable . pytest pytest-timeout hypothesis
+	build/newest/bin/softfinger compile --all
+	build/newest/bin/python -m pytest $(SERVO_TESTS) $(LOWEST_TESTS) $(NEWEST_TESTS)
+
 lint: $(TO_TEST)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -105,4 +119,4 @@ $(TO_DOCUMENT): $(TO_RUN)
 	@touch $@
 
 clean:
-	rm -rf $(VENV) build *.egg-info .pytest_cache .mypy_cache .ruff_cache
+	rm -rf .venv .venv-* build *.egg-info .pytest_cache .mypy_cache .ruff_cache
