@@ -13,8 +13,6 @@ It depends on the number, its place in its array and SEED alone. So the same com
 same bits again, but an array other ones than a number, and neither are alike that are by symmetry.
 Whole numbers stay: every library has sin 0 and cos 0 exactly.
 
-A warning then names this file as the table's caller, by which one test of `test_table` fails.
-
 It does not reach operators (``+``, ``@``), methods of arrays, what kernels compute on the way,
 modules that are imported within a function, and other processes. `tests.harness.arithmetic` has
 another BLAS and other machine code for those.
@@ -42,12 +40,12 @@ _NUMPY = (
 _LINALG = "inv solve lstsq eigh eigvalsh eig eigvals svd qr cholesky pinv det norm"
 _SOLVERS = {"scipy.integrate": "solve_ivp", "scipy.optimize": "curve_fit"}
 _PRODUCT = {
-    "softfinger.kinematics.contact.table": "ContactTable.__call__",
     "softfinger.kinematics.contact.closed_form": "closed_forms",
     "softfinger.kinematics.contact.quadrature": "integrate",
     "softfinger.kinematics.contact.material": "Material.stress Material.energy_density",
     "softfinger.kinematics.sensing.pressure_grid": "SensorGrid.pressure",
 }
+_TABLE = "softfinger.kinematics.contact.table"
 _PLANT = "softfinger.daemon.simulation.physics.simulated_hand"
 _TIMES = ("step", "sample_period")  # parameters that divide a millisecond, and so are exact
 _KERNELS = (Dispatcher, InnerKernel)
@@ -70,6 +68,9 @@ class Perturbation:
             self._wrap(importlib.import_module(module), names, self._moving_first)
         for module, names in _PRODUCT.items():
             self._wrap(importlib.import_module(module), names, self._moving)
+        table = importlib.import_module(_TABLE)
+        self._wrap(table, "lookup", self._moving)
+        self._wrap(table, "lookups", self._moving_out)
         self._wrap(importlib.import_module(_PLANT), "SimulatedHand.__init__", self._moving_plant)
 
     def enter_modules(self) -> None:
@@ -133,6 +134,13 @@ class Perturbation:
             return solver(self._moving(function), *words, **named)
 
         return wraps(solver)(call)
+
+    def _moving_out(self, lookups: Function) -> Function:
+        def call(data: Any, d: Any, theta: Any, out: Any, inside: Any) -> None:
+            lookups(data, d, theta, out, inside)
+            self.moved(out)
+
+        return call
 
     def _moving_plant(self, begin: Function) -> Function:
         def call(hand: Any, *words: Any, **named: Any) -> None:
