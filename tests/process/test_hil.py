@@ -239,7 +239,6 @@ def test_servos_stop_by_themselves_and_the_hand_works_again(rig):
     assert "ended with a fault" in "".join(daemon.lines)
 
 
-@pytest.mark.extended
 def test_what_gets_lost_on_the_line_does_not_keep_torque_on(rig):
     rig.start()
 
