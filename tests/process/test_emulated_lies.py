@@ -8,7 +8,6 @@ from typing import Any
 import pytest
 
 from tests.conftest import until
-from tests.harness.daemon_process import PATIENT
 from tests.soak.rig import Rig
 
 pytestmark = pytest.mark.extended
@@ -26,12 +25,17 @@ def rig() -> Iterator[Rig]:
     with Rig() as made:
         text = made.config.read_text(encoding="utf-8").replace('loop.clock = "real"\n', "")
         made.config.write_text(text, encoding="utf-8")
-        made.start(*PATIENT)
+        made.start("--set", "servos.fault_after=1.0")  # of the hand's time
         yield made
 
 
 def mode(rig: Rig) -> str:
     return str((rig.status(60.0) or {"mode": "none"})["mode"])
+
+
+def reaches(rig: Rig, wanted: str) -> None:
+    until(lambda: mode(rig) in (wanted, "fault"))
+    assert mode(rig) == wanted, rig.log()[-5:]
 
 
 def gripped(rig: Rig) -> None:
@@ -48,10 +52,10 @@ def gripped(rig: Rig) -> None:
         done("disarm")
     done("arm")
     done("release")
-    until(lambda: mode(rig) == "armed")
+    reaches(rig, "armed")
     rig.send("place")
     done("grasp", force=FORCE)
-    until(lambda: mode(rig) == "holding")
+    reaches(rig, "holding")
 
 
 def watched(rig: Rig) -> Iterator[dict[str, Any]]:
