@@ -127,8 +127,7 @@ class AsyncHand(HandClient[Coroutine[Any, Any, None]]):
         attempts = Attempts(self._request(name, numbers), self.timeout)
         where, keys = self.command_address, self._keys
         while True:
-            remaining = attempts.remaining()
-            reply = await asyncio.to_thread(send_once, where, attempts.request, remaining, keys)
+            reply = await asyncio.to_thread(send_once, where, attempts, keys)
             if not attempts.again(reply):
                 return accepted(reply)
             await asyncio.sleep(AGAIN_AFTER)

@@ -49,6 +49,7 @@ class Attempts:
     def __init__(self, request: dict[str, Any], timeout: float) -> None:
         """``timeout`` [s] bounds all attempts together."""
         self.request = {**request, "key": secrets.token_hex(8)}
+        self.timeout = timeout
         self._end = time.monotonic() + timeout
 
     def remaining(self) -> float:
@@ -57,7 +58,7 @@ class Attempts:
 
     def again(self, reply: dict[str, Any]) -> bool:
         """Return True if the command is to be sent again, after `AGAIN_AFTER` s."""
-        return reply.get("reason") == Reason.LATE and self.remaining() > AGAIN_AFTER
+        return reply.get("reason") == Reason.LATE and self.remaining() > 2.0 * AGAIN_AFTER
 
 
 def send(
@@ -70,15 +71,14 @@ def send(
     A ``stop`` to a daemon of this user on this machine goes past all other clients.
     """
     attempts = Attempts(request, timeout)
-    while attempts.again(reply := send_once(address, attempts.request, attempts.remaining(), keys)):
+    while attempts.again(reply := send_once(address, attempts, keys)):
         time.sleep(AGAIN_AFTER)
     return reply
 
 
-def send_once(
-    address: str, request: dict[str, Any], timeout: float, keys: ClientKeys | None = None
-) -> dict[str, Any]:
-    """Send one command as it is, and return the reply; see `send`."""
+def send_once(address: str, attempts: Attempts, keys: ClientKeys | None = None) -> dict[str, Any]:
+    """Make one attempt, and return the reply; see `send`."""
+    request, timeout = attempts.request, attempts.remaining()
     if request.get("command") == "stop":
         stopped = stop_locally(address, min(timeout, LOCALLY))
         if stopped is not None:
@@ -98,11 +98,12 @@ def send_once(
         silence = min(SILENCE, timeout)
         answered = socket.poll(math.ceil(silence * 1e3))
         if not answered and silence < timeout:
-            _log.warning(still_waiting(answer, timeout))
+            _log.warning(still_waiting(answer, attempts.timeout))
             answered = socket.poll(math.ceil((timeout - silence) * 1e3))
         if not answered:
             hint = " (with access.keys it needs keys: --keys, keys=)" if keys is None else ""
-            text = f"no {answer} within {timeout:.3g} s; is softfinger running, or still starting?"
+            within = f"within {attempts.timeout:g} s"
+            text = f"no {answer} {within}; is softfinger running, or still starting?"
             raise NoAnswer(f"{text}{hint}")
         reply = msgpack.unpackb(socket.recv(), raw=False)
     finally:

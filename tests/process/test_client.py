@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from softfinger import AsyncHand, Hand, HandFault, HandState, NoAnswer, NoStream, NotInTime, Refused
+from softfinger.daemon.client import command_client
 from softfinger.daemon.client.asynchronous import AsyncSubscription
 from softfinger.daemon.client.command_client import UNCONFIRMED
 from softfinger.daemon.client.connection import SILENCE
@@ -139,7 +140,7 @@ def arm_async(fake: FakeDaemon, timeout: float) -> None:
 
 
 @pytest.mark.parametrize("arm", [arm_blocking, arm_async])
-def test_a_late_command_is_sent_again_with_its_key_and_a_refused_one_is_not(fake, arm):
+def test_a_late_command_is_sent_again_with_its_key_and_a_refused_one_is_not(fake, arm, monkeypatch):
     fake.replies["arm"] = [LATE, LATE, {"ok": True}, MODE]
     arm(fake, 60.0)
     assert len(fake.requests) == 3
@@ -149,10 +150,12 @@ def test_a_late_command_is_sent_again_with_its_key_and_a_refused_one_is_not(fake
     assert caught.value.reason == "mode"
     assert len(fake.requests) == 4
     assert len(set(fake.keys)) == 2
+    monkeypatch.setattr(command_client, "AGAIN_AFTER", 100.0)  # no time is left for a second try
     fake.replies["arm"] = LATE
     with pytest.raises(Refused, match="old when its turn came") as caught:
-        arm(fake, 0.2)
+        arm(fake, 60.0)
     assert caught.value.reason == "late"
+    assert len(fake.requests) == 5
 
 
 def test_a_cancelled_command_is_not_sent_again(fake):
