@@ -95,7 +95,9 @@ def lookups(rounds: int, count: int = 512) -> Report:
         ("", [(d, theta)], count, None),
         (", called", single, _SINGLE, _CALL_NS),
     ):
-        subjects = {f"{name}{way}": partial(each, table, chosen) for name, table in tables.items()}
+        subjects = {
+            f"{name}{way}": partial(call_with_each, table, chosen) for name, table in tables.items()
+        }
         for (name, taken), table in zip(
             interleave(subjects, rounds).items(), tables.values(), strict=True
         ):
@@ -188,7 +190,7 @@ def estimates(
     return run
 
 
-def each(call: Callable[..., object], arguments: Sequence[tuple[Any, ...]]) -> None:
+def call_with_each(call: Callable[..., object], arguments: Sequence[tuple[Any, ...]]) -> None:
     """Call with each of these arguments."""
     for one in arguments:
         call(*one)
@@ -199,4 +201,4 @@ def decode(frames: FloatArray) -> Callable[[], object]:
     counts = np.maximum(frames / _PASCAL_PER_COUNT, 0.0).astype(np.uint16)
     packets = [ENCODERS["cobs"].encode(frame, k, 0.01 * k) for k, frame in enumerate(counts)]
     feed = CobsDecoder(*frames.shape[1:]).feed
-    return partial(each, feed, [(packet, 0.0) for packet in packets])
+    return partial(call_with_each, feed, [(packet, 0.0) for packet in packets])
