@@ -29,7 +29,7 @@ LOWEST_PIP := build/lowest/bin/python $(PIP_INSTALL) --quiet
 NEWEST_PIP := build/newest/bin/python $(PIP_INSTALL) --quiet --constraint constraints.txt
 SERVO_TESTS := tests/process/test_servo_sdk.py tests/unit/test_servo_round_trip.py
 LOWEST_TESTS := tests/process/test_servo_checks.py $(addprefix tests/unit/test_,settings.py schema.py)
-NEWEST_TESTS := $(addprefix tests/unit/test_,commands.py hand.py loop.py) tests/process/test_client.py
+NEWEST_TESTS := tests/unit/test_stream.py tests/process/test_client.py
 # The tests that compare what BLAS, NumPy's loops and compiled kernels compute: no processes, no
 # pictures, and of the whole hand's work hardly more than the recorded one.
 NUMERICAL := blur calibrate calibrated_hand calibration contact_filter error_budget estimator \
@@ -63,6 +63,7 @@ test-all: test-extended test
 
 test-arithmetic: $(TO_TEST)
 	@$(BIN)/python -m tests.harness.arithmetic softfinger compile --all
+	@$(BIN)/python -m tests.harness.arithmetic softfinger compile --all --config solid
 	$(BIN)/python -m tests.harness.arithmetic pytest --numprocesses $$(nproc) --dist worksteal \
 		-m 'not extended' $(NUMERICAL_TESTS) $(ARGS)
 
@@ -86,7 +87,7 @@ lowest:
 newest:
 	"$$($(PYTHON) -m tests.harness.newest_python)" -m venv --clear build/newest
 	$(NEWEST_PIP) --editable . pytest pytest-timeout hypothesis
-	build/newest/bin/softfinger compile --all
+	build/newest/bin/softfinger compile
 	build/newest/bin/python -m pytest $(SERVO_TESTS) $(LOWEST_TESTS) $(NEWEST_TESTS)
 
 lint: $(TO_TEST)

@@ -78,9 +78,9 @@ def send(
 
 def send_once(address: str, attempts: Attempts, keys: ClientKeys | None = None) -> dict[str, Any]:
     """Make one attempt, and return the reply; see `send`."""
-    request, timeout = attempts.request, attempts.remaining()
+    request, timeout, remaining = attempts.request, attempts.timeout, attempts.remaining()
     if request.get("command") == "stop":
-        stopped = stop_locally(address, min(timeout, LOCALLY))
+        stopped = stop_locally(address, min(remaining, LOCALLY))
         if stopped is not None:
             return stopped
     answer = f"answer to {request['command']} from {address}"
@@ -95,16 +95,16 @@ def send_once(address: str, attempts: Attempts, keys: ClientKeys | None = None) 
         except zmq.ZMQError as error:
             raise NoAnswer(f"{address}: {error}") from None
         socket.send(msgpack.packb(request))
-        silence = min(SILENCE, timeout)
+        silence = min(SILENCE, remaining)
         answered = socket.poll(math.ceil(silence * 1e3))
-        if not answered and silence < timeout:
-            _log.warning(still_waiting(answer, attempts.timeout))
-            answered = socket.poll(math.ceil((timeout - silence) * 1e3))
+        if not answered and silence < remaining:
+            _log.warning(still_waiting(answer, timeout))
+            answered = socket.poll(math.ceil((remaining - silence) * 1e3))
         if not answered:
             hint = " (with access.keys it needs keys: --keys, keys=)" if keys is None else ""
-            within = f"within {attempts.timeout:g} s"
-            text = f"no {answer} {within}; is softfinger running, or still starting?"
-            raise NoAnswer(f"{text}{hint}")
+            raise NoAnswer(
+                f"no {answer} within {timeout:g} s; is softfinger running, or still starting?{hint}"
+            )
         reply = msgpack.unpackb(socket.recv(), raw=False)
     finally:
         socket.close()
