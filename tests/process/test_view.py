@@ -246,7 +246,7 @@ def test_a_command_is_sent_once_and_not_long_after_its_picture() -> None:
     grasp = {"command": "grasp", "force": 5.0, "client": "page 1"}
     with (
         FakeDaemon() as fake,
-        view(fake, "--timeout", "20") as viewed,
+        view(fake, "--timeout", "8") as viewed,
         Watcher(viewed.host) as page,
     ):
         token = viewed.commanding.removeprefix(viewed.address)
@@ -259,7 +259,7 @@ def test_a_command_is_sent_once_and_not_long_after_its_picture() -> None:
         fake.replies["grasp"] = {"ok": False, "error": "grasp: not while disarmed; arm first"}
         assert press() == "✗ grasp: not while disarmed; arm first"
         assert fake.requests == [grasp, grasp]
-        late = {"seen": page.next()["now"] - 20.0}
+        late = {"seen": page.next()["now"] - 8.0}
         for odd in (late, {}):
             assert ask(viewed.host, token, {**grasp, **odd}).endswith("s behind")
         for odd in (None, "grasp", [], {"seen": 1.0}, {**grasp, "seen": None}):

@@ -445,7 +445,7 @@ def test_a_command_that_is_too_old_has_no_effect(make, name, mode, oldest):
         loop._fail("a fault")
     assert loop.state.mode == mode
     request = {"command": name, **numbers.get(name, {})}
-    with pytest.raises(Refused, match="send it again") as caught:
+    with pytest.raises(Refused, match="old when its turn came") as caught:
         loop.command(request, oldest + 0.01)
     assert caught.value.reason == "late"
     loop.advance(0.05)

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from softfinger.daemon.clock import HandClock, RealClock, VirtualClock, make_clock
 from softfinger.daemon.loop import build as build_module
+from softfinger.daemon.loop import timing
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.loop.publishing import parts
 from softfinger.daemon.loop.timing import EVERY, RECENT, Lateness
@@ -81,7 +82,10 @@ def test_what_a_simulated_hand_does_is_the_same_however_late_the_machine(undistu
     assert undisturbed["object"]["valid"]
 
 
-def test_a_simulated_hand_waits_for_the_machine_and_says_so_now_and_then(on_late_machine):
+def test_a_simulated_hand_waits_for_the_machine_and_says_so_now_and_then(
+    on_late_machine, monkeypatch
+):
+    monkeypatch.setattr(timing, "EVERY", 5.0)
     daemon, machine, events = on_late_machine("auto", task={"name": "demo"})
     machine.work(60.0)  # building everything is no lateness
     machine.late_by = [0.0] * 100 + [0.4] + [0.0] * 50 + [0.5]
@@ -92,7 +96,7 @@ def test_a_simulated_hand_waits_for_the_machine_and_says_so_now_and_then(on_late
     assert state.timing.late_in_row == 0
     told = [text for level, kind, text in events if kind == "late"]
     assert told == ["this machine is busy: the hand waited 0.40 s, 0.4 s in all"]
-    daemon.loop.advance(EVERY)
+    daemon.loop.advance(2.0)
     told = [text for level, kind, text in events if kind == "late"]
     assert told[1:] == ["this machine is busy: the hand waited 0.50 s, 0.9 s in all"]
 

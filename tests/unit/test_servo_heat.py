@@ -186,8 +186,8 @@ def test_a_grip_that_gets_too_hot_is_eased_and_holds():
 @pytest.mark.parametrize(
     ("action", "mode"),
     [
-        ("hold", Mode.FAULT),
-        pytest.param("release", Mode.ARMED, marks=pytest.mark.extended),
+        ("release", Mode.ARMED),
+        pytest.param("hold", Mode.FAULT, marks=pytest.mark.extended),
         pytest.param("stop", Mode.DISARMED, marks=pytest.mark.extended),
     ],
 )
