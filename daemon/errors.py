@@ -73,8 +73,10 @@ class Reason(StrEnum):
 _MEANINGS = {
     Reason.LATE: "The command was too old when its turn came, or a servo's reply was late. "
     "It has no effect. Send it again if you still want it.",
-    Reason.STOPPED: "The command was sent before the last `stop`. Do not repeat it automatically.",
-    Reason.SUPERSEDED: "A newer `hold` of the same connection replaced this one.",
+    Reason.STOPPED: "The command was sent before the last `stop`, or too soon after it to tell. "
+    "Do not repeat it automatically.",
+    Reason.SUPERSEDED: "A newer `hold` of the same connection replaced this one, or another "
+    "command was carried out before this one was repeated.",
     Reason.BUSY: "Too many commands are waiting, or this client sends too many. Send fewer.",
     Reason.LEASE: "Another client commands the hand (`commands.lease`).",
     Reason.MODE: "The hand does not accept this command in its present mode.",

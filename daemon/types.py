@@ -20,6 +20,7 @@ if TYPE_CHECKING:  # a command's client needs no NumPy
 FINGERS = ("left", "right")
 STREAM_ADDRESS = "tcp://127.0.0.1:9872"  # unless settings or a client say otherwise
 COMMAND_ADDRESS = "tcp://127.0.0.1:9873"
+UNLEASED = frozenset({"stop", "disarm", "status"})  # commands that can only make the hand safer
 GRIP_FRACTION = 0.9  # of `safety.force_max` that a grip may be asked for, or raised to by itself
 Event = tuple[str, str, str]  # level, kind, text
 

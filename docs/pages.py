@@ -157,7 +157,8 @@ def stream() -> str:
 
 def commands() -> str:
     """The hand's commands from the table of modes, the command line's words from its parser."""
-    from softfinger.daemon.control.modes import COMMANDS, UNLEASED, Mode
+    from softfinger.daemon.control.modes import COMMANDS, Mode
+    from softfinger.daemon.types import UNLEASED
     from softfinger.tools.terminal.send import _EPILOG
 
     parts = [

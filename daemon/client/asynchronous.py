@@ -126,11 +126,13 @@ class AsyncHand(HandClient[Coroutine[Any, Any, None]]):
         """
         attempts = Attempts(self._request(name, numbers), self.timeout)
         where, keys = self.command_address, self._keys
-        while True:
-            reply = await asyncio.to_thread(send_once, where, attempts, keys)
-            if not attempts.again(reply):
-                return accepted(reply)
+        reply = await asyncio.to_thread(send_once, where, attempts, keys)
+        while attempts.again(reply):
             await asyncio.sleep(AGAIN_AFTER)
+            if not attempts.remaining():  # the machine slept
+                break
+            reply = await asyncio.to_thread(send_once, where, attempts, keys)
+        return accepted(reply)
 
     async def _carry_out(self, command: str, **numbers: float | None) -> None:
         try:

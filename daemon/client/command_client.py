@@ -22,6 +22,7 @@ from softfinger.daemon.client.connection import (
     still_waiting,
 )
 from softfinger.daemon.errors import HandClosed, Reason, Refused
+from softfinger.daemon.types import UNLEASED
 from softfinger.daemon.wire.keys import ClientKeys, load_client
 from softfinger.daemon.wire.local_stop import stop_locally
 
@@ -30,6 +31,7 @@ _Done = TypeVar("_Done")
 _log = logging.getLogger(__name__)
 
 AGAIN_AFTER = 0.05  # s until a command that was late is sent again
+_CLOCK = getattr(time, "CLOCK_BOOTTIME", None)  # Linux's
 LOCALLY = 0.5  # s for a daemon to answer past all other clients
 UNCONFIRMED = "the servos have not confirmed torque off yet"  # to ``torque_off``: ``unconfirmed``
 
@@ -41,24 +43,30 @@ class NoAnswer(SoftfingerError):
 class Attempts:
     """Decides whether a command is sent again, within the time that its caller waits for a reply.
 
-    A daemon that stalled refuses what became too old meanwhile, as ``late``, and without effect.
-    Every attempt carries the same key, so that the daemon carries the command out once at most, and
-    not after a stop that came in between.
+    After a stall the daemon refuses commands that became too old, with the reason ``late``; they
+    have no effect. All attempts carry the same key, so the daemon carries out the command at most
+    once, and not after a stop or another command that came in between.
     """
 
     def __init__(self, request: dict[str, Any], timeout: float) -> None:
         """``timeout`` [s] bounds all attempts together."""
-        self.request = {**request, "key": secrets.token_hex(8)}
+        harmless = request.get("command") in UNLEASED
+        self.request = request if harmless else {**request, "key": secrets.token_hex(8)}
         self.timeout = timeout
-        self._end = time.monotonic() + timeout
+        self._end = _now() + timeout
 
     def remaining(self) -> float:
         """Return the time [s] that is left."""
-        return max(self._end - time.monotonic(), 0.0)
+        return max(self._end - _now(), 0.0)
 
     def again(self, reply: dict[str, Any]) -> bool:
         """Return True if the command is to be sent again, after `AGAIN_AFTER` s."""
         return reply.get("reason") == Reason.LATE and self.remaining() > 2.0 * AGAIN_AFTER
+
+
+def _now() -> float:
+    """Return monotonic time [s] that goes on while the machine sleeps, where the system has it."""
+    return time.clock_gettime(_CLOCK) if _CLOCK is not None else time.monotonic()
 
 
 def send(
@@ -67,12 +75,16 @@ def send(
     """Send one command and return the reply. Raises NoAnswer after ``timeout`` s.
 
     A command that the daemon refuses as late is sent again, within ``timeout``. A warning is logged
-    when the reply takes long, which without handlers goes to standard error.
+    if the reply takes longer than 1 s; without logging handlers it goes to standard error.
     A ``stop`` to a daemon of this user on this machine goes past all other clients.
     """
     attempts = Attempts(request, timeout)
-    while attempts.again(reply := send_once(address, attempts, keys)):
+    reply = send_once(address, attempts, keys)
+    while attempts.again(reply):
         time.sleep(AGAIN_AFTER)
+        if not attempts.remaining():  # the machine slept
+            break
+        reply = send_once(address, attempts, keys)
     return reply
 
 

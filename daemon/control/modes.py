@@ -47,6 +47,5 @@ COMMANDS: dict[str, tuple[frozenset[Mode], dict[str, bool]]] = {
     "status": (_ANY, {}),
 }
 
-# Neither stiffens nor moves the hand, so it may be carried out although it is some time old.
+# These never stiffen or move the hand, so they may be carried out although they are some time old.
 HARMLESS = frozenset({"disarm", "tare", "clear"})
-UNLEASED = frozenset({"stop", "disarm", "status"})  # can only make the hand safer

@@ -17,7 +17,7 @@ DESCRIPTORS = 64  # that are not clients'
 CLIENTS = 256  # connections, of commands and stream together
 STALLED = 3.0  # s of processor time within one step after which the process is ended, …
 BLOCKED = 30.0  # … and of any time; a machine that is busy or stops it takes only such time
-GAP = 0.05  # s between two looks at requests, after which those found are dated by the earlier look
+GAP = 0.05  # s; after a longer gap between polls, requests are dated by the earlier poll
 
 # A connection
 HANDSHAKE = 2.0  # s in which a client has to have finished its handshake

@@ -2,8 +2,8 @@
 
 libzmq's own thread reads ahead of us, so what arrived before a stop is known by time alone. After
 it all requests are refused for a moment, and on while they come thicker than clients may send them,
-as those do that have waited. The stop's own answer waits as long, within a bound. Likewise, after
-a gap between two looks at the socket, requests are dated by the look before the gap.
+as those do that have waited. The stop's own answer waits as long, within a bound. If the socket was
+not polled for more than `bounds.GAP`, requests that are then found are dated by the poll before.
 
 Without keys everybody is let in, but libzmq hangs up on all who don't greet it as ZMTP 3 does: web
 pages among them, whose POST older versions take for messages.
@@ -201,14 +201,15 @@ class CommandEndpoint(Endpoint):
         self._requests = requests
         self._clients: OrderedDict[bytes, Client] = OrderedDict()
         self.past = -math.inf
-        self._empty = True  # at the last poll
-        self._looked = clock()  # at the socket; nothing came before it was bound
-        self._gap_began: float | None = None  # while requests may be left of a gap between looks …
-        self._gap_ended = 0.0  # … which ended then
+        self._looked = clock()  # time of the last poll; nothing came before the socket was bound
+        # Time of the last poll before a gap; None once all requests from the gap have been read.
+        self._gap_began: float | None = None
+        self._gap_ended = 0.0
+        self._gap_left = 0  # requests that may still be from the gap
         self._since = 0.0  # a fence was raised, or last looked at; since then …
         self._came = 0  # … so many requests came that change something
-        self._replies: list[list[bytes]] = []  # held back …
-        self._held = 0.0  # … for so long, of which a stall counts little
+        self._replies: list[list[bytes]] = []  # held back until the fence is passed
+        self._held = 0.0  # s, of which each step counts PURGE at most: a stall doesn't use it up
         limit = bounds.FRAMES * config.max_bytes
         super().__init__(admission, zmq.ROUTER, config.commands, "commands.address", config, limit)
 
@@ -225,29 +226,38 @@ class CommandEndpoint(Endpoint):
             if self._gap_began is None:
                 self._gap_began = self._looked
             self._gap_ended = began
+            self._gap_left = bounds.CLIENTS * bounds.QUEUE
         self._held += min(began - self._looked, bounds.PURGE)
         self._looked = began
-        if self.past == math.inf and began - self._since > bounds.PURGE:
-            if self._empty and self._came <= bounds.ALL_RATE * bounds.PURGE:
-                self.past = self._requests.past = began
-            self._since = began
-            self._came = 0
         if self.past < math.inf or self._held > bounds.LONGEST_HELD:
             self._answer_held()
-        self._empty = False
         while (now := self._clock()) < began + bounds.TURN:
             parts = self._parts()
             if parts is None:
-                self._empty = True
-                if now - self._gap_ended > bounds.PURGE:
-                    self._gap_began = None
+                self._has_read_all(now)
                 return
             *route, payload = (part.bytes for part in parts)
             self._came += b"status" not in payload
+            self._gap_left -= 1
+            if self._gap_left < 0:  # more than can have waited
+                self._gap_began = None
             if len(route) < _PARTS:
                 came = now if self._gap_began is None else self._gap_began
                 client = self._client(route[0], self._admission.name(parts[-1]), now)
                 self._requests.take(client, route, payload, now, came)
+
+    def _has_read_all(self, now: float) -> None:
+        """Note that nothing waits: perhaps all has been read that came before a gap or a fence.
+
+        libzmq's thread may still hand on a message. So both take `PURGE` without a further gap.
+        """
+        if now - self._gap_ended > bounds.PURGE:
+            self._gap_began = None
+        if self.past == math.inf and now - self._since > bounds.PURGE:
+            if self._gap_began is None and self._came <= bounds.ALL_RATE * bounds.PURGE:
+                self.past = self._requests.past = now
+            self._since = now
+            self._came = 0
 
     def _client(self, identity: bytes, name: str, now: float) -> Client:
         client = self._clients.get(identity)

@@ -6,9 +6,9 @@ and none more than its share. A client that sends more than it may a second is r
 pauses. Nothing here reads or sends.
 
 Each request carries the time at which it came, by which the loop judges its age. The loop raises a
-fence with every stop. What came before `RequestQueue.past` is refused: the time at which all had
-been read that may have come before the fence. A ``status`` changes nothing, and is answered
-whenever it came. Of the setpoints (``hold``) of one connection only the newest waits.
+fence with every stop. Requests that arrived before `RequestQueue.past` are refused; that is the
+time by which everything sent before the fence had been read. A ``status`` changes nothing, and is
+answered whenever it came. A ``hold`` takes the place of the one that waits just before it.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class _Request(NamedTuple):
     route: Route
     came: float
     packed: bytes
-    is_hold: bool
+    setpoints: frozenset[str]  # what a hold sets; empty for other commands
 
 
 class RequestQueue:
@@ -122,7 +122,8 @@ class RequestQueue:
         else:
             name = request["command"]
             came = ALWAYS if name == "status" else came
-            self._queue(client, _Request(route, came, msgpack.packb(request), name == "hold"))
+            setpoints = frozenset(request) - {"key"} if name == "hold" else frozenset[str]()
+            self._queue(client, _Request(route, came, msgpack.packb(request), setpoints))
 
     def _shared(self, client: Client, now: float) -> float:
         """Return what each client may send in a second: less when many send."""
@@ -144,7 +145,7 @@ class RequestQueue:
         queued = self._waiting.get(client)
         if queued is None:
             self._waiting[client] = queued = deque()
-        elif request.is_hold and queued[-1].is_hold:
+        elif queued[-1].setpoints and queued[-1].setpoints <= request.setpoints:
             self._refuse(queued.pop().route, Refused(_SUPERSEDED, Reason.SUPERSEDED))
             self._count -= 1
         elif len(queued) >= bounds.WAITING_EACH or self._count >= bounds.WAITING:

@@ -31,13 +31,14 @@ from softfinger.daemon.wire.publisher import Publisher
 
 EventSink = Callable[[str, str, str], None]
 
-_START_AGE = 0.2  # s; an older command no longer stiffens or moves the hand
+_START_AGE = 0.2  # s; an older command stiffens or moves nothing, except a hold during a grip
 
 
 def start_age(settings: Settings, waits: bool) -> float:
     """Return the age [s] up to which a command that stiffens or moves the hand is carried out.
 
-    Servos that their own watchdog stopped are not as the client of an older command saw them.
+    An older command may have been sent before the servos' watchdog stopped them, when the hand was
+    in another state.
     ``waits``: the servos' time stands still while this machine is late, and with it the watchdog.
     """
     watchdog = 0.0 if settings.simulated or waits else settings.servos.watchdog

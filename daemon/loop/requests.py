@@ -12,16 +12,16 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from softfinger.daemon.control.envelope import Envelope
-from softfinger.daemon.control.modes import COMMANDS, GRIPPING, HARMLESS, HELD, UNLEASED, Mode
+from softfinger.daemon.control.modes import COMMANDS, GRIPPING, HARMLESS, HELD, Mode
 from softfinger.daemon.control.state_machine import Control, off_range
 from softfinger.daemon.errors import Reason, Refused, ServoError, TactileError
 from softfinger.daemon.perception.perception import Perception
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.safety.safety import Safety
 from softfinger.daemon.safety.torque_state import TorqueState
-from softfinger.daemon.types import FINGERS, GRIP_FRACTION, State
+from softfinger.daemon.types import FINGERS, GRIP_FRACTION, UNLEASED, State
 
-LONGEST_AGE = 1.0  # s; an older command is not carried out, except status
+LONGEST_AGE = 1.0  # s; an older command is not carried out, except status and stop
 _COMPLIANCE = (0.01, 1.0)  # rad/(N·m)
 _ENVELOPE = frozenset({"command", "client"})
 _FIRST = {Mode.DISARMED: "arm first", Mode.FAULT: "clear the fault first"}
@@ -211,8 +211,8 @@ class Requests:
     def _check_age(self, name: str, age: float) -> None:
         """Raise Refused for a command that is too old.
 
-        A client whose command waited out a stall of the machine may no longer want the hand to
-        start. Setpoints of a stream and what is harmless are carried out a little longer.
+        After a stall the client may no longer want the hand to move. Setpoints during a grip and
+        harmless commands are accepted up to a greater age.
         """
         if name == "status":
             return

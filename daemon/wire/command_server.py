@@ -3,9 +3,10 @@
 It runs in the loop's thread, once a tick, without a lock. A ``stop`` goes first; what came before
 one is refused, wherever it waits (see `gateway.request_queue`), but for a ``status``.
 
-A client may give a request a ``key`` of its own choice and send it again, with the same key, when
-it was refused as late. The command is then carried out once at most, and never after a ``stop``
-that came after the first sending.
+A client may give a request a ``key`` that no other request has, and send the same map again when it
+was refused as late. The command is then carried out once at most, and only if no other command was
+carried out since that refusal: the newest command prevails. What can only make the hand safer
+(`UNLEASED`) is carried out each time.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import msgpack
 
 from softfinger.daemon.errors import Reason, Refused
+from softfinger.daemon.types import UNLEASED
 from softfinger.daemon.wire.loop_link import Ask, Link, machine_time
 
 if TYPE_CHECKING:  # the gateway has no use for it
@@ -36,7 +38,8 @@ _VALUES = (str, int, float)  # and bool, which is an int
 class _Outcome(NamedTuple):
     """Reply to a request that has a key."""
 
-    stops: int  # how many the hand had been given until then
+    stops: int  # number of stops when the request was first refused or carried out
+    changes: int  # and of other commands carried out
     reply: bytes  # empty when the request was late, and may be sent again
 
 
@@ -55,7 +58,8 @@ class CommandServer:
         self._local = local
         self._clock = clock
         self._stops = 0
-        self._outcomes: OrderedDict[str, _Outcome] = OrderedDict()  # by key, the oldest first
+        self._changes = 0  # commands carried out that may change the hand, but for stops
+        self._outcomes: OrderedDict[bytes, _Outcome] = OrderedDict()  # by request, oldest first
         self._stopped: bytes | None = None  # answer to a local stop, until the gateway knows it
         self._answer_by = 0.0
         if local is not None:
@@ -82,7 +86,8 @@ class CommandServer:
             link.reply(stop.number, reply)
         for _ in range(_A_TICK):
             while link.asked and link.asked[0].came < link.past:
-                link.reply(link.asked.popleft().number, refusal(stopped()))
+                ask = link.asked.popleft()
+                link.reply(ask.number, self._answer(ask, _refuse_stopped))
             if not link.asked:
                 return
             ask = link.asked.popleft()
@@ -103,18 +108,24 @@ class CommandServer:
     def _answer(self, ask: Ask, handler: Handler) -> bytes:
         """Return the reply to a request; one that has a key is carried out once at most."""
         request = msgpack.unpackb(ask.packed)
-        key = request.pop("key", None)
-        stops, reply = self._outcomes.pop(key, _Outcome(self._stops, b""))
-        late = False
+        name = request["command"]
+        keyed = request.pop("key", None) is not None and name not in UNLEASED
+        present = _Outcome(self._stops, self._changes, b"")
+        first = self._outcomes.pop(ask.packed, present) if keyed else present
+        reply, late = first.reply, False
         if not reply:
             try:
-                if stops != self._stops:
+                if first.stops != self._stops:
                     raise stopped()
+                if first.changes != self._changes:
+                    text = f"{name}: another command was carried out since this one was late"
+                    raise Refused(text, Reason.SUPERSEDED)
                 reply = _accepted(handler(request, self._clock() - ask.came))
+                self._changes += name != "status"
             except Refused as refused:
                 reply, late = refusal(refused), refused.reason == Reason.LATE
-        if key is not None:
-            self._outcomes[key] = _Outcome(stops, b"" if late else reply)
+        if keyed:
+            self._outcomes[ask.packed] = first._replace(reply=b"" if late else reply)
             if len(self._outcomes) > _KEYS:
                 self._outcomes.popitem(last=False)
         return reply
@@ -135,6 +146,10 @@ class CommandServer:
 def _accepted(reply: dict[str, Any]) -> bytes:
     packed: bytes = msgpack.packb({"ok": True, **reply})
     return packed
+
+
+def _refuse_stopped(*_: object) -> dict[str, Any]:
+    raise stopped()
 
 
 def stopped() -> Refused:

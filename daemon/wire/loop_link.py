@@ -210,7 +210,7 @@ class Link:
         self._waiting.clear()
 
     def raise_fence(self) -> None:
-        """Refuse from now on the requests that came before: the hand was stopped."""
+        """Refuse all requests that arrived before this call, because the hand was stopped."""
         self._fence = (self._fence + 1) % _FENCES
         self.past = math.inf
         self._waiting.append(FENCE + NUMBER.pack(self._fence))

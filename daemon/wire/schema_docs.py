@@ -56,10 +56,11 @@ than 0.2 s (or `servos.watchdog`, where that is shorter). `disarm`, `tare`, `cle
 while the hand grips, are carried out up to an age of 1 s, `status` and `stop` always.
 
 To send a late command again safely, give it a `key`: a text of 1 to 64 characters that no other
-command has, for example a random number. Send the same map again with the same key. The daemon
-carries out a key at most once, answers a repetition with the first reply, and refuses it as
-`stopped` if the hand was stopped in between. `Hand`, `AsyncHand`, `softfinger send`, `monitor` and
-`view` do this by themselves.
+command has, for example a random number. Send the same map again. The daemon carries it out at most
+once, and answers a repetition with the first reply. It refuses the repetition as `stopped` if the
+hand was stopped since it refused the first one as late, and as `superseded` if it has carried out
+another command since. `disarm` needs no key; it is carried out each time. `Hand`, `AsyncHand`,
+`softfinger send`, `monitor` and `view` repeat late commands by themselves.
 """
 
 

@@ -1,5 +1,6 @@
 """Command server and client on real sockets; what is heard when, and how a request must look."""
 
+import math
 import os
 import select
 import stat
@@ -17,6 +18,7 @@ from softfinger.daemon.control.modes import COMMANDS, Mode
 from softfinger.daemon.errors import Reason, Refused
 from softfinger.daemon.gateway import bounds
 from softfinger.daemon.gateway.bounds import Config
+from softfinger.daemon.gateway.request_queue import RequestQueue
 from softfinger.daemon.gateway.supervisor import Gateway
 from softfinger.daemon.loop import build
 from softfinger.daemon.loop.loop import start_age
@@ -176,9 +178,9 @@ def test_a_key_is_carried_out_once_and_its_reply_repeated(context, addresses):
             assert msgpack.unpackb(asking.socket.recv()) == {"ok": True, "count": count}
 
 
-@pytest.mark.parametrize("stop", ["none", "by a signal", "by a client"])
-def test_a_late_command_is_carried_out_when_it_is_repeated_unless_the_hand_was_stopped(
-    context, addresses, stop
+@pytest.mark.parametrize("meanwhile", ["", "signal", "stop", "disarm", "status"])
+def test_a_late_command_is_carried_out_when_it_is_repeated_unless_another_was_meanwhile(
+    context, addresses, meanwhile
 ):
     clock, aged = VirtualClock(), Aged()
     with Served(commands=addresses[1], clock=clock) as served:
@@ -187,21 +189,62 @@ def test_a_late_command_is_carried_out_when_it_is_repeated_unless_the_hand_was_s
         pass_time(clock, 0.5)
         until(lambda: [served.serve(aged), asking.socket.poll(0)][1])
         assert msgpack.unpackb(asking.socket.recv())["reason"] == "late"
-        if stop == "by a signal":
+        for _ in range(4):  # the gap is over
+            pass_time(clock, bounds.PURGE / 2)
+            served.serve(aged)
+        if meanwhile == "signal":
             served.server.raise_fence()
-        elif stop == "by a client":
-            stopping = Asking(context, served, addresses[1], "stop")
-            until(lambda: [served.serve(aged), pass_time(clock, 1e-3), stopping.socket.poll(0)][2])
-        until(lambda: served._is_open())  # far enough from the stop to tell
-        stopped = len(aged.ages)
+        elif meanwhile:
+            other = Asking(context, served, addresses[1], meanwhile)
+            until(lambda: [served.serve(aged), pass_time(clock, 1e-3), other.socket.poll(0)][2])
+        until(lambda: served._is_open())  # far enough from a stop to tell
+        count = len(aged.ages)
         asking.send(keyed())
         until(lambda: [served.serve(aged), asking.socket.poll(0)][1])
         reply = msgpack.unpackb(asking.socket.recv())
-        if stop == "none":
-            assert reply == {"ok": True, "count": 1}
+        if meanwhile in ("", "status"):
+            assert reply == {"ok": True, "count": count + 1}
         else:
-            assert reply["reason"] == "stopped"
-            assert len(aged.ages) == stopped
+            assert reply["reason"] == ("superseded" if meanwhile == "disarm" else "stopped")
+            assert len(aged.ages) == count
+
+
+def test_a_disarm_is_carried_out_each_time_whatever_its_key(context, addresses):
+    aged = Aged()
+    with Served(commands=addresses[1], clock=VirtualClock()) as served:
+        for count in (1, 2):
+            asking = Asking(context, served, addresses[1], keyed("disarm"))
+            until(lambda: [served.serve(aged), asking.socket.poll(0)][1])  # noqa: B023
+            assert msgpack.unpackb(asking.socket.recv()) == {"ok": True, "count": count}
+
+
+def test_a_fence_is_passed_only_after_some_time_without_a_gap(context, addresses):
+    """What came before a stop may be handed on by libzmq's thread after a gap, too."""
+    clock, aged = VirtualClock(), Aged()
+    with Served(commands=addresses[1], clock=clock) as served:
+        served.server.raise_fence()
+        served.settle()
+        pass_time(clock, 2.0 * bounds.GAP)
+        served.settle()
+        assert served.link.past == math.inf
+        until(lambda: served._is_open())
+        asking = Asking(context, served, addresses[1], "arm")
+        until(lambda: [served.serve(aged), asking.socket.poll(0)][1])
+        assert msgpack.unpackb(asking.socket.recv())["ok"]
+
+
+def test_a_setpoint_replaces_only_one_that_sets_no_more_than_it_does():
+    answered = []
+    queue = RequestQueue(200, 100.0, lambda *_: False, lambda route, _: answered.append(route[0]))
+    client = queue.new_client("", 0.0)
+    for name, numbers in (
+        (b"force", {"force": 8.0}),
+        (b"angle", {"angle": 0.1}),
+        (b"both", {"force": 5.0, "angle": 0.1}),
+        (b"later", {"force": 4.0, "angle": 0.2}),
+    ):
+        queue.take(client, [name], msgpack.packb({"command": "hold", **numbers}), 0.0, 0.0)
+    assert answered == [b"angle", b"both"]
 
 
 def test_of_setpoints_that_wait_only_the_newest_is_carried_out(context, addresses):

@@ -148,3 +148,17 @@ def test_a_backlog_that_libzmq_hands_on_bit_by_bit_dies_with_a_stop():
             scene.act("gateway")
             scene.act("loop")
         assert scene.replies[-1]["ok"]
+
+
+def test_a_flood_does_not_date_commands_by_a_gap_for_ever():
+    """No more can have waited than the connections hold, though the socket is never empty."""
+    with patch.object(bounds, "CLIENTS", 1), patch.object(bounds, "QUEUE", 20), played() as scene:
+        door = scene.served.service._commands
+        scene.pass_time(0.5)
+        for _ in range(100):
+            scene.ask(0, command="status")
+        scene.act("gateway")
+        assert door._gap_began is not None
+        while len(scene.arrived) > 70:
+            scene.act("gateway")
+        assert door._gap_began is None

@@ -23,8 +23,7 @@ from numpy.typing import NDArray
 from softfinger.daemon.client.command_client import AGAIN_AFTER, LOCALLY, UNCONFIRMED, Attempts
 from softfinger.daemon.client.connection import PATIENCE, SILENCE, drain, subscribe, unpack
 from softfinger.daemon.client.stream import read
-from softfinger.daemon.control.modes import UNLEASED
-from softfinger.daemon.types import FINGERS, GRIP_FRACTION
+from softfinger.daemon.types import FINGERS, GRIP_FRACTION, UNLEASED
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.local_stop import stop_locally
 
@@ -299,7 +298,8 @@ class _Pending:
     socket: zmq.Socket[bytes]
     attempts: Attempts
     sent: float
-    again_at: float = math.inf  # when it is sent again, after it was late
+    late: dict[str, Any] | None = None  # the daemon's refusal, until the command is sent again …
+    again_at: float = 0.0  # … then
     warned: bool = False  # that it takes long
 
 
@@ -343,9 +343,15 @@ class Commander:
     def collect(self, now: float) -> None:
         """Take the replies that came, give up on those that are overdue."""
         for each in list(self._pending):
-            if now >= each.again_at:
-                each.again_at = math.inf
-                each.socket.send(msgpack.packb(each.attempts.request), zmq.NOBLOCK)
+            if each.late is not None:
+                if now < each.again_at:
+                    continue
+                if each.attempts.remaining():
+                    each.late = None
+                    each.socket.send(msgpack.packb(each.attempts.request), zmq.NOBLOCK)
+                else:  # suspended meanwhile
+                    self._end(each, now, each.late)
+                continue
             try:
                 payload = each.socket.recv(zmq.NOBLOCK)
             except zmq.Again:
@@ -354,19 +360,25 @@ class Commander:
                     each.warned = True
                     so_far = f"within {PATIENCE:g} s" if overdue else f"yet, {PATIENCE:g} s at most"
                     self.refuse(now, f"{each.label}: no answer from {self._address} {so_far}")
-                if not overdue:
-                    continue
+                if overdue:
+                    self._close(each)
+                continue
+            try:
+                record = msgpack.unpackb(payload)
+            except (ValueError, RecursionError, msgpack.UnpackException):
+                record = None
+            if isinstance(record, dict) and each.attempts.again(record):
+                each.late, each.again_at = record, now + AGAIN_AFTER
             else:
-                try:
-                    record = msgpack.unpackb(payload)
-                except (ValueError, RecursionError, msgpack.UnpackException):
-                    record = None
-                if isinstance(record, dict) and each.attempts.again(record):
-                    each.again_at = now + AGAIN_AFTER
-                    continue
-                self.reply = judge(now, each.label, record)
-            each.socket.close()
-            self._pending.remove(each)
+                self._end(each, now, record)
+
+    def _end(self, command: _Pending, now: float, record: Any) -> None:
+        self.reply = judge(now, command.label, record)
+        self._close(command)
+
+    def _close(self, command: _Pending) -> None:
+        command.socket.close()
+        self._pending.remove(command)
 
 
 def judge(now: float, label: str, record: Any) -> ShownReply:

@@ -64,7 +64,7 @@ class Site:
         self,
         loop: asyncio.AbstractEventLoop,
         token: str | None,
-        send: Callable[[dict[str, Any]], dict[str, Any]],
+        send: Callable[[dict[str, Any], float], dict[str, Any]],
         foxglove: Foxglove | None,
         stale: float,
     ) -> None:
@@ -188,7 +188,8 @@ class Site:
         if name != "stop" and not age < self._stale:
             return f"✗ {name}: dropped, the page is {age:.0f} s behind"
         try:
-            reply = judge(time.monotonic(), name, self._send(asked))
+            remaining = self._stale if name == "stop" else self._stale - age
+            reply = judge(time.monotonic(), name, self._send(asked, remaining))
         except NoAnswer as error:
             return f"✗ {name}: {error}"
         return f"{'✓' if reply.ok else '✗'} {reply.text}"
@@ -218,7 +219,7 @@ def show(arguments: argparse.Namespace, ending: Ending) -> None:
     foxglove = Foxglove(loop) if arguments.foxglove is not None else None
     live = recording is None
     token = secrets.token_urlsafe(16) if live else None
-    hand_on = partial(send, arguments.commands, timeout=arguments.timeout, keys=keys)
+    hand_on = partial(send, arguments.commands, keys=keys)
     site = Site(loop, token, hand_on, foxglove, arguments.timeout)
     pictures = Pictures(
         site.publish, lambda: bool(site.waiting), _say, live=live, foxglove=foxglove
