@@ -36,10 +36,16 @@ class Seen:
 class Watched:
     """A daemon on virtual time, its hand's truth recorded. Raises SettingsError."""
 
-    def __init__(self, sections: dict[str, dict[str, Any]]) -> None:
+    def __init__(
+        self,
+        sections: dict[str, dict[str, Any]],
+        hand: dict[str, dict[str, Any]] | None = None,
+    ) -> None:
+        """``hand``: sections of the hand, where it is not what the daemon assumes."""
         settings = checked(sections | {"loop": {"clock": "virtual"}})
         self.events: list[Event] = []
-        self._daemon = Daemon(settings, wire=False, on_event=self._note)
+        real = None if hand is None else checked(hand | {"loop": {"clock": "virtual"}})
+        self._daemon = Daemon(settings, wire=False, on_event=self._note, hand=real)
         self.loop, self.state = self._daemon.loop, self._daemon.loop.state
         self.control = self.loop._control
         assert self._daemon.hand is not None

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from softfinger.daemon.control import setpoint, slip_monitor
 from softfinger.daemon.control.setpoint import SetpointState
 from softfinger.daemon.control.slip_monitor import SlipState, mean
+from softfinger.daemon.perception import witnesses
 from softfinger.daemon.perception.contact_filter_kernels import GraspState
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 from softfinger.kinematics.compiled.layout import Pair, Record, Records
@@ -121,7 +122,13 @@ def grip_torques(
     g = grips[0]
     grasp = grasps[0]
     g.force.target = slip_monitor.update(
-        g.slip, grasp, g.commanded, holding, g.closing_friction, dq
+        g.slip,
+        grasp,
+        g.commanded,
+        holding,
+        g.closing_friction,
+        dq,
+        witnesses.doubts(grasp.witnesses),
     )
     if g.slip.reflex and g.force.target > g.force.value:
         setpoint.reset(g.force, force_windows, g.force.target)

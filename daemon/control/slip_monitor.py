@@ -5,16 +5,19 @@ With the names of `SlipLaw`, `SlipState` and `GraspState`, at each tick:
     standing torque    mean(torque_residual) − closing · joint_friction, averaged: smooth
     load L of a tip    smooth − still, between 0 and smooth
                        = load_arm L + load_curvature L²                       (`load_of`)
-    s.friction         joint_friction + load_friction · mean normal force · its lever
+    s.friction         max(joint_friction, free_torque) + load_friction · normal force · its lever
     sure               |L| − (1/2 … 3/2) s.friction/load_arm
     s.load             min(max(4 sure, 0), |L| + s.friction/slope, friction force_limit)
     spare              friction (1 − margin) − shear         of the normal force, for a load
     needed             max(s.load, felt, object_load/2)/spare
     force              min(max(commanded, needed), force_limit)
-    force_limit        min(commanded + min(raise_max, raise_ratio · commanded), force_max)
+    force_limit        min(commanded + min(raise_max, share · commanded), force_max)
+    share              raise_ratio where s.moved, else at most _UNSURE_SHARE
 
-`needed` stays for _HOLD_TIME and then falls by raise_max in _BACK. A load that comes at once, or a
-turn of the object beyond μ (d1 + d2)/2W · _WELL, raises the force at once.
+`s.moved`: the object has turned, both joints have given way at once, or |L| is more than _CERTAIN
+times what friction can hide. `needed` stays for _HOLD_TIME and then falls by raise_max in _BACK. A
+load that comes at once, or a turn of the object beyond μ (d1 + d2)/2W · _WELL, raises the force at
+once.
 
 What these sensors show, and what they don't:
 
@@ -24,11 +27,13 @@ What these sensors show, and what they don't:
   shear (`hand.grasp_state`), where both joints show it alike; what frames that drift explain is
   taken off before (`perception.witnesses`), and a wrong torque constant is no load
   (`perception.scales`). A joint's friction hides a load of its torque over W turn, 1.7 N a tip at
-  the default hand; gears with friction of their own load hide more, the firmer the grip is. Up to
-  that, what is seen when holding begins, and what changes slower than in a second, is taken as
-  friction. Less than half of it is no sign of a load; a load that is seen is taken for more by what
-  friction may hide. So a grip whose tips' friction bears less than about twice that is not guarded
-  well, at the default hand below 7 N, and below 2.8 N not at all.
+  the default hand; gears with friction of their own load hide more, the firmer the grip is. What
+  friction the joints have, each approach shows (`GraspState.free_torque`). Up to that, what is seen
+  when holding begins, and what changes slower than in a second, is taken as friction: torque that
+  the force law adds while a joint sticks is no load. Less than half of it is no sign of a load; a
+  load that is seen is taken for more by what friction may hide. So a grip whose tips' friction
+  bears less than about twice that is not guarded well, at the default hand below 7 N, and below 2.8
+  N not at all.
 - A load towards the palm wedges the object between the tips: it shows less, and needs more to slip.
   Of a sudden one the torques never show more than lever²/4 bow, or 0.07 N·m at 10 N.
 - The object's angle is known twice, from frames and from the joints by rolling. What frames correct
@@ -72,6 +77,9 @@ _SIGNS = 4.0  # standard deviations, of the angle and of the torques, more than 
 _BOTH = 0.5  # of the mean of both joints' torques: each must show so much of a load, …
 _AT_ONCE = 0.25  # … and so much of one that comes at once, while a joint may still stick
 _BALANCED = 0.6  # of both tips' mean force: each must feel so much, as of any object that is free
+_FRICTION_MOST = 0.3  # N·m: what more a joint took on its way was no friction
+_UNSURE_SHARE = 0.3  # of the force asked for: no grip is raised by more before something moves, …
+_CERTAIN = 2.0  # … or joints that stand show more than so many times what friction can hold
 _ARM_MIN = 0.2  # of the object's width: a load's lever is not taken for less
 _SPARE_MIN = 0.3  # of the friction: where rolling takes more, a firmer grip hardly helps
 
@@ -103,6 +111,7 @@ class SlipState(Record):
     reflex: bool  # it has, or a load came at once: the grip is to be raised at once
     known: bool  # what stood of the joints' torques when holding began:
     still: float  # friction, as a rule [N·m]
+    moved: bool  # a joint gave way to a load, or the object turned: so the grip was raised
     smooth: Pair  # what nothing else explains of them, averaged [N·m]
     variance: Pair  # of both joints' mean about that, and of half their difference [N²·m²]
     speed: Pair  # of the joints, averaged [rad/s]
@@ -133,7 +142,7 @@ def set_law(law: SlipLaw, settings: Settings) -> None:
 @inner_kernel
 def forget(s: SlipState) -> None:
     """Forget the object: nothing is held any more, or something else."""
-    s.turned = s.known = s.reflex = False
+    s.turned = s.known = s.reflex = s.moved = False
     s.load = s.guarded = s.felt = s.twisted = s.still = s.age = s.friction = 0.0
     s.smooth[:] = s.variance[:] = s.speed[:] = 0.0
     s.unexplained_rotation[:] = s.away[:] = 0.0
@@ -154,22 +163,28 @@ def begin(s: SlipState, grasp: GraspState) -> None:
 
 @inner_kernel
 def update(
-    s: SlipState, grasp: GraspState, commanded: float, holding: bool, closing: float, dq: Two
+    s: SlipState,
+    grasp: GraspState,
+    commanded: float,
+    holding: bool,
+    closing: float,
+    dq: Two,
+    doubted: bool,
 ) -> float:
     """Return the grip force [N] to go to: ``commanded``, or more where the margin needs it.
 
     ``holding``: nothing but loads moves the joints. ``closing``, -1 to 1: how much of the joints'
-    friction is given at present for closing. ``dq`` [rad/s]: of the joints.
+    friction is given at present for closing. ``dq`` [rad/s]: of the joints. ``doubted``: what is
+    measured is named as false, and raises no grip.
     """
     law = s.law
     s.turned = False
     moment = mean(grasp.normal) * mean(grasp.moment_arm)
-    s.friction = law.joint_friction + law.load_friction * moment
-    raised = min(law.raise_max, law.raise_ratio * commanded)
-    s.force_limit = max(min(commanded + raised, law.force_max), commanded)
+    s.friction = _friction(s, grasp) + law.load_friction * moment
     monitored = holding and s.known and grasp.load_arm > 0.0
     # Of the shear one part grows with the grip, the rolling's; the load is borne by both tips.
     spare = law.friction * (1.0 - law.margin) - grasp.shear
+    bearing = max(spare, _SPARE_MIN * law.friction)
     sudden = _average(s, grasp, closing, dq, monitored, spare)
     if monitored:
         _estimate_load(s, grasp)
@@ -184,11 +199,16 @@ def update(
         s.load = min(s.load, felt + _SHEAR_JUMP)
     bears = spare * mean(grasp.normal)
     sudden = _shear_jumps(s, felt, grasp.twisted, bears, monitored) or sudden
+    if doubted:
+        s.load = felt = s.needed = 0.0
+        s.turned = sudden = s.moved = False
     s.guarded = max(s.load, felt, 0.5 * law.object_load)
-    needed = s.guarded / max(spare, _SPARE_MIN * law.friction)
+    needed = s.guarded / bearing
     if s.turned:
         needed = max(needed, (1.0 + _TURNED_MORE) * max(commanded, s.needed))
     s.reflex = s.turned or sudden
+    s.moved = s.moved or s.reflex
+    s.force_limit = _force_limit(s, commanded, 0.5 * law.object_load / bearing)
     if sudden:
         needed = s.force_limit  # how much more is to come is not known
     if needed >= s.needed:
@@ -198,7 +218,17 @@ def update(
         s.idle += law.dt
         if s.idle > _HOLD_TIME:
             s.needed = max(s.needed - law.raise_max / _BACK * law.dt, needed)
+            s.moved = s.moved and s.needed > commanded
     return min(max(commanded, s.needed), s.force_limit)
+
+
+@inner_kernel
+def _force_limit(s: SlipState, commanded: float, declared: float) -> float:
+    """Return the force [N] that a grip may be raised to; a ``declared`` load's is not in doubt."""
+    law = s.law
+    share = law.raise_ratio if s.moved else min(law.raise_ratio, _UNSURE_SHARE)
+    raised = min(max(share * commanded, declared - commanded), law.raise_ratio * commanded)
+    return max(min(commanded + min(raised, law.raise_max), law.force_max), commanded)
 
 
 @inner_kernel
@@ -248,6 +278,12 @@ def _average(
 
 
 @inner_kernel
+def _friction(s: SlipState, grasp: GraspState) -> float:
+    """Return the most friction [N·m] that the joints may have, as the approach has shown it."""
+    return min(max(mean(grasp.free_torque), s.law.joint_friction), _FRICTION_MOST)
+
+
+@inner_kernel
 def _shear_jumps(s: SlipState, felt: float, twisted: float, bears: float, monitored: bool) -> bool:
     """Take in the load and the twist that solid tips feel [N]; whether one has come at once.
 
@@ -278,6 +314,7 @@ def _estimate_load(s: SlipState, grasp: GraspState) -> None:
     load = abs(load)
     # Half the friction is no sign yet, and after a motion it may turn round; from all of it on
     # as much may be hidden. What no raised grip bears need not be told apart.
+    s.moved = s.moved or load > _CERTAIN * friction
     sure = load - (0.5 + max(1.0 - s.age / _LEARN, 0.0)) * friction
     undetected = s.friction / max(slope, _ARM_MIN * law.width)
     s.load = min(max(4.0 * sure, 0.0), load + undetected, law.friction * s.force_limit)

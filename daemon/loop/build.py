@@ -51,8 +51,11 @@ class Daemon:
         *,
         on_event: EventSink | None = None,
         wire: bool = True,
+        hand: Settings | None = None,
     ) -> None:
+        """``hand``: what a simulated hand is made of, where that is not what the daemon assumes."""
         self.settings = settings
+        self._hand_settings = settings if hand is None else hand
         self.clock: LoopClock = make_clock(settings)
         self._closers: list[Callable[[], None]] = []
         self.gateway: Gateway | None = None  # the process that serves clients
@@ -127,19 +130,22 @@ class Daemon:
     def _make_hand(self) -> SimulatedHand | None:
         """The simulated hand, where a backend wants one.
 
-        Its tips are of the settings' material, whatever a calibration says of them.
+        Its tips are of the material in the settings, whatever a calibration says of them.
         """
         settings = self.settings
         if not needs_hand(settings.servos.backend, settings.tactile.backend):
             return None
         from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 
-        table = next((each.table for each in self.models if not each.own_material), None)
+        real = self._hand_settings
+        table = None
+        if real is settings:
+            table = next((each.table for each in self.models if not each.own_material), None)
         if table is None:
-            table = make_table(settings, make_material(settings.material))
+            table = make_table(real, make_material(real.material))
         own = backend("servos", settings.servos.backend).hand
         made: SimulatedHand = (own if callable(own) else SimulatedHand)(
-            settings, self.clock.now(), table
+            real, self.clock.now(), table
         )
         return made
 

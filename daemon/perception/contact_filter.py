@@ -182,6 +182,9 @@ class ContactFilter:
         contact.shear_x, contact.shear_y = estimate.shear_x, estimate.shear_y
         if not in_contact:
             tip = self._state.tip[finger]
+            if tip.in_contact:
+                self.grasp.free_torque[finger] = 0.0  # the next approach shows it anew
+                tip.efforts[:] = 0.0
             tip.in_contact, tip.d.mean = False, 0.0
             _fill_from_frame(
                 contact,

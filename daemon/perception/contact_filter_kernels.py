@@ -73,6 +73,8 @@ _TURN_MOST = 1.0  # rad from reading to reading
 _GATE = 9.0  # squared Mahalanobis distance
 _BY_TURNING = 0.8  # of such an angle's variance: the object turned, rather than tapers otherwise
 _FIRM = 1.0  # N of both tips, from which on an object does not rock between them
+_BRIEF = 0.02  # s over which a free joint's torque is averaged, for its greatest
+_UNFELT = 0.1  # s that a touch may last before it is felt
 _FOLLOWED = 1.0  # responses of the cells after a touch, in which each frame begins anew
 # A footprint that grows within the cells' response looks wider and flatter, by so much times the
 # variance of the d that it is a mean of, over d²: by the fit of a mean of paraboloids.
@@ -106,6 +108,9 @@ class TrackedTip(Record):
     q: float  # tracked joint [rad]
     unseen: float  # joint motion since the last frame that the velocity can't show [rad]
     torque: float  # of the joint [N·m]
+    effort: float  # likewise, averaged while nothing touches the tip [N·m]
+    efforts: Pair  # the greatest lately, and before: a touch is felt later than it begins
+    since: float  # the last of them began [s]
     speed: float  # of the joint [rad/s]
     shared: Pair  # the variances of d and θ that all frames share
     law: Annotated[FloatArray, LAW_POINTS]  # relative error of F by table and law, over d
@@ -137,6 +142,7 @@ class GraspState(Record):
     torque_residual: Pair  # what only a load along the faces explains of the joints' torques [N·m]
     load_arm: float  # a load L makes them arm L + curvature L²; 0: none shows [m]
     load_curvature: float  # [m/N]
+    free_torque: Pair  # the most that each joint took on its way to the touch: friction's bound
     scales: Scales  # of what feels the tips' forces
     witnesses: WitnessState  # and what speaks against it
 
@@ -255,6 +261,7 @@ def predict(
     f = filters[0]
     left = f.tip[0]
     right = f.tip[1]
+    slower = left.speed, right.speed
     left.speed = dq[0]
     right.speed = dq[1]
     dt = t - f.t
@@ -262,7 +269,10 @@ def predict(
         return
     for k in range(2):
         trusted = witnesses.trusted_current(f.grasp.witnesses, k, current[k], goal[k], dt)
-        f.tip[k].torque = f.torque_constant * trusted
+        tip = f.tip[k]
+        tip.torque = f.torque_constant * trusted
+        if not tip.in_contact:
+            _watch_effort(tip, f.grasp, k, t, dt, dq[k] - slower[k])
     f.t = t
     kept = math.exp(-dt / f.response) if f.response > 0.0 else 0.0
     if dt > HISTORY:
@@ -319,6 +329,25 @@ def predict(
         row.spread[k] = kept * (last.spread[k] + (1.0 - kept) * behind * behind)
         row.q[k] = _between(f.tip[k].q, last.q[k], kept)
         row.firmness[k] = _between(f.tip[k].firmness, last.firmness[k], kept)
+
+
+@inner_kernel
+def _watch_effort(
+    tip: TrackedTip, grasp: GraspState, finger: int, t: float, dt: float, faster: float
+) -> None:
+    """Note the greatest torque that a joint's friction took while it moved freely.
+
+    It is ``faster`` by so much than at the last reading [rad/s]. The last moments are left out, in
+    which the tip may touch already and not be felt.
+    """
+    accelerating = grasp.scales.inertia * faster / dt
+    tip.effort += (tip.torque - accelerating - tip.effort) * min(dt / _BRIEF, 1.0)
+    tip.efforts[0] = max(tip.efforts[0], abs(tip.effort))
+    if t - tip.since > _UNFELT:
+        grasp.free_torque[finger] = max(grasp.free_torque[finger], tip.efforts[1])
+        tip.efforts[1] = tip.efforts[0]
+        tip.efforts[0] = 0.0
+        tip.since = t
 
 
 @inner_kernel
@@ -528,8 +557,8 @@ def update(
         force, _, stiffness, _, _, _, _ = lookup(table, d, total_tilt(theta, tilt_y))
         power = force / (stiffness * d)
         d *= firmness**-power
-    if both and f.grasp.witnesses.drifted[finger] > witnesses.DRIFT_TIME:
-        return False
+    if both:
+        tip.d.mean = max(tip.d.mean - witnesses.set_aside(f.grasp.witnesses, finger), _D_MIN)
     if both and min(f.grasp.normal[0], f.grasp.normal[1]) > _FIRM:
         innovation = angle - (f.angle.mean + 0.5 * sense * f.taper - angle_since)
         if witnesses.refuses(
@@ -585,7 +614,9 @@ def update(
             _update_angle(f, sense, angle_since, angle, angle_variance)
         return True
     before_it = tip.d.mean
-    if free and not early:
+    if f.grasp.witnesses.off[finger] != 0.0:
+        tip.fresh = False  # the joints tell d
+    elif free and not early:
         _update_tip(tip, f.count * f.length, d_since, d, gain, noise)
     elif not free:
         _update_product(

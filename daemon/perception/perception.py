@@ -16,8 +16,10 @@ from numpy.typing import NDArray
 
 from softfinger.daemon.perception.calibration_file import Converter, least_end
 from softfinger.daemon.perception.contact_filter import ContactFilter
+from softfinger.daemon.perception.contact_filter_kernels import HOLDING
 from softfinger.daemon.perception.finger_model import FingerModel, make_estimator
 from softfinger.daemon.perception.scales import forget
+from softfinger.daemon.perception.zero import ZeroWatch
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.tactile.base import TactileSensor
 from softfinger.daemon.types import FINGERS, Event, Frame, SensorFacts, State
@@ -64,7 +66,7 @@ class Perception:
         if not self.fingers:
             return
         for each in self.fingers:
-            frame = each.update()
+            frame = each.update(state.phase == HOLDING)
             if frame is not None:
                 if each.repeats.long:
                     frame = replace(frame, valid=False)
@@ -145,6 +147,8 @@ class FingerPerception:
         self.facts = self._facts(settings, model)
         self._events = events
         self._zero: NDArray[np.uint16] | None = None  # where there is no converter
+        live = np.ones(model.grid.shape, np.bool_) if active is None else active
+        self._moved = ZeroWatch(model.grid, settings.tip.radius, live)
         self._tare_sum: NDArray[np.uint32] | int = 0
         self._tare_left = 0
 
@@ -157,9 +161,13 @@ class FingerPerception:
         """Take the mean of the next frames as zero, cell by cell."""
         self._tare_sum = 0
         self._tare_left = _TARE_FRAMES
+        self._moved.forget()
 
-    def update(self) -> Frame | None:
-        """Return the newest frame, estimated, where it is a new one; None where it is not."""
+    def update(self, holding: bool = False) -> Frame | None:
+        """Return the newest frame, estimated, where it is a new one; None where it is not.
+
+        ``holding``: a grip rests, so that its cells tell how far their zero has moved.
+        """
         frame, last = self.sensor.latest(), self.frame
         if frame is None or frame is last:
             return None
@@ -172,6 +180,9 @@ class FingerPerception:
         counts = frame.data
         if self._tare_left and frame.valid:
             self._learn_zero(counts)
+        if frame.valid:
+            self._moved.follow(counts, self.estimate, holding and self.estimate.contact)
+            counts = self._moved.corrected(counts, int(self._full))
         if self._converter is not None:
             readings: NDArray[Any] = self._converter(counts)
         elif self._zero is not None:

@@ -14,8 +14,10 @@ Frames, encoders and torques each tell how hard a tip is pressed. A scale that i
   repeats one.
 - *current*: a joint's current is not the goal's.
 
-Frames that are doubted are refused: the contact is carried on by the joints, the grip's push stays
-as it was, and what holds for a board that has fallen silent follows.
+Frames that jump are refused: the contact is carried on by the joints, the grip's push stays as it
+was, and what holds for a board that has fallen silent follows. Of frames that drift d is refused
+alone, with what they have falsified of it since the grip holds: their zero has moved, they still
+show that something touches and where. The joints tell d until the contact ends.
 """
 
 from __future__ import annotations
@@ -33,7 +35,7 @@ _TURNING = 0.1  # rad/s of both joints together, or …
 _GOES_ON = 0.06  # … rad from frame to frame, likewise
 JUMPS_MAX = 2  # frames that are refused before it is reported
 _GIVE_UP = 50  # frames after which the contact is taken as they show it
-_RECENT = 2.0  # s within which a drift shows
+_RECENT = 600.0  # s within which a drift shows
 _DRIFT = 0.08  # N·m that frames and closing must be apart
 _DRIFT_RATIO = 0.15  # of the joint's moment, likewise
 _RATIO_MIN, _RATIO_MAX = 0.6, 1.5  # times as much the torque changes then, …
@@ -55,6 +57,7 @@ class WitnessState(Record):
     corrected: Pair  # d that frames have added lately to what the joints did [m]
     standing: Pair  # the torque that nothing explains, averaged [N·m]
     drifted: Pair  # for how long frames contradict closing and torque [s]
+    off: Pair  # d that frames then showed too much: they tell of it no more; 0: they do [m]
     off_goal: Pair  # for how long the current is not its goal's [s]
 
 
@@ -66,14 +69,14 @@ def forget(w: WitnessState) -> None:
     w.jumps[:] = 0.0
     w.corrected[:] = 0.0
     w.standing[:] = 0.0
-    w.drifted[:] = 0.0
+    w.drifted[:] = w.off[:] = 0.0
 
 
 @inner_kernel
 def doubts(w: WitnessState) -> bool:
     """Return whether a witness is to be named."""
     for k in range(2):
-        frames = w.jumps[k] > JUMPS_MAX or w.drifted[k] > DRIFT_TIME
+        frames = w.jumps[k] > JUMPS_MAX or w.off[k] != 0.0
         if frames or w.off_goal[k] > CURRENT_TIME:
             return True
     return False
@@ -113,6 +116,17 @@ def refuses(
         return False
     w.jumps[finger] += 1.0
     return True
+
+
+@inner_kernel
+def set_aside(w: WitnessState, finger: int) -> float:
+    """Return what is to be taken off a finger's d [m] as frames are found to drift, else 0."""
+    if w.off[finger] != 0.0 or w.drifted[finger] <= DRIFT_TIME:
+        return 0.0
+    off: float = w.corrected[finger]
+    w.off[finger] = off
+    w.corrected[finger] = 0.0
+    return off
 
 
 @inner_kernel
@@ -174,8 +188,11 @@ def trusted_current(w: WitnessState, finger: int, current: float, goal: float, d
 
     ``goal`` is 0 where no grip says what it should be.
     """
-    if goal <= 0.0 or abs(current - goal) <= _CURRENT * goal + _CURRENT_NOISE:
+    if goal <= 0.0:
         w.off_goal[finger] = 0.0
         return current
-    w.off_goal[finger] += dt
+    if abs(current - goal) <= _CURRENT * goal + _CURRENT_NOISE:
+        w.off_goal[finger] = 0.0
+    else:
+        w.off_goal[finger] += dt
     return goal

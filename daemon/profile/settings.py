@@ -185,7 +185,7 @@ class TactileSettings(Section):
     # 2508.20959), linearity ± 3 % (FlexiForce's manual).
     smooth_error: Annotated[float, Field(ge=0, le=1)] = 0.035
     gain_error: Annotated[float, Field(gt=0, le=1)] = 0.25  # relative, likewise of all cells alike
-    latency: Delay = 0.005  # s from the middle of a scan to the first byte on the wire
+    latency: Delay = 0.02  # s from the middle of a scan to the first byte on the wire
     response: Delay = 0.0  # s, first-order lag of the cells, made up for by the joints
     open_timeout: Seconds = 2.0  # s to wait for a first good frame
     sensor: tuple[str, str] = ("", "")  # identifies the sensors, as a serial number
@@ -384,7 +384,7 @@ class SimulationSettings(Section):
     tactile_drift: NonNegative = 0.0  # Pa, how far the cells' zeros wander
     tactile_gain_drift: Fraction = 0.0  # relative, likewise the gain of all, as by warmth
     tactile_drift_time: Positive = 60.0  # s in which they do
-    tactile_delay: Delay = 0.010  # s from the middle of a scan to its arrival
+    tactile_delay: Delay = 0.020  # s from the middle of a scan to its arrival
     tactile_jitter: Delay = 0.0  # s that a frame may come later still
     tactile_dropped: Annotated[float, Field(ge=0, le=0.99)] = 0.0  # share of frames that never come
     palm: Place = 0.0  # m, the palm's place along y; the pivots are at 0

@@ -474,8 +474,7 @@ def _doubt(view: View, finger: int) -> str:
             f"{side} sensor shows {what} at once, which neither the joints nor the other tip "
             "explain: its image has moved or is old, or the object ends under it"
         )
-    if found.drifted[finger] > witnesses.DRIFT_TIME:
-        off = 1e3 * found.corrected[finger]
+    if off := 1e3 * found.off[finger]:
         return (
             f"{side} sensor feels {abs(off):.1f} mm {'less' if off < 0.0 else 'more'} of the tip's "
             "displacement than its joint's closing and torque say: tare it"

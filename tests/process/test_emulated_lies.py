@@ -1,7 +1,11 @@
-"""Measurements that lie on the emulated hand, over serial bytes: its own true force is bounded."""
+"""Measurements that lie, and a hand that is not as its settings say, over serial bytes.
 
+The emulated hand's own true force is the judge.
+"""
+
+import contextlib
 import select
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from statistics import fmean
 from typing import Any
 
@@ -19,13 +23,24 @@ CURRENT = "left:current=2"
 REFUSED = "left:shift-x=3"  # the hand lets go
 
 
-@pytest.fixture(scope="module")
-def rig() -> Iterator[Rig]:
-    """An emulated hand and its daemon, which share one time, and wait for a busy machine."""
+@contextlib.contextmanager
+def running(hand: Sequence[str] = (), daemon: Sequence[str] = ()) -> Iterator[Rig]:
+    """Yield an emulated hand and its daemon, which share one time, and wait for a busy machine.
+
+    ``hand``, ``daemon``: what they are told beside the profile.
+    """
     with Rig() as made:
         text = made.config.read_text(encoding="utf-8").replace('loop.clock = "real"\n', "")
         made.config.write_text(text, encoding="utf-8")
-        made.start("--set", "servos.fault_after=1.0")  # of the hand's time
+        made.hand_words = tuple(word for each in hand for word in ("--set", each))
+        told = ("servos.fault_after=1.0", *daemon)  # of the hand's time
+        made.start(*(word for each in told for word in ("--set", each)))
+        yield made
+
+
+@pytest.fixture(scope="module")
+def rig() -> Iterator[Rig]:
+    with running() as made:
         yield made
 
 
@@ -58,14 +73,14 @@ def gripped(rig: Rig) -> None:
     reaches(rig, "holding")
 
 
-def watched(rig: Rig) -> Iterator[dict[str, Any]]:
+def watched(rig: Rig, seconds: float = LOOK) -> Iterator[dict[str, Any]]:
     """Yield the emulated hand's reports until it has lived for so long, or nothing drives it."""
     begin = rig.report()["t"]
     while True:
         report = rig.report()
         yield report
         driven = any(servo["torque"] for servo in report["servos"])
-        if report["t"] > begin + LOOK or not driven:
+        if report["t"] > begin + seconds or not driven:
             return
         select.select([], [], [], 0.005)  # the processor is for those who grip
 
@@ -88,3 +103,38 @@ def test_a_lie_is_bounded_and_nothing_else_is_named(rig, lie):
     end = reports[-1]["t"] - SETTLED
     last = fmean(fmean(report["force"]) for report in reports if report["t"] > end)
     assert last == pytest.approx(FORCE, rel=0.2)
+
+
+@pytest.mark.parametrize(
+    ("hand", "daemon", "words", "seconds", "least", "says"),
+    [
+        (["simulation.joint_friction=0.12"], [], "", 4.0, 0.8, False),
+        (["simulation.tactile_delay=0.015"], ["tactile.latency=0.02"], "", 4.0, 0.8, False),
+        ([], [], "left:drift=0.05@0..20 right:drift=0.05@0..20", 22.0, 0.8, False),
+        ([], [], "left:drift=-0.05@0..20 right:drift=-0.05@0..20", 22.0, 0.7, True),
+        (
+            [],
+            [],
+            "gain=0.5@0..5 left:current=0.5@0..5 right:current=0.5@0..5",
+            7.0,
+            0.8,
+            True,
+        ),
+    ],
+    ids=["friction", "latency", "zeros rise", "zeros sink", "gains and currents"],
+)
+def test_a_hand_that_is_not_as_its_settings_say_does_not_squeeze(
+    hand, daemon, words, seconds, least, says
+):
+    with running(hand, daemon) as rig:
+        gripped(rig)
+        if words:
+            rig.send(words)
+        reports = list(watched(rig, seconds))
+        means = [fmean(report["force"]) / FORCE for report in reports]
+        assert max(means) < 1.3
+        assert mode(rig) == "holding", rig.log()[-5:]
+        end = reports[-1]["t"] - SETTLED
+        last = [m for m, report in zip(means, reports, strict=True) if report["t"] > end]
+        assert least < fmean(last) < 1.2
+        assert any("witness." in line for line in rig.log()) == says

@@ -59,13 +59,16 @@ class Rig:
         self.context: zmq.Context[Any] = zmq.Context()
         self._running = contextlib.ExitStack()  # the emulated hand
         self.hand: subprocess.Popen[str] | None = None
+        self.hand_words: tuple[str, ...] = ()  # of `softfinger emulate`, beside the config
         self.daemon: subprocess.Popen[bytes] | None = None
         self._states: zmq.Socket[bytes] | None = None
 
     def start(self, *words: str) -> None:
         """Start whatever does not run, the daemon with these ``words`` too. Raises RigError."""
         if self.hand is None or self.hand.poll() is not None:
-            self.hand = self._running.enter_context(emulator(self.ports, self.config))
+            self.hand = self._running.enter_context(
+                emulator(self.ports, self.config, *self.hand_words)
+            )
         if not self.alive:
             self.start_daemon(*words)
 

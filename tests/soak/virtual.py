@@ -677,7 +677,7 @@ class Soak:
             side, finger = FINGERS[sensor.finger], sensor.finger
             if (
                 found.jumps[finger] > witnesses.JUMPS_MAX
-                or found.drifted[finger] > witnesses.DRIFT_TIME
+                or found.off[finger] != 0.0
                 or sensor.repeats.long
             ):
                 yield f"{side}_sensor"

@@ -103,8 +103,8 @@ def test_a_measurement_that_misses_its_aim_is_no_success(monkeypatch, capsys):
     [
         (["tik"], "found 'tik', expected one of estimator"),
         (["witnesses", "--only", "no such lie"], "no case of witnesses has this in its name"),
-        (["tick", "--full"], "--full: reflex alone has it"),
-        (["--trials", "3"], "--trials: witnesses alone has it"),
+        (["tick", "--full"], "--full: for reflex alone"),
+        (["--trials", "3"], "--trials: for witnesses or robustness alone"),
     ],
 )
 def test_refusals_come_before_the_measurements(words, text, capsys):
@@ -153,7 +153,7 @@ def test_a_load_that_is_held_slides_and_one_that_is_lost_is_said():
 
 
 def holding(force: float = 8.0) -> VirtualGrip:
-    grip = VirtualGrip(1, random.Random(1), {})
+    grip = VirtualGrip.drawn(1, random.Random(1), {})
     grip.command("arm")
     grip.loop.advance(0.1)
     grip.command("grasp", force=force)

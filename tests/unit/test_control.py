@@ -15,7 +15,7 @@ from softfinger.tools.watched import Watched
 
 PAPER: dict[str, dict[str, Any]] = {
     "material": {"law": "constant"},
-    "tactile": {"rate": 25.0},
+    "tactile": {"rate": 25.0, "latency": 0.040},
     "simulation": {"tactile_delay": 0.040},
 }
 ANGLE = math.radians(10.0)

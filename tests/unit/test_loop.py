@@ -184,7 +184,7 @@ def test_the_state_tells_what_the_grip_goes_to(make):
     assert 9.0 < goal.force <= 18.0
     daemon.loop.advance(1.0)
     felt = [contact.force for contact in daemon.loop.state.contacts]
-    assert sum(felt) / 2.0 == pytest.approx(goal.force, rel=0.03)
+    assert sum(felt) / 2.0 == pytest.approx(goal.force, rel=0.05)
     command(daemon, "release")
     daemon.loop.advance(0.01)
     assert math.isnan(goal.force)

@@ -21,18 +21,16 @@ FRICTION = 0.05 / 0.03  # N of a load, what a joint's friction may hide of it by
 @pytest.mark.parametrize(
     "sections", [{}, pytest.param(PAPER, marks=pytest.mark.extended)], ids=["100 Hz", "25 Hz"]
 )
-@pytest.mark.parametrize(
-    "way", [1.0, pytest.param(-1.0, marks=pytest.mark.extended)], ids=["outwards", "to the palm"]
-)
-def test_a_push_beyond_the_margin_is_held_by_a_firmer_grip(sections, way):
+def test_a_push_beyond_the_margin_is_held_by_a_firmer_grip(sections):
+    """Away from the palm; towards it the object is wedged, and torques hardly show it."""
     seen, moved = {}, {}
     for raised in (0.0, 10.0):
         with Hand(sections | {"control": {"grip_raise_max": raised}}) as hand:
             grasped(hand)
             before = hand.plant.object_pose.copy()
-            used = push_along(hand, way * 0.5 * BORNE, rate=9.0)
+            used = push_along(hand, 0.5 * BORNE, rate=9.0)
             assert used < 0.75
-            push_along(hand, way * 1.4 * BORNE, rate=9.0, start=way * 0.5 * BORNE)
+            push_along(hand, 1.4 * BORNE, rate=9.0, start=0.5 * BORNE)
             hand.watch(0.5)
             moved[raised] = math.dist(hand.plant.object_pose[:2], before[:2])
             seen[raised] = hand.mode, hand.plant.force.mean()
@@ -46,6 +44,7 @@ def test_the_grip_comes_back_when_the_load_has_gone():
     with Hand(PAPER) as hand:
         grasped(hand)
         push_along(hand, BORNE, rate=9.0)
+        hand.watch(0.5)
         assert hand.plant.force.mean() > 1.2 * FORCE
         hand.plant.apply_load(0.0, 0.0)
         hand.watch(4.0)
@@ -227,6 +226,44 @@ def test_noise_of_the_currents_is_no_load_and_a_load_in_it_is(force):
     watched.held.torque_residual = [0.35, 0.35]
     watched.grip.torques(Reading(dq=[GIVES_WAY, GIVES_WAY]), ObjectPose(), True)
     assert watched.grip.slip.reflex
+
+
+def standing(load: float, asked: float = 4.0) -> Watched:
+    """A grip under a load that has come slowly, while no joint moved."""
+    watched = at_rest(asked)
+    for part in np.linspace(0.0, load, 500):
+        watched.run(part, 1, normal=asked)
+    watched.run(load, 100, normal=asked)
+    return watched
+
+
+def test_torque_alone_raises_a_grip_by_three_tenths_unless_it_is_more_than_friction_can_hold():
+    assert standing(1.7 * FRICTION).grip.target == pytest.approx(1.3 * 4.0)
+    assert standing(3.0 * FRICTION).grip.target > 1.5 * 4.0
+    declared = Watched(4.0, object_load=6.0)
+    declared.grip.begin_holding()
+    assert declared.run(0.0, 500) == pytest.approx(0.5 * 6.0 / (0.6 * 0.8))
+
+
+def test_friction_that_the_approach_has_shown_hides_as_much():
+    for shown, raised in ((0.05, True), (0.2, False), (5.0, False)):
+        watched = Watched(friction_speed=1e6)
+        watched.held.free_torque = [shown, shown]
+        watched.run(0.0, 500, holding=False)
+        watched.grip.begin_holding()
+        for load in np.linspace(0.0, 5.5, 500):
+            watched.run(load, 1)
+        assert (watched.run(5.5, 100) > FORCE) == raised
+        assert watched.grip.slip.friction == pytest.approx(min(shown, 0.3))
+
+
+@pytest.mark.parametrize("evidence", ["off", "jumps", "off_goal"])
+def test_a_channel_that_is_named_ends_what_it_raised(evidence):
+    watched = at_rest()
+    assert watched.run(2.0 * FRICTION, 1, speed=GIVES_WAY) == FORCE + 10.0
+    getattr(watched.held.witnesses, evidence)[0] = 5.0
+    assert watched.run(2.0 * FRICTION, 1, speed=GIVES_WAY) == FORCE
+    assert not watched.grip.slip.reflex
 
 
 def test_the_raise_is_bounded_by_its_setting_and_by_the_force_that_is_a_fault():

@@ -27,11 +27,14 @@ MEASUREMENTS = {
     "control": "what each grip law leaves of an object's angle",
     "reflex": "greater loads on a grip that bears one: held or lost, slid, answered",
     "witnesses": "false measurements, and the true force of a grip on them, a quarter of an hour",
+    "robustness": "hands that are not as their settings say, and the true force of their grips",
 }
-SWEPT = ("reflex", "witnesses")  # on virtual time, which others on the machine don't disturb
+# On virtual time, which others on the machine don't disturb.
+SWEPT = ("reflex", "witnesses", "robustness")
 PAGE = ("estimator", "tick")
 _PAGE_COLUMNS = ("median", "p99", "unit", "aim ≤", "relative error", "RMS of d [µm]")
-_OWN = {"full": "reflex", "trials": "witnesses", "only": "witnesses"}  # options of one of them
+_CASES = ("witnesses", "robustness")
+_OWN = {"full": ("reflex",), "trials": _CASES, "only": _CASES}  # options of some of them
 FAILED = 1  # exit status; 2 is for words that are refused
 
 
@@ -45,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "about a minute",
     )
     parser.add_argument(
-        "--trials", type=_trials, metavar="N", help="trials of each case of 'witnesses'"
+        "--trials", type=_trials, metavar="N", help=f"trials of each case of {' and '.join(_CASES)}"
     )
     parser.add_argument(
         "--only", default="", metavar="TEXT", help="its cases with this in their name"
@@ -108,7 +111,7 @@ def _journal(file: Path, name: str) -> Path:
 def _measured(name: str, arguments: argparse.Namespace) -> list[Report]:
     """A measurement's tables, none where it failed."""
     tables: list[Report] = []
-    more = {key: getattr(arguments, key) for key, of in _OWN.items() if of == name}
+    more = {key: getattr(arguments, key) for key, of in _OWN.items() if name in of}
     if name in SWEPT:
 
         def sweep(work: Callable[[Any], Any], cases: list[Any]) -> Iterator[Any]:
@@ -163,9 +166,9 @@ def _module(name: str) -> ModuleType:
 
 def _check(names: list[str], arguments: argparse.Namespace) -> None:
     """Refuse what can be refused before anything is measured. Raises ValueError."""
-    for key, name in _OWN.items():
-        if getattr(arguments, key) and names != [name]:
-            raise ValueError(f"--{key}: {name} alone has it")
+    for key, of in _OWN.items():
+        if getattr(arguments, key) and (len(names) != 1 or names[0] not in of):
+            raise ValueError(f"--{key}: for {' or '.join(of)} alone")
     for name in names:
         if name not in MEASUREMENTS:
             raise ValueError(f"found {name!r}, expected one of {', '.join(MEASUREMENTS)}")

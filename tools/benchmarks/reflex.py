@@ -109,7 +109,7 @@ def overloaded(
     Raises RuntimeError without a grip.
     """
     chance = random.Random(seed)
-    with VirtualGrip(seed, chance, settings) as grip:
+    with VirtualGrip.drawn(seed, chance, settings) as grip:
         loop, state = grip.loop, grip.state
         grip.command("arm")
         loop.advance(0.1)

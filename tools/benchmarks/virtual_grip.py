@@ -12,7 +12,7 @@ import math
 import random
 from collections.abc import Callable, Sequence
 from statistics import fmean
-from typing import Any
+from typing import Any, Self
 
 from softfinger.daemon.errors import Refused
 from softfinger.daemon.simulation.faults import OBJECT, parse_faults
@@ -31,10 +31,11 @@ _SLIPS = 0.999  # of what friction bears
 class Watch:
     """The true forces and the object's place, tick by tick."""
 
-    def __init__(self, asked: float) -> None:
+    def __init__(self, asked: float, too_much: float = TOO_MUCH) -> None:
         self.asked = asked  # N
+        self.too_much = too_much  # of that
         self.peak = 0.0  # force over what is asked for, of either tip
-        self.above = 0.0  # longest time above `TOO_MUCH` [s]
+        self.above = 0.0  # longest time above `too_much` [s]
         self.slid = 0.0  # by how much the object was displaced with torque on [m]
         self._mean: list[tuple[float, float]] = []  # when [s], force over what is asked for
         self._below = math.inf  # since then above
@@ -45,7 +46,7 @@ class Watch:
         ratios = [force / self.asked for force in forces]
         self._mean.append((t, fmean(ratios)))
         self.peak = max(self.peak, *ratios)
-        self._below = min(self._below, t) if max(ratios) > TOO_MUCH else math.inf
+        self._below = min(self._below, t) if max(ratios) > self.too_much else math.inf
         self.above = max(self.above, t - self._below)
         self._place = self._place or place
         if torque:
@@ -56,19 +57,35 @@ class Watch:
         end = self._mean[-1][0] - _LAST
         return fmean(ratio for t, ratio in self._mean if t > end)
 
+    def first_off(self, share: float) -> float:
+        """Return when the mean force, once it was near, was off by more than ``share`` [s]."""
+        came = False
+        for t, ratio in self._mean:
+            near = abs(ratio - 1.0) <= share
+            if came and not near:
+                return t
+            came = came or near
+        return math.inf
+
 
 class VirtualGrip(Watched):
-    """A grip whose mass and torque constant are drawn; ``look`` is called after each tick."""
+    """A grip; ``look`` is called after each tick."""
 
-    def __init__(self, seed: int, chance: random.Random, sections: Sections) -> None:
-        drawn = {"seed": seed, "object_mass": 0.1 * 2.0 ** chance.uniform(-1.0, 1.0)}
+    def __init__(self, daemon: Sections, hand: Sections | None = None, torque: float = 1.0) -> None:
+        """``hand``: of other settings; ``torque``: its torque constant over the settings'."""
         self.alarms: list[tuple[float, str]] = []  # warnings and errors: when [s], kind
-        super().__init__(merged(sections, {"simulation": drawn}))
-        error = chance.uniform(-_TORQUE_ERROR, _TORQUE_ERROR)
-        self.plant.plant.parameters.torque_constant *= 1.0 + error
+        super().__init__(merged(daemon, {}), None if hand is None else merged(hand, {}))
+        self.plant.plant.parameters.torque_constant *= torque
         self.look: Callable[[], None] = lambda: None
         self.loop.heartbeat = lambda _: self.look()
         self.loop.advance(0.1)
+
+    @classmethod
+    def drawn(cls, seed: int, chance: random.Random, sections: Sections) -> Self:
+        """Return a grip whose mass and torque constant are drawn."""
+        drawn = {"seed": seed, "object_mass": 0.1 * 2.0 ** chance.uniform(-1.0, 1.0)}
+        error = chance.uniform(-_TORQUE_ERROR, _TORQUE_ERROR)
+        return cls(merged(sections, {"simulation": drawn}), torque=1.0 + error)
 
     def _note(self, *event: str) -> None:
         super()._note(*event)

@@ -192,7 +192,7 @@ def trial(case: WitnessCase, seed: int) -> GripTrial:
     side = chance.choice(FINGERS)
     found = GripTrial(tuple(name.format(side=side) for name in case.false))
     words = case.words.format(side=side)
-    with VirtualGrip(seed, chance, case.settings) as grip:
+    with VirtualGrip.drawn(seed, chance, case.settings) as grip:
         loop, state = grip.loop, grip.state
         if case.before:
             grip.begin(words)

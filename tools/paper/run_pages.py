@@ -127,7 +127,12 @@ def _daemon(sections: Sections) -> Daemon:
         "tip": {"radius": RADIUS},
         "material": {"law": "constant", "modulus": MODULUS},
         # A calibrated sensor: what its frames are higher is the tip, which is stiffer.
-        "tactile": {"rate": 1.0 / SCAN, "noise": 0.005 * MODULUS, "gain_error": 1e-3},
+        "tactile": {
+            "rate": 1.0 / SCAN,
+            "latency": SCAN,
+            "noise": 0.005 * MODULUS,
+            "gain_error": 1e-3,
+        },
         "loop": {"clock": "virtual"},
         "simulation": {
             "tactile_delay": SCAN,

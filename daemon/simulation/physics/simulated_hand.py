@@ -220,6 +220,7 @@ class SimulatedHand:
         """
         if table is None:
             table = make_table(settings, make_material(settings.material))
+        self.settings = settings
         self.table = table
         self.step = stiff_step(settings, table) if step is None else step
         self.start = start

@@ -46,16 +46,19 @@ class StageTouch(NamedTuple):
 class SimulatedTactile:
     """Frames of one fingertip of a :class:`SimulatedHand`.
 
-    A frame is due at every k / ``tactile.rate`` since the hand's start, shows the contact of that
-    instant and arrives ``simulation.tactile_delay`` later, or later still, or never (see
-    :class:`Arrivals`). Only the newest that has arrived is read, and only when it is asked for;
-    ``seq`` counts the others too. What is wrong with it is in the hand's ``measurement_faults``.
+    The sensor is that of the hand's own settings. A frame is due at every k / ``tactile.rate``
+    since the hand's start, shows the contact of that instant and arrives
+    ``simulation.tactile_delay`` later, or later still, or never (see :class:`Arrivals`). As on
+    hardware nobody tells when it was sampled: ``settings.tactile.latency`` before it was due.
+    Only the newest that has arrived is read, and only when it is asked for; ``seq`` counts the
+    others too. What is wrong with it is in the hand's ``measurement_faults``.
     ``stage``, where there is one, presses the tip instead of the hand's object: it takes the time
     since the hand's start [s].
     """
 
     def __init__(self, settings: Settings, hand: SimulatedHand, clock: Clock, finger: int) -> None:
-        simulation, tactile = settings.simulation, settings.tactile
+        simulation, tactile = hand.settings.simulation, hand.settings.tactile
+        self._early = simulation.tactile_delay - settings.tactile.latency
         self._hand = hand
         self._clock = clock
         self._finger = finger
@@ -69,9 +72,9 @@ class SimulatedTactile:
             (simulation.seed, finger, 1),
         )
         self._shape = (tactile.rows, tactile.cols)
-        self._model = make_sensor_model(settings, finger)
-        self._radius = settings.tip.radius
-        self._solid = settings.tip.physics == "solid"
+        self._model = make_sensor_model(hand.settings, finger)
+        self._radius = hand.settings.tip.radius
+        self._solid = hand.settings.tip.physics == "solid"
         self.stage: Callable[[float], StageTouch] | None = None
         self._relaxation = list(
             zip(simulation.tip_relaxation, simulation.tip_relaxation_times, strict=True)
@@ -131,7 +134,7 @@ class SimulatedTactile:
         t = self._hand.start + number * self._period
         data = self._counts(t)
         self._given.append(data)
-        self._frame = Frame(seq=number + 1, t_sample=t, t_arrival=arrival, valid=True, data=data)
+        self._frame = Frame(number + 1, t + self._early, arrival, valid=True, data=data)
 
     def _counts(self, t: float) -> NDArray[np.uint16]:
         """Return the cells' readings at ``t`` [s], or the next of the frames that are repeated."""

@@ -1,0 +1,142 @@
+"""Hands that are not as their settings say; judged by the plant's truth."""
+
+import math
+
+import numpy as np
+import pytest
+
+from softfinger.daemon.perception.zero import ZeroWatch
+from softfinger.kinematics.estimation.estimator import ContactEstimate
+from softfinger.kinematics.sensing.pressure_grid import SensorGrid
+from softfinger.tools.benchmarks.robustness import ROWS, HandCase, drawn, grip
+from softfinger.tools.benchmarks.virtual_grip import VirtualGrip
+
+ROW = {case.name: case for case in ROWS}
+LONG = pytest.mark.extended
+
+
+@pytest.mark.parametrize(
+    ("name", "seed"),
+    [
+        ("as set", 1),
+        ("joint friction 0.12 N·m", 1),
+        ("joint friction 0.20 N·m", 1),
+        *(pytest.param("joint friction 0.12 N·m", seed, marks=LONG) for seed in (2, 3, 4)),
+        *(pytest.param("stiction 0.15 N·m", seed, marks=LONG) for seed in (1, 2, 3, 4)),
+        ("zero +5% in 20 s, 8 bits", 1),
+        pytest.param("zero +5% in 20 s", 1, marks=LONG),
+        ("both gains and currents halve in 5 s", 1),
+    ],
+)
+def test_what_the_settings_do_not_know_moves_no_force(name, seed):
+    found = grip(ROW[name], seed)
+    assert found.held
+    assert found.settled == pytest.approx(1.0, abs=0.2)
+    assert found.peak < 1.3
+    assert not found.raised
+    assert found.accused == ()
+
+
+@pytest.mark.parametrize(
+    ("name", "seed"),
+    [
+        ("zero -5% in 20 s", 1),
+        *(pytest.param(name, 2, marks=LONG) for name in ROW if "zero -" in name),
+    ],
+)
+def test_a_zero_that_sinks_is_named_and_its_grip_stays(name, seed):
+    """Where readings end at 0, nothing but the joints' closing shows how far it has sunk."""
+    found = grip(ROW[name], seed)
+    assert found.end == "holding"
+    assert 0.7 < found.settled < 1.2
+    assert found.peak < 1.4
+    assert found.named < math.inf
+    assert not found.raised
+
+
+@pytest.mark.parametrize("delay", [0.005, 0.01, 0.02])
+@pytest.mark.parametrize("force", [6.0, pytest.param(20.0, marks=LONG)])
+def test_frames_as_late_as_the_default_says_or_sooner_leave_the_force(delay, force):
+    late = HandCase("late", force, {"simulation": {"tactile_delay": delay}})
+    found = grip(late)
+    assert found.settled == pytest.approx(1.0, abs=0.1)
+    assert found.accused == ()
+
+
+@pytest.mark.parametrize(("friction", "stiction"), [(0.05, 0.0), (0.12, 0.0), (0.05, 0.1)])
+def test_the_approach_shows_the_joints_friction(friction, stiction):
+    hand = {"simulation": {"joint_friction": friction, "joint_stribeck": stiction}}
+    with VirtualGrip({}, hand) as grip:
+        grip.command("arm")
+        grip.loop.advance(0.1)
+        grip.command("grasp", force=6.0)
+        assert grip.until("holding", 4.0)
+        # Of the stiction as much as is left while the joint begins to move, and its damping.
+        shown = grip.contact_filter.grasp.free_torque
+        assert (shown > friction + 0.5 * stiction).all()
+        assert (shown < friction + stiction + 0.025).all()
+
+
+def test_the_same_hand_is_drawn_from_the_same_seed():
+    assert drawn(7) == drawn(7)
+    hands = [drawn(seed) for seed in range(1, 201)]
+    delays = [hand.hand["simulation"]["tactile_delay"] for hand in hands]
+    assert min(delays) < 0.025 < 0.055 < max(delays) <= 0.06
+    assert 0.4 < np.mean([hand.load != 0.0 for hand in hands]) < 0.6
+
+
+def frames(zero: float, cells: int = 32, pressed: int = 200) -> np.ndarray:
+    """Counts of a tip of 20 mm that is pressed 3 mm deep, over a zero."""
+    at = (np.arange(cells) - 0.5 * (cells - 1)) * 0.058 / cells
+    inside = np.hypot(*np.meshgrid(at, at)) < 10.5e-3
+    return np.where(inside, pressed + zero, zero).astype(np.uint16)
+
+
+def zero_watch(side: float = 0.058) -> tuple[ZeroWatch, ContactEstimate]:
+    grid = SensorGrid(32, 32, side / 32)
+    contact = ContactEstimate()
+    contact.d, contact.contact = 3e-3, True
+    return ZeroWatch(grid, 0.02, np.ones(grid.shape, np.bool_)), contact
+
+
+def test_a_zero_that_rises_is_taken_off_and_full_cells_stay_full():
+    watch, contact = zero_watch()
+    for zero in (3, 4, 9):
+        watch.follow(frames(zero), contact, holding=True)
+    assert watch.shift == 6
+    counts = frames(9)
+    counts[16, 16] = 255
+    corrected = watch.corrected(counts, 255)
+    assert corrected[16, 16] == 255
+    assert corrected[0, 0] == 3
+    assert corrected[16, 14] == 203
+    watch.forget()
+    assert watch.corrected(counts, 255) is counts
+
+
+def test_a_zero_is_followed_only_while_a_grip_rests_and_goes_on_from_there():
+    watch, contact = zero_watch()
+    watch.follow(frames(3), contact, holding=True)
+    watch.follow(frames(8), contact, holding=True)
+    watch.follow(frames(20), contact, holding=False)
+    assert watch.shift == 5
+    watch.follow(frames(20), contact, holding=True)  # that may be the grip's own crosstalk
+    assert watch.shift == 5
+    watch.follow(frames(22), contact, holding=True)
+    assert watch.shift == 7
+
+
+def test_a_second_contact_beside_the_footprint_is_no_zero():
+    watch, contact = zero_watch()
+    watch.follow(frames(3), contact, holding=True)
+    touched = frames(3)
+    touched[:, :6] = 100
+    watch.follow(touched, contact, holding=True)
+    assert watch.shift == 0
+
+
+def test_a_sensor_that_the_footprint_fills_tells_nothing():
+    watch, contact = zero_watch(side=0.018)
+    for zero in (3, 9):
+        watch.follow(frames(zero), contact, holding=True)
+    assert watch.shift == 0

@@ -1,0 +1,287 @@
+"""Hands that are not as their settings say: the true force of a grip, by the plant.
+
+Plant and daemon have settings of their own. *Rows* differ in one thing each, by as much as an
+ordinary healthy hand does; the *ensemble* is drawn at random and differs in all of them at once.
+Grips run on virtual time, so nothing depends on the machine.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+import sys
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from softfinger.daemon.control.modes import GRIPPING
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.simulation.emulator.emulator import DEFAULT_BOARD
+from softfinger.daemon.simulation.faults import parse_faults
+from softfinger.daemon.types import FINGERS
+from softfinger.tools.benchmarks.measuring import Report
+from softfinger.tools.benchmarks.rigs import Sections, merged
+from softfinger.tools.benchmarks.virtual_grip import VirtualGrip, Watch
+
+_TRIALS, _HANDS = 20, 400
+_GRIP, _REST, _LOOK = 4.0, 1.2, 6.0  # s: until it holds at most, held in peace, looked at
+_NEAR, _FAR, _LOST = 0.2, 0.3, 0.01  # shares of the force; m
+_SAID = 2.0  # s within which a force further off than `_NEAR` is to be explained
+_STRONG, _BRIEFLY = 1.4, 0.1  # of the force asked for, s: no load, no more
+_WITNESS = "witness."
+_GAIN_OFF = math.log(1.3)  # of a sensor that may be named
+_BORNE = 0.8  # of what friction bears: a load that no hand need lose
+
+# A scale of 127.5 kPa, as boards have it, and not the simulated sensor's of 262 kPa.
+_EIGHT_BITS: Sections = {"tactile": {**DEFAULT_BOARD, "backend": "simulated"}}
+_LATENCY = Settings().tactile.latency
+
+
+@dataclass(frozen=True)
+class HandCase:
+    """A grip of ``force`` [N] by a daemon on a hand of other settings."""
+
+    name: str
+    force: float
+    hand: Sections = field(default_factory=dict)  # where it is not as the daemon's settings say
+    daemon: Sections = field(default_factory=dict)
+    torque: float = 1.0  # true torque constant over the settings'
+    words: str = ""  # faults as `softfinger emulate --fault` takes them, once it holds
+    load: float = 0.0  # N along the faces, and …
+    within: float = 0.0  # … s in which it comes
+    turn: float = 0.0  # rad
+    false: tuple[str, ...] = ()  # channels that may be named
+
+
+def _hand(**simulation: Any) -> Sections:
+    return {"simulation": simulation}
+
+
+_BOTH = tuple(f"{side}_sensor" for side in FINGERS)
+_RUBBER = (0.1, 0.2, 0.2)
+ROWS = (
+    HandCase("as set", 6.0),
+    HandCase("joint friction 0.12 N·m", 6.0, _hand(joint_friction=0.12)),
+    HandCase("joint friction 0.20 N·m", 12.0, _hand(joint_friction=0.20)),
+    HandCase("stiction 0.15 N·m", 6.0, _hand(joint_stribeck=0.15)),
+    *(
+        HandCase(f"zero {drift:+.0%} in {s} s{of}", 6.0, {}, board, 1.0, f"drift={drift}@0..{s}")
+        for of, board in (("", {}), (", 8 bits", _EIGHT_BITS))
+        for drift, s in ((-0.05, 20), (-0.02, 20), (0.05, 20), (-0.05, 120))
+    ),
+    *(
+        HandCase(f"frames {ms} ms older", force, _hand(tactile_delay=_LATENCY + 1e-3 * ms))
+        for ms, force in ((15, 12.0), (30, 6.0), (10, 20.0))
+    ),
+    HandCase("rubber that relaxes", 6.0, _hand(tip_relaxation=_RUBBER)),
+    HandCase("cells of 80 ms", 6.0, _hand(tactile_response=0.08)),
+    HandCase("both of these", 6.0, _hand(tip_relaxation=_RUBBER, tactile_response=0.08)),
+    HandCase(
+        "both gains and currents halve in 5 s",
+        6.0,
+        words="gain=0.5@0..5 left:current=0.5@0..5 right:current=0.5@0..5",
+        false=(*_BOTH, "left_current", "right_current"),
+    ),
+    HandCase("both images wander by 6 cells in 60 s", 6.0, words="shift-x=6@0..60", false=_BOTH),
+)
+
+_ENSEMBLE = "hand "
+NAMES = (*(case.name for case in ROWS), *(f"{_ENSEMBLE}{seed}" for seed in range(1, _HANDS + 1)))
+
+
+def drawn(seed: int) -> HandCase:
+    """Return a hand of the ensemble: it differs from its settings in everything at once."""
+    chance = random.Random(f"{_ENSEMBLE}{seed}")
+
+    def span(low: float, high: float) -> float:
+        return chance.uniform(low, high)
+
+    def ratio(low: float, high: float) -> float:
+        return math.exp(chance.uniform(math.log(low), math.log(high)))
+
+    calibrated = chance.random() < 0.5
+    modulus = span(0.95, 1.05) if calibrated else ratio(0.6, 1.6)
+    gains = ratio(0.6, 1.5), ratio(0.6, 1.5)
+    friction, force = span(0.3, 0.8), span(3.0, 20.0)
+    relaxing = [chance.random() for _ in range(3)]
+    relaxing = [span(0.0, 0.5) * each / sum(relaxing) for each in relaxing]
+    noise = ratio(0.5, 2.0) * Settings().tactile.noise
+    hand = merged(
+        {"tactile": {"centre": (span(-1e-3, 1e-3), span(-1e-3, 1e-3))}},
+        _hand(
+            seed=seed,
+            joint_friction=ratio(0.02, 0.20),
+            joint_stribeck=span(0.0, 0.1),
+            tactile_gain=gains,
+            modulus_scale=modulus,
+            tactile_delay=_LATENCY + span(0.0, 0.04),
+            tip_relaxation=tuple(relaxing),
+            tactile_response=span(0.0, 0.08),
+            tip_friction=friction,
+            object_mass=ratio(0.02, 1.0),
+            tactile_noise=noise,
+        ),
+    )
+    hand["tactile"]["rotation"] = tuple(math.radians(span(-5.0, 5.0)) for _ in FINGERS)
+    drifts = {side: span(-0.05, 0.05) for side in FINGERS}
+    over = span(10.0, 120.0)
+    words = " ".join(f"{side}:drift={drift:.4f}@0..{over:.1f}" for side, drift in drifts.items())
+    off = (abs(math.log(gain)) > _GAIN_OFF for gain in gains)
+    pushed, turned = chance.random() < 0.5, chance.random() < 0.5
+    return HandCase(
+        f"{_ENSEMBLE}{seed}",
+        force,
+        hand,
+        {"material": {"modulus_error": 0.05 if calibrated else 0.0}},
+        span(0.85, 1.15),
+        words,
+        load=chance.choice((-1.0, 1.0)) * span(0.0, _BORNE) * 2.0 * friction * force * pushed,
+        within=chance.choice((0.0, 0.3, 2.0)),
+        turn=span(-0.14, 0.14) * turned,
+        # A drifting zero is a fault of its sensor, too.
+        false=tuple(
+            f"{side}_sensor"
+            for side, wrong in zip(FINGERS, off, strict=True)
+            if wrong or abs(drifts[side]) > 0.01
+        ),
+    )
+
+
+@dataclass
+class Outcome:
+    """A grip's outcome; forces over what was asked for, times [s]."""
+
+    held: bool = False  # it came to hold
+    settled: float = math.nan  # mean of both tips in the end; NaN where they were let go
+    peak: float = 0.0  # of either tip, while nothing loads the object
+    above: float = 0.0  # longest time above `_STRONG`, likewise
+    first_off: float = math.inf  # when the mean was off by more than `_NEAR` first
+    named: float = math.inf  # when a false channel was named first
+    accused: tuple[str, ...] = ()  # channels that are not false
+    raised: bool = False  # more force was asked for than commanded, while nothing loads
+    lost: bool = False  # the object has gone
+    end: str = ""  # fault or mode
+
+    def well(self) -> bool:
+        """Within `_NEAR`, or named in time and not raised."""
+        near = self.held and abs(self.settled - 1.0) <= _NEAR and self.above == 0.0
+        told = self.named - self.first_off <= _SAID and not self.raised
+        return near or (self.first_off < math.inf and told)
+
+
+def grip(case: HandCase, seed: int = 1) -> Outcome:
+    """Run one grip of a case; ``seed`` of its noise and its finger."""
+    chance, found = random.Random(f"{case.name} {seed}"), Outcome()
+    daemon = merged({"simulation": {"seed": seed}}, case.daemon)
+    with VirtualGrip(daemon, merged(case.hand, daemon), case.torque) as hand:
+        loop, state = hand.loop, hand.state
+        hand.command("arm")
+        loop.advance(0.1 + chance.uniform(0.0, 0.02))
+        watch, begin = Watch(case.force, _STRONG), state.t
+        loaded = False
+
+        def look() -> None:
+            if loaded:
+                return
+            forces = hand.plant.force.tolist()
+            watch.see(state.t, forces, hand.plant.object_pose[:2].tolist(), state.torque)
+            found.raised = found.raised or state.goal.force > 1.02 * case.force
+
+        hand.look = look
+        hand.command("grasp", force=case.force)
+        found.held = hand.until("holding", _GRIP)
+        loop.advance(_REST + chance.uniform(0.0, 0.02))
+        over = 0.0
+        if case.words:
+            over = max(event.over for event in parse_faults(case.words.split(), ()))
+            hand.begin(case.words)
+        loop.advance(over + _LOOK)
+        if case.turn:
+            hand.command("rotate", angle=case.turn)
+            loop.advance(2.0)
+        gripped = state.mode in GRIPPING
+        found.settled = watch.settled() if gripped else math.nan
+        found.peak, found.above, found.first_off = watch.peak, watch.above, watch.first_off(_NEAR)
+        if case.load and gripped and hand.between():
+            loaded = True
+            for k in range(_STEPS := 20):
+                hand.plant.load(push=case.load * (k + 1) / _STEPS)
+                loop.advance(case.within / _STEPS)
+            loop.advance(2.0)
+            found.lost = not hand.between()
+        found.end = state.fault_name or str(state.mode)
+        names = [(t - begin, k.removeprefix(_WITNESS)) for t, k in hand.alarms if _WITNESS in k]
+    found.accused = tuple(dict.fromkeys(name for _, name in names if name not in case.false))
+    found.first_off -= begin
+    # What is said of a force that is off explains it, whichever channel is at fault.
+    found.named = min((t for t, _ in names), default=math.inf)
+    return found
+
+
+def _outcome(drawn_case: tuple[HandCase, int]) -> dict[str, Any]:
+    return asdict(grip(*drawn_case))
+
+
+def measure(
+    brief: bool = False,
+    trials: int | None = None,
+    only: str = "",
+    sweep: Callable[..., Iterable[Any]] = map,
+) -> list[Report]:
+    """Return a table of the rows and one of the ensemble; ``brief``: a few of each."""
+    trials = trials or (1 if brief else _TRIALS)
+    hands = [drawn(seed) for seed in range(1, (4 if brief else trials * _HANDS // _TRIALS) + 1)]
+    rows = [case for case in ROWS if only in case.name]
+    if only:
+        hands = [case for case in hands if only in case.name]
+    seeds = range(1, trials + 1)
+    jobs = [(case, seed) for case in rows for seed in seeds] + [(hand, 1) for hand in hands]
+    outcomes = (Outcome(**each) for each in sweep(_outcome, jobs))
+    reports = []
+    if rows:
+        table = [_row(case, [next(outcomes) for _ in seeds]) for case in rows]
+        failed = any(row["well"] < trials for row in table)
+        reports.append(Report("true force over asked, one thing other", table, failed=failed))
+    if hands:
+        reports.append(_ensemble(hands, [next(outcomes) for _ in hands]))
+    return reports
+
+
+def _row(case: HandCase, found: list[Outcome]) -> dict[str, Any]:
+    settled = sorted(each.settled for each in found if not math.isnan(each.settled))
+    well = sum(each.well() for each in found)
+    print(f"{case.name}: {well} of {len(found)}", file=sys.stderr, flush=True)
+    return {
+        "name": f"{case.force:g} N: {case.name}",
+        "well": well,
+        "trials": len(found),
+        "least": settled[0] if settled else None,
+        "most": settled[-1] if settled else None,
+        "peak": max(each.peak for each in found),
+        "above s": max(each.above for each in found),
+        "raised": sum(each.raised for each in found),
+        "named": sum(each.named < math.inf for each in found),
+        "accused": sum(bool(each.accused) for each in found),
+        "let go": sum(math.isnan(each.settled) for each in found),
+    }
+
+
+def _ensemble(hands: list[HandCase], found: list[Outcome]) -> Report:
+    count = len(found)
+
+    def share(what: str, aim: str, number: int, of: int = count) -> dict[str, Any]:
+        return {"name": what, "aim": aim, "number": number, "of": of, "%": 100.0 * number / of}
+
+    off = [abs(each.settled - 1.0) for each in found]
+    loaded = [each for case, each in zip(hands, found, strict=True) if case.load]
+    rows = [
+        share("true force within 20 %", "≥ 90 %", sum(each <= _NEAR for each in off)),
+        share("within 30 %", "≥ 98 %", sum(each <= _FAR for each in off)),
+        share("above 1.4 for 0.1 s, unloaded", "0", sum(e.above > _BRIEFLY for e in found)),
+        share("objects lost", "≤ 1 %", sum(e.lost for e in loaded), max(len(loaded), 1)),
+        share("healthy channel accused", "≤ 2 %", sum(bool(e.accused) for e in found)),
+        share("did not come to hold", "", sum(not each.held for each in found)),
+        share("let go", "", sum(math.isnan(each.settled) for each in found)),
+        share("raised, unloaded", "", sum(each.raised for each in found)),
+    ]
+    return Report(f"{count} hands drawn at random", rows)
