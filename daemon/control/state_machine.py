@@ -30,7 +30,6 @@ _STEADY_FORCE = 0.02  # share, and …
 _STEADY_ANGLE = 2e-3  # … rad, within which setpoints may flicker without counting as new ones
 _TILT_RESERVE = 0.1  # rad of tilt kept from the limit that is a fault
 _RAISED = 1.02  # of the force asked for, above which the grip is reported as raised
-_EASING = 3.0  # s in which a grip is eased
 _LOST_AFTER = 0.1  # s without contact in a grip
 _EMPTY_AFTER = 0.05  # s in which a grip is too narrow to hold anything
 
@@ -122,9 +121,9 @@ class Control:
         self._force = force
         self._enter(Mode.GRASPING)
 
-    def ease(self, most: float) -> None:
-        """Let the present grip press with ``most`` [N] at most, whatever is asked for."""
-        self._grip.ease(most, _EASING)
+    def ease(self, most: float, seconds: float) -> None:
+        """Let this grip come down to ``most`` [N] within ``seconds``, and press no more after."""
+        self._grip.ease(most, seconds)
         self._unsettle()
 
     def load_needs(self) -> float:

@@ -124,7 +124,7 @@ class HeatWatch:
         eased = max(min(lasts, now), _AT_ONCE * now, control.load_needs())
         if eased < _EASED * now:
             self._eased = state.t
-            control.ease(eased)
+            control.ease(eased, _LAST)
             text = f"{who}: grip eased from {now:.1f} to {eased:.1f} N"
             events.append(("warning", "servos.heat", text))
             return ""
