@@ -147,7 +147,7 @@ class Loop:
         try:
             self.advance(duration)
         finally:
-            self._control.torque = False
+            self._control.stop()
             self.torque.end()
             if self.state.torque:
                 self.emit("error", "end", "ended, torque MAY STILL BE ON")

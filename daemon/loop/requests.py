@@ -12,8 +12,9 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from softfinger.daemon.control.envelope import Envelope
+from softfinger.daemon.control.fingers import off_range
 from softfinger.daemon.control.modes import COMMANDS, GRIPPING, HARMLESS, HELD, Mode
-from softfinger.daemon.control.state_machine import Control, off_range
+from softfinger.daemon.control.state_machine import Control
 from softfinger.daemon.errors import Reason, Refused, ServoError, TactileError
 from softfinger.daemon.perception.perception import Perception
 from softfinger.daemon.profile.settings import Settings
@@ -273,7 +274,7 @@ class Requests:
             text = "needs both fingers and the object model in the scene"
             refuse_if(not turns, Reason.SCENE, text)
             if self._control.mode in HELD and (name == "rotate" or not state.object.valid):
-                text = self._control.why_not_turn(numbers["angle"])
+                text = self._control.fingers.why_not_turn(numbers["angle"])
                 refuse_if(text, Reason.BOUNDS if state.object.valid else Reason.STATE, text)
         if name == "set":
             compliance, (low, high) = numbers["compliance"], _COMPLIANCE

@@ -121,7 +121,7 @@ class HeatWatch:
         now = state.goal.force
         square = lasting_square(self._states[i].array, self._limits.temperature_max - _BELOW)
         lasts = now * math.sqrt(square / max(self._square[i], 1e-6))
-        eased = max(min(lasts, now), _AT_ONCE * now, control.load_needs())
+        eased = max(min(lasts, now), _AT_ONCE * now, control.grip.load_needs())
         if eased < _EASED * now:
             self._eased = state.t
             control.ease(eased, _LAST)

@@ -193,6 +193,17 @@ def test_a_known_load_raises_the_grip_within_its_bound():
             assert any("each tip may bear 6.0 N along" in text for _, _, text in hand.events)
 
 
+def test_each_grip_that_is_raised_is_reported():
+    with watched({"control": {"object_load": 12.0}}) as hand:
+        grasped(hand, force=8.0)
+        hand.command("release")
+        hand.run(1.5)
+        hand.command("grasp", force=8.0)
+        hand.run(1.0)
+        raised = [text for _, _, text in hand.events if text.startswith("grip raised above")]
+        assert len(raised) == 2
+
+
 @pytest.mark.parametrize("sections", [{}, PAPER], ids=["100 Hz", "25 Hz"])
 def test_prediction_is_within_its_own_uncertainty_in_motion(sections):
     tactile = sections.get("tactile", {}) | {"smooth_error": 0.0}  # of an ideal sensor

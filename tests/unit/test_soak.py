@@ -68,8 +68,10 @@ def test_a_goal_beyond_its_limits_is_seen(soak, q, current):
 
 def test_torque_after_a_stop_is_seen(soak):
     holding(soak)
+    control = soak.daemon.loop._control
+    before = control.state
     soak.daemon.loop.command({"command": "stop"})
-    soak.daemon.loop._control.torque = True  # as if it had not been heard
+    control.state = before  # as if it had not been heard
     soak._carried_out({"command": "stop"}, "holding")
     with pytest.raises(AssertionError, match="after a stop while holding: a motor is driven"):
         soak.run(3)

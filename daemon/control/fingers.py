@@ -1,0 +1,126 @@
+"""The fingers as the control's states use them: contacts in, goals of the joints out."""
+
+from __future__ import annotations
+
+import math
+
+from softfinger.daemon.control.setpoint import Setpoint, SetpointState
+from softfinger.daemon.perception.contact_filter_kernels import GraspState
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.types import FINGERS, Goal, State
+
+# rad from the present angle to the goal of a joint that is to give a torque: far enough that the
+# servo's current bound decides (`perception.contact_filter` expects 0.25 rad), and less than
+# `safety.goal_reach`, so that the goal may change sides at once.
+_GOAL_OFFSET = 0.35
+# rad between the tilt that a turn may lead to and the tilt that is a fault.
+_TILT_RESERVE = 0.1
+
+
+def off_range(angle: float, low: float, high: float) -> str:
+    """Return what was found and expected of an angle [rad], in degrees and radians."""
+    found, least, most = (f"{math.degrees(each):.1f}°" for each in (angle, low, high))
+    return f"found {found} ({angle:.4g} rad), expected {least} to {most} ({low:.2f} to {high:.2f})"
+
+
+class Fingers:
+    """The scene's fingers: their contacts, and setpoints that their joints follow."""
+
+    def __init__(self, settings: Settings, state: State, grasp: GraspState) -> None:
+        """``state`` and ``grasp`` are read at each tick, and never written."""
+        self.indices = [FINGERS.index(finger) for finger in sorted(settings.scene.fingers)]
+        self.reading, self.pose, self.grasp = state.reading, state.object, grasp
+        self._settings, self._contacts = settings, state.contacts
+        dt, smooth = 1.0 / settings.loop.rate, settings.control.smooth_time
+        self._joints = [Setpoint(dt, smooth, SetpointState()) for _ in FINGERS]
+
+    # Contacts
+
+    @property
+    def in_contact(self) -> bool:
+        """True if all fingers touch something."""
+        return all(self._contacts[index].contact for index in self.indices)
+
+    @property
+    def force(self) -> float:
+        """Mean force of the tips [N]."""
+        return sum(self._contacts[index].force for index in self.indices) / len(self.indices)
+
+    def turning_range(self) -> tuple[float, float]:
+        """Return the lowest and the highest angle [rad] to which this grip can turn the object.
+
+        While the object turns by φ, each joint leans by φ over the sum of its turns, and each tip's
+        tilt changes by both. The range ends at limits of joint angles and tilts.
+        """
+        settings, present = self._settings, self.pose.angle
+        lean = 1.0 / max(self.grasp.jacobian_rotation[0] + self.grasp.jacobian_rotation[1], 0.1)
+        low, high = -math.inf, math.inf
+        for index, sense in ((0, 1.0), (1, -1.0)):
+            contact, q = self._contacts[index], self.reading.q[index]
+            depth = 1.0 - contact.d / settings.tip.radius
+            reach = math.asin(max(depth, 0.0)) - settings.safety.theta_margin - _TILT_RESERVE
+            low = max(low, (-reach - contact.theta) / (1.0 + lean))
+            high = min(high, (reach - contact.theta) / (1.0 + lean))
+            down, up = settings.hand.q_min[index] - q, settings.hand.q_max[index] - q
+            ends = sorted((sense * down / lean, sense * up / lean))
+            low, high = max(low, ends[0]), min(high, ends[1])
+        return present + min(low, 0.0), present + max(high, 0.0)
+
+    def why_not_turn(self, angle: float) -> str:
+        """Return why the held object can't be turned to ``angle`` [rad] now; empty where it can."""
+        if not self.pose.valid:
+            return "the object's angle is not known"
+        low, high = self.turning_range()
+        return "" if low <= angle <= high else f"angle: {off_range(angle, low, high)} in this grip"
+
+    # Setpoints
+
+    def hold_here(self) -> None:
+        """Set all setpoints to the joints' present angles, at rest."""
+        for index, q in enumerate(self.reading.q):
+            self._joints[index].reset(q)
+
+    def go_to(self, index: int, q: float) -> None:
+        """Set the target of one joint's setpoint to ``q`` [rad]."""
+        self._joints[index].target = q
+
+    def close(self, touching: set[int]) -> set[int]:
+        """Close the fingers that don't touch, and return those that do.
+
+        A finger stops when it is not among ``touching``, the result of the last tick.
+        """
+        law, now = self._settings.control, set[int]()
+        for index in self.indices:
+            contact = self._contacts[index]
+            if not (contact.valid and contact.contact and contact.force > law.contact_force):
+                self.go_to(index, self._settings.hand.q_max[index])
+                continue
+            now.add(index)
+            if index not in touching:
+                self._joints[index].reset(self.reading.q[index])
+        return now
+
+    def ramp(self, rate: float) -> bool:
+        """Move the setpoints on, at most at ``rate`` [rad/s]; True if all are at their targets."""
+        arrived = [joint.step(rate) for joint in self._joints]
+        return all(arrived)
+
+    @property
+    def distance(self) -> float:
+        """Largest distance of a joint from its setpoint's target [rad]."""
+        return max(abs(self.reading.q[i] - self._joints[i].target) for i in self.indices)
+
+    # Goals
+
+    def rest(self, goal: Goal, current: float) -> None:
+        """Let the joints follow their setpoints with at most ``current`` [A]."""
+        for index in self.indices:
+            goal.q[index] = self._joints[index].value
+            goal.current[index] = current
+
+    def pull(self, goal: Goal, torques: tuple[float, float]) -> None:
+        """Let the joints give ``torques`` [N·m], positive closing."""
+        for index in self.indices:
+            current = torques[index] / self._settings.control.torque_constant
+            goal.q[index] = self.reading.q[index] + math.copysign(_GOAL_OFFSET, current)
+            goal.current[index] = abs(current)
