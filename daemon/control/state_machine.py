@@ -202,13 +202,13 @@ class Control:
         state, force = self.state, self.grip.commanded
         if isinstance(state, Settled):
             return HOLDING
-        if not isinstance(state, Approaching | Gripping) or self.grip.turning:
-            return OTHER
         if isinstance(state, Approaching):
             return OTHER if state.empty_for else RAMPING
+        if not isinstance(state, Gripping) or self.grip.turning or state.history.empty_for:
+            return OTHER
         # The torques of a force that the grip has settled with were used before this turn.
         is_used = isinstance(state, Turning) and force == state.history.settled_force
-        return OTHER if is_used or state.history.empty_for else RAMPING
+        return OTHER if is_used else RAMPING
 
     def _enter(self, state: ControlState) -> None:
         last, self.state = self.state, state

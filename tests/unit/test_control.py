@@ -9,7 +9,7 @@ import pytest
 
 from softfinger.daemon.control.setpoint import Setpoint, SetpointState
 from softfinger.daemon.errors import Refused
-from softfinger.daemon.perception.contact_filter_kernels import HOLDING
+from softfinger.daemon.perception.contact_filter_kernels import HOLDING, RAMPING
 from softfinger.daemon.profile.load import load
 from softfinger.tools.watched import Watched
 
@@ -191,6 +191,22 @@ def test_a_known_load_raises_the_grip_within_its_bound():
             assert hand.mode == "holding"
             assert seen.force[-200:].mean() == pytest.approx(expected, rel=KNOWN)
             assert any("each tip may bear 6.0 N along" in text for _, _, text in hand.events)
+
+
+def test_an_approach_has_the_same_phase_after_a_turn_that_was_not_finished():
+    with watched({}) as hand:
+        hand.grasp(8.0)
+        hand.run(0.01)
+        assert (hand.mode, hand.control.phase) == ("grasping", RAMPING)
+        hand.run(2.0)
+        hand.command("rotate", angle=ANGLE)
+        hand.run(0.05)
+        assert hand.mode == "rotating"
+        hand.command("release")
+        hand.run(1.5)
+        hand.command("grasp", force=8.0)
+        hand.run(0.01)
+        assert (hand.mode, hand.control.phase) == ("grasping", RAMPING)
 
 
 def test_each_grip_that_is_raised_is_reported():
