@@ -53,7 +53,14 @@ _ROWS = 4  # of a tip: d, θ, shear along the tilt and across it
 _NEAR = 0.005  # m from a tip within which a step may bring a touch
 _LEAST = 1e-9  # m of a touch, N; sin θ of a tilt, below it any direction on the face is along it
 _SHEAR = 2  # the row of the shear along the tilt
-_LEFT_OUT = ("tip_relaxation", "tip_micro_slip", "tip_creep_time", "joint_load_friction")
+_LEFT_OUT = (
+    "tip_relaxation",
+    "tip_micro_slip",
+    "tip_creep_time",
+    "joint_load_friction",
+    "joint_stribeck",
+)
+_IMPEDANCE = 0.9999  # of the joints' friction, MuJoCo's highest: with its 0.9 they creep by mrad/s
 
 
 class Touch(Record):
@@ -304,7 +311,8 @@ def hand_mjcf(settings: Settings, p: Parameters) -> str:
         fingers += f"""
 <body pos="{-side * p.half_separation:.9g} 0 0">
 <joint name="{name}" axis="0 0 {-side}" range="{p.stop_low[k]:.9g} {p.stop_high[k]:.9g}"
- armature="{p.joint_inertia}" damping="{p.joint_damping}" frictionloss="{p.joint_friction}"/>
+ armature="{p.joint_inertia}" damping="{p.joint_damping}" frictionloss="{p.joint_friction}"
+ solimpfriction="{_IMPEDANCE} {_IMPEDANCE}"/>
 <geom type="capsule" size="{0.3 * p.radius:.9g}" fromto="0 0 0 {end}"/>
 <geom name="{name}_tip" size="{p.radius:.9g}" pos="{end}" xyaxes="0 {side} 0 0 0 1"/>
 </body>"""

@@ -404,6 +404,7 @@ class SimulationSettings(Section):
     # share of the gears' torque that is friction, and so much more of it at rest
     joint_load_friction: tuple[Fraction, Fraction] = (0.0, 0.0)
     joint_stribeck_speed: Positive = 0.12  # rad/s over which what is more at rest falls to 1/e
+    joint_presliding: Positive = 0.0005  # rad that gears give way elastically before they slip
     servo_heat: tuple[Factor, Factor, Factor] = (1.0, 1.0, 1.0)  # of heating, cooling, capacity
     ambient: Annotated[float, Field(ge=-40, le=80)] = 25.0  # °C around the servos
     compression_speed: NonNegative = 0.004  # m/s, presses the object on the tips; no servos only

@@ -119,6 +119,7 @@ def random_hand(generator: np.random.Generator, long: bool = False):
         "tip_micro_slip": bool(generator.integers(2)),
         "joint_stribeck": float(generator.uniform(0, 0.1)),
         "joint_load_friction": tuple(generator.uniform(0, 0.3, 2).tolist()),
+        "joint_presliding": float(10 ** generator.uniform(-5, -2)),
     }
     hand = make(table, **parameters)
     if long:

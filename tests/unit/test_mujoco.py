@@ -83,7 +83,8 @@ def test_what_it_can_not_do_is_refused():
         SoftTips(*scene(integrator="RK4"), SETTINGS, ("tip",), ("wall",))
     with pytest.raises(SettingsError, match=r"tip: expected a sphere of 0\.02 m"):
         SoftTips(*scene(radius=0.01), SETTINGS, ("tip",), ("wall",))
-    for key, value in (("object_shape", "disc"), ("tip_creep_time", 1.0)):
+    refused = {"object_shape": "disc", "tip_creep_time": 1.0, "joint_stribeck": 0.01}
+    for key, value in refused.items():
         with pytest.raises(SettingsError, match=key):
             MujocoHand(checked({"simulation": {key: value}}))
 

@@ -39,7 +39,7 @@ def weight_energy(plant: Plant) -> float:
 
 @inner_kernel
 def elastic_energy(plant: Plant) -> float:
-    """Return the energy [J] of the end stops and of all contacts in the first stage."""
+    """Return the energy [J] of end stops, bristles and all contacts in the first stage."""
     p, stage = plant.parameters, plant.stages[0]
     energy: float = plant.palm_energy
     for finger in range(2):
@@ -47,6 +47,8 @@ def elastic_energy(plant: Plant) -> float:
         beyond = min(q - p.stop_low[finger], 0.0)
         beyond += max(q - p.stop_high[finger], 0.0)
         energy += 0.5 * p.stop_stiffness * beyond * beyond
+        gears = plant.gears[finger]
+        energy += 0.5 * gears.friction / p.presliding * gears.bent * gears.bent
         energy += stage.on_object[finger].energy
         energy += stage.on_tip[finger].energy
     return energy
@@ -117,12 +119,14 @@ def guard_step(plant: Plant, was_on_rim: bool) -> int:
 
 @inner_kernel
 def shorten(plant: Plant, scale: float) -> None:
-    """Leave only ``scale`` of the displacement and of the shears that the step brought."""
+    """Leave only ``scale`` of what a step brought to positions, shears and bristles."""
     before, now = plant.earlier, plant.state
     for j in range(5):
         now.position[j] = before.position[j] + scale * (now.position[j] - before.position[j])
     for j in range(2):
         now.shear[j] = before.shear[j] + scale * (now.shear[j] - before.shear[j])
+        bent = now.bristles[j] - before.bristles[j]
+        now.bristles[j] = before.bristles[j] + scale * bent
         layers, earlier = plant.layers[j], plant.earlier_layers[j]
         mean = square = 0.0
         for k in range(LAYERS):  # whole arrays at once would load Numba's ufuncs at each start

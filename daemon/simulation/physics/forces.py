@@ -72,14 +72,14 @@ def set_motor_slopes(plant: Plant, g: float) -> None:
 
 
 @inner_kernel
-def stop_stiffness(plant: Plant, joint: int) -> float:
-    """Return the stiffness [N·m/rad] of an end stop within a step of the joint, else 0."""
+def joint_stiffness(plant: Plant, joint: int) -> float:
+    """Return the stiffness [N·m/rad] of a joint's bristles and of an end stop within a step."""
     p = plant.parameters
-    stiffness: float = 0.0
+    stiffness: float = plant.gears[joint].stiffness
     q = plant.state.position[joint]
     ahead = q + p.step * plant.state.velocity[joint]
     if min(q, ahead) < p.stop_low[joint] or max(q, ahead) > p.stop_high[joint]:
-        stiffness = p.stop_stiffness
+        stiffness += p.stop_stiffness
     return stiffness
 
 
@@ -101,8 +101,8 @@ def free_object(plant: Plant, now: Motion) -> None:
 
 
 @inner_kernel
-def joint_friction(plant: Plant, finger: int, rate: float, current: float) -> float:
-    """Return how much friction [N·m] a joint has by its motor's ``current`` and by its load.
+def friction_level(plant: Plant, finger: int, rate: float, current: float) -> float:
+    """Return the torque [N·m] at which a joint's gears slip, by motor ``current`` and load.
 
     Base, Stribeck and load terms are those identified for such servos (model M4 of Rhoban's,
     arXiv 2410.08650), the gears' torque being |external − motor|.
@@ -116,18 +116,54 @@ def joint_friction(plant: Plant, finger: int, rate: float, current: float) -> fl
 
 
 @inner_kernel
-def free_joint(plant: Plant, finger: int, now: Motion) -> float:
+def bend_bristles(plant: Plant, finger: int, now: Motion, is_first: bool) -> float:
+    """Return the torque [N·m] of a joint's bristles; sets their damping as the joint's drag.
+
+    Elastic bristles with the deflection z join the gears and slip at the friction level f. This is
+    the elasto-plastic model of Dupont, Hayward, Armstrong and Altpeter (IEEE Trans. Automatic
+    Control 47(5), 2002) with one deflection z_p = ``presliding`` for break-away and steady slip:
+
+        torque = f z/z_p    ż = q̇ while |z| ≤ z_p
+
+    Below f the bristles are elastic, so a load below f, steady or oscillating, causes no drift.
+    Their number follows f. Bristles that join are not bent, on average at half of the step, and
+    bristles that leave take their energy with them, so a change of f adds no energy. Damping of the
+    stuck joint is half of the critical one, and bristles and damping together stay within f.
+    """
+    p, gears = plant.parameters, plant.gears[finger]
+    rate = now.velocity[finger]
+    friction = friction_level(plant, finger, rate, now.current[finger])
+    bent = now.bristles[finger]
+    if friction > gears.level:
+        bent -= (1.0 - gears.level / friction) * 0.5 * (gears.deflection + bent)
+    bent = min(max(bent, -p.presliding), p.presliding)
+    stiffness = friction / p.presliding
+    torque: float = stiffness * bent
+    damping = math.sqrt(stiffness * p.joint_inertia)
+    if rate != 0.0:
+        before_slip = friction - (torque if rate > 0.0 else -torque)
+        damping = min(damping, before_slip / abs(rate))
+        stiffness = min(stiffness, before_slip / (p.step * abs(rate)))
+    plant.drag[finger] = damping
+    gears.friction = friction
+    gears.bent = bent
+    if is_first:
+        gears.stiffness = stiffness
+    return torque
+
+
+@inner_kernel
+def free_joint(plant: Plant, finger: int, now: Motion, is_first: bool) -> float:
     """Return torque [N·m] of a joint's friction and end stops; sets its drag."""
     p = plant.parameters
-    q, rate = now.position[finger], now.velocity[finger]
-    friction = joint_friction(plant, finger, rate, now.current[finger])
-    drag = p.joint_damping + friction / math.sqrt(rate * rate + p.joint_speed**2)
+    q = now.position[finger]
+    torque = -bend_bristles(plant, finger, now, is_first)
+    plant.drag[finger] += p.joint_damping
     beyond = min(q - p.stop_low[finger], 0.0) + max(q - p.stop_high[finger], 0.0)
     if beyond != 0.0:
-        drag += math.sqrt(p.stop_stiffness * p.joint_inertia)
-    plant.drag[finger] = drag
-    torque: float = -drag * rate - p.stop_stiffness * beyond
-    return torque
+        plant.drag[finger] += math.sqrt(p.stop_stiffness * p.joint_inertia)
+        torque -= p.stop_stiffness * beyond
+    return torque - float(plant.drag[finger] * now.velocity[finger])
 
 
 @inner_kernel
@@ -152,7 +188,7 @@ def place_finger(plant: Plant, finger: int, q: float) -> None:
 def evaluate_hand(plant: Plant, table: Pointer, now: Motion, stage: Stage, is_first: bool) -> None:
     """Evaluate all contacts of ``now`` into the ``stage``, and all forces but the motors'.
 
-    The drag is friction over velocity, in the forces already.
+    The drag is viscous friction over velocity, in the forces already.
     """
     p, forces = plant.parameters, plant.forces
     nx = math.cos(now.position[4])
@@ -165,14 +201,13 @@ def evaluate_hand(plant: Plant, table: Pointer, now: Motion, stage: Stage, is_fi
     if with_object:
         touch_palm(plant, now, stage, nx, ny, is_first)
     for finger in range(2):
-        torque = free_joint(plant, finger, now)
-        plant.external[finger] = -torque
+        torque = 0.0
         if p.present[finger] != 0:
             place_finger(plant, finger, now.position[finger])
             if with_object:
                 tip = stage.on_object[finger]
                 touch_object(plant, table, tip, finger, now, nx, ny)
-                torque += tip.forces[0]
+                torque = tip.forces[0]
                 forces[2] += tip.forces[1]
                 forces[3] += tip.forces[2]
                 forces[4] += tip.forces[3]
@@ -180,7 +215,8 @@ def evaluate_hand(plant: Plant, table: Pointer, now: Motion, stage: Stage, is_fi
     if p.present[0] != 0 and p.present[1] != 0:
         touch_each_other(plant, table, now, stage, is_first)
     for finger in range(2):
-        plant.external[finger] += forces[finger]
+        plant.external[finger] = forces[finger]
+        forces[finger] += free_joint(plant, finger, now, is_first)
 
 
 @inner_kernel

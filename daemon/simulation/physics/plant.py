@@ -6,11 +6,11 @@ each motor are advanced by fixed sub-steps of a two-stage Rosenbrock method (ROS
     (1 − γhA) k1 = f(y)    (1 − γhA) k2 = f(y + h k1) − 2 k1    y ← y + h (3 k1 + k2)/2
 
 It is of second order whatever matrix A is, and L-stable where A is the Jacobian; A here holds what
-is stiff: the contacts' normal, turning and shear stiffness with their losses, end stops, friction
-at its secant, the motors' lag and the servos' loops. Of the unknowns only the five accelerations
-are coupled, so that a step costs two evaluations of the tips and one 5 × 5 factorisation. Coulomb
-slip is a return of the shears into their limits at the start of a step. The energy guard has the
-last word.
+is stiff: the contacts' normal, turning and shear stiffness with their losses, end stops, the
+gears' bristles, the table's friction at its secant, the motors' lag and the servos' loops. Of the
+unknowns only the five accelerations are coupled, so that a step costs two evaluations of the tips
+and one 5 × 5 factorisation. Coulomb slip is a return of shears and bristles into their limits at
+the start of a step. The energy guard has the last word.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from softfinger.daemon.simulation.physics.forces import (
     current_reference,
     evaluate_hand,
     evaluate_state,
+    joint_stiffness,
     script_x,
     set_motor_slopes,
-    stop_stiffness,
 )
 from softfinger.daemon.simulation.physics.plant_state import (
     ALONG_SHEAR,
@@ -85,7 +85,7 @@ def load_motors(plant: Plant, now: Motion, k: Motion, g: float) -> None:
         change = (reference - now.current[j] - 2.0 * lag * k.current[j]) / (lag + g) - fall
         k.current[j] = change
         torque = constant * (now.current[j] + g * change)
-        plant.load[j] += torque - g * stop_stiffness(plant, j) * displacement
+        plant.load[j] += torque - g * joint_stiffness(plant, j) * displacement
 
 
 @inner_kernel
@@ -133,6 +133,7 @@ def go_to_second_stage(plant: Plant, h: float) -> None:
         later.velocity[j] = state.velocity[j] + h * k.velocity[j]
     for j in range(2):
         later.shear[j] = state.shear[j] + h * k.shear[j]
+        later.bristles[j] = state.bristles[j] + h * k.position[j]
         later.current[j] = state.current[j] + h * k.current[j]
     for j in range(SHEARS):
         later.extra_shear[j] = state.extra_shear[j] + h * k.extra_shear[j]
@@ -181,7 +182,10 @@ def go_on(plant: Plant, h: float) -> None:
             limit /= p.length + abs(p.offset)
         elif j == 4:
             limit /= p.extent
-        state.position[j] += bounded(displacement, limit)
+        displacement = bounded(displacement, limit)
+        state.position[j] += displacement
+        if j < 2:
+            state.bristles[j] += displacement
         state.velocity[j] = bounded(state.velocity[j] + change, limit / h)
 
 
@@ -195,6 +199,16 @@ def go_back(plant: Plant, table: Pointer) -> None:
             return
     shorten(plant, 0.0)
     evaluate_state(plant, table)
+
+
+@inner_kernel
+def enter_bristles(plant: Plant) -> None:
+    """Bring the bristles within their limits; keep their level for the next step."""
+    for joint in range(2):
+        gears = plant.gears[joint]
+        gears.level = gears.friction
+        gears.deflection = gears.bent
+        plant.state.bristles[joint] = gears.bent
 
 
 # --- what the tips feel, at the instants of the sensors' frames ----------------------------------
@@ -274,6 +288,7 @@ def step(plants: Records[Plant], table: FloatArray, ring: Records[Sample], count
     relaxing = p.creep > 0.0 or p.micro_slip
     evaluate_state(plant, data)
     open_guard(plant)
+    enter_bristles(plant)
     settle(plant, ring)
     for _ in range(count):
         if scripted:
@@ -302,9 +317,12 @@ def step(plants: Records[Plant], table: FloatArray, ring: Records[Sample], count
             if changed == 2:
                 go_back(plant, data)
             elif changed == 1:
+                # Bristles that join the slowed gears are not bent either.
+                enter_bristles(plant)
                 evaluate_state(plant, data)
             if changed != 0:
                 enter_changed(plant)
+        enter_bristles(plant)
         settle(plant, ring)
         if p.remembers:
             # Firmness is constant within a step; what its change brings is the tip's own.

@@ -38,12 +38,16 @@ Shears = Annotated[FloatArray, SHEARS]
 
 
 class Motion(Record):
-    """Coordinates, velocities, shears and currents: of a state, or their rates of change."""
+    """Coordinates, velocities, shears and currents: of a state, or their rates of change.
+
+    The bristles' rates are those of their joints.
+    """
 
     position: Five  # [rad], [rad], [m], [m], [rad]
     velocity: Five
     shear: Pair  # d_t of the tips on the object [m]
     extra_shear: Shears  # [m]
+    bristles: Pair  # deflection of those of the joints' gears [rad]
     current: Pair  # [A]
 
 
@@ -116,7 +120,7 @@ class Parameters(Record):
     stribeck: float  # more at rest [N·m]
     load_friction: Pair  # share of the gears' torque, and more of it at rest
     stribeck_speed: float  # over which what is more at rest falls to 1/e [rad/s]
-    joint_speed: float  # below it joint friction is viscous [rad/s]
+    presliding: float  # deflection at which the bristles' friction is fully built up [rad]
     torque_constant: float  # [N·m/A]
     electric_time: float  # lag of the current [s]
     current_limit: float  # [A]
@@ -153,6 +157,16 @@ class Finger(Record):
     y: float
     x_q: float  # derivatives by the joint angle [m/rad]
     y_q: float
+
+
+class Gears(Record):
+    """Friction of a joint's gears, carried by elastic bristles between the teeth."""
+
+    deflection: float  # of the bristles when the step began [rad]
+    level: float  # friction level then [N·m]
+    bent: float  # deflection as last evaluated, within its limits [rad]
+    friction: float  # friction level, likewise [N·m]
+    stiffness: float  # of the bristles in the step's matrix [N·m/rad]
 
 
 class TipContact(Record):
@@ -233,6 +247,7 @@ class Plant(Record):
     second: Motion  # k2
     stages: Annotated[Records[Stage], 2]
     fingers: Annotated[Records[Finger], 2]
+    gears: Annotated[Records[Gears], 2]
     forces: Five  # on the coordinates, but for the motors'
     drag: Five  # friction over velocity
     external: Pair  # contacts' torque on each joint, as last evaluated [N·m]

@@ -6,7 +6,7 @@ other, extra rows join in.
 
 from __future__ import annotations
 
-from softfinger.daemon.simulation.physics.forces import stop_stiffness
+from softfinger.daemon.simulation.physics.forces import joint_stiffness
 from softfinger.daemon.simulation.physics.plant_state import (
     ALONG_D,
     ALONG_SHEAR,
@@ -26,7 +26,7 @@ def joint_pivot(plant: Plant, joint: int, g: float) -> float:
     """Return the matrix's entry of a joint by itself: inertia, friction, stop and motor."""
     motor = plant.motor_by_rate[joint] + g * plant.motor_by_q[joint]
     pivot: float = plant.parameters.joint_inertia + g * (
-        plant.drag[joint] + g * (stop_stiffness(plant, joint) + motor)
+        plant.drag[joint] + g * (joint_stiffness(plant, joint) + motor)
     )
     return pivot
 

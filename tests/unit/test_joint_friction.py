@@ -1,0 +1,170 @@
+"""Presliding friction of the joints: it sticks, breaks away and turns round as a reference does."""
+
+import math
+from collections.abc import Iterable
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
+from tests.harness.plant import CONSTANT, CURRENT, PAPER, POSITION, hold_with, make, place, run
+
+FRICTION = 0.05  # N·m, of the settings' default hand
+PRESLIDING = 0.0005  # rad, likewise
+INERTIA, DAMPING = 0.010, 0.02  # kg·m², N·m·s/rad, likewise
+STRIBECK_SPEED = 0.12  # rad/s, likewise
+COUNT = 2.0 * math.pi / 4096  # rad of an encoder
+
+
+def joint(step: float | None = None, **simulation: float) -> SimulatedHand:
+    """The left joint at 0 rad, free in air."""
+    hand = make(PAPER, step, object_shape="none", **simulation)
+    hold_with(hand, (0.0, 0.0))
+    place(hand, (0.0, -0.3), (0.0, 0.3, 0.0))
+    return hand
+
+
+def load(hand: SimulatedHand, torques: Iterable[float], each: float) -> np.ndarray:
+    """Give the joint these motor torques [N·m] for ``each`` [s]; its angle after each."""
+    found = []
+    for torque in torques:
+        hand.drive(0, CURRENT, True, 0.0, torque / CONSTANT)
+        run(hand, each)
+        found.append(hand.q[0])
+    return np.array(found)
+
+
+# Stick.
+
+
+@pytest.mark.parametrize("share", [0.1, 0.6, 0.98])
+def test_a_standing_load_below_stiction_bends_the_bristles_and_nothing_creeps(share):
+    hand = joint()
+    (*_, angle) = load(hand, np.linspace(0.0, share * FRICTION, 200), 0.005)
+    run(hand, 1.0)
+    assert hand.q[0] == pytest.approx(share * PRESLIDING, rel=1e-3)
+    assert angle == pytest.approx(hand.q[0], rel=0.02)
+    before = hand.q[0]
+    run(hand, 60.0)
+    assert abs(hand.q[0] - before) < 1e-9 * COUNT
+
+
+def test_an_oscillating_load_below_stiction_causes_no_drift():
+    # A LuGre joint creeps here in each period (Dupont et al., 2002).
+    hand = joint()
+    load(hand, np.linspace(0.0, 0.6 * FRICTION, 100), 0.005)
+    phases = np.arange(0.0, 60.0, 0.02) * 2.0 * math.pi
+    turn = load(hand, FRICTION * (0.6 + 0.3 * np.sin(phases)), 0.02).reshape(60, 50)
+    assert np.ptp(turn[1]) == pytest.approx(0.6 * PRESLIDING, rel=0.05)
+    np.testing.assert_allclose(turn[-1], turn[1], rtol=0, atol=1e-9 * COUNT)
+
+
+# Slip.
+
+
+def test_break_away_is_at_the_stiction_level():
+    stribeck = 0.4 * FRICTION
+    hand = joint(joint_stribeck=stribeck)
+    torques = np.linspace(0.0, 1.2 * (FRICTION + stribeck), 1500)
+    angles = load(hand, torques, 0.005)
+    slipped = torques[np.argmax(angles > 1.05 * PRESLIDING)]
+    assert slipped == pytest.approx(FRICTION + stribeck, rel=0.01)
+    # What is more at rest falls off, so that it runs away.
+    assert angles[-1] > 100 * PRESLIDING
+
+
+def test_a_reversal_turns_friction_round_over_twice_the_presliding():
+    hand = joint(joint_damping=0.0)
+    p = hand.plant.parameters
+    p.position_gain, p.rate_gain = 200.0, 2.0  # A/rad, A·s/rad: the joint follows its goal
+    speed, each = 0.01, 0.001  # rad/s, s
+    way = np.concatenate((np.arange(0.0, 0.02, speed * each), np.arange(0.02, 0.0, -speed * each)))
+    torques, angles = [], []
+    for goal in way:
+        hand.drive(0, POSITION, True, goal, 0.0)
+        run(hand, each)
+        torques.append(CONSTANT * hand.current[0])
+        angles.append(hand.q[0])
+    torque, angle = np.array(torques), np.array(angles)
+    turn = len(way) // 2
+    closing, opening = torque[turn - 200 : turn].mean(), torque[-200:].mean()
+    assert closing == pytest.approx(FRICTION, rel=0.01)
+    assert closing - opening == pytest.approx(2.0 * FRICTION, rel=0.01)
+    # Between them it is a straight line; its slope tells half or twice the presliding apart.
+    within = slice(turn + 20, turn + 80)
+    slope, _ = np.polyfit(angle[within], torque[within], 1)
+    assert slope == pytest.approx(FRICTION / PRESLIDING, rel=0.02)
+
+
+def test_friction_takes_a_moving_joints_energy_and_the_bristles_give_theirs_back():
+    hand = joint(joint_damping=0.0)
+    place(hand, (0.0, -0.3), (0.0, 0.3, 0.0), (0.5, 0.0))
+    energy, angles = [hand.energy()], []
+    for _ in range(1200):
+        hand.advance(hand.t + 1.5 * hand.step)
+        energy.append(hand.energy())
+        angles.append(hand.q[0])
+    assert energy[0] == pytest.approx(0.5 * INERTIA * 0.5**2)
+    assert (np.diff(energy) <= 0.0).all()
+    assert energy[-1] < 1e-6 * energy[0]
+    way = energy[0] / FRICTION
+    assert max(angles) == pytest.approx(way, abs=PRESLIDING)
+    assert max(angles) - angles[-1] == pytest.approx(PRESLIDING, rel=0.02)
+
+
+# An adaptive solver.
+
+
+def reference(torque: float, rate: float, stribeck: float, seconds: float) -> np.ndarray:
+    """Angle, rate and deflection by the same equations, from rest at 0 with ``rate`` [rad/s]."""
+
+    def equations(_t, state):
+        _, v, z = state
+        still = stribeck * math.exp(-abs(v) / STRIBECK_SPEED)
+        level = FRICTION + still
+        drag = math.sqrt(level / PRESLIDING * INERTIA) * v
+        friction = min(max(level * z / PRESLIDING + drag, -level), level)
+        acceleration = (torque - DAMPING * v - friction) / INERTIA
+        rise = -still / STRIBECK_SPEED * math.copysign(acceleration, acceleration * v)
+        bends = v - z * max(rise, 0.0) / level
+        if abs(z) >= PRESLIDING and z * bends > 0.0:
+            bends = 0.0
+        return v, acceleration, bends
+
+    found = solve_ivp(
+        equations, (0.0, seconds), (0.0, rate, 0.0), "DOP853", rtol=1e-9, atol=1e-13, max_step=1e-4
+    )
+    return found.y[:, -1]
+
+
+SECONDS = 0.1
+SCALE = (PRESLIDING, 0.1, PRESLIDING)
+
+
+def errors(torque: float, rate: float, stribeck: float, counts: Iterable[int]) -> list[float]:
+    """Largest error over SCALE with each number of steps."""
+    exact, found = reference(torque, rate, stribeck, SECONDS), []
+    for count in counts:
+        hand = joint(SECONDS / count, joint_stribeck=stribeck)
+        hold_with(hand, (torque / CONSTANT, 0.0))
+        place(hand, (0.0, -0.3), (0.0, 0.3, 0.0), (rate, 0.0))
+        run(hand, SECONDS)
+        state = (hand.q[0], hand.dq[0], hand.plant.state.bristles[0])
+        found.append(np.abs((np.array(state) - exact) / SCALE).max())
+        assert hand.plant.guarded == 0
+    return found
+
+
+def test_stick_is_of_order_two_and_agrees_with_an_adaptive_solver():
+    coarse, fine = errors(0.6 * FRICTION, 0.0, 0.0, (400, 800))
+    assert coarse < 1e-6
+    assert coarse / fine == pytest.approx(4.0, rel=0.05)
+
+
+@pytest.mark.parametrize("stribeck", [0.0, 0.03])
+@pytest.mark.parametrize("rate", [0.2, -0.3])
+def test_slip_and_the_stick_after_it_agree_with_an_adaptive_solver(rate, stribeck):
+    coarse, fine = errors(0.6 * FRICTION, rate, stribeck, (400, 12_800))
+    assert coarse < 5e-3
+    assert fine < 1e-4
