@@ -151,7 +151,8 @@ def press(
         along, across = (touch.shear * touch.along).sum(), (touch.shear * touch.across).sum()
         within = along * along + across * across
         scale = math.sqrt((touch.shear**2).sum() / within) if within > 0.0 else 0.0
-        tip.shear = scale * along + dt * (rates[2] - math.tan(tip.theta) * rates[0])
+        coupled = p.shear_coupling * math.tan(tip.theta)
+        tip.shear = scale * along + dt * (rates[2] - coupled * rates[0])
         touch.shear_across = scale * across + dt * rates[3]
         rim = rim_on_plane(p, tip)
         tip.rim = max(rim, 0.0)

@@ -390,6 +390,7 @@ class SimulationSettings(Section):
     palm: Place = 0.0  # m, the palm's place along y; the pivots are at 0
     palm_friction: NonNegative = 0.3  # Coulomb, object on the palm
     tip_loss: Delay = 0.002  # s, the tip's damping over its stiffness
+    tip_law: Literal["springs", "bristles"] = "springs"  # along the face; springs lean with θ
     tip_shear_stiffness: Ratio = 1.0  # of its springs along the face over that across it
     tip_creep_time: NonNegative = 0.0  # s in which a stuck shear relaxes to 1/e; 0: it stays
     tip_micro_slip: bool = False  # the footprint's edge slips before all of it does

@@ -120,6 +120,7 @@ def random_hand(generator: np.random.Generator, long: bool = False):
         "joint_stribeck": float(generator.uniform(0, 0.1)),
         "joint_load_friction": tuple(generator.uniform(0, 0.3, 2).tolist()),
         "joint_presliding": float(10 ** generator.uniform(-5, -2)),
+        "tip_law": str(generator.choice(["springs", "bristles"])),
     }
     hand = make(table, **parameters)
     if long:

@@ -39,6 +39,8 @@ def tip_at(hand: SimulatedHand, finger: int, q, pose, shear: float) -> TipContac
 GRADIENTS = {
     "soft": ((0.001, 0.010), {}),
     "softer along": ((0.001, 0.010), {"tip_shear_stiffness": 0.6}),
+    "bristles": ((0.001, 0.010), {"tip_law": "bristles"}),
+    "bristles on the rim": ((0.010, 0.019), {"tip_law": "bristles"}),
     "rim": ((0.010, 0.019), {}),
     "flat on the rim": ((0.0190, 0.0205), {}),
     "corner": ((0.001, 0.015), {"object_height": 0.002}),
@@ -89,6 +91,25 @@ def gradient_of_one_energy(table, depth, scene):
         )
         checked += 1
     assert checked > 15
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.2])
+def test_bristles_bear_a_shear_whatever_the_tilt_and_press_as_the_springs_do(tilt):
+    d, shear = 0.004, 3e-4
+    pose = -0.010 - d / math.cos(tilt), 0.08, tilt
+    springs, bristles = (
+        tip_at(make(PAPER, tip_law=law, tip_friction=50.0), 0, 0.0, pose, shear)
+        for law in ("springs", "bristles")
+    )
+    d = bristles.d
+    assert bristles.force == springs.force
+    assert bristles.tangential == pytest.approx(2.0 * math.pi * MODULUS * d * shear, rel=1e-6)
+    pressed = math.pi * MODULUS * (d**2 / math.cos(tilt) ** 2 + shear**2)
+    assert bristles.normal == pytest.approx(pressed, rel=1e-6)
+    energy = math.pi * MODULUS * (d**3 / (3.0 * math.cos(tilt) ** 2) + d * shear**2)
+    assert bristles.energy == pytest.approx(energy, rel=1e-6)
+    leans = math.pi * MODULUS * d**2 * math.tan(tilt)
+    assert springs.tangential - bristles.tangential == pytest.approx(leans, rel=1e-6)
 
 
 # Energy.

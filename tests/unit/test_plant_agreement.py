@@ -150,6 +150,7 @@ class Equations:
     weight: np.ndarray
     corners: np.ndarray | None = None  # of the object's frame; on a palm at y = ``palm``
     palm: float = 0.0
+    coupling: float = 1.0  # of a shear with d and θ: 0 for bristles
 
     def __call__(self, _t, y):
         x, v = y[:5], y[5:10]
@@ -162,11 +163,11 @@ class Equations:
             d, theta = contact.variables(x)
             jacobian = contact.jacobian(x)
             cos, sin, tan = np.cos(theta), np.sin(theta), np.tan(theta)
-            row = contact.slide(x) - tan * jacobian[0]
+            row = contact.slide(x) - self.coupling * tan * jacobian[0]
             k = math.pi * MODULUS * contact.share
-            by_d = k * (d * d / cos**2 + 2 * d * u * tan + u * u)
-            by_theta = k * (2 * d**3 * sin / (3 * cos**3) + d * d * u / cos**2)
-            by_shear = k * (d * d * tan + 2 * d * u)
+            by_d = k * (d * d / cos**2 + self.coupling * 2 * d * u * tan + u * u)
+            by_theta = k * (2 * d**3 * sin / (3 * cos**3) + self.coupling * d * d * u / cos**2)
+            by_shear = k * (self.coupling * d * d * tan + 2 * d * u)
             by_d += self.loss * 2 * k * d / cos**2 * (jacobian[0] @ v)
             by_theta += self.loss * k * d**3 / (1.5 * cos**3) * (jacobian[1] @ v)
             by_shear += self.loss * 2 * k * d * (row @ v)
@@ -203,10 +204,12 @@ class Scene:
     velocity: tuple = (0.05, 0.05, 0.5)
     currents: tuple = (0.65, 0.68)
     corners: np.ndarray | None = None
+    coupling: float = 1.0
 
 
 SCENES = {
     "rectangle": Scene(wedge(0.040)),
+    "bristles": Scene(wedge(0.040), {"tip_law": "bristles"}, coupling=0.0),
     "wedge": Scene(wedge(0.040, 0.2), {"object_shape": "wedge", "object_taper": 0.2}),
     "disc": Scene(disc(0.018), {"object_shape": "disc", "object_radius": 0.018}, q=(0.21, 0.20)),
     "tips": Scene(
@@ -257,6 +260,7 @@ def test_agreement_with_an_adaptive_solver_and_order_two(name, loss):
         p.mass * p.gravity,
         scene.corners,
         0.05,
+        scene.coupling,
     )
     found = solve_ivp(
         equations,

@@ -86,6 +86,7 @@ class Parameters(Record):
     friction: float
     loss: float  # damping over stiffness [s]
     shear_stiffness: float  # over that of the springs
+    shear_coupling: float  # of d_t with d and θ: 1 by springs, 0 by bristles
     creep: float  # share of a stuck shear that relaxes in a sub-step
     micro_slip: bool  # the footprint's edge slips before all of it does
     remembers: bool  # the tips relax
@@ -179,7 +180,7 @@ class TipContact(Record):
     theta: float  # tilt of the object against the tip [rad]
     sine: float  # of θ
     cosine: float
-    tangent: float  # tan θ, 0 where nothing soft is left
+    tangent: float  # tan θ, 0 where nothing soft is left and for bristles
     gain: float  # of the force against a plane: w(θ) and the face's curvature
     curvature: float  # curvature of what is touched [1/m]
     travel: float  # how much deeper the step may lead [m]

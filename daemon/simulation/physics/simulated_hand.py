@@ -98,6 +98,7 @@ def set_parameters(p: Parameters, settings: Settings, table: ContactTable, step:
     p.friction = simulation.tip_friction
     p.loss = simulation.tip_loss
     p.shear_stiffness = simulation.tip_shear_stiffness
+    p.shear_coupling = float(simulation.tip_law == "springs")
     if simulation.tip_creep_time > 0.0:
         p.creep = -math.expm1(-step / simulation.tip_creep_time)
     p.micro_slip = simulation.tip_micro_slip

@@ -12,6 +12,12 @@ finger's side. U_rim is a stiff spring between the backing plate's rim and the o
 plane at d = a(1 − |sin θ|), the end of the soft tip's range; just before it, at
 a(1 − √(sin² θ + 0.03²)), U₀ goes on linearly in d and F stays.
 
+That is the law ``simulation.tip_law = "springs"``. With ``"bristles"`` the term sin θ d_t is left
+out: the tangential force T = 2 s F cos θ d_t/d, 2πE s d d_t for a constant E, comes from a bristle
+at the contact's centre that neither a tilt nor a press bends, and d_t follows the slide there
+alone. Force upright, at d_t = 0 and on the sensor are the same. A controller that subtracts the
+springs' own tangential terms then meets a tip that does not have them.
+
 The tip touches the object's nearest point: on a face, along the face's normal; on a corner, along
 the line to it, as if on the plane normal to that line; on a disc, along the line to its centre. A
 disc stands upright on the hand's plane, so that its face is curved about one axis, with radius R.
@@ -121,14 +127,14 @@ def clear_contact(tip: TipContact) -> None:
 def contact_forces(p: Parameters, table: Pointer, tip: TipContact, factor: float) -> None:
     """Compute forces, stiffness and losses of a ``tip`` along d, θ and d_t.
 
-    With ζ the shear d_t, v its variance, γ = ``gain`` = w(θ) κ, ρ = ``ratio`` = s cos θ/d, within
-    the soft range:
+    With ζ the shear d_t, v its variance, γ = ``gain`` = w(θ) κ, ρ = ``ratio`` = s cos θ/d and
+    χ = ``shear_coupling``, 1 for springs and 0 for bristles, within the soft range:
 
-        T = t0 + t1 ζ             t0 = γ F sin θ,  t1 = 2 γ F ρ
-        N = n0 + n1 ζ + n2 ζ²     n0 = γ ∂U₀/∂d − t0 tan θ + ∂U_rim/∂d
-                                  n1 = γ ∂F/∂d sin θ − t1 tan θ,  n2 = γ ρ (∂F/∂d − F/d)
-        U = γ (U₀ + F sheared) + U_rim     sheared = ζ sin θ + ρ (ζ² + v)
-        |T| ≤ μ N bounds ζ on both sides of ``neutral`` = −d tan θ/2s, where T = 0
+        T = t0 + t1 ζ             t0 = χ γ F sin θ,  t1 = 2 γ F ρ
+        N = n0 + n1 ζ + n2 ζ²     n0 = γ ∂U₀/∂d − χ t0 tan θ + ∂U_rim/∂d
+                                  n1 = χ (γ ∂F/∂d sin θ − t1 tan θ),  n2 = γ ρ (∂F/∂d − F/d)
+        U = γ (U₀ + F sheared) + U_rim     sheared = χ ζ sin θ + ρ (ζ² + v)
+        |T| ≤ μ N bounds ζ on both sides of ``neutral`` = −χ d tan θ/2s, where T = 0
         losses: loss · stiffness · rate    stiffness = γ/cos θ (∂F/∂d, 2d/3 ∂U₀/∂d) and t1
 
     ``factor`` is κ. Takes from the tip d, θ, travel, rates, slip rate, shear, its variance and the
@@ -152,6 +158,7 @@ def contact_forces(p: Parameters, table: Pointer, tip: TipContact, factor: float
     force = 0.0
     normal = along_d
     tangential = 0.0
+    leaning = 0.0
     tangent = 0.0
     stiffness_d = 0.0
     stiffness_theta = 0.0
@@ -159,7 +166,8 @@ def contact_forces(p: Parameters, table: Pointer, tip: TipContact, factor: float
     ahead = 0.0  # stiffness of the soft part that the step may add
     if gain > 0.0:
         inverse_cosine = 1.0 / cosine
-        tangent = sine * inverse_cosine
+        leaning = sine * inverse_cosine
+        tangent = p.shear_coupling * leaning
         ahead = stiffness_ahead(table, 2.0 * math.pi * p.modulus * gain, tip.travel)
         ahead *= inverse_cosine
     if gain > 0.0 and d > D_MIN:
@@ -181,7 +189,7 @@ def contact_forces(p: Parameters, table: Pointer, tip: TipContact, factor: float
             d_soft_theta = 0.0
         force, soft, force_d, force_theta, _, soft_theta, _ = lookup_at(table, d_soft, tip.theta)
         slope, slope_d, slope_theta = normal_at(
-            table, d_soft, tip.theta, (force, force_d, force_theta), tangent, inverse_cosine
+            table, d_soft, tip.theta, (force, force_d, force_theta), leaning, inverse_cosine
         )
         scale = p.scale
         force *= scale
@@ -199,10 +207,11 @@ def contact_forces(p: Parameters, table: Pointer, tip: TipContact, factor: float
         # T and N are polynomials of the shear: T = t0 + t1 d_t, N = n0 + n1 d_t + n2 d_t².
         firm = p.shear_stiffness
         ratio = firm * cosine * inverse_d
-        t0 = gain * force * sine
+        coupled = p.shear_coupling * sine
+        t0 = gain * force * coupled
         t1 = 2.0 * gain * force * ratio
         n0 = gain * slope - t0 * tangent + along_d
-        n1 = gain * d_soft_d * force_d * sine - t1 * tangent
+        n1 = gain * d_soft_d * force_d * coupled - t1 * tangent
         n2 = gain * d_soft_d * ratio * (force_d - force * inverse_d)
         curvature = max(n2, 0.25 * gain * force * ratio * inverse_d)
         neutral = -0.5 * tangent * d_soft / firm  # where T = 0
@@ -224,10 +233,11 @@ def contact_forces(p: Parameters, table: Pointer, tip: TipContact, factor: float
 
         # U's second term and its derivatives.
         bent = firm * sine * inverse_d
-        sheared = sine * shear + ratio * shear * shear + ratio * shear_variance
+        sheared = coupled * shear + ratio * shear * shear + ratio * shear_variance
         by_soft = force_d * sheared - force * ratio * inverse_d * shear * shear
         by_soft -= force * ratio * inverse_d * shear_variance
-        by_theta = force_theta * sheared + force * shear * (cosine - bent * shear)
+        by_theta = force_theta * sheared
+        by_theta += force * shear * (p.shear_coupling * cosine - bent * shear)
         by_theta -= force * bent * shear_variance
         soft += force * sheared
         energy += gain * soft
@@ -240,7 +250,7 @@ def contact_forces(p: Parameters, table: Pointer, tip: TipContact, factor: float
         shear = 0.0
 
     # Losses: a tip that leaves doesn't pull, and shear's loss stays within friction. Stick is
-    # without slide, but for the tan θ ḋ that keeps the virtual work consistent.
+    # without slide, but for the springs' tan θ ḋ that keeps the virtual work consistent.
     rate_d = tip.rate_d
     rate_t = tip.slip_rate - tangent * rate_d
     loss = p.loss
