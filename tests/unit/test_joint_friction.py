@@ -60,6 +60,18 @@ def test_an_oscillating_load_below_stiction_causes_no_drift():
     np.testing.assert_allclose(turn[-1], turn[1], rtol=0, atol=1e-9 * COUNT)
 
 
+def test_bristles_far_stiffer_than_the_step_stick_too():
+    presliding, inertia = 1e-6, 1e-4  # rad, kg·m²: 0.3 ms for a swing, in steps of 0.25 ms
+    hand = joint(2.5e-4, joint_presliding=presliding, joint_inertia=inertia)
+    load(hand, np.linspace(0.0, 0.6 * FRICTION, 100), 0.005)
+    run(hand, 1.0)
+    # The way there may take some slip.
+    assert hand.q[0] == pytest.approx(0.6 * presliding, abs=presliding)
+    assert abs(hand.dq[0]) < 1e-9
+    assert hand.plant.state.bristles[0] == pytest.approx(0.6 * presliding, rel=1e-6)
+    assert hand.plant.guarded == 0
+
+
 # Slip.
 
 
@@ -111,6 +123,25 @@ def test_friction_takes_a_moving_joints_energy_and_the_bristles_give_theirs_back
     way = energy[0] / FRICTION
     assert max(angles) == pytest.approx(way, abs=PRESLIDING)
     assert max(angles) - angles[-1] == pytest.approx(PRESLIDING, rel=0.02)
+
+
+def test_a_level_that_changes_at_rest_adds_no_torque_to_the_bristles():
+    share = 0.5
+    hand = joint(joint_load_friction=(share, 0.0))
+    hand.plant.parameters.joints_held = True
+    hand.plant.state.bristles[0] = 0.6 * PRESLIDING
+
+    def torque(motor: float) -> float:
+        load(hand, [motor], 0.02)  # longer than the motor's lag
+        gears = hand.plant.gears[0]
+        assert gears.friction == pytest.approx(FRICTION + share * motor, rel=1e-6)
+        return gears.friction * gears.bent / PRESLIDING
+
+    bent = 0.6 * FRICTION
+    assert torque(0.0) == pytest.approx(bent, rel=1e-6)
+    assert torque(1.0) == pytest.approx(bent, rel=1e-6), "those that join are not bent"
+    parted = FRICTION / (FRICTION + share)
+    assert torque(0.0) == pytest.approx(bent * parted, rel=1e-6), "those that leave take theirs"
 
 
 # An adaptive solver.
