@@ -133,7 +133,8 @@ def grip_torques(
     if g.slip.reflex and g.force.target > g.force.value:
         setpoint.reset(g.force, force_windows, g.force.target)
     target = setpoint.advance(g.force, force_windows, g.force_rate)
-    grip_force = target + _correction(g, target, mean(grasp.force))
+    bound = _INTEGRAL_RATIO * g.force.target
+    grip_force = target + _correction(g, target, mean(grasp.force), bound)
     load = grasp.load_arm * g.slip.load
     g.grip_force = min(grip_force, _force_limit(g, load, mean(grasp.moment_arm)))
     if g.law.upright and not g.steering:
@@ -182,8 +183,12 @@ def single_torque(
     close = 0.0
     if not frames_late:
         target = setpoint.advance(g.force, force_windows, g.force_rate)
-        grip_force = target + _correction(g, target, grasp.force[finger])
-        g.grip_force = min(grip_force, _force_limit(g, 0.0, arm))
+        # The object stands by itself, so that the tip's friction on it may take some of the torque.
+        q, law = grasp.q[finger], g.law
+        reach = law.length * math.sin(q) + law.offset * math.cos(q) + law.radius
+        limit = _force_limit(g, g.slip.law.friction * g.force.target * reach, arm)
+        bound = max(limit - g.force.target, 0.0)
+        g.grip_force = min(target + _correction(g, target, grasp.force[finger], bound), limit)
         close = g.force.speed / (stiffness * arm)
     damping = g.law.damping * math.sqrt(stiffness * arm * arm) * (close - dq)
     geared = _geared(g.law, arm * g.grip_force, close)
@@ -205,15 +210,14 @@ def _turning(grasp: GraspState) -> float:
 
 
 @inner_kernel
-def _correction(g: GripState, target: float, felt: float) -> float:
-    """Return the force [N] that feedback adds to the feed-forward."""
+def _correction(g: GripState, target: float, felt: float, bound: float) -> float:
+    """Return the force [N] that feedback adds to the feed-forward; ``bound``: of its integral."""
     law = g.law
     error = target - felt
     # Beyond what the servos may give, more error must not be stored.
     full = abs(g.torque[0]) >= law.torque_max or abs(g.torque[1]) >= law.torque_max
     if not full or error < 0.0:
         integral = g.integral + law.force_bandwidth * error * law.dt
-        bound = _INTEGRAL_RATIO * g.force.target
         g.integral = min(max(integral, -bound), bound)
     return law.force_gain * error + g.integral
 

@@ -254,8 +254,10 @@ def _average(
         before = 0.5 * (s.smooth[0] + sense * s.smooth[1])
         before -= s.still if k == 0 else min(max(before, -friction), friction)
         alike = min(off1 * off, sense * off2 * off) > _AT_ONCE * off * off
-        gives = 0.5 * (s.speed[0] - dq[0] + sense * (s.speed[1] - dq[1]))
-        yields = gives * math.copysign(1.0, off) > _YIELDS
+        # Each: one alone has broken loose, or stops after that.
+        gives1 = math.copysign(s.speed[0] - dq[0], off * (s.speed[0] - dq[0]))
+        gives2 = math.copysign(s.speed[1] - dq[1], sense * off * (s.speed[1] - dq[1]))
+        yields = min(gives1, gives2) > _YIELDS
         flicker = _SIGNS * math.sqrt(s.variance[k]) + unsettled
         felt = abs(off) > flicker and abs(before + off) > abs(before)
         if monitored and alike and balanced and yields and felt:

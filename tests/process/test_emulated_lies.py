@@ -109,7 +109,7 @@ def test_a_lie_is_bounded_and_nothing_else_is_named(rig, lie):
     ("hand", "daemon", "words", "seconds", "least", "says"),
     [
         (["simulation.joint_friction=0.12"], [], "", 4.0, 0.8, False),
-        (["simulation.tactile_delay=0.015"], ["tactile.latency=0.02"], "", 4.0, 0.8, False),
+        (["simulation.tactile_delay=0.025"], ["tactile.latency=0.02"], "", 4.0, 0.8, False),
         ([], [], "left:drift=0.05@0..20 right:drift=0.05@0..20", 22.0, 0.8, False),
         ([], [], "left:drift=-0.05@0..20 right:drift=-0.05@0..20", 22.0, 0.7, True),
         (

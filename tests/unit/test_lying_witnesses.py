@@ -150,7 +150,7 @@ def test_rolling_that_both_tips_show_alike_in_a_turn_is_no_drift() -> None:
         grasped(hand, 10.0)
         hand.plant.load(twist=-0.122)
         hand.watch(0.3)
-        hand.command("rotate", angle=0.2145)
+        hand.command("rotate", angle=0.205)
         hand.watch(1.5)
         assert hand.mode == "holding"
         assert not [event for event in hand.events if event[1].startswith("witness")]

@@ -109,7 +109,7 @@ def test_a_sensor_lies_and_its_tip_feels_the_truth():
     lying.faults.begin("gain", 0.5, 1.45, 0.1)
     true, read = honest.pressed(30), lying.pressed(30)
     sums = np.array([b.sum() / a.sum() for a, b in zip(true, read, strict=True)])
-    instants = 1.40 + 0.01 * np.arange(30)
+    instants = 1.39 + 0.01 * np.arange(30)
     np.testing.assert_allclose(sums, np.interp(instants, [1.45, 1.55], [1.0, 0.5]), atol=2e-3)
     np.testing.assert_array_equal(honest.hand.force, lying.hand.force)
     # Of the other finger nothing is wrong.

@@ -24,7 +24,7 @@ from softfinger.tools.benchmarks.rigs import Sections, merged
 from softfinger.tools.benchmarks.virtual_grip import VirtualGrip, Watch
 
 _TRIALS, _HANDS = 20, 400
-_GRIP, _REST, _LOOK = 4.0, 1.2, 6.0  # s: until it holds at most, held in peace, looked at
+_GRIP, _REST, _LOOK = 8.0, 1.2, 6.0  # s: until it holds at most, held in peace, looked at
 _NEAR, _FAR, _LOST = 0.2, 0.3, 0.01  # shares of the force; m
 _SAID = 2.0  # s within which a force further off than `_NEAR` is to be explained
 _STRONG, _BRIEFLY = 1.4, 0.1  # of the force asked for, s: no load, no more
