@@ -55,6 +55,11 @@ _GRACE = 1.0
 _FORCE_REACHED = 0.03
 # Share of the force target that gears may hold above it, besides: 6 % in the small hand.
 _HELD_OVER = 0.12
+# Share of the force target that friction may hold: 0.05 N·m at the default finger are a tenth of
+# 6 N. The force law brings it in the end, which takes s, since it grows with the error.
+_NEAR = 0.1
+# s after which such a force is reached, too: ten times what the law takes without friction.
+_STUCK = 2.0
 # rad off the angle's target: the angle scatters by 0.5 to 2 mrad (1 σ) with simulated sensors.
 _ANGLE_REACHED = math.radians(0.5)
 # s for which force and angle have to stay reached: five frames at 25 Hz, two default smooth_time.
@@ -147,6 +152,7 @@ class Gripping(ControlState):
 
     history: GripHistory
     reached_for: float = 0.0  # since force and angle are at their targets [s]
+    near_for: float = 0.0  # since the force is so near that friction may hold the rest [s]
 
 
 @dataclass(kw_only=True)
@@ -459,7 +465,10 @@ class Control:
             is_reached = not abs(pose.angle - grip.target_angle) >= _ANGLE_REACHED  # also for NaN
         if not isinstance(state, Turning):
             streamed = isinstance(state, Pressing) and state.order.is_streamed
-            is_reached = is_reached and self._is_force_reached(streamed)
+            near = abs(self.fingers.force - grip.target) < _NEAR * grip.target
+            state.near_for = state.near_for + dt if near and not grip.shaking else 0.0
+            stuck = state.near_for > _STUCK
+            is_reached = is_reached and (stuck or self._is_force_reached(streamed))
         state.reached_for = state.reached_for + dt if is_reached else 0.0
         if state.reached_for <= _SETTLED:
             return

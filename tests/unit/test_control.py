@@ -411,3 +411,18 @@ def test_a_hand_that_does_not_know_of_its_cells_response_lets_go():
         hand.command("rotate", angle=math.radians(8.0))
         hand.run(4.0)
         assert hand.mode != "holding"
+
+
+@pytest.mark.parametrize(("share", "holds"), [(0.92, True), (0.85, False), (1.08, True)])
+def test_a_force_that_friction_keeps_a_little_off_counts_as_reached_after_2_s(
+    monkeypatch, share, holds
+):
+    with Watched({}) as hand:
+        hand.grasp(6.0)
+        monkeypatch.setattr(type(hand.control.fingers), "force", property(lambda _: share * 6.0))
+        while not hand.plant.normal.min() > 4.0:
+            hand.run(0.01)
+        hand.run(1.5)
+        assert hand.mode == "grasping"
+        hand.run(1.5)
+        assert (hand.mode == "holding") == holds

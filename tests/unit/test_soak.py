@@ -28,7 +28,7 @@ def holding(soak: Soak) -> Soak:
 
 @pytest.mark.parametrize(
     ("sequences", "unjudged"),
-    [(2, 10), pytest.param(12, 4, marks=pytest.mark.extended)],
+    [(2, 10), pytest.param(12, 5, marks=pytest.mark.extended)],
 )
 def test_sequences_hold_and_break_nothing(sequences, unjudged):
     account = Account()
