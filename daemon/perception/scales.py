@@ -50,6 +50,7 @@ _TORQUE_NOISE = 0.02  # N·m of a joint that stands
 _MOVING_NOISE = 0.05  # N·m of one that moves: inertia, damping
 _MOVING = 0.05  # rad/s
 _INTERVAL_MAX = 0.1  # s
+_LATENCY_ERROR = 0.01  # s, standard deviation of a frame's time that nobody measured
 _BALANCE_ERROR = 0.05  # of the tips' forces, and …
 _RUBBED = 0.4  # … N that a table may take off one of them
 _GATE = 3.0  # standard deviations: what is further off counts as no more than so much
@@ -82,6 +83,7 @@ class Scales(Record):
     most: float  # greatest torque of the grip, of both joints' mean [N·m]
     speed: float  # of the joints' closing when torques were taken in last [rad/s]
     t: float  # and when that was [s]
+    last: float  # mean moment of the tips' forces then [N·m]
     modulus: Pair  # e^ε: force over the table's
     torque: Pair  # of the joints, and …
     moment: Pair  # … of the tips' forces about them, when torques were taken in last [N·m]
@@ -259,11 +261,16 @@ def update_torque(s: Scales, torque: Pair, moment: Pair, speed: float, t: float)
         slopes[OFFSET + k] = 0.5
     innovation -= s.friction * min(max(speed / _MOVING, -1.0), 1.0) + s.inertia * faster / since
     noise = _MOVING_NOISE if abs(speed) > _MOVING else _TORQUE_NOISE
+    # Frames may be older than their time says: the force is that of a little before or after. Where
+    # frames don't tell d, the ramp is all there is to tell their gain.
+    both = 0.5 * (moment[0] + moment[1])
+    late = _LATENCY_ERROR * (both - s.last) / since * (1.0 - 0.5 * (s.product[0] + s.product[1]))
+    s.last = both
     # Where torques have gone back, the gears hold something between nothing and all of it.
     given = 0.5 * (torque[0] + torque[1])
     s.most = max(s.most, given)
     held = min(s.most - given, s.held * 0.5 * (moment[0] + moment[1]))
-    _update(s, innovation, noise * noise + held * held, _GATE)
+    _update(s, innovation, noise * noise + held * held + late * late, _GATE)
 
 
 @inner_kernel

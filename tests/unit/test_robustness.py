@@ -25,6 +25,9 @@ LONG = pytest.mark.extended
         *(pytest.param("stiction 0.15 N·m", seed, marks=LONG) for seed in (1, 2, 3, 4)),
         ("zero +5% in 20 s, 8 bits", 1),
         pytest.param("zero +5% in 20 s", 1, marks=LONG),
+        ("frames 15 ms older", 1),
+        ("frames 10 ms older", 1),
+        *(pytest.param(name, 1, marks=LONG) for name in ("frames 30 ms older", "cells of 80 ms")),
         ("both gains and currents halve in 5 s", 1),
     ],
 )

@@ -65,7 +65,13 @@ ROWS = (
     HandCase("joint friction 0.20 N·m", 12.0, _hand(joint_friction=0.20)),
     HandCase("stiction 0.15 N·m", 6.0, _hand(joint_stribeck=0.15)),
     *(
-        HandCase(f"zero {drift:+.0%} in {s} s{of}", 6.0, {}, board, 1.0, f"drift={drift}@0..{s}")
+        HandCase(
+            f"zero {drift:+.0%} in {s} s{of}",
+            6.0,
+            daemon=board,
+            words=f"drift={drift}@0..{s}",
+            false=_BOTH,
+        )
         for of, board in (("", {}), (", 8 bits", _EIGHT_BITS))
         for drift, s in ((-0.05, 20), (-0.02, 20), (0.05, 20), (-0.05, 120))
     ),
