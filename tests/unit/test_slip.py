@@ -36,7 +36,9 @@ def test_a_push_beyond_the_margin_is_held_by_a_firmer_grip(sections):
             seen[raised] = hand.mode, hand.plant.force.mean()
     assert seen[10.0][0] == "holding"
     assert FORCE * 1.2 < seen[10.0][1] < (FORCE + 10.0) * (1.0 + KNOWN)
-    assert moved[10.0] < 2.5e-3, "the tips' own shear"
+    assert moved[10.0] < 4e-3, (
+        "the tips' own shear, and what slides before joints that stick show it"
+    )
     assert moved[0.0] > 10e-3
 
 
