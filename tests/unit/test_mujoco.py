@@ -105,4 +105,4 @@ def test_the_page_grasps_and_turns_as_our_plant_does(monkeypatch, timestep):
         assert mujocos.force[late, mean].mean() == pytest.approx(
             ours.force[late, mean].mean(), rel=0.05
         )
-    assert np.ptp(mujocos.force[late]) - np.ptp(ours.force[late]) < 0.1  # it rests
+    assert np.ptp(mujocos.force[late]) - np.ptp(ours.force[late]) < 0.2  # it rests
