@@ -186,7 +186,7 @@ def single_torque(
         # The object stands by itself, so that the tip's friction on it may take some of the torque.
         q, law = grasp.q[finger], g.law
         reach = law.length * math.sin(q) + law.offset * math.cos(q) + law.radius
-        limit = _force_limit(g, g.slip.law.friction * g.force.target * reach, arm)
+        limit = _force_limit(g, g.slip.law.friction * g.force.target * max(reach, 0.0), arm)
         bound = max(limit - g.force.target, 0.0)
         g.grip_force = min(target + _correction(g, target, grasp.force[finger], bound), limit)
         close = g.force.speed / (stiffness * arm)

@@ -26,6 +26,7 @@ from softfinger.daemon.types import FINGERS, Event, Frame, SensorFacts, State
 from softfinger.kinematics.estimation.estimator import ContactEstimate
 
 _TARE_FRAMES = 16
+_ZERO_EVERY = 8  # frames: a zero that warmth moves takes seconds
 _STEPS = 65535  # of a published pressure
 _REMEMBERED = 2.0  # s of frames that are known again
 _REPEATED = 0.1  # s of frames that come again, from which on that is no chance …
@@ -181,7 +182,9 @@ class FingerPerception:
         if self._tare_left and frame.valid:
             self._learn_zero(counts)
         if frame.valid:
-            self._moved.follow(counts, self.estimate, holding and self.estimate.contact)
+            rests = holding and self.estimate.contact
+            if not rests or self.frames % _ZERO_EVERY == 0:
+                self._moved.follow(counts, self.estimate, rests)
             counts = self._moved.corrected(counts, int(self._full))
         if self._converter is not None:
             readings: NDArray[Any] = self._converter(counts)
