@@ -149,7 +149,6 @@ class State:
     t: float = 0.0
     wall: float = 0.0  # Unix time [s]
     mode: str = "disarmed"
-    phase: int = 0  # of a grip, as `perception.contact_filter_kernels` has them
     fault: str = ""
     fault_name: str = ""  # its limit in `safety.limits`
     torque: bool = False  # on, or not confirmed to be off

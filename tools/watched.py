@@ -50,7 +50,7 @@ class Watched:
         self.control = self.loop._control
         assert self._daemon.hand is not None
         self.plant = self._daemon.hand
-        self.contact_filter = self.loop.perception.filter
+        self.estimator = self.loop.perception.filter
         self.contacts = self.state.contacts
         self.settings = settings
 

@@ -28,7 +28,7 @@ from softfinger.daemon.control import grip_kernels as kernels
 from softfinger.daemon.control.grip_kernels import GripState
 from softfinger.daemon.control.setpoint import Setpoint
 from softfinger.daemon.control.slip_monitor import set_law
-from softfinger.daemon.perception.contact_filter_kernels import GraspState
+from softfinger.daemon.perception.grasp import GraspState
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import ObjectPose, Reading
 

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from softfinger.daemon.control import setpoint, slip_monitor
 from softfinger.daemon.control.setpoint import SetpointState
 from softfinger.daemon.control.slip_monitor import SlipState, mean
-from softfinger.daemon.perception import witnesses
-from softfinger.daemon.perception.contact_filter_kernels import GraspState
+from softfinger.daemon.perception.grasp import GraspState
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 from softfinger.kinematics.compiled.layout import Pair, Record, Records
 from softfinger.kinematics.hand.upright import upright_spring
@@ -128,7 +127,8 @@ def grip_torques(
         holding,
         g.closing_friction,
         dq,
-        witnesses.doubts(grasp.witnesses),
+        g.torque,
+        grasp.doubted,
     )
     if g.slip.reflex and g.force.target > g.force.value:
         setpoint.reset(g.force, force_windows, g.force.target)

@@ -2,58 +2,56 @@
 
 With the names of `SlipLaw`, `SlipState` and `GraspState`, at each tick:
 
-    standing torque    mean(torque_residual) − closing · joint_friction, averaged: smooth
-    load L of a tip    smooth − still, between 0 and smooth
-                       = load_arm L + load_curvature L²                       (`load_of`)
+    r                  mean(torque_residual) − closing · joint_friction, low-pass filtered: smooth
+    L                  load on each tip: r − still = load_arm L + load_curvature L²      (`load_of`)
     s.friction         max(joint_friction, free_torque) + load_friction · normal force · its lever
     sure               |L| − (1/2 … 3/2) s.friction/load_arm
     s.load             min(max(4 sure, 0), |L| + s.friction/slope, friction force_limit)
-    spare              friction (1 − margin) − shear         of the normal force, for a load
+    spare              friction (1 − margin) − shear                      of the normal force
     needed             max(s.load, felt, object_load/2)/spare
     force              min(max(commanded, needed), force_limit)
     force_limit        min(commanded + min(raise_max, share · commanded), force_max)
-    share              raise_ratio where s.moved, else at most _UNSURE_SHARE
+    share              raise_ratio if s.moved, else at most _UNSURE_SHARE
 
-`s.moved`: the object has turned, both joints have given way at once, or |L| is more than _CERTAIN
-times what friction can hide. `needed` stays for _HOLD_TIME and then falls by raise_max in _BACK. A
-load that comes at once, or a turn of the object beyond μ (d1 + d2)/2W · _WELL, raises the force at
-once.
+`still` is the part of the residual that is not a load. It starts with the residual that stands when
+holding begins, because an error of the modulus or the torque constant is the largest part of that.
+It then follows r within a second, and it follows the commanded torque while the joints stand still:
+torque that the force law adds to a joint that sticks is carried by friction. It stays within
+s.friction of its start; rubber that relaxes may lower it by a further _RELAXES of the tip's moment.
 
-What these sensors show, and what they don't:
+`s.moved` is true once the object has turned, both joints have given way at once, or |L| exceeds
+twice what friction can hide. `needed` stays for _HOLD_TIME and then falls by raise_max in _BACK. A
+sudden load, or a turn of the object beyond μ (d1 + d2)/2W · _WELL, raises the force at once.
 
-- A pressure grid feels normal pressure only, no shear. A solid tip's frames show the
-  shear on its face, to 0.1 N.
-- The joints' currents show a load along the faces: what pressure does not explain of a torque is
-  shear (`hand.grasp_state`), where both joints show it alike; what frames that drift explain is
-  taken off before (`perception.witnesses`), and a wrong torque constant is no load
-  (`perception.scales`). A joint's friction hides a load of its torque over W turn, 1.7 N a tip at
-  the default hand; gears with friction of their own load hide more, the firmer the grip is. What
-  friction the joints have, each approach shows (`GraspState.free_torque`). Up to that, what is seen
-  when holding begins, and what changes slower than in a second, is taken as friction: torque that
-  the force law adds while a joint sticks is no load. Less than half of it is no sign of a load; a
-  load that is seen is taken for more by what friction may hide. So a grip whose tips' friction
-  bears less than about twice that is not guarded well, at the default hand below 7 N, and below 2.8
-  N not at all.
-- A load towards the palm wedges the object between the tips: it shows less, and needs more to slip.
-  Of a sudden one the torques never show more than lever²/4 bow, or 0.07 N·m at 10 N.
-- The object's angle is known twice, from frames and from the joints by rolling. What frames correct
-  and no joint explains is shear of the tips up to μ (d1 + d2)/2W, and slip well beyond.
-- An object that slides along its parallel faces without turning changes no d, no θ and no joint. So
-  the margin is kept before, and ``control.tip_friction`` must not be more than the real friction.
-- While the grip is built up or the object turns, currents also move the joints: the last load is
-  kept. A load that grows by more than about 10 N a second is too fast for that.
-- One that comes at once makes the joints give way, and their damping shows it before the sensors
-  do: where both joints' torques jump by more than they flicker while the encoders say that the
-  joints give way, and what stands and comes leaves too little of the friction, it is believed at
-  the same tick; so is a twist, of which they show the contrary. A sliding tip shows no more than
-  friction bears, so the grip is raised by all it may, as fast as ``safety.current_rate`` lets it.
+The sensors have these limits:
+
+- A pressure grid measures normal pressure only. A solid tip's frames also show the shear on its
+  face, to 0.1 N.
+- The joints' currents show a load along the faces as torque beyond the tips' normal forces, if both
+  joints show it alike. Joint friction hides a load of its torque over load_arm, 2 N a tip for the
+  default hand. A load that arrives slowly stays hidden in friction, so a 10 N grip is raised too
+  late for loads that grow by more than about 6 N/s (simulated). A weak grip, below 7 N for the
+  default hand, is not guarded well; below 2.8 N not at all.
+- A load towards the palm wedges the object between the tips. It shows less, and slips later. A
+  sudden one never shows more than lever²/4 bow, or 0.07 N·m at 10 N.
+- The object's angle is measured by the frames and predicted by rolling. A difference is shear of
+  the tips up to μ (d1 + d2)/2W, and slip well beyond.
+- An object that slides along parallel faces without turning changes no d, no θ and no joint angle.
+  ``control.tip_friction`` must therefore not exceed the real friction.
+- While the grip is built up or the object turns, currents also move the joints, and the last load
+  is kept.
+- A sudden load makes both joints give way, and the damping torque shows that before the sensors do:
+  both torques jump beyond their noise while both encoders move. For a pull the jumps have the same
+  sign, for a twist opposite ones. A sideways push looks like a twist. The grip is then raised by as
+  much as allowed, as fast as ``safety.current_rate`` permits, since a sliding tip shows no more
+  load than its friction bears.
 """
 
 from __future__ import annotations
 
 import math
 
-from softfinger.daemon.perception.contact_filter_kernels import GraspState
+from softfinger.daemon.perception.grasp import GraspState
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import GRIP_FRACTION
 from softfinger.kinematics.compiled.kernel import inner_kernel
@@ -79,7 +77,7 @@ _AT_ONCE = 0.25  # … and so much of one that comes at once, while a joint may 
 _BALANCED = 0.6  # of both tips' mean force: each must feel so much, as of any object that is free
 _FRICTION_MOST = 0.3  # N·m: what more a joint took on its way was no friction
 _UNSURE_SHARE = 0.3  # of the force asked for: no grip is raised by more before something moves, …
-_CERTAIN = 2.0  # … or joints that stand show more than so many times what friction can hold
+_RELAXES = 0.2  # share of a tip's force that rubber may lose while it is held
 _ARM_MIN = 0.2  # of the object's width: a load's lever is not taken for less
 _SPARE_MIN = 0.3  # of the friction: where rolling takes more, a firmer grip hardly helps
 
@@ -111,6 +109,8 @@ class SlipState(Record):
     reflex: bool  # it has, or a load came at once: the grip is to be raised at once
     known: bool  # what stood of the joints' torques when holding began:
     still: float  # friction, as a rule [N·m]
+    base: float  # what stood of it beyond friction: of a force that is not known well [N·m]
+    given: float  # mean torque of both joints at the last tick [N·m]
     moved: bool  # a joint gave way to a load, or the object turned: so the grip was raised
     smooth: Pair  # what nothing else explains of them, averaged [N·m]
     variance: Pair  # of both joints' mean about that, and of half their difference [N²·m²]
@@ -143,7 +143,7 @@ def set_law(law: SlipLaw, settings: Settings) -> None:
 def forget(s: SlipState) -> None:
     """Forget the object: nothing is held any more, or something else."""
     s.turned = s.known = s.reflex = s.moved = False
-    s.load = s.guarded = s.felt = s.twisted = s.still = s.age = s.friction = 0.0
+    s.load = s.guarded = s.felt = s.twisted = s.still = s.base = s.age = s.friction = 0.0
     s.smooth[:] = s.variance[:] = s.speed[:] = 0.0
     s.unexplained_rotation[:] = s.away[:] = 0.0
     s.needed = s.force_limit = s.idle = 0.0
@@ -155,7 +155,8 @@ def begin(s: SlipState, grasp: GraspState) -> None:
     s.known = grasp.load_arm > 0.0
     if not s.known:
         return
-    s.still = min(max(mean(s.smooth), -s.friction), s.friction)
+    s.still = mean(s.smooth)
+    s.base = s.still - min(max(s.still, -s.friction), s.friction)
     s.unexplained_rotation[:] = grasp.unexplained_rotation
     s.away[:] = 0.0
     s.age = _SMOOTH
@@ -169,6 +170,7 @@ def update(
     holding: bool,
     closing: float,
     dq: Two,
+    given_torques: Pair,
     doubted: bool,
 ) -> float:
     """Return the grip force [N] to go to: ``commanded``, or more where the margin needs it.
@@ -182,12 +184,14 @@ def update(
     moment = mean(grasp.normal) * mean(grasp.moment_arm)
     s.friction = _friction(s, grasp) + law.load_friction * moment
     monitored = holding and s.known and grasp.load_arm > 0.0
+    given = mean(given_torques)
     # Of the shear one part grows with the grip, the rolling's; the load is borne by both tips.
     spare = law.friction * (1.0 - law.margin) - grasp.shear
     bearing = max(spare, _SPARE_MIN * law.friction)
     sudden = _average(s, grasp, closing, dq, monitored, spare)
     if monitored:
-        _estimate_load(s, grasp)
+        standing = max(abs(dq[0]), abs(dq[1])) < _YIELDS
+        _estimate_load(s, grasp, given, standing)
         _watch_turning(s, grasp)
     else:
         s.unexplained_rotation[:] = grasp.unexplained_rotation
@@ -202,6 +206,7 @@ def update(
     if doubted:
         s.load = felt = s.needed = 0.0
         s.turned = sudden = s.moved = False
+    s.given = given
     s.guarded = max(s.load, felt, 0.5 * law.object_load)
     needed = s.guarded / bearing
     if s.turned:
@@ -299,24 +304,27 @@ def _shear_jumps(s: SlipState, felt: float, twisted: float, bears: float, monito
 
 
 @inner_kernel
-def _estimate_load(s: SlipState, grasp: GraspState) -> None:
-    """Tell the load from the joints' friction."""
+def _estimate_load(s: SlipState, grasp: GraspState, given: float, standing: bool) -> None:
+    """Tell the load from the joints' friction, and from rubber that relaxes."""
     law = s.law
     both = _alike(s)
     off = both - s.still
-    friction = s.friction / grasp.load_arm
     s.age = min(s.age + law.dt, _LEARN)
-    if abs(load_of(off, grasp.load_arm, grasp.load_curvature)[0]) < friction:
+    if standing:  # what was commanded meanwhile, friction holds
+        s.still += given - s.given
+    relaxed = _RELAXES * mean(grasp.normal) * mean(grasp.moment_arm)
+    if -s.friction - relaxed < off < s.friction:
         # So little may as well be friction that gives way; what comes slower stays hidden.
-        still = s.still + off * law.dt / s.age
-        s.still = min(max(still, -s.friction), s.friction)
+        s.still += off * law.dt / s.age
+    s.still = min(max(s.still, s.base - s.friction - relaxed), s.base + s.friction)
     # Friction that lets go, or turns round, is no load.
-    off = min(max(off, min(both, 0.0)), max(both, 0.0))
+    off = min(max(off, min(both - s.base, 0.0)), max(both - s.base, 0.0))
     load, slope = load_of(off, grasp.load_arm, grasp.load_curvature)
     load = abs(load)
     # Half the friction is no sign yet, and after a motion it may turn round; from all of it on
     # as much may be hidden. What no raised grip bears need not be told apart.
-    s.moved = s.moved or load > _CERTAIN * friction
+    friction = s.friction / grasp.load_arm
+    s.moved = s.moved or load > 2.0 * friction
     sure = load - (0.5 + max(1.0 - s.age / _LEARN, 0.0)) * friction
     undetected = s.friction / max(slope, _ARM_MIN * law.width)
     s.load = min(max(4.0 * sure, 0.0), load + undetected, law.friction * s.force_limit)

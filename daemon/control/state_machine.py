@@ -42,7 +42,7 @@ from dataclasses import dataclass, field
 from softfinger.daemon.control.fingers import Fingers
 from softfinger.daemon.control.grip import Grip
 from softfinger.daemon.control.modes import Mode
-from softfinger.daemon.perception.contact_filter_kernels import HOLDING, OTHER, RAMPING, GraspState
+from softfinger.daemon.perception.grasp import GraspState
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS, Event, Goal, State
 
@@ -201,20 +201,6 @@ class Control:
     def torque(self) -> bool:
         """True if the servos' torque shall be on."""
         return not isinstance(self.state, Off)
-
-    @property
-    def phase(self) -> int:
-        """The grip's phase, by which perception uses the joints' torques."""
-        state, force = self.state, self.grip.commanded
-        if isinstance(state, Settled):
-            return HOLDING
-        if isinstance(state, Approaching):
-            return OTHER if state.empty_for else RAMPING
-        if not isinstance(state, Gripping) or self.grip.turning or state.history.empty_for:
-            return OTHER
-        # The torques of a force that the grip has settled with were used before this turn.
-        is_used = isinstance(state, Turning) and force == state.history.settled_force
-        return OTHER if is_used else RAMPING
 
     def _enter(self, state: ControlState) -> None:
         last, self.state = self.state, state
@@ -378,7 +364,8 @@ class Control:
             return self._settings.safety.current_move
         # A tip that meets the object before it is felt shall not press beyond the force wanted.
         pressed = 0.5 * state.order.force * self._settings.hand.finger_length * law.driving
-        pressed += law.joint_friction
+        # A joint that stands under it, and whose tip feels nothing, has more friction than is set.
+        pressed += max(law.joint_friction, float(self.fingers.grasp.free_torque.max()))
         return min(law.approach_current, pressed / law.torque_constant)
 
     def _travel(self, state: Travelling, dt: float) -> None:

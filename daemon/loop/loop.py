@@ -264,7 +264,7 @@ class Loop:
             control.step(self.period, state.goal)
         if control.events or self.perception.events or self._reports:
             self._emit_events()
-        state.mode, state.phase = control.mode, control.phase
+        state.mode = control.mode
 
     def _emit_events(self) -> None:
         for events in (self.perception.events, self._control.events):
@@ -363,7 +363,7 @@ class Loop:
             self._latch(reason, name)
             self._control.fail(reason, name)
             self._emit_events()
-            self.state.mode, self.state.phase = self._control.mode, self._control.phase
+            self.state.mode = self._control.mode
 
     def _latch(self, reason: str, name: str) -> None:
         """The one place that writes the state's fault; empty texts clear it."""

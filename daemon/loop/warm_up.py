@@ -155,24 +155,24 @@ def _sensor(scene: WantedScene) -> None:
 
 
 def _filter(scene: WantedScene) -> None:
-    from softfinger.daemon.perception.contact_filter import ContactFilter
+    from softfinger.daemon.perception.hand_estimator import HandEstimator
 
     settings, fingers = scene.settings, scene.sensing
     left, right = scene.models
-    contact_filter = ContactFilter(settings, (left.table, right.table))
+    estimator = HandEstimator(settings, (left.table, right.table))
     contacts, pose = [Contact(), Contact()], ObjectPose()
     frame = Frame(1, 0.0, 0.0, True, np.zeros((1, 1), np.uint16))
     touch = ContactEstimate(contact=True, invalid=Invalid.NONE, d=1e-3)
     for k in (1, 2):
-        contact_filter.predict(Reading(t=0.01 * k))
+        estimator.predict(Reading(t=0.01 * k))
         for finger in fingers:
-            contact_filter.update(finger, frame, touch, contacts[finger])
-        contact_filter.write_contacts(0.01 * k, contacts, pose)
+            estimator.update(finger, frame, touch, contacts[finger])
+        estimator.write_contacts(0.01 * k, contacts, pose)
 
 
 def _grip(scene: WantedScene) -> None:
     from softfinger.daemon.control.grip import Grip
-    from softfinger.daemon.perception.contact_filter_kernels import GraspState
+    from softfinger.daemon.perception.grasp import GraspState
 
     fingers, pose, reading = scene.sensing, ObjectPose(), Reading()
     if not fingers:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.perception.calibration_file import Calibration, Converter, calibration_for
-from softfinger.daemon.perception.scales import CALIBRATED_ERROR, MODULUS_ERROR, UNKNOWN, Prior
+from softfinger.daemon.perception.known import CALIBRATED_ERROR, MODULUS_ERROR, UNKNOWN, Prior
 from softfinger.daemon.profile.factory import (
     law_problem,
     make_grid,

@@ -1,6 +1,6 @@
 """Perception of each finger: its newest frame calibrated and estimated, then filtered.
 
-`FingerPerception` estimates each frame once; `perception.contact_filter` carries the estimates on
+`FingerPerception` estimates each frame once; `perception.estimator` carries the estimates on
 to the contacts of every tick.
 """
 
@@ -15,18 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softfinger.daemon.perception.calibration_file import Converter, least_end
-from softfinger.daemon.perception.contact_filter import ContactFilter
-from softfinger.daemon.perception.contact_filter_kernels import HOLDING
 from softfinger.daemon.perception.finger_model import FingerModel, make_estimator
-from softfinger.daemon.perception.scales import forget
-from softfinger.daemon.perception.zero import ZeroWatch
+from softfinger.daemon.perception.hand_estimator import HandEstimator
+from softfinger.daemon.perception.zero import UnpressedCells
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.tactile.base import TactileSensor
 from softfinger.daemon.types import FINGERS, Event, Frame, SensorFacts, State
 from softfinger.kinematics.estimation.estimator import ContactEstimate
 
 _TARE_FRAMES = 16
-_ZERO_EVERY = 8  # frames: a zero that warmth moves takes seconds
+_ZERO_EVERY = 8  # frames: what warmth moves takes seconds
 _STEPS = 65535  # of a published pressure
 _REMEMBERED = 2.0  # s of frames that are known again
 _REPEATED = 0.1  # s of frames that come again, from which on that is no chance …
@@ -49,7 +47,7 @@ class Perception:
             FingerPerception(sensor, models[finger], settings, self.events)
             for finger, sensor in sorted(sensors.items())
         ]
-        self.filter = ContactFilter(
+        self.filter = HandEstimator(
             settings,
             (models[0].table, models[1].table),
             (models[0].material, models[1].material),
@@ -57,8 +55,7 @@ class Perception:
         )
 
     def tare(self) -> None:
-        """Take the mean of the next frames as zero, cell by cell; forget the scales of the old."""
-        forget(self.filter.grasp.scales, 1.0)
+        """Take the mean of the next frames as zero, cell by cell."""
         for each in self.fingers:
             each.tare()
 
@@ -67,13 +64,13 @@ class Perception:
         if not self.fingers:
             return
         for each in self.fingers:
-            frame = each.update(state.phase == HOLDING)
+            frame = each.update()
             if frame is not None:
                 if each.repeats.long:
                     frame = replace(frame, valid=False)
                 contact = state.contacts[each.finger]
                 self.filter.update(each.finger, frame, each.estimate, contact, each.changes)
-        self.filter.write_contacts(state.t, state.contacts, state.object, state.phase)
+        self.filter.write_contacts(state.t, state.contacts, state.object)
 
 
 class Repeats:
@@ -139,17 +136,20 @@ class FingerPerception:
         )
         self._full = float(tactile.full_count)
         self._scale = tactile.pascal_per_count  # of the readings
+        self._quantum = tactile.pascal_per_count  # of a count where nothing presses
         self._converter: Converter | None = None
         if calibration is not None:
             self._converter = Converter(calibration, tactile.pascal_per_count)
             self._scale = 1.0
+            self._quantum = self._converter.quantum
         self._readings: NDArray[Any] | None = None  # of the newest frame: counts over zero, or Pa
         self._as_pressure = settings.stream.tactile_unit == "Pa"
         self.facts = self._facts(settings, model)
         self._events = events
         self._zero: NDArray[np.uint16] | None = None  # where there is no converter
         live = np.ones(model.grid.shape, np.bool_) if active is None else active
-        self._moved = ZeroWatch(model.grid, settings.tip.radius, live)
+        self._unpressed = UnpressedCells(model.grid, settings.tip.radius, live)
+        self._noise = tactile.noise  # of a cell, as set [Pa]
         self._tare_sum: NDArray[np.uint32] | int = 0
         self._tare_left = 0
 
@@ -162,13 +162,10 @@ class FingerPerception:
         """Take the mean of the next frames as zero, cell by cell."""
         self._tare_sum = 0
         self._tare_left = _TARE_FRAMES
-        self._moved.forget()
+        self._unpressed.forget_zero()
 
-    def update(self, holding: bool = False) -> Frame | None:
-        """Return the newest frame, estimated, where it is a new one; None where it is not.
-
-        ``holding``: a grip rests, so that its cells tell how far their zero has moved.
-        """
+    def update(self) -> Frame | None:
+        """Return the newest frame, estimated, where it is a new one; None where it is not."""
         frame, last = self.sensor.latest(), self.frame
         if frame is None or frame is last:
             return None
@@ -182,10 +179,10 @@ class FingerPerception:
         if self._tare_left and frame.valid:
             self._learn_zero(counts)
         if frame.valid:
-            rests = holding and self.estimate.contact
-            if not rests or self.frames % _ZERO_EVERY == 0:
-                self._moved.follow(counts, self.estimate, rests)
-            counts = self._moved.corrected(counts, int(self._full))
+            if self.frames % _ZERO_EVERY == 1:
+                self._unpressed.follow(counts)
+                self._estimator.noise = max(self._noise, self._unpressed.noise * self._quantum)
+            counts = self._unpressed.corrected(counts, int(self._full))
         if self._converter is not None:
             readings: NDArray[Any] = self._converter(counts)
         elif self._zero is not None:

@@ -1,9 +1,9 @@
-"""Zero of a sensor in a grip: how far it has moved, by the cells beside the footprint.
+"""Zero and noise of a sensor, by the cells that no tip can press.
 
-A cell that nothing presses reads its zero. Under a tip of 20 mm some 60 % of a 58 mm grid is beside
-the footprint, so the median of these cells follows the zero while the tip is pressed, and a second
-contact on a few of them does not. Readings end at 0: a zero that falls below it is not seen here,
-but by the joints' closing (`perception.witnesses`).
+A cell that nothing presses reads its zero, and about it its noise. Under a tip of 20 mm some 60 %
+of a 58 mm grid lies beyond the tip, so these cells show both whatever the tip does, and a second
+contact on a few of them changes no median. Readings end at 0: a zero that falls below it is not
+seen here, but by the joints' closing (`perception.hand_channels`).
 """
 
 from __future__ import annotations
@@ -13,50 +13,56 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from softfinger.kinematics.estimation.estimator import ContactEstimate
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
-_BESIDE = 2.0  # pitches from the footprint's rim, from which on a cell feels nothing of it
+_BESIDE = 2.0  # pitches from the tip's rim, from which on a cell feels nothing of it
 _FEWEST = 50  # cells: below, nothing is said
+_AVERAGED = 8  # frames of which the noise is averaged
 
 
-class ZeroWatch:
-    """Follows one sensor's zero while a grip holds."""
+class UnpressedCells:
+    """Follows one sensor's zero, and its noise."""
 
     def __init__(self, grid: SensorGrid, radius: float, live: NDArray[np.bool_]) -> None:
         """``radius`` [m] of the tip; ``live`` [rows, cols]: cells that work."""
         (pitch_x, pitch_y), (centre_x, centre_y) = grid.pitches, grid.centre
         x = (np.arange(grid.cols) - 0.5 * (grid.cols - 1)) * pitch_x - centre_x
         y = (np.arange(grid.rows) - 0.5 * (grid.rows - 1)) * pitch_y - centre_y
-        distance = np.hypot(*np.meshgrid(x, y)).ravel()
-        cells = np.flatnonzero(live.ravel())
-        self._cells = cells[np.argsort(distance[cells], kind="stable")]  # by their distance …
-        self._distance = distance[self._cells]  # … from the tip's centre [m]
-        self._radius = radius
-        self._margin = _BESIDE * max(grid.pitches) + 3.0 * grid.blur
-        self._reference = math.nan  # of the counts beside the footprint when the grip began to hold
+        distance = np.hypot(*np.meshgrid(x, y))
+        reach = radius + _BESIDE * max(grid.pitches) + 3.0 * grid.blur
+        cells = np.flatnonzero(live & (distance > reach))
+        self._cells = cells if cells.size >= _FEWEST else cells[:0]
+        self._reference: float | None = None  # median of these cells at the tare
+        self._variance: float | None = None
         self.shift = 0  # counts that the zero has risen since the tare
 
-    def forget(self) -> None:
+    @property
+    def noise(self) -> float:
+        """Standard deviation of a cell [counts]; 0 where nothing shows it."""
+        return 0.0 if self._variance is None else math.sqrt(self._variance)
+
+    def forget_zero(self) -> None:
         """The zero is learnt anew."""
         self.shift = 0
-        self._reference = math.nan
+        self._reference = None
 
-    def follow(self, counts: NDArray[np.uint16], contact: ContactEstimate, holding: bool) -> None:
-        """Take in a frame of raw ``counts`` and the last ``contact``; ``holding``: a grip rests."""
-        if not holding:
-            self._reference = math.nan
+    def follow(self, counts: NDArray[np.uint16]) -> None:
+        """Take in a frame of raw ``counts``."""
+        if not self._cells.size:
             return
-        rim = self._radius - contact.d
-        reach = math.sqrt(max(self._radius**2 - rim**2, 0.0)) + self._margin
-        reach += max(rim, 0.0) * math.hypot(contact.tilt_x, contact.tilt_y)
-        beside = self._cells[np.searchsorted(self._distance, reach) :]
-        if beside.size < _FEWEST:
-            return
-        level = float(np.median(counts.ravel()[beside]))
-        if math.isnan(self._reference):
-            self._reference = level - self.shift
+        read = counts.ravel()[self._cells].astype(np.float64)
+        level = float(np.median(read))
+        if self._reference is None:
+            self._reference = level
         self.shift = round(level - self._reference)
+        # What is above the median alone: readings may end below it. A cell that something presses
+        # counts as if it were three deviations off; the counts' own rounding is known to others.
+        above = np.maximum(read - level, 0.0)
+        most = 3.0 * max(self.noise, 1.0) if self._variance is not None else math.inf
+        square = 2.0 * float(np.square(np.minimum(above, most)).mean()) - 1.0 / 12.0
+        square = max(square, 0.0)
+        before = square if self._variance is None else self._variance
+        self._variance = before + (square - before) / _AVERAGED
 
     def corrected(self, counts: NDArray[np.uint16], full: int) -> NDArray[np.uint16]:
         """Return the counts less what the zero has moved by; ``full`` ones stay."""

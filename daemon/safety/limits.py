@@ -20,10 +20,10 @@ from typing import Literal
 import numpy as np
 
 from softfinger.daemon.control.modes import GRIPPING, HELD
-from softfinger.daemon.perception import witnesses
-from softfinger.daemon.perception.contact_filter_kernels import OTHER, GraspState
+from softfinger.daemon.perception import hand_channels as channels
+from softfinger.daemon.perception.grasp import GraspState
+from softfinger.daemon.perception.hand_state import CURRENT_TIME
 from softfinger.daemon.perception.perception import FingerPerception
-from softfinger.daemon.perception.scales import GAIN, GAIN_DOUBTED
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.control_table import VOLTAGE_UNIT, by_name, hardware_error_names
 from softfinger.daemon.types import FINGERS, Contact, Reading, State
@@ -459,22 +459,30 @@ def _tactile_silent(view: View, state: State, _: float, i: int) -> str:
     cure = ""
     if any(each.finger == i and each.sensor.counters().get("port_lost") for each in view.sensors):
         cure = ": its port is gone, and `clear`, or `disarm` and `arm`, opens it again"
-    return _doubt(view, i) or f"tactile: no {what} of the {FINGERS[i]} sensor for {age:.3f} s{cure}"
+    return (
+        _doubt(view, state, i)
+        or f"tactile: no {what} of the {FINGERS[i]} sensor for {age:.3f} s{cure}"
+    )
 
 
-def _doubt(view: View, finger: int) -> str:
+def _doubt(view: View, state: State, finger: int) -> str:
     """Return why a sensor's frames are refused, or an empty text."""
-    side, found = FINGERS[finger], view.grasp.witnesses
-    if found.jumps[finger] > witnesses.JUMPS_MAX:
-        turned, deeper = found.innovation[finger], 1e3 * found.deeper[finger]
+    side, found = FINGERS[finger], view.grasp
+    if found.refused[finger] > channels.JUMPS_MAX:
+        turned, deeper = found.angle_off[finger], 1e3 * found.d_off[finger]
         what = f"the object turned by {math.degrees(abs(turned)):.0f}°"
-        if abs(turned) <= witnesses.JUMP:
+        if abs(turned) <= channels.JUMP:
             what = f"the tip {abs(deeper):.1f} mm {'deeper' if deeper > 0.0 else 'less deep'}"
         return (
             f"{side} sensor shows {what} at once, which neither the joints nor the other tip "
             "explain: its image has moved or is old, or the object ends under it"
         )
-    if off := 1e3 * found.off[finger]:
+    if found.drifted[finger] and view.holds(state):
+        off, turned = 1e3 * found.drift[finger], math.degrees(found.shift[finger])
+        if abs(found.shift[finger]) > channels.OFF_ANGLE:
+            return (
+                f"{side} sensor's image has moved: it shows {turned:+.0f}° that no joint has rolled"
+            )
         return (
             f"{side} sensor feels {abs(off):.1f} mm {'less' if off < 0.0 else 'more'} of the tip's "
             "displacement than its joint's closing and torque say: tare it"
@@ -485,13 +493,14 @@ def _doubt(view: View, finger: int) -> str:
     return ""
 
 
+_GAIN_DOUBTED = 1.5  # prior standard deviations off, a sensor's gain is reported
+
+
 def _gain_doubt(view: View, finger: int) -> str:
     """Say what a sensor reads where its gain is off by more than is usual, or an empty text."""
-    scales = view.grasp.scales
-    at = GAIN + finger
-    off = scales.mean[at] - scales.expected[at]
-    unsure = math.sqrt(scales.covariance[at, at])
-    if not abs(off) - unsure > GAIN_DOUBTED * math.sqrt(scales.prior[at]):
+    grasp = view.grasp
+    off, unsure = grasp.gain_off[finger], grasp.gain_std[finger]
+    if not abs(off) - unsure > _GAIN_DOUBTED * grasp.gain_prior[finger]:
         return ""
     return (
         f"{FINGERS[finger]} sensor reads {math.exp(off):.0%} of what the joints and the other tip "
@@ -506,12 +515,14 @@ def _enter_witnesses(finger: int, side: str) -> None:
         if finger not in view.fingers:
             return ""
         # The cells of a tip that is let go may follow more slowly than their shape says.
-        return _doubt(view, finger) or ("" if state.phase == OTHER else _gain_doubt(view, finger))
+        return _doubt(view, state, finger) or (
+            _gain_doubt(view, finger) if view.holds(state) else ""
+        )
 
     @Limit(f"witness.{side}_current", "a joint's current in a grip, by its goal", "warn",
         (), "servos", in_turn=True)  # fmt: skip
     def _current(view: View, state: State, _: float) -> str:
-        if not view.grasp.witnesses.off_goal[finger] > witnesses.CURRENT_TIME:
+        if not view.grasp.off_goal[finger] > CURRENT_TIME:
             return ""
         return (
             f"{side} joint's current reads {state.reading.current[finger]:.2f} A where its goal is "

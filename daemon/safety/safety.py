@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from softfinger.daemon.control.modes import GRIPPING, Mode
-from softfinger.daemon.perception.contact_filter_kernels import GraspState
+from softfinger.daemon.perception.grasp import GraspState
 from softfinger.daemon.perception.perception import FingerPerception
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.safety.limits import LIMITS, Check, Limit, View

@@ -161,8 +161,6 @@ class ContactEstimator:
         readings: Readings | None = None,
         known: Uncertainty | None = None,
     ) -> None:
-        if not (math.isfinite(noise) and noise > 0.0):
-            raise ValueError(f"noise must be a positive number of Pa, got {noise}")
         if tip.physics == "measured":
             raise ValueError(
                 "a measured tip has no model of its frames: expected a tip of springs or solid; "
@@ -181,7 +179,7 @@ class ContactEstimator:
         state = self.state = EstimatorState()
         self.scratch: tuple[FloatArray, IntArray | None, Any]  # … and what it takes last
         options = self._options = state.options
-        options.noise = noise
+        self.noise = noise
         options.saturation = math.inf
         # Counts are rounded, so the smallest one sent stands for half a count less and up.
         options.floor = max(readings.threshold - 0.5, 0.0)
@@ -258,6 +256,17 @@ class ContactEstimator:
         if reading is not None and not reading > 0.0:
             raise ValueError(f"saturation must be positive, got {reading}")
         self._saturation, self._full = reading, math.nan
+
+    @property
+    def noise(self) -> float:
+        """Standard deviation of a cell [Pa]. Raises ValueError for one that is not positive."""
+        return float(self._options.noise)
+
+    @noise.setter
+    def noise(self, noise: float) -> None:
+        if not (math.isfinite(noise) and noise > 0.0):
+            raise ValueError(f"noise must be a positive number of Pa, got {noise}")
+        self._options.noise = noise
 
     def __call__(self, frame: NDArray[Any], pascal_per_count: float = 1.0) -> ContactEstimate:
         """Estimate from this frame alone: a new result, whatever frames came before.

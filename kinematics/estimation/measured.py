@@ -69,6 +69,8 @@ class MeasuredEstimator:
 
     saturation: float | None = None  # a full cell counts as it reads
 
+    noise = 0.0  # of a cell [Pa]: this one goes by what its tip's curves have measured
+
     def __init__(
         self,
         tip: Fingertip,

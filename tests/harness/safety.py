@@ -5,7 +5,7 @@ from typing import Any, cast
 import numpy as np
 
 from softfinger.daemon.control.modes import Mode
-from softfinger.daemon.perception.contact_filter_kernels import GraspState
+from softfinger.daemon.perception.grasp import GraspState
 from softfinger.daemon.perception.perception import Repeats
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.safety.limits import LIMITS

@@ -32,7 +32,8 @@ from softfinger.daemon.control.modes import COMMANDS, Mode
 from softfinger.daemon.errors import Refused, ServoError
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.loop.publishing import Publishing
-from softfinger.daemon.perception import witnesses
+from softfinger.daemon.perception import hand_channels as channels
+from softfinger.daemon.perception.hand_state import CURRENT_TIME
 from softfinger.daemon.profile.load import checked
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS, GRIP_FRACTION, Frame, Goal, Reading
@@ -660,7 +661,7 @@ class Soak:
     def _judge_witnesses(self, mode: str) -> None:
         if not self._covered():
             self._uncovered_t = self.daemon.loop.state.t
-        for name in self._doubts():
+        for name in self._doubts(mode in _GRIPPING):
             self._names(name)
         if mode not in HONEST:
             return
@@ -669,19 +670,19 @@ class Soak:
         elif not self._false:
             self.must(LOADED if self._loaded else HONEST[mode], True)
 
-    def _doubts(self) -> Iterator[str]:
+    def _doubts(self, held: bool) -> Iterator[str]:
         """What the perception's own state holds for false."""
         perception = self.daemon.loop.perception
-        found = perception.filter.grasp.witnesses
+        found = perception.filter.grasp
         for sensor in perception.fingers:
             side, finger = FINGERS[sensor.finger], sensor.finger
             if (
-                found.jumps[finger] > witnesses.JUMPS_MAX
-                or found.off[finger] != 0.0
+                found.refused[finger] > channels.JUMPS_MAX
+                or (held and found.drifted[finger])
                 or sensor.repeats.long
             ):
                 yield f"{side}_sensor"
-            if found.off_goal[finger] > witnesses.CURRENT_TIME:
+            if found.off_goal[finger] > CURRENT_TIME:
                 yield f"{side}_current"
 
     def _names(self, name: str) -> None:

@@ -118,11 +118,10 @@ def test_each_tips_material_reaches_estimate_table_and_prediction(settings):
             loop.advance(0.01)
         assert loop.state.mode == "holding"
         loop.advance(0.2)
-        scales = loop.perception.filter.grasp.scales
         for model, contact in zip(daemon.models, loop.state.contacts, strict=True):
             assert contact.gain == 1.0
             expected = model.table(contact.d, total_tilt(contact.theta, contact.tilt_y))
-            scale = scales.modulus[model.finger]
+            scale = contact.modulus_scale
             assert scale == pytest.approx(1.0, abs=0.1)
             assert contact.force == pytest.approx(scale * expected.force, rel=1e-9)
             assert contact.energy == pytest.approx(scale * expected.energy, rel=1e-9)

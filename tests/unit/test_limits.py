@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from softfinger.daemon.control.modes import Mode
-from softfinger.daemon.perception.contact_filter_kernels import HOLDING, GraspState
-from softfinger.daemon.perception.scales import GAIN, UNKNOWN, set_prior
+from softfinger.daemon.perception.grasp import GraspState
 from softfinger.daemon.profile.settings import SafetySettings as Limits
 from softfinger.daemon.safety.limits import LIMITS, View
 from softfinger.daemon.types import State
@@ -220,21 +219,18 @@ def test_a_warning_at_its_limit_does_not_flicker():
 
 def test_each_witness_that_is_doubted_is_named():
     grasp = GraspState()
-    set_prior(grasp.scales, (UNKNOWN, UNKNOWN), 0.05, 0.01, 0.0)
-    judge, state = safety(grasp=grasp), sound()
-    judged(judge, state, 0.5)
-    assert judge.warnings == []
-    grasp.scales.mean[GAIN + 1] = math.log(0.5)
-    grasp.scales.covariance[GAIN + 1, GAIN + 1] = 0.1**2
+    grasp.gain_prior[:] = 0.25
+    judge, state = safety(grasp=grasp), sound(Mode.RELEASING)
+    grasp.gain_off[1], grasp.gain_std[1] = math.log(0.5), 0.1
     judged(judge, state, 0.5)
     assert judge.warnings == [], "cells follow more slowly than a tip is let go"
-    state.phase = HOLDING
-    grasp.scales.covariance[GAIN + 1, GAIN + 1] = 0.4**2
+    state = sound()
+    grasp.gain_std[1] = 0.4
     judged(judge, state, 0.5)
     assert judge.warnings == [], "that is not known well"
-    grasp.scales.covariance[GAIN + 1, GAIN + 1] = 0.1**2
-    grasp.witnesses.jumps[0], grasp.witnesses.innovation[0] = 3.0, -0.2
-    grasp.witnesses.off_goal[1] = 0.2
+    grasp.gain_std[1] = 0.1
+    grasp.refused[0], grasp.angle_off[0] = 3.0, -0.2
+    grasp.off_goal[1] = 0.2
     state.reading.current[1], state.goal.current[1] = 0.1, 0.2
     judged(judge, state, 0.5)
     told = {warning.name: warning.text for warning in judge.warnings}

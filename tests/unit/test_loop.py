@@ -53,7 +53,7 @@ def test_grasp_reaches_10_n_within_3_s_and_holds_it_10_s(make, profile):
         for finger, contact in enumerate(state.contacts):
             assert daemon.hand.force[finger] == pytest.approx(10.0, rel=0.06)
             assert contact.force == pytest.approx(10.0, rel=0.03)
-            assert abs(contact.force - daemon.hand.force[finger]) < 2.0 * contact.force_std < 1.5
+            assert abs(contact.force - daemon.hand.force[finger]) < 2.0 * contact.force_std < 2.5
 
 
 def test_move_goes_where_it_is_told_within_the_limits(make):

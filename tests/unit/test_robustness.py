@@ -5,8 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from softfinger.daemon.perception.zero import ZeroWatch
-from softfinger.kinematics.estimation.estimator import ContactEstimate
+from softfinger.daemon.perception.zero import UnpressedCells
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from softfinger.tools.benchmarks.robustness import ROWS, HandCase, drawn, grip
 from softfinger.tools.benchmarks.virtual_grip import VirtualGrip
@@ -75,7 +74,7 @@ def test_the_approach_shows_the_joints_friction(friction, stiction):
         grip.command("grasp", force=6.0)
         assert grip.until("holding", 4.0)
         # Of the stiction as much as is left while the joint begins to move, and its damping.
-        shown = grip.contact_filter.grasp.free_torque
+        shown = grip.estimator.grasp.free_torque
         assert (shown > friction + 0.5 * stiction).all()
         assert (shown < friction + stiction + 0.025).all()
 
@@ -95,51 +94,48 @@ def frames(zero: float, cells: int = 32, pressed: int = 200) -> np.ndarray:
     return np.where(inside, pressed + zero, zero).astype(np.uint16)
 
 
-def zero_watch(side: float = 0.058) -> tuple[ZeroWatch, ContactEstimate]:
+def unpressed(side: float = 0.058) -> UnpressedCells:
     grid = SensorGrid(32, 32, side / 32)
-    contact = ContactEstimate()
-    contact.d, contact.contact = 3e-3, True
-    return ZeroWatch(grid, 0.02, np.ones(grid.shape, np.bool_)), contact
+    return UnpressedCells(grid, 0.02, np.ones(grid.shape, np.bool_))
 
 
 def test_a_zero_that_rises_is_taken_off_and_full_cells_stay_full():
-    watch, contact = zero_watch()
+    cells = unpressed()
     for zero in (3, 4, 9):
-        watch.follow(frames(zero), contact, holding=True)
-    assert watch.shift == 6
+        cells.follow(frames(zero))
+    assert cells.shift == 6
     counts = frames(9)
     counts[16, 16] = 255
-    corrected = watch.corrected(counts, 255)
+    corrected = cells.corrected(counts, 255)
     assert corrected[16, 16] == 255
     assert corrected[0, 0] == 3
     assert corrected[16, 14] == 203
-    watch.forget()
-    assert watch.corrected(counts, 255) is counts
+    cells.forget_zero()
+    assert cells.corrected(counts, 255) is counts
 
 
-def test_a_zero_is_followed_only_while_a_grip_rests_and_goes_on_from_there():
-    watch, contact = zero_watch()
-    watch.follow(frames(3), contact, holding=True)
-    watch.follow(frames(8), contact, holding=True)
-    watch.follow(frames(20), contact, holding=False)
-    assert watch.shift == 5
-    watch.follow(frames(20), contact, holding=True)  # that may be the grip's own crosstalk
-    assert watch.shift == 5
-    watch.follow(frames(22), contact, holding=True)
-    assert watch.shift == 7
-
-
-def test_a_second_contact_beside_the_footprint_is_no_zero():
-    watch, contact = zero_watch()
-    watch.follow(frames(3), contact, holding=True)
+def test_a_second_contact_beside_the_tip_is_no_zero():
+    cells = unpressed()
+    cells.follow(frames(3))
     touched = frames(3)
     touched[:, :6] = 100
-    watch.follow(touched, contact, holding=True)
-    assert watch.shift == 0
+    cells.follow(touched)
+    assert cells.shift == 0
 
 
-def test_a_sensor_that_the_footprint_fills_tells_nothing():
-    watch, contact = zero_watch(side=0.018)
+def test_a_sensor_that_the_tip_fills_tells_nothing():
+    cells = unpressed(side=0.018)
     for zero in (3, 9):
-        watch.follow(frames(zero), contact, holding=True)
-    assert watch.shift == 0
+        cells.follow(frames(zero))
+    assert cells.shift == 0
+    assert cells.noise == 0.0
+
+
+@pytest.mark.parametrize("zero", [0, 40])
+@pytest.mark.parametrize("sigma", [1.0, 3.0, 12.0])
+def test_the_noise_is_that_of_cells_which_nothing_presses(zero, sigma):
+    cells, rng = unpressed(), np.random.default_rng(1)
+    for _ in range(40):
+        noisy = frames(zero) + rng.normal(0.0, sigma, (32, 32))
+        cells.follow(np.clip(np.rint(noisy), 0, 255).astype(np.uint16))
+    assert cells.noise == pytest.approx(sigma, rel=0.25)

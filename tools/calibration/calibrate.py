@@ -153,10 +153,10 @@ def _frames(text: str) -> int:
 def calibrate_scales(arguments: argparse.Namespace, settings: Settings) -> str:
     """Write a finger's scales into its file and return the line to print.
 
-    Sensor gains change when a sensor is mounted again, and a tip's modulus may be known from
-    nothing but its rubber's name: grips tell both (`daemon.perception.scales`), and a daemon that
-    begins with them grips right the first time. Raises CalibrationError where no grip has told of
-    them, NoStream without a daemon, and CalibrationFileError.
+    A sensor's gain changes when the sensor is mounted again, and a tip's modulus may be known only
+    by the name of its rubber. A grip shows both (`daemon.perception.hand_channels`), and a daemon
+    that starts with them reaches the right force in its first grip. Raises CalibrationError if no
+    grip has shown them, NoStream without a daemon, and CalibrationFileError.
     """
     from softfinger.daemon.perception.calibration_file import ScalesStep, now, save_calibration
     from softfinger.kinematics.calibration.calibration import CalibrationError

@@ -1,12 +1,9 @@
-"""Contacts between the tactile frames: a Kalman filter, predicted by joints, updated by frames.
+"""The hand's state between the tactile frames: predicted by joints, corrected by channels.
 
 A frame is exact but late and rare; joints are fresh but coarse. While an object is held, joint
 motion carries d and the object's angle φ on by the rolling constraints (`hand.grasp_state`). A
-frame is compared with the prediction for the instant at which it was sampled, and this innovation,
-weighed by both variances, updates the present.
-
-An encoder reads whole counts: the tracked angle runs on with the measured velocity and is held
-inside the count that was read, so that it is exact at each count's edge.
+frame is compared with the prediction for the instant at which it was sampled. `hand_state` has the
+state and its prediction, `hand_channels` what corrects it.
 
 φ is the angle of the bisector of the object's faces; how much these lean towards each other, the
 taper α, is found from the frames of both tips, beginning with ``object.taper``. So each tip's θ is
@@ -29,18 +26,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softfinger.daemon.perception import contact_filter_kernels as kernels
-from softfinger.daemon.perception.contact_filter_kernels import FilterState, Past
-from softfinger.daemon.perception.scales import (
-    GAIN,
-    MODULUS,
-    TORQUE,
-    UNKNOWN,
-    Prior,
-    Scales,
-    end_touch,
-    set_prior,
-)
+from softfinger.daemon.perception import hand_channels as channels
+from softfinger.daemon.perception import hand_state as states
+from softfinger.daemon.perception.hand_state import HISTORY, LAW_POINTS, HandFilter, Past
+from softfinger.daemon.perception.known import UNKNOWN, Prior
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.control_table import COUNTS_PER_TURN, VELOCITY_UNIT
 from softfinger.daemon.types import FINGERS, Contact, Frame, Goal, ObjectPose, Reading
@@ -53,11 +42,14 @@ from softfinger.kinematics.hand.grasp_state import total_tilt
 
 FloatArray = NDArray[np.float64]
 
+_TAPER_ERROR = 0.1  # rad that `object.taper` may be off
+_LATENCY_ERROR = 0.03  # s that `tactile.latency` may
+_FRICTION_ERROR = 0.05  # N·m that `control.joint_friction` may
 _FAR = 0.25  # rad off its goal, a grip's joint takes all the current that it may
 
 
-class ContactFilter:
-    """The filter of one hand. Costs nothing but a comparison while no tip is touched."""
+class HandEstimator:
+    """The estimator of one hand. Costs nothing but a comparison while no tip is touched."""
 
     def __init__(
         self,
@@ -72,46 +64,61 @@ class ContactFilter:
         self._with_object = settings.scene.object_model
         self._age_max = settings.safety.frame_age_fault * (1.0 / settings.tactile.rate)
         self._tables = tables[0].data, tables[1].data
-        self._state = state = FilterState()
+        self._state = state = HandFilter()
         state.half_separation = 0.5 * hand.pivot_separation
         state.length = hand.finger_length
         state.offset = hand.finger_offset
         state.radius = settings.tip.radius
         state.count = 2.0 * math.pi / (COUNTS_PER_TURN * gear)
-        state.slow = 0.5 * VELOCITY_UNIT / gear
+        state.velocity_unit = VELOCITY_UNIT / gear
+        state.latency = settings.tactile.latency
         state.response = settings.tactile.response
         state.relaxation[:] = settings.tip.relaxation
         state.relaxation_time[:] = settings.tip.relaxation_times
-        state.torque_constant = settings.control.torque_constant / settings.control.driving
-        state.taper = state.assumed_taper = settings.object.taper
+        control = settings.control
+        state.torque_constant = control.torque_constant / control.driving
+        state.inertia = control.joint_inertia
+        state.held = control.load_held
         state.alone = len(self._fingers) == 1
         state.gain_known = settings.estimator.free_gain is False
         state.t = -math.inf
-        ratios = np.linspace(1e-3, 1.0, kernels.LAW_POINTS)
+        ratios = np.linspace(1e-3, 1.0, LAW_POINTS)
         for finger, table in enumerate(tables):
             law = 0.0 if materials is None else materials[finger].force_error(ratios)
             state.tip[finger].law[:] = np.hypot(law, table.max_error)
             state.tip[finger].firmness = 1.0 + sum(settings.tip.relaxation)
-        control = settings.control
-        set_prior(
-            state.grasp.scales,
-            priors,
-            control.joint_friction,
-            control.joint_inertia,
-            control.load_held,
-        )
         self._priors = priors
-        self._history: Any = np.zeros(
-            round(kernels.HISTORY * settings.loop.rate) + 2, dtype=Past.dtype
-        )
+        self._history: Any = np.zeros(round(HISTORY * settings.loop.rate) + 2, dtype=Past.dtype)
         self._history["t"] = -math.inf
         self._history["firmness"] = 1.0 + sum(settings.tip.relaxation)
         self.grasp = state.grasp
+        self._set_prior(settings, priors)
         self.grasp.turning = 0.5 * sum(_turning(table, state.radius) for table in tables)
         self._read = False  # the joints are known
         self._in_contact = [False, False]  # tips that touch and are carried on by the joints
-        self._news = True  # the scales may have changed
         self._invalid = [Invalid.NO_FRAME] * 2  # why the newest frame's estimate can't be used
+
+    def _set_prior(self, settings: Settings, priors: tuple[Prior, Prior]) -> None:
+        """Write what is known before anything touches, and begin with it."""
+        state = self._state
+        for finger, prior in enumerate(priors):
+            for at, (mean, error) in (
+                (states.MODULUS, (math.log(prior.modulus[0]), prior.modulus[1])),
+                (states.GAIN, (math.log(prior.gain[0]), prior.gain[1])),
+                (states.TORQUE, (prior.torque[0] - 1.0, prior.torque[1])),
+                (states.ENCODER, (0.0, state.count / math.sqrt(12.0))),
+            ):
+                state.expected[at + finger], state.prior[at + finger] = mean, error**2
+            self.grasp.gain_prior[finger] = prior.gain[1]
+        for at, mean, error in (
+            (states.ANGLE, 0.0, 1.0),
+            (states.TAPER, settings.object.taper, _TAPER_ERROR),
+            (states.LATENCY, 0.0, _LATENCY_ERROR),
+            (states.FRICTION, settings.control.joint_friction, _FRICTION_ERROR),
+        ):
+            state.expected[at], state.prior[at] = mean, error**2
+        state.mean[:] = state.expected
+        state.covariance[:] = np.diag(state.prior)
 
     def predict(self, reading: Reading, goal: Goal | None = None) -> None:
         """Predict the estimates at the instant of a good reading.
@@ -122,7 +129,7 @@ class ContactFilter:
         q1, q2 = reading.q
         dq1, dq2 = reading.dq
         current1, current2 = reading.current
-        kernels.predict(
+        states.predict(
             self._state.array,
             self._history,
             reading.t,
@@ -156,7 +163,7 @@ class ContactFilter:
         if in_contact and self._in_contact[finger] and not changes:
             contact.t_valid = frame.t_arrival
             return
-        if in_contact and not kernels.update(
+        if in_contact and not channels.update(
             self._state.array,
             self._history,
             finger,
@@ -174,8 +181,7 @@ class ContactFilter:
         ):
             self._invalid[finger] = Invalid.JOINTS
             return
-        self._touch(finger, in_contact)
-        self._news = True
+        self._in_contact[finger] = in_contact
         contact.t_valid = frame.t_arrival
         contact.contact, contact.gain = estimate.contact, estimate.gain
         contact.tilt_y, contact.misfit = estimate.tilt_y, estimate.misfit
@@ -185,7 +191,8 @@ class ContactFilter:
             if tip.in_contact:
                 self.grasp.free_torque[finger] = 0.0  # the next approach shows it anew
                 tip.efforts[:] = 0.0
-            tip.in_contact, tip.d.mean = False, 0.0
+            tip.in_contact = False
+            self._state.mean[states.D + finger] = 0.0
             _fill_from_frame(
                 contact,
                 estimate,
@@ -195,32 +202,18 @@ class ContactFilter:
                 self._state.radius,
             )
 
-    def _touch(self, finger: int, in_contact: bool) -> None:
-        """Note whether a finger's tip touches; what scales learn of a touch may end with it."""
-        touching = any(self._in_contact)
-        self._in_contact[finger] = in_contact
-        if touching and not any(self._in_contact):
-            end_touch(self.grasp.scales)
-
-    def write_contacts(
-        self, t: float, contacts: list[Contact], pose: ObjectPose, phase: int = kernels.OTHER
-    ) -> None:
-        """Write the estimates of time ``t`` into contacts and pose.
-
-        By the ``phase`` of a grip torques are taken for what they tell.
-        """
+    def write_contacts(self, t: float, contacts: list[Contact], pose: ObjectPose) -> None:
+        """Write the estimates of time ``t`` into contacts and pose."""
         in_contact = self._in_contact
         pose.valid = in_contact[0] and in_contact[1] and self._with_object
         pose.angle = pose.width = 0.0
         if in_contact[0] or in_contact[1]:
-            left, right, angle, width = kernels.write_grasp(self._state.array, *self._tables, phase)
+            left, right, angle, width = channels.write_grasp(self._state.array, *self._tables)
             tips = left, right
             if pose.valid:
                 pose.angle, pose.width = angle, width
-        if self._news:
-            self._news = False
-            for finger in self._fingers:
-                _write_scales(contacts[finger], self.grasp.scales, finger)
+        for finger in self._fingers:
+            self._write_scales(contacts[finger], finger)
         oldest = t - self._age_max
         for finger in self._fingers:
             contact = contacts[finger]
@@ -239,23 +232,21 @@ class ContactFilter:
             if not contact.t_valid >= oldest:
                 contact.invalid, pose.valid = contact.invalid or Invalid.STALE, False
 
+    def _write_scales(self, contact: Contact, finger: int) -> None:
+        state, grasp = self._state, self.grasp
+        at = states.MODULUS + finger
+        contact.modulus_scale = modulus = math.exp(state.mean.item(at))
+        contact.modulus_scale_std = modulus * math.sqrt(max(state.covariance.item(at, at), 0.0))
+        contact.sensor_gain = gain = math.exp(state.mean.item(states.GAIN + finger))
+        contact.sensor_gain_std = gain * grasp.gain_std.item(finger)
+        at = states.TORQUE + finger
+        contact.torque_scale = 1.0 + state.mean.item(at)
+        contact.torque_scale_std = math.sqrt(max(state.covariance.item(at, at), 0.0))
+
 
 def _commanded_current(goal: Goal, finger: int, q: float) -> float:
     """The current [A] of a goal that is so far from ``q`` that nothing but its bound counts."""
     return goal.current[finger] if goal.q[finger] - q > _FAR else 0.0
-
-
-def _write_scales(contact: Contact, scales: Scales, finger: int) -> None:
-    mean, covariance = scales.mean, scales.covariance
-    at = MODULUS + finger
-    contact.modulus_scale = modulus = math.exp(mean.item(at))
-    contact.modulus_scale_std = modulus * math.sqrt(covariance.item(at, at))
-    at = GAIN + finger
-    contact.sensor_gain = gain = math.exp(mean.item(at))
-    contact.sensor_gain_std = gain * math.sqrt(covariance.item(at, at))
-    at = TORQUE + finger
-    contact.torque_scale = 1.0 + mean.item(at)
-    contact.torque_scale_std = math.sqrt(covariance.item(at, at))
 
 
 def _turning(table: ContactTable, radius: float) -> float:
@@ -293,7 +284,7 @@ def _fill_from_frame(
         along = contact.theta / tilt if tilt > 0.0 else 0.0
         across = contact.tilt_y / tilt if tilt > 0.0 else 0.0
         slopes = modulus * np.array([by_d, by_tilt * along, by_tilt * across])
-        law_error = np.interp(contact.d / radius, np.linspace(0.0, 1.0, kernels.LAW_POINTS), law)
+        law_error = np.interp(contact.d / radius, np.linspace(0.0, 1.0, LAW_POINTS), law)
         relative = law_error**2 + stiff * gain / (stiff + gain)
         variance = slopes @ estimate.covariance[:3, :3] @ slopes + relative * contact.force**2
         contact.force_std = math.sqrt(variance)
