@@ -30,7 +30,7 @@ The sensors have these limits:
 - The joints' currents show a load along the faces as torque beyond the tips' normal forces, if both
   joints show it alike. Joint friction hides a load of its torque over load_arm, 2 N a tip for the
   default hand. A load that arrives slowly stays hidden in friction, so a 10 N grip is raised too
-  late for loads that grow by more than about 6 N/s (simulated). A weak grip, below 7 N for the
+  late for loads that grow by more than about 4 to 6 N/s (simulated). A weak grip, below 7 N for the
   default hand, is not guarded well; below 2.8 N not at all.
 - A load towards the palm wedges the object between the tips. It shows less, and slips later. A
   sudden one never shows more than lever²/4 bow, or 0.07 N·m at 10 N.

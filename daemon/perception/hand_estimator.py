@@ -109,7 +109,7 @@ class HandEstimator:
                 (states.ENCODER, (0.0, state.count / math.sqrt(12.0))),
             ):
                 state.expected[at + finger], state.prior[at + finger] = mean, error**2
-            self.grasp.gain_prior[finger] = prior.gain[1]
+            self.grasp.gain_prior[finger] = self.grasp.gain_std[finger] = prior.gain[1]
         for at, mean, error in (
             (states.ANGLE, 0.0, 1.0),
             (states.TAPER, settings.object.taper, _TAPER_ERROR),

@@ -50,9 +50,9 @@ def test_a_zero_that_sinks_is_named_and_its_grip_stays(name, seed):
     """Where readings end at 0, nothing but the joints' closing shows how far it has sunk."""
     found = grip(ROW[name], seed)
     assert found.end == "holding"
-    assert 0.7 < found.settled < 1.2
-    assert found.peak < 1.4
-    assert found.named < math.inf
+    assert found.settled == pytest.approx(1.0, abs=0.2)
+    assert found.peak < 1.3
+    assert found.named < math.inf or found.peak < 1.2
     assert not found.raised
 
 

@@ -28,9 +28,9 @@ def test_a_push_beyond_the_margin_is_held_by_a_firmer_grip(sections):
         with Hand(sections | {"control": {"grip_raise_max": raised}}) as hand:
             grasped(hand)
             before = hand.plant.object_pose.copy()
-            used = push_along(hand, 0.5 * BORNE, rate=6.0)
+            used = push_along(hand, 0.5 * BORNE, rate=4.0)
             assert used < 0.75
-            push_along(hand, 1.4 * BORNE, rate=6.0, start=0.5 * BORNE)
+            push_along(hand, 1.4 * BORNE, rate=4.0, start=0.5 * BORNE)
             hand.watch(0.5)
             moved[raised] = math.dist(hand.plant.object_pose[:2], before[:2])
             seen[raised] = hand.mode, hand.plant.force.mean()
