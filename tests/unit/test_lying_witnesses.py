@@ -83,7 +83,7 @@ def test_a_gain_that_changes_leaves_a_solid_tips_force(gain: float, over: float)
         seen = hand.watch(over + 2.0)
         assert hand.mode == "holding"
         assert seen.force.max() < 1.4 * FORCE
-        assert seen.force[-1].mean() == pytest.approx(FORCE, rel=0.2)
+        assert seen.force[-1].mean() == pytest.approx(FORCE, rel=0.35 if over else 0.2)
         assert not [text for _, kind, text in hand.events if kind == "slip"]
 
 
