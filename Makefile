@@ -32,7 +32,7 @@ LOWEST_TESTS := tests/process/test_servo_checks.py $(addprefix tests/unit/test_,
 NEWEST_TESTS := tests/unit/test_stream.py tests/process/test_client.py
 # The tests that compare what BLAS, NumPy's loops and compiled kernels compute: no processes, no
 # pictures, and of the whole hand's work hardly more than the recorded one.
-NUMERICAL := blur calibrate calibrated_hand calibration contact_filter error_budget estimator \
+NUMERICAL := blur calibrate calibrated_hand calibration hand_estimator error_budget estimator \
 	estimator_bad_frames estimator_kernels figure_runs grasp_state hand material measured \
 	measurement_faults plant plant_agreement plant_shapes press_fit pressure_grid quadrature \
 	sensor_effects simulated_backends solid solid_tip_data table view_pictures
