@@ -95,6 +95,7 @@ class HandEstimator:
         self._set_prior(settings, priors)
         self.grasp.turning = 0.5 * sum(_turning(table, state.radius) for table in tables)
         self._read = False  # the joints are known
+        self._has_news = True  # a frame has come since the calibration factors were written
         self._in_contact = [False, False]  # tips that touch and are carried on by the joints
         self._invalid = [Invalid.NO_FRAME] * 2  # why the newest frame's estimate can't be used
 
@@ -182,6 +183,7 @@ class HandEstimator:
             self._invalid[finger] = Invalid.JOINTS
             return
         self._in_contact[finger] = in_contact
+        self._has_news = True
         contact.t_valid = frame.t_arrival
         contact.contact, contact.gain = estimate.contact, estimate.gain
         contact.tilt_y, contact.misfit = estimate.tilt_y, estimate.misfit
@@ -212,8 +214,10 @@ class HandEstimator:
             tips = left, right
             if pose.valid:
                 pose.angle, pose.width = angle, width
-        for finger in self._fingers:
-            self._write_scales(contacts[finger], finger)
+        if self._has_news:
+            self._has_news = False
+            for finger in self._fingers:
+                self._write_scales(contacts[finger], finger)
         oldest = t - self._age_max
         for finger in self._fingers:
             contact = contacts[finger]
