@@ -10,7 +10,7 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS, Goal, State
 
 # rad from the present angle to the goal of a joint that is to give a torque: far enough that the
-# servo's current bound decides (`perception.estimator` expects 0.25 rad), and less than
+# servo's current bound decides (`hand_estimator` expects 0.25 rad), and less than
 # `safety.goal_reach`, so that the goal may change sides at once.
 _GOAL_OFFSET = 0.35
 # rad between the tilt that a turn may lead to and the tilt that is a fault.

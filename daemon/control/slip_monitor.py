@@ -17,7 +17,8 @@ With the names of `SlipLaw`, `SlipState` and `GraspState`, at each tick:
 holding begins, because an error of the modulus or the torque constant is the largest part of that.
 It then follows r within a second, and it follows the commanded torque while the joints stand still:
 torque that the force law adds to a joint that sticks is carried by friction. It stays within
-s.friction of its start; rubber that relaxes may lower it by a further _RELAXES of the tip's moment.
+s.friction of `base`, the part of its start that exceeds friction; rubber that relaxes may lower it
+by a further _RELAXES of the tip's moment.
 
 `s.moved` is true once the object has turned, both joints have given way at once, or |L| exceeds
 twice what friction can hide. `needed` stays for _HOLD_TIME and then falls by raise_max in _BACK. A

@@ -372,8 +372,8 @@ def _refuses(
 def _steepness(h: HandFilter, finger: int) -> float:
     """Return ∂ ln F/∂d [1/m] of a tip.
 
-    Where frames show but a product, at the d that they show: at the estimate, each channel's slope
-    would be that of another d, and what none of them tells would seem to be told.
+    If frames show only a product of force and gain, this is the slope that the footprint uses too,
+    low-pass filtered: different slopes would make unobservable directions look observed.
     """
     tip = h.tip[finger]
     if tip.product:

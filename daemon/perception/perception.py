@@ -1,6 +1,6 @@
 """Perception of each finger: its newest frame calibrated and estimated, then filtered.
 
-`FingerPerception` estimates each frame once; `perception.estimator` carries the estimates on
+`FingerPerception` estimates each frame once; `hand_estimator` carries the estimates on
 to the contacts of every tick.
 """
 
