@@ -127,7 +127,7 @@ class Grip:
         """Return the force [N] that the load needs with its margin, what may be hidden included."""
         law, grasp = self.slip.law, self._grasp
         load = self.slip.guarded
-        if not law.shear_shows and law.object_load == 0.0:  # nothing says that there is none
+        if not law.has_shear and law.object_load == 0.0:  # nothing says that there is none
             load = max(load, law.joint_friction / max(grasp.load_arm, 0.5 * law.width))
         spare = law.friction * (1.0 - law.margin) - grasp.shear
         return max(load / max(spare, 0.3 * law.friction), self.slip.needed)

@@ -89,7 +89,7 @@ def start(
     """Take over from the approach with ``felt`` N on the tips."""
     g = grips[0]
     q = grasps[0].q
-    slip_monitor.forget(g.slip)
+    slip_monitor.reset(g.slip)
     setpoint.reset(g.force, force_windows, felt)
     g.integral = g.shift = g.closing_friction = g.dither_elapsed = 0.0
     g.offset = 0.5 * (q[0] - q[1])
@@ -128,7 +128,6 @@ def grip_torques(
         g.closing_friction,
         dq,
         g.torque,
-        grasp.doubted,
     )
     if g.slip.reflex and g.force.target > g.force.value:
         setpoint.reset(g.force, force_windows, g.force.target)
@@ -325,7 +324,7 @@ def _equal_torques(
         lengths = (law.half_separation, law.length, law.offset, law.radius)
         depth = mean(grasp.d)
         spring = min(
-            upright_spring(closed, depth, target, grasp.turning, lengths), g.joint_stiffness
+            upright_spring(closed, depth, target, grasp.tip_turning, lengths), g.joint_stiffness
         )
         # What then holds the fingers begins with the torque that the spring has come to.
         g.offset = antisymmetric * (1.0 - spring / g.joint_stiffness)

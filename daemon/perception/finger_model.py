@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.perception.calibration_file import Calibration, Converter, calibration_for
-from softfinger.daemon.perception.known import CALIBRATED_ERROR, MODULUS_ERROR, UNKNOWN, Prior
+from softfinger.daemon.perception.prior import CALIBRATED_ERROR, MODULUS_ERROR, UNKNOWN, Prior
 from softfinger.daemon.profile.factory import (
     law_problem,
     make_grid,
@@ -39,7 +39,7 @@ class FingerModel:
     table: ContactTable
     grid: SensorGrid
     calibration: Calibration | None = None
-    scales: Prior = UNKNOWN
+    prior: Prior = UNKNOWN
 
     @property
     def own_material(self) -> bool:
@@ -79,8 +79,8 @@ def make_models(
                 common = law, make_table(settings, law)
             material, table = common
         grid = calibrated_grid(settings, finger, calibration)
-        scales = _known_scales(settings, calibration)
-        made[finger] = FingerModel(finger, material, table, grid, calibration, scales)
+        prior = _prior(settings, calibration)
+        made[finger] = FingerModel(finger, material, table, grid, calibration, prior)
         if calibration is not None and on_event is not None:
             on_event("info", "calibration", f"{name}: {calibration.summary()}")
         if material.misfits is not None and on_event is not None:
@@ -93,11 +93,11 @@ def make_models(
     return left, right
 
 
-def _known_scales(settings: Settings, calibration: Calibration | None) -> Prior:
-    """Return what is known of a finger's scales: by earlier grips, or else by the settings."""
+def _prior(settings: Settings, calibration: Calibration | None) -> Prior:
+    """Return the prior of a finger: from `calibrate scales`, otherwise from the settings."""
     if calibration is not None and calibration.scales is not None:
         found = calibration.scales
-        # A gain changes again, by warmth or with the next load, however well a grip showed it.
+        # A gain changes with temperature and load, so its calibration does not make it certain.
         gain = found.gain[0], max(found.gain[1], settings.tactile.gain_error)
         return Prior(found.modulus, gain, found.torque)
     error = settings.material.modulus_error or MODULUS_ERROR

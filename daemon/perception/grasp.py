@@ -1,45 +1,73 @@
-"""The held object at this tick, as perception tells control and safety of it."""
+"""The held object in this tick: the result of perception that control and safety read."""
 
 from __future__ import annotations
 
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+
 from softfinger.kinematics.compiled.layout import Pair, Record
+
+CHANNELS = (
+    "angle, left",
+    "angle, right",
+    "footprint, left",
+    "footprint, right",
+    "amplitude, left",
+    "amplitude, right",
+    "encoder, left",
+    "encoder, right",
+    "torque",
+    "balance",
+)
 
 
 class GraspState(Record):
-    """Response of the held object to the joints at this tick, and what speaks against a channel."""
+    """Forces and lever arms of the held object, and the consistency of each channel.
+
+    Pairs are (left, right). SI units.
+    """
 
     t: float  # when the joints were read [s]
-    d: Pair  # displacements [m]
-    force: Pair  # of the tips, their moduli's scale times their tables' [N]
-    angle_std: float  # standard deviation of the object's angle [rad]
-    taper: float  # α between the object's faces, as both tips feel them [rad]
-    unexplained_rotation: Pair  # of the object, by no joint, summed, as each tip shows it [rad]
-    turning: float  # ∂U/∂θ over F θ d of the tips, upright: set once
     q: Pair  # joint angles [rad]
-    moment_arm: Pair  # ∂(d1 + d2)/∂q [m]
-    jacobian_rotation: Pair  # r of φ̇ = r1 q̇1 − r2 q̇2
-    jacobian_slide: float  # ∂(d1 + d2)/∂φ [m/rad]
-    energy_arm: Pair  # torque over force by the energy [m]
+    d: Pair  # displacements of the tips [m]
+    force: Pair  # elastic forces of the tips [N]
     stiffness: Pair  # ∂F/∂d [N/m]
     normal: Pair  # normal forces [N]
-    shear: float  # shear over normal force, by the object's balance, unloaded
-    sheared: float  # along the faces, as solid tips' newest frames show it [N]
-    twisted: float  # likewise, of a twist: alike on both faces [N]
-    torque_residual: Pair  # what only a load along the faces explains of the joints' torques [N·m]
-    torque_std: float  # of the joints' mean torque, by what is not known of the tips' forces [N·m]
-    load_arm: float  # a load L makes them arm L + curvature L²; 0: none shows [m]
+    shear: float  # shear force over normal force in the balance without a load
+    angle_std: float  # standard deviation of the object's angle [rad]
+    taper: float  # angle α between the object's faces [rad]
+    tip_turning: float  # ∂U/∂θ over F θ d of an upright tip; constant
+
+    # Lever arms
+    moment_arm: Pair  # ∂(d1 + d2)/∂q [m]
+    jacobian_rotation: Pair  # r1, r2 of φ̇ = r1 q̇1 − r2 q̇2
+    jacobian_slide: float  # ∂(d1 + d2)/∂φ [m/rad]
+    energy_arm: Pair  # joint torque over force, by the gradient of the energy [m]
+
+    # Load along the faces: it causes the mean residual load_arm L + load_curvature L².
+    torque_residual: Pair  # joint torque that only a load along the faces explains [N·m]
+    torque_std: float  # uncertainty of the mean residual by the tips' forces [N·m]
+    load_arm: float  # [m]; 0: the torques show no load
     load_curvature: float  # [m/N]
-    free_torque: Pair  # the most that each joint took on its way to the touch: friction's bound
-    refused: Pair  # frames in a row that were not believed
-    angle_off: Pair  # of the newest frame's angle from what was expected [rad]
-    d_off: Pair  # likewise, of its d [m]
-    drift: Pair  # d that frames show beyond the tips' [m] …
-    drift_std: Pair  # … and its standard deviation
-    shift: Pair  # likewise of the angle [rad]
-    shift_std: Pair
-    gain_off: Pair  # logarithm of the sensors' gains over what was known of them before …
-    gain_std: Pair  # … its standard deviation, and that of what was known
-    gain_prior: Pair
-    drifted: Pair  # 1 where one of the two is more than the sensor's frames may be off
-    off_goal: Pair  # for how long a joint's current has not been its goal's [s]
-    doubted: bool  # a channel is named as false
+    pull_shear: float  # shear of a pull in the newest frames of solid tips [N]
+    twist_shear: float  # shear of a twist, likewise [N]
+    free_torque: Pair  # largest torque of each joint in the free approach [N·m]
+    unexplained_rotation: Pair  # rotation of the object that no joint caused, summed [rad]
+
+    # Consistency
+    nis: Annotated[NDArray[np.float64], len(CHANNELS)]  # averaged, 1 is expected
+    angle_innovation: Pair  # of the newest frame's angle [rad]
+    d_innovation: Pair  # of the newest frame's displacement [m]
+    rejected_count: Pair  # frames rejected in a row
+    d_bias: Pair  # [m]
+    d_bias_std: Pair
+    angle_bias: Pair  # [rad]
+    angle_bias_std: Pair
+    has_bias: Pair  # 1 if one of the biases of a sensor is significant
+    gain_change: Pair  # logarithm of the gain over its prior
+    gain_std: Pair
+    gain_prior_std: Pair
+    current_off_time: Pair  # for how long a joint's current has differed from its goal [s]
+    sensor_fault: bool  # one of the channels is faulty: no reason to increase the force

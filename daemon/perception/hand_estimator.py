@@ -1,21 +1,21 @@
-"""The hand's state between the tactile frames: predicted by joints, corrected by channels.
+"""The estimator of the hand: contacts and object pose in each tick.
 
-A frame is exact but late and rare; joints are fresh but coarse. While an object is held, joint
-motion carries d and the object's angle φ on by the rolling constraints (`hand.grasp_state`). A
-frame is compared with the prediction for the instant at which it was sampled. `hand_state` has the
-state and its prediction, `hand_channels` what corrects it.
+Frames are precise, but late and rare; joint readings are frequent, but coarse. While an object is
+held, the joints move d and the object's angle φ by the rolling constraints (`hand.grasp_state`),
+and each frame corrects them. `hand_state` has the state and its prediction, `frame_channels` and
+`grasp_kernels` have the measurements.
 
-φ is the angle of the bisector of the object's faces; how much these lean towards each other, the
-taper α, is found from the frames of both tips, beginning with ``object.taper``. So each tip's θ is
-what its own sensor measures, whatever is held. A shifted sensor looks the same; that is not judged
-here: the safety limit ``hand.angle`` compares the frames with ``object.taper`` alone. A disc has no
-faces and no angle: φ is the direction of the line from contact to contact, not how the disc is
-turned, and ``rotate`` goes by it. That line goes with the tips: it turns by 2 L sin q/(2R + 2a − d1
-− d2) of what the joints lean, 0.4 instead of the predicted 1.5 for R = 20 mm and the default hand.
-So the frames have more to correct, turning takes longer, and the disc rolls further than is asked;
-since its curved contact looks less tilted than it is, φ comes out a fifth too small. Where the
-fingers stand straight or lean outwards the line does not follow the joints: a disc of R ≥ 30 mm is
-held, but turning it ends at the tips' limits.
+φ is the angle of the bisector of the object's faces. The taper α between the faces is estimated
+from the frames of both tips and starts at ``object.taper``. A shifted sensor looks like a taper;
+the limit ``hand.angle`` compares the frames with ``object.taper`` for that reason.
+
+A disc has no faces: φ is then the direction of the line between the contacts, and ``rotate`` acts
+on this line. It turns by 2 L sin q/(2R + 2a − d1 − d2) per joint angle, 0.4 for a radius R of
+20 mm and the default hand, where the prediction for faces is 1.5. The frames correct the rest, so
+turning takes longer and the disc rolls further than commanded. A curved contact looks less tilted
+than it is, which makes φ one fifth too small. If the fingers stand straight or lean outwards, the
+line does not follow the joints: a disc with R ≥ 30 mm can be held, but turning it ends at the
+limits of the tips.
 """
 
 from __future__ import annotations
@@ -26,10 +26,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softfinger.daemon.perception import hand_channels as channels
+from softfinger.daemon.perception import frame_channels, grasp_kernels
 from softfinger.daemon.perception import hand_state as states
+from softfinger.daemon.perception.frame_channels import FrameContact
 from softfinger.daemon.perception.hand_state import HISTORY, LAW_POINTS, HandFilter, Past
-from softfinger.daemon.perception.known import UNKNOWN, Prior
+from softfinger.daemon.perception.prior import UNKNOWN, Prior
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.control_table import COUNTS_PER_TURN, VELOCITY_UNIT
 from softfinger.daemon.types import FINGERS, Contact, Frame, Goal, ObjectPose, Reading
@@ -42,14 +43,15 @@ from softfinger.kinematics.hand.grasp_state import total_tilt
 
 FloatArray = NDArray[np.float64]
 
-_TAPER_ERROR = 0.1  # rad that `object.taper` may be off
-_LATENCY_ERROR = 0.03  # s that `tactile.latency` may
-_FRICTION_ERROR = 0.05  # N·m that `control.joint_friction` may
-_FAR = 0.25  # rad off its goal, a grip's joint takes all the current that it may
+# Standard deviations of settings
+_TAPER_ERROR = 0.1  # rad, `object.taper`
+_LATENCY_ERROR = 0.03  # s, `tactile.latency`
+_FRICTION_ERROR = 0.05  # N·m, `control.joint_friction`
+_GOAL_DISTANCE = 0.25  # rad; a joint this far from its goal takes all the current of the goal
 
 
 class HandEstimator:
-    """The estimator of one hand. Costs nothing but a comparison while no tip is touched."""
+    """Estimator of one hand. Without a contact it costs one comparison a tick."""
 
     def __init__(
         self,
@@ -58,7 +60,7 @@ class HandEstimator:
         materials: tuple[Material, Material] | None = None,
         priors: tuple[Prior, Prior] = (UNKNOWN, UNKNOWN),
     ) -> None:
-        """Take each tip's table, its material, whose law may be off its points, and its scales."""
+        """Take each tip's table, its material, whose law has an error, and its priors."""
         hand, gear = settings.hand, settings.servos.gear_ratio
         self._fingers = [FINGERS.index(finger) for finger in sorted(settings.scene.fingers)]
         self._with_object = settings.scene.object_model
@@ -78,29 +80,29 @@ class HandEstimator:
         control = settings.control
         state.torque_constant = control.torque_constant / control.driving
         state.inertia = control.joint_inertia
-        state.held = control.load_held
-        state.alone = len(self._fingers) == 1
-        state.gain_known = settings.estimator.free_gain is False
+        state.load_held = control.load_held
+        state.is_single = len(self._fingers) == 1
+        state.gain_is_known = settings.estimator.free_gain is False
         state.t = -math.inf
         ratios = np.linspace(1e-3, 1.0, LAW_POINTS)
         for finger, table in enumerate(tables):
             law = 0.0 if materials is None else materials[finger].force_error(ratios)
             state.tip[finger].law[:] = np.hypot(law, table.max_error)
-            state.tip[finger].firmness = 1.0 + sum(settings.tip.relaxation)
+            state.tip[finger].relaxation = 1.0 + sum(settings.tip.relaxation)
         self._priors = priors
         self._history: Any = np.zeros(round(HISTORY * settings.loop.rate) + 2, dtype=Past.dtype)
         self._history["t"] = -math.inf
-        self._history["firmness"] = 1.0 + sum(settings.tip.relaxation)
+        self._history["relaxation"] = 1.0 + sum(settings.tip.relaxation)
         self.grasp = state.grasp
         self._set_prior(settings, priors)
-        self.grasp.turning = 0.5 * sum(_turning(table, state.radius) for table in tables)
-        self._read = False  # the joints are known
-        self._has_news = True  # a frame has come since the calibration factors were written
-        self._in_contact = [False, False]  # tips that touch and are carried on by the joints
-        self._invalid = [Invalid.NO_FRAME] * 2  # why the newest frame's estimate can't be used
+        self.grasp.tip_turning = 0.5 * sum(_tip_turning(table, state.radius) for table in tables)
+        self._joints_known = False
+        self._has_news = True  # a frame came since the calibration factors were written
+        self._in_contact = [False, False]
+        self._invalid = [Invalid.NO_FRAME] * 2  # reason why the newest estimate is not used
 
     def _set_prior(self, settings: Settings, priors: tuple[Prior, Prior]) -> None:
-        """Write what is known before anything touches, and begin with it."""
+        """Write the priors and start with them."""
         state = self._state
         for finger, prior in enumerate(priors):
             for at, (mean, error) in (
@@ -110,7 +112,7 @@ class HandEstimator:
                 (states.ENCODER, (0.0, state.count / math.sqrt(12.0))),
             ):
                 state.expected[at + finger], state.prior[at + finger] = mean, error**2
-            self.grasp.gain_prior[finger] = self.grasp.gain_std[finger] = prior.gain[1]
+            self.grasp.gain_prior_std[finger] = self.grasp.gain_std[finger] = prior.gain[1]
         for at, mean, error in (
             (states.ANGLE, 0.0, 1.0),
             (states.TAPER, settings.object.taper, _TAPER_ERROR),
@@ -120,16 +122,20 @@ class HandEstimator:
             state.expected[at], state.prior[at] = mean, error**2
         state.mean[:] = state.expected
         state.covariance[:] = np.diag(state.prior)
+        self.grasp.nis[:] = 1.0
 
     def predict(self, reading: Reading, goal: Goal | None = None) -> None:
-        """Predict the estimates at the instant of a good reading.
+        """Predict the state at the time of a valid reading.
 
-        ``goal``: what it was to be, where a grip set its currents.
+        ``goal`` is the goal that the servos had, if a grip set their currents.
         """
-        self._read = True
+        self._joints_known = True
         q1, q2 = reading.q
         dq1, dq2 = reading.dq
         current1, current2 = reading.current
+        commanded = 0.0, 0.0
+        if goal is not None:
+            commanded = _commanded_current(goal, 0, q1), _commanded_current(goal, 1, q2)
         states.predict(
             self._state.array,
             self._history,
@@ -137,9 +143,7 @@ class HandEstimator:
             (q1, q2),
             (dq1, dq2),
             (current1, current2),
-            (0.0, 0.0)
-            if goal is None
-            else (_commanded_current(goal, 0, q1), _commanded_current(goal, 1, q2)),
+            commanded,
         )
 
     def update(
@@ -148,33 +152,29 @@ class HandEstimator:
         frame: Frame,
         estimate: ContactEstimate,
         contact: Contact,
-        changes: bool = True,
+        has_changed: bool = True,
     ) -> None:
         """Update by a finger's new ``frame`` and its ``estimate``; write both into ``contact``.
 
-        In a contact a frame that ``changes`` nothing, bit by bit, tells nothing new: a board that
-        has frozen, or repeats its last second, sends it while the joints close.
+        A frame that repeats an earlier one bit by bit has not changed. In a contact it comes from a
+        board that is frozen or sends old data, so it is not used.
         """
         contact.seq, contact.t, contact.t_arrival = frame.seq, frame.t_sample, frame.t_arrival
         self._invalid[finger] = estimate.invalid if frame.valid else Invalid.FRAME
         if self._invalid[finger]:
-            return  # nothing is learnt: the contact is carried on, and grows older
-        # Before a first reading nothing is known of the joints: the frame stands for itself.
-        in_contact = estimate.contact and self._read
-        if in_contact and self._in_contact[finger] and not changes:
+            return  # the joints carry the contact on, and its age grows
+        # Without a reading of the joints, the frame is used alone.
+        in_contact = estimate.contact and self._joints_known
+        if in_contact and self._in_contact[finger] and not has_changed:
             contact.t_valid = frame.t_arrival
             return
-        if in_contact and not channels.update(
+        if in_contact and not frame_channels.update(
             self._state.array,
             self._history,
             finger,
             frame.t_sample,
-            (
-                estimate.d,
-                estimate.tilt_x,
-                estimate.tilt_y,
-                estimate.gain,
-                estimate.shear_x,
+            FrameContact(
+                estimate.d, estimate.tilt_x, estimate.tilt_y, estimate.gain, estimate.shear_x
             ),
             estimate.covariance,
             estimate.systematic,
@@ -191,8 +191,8 @@ class HandEstimator:
         if not in_contact:
             tip = self._state.tip[finger]
             if tip.in_contact:
-                self.grasp.free_torque[finger] = 0.0  # the next approach shows it anew
-                tip.efforts[:] = 0.0
+                self.grasp.free_torque[finger] = 0.0  # measured again in the next approach
+                tip.free_torque_max[:] = 0.0
             tip.in_contact = False
             self._state.mean[states.D + finger] = 0.0
             _fill_from_frame(
@@ -210,14 +210,14 @@ class HandEstimator:
         pose.valid = in_contact[0] and in_contact[1] and self._with_object
         pose.angle = pose.width = 0.0
         if in_contact[0] or in_contact[1]:
-            left, right, angle, width = channels.write_grasp(self._state.array, *self._tables)
-            tips = left, right
+            result = grasp_kernels.write_grasp(self._state.array, *self._tables)
+            tips = result.left, result.right
             if pose.valid:
-                pose.angle, pose.width = angle, width
+                pose.angle, pose.width = result.angle, result.width
         if self._has_news:
             self._has_news = False
             for finger in self._fingers:
-                self._write_scales(contacts[finger], finger)
+                self._write_factors(contacts[finger], finger)
         oldest = t - self._age_max
         for finger in self._fingers:
             contact = contacts[finger]
@@ -236,7 +236,8 @@ class HandEstimator:
             if not contact.t_valid >= oldest:
                 contact.invalid, pose.valid = contact.invalid or Invalid.STALE, False
 
-    def _write_scales(self, contact: Contact, finger: int) -> None:
+    def _write_factors(self, contact: Contact, finger: int) -> None:
+        """Write the calibration factors."""
         state, grasp = self._state, self.grasp
         at = states.MODULUS + finger
         contact.modulus_scale = modulus = math.exp(state.mean.item(at))
@@ -249,12 +250,12 @@ class HandEstimator:
 
 
 def _commanded_current(goal: Goal, finger: int, q: float) -> float:
-    """The current [A] of a goal that is so far from ``q`` that nothing but its bound counts."""
-    return goal.current[finger] if goal.q[finger] - q > _FAR else 0.0
+    """Return the current [A] of a goal that is out of reach, so that the current is limited."""
+    return goal.current[finger] if goal.q[finger] - q > _GOAL_DISTANCE else 0.0
 
 
-def _turning(table: ContactTable, radius: float) -> float:
-    """∂U/∂θ over F θ d of a tip that is about upright: 2/3 of springs, about 0 of solid rubber."""
+def _tip_turning(table: ContactTable, radius: float) -> float:
+    """Return ∂U/∂θ over F θ d near upright: 2/3 for springs, about 0 for solid rubber."""
     d, theta = 0.15 * radius, 0.05
     contact = table(d, theta)
     return float(contact.energy_theta / (contact.force * d)) / theta
@@ -268,27 +269,27 @@ def _fill_from_frame(
     prior: Prior,
     radius: float,
 ) -> None:
-    """Fill ``contact`` from one frame's estimate alone; ``table`` and ``law``: its tip's.
+    """Fill ``contact`` from one frame alone; ``table`` and ``law`` are those of its tip.
 
-    By the ``prior``, modulus and gain share out what the frame is higher than the model.
+    The priors divide the frame's amplitude between modulus and gain.
     """
-    contact.d, contact.theta = estimate.d, estimate.tilt_x  # and without a contact 0, as all else
+    contact.d, contact.theta = estimate.d, estimate.tilt_x
     contact.d_std, contact.theta_std = estimate.d_std, estimate.tilt_x_std
     contact.force = contact.energy = contact.force_std = 0.0
     contact.inside = True
     if not estimate.contact:
-        contact.force_std = lookup(table, contact.d_std, 0.0)[0]  # of what could hide
-    else:
-        tilt = total_tilt(contact.theta, contact.tilt_y)
-        force, energy, by_d, by_tilt, _, _, contact.inside = lookup(table, contact.d, tilt)
-        stiff, gain = prior.modulus[1] ** 2, prior.gain[1] ** 2
-        expected = prior.modulus[0] * prior.gain[0]
-        modulus = prior.modulus[0] * (contact.gain / expected) ** (stiff / (stiff + gain))
-        contact.force, contact.energy = modulus * force, modulus * energy
-        along = contact.theta / tilt if tilt > 0.0 else 0.0
-        across = contact.tilt_y / tilt if tilt > 0.0 else 0.0
-        slopes = modulus * np.array([by_d, by_tilt * along, by_tilt * across])
-        law_error = np.interp(contact.d / radius, np.linspace(0.0, 1.0, LAW_POINTS), law)
-        relative = law_error**2 + stiff * gain / (stiff + gain)
-        variance = slopes @ estimate.covariance[:3, :3] @ slopes + relative * contact.force**2
-        contact.force_std = math.sqrt(variance)
+        contact.force_std = lookup(table, contact.d_std, 0.0)[0]  # of a contact below the noise
+        return
+    tilt = total_tilt(contact.theta, contact.tilt_y)
+    force, energy, by_d, by_tilt, _, _, contact.inside = lookup(table, contact.d, tilt)
+    stiff, gain = prior.modulus[1] ** 2, prior.gain[1] ** 2
+    expected = prior.modulus[0] * prior.gain[0]
+    modulus = prior.modulus[0] * (contact.gain / expected) ** (stiff / (stiff + gain))
+    contact.force, contact.energy = modulus * force, modulus * energy
+    along = contact.theta / tilt if tilt > 0.0 else 0.0
+    across = contact.tilt_y / tilt if tilt > 0.0 else 0.0
+    slopes = modulus * np.array([by_d, by_tilt * along, by_tilt * across])
+    law_error = np.interp(contact.d / radius, np.linspace(0.0, 1.0, LAW_POINTS), law)
+    relative = law_error**2 + stiff * gain / (stiff + gain)
+    variance = slopes @ estimate.covariance[:3, :3] @ slopes + relative * contact.force**2
+    contact.force_std = math.sqrt(variance)

@@ -51,7 +51,7 @@ class Perception:
             settings,
             (models[0].table, models[1].table),
             (models[0].material, models[1].material),
-            (models[0].scales, models[1].scales),
+            (models[0].prior, models[1].prior),
         )
 
     def tare(self) -> None:

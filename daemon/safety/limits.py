@@ -20,8 +20,9 @@ from typing import Literal
 import numpy as np
 
 from softfinger.daemon.control.modes import GRIPPING, HELD
-from softfinger.daemon.perception import hand_channels as channels
+from softfinger.daemon.perception.frame_channels import ANGLE_JUMP, REJECTED_MAX
 from softfinger.daemon.perception.grasp import GraspState
+from softfinger.daemon.perception.grasp_kernels import ANGLE_BIAS_MIN
 from softfinger.daemon.perception.hand_state import CURRENT_TIME
 from softfinger.daemon.perception.perception import FingerPerception
 from softfinger.daemon.profile.settings import Settings
@@ -468,18 +469,18 @@ def _tactile_silent(view: View, state: State, _: float, i: int) -> str:
 def _doubt(view: View, state: State, finger: int) -> str:
     """Return why a sensor's frames are refused, or an empty text."""
     side, found = FINGERS[finger], view.grasp
-    if found.refused[finger] > channels.JUMPS_MAX:
-        turned, deeper = found.angle_off[finger], 1e3 * found.d_off[finger]
+    if found.rejected_count[finger] > REJECTED_MAX:
+        turned, deeper = found.angle_innovation[finger], 1e3 * found.d_innovation[finger]
         what = f"the object turned by {math.degrees(abs(turned)):.0f}°"
-        if abs(turned) <= channels.JUMP:
+        if abs(turned) <= ANGLE_JUMP:
             what = f"the tip {abs(deeper):.1f} mm {'deeper' if deeper > 0.0 else 'less deep'}"
         return (
             f"{side} sensor shows {what} at once, which neither the joints nor the other tip "
             "explain: its image has moved or is old, or the object ends under it"
         )
-    if found.drifted[finger] and view.holds(state):
-        off, turned = 1e3 * found.drift[finger], math.degrees(found.shift[finger])
-        if abs(found.shift[finger]) > channels.OFF_ANGLE:
+    if found.has_bias[finger] and view.holds(state):
+        off, turned = 1e3 * found.d_bias[finger], math.degrees(found.angle_bias[finger])
+        if abs(found.angle_bias[finger]) > ANGLE_BIAS_MIN:
             return (
                 f"{side} sensor's image has moved: it shows {turned:+.0f}° that no joint has rolled"
             )
@@ -499,8 +500,8 @@ _GAIN_DOUBTED = 1.5  # prior standard deviations off, a sensor's gain is reporte
 def _gain_doubt(view: View, finger: int) -> str:
     """Say what a sensor reads where its gain is off by more than is usual, or an empty text."""
     grasp = view.grasp
-    off, unsure = grasp.gain_off[finger], grasp.gain_std[finger]
-    if not abs(off) - unsure > _GAIN_DOUBTED * grasp.gain_prior[finger]:
+    off, unsure = grasp.gain_change[finger], grasp.gain_std[finger]
+    if not abs(off) - unsure > _GAIN_DOUBTED * grasp.gain_prior_std[finger]:
         return ""
     return (
         f"{FINGERS[finger]} sensor reads {math.exp(off):.0%} of what the joints and the other tip "
@@ -522,7 +523,7 @@ def _enter_witnesses(finger: int, side: str) -> None:
     @Limit(f"witness.{side}_current", "a joint's current in a grip, by its goal", "warn",
         (), "servos", in_turn=True)  # fmt: skip
     def _current(view: View, state: State, _: float) -> str:
-        if not view.grasp.off_goal[finger] > CURRENT_TIME:
+        if not view.grasp.current_off_time[finger] > CURRENT_TIME:
             return ""
         return (
             f"{side} joint's current reads {state.reading.current[finger]:.2f} A where its goal is "

@@ -32,7 +32,7 @@ from softfinger.daemon.control.modes import COMMANDS, Mode
 from softfinger.daemon.errors import Refused, ServoError
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.loop.publishing import Publishing
-from softfinger.daemon.perception import hand_channels as channels
+from softfinger.daemon.perception.frame_channels import REJECTED_MAX
 from softfinger.daemon.perception.hand_state import CURRENT_TIME
 from softfinger.daemon.profile.load import checked
 from softfinger.daemon.profile.settings import Settings
@@ -677,12 +677,12 @@ class Soak:
         for sensor in perception.fingers:
             side, finger = FINGERS[sensor.finger], sensor.finger
             if (
-                found.refused[finger] > channels.JUMPS_MAX
-                or (held and found.drifted[finger])
+                found.rejected_count[finger] > REJECTED_MAX
+                or (held and found.has_bias[finger])
                 or sensor.repeats.long
             ):
                 yield f"{side}_sensor"
-            if found.off_goal[finger] > CURRENT_TIME:
+            if found.current_off_time[finger] > CURRENT_TIME:
                 yield f"{side}_current"
 
     def _names(self, name: str) -> None:

@@ -23,7 +23,7 @@ SETTINGS = Settings()
 
 @kernel
 def corrected(hands: Records[HandFilter], innovation: float, variance: float, gate: float) -> None:
-    correct(hands[0], innovation, variance, gate)
+    correct(hands[0], 0, innovation, variance, gate)
 
 
 def some_hand(rng: np.random.Generator) -> HandFilter:

@@ -219,9 +219,9 @@ def test_a_warning_at_its_limit_does_not_flicker():
 
 def test_each_witness_that_is_doubted_is_named():
     grasp = GraspState()
-    grasp.gain_prior[:] = 0.25
+    grasp.gain_prior_std[:] = 0.25
     judge, state = safety(grasp=grasp), sound(Mode.RELEASING)
-    grasp.gain_off[1], grasp.gain_std[1] = math.log(0.5), 0.1
+    grasp.gain_change[1], grasp.gain_std[1] = math.log(0.5), 0.1
     judged(judge, state, 0.5)
     assert judge.warnings == [], "cells follow more slowly than a tip is let go"
     state = sound()
@@ -229,8 +229,8 @@ def test_each_witness_that_is_doubted_is_named():
     judged(judge, state, 0.5)
     assert judge.warnings == [], "that is not known well"
     grasp.gain_std[1] = 0.1
-    grasp.refused[0], grasp.angle_off[0] = 3.0, -0.2
-    grasp.off_goal[1] = 0.2
+    grasp.rejected_count[0], grasp.angle_innovation[0] = 3.0, -0.2
+    grasp.current_off_time[1] = 0.2
     state.reading.current[1], state.goal.current[1] = 0.1, 0.2
     judged(judge, state, 0.5)
     told = {warning.name: warning.text for warning in judge.warnings}

@@ -110,7 +110,7 @@ def test_an_estimate_that_is_no_number_or_no_hands_begins_anew():
         assert hand.mode == "holding"
         state.mean[TAPER] = math.pi
         hand.watch(0.1)
-        assert abs(state.turned) < 1.0
+        assert abs(state.rotation) < 1.0
 
 
 def test_a_sensor_that_is_honest_again_is_believed_again() -> None:

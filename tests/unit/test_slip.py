@@ -133,7 +133,7 @@ def test_what_friction_may_be_is_not_a_load_and_what_it_can_not_is():
     for load in np.linspace(1.5, 6.0, 500):
         watched.run(load, 1)
     found = watched.run(6.0, 500)
-    expected = (6.0 - watched.grip.slip.still / 0.03 + FRICTION) / (0.6 * 0.8)
+    expected = (6.0 - watched.grip.slip.offset / 0.03 + FRICTION) / (0.6 * 0.8)
     assert found == pytest.approx(expected, rel=0.01)
 
 
@@ -185,7 +185,7 @@ def test_a_load_that_stands_leaves_less_to_come():
     assert watched.run(3.0 + 0.8 * FRICTION, 1, speed=GIVES_WAY) == FORCE + 10.0
 
 
-@pytest.mark.parametrize("kind", ["sheared", "twisted"])
+@pytest.mark.parametrize("kind", ["pull_shear", "twist_shear"])
 def test_solid_tips_show_a_load_by_themselves(kind):
     watched = at_rest()
     setattr(watched.held, kind, -1.0)
@@ -262,7 +262,7 @@ def test_friction_that_the_approach_has_shown_hides_as_much():
 def test_a_channel_that_is_named_ends_what_it_raised():
     watched = at_rest()
     assert watched.run(2.0 * FRICTION, 1, speed=GIVES_WAY) == FORCE + 10.0
-    watched.held.doubted = True
+    watched.held.sensor_fault = True
     assert watched.run(2.0 * FRICTION, 1, speed=GIVES_WAY) == FORCE
     assert not watched.grip.slip.reflex
 

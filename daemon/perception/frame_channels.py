@@ -1,0 +1,391 @@
+"""Updates of the hand's state by a tactile frame: angle, footprint and amplitude.
+
+Channel     Measures                                                   Noise
+angle       φ ∓ α/2 ± ENCODER + ANGLE_BIAS − θ̇ LATENCY                 covariance of the frame
+footprint   D + D_BIAS − ḋ LATENCY; with a fixed gain                  covariance of the frame
+            ln F(D, θ) + MODULUS + GAIN − (∂ ln F/∂d) ḋ LATENCY
+amplitude   MODULUS + GAIN, if the gain was fitted                     2 % and the frame's
+
+A frame shows the hand at the time of its scan, so it is compared with the state of that time by
+the history of the joints. `estimate.systematic`, the covariance that all frames share, is not part
+of the noise: it widens the published deviations and is never estimated.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softfinger.daemon.perception.grasp import GraspState
+from softfinger.daemon.perception.hand_state import (
+    AMPLITUDE,
+    ANGLE,
+    ANGLE_BIAS,
+    ANGLE_CHANNEL,
+    D_BIAS,
+    ENCODER,
+    FOOTPRINT,
+    FRICTION,
+    GAIN,
+    LATENCY,
+    MODULUS,
+    STATES,
+    TAPER,
+    TORQUE,
+    D,
+    HandFilter,
+    Past,
+    begin,
+    correct,
+    expected_variance,
+    interpolate,
+    reset,
+)
+from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
+from softfinger.kinematics.compiled.layout import Records
+from softfinger.kinematics.contact.lookup import lookup
+from softfinger.kinematics.hand.grasp_state import total_tilt
+
+FloatArray = NDArray[np.float64]
+
+GATE = 3.0  # standard deviations at which an innovation is clipped
+D_MIN = 1e-5  # m, least displacement of a tip that touches
+# A frame is an outlier beyond _OUTLIER_GATE standard deviations and one of these:
+ANGLE_JUMP = 0.12  # rad; correct frames stay within 0.04 of the prediction
+D_JUMP = 1e-3  # m
+REJECTED_MAX = 2  # rejected frames in a row before the sensor is reported
+_OUTLIER_GATE = 5.0
+_SUPPORT = 0.5  # part of a jump that the other tip must show as well to support it
+_SPEED_SUPPORT = 0.1  # rad/s, speed of the joints that supports a rotation
+_CONTINUES = 0.06  # rad from frame to frame, a rotation that goes on
+_RESTART = 50  # rejected frames after which the contact starts again from the frames
+_FIRM = 1.0  # N on each tip; below, an object may rock between the tips
+_RATE_TIME = 0.005  # s, least interval over which rates of d and θ are computed
+# A footprint that grows within the response of the cells looks wider and flatter: relative change
+# per var(d)/d², from the fit of a paraboloid to a mean of paraboloids.
+_WIDER, _FLATTER, _SPREAD_MAX = 1.4, 2.0, 0.1
+_SLOPE_KEPT = 0.9  # low-pass filter of ∂ ln F/∂d from frame to frame
+_AMPLITUDE_ERROR = 0.02  # relative, of the pressure model
+_AMPLITUDES = 1e-3, 1e3  # bounds of a frame's amplitude over the model's
+_FIRST_D_ERROR = 0.5  # prior of the first d of a contact, relative
+_FIRST_ANGLE_ERROR = 1.0  # rad, prior of the first angle
+_LOAD = 0.05  # N·m, standard deviation of a load on the object before it is gripped
+
+
+class FrameContact(NamedTuple):
+    """Contact found in one frame [m, rad, rad, -, N]."""
+
+    d: float
+    theta: float
+    tilt_y: float
+    gain: float
+    shear: float
+
+
+class PastMotion(NamedTuple):
+    """Integrals of the predicted motion of one finger at one time."""
+
+    d: float
+    spread: float
+    angle: float
+    q: float
+    relaxation: float
+
+
+@inner_kernel
+def _motion_at(history: Records[Past], newest: int, t: float, finger: int) -> PastMotion:
+    """Interpolate the history at time ``t``; beyond its ends, return the end."""
+    size = len(history)
+    before = after = newest
+    fraction = 0.0
+    for back in range(size):
+        row = (newest - back) % size
+        if history[row].t == -math.inf:  # the frame is older than the first reading
+            before = after
+            break
+        before = row
+        if history[row].t <= t:
+            span = history[after].t - history[row].t
+            fraction = (t - history[row].t) / span if span > 0.0 else 0.0
+            break
+        after = row
+    first = history[before]
+    last = history[after]
+    return PastMotion(
+        interpolate(first.d[finger], last.d[finger], fraction),
+        interpolate(first.spread[finger], last.spread[finger], fraction),
+        interpolate(first.angle, last.angle, fraction),
+        interpolate(first.q[finger], last.q[finger], fraction),
+        interpolate(first.relaxation[finger], last.relaxation[finger], fraction),
+    )
+
+
+@inner_kernel
+def _rates(
+    h: HandFilter, history: Records[Past], finger: int, scan: float, sense: float
+) -> tuple[float, float]:
+    """Return the rates of d [m/s] and θ [rad/s] at the ``scan``: their slopes by the latency.
+
+    They are secants over one standard deviation of the latency, since the joints may have stopped
+    meanwhile. Rates within the resolution of the velocities are 0.
+    """
+    span = max(math.sqrt(max(h.covariance[LATENCY, LATENCY], 0.0)), _RATE_TIME)
+    early = _motion_at(history, h.newest, scan - span, finger)
+    end = min(scan + span, h.t)
+    late = _motion_at(history, h.newest, end, finger)
+    span = max(end - (scan - span), _RATE_TIME)
+    d_rate = (late.d - early.d) / span
+    theta_rate = (late.angle - early.angle - sense * (late.q - early.q)) / span
+    if abs(d_rate) < h.velocity_unit * h.length:
+        d_rate = 0.0
+    if abs(theta_rate) < 2.0 * h.velocity_unit:
+        theta_rate = 0.0
+    return d_rate, theta_rate
+
+
+@inner_kernel
+def _set_angle_slopes(h: HandFilter, finger: int, sense: float, theta_rate: float) -> None:
+    h.slopes[ANGLE] = 1.0
+    h.slopes[TAPER] = 0.5 * sense
+    h.slopes[ANGLE_BIAS + finger] = 1.0
+    h.slopes[ENCODER + finger] = -sense
+    h.slopes[LATENCY] = -theta_rate
+
+
+@inner_kernel
+def _set_d_slopes(h: HandFilter, finger: int, slope: float, d_rate: float) -> None:
+    h.slopes[D + finger] = slope
+    h.slopes[LATENCY] = -slope * d_rate
+
+
+@inner_kernel
+def _set_footprint_slopes(h: HandFilter, finger: int, d_rate: float) -> None:
+    _set_d_slopes(h, finger, 1.0, d_rate)
+    h.slopes[D_BIAS + finger] = 1.0
+
+
+@kernel
+def update(
+    hands: Records[HandFilter],
+    history: Records[Past],
+    finger: int,
+    t: float,
+    found: FrameContact,
+    covariance: FloatArray,
+    systematic: FloatArray,
+    table: FloatArray,
+) -> bool:
+    """Update by one finger's frame of time ``t``; return False if the frame is rejected.
+
+    ``covariance`` [4, 4] of d, θ, tilt_y and gain; ``systematic`` is the part of it that all frames
+    share. A covariance of the gain above 0 means that the gain was fitted.
+    """
+    h = hands[0]
+    tip = h.tip[finger]
+    other = h.tip[1 - finger]
+    if not _is_finite(h):
+        tip.in_contact = other.in_contact = False
+        h.grasp.unexplained_rotation[:] = 0.0
+    d_noise = covariance[0, 0] - systematic[0, 0]
+    theta_noise = covariance[1, 1] - systematic[1, 1]
+    sense = -1.0 if finger == 0 else 1.0
+    scan = t - h.mean[LATENCY]
+    at_scan = _motion_at(history, h.newest, scan, finger)
+    d_rate, theta_rate = _rates(h, history, finger, scan, sense)
+    d_since = tip.travel[0] - at_scan.d
+    q_since = tip.travel[1] - at_scan.q
+    rotation_since = h.rotation - at_scan.angle
+    face = found.theta + sense * (tip.q - q_since)  # angle of the face at the scan
+    is_fitted = covariance[3, 3] > 0.0
+    gain_is_fixed = not (is_fitted or h.gain_is_known)
+    tilt = total_tilt(found.theta, found.tilt_y)
+    shown, _, stiffness, _, _, _, _ = lookup(table, found.d, tilt)
+    log_slope = stiffness / shown
+    d = found.d
+    gain = found.gain
+    if is_fitted:
+        spread = min(at_scan.spread / (d * d), _SPREAD_MAX)
+        gain /= at_scan.relaxation * (1.0 - _FLATTER * spread)
+        d /= 1.0 + _WIDER * spread
+    elif h.gain_is_known:
+        d -= math.log(at_scan.relaxation) / log_slope
+    begins = not tip.in_contact
+    if begins:
+        tip.touch_time = h.t
+        _begin_contact(h, finger, sense, face + rotation_since)
+    # Cells that still respond to the touch show motion from before it, which no history has.
+    is_responding = h.t - tip.touch_time < h.response
+    if begins or is_responding:
+        reset(h, D + finger, d + d_since, (_FIRST_D_ERROR * d) ** 2)
+    d_then = h.mean[D + finger] - d_since
+    angle_then = h.mean[ANGLE] + 0.5 * sense * h.mean[TAPER] - rotation_since
+    angle_innovation = face - (angle_then + h.mean[ANGLE_BIAS + finger])
+    d_innovation = d - (d_then + h.mean[D_BIAS + finger])
+    is_held = tip.in_contact and other.in_contact and not is_responding
+    if is_held and min(h.grasp.normal[0], h.grasp.normal[1]) > _FIRM:
+        _set_angle_slopes(h, finger, sense, theta_rate)
+        angle_variance = expected_variance(h) + theta_noise
+        h.slopes[:] = 0.0
+        _set_footprint_slopes(h, finger, d_rate)
+        d_variance = expected_variance(h) + d_noise
+        h.slopes[:] = 0.0
+        speed = abs(tip.speed) + abs(other.speed)
+        jump = d_innovation if is_fitted else 0.0
+        if _is_rejected(
+            h.grasp, finger, (angle_innovation, angle_variance), (jump, d_variance), speed
+        ):
+            return False
+    tip.tilt_y = found.tilt_y
+    tip.gain_is_fixed = gain_is_fixed
+    tip.shear = found.shear
+    tip.shared_variance[0] = systematic[0, 0]
+    tip.shared_variance[1] = systematic[1, 1]
+    if gain_is_fixed:  # GAIN is a state, so its part of the error is not shared
+        by_gain = h.prior[GAIN + finger] ** 0.5 / log_slope
+        tip.shared_variance[0] = max(systematic[0, 0] - by_gain * by_gain, 0.0)
+    tip.has_new_frame = not is_responding
+    _update_angle(h, finger, sense, angle_innovation, theta_noise, theta_rate, begins)
+    tip.in_contact = True
+    if gain_is_fixed:
+        expected, _, stiffness, _, _, _, _ = lookup(table, max(d_then, D_MIN), tilt)
+        kept = 0.0 if begins else _SLOPE_KEPT
+        tip.log_slope = interpolate(stiffness / expected, tip.log_slope, kept)
+        innovation = math.log(shown / (at_scan.relaxation * expected))
+        innovation -= h.mean[MODULUS + finger] + h.mean[GAIN + finger]
+        _set_d_slopes(h, finger, tip.log_slope, d_rate)
+        h.slopes[MODULUS + finger] = h.slopes[GAIN + finger] = 1.0
+        _update_footprint(h, finger, innovation, d_noise * log_slope * log_slope)
+    else:
+        _set_footprint_slopes(h, finger, d_rate)
+        _update_footprint(h, finger, d_innovation, d_noise)
+    if is_fitted and not h.gain_is_known:
+        # The errors of d and gain are correlated: the footprint has used the common part.
+        ratio = (covariance[0, 3] - systematic[0, 3]) / (d_noise * gain)
+        gain_noise = (covariance[3, 3] - systematic[3, 3]) / (gain * gain)
+        own_noise = max(gain_noise - ratio * ratio * d_noise, 0.0)
+        d_left = d - (h.mean[D + finger] - d_since + h.mean[D_BIAS + finger])
+        innovation = math.log(min(max(gain, _AMPLITUDES[0]), _AMPLITUDES[1])) - ratio * d_left
+        innovation -= h.mean[MODULUS + finger] + h.mean[GAIN + finger]
+        _set_d_slopes(h, finger, -ratio, d_rate)
+        h.slopes[D_BIAS + finger] = -ratio
+        h.slopes[MODULUS + finger] = h.slopes[GAIN + finger] = 1.0
+        variance = own_noise + _AMPLITUDE_ERROR * _AMPLITUDE_ERROR
+        correct(h, AMPLITUDE + finger, innovation, variance, GATE)
+    h.mean[D + finger] = max(h.mean[D + finger], D_MIN)
+    return True
+
+
+@inner_kernel
+def _is_finite(h: HandFilter) -> bool:
+    total = 0.0
+    for state in range(STATES):
+        total += abs(h.mean[state]) + h.covariance[state, state]
+    return total < math.inf
+
+
+@inner_kernel
+def _begin_contact(h: HandFilter, finger: int, sense: float, face: float) -> None:
+    """Reset one finger's states at its touch; ``face`` is the angle in its first frame [rad].
+
+    If the other tip does not touch, all states start again.
+    """
+    for state in (MODULUS, GAIN, TORQUE):
+        reset(h, state + finger, h.expected[state + finger], h.prior[state + finger])
+    reset(h, D_BIAS + finger, 0.0, 0.0)
+    reset(h, ANGLE_BIAS + finger, 0.0, 0.0)
+    h.grasp.rejected_count[:] = 0.0
+    h.tip[finger].d_innovation = 0.0
+    if h.tip[1 - finger].in_contact:
+        return
+    begin(h)
+    reset(h, ANGLE, face - 0.5 * sense * h.mean[TAPER], _FIRST_ANGLE_ERROR**2)
+    for k in range(2):
+        measured = h.grasp.free_torque[k]
+        if measured > 0.0:
+            h.mean[FRICTION] += 0.5 * (measured - h.expected[FRICTION])
+            h.covariance[FRICTION, FRICTION] *= 0.5
+    h.covariance[FRICTION, FRICTION] += _LOAD * _LOAD
+
+
+@inner_kernel
+def _update_angle(
+    h: HandFilter,
+    finger: int,
+    sense: float,
+    innovation: float,
+    noise: float,
+    theta_rate: float,
+    begins: bool,
+) -> None:
+    """Update by the angle of a frame. Beyond the gate the object has turned, unpredicted."""
+    before = h.mean[ANGLE] + h.mean[ANGLE_BIAS + finger]
+    _set_angle_slopes(h, finger, sense, theta_rate)
+    if innovation * innovation > GATE * GATE * (expected_variance(h) + noise):
+        h.covariance[ANGLE, ANGLE] += innovation * innovation
+    correct(h, ANGLE_CHANNEL + finger, innovation, noise, math.inf)
+    if not begins:
+        rotation = h.mean[ANGLE] + h.mean[ANGLE_BIAS + finger] - before
+        h.grasp.unexplained_rotation[finger] += rotation
+
+
+@inner_kernel
+def _update_footprint(h: HandFilter, finger: int, innovation: float, noise: float) -> None:
+    """Update by the footprint with the slopes that are set.
+
+    Beyond the gate, opposite innovations of the tips mean that the object has moved sideways. With
+    a fixed gain, equal ones mean that the gain has changed.
+    """
+    d_innovation = innovation / h.slopes[D + finger]
+    other = h.tip[1 - finger].d_innovation
+    h.tip[finger].d_innovation = d_innovation
+    if innovation * innovation > GATE * GATE * (expected_variance(h) + noise):
+        if d_innovation * other < 0.0:
+            moved = min(d_innovation * d_innovation, other * other)
+            for i in range(2):
+                for j in range(2):
+                    h.covariance[D + i, D + j] += moved if i == j else -moved
+        elif h.tip[finger].gain_is_fixed:
+            h.covariance[GAIN + finger, GAIN + finger] += innovation * innovation
+    correct(h, FOOTPRINT + finger, innovation, noise, GATE)
+
+
+@inner_kernel
+def _is_rejected(
+    grasp: GraspState,
+    finger: int,
+    angle: tuple[float, float],
+    d: tuple[float, float],
+    speed: float,
+) -> bool:
+    """Return True if the frame of a held object is an outlier.
+
+    ``angle`` and ``d`` are (innovation, variance), ``speed`` is that of both joints [rad/s]. A jump
+    of one frame is an outlier unless the other tip and the joints support it. A rotation is real if
+    both tips show it and the joints move or the rotation continues. A displacement is real if the
+    joints move, or if both tips show it: a blow presses the object into one tip and away from the
+    other. The first frame of a real jump is rejected too, because the other tip is not known yet.
+    """
+    angle_innovation, angle_variance = angle
+    d_innovation, d_variance = d
+    other = grasp.angle_innovation[1 - finger]
+    last = grasp.angle_innovation[finger]
+    grasp.angle_innovation[finger] = angle_innovation
+    grasp.d_innovation[finger] = d_innovation
+    has_turned = abs(angle_innovation) > max(ANGLE_JUMP, _OUTLIER_GATE * math.sqrt(angle_variance))
+    has_moved = abs(d_innovation) > max(D_JUMP, _OUTLIER_GATE * math.sqrt(d_variance))
+    if has_moved:
+        other_d = abs(grasp.d_innovation[1 - finger])
+        has_moved = speed < _SPEED_SUPPORT and other_d < _SUPPORT * abs(d_innovation)
+    if has_turned:
+        was_rejected = grasp.rejected_count[finger] > 0.0
+        continues = was_rejected and abs(angle_innovation - last) > _CONTINUES
+        both_show_it = angle_innovation * other > _SUPPORT * angle_innovation * angle_innovation
+        has_turned = not (both_show_it and (speed > _SPEED_SUPPORT or continues))
+    if grasp.rejected_count[finger] >= _RESTART or not (has_turned or has_moved):
+        grasp.rejected_count[finger] = 0.0
+        return False
+    grasp.rejected_count[finger] += 1.0
+    return True

@@ -1,0 +1,295 @@
+"""The grasp by the estimated state, and the updates by torques and by the balance of the tips.
+
+Channel   Measures                                                         Noise
+torque    mean of (1 + TORQUE) times the moment of the tips' forces,       0.05 N·m, and what the
+          + FRICTION + inertia, while the joints close                     gears may hold
+balance   ln N1 − ln N2 = 0, with the normal forces N                      5 % and 0.4 N
+
+The force of a tip is ρ e^MODULUS F(D, θ), with its contact table F and its relaxation factor ρ.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softfinger.daemon.perception.frame_channels import GATE, REJECTED_MAX
+from softfinger.daemon.perception.grasp import GraspState
+from softfinger.daemon.perception.hand_state import (
+    ANGLE,
+    ANGLE_BIAS,
+    BALANCE,
+    CURRENT_TIME,
+    D_BIAS,
+    FRICTION,
+    GAIN,
+    LAW_POINTS,
+    MODULUS,
+    TAPER,
+    TORQUE,
+    TORQUES,
+    D,
+    HandFilter,
+    TrackedTip,
+    correct,
+    expected_variance,
+    interpolate,
+    motion_of,
+)
+from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
+from softfinger.kinematics.compiled.layout import Records
+from softfinger.kinematics.contact.lookup import lookup
+from softfinger.kinematics.hand.grasp_state import holding_levers, load_torques, total_tilt
+
+FloatArray = NDArray[np.float64]
+
+_TORQUE_NOISE = 0.05  # N·m of moving joints
+_CLOSING_MIN = 0.03  # rad/s, above the resolution of the velocity: the friction opposes closing
+_BALANCE_ERROR = 0.05  # relative, of the normal forces, and …
+_RUBBING = 0.4  # N, friction of the object on a table, …
+_RUBBING_TIME = 0.1  # s, correlation time of both
+# A bias is significant beyond all of these
+_BIAS_GATE = 5.0  # standard deviations
+_BIAS_OWN = 0.8  # of the other sensor's bias, because a part of a bias appears in both
+_D_BIAS_MIN, ANGLE_BIAS_MIN = 0.1, 0.06  # of d; rad
+
+
+class TipResult(NamedTuple):
+    """Result of one tip [m, rad, N, J] with its standard deviations."""
+
+    d: float
+    theta: float
+    force: float
+    energy: float
+    d_std: float
+    theta_std: float
+    force_std: float
+    inside: bool  # the contact table covers it
+
+
+class GraspResult(NamedTuple):
+    """Result of both tips and the object [rad, m]."""
+
+    left: TipResult
+    right: TipResult
+    angle: float
+    width: float
+
+
+@inner_kernel
+def _log_slope(h: HandFilter, finger: int) -> float:
+    """Return ∂ ln F/∂d [1/m] of a tip.
+
+    With a fixed gain this is the slope of the footprint channel. Two different slopes would make
+    unobservable directions look observed.
+    """
+    tip = h.tip[finger]
+    slope: float = tip.log_slope
+    if not tip.gain_is_fixed:
+        slope = h.grasp.stiffness[finger] / max(h.grasp.force[finger], 1e-3)
+    return slope
+
+
+@inner_kernel
+def _set_torque_slopes(h: HandFilter) -> float:
+    """Set the slopes of both joints' mean torque by the tips' forces; return that torque [N·m]."""
+    expected = 0.0
+    for k in range(2):
+        scale = 1.0 + h.mean[TORQUE + k]
+        moment = h.tip[k].torque / scale - h.grasp.torque_residual[k]
+        expected += 0.5 * scale * moment
+        h.slopes[TORQUE + k] = 0.5 * moment
+        h.slopes[MODULUS + k] = 0.5 * scale * moment
+        h.slopes[D + k] = 0.5 * scale * moment * _log_slope(h, k)
+    return expected
+
+
+@inner_kernel
+def _update_by_torques(h: HandFilter, dt: float) -> None:
+    """Update by the joints' mean torque while they close, and by the balance of the tips."""
+    torque = 0.5 * (h.tip[0].torque + h.tip[1].torque)
+    h.torque_max = max(h.torque_max, torque)
+    innovation = torque - h.mean[FRICTION] - _set_torque_slopes(h)
+    if h.closing > _CLOSING_MIN:
+        innovation -= h.inertia * (h.closing - h.last_closing) / dt
+        h.slopes[FRICTION] = 1.0
+        # After the torque has decreased, the gears hold between nothing and all of the decrease.
+        held = min(h.torque_max - torque, h.load_held * torque)
+        correct(h, TORQUES, innovation, _TORQUE_NOISE * _TORQUE_NOISE + held * held, GATE)
+    h.slopes[:] = 0.0
+    normal = h.grasp.normal
+    least = min(normal[0], normal[1])
+    if least > 0.0 and h.t > h.balance_time:
+        for k in range(2):
+            sense = 1.0 - 2.0 * k
+            h.slopes[MODULUS + k] = sense
+            h.slopes[D + k] = sense * _log_slope(h, k)
+        error = _BALANCE_ERROR + _RUBBING / least
+        variance = error * error * max(_RUBBING_TIME / (h.t - h.balance_time), 1.0)
+        correct(h, BALANCE, math.log(normal[1] / normal[0]), variance, GATE)
+    h.balance_time = h.t
+
+
+@inner_kernel
+def _law_error(tip: TrackedTip, fraction: float) -> float:
+    """Return the relative error of F by table and law; ``fraction`` is d over the radius."""
+    t = min(max(fraction, 0.0), 1.0) * (LAW_POINTS - 1.001)
+    k = int(t)
+    return interpolate(tip.law[k], tip.law[k + 1], t - k)
+
+
+@inner_kernel
+def _write_tip(h: HandFilter, finger: int, theta: float, table: FloatArray) -> TipResult:
+    tip = h.tip[finger]
+    grasp = h.grasp
+    tilt = total_tilt(theta, tip.tilt_y)
+    d = h.mean[D + finger]
+    force, energy, stiffness, by_tilt, _, _, inside = lookup(table, d, tilt)
+    modulus = math.exp(h.mean[MODULUS + finger]) * tip.relaxation
+    force *= modulus
+    stiffness *= modulus
+    grasp.q[finger] = tip.q
+    grasp.d[finger] = max(d, 0.0)
+    grasp.force[finger] = force
+    grasp.stiffness[finger] = stiffness
+    h.slopes[D + finger] = stiffness
+    h.slopes[MODULUS + finger] = force
+    by_state = expected_variance(h)
+    h.slopes[:] = 0.0
+    h.slopes[ANGLE] = 1.0
+    h.slopes[TAPER] = finger - 0.5
+    theta_variance = expected_variance(h) + tip.shared_variance[1]
+    h.slopes[:] = 0.0
+    d_shared = tip.shared_variance[0]
+    law = _law_error(tip, d / h.radius) * force
+    by_angle = modulus * by_tilt * (theta / tilt if tilt > 0.0 else 0.0)
+    force_variance = by_state + stiffness * stiffness * d_shared
+    force_variance += by_angle * by_angle * theta_variance + law * law
+    return TipResult(
+        grasp.d[finger],
+        theta,
+        force,
+        modulus * energy,
+        math.sqrt(max(h.covariance[D + finger, D + finger], 0.0) + d_shared),
+        math.sqrt(theta_variance),
+        math.sqrt(force_variance),
+        inside,
+    )
+
+
+@kernel
+def write_grasp(hands: Records[HandFilter], table1: FloatArray, table2: FloatArray) -> GraspResult:
+    """Write the grasp of the present state, then update the state by the joints' torques."""
+    h = hands[0]
+    grasp = h.grasp
+    left = h.tip[0]
+    right = h.tip[1]
+    taper = h.mean[TAPER]
+    angle = h.mean[ANGLE]
+    motion = motion_of(h)
+    theta = angle - 0.5 * taper + left.q, angle + 0.5 * taper - right.q
+    result1 = _write_tip(h, 0, theta[0], table1)
+    result2 = _write_tip(h, 1, theta[1], table2)
+    dt = h.t - grasp.t
+    grasp.t = h.t
+    grasp.angle_std = math.sqrt(max(h.covariance[ANGLE, ANGLE], 0.0))
+    grasp.taper = taper
+    arm1, arm2, turn1, turn2, grasp.jacobian_slide, width, _ = motion
+    grasp.moment_arm[0] = arm1
+    grasp.moment_arm[1] = arm2
+    grasp.jacobian_rotation[0] = turn1
+    grasp.jacobian_rotation[1] = turn2
+    d = h.mean[D], h.mean[D + 1]
+    energy_arm1, energy_arm2, shear, normal1, normal2 = holding_levers(
+        table1, table2, d, theta, taper, motion
+    )
+    grasp.energy_arm[0] = energy_arm1
+    grasp.energy_arm[1] = energy_arm2
+    by_taper = 0.5 * math.tan(0.5 * taper) * (normal1 + normal2)
+    grasp.shear = 0.0
+    if normal1 + normal2 > 0.0:
+        grasp.shear = 2.0 * (abs(shear) + abs(by_taper)) / (normal1 + normal2)
+    modulus1 = math.exp(h.mean[MODULUS]) * left.relaxation
+    modulus2 = math.exp(h.mean[MODULUS + 1]) * right.relaxation
+    grasp.normal[0] = modulus1 * normal1
+    grasp.normal[1] = modulus2 * normal2
+    torque1 = left.torque / (1.0 + h.mean[TORQUE])
+    torque2 = right.torque / (1.0 + h.mean[TORQUE + 1])
+    residual1, residual2, grasp.load_arm, curvature = load_torques(
+        table1,
+        table2,
+        d,
+        theta,
+        taper,
+        motion,
+        (shear - by_taper, shear + by_taper),
+        (torque1 / modulus1, torque2 / modulus2),
+    )
+    grasp.torque_residual[0] = modulus1 * residual1
+    grasp.torque_residual[1] = modulus2 * residual2
+    grasp.load_curvature = 2.0 * curvature / (modulus1 + modulus2)
+    _write_shear(h)
+    _set_torque_slopes(h)
+    grasp.torque_std = math.sqrt(expected_variance(h))
+    h.slopes[:] = 0.0
+    if (left.has_new_frame or right.has_new_frame) and left.in_contact and right.in_contact:
+        left.has_new_frame = right.has_new_frame = False
+        if grasp.load_arm > 0.0 and dt > 0.0:
+            _update_by_torques(h, dt)
+    _write_consistency(h)
+    return GraspResult(result1, result2, angle, width)
+
+
+@inner_kernel
+def _write_shear(h: HandFilter) -> None:
+    """Split the shear of solid tips: a pull is opposite on the two faces, a twist alike."""
+    left = h.tip[0].shear
+    right = h.tip[1].shear
+    common = math.copysign(min(abs(left), abs(right)), left)
+    h.grasp.pull_shear = common if left * right < 0.0 else 0.0
+    h.grasp.twist_shear = common - h.grasp.pull_shear
+
+
+@inner_kernel
+def _write_consistency(h: HandFilter) -> None:
+    """Write the biases, and whether a channel is faulty."""
+    grasp = h.grasp
+    grasp.sensor_fault = False
+    for k in range(2):
+        grasp.d_bias[k] = h.mean[D_BIAS + k]
+        grasp.d_bias_std[k] = math.sqrt(max(h.covariance[D_BIAS + k, D_BIAS + k], 0.0))
+        grasp.angle_bias[k] = h.mean[ANGLE_BIAS + k]
+        variance = h.covariance[ANGLE_BIAS + k, ANGLE_BIAS + k]
+        grasp.angle_bias_std[k] = math.sqrt(max(variance, 0.0))
+        grasp.gain_change[k] = h.mean[GAIN + k] - h.expected[GAIN + k]
+        grasp.gain_std[k] = math.sqrt(max(h.covariance[GAIN + k, GAIN + k], 0.0))
+    for k in range(2):
+        has_bias = _has_bias(grasp, k)
+        grasp.has_bias[k] = 1.0 if has_bias else 0.0
+        if (
+            has_bias
+            or grasp.rejected_count[k] > REJECTED_MAX
+            or grasp.current_off_time[k] > CURRENT_TIME
+        ):
+            grasp.sensor_fault = True
+
+
+@inner_kernel
+def _has_bias(grasp: GraspState, finger: int) -> bool:
+    """Return True if a sensor's zero or image has moved significantly."""
+    if not (grasp.d_bias_std[finger] > 0.0 and grasp.d[finger] > 0.0):
+        return False
+    in_d: bool = abs(grasp.d_bias[finger]) > max(
+        _D_BIAS_MIN * grasp.d[finger],
+        _BIAS_GATE * grasp.d_bias_std[finger],
+        _BIAS_OWN * abs(grasp.d_bias[1 - finger]),
+    )
+    in_angle = abs(grasp.angle_bias[finger]) > max(
+        ANGLE_BIAS_MIN,
+        _BIAS_GATE * grasp.angle_bias_std[finger],
+        _BIAS_OWN * abs(grasp.angle_bias[1 - finger]),
+    )
+    return in_d or in_angle
