@@ -118,7 +118,7 @@ def build(version: str) -> None:
         print(f"  git commit --all --message 'release: {version}'")
     print(f"  git tag --annotate v{version} --message 'softfinger {version}'")
     print(f"  git push origin HEAD v{version}")
-    print(f"  {Path(sys.executable).relative_to(ROOT)} -m twine upload dist/*")
+    print(f"  {sys.executable} -m twine upload dist/*")
 
 
 def _git(*words: str) -> str:
