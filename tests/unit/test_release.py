@@ -77,3 +77,17 @@ def test_unreleased_entries_move_below_the_version_and_its_date(release):
 def test_a_release_that_does_not_fit_the_changelog_is_refused(release, log, version, message):
     with pytest.raises(release.ReleaseError, match=message):
         release.dated(log, version, TODAY)
+
+
+def test_workflows_use_actions_by_their_commit_and_hooks_the_ruff_of_make_lint():
+    workflows = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
+    used = [
+        line
+        for path in workflows
+        for line in re.findall(r"(?m)uses: (.*)$", path.read_text(encoding="utf-8"))
+    ]
+    assert len(used) >= len(workflows) > 0
+    assert [each for each in used if not re.fullmatch(r"\S+@[0-9a-f]{40} # v[\d.]+", each)] == []
+    hooks = (ROOT / ".pre-commit-config.yaml").read_text(encoding="utf-8")
+    pinned = (ROOT / "constraints.txt").read_text(encoding="utf-8")
+    assert re.findall(r"rev: v(\S+)", hooks) == re.findall(r"(?m)^ruff==(\S+)", pinned)
