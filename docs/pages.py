@@ -1,6 +1,6 @@
 """The pages of the site that are made at its build: from the code, and from the project's folder.
 
-MkDocs calls `on_files` and `on_page_markdown` (``hooks`` in mkdocs.yml). `PAGES` is all there is.
+MkDocs calls the functions named ``on_…`` (``hooks`` in mkdocs.yml). `PAGES` is all there is.
 """
 
 from __future__ import annotations
@@ -363,6 +363,14 @@ _LINKS = {
     "tools/examples/grasp_and_turn.py": "example.md",
     "daemon/tactile/cobs.py": "contributing.md#a-tactile-board",
 }
+
+
+def on_config(config: Any) -> Any:
+    """State the version and the licence at the foot of every page."""
+    from softfinger import __version__
+
+    config.copyright = f"softfinger {__version__}, MIT licence"
+    return config
 
 
 def on_files(files: Any, config: Any) -> Any:
