@@ -190,6 +190,32 @@ def limits() -> str:
     return "".join(rows)
 
 
+# --- events ---------------------------------------------------------------------------------------
+
+
+_EVENTS = """\
+# Events
+
+The daemon reports what happens as events: on the topic [`hand/event`](stream.md), in its log, and
+in `softfinger monitor` and `view`. An event has a level, a kind and a text. The text has the
+details of the case; this table explains the kinds.
+
+An error of a kind that [Limits](limits.md) lists is a *fault*: torque is off until the cause is
+removed and `clear` was sent.
+
+"""
+
+
+def events() -> str:
+    """Every kind of event, from the table that explains them."""
+    from softfinger.daemon.wire.event_kinds import KINDS
+
+    parts = [_EVENTS, _head("kind", "level", "cause", "what to do")]
+    for kind, each in KINDS.items():
+        parts.append(_row(f"`{kind}`", each.levels, each.cause, each.remedy))
+    return "".join(parts)
+
+
 # --- the interface for programs -------------------------------------------------------------------
 
 
@@ -299,6 +325,7 @@ PAGES: dict[str, Callable[[], str]] = {
     "commands.md": commands,
     "command-line.md": command_line,
     "limits.md": limits,
+    "events.md": events,
     "api.md": api,
 }
 # Where a link to a file of the project's folder leads to on the site.
@@ -310,6 +337,7 @@ _LINKS = {
     "config/sim.toml": "configuration.md",
     "daemon/control/modes.py": "commands.md",
     "daemon/safety/limits.py": "limits.md",
+    "daemon/wire/event_kinds.py": "events.md",
     "softfinger/__init__.py": "api.md",
     "tools/examples/grasp_and_turn.py": "example.md",
     "daemon/tactile/cobs.py": "contributing.md#a-tactile-board",
