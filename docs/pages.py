@@ -41,14 +41,14 @@ def _head(*cells: str) -> str:
 _SETTINGS = """\
 # Settings
 
-A profile is a TOML file that names what differs from these defaults, the built-in simulated hand.
-Any key may be set for one run, as `--set loop.rate=1000`. SI units; pairs are [left, right].
-The hand's parts are settings, too: one finger or two, sensors without servos, servos without
-sensors.
+A profile is a TOML file with the settings that differ from the defaults below, which are those of
+the built-in simulated hand. To change a setting for one run, write `--set loop.rate=1000`. Units
+are SI unless stated otherwise, and pairs are [left, right]. A hand may have one finger or two, and
+may lack servos or sensors.
 
-Unknown keys, wrong types and numbers out of range are errors, all in one report. What only building
-shows is told after that: whether a contact table can reach `table.tolerance`, how far a measured
-law is off its points, and whether a calibration file fits.
+Unknown keys, wrong types and numbers out of range are reported together at the start. Errors that
+only show while the models are built follow: a contact table that cannot reach `table.tolerance`, a
+law that misses its measured points, a calibration file that does not fit.
 
 `softfinger config reference SECTION` prints a section in the terminal.
 
@@ -200,8 +200,8 @@ The daemon reports what happens as events: on the topic [`hand/event`](stream.md
 in `softfinger monitor` and `view`. An event has a level, a kind and a text. The text has the
 details of the case; this table explains the kinds.
 
-An error of a kind that [Limits](limits.md) lists is a *fault*: torque is off until the cause is
-removed and `clear` was sent.
+An error whose kind [Limits](limits.md) lists as a `fault` turns torque off. Remove its cause, then
+send `clear`.
 
 """
 
