@@ -6,6 +6,7 @@
 # make lowest: the tests of servos, settings and wire with the oldest packages that pyproject.toml allows.
 # make docs: the documentation site, in build/site.
 # make newest: a fast part of the tests with the newest Python on this machine.
+# make release VERSION=1.2.3: sets version and changelog, checks, builds the packages, and prints the commands that publish.
 # Each sets up in .venv what it needs and no more. PYTHON=python3.13 chooses the interpreter (3.11 or later), which then
 # has an environment of its own, as .venv-3.13.
 
@@ -18,7 +19,9 @@ endif
 BIN := $(VENV)/bin
 # Byte code is then made of what is imported; most of the packages' modules never are.
 PIP_INSTALL := -m pip --disable-pip-version-check install --no-compile
-INSTALL := $(BIN)/python $(PIP_INSTALL) --constraint constraints.txt
+# CONSTRAINTS= takes the newest dependencies in place of the tested ones.
+CONSTRAINTS := --constraint constraints.txt
+INSTALL := $(BIN)/python $(PIP_INSTALL) $(CONSTRAINTS)
 WORKERS := $(shell expr $$(nproc) + 2) # some wait for something while the others compute
 # Which lines no test ran is told where Python can count them for next to nothing (3.12 and later).
 COVERAGE = $(shell $(BIN)/python -c "import sys; print('--cov' * (sys.version_info >= (3, 12)))")
@@ -26,7 +29,7 @@ PYTEST = $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist worksteal
 # Otherwise each test process compiles the kernels of both kinds of tips at the same time.
 COMPILE = $(BIN)/softfinger compile --all && $(BIN)/softfinger compile --all --config solid
 LOWEST_PIP := build/lowest/bin/python $(PIP_INSTALL) --quiet
-NEWEST_PIP := build/newest/bin/python $(PIP_INSTALL) --quiet --constraint constraints.txt
+NEWEST_PIP := build/newest/bin/python $(PIP_INSTALL) --quiet $(CONSTRAINTS)
 SERVO_TESTS := tests/process/test_servo_sdk.py tests/unit/test_servo_round_trip.py
 LOWEST_TESTS := tests/process/test_servo_checks.py $(addprefix tests/unit/test_,settings.py schema.py)
 NEWEST_TESTS := tests/unit/test_stream.py tests/process/test_client.py
@@ -41,11 +44,12 @@ NUMERICAL_TESTS := tests/process/test_replay_recording.py::test_the_golden_recor
 TO_RUN := $(VENV)/.ready-run
 TO_TEST := $(VENV)/.ready-test
 TO_DOCUMENT := $(VENV)/.ready-docs
+TO_RELEASE := $(VENV)/.ready-release
 
 # Byte code is kept whatever the environment says: a test run starts hundreds of processes.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: run test test-extended test-all test-arithmetic warm docs lowest newest lint format clean
+.PHONY: run test test-extended test-all test-arithmetic warm docs lowest newest lint format release clean
 
 run: $(TO_RUN)
 	@echo "Starting the simulated hand at work; q ends it."
@@ -99,24 +103,34 @@ format: $(TO_TEST)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
+release: $(TO_RELEASE)
+	@$(BIN)/python .ci/release.py prepare "$(VERSION)"
+	@$(MAKE) lint docs test
+	@$(BIN)/python .ci/release.py build "$(VERSION)"
+
 $(TO_RUN): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
 		|| { echo "softfinger needs Python 3.11 or later; say which with PYTHON=…"; exit 1; }
 	@echo "Setting up $(VENV) once: numpy, numba and seven small packages, about 100 MB to fetch."
 	@$(PYTHON) -m venv $(VENV)
+	@$(INSTALL) --quiet 'pip>=25.1' # the first that installs dependency groups
 	@$(INSTALL) --editable .
 	@$(BIN)/softfinger compile --config demo
 	@touch $@
 
 $(TO_TEST): $(TO_RUN)
 	@echo "Adding what the tests need to $(VENV) once: pyarrow, scipy and others."
-	@$(INSTALL) --editable '.[dev]'
+	@$(INSTALL) --editable . --group dev
 	@$(COMPILE)
 	@touch $@
 
 $(TO_DOCUMENT): $(TO_RUN)
 	@echo "Adding MkDocs and its theme to $(VENV) once."
-	@$(INSTALL) --editable '.[docs]'
+	@$(INSTALL) --editable . --group docs
+	@touch $@
+
+$(TO_RELEASE): $(TO_TEST) $(TO_DOCUMENT)
+	@$(INSTALL) --group release
 	@touch $@
 
 clean:

@@ -7,7 +7,7 @@ function for a shape) that is called as the built-in ones are. It may have
 - ``metal``: it is real hardware (True unless it says otherwise),
 - ``hand``: it needs the simulated hand, which it then is given as the built-in ones are; servos
   may name the class that is made in the place of `SimulatedHand`, with its arguments,
-- ``Settings``: a pydantic model, best derived from `profile.settings.Section`, of the profile's
+- ``Settings``: a pydantic model, best derived from `profile.fields.Section`, of the profile's
   table ``[plugins.NAME]``; the validated settings are its last argument.
 """
 

@@ -1,13 +1,11 @@
 """The pages of the site that are made at its build: from the code, and from the project's folder.
 
-MkDocs calls `on_files` and `on_page_markdown` (``hooks`` in mkdocs.yml). `PAGES` is all there is.
+MkDocs calls the functions named ``on_…`` (``hooks`` in mkdocs.yml). `PAGES` is all there is.
 """
 
 from __future__ import annotations
 
 import argparse
-import ast
-import inspect
 import itertools
 import json
 import os
@@ -43,49 +41,47 @@ def _head(*cells: str) -> str:
 _SETTINGS = """\
 # Settings
 
-A profile is a TOML file that names what differs from these defaults, the built-in simulated hand.
-Any key may be set for one run, as `--set loop.rate=1000`. SI units; pairs are [left, right].
-The hand's parts are settings, too: one finger or two, sensors without servos, servos without
-sensors.
+A profile is a TOML file with the settings that differ from the defaults below, which are those of
+the built-in simulated hand. To change a setting for one run, write `--set loop.rate=1000`. Units
+are SI unless stated otherwise, and pairs are [left, right]. A hand may have one finger or two, and
+may lack servos or sensors.
 
-Unknown keys, wrong types and numbers out of range are errors, all in one report. What only building
-shows is told after that: whether a contact table can reach `table.tolerance`, how far a measured
-law is off its points, and whether a calibration file fits.
+Unknown keys, wrong types and numbers out of range are reported together at the start. Errors that
+only show while the models are built follow: a contact table that cannot reach `table.tolerance`, a
+law that misses its measured points, a calibration file that does not fit.
 
 `softfinger config reference SECTION` prints a section in the terminal.
+
+Editors complete and check keys with the JSON schema that the first line of the packaged profiles
+names (Even Better TOML in VS Code, Taplo in others). Begin a profile of your own with both:
+
+```sh
+softfinger config show hil > my.toml
+softfinger config schema > schema.json
+```
 
 ## Profiles
 
 `--config hil` finds one of these by its name, wherever softfinger is installed; a path names a
-profile of your own, which `softfinger config show hil > my.toml` begins.
+profile of your own.
 
 """
 
 
 def configuration() -> str:
-    """Every section and key, from the classes of the settings and the comments in them."""
-    from softfinger.daemon.profile import settings
+    """Every section and key, from their declarations."""
+    from softfinger.daemon.profile import reference
 
-    source = inspect.getsource(settings)
-    comments = {
-        node.name: _comments(source.splitlines(), node)
-        for node in ast.parse(source).body
-        if isinstance(node, ast.ClassDef)
-    }
     parts = [_SETTINGS, _head("profile", "what it is"), *_profiles()]
-    for section, field in settings.Settings.model_fields.items():
-        model: Any = field.annotation
-        schema = model.model_json_schema()["properties"] if model.model_fields else {}
-        parts.append(
-            f"\n## `[{section}]`\n\n{inspect.cleandoc(model.__doc__).replace('``', '`')}\n\n"
-        )
-        if schema:
-            parts.append(_head("key", "default", "may be", "meaning, unit"))
-        for key, default in model.model_fields.items():
-            value = json.dumps(default.default, ensure_ascii=False)
-            allowed = _allowed(settings, section, key, schema[key])
-            meaning = comments[model.__name__].get(key, "")
-            parts.append(_row(f"`{key}`", f"`{value}`", allowed, meaning))
+    keys = reference.every_key()
+    for name, section in reference.sections().items():
+        parts.append(f"\n## `[{name}]`\n\n{reference.about(section)}\n\n")
+        rows = [key for key in keys if key.section == name]
+        if rows:
+            parts.append(_head("key", "default", "unit", "allowed", "meaning"))
+        for key in rows:
+            cells = (f"`{key.name}`", f"`{key.default}`", key.unit, key.allowed, key.meaning)
+            parts.append(_row(*cells))
     return "".join(parts)
 
 
@@ -95,51 +91,6 @@ def _profiles() -> list[str]:
     from softfinger.tools.setup.config import subject
 
     return [_row(f"`{name}`", subject(Path(name))) for name in names()]
-
-
-def _comments(lines: list[str], node: ast.ClassDef) -> dict[str, str]:
-    """What stands behind each field of a class, or above it where its line is full."""
-    found = {}
-    for each in node.body:
-        if isinstance(each, ast.AnnAssign) and isinstance(each.target, ast.Name):
-            own = "\n".join(lines[each.lineno - 1 : each.end_lineno])
-            word = re.search(r"# (.*)$", own, re.M) or re.match(r" +# (.*)", lines[each.lineno - 2])
-            found[each.target.id] = word[1] if word else ""
-    return found
-
-
-def _allowed(settings: Any, section: str, key: str, schema: dict[str, Any]) -> str:
-    """The values that a key takes, in words."""
-    from softfinger.daemon.backends import BUILT_IN
-
-    names = {
-        "servos.backend": BUILT_IN["servos"],
-        "tactile.backend": BUILT_IN["tactile"],
-        "simulation.object_shape": BUILT_IN["shapes"],
-    }.get(f"{section}.{key}")
-    if names is not None:
-        return ", ".join(f"`{name}`" for name in names) + ", or a [plugin](plugins.md)'s"
-    return _words(schema)
-
-
-def _words(schema: dict[str, Any]) -> str:
-    if "prefixItems" in schema:
-        return f"pair: {_words(schema['prefixItems'][0])}"
-    if "items" in schema:
-        return f"list: {_words(schema['items'])}"
-    if "enum" in schema:
-        return ", ".join(f"`{json.dumps(value)}`" for value in schema["enum"])
-    if "const" in schema:
-        return f"`{json.dumps(schema['const'])}`"
-    ends = [
-        ("≥", "minimum"),
-        (">", "exclusiveMinimum"),
-        ("≤", "maximum"),
-        ("<", "exclusiveMaximum"),
-    ]
-    bounds = [f"{sign} {schema[end]:.7g}" for sign, end in ends if end in schema]
-    kinds = {"number": "", "integer": "whole", "boolean": "`true`, `false`", "string": "text"}
-    return ", ".join(filter(None, [kinds[schema["type"]], *bounds]))
 
 
 # --- the stream -----------------------------------------------------------------------------------
@@ -237,6 +188,32 @@ def limits() -> str:
         keys = ", ".join(_values(settings, row))
         rows.append(_row(f"`{row.name}`", row.quantity, row.level, when, keys and f"`{keys}`"))
     return "".join(rows)
+
+
+# --- events ---------------------------------------------------------------------------------------
+
+
+_EVENTS = """\
+# Events
+
+The daemon reports what happens as events: on the topic [`hand/event`](stream.md), in its log, and
+in `softfinger monitor` and `view`. An event has a level, a kind and a text. The text has the
+details of the case; this table explains the kinds.
+
+An error whose kind [Limits](limits.md) lists as a `fault` turns torque off. Remove its cause, then
+send `clear`.
+
+"""
+
+
+def events() -> str:
+    """Every kind of event, from the table that explains them."""
+    from softfinger.daemon.wire.event_kinds import KINDS
+
+    parts = [_EVENTS, _head("kind", "level", "cause", "what to do")]
+    for kind, each in KINDS.items():
+        parts.append(_row(f"`{kind}`", each.levels, each.cause, each.remedy))
+    return "".join(parts)
 
 
 # --- the interface for programs -------------------------------------------------------------------
@@ -348,6 +325,7 @@ PAGES: dict[str, Callable[[], str]] = {
     "commands.md": commands,
     "command-line.md": command_line,
     "limits.md": limits,
+    "events.md": events,
     "api.md": api,
 }
 # Where a link to a file of the project's folder leads to on the site.
@@ -359,10 +337,19 @@ _LINKS = {
     "config/sim.toml": "configuration.md",
     "daemon/control/modes.py": "commands.md",
     "daemon/safety/limits.py": "limits.md",
+    "daemon/wire/event_kinds.py": "events.md",
     "softfinger/__init__.py": "api.md",
     "tools/examples/grasp_and_turn.py": "example.md",
     "daemon/tactile/cobs.py": "contributing.md#a-tactile-board",
 }
+
+
+def on_config(config: Any) -> Any:
+    """State the version and the licence at the foot of every page."""
+    from softfinger import __version__
+
+    config.copyright = f"softfinger {__version__}, MIT licence"
+    return config
 
 
 def on_files(files: Any, config: Any) -> Any:

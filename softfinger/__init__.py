@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from softfinger.kinematics.sensing.pressure_grid import SensorGrid
     from softfinger.tools.recordings.reader import read_recording
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __all__ = [
     "AsyncHand",

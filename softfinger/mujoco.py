@@ -27,7 +27,8 @@ from pydantic import Field
 
 from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.profile.factory import make_grid, make_material, make_table, make_tip
-from softfinger.daemon.profile.settings import Section, Settings
+from softfinger.daemon.profile.fields import Section
+from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.simulated import SimulatedServos
 from softfinger.daemon.simulation.physics.forces import current_reference
 from softfinger.daemon.simulation.physics.outline import rim_on_plane

@@ -19,7 +19,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from softfinger.daemon.errors import TactileError
 from softfinger.daemon.own_files import read_file
-from softfinger.daemon.profile.settings import Finite, NonNegative, Positive, Settings
+from softfinger.daemon.profile.fields import Finite, NonNegative, Positive
+from softfinger.daemon.profile.settings import Settings
 from softfinger.kinematics.compiled.own_folder import write_whole
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.tip_curves import TipCurves

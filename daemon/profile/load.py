@@ -24,7 +24,7 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.profile.validation import problems, shown
 
 _PROFILES = Path(softfinger.__file__).parent / "config"
-_MOST = 256 << 10  # bytes; the reference, which names every key, has 12 kB
+_MOST = 256 << 10  # bytes; the reference, which names every key, has 21 kB
 _DEEPEST = 8  # tables and arrays in each other
 _TOLD = 20  # errors of one profile
 # A key of so many parts: one of thousands takes tomllib minutes.

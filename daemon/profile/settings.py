@@ -1,302 +1,432 @@
-"""Settings: the sections of a profile, with their defaults, bounds and units.
+"""Settings: the sections of a profile, with defaults, bounds, units and meanings.
 
-Nothing here acts on them; `profile.load` reads and checks a file. The defaults alone are the
-built-in simulated hand; ``config/sim.toml`` spells them out. Lengths are m, angles rad, currents A,
-rates Hz; pairs are (left, right).
+The defaults are the built-in simulated hand. `profile.load` reads and checks a file;
+`profile.reference` writes ``config/sim.toml`` and the JSON schema from these declarations. Pairs
+are (left, right).
 """
 
 from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
-from pydantic_core import PydanticCustomError
+from pydantic import ConfigDict
 
-from softfinger.daemon.backends import Kind, backend, known, known_servo_models
-from softfinger.daemon.errors import PluginError
+from softfinger.daemon.backends import BUILT_IN, backend
+from softfinger.daemon.profile.fields import (
+    Angle,
+    Counts,
+    Delay,
+    Factor,
+    Finite,
+    Fraction,
+    GearLoss,
+    Index,
+    Length,
+    Modulus,
+    NonNegative,
+    Place,
+    Positive,
+    Processor,
+    Rate,
+    Seconds,
+    Section,
+    ServoId,
+    ServoModel,
+    names_backend,
+    setting,
+)
+from softfinger.daemon.profile.simulation_settings import SimulationSettings
 from softfinger.daemon.types import COMMAND_ADDRESS, STREAM_ADDRESS
 
-# Every number has an end on both sides: implausible values are typing errors, and must not reach
-# an integral. Bounds are closed or open as the quantity is.
-Positive = Annotated[float, Field(ge=1e-9, le=1e9, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False)]
-Finite = Annotated[float, Field(ge=-1e9, le=1e9, allow_inf_nan=False)]
-_METRES = {"unit": "m"}  # by which a report knows lengths that seem to be in mm
-Length = Annotated[float, Field(ge=1e-4, le=1, allow_inf_nan=False, json_schema_extra=_METRES)]
-Place = Annotated[float, Field(ge=-10, le=10, allow_inf_nan=False)]  # m
-Angle = Annotated[float, Field(ge=-6.3, le=6.3, allow_inf_nan=False)]  # rad
-Seconds = Annotated[float, Field(gt=0, le=60, allow_inf_nan=False)]
-Delay = Annotated[float, Field(ge=0, le=60, allow_inf_nan=False)]  # s
-Rate = Annotated[float, Field(ge=0.1, le=10_000, allow_inf_nan=False)]  # Hz
-Acceleration = Annotated[float, Field(ge=-100, le=100, allow_inf_nan=False)]  # m/s²
-Factor = Annotated[float, Field(ge=1e-5, le=1e5, allow_inf_nan=False)]
-Counts = Annotated[int, Field(ge=-1_048_575, le=1_048_575)]
-Modulus = Annotated[float, Field(ge=1, le=1e10, allow_inf_nan=False)]  # Pa
-Fraction = Annotated[float, Field(ge=0, le=1)]
-Ratio = Annotated[float, Field(ge=0.1, le=10)]
-GearLoss = Annotated[float, Field(ge=0, le=0.5)]
 Finger = Literal["left", "right"]
-Index = Annotated[int, Field(ge=0, le=255)]
 Cells = tuple[tuple[Index, Index], ...]
 LawName = Literal["energy", "upright"]
 ServoMode = Literal["current-based position", "current", "position"]
 
 
-def _backend(kind: Kind) -> AfterValidator:
-    """A text that names a backend, in pydantic's words for a Literal."""
-
-    def check(name: str) -> str:
-        try:
-            backend(kind, name)
-        except PluginError as error:
-            why = {"why": str(error)}
-            raise PydanticCustomError("plugin", "a plugin that works: {why}", why) from None
-        except KeyError:
-            *most, last = map(repr, known(kind))
-            listed = {"known": f"{', '.join(most)} or {last}"}
-            raise PydanticCustomError("one_of", "Input should be {known}", listed) from None
-        return name
-
-    return AfterValidator(check)
-
-
-def _servo_model(name: str) -> str:
-    if models := known_servo_models(name):
-        raise PydanticCustomError("servo_model", "one of {known}", {"known": models})
-    return name
-
-
-Model = Annotated[str, AfterValidator(_servo_model)]
-
-
-class Section(BaseModel):
-    """Base of all sections: unknown keys are errors, values are not converted, nothing changes.
-
-    A whole number is accepted where a float is asked for; a string never is.
-    """
-
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
-
-
 class SceneSettings(Section):
-    """Parts that take part. A backend set to ``none`` takes the servos or the sensors out."""
+    """Parts of the hand that are used. The backend ``none`` removes the servos or the sensors."""
 
-    # one or two
-    fingers: Annotated[tuple[Finger, ...], Field(min_length=1, max_length=2)] = ("left", "right")
-    object_model: bool = True  # estimate the object's angle and width from the two contacts
+    fingers: tuple[Finger, ...] = setting(
+        ("left", "right"), "", "The fingers of the hand, one or two.", min_length=1, max_length=2
+    )
+    object_model: bool = setting(
+        True, "", "Estimate the object's angle and width from both contacts."
+    )
 
 
 class GeometrySettings(Section):
     """Two rotational fingers in a plane: pivots at (∓pivot_separation/2, 0), q > 0 closes."""
 
-    pivot_separation: Length = 0.100  # m between the fingers' axes
-    finger_length: Length = 0.080  # m, axis to the centre of the tip's base, along the finger
-    finger_offset: Place = 0.0  # m, the same across the finger; positive towards the other one
-    q_min: tuple[Angle, Angle] = (-0.5, -0.5)  # rad, as far as it opens
-    q_max: tuple[Angle, Angle] = (1.0, 1.0)  # rad, as far as it closes
-    open_angle: tuple[Angle, Angle] = (0.0, 0.0)  # where release goes
+    pivot_separation: Length = setting(0.100, "m", "Distance between the axes of the two joints.")
+    finger_length: Length = setting(
+        0.080, "m", "Distance from the axis to the centre of the tip's base, along the finger."
+    )
+    finger_offset: Place = setting(
+        0.0, "m", "The same distance across the finger, positive towards the other finger."
+    )
+    q_min: tuple[Angle, Angle] = setting((-0.5, -0.5), "rad", "Joint angle of the widest opening.")
+    q_max: tuple[Angle, Angle] = setting((1.0, 1.0), "rad", "Largest joint angle when closing.")
+    open_angle: tuple[Angle, Angle] = setting(
+        (0.0, 0.0), "rad", "Joint angle that `release` moves to."
+    )
 
 
 class TipSettings(Section):
-    """The soft hemispherical fingertip: the paper's springs, solid rubber, or curves of its own.
+    """The soft hemispherical fingertip: the paper's springs, solid rubber, or measured curves.
 
-    Those are measured by `calibrate law` and stand in the files of ``tactile.calibration``.
+    `calibrate law` measures the curves and stores them in the files of ``tactile.calibration``.
     """
 
-    radius: Length = 0.020  # m
-    radius_error: Annotated[float, Field(ge=0, le=0.1)] = 0.0  # relative, standard deviation
-    physics: Literal["springs", "solid", "measured"] = "springs"  # the contact model
-    poisson: Annotated[float, Field(ge=0.45, le=0.4995)] = 0.49  # of a solid tip
-    base: Literal["bonded", "lying"] = "bonded"  # a solid tip on its sensor
-    face: Literal["frictionless", "sticking"] = "frictionless"  # a solid tip on the object
-    # how much firmer it is at once than in the end, by each of three Prony terms
-    relaxation: tuple[Fraction, Fraction, Fraction] = (0.0, 0.0, 0.0)
-    # s, of each: a human fingerpad's (Pawluk & Howe, 1999)
-    relaxation_times: tuple[Positive, Positive, Positive] = (0.004, 0.07, 1.4)
+    radius: Length = setting(0.020, "m", "Radius of the hemisphere.")
+    radius_error: float = setting(
+        0.0, "", "Relative standard deviation of the radius.", ge=0, le=0.1
+    )
+    physics: Literal["springs", "solid", "measured"] = setting(
+        "springs", "", "Contact model: the paper's springs, solid rubber, or measured curves."
+    )
+    poisson: float = setting(0.49, "", "Poisson's ratio of a solid tip.", ge=0.45, le=0.4995)
+    base: Literal["bonded", "lying"] = setting(
+        "bonded", "", "Base of a solid tip: bonded to the sensor, or lying on it and free to slide."
+    )
+    face: Literal["frictionless", "sticking"] = setting(
+        "frictionless", "", "Contact of a solid tip with the object."
+    )
+    relaxation: tuple[Fraction, Fraction, Fraction] = setting(
+        (0.0, 0.0, 0.0), "", "Amplitudes of three Prony terms: shares of its final stiffness by "
+        "which the tip is firmer at first."
+    )  # fmt: skip
+    relaxation_times: tuple[Positive, Positive, Positive] = setting(
+        (0.004, 0.07, 1.4), "s", "Time constants of the Prony terms; the defaults are those of a "
+        "human fingerpad (Pawluk & Howe, 1999)."
+    )  # fmt: skip
 
 
 class MaterialSettings(Section):
     """Stress-strain law of the tip: the paper's Table I, a constant modulus, or measured points."""
 
-    law: Literal["table_i", "constant", "points"] = "table_i"  # stress over strain
-    modulus: Modulus = 0.304e6  # Pa, for law = "constant"
-    strain: tuple[Finite, ...] = ()  # 1, for law = "points"
-    stress: tuple[Finite, ...] = ()  # Pa, for law = "points"
-    modulus_error: Annotated[float, Field(ge=0, le=1)] = 0.0  # relative, standard deviation
-    force_error_max: Positive = 0.05  # of F, by the law's misfit of its points, d > radius/20
+    law: Literal["table_i", "constant", "points"] = setting("table_i", "", "Stress-strain law.")
+    modulus: Modulus = setting(0.304e6, "Pa", 'Modulus for law = "constant".')
+    strain: tuple[Finite, ...] = setting((), "", 'Strains of the points for law = "points".')
+    stress: tuple[Finite, ...] = setting((), "Pa", 'Stresses of the points for law = "points".')
+    modulus_error: float = setting(
+        0.0, "", "Relative standard deviation of the modulus.", ge=0, le=1
+    )
+    force_error_max: Positive = setting(
+        0.05, "", "Largest relative error of the force that the fit of the points may cause at "
+        "d > radius/20; a larger one is an error."
+    )  # fmt: skip
 
 
 class TableSettings(Section):
-    """The contact table: largest relative error of force, energy and their partials."""
+    """The contact table, a lookup of force, energy and their partial derivatives."""
 
-    tolerance: Annotated[float, Field(ge=1e-13, le=1e-2)] = 1e-9  # relative
+    tolerance: float = setting(
+        1e-9, "", "Largest relative error of the looked-up values.", ge=1e-13, le=1e-2
+    )
 
 
 class ServoSettings(Section):
-    """The joints."""
+    """The servos of the joints."""
 
-    backend: Annotated[str, _backend("servos")] = "simulated"  # what drives the joints
-    port: str = "/dev/ttyUSB0"  # "{dir}" stands for the folder given by --dir
-    baud: Annotated[int, Field(ge=9600, le=4_500_000)] = 2_000_000  # bit/s
-    model: Model = "XM430-W350"  # of both servos
-    # on the bus, each another
-    ids: tuple[Annotated[int, Field(ge=0, le=252)], Annotated[int, Field(ge=0, le=252)]] = (1, 2)
-    direction: tuple[Literal[-1, 1], Literal[-1, 1]] = (1, -1)  # sign of counts when closing
-    zero: tuple[Counts, Counts] = (2048, 2048)  # counts at q = 0
-    gear_ratio: Positive = 1.0  # servo turns for one joint turn
-    current_limit: tuple[Positive, Positive] = (6.0, 6.0)  # A; the servo's own limit binds too
-    mode: ServoMode = "current-based position"  # or "current", or "position" (can't grasp)
-    stiffness: Positive = 8.0  # A/rad of the daemon's position loop, in current mode alone
-    damping: NonNegative = 0.4  # A·s/rad, likewise
-    reply_timeout: Annotated[float, Field(gt=0, le=1)] = 0.004  # s, a missing reply costs no more
-    open_timeout: Seconds = 5.0  # s to wait at the start for servos that do not answer yet
-    fault_after: Seconds = 0.05  # s without a good reading → fault
-    watchdog: Annotated[float, Field(ge=0, le=2.54)] = 0.1  # s, the servo's own; 0 leaves it off
-    heat_rise: NonNegative = 0.0  # K/A² that its case warms by in the end; 0: the model's own
-    heat_time: NonNegative = 0.0  # s in which it does, likewise
+    backend: Annotated[str, names_backend("servos")] = setting(
+        "simulated", "", "Driver of the servos.", examples=[*BUILT_IN["servos"]]
+    )
+    port: str = setting(
+        "/dev/ttyUSB0", "", 'Serial port. "{dir}" stands for the folder given by --dir.'
+    )
+    baud: int = setting(2_000_000, "bit/s", "Rate of the bus.", ge=9600, le=4_500_000)
+    model: ServoModel = setting("XM430-W350", "", "Model of both servos.")
+    ids: tuple[ServoId, ServoId] = setting((1, 2), "", "IDs of the servos on the bus.")
+    direction: tuple[Literal[-1, 1], Literal[-1, 1]] = setting(
+        (1, -1), "", "Sign of the change of the servo's counts when the finger closes."
+    )
+    zero: tuple[Counts, Counts] = setting((2048, 2048), "counts", "Servo position at q = 0.")
+    gear_ratio: Positive = setting(1.0, "", "Turns of the servo for one turn of the joint.")
+    current_limit: tuple[Positive, Positive] = setting(
+        (6.0, 6.0), "A", "Upper bound of the goal current; the servo's own limit applies as well."
+    )
+    mode: ServoMode = setting(
+        "current-based position", "", "Operating mode of the servos; `position` cannot grasp."
+    )
+    stiffness: Positive = setting(
+        8.0, "A/rad", "Gain of the daemon's position loop in the mode `current`."
+    )
+    damping: NonNegative = setting(
+        0.4, "A·s/rad", "Velocity gain of the daemon's position loop in the mode `current`."
+    )
+    reply_timeout: float = setting(
+        0.004, "s", "Longest time that the loop waits for a servo's reply.", gt=0, le=1
+    )
+    open_timeout: Seconds = setting(
+        5.0, "s", "Longest time to wait at the start for servos that do not answer."
+    )
+    fault_after: Seconds = setting(0.05, "s", "Time without a valid reading that is a fault.")
+    watchdog: float = setting(
+        0.1, "s", "Time without a command after which a servo stops by itself; 0 disables its "
+        "watchdog.", ge=0, le=2.54
+    )  # fmt: skip
+    heat_rise: NonNegative = setting(
+        0.0, "K/A²", "Final temperature rise of the servo's case; 0 stands for the model's value."
+    )
+    heat_time: NonNegative = setting(
+        0.0, "s", "Time constant of that rise; 0 stands for the model's value."
+    )
 
 
 class TactileSettings(Section):
     """The pressure grids under the tips."""
 
-    backend: Annotated[str, _backend("tactile")] = "simulated"  # where frames come from
-    port: tuple[str, str] = ("/dev/ttyUSB1", "/dev/ttyUSB2")  # "{dir}" as for the servos
-    baud: Annotated[int, Field(ge=9600, le=12_000_000)] = 2_000_000  # bit/s
-    rows: Annotated[int, Field(ge=4, le=256)] = 44  # cells along y
-    cols: Annotated[int, Field(ge=4, le=256)] = 44  # cells along x
-    pitch: Annotated[Length, Field(le=0.05)] = 0.058 / 44  # m from cell to cell
-    pitch_y: Annotated[float, Field(ge=0, le=0.05, json_schema_extra=_METRES)] = 0.0  # 0: as pitch
-    centre: tuple[Place, Place] = (0.0, 0.0)  # tip centre off the grid's centre (x, y)
-    rotation: tuple[Angle, Angle] = (0.0, 0.0)  # sensor's axes against the finger's, about +z
-    blur: Annotated[float, Field(ge=0, le=0.01)] = 0.0  # m, the elastomer's standard deviation
-    dead: tuple[Cells, Cells] = ((), ())  # cells [row, col] that are left out
-    threshold: Annotated[int, Field(ge=0, le=255)] = 0  # smallest count sent; 0 stands for less
-    pascal_per_count: Positive = 4.0  # Pa of one count
-    full_count: Annotated[int, Field(ge=1, le=65535)] = 65535  # cells that read it are saturated
-    rate: Rate = 100.0  # frames a second that are expected
-    noise: Positive = 1520.0  # Pa a cell, standard deviation (0.5 % of 0.304 MPa)
-    baseline_error: NonNegative = 0.0  # Pa, likewise of a shift of all cells since the tare
-    slope_error: NonNegative = 0.0  # Pa, of the same from the tip's middle to its rim, x and y
-    centre_error: Annotated[float, Field(ge=0, le=0.01)] = 0.0  # m, of the tip's centre, x and y
-    pitch_error: Annotated[float, Field(ge=0, le=0.1)] = 0.0  # relative
-    rotation_error: Annotated[float, Field(ge=0, le=0.5)] = 0.0  # rad, of the sensor about the tip
-    skew_error: Annotated[float, Field(ge=0, le=0.01)] = 0.0  # m that a face goes during a scan
-    # What neighbours share, of the pressure: crosstalk is below 3.3 % with a good read-out (arXiv
-    # 2508.20959), linearity ± 3 % (FlexiForce's manual).
-    smooth_error: Annotated[float, Field(ge=0, le=1)] = 0.035
-    gain_error: Annotated[float, Field(gt=0, le=1)] = 0.25  # relative, likewise of all cells alike
-    latency: Delay = 0.02  # s from the middle of a scan to the first byte on the wire
-    response: Delay = 0.0  # s, first-order lag of the cells, made up for by the joints
-    open_timeout: Seconds = 2.0  # s to wait for a first good frame
-    sensor: tuple[str, str] = ("", "")  # identifies the sensors, as a serial number
-    calibration: tuple[str, str] = ("", "")  # files of `softfinger calibrate`; replace what's above
-    recording: tuple[str, str] = ("", "")  # backend = "replay": .npz, folder of .npy, ASCII export
-    replay_again: bool = True  # backend = "replay": from the start at the end, else it ends
+    backend: Annotated[str, names_backend("tactile")] = setting(
+        "simulated", "", "Source of the frames.", examples=[*BUILT_IN["tactile"]]
+    )
+    port: tuple[str, str] = setting(
+        ("/dev/ttyUSB1", "/dev/ttyUSB2"), "",
+        'Serial ports. "{dir}" stands for the folder given by --dir.'
+    )  # fmt: skip
+    baud: int = setting(2_000_000, "bit/s", "Rate of the serial ports.", ge=9600, le=12_000_000)
+    rows: int = setting(44, "", "Number of rows (cells along y).", ge=4, le=256)
+    cols: int = setting(44, "", "Number of columns (cells along x).", ge=4, le=256)
+    pitch: float = setting(
+        0.058 / 44, "m", "Distance between the centres of columns.", ge=1e-4, le=0.05
+    )
+    pitch_y: float = setting(
+        0.0, "m", "Distance between the centres of rows; 0 stands for `pitch`.", ge=0, le=0.05
+    )
+    centre: tuple[Place, Place] = setting(
+        (0.0, 0.0), "m", "Position (x, y) of the tip's centre relative to the grid's centre."
+    )
+    rotation: tuple[Angle, Angle] = setting(
+        (0.0, 0.0), "rad", "Rotation of each sensor relative to its finger, about +z."
+    )
+    blur: float = setting(
+        0.0, "m", "Standard deviation of the blur by the layer above the cells.", ge=0, le=0.01
+    )
+    dead: tuple[Cells, Cells] = setting(
+        ((), ()), "", "Cells [row, col] of each sensor that are ignored."
+    )
+    threshold: int = setting(
+        0, "counts", "Smallest count that the board sends; it sends 0 below.", ge=0, le=255
+    )
+    pascal_per_count: Positive = setting(4.0, "Pa", "Pressure of one count.")
+    full_count: int = setting(
+        65535, "counts", "Count at which a cell is saturated.", ge=1, le=65535
+    )
+    rate: Rate = setting(100.0, "Hz", "Expected rate of frames.")
+    noise: Positive = setting(
+        1520.0, "Pa", "Standard deviation of a cell's noise (default: 0.5 % of 0.304 MPa)."
+    )
+    baseline_error: NonNegative = setting(
+        0.0, "Pa", "Standard deviation of a common shift of all cells since the last tare."
+    )
+    slope_error: NonNegative = setting(
+        0.0, "Pa", "Standard deviation of a linear change of the zero from the tip's centre to its "
+        "rim, in x and in y."
+    )  # fmt: skip
+    centre_error: float = setting(
+        0.0, "m", "Standard deviation of `centre`, in x and in y.", ge=0, le=0.01
+    )
+    pitch_error: float = setting(0.0, "", "Relative standard deviation of the pitch.", ge=0, le=0.1)
+    rotation_error: float = setting(0.0, "rad", "Standard deviation of `rotation`.", ge=0, le=0.5)
+    skew_error: float = setting(
+        0.0, "m", "Standard deviation of the object's motion during one scan.", ge=0, le=0.01
+    )
+    # Crosstalk is below 3.3 % with a good read-out (arXiv 2508.20959), linearity ± 3 %
+    # (FlexiForce's manual).
+    smooth_error: float = setting(
+        0.035, "", "Relative standard deviation of pressure errors that neighbouring cells share, "
+        "as by crosstalk or hysteresis.", ge=0, le=1
+    )  # fmt: skip
+    gain_error: float = setting(
+        0.25, "", "Relative standard deviation of the sensor's gain.", gt=0, le=1
+    )
+    latency: Delay = setting(
+        0.02, "s", "Time from the middle of a scan to the arrival of the frame's first byte."
+    )
+    response: Delay = setting(
+        0.0, "s", "Time constant of the cells' first-order lag; the estimate compensates for it."
+    )
+    open_timeout: Seconds = setting(2.0, "s", "Longest time to wait for the first valid frame.")
+    sensor: tuple[str, str] = setting(
+        ("", ""), "", "Names of the sensors, such as serial numbers; calibrations state them."
+    )
+    calibration: tuple[str, str] = setting(
+        ("", ""), "", "Files of `softfinger calibrate`; their values replace those above."
+    )
+    recording: tuple[str, str] = setting(
+        ("", ""), "", 'Frames for backend = "replay": an .npz file, a folder of .npy files, or an '
+        "ASCII export."
+    )  # fmt: skip
+    replay_again: bool = setting(
+        True, "", 'With backend = "replay": start again at the end of the recording.'
+    )
 
 
 class EstimatorSettings(Section):
-    """Estimation of d and θ from a frame.
+    """Estimation of displacement and angle from a frame."""
 
-    ``auto`` frees the gain of springs, and takes a solid tip's for known: its frames tell d by the
-    force alone.
-    """
-
-    method: Literal["ml"] = "ml"  # maximum likelihood
-    free_gain: Literal["auto", True, False] = "auto"  # estimate measured/modelled pressure too
+    method: Literal["ml"] = setting("ml", "", "Estimator: maximum likelihood.")
+    free_gain: Literal["auto", True, False] = setting(
+        "auto", "", "Estimate the sensor's gain with each frame. `auto` does so for springs only: "
+        "frames of a solid tip show d by the force alone, so its gain must be known."
+    )  # fmt: skip
 
 
 class LoopSettings(Section):
-    """The tick and its clock.
+    """The control loop and its clock.
 
-    ``real`` is this machine's time; ``hand`` a simulated hand's own, which waits while the machine
-    is busy; ``virtual`` runs as fast as the machine can. The latter two need simulated backends;
-    ``auto`` is ``hand`` with these and on the ports of `softfinger emulate`, else ``real``.
+    ``real`` is the machine's time. ``hand`` is the time of a simulated hand, which waits while the
+    machine is busy. ``virtual`` runs as fast as the machine can. ``hand`` and ``virtual`` need
+    simulated backends. ``auto`` is ``hand`` with these and on the ports of `softfinger emulate`,
+    otherwise ``real``.
     """
 
-    rate: Annotated[float, Field(ge=10, le=5000)] = 500.0  # Hz, ticks
-    # auto: real; of a simulated hand one that stands still while the machine is late
-    clock: Literal["auto", "hand", "real", "virtual"] = "auto"
+    rate: float = setting(500.0, "Hz", "Rate of the control loop.", ge=10, le=5000)
+    clock: Literal["auto", "hand", "real", "virtual"] = setting("auto", "", "Clock of the loop.")
 
 
 class RealtimeSettings(Section):
-    """Measures for a steady tick; the daemon reports what the system refuses and runs without it.
+    """Measures for a punctual control loop. The daemon reports those that the system refuses.
 
-    All but the priority are harmless: a program at SCHED_FIFO keeps others off its processor.
+    All are harmless except the priority: a loop at SCHED_FIFO keeps other programs off its
+    processor.
     """
 
-    priority: Annotated[int, Field(ge=0, le=80)] = 0  # of SCHED_FIFO; 0: the usual scheduling
-    slice: Annotated[float, Field(ge=0, le=0.1)] = 1e-4  # s; short ones run sooner; 0: the system's
-    cpus: tuple[Annotated[int, Field(ge=0, le=1023)], ...] = ()  # the loop's; none named: all
-    lock_memory: bool = True  # nothing of the process is swapped out
-    hold_latency: bool = True  # processors stay out of idle states that take long to leave
-    timer_slack: Annotated[float, Field(ge=0, le=1e-3)] = 1e-9  # s; 0: the system's, 50 µs
-    freeze_collector: bool = True  # a full collection would take tens of milliseconds
-    spin: Annotated[float, Field(ge=0, le=1e-3)] = 5e-5  # s before a tick that are waited awake
+    priority: int = setting(
+        0, "", "Priority under SCHED_FIFO; 0 keeps the usual scheduling.", ge=0, le=80
+    )
+    slice: float = setting(
+        1e-4, "s", "Scheduler slice; short ones are scheduled sooner; 0 keeps the system's.",
+        ge=0, le=0.1
+    )  # fmt: skip
+    cpus: tuple[Processor, ...] = setting(
+        (), "", "Processors that the loop may use; an empty list allows all."
+    )
+    lock_memory: bool = setting(True, "", "Keep the process's memory from being swapped out.")
+    hold_latency: bool = setting(
+        True, "", "Keep the processors out of idle states that take long to leave."
+    )
+    timer_slack: float = setting(
+        1e-9, "s", "Timer slack; 0 keeps the system's, usually 50 µs.", ge=0, le=1e-3
+    )
+    freeze_collector: bool = setting(
+        True, "", "Exclude start-up objects from garbage collection, which would take tens of "
+        "milliseconds."
+    )  # fmt: skip
+    spin: float = setting(
+        5e-5, "s", "Time before each tick that the loop waits awake.", ge=0, le=1e-3
+    )
 
 
 class StreamSettings(Section):
-    """The publisher. A topic goes out every n-th tick, with the n nearest to its rate."""
+    """The published stream. A topic is sent every n-th tick, with the n nearest to its rate."""
 
-    address: str = STREAM_ADDRESS  # tcp or ipc
-    state_rate: Rate = 100.0  # Hz
-    tactile_rate: Rate = 100.0  # Hz, of each finger's frames
-    tactile_unit: Literal["count", "Pa"] = "count"  # raw, or what the estimator makes of it
-    queue: Annotated[int, Field(ge=1, le=100_000)] = 2000  # messages kept for a slow subscriber
+    address: str = setting(STREAM_ADDRESS, "", "Address of the stream, tcp or ipc.")
+    state_rate: Rate = setting(100.0, "Hz", "Rate of the state.")
+    tactile_rate: Rate = setting(100.0, "Hz", "Rate of each finger's frames.")
+    tactile_unit: Literal["count", "Pa"] = setting(
+        "count", "", "Send raw counts, or the pressures that the estimator uses."
+    )
+    queue: int = setting(2000, "messages", "Messages kept for a slow subscriber.", ge=1, le=100_000)
 
 
 class CommandSettings(Section):
     """The command server."""
 
-    address: str = COMMAND_ADDRESS  # tcp or ipc
-    lease: Seconds = 2.0  # s a commander keeps the hand after its last command
-    on_silence: Literal["hold", "release", "stop"] = "hold"  # what the hand does then
-    max_bytes: Annotated[int, Field(ge=64, le=1_000_000)] = 4096  # bytes of a command
-    per_second: Annotated[float, Field(ge=1, le=10_000)] = 200.0  # a client; stop is always heard
+    address: str = setting(COMMAND_ADDRESS, "", "Address of the command server, tcp or ipc.")
+    lease: Seconds = setting(
+        2.0, "s", "Time that a client keeps control of the hand after its last command."
+    )
+    on_silence: Literal["hold", "release", "stop"] = setting(
+        "hold", "", "Action when the client in control falls silent."
+    )
+    max_bytes: int = setting(4096, "bytes", "Longest command.", ge=64, le=1_000_000)
+    per_second: float = setting(
+        200.0, "Hz", "Rate of commands that one client may send; `stop` is always accepted.",
+        ge=1, le=10_000
+    )  # fmt: skip
 
 
 class AccessSettings(Section):
-    """Access to stream and commands. Addresses off this machine need keys."""
+    """Access to stream and commands. Addresses that other machines can reach need keys."""
 
-    keys: str = ""  # folder that `softfinger keys` made: both sockets take only its clients
-    ipc_mode: Literal["0600", "0660", "0666"] = "0600"  # rights of an ipc address's file
+    keys: str = setting(
+        "", "", "Folder made by `softfinger keys`; both sockets then accept only its clients."
+    )
+    ipc_mode: Literal["0600", "0660", "0666"] = setting("0600", "", "File mode of an ipc address.")
 
 
 class ControlSettings(Section):
-    """Gains and rates of the control law; each default was chosen in simulation."""
+    """Gains and rates of the control law; the defaults were chosen in simulation."""
 
-    torque_constant: Factor = 1.78  # N·m per A at the joint (XM430-W350: 4.1 N·m at 2.3 A)
-    torque_error: Annotated[float, Field(gt=0, le=1)] = 0.1  # relative, standard deviation
-    approach_speed: Positive = 0.3  # rad/s
-    approach_current: Positive = 0.15  # A, while closing: a tip that feels nothing presses no more
-    move_speed: Positive = 1.0  # rad/s
-    contact_force: Positive = 0.5  # N at which a finger counts as touching
-    force_default: Positive = 5.0  # N, grasp without force=
-    law: LawName = "energy"  # "upright" needs no angle
-    force_time: Seconds = 0.1  # s in which the force goes from what is felt to what is wanted
-    smooth_time: Seconds = 0.1  # s over which references are averaged: bounds their jerk
-    force_gain: NonNegative = 1.0  # N a N of force error
-    force_bandwidth: NonNegative = 1.0  # Hz of the force integral
-    rotate_speed: Positive = 1.3  # rad/s of the object's angle
-    rotate_bandwidth: NonNegative = 4.0  # Hz of the angle integral
-    joint_stiffness: Positive = 45.0  # N·m/rad, on the antisymmetric motion
-    dither_torque: NonNegative = 0.3  # N·m, antisymmetric, by which "upright" frees the joints
-    dither_frequency: Annotated[float, Field(ge=3, le=50)] = 5.0  # Hz; slower, the grip would swing
-    dither_time: Delay = 2.0  # s in which it fades
-    joint_inertia: Factor = 0.010  # kg·m², finger and rotor: what is damped
-    damping_ratio: NonNegative = 0.7  # of that inertia on the tips' and the joints' stiffness
-    joint_friction: NonNegative = 0.05  # N·m of Coulomb friction, given where motion is wanted
-    joint_load_friction: GearLoss = 0.0  # share of the gears' torque: MX-64 0.23, XL330 0.3
-    friction_speed: Positive = 0.02  # rad/s wanted from which on all of it is given
-    tip_friction: Positive = 0.6  # Coulomb, tip on object, that is counted on
-    slip_margin: Fraction = 0.2  # share of that friction which is kept unused
-    object_load: NonNegative = 0.0  # N along the tips' faces, the object's weight as a rule
-    grip_raise_max: NonNegative = 10.0  # N that the grip may be raised to keep the margin …
-    grip_raise_share: NonNegative = 1.0  # … and of the force asked for; the smaller one binds
-    envelope: str = ""  # what the hand holds, by `softfinger envelope --keep`; "": the built-in's
+    torque_constant: Factor = setting(
+        1.78, "N·m/A", "Joint torque per current (XM430-W350: 4.1 N·m at 2.3 A)."
+    )
+    torque_error: float = setting(
+        0.1, "", "Relative standard deviation of the torque constant.", gt=0, le=1
+    )
+    approach_speed: Positive = setting(0.3, "rad/s", "Joint speed when closing on an object.")
+    approach_current: Positive = setting(
+        0.15, "A", "Highest current when closing; it bounds the force of a tip whose sensor fails."
+    )
+    move_speed: Positive = setting(1.0, "rad/s", "Joint speed of `move` and `release`.")
+    contact_force: Positive = setting(0.5, "N", "Force at which a finger counts as touching.")
+    force_default: Positive = setting(5.0, "N", "Force of a `grasp` without force=.")
+    law: LawName = setting("energy", "", "Grip law; `upright` does not measure the object's angle.")
+    force_time: Seconds = setting(
+        0.1, "s", "Time in which the force changes from the measured to the commanded value."
+    )
+    smooth_time: Seconds = setting(
+        0.1, "s", "Time over which setpoints are averaged; it bounds their jerk."
+    )
+    force_gain: NonNegative = setting(1.0, "", "Proportional gain of the force controller.")
+    force_bandwidth: NonNegative = setting(1.0, "Hz", "Bandwidth of the force integral.")
+    rotate_speed: Positive = setting(1.3, "rad/s", "Speed of the object's angle in `rotate`.")
+    rotate_bandwidth: NonNegative = setting(4.0, "Hz", "Bandwidth of the angle integral.")
+    joint_stiffness: Positive = setting(
+        45.0, "N·m/rad", "Stiffness of the position loop on the antisymmetric joint motion."
+    )
+    dither_torque: NonNegative = setting(
+        0.3, "N·m", "Antisymmetric torque by which `upright` overcomes joint friction."
+    )
+    dither_frequency: float = setting(
+        5.0, "Hz", "Frequency of that torque; a lower one would swing the grip.", ge=3, le=50
+    )
+    dither_time: Delay = setting(2.0, "s", "Time in which that torque fades.")
+    joint_inertia: Factor = setting(
+        0.010, "kg·m²", "Inertia of finger and rotor that the damping is computed from."
+    )
+    damping_ratio: NonNegative = setting(
+        0.7, "", "Damping ratio of that inertia on the stiffness of tips and position loop."
+    )
+    joint_friction: NonNegative = setting(
+        0.05, "N·m", "Coulomb friction that is compensated while the joint is to move."
+    )
+    joint_load_friction: GearLoss = setting(
+        0.0, "", "Gear friction as a share of the gears' torque (MX-64 0.23, XL330 0.3)."
+    )
+    friction_speed: Positive = setting(
+        0.02, "rad/s", "Commanded speed from which on friction is fully compensated."
+    )
+    tip_friction: Positive = setting(0.6, "", "Assumed Coulomb coefficient of tip on object.")
+    slip_margin: Fraction = setting(0.2, "", "Share of that friction that is kept in reserve.")
+    object_load: NonNegative = setting(
+        0.0, "N", "Known load along the faces of the tips, usually the object's weight."
+    )
+    grip_raise_max: NonNegative = setting(
+        10.0, "N", "Largest increase of the grip force against slip."
+    )
+    grip_raise_share: NonNegative = setting(
+        1.0, "", "Largest increase as a share of the commanded force; the smaller bound applies."
+    )
+    envelope: str = setting(
+        "", "", "File of `softfinger envelope --keep`, which `grasp` is checked with; empty: the "
+        "built-in hand's."
+    )  # fmt: skip
 
     @property
     def driving(self) -> float:
-        """Return a motor's torque over the tip's where the joint closes, (1 + μ)/(1 − μ).
+        """Return the motor's torque over the tip's where the joint closes, (1 + μ)/(1 − μ).
 
         Gears bear both torques, and a share μ of each is friction. Where it opens, the inverse.
         """
@@ -309,114 +439,86 @@ class ControlSettings(Section):
 
 
 class SafetySettings(Section):
-    """Limits. The goal is bounded by them; crossing a hard one latches a fault."""
+    """Limits. The goal is kept within them; crossing a hard limit latches a fault."""
 
-    current_max: Positive = 1.2  # A
-    current_move: Positive = 0.4  # A, while nothing is grasped
-    force_max: Positive = 30.0  # N
-    d_max: Length = 0.012  # m
-    theta_margin: Annotated[float, Field(ge=0, le=1)] = 0.05  # rad kept from the domain's limit
-    velocity_max: Positive = 6.0  # rad/s
-    frame_age_hold: Positive = 3.0  # frame periods: nothing is moved on
-    frame_age_fault: Positive = 10.0  # frame periods: fault
-    frame_age_action: Literal["torque off", "open"] = "torque off"  # open: first, then the fault
-    goal_reach: Positive = 0.5  # rad off the present angle within which a goal may jump
-    goal_speed: Positive = 3.0  # rad/s of a goal that is further off
-    current_rate: Positive = 60.0  # A/s with which a goal current may rise
-    current_fault: Positive = 1.8  # A measured for 0.1 s → fault
-    stall_error: Positive = 0.1  # rad off its goal, with all the current it may take …
-    stall_time: Seconds = 2.0  # … for so many s: a joint has stalled → fault
-    temperature_max: Positive = 70.0  # °C of a servo → fault
-    heat_warn: Positive = 60.0  # s before that: warned, and a grip eased to what lasts
-    heat_action: Literal["hold", "release", "stop"] = "hold"  # where the load needs more
-    voltage_min: NonNegative = 0.0  # V of a servo's supply → fault; 0: the model's own limit
-    voltage_max: NonNegative = 0.0  # V, likewise
-    residual_angle: Positive = 0.2  # rad between the object's angles by the two fingers → fault
-    residual_width: Positive = 0.004  # m of the held object's width since the grip → fault
-    residual_force: Positive = 0.5  # share by which the two tips' forces differ: warning
-    saturated: Fraction = 0.05  # share of a sensor's cells that are full: warning
-    frozen_after: Delay = 0.5  # s of identical frames while something touches → fault; 0: never
-    overruns_fault: Annotated[int, Field(ge=1)] = 100  # ticks late in a row → fault
+    current_max: Positive = setting(1.2, "A", "Highest goal current.")
+    current_move: Positive = setting(0.4, "A", "Highest goal current while nothing is grasped.")
+    force_max: Positive = setting(30.0, "N", "Normal force of a tip that is a fault.")
+    d_max: Length = setting(0.012, "m", "Displacement of a tip that is a fault.")
+    theta_margin: float = setting(
+        0.05, "rad", "Margin of |θ| from the limit of the contact model that is a fault.",
+        ge=0, le=1
+    )  # fmt: skip
+    velocity_max: Positive = setting(6.0, "rad/s", "Joint speed that is a fault.")
+    frame_age_hold: Positive = setting(
+        3.0, "frame periods", "Age of the last frame from which on the goal is not moved."
+    )
+    frame_age_fault: Positive = setting(
+        10.0, "frame periods", "Age of the last frame that is a fault."
+    )
+    frame_age_action: Literal["torque off", "open"] = setting(
+        "torque off", "", "Reaction to such a fault; `open` opens the hand first."
+    )
+    goal_reach: Positive = setting(
+        0.5, "rad", "Distance from the present joint angle within which the goal may jump."
+    )
+    goal_speed: Positive = setting(3.0, "rad/s", "Speed of a goal that is further away.")
+    current_rate: Positive = setting(60.0, "A/s", "Fastest rise of a goal current.")
+    current_fault: Positive = setting(
+        1.8, "A", "Measured current that is a fault if it lasts for 0.1 s."
+    )
+    stall_error: Positive = setting(
+        0.1, "rad", "Distance from the goal, at the highest current, of a stalled joint."
+    )
+    stall_time: Seconds = setting(2.0, "s", "Duration of a stall that is a fault.")
+    temperature_max: Positive = setting(70.0, "°C", "Servo temperature that is a fault.")
+    heat_warn: Positive = setting(
+        60.0, "s", "Predicted time to that fault at which the daemon warns and eases the grip."
+    )
+    heat_action: Literal["hold", "release", "stop"] = setting(
+        "hold", "", "Action if the load does not allow an eased grip."
+    )
+    voltage_min: NonNegative = setting(
+        0.0, "V", "Lowest supply voltage of a servo; 0 stands for the model's limit."
+    )
+    voltage_max: NonNegative = setting(
+        0.0, "V", "Highest supply voltage of a servo; 0 stands for the model's limit."
+    )
+    residual_angle: Positive = setting(
+        0.2, "rad", "Difference of the object's angles by the two fingers that is a fault."
+    )
+    residual_width: Positive = setting(
+        0.004, "m", "Change of the held object's width since the grip that is a fault."
+    )
+    residual_force: Positive = setting(
+        0.5, "", "Relative difference of the two tips' forces that is reported."
+    )
+    saturated: Fraction = setting(0.05, "", "Share of saturated cells that is reported.")
+    frozen_after: Delay = setting(
+        0.5, "s", "Time of identical frames during contact that is a fault; 0: never."
+    )
+    overruns_fault: int = setting(100, "ticks", "Consecutive late ticks that are a fault.", ge=1)
 
 
 class ObjectSettings(Section):
-    """Assumptions on the object."""
+    """Assumptions about the object."""
 
-    width: Length = 0.040  # m between its faces
-    taper: Annotated[float, Field(ge=-1.5, le=1.5)] = (
-        0.0  # rad between its faces; above 0 it is wider at the palm
+    width: Length = setting(0.040, "m", "Distance between its faces.")
+    taper: float = setting(
+        0.0, "rad", "Angle between its faces; positive if it is wider at the palm.",
+        ge=-1.5, le=1.5
+    )  # fmt: skip
+    width_min: NonNegative = setting(
+        0.002, "m", "Distance of the tips below which they hold nothing, and the hand opens."
     )
-    width_min: NonNegative = 0.002  # m; tips nearer to each other hold nothing: the hand opens
-
-
-class SimulationSettings(Section):
-    """The plant behind simulated backends and the emulator; these defaults are our own choice."""
-
-    seed: Annotated[int, Field(ge=0)] = 1  # of noise and faults
-    object_mass: Factor = 0.10  # kg
-    object_shape: Annotated[str, _backend("shapes")] = "rectangle"  # seen from the side
-    object_width: Length = 0.040  # m; of a wedge: at half its height
-    object_height: Length = 0.060  # m, away from the palm
-    object_radius: Length = 0.020  # m, of a disc
-    object_taper: Annotated[float, Field(ge=-1.5, le=1.5)] = 0.17  # rad between a wedge's faces
-    object_position: tuple[Place, Place] = (0.0, 0.080)  # m, in the hand's plane
-    object_angle: Angle = 0.0  # rad, at the start
-    gravity: tuple[Acceleration, Acceleration] = (
-        0.0,
-        0.0,
-    )  # m/s²; the hand lies on a table
-    table_friction: NonNegative = 0.3  # Coulomb, object on the table it lies on
-    tip_friction: NonNegative = 0.6  # Coulomb, tip on object
-    modulus_scale: Factor = 1.0  # the real tip over the settings' material
-    tactile_noise: NonNegative = 1520.0  # Pa a cell
-    tactile_gain: tuple[Factor, Factor] = (1.0, 1.0)  # each sensor reads so many times the pressure
-    tactile_gain_spread: Fraction = 0.0  # standard deviation of the cells' sensitivities
-    tactile_dead: Fraction = 0.0  # share of cells that read 0, beside those of tactile.dead
-    tactile_blur: Annotated[float, Field(ge=0, le=0.1)] = 0.0  # m, standard deviation
-    tactile_hysteresis: Fraction = 0.0  # reads up to so much more while a cell is unloaded
-    tactile_creep: Fraction = 0.0  # rise of the reading under a lasting pressure
-    tactile_creep_time: Positive = 10.0  # s in which it comes about
-    tactile_response: Delay = 0.0  # s, first-order lag of the reading
-    tactile_exponent: Factor = 1.0  # of the pressure that a cell's reading goes with
-    tactile_fold: NonNegative = 0.0  # Pa above which a cell reads less again; 0: never
-    tactile_crosstalk: Fraction = 0.0  # share of a line's mean that its cells read too much
-    tactile_row_noise: NonNegative = 0.0  # Pa, what all cells of a row share
-    tactile_drift: NonNegative = 0.0  # Pa, how far the cells' zeros wander
-    tactile_gain_drift: Fraction = 0.0  # relative, likewise the gain of all, as by warmth
-    tactile_drift_time: Positive = 60.0  # s in which they do
-    tactile_delay: Delay = 0.020  # s from the middle of a scan to its arrival
-    tactile_jitter: Delay = 0.0  # s that a frame may come later still
-    tactile_dropped: Annotated[float, Field(ge=0, le=0.99)] = 0.0  # share of frames that never come
-    palm: Place = 0.0  # m, the palm's place along y; the pivots are at 0
-    palm_friction: NonNegative = 0.3  # Coulomb, object on the palm
-    tip_loss: Delay = 0.002  # s, the tip's damping over its stiffness
-    tip_law: Literal["springs", "bristles"] = "springs"  # along the face; springs lean with θ
-    tip_shear_stiffness: Ratio = 1.0  # of its springs along the face over that across it
-    tip_creep_time: NonNegative = 0.0  # s in which a stuck shear relaxes to 1/e; 0: it stays
-    tip_micro_slip: bool = False  # the footprint's edge slips before all of it does
-    # how much firmer a tip is at once than in the end, by each of three Prony terms; 0: elastic
-    tip_relaxation: tuple[Fraction, Fraction, Fraction] = (0.0, 0.0, 0.0)
-    # s, of each: a human fingerpad's (Pawluk & Howe, 1999)
-    tip_relaxation_times: tuple[Positive, Positive, Positive] = (0.004, 0.07, 1.4)
-    joint_inertia: Factor = 0.010  # kg·m² at the joint: finger and reflected rotor
-    joint_damping: NonNegative = 0.02  # N·m·s/rad
-    joint_friction: NonNegative = 0.05  # N·m, Coulomb
-    joint_stribeck: NonNegative = 0.0  # N·m of friction more at rest
-    # share of the gears' torque that is friction, and so much more of it at rest
-    joint_load_friction: tuple[Fraction, Fraction] = (0.0, 0.0)
-    joint_stribeck_speed: Positive = 0.12  # rad/s over which what is more at rest falls to 1/e
-    joint_presliding: Positive = 0.0005  # rad that gears give way elastically before they slip
-    servo_heat: tuple[Factor, Factor, Factor] = (1.0, 1.0, 1.0)  # of heating, cooling, capacity
-    ambient: Annotated[float, Field(ge=-40, le=80)] = 25.0  # °C around the servos
-    compression_speed: NonNegative = 0.004  # m/s, presses the object on the tips; no servos only
 
 
 class TaskSettings(Section):
-    """Task that the daemon does by itself after start."""
+    """A task that the daemon starts by itself."""
 
-    name: Literal["none", "demo"] = "none"  # what the hand does by itself
-    force: Positive = 8.0  # N, the tips' mean
-    angle: Angle = 0.14  # rad, to either side
+    name: Literal["none", "demo"] = setting("none", "", "The task.")
+    force: Positive = setting(8.0, "N", "Mean force of the tips.")
+    angle: Angle = setting(0.14, "rad", "Rotation of the object to either side.")
 
 
 class PluginSettings(Section):
@@ -431,7 +533,7 @@ class PluginSettings(Section):
 
 
 class Settings(Section):
-    """All sections. ``Settings()`` is the built-in simulated hand."""
+    """A profile of softfinger. The defaults are the built-in simulated hand."""
 
     scene: SceneSettings = SceneSettings()
     hand: GeometrySettings = GeometrySettings()

@@ -5,7 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from softfinger.daemon.profile.settings import SimulationSettings, TactileSettings
+from softfinger.daemon.profile.settings import TactileSettings
+from softfinger.daemon.profile.simulation_settings import SimulationSettings
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid

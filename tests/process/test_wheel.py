@@ -102,7 +102,12 @@ def test_it_holds_one_package_with_all_its_data(wheel):
             assert f"softfinger/{module.relative_to(ROOT)}" in names
     for profile in (ROOT / "config").glob("*.toml"):
         assert f"softfinger/config/{profile.name}" in names
-    data = ("py.typed", "daemon/wire/STREAM.md", "tools/viewing/foxglove_layout.json")
+    data = (
+        "py.typed",
+        "config/schema.json",
+        "daemon/wire/STREAM.md",
+        "tools/viewing/foxglove_layout.json",
+    )
     assert {f"softfinger/{name}" for name in data} <= names
     assert not any(name.startswith("softfinger/tests") for name in names)
 
@@ -140,7 +145,9 @@ def test_folders_of_the_same_names_are_in_nobodys_way(wheel, tmp_path):
     run("-c", _PUBLIC)
     assert run("-m", "softfinger", "--version").startswith("softfinger ")
     assert "tip.force" in run("-m", "softfinger", "limits")
-    assert run("-m", "softfinger", "config", "reference", "tip.radius") == "tip.radius = 0.02 # m\n"
+    assert run("-m", "softfinger", "config", "reference", "tip.radius").endswith(
+        "= 0.02 # m, 0.0001 to 1\n"
+    )
 
 
 def test_each_pin_may_be_installed_on_the_oldest_python_that_is_promised():

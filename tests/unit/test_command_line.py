@@ -1,5 +1,6 @@
 """The command line's front: first steps, profiles shown, numbers with units."""
 
+import json
 import math
 import tomllib
 from pathlib import Path
@@ -89,8 +90,12 @@ def test_profiles_and_keys_are_shown_from_any_folder(inline, tmp_path, monkeypat
         tomllib.loads(inline("config", "reference", "tactile").stdout)["tactile"]
         == every["tactile"]
     )
-    (line,) = inline("config", "reference", "tactile.full_count").stdout.splitlines()
-    assert line.startswith("tactile.full_count = 65535 # ")
+    meaning, key = inline("config", "reference", "tactile.full_count").stdout.splitlines()
+    assert meaning == "# Count at which a cell is saturated."
+    assert key == "tactile.full_count = 65535 # counts, integer, 1 to 65535"
+    schema = json.loads(inline("config", "schema").stdout)
+    assert schema == json.loads(find(Path("sim")).with_name("schema.json").read_text("utf-8"))
+    assert set(schema["properties"]) == set(every)
     missing = inline("config", "reference", "tactile.radius")
     assert missing.returncode == 2
     assert "tactile.radius: found no such section or key" in missing.stderr

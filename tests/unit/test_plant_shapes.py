@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from softfinger.daemon.clock import VirtualClock
-from softfinger.daemon.profile.settings import Settings, SimulationSettings
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.profile.simulation_settings import SimulationSettings
 from softfinger.daemon.simulation.physics.shapes import shape_of
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.daemon.simulation.sensor.simulated_tactile import SimulatedTactile

@@ -1,5 +1,6 @@
 """Settings: profiles load, and whatever is wrong with one is told in one report."""
 
+import json
 import tomllib
 from pathlib import Path
 
@@ -7,6 +8,7 @@ import pytest
 
 from softfinger.daemon.backends import BUILT_IN, known
 from softfinger.daemon.errors import SettingsError
+from softfinger.daemon.profile import reference
 from softfinger.daemon.profile.load import load, names
 from softfinger.daemon.profile.settings import Settings
 
@@ -28,16 +30,46 @@ def test_no_file_is_the_built_in_simulated_hand():
     assert load().servos.backend == "simulated"
 
 
-def test_sim_profile_equals_the_built_in_hand_and_names_every_key():
+def test_sim_profile_is_the_built_in_hand_with_every_key_as_it_is_declared():
     path = CONFIG / "sim.toml"
+    assert path.read_text(encoding="utf-8") == reference.profile()
     assert load(path) == Settings()
-    written = tomllib.loads(path.read_text(encoding="utf-8"))
+    written = tomllib.loads(reference.profile())
     for name, section in Settings():
         assert list(written[name]) == list(type(section).model_fields), name
 
 
+def test_the_schema_for_editors_has_meaning_unit_and_default_of_every_key():
+    schema = json.loads(reference.schema_text())
+    keys = reference.every_key()
+    assert len(keys) > 180
+    for key in keys:
+        declared = schema["properties"][key.section]["properties"][key.name]
+        assert declared["description"] == key.meaning
+        assert declared.get("unit", "") == key.unit
+        assert declared["default"] == json.loads(key.default)
+
+
+@pytest.mark.parametrize(
+    ("key", "allowed"),
+    [
+        ("tip.radius", "0.0001 to 1"),
+        ("tactile.noise", "> 0"),
+        ("tactile.dead", "integer, 0 to 255"),
+        ("estimator.free_gain", '"auto", true, false'),
+        ("servos.reply_timeout", "> 0, ≤ 1"),
+        ("safety.overruns_fault", "integer, ≥ 1"),
+        ("stream.address", ""),
+    ],
+)
+def test_the_reference_shows_the_allowed_values(key, allowed):
+    shown = {f"{each.section}.{each.name}": each.allowed for each in reference.every_key()}
+    assert shown[key] == allowed
+
+
 @pytest.mark.parametrize("path", sorted(CONFIG.glob("*.toml")), ids=lambda path: path.name)
-def test_every_profile_loads(path, tmp_path):
+def test_every_profile_loads_and_names_the_schema(path, tmp_path):
+    assert path.read_text(encoding="utf-8").startswith("#:schema ./schema.json\n# ")
     settings = load(path, tmp_path)
     assert "{dir}" not in settings.servos.port + "".join(settings.tactile.port)
 

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import argparse
-import re
+import itertools
 from pathlib import Path
 
 from softfinger.daemon.errors import SettingsError
+from softfinger.daemon.profile import reference
 from softfinger.daemon.profile.load import find, names, profile_text
 
-_REFERENCE = Path("sim")  # it has every key, with default, unit and meaning
 _EPILOG = """\
   softfinger config show hil > my.toml      the beginning of a profile of your own
+  softfinger config schema > schema.json    beside it: editors then complete and check keys
   softfinger config reference tactile       that section alone; or a key's name, as pitch"""
 
 
@@ -21,8 +22,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     actions.add_parser("list", help="the profiles' names")
     show = actions.add_parser("show", help="print a profile")
     show.add_argument("profile", type=Path, metavar="PROFILE", help=f"one of {', '.join(names())}")
-    reference = actions.add_parser("reference", help="every key, with default, unit and meaning")
-    reference.add_argument("what", nargs="?", default="", metavar="SECTION|KEY")
+    every = actions.add_parser("reference", help="every key, with default, bounds and meaning")
+    every.add_argument("what", nargs="?", default="", metavar="SECTION|KEY")
+    actions.add_parser("schema", help="the JSON schema of a profile, for editors")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -33,8 +35,10 @@ def run(arguments: argparse.Namespace) -> int:
             print(f"{name:{width}}  {subject(Path(name))}")
     elif arguments.action == "show":
         print(_text(arguments.profile), end="")
+    elif arguments.action == "schema":
+        print(reference.schema_text(), end="")
     else:
-        print(_part(_text(_REFERENCE), arguments.what), end="")
+        print(_explained(arguments.what), end="")
     return 0
 
 
@@ -43,24 +47,24 @@ def _text(profile: Path) -> str:
 
 
 def subject(profile: Path) -> str:
-    """Return the comment that a profile begins with, up to its first stop."""
-    comment = re.match(r"(#.*\n)+", _text(profile))
-    words = "" if comment is None else comment[0].replace("#", " ")
-    return re.split(r"[:.] ", " ".join(words.split()))[0]
+    """Return the first sentence of the comment that a profile begins with."""
+    comment = itertools.takewhile(lambda line: line.startswith("#"), _text(profile).splitlines())
+    words = " ".join(line[1:].strip() for line in comment if not line.startswith("#:"))
+    return min((words.partition(mark)[0] for mark in (": ", ". ")), key=len)
 
 
-def _part(text: str, what: str) -> str:
-    """The section called ``what``, or the lines of a key, as ``section.key`` or alone."""
+def _explained(what: str) -> str:
+    """Return the text of a section, or of the keys called ``section.key`` or ``key``."""
     if not what:
-        return text
-    section, _, key = what.rpartition(".")
-    lines = []
-    for part in re.split(r"\n(?=\[)", text)[1:]:
-        title, *rest = part.splitlines()
-        if title == f"[{what}]":
-            return f"{part.rstrip()}\n"
-        if section in ("", title[1:-1]):
-            lines += [f"{title[1:-1]}.{line}" for line in rest if line.split(" = ")[0] == key]
+        return reference.profile()
+    if what in reference.sections():
+        return reference.section_text(what)
+    lines = [
+        line
+        for key in reference.every_key()
+        if what in (key.name, f"{key.section}.{key.name}")
+        for line in key.lines(f"{key.section}.")
+    ]
     if not lines:
         raise SettingsError(
             f"{what}: found no such section or key; see `softfinger config reference`"

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from softfinger.daemon.backends import backend
-from softfinger.daemon.profile.settings import Settings, SimulationSettings
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.profile.simulation_settings import SimulationSettings
 from softfinger.daemon.simulation.physics.plant_state import (
     CORNERS,
     DISC,

@@ -21,7 +21,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from softfinger.daemon.profile.settings import SimulationSettings, TactileSettings
+from softfinger.daemon.profile.settings import TactileSettings
+from softfinger.daemon.profile.simulation_settings import SimulationSettings
 from softfinger.daemon.simulation.faults import MeasurementFaults
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material

@@ -4,7 +4,8 @@ import numpy as np
 from pydantic import Field
 
 from softfinger.daemon.clock import Clock
-from softfinger.daemon.profile.settings import Section, TactileSettings
+from softfinger.daemon.profile.fields import Section
+from softfinger.daemon.profile.settings import TactileSettings
 from softfinger.daemon.types import Frame
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from softfinger.daemon.profile.settings import SimulationSettings
+from softfinger.daemon.profile.simulation_settings import SimulationSettings
 from softfinger.daemon.simulation.physics.shapes import Shape, polygon
 
 

@@ -1,0 +1,152 @@
+"""Prepare a release: set the version, date the changelog, build the packages and check them.
+
+`make release VERSION=X.Y.Z` runs ``prepare``, then lint, tests and documentation, then ``build``.
+Both steps may be repeated. Committing, tagging and uploading stay with the person who releases.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import re
+import shutil
+import subprocess
+import sys
+import venv
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+CHANGELOG = "CHANGELOG.md"
+# Each file that states the version, and the pattern of the line that does.
+VERSION_LINES = {
+    "softfinger/__init__.py": r'(?m)^(__version__ = ")(.*)(")$',
+    "lerobot_robot_softfinger/pyproject.toml": r'(?m)^(version = ")(.*)(")$',
+    "CITATION.cff": r"(?m)^(version: )(.*)()$",
+}
+MAX_LINES = 40  # of a release in the changelog, without blank lines
+_UNRELEASED = "## [Unreleased]\n"
+
+
+class ReleaseError(Exception):
+    """The release cannot be made as asked."""
+
+
+def sections(changelog: str) -> dict[str, str]:
+    """Map each version in the changelog, and ``Unreleased``, to the text below its heading."""
+    parts = re.split(r"(?m)^## \[(.+?)\].*\n", changelog)
+    return dict(zip(parts[1::2], (text.strip() for text in parts[2::2]), strict=True))
+
+
+def dated(changelog: str, version: str, today: datetime.date) -> str:
+    """Move the unreleased entries below a heading for ``version``.
+
+    A changelog that already has this version, and no other entries, is returned as it is.
+
+    Raises
+    ------
+    ReleaseError
+        If the version has no entries, is not newer than the last one, or has too many lines.
+    """
+    found = sections(changelog)
+    unreleased = found.pop("Unreleased", None)
+    if unreleased is None:
+        raise ReleaseError(f"{CHANGELOG}: found no heading {_UNRELEASED.strip()!r}; add it")
+    if unreleased and version in found:
+        raise ReleaseError(
+            f"{CHANGELOG}: found entries below both Unreleased and {version}; fold them into one"
+        )
+    if not unreleased and version not in found:
+        raise ReleaseError(f"{CHANGELOG}: found no entries for {version} below Unreleased")
+    older = [each for each in found if each != version]
+    if older and _parts(version) <= max(map(_parts, older)):
+        newest = max(older, key=_parts)
+        raise ReleaseError(f"VERSION: found {version}, expected one above {newest}")
+    text = found.get(version, unreleased)
+    count = 1 + sum(bool(line.strip()) for line in text.splitlines())
+    if count > MAX_LINES:
+        raise ReleaseError(
+            f"{CHANGELOG}: found {count} lines for {version}, expected at most {MAX_LINES}; "
+            "keep what users notice"
+        )
+    if not unreleased:
+        return changelog
+    return changelog.replace(_UNRELEASED, f"{_UNRELEASED}\n## [{version}] - {today}\n", 1)
+
+
+def _parts(version: str) -> tuple[int, ...]:
+    if not re.fullmatch(r"\d+\.\d+\.\d+", version):
+        raise ReleaseError(f"VERSION: found {version!r}, expected three numbers, as 1.4.0")
+    return tuple(map(int, version.split(".")))
+
+
+def prepare(version: str) -> None:
+    """Write the version and the changelog's date into the tree."""
+    _parts(version)
+    ours = {CHANGELOG, *VERSION_LINES}
+    changed = {line[3:] for line in _git("status", "--porcelain").splitlines()}
+    if others := sorted(changed - ours):
+        raise ReleaseError(f"found uncommitted files, commit or stash them: {', '.join(others)}")
+    if _git("tag", "--list", f"v{version}"):
+        raise ReleaseError(f"VERSION: found the tag v{version}, expected a version without one")
+    log = ROOT / CHANGELOG
+    log.write_text(dated(log.read_text("utf-8"), version, datetime.date.today()), "utf-8")
+    for name, pattern in VERSION_LINES.items():
+        text = (ROOT / name).read_text("utf-8")
+        (ROOT / name).write_text(re.sub(pattern, rf"\g<1>{version}\g<3>", text), "utf-8")
+
+
+def build(version: str) -> None:
+    """Build sdist and wheel into ``dist/``, check them, and print the commands that release."""
+    dist = ROOT / "dist"
+    shutil.rmtree(dist, ignore_errors=True)
+    _run(sys.executable, "-m", "build", "--outdir", dist)
+    built = sorted(dist.iterdir())
+    _run(sys.executable, "-m", "twine", "check", "--strict", *built)
+    environment = ROOT / "build" / "release"
+    venv.create(environment, clear=True, with_pip=True)
+    wheel = next(path for path in built if path.suffix == ".whl")
+    python = environment / "bin" / "python"
+    constraints = ("--constraint", ROOT / "constraints.txt")
+    _run(python, "-m", "pip", "install", "--quiet", *constraints, wheel)
+    command = [environment / "bin" / "softfinger", "--version"]
+    told = subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+    if told != f"softfinger {version}":
+        raise ReleaseError(f"{wheel.name}: --version prints {told!r}, expected {version}")
+    print(f"{wheel.name}: prints {told!r}")
+    print("To release, type:")
+    if _git("status", "--porcelain"):
+        print(f"  git commit --all --message 'release: {version}'")
+    print(f"  git tag --annotate v{version} --message 'softfinger {version}'")
+    print(f"  git push origin HEAD v{version}")
+    print(f"  {sys.executable} -m twine upload dist/*")
+
+
+def _git(*words: str) -> str:
+    done = subprocess.run(
+        ["git", *words], cwd=ROOT, check=True, capture_output=True, text=True, encoding="utf-8"
+    )
+    return done.stdout
+
+
+def _run(*words: str | Path) -> None:
+    subprocess.run(words, cwd=ROOT, check=True)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("step", choices=("prepare", "build"))
+    parser.add_argument("version", metavar="X.Y.Z")
+    arguments = parser.parse_args()
+    try:
+        {"prepare": prepare, "build": build}[arguments.step](arguments.version)
+    except ReleaseError as error:
+        print(f"release: {error}", file=sys.stderr)
+        return 1
+    except subprocess.CalledProcessError as error:
+        print(f"release: {error.cmd[0]} ended with status {error.returncode}", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

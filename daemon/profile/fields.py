@@ -1,0 +1,90 @@
+"""Fields of settings: the types of numbers with their bounds, and the base of all sections."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic_core import PydanticCustomError
+
+from softfinger.daemon.backends import Kind, backend, known, known_servo_models
+from softfinger.daemon.errors import PluginError
+
+# Every number has an end on both sides: implausible values are typing errors, and must not reach
+# an integral. Bounds are closed or open as the quantity is.
+Positive = Annotated[float, Field(ge=1e-9, le=1e9, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False)]
+Finite = Annotated[float, Field(ge=-1e9, le=1e9, allow_inf_nan=False)]
+Length = Annotated[float, Field(ge=1e-4, le=1, allow_inf_nan=False)]  # m
+Place = Annotated[float, Field(ge=-10, le=10, allow_inf_nan=False)]  # m
+Angle = Annotated[float, Field(ge=-6.3, le=6.3, allow_inf_nan=False)]  # rad
+Seconds = Annotated[float, Field(gt=0, le=60, allow_inf_nan=False)]
+Delay = Annotated[float, Field(ge=0, le=60, allow_inf_nan=False)]  # s
+Rate = Annotated[float, Field(ge=0.1, le=10_000, allow_inf_nan=False)]  # Hz
+Acceleration = Annotated[float, Field(ge=-100, le=100, allow_inf_nan=False)]  # m/s²
+Factor = Annotated[float, Field(ge=1e-5, le=1e5, allow_inf_nan=False)]
+Counts = Annotated[int, Field(ge=-1_048_575, le=1_048_575)]
+Modulus = Annotated[float, Field(ge=1, le=1e10, allow_inf_nan=False)]  # Pa
+Fraction = Annotated[float, Field(ge=0, le=1)]
+Ratio = Annotated[float, Field(ge=0.1, le=10)]
+GearLoss = Annotated[float, Field(ge=0, le=0.5)]
+Index = Annotated[int, Field(ge=0, le=255)]
+ServoId = Annotated[int, Field(ge=0, le=252)]
+Processor = Annotated[int, Field(ge=0, le=1023)]
+
+
+def setting(default: Any, unit: str, description: str, **options: Any) -> Any:
+    """Declare a key of a section.
+
+    Profile reference, documentation and JSON schema are generated from these declarations.
+
+    Parameters
+    ----------
+    default
+        The value of the built-in simulated hand.
+    unit
+        SI unit of the value or of each of its elements; empty if it has none.
+    description
+        The meaning in plain English, one or two sentences.
+    **options
+        Bounds and examples, as in :func:`pydantic.Field`.
+    """
+    if unit:
+        options["json_schema_extra"] = {"unit": unit}
+    return Field(default, description=description, **options)
+
+
+class Section(BaseModel):
+    """Base of all sections: unknown keys are errors, values are not converted, nothing changes.
+
+    A whole number is accepted where a float is asked for; a string never is.
+    """
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+
+
+def names_backend(kind: Kind) -> AfterValidator:
+    """Check that a text names a backend; the error has the words of pydantic's for a Literal."""
+
+    def check(name: str) -> str:
+        try:
+            backend(kind, name)
+        except PluginError as error:
+            why = {"why": str(error)}
+            raise PydanticCustomError("plugin", "a plugin that works: {why}", why) from None
+        except KeyError:
+            *most, last = map(repr, known(kind))
+            listed = {"known": f"{', '.join(most)} or {last}"}
+            raise PydanticCustomError("one_of", "Input should be {known}", listed) from None
+        return name
+
+    return AfterValidator(check)
+
+
+def _servo_model(name: str) -> str:
+    if models := known_servo_models(name):
+        raise PydanticCustomError("servo_model", "one of {known}", {"known": models})
+    return name
+
+
+ServoModel = Annotated[str, AfterValidator(_servo_model)]

@@ -1,0 +1,158 @@
+"""The reference of all settings, generated from their declarations.
+
+``python -m softfinger.daemon.profile.reference`` writes ``config/sim.toml``, the built-in simulated
+hand with every key explained, and ``config/schema.json``, the JSON schema for editors.
+"""
+
+from __future__ import annotations
+
+import inspect
+import json
+import textwrap
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from pydantic.json_schema import GenerateJsonSchema
+
+import softfinger
+from softfinger.daemon.profile.fields import Section
+from softfinger.daemon.profile.settings import Settings
+
+_WIDTH = 100  # columns of sim.toml
+_NO_BOUND = 1e9  # bounds this large only catch typing errors
+_HEAD = """\
+#:schema ./schema.json
+# The built-in simulated hand, with every setting: `softfinger run` without a profile is the same as
+# with this file. A profile of your own needs only the settings that differ. Units are SI unless
+# stated otherwise; pairs are [left, right].
+"""
+
+
+class Key(NamedTuple):
+    """One setting, as the reference shows it."""
+
+    section: str
+    name: str
+    default: str  # as in TOML
+    unit: str
+    allowed: str  # values: bounds, or names in quotation marks
+    meaning: str
+
+    def lines(self, prefix: str = "") -> Iterator[str]:
+        """Yield the TOML lines: the meaning in a comment, then the key with its default."""
+        yield from _comment(self.meaning)
+        limits = ", ".join(filter(None, (self.unit, self.allowed)))
+        yield f"{prefix}{self.name} = {self.default}{f' # {limits}' * bool(limits)}"
+
+
+class _WithoutTitles(GenerateJsonSchema):
+    """A schema without titles, which would only repeat the names of the keys."""
+
+    def field_title_should_be_set(self, schema: Any) -> bool:
+        return False
+
+
+def schema_text() -> str:
+    """Return the JSON schema of a profile, in one line since only programs read it."""
+    schema = {
+        "$schema": GenerateJsonSchema.schema_dialect,
+        "title": "softfinger profile",
+        "type": "object",
+        "additionalProperties": False,
+        "properties": {
+            name: section.model_json_schema(schema_generator=_WithoutTitles)
+            for name, section in sections().items()
+        },
+    }
+    return json.dumps(schema, ensure_ascii=False) + "\n"
+
+
+def sections() -> dict[str, type[Section]]:
+    """Return the sections of a profile by their names."""
+    return {name: type(section) for name, section in Settings()}
+
+
+def about(section: type[Section]) -> str:
+    """Return what a section is for, in Markdown."""
+    return inspect.cleandoc(section.__doc__ or "").replace("``", "`")
+
+
+def every_key() -> list[Key]:
+    """Return every setting, in the order of the profile."""
+    return [
+        Key(
+            name,
+            key,
+            json.dumps(declared["default"], ensure_ascii=False),
+            declared.get("unit", ""),
+            _allowed(declared),
+            declared["description"],
+        )
+        for name, section in sections().items()
+        for key, declared in section.model_json_schema().get("properties", {}).items()
+    ]
+
+
+def profile() -> str:
+    """Return the text of ``config/sim.toml``."""
+    return _HEAD + "".join(f"\n{section_text(name)}" for name in sections())
+
+
+def section_text(name: str) -> str:
+    """Return the TOML text of a section. Raises KeyError."""
+    lines = [f"[{name}]", *_comment(about(sections()[name]))]
+    for key in every_key():
+        if key.section == name:
+            lines += ["", *key.lines()]
+    return "".join(f"{line}\n" for line in lines)
+
+
+def _comment(text: str) -> Iterator[str]:
+    for paragraph in text.split("\n\n"):
+        yield from textwrap.wrap(
+            " ".join(paragraph.split()), _WIDTH, initial_indent="# ", subsequent_indent="# "
+        )
+
+
+def _allowed(declared: dict[str, Any]) -> str:
+    """Return the values that a key, or each of its elements, may have."""
+    if "prefixItems" in declared:
+        return _allowed(declared["prefixItems"][0])
+    if "items" in declared:
+        return _allowed(declared["items"])
+    if "const" in declared:
+        return json.dumps(declared["const"])
+    if "enum" in declared:
+        return ", ".join(map(json.dumps, declared["enum"]))
+    if "examples" in declared:
+        return ", ".join([*map(json.dumps, declared["examples"]), "or a plugin's name"])
+    if declared["type"] == "boolean":
+        return "true, false"
+    whole = "integer" if declared["type"] == "integer" else ""
+    return ", ".join(filter(None, (whole, _bounds(declared))))
+
+
+def _bounds(declared: dict[str, Any]) -> str:
+    low: float = declared.get("minimum", -_NO_BOUND)
+    high: float = declared.get("maximum", _NO_BOUND)
+    above: float | None = declared.get("exclusiveMinimum")
+    if 0.0 < low <= 1.0 / _NO_BOUND:  # the quantity is positive
+        above = 0
+    upper = high < _NO_BOUND
+    if above is not None:
+        return f"> {above:g}" + f", ≤ {high:.7g}" * upper
+    if low > -_NO_BOUND:
+        return f"{low:.7g} to {high:.7g}" if upper else f"≥ {low:g}"
+    return f"≤ {high:.7g}" * upper
+
+
+def main() -> None:
+    """Write both files."""
+    folder = Path(softfinger.__file__).parent / "config"
+    (folder / "sim.toml").write_text(profile(), encoding="utf-8")
+    (folder / "schema.json").write_text(schema_text(), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,146 @@
+"""Settings of the simulated hand: object, tips, sensors, joints and servos."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from softfinger.daemon.backends import BUILT_IN
+from softfinger.daemon.profile.fields import (
+    Acceleration,
+    Angle,
+    Delay,
+    Factor,
+    Fraction,
+    Length,
+    NonNegative,
+    Place,
+    Positive,
+    Ratio,
+    Section,
+    names_backend,
+    setting,
+)
+
+
+class SimulationSettings(Section):
+    """The plant behind simulated backends and the emulated hand; its defaults are our choice."""
+
+    seed: int = setting(1, "", "Seed of noise and faults.", ge=0)
+    object_mass: Factor = setting(0.10, "kg", "Mass of the object.")
+    object_shape: Annotated[str, names_backend("shapes")] = setting(
+        "rectangle", "", "Shape of the object in the hand's plane.", examples=[*BUILT_IN["shapes"]]
+    )
+    object_width: Length = setting(
+        0.040, "m", "Width of the object; of a wedge, at half its height."
+    )
+    object_height: Length = setting(0.060, "m", "Height of the object, away from the palm.")
+    object_radius: Length = setting(0.020, "m", "Radius of a disc.")
+    object_taper: float = setting(
+        0.17, "rad", "Angle between the faces of a wedge.", ge=-1.5, le=1.5
+    )
+    object_position: tuple[Place, Place] = setting(
+        (0.0, 0.080), "m", "Initial position (x, y) of the object in the hand's plane."
+    )
+    object_angle: Angle = setting(0.0, "rad", "Initial angle of the object.")
+    gravity: tuple[Acceleration, Acceleration] = setting(
+        (0.0, 0.0),
+        "m/s²",
+        "Gravity (x, y) in the hand's plane; by default the hand lies on a table.",
+    )
+    table_friction: NonNegative = setting(
+        0.3, "", "Coulomb coefficient of the object on the table on which the hand lies."
+    )
+    tip_friction: NonNegative = setting(0.6, "", "Coulomb coefficient of tip on object.")
+    modulus_scale: Factor = setting(
+        1.0, "", "Modulus of the simulated tips over that of the profile's material."
+    )
+    tactile_noise: NonNegative = setting(1520.0, "Pa", "Standard deviation of a cell's noise.")
+    tactile_gain: tuple[Factor, Factor] = setting(
+        (1.0, 1.0), "", "Gain of each sensor: reading over pressure."
+    )
+    tactile_gain_spread: Fraction = setting(
+        0.0, "", "Relative standard deviation of the cells' gains."
+    )
+    tactile_dead: Fraction = setting(
+        0.0, "", "Share of cells that read 0, in addition to `tactile.dead`."
+    )
+    tactile_blur: float = setting(
+        0.0, "m", "Standard deviation of the blur by the layer above the cells.", ge=0, le=0.1
+    )
+    tactile_hysteresis: Fraction = setting(
+        0.0, "", "Relative excess of the reading while a cell is unloaded."
+    )
+    tactile_creep: Fraction = setting(
+        0.0, "", "Relative rise of the reading under constant pressure."
+    )
+    tactile_creep_time: Positive = setting(10.0, "s", "Time constant of that rise.")
+    tactile_response: Delay = setting(0.0, "s", "Time constant of the cells' first-order lag.")
+    tactile_exponent: Factor = setting(
+        1.0, "", "Exponent of the pressure in the cells' characteristic."
+    )
+    tactile_fold: NonNegative = setting(
+        0.0, "Pa", "Pressure above which the reading of a cell falls again; 0: never."
+    )
+    tactile_crosstalk: Fraction = setting(
+        0.0, "", "Share of the mean of its row and column that a cell reads in addition."
+    )
+    tactile_row_noise: NonNegative = setting(
+        0.0, "Pa", "Standard deviation of the noise that all cells of a row share."
+    )
+    tactile_drift: NonNegative = setting(
+        0.0, "Pa", "Standard deviation of the drift of each cell's zero."
+    )
+    tactile_gain_drift: Fraction = setting(
+        0.0, "", "Relative standard deviation of the drift of the sensor's gain."
+    )
+    tactile_drift_time: Positive = setting(60.0, "s", "Time constant of both drifts.")
+    tactile_delay: Delay = setting(
+        0.020, "s", "Time from the middle of a scan to the arrival of the frame."
+    )
+    tactile_jitter: Delay = setting(0.0, "s", "Largest additional delay of a frame.")
+    tactile_dropped: float = setting(0.0, "", "Share of frames that are lost.", ge=0, le=0.99)
+    palm: Place = setting(0.0, "m", "Position of the palm along y; the pivots are at 0.")
+    palm_friction: NonNegative = setting(0.3, "", "Coulomb coefficient of the object on the palm.")
+    tip_loss: Delay = setting(0.002, "s", "Damping of the tip over its stiffness.")
+    tip_law: Literal["springs", "bristles"] = setting(
+        "springs", "", "Tangential law of the tips; springs lean with θ, bristles do not."
+    )
+    tip_shear_stiffness: Ratio = setting(
+        1.0, "", "Tangential over normal stiffness of the tip's springs."
+    )
+    tip_creep_time: NonNegative = setting(
+        0.0, "s", "Time constant with which a sticking tip's shear relaxes; 0: it does not."
+    )
+    tip_micro_slip: bool = setting(
+        False, "", "Let the edge of the footprint slip before the rest does."
+    )
+    tip_relaxation: tuple[Fraction, Fraction, Fraction] = setting(
+        (0.0, 0.0, 0.0), "", "Amplitudes of three Prony terms: shares of its final stiffness by "
+        "which the tip is firmer at first; 0: elastic."
+    )  # fmt: skip
+    tip_relaxation_times: tuple[Positive, Positive, Positive] = setting(
+        (0.004, 0.07, 1.4), "s", "Time constants of the Prony terms; the defaults are those of a "
+        "human fingerpad (Pawluk & Howe, 1999)."
+    )  # fmt: skip
+    joint_inertia: Factor = setting(
+        0.010, "kg·m²", "Inertia of the finger and the reflected rotor at the joint."
+    )
+    joint_damping: NonNegative = setting(0.02, "N·m·s/rad", "Viscous friction of the joint.")
+    joint_friction: NonNegative = setting(0.05, "N·m", "Coulomb friction of the joint.")
+    joint_stribeck: NonNegative = setting(0.0, "N·m", "Additional friction of a joint at rest.")
+    joint_load_friction: tuple[Fraction, Fraction] = setting(
+        (0.0, 0.0), "", "Gear friction as a share of the gears' torque, and its addition at rest."
+    )
+    joint_stribeck_speed: Positive = setting(
+        0.12, "rad/s", "Joint speed at which the friction added at rest has fallen to 1/e."
+    )
+    joint_presliding: Positive = setting(
+        0.0005, "rad", "Elastic deflection of the gears before they slip."
+    )
+    servo_heat: tuple[Factor, Factor, Factor] = setting(
+        (1.0, 1.0, 1.0), "", "Factors of the servos' heating, cooling and heat capacity."
+    )
+    ambient: float = setting(25.0, "°C", "Temperature around the servos.", ge=-40, le=80)
+    compression_speed: NonNegative = setting(
+        0.004, "m/s", "Speed at which the object is pressed on the tips if there are no servos."
+    )

@@ -1,0 +1,93 @@
+"""A release: its changelog section, and one version in all files that state it."""
+
+import datetime
+import importlib.util
+import re
+from pathlib import Path
+
+import pytest
+
+import softfinger
+
+ROOT = Path(__file__).parents[2]
+TODAY = datetime.date(2031, 2, 3)
+LOG = """# Changelog
+
+## [Unreleased]
+
+### Added
+
+- A second hand.
+
+## [1.2.0] - 2030-01-01
+
+### Fixed
+
+- A sign.
+"""
+
+
+@pytest.fixture(scope="module")
+def release():
+    spec = importlib.util.spec_from_file_location("release", ROOT / ".ci" / "release.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_every_file_states_the_version_of_the_package(release):
+    for name, pattern in release.VERSION_LINES.items():
+        (found,) = re.findall(pattern, (ROOT / name).read_text(encoding="utf-8"))
+        assert found[1] == softfinger.__version__, name
+
+
+def test_the_changelog_has_short_sections_and_begins_with_unreleased(release):
+    found = release.sections((ROOT / "CHANGELOG.md").read_text(encoding="utf-8"))
+    versions = list(found)
+    assert versions[0] == "Unreleased"
+    assert versions[1] == softfinger.__version__
+    for version in versions[1:]:
+        kinds = re.findall(r"(?m)^### (.*)$", found[version])
+        assert len(kinds) == len(set(kinds)), version
+        assert sum(bool(line) for line in found[version].splitlines()) < release.MAX_LINES
+
+
+def test_unreleased_entries_move_below_the_version_and_its_date(release):
+    after = release.dated(LOG, "1.3.0", TODAY)
+    assert "## [Unreleased]\n\n## [1.3.0] - 2031-02-03\n\n### Added\n" in after
+    assert release.sections(after) == {
+        "Unreleased": "",
+        "1.3.0": "### Added\n\n- A second hand.",
+        "1.2.0": "### Fixed\n\n- A sign.",
+    }
+    assert release.dated(after, "1.3.0", datetime.date(2032, 1, 1)) == after
+
+
+@pytest.mark.parametrize(
+    ("log", "version", "message"),
+    [
+        (LOG, "1.3", r"VERSION: found '1\.3', expected three numbers"),
+        (LOG, "1.2.0", r"entries below both Unreleased and 1\.2\.0"),
+        (LOG, "1.1.9", r"VERSION: found 1\.1\.9, expected one above 1\.2\.0"),
+        (LOG.replace("- A second hand.", "- A hand.\n" * 40), "1.3.0", r"found 42 lines for 1\.3"),
+        (LOG.replace("### Added\n\n- A second hand.\n", ""), "1.3.0", r"no entries for 1\.3\.0"),
+        (LOG.replace("## [Unreleased]\n", ""), "1.3.0", r"no heading '## \[Unreleased\]'"),
+    ],
+)
+def test_a_release_that_does_not_fit_the_changelog_is_refused(release, log, version, message):
+    with pytest.raises(release.ReleaseError, match=message):
+        release.dated(log, version, TODAY)
+
+
+def test_workflows_use_actions_by_their_commit_and_hooks_the_ruff_of_make_lint():
+    workflows = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
+    used = [
+        line
+        for path in workflows
+        for line in re.findall(r"(?m)uses: (.*)$", path.read_text(encoding="utf-8"))
+    ]
+    assert len(used) >= len(workflows) > 0
+    assert [each for each in used if not re.fullmatch(r"\S+@[0-9a-f]{40} # v[\d.]+", each)] == []
+    hooks = (ROOT / ".pre-commit-config.yaml").read_text(encoding="utf-8")
+    pinned = (ROOT / "constraints.txt").read_text(encoding="utf-8")
+    assert re.findall(r"rev: v(\S+)", hooks) == re.findall(r"(?m)^ruff==(\S+)", pinned)
