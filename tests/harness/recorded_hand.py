@@ -65,20 +65,23 @@ def published(
     seconds: float,
     changes: tuple[str, ...] = (),
     profile: str | None = None,
+    hand: tuple[str, ...] = (),
 ) -> Messages:
-    """All that the hand publishes under ``script``; ``folder`` is for its sockets."""
-    settings = load(
-        None if profile is None else Path(profile),
-        changes=[
-            "loop.clock=virtual",
-            "stream.state_rate=100",
-            f"stream.address=ipc://{folder}/stream",
-            f"commands.address=ipc://{folder}/commands",
-            *changes,
-        ],
+    """All that the hand publishes under ``script``; ``folder`` is for its sockets.
+
+    ``hand``: settings of the simulated hand that the daemon does not have.
+    """
+    common = (
+        "loop.clock=virtual",
+        "stream.state_rate=100",
+        f"stream.address=ipc://{folder}/stream",
+        f"commands.address=ipc://{folder}/commands",
+        *changes,
     )
+    path = None if profile is None else Path(profile)
+    settings = load(path, changes=common)
     taken: Messages = []
-    with Daemon(settings) as daemon:
+    with Daemon(settings, hand=load(path, changes=(*common, *hand))) as daemon:
         publisher = daemon.publisher
         publisher._link = Keeping(taken)
         publisher.settings(daemon.clock.wall(), daemon.clock.now(), facts(settings, daemon.models))
@@ -94,11 +97,12 @@ def record_hand(
     changes: tuple[str, ...] = (),
     without: tuple[bytes, ...] = (),
     profile: str | None = None,
+    hand: tuple[str, ...] = (),
 ) -> None:
     """The commands in ``due`` at their ticks (500 a second); topics ``without`` are left out."""
     writer = RecordingWriter(path)
     with TemporaryDirectory() as folder:
-        for topic, message in published(Path(folder), Script(due), seconds, changes, profile):
+        for topic, message in published(Path(folder), Script(due), seconds, changes, profile, hand):
             if topic not in without:
                 writer.add(topic, message)
     writer.close()

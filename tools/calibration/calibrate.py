@@ -1,4 +1,4 @@
-"""``softfinger calibrate``: one step of calibrating the joints or the sensor under one tip."""
+"""``softfinger calibrate``: one step of calibrating the hand, or the sensor under one tip."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from softfinger.daemon.client.hand import Hand
 from softfinger.daemon.client.stream import read
 from softfinger.daemon.wire.schema import STATE, HandState
-from softfinger.tools.arguments import add_daemon, add_profile, number, profile, stream_address
+from softfinger.tools.arguments import add_daemon, add_profile, addresses, number, profile
 from softfinger.tools.extras import MissingExtra
 from softfinger.tools.recordings.reader import Recording
 
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 STEPS = (
     "joints",
     "heat",
+    "friction",
+    "latency",
     "tare",
     "equilibrate",
     "curve",
@@ -30,14 +32,19 @@ STEPS = (
     "relaxation",
     "scales",
 )
+_OF_PROFILE = STEPS[: STEPS.index("tare")]  # the others are of a tip
 _LEARNT = 0.8  # of the settings' doubt about a sensor's gain: with more, no grip has told of it
 _LEAST = 0.02  # relative, of each scale: rubber and joints are not the same from day to day
 _EPILOG = """\
-the joints; FILE is a profile, made of --config's if absent:
+the profile; FILE is one, made of --config's if absent:
   joints       with torque off each finger is closed, opened and put upright by hand: its servo,
                direction, zero and range, of both
   heat         from the recording of a grip of some minutes, begun cold: by how much the servo of
                --finger warms, and how fast
+  friction     what each joint loses to friction, in air: the running daemon sweeps it there and
+               back; or from a recording of such motion
+  latency      by how much frames are late: the running daemon grasps an object with several
+               forces (--force: the first); or from a recording of such a grip
 
 steps of a tip, in this order; each is written into FILE, which keeps the others:
   tare         unloaded: the zero of each cell; its noise, how that correlates, and drift
@@ -106,25 +113,37 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "(closed, open, zero) for a joint's",
     )
     parser.add_argument("--no-plot", action="store_true", help="draw no picture")
-    add_daemon(parser, stream_address)  # of scales
+    add_daemon(parser, addresses)  # of friction, latency and scales
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Do one step. Raises SoftfingerError or OSError; then the file is unchanged."""
     step = arguments.step
-    if step in ("joints", "heat") and arguments.config is None:
+    if step in _OF_PROFILE and arguments.config is None:
         arguments.config = arguments.file
     settings = profile(arguments)
-    if step in ("joints", "heat"):
-        from softfinger.tools.calibration.joints import calibrate_heat, calibrate_joints
-
-        told = (calibrate_heat if step == "heat" else calibrate_joints)(arguments, settings)
+    if step in _OF_PROFILE:
+        told = _calibrate_profile(arguments, settings)
     elif step == "scales":
         told = calibrate_scales(arguments, settings)
     else:
         told = _calibrate_tip(arguments, settings)
     print(f"{step}: {told}; written to {arguments.file}")
     return 0
+
+
+def _calibrate_profile(arguments: argparse.Namespace, settings: Settings) -> str:
+    if arguments.step == "friction":
+        from softfinger.tools.calibration.friction import calibrate_friction
+
+        return calibrate_friction(arguments, settings)
+    if arguments.step == "latency":
+        from softfinger.tools.calibration.latency import calibrate_latency
+
+        return calibrate_latency(arguments, settings)
+    from softfinger.tools.calibration.joints import calibrate_heat, calibrate_joints
+
+    return (calibrate_heat if arguments.step == "heat" else calibrate_joints)(arguments, settings)
 
 
 def _calibrate_tip(arguments: argparse.Namespace, settings: Settings) -> str:
@@ -188,7 +207,7 @@ def _last_state(arguments: argparse.Namespace) -> HandState:
     from softfinger.kinematics.calibration.calibration import CalibrationError
 
     if not arguments.recording:
-        with Hand(arguments.address, keys=arguments.keys) as hand:
+        with Hand(*arguments.address, keys=arguments.keys) as hand:
             return hand.state()
     path = arguments.recording[-1]
     last = deque(Recording(path).messages({STATE}), maxlen=1)

@@ -14,7 +14,7 @@ import struct
 import zlib
 from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, BinaryIO
+from typing import IO, TYPE_CHECKING, Any, BinaryIO, Protocol
 
 from softfinger.daemon.errors import RecordingError
 from softfinger.daemon.own_files import MOST, open_regular, unpacked_most
@@ -54,6 +54,17 @@ def read_recording(path: str | Path) -> dict[str, NDArray[Any]]:
         raise RecordingError(f"{path}: no {STATE.decode()} in it")
     columns = to_columns(states)
     return {"t": (columns["mono_ns"] - columns["mono_ns"][0]) * 1e-9, **columns}
+
+
+class MessageSource(Protocol):
+    """A stream's messages, stored in a file or in memory; ``path`` names it in messages."""
+
+    path: Path
+
+    def messages(
+        self, topics: Collection[bytes] | None = None
+    ) -> Iterator[tuple[bytes, dict[str, Any]]]:
+        """Yield topic and map of each message of ``topics``, in order."""
 
 
 class Recording:

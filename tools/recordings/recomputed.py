@@ -23,7 +23,7 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS, Frame
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.publisher import packer
-from softfinger.tools.recordings.reader import Recording
+from softfinger.tools.recordings.reader import MessageSource, Recording
 
 if TYPE_CHECKING:
     from softfinger.daemon.perception.finger_model import FingerModel
@@ -59,7 +59,7 @@ class Comparison:
     differences: dict[str, Difference] = field(default_factory=dict)
 
 
-def recorded_settings(recording: Recording) -> tuple[Settings, list[str]]:
+def recorded_settings(recording: MessageSource) -> tuple[Settings, list[str]]:
     """Return the recording's settings and calibrations (JSON). Raises RecordingError.
 
     The settings name no files: a recording may come from anywhere.
@@ -81,7 +81,7 @@ def recorded_settings(recording: Recording) -> tuple[Settings, list[str]]:
     return without_files(settings), [str(each) for each in calibrations]
 
 
-def recorded_models(recording: Recording) -> tuple[FingerModel, FingerModel]:
+def recorded_models(recording: MessageSource) -> tuple[FingerModel, FingerModel]:
     """Return the models of a recording's fingers by its own settings and calibrations.
 
     Raises RecordingError, SettingsError, TactileError.
@@ -95,7 +95,7 @@ def recorded_models(recording: Recording) -> tuple[FingerModel, FingerModel]:
 
 
 def counts_of(
-    recording: Recording, message: dict[str, Any], settings: Settings
+    recording: MessageSource, message: dict[str, Any], settings: Settings
 ) -> NDArray[np.uint16]:
     """Return a frame's counts. Raises RecordingError for pressures, or a grid of another shape."""
     if message.get("unit") != "count":

@@ -1,0 +1,174 @@
+"""Friction of a joint that moves there and back in air: Coulomb, viscous, and at break-away."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from softfinger.kinematics.calibration.calibration import CalibrationError
+
+FloatArray = NDArray[np.float64]
+
+RUN_MAX = 3600.0  # s of data: a grid of more is not worth its memory
+_STEP = 0.01  # s of the grid on which motion and torque are compared
+_AROUND = 6  # steps to either side over which velocity and acceleration are fitted
+_GAP = 0.035  # s without data, which nothing is interpolated across
+_MOVES = 0.2  # rad/s, above which the friction at rest has mostly gone (XL330: 0.12 rad/s)
+_RESTS = 0.02  # rad/s, below which a joint stands: one count of 1.5 mrad in 0.08 s
+_AWAY = 5e-3  # rad from where it stood: three counts, ten times what gears give way
+_SLOW = 0.1, 20  # rad/s of a goal over so many steps: it breaks a joint away with little inertia
+_SECONDS = 0.5  # of motion in each direction, at least
+_SHARED = 0.2  # s for which remaining errors are alike
+_FEWEST = 3  # break-aways for a mean
+# N·m·s/rad, mean and standard deviation: identified for such servos are 0.015 to 0.051 (model M4 of
+# Rhoban's BAM, arXiv 2410.08650).
+_VISCOUS = 0.02, 0.02
+_INERTIA_ERROR = 0.5  # relative, of the inertia that is set
+
+
+class FrictionFit(NamedTuple):
+    """Friction of one joint [N·m] with standard deviations."""
+
+    coulomb: float
+    coulomb_std: float
+    viscous: float  # [N·m·s/rad]
+    viscous_std: float
+    stiction: float  # at break-away; NaN if fewer than three slow strokes began from rest
+    stiction_std: float
+
+
+def fit_friction(
+    t: ArrayLike,
+    q: ArrayLike,
+    goal: ArrayLike,
+    torque: ArrayLike,
+    inertia: float,
+    step: float,
+) -> FrictionFit:
+    """Fit a joint's motion there and back in air by least squares.
+
+    While the joint moves, its motor gives
+
+        torque = F sign(q̇) + b q̇ + J q̈ + c0 + c1 q + c2 q²
+
+    with the Coulomb friction F and the viscous friction b ≥ 0. The polynomial is the part that the
+    direction of motion does not change: weight, cables, an offset of the current. Friction at
+    break-away is the largest torque of a start from rest behind a slow goal.
+
+    Parameters
+    ----------
+    t, q, goal, torque
+        Time [s], joint angle and its goal [rad], torque of the motor [N·m].
+    inertia
+        J [kg·m²], known to 50 %.
+    step
+        Resolution of the torque [N·m].
+
+    Raises
+    ------
+    CalibrationError
+        If the joint moves for less than 0.5 s in either direction, or the data last for more than
+        an hour.
+    """
+    at, angle, led, given = (np.asarray(each, np.float64) for each in (t, q, goal, torque))
+    if at.size and at[-1] - at[0] > RUN_MAX:
+        raise CalibrationError(too_long(at[-1] - at[0]))
+    grid = np.arange(at[0], at[-1], _STEP) if at.size else at
+    if grid.size <= 2 * _AROUND:
+        raise CalibrationError(_too_little(0.0, 0.0))
+    shown, push = np.interp(grid, at, angle), np.interp(grid, at, given)
+    place, rate, acceleration = _motion(shown)
+    after = np.clip(np.searchsorted(at, grid, "right"), 1, at.size - 1)
+    whole = at[after] - at[after - 1] < _GAP
+    # The joint moves one way all around an instant, so smoothing blurs no reversal.
+    closes, opens = (_throughout(whole & (sign * rate > _MOVES)) for sign in (1.0, -1.0))
+    seconds = [float(np.count_nonzero(each)) * _STEP for each in (closes, opens)]
+    if min(seconds) < _SECONDS:
+        raise CalibrationError(_too_little(*seconds))
+    used = closes | opens
+    x = place - place[used].mean()
+    columns = np.stack([np.sign(rate), rate, acceleration, x**0, x, x * x], axis=1)
+    found, std = _least_squares(columns[used], push[used], inertia, step)
+    breaks = _break_aways(shown, rate, push - columns[:, 3:] @ found[3:], np.interp(grid, at, led))
+    stiction, stiction_std = breaks.mean(axis=0) if len(breaks) >= _FEWEST else (math.nan, math.nan)
+    return FrictionFit(
+        max(float(found[0]), 0.0),
+        float(std[0]),
+        float(found[1]),
+        float(std[1]),
+        float(stiction),
+        math.hypot(float(stiction_std), step / math.sqrt(12.0)),
+    )
+
+
+def too_long(seconds: float) -> str:
+    """Return the message for data of so many ``seconds``."""
+    return f"found {seconds:.0f} s of data, expected {RUN_MAX:g} s at most"
+
+
+def _too_little(closing: float, opening: float) -> str:
+    return (
+        f"found {closing:.1f} s of closing and {opening:.1f} s of opening above {_MOVES:g} rad/s "
+        f"in air, expected {_SECONDS:g} s of each at least"
+    )
+
+
+def _motion(q: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return angle, velocity and acceleration by a parabola through each instant's neighbours."""
+    offsets = _STEP * np.arange(-_AROUND, _AROUND + 1)
+    fits = np.linalg.pinv(np.stack([offsets**0, offsets, 0.5 * offsets**2], axis=1))
+    padded = np.pad(q, _AROUND, mode="edge")
+    place, rate, acceleration = (np.convolve(padded, fit[::-1], "valid") for fit in fits)
+    return place, rate, acceleration
+
+
+def _throughout(holds: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return True where something holds at each of an instant's neighbours."""
+    size = 2 * _AROUND + 1
+    return np.convolve(np.pad(holds, _AROUND), np.ones(size), "valid") > size - 0.5
+
+
+def _least_squares(
+    columns: FloatArray, values: FloatArray, inertia: float, step: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return solution and standard deviations."""
+    prior = np.array([0.0, _VISCOUS[0], inertia, 0.0, 0.0, 0.0])
+    weight = np.diag([0.0, _VISCOUS[1] ** -2, (_INERTIA_ERROR * inertia) ** -2, 0.0, 0.0, 0.0])
+    rounding = step * step / 12.0
+    variance = rounding
+    for _ in range(2):  # the second with the noise that the first finds
+        per_sample = _STEP / _SHARED / variance
+        covariance = np.linalg.inv(per_sample * columns.T @ columns + weight)
+        found = covariance @ (per_sample * columns.T @ values + weight @ prior)
+        variance = max(float(np.mean((values - columns @ found) ** 2)), rounding)
+    std = np.sqrt(np.diag(covariance))
+    if found[1] < 0.0:  # friction that falls with the speed: the solution for b = 0
+        found = found - covariance[:, 1] * (found[1] / covariance[1, 1])
+    # A current that rests between two counts is off by the same part of a count throughout.
+    std[0] = math.hypot(float(std[0]), math.sqrt(rounding))
+    return found, std
+
+
+def _break_aways(q: FloatArray, rate: FloatArray, push: FloatArray, goal: FloatArray) -> FloatArray:
+    """Return torque and standard deviation of each start from rest behind a slow goal, [n, 2].
+
+    A goal rises by whole counts, and the torque with it: break-away is between the largest torque
+    and the one before.
+    """
+    found = []
+    speed, steps = _SLOW
+    rests = _throughout(np.abs(rate) < _RESTS)
+    for last in np.flatnonzero(rests[:-1] & ~rests[1:]):
+        way = q[last:] - q[last]
+        away = np.flatnonzero(np.abs(way) > _AWAY)
+        led = goal[max(last - steps, 0) : last + int(away[0]) + steps] if away.size else goal
+        if np.abs(led[steps:] - led[:-steps]).max(initial=0.0) > speed * steps * _STEP:
+            continue
+        toward = math.copysign(1.0, way[away[0]]) * push[last : last + away[0] + 1]
+        most = int(toward.argmax())
+        held, largest = toward[max(most - 1, 0)], toward[most]
+        found.append((0.5 * (held + largest), (largest - held) / math.sqrt(12.0)))
+    return np.array(found).reshape(-1, 2)

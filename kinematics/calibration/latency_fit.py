@@ -1,0 +1,185 @@
+"""Latency of tactile frames: the time by which the tips' d follows the joints' closing."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from softfinger.kinematics.calibration.calibration import CalibrationError
+from softfinger.kinematics.calibration.friction_fit import RUN_MAX, too_long
+
+FloatArray = NDArray[np.float64]
+
+_STEP = 1e-3  # s of the grid on which the closing is compared, and of the delays tried first
+_LONGEST, _EARLY = 0.2, 0.02  # s of latency at most, and below none, for a minimum to be inside
+_MOVES, _SMOOTHED = 2e-3, 0.05  # m/s of closing, averaged over so many s: a ramp, which …
+_BESIDE = 0.2  # … with so many s before and after it is compared, …
+_LEAST = 8e-4  # … if it closes by so many m: seven counts of an encoder
+_FEWEST = 8  # frames
+_CLOCKS = 1e-3  # s, standard deviation of the times of ticks, readings and frames
+_WIDER, _SPREAD_MAX = 1.4, 0.1  # of a footprint that grows, as in `perception.frame_channels`
+_ROUNDS = 3  # in which the touch and the fit are found in turns
+
+
+class LatencyFit(NamedTuple):
+    """Delay of the frames beyond the latency in their times, with its standard deviation [s]."""
+
+    delay: float
+    std: float
+    scale: float  # of d by frames over d by joints
+    residual: float  # r.m.s. of d that the fit leaves [m]
+    ramps: int
+
+
+def fit_latency(
+    frames: tuple[ArrayLike, ArrayLike, ArrayLike],
+    joints: tuple[ArrayLike, ArrayLike],
+    errors: tuple[float, float],
+    latency: float,
+    response: float = 0.0,
+) -> LatencyFit:
+    """Fit frames of a grip whose force rises or falls, by least squares over its ramps k.
+
+        d(t) = scale · closing(t − delay) + offset_k
+
+    Cells with a response show the closing after a first-order lag, on a footprint that is wider
+    while it grows.
+
+    Parameters
+    ----------
+    frames
+        Times [s], d [m] and the standard deviation of its noise [m].
+    joints
+        Times [s] and the depth to which they close [m], from any origin.
+    errors
+        Standard deviations: of the joints' depth by their encoders [m], and of d by the frames,
+        relative.
+    latency
+        Latency that the frames' times contain [s].
+    response
+        Time constant of the cells [s].
+
+    Raises
+    ------
+    CalibrationError
+        If the joints close by less than 0.8 mm in every ramp, or the data last for more than an
+        hour.
+    """
+    t, d, std = (np.asarray(each, np.float64) for each in frames)
+    read, closed = (np.asarray(each, np.float64) for each in joints)
+    if t.size < _FEWEST or read.size < 2:
+        raise CalibrationError(_too_little(0.0))
+    if read[-1] - read[0] > RUN_MAX:
+        raise CalibrationError(too_long(read[-1] - read[0]))
+    grid = np.arange(read[0], read[-1], _STEP)
+    closing = np.interp(grid, read, closed - closed[0])
+    rate = _rate(closing)
+    ramps, widest = _ramps(t, grid, closing, rate)
+    used = ramps.any(axis=1)
+    if np.count_nonzero(used) < _FEWEST:
+        raise CalibrationError(_too_little(widest))
+    encoder, scale_error = errors
+    data = _Ramps(t[used], d[used], np.hypot(std[used], encoder), ramps[used])
+    touch = -math.inf
+    for _ in range(_ROUNDS if response > 0.0 else 1):
+        shown, spread = _shown(np.maximum(closing, touch), response)
+        fit, offset = _fit(data, grid, shown, spread, scale_error, latency)
+        touch = -offset / fit.scale
+    # At rest an encoder is off by the same throughout, and half of that shifts the ramp.
+    speed = float(np.abs(np.interp(data.t, grid, rate)).max())
+    held = 0.5 * encoder / speed / math.sqrt(ramps.shape[1])
+    return fit._replace(std=math.hypot(fit.std, held))
+
+
+class _Ramps(NamedTuple):
+    """Frames of the ramps: times, d and standard deviations, and which ramp is theirs."""
+
+    t: FloatArray
+    d: FloatArray
+    std: FloatArray
+    of: NDArray[np.bool_]
+
+
+def _fit(
+    data: _Ramps,
+    grid: FloatArray,
+    shown: FloatArray,
+    spread: FloatArray,
+    scale_error: float,
+    latency: float,
+) -> tuple[LatencyFit, float]:
+    """Fit to what the cells would show of the closing; also return the offset of d [m]."""
+
+    def solve(delay: float) -> tuple[FloatArray, FloatArray]:
+        at = data.t - delay
+        wide = np.minimum(np.interp(at, grid, spread) / data.d**2, _SPREAD_MAX)
+        rows = np.column_stack([np.interp(at, grid, shown), data.of]) / data.std[:, None]
+        rows = np.vstack([rows, [1.0 / scale_error, *np.zeros(data.of.shape[1])]])
+        values = np.append(data.d / (1.0 + _WIDER * wide) / data.std, 1.0 / scale_error)
+        x = np.linalg.lstsq(rows, values, rcond=None)[0]
+        return x, values - rows @ x
+
+    delays = np.arange(-_EARLY, _LONGEST, _STEP) - latency
+    costs = np.array([float(np.sum(np.square(solve(delay)[1]))) for delay in delays])
+    best = int(np.argmin(costs))
+    near = slice(max(best - 5, 0), best + 6)
+    bend, slope, _ = np.polyfit(delays[near] - delays[best], costs[near], 2)
+    delay, bend = float(delays[best]), max(float(bend), 1e-9)
+    if 0 < best < delays.size - 1:
+        delay -= 0.5 * float(slope) / bend
+    x, off = solve(delay)
+    off = off[:-1]
+    excess = max(float(off @ off) / max(off.size - x.size - 1, 1), 1.0)
+    alike = float(np.clip(off[1:] @ off[:-1] / (off @ off), 0.0, 0.9))
+    std = math.sqrt(excess * (1.0 + alike) / (1.0 - alike) / bend)
+    residual = float(np.sqrt(np.mean(np.square(off * data.std))))
+    result = LatencyFit(delay, math.hypot(std, _CLOCKS), float(x[0]), residual, data.of.shape[1])
+    return result, float(np.median(x[1:]))
+
+
+def _too_little(widest: float) -> str:
+    return (
+        f"found a ramp of {widest * 1e3:.1f} mm by the joints, expected "
+        f"{_LEAST * 1e3:g} mm at least while both tips touch"
+    )
+
+
+def _shown(closing: FloatArray, response: float) -> tuple[FloatArray, FloatArray]:
+    """Return what cells with a first-order lag show of ``closing``, and its spread [m²]."""
+    if response == 0.0:
+        return closing, np.zeros_like(closing)
+    share = -math.expm1(-_STEP / response)
+    mean, spread = np.empty_like(closing), np.empty_like(closing)
+    last, variance = float(closing[0]), 0.0
+    for k, value in enumerate(closing.tolist()):
+        behind = value - last
+        last += share * behind
+        variance = (1.0 - share) * (variance + share * behind * behind)
+        mean[k], spread[k] = last, variance
+    return mean, spread
+
+
+def _rate(closing: FloatArray) -> FloatArray:
+    """Return the smoothed speed of closing [m/s]."""
+    around = np.full(round(_SMOOTHED / _STEP) | 1, 1.0)
+    smooth = np.convolve(np.pad(closing, around.size // 2, mode="edge"), around, "valid")
+    return np.asarray(np.gradient(smooth / around.size, _STEP))
+
+
+def _ramps(
+    t: FloatArray, grid: FloatArray, closing: FloatArray, rate: FloatArray
+) -> tuple[NDArray[np.bool_], float]:
+    """Return which of the ramps each frame belongs to, [n, ramps], and the widest one [m]."""
+    near = np.convolve(np.abs(rate) > _MOVES, np.ones(2 * round(_BESIDE / _STEP) + 1), "same") > 0.5
+    number = np.cumsum(near & ~np.append(False, near[:-1])) * near  # of a ramp, 0: none
+    index = np.clip(np.searchsorted(grid, t), 0, grid.size - 1)
+    widths = {
+        k: float(np.ptp(closing[index[number[index] == k]]))
+        for k in np.unique(number[index])
+        if k > 0
+    }
+    wide = [k for k, width in widths.items() if width > _LEAST]
+    return np.equal.outer(number[index], wide), max(widths.values(), default=0.0)

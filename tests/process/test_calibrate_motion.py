@@ -1,0 +1,102 @@
+"""`calibrate friction` and `calibrate latency` move a hand on ptys by its running daemon."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from softfinger import Hand
+from softfinger.daemon.profile.load import load
+from softfinger.tools.cli import main
+from tests.conftest import own_addresses
+from tests.harness.daemon_process import Running
+from tests.harness.emulated import HIL, EmulatorProcess
+
+FRICTION, AT_REST, LATENCY = 0.09, 0.13, 0.035  # of the hand; the profile has 0.05 and 0.015
+BYTES = 5.13e-3  # s of a frame on the wire
+COUNT = 1.78 * 2.69e-3  # N·m of one count of the current
+PLANT = {
+    "simulation.joint_friction": FRICTION,
+    "simulation.joint_stribeck": AT_REST - FRICTION,
+    "simulation.tactile_delay": LATENCY + BYTES,
+}
+WAITING = ["--set", "servos.fault_after=1.0", "--set", "safety.frame_age_fault=100"]
+
+Calibrate = Callable[..., int]
+
+
+@pytest.fixture(scope="module")
+def hand(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Hand]]:
+    """A profile of the hand, and a client of the daemon on it."""
+    folder = tmp_path_factory.mktemp("hand")
+    addresses = own_addresses()
+    profile = folder / "my.toml"
+    head = f'stream.address = "{addresses[0]}"\ncommands.address = "{addresses[1]}"\n'
+    profile.write_text(head + HIL.read_text(encoding="utf-8"), encoding="utf-8")
+    words = [word for key, value in PLANT.items() for word in ("--set", f"{key}={value}")]
+    with EmulatorProcess("--dir", folder, "--config", HIL, *words) as emulator:
+        emulator.ready()
+        daemon = Running("--config", str(profile), "--dir", str(folder), *WAITING)
+        try:
+            with Hand(*addresses, timeout=120.0) as client:
+                yield profile, client
+        finally:
+            daemon.kill()
+
+
+@pytest.fixture
+def calibrate(hand: tuple[Path, Hand]) -> Calibrate:
+    """Runs a step on the module's hand, which ends disarmed."""
+    profile, client = hand
+    address = f"{client.stream_address},{client.command_address}"
+    where = ["--dir", str(profile.parent), "--address", address, "--move", "true"]
+
+    def run(step: str, *words: str) -> int:
+        return main(["calibrate", step, str(profile), *where, *words])
+
+    return run
+
+
+def test_the_daemon_sweeps_a_joint(hand, calibrate, capsys):
+    profile, client = hand
+    assert calibrate("friction", "--set", 'scene.fingers=["left"]') == 0
+    told = capsys.readouterr()
+    assert "nothing may be between or beside the fingers; sweeps left 0° to -23°" in told.err
+    # A tenth of the friction that is more at rest is left at the speeds of the sweep.
+    found = load(profile, profile.parent)
+    assert found.control.joint_friction == pytest.approx(FRICTION, abs=2 * COUNT)
+    shown = float(told.out.split("at break-away ")[1].split(" ")[0])
+    assert shown == pytest.approx(AT_REST, abs=3 * COUNT)
+    assert client.state().mode == "disarmed"
+
+
+def test_the_daemon_grasps_with_several_forces(hand, calibrate, capsys):
+    profile, client = hand
+    assert calibrate("latency", "--force", "8") == 0
+    told = capsys.readouterr()
+    assert "put an object between the fingers, for 8 N" in told.err
+    assert "(the daemon had 15 ms), by " in told.out
+    assert load(profile, profile.parent).tactile.latency == pytest.approx(LATENCY, abs=4e-3)
+    assert client.state().mode == "disarmed"
+
+
+def test_a_touch_ends_the_sweep_and_torque(hand, calibrate, capsys):
+    profile, client = hand
+    before = profile.read_text(encoding="utf-8")
+    assert calibrate("friction", "--set", "hand.q_min=[-0.1,-0.1]") == 1
+    assert "friction: left: a tip touches something" in capsys.readouterr().err
+    assert client.wait_for(lambda state: not state.torque, 60.0).mode == "disarmed"
+    assert profile.read_text(encoding="utf-8") == before
+
+
+def test_a_hand_at_work_is_left_alone(hand, calibrate, capsys):
+    _, client = hand
+    client.arm()
+    client.grasp(force=5.0)
+    client.wait_for(lambda state: state.mode == "holding", 120.0)
+    try:
+        assert calibrate("friction") == 1
+        assert "found the hand holding, expected it disarmed or armed" in capsys.readouterr().err
+        assert client.state().mode == "holding"
+    finally:
+        client.stop()

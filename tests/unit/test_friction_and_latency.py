@@ -1,0 +1,207 @@
+"""`calibrate friction` and `calibrate latency` on hands that are not as their profile says."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from softfinger.daemon.profile.load import load
+from softfinger.kinematics.calibration.calibration import CalibrationError
+from softfinger.kinematics.calibration.friction_fit import fit_friction
+from softfinger.kinematics.calibration.latency_fit import fit_latency
+from softfinger.tools.calibration.friction import _way
+from softfinger.tools.cli import main
+from tests.harness.recorded_hand import record_hand
+
+Due = dict[int, dict[str, Any]]
+
+EMPTY = "simulation.object_position=[0.0,0.3]"  # out of reach
+CONFIG = Path(__file__).parents[2] / "config"
+SMALL, VELOSTAT = CONFIG / "small.toml", str(CONFIG / "velostat.toml")
+COUNT = 1.78 * 2.69e-3  # N·m of one count of an XM430's current
+TICK = 2e-3  # s
+
+
+def sweeps(*strokes: tuple[float, float]) -> tuple[Due, float]:
+    """Strokes from 0 to an angle [rad] and back at a speed [rad/s]: commands, and their end [s]."""
+    due: Due = {100: {"command": "arm"}}
+    tick = 150
+    for wide, speed in strokes:
+        for first, last in ((0.0, wide), (wide, 0.0)):
+            steps = round(abs(wide) / speed / (10 * TICK))
+            for k in range(1, steps + 1):
+                angle = first + (last - first) * k / steps
+                due[tick + 10 * k] = {"command": "move", "left": angle, "right": angle}
+            tick += 10 * steps + 200
+    return due, (tick + 100) * TICK
+
+
+def calibrate(step: str, folder: Any, *words: str) -> int:
+    profile = folder / "my.toml"
+    if not profile.exists():
+        profile.write_text("", encoding="utf-8")
+    recording = str(folder / "run.mcap")
+    return main(["calibrate", step, str(profile), "--recording", recording, *words])
+
+
+@pytest.mark.parametrize(
+    ("friction", "more", "expected", "at_rest"),
+    [(0.02, 0.0, 0.02, None), (0.2, 0.0, 0.2, None), (0.05, 0.15, 0.06, 0.2)],
+)
+def test_a_sweep_shows_friction(tmp_path, capsys, friction, more, expected, at_rest):
+    due, end = sweeps((-0.05, 0.05), (-0.05, 0.05), (-0.4, 0.3), (-0.4, 0.6))
+    hand = (f"simulation.joint_friction={friction}", f"simulation.joint_stribeck={more}")
+    record_hand(tmp_path / "run.mcap", due, end, (EMPTY,), hand=hand)
+    assert calibrate("friction", tmp_path) == 0
+    told = capsys.readouterr().out
+    found = load(tmp_path / "my.toml").control.joint_friction
+    # What is more at rest falls by e in 0.12 rad/s: a tenth of it is left at these speeds.
+    assert found == pytest.approx(expected, abs=2 * COUNT)
+    assert f"control.joint_friction = {found:g}" in told
+    assert ("at break-away" in told) == (at_rest is not None)
+    if at_rest is not None:
+        shown = float(told.split("at break-away ")[1].split(" ")[0])
+        assert shown == pytest.approx(at_rest, abs=3 * COUNT)
+
+
+def test_the_friction_of_a_small_servo(tmp_path):
+    due, end = sweeps((-0.4, 0.3), (-0.4, 0.6))
+    (tmp_path / "my.toml").write_text(SMALL.read_text(encoding="utf-8"), encoding="utf-8")
+    hand = ("simulation.joint_friction=0.006",)
+    record_hand(tmp_path / "run.mcap", due, end, (EMPTY,), profile=str(SMALL), hand=hand)
+    assert calibrate("friction", tmp_path) == 0
+    found = load(tmp_path / "my.toml").control.joint_friction
+    assert found == pytest.approx(0.006 / (1.0 - 0.25), abs=1e-3)  # a quarter of the gears' torque
+
+
+def test_what_does_not_change_with_the_direction_is_no_friction():
+    t = np.arange(0.0, 16.0, 0.01)
+    q = 0.2 * np.cos(2.0 * math.pi * t / 4.0)
+    rate, acceleration = np.gradient(q, t), np.gradient(np.gradient(q, t), t)
+    weight = 0.06 * np.sin(q) + 0.04
+    torque = 0.08 * np.sign(rate) + 0.03 * rate + 0.013 * acceleration + weight
+    noise = np.random.default_rng(3).normal(0.0, 0.003, t.size)
+    shown = COUNT * np.round((torque + noise) / COUNT)
+    found = fit_friction(t, q, q, shown, 0.010, COUNT)
+    assert found.coulomb == pytest.approx(0.08, abs=2 * found.coulomb_std)
+    assert found.viscous == pytest.approx(0.03, abs=2 * found.viscous_std)
+    assert found.coulomb_std < COUNT
+    closing = np.maximum.accumulate(q[t < 4.0])
+    with pytest.raises(CalibrationError, match=r"found 0\.\d s of closing and 0\.0 s of opening"):
+        fit_friction(t[t < 4.0], closing, closing, shown[t < 4.0], 0.010, COUNT)
+    with pytest.raises(CalibrationError, match=r"found 0\.0 s of closing"):
+        fit_friction([], [], [], [], 0.010, COUNT)
+
+
+def test_only_motion_in_air_counts(tmp_path, capsys):
+    due: Due = {
+        100: {"command": "arm"},
+        150: {"command": "grasp", "force": 8.0},
+        1000: {"command": "release"},
+    }
+    record_hand(tmp_path / "run.mcap", due, 3.0)
+    assert calibrate("friction", tmp_path) == 1
+    assert "friction: left: found 0.1 s of closing and " in capsys.readouterr().err
+    assert load(tmp_path / "my.toml").control.joint_friction == 0.05
+
+
+def test_times_that_no_run_has_are_refused():
+    t, still = np.array([0.0, 1e9]), np.zeros(2)
+    with pytest.raises(CalibrationError, match="found 1000000000 s of data"):
+        fit_friction(t, still, still, still, 0.010, COUNT)
+    frames = np.linspace(0.0, 1.0, 50)
+    with pytest.raises(CalibrationError, match="found 1000000000 s of data"):
+        fit_latency((frames, frames, frames), (t, still), (2e-5, 0.2), 0.02)
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        (["--set", "servos.model=XL430-W250"], "one that measures its current"),
+        (["--recording", "a.mcap", "b.mcap"], "expected one --recording"),
+    ],
+)
+def test_what_shows_no_friction_is_refused(tmp_path, capsys, words, why):
+    assert calibrate("friction", tmp_path, *words) == 1
+    assert why in capsys.readouterr().err
+
+
+def test_a_sweep_goes_where_nothing_is():
+    assert _way(load(None), "left") == (0.0, -0.4)
+    inward = load(None, changes=["hand.open_angle=[-0.4,-0.4]"])
+    assert _way(inward, "right") == (-0.4, 0.4)
+    narrow = load(None, changes=["hand.q_min=[-0.1,-0.1]", "hand.q_max=[0.15,0.15]"])
+    with pytest.raises(CalibrationError, match=r"found 6° from hand\.open_angle"):
+        _way(narrow, "left")
+
+
+ARM: Due = {100: {"command": "arm"}}
+GRASP: Due = {**ARM, 150: {"command": "grasp", "force": 8.0}}
+FORCES: Due = {
+    **GRASP,
+    1100: {"command": "grasp", "force": 4.0},
+    1700: {"command": "grasp", "force": 10.0},
+}
+
+
+@pytest.mark.parametrize(
+    ("profile", "latency", "hand"),
+    [
+        (None, 0.0, ()),
+        (None, 0.06, ("simulation.joint_friction=0.2",)),
+        (None, 0.03, ("simulation.modulus_scale=0.7", "simulation.tactile_gain=[0.7,1.4]")),
+        pytest.param("velostat", 0.03, (), marks=pytest.mark.extended),
+        pytest.param("capacitive", 0.06, (), marks=pytest.mark.extended),
+        pytest.param("solid", 0.045, (), marks=pytest.mark.extended),
+    ],
+)
+def test_a_grip_shows_how_late_frames_are(tmp_path, capsys, profile, latency, hand):
+    path = None if profile is None else str(CONFIG / f"{profile}.toml")
+    plant = (f"simulation.tactile_delay={latency}", *hand)
+    record_hand(tmp_path / "run.mcap", FORCES, 4.4, profile=path, hand=plant)
+    assert calibrate("latency", tmp_path) == 0
+    told = capsys.readouterr().out
+    # Cells that follow within 60 ms hide some of it; else it is known to a few ms.
+    tolerance = 6e-3 if profile == "velostat" else 3e-3
+    assert load(tmp_path / "my.toml").tactile.latency == pytest.approx(latency, abs=tolerance)
+    assert float(told.split(" ± ")[1].split(" ms")[0]) < 1e3 * tolerance
+    assert "(the daemon had 20 ms)" in told
+
+
+@pytest.mark.parametrize(
+    ("profile", "due", "hand", "why"),
+    [
+        (None, ARM, (), "found a ramp of 0.0 mm by the joints"),
+        (None, FORCES, ("simulation.object_angle=0.3",), "neither slides nor tilts"),
+        (VELOSTAT, GRASP, (), "found a standard deviation of 16"),
+    ],
+)
+def test_a_grip_that_shows_no_latency_is_refused(tmp_path, capsys, profile, due, hand, why):
+    end = 4.4 if due is FORCES else 1.8
+    record_hand(tmp_path / "run.mcap", due, end, profile=profile, hand=hand)
+    assert calibrate("latency", tmp_path) == 1
+    assert why in capsys.readouterr().err
+    assert load(tmp_path / "my.toml").tactile.latency == 0.02
+
+
+@pytest.mark.parametrize("delay", [-0.015, 0.037])
+def test_a_delay_is_found_from_numbers(delay):
+    chance = np.random.default_rng(7)
+    read = np.arange(0.0, 2.0, 0.01)
+    t = np.arange(0.2, 1.9, 0.01) + 0.003
+
+    def closing(at):
+        return 2e-3 * (np.tanh((at - 0.5) / 0.04) - 0.7 * np.tanh((at - 1.2) / 0.04))
+
+    d = 1.1 * closing(t - delay) + 5e-3 + chance.normal(0.0, 3e-5, t.size)
+    std = np.full(t.size, 3e-5)
+    found = fit_latency((t, d, std), (read, closing(read) + 0.08), (2e-5, 0.2), 0.02)
+    assert found.delay == pytest.approx(delay, abs=2 * found.std)
+    assert found.std < 1.5e-3
+    assert found.ramps == 2
+    assert found.scale == pytest.approx(1.1, abs=0.02)
+    still = np.zeros_like(read)
+    with pytest.raises(CalibrationError, match=r"expected 0\.8 mm at least"):
+        fit_latency((t, d, std), (read, still), (2e-5, 0.2), 0.02)

@@ -1,0 +1,110 @@
+"""A running daemon's hand, moved for a calibration while its stream is stored."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+from collections.abc import Callable, Collection, Iterator
+from pathlib import Path
+from typing import Any, Self
+
+import zmq
+
+from softfinger.daemon.client.connection import PATIENCE, drain, subscribe, unpack
+from softfinger.daemon.client.hand import Hand
+from softfinger.daemon.client.stream import no_stream, read
+from softfinger.daemon.errors import HandFault
+from softfinger.daemon.wire.schema import SETTINGS, STATE, TACTILE, HandState
+from softfinger.kinematics.calibration.calibration import CalibrationError
+from softfinger.tools.arguments import client_keys
+
+_MOST = 1000  # messages taken at once
+_WITHIN = 20.0  # s of the hand's time for a command to be carried out
+
+
+class LiveHand:
+    """A context in which the hand is armed, and its stream stored as in a `Recording`.
+
+    On leaving, a hand that was disarmed is disarmed. After an error torque goes off.
+    """
+
+    path = Path("the stream")
+
+    def __init__(self, arguments: argparse.Namespace) -> None:
+        self._address, self._keys = arguments.address, arguments.keys
+        self._taken: list[tuple[bytes, dict[str, Any]]] = []
+        self._disarm = False
+        self._commanded = False  # a command of ours was accepted
+
+    def __enter__(self) -> Self:
+        with contextlib.ExitStack() as stack:
+            self._hand = stack.enter_context(Hand(*self._address, keys=self._keys))
+            context = stack.enter_context(zmq.Context())
+            if (keys := client_keys(self._keys)) is not None:
+                keys.guard(context)
+            self._socket = subscribe(context, self._address[0], SETTINGS, STATE, TACTILE)
+            stack.push(self._leave)
+            mode = next(self.states()).mode
+            if mode not in ("disarmed", "armed"):
+                raise CalibrationError(f"found the hand {mode}, expected it disarmed or armed")
+            if mode == "disarmed":
+                self.command("arm")
+                self._disarm = True
+            self.until(lambda state: state.mode == "armed" and state.torque)
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        self._stack.__exit__(*error)
+
+    def _leave(self, kind: type[BaseException] | None, *_: object) -> None:
+        self._socket.close()
+        if kind is not None and self._commanded:
+            self._hand.stop()
+        elif self._disarm:
+            self._hand.disarm()
+
+    def command(self, name: str, **numbers: float) -> None:
+        """Send a command. Raises Refused and NoAnswer."""
+        self._hand.command(name, **numbers)
+        self._commanded = True
+
+    def states(self) -> Iterator[HandState]:
+        """Yield the newest state, again and again; all that comes is stored. Raises NoStream."""
+        while True:
+            if not self._socket.poll(int(1e3 * PATIENCE)):
+                raise no_stream(self._address[0], STATE, PATIENCE)
+            newest = None
+            for frames in drain(self._socket, _MOST):
+                with contextlib.suppress(ValueError):  # not a message
+                    topic, message = unpack(frames)
+                    self._taken.append((topic, message))
+                    newest = message if topic == STATE else newest
+            if newest is not None:
+                state = read(HandState, newest)
+                if state.fault:
+                    raise HandFault(state.fault)
+                yield state
+
+    def until(self, holds: Callable[[HandState], object]) -> None:
+        """Wait for a state for which ``holds`` is true. Raises CalibrationError after 20 s."""
+        begin = None
+        for state in self.states():
+            if holds(state):
+                return
+            begin = begin or state.mono_ns
+            if (state.mono_ns - begin) * 1e-9 > _WITHIN:
+                raise CalibrationError(f"the hand is still {state.mode} after {_WITHIN:g} s")
+
+    def wait(self, seconds: float) -> None:
+        """Wait by the hand's time."""
+        end = next(self.states()).mono_ns + int(1e9 * seconds)
+        self.until(lambda state: state.mono_ns >= end)
+
+    def messages(
+        self, topics: Collection[bytes] | None = None
+    ) -> Iterator[tuple[bytes, dict[str, Any]]]:
+        """Yield the stored messages of ``topics`` in the order in which they came."""
+        for topic, message in self._taken:
+            if topics is None or topic in topics:
+                yield topic, message
