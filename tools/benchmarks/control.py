@@ -22,7 +22,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from softfinger.daemon.control.grip import Grip
-from softfinger.daemon.errors import Refused
 from softfinger.daemon.types import ObjectPose, Reading
 from softfinger.tools.benchmarks.measuring import Report, Row, figure
 from softfinger.tools.benchmarks.rigs import SENSORS, SOLID, Sections, merged
@@ -162,11 +161,8 @@ def left(way: Way, simulation: Mapping[str, Any]) -> float:
             hand.control.grip = way.law(hand)
         hand.grasp(_FORCE)
         hand.run(_FOUND - _STEERED)
-        try:
-            if way.is_steered:
-                hand.command("rotate", angle=0.0)
-        except Refused:
-            return math.nan
+        if way.is_steered:  # without waiting for a force that not every law feels
+            hand.control.grip.steer(hand.state.object.angle, 0.0)
         hand.run(_STEERED)
         is_held = min(hand.plant.force) > 0.0
         return math.degrees(abs(float(hand.plant.object_pose[2]))) if is_held else math.nan
