@@ -142,9 +142,9 @@ ASKEW = {"object_angle": math.radians(5.0)}
         (control.LATE["two-phased, 300 ms"], 0.0, 1.0),
         (control.LATE["energy, 0.5 Hz, 300 ms"], 0.0, 1.0),
         (control.LATE["energy, 4 Hz, 0 ms"], 0.0, 0.2),
-        (control.LATE["energy, 4 Hz, 100 ms"], 5.0, 90.0),
-        (control.WAYS["upright, torque constants 5 % apart"], 1.5, 3.0),
-        (control.WAYS["upright, tips without tangential coupling"], 0.2, 1.2),
+        (control.LATE["energy, 4 Hz, 50 ms"], 5.0, 45.0),
+        (control.LIMITS["torque constants 5 % apart"], 1.5, 3.0),
+        (control.LIMITS["tips without tangential coupling"], 0.2, 1.2),
     ],
 )
 def test_what_a_law_leaves_of_the_objects_angle(way, low, high):
@@ -154,7 +154,7 @@ def test_what_a_law_leaves_of_the_objects_angle(way, low, high):
 
 def test_an_object_that_is_not_held_is_counted_and_leaves_the_other_draws():
     far = {"object_position": (0.0, 0.4)}
-    row = control._row("energy", control.WAYS["energy"], [ASKEW, ASKEW | far])
+    row = control.row("energy", control.WAYS["energy"], [ASKEW, ASKEW | far])
     assert (row["n"], row["not held"]) == (1, 1)
 
 

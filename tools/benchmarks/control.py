@@ -29,7 +29,7 @@ from softfinger.tools.watched import Watched
 
 _FORCE = 10.0  # N
 _ASKEW = math.radians(5.0)
-_DRAWS = 12  # of how the plant differs from the settings, the same for all laws
+_DRAWS = 12
 _FOUND = 5.0  # s from the command to grasp on, when the object's angle is read
 _STEERED = 2.0  # s before that, in which it is steered to 0
 DELAYS = (0.0, 0.05, 0.1, 0.2, 0.3)  # s
@@ -91,12 +91,13 @@ class Way(NamedTuple):
     aim: float | None = None
     is_steered: bool = False  # to 0, by the measured angle
     law: Callable[[Watched], Grip] | None = None  # in place of the daemon's
+    force: float = _FORCE
+    weight: tuple[float, float] = (0.0, 0.0)  # N along x and y, once the grip is firm
 
 
 EQUAL_TORQUES = {"law": "upright", "dither_time": 0.0, "joint_stiffness": 1e-9}
 _UPRIGHT = {"law": "upright"}
 _RELAXING: Sections = {"simulation": {"tip_creep_time": 20.0, "tip_micro_slip": True}}
-_UNCOUPLED: Sections = {"simulation": {"tip_law": "bristles"}}
 WAYS = {
     "equal torques (blind)": Way(EQUAL_TORQUES),
     "equal torques, tips that relax": Way(EQUAL_TORQUES, _RELAXING),
@@ -106,13 +107,38 @@ WAYS = {
     "upright (blind)": Way(_UPRIGHT, aim=0.5),
     "upright, tips that relax": Way(_UPRIGHT, _RELAXING, 0.5),
     "upright, solid tips": Way(_UPRIGHT, SOLID, 0.5),
-    "upright, tips without tangential coupling": Way(_UPRIGHT, _UNCOUPLED),
-    "upright, torque constants 1 % apart": Way(_UPRIGHT, law=partial(Altered, apart=0.01)),
-    "upright, torque constants 5 % apart": Way(_UPRIGHT, law=partial(Altered, apart=0.05)),
     **{
         f"energy, steered to 0, {sensor}": Way({}, flaws, 1.0, True)
         for sensor, flaws in SENSORS.items()
     },
+}
+
+
+def _upright(
+    law: Callable[[Watched], Grip] | None = None,
+    force: float = _FORCE,
+    width: float = 0.0,
+    weight: tuple[float, float] = (0.0, 0.0),
+    **simulation: Any,
+) -> Way:
+    """Return the blind law on a plant that it does not assume."""
+    tips: Sections = {"simulation": simulation}
+    if width:
+        tips = {"object": {"width": width}, "simulation": {"object_width": width}}
+    return Way(_UPRIGHT, tips, law=law, force=force, weight=weight)
+
+
+LIMITS = {
+    "torque constants 1 % apart": _upright(partial(Altered, apart=0.01)),
+    "torque constants 5 % apart": _upright(partial(Altered, apart=0.05)),
+    "tips without tangential coupling": _upright(tip_law="bristles"),
+    "tips half as stiff along the face": _upright(tip_shear_stiffness=0.5),
+    "tips twice as stiff along the face": _upright(tip_shear_stiffness=2.0),
+    "a weight of 2 N along the fingers": _upright(weight=(0.0, -2.0)),
+    "a weight of 2 N across the fingers": _upright(weight=(2.0, 0.0)),
+    **{f"a grip of {force:g} N": _upright(force=force) for force in (3.0, 2.0, 1.0)},
+    **{f"joint friction {each:g} N·m": _upright(joint_friction=each) for each in (0.1, 0.15, 0.2)},
+    **{f"an object of {1e3 * width:g} mm": _upright(width=width) for width in (0.06, 0.07, 0.09)},
 }
 LATE = {
     f"{name}, {1e3 * delay:g} ms": Way(control, is_steered=True, law=partial(law, delay=delay))
@@ -127,8 +153,18 @@ LATE = {
 
 def measure(brief: bool = False) -> list[Report]:
     """Return the angles that are left [°]; p99 of a few draws is about the worst of them."""
+    plants = drawn(2 if brief else _DRAWS)
+    title = f"left of {math.degrees(_ASKEW):g}° after {_FOUND:g} s at {_FORCE:g} N"
+    return [
+        Report(f"{title}{of}", [row(name, way, plants) for name, way in ways.items()])
+        for of, ways in (("", WAYS), (", upright, limits", LIMITS), (", its angle late", LATE))
+    ]
+
+
+def drawn(count: int = _DRAWS) -> list[dict[str, Any]]:
+    """Return how each plant differs from the settings; the same for all laws."""
     rng = np.random.default_rng(16)
-    drawn = [
+    return [
         {
             "seed": k,
             "object_angle": _ASKEW * (-1.0) ** k,
@@ -137,17 +173,13 @@ def measure(brief: bool = False) -> list[Report]:
             "tip_friction": rng.uniform(0.2, 0.8),
             "object_mass": 0.10 * 2.0 ** rng.uniform(-1.0, 1.0),
         }
-        for k in range(2 if brief else _DRAWS)
-    ]
-    title = f"left of {math.degrees(_ASKEW):g}° after {_FOUND:g} s at {_FORCE:g} N"
-    return [
-        Report(title, [_row(name, way, drawn) for name, way in WAYS.items()]),
-        Report(f"{title}, its angle late", [_row(name, way, drawn) for name, way in LATE.items()]),
+        for k in range(count)
     ]
 
 
-def _row(name: str, way: Way, drawn: list[dict[str, Any]]) -> Row:
-    found = [left(way, draw) for draw in drawn]
+def row(name: str, way: Way, plants: list[dict[str, Any]]) -> Row:
+    """Return a law's row: what is left on these plants, and how many were not held."""
+    found = [left(way, plant) for plant in plants]
     held = [each for each in found if not math.isnan(each)]
     more = {"not held": len(found) - len(held)}
     return figure(name, "°", held, way.aim, **more) if held else {"name": name, **more}
@@ -159,8 +191,12 @@ def left(way: Way, simulation: Mapping[str, Any]) -> float:
     with Watched(sections) as hand:
         if way.law is not None:
             hand.control.grip = way.law(hand)
-        hand.grasp(_FORCE)
-        hand.run(_FOUND - _STEERED)
+        hand.grasp(way.force)
+        begun = hand.now
+        while min(hand.plant.force) < 0.7 * way.force and hand.now < begun + _FOUND - _STEERED:
+            hand.run(hand.loop.period)
+        hand.plant.apply_load(*way.weight)
+        hand.run(begun + _FOUND - _STEERED - hand.now)
         if way.is_steered:  # without waiting for a force that not every law feels
             hand.control.grip.steer(hand.state.object.angle, 0.0)
         hand.run(_STEERED)

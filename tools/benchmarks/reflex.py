@@ -22,7 +22,13 @@ from softfinger.tools.benchmarks.measuring import Report, Row, figure
 from softfinger.tools.benchmarks.rigs import SENSORS, SOLID, RigError, Sections, merged
 from softfinger.tools.benchmarks.virtual_grip import VirtualGrip
 
-TIPS: dict[str, Sections] = {"springs": {}, "solid": SOLID, **SENSORS}  # sensors: on springs
+# Plants, each with the ideal sensor, and sensors on springs.
+TIPS: dict[str, Sections] = {
+    "springs": {},
+    "bristles": {"simulation": {"tip_law": "bristles"}},
+    "solid": SOLID,
+    **SENSORS,
+}
 MASSES = (0.1, 0.5, 2.0)  # kg
 STANDING = (0.0, 3.0, 6.0, 8.0, 9.0)  # N
 OVERLOADS = (12.5, 13.0, 14.0, 15.0, 16.0, 18.0)  # N; the tips' friction bears 12 N of 10 N
@@ -87,7 +93,7 @@ def _table(
         tried = [next(outcomes) for _ in range(trials)]
         found = [Overload(*each) for each in tried if each is not None]
         told = row(f"{standing:g} N, then a {kind} of {overload:g} N", found)
-        rows.append(told | {"no grip": trials - len(found)})
+        rows.append(told | {"trials": trials, "no grip": trials - len(found)})
     said = [each["said ms"] for each in rows if each["held %"] < 100.0]
     note = f"  said that the object has gone: in {max(said, default=0.0):.0f} ms, aim ≤ {_SAID:g}"
     return Report(f"{name}, answer", rows, notes=(note,) if said else ())
