@@ -496,6 +496,22 @@ def _control(table: int) -> str:
     return _table(heads, _shown(shown, ("median", "p99", "n", "not held")))
 
 
+def control_late() -> str:
+    """What each law leaves of an angle that it gets late, from the third table of that file."""
+    _, rows = _stored("control.json")
+    found: dict[str, dict[str, str]] = {}
+    for row in rows:
+        if "late" in row["table"]:
+            law, delay = row["name"].rsplit(", ", 1)
+            held = "" if row.get("median") is None else f"{row['median']:.2g}°"
+            lost = f"{row['not held']} of {row['not held'] + (row.get('n') or 0)} lost"
+            cells = filter(None, (held, row["not held"] and lost))
+            found.setdefault(delay, {})[law] = ", ".join(cells)
+    laws = list(next(iter(found.values())))
+    told = ([delay, *(by_law[law] for law in laws)] for delay, by_law in found.items())
+    return _table(("delay", *laws), told)
+
+
 def held_loads() -> str:
     """How many sudden loads each simulated hand held, of docs/reflex.json."""
     _, rows = _stored("reflex.json")
@@ -520,16 +536,16 @@ def envelope_map() -> str:
     from softfinger.daemon.control.envelope import HELD
 
     found = tomllib.loads((ROOT / "daemon/control/envelope.toml").read_text(encoding="utf-8"))
-    masses, rows = found["mass"], []
+    masses, columns = found["mass"], {}
     for shape in found["shapes"]:
         for k, friction in enumerate(found["friction"]):
             outcomes = found[shape][k * len(masses) : (k + 1) * len(masses)]
-            columns = ("".join(each) for each in zip(*outcomes, strict=True))
-            counts = [len(each) - len(each.lstrip(HELD)) for each in columns]
-            heaviest = (f"{masses[count - 1]:g}" if count else "–" for count in counts)
-            rows.append([f"{_SHAPES[shape]}, {friction:g}", *heaviest])
-    sizes = (f"{1e3 * each:g} mm" for each in found["size"])
-    return _table(("shape, friction", *sizes), rows)
+            by_size = ("".join(each) for each in zip(*outcomes, strict=True))
+            counts = [len(each) - len(each.lstrip(HELD)) for each in by_size]
+            heaviest = [f"{masses[count - 1]:g}" if count else "–" for count in counts]
+            columns[f"{_SHAPES[shape]}, {friction:g}"] = heaviest
+    sizes = [f"{1e3 * each:g}" for each in found["size"]]
+    return _table(("size [mm]", *columns), zip(sizes, *columns.values(), strict=True))
 
 
 _SHAPES = {"rectangle": "block", "disc": "disc"}
@@ -563,7 +579,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "measured": measured,
     "control": partial(_control, 0),
     "control_limits": partial(_control, 1),
-    "control_late": partial(_control, 2),
+    "control_late": control_late,
     "held_loads": held_loads,
     "envelope_map": envelope_map,
 }
