@@ -1,16 +1,21 @@
 """The pages of the site that are made at its build: from the code, and from the project's folder.
 
-MkDocs calls the functions named ``on_…`` (``hooks`` in mkdocs.yml). `PAGES` is all there is.
+MkDocs calls the functions named ``on_…`` (``hooks`` in mkdocs.yml). `PAGES` are whole pages, and
+`TABLES` tables within pages: no figure that the code can compute is typed.
 """
 
 from __future__ import annotations
 
 import argparse
+import html
 import itertools
 import json
+import math
 import os
 import re
-from collections.abc import Callable
+import tomllib
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +38,15 @@ def _row(*cells: str) -> str:
 
 def _head(*cells: str) -> str:
     return _row(*cells) + "|---" * len(cells) + "|\n"
+
+
+def _table(heads: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    return _head(*heads) + "".join(_row(*cells) for cells in rows)
+
+
+def _signed(value: float, form: str) -> str:
+    """The number with a real minus sign, and 0 without one."""
+    return f"{value:{form}}".replace("-", "−") if float(f"{value:{form}}") else f"{0.0:{form}}"
 
 
 # --- settings -------------------------------------------------------------------------------------
@@ -237,16 +251,183 @@ def api() -> str:
 
 def checkpoints() -> str:
     """Closed forms at a few places."""
-    import math
-
     from softfinger.kinematics.contact.closed_form import closed_forms
 
-    rows = [_head("d [mm]", "θ [°]", "F [N]", "U [mJ]", "∂U/∂d [N]", "∂U/∂θ [mN·m]")]
+    rows = []
     for d, theta in ((2, 0), (2, 30), (4, 0), (4, 15), (6, 30), (8, 0), (8, 30)):
         c = closed_forms(0.304e6, 1e-3 * d, math.radians(theta))
         values = c.force, 1e3 * c.energy, c.energy_d, 1e3 * c.energy_theta
-        rows.append(_row(str(d), str(theta), *(f"{float(each):.12g}" for each in values)))
-    return "".join(rows)
+        rows.append([str(d), str(theta), *(f"{float(each):.12g}" for each in values)])
+    return _table(("d [mm]", "θ [°]", "F [N]", "U [mJ]", "∂U/∂d [N]", "∂U/∂θ [mN·m]"), rows)
+
+
+def rates() -> str:
+    """How fast force and energy change with the tilt at 25°, by the paper's integrals."""
+    from softfinger.tools.paper.model_pages import DEPTHS, ENERGY, FORCE
+
+    heads = ("d [mm]", *(f"d = {d}" for d in DEPTHS))
+    rows = [
+        [f"∂{each.symbol}/∂θ at 25° [{each.unit}/rad]"]
+        + [f"{float(each.steepness(float(d))):.3g}" for d in DEPTHS]
+        for each in (FORCE, ENERGY)
+    ]
+    return _table(heads, rows)
+
+
+def exponents() -> str:
+    """The exponent of the displacement by both laws, from 1 to 8 mm."""
+    from softfinger.tools.paper.model_pages import ENERGY, FORCE, over_depth
+
+    force, energy = (over_depth("", each)[1] for each in (FORCE, ENERGY))
+    laws = ("fitted exponent of d", "fitted exponent of d, Table I's law")
+    rows = [
+        [f"{tilt:.0f}", *(f"{sheet[law][k]:.3f}" for sheet in (force, energy) for law in laws)]
+        for k, tilt in enumerate(force["theta"])
+    ]
+    heads = ("θ [°]", "F, constant E", "F, Table I", "U, constant E", "U, Table I")
+    return _table(heads, rows)
+
+
+def early_minimum() -> str:
+    """Where force and energy are least if a share of a rolling shears the tip."""
+    from softfinger.tools.paper.model_pages import DEPTHS
+    from softfinger.tools.paper.sheared_rolling import sheared_rolling
+
+    *_, minima, plant = sheared_rolling()
+    names = ("least F on the base", "least U")
+    rows = []
+    for d in DEPTHS:
+        cells = [str(d)]
+        for share in (2.0, 5.0, 10.0):
+            at = (minima["d"] == d) & (minima["share"] == share)
+            cells += [_signed(float(minima[name][at][0]), ".1f") for name in names]
+        rows.append([*cells, _signed(float(plant["least U"][plant["d"] == d][0]), ".1f")])
+    heads = [f"{symbol}, {share} %" for share in (2, 5, 10) for symbol in "FU"]
+    return _table(("d [mm]", *heads, "U, 5 %, simulated tip"), rows)
+
+
+def upright_forces() -> str:
+    """Forces of upright tips of several laws."""
+    from softfinger.kinematics.contact.closed_form import Fingertip
+    from softfinger.kinematics.contact.material import Material
+    from softfinger.kinematics.contact.table import ContactTable
+
+    radius, modulus = 0.020, 0.304e6
+
+    def force(d: float, *law: Any) -> float:
+        table = ContactTable.build(Fingertip(radius, *law), Material.constant(modulus))
+        return float(table(d, 0.0).force)
+
+    rows = []
+    for d in (0.001, 0.002, 0.004, 0.006):
+        solid = [
+            f"{force(d, 'solid', 0.49, base):.3g} ({force(d, 'solid', 0.49, base, 'sticking'):.3g})"
+            for base in ("bonded", "lying")
+        ]
+        hertz = 4.0 / 3.0 * modulus / 0.75 * math.sqrt(radius) * d**1.5
+        rows.append([f"{1e3 * d:g}", f"{force(d):.3g}", *solid, f"{hertz:.3g}"])
+    solid_heads = (f"solid, {base}, ν 0.49 (sticking)" for base in ("bonded", "lying"))
+    return _table(("d [mm]", "springs, F [N]", *solid_heads, "Hertz, ν ½"), rows)
+
+
+def minimum_strength() -> str:
+    """c of each kind of tip, near upright: how much its energy rises with the tilt."""
+    from softfinger.kinematics.contact.closed_form import Fingertip
+    from softfinger.kinematics.contact.material import Material
+    from softfinger.kinematics.contact.table import ContactTable
+
+    theta, rows = 0.01, []
+    for name, law in (
+        ("springs, before sliding", ()),
+        ("solid rubber, lying on its sensor", ("solid", 0.49, "lying")),
+        ("solid rubber, bonded", ("solid", 0.49, "bonded")),
+    ):
+        table = ContactTable.build(Fingertip(0.020, *law), Material.constant(0.304e6))
+        found = [table(d, theta) for d in (0.001, 0.002, 0.004, 0.006)]
+        depths = (0.001, 0.002, 0.004, 0.006)
+        strength = [
+            float(c.energy_theta / (c.force * theta * d))
+            for c, d in zip(found, depths, strict=True)
+        ]
+        rows.append([name, *(_signed(each, ".3f") for each in strength)])
+    return _table(("tip", "d = 1 mm", "2 mm", "4 mm", "6 mm"), rows)
+
+
+def _grips() -> list[tuple[str, float, float, float, float]]:
+    """Name, d [m], q [rad], c and upright spring [N·m/rad] of grips of 10 N on 40 mm."""
+    from softfinger.daemon.profile.factory import make_material, make_table
+    from softfinger.daemon.profile.settings import Settings
+    from softfinger.kinematics.hand.upright import upright_spring
+
+    found = []
+    constant = {"material": {"law": "constant", "modulus": 0.304e6}}
+    for name, sections in (
+        ("built-in hand, Table I", {}),
+        ("constant E, 0.304 MPa", constant),
+    ):
+        settings = Settings.model_validate(sections)
+        table = make_table(settings, make_material(settings.material))
+        hand, tip = settings.hand, settings.tip.radius
+        low, high = 0.0, 0.01
+        while high - low > 1e-9:
+            d = 0.5 * (low + high)
+            inward = 0.5 * hand.pivot_separation - tip + d - 0.5 * _WIDTH
+            q = math.asin(inward / hand.finger_length)
+            low, high = (d, high) if float(table(d, q).force) < _FORCE else (low, d)
+        c = table(d, 0.01)
+        turning = float(c.energy_theta / (c.force * 0.01 * d))
+        lengths = 0.5 * hand.pivot_separation, hand.finger_length, hand.finger_offset, tip
+        spring = upright_spring.py_func(q, d, _FORCE, turning, lengths)
+        found.append((name, d, q, turning, spring))
+    return found
+
+
+_FORCE, _WIDTH = 10.0, 0.040  # N, m of the grips that the pages speak of
+
+
+def upright_grips() -> str:
+    """Displacement, joint angle and spring of a grip, and what stuck tips leave of an angle."""
+    rows = []
+    for name, d, q, c, spring in _grips():
+        angles = (_signed(_left_of(k, d, q, c), ".3f") for k in (0.0, spring, 1e9))
+        rows.append([name, f"{1e3 * d:.2f}", f"{math.degrees(q):.1f}", f"{spring:.3f}", *angles])
+    heads = ("d [mm]", "q [°]", "k [N·m/rad]", "φ/φ0: no spring", "spring k", "locked fingers")
+    return _table(("10 N on 40 mm", *heads), rows)
+
+
+def _left_of(spring: float, d: float, q: float, c: float) -> float:
+    """φ/φ0 by the closed form of `kinematics.hand.upright`, of the built-in hand's lengths [m]."""
+    inward, radius = 0.080 * math.sin(q), 0.020
+    b = spring / (_FORCE * 0.050)
+    line = _WIDTH * (2.0 * inward + (1.0 - 2.0 * c) * d - b * (_WIDTH - d))
+    rolled = radius - d + inward + 0.5 * (1.0 + b) * d
+    return line / (line - 4.0 * (radius - d + c * d) * rolled)
+
+
+def symmetric_grips() -> str:
+    """Joint angle, normal force and torque of symmetric grips whose tips bear no shear."""
+    rows = []
+    for d in (2, 4, 6, 8):
+        q = math.asin((50.0 - 20.0 + d - 20.0) / 80.0)
+        normal = math.pi * 0.304 * d**2 * (1.0 + 0.25 * math.tan(q) ** 2)
+        cells = f"{math.degrees(q):.3f}", f"{normal:.3f}", f"{normal * 80.0 * math.cos(q):.1f}"
+        rows.append([str(d), *cells])
+    return _table(("d [mm]", "q [°]", "N [N]", "τ [mN·m]"), rows)
+
+
+def relaxations() -> str:
+    """Force after a sudden press that stays, over what lasts, of three kinds of memory."""
+    times = (0.001, 0.01, 0.1, 1.0, 10.0)
+    prony = list(zip((0.1, 0.2, 0.2), (0.004, 0.07, 1.4), strict=True))
+    laws: dict[str, Callable[[float], float]] = {
+        "Kelvin-Voigt": lambda t: 1.0,
+        "Maxwell, 1.4 s": lambda t: math.exp(-t / 1.4),
+        "Prony, (0.1, 0.2, 0.2)": lambda t: (
+            1.0 + sum(share * math.exp(-t / tau) for share, tau in prony)
+        ),
+    }
+    rows = [[name, *(f"{law(t):.3f}" for t in times)] for name, law in laws.items()]
+    return _table(("", *(f"{t:g} s" for t in times)), rows)
 
 
 def errata() -> str:
@@ -254,8 +435,9 @@ def errata() -> str:
     from softfinger.tools.paper.figures import pages
 
     found = dict.fromkeys(each for page in pages().values() for each in page.errata)
-    rows = [_row(each.place, each.printed, each.holds) for each in found]
-    return _head("place", "printed", "holds") + "".join(rows)
+    return _table(
+        ("place", "printed", "holds"), ((each.place, each.printed, each.holds) for each in found)
+    )
 
 
 def servos() -> str:
@@ -278,41 +460,128 @@ def servos() -> str:
     return "".join(rows)
 
 
+def _stored(name: str) -> tuple[str, list[dict[str, Any]]]:
+    """The machine and the rows of a file of docs/ that `softfinger bench --json` wrote."""
+    content = json.loads((ROOT / "docs" / name).read_text(encoding="utf-8"))
+    load = " to ".join(f"{each:.1f}" for each in content["load"])
+    about = f"{content['machine']}, {content['cores']} cores, load {load}.\n"
+    return about, [row for row in content["rows"] if row["table"]]
+
+
+def _shown(rows: Iterable[dict[str, Any]], keys: Sequence[str]) -> Iterable[list[str]]:
+    for row in rows:
+        cells = (row.get(key) for key in keys)
+        told = ("" if c is None else c if isinstance(c, str) else f"{c:.3g}" for c in cells)
+        yield [row["name"], *told]
+
+
 def measured() -> str:
     """The figures that docs/benchmarks.json keeps, of a `softfinger bench` without names."""
-    content = json.loads((ROOT / "docs" / "benchmarks.json").read_text(encoding="utf-8"))
-    load = " to ".join(f"{each:.1f}" for each in content["load"])
-    parts = [f"{content['machine']}, {content['cores']} cores, load {load}.\n"]
-    shown = [row for row in content["rows"] if row["table"] and row.get("median") is not None]
-    for title, rows in itertools.groupby(shown, key=lambda row: row["table"]):
-        parts.append(
-            "\n" + _head(title, "median", "p99", "unit", "aim ≤", "error", "RMS of d [µm]")
-        )
-        for row in rows:
-            keys = ("median", "p99", "unit", "aim ≤", "relative error", "RMS of d [µm]")
-            cells = (row.get(key) for key in keys)
-            told = ("" if c is None else c if isinstance(c, str) else f"{c:.3g}" for c in cells)
-            parts.append(_row(row["name"], *told))
+    about, rows = _stored("benchmarks.json")
+    keys = ("median", "p99", "unit", "aim ≤", "relative error", "RMS of d [µm]")
+    parts = [about]
+    shown = (row for row in rows if row.get("median") is not None)
+    for title, each in itertools.groupby(shown, key=lambda row: row["table"]):
+        heads = (title, "median", "p99", "unit", "aim ≤", "error", "RMS of d [µm]")
+        parts.append("\n" + _table(heads, _shown(each, keys)))
     return "".join(parts)
+
+
+def _control(table: int) -> str:
+    """One of the tables of docs/control.json, of a `softfinger bench control`."""
+    _, rows = _stored("control.json")
+    titles = list(dict.fromkeys(row["table"] for row in rows))
+    shown = (row for row in rows if row["table"] == titles[table])
+    heads = ("", "median [°]", "p99 [°]", "draws held", "not held")
+    return _table(heads, _shown(shown, ("median", "p99", "n", "not held")))
+
+
+def control_late() -> str:
+    """What each law leaves of an angle that it gets late, from the third table of that file."""
+    _, rows = _stored("control.json")
+    found: dict[str, dict[str, str]] = {}
+    for row in rows:
+        if "late" in row["table"]:
+            law, delay = row["name"].rsplit(", ", 1)
+            held = "" if row.get("median") is None else f"{row['median']:.2g}°"
+            lost = f"{row['not held']} of {row['not held'] + (row.get('n') or 0)} lost"
+            cells = filter(None, (held, row["not held"] and lost))
+            found.setdefault(delay, {})[law] = ", ".join(cells)
+    laws = list(next(iter(found.values())))
+    told = ([delay, *(by_law[law] for law in laws)] for delay, by_law in found.items())
+    return _table(("delay", *laws), told)
+
+
+def held_loads() -> str:
+    """How many sudden loads each simulated hand held, of docs/reflex.json."""
+    _, rows = _stored("reflex.json")
+    found: dict[str, dict[str, list[int]]] = {}
+    for row in rows:
+        if "push" in row["name"]:
+            tips, mass = row["table"].removesuffix(", answer").rsplit(", ", 1)
+            counts = found.setdefault(tips, {}).setdefault(mass, [0, 0, 0])
+            trials = round(row["trials"])
+            gripped = trials - round(row["no grip"])
+            counts[0] += round(0.01 * (row["held %"] or 0.0) * gripped)
+            counts[1] += trials
+            counts[2] += trials - gripped
+    masses = list(next(iter(found.values())))
+    told = "{0} of {1}".format
+    cells = ([tips, *(told(*by_mass[mass]) for mass in masses)] for tips, by_mass in found.items())
+    return _table(("tips or sensor", *masses), cells)
+
+
+def envelope_map() -> str:
+    """The heaviest mass of each object that the built-in hand's map holds, and all lighter ones."""
+    from softfinger.daemon.control.envelope import HELD
+
+    found = tomllib.loads((ROOT / "daemon/control/envelope.toml").read_text(encoding="utf-8"))
+    masses, columns = found["mass"], {}
+    for shape in found["shapes"]:
+        for k, friction in enumerate(found["friction"]):
+            outcomes = found[shape][k * len(masses) : (k + 1) * len(masses)]
+            by_size = ("".join(each) for each in zip(*outcomes, strict=True))
+            counts = [len(each) - len(each.lstrip(HELD)) for each in by_size]
+            heaviest = [f"{masses[count - 1]:g}" if count else "–" for count in counts]
+            columns[f"{_SHAPES[shape]}, {friction:g}"] = heaviest
+    sizes = [f"{1e3 * each:g}" for each in found["size"]]
+    return _table(("size [mm]", *columns), zip(sizes, *columns.values(), strict=True))
+
+
+_SHAPES = {"rectangle": "block", "disc": "disc"}
 
 
 def published() -> str:
     """The rows of `softfinger validate`, computed anew."""
     from softfinger.tools.paper.validate import FIGURES, comparisons
 
-    rows = [_head("", "quantity", "published", "here", "source", "what stands between")]
-    for each in comparisons():
-        cells = each.quantity, each.published, each.ours, each.source, each.why
-        rows.append(_row(FIGURES[each.verdict], *cells))
-    return "".join(rows)
+    heads = ("", "quantity", "published", "here", "source", "what stands between")
+    rows = (
+        (FIGURES[each.verdict], each.quantity, each.published, each.ours, each.source, each.why)
+        for each in comparisons()
+    )
+    return _table(heads, rows)
 
 
-TABLES = {
+TABLES: dict[str, Callable[[], str]] = {
     "published": published,
     "checkpoints": checkpoints,
+    "rates": rates,
+    "exponents": exponents,
+    "early_minimum": early_minimum,
+    "upright_forces": upright_forces,
+    "minimum_strength": minimum_strength,
+    "upright_grips": upright_grips,
+    "symmetric_grips": symmetric_grips,
+    "relaxations": relaxations,
     "errata": errata,
     "servos": servos,
     "measured": measured,
+    "control": partial(_control, 0),
+    "control_limits": partial(_control, 1),
+    "control_late": control_late,
+    "held_loads": held_loads,
+    "envelope_map": envelope_map,
 }
 
 PAGES: dict[str, Callable[[], str]] = {
@@ -372,3 +641,41 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
         return f"]({_LINKS.get(target, target)}{found[2]})"
 
     return re.sub(r"\]\(((?!https?:)[^)#]+)(#[^)]*|)\)", link, markdown)
+
+
+def on_page_content(content: str, **_: Any) -> str:
+    """Formulas and drawings as part of the page, in the colours of its theme.
+
+    Formulas, which the extension arithmatex has marked, become MathML: browsers draw it without any
+    script or font of the site's. Drawings use `currentColor`, which an image would not inherit.
+    """
+    content = re.sub(
+        r'<(div|span) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', _formula, content, flags=re.S
+    )
+    return re.sub(r'<img [^>]*src="pictures/(\w+)\.svg"[^>]*>', _drawing, content)
+
+
+def _formula(found: re.Match[str]) -> str:
+    from latex2mathml.converter import convert
+
+    tex, display = html.unescape(found[2]).strip(), "block" if found[1] == "div" else "inline"
+    # A function is set apart from what it multiplies and from its argument, as TeX does it.
+    function = r"\\(?:arcsin|cos|ln|sin|tan)(?:\^\d)?(?![a-z])"
+    tex = re.sub(rf"(?<=[\w)}}])\s*(?={function})", r" \, ", tex)
+    tex = re.sub(rf"({function})\s*(?=[\\\w])", r"\1 \, ", tex)
+    return convert(tex, display=display)
+
+
+def _drawing(found: re.Match[str]) -> str:
+    """The drawing itself, its styles bound to it alone."""
+    name = found[1]
+    text = (ROOT / "docs" / "pictures" / f"{name}.svg").read_text(encoding="utf-8")
+
+    def bound(rule: re.Match[str]) -> str:
+        return ", ".join(f".{name} {each.strip()}" for each in rule[1].split(",")) + rule[2]
+
+    def style(sheet: re.Match[str]) -> str:
+        return re.sub(r"([^{}]+)(\{[^}]*\})", bound, sheet[0][7:-8]).join(("<style>", "</style>"))
+
+    text = re.sub(r"<style>.*?</style>", style, text, flags=re.S)
+    return text.replace("<svg ", f'<svg class="{name}" ', 1)

@@ -25,6 +25,7 @@ from softfinger.tools.benchmarks.measuring import (
     figure,
     interleave,
 )
+from softfinger.tools.benchmarks.rigs import RigError
 from softfinger.tools.benchmarks.virtual_grip import VirtualGrip, Watch
 from softfinger.tools.benchmarks.witnesses import (
     BOUNDED,
@@ -130,11 +131,50 @@ def test_estimates_stand_beside_the_bound():
     assert error["decode: cobs"] is None
 
 
-@pytest.mark.extended
-def test_a_law_that_does_not_turn_the_object_leaves_it_askew(monkeypatch):
-    monkeypatch.setattr(control, "WAYS", {"energy": control.WAYS["energy"]})
-    (table,) = control.measure(brief=True)
-    assert [4.0 < row["median"] < 5.0 for row in table.rows] == [True]
+ASKEW = {"object_angle": math.radians(5.0)}
+
+
+@pytest.mark.parametrize(
+    ("way", "low", "high"),
+    [
+        (control.WAYS["energy"], 4.0, 5.0),
+        (control.LATE["two-phased, 0 ms"], 0.0, 0.2),
+        (control.LATE["two-phased, 300 ms"], 0.0, 1.0),
+        (control.LATE["energy, 0.5 Hz, 300 ms"], 0.0, 1.0),
+        (control.LATE["energy, 4 Hz, 0 ms"], 0.0, 0.2),
+        (control.LATE["energy, 4 Hz, 50 ms"], 5.0, 45.0),
+        (control.LIMITS["torque constants 5 % apart"], 1.5, 3.0),
+        (control.LIMITS["tips without tangential coupling"], 0.2, 1.2),
+    ],
+)
+def test_what_a_law_leaves_of_the_objects_angle(way, low, high):
+    # A delay is borne where the integral's bandwidth times it is below π/2.
+    assert low <= control.left(way, ASKEW) <= high
+
+
+def test_an_object_that_is_not_held_is_counted_and_leaves_the_other_draws():
+    far = {"object_position": (0.0, 0.4)}
+    row = control.row("energy", control.WAYS["energy"], [ASKEW, ASKEW | far])
+    assert (row["n"], row["not held"]) == (1, 1)
+
+
+def test_a_part_that_fails_leaves_the_other_parts(monkeypatch, capsys):
+    def let_go(title: str, **_: object) -> Report:
+        raise RigError("the hand does not hold: grasping")
+
+    monkeypatch.setattr(tick, "_in_turns", let_go)
+    monkeypatch.setattr(tick, "in_the_loop", lambda title, **_: Report(title, [{"name": "x"}]))
+    assert cli.main(["bench", "tick", "--brief"]) == 1
+    printed = capsys.readouterr()
+    assert "bench: tick: tick: the hand does not hold: grasping\n" in printed.err
+    assert "the simulated hand" in printed.out
+    assert printed.out.count("hardware in the loop") == 2
+
+
+def test_a_grip_that_does_not_come_about_is_counted():
+    outcomes = iter([None, (0.01, 0.002, False)])
+    (row,) = reflex._table("springs", [(0.0, 13.0, "push")], 2, outcomes).rows
+    assert (row["no grip"], row["held %"], row["median"]) == (1, 100.0, 10.0)
 
 
 @pytest.mark.extended

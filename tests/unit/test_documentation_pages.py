@@ -1,6 +1,7 @@
 """The site's pages are made, their links lead somewhere, and quoted messages the program's."""
 
 import ast
+import html
 import importlib.util
 import re
 from pathlib import Path
@@ -82,6 +83,57 @@ def test_every_erratum_is_told(site):
     for page in pages().values():
         assert all(each.holds in text for each in page.errata)
     assert "15.8197516322" in text  # F at 4 mm, 15°
+
+
+def test_figures_of_the_models_are_computed(site):
+    _, pages = site
+    for name, row in (
+        ("model.md", "| 6 | −0.9 | −0.8 | −1.8 | −1.8 | −2.8 | −3.2 | −1.8 |"),
+        ("model.md", "| 30 | 2.000 | 2.066 | 3.000 | 3.040 |"),
+        ("model.md", "| ∂F/∂θ at 25° [N/rad] | 1.97 | 7.86 | 17.7 | 31.4 |"),
+        ("grasped-object.md", "| 4 | 10.079 | 15.401 | 1213.1 |"),
+        ("local-minimum.md", "| 4.75 | 10.6 | 0.394 | −0.866 | 0.000 | 0.889 |"),
+        ("local-minimum.md", "| springs, before sliding | 0.667 | 0.667 | 0.667 | 0.667 |"),
+        ("tip-models.md", "| Maxwell, 1.4 s | 0.999 | 0.993 | 0.931 | 0.490 | 0.001 |"),
+        ("which-model.md", "| 4 | 15.3 | 31.5 (31.6) | 24.2 (24.2) | 19.3 |"),
+    ):
+        assert row in pages[name], f"{name}: {row}"
+
+
+FORMULA = re.compile(r"(?s)\$\$(.+?)\$\$|(?<![\\$\w])\$(?! )([^$\n]+?)(?<! )\$(?!\w)")
+
+
+def test_every_formula_is_typeset(site):
+    module, pages = site
+    found = 0
+    for name, text in pages.items():
+        plain = written(text)
+        assert plain.replace("$$", "").count("$") % 2 == 0, name
+        for block, inline in FORMULA.findall(plain):
+            tag, ends = ("div", "[]") if block else ("span", "()")
+            tex = html.escape(block or inline, quote=False)
+            marked = f'<{tag} class="arithmatex">\\{ends[0]}{tex}\\{ends[1]}</{tag}>'
+            shown = module.on_page_content(marked)
+            assert shown.startswith("<math"), f"{name}: {block or inline}"
+            assert "\\" not in shown, f"{name}: {shown}: a command that is not known"
+            found += 1
+    assert found > 150
+
+
+def test_a_function_stands_apart_from_its_factors(site):
+    shown = site[0].on_page_content(r'<span class="arithmatex">\(d \sin\theta\)</span>')
+    assert [each for each in ("d", "sin") if f"<mi>{each}</mi><mspace" not in shown] == []
+
+
+def test_drawings_take_the_colours_of_the_page(site):
+    shown = site[0].on_page_content('<p><img alt="x" src="pictures/axes.svg" /></p>')
+    assert shown.startswith('<p><svg class="axes"')
+    assert ".axes text{" in shown
+    assert re.findall(r"(?m)^(?:text|line|path|rect)\b.*\{", shown) == []
+    for path in ROOT.glob("docs/pictures/*.svg"):
+        text = path.read_text(encoding="utf-8")
+        assert "currentColor" in text
+        assert "#222" not in text
 
 
 ROW = re.compile(r"(?m)^\| ([^|]*) \|.*\|.*\|$")

@@ -11,14 +11,19 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 from numpy.typing import NDArray
+from scipy.integrate import dblquad
 
+from softfinger.kinematics.contact.material import Material
 from softfinger.tools import cli, style
 from softfinger.tools.paper import experiment_pages, figures, validate
 from softfinger.tools.paper.model_pages import double_integrals
 from softfinger.tools.paper.validate import Beside
 from tests.harness.paper_tip import CHECKPOINTS
 
-NUMBERS = ("fig3", "fig4b", "fig5b", "fig7", "fig10")
+NUMBERS = ("fig3", "fig4a", "fig4b", "fig5a", "fig5b", "fig7", "fig10", "fig10_shear")
+
+
+LINEAR = Material.constant(0.304e6)
 
 
 def read(path: Path) -> dict[str, NDArray[np.float64]]:
@@ -76,6 +81,93 @@ def test_double_integrals_meet_the_one_dimensional_form() -> None:
     energy = 0.5 * modulus * np.sum(((r2 + 2 * q * q) * angle - 3 * q * b) * dx)
     got = double_integrals(a, modulus, d, theta)
     np.testing.assert_allclose(got, (force, energy), rtol=1e-9)
+
+
+def by_quadrature(
+    d: float, theta: float, shear: float = 0.0, law: Material = LINEAR
+) -> tuple[float, float]:
+    """F [N] and U [J] by SciPy, spring by spring; a shear moves each spring's end along the face.
+
+    Sheared springs are of a constant modulus, as stiff sideways as along the axis.
+    """
+    a, s, c = 0.020, np.sin(theta), np.cos(theta)
+    h, rho = a - d, np.sqrt(d * (2.0 * a - d))
+
+    def cell(share: float, angle: float, is_energy: bool) -> float:
+        x, y = h * s + rho * c * share * np.cos(angle), rho * share * np.sin(angle)
+        length = np.sqrt(a * a - x * x - y * y)
+        strain = 1.0 - (h - x * s) / (c * length) + shear * s / length
+        value = length * law.energy_density(strain) if is_energy else law.stress(strain)
+        if is_energy:
+            value += 0.5 * law.reference_modulus * (shear * c) ** 2 / length
+        return float(value) * rho * rho * c * share
+
+    found = (
+        dblquad(cell, 0.0, np.pi, 0.0, 1.0, args=(each,), epsabs=0.0, epsrel=1e-7)[0]
+        for each in (False, True)
+    )
+    return tuple(2.0 * each for each in found)
+
+
+@pytest.mark.parametrize(("tilt", "name", "row"), [(0, "fig4b", 0), (30, "fig5b", 1)])
+def test_exponents_of_both_laws(folder: Path, tilt: int, name: str, row: int) -> None:
+    symbol, upright = "FU"[row], (2.0, 3.0)[row]
+    columns, fitted = read(folder / f"{name}.csv"), read(folder / f"{name}_exponents.csv")
+    assert columns[f"exponent at {tilt} deg [1]"][1:] == pytest.approx(upright, abs=1e-8)
+    assert fitted["fitted exponent of d [1]"] == pytest.approx(upright, abs=1e-11)
+    d, step = 0.006, 1e-3
+    above, below = (
+        by_quadrature(d * each, np.radians(tilt), law=Material.table_i())[row]
+        for each in (1.0 + step, 1.0 - step)
+    )
+    local = np.log(above / below) / np.log((1.0 + step) / (1.0 - step))
+    assert columns[f"exponent of Table I's law at {tilt} deg [1]"][60] == pytest.approx(
+        local, abs=1e-5
+    )
+    assert local > upright + 0.04
+    power = fitted["fitted exponent of d, Table I's law [1]"]
+    assert (np.diff(power) > 0.0).all(), f"{symbol} rises with a higher power, the more tilted"
+
+
+def test_rate_of_change_by_the_tilt(folder: Path) -> None:
+    theta = np.radians(25.0)
+    for name, head, row in (("fig4a", "dF/dtheta", 0), ("fig5a", "dU/dtheta", 1)):
+        columns = read(folder / f"{name}_rate.csv")
+        (rate,) = (each for key, each in columns.items() if key.startswith(head))
+        d, step = columns["d [mm]"][-1] * 1e-3, 1e-3
+        above, below = (by_quadrature(d, theta + each)[row] for each in (step, -step))
+        scale = (1.0, 1e3)[row]
+        assert rate[-1] == pytest.approx(scale * (above - below) / (2.0 * step), rel=1e-5)
+        assert rate == pytest.approx(rate[0] * (columns["d [mm]"] / 2.0) ** (2 + row), rel=1e-6)
+
+
+def test_a_rolling_that_shears_the_tip_is_least_before_upright(folder: Path) -> None:
+    minima = read(folder / "fig10_shear_minima.csv")
+    felt = read(folder / "fig10_shear_plant_minima.csv")
+    (row,) = np.flatnonzero((minima["d [mm]"] == 6.0) & (minima["share [%]"] == 5.0))
+    start, d, near = np.radians(-11.5), 0.006, np.radians(0.5)
+    for column, which in (("least F on the base [deg]", 0), ("least U [deg]", 1)):
+        at = np.radians(minima[column][row])
+        below, here, above = (
+            by_quadrature(d, each, 0.05 * 0.014 * (each - start))[which]
+            for each in (at - near, at, at + near)
+        )
+        assert here < min(below, above)
+        assert below == pytest.approx(above, rel=2e-6), "symmetric about the minimum"
+        assert minima[column][minima["share [%]"] == 0.0] == pytest.approx(0.0, abs=1e-6)
+    assert felt["least U [deg]"] == pytest.approx(
+        minima["least U [deg]"][minima["share [%]"] == 5.0], abs=0.01
+    )
+    # The plant's balance has the rim's springs, which are sheared as soon as they touch.
+    balance = felt["least N cos theta + T sin theta [deg]"]
+    assert (balance < minima["least F on the base [deg]"][minima["share [%]"] == 5.0]).all()
+    model, plant = read(folder / "fig10_shear.csv"), read(folder / "fig10_shear_plant.csv")
+    assert plant["U [mJ]"] == pytest.approx(model["U, 5% [mJ]"], rel=1e-6)
+    shear = 0.05 * 14.0 * np.radians(model["theta [deg]"] + 11.5)  # mm
+    rim = np.pi * 0.304 * shear**2 * np.cos(np.radians(model["theta [deg]"]))
+    assert plant["F on the base [N]"] == pytest.approx(
+        model["F on the base, 5% [N]"] + rim, rel=1e-6
+    )
 
 
 def test_table_i(folder: Path) -> None:
@@ -176,7 +268,8 @@ def test_named_figures_only(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
 def test_without_matplotlib_the_numbers_are_written(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     assert cli.main(["figures", "fig4a", "--out", str(tmp_path)]) == 0
-    assert {path.name for path in tmp_path.iterdir()} == {"fig4a.csv", "errata.csv"}
+    written = {"fig4a.csv", "fig4a_rate.csv", "errata.csv"}
+    assert {path.name for path in tmp_path.iterdir()} == written
     error = capsys.readouterr().err
     assert "only the CSV files were written" in error
     assert "pip install 'softfinger[plot]'" in error

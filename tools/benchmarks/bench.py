@@ -124,8 +124,8 @@ def _measured(name: str, arguments: argparse.Namespace) -> list[Report]:
     except (RuntimeError, SoftfingerError) as error:  # on a busy machine a hand may let go
         print(f"bench: {name}: {error}", file=sys.stderr)
     for table in tables:
-        if table.failed:
-            print(*table.notes, sep="\n", file=sys.stderr)
+        for note in table.notes if table.failed else ():
+            print(f"bench: {name}: {note}", file=sys.stderr)
     return tables
 
 

@@ -2,46 +2,169 @@
 
 Judged by the plant's truth, not by the daemon's estimates, over plants that differ from the
 settings. The sensor is the ideal one, or one of those with flaws. On virtual time: nothing here
-depends on the machine's speed. Beside the daemon's laws stands one of the literature, equal
-torques: the law upright without its spring and dither.
+depends on the machine's speed.
+
+Beside the daemon's laws stand two of the literature. *Equal torques* is the law upright without its
+spring and dither. *Two-phased* is the serial two-phased controller of soft-fingered manipulation,
+:class:`TwoPhased`. It was published with a camera that shows the object's angle late, so both it
+and the daemon's law are also given an angle that is up to 0.3 s old.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from softfinger.tools.benchmarks.measuring import Report, figure
+from softfinger.daemon.control.grip import Grip
+from softfinger.daemon.types import ObjectPose, Reading
+from softfinger.tools.benchmarks.measuring import Report, Row, figure
 from softfinger.tools.benchmarks.rigs import SENSORS, SOLID, Sections, merged
 from softfinger.tools.watched import Watched
 
 _FORCE = 10.0  # N
 _ASKEW = math.radians(5.0)
-_DRAWS = 12  # of how the plant differs from the settings, the same for all laws
+_DRAWS = 12
 _FOUND = 5.0  # s from the command to grasp on, when the object's angle is read
-_STEERED = "energy, steered to 0"  # by its measured angle
+_STEERED = 2.0  # s before that, in which it is steered to 0
+DELAYS = (0.0, 0.05, 0.1, 0.2, 0.3)  # s
+_SLOW = 0.5  # Hz of an angle integral that bears all of these: ω times the delay is below π/2
+
+
+class Altered(Grip):
+    """The daemon's law, with an object's angle that is ``delay`` [s] old.
+
+    Its joints' torque constants are a share ``apart`` of their mean apart.
+    """
+
+    def __init__(self, hand: Watched, delay: float = 0.0, apart: float = 0.0) -> None:
+        fingers = hand.control.fingers
+        super().__init__(hand.settings, fingers.indices, fingers.grasp)
+        ticks = round(delay * hand.settings.loop.rate)
+        self._poses: deque[ObjectPose] = deque(maxlen=ticks + 1)
+        self._apart = apart
+
+    def torques(self, reading: Reading, pose: ObjectPose, holding: bool) -> tuple[float, float]:
+        """Return the joints' torques [N·m]."""
+        self._poses.append(replace(pose))
+        torque1, torque2 = self._law(reading, self._poses[0], holding)
+        return torque1 * (1.0 + 0.5 * self._apart), torque2 * (1.0 - 0.5 * self._apart)
+
+    def _law(self, reading: Reading, pose: ObjectPose, holding: bool) -> tuple[float, float]:
+        return super().torques(reading, pose, holding)
+
+
+class TwoPhased(Altered):
+    """The published serial two-phased controller.
+
+    Phase one integrates the error of the object's angle into an antisymmetric goal of the joints.
+    Phase two is a PD law of the joints for that goal, on top of equal bias torques for the grip.
+    It feels no force: the bias is what the wanted force asks for.
+    """
+
+    def _law(self, reading: Reading, pose: ObjectPose, _: bool) -> tuple[float, float]:
+        state, grasp, (q1, q2), (dq1, dq2) = self._state, self._grasp, reading.q, reading.dq
+        self.force.step(state.force_rate)
+        if pose.valid and not math.isnan(self.target_angle):
+            error = self.target_angle - pose.angle
+            rate = 2.0 * math.pi * _SLOW * error / sum(grasp.jacobian_rotation)
+            state.offset += rate * state.law.dt
+        bias = 0.5 * self.force.value * sum(grasp.moment_arm)
+        damping = state.law.damping * math.sqrt(state.joint_stiffness)
+        lean = state.joint_stiffness * (state.offset - 0.5 * (q1 - q2))
+        return bias + lean - damping * dq1, bias - lean - damping * dq2
+
+
+_AS_SET: Sections = {}
+
+
+class Way(NamedTuple):
+    """A law: settings of `control`, the plant's tips and sensors, and the aim [°]."""
+
+    control: Mapping[str, Any] = _AS_SET
+    tips: Sections = _AS_SET
+    aim: float | None = None
+    is_steered: bool = False  # to 0, by the measured angle
+    law: Callable[[Watched], Grip] | None = None  # in place of the daemon's
+    force: float = _FORCE
+    weight: tuple[float, float] = (0.0, 0.0)  # N along x and y, once the grip is firm
+
+
 EQUAL_TORQUES = {"law": "upright", "dither_time": 0.0, "joint_stiffness": 1e-9}
+_UPRIGHT = {"law": "upright"}
 _RELAXING: Sections = {"simulation": {"tip_creep_time": 20.0, "tip_micro_slip": True}}
-# Settings of `control`, tips, aim for what is left [°].
-WAYS: dict[str, tuple[dict[str, Any], Sections, float | None]] = {
-    "equal torques (blind)": (EQUAL_TORQUES, {}, None),
-    "equal torques, tips that relax": (EQUAL_TORQUES, _RELAXING, None),
-    "equal torques, solid tips": (EQUAL_TORQUES, SOLID, None),
-    "energy": ({}, {}, None),
-    _STEERED: ({}, {}, 0.2),
-    "upright (blind)": ({"law": "upright"}, {}, 0.5),
-    "upright, tips that relax": ({"law": "upright"}, _RELAXING, 0.5),
-    "upright, solid tips": ({"law": "upright"}, SOLID, 0.5),
-    **{f"{_STEERED}, {sensor}": ({}, flaws, 1.0) for sensor, flaws in SENSORS.items()},
+WAYS = {
+    "equal torques (blind)": Way(EQUAL_TORQUES),
+    "equal torques, tips that relax": Way(EQUAL_TORQUES, _RELAXING),
+    "equal torques, solid tips": Way(EQUAL_TORQUES, SOLID),
+    "energy": Way(),
+    "energy, steered to 0": Way(aim=0.2, is_steered=True),
+    "upright (blind)": Way(_UPRIGHT, aim=0.5),
+    "upright, tips that relax": Way(_UPRIGHT, _RELAXING, 0.5),
+    "upright, solid tips": Way(_UPRIGHT, SOLID, 0.5),
+    **{
+        f"energy, steered to 0, {sensor}": Way({}, flaws, 1.0, True)
+        for sensor, flaws in SENSORS.items()
+    },
+}
+
+
+def _upright(
+    law: Callable[[Watched], Grip] | None = None,
+    force: float = _FORCE,
+    width: float = 0.0,
+    weight: tuple[float, float] = (0.0, 0.0),
+    **simulation: Any,
+) -> Way:
+    """Return the blind law on a plant that it does not assume."""
+    tips: Sections = {"simulation": simulation}
+    if width:
+        tips = {"object": {"width": width}, "simulation": {"object_width": width}}
+    return Way(_UPRIGHT, tips, law=law, force=force, weight=weight)
+
+
+LIMITS = {
+    "torque constants 1 % apart": _upright(partial(Altered, apart=0.01)),
+    "torque constants 5 % apart": _upright(partial(Altered, apart=0.05)),
+    "tips without tangential coupling": _upright(tip_law="bristles"),
+    "tips half as stiff along the face": _upright(tip_shear_stiffness=0.5),
+    "tips twice as stiff along the face": _upright(tip_shear_stiffness=2.0),
+    "a weight of 2 N along the fingers": _upright(weight=(0.0, -2.0)),
+    "a weight of 2 N across the fingers": _upright(weight=(2.0, 0.0)),
+    **{f"a grip of {force:g} N": _upright(force=force) for force in (3.0, 2.0, 1.0)},
+    **{f"joint friction {each:g} N·m": _upright(joint_friction=each) for each in (0.1, 0.15, 0.2)},
+    **{f"an object of {1e3 * width:g} mm": _upright(width=width) for width in (0.06, 0.07, 0.09)},
+}
+LATE = {
+    f"{name}, {1e3 * delay:g} ms": Way(control, is_steered=True, law=partial(law, delay=delay))
+    for name, control, law in (
+        ("two-phased", {}, TwoPhased),
+        ("energy, 4 Hz", {}, Altered),
+        (f"energy, {_SLOW:g} Hz", {"rotate_bandwidth": _SLOW}, Altered),
+    )
+    for delay in DELAYS
 }
 
 
 def measure(brief: bool = False) -> list[Report]:
     """Return the angles that are left [°]; p99 of a few draws is about the worst of them."""
+    plants = drawn(2 if brief else _DRAWS)
+    title = f"left of {math.degrees(_ASKEW):g}° after {_FOUND:g} s at {_FORCE:g} N"
+    return [
+        Report(f"{title}{of}", [row(name, way, plants) for name, way in ways.items()])
+        for of, ways in (("", WAYS), (", upright, limits", LIMITS), (", its angle late", LATE))
+    ]
+
+
+def drawn(count: int = _DRAWS) -> list[dict[str, Any]]:
+    """Return how each plant differs from the settings; the same for all laws."""
     rng = np.random.default_rng(16)
-    drawn = [
+    return [
         {
             "seed": k,
             "object_angle": _ASKEW * (-1.0) ** k,
@@ -50,18 +173,32 @@ def measure(brief: bool = False) -> list[Report]:
             "tip_friction": rng.uniform(0.2, 0.8),
             "object_mass": 0.10 * 2.0 ** rng.uniform(-1.0, 1.0),
         }
-        for k in range(2 if brief else _DRAWS)
+        for k in range(count)
     ]
-    rows = []
-    for name, (law, tips, aim) in WAYS.items():
-        left = []
-        for draw in drawn:
-            with Watched(merged({"simulation": draw, "control": law}, tips)) as hand:
-                hand.grasp(_FORCE)
-                hand.run(_FOUND - 2.0)
-                if name.startswith(_STEERED):
-                    hand.command("rotate", angle=0.0)
-                hand.run(2.0)
-                left.append(math.degrees(abs(float(hand.plant.object_pose[2]))))
-        rows.append(figure(name, "°", left, aim))
-    return [Report(f"left of {math.degrees(_ASKEW):g}° after {_FOUND:g} s at {_FORCE:g} N", rows)]
+
+
+def row(name: str, way: Way, plants: list[dict[str, Any]]) -> Row:
+    """Return a law's row: what is left on these plants, and how many were not held."""
+    found = [left(way, plant) for plant in plants]
+    held = [each for each in found if not math.isnan(each)]
+    more = {"not held": len(found) - len(held)}
+    return figure(name, "°", held, way.aim, **more) if held else {"name": name, **more}
+
+
+def left(way: Way, simulation: Mapping[str, Any]) -> float:
+    """Return what is left of the object's angle [°] on this plant; NaN where it is not held."""
+    sections = merged({"simulation": simulation, "control": way.control}, way.tips)
+    with Watched(sections) as hand:
+        if way.law is not None:
+            hand.control.grip = way.law(hand)
+        hand.grasp(way.force)
+        begun = hand.now
+        while min(hand.plant.force) < 0.7 * way.force and hand.now < begun + _FOUND - _STEERED:
+            hand.run(hand.loop.period)
+        hand.plant.apply_load(*way.weight)
+        hand.run(begun + _FOUND - _STEERED - hand.now)
+        if way.is_steered:  # without waiting for a force that not every law feels
+            hand.control.grip.steer(hand.state.object.angle, 0.0)
+        hand.run(_STEERED)
+        is_held = min(hand.plant.force) > 0.0
+        return math.degrees(abs(float(hand.plant.object_pose[2]))) if is_held else math.nan

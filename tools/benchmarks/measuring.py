@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from softfinger.daemon.errors import SoftfingerError
 from softfinger.tools.terminal.typeset import plain_table, table_text
 
 # One measured thing; each key is the heading of its column, "name" the first of them.
@@ -40,6 +41,17 @@ class Report:
         for row in self.rows:
             table.add_row(*(_cell(row.get(key)) for key in keys))
         return "\n".join([table_text(table, 10_000), *self.notes])
+
+
+def attempt(title: str, part: Callable[[], Report]) -> Report:
+    """Return the table of one part of a measurement, or a failed one with the reason.
+
+    On a busy machine a hand may let go; the other parts go on.
+    """
+    try:
+        return part()
+    except (RuntimeError, SoftfingerError) as error:
+        return Report(title, [], notes=(f"{title}: {error}",), failed=True)
 
 
 def _cell(value: Any) -> str:

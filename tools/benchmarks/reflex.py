@@ -19,10 +19,16 @@ from typing import Any, NamedTuple
 
 from softfinger.daemon.control.modes import GRIPPING
 from softfinger.tools.benchmarks.measuring import Report, Row, figure
-from softfinger.tools.benchmarks.rigs import SENSORS, SOLID, Sections, merged
+from softfinger.tools.benchmarks.rigs import SENSORS, SOLID, RigError, Sections, merged
 from softfinger.tools.benchmarks.virtual_grip import VirtualGrip
 
-TIPS: dict[str, Sections] = {"springs": {}, "solid": SOLID, **SENSORS}  # sensors: on springs
+# Plants, each with the ideal sensor, and sensors on springs.
+TIPS: dict[str, Sections] = {
+    "springs": {},
+    "bristles": {"simulation": {"tip_law": "bristles"}},
+    "solid": SOLID,
+    **SENSORS,
+}
 MASSES = (0.1, 0.5, 2.0)  # kg
 STANDING = (0.0, 3.0, 6.0, 8.0, 9.0)  # N
 OVERLOADS = (12.5, 13.0, 14.0, 15.0, 16.0, 18.0)  # N; the tips' friction bears 12 N of 10 N
@@ -70,9 +76,13 @@ def measure(
     return [_table(name, loads, trials, outcomes) for name in hands]
 
 
-def _outcome(case: tuple[Sections, tuple[float, float, str], int]) -> Overload:
+def _outcome(case: tuple[Sections, tuple[float, float, str], int]) -> Overload | None:
+    """Return the outcome of a case; None where no grip came about."""
     settings, (standing, overload, kind), seed = case
-    return overloaded(settings, standing, overload, seed, kind)
+    try:
+        return overloaded(settings, standing, overload, seed, kind)
+    except RigError:
+        return None
 
 
 def _table(
@@ -80,8 +90,10 @@ def _table(
 ) -> Report:
     rows = []
     for standing, overload, kind in loads:
-        found = [Overload(*next(outcomes)) for _ in range(trials)]
-        rows.append(row(f"{standing:g} N, then a {kind} of {overload:g} N", found))
+        tried = [next(outcomes) for _ in range(trials)]
+        found = [Overload(*each) for each in tried if each is not None]
+        told = row(f"{standing:g} N, then a {kind} of {overload:g} N", found)
+        rows.append(told | {"trials": trials, "no grip": trials - len(found)})
     said = [each["said ms"] for each in rows if each["held %"] < 100.0]
     note = f"  said that the object has gone: in {max(said, default=0.0):.0f} ms, aim ≤ {_SAID:g}"
     return Report(f"{name}, answer", rows, notes=(note,) if said else ())
@@ -95,7 +107,7 @@ def row(name: str, found: Sequence[Overload]) -> Row:
     return times | {
         "greatest": max(answers, default=math.nan),
         "unanswered": sum(each.answer == math.inf for each in found),
-        "held %": 100.0 * len(held) / len(found),
+        "held %": 100.0 * len(held) / len(found) if found else math.nan,
         "slid mm": 1e3 * max((each.slid for each in held), default=math.nan),
         "said ms": 1e3 * max((each.said for each in found if each.lost), default=math.nan),
     }
@@ -106,7 +118,7 @@ def overloaded(
 ) -> Overload:
     """Grip, bear ``standing`` [N], then ``overload`` [N], a push or a twist.
 
-    Raises RuntimeError without a grip.
+    Raises RigError without a grip.
     """
     chance = random.Random(seed)
     with VirtualGrip.drawn(seed, chance, settings) as grip:
@@ -115,7 +127,7 @@ def overloaded(
         loop.advance(0.1)
         grip.command("grasp", force=_FORCE)
         if not grip.until("holding", _GRIP):
-            raise RuntimeError(f"the hand does not hold: {state.mode} {state.fault}")
+            raise RigError(f"the hand does not hold: {state.mode} {state.fault}")
         loop.advance(1.0 + chance.uniform(0.0, 0.02))
         for k in range(_STEPS):
             grip.plant.load(push=standing * (k + 1) / _STEPS)

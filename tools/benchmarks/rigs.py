@@ -82,13 +82,16 @@ def virtual_daemon(*topics: bytes) -> Iterator[Daemon]:
 
 
 def hold(daemon: Daemon, force: float = 8.0) -> None:
-    """Grasp the simulated object. Raises RigError when it is not held within 3 s, or Refused."""
+    """Grasp the simulated object. Raises RigError when it is not held within 10 s, or Refused."""
     loop = daemon.loop
     loop.advance(0.2)
     loop.command({"command": "arm"})
     loop.advance(0.2)
     loop.command({"command": "grasp", "force": force})
-    loop.advance(3.0)
+    for _ in range(10):
+        loop.advance(1.0)
+        if loop.state.mode == "holding":
+            break
     must_hold(daemon)
 
 

@@ -283,8 +283,8 @@ PAGES = {
         notes=(
             "Negative angles are those that the finger's rotation makes. The paper gives neither d "
             "nor the distance of the finger's root: four depths are shown, and in (a) d grows from "
-            "first touch at 0° as sin |θ|. The measured forces, off by about 17 % in (b) and least "
-            "slightly before 0°, are not reproduced.",
+            "first touch at 0° as sin |θ|. The measured forces, off by about 17 % in (b), are not "
+            "reproduced; that they are least slightly before 0° is, in fig10_shear.",
         ),
     ),
     "fig11": FigurePage(

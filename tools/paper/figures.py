@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 NAMES = (
     *("fig3", "fig4a", "fig4b", "fig5a", "fig5b"),
-    *("fig7", "fig7_run", "fig10", "fig10_run", "fig11"),
+    *("fig7", "fig7_run", "fig10", "fig10_run", "fig10_shear", "fig11"),
 )
 BY_NAME = ("slow_turn",)  # long: drawn only when it is named
 
@@ -36,9 +36,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def pages() -> dict[str, FigurePage]:
     """Return all figures by name."""
-    from softfinger.tools.paper import experiment_pages, model_pages, run_pages, slow_turn
+    from softfinger.tools.paper import (
+        experiment_pages,
+        model_pages,
+        run_pages,
+        sheared_rolling,
+        slow_turn,
+    )
 
-    modules = (model_pages, experiment_pages, run_pages, slow_turn)
+    modules = (model_pages, experiment_pages, run_pages, sheared_rolling, slow_turn)
     found = {name: page for each in modules for name, page in each.PAGES.items()}
     return {name: found[name] for name in (*NAMES, *BY_NAME)}
 

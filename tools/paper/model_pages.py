@@ -6,6 +6,7 @@ numerically.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -21,6 +22,7 @@ from softfinger.kinematics.contact.material import (
     TABLE_I_STRAIN,
     Material,
 )
+from softfinger.kinematics.contact.quadrature import integrate
 from softfinger.tools.paper.sheets import (
     CIRCLE,
     DEPTH,
@@ -41,6 +43,9 @@ MODULUS = TABLE_I_MAXIMUM  # the paper's choice [Pa]
 MILLI = 1e-3
 MPA = 1e-6
 _NODES = 64  # of the double integrals
+_STEEP = 25  # degrees, where the rate of change by the tilt is told
+_FITTED = slice(10, None)  # of the displacements: exponents are fitted from 1 to 8 mm
+_NEAR = 1e-4  # relative, and rad: steps of differences
 DEPTHS = (2, 4, 6, 8)  # mm
 TILTS = (0, 5, 10, 15, 20, 25, 30)  # degrees
 
@@ -135,6 +140,7 @@ class Plotted:
     unit: str
     scale: float  # from SI to the unit
     row: int  # in closed_forms and double_integrals
+    slope: int  # of its derivative by d, in closed_forms
     exponent: int
     equation: int
     power: str  # of the displacement at θ = 0
@@ -149,6 +155,17 @@ class Plotted:
         """Return the paper's double integral in the figure's unit; d in mm, θ in degrees."""
         pair = double_integrals(TIP.radius, MODULUS, d * MILLI, np.radians(theta))
         return pair[self.row] * self.scale
+
+    def local_exponent(self, d: Numbers, theta: Numbers) -> FloatArray:
+        """Return the slope of the integral's logarithm over that of d; d in mm, θ in degrees."""
+        above, below = (self.integral(d * (1.0 + step), theta) for step in (_NEAR, -_NEAR))
+        return np.log(above / below) / math.log((1.0 + _NEAR) / (1.0 - _NEAR))
+
+    def steepness(self, d: Numbers) -> FloatArray:
+        """Return the integral's slope over θ at 25° [unit/rad]; d in mm."""
+        step = math.degrees(_NEAR)
+        above, below = (self.integral(d, np.float64(_STEEP + each)) for each in (step, -step))
+        return (above - below) / (2.0 * _NEAR)
 
     def at_zero_tilt(self, d: Numbers) -> FloatArray:
         """Return the paper's continuous line: πEd² or πEd³/3, in the figure's unit; d in mm."""
@@ -171,9 +188,9 @@ class Plotted:
         }
 
 
-FORCE = Plotted("F", "total elastic force", "N", 1.0, 0, 2, 3, "πEd²", "1/cos θ", np.pi)
+FORCE = Plotted("F", "total elastic force", "N", 1.0, 0, 2, 2, 3, "πEd²", "1/cos θ", np.pi)
 ENERGY = Plotted(
-    "U", "elastic potential energy", "mJ", 1e3, 1, 3, 10, "πEd³/3", "1/cos² θ", np.pi / 3
+    "U", "elastic potential energy", "mJ", 1e3, 1, 4, 3, 10, "πEd³/3", "1/cos² θ", np.pi / 3
 )
 
 
@@ -183,13 +200,17 @@ def over_tilt(name: str, quantity: Plotted) -> tuple[Sheet, ...]:
     columns = {"theta [deg]": theta}
     for d in DEPTHS:
         columns |= quantity.columns(np.float64(d), theta, f"at d = {d} mm")
-    return (Sheet(name, columns),)
+    depths = np.array(DEPTHS, dtype=np.float64)
+    head = f"d{quantity.symbol}/dtheta at {_STEEP} deg [{quantity.unit}/rad]"
+    rate = {"d [mm]": depths, head: quantity.steepness(depths)}
+    return Sheet(name, columns), Sheet(f"{name}_rate", rate)
 
 
 def over_depth(name: str, quantity: Plotted) -> tuple[Sheet, ...]:
-    """Tabulate over d to 8 mm at each tilt, with the ratio to the power at θ = 0; the exponents.
+    """Tabulate over d to 8 mm at each tilt: factor over the power at θ = 0, exponents by both laws.
 
-    Factor and exponent come from the double integral, so that they owe the closed form nothing.
+    Factor and exponent come from the double integral, so that they owe the closed form nothing; for
+    Table I's law from its own integral.
     """
     d = np.arange(81) / 10.0
     power = quantity.at_zero_tilt(d)
@@ -198,17 +219,32 @@ def over_depth(name: str, quantity: Plotted) -> tuple[Sheet, ...]:
     for tilt in TILTS:
         theta, at = np.float64(tilt), f"at {tilt} deg"
         columns |= quantity.columns(d, theta, at)
-        cosine, integral = np.cos(np.radians(theta)), quantity.integral(d, theta)
-        factor = np.divide(integral, power, out=np.full_like(d, np.nan), where=d > 0)
-        columns[f"factor {at} [1]"] = factor
+        integral = quantity.integral(d, theta)
+        law = integrate(TIP, Material.table_i(), d * MILLI, np.radians(theta))
+        value, slope = np.asarray(law[quantity.row]), np.asarray(law[quantity.slope])
+        local = np.full((2, d.size), np.nan)
+        local[0, 1:] = quantity.local_exponent(d[1:], theta)
+        local[1, 1:] = slope[1:] * d[1:] * MILLI / value[1:]
+        columns |= {
+            f"{quantity.symbol} of Table I's law {at} [{quantity.unit}]": value * quantity.scale,
+            f"exponent {at} [1]": local[0],
+            f"exponent of Table I's law {at} [1]": local[1],
+        }
         row = {
             "theta [deg]": tilt,
-            "fitted exponent of d [1]": np.polyfit(np.log(d[1:]), np.log(integral[1:]), 1)[0],
-            "fitted factor [1]": factor[-1],
-            f"factor {quantity.prefactor} [1]": cosine ** (1 - quantity.exponent),
+            "fitted exponent of d [1]": _power(d, integral),
+            "fitted exponent of d, Table I's law [1]": _power(d, value),
+            "fitted factor [1]": integral[-1] / power[-1],
+            f"factor {quantity.prefactor} [1]": math.cos(math.radians(tilt))
+            ** (1 - quantity.exponent),
         }
         rows.append(row)
     return Sheet(name, columns), summary(f"{name}_exponents", rows)
+
+
+def _power(d: FloatArray, values: FloatArray) -> float:
+    """Return the exponent of the power law of d that fits ``values`` best, from 1 to 8 mm."""
+    return float(np.polyfit(np.log(d[_FITTED]), np.log(values[_FITTED]), 1)[0])
 
 
 def _key(axes: Axes, quantity: Plotted) -> None:
@@ -216,12 +252,14 @@ def _key(axes: Axes, quantity: Plotted) -> None:
     axes.plot([], [], **CIRCLE | {"ms": 4, "mec": INK}, label=f"eq. {quantity.equation}")
 
 
-def _tilt_curves(quantity: Plotted, axes: Axes, numbers: Sheet) -> None:
+def _tilt_curves(quantity: Plotted, axes: Axes, numbers: Sheet, rates: Sheet) -> None:
     theta = numbers["theta"]
-    for d, style in zip(DEPTHS, ordered(len(DEPTHS)), strict=True):
+    rate = rates[f"d{quantity.symbol}/dtheta at {_STEEP} deg"]
+    for d, at, style in zip(DEPTHS, rate, ordered(len(DEPTHS)), strict=True):
         closed = numbers[f"{quantity.symbol} at d = {d} mm"]
         integral = numbers[f"{quantity.symbol} by eq. {quantity.equation} at d = {d} mm"]
-        axes.plot(theta, closed, **style, label=f"d = {d} mm")
+        label = f"d = {d} mm: {at:.1f} {quantity.unit}/rad at {_STEEP}°"
+        axes.plot(theta, closed, **style, label=label)
         look = CIRCLE | {"ms": 4, "mec": style["color"], "clip_on": False}
         axes.plot(theta[::10], integral[::10], **look)
         axes.plot(0.0, closed[theta == 0.0], "v", ms=6, color=style["color"])
@@ -239,14 +277,21 @@ def _depth_curves(quantity: Plotted, axes: Axes, numbers: Sheet, _: Sheet) -> No
     _key(axes, quantity)
 
 
-def _factors(axes: Axes, numbers: Sheet, _: Sheet) -> None:
-    for tilt, style in zip(TILTS, ordered(len(TILTS)), strict=True):
-        factor = numbers[f"factor at {tilt} deg"]
-        axes.plot(numbers["d"][1:], factor[1:], **style, label=f"{tilt}°: {factor[-1]:.3f}")
+def _exponents(quantity: Plotted, axes: Axes, numbers: Sheet, fitted: Sheet) -> None:
+    d = numbers["d"]
+    axes.axhline(
+        quantity.exponent, color=INK, label=f"constant E, every angle: {quantity.exponent}"
+    )
+    axes.plot(d[10::10], numbers["exponent at 30 deg"][10::10], **CIRCLE | {"ms": 4, "mec": INK})
+    power = fitted["fitted exponent of d, Table I's law"]
+    for tilt, fit, style in zip(TILTS, power, ordered(len(TILTS)), strict=True):
+        if tilt % 10 == 0:
+            local = numbers[f"exponent of Table I's law at {tilt} deg"]
+            axes.plot(d, local, **style, label=f"Table I, {tilt}°: {fit:.3f} from 1 to 8 mm")
 
 
 def _tilt_page(name: str, title: str, height: float, quantity: Plotted, **more: Any) -> FigurePage:
-    legend = {"loc": "upper center", "ncols": 3}
+    legend = {"loc": "upper center", "ncols": 2, "columnspacing": 1.0}
     panel = Panel(partial(_tilt_curves, quantity), "θ [deg]", quantity.axis, "", (-25, 25),
                   (0, 1.25 * quantity.largest(25.0)), legend)  # fmt: skip
     return FigurePage(title, (5.2, height), partial(over_tilt, name, quantity), (panel,), **more)
@@ -256,11 +301,16 @@ def _depth_page(name: str, title: str, quantity: Plotted, **more: Any) -> Figure
     line = f"continuous line: {quantity.symbol}(d, 0) = {quantity.power}"
     left = Panel(partial(_depth_curves, quantity), DEPTH, quantity.axis, line, (0, 8),
                  (0, 1.12 * quantity.largest(30.0)), "upper left")  # fmt: skip
-    right = Panel(_factors, DEPTH,
-                  f"{quantity.symbol} by eq. {quantity.equation} over {quantity.power}",
-                  f"flat: the exponent is exactly {quantity.exponent}", (0, 8),
-                  (0.99, 1.02 + 1.4 * (quantity.largest(30.0) / quantity.largest(0.0) - 1.0)),
-                  {"loc": "upper center", "ncols": 2})  # fmt: skip
+    n = quantity.exponent
+    right = Panel(
+        partial(_exponents, quantity),
+        DEPTH,
+        f"d ln {quantity.symbol} / d ln d",
+        "exponent of the displacement",
+        (0, 8),
+        (n - 0.02, n + 0.4),
+        "upper left",
+    )
     sheets = partial(over_depth, name, quantity)
     layout = {"width_ratios": (1.15, 1.0)}
     return FigurePage(title, (7.4, 4.1), sheets, (left, right), layout=layout, **more)
@@ -322,8 +372,9 @@ PAGES = {
                 "III-B",
                 "the continuous line is πEd², and all the other curves follow a power law whose "
                 "exponent is more than the square",
-                "the exponent is exactly 2 at every angle; the angle changes the prefactor alone, "
-                "F = πEd² · 1/cos θ.",
+                "with the constant E that is plotted the exponent is exactly 2 at every angle; the "
+                "angle changes the prefactor alone, F = πEd² · 1/cos θ. With Table I's law it is "
+                "above 2, more so tilted.",
             ),
         ),
         notes=(_TIP,),
@@ -355,8 +406,9 @@ PAGES = {
                 "III-B",
                 "the continuous line is proportional to the cube of d, and the power law exceeds "
                 "the cube as the angle increases to 30°",
-                "the exponent is exactly 3 at every angle; the angle changes the prefactor alone, "
-                "U = (πEd³/3) · 1/cos² θ.",
+                "with the constant E that is plotted the exponent is exactly 3 at every angle; the "
+                "angle changes the prefactor alone, U = (πEd³/3) · 1/cos² θ. With Table I's law it "
+                "is above 3, more so tilted.",
             ),
         ),
         notes=(_TIP,),

@@ -114,7 +114,7 @@ def run_rolling(depth: int) -> dict[str, FloatArray]:
     }
 
     def place(hand: SimulatedHand, fraction: float) -> None:
-        _roll(hand, depth * MILLI, -ROLLED * fraction)
+        roll(hand, depth * MILLI, -ROLLED * fraction)
 
     with _daemon(sections) as daemon:
         rows = _frames(daemon, _ROLL_STEPS, place)
@@ -189,14 +189,17 @@ def _columns(
     return columns
 
 
-def _roll(hand: SimulatedHand, d: float, angle: float) -> None:
-    """Put the held object where it has rolled to ``angle`` [rad] with ``d`` [m] held."""
+def roll(hand: SimulatedHand, d: float, angle: float, rolling: float = 1.0) -> None:
+    """Put the held object where it has rolled to ``angle`` [rad] with ``d`` [m] held.
+
+    ``rolling``: share of its face's motion that the tip rolls off.
+    """
     q = float(hand.q[0])
     parameters = hand.plant.parameters
     length = parameters.length
     tip = -_HALF_SEPARATION + length * math.sin(q), length * math.cos(q)
     out = RADIUS + 0.5 * _WIDTH - d
-    along = (RADIUS - d) * angle  # the tip's place on the face, by rolling
+    along = rolling * (RADIUS - d) * angle  # the tip's place on the face
     parameters.script_x = tip[0] + out * math.cos(angle) + along * math.sin(angle)
     hand.object_pose[:] = (
         parameters.script_x,

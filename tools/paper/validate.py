@@ -121,6 +121,8 @@ def _tips() -> Iterator[Beside]:
 
 
 def _energy() -> Iterator[Beside]:
+    from softfinger.tools.paper import sheared_rolling
+
     source = "Inoue & Hirai, the paper that this model is from"
     for law in _LAWS:
         energy = _table(law)(np.full(TILTS.shape, 0.004), TILTS, "energy")
@@ -132,6 +134,12 @@ def _energy() -> Iterator[Beside]:
         )
         yield between(f"tilt of the least U at d = 4 mm: {law}", 0.0, 0.0, source, least, ".1f",
                       "°", why)  # fmt: skip
+    theta = np.radians(np.linspace(-11.5, 9.2, 208))
+    rolled = sheared_rolling.rolled(0.006, 0.05, theta)
+    before = sheared_rolling.least(theta, rolled["F on the base"])
+    yield Beside("tilt of the least force in rolling, d = 6 mm: springs", "slightly before 0°",
+                 source, f"{before:.1f}°", "agree" if -3.0 < before < 0.0 else "disagree",
+                 "where 5 % of the motion is not rolled off, but shears the tip")  # fmt: skip
     d, chosen = 1e-3 * np.arange(8, 33) / 4.0, Material.constant(1.0)
     for face in ("frictionless", "sticking"):
         solid = ContactTable.build(replace(_LAWS["solid, bonded"], face=face), chosen)(d, 0.0).force

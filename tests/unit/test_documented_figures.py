@@ -1,0 +1,65 @@
+"""Figures of the pages that take too long for the site's build: they are the code's own."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from softfinger import SensorGrid
+from softfinger.kinematics.calibration.press_fit import Presses, compare_tips
+from softfinger.tools.benchmarks import control
+
+ROOT = Path(__file__).parents[2]
+ROW = re.compile(
+    r"(?m)^\| (bonded|lying), (\w+) \| (upright[^|]*) \| (bonded|lying), \**(\w+)\** "
+    r"\| ([\d.]+) \| (\S+) % \| (\S+) \|$"
+)
+MODULUS, RADIUS, POISSON, NOISE = 0.25e6, 0.020, 0.49, 600.0
+GRID = SensorGrid(44, 44, 0.058 / 44)
+
+
+@pytest.mark.extended
+def test_the_laws_that_are_found_on_other_elements_are_as_which_model_says() -> None:
+    page = (ROOT / "docs" / "which-model.md").read_text(encoding="utf-8").replace("−", "-")
+    rows = ROW.findall(page)
+    assert len(rows) == 5
+    with np.load(ROOT / "tests" / "golden" / "solid_frames.npz") as file:
+        kinds, d, theta = file["base"], file["d"] * RADIUS, file["theta"]
+        frames = file["frame"].astype(np.float64) * MODULUS
+    for base, face, tilts, found_base, found_face, chi2, off, poisson_off in rows:
+        chosen = kinds == base + "-sticking" * (face == "sticking")
+        if tilts == "upright":
+            chosen &= theta == 0.0
+        seen = frames[chosen]
+        seen += NOISE * np.random.default_rng(1).standard_normal(seen.shape)
+        used = np.ones(seen.shape, np.bool_)
+        presses = Presses(seen, d[chosen], theta[chosen], NOISE, used)
+        best, *_ = compare_tips(presses, RADIUS, GRID, np.ones(GRID.shape, np.bool_))
+        assert (best.tip.base, best.tip.face) == (found_base, found_face)
+        assert best.chi2 == pytest.approx(float(chi2), abs=0.06)
+        assert 100.0 * (best.modulus / MODULUS - 1.0) == pytest.approx(float(off), abs=0.2)
+        assert best.tip.poisson - POISSON == pytest.approx(float(poisson_off), abs=0.002)
+
+
+@pytest.mark.extended
+@pytest.mark.parametrize(
+    ("name", "way"),
+    [
+        (name, ways[name])
+        for ways, name in (
+            (control.WAYS, "energy, steered to 0"),
+            (control.WAYS, "upright (blind)"),
+            (control.LIMITS, "torque constants 5 % apart"),
+            (control.LIMITS, "tips without tangential coupling"),
+            (control.LATE, "two-phased, 300 ms"),
+        )
+    ],
+)
+def test_the_kept_angles_are_those_that_the_laws_leave_today(name, way) -> None:
+    content = json.loads((ROOT / "docs" / "control.json").read_text(encoding="utf-8"))
+    (kept,) = (row for row in content["rows"] if row["name"] == name)
+    found = control.row(name, way, control.drawn())
+    assert (found["n"], found["not held"]) == (kept["n"], kept["not held"])
+    assert found["median"] == pytest.approx(kept["median"], rel=0.2, abs=0.1)

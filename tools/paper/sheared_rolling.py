@@ -1,0 +1,179 @@
+"""Sec. IV-B's minimum slightly before 0°: rolling of which a small share shears the tip.
+
+The finger has been tilted to −11.5°, then the object rolls to 9.2° at a fixed displacement d. If a
+share s of the motion of the face is not rolled off, the tip is sheared by
+
+    ζ = s (a − d) (θ − θ₀),    θ₀ = −11.5°
+
+With the springs of the parallel distributed model, each as stiff sideways as along its axis,
+
+    U = πE [d³/(3 cos² θ) + d² ζ tan θ + d ζ²]      F = πE [d²/cos θ + 2 d ζ sin θ]
+
+F is the sum of the springs' forces on the base, which is what a sensor under the tip measures. The
+term with ζ has the sign of θ, so both are least before the object is upright. ∂U/∂d, the force on
+the face at a fixed tilt and shear, is least in between.
+
+*Plant* is the simulated tip: its rows integrate the shear, its forces and energy are read. What
+presses on its base is N cos θ + T sin θ. This is F and πE ζ² cos θ more, for the springs at the
+contact's rim, which the plant's energy shears as soon as they touch.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cache, partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.simulation.physics.plant_state import ALONG_SHEAR
+from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
+from softfinger.tools.paper.model_pages import DEPTHS, MILLI, MODULUS, TIP
+from softfinger.tools.paper.run_pages import ROLLED, TILTED, roll
+from softfinger.tools.paper.sheets import (
+    DOT,
+    RELATIVE,
+    FigurePage,
+    FloatArray,
+    Panel,
+    Sheet,
+    summary,
+)
+from softfinger.tools.style import GREY, ordered
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+SHARES = (0.0, 0.02, 0.05, 0.1)  # that are drawn
+_EACH = tuple(k / 100.0 for k in range(11))
+DEPTH, SHARE = 6, 0.05  # mm; that are drawn, and run on the plant
+_STEPS = 208
+_FORCE, _SLOPE, _ENERGY = "F on the base", "dU/dd", "U"
+
+
+def rolled(d: float, share: float, theta: FloatArray) -> dict[str, FloatArray]:
+    """Return F, ∂U/∂d [N] and U [mJ] at tilts ``theta`` [rad], ``d`` [m] held."""
+    shear = share * (TIP.radius - d) * (theta + TILTED)
+    sine, cosine, tangent = np.sin(theta), np.cos(theta), np.tan(theta)
+    stiff = math.pi * MODULUS
+    return {
+        _FORCE: stiff * (d**2 / cosine + 2.0 * d * shear * sine),
+        _SLOPE: stiff * (d**2 / cosine**2 + 2.0 * d * shear * tangent + shear**2),
+        _ENERGY: 1e3 * stiff * (d**3 / (3.0 * cosine**2) + d**2 * shear * tangent + d * shear**2),
+    }
+
+
+def plant(d: float, share: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return θ [rad], N cos θ + T sin θ [N] and U [mJ] of the simulated tip, ``d`` [m] held."""
+    settings = Settings.model_validate(
+        {
+            "scene": {"fingers": ("left",)},
+            "servos": {"backend": "none"},
+            "hand": {"open_angle": (TILTED, 0.0)},
+            "tip": {"radius": TIP.radius},
+            "material": {"law": "constant", "modulus": MODULUS},
+            "simulation": {"object_height": 0.2, "compression_speed": 0.0},
+        }
+    )
+    hand = SimulatedHand(settings)
+    tip = hand.plant.stages[0].on_object[0]
+    rows = []
+    for k in range(_STEPS + 1):
+        before, row = hand.object_pose.copy(), tip.rows[ALONG_SHEAR, 1:].copy()
+        roll(hand, d, -ROLLED * k / _STEPS, 1.0 - share)
+        if k:
+            row = 0.5 * (row + tip.rows[ALONG_SHEAR, 1:])
+            hand.shear[0] += row @ (hand.object_pose - before)
+            hand.refresh()
+        theta = float(hand.theta[0])
+        base = hand.normal[0] * math.cos(theta) + hand.tangential[0] * math.sin(theta)
+        rows.append((-theta, base, 1e3 * tip.energy))
+    theta, base, energy = np.array(rows).T
+    return theta, base, energy
+
+
+def least(theta: FloatArray, values: FloatArray) -> float:
+    """Return the angle [degrees] at which ``values`` are least, between the given ones."""
+    k = int(np.clip(np.argmin(values), 1, len(values) - 2))
+    near = slice(k - 1, k + 2)
+    a, b, _ = np.polyfit(theta[near] - theta[k], values[near], 2)
+    return math.degrees(theta[k] - 0.5 * b / a)
+
+
+@cache
+def sheared_rolling() -> tuple[Sheet, ...]:
+    """Return the curves at one depth, the plant's, and where each is least at all depths."""
+    theta = np.linspace(-TILTED, ROLLED - TILTED, _STEPS + 1)
+    columns = {"theta [deg]": np.degrees(theta)}
+    rows = []
+    for depth in DEPTHS:
+        d = depth * MILLI
+        for share in _EACH:
+            curves = rolled(d, share, theta)
+            angles = {f"least {name} [deg]": least(theta, each) for name, each in curves.items()}
+            rows.append({"d [mm]": depth, "share [%]": 100.0 * share, **angles})
+            if depth == DEPTH and share in SHARES:
+                columns[f"F on the base, {share:.0%} [N]"] = curves[_FORCE]
+                columns[f"U, {share:.0%} [mJ]"] = curves[_ENERGY]
+    seen = {depth: plant(depth * MILLI, SHARE) for depth in DEPTHS}
+    felt = [
+        {
+            "d [mm]": depth,
+            "share [%]": 100.0 * SHARE,
+            "least N cos theta + T sin theta [deg]": least(tilt, base),
+            "least U [deg]": least(tilt, energy),
+        }
+        for depth, (tilt, base, energy) in seen.items()
+    ]
+    tilt, base, energy = seen[DEPTH]
+    run = {"theta [deg]": np.degrees(tilt), "F on the base [N]": base, "U [mJ]": energy}
+    return (
+        Sheet("fig10_shear", columns),
+        Sheet("fig10_shear_plant", run),
+        summary("fig10_shear_minima", rows),
+        summary("fig10_shear_plant_minima", felt),
+    )
+
+
+def _curves(name: str, axes: Axes, model: Sheet, run: Sheet, *_: Sheet) -> None:
+    theta = model["theta"]
+    upright = float(np.interp(0.0, theta, model[f"{name}, 0%"]))
+    for share, style in zip(SHARES, ordered(len(SHARES)), strict=True):
+        ratio = model[f"{name}, {share:.0%}"] / upright
+        axes.plot(theta, ratio, **style, label=f"{share:.0%} not rolled off")
+        where = least(np.radians(theta), ratio)
+        axes.plot(where, np.interp(where, theta, ratio), "v", ms=6, color=style["color"])
+    axes.plot(run["theta"][::13], run[name][::13] / upright, **DOT, label=f"plant, {SHARE:.0%}")
+
+
+def _minima(axes: Axes, _model: Sheet, _run: Sheet, minima: Sheet, felt: Sheet) -> None:
+    axes.axhline(0.0, color=GREY, linewidth=0.7)
+    for depth, style in zip(DEPTHS, ordered(len(DEPTHS)), strict=True):
+        rows = minima["d"] == depth
+        axes.plot(
+            minima["share"][rows], minima[f"least {_ENERGY}"][rows], **style, label=f"{depth} mm"
+        )
+    axes.plot(felt["share"], felt["least U"], **DOT, label="plant")
+
+
+PAGES = {
+    "fig10_shear": FigurePage(
+        "Sec. IV-B: the minimum slightly before 0°, by the tip's own tangential term",
+        (9.6, 4.0),
+        sheared_rolling,
+        (
+            Panel(partial(_curves, _FORCE), RELATIVE, "F(θ)/F(0) without shear",
+                  f"(a) force on the base, d = {DEPTH} mm", None, (0.99, 1.07), "upper center"),
+            Panel(partial(_curves, _ENERGY), RELATIVE, "U(θ)/U(0) without shear",
+                  f"(b) energy, d = {DEPTH} mm", None, (0.98, 1.14), "upper center"),
+            Panel(_minima, "share that is not rolled off [%]", "angle of the least U [deg]",
+                  "(c) where U is least", None, None, "lower left"),
+        ),
+        notes=(
+            "The object rolls from −11.5° to 9.2° at a fixed d. What it does not roll off shears "
+            "the tip, by s (a − d)(θ + 11.5°). The paper puts the shift down to lateral springs; "
+            "these springs, each as stiff sideways as along its axis, have it.",
+        ),
+    ),
+}  # fmt: skip
