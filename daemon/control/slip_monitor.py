@@ -4,7 +4,7 @@ In each tick, with the names of `SlipLaw`, `SlipState` and `GraspState`:
 
     r         torque residual of the joints, low-pass filtered; r̄ is its mean
     L         load on each tip: r̄ − offset = load_arm L + load_curvature L²           (`load_of`)
-    load      min(4 max(|L| − friction/(2 load_arm), 0), |L| + 2 friction/slope)
+    load      min(4 max(|L| − friction/(2 load_arm), 0), |L| + friction/slope)
     needed    max(load, shear of solid tips, object_load/2)/(tip_friction (1 − margin) − shear)
     force     min(max(commanded, needed), force_limit)
 
@@ -15,8 +15,7 @@ to a joint that sticks. It stays within `friction` of its start, or a further _R
 tips' moment below it, because rubber relaxes.
 
 **Load.** Friction hides a load of up to friction/load_arm, 2 N for each tip of the default hand.
-Half of it is ignored. From there on the load is increased by the hidden part, which is twice as
-large, because a load reverses the friction of a joint that has closed. An increase of the
+Half of it is ignored. From there on the load is increased by the hidden part. An increase of the
 grip force by more than _SHARE_UNCONFIRMED needs a confirmation: the object has turned, both joints
 have yielded at once, or |L| exceeds twice the friction.
 
@@ -321,7 +320,7 @@ def _estimate_load(s: SlipState, grasp: GraspState, torque_change: float, dq: Tw
     s.is_confirmed = s.is_confirmed or load > 2.0 * hidden
     certain = load - (0.5 + max(1.0 - s.age / _SETTLING, 0.0)) * hidden
     hidden = s.friction / max(slope, _ARM_MIN * law.width)
-    s.load = min(max(4.0 * certain, 0.0), load + 2.0 * hidden, law.friction * s.force_limit)
+    s.load = min(max(4.0 * certain, 0.0), load + hidden, law.friction * s.force_limit)
 
 
 @inner_kernel
