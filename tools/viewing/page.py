@@ -160,9 +160,7 @@ class Site:
         if upgrade and path == "/":
             known += [[origin] for origin in ORIGINS]
         here = [host.partition(":")[0] in (_LOOPBACK, "localhost") for host in hosts]
-        if (
-            self._announce is not None
-        ):  # with a secret in each request, its host's name is no matter
+        if self._announce is not None:  # each request has a secret; its host may have any name
             here = [True]
             if not self._allows(request):
                 return self._exchange(connection, request)
@@ -327,7 +325,8 @@ def show(arguments: argparse.Namespace, ending: Ending) -> None:
         serving.start()
         try:
             if foxglove is not None:
-                print(f"view: ws://{address} for Foxglove; layout: {LAYOUT}")
+                secret = f"/?token={token}" if away else ""
+                print(f"view: ws://{address}{secret} for Foxglove; layout: {LAYOUT}")
             if live and not away:
                 print(f"view: http://{address}/?token={token} to see and command the hand")
             if away:
