@@ -54,9 +54,9 @@ class Viewed:
 class Watcher:
     """A page's connection: asks for pictures."""
 
-    def __init__(self, host: str, **more: Any) -> None:
+    def __init__(self, host: str, query: str = "", **more: Any) -> None:
         waits: Any = {"open_timeout": WAIT, "ping_timeout": None}
-        url = f"ws://{host}/pictures"
+        url = f"ws://{host}/pictures{query}"
         self._connection = connect(url, proxy=None, max_size=None, **waits, **more)
 
     def next(self) -> dict[str, Any]:

@@ -317,6 +317,8 @@ def test_other_machines_need_a_code_that_works_once() -> None:
         assert location(viewed.host, line.split()[1].removeprefix(f"http://{viewed.host}")) == place
         listening = psutil.Process(viewed.process.pid).net_connections()
         assert [each.laddr.ip for each in listening if each.status == "LISTEN"] == ["127.0.0.2"]
+        with Watcher(viewed.host, query) as page:
+            until(lambda: page.next()["mode"] == "holding")
         viewed.end()
 
 

@@ -251,6 +251,7 @@ def test_the_past_looks_past(page, fake):
         )
         until(lambda: page("document.querySelector('[name=release]').disabled"))
         assert not page("document.querySelector('[name=stop]').disabled")
+        assert page(PALE) == []
         fake.silent.clear()
         until(lambda: page.text(".mode") == "holding" and not old())
         viewed.process.kill()
@@ -541,4 +542,8 @@ def test_a_recording_is_played(page, tmp_path):
         until(lambda: page("picture.place.playing && picture.place.speed === 0.1"))
         page.key("Space", " ", text=" ")
         until(lambda: not page("picture.place.playing"))
+        assert page(PALE) == []
+        page.browser.resize(390, 844, 2)
+        until(lambda: page("document.documentElement.scrollWidth") <= 390)
+        assert page(COVERED) == []
         viewed.end()

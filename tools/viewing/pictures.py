@@ -360,7 +360,7 @@ class Pictures:
         return {"lines": lines, "dots": dots}
 
     def _notes(self) -> list[str]:
-        """What needs attention: a recent warning, why a finger is not valid, a near limit."""
+        """Return recent warnings, reasons why a finger is not valid, and near limits."""
         state, safety, feed = self.feed.state, self._settings.safety, self.feed
         last = [each for each in feed.events[-1:] if each.level == "warning"]
         notes = [each.text for each in last if self.time - each.timestamp < _LATELY]
