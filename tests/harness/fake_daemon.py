@@ -82,7 +82,8 @@ class FakeDaemon:
     """Publishes at 100 Hz (frames at 25 Hz) until closed. ``changes`` go into every state.
 
     ``requests`` holds what the command socket was sent, ``keys`` the key of each; ``replies`` maps
-    a command to its reply, or to a list of replies to one after the other.
+    a command to its reply, or to a list of replies to one after the other. Without states while it
+    is ``silent``, without answers while it is ``deaf``, without frames of fingers in ``dead``.
     """
 
     def __init__(self) -> None:
@@ -91,6 +92,8 @@ class FakeDaemon:
         self.requests: list[dict[str, Any]] = []
         self.keys: list[str] = []
         self.silent = threading.Event()
+        self.deaf = threading.Event()
+        self.dead: set[str] = set()
         self.published = 0  # states so far
         self._extra: list[list[bytes]] = []
         self._context: zmq.Context[Any] = zmq.Context()
@@ -118,7 +121,7 @@ class FakeDaemon:
         began = time.monotonic()
         seq = 0
         while not self._over.wait(0.01):
-            while self._server.poll(0):
+            while not self.deaf.is_set() and self._server.poll(0):
                 request = msgpack.unpackb(self._server.recv())
                 self.keys.append(request.pop("key", ""))
                 self.requests.append(request)
@@ -135,6 +138,8 @@ class FakeDaemon:
             self._publisher.send_multipart([b"hand/state", msgpack.packb(message)])
             if seq % 4 == 0:
                 for side in (0, 1):
+                    if ("left", "right")[side] in self.dead:
+                        continue
                     payload = msgpack.packb(frame(t, side))
                     self._publisher.send_multipart([b"hand/tactile", payload])
             seq += 1

@@ -79,7 +79,14 @@ class Browser:
     def evaluate(self, script: str) -> Any:
         """The value of a JavaScript expression in the page."""
         answer = self.ask("Runtime.evaluate", expression=script, returnByValue=True)
+        if "exceptionDetails" in answer:
+            raise RuntimeError(f"{script}: {answer['result'].get('description')}")
         return answer["result"].get("value")
+
+    def prefer(self, colours: str) -> None:
+        """Prefer ``dark`` or ``light`` colours, as a system's setting does."""
+        feature = {"name": "prefers-color-scheme", "value": colours}
+        self.ask("Emulation.setEmulatedMedia", features=[feature])
 
     def ask(self, method: str, **parameters: Any) -> Any:
         """Send one command and wait for its answer. Raises RuntimeError when it is an error."""

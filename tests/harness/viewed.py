@@ -2,7 +2,9 @@
 
 import json
 import subprocess
+from pathlib import Path
 from typing import Any, Self
+from urllib.parse import urlsplit
 
 from websockets.sync.client import connect
 
@@ -12,11 +14,15 @@ WAIT = 60.0  # s for one picture
 
 
 class Viewed:
-    """Serving when constructed. ``address`` is the page's, ``commanding`` that with the token."""
+    """Serving when constructed. ``address`` is the page's, ``commanding`` that with the token.
 
-    def __init__(self, *words: str) -> None:
+    ``folder``: where it runs, and records.
+    """
+
+    def __init__(self, *words: str, folder: Path | None = None) -> None:
         self.process = subprocess.Popen(
             [*SOFTFINGER, "view", *words, "--no-browser", "--port", "0"],
+            cwd=folder,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
@@ -25,9 +31,9 @@ class Viewed:
         for line in self.process.stdout:
             self.commanding = self.commanding or line.split()[1]
             self.address = line.split()[1]
-            if line.rstrip().endswith("to see it"):
+            if line.rstrip().endswith(("to see it", "in one browser")):
                 break
-        self.host = self.address.removeprefix("http://").rstrip("/")
+        self.host = urlsplit(self.address).netloc
 
     def end(self) -> str:
         """End it as a signal does, and return what it said."""
@@ -48,9 +54,9 @@ class Viewed:
 class Watcher:
     """A page's connection: asks for pictures."""
 
-    def __init__(self, host: str, **more: Any) -> None:
+    def __init__(self, host: str, query: str = "", **more: Any) -> None:
         waits: Any = {"open_timeout": WAIT, "ping_timeout": None}
-        url = f"ws://{host}/pictures"
+        url = f"ws://{host}/pictures{query}"
         self._connection = connect(url, proxy=None, max_size=None, **waits, **more)
 
     def next(self) -> dict[str, Any]:
@@ -60,6 +66,7 @@ class Watcher:
             message: dict[str, Any] = json.loads(self.socket.recv(timeout=WAIT))
             if "palette" not in message:
                 return message
+            self.scene = message
 
     def __enter__(self) -> Self:
         self.socket = self._connection.__enter__()

@@ -21,13 +21,13 @@ import zmq
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
+from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.publisher import pack
 from softfinger.tools.ending import Ending
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.viewing.page import listen
-from softfinger.tools.viewing.pictures import TOPICS, Pictures
-from softfinger.tools.viewing.planar import COLOURS
+from softfinger.tools.viewing.pictures import TOPICS, Pictures, Row
 from softfinger.tools.viewing.sources import Playback, ViewError, follow
 from tests.conftest import until
 from tests.harness.fake_daemon import FakeDaemon, event, finger, frame, state
@@ -57,11 +57,13 @@ class Kept:
     def __init__(self, *, live: bool = False) -> None:
         self.newest: dict[str, Any] = {}
         self.scene: dict[str, Any] = {}
+        self.rows: list[list[Any]] = []
         self.said: list[str] = []
         self.pictures = Pictures(self._take, lambda: True, self.said.append, live=live)
 
-    def _take(self, scene: bytes, picture: bytes) -> None:
+    def _take(self, scene: str, picture: str, rows: list[Row]) -> None:
         self.scene, self.newest = orjson.loads(scene), orjson.loads(picture)
+        self.rows = [orjson.loads(row.text) for row in rows]
 
 
 def view(fake: FakeDaemon, *words: str) -> Viewed:
@@ -78,16 +80,20 @@ def got(host: str, path: str, **headers: str) -> tuple[int, str]:
     return answer.status, body
 
 
+def location(host: str, path: str) -> str:
+    """Where a request is sent on to."""
+    connection = http.client.HTTPConnection(host, timeout=60)
+    connection.request("GET", path)
+    answer = connection.getresponse()
+    assert answer.status == 303
+    return str(answer.headers["Location"])
+
+
 def ask(host: str, query: str, asked: Any, **more: Any) -> str:
     """Send a command, or what is none, as a page does; its answer."""
     with connect(f"ws://{host}/command{query}", proxy=None, open_timeout=WAIT, **more) as line:
         line.send(orjson.dumps(asked).decode())
         return str(line.recv(timeout=WAIT))
-
-
-def told(picture: dict[str, Any], panel: str) -> list[list[Any]]:
-    """A panel's texts: colour, place, words."""
-    return list(picture["panels"][panel]["texts"])
 
 
 # What is shown
@@ -100,34 +106,40 @@ def test_a_picture_has_the_streams_values() -> None:
         with view(fake) as viewed, Watcher(viewed.host) as page:
             pictures = [page.next() for _ in range(5)]
             fake.send(schema.EVENT, msgpack.packb(event(7, "slip", "the object slips", "warning")))
-            while not ((picture := page.next())["events"] and picture["status"] == "live"):
+            while not (picture := page.next())["events"]:
                 pictures.append(picture)
+            scene = page.scene
             said = viewed.end()
     seqs = [each["seq"] for each in pictures]
     assert seqs == sorted(seqs)
     assert seqs[0] < picture["seq"]
+    numbers = [row[0] for each in (*pictures, picture) for row in each["rows"]]
+    assert numbers == [*range(numbers[0], picture["row"][0])]  # each row once
     expected = {
-        "Force [N]": {"left 7.5 ± 0.05", "goal 9"},
-        "Displacement d [mm]": {"right 3.31 ± 0.02"},
-        "Object's angle [°]": {"object 4.98", f"goal {math.degrees(0.1):.3g}"},
-        "Energy [mJ]": {"right 12.3"},
-        "Joints [°]": {f"right {math.degrees(0.44):.3g}"},
-        "Currents [A]": {"right 0.213"},
-        "Tick [µs]": {"work 11"},
+        "left.force": 7.5,
+        "left.force_std": 0.05,
+        "goal_force": 9.0,
+        "right.d": 3.31,
+        "right.d_std": 0.02,
+        "object.angle": 4.98,
+        "goal_angle": math.degrees(0.1),
+        "object.width": 40.0,
+        "right.energy": 12.34,
+        "right.q": math.degrees(0.44),
+        "right.current": 0.213,
+        "compute_s": 11.0,
+        "left.theta_std": 0.1,
     }
-    shown = {name: {text[3] for text in told(picture, name)} for name in expected}
-    assert {name: expected[name] - words for name, words in shown.items()} == {
-        name: set() for name in expected
-    }
-    tilts = [text[3].split(" ± ")[1] for text in told(picture, "Tilt θ [°]") if "±" in text[3]]
-    assert tilts == ["0.1", "0.1"]
-    assert (picture["mode"], picture["status"], picture["fault"]) == ("holding", "live", "")
-    assert picture["events"][-1][1:] == ["warning", "slip", "the object slips"]
-    assert "the object slips · grip: goal 9.0 N" in picture["limits"]
-    assert picture["limits"].endswith(
-        "nearest limit: left temperature at 94% of safety.temperature_max"
-    )
-    assert "servos 66 / 41 °C, 12.1 / 12.1 V" in picture["facts"]
+    shown = {path: picture["row"][scene["columns"][path]] for path in expected}
+    assert shown == pytest.approx(expected, abs=1e-4)
+    assert picture["row"][2] == picture["mode"] == "holding"
+    assert (picture["fault"], picture["age"] < picture["patience"]["state"]) == ("", True)
+    assert picture["events"][-1][2:] == ["warning", "slip", "the object slips"]
+    assert picture["notes"][0] == "the object slips"
+    assert "left temperature at 94% of safety.temperature_max" in picture["notes"]
+    assert not [note for note in picture["notes"] if "right" in note]  # far from its limits
+    facts = dict(zip(picture["facts"][::2], picture["facts"][1::2], strict=True))
+    assert facts["Servos"] == "66 / 41 °C, 12.1 / 12.1 V"
     for name in ("left", "right"):
         image = picture["panels"][name]["image"]
         levels = np.frombuffer(base64.b64decode(image["data"]), np.uint8).reshape(44, 44)
@@ -135,10 +147,23 @@ def test_a_picture_has_the_streams_values() -> None:
         assert levels[20:24, 20:24].min() > 10
         assert levels[:8].max() < 6  # noise
         assert len(picture["panels"][name]["lines"]) == 2  # the rim and the footprint
+        assert picture["panels"][name]["scale"] == ["≤ 3", "50 kPa"]
     assert len(picture["panels"]["landscape"]["dots"]) == 2
-    assert told(picture, "hand")[0][3] == "7.5 N"
-    assert "schema 2, this page knows 1" in picture["facts"]
+    assert picture["panels"]["hand"]["texts"][0][3] == "7.5 N"
+    assert "the stream has schema 2, this page knows 1" in picture["notes"]
     assert "0 messages could not be read" in said
+
+
+def test_free_tips_look_free() -> None:
+    kept = Kept()
+    noise = np.random.default_rng(1).normal(0.0, Settings().tactile.noise / 4.0, (44, 44))
+    counts = np.clip(noise, 0.0, None).astype("<u2")  # of 4 Pa
+    kept.pictures.take(schema.TACTILE, {**frame(0.0, 0), "data": counts.tobytes()})
+    kept.pictures.take(schema.STATE, state(0.0, 1))
+    kept.pictures.draw()
+    levels = np.frombuffer(base64.b64decode(kept.newest["panels"]["left"]["image"]["data"]), "u1")
+    assert (levels == 0).mean() > 0.95
+    assert levels.max() < 0.3 * (len(kept.scene["palette"]) - 1)
 
 
 def test_pages_share_one_subscription_and_a_slow_one_is_sent_nothing_that_it_did_not_ask_for():
@@ -170,11 +195,11 @@ def test_pages_share_one_subscription_and_a_slow_one_is_sent_nothing_that_it_did
     [
         (
             ('scene.fingers=["left"]', "scene.object_model=false"),
-            {"right", "Object's angle [°]"},
+            {"right", "Object angle", "Object width"},
             "left",
         ),
-        (("servos.backend=none",), {"Joints [°]", "Currents [A]"}, "right"),
-        (("tactile.backend=none",), {"left", "right"}, "Joints [°]"),
+        (("servos.backend=none",), {"Joint angles", "Motor current"}, "right"),
+        (("tactile.backend=none",), {"left", "right"}, "Joint angles"),
     ],
 )
 def test_what_the_scene_lacks_has_no_place(tmp_path, changes, gone, there):
@@ -184,6 +209,7 @@ def test_what_the_scene_lacks_has_no_place(tmp_path, changes, gone, there):
         kept.pictures.take(topic, message)
     kept.pictures.draw()
     names = {each["name"] for each in kept.scene["panels"]}
+    names |= {each["title"] for each in kept.scene["plots"]}
     assert there in names
     assert not gone & names
 
@@ -269,6 +295,33 @@ def test_a_command_is_sent_once_and_not_long_after_its_picture() -> None:
         assert len(fake.requests) == 2
 
 
+def test_other_machines_need_a_code_that_works_once() -> None:
+    # Any address but the loopback's own is one that other machines may reach.
+    with FakeDaemon() as fake, view(fake, "--host", "127.0.0.2") as viewed:
+        code = viewed.address.removeprefix(f"http://{viewed.host}")
+        for path in ("/", "/?code=", "/?code=abc", "/?token=", "/?token=abc"):
+            status, body = got(viewed.host, path)
+            assert status == 403
+            assert "newest address" in body
+            with pytest.raises(InvalidStatus, match="403"), Watcher(viewed.host):
+                pass
+        place = location(viewed.host, code)
+        assert place.startswith("/?token=")
+        assert "STOP" in got(viewed.host, place)[1]
+        query = place.removeprefix("/")
+        assert ask(viewed.host, query, {"command": "stop"}) == "✓ stop: ok"
+        with pytest.raises(InvalidStatus, match="403"):
+            ask(viewed.host, query, {"command": "stop"}, origin="http://evil.example")
+        assert got(viewed.host, code)[0] == 403  # it was for one browser
+        line = viewed.process.stdout.readline()  # the next one's
+        assert location(viewed.host, line.split()[1].removeprefix(f"http://{viewed.host}")) == place
+        listening = psutil.Process(viewed.process.pid).net_connections()
+        assert [each.laddr.ip for each in listening if each.status == "LISTEN"] == ["127.0.0.2"]
+        with Watcher(viewed.host, query) as page:
+            until(lambda: page.next()["mode"] == "holding")
+        viewed.end()
+
+
 # A recording
 
 
@@ -289,25 +342,31 @@ def test_a_recording_is_shown_from_any_place(recorded):
                 until(lambda: abs(kept.newest["time"] - when) < 0.02)  # noqa: B023
                 picture = kept.newest
                 at = next(each for each in states if each["timestamp"] == picture["time"])
-                assert (picture["mode"], picture["status"]) == (at["mode"], "recording")
+                assert (picture["mode"], kept.scene["live"]) == (at["mode"], False)
                 past = {each["timestamp"]: each["left"]["force"] for each in states}
-                blue = [*COLOURS["left"]]
-                lines = picture["panels"]["Force [N]"]["lines"]
-                (points,) = (points for colour, _, points in lines if colour == blue)
-                assert len(points) == pytest.approx(10 * place, abs=4)
-                for time, force in zip(points[::2], points[1::2], strict=True):
-                    was = min(past, key=lambda stamp: abs(stamp - picture["time"] - time))
-                    assert force == (
-                        pytest.approx(past[was], abs=1e-4) if math.isfinite(past[was]) else None
-                    )
+                rows = [row for row in kept.rows if row[0] >= picture["first"]]
+                assert len(rows) == pytest.approx(10 * place, abs=2)
+                for row in rows:
+                    force, was = row[kept.scene["columns"]["left.force"]], past[row[1]]
+                    assert force == (pytest.approx(was, abs=1e-4) if math.isfinite(was) else None)
             assert playback.position == 1.5
             playback.ask("play")
             until(lambda: not playback.playing)  # at its end
             assert playback.position == pytest.approx(recording.duration)
             drawn = kept.newest
             until(lambda: kept.newest is not drawn)  # and stays there
+            for odd in ("speed 0", "speed fast", "speed 1e9", "speed nan", "nan", "later"):
+                playback.ask(odd)
+            playback.ask("speed 0.5")
             playback.ask("play")
             until(lambda: 0.0 < playback.position < 1.0)  # and plays again
+            until(lambda: kept.newest["place"]["speed"] == 0.5)
+            marks = [(kind, text) for _, _, kind, text in kept.scene["marks"]]
+            assert ("mode", "disarmed → armed") in marks
+            assert ("mode", "holding → rotating") in marks
+            assert [at for at, *_ in kept.scene["marks"]] == sorted(
+                at for at, *_ in kept.scene["marks"]
+            )
         finally:
             ending.end()
             thread.join()
@@ -358,21 +417,23 @@ def test_while_a_picture_is_drawn_states_wait(context, addresses):
             ending.end()
             thread.join()
     draw()
-    assert "0 lost, 0 unreadable" in kept.newest["facts"]
+    facts = kept.newest["facts"]
+    assert facts[facts.index("Messages lost") + 1] == "0"
+    assert facts[facts.index("Messages unreadable") + 1] == "0"
 
 
 def test_waiting_is_told_and_a_signal_ends_it() -> None:
     with FakeDaemon() as fake:
         fake.silent.set()
         with view(fake) as viewed, Watcher(viewed.host) as page:
-            assert page.next()["status"] == "waiting"
+            assert page.next()["age"] is None
             waiting = f"waiting for a stream from {fake.state_address}"
             assert any(waiting in line for line in viewed.process.stderr)
             fake.silent.clear()
             assert any("the stream has begun" in line for line in viewed.process.stderr)
-            until(lambda: page.next()["status"] == "live")
+            until(lambda: (page.next()["age"] or 1.0) < 0.1)
             fake.silent.set()
-            until(lambda: page.next()["status"] == "lost")
+            until(lambda: page.next()["age"] > 1.0)
             viewed.process.send_signal(signal.SIGINT)
             assert "states seen" in viewed.process.stderr.read()
             assert viewed.process.wait(300) == 0
@@ -400,7 +461,10 @@ def test_bad_input_is_one_clear_line(tmp_path, inline, monkeypatch, words, reaso
 
 def test_pages_whose_port_nobody_chose_get_one_each() -> None:
     with ExitStack() as stack:  # the first one's is taken for the others
-        ports = [stack.enter_context(listen(None)).getsockname()[1] for _ in range(3)]
+        here = "127.0.0.1"
+        ports = [stack.enter_context(listen(here, None)).getsockname()[1] for _ in range(3)]
         assert len(set(ports)) == 3
         with pytest.raises(ViewError, match=f"port {ports[0]}"):
-            listen(ports[0])
+            listen(here, ports[0])
+        with pytest.raises(ViewError, match=r"--host 192\.0\.2\.1 can't be used"):
+            listen("192.0.2.1", None)  # of documentation

@@ -1,4 +1,4 @@
-"""The page of ``softfinger view`` in a real browser: what it shows, and what its buttons do."""
+"""The page of ``softfinger view`` in a real browser: what it shows, and what its controls do."""
 
 import math
 import os
@@ -10,11 +10,13 @@ from typing import Any
 import pytest
 
 from softfinger import Hand
+from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.terminal.feed import MEANINGS
 from softfinger.tools.viewing.planar import COLOURS
 from tests.conftest import until
 from tests.harness.daemon_process import PATIENCE
 from tests.harness.daemon_process import ask as command
+from tests.harness.fake_daemon import FakeDaemon
 from tests.harness.headless_browser import Browser, browser_path
 from tests.harness.recorded_hand import record_hand
 from tests.harness.viewed import Viewed
@@ -27,14 +29,47 @@ pytestmark = [
 LEASE = 10.0  # s
 PATIENT = "\n".join(f"{key} = {value}" for key, value in PATIENCE.items())
 # The fraction of a canvas's pixels that nearly have a colour.
-FRACTION = """((name, colour) => {
-  const canvas = document.querySelector(`.${name} canvas`);
+FRACTION = """((selector, colour) => {
+  const canvas = document.querySelector(`${selector} canvas`);
   const data = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data;
   let count = 0;
   for (let k = 0; k < data.length; k += 4)
     count += data[k + 3] > 200 && colour.every((value, c) => Math.abs(data[k + c] - value) < 30);
   return 4 * count / data.length;
 })"""
+# Every text that can be seen and whose contrast with its ground is below WCAG's AA: 4.5, or 3 for
+# large letters.
+PALE = """(() => {
+  const linear = part => part <= 10.31 ? part / 3294.6 : ((part / 255 + 0.055) / 1.055) ** 2.4;
+  const parts = colour => colour.match(/[\\d.]+/g).map(Number);
+  const light = ([r, g, b]) => 0.2126 * linear(r) + 0.7152 * linear(g) + 0.0722 * linear(b);
+  const ground = element => {
+    for (; element; element = element.parentElement) {
+      const colour = parts(getComputedStyle(element).backgroundColor);
+      if ((colour[3] ?? 1) > 0.99) return colour;
+    }
+  };
+  const found = [];
+  for (const element of document.body.querySelectorAll("*")) {
+    const style = getComputedStyle(element), box = element.getBoundingClientRect();
+    const text = [...element.childNodes].filter(node => node.nodeType === 3 && node.data.trim());
+    if (!text.length || !box.width || style.visibility === "hidden") continue;
+    if (["SCRIPT", "STYLE", "OPTION"].includes(element.tagName)) continue;
+    const both = [light(parts(style.color)), light(ground(element))].sort((a, b) => b - a);
+    const contrast = (both[0] + 0.05) / (both[1] + 0.05), size = parseFloat(style.fontSize);
+    const large = size >= 24 || (size >= 18.7 && style.fontWeight >= 700);
+    if (contrast < (large ? 3 : 4.5)) found.push(`${element.textContent}: ${contrast.toFixed(2)}`);
+  }
+  return found;
+})()"""
+# The buttons and fields that something else covers, or that leave the window.
+COVERED = """[...document.querySelectorAll("button, input, select")].filter(each => {
+  if (!each.offsetWidth || each.closest("dialog")) return false;
+  each.scrollIntoView({ block: "center" });
+  const { left, right, top, bottom } = each.getBoundingClientRect();
+  const there = document.elementFromPoint((left + right) / 2, (top + bottom) / 2);
+  return left < 0 || right > innerWidth || !(there === each || each.contains(there));
+}).map(each => each.outerHTML)"""
 
 
 class Page:
@@ -56,16 +91,43 @@ class Page:
 
     def click(self, selector: str) -> None:
         """Once it may be pressed."""
-        button = f"document.querySelector('footer {selector}')"
+        button = f"document.querySelector('{selector}')"
         until(lambda: self(f"!!{button} && !{button}.disabled"))
         self(f"{button}.click()")
 
-    def key(self, code: str, **named: Any) -> None:
-        for kind in ("keyDown", "keyUp"):
-            self.browser.ask("Input.dispatchKeyEvent", type=kind, code=code, **named)
+    def focus(self, selector: str) -> None:
+        self(f"document.querySelector('{selector}').focus()")
 
-    def fraction(self, panel: str, colour: tuple[int, int, int]) -> float:
-        return float(self(f"{FRACTION}('{panel}', {list(colour)})"))
+    def key(self, code: str, key: str = "", **named: Any) -> None:
+        for kind in ("keyDown", "keyUp"):
+            self.browser.ask("Input.dispatchKeyEvent", type=kind, code=code, key=key, **named)
+
+    def letter(self, key: str) -> None:
+        self.key(f"Key{key.upper()}", key, text=key)
+
+    def arrow(self, where: str) -> None:
+        number = {"Left": 37, "Up": 38, "Right": 39, "Down": 40}[where]
+        self.key(f"Arrow{where}", f"Arrow{where}", windowsVirtualKeyCode=number)
+
+    def type(self, selector: str, text: str) -> None:
+        """Replace what a field has, and press Enter."""
+        self(f"document.querySelector('{selector}').select()")
+        self.browser.ask("Input.insertText", text=text)
+        self.key("Enter", "Enter", text="\r")
+
+    def mouse(self, kind: str, at: tuple[float, float], **named: Any) -> None:
+        self.browser.ask("Input.dispatchMouseEvent", type=kind, x=at[0], y=at[1], **named)
+
+    def place(self, selector: str, across: float) -> tuple[float, float]:
+        """A point on an element, at this share of its width."""
+        left, width, top, height = self(
+            "(({left, width, top, height}) => [left, width, top, height])"
+            f"(document.querySelector('{selector}').getBoundingClientRect())"
+        )
+        return left + across * width, top + 0.5 * height
+
+    def fraction(self, selector: str, colour: tuple[int, int, int]) -> float:
+        return float(self(f"{FRACTION}('{selector}', {list(colour)})"))
 
     def lag(self) -> float:
         """How far the page is behind the stream [s]."""
@@ -75,9 +137,23 @@ class Page:
 @pytest.fixture
 def page(tmp_path: Path) -> Iterator[Page]:
     path = browser_path()
+    assert path is not None
     browser = Browser(path, tmp_path / "profile")
+    browser.prefer("dark")
     yield Page(browser)
     browser.close()
+
+
+def viewing(fake: FakeDaemon, *words: str, folder: Path | None = None) -> Viewed:
+    where = f"{fake.state_address},{fake.command_address}"
+    return Viewed("--address", where, "--timeout", "60", *words, folder=folder)
+
+
+def forces(fake: FakeDaemon) -> list[float]:
+    return [each["force"] for each in fake.requests if each["command"] == "grasp"]
+
+
+# What is shown
 
 
 def test_every_button_brings_its_mode_and_a_lost_page_gives_the_hand_back(
@@ -91,33 +167,37 @@ def test_every_button_brings_its_mode_and_a_lost_page_gives_the_hand_back(
     ):
         page.open(viewed.commanding)
 
-        def press(button: str, mode: str) -> None:
-            page.click(button)
+        def mode_is(mode: str) -> None:
             until(lambda: page.text(".mode") == mode)
             assert hand.state().mode == mode
+
+        def press(button: str, mode: str) -> None:
+            page.click(button)
+            mode_is(mode)
 
         press("[name=arm]", "armed")
         assert "page" in command(commands, "release", client="another")["error"]  # it commands
         press("[name=grasp]", "holding")
         assert hand.state().goal_force == pytest.approx(5.0)
+        page("document.querySelector('#more').open = true")
         for name, colour in COLOURS.items():
-            for panel, seen, least in (
-                ("hand", colour, 0.002),
-                ("plot", colour, 0.0005),
-                ("landscape", colour, 0.0003),
-                (name, (255, 255, 255), 0.001),  # the footprint
-                (name, (132, 198, 74), 0.0005),  # high pressure
-            ):
-                until(lambda: page.fraction(panel, seen) > least)  # noqa: B023
-        until(lambda: page.fraction("hand", (0, 158, 115)) > 0.001)  # the object
+            if name == "goal":
+                continue
+            until(lambda: page.fraction(".hand", colour) > 0.001)  # noqa: B023
+        for name in ("left", "right"):
+            until(lambda: page.fraction(".plot", COLOURS[name]) > 0.0005)  # noqa: B023
+            until(lambda: page.fraction(f".{name}", (255, 255, 255)) > 0.001)  # noqa: B023
+            until(lambda: page.fraction(f".{name}", (132, 198, 74)) > 0.0005)  # noqa: B023
+        until(lambda: page.fraction(".landscape", (88, 166, 255)) > 0.0001)
+        until(lambda: page.text(".headline").count("±") == 4)
         page.click("[name=rotate]:last-of-type")
         hand.wait_for(lambda state: state.goal_angle > math.radians(4.0), 60.0)
         hand.wait_for(lambda state: state.mode == "holding", 60.0)
-        page.click("[name=disarm]")
-        until(lambda: "lets the object fall" in page.text(".reply"))
+        modes = "[...document.querySelectorAll('.legend li')].map(each => each.dataset.mode)"
+        until(lambda: {"holding", "rotating"} <= set(page(modes)))
         press("[name=release]", "armed")
-        page("document.querySelector('[name=grasp]').focus()")
-        page.key("Space", key=" ", text=" ")
+        page.focus("[name=grasp]")
+        page.key("Space", " ", text=" ")
         hand.wait_for(lambda state: state.mode == "disarmed", 60.0)
         until(lambda: page.text(".reply") == "✓ stop: ok")  # and grasp was not pressed
         page.click("[name=tare]")
@@ -125,10 +205,17 @@ def test_every_button_brings_its_mode_and_a_lost_page_gives_the_hand_back(
         hand.collect(1.0)  # the frames of which the tare is the mean
         press("[name=arm]", "armed")
         press("[name=grasp]", "holding")
-        until(lambda: page("Date.now() > asked + 3000"))  # else it counts as pressed again
         page.click("[name=disarm]")
-        until(lambda: "press it again" in page.text(".reply"))
-        press("[name=disarm]", "disarmed")
+        until(lambda: page("document.querySelector('#sure').open"))
+        page.click("#sure [value=no]")
+        until(lambda: not page("document.querySelector('#sure').open"))
+        assert hand.state().mode == "holding"
+        page.click("[name=disarm]")
+        press("#sure [value=disarm]", "disarmed")
+        page("document.activeElement.blur()")
+        for key, mode in (("a", "armed"), ("g", "holding"), ("r", "armed"), ("d", "disarmed")):
+            page.letter(key)
+            mode_is(mode)
         press("[name=arm]", "armed")
         press("[name=stop]", "disarmed")
         press("[name=arm]", "armed")
@@ -138,18 +225,168 @@ def test_every_button_brings_its_mode_and_a_lost_page_gives_the_hand_back(
         viewed.end()
 
 
+def test_the_past_looks_past(page, fake):
+    with viewing(fake) as viewed:
+        page.open(viewed.commanding)
+
+        def old() -> set[str]:
+            names = "[...document.querySelectorAll('.old')].map(each => each.className)"
+            return set(" ".join(page(names)).split()) - {"old", "card"}
+
+        assert page.text(".mode") == "holding"
+        # From when the last state should have been followed by another.
+        assert page("picture.patience.state + scene.period") <= 0.5
+        fake.dead.add("left")
+        until(lambda: old() == {"left"})
+        assert "s old" in page.text(".left .age")
+        fake.dead.clear()
+        until(lambda: not old())
+        fake.silent.set()
+        until(lambda: page.text(".mode") == "No stream")
+        everything = {"left", "right", "hand", "plot", "headline", "landscape"}
+        assert old() == everything
+        assert page("[...document.querySelectorAll('.old .age')].every(each => each.textContent)")
+        assert page("getComputedStyle(document.querySelector('.mode')).backgroundColor") == (
+            "rgb(198, 40, 40)"
+        )
+        until(lambda: page("document.querySelector('[name=release]').disabled"))
+        assert not page("document.querySelector('[name=stop]').disabled")
+        assert page(PALE) == []
+        fake.silent.clear()
+        until(lambda: page.text(".mode") == "holding" and not old())
+        viewed.process.kill()
+        until(lambda: old() == everything)
+        until(lambda: "server doesn't answer" in page.text(".stream"))
+
+
+def test_plots_have_axes_a_cursor_zoom_and_a_pause(page, fake):
+    with viewing(fake) as viewed:
+        page.open(viewed.address)
+        until(lambda: page("past.rows.length") > 40)
+        spans = page("charts.map(chart => [chart.high - chart.low, chart.plot.span])")
+        assert all(shown >= least for shown, least in spans[:4])
+        scales = "JSON.stringify(charts.slice(0, 4).map(chart => [chart.low, chart.high]))"
+        assert page(scales) == page(scales)
+        assert page("view.label(view.range[1], 1)") == "now"
+        assert page("view.label(view.range[1] - 5, 1)") == "−5 s"
+        plot = ".plots figure:first-child canvas"
+        page.mouse("mouseMoved", page.place(plot, 0.9))
+        until(lambda: page("view.cursor") is not None)
+        shown = page("charts[0].values[0].textContent")
+        there = page("past.near(view.cursor)[charts[0].plot.lines[0].column]")
+        assert shown == f"left {there:.1f} ± 0.05"
+        assert page("charts[1].canvas.getAttribute('aria-label')").startswith("Object angle")
+        white = (231, 234, 241)
+        for k in (1, 2, 3, 4):
+            until(lambda: page.fraction(f".plots figure:nth-child({k})", white) > 0.001)  # noqa: B023
+        page.mouse("mouseMoved", (1, 1))
+        until(lambda: page("view.cursor") is None)
+
+        page.mouse("mouseMoved", page.place(plot, 0.6))
+        page.mouse("mousePressed", page.place(plot, 0.6), button="left", clickCount=1)
+        page.mouse("mouseMoved", page.place(plot, 0.9), button="left", buttons=1)
+        page.mouse("mouseReleased", page.place(plot, 0.9), button="left", clickCount=1)
+        until(lambda: page("view.end") is not None)
+        assert 5.0 < page("view.span") < 8.0  # 0.3 of 20 s, which have margins
+        assert page.text("#hold") == "Resume"
+        assert page("/^[0-9:.]+$/.test(view.label(view.range[0], 1))")  # times of day
+        page.click("#follow")
+        assert page("[view.span, view.end]") == [20, None]
+        page.mouse("mouseWheel", page.place(plot, 0.5), deltaX=0, deltaY=-100, modifiers=2)
+        until(lambda: page("view.span") < 20)
+        page("document.activeElement.blur()")
+        page.letter("p")
+        until(lambda: page.text("#hold") == "Resume")
+        shown, seen = page("view.range"), page("picture.seq")
+        until(lambda: page("picture.seq") > seen)
+        assert page("view.range") == shown
+        page.focus(".plots")
+        page.arrow("Left")
+        assert shown[0] < page("view.cursor") < shown[1]
+        page.key("Escape", "Escape")
+        until(lambda: page("[view.span, view.end, view.cursor]") == [20, None, None])
+        assert page("scene.modes.includes('holding')")
+        until(lambda: page.text(".legend") == "holding")
+        for name in ("left", "right"):
+            assert page.text(f".{name} .scale") == "≤ 350 kPa"
+        viewed.end()
+
+
+# Commands
+
+
+def test_controls_follow_the_hand_and_the_last_value_is_always_sent(page, fake):
+    fake.changes = {"goal_force": 9.0}
+    with viewing(fake) as viewed:
+        page.open(viewed.commanding)
+        number, slider = "#force [type=number]", "#force [type=range]"
+
+        def shows(force: float) -> bool:
+            value = f"[...document.querySelectorAll('{number}, {slider}')].map(each => +each.value)"
+            return bool(page(value) == [force, force])
+
+        until(lambda: shows(9.0))
+        fake.changes = {"goal_force": 12.0}  # by another client
+        until(lambda: shows(12.0))
+        page.focus(slider)
+        page.arrow("Right")
+        until(lambda: forces(fake) == [12.5])
+        fake.changes = {"goal_force": 12.5}
+        until(lambda: page.text("#force output") == "✓ 12.5 N accepted")
+
+        fake.deaf.set()  # a slow daemon
+        for _ in range(8):
+            page.arrow("Right")
+        assert shows(16.5)
+        assert "is being sent" in page.text("#force output")
+        fake.deaf.clear()
+        until(lambda: forces(fake)[-1] == 16.5)
+        assert len(forces(fake)) <= 3  # those between were no longer wanted
+        until(lambda: page.text("#force output") == "✓ 16.5 N accepted")
+        fake.changes = {"goal_force": 16.5}
+        until(lambda: page("settings.force.wanted") is None)
+        assert shows(16.5)
+
+        page.type(number, "7.3")
+        until(lambda: forces(fake)[-1] == 7.3)
+        fake.changes = {"goal_force": 7.3}
+        until(lambda: page("settings.force.wanted") is None)
+        page.type(number, "99")
+        until(lambda: "bad" in page("document.querySelector('#force output').className"))
+        assert forces(fake)[-1] == 7.3
+        page.focus("body")
+        page("document.activeElement.blur()")
+
+        fake.replies["grasp"] = {"ok": False, "error": "grasp: too hot for that"}
+        page.key("Equal", "+", text="+")
+        until(lambda: page.text("#force output") == "✗ grasp: too hot for that")
+        until(lambda: page("settings.force.wanted") is None)  # it is not what the hand does
+        del fake.replies["grasp"]
+        until(lambda: page("document.querySelector('#force [type=number]').value") == "7.3")
+
+        fake.deaf.set()
+        for _ in range(2):
+            page.key("Equal", "+", text="+")
+        before = page("lanes.grasp.next !== null")
+        page.key("Space", " ", text=" ")
+        until(lambda: "was not sent: a stop came first" in page.text("#force output"))
+        assert before
+        fake.deaf.clear()
+        until(lambda: [each["command"] for each in fake.requests].count("stop") == 1)
+        viewed.end()
+
+
 def test_the_page_keeps_up_survives_sleep_and_reload_and_asks_nobody_else(page, fake):
-    addresses = f"{fake.state_address},{fake.command_address}"
-    where = ("--address", addresses, "--timeout", "60")
     fake.changes = {"mode": "fault", "fault": "<b>tip.force</b>: 31 N"}
-    with Viewed(*where) as viewed:
+    with viewing(fake) as viewed:
         page.open(viewed.address)  # fills the browser's cache, as a second visit finds it
-        assert "Watching" in page.text("footer")
-        page("document.querySelector('summary').click()")
-        explained = page("document.querySelector('details').innerText")
+        assert "Watching" in page.text("aside")
+        page.click("#help")
+        explained = page("document.querySelector('#explained').innerText")
         assert not [each for each in sum(MEANINGS, ()) if each not in explained]
-        until(lambda: page.text(".fault") == "<b>tip.force</b>: 31 N")
-        page.key("Space", key=" ", text=" ")
+        page.click("#explained button")
+        until(lambda: page.text(".fault") == "Fault: <b>tip.force</b>: 31 N")
+        page.key("Space", " ", text=" ")
         page("send('stop')")
         page.open(viewed.commanding)
         page.click("[name=clear]")
@@ -162,13 +399,10 @@ def test_the_page_keeps_up_survives_sleep_and_reload_and_asks_nobody_else(page, 
         until(lambda: fake.published > asleep + 1000)  # 10 s of the stream
         os.killpg(page.browser.process.pid, signal.SIGCONT)
         until(lambda: page.lag() < 0.5)
+        rows = page("past.rows.map(row => row[0])")
+        assert rows == [*range(rows[0], rows[0] + len(rows))]  # those that it slept through, too
         page.click("[name=stop]")  # heard although the page's connection was given up meanwhile
         until(lambda: fake.requests[-1]["command"] == "stop")
-
-        fake.silent.set()
-        until(lambda: page("document.querySelector('[name=clear]').disabled"))
-        assert not page("document.querySelector('[name=stop]').disabled")
-        fake.silent.clear()
 
         page("location.reload()")
         until(lambda: page("performance.getEntriesByType('navigation')[0].type") == "reload")
@@ -176,15 +410,6 @@ def test_the_page_keeps_up_survives_sleep_and_reload_and_asks_nobody_else(page, 
         page.click("[name=clear]")
         until(lambda: fake.requests[-1]["command"] == "clear")
         assert fake.requests[0]["client"] != fake.requests[-1]["client"]
-
-        page.browser.resize(390, 844, 2)
-        until(lambda: page("document.documentElement.scrollWidth") <= 390)
-        edges = page(
-            "(({left, right, bottom}) => [left, right, bottom])"
-            "(document.querySelector('[name=stop]').getBoundingClientRect())"
-        )
-        assert 0 <= edges[0] < edges[1] <= 390
-        assert edges[2] <= 844
         foreign = [
             url
             for url in page.browser.requests
@@ -202,15 +427,123 @@ def test_the_page_keeps_up_survives_sleep_and_reload_and_asks_nobody_else(page, 
         viewed.end()
 
 
-def test_a_recordings_slider_goes_to_its_place(page, tmp_path):
+def test_the_record_button_writes_a_recording(page, fake, tmp_path):
+    with viewing(fake, folder=tmp_path) as viewed:
+        page.open(viewed.commanding)
+        page.click("[name=record]")
+        until(lambda: page.text("[name=record]").startswith("End recording"))
+        (path,) = tmp_path.glob("softfinger-*.mcap")
+        seen = fake.published
+        until(lambda: fake.published > seen + 50)
+        page.click("[name=record]")
+        until(lambda: page.text("[name=record]") == "Record")
+        assert Recording(path).count(b"hand/state") > 0
+        assert not Recording(path).truncated
+        page.click("[name=record]")  # ends with the page's server
+        until(lambda: len(list(tmp_path.glob("softfinger-*.mcap"))) == 2)
+        viewed.end()
+        assert not any(Recording(each).truncated for each in tmp_path.glob("*.mcap"))
+
+
+# For everybody
+
+
+def test_colours_labels_and_keys_serve_everybody(page, fake):
+    with viewing(fake) as viewed:
+        page.open(viewed.commanding)
+        page("document.querySelectorAll('details').forEach(each => each.open = true)")
+        for preferred in ("light", "dark"):
+            page.browser.prefer(preferred)
+            until(lambda: page("document.documentElement.dataset.theme") == preferred)  # noqa: B023
+            fake.send_event("slip", "the object slips", "warning")
+            fake.send_event("fault", "as a test has it", "error")
+            until(lambda: "as a test has it" in page.text(".events"))
+            assert page(PALE) == []
+        page.click("#theme")
+        until(lambda: page("document.documentElement.dataset.theme") == "light")
+        page.open(viewed.commanding)  # chosen here, for this browser
+        assert page("document.documentElement.dataset.theme") == "light"
+
+        tree = page.browser.ask("Accessibility.getFullAXTree")["nodes"]
+        controls = {"button", "slider", "spinbutton", "combobox", "checkbox", "img"}
+        unnamed = [
+            each
+            for each in tree
+            if each.get("role", {}).get("value") in controls
+            and not each.get("name", {}).get("value")
+        ]
+        assert not unnamed
+        order = []
+        for _ in range(9):
+            page.key("Tab", "Tab", windowsVirtualKeyCode=9)
+            order.append(page("document.activeElement.name || document.activeElement.id"))
+        assert order == [
+            *("record", "theme", "help", "stop", "release", "disarm"),
+            *("force-number", "", "grasp"),
+        ]
+        viewed.end()
+
+
+def test_a_phone_opens_the_page_once_and_can_use_all_of_it(page, fake):
+    with viewing(fake, "--host", "127.0.0.2") as viewed:
+        page.browser.resize(390, 844, 2)
+        page.open(viewed.address)
+        assert page("location.search").startswith("?token=")
+        page("location.reload()")
+        until(lambda: page("document.body?.dataset.seq"))
+        until(lambda: page("document.documentElement.scrollWidth") <= 390)
+        assert page(COVERED) == []
+        left, right, top, bottom = page(
+            "(({left, right, top, bottom}) => [left, right, top, bottom])"
+            "(document.querySelector('.urgent').getBoundingClientRect())"
+        )
+        assert 0 <= left < right <= 390
+        assert bottom <= 844
+        assert bottom - top < 0.1 * 844
+        small = (
+            "[...document.querySelectorAll('aside button')]"
+            ".filter(each => each.offsetHeight < 44).length"
+        )
+        assert page(small) == 0
+        page.click("[name=stop]")
+        until(lambda: fake.requests and fake.requests[-1]["command"] == "stop")
+        page.browser.resize(1280, 800)
+        assert page(COVERED) == []
+        viewed.end()
+
+
+# A recording
+
+
+def test_a_recording_is_played(page, tmp_path):
     path = tmp_path / "a.mcap"
     record_hand(path, {30: {"command": "arm"}, 60: {"command": "grasp", "force": 8.0}}, 2.0)
     with Viewed(str(path)) as viewed:
         page.open(viewed.address)
-        until(lambda: page.text(".reply").startswith("2.0 of 2.0"))
+        until(lambda: page.text("#clock") == "2.0 of 2.0 s")
+        until(lambda: page.text("#playing") == "Play")
         assert page("document.querySelector('[name=stop]')") is None
         assert page.text(".mode") == "holding"
-        page("document.querySelector('#place').focus()")
-        page.key("Home", key="Home", windowsVirtualKeyCode=36)
+        until(lambda: page("scene.marks.length") == 3)
+        for colour in ((90, 98, 112), (149, 87, 0), (0, 117, 86)):  # disarmed, grasping, holding
+            until(lambda: page.fraction(".track", colour) > 0.001)  # noqa: B023
+        page.focus("#place")
+        page.key("Home", "Home", windowsVirtualKeyCode=36)
         until(lambda: page.text(".mode") == "disarmed")
+        assert page("past.rows.every(row => row[1] - view.start < 0.5)")
+        page("document.activeElement.blur()")
+        page.key("Period", ".", text=".")
+        until(lambda: page.text("#mark") == "disarmed → armed")
+        page.arrow("Right")
+        until(lambda: page("picture.place.position") > 1.0)
+        page("const speed = document.querySelector('#speed'); speed.value = '0.1'")
+        page("document.querySelector('#speed').onchange()")
+        page.key("Space", " ", text=" ")
+        until(lambda: page("picture.place.playing && picture.place.speed === 0.1"))
+        page.key("Space", " ", text=" ")
+        until(lambda: not page("picture.place.playing"))
+        assert page(PALE) == []
+        page.browser.resize(390, 844, 2)
+        until(lambda: page("document.documentElement.scrollWidth") <= 390)
+        assert page(COVERED) == []
         viewed.end()

@@ -26,7 +26,7 @@ from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.schema import HandState
 from softfinger.tools.recordings import channels
 from softfinger.tools.terminal.feed import number
-from softfinger.tools.viewing.planar import Colour, Drawn, hand_parts
+from softfinger.tools.viewing.planar import COLOURS, Drawn, hand_parts
 
 LAYOUT = Path(__file__).with_name("foxglove_layout.json")
 ORIGINS = ("https://app.foxglove.dev", "file://")  # of Foxglove in the browser and on the desktop
@@ -188,5 +188,5 @@ def _pose(x: float, y: float) -> dict[str, Any]:
     return {"position": _point(x, y), "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}}
 
 
-def _colour(colour: Colour) -> dict[str, float]:
-    return dict(zip("rgb", (part / 255.0 for part in colour), strict=True)) | {"a": 1.0}
+def _colour(name: str) -> dict[str, float]:
+    return dict(zip("rgb", (part / 255.0 for part in COLOURS[name]), strict=True)) | {"a": 1.0}

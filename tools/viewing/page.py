@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import errno
 import json
 import logging
 import os
@@ -22,7 +23,7 @@ from collections.abc import Awaitable, Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import parse_qs, urlsplit
 
 from websockets.asyncio.server import ServerConnection, serve
@@ -37,11 +38,12 @@ from softfinger.tools.processes.compile import build_kernels
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.terminal.feed import MEANINGS, judge
 from softfinger.tools.viewing.foxglove_server import LAYOUT, ORIGINS, PROTOCOLS, Foxglove
-from softfinger.tools.viewing.pictures import Pictures
+from softfinger.tools.viewing.pictures import Pictures, Row
+from softfinger.tools.viewing.recorder import PageRecorder
 from softfinger.tools.viewing.sources import Playback, ViewError, follow
 
 _HELP = "".join(f"<dt><b>{words}</b><dd>{meaning}" for words, meaning in MEANINGS)
-_PAGE = Path(__file__).with_name("page.html").read_text("utf-8").replace("MEANINGS", _HELP)
+_WEB = Path(__file__).with_name("web")
 _LOOPBACK = "127.0.0.1"
 _PORT = 9090  # where nobody says another
 _NICE = 5  # everything real-time goes first
@@ -52,29 +54,59 @@ _LARGEST = 65536  # bytes of what a page or a client of Foxglove sends
 _say = to_stderr("view")
 
 
+def _page() -> str:
+    """Return the whole page: what a browser loads is one document, with style and scripts."""
+    html, style, *scripts = (
+        (_WEB / name).read_text("utf-8")
+        for name in ("page.html", "page.css", "charts.js", "controls.js", "page.js")
+    )
+    parts = {"MEANINGS": _HELP, "STYLE": style, "SCRIPTS": "".join(scripts)}
+    return re.sub("MEANINGS|STYLE|SCRIPTS", lambda word: parts[word[0]], html)
+
+
+_PAGE = _page()
+
+
+class _Published(NamedTuple):
+    """A picture, with what a page needs beside it."""
+
+    scene: str
+    picture: str
+    rows: list[Row]
+
+
 class Site:
     """The page, the pictures and commands of all pages, and what Foxglove connects to.
 
     Lets in what names this machine as its host, and pages of this very server: a name that an
     attacker's DNS leads here is another host; a foreign page's requests carry its own origin.
-    Pages with the ``token`` may command, by ``send``; None: they play a recording, by ``wish``.
+    Pages with the ``token`` may command, by ``send``; without it they play a recording, by
+    ``wish``. Where other machines can reach it, even looking needs the token, and a browser gets
+    it for a code that is good for one.
     """
 
     def __init__(
         self,
         loop: asyncio.AbstractEventLoop,
-        token: str | None,
-        send: Callable[[dict[str, Any], float], dict[str, Any]],
+        token: str,
+        send: Callable[[dict[str, Any], float], dict[str, Any]] | None,
         foxglove: Foxglove | None,
         stale: float,
+        announce: Callable[[str], None] | None = None,
     ) -> None:
-        """``stale`` [s] after its picture a command is dropped."""
+        """``stale`` [s] after its picture a command is dropped.
+
+        ``announce``, of a page that other machines can reach, is told each one-time code.
+        """
         self._loop = loop
         self._token = token
+        self._code = ""  # for one browser
+        self._announce = announce
         self._send = send
         self._stale = stale
         self._ended = asyncio.Event()
-        self.waiting: list[asyncio.Future[tuple[str, str]]] = []  # pages, for the next picture
+        self.waiting: list[asyncio.Future[_Published]] = []  # pages, for the next picture
+        self.record: Callable[[], str] = lambda: ""  # begins a recording, or ends it
         self.wish: Callable[[str], None] = lambda _: None  # what pages ask with each picture
         self._routes: dict[str, Callable[[ServerConnection], Awaitable[None]]] = {
             "/pictures": self._show,
@@ -83,9 +115,15 @@ class Site:
         if foxglove is not None:
             self._routes["/"] = foxglove.serve
 
-    def publish(self, scene: str, picture: str) -> None:
-        """Give both to the pages that wait, from another thread."""
-        self._loop.call_soon_threadsafe(self._give, (scene, picture))
+    def publish(self, scene: str, picture: str, rows: list[Row]) -> None:
+        """Give them to the pages that wait, from another thread."""
+        self._loop.call_soon_threadsafe(self._give, _Published(scene, picture, rows))
+
+    def announce(self) -> None:
+        """Make a new one-time code, and tell it, if one is needed."""
+        if self._announce is not None:
+            self._code = secrets.token_urlsafe(8)
+            self._announce(self._code)
 
     def end(self) -> None:
         """End `run`, from another thread."""
@@ -122,6 +160,10 @@ class Site:
         if upgrade and path == "/":
             known += [[origin] for origin in ORIGINS]
         here = [host.partition(":")[0] in (_LOOPBACK, "localhost") for host in hosts]
+        if self._announce is not None:  # each request has a secret; its host may have any name
+            here = [True]
+            if not self._allows(request):
+                return self._exchange(connection, request)
         if here != [True] or origins not in known:
             return connection.respond(403, "only for pages of this machine")
         if upgrade and path in self._routes:
@@ -129,45 +171,58 @@ class Site:
         if upgrade or path != "/":
             return connection.respond(404, "nothing here")
         watched = "command" if self._allows(request) else "watch"
-        shown = "play" if self._token is None else watched
+        shown = "play" if self._send is None else watched
         others = rf'<section class="(?!{shown}).*?</section>'
         response = connection.respond(200, re.sub(others, "", _PAGE, flags=re.S))
         del response.headers["Content-Type"]
         response.headers["Content-Type"] = "text/html; charset=utf-8"
         return response
 
+    def _exchange(self, connection: ServerConnection, request: Request) -> Response:
+        """Send a browser with the one-time code to the page with the token; refuse others."""
+        if not self._code or not _has(request, "code", self._code):
+            said = "This page needs the newest address that softfinger view prints; each works once"
+            return connection.respond(403, said)
+        self.announce()
+        response = connection.respond(303, "")
+        response.headers["Location"] = f"/?token={self._token}"
+        return response
+
     def _allows(self, request: Request) -> bool:
         """Return whether it has the token."""
-        given = parse_qs(urlsplit(request.path).query).get("token", [""])[0]
-        token = self._token
-        return token is not None and secrets.compare_digest(given.encode(), token.encode())
+        return _has(request, "token", self._token)
 
     async def _serve(self, connection: ServerConnection) -> None:
         assert connection.request is not None
         await self._routes[urlsplit(connection.request.path).path](connection)
 
-    def _give(self, pair: tuple[str, str]) -> None:
+    def _give(self, published: _Published) -> None:
         for each in self.waiting:
             if not each.done():
-                each.set_result(pair)
+                each.set_result(published)
         self.waiting = []
 
     async def _show(self, page: ServerConnection) -> None:
-        """Send a page the next picture each time it asks, and the scene where it is another."""
-        known = ""
+        """Send a page the next picture each time it asks, with the rows that it does not have.
+
+        Before it the scene, where it is another.
+        """
+        known, next_row = "", 0
         async for wish in page:
             self.wish(str(wish))
             self.waiting.append(self._loop.create_future())
-            scene, picture = await self.waiting[-1]
+            scene, picture, rows = await self.waiting[-1]
             if scene != known:
                 await page.send(scene)
             known = scene
-            await page.send(picture)
+            fresh = [row.text for row in rows if row.number >= next_row]
+            next_row = rows[-1].number + 1 if rows else next_row
+            await page.send(f'{picture[:-1]},"rows":[{",".join(fresh)}]}}')
 
     async def _command(self, page: ServerConnection) -> None:
         """Carry out what a page with the token asks of the daemon, once, and tell it the answer."""
         assert page.request is not None
-        allowed = self._allows(page.request)
+        allowed = self._send is not None and self._allows(page.request)
         async for text in page:
             answer = "✗ needs the token that the terminal prints"
             if allowed:
@@ -185,24 +240,38 @@ class Site:
             age = time.monotonic() - float(asked.pop("seen", "nan"))
         except (ValueError, TypeError, LookupError, AttributeError) as error:
             return f"✗ no command: {error!r}"
+        if name == "record":
+            return self.record()
         if name != "stop" and not age < self._stale:
             return f"✗ {name}: dropped, the page is {age:.0f} s behind"
         try:
             remaining = self._stale if name == "stop" else self._stale - age
+            assert self._send is not None
             reply = judge(time.monotonic(), name, self._send(asked, remaining))
         except NoAnswer as error:
             return f"✗ {name}: {error}"
         return f"{'✓' if reply.ok else '✗'} {reply.text}"
 
 
-def listen(port: int | None) -> socket.socket:
-    """A socket on ``port``; None: 9090 or, where that is taken, any. Raises ViewError."""
+def _has(request: Request, name: str, secret: str) -> bool:
+    """Return True if the request's query has this secret under ``name``."""
+    given = parse_qs(urlsplit(request.path).query).get(name, [""])[0]
+    return secrets.compare_digest(given.encode(), secret.encode())
+
+
+def listen(host: str, port: int | None) -> socket.socket:
+    """A socket on ``port`` of ``host``; None: 9090 or, where that is taken, any.
+
+    Raises ViewError.
+    """
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
-        listener = socket.create_server((_LOOPBACK, _PORT if port is None else port))
+        listener = socket.create_server((host, _PORT if port is None else port), family=family)
     except OSError as error:
-        if port is not None:
-            raise ViewError(f"port {port} can't be used: {error.strerror}") from None
-        return listen(0)
+        if port is not None or error.errno != errno.EADDRINUSE:
+            at = f"--host {host}" if port is None else f"port {port} of {host}"
+            raise ViewError(f"{at} can't be used: {error.strerror}") from None
+        return listen(host, 0)
     # What waits in the system's buffer is what a client takes without reading.
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER)
     return listener
@@ -217,42 +286,70 @@ def show(arguments: argparse.Namespace, ending: Ending) -> None:
     loop = asyncio.new_event_loop()
     loop.set_default_executor(ThreadPoolExecutor(_AT_ONCE))
     foxglove = Foxglove(loop) if arguments.foxglove is not None else None
-    live = recording is None
-    token = secrets.token_urlsafe(16) if live else None
-    hand_on = partial(send, arguments.commands, keys=keys)
-    site = Site(loop, token, hand_on, foxglove, arguments.timeout)
-    pictures = Pictures(
-        site.publish, lambda: bool(site.waiting), _say, live=live, foxglove=foxglove
-    )
-    source = partial(follow, arguments, keys, pictures, ending, _say)
-    if recording is not None:
-        playback = Playback(recording, pictures, 1.0 / arguments.rate)
-        site.wish, source = playback.ask, partial(playback.run, ending)
+    live, away = recording is None, arguments.host not in (_LOOPBACK, "localhost", "::1")
+    token = secrets.token_urlsafe(16)
+    hand_on = partial(send, arguments.commands, keys=keys) if live else None
+    port = arguments.port if foxglove is None else arguments.foxglove
+    with listen(arguments.host, port) as listener:
+        address = _address(listener)
 
-    def run(listener: socket.socket) -> None:
-        try:
-            loop.run_until_complete(site.run(listener))
-        finally:
-            ending.end()
+        def announce(code: str) -> None:
+            print(f"view: http://{address}/?code={code} opens in one browser", flush=True)
 
-    with listen(arguments.port if foxglove is None else arguments.foxglove) as listener:
-        serving = threading.Thread(target=run, args=(listener,))
+        site = Site(loop, token, hand_on, foxglove, arguments.timeout, announce if away else None)
+        period = 1.0 / arguments.rate
+        pictures = Pictures(
+            site.publish,
+            lambda: bool(site.waiting),
+            _say,
+            live=live,
+            period=period,
+            foxglove=foxglove,
+        )
+        recorder = PageRecorder(
+            arguments.address, str(arguments.keys or ""), partial(setattr, pictures, "recording")
+        )
+        site.record = recorder.toggle
+        source = partial(follow, arguments, keys, pictures, ending, _say)
+        if recording is not None:
+            playback = Playback(recording, pictures, period)
+            site.wish, source = playback.ask, partial(playback.run, ending)
+
+        def run() -> None:
+            try:
+                loop.run_until_complete(site.run(listener))
+            finally:
+                ending.end()
+
+        serving = threading.Thread(target=run)
         serving.start()
-        host = f"{_LOOPBACK}:{listener.getsockname()[1]}"
         try:
             if foxglove is not None:
-                print(f"view: ws://{host} for Foxglove; layout: {LAYOUT}")
-            if token is not None:
-                print(f"view: http://{host}/?token={token} to see and command the hand")
-            print(f"view: http://{host}/ to see it", flush=True)
-            if foxglove is None and not arguments.no_browser:
+                secret = f"/?token={token}" if away else ""
+                print(f"view: ws://{address}{secret} for Foxglove; layout: {LAYOUT}")
+            if live and not away:
+                print(f"view: http://{address}/?token={token} to see and command the hand")
+            if away:
+                site.announce()
+            else:
+                print(f"view: http://{address}/ to see it", flush=True)
+            if foxglove is None and not away and not arguments.no_browser:
                 # Without the token: other users of this machine may read a browser's command line.
-                webbrowser.open(f"http://{host}/")
+                webbrowser.open(f"http://{address}/")
             ending.begin()
             source()
         finally:
+            recorder.close()
             site.end()
             serving.join()
     _say(f"{pictures.seen} states seen, {pictures.unreadable} messages could not be read")
     if pictures.seen == 0:
         raise ViewError(f"{arguments.file or arguments.address}: nothing came that can be shown")
+
+
+def _address(listener: socket.socket) -> str:
+    """Host and port for a browser; of all addresses of this machine its name."""
+    host, port = listener.getsockname()[:2]
+    if host in ("0.0.0.0", "::"):
+        host = socket.gethostname()
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"

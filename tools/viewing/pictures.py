@@ -1,8 +1,8 @@
-"""The stream's messages as what a page draws: one picture for all pages, whole each time.
+"""The stream's messages as data that a page draws: the scene, pictures, and rows of the plots.
 
-A picture is JSON: lines, dots, texts and images of each panel, and the last seconds of the plots.
-Nothing in it refers to an earlier one, so that a page may miss as many as it likes. What stands
-still, as the energy landscape, is the scene.
+A picture is JSON: lines, dots, texts and images of each panel, of one moment. The scene is what
+stands still: the layout, the energy landscape. A row has the values of all plots at one moment; a
+page gets each row once, also when it misses pictures. Colours are names, which the page has RGB of.
 """
 
 from __future__ import annotations
@@ -12,16 +12,16 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable
-from itertools import groupby, takewhile
+from itertools import takewhile
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import orjson
 from numpy.typing import NDArray
 
 from softfinger.daemon.client.stream import Gaps
-from softfinger.daemon.control.modes import COMMANDS
+from softfinger.daemon.control.modes import COMMANDS, GRIPPING, Mode
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.physics.simulated_hand import geometry_of
 from softfinger.daemon.types import FINGERS
@@ -29,58 +29,99 @@ from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.schema import HandState
 from softfinger.tools.terminal import heatmap
 from softfinger.tools.terminal.feed import Feed, number, printable, text
+from softfinger.tools.terminal.status import why_invalid
 from softfinger.tools.terminal.typeset import micro, short
 from softfinger.tools.viewing import planar
 from softfinger.tools.viewing.known import THETA_END, fingers_of, landscape, read_settings
-from softfinger.tools.viewing.planar import COLOURS, GOAL, OBJECT, Colour, FloatArray, touches
+from softfinger.tools.viewing.planar import GOAL, OBJECT, FloatArray, touches
 
 if TYPE_CHECKING:
     from softfinger.tools.viewing.foxglove_server import Foxglove
 
 TOPICS = (*Feed().topics, schema.TRUTH)
-SECONDS = 12.0  # of the past in the plots
-_STEP = 0.2  # s from one column of the plots to the next
-_TRAIL = 30  # of these columns on the landscape
-_EVENTS = 30  # shown
+SECONDS = 60.0  # of the past that a page gets when it opens
+STEP = 0.1  # s from one row of the plots to the next
+_TRAIL = 60  # of these rows on the landscape
+_EVENTS = 50  # shown
 _LATELY = 5.0  # s for which a warning counts as present
-_LATE = (204, 96, 150)
-_WHITE = (255, 255, 255)
-_GRID = (44, 48, 64)
-_OUTSIDE = (112, 112, 116)  # where no such contact can be
+_NEAR = 0.8  # of a limit from which it is shown
+_DARK = 2.0  # standard deviations of a cell's noise that a pressure map draws as zero
+_SMALLEST = 10.0  # likewise, the least end of its scale
+_PATIENCE = 0.35  # s without a message from which the last one is shown as old …
+_PERIODS = 4.0  # … or so many of the stream's periods, where that is longer
 _MOST = 1e6  # of what is drawn; a stranger's numbers are of any size
 _DEGREE = math.degrees(1.0)
-_LEVELS = {"info": (120, 120, 120), "warning": (214, 140, 0), "error": (214, 54, 40)}
-_MODES = {
-    "disarmed": (120, 120, 120),
-    "armed": (86, 140, 190),
-    "moving": (120, 100, 190),
-    "grasping": (230, 160, 30),
-    "holding": (0, 158, 115),
-    "rotating": (60, 170, 210),
-    "releasing": (190, 150, 90),
-    "fault": (214, 54, 40),
-}
-_PLOTS = {  # title: factor, fields of `hand/state`
-    "Force [N]": (1.0, "left.force right.force goal_force"),
-    "Displacement d [mm]": (1e3, "left.d right.d"),
-    "Object's angle [°]": (_DEGREE, "object.angle goal_angle"),
-    "Tilt θ [°]": (_DEGREE, "left.theta right.theta"),
-    "Energy [mJ]": (1e3, "left.energy right.energy"),
-    "Joints [°]": (_DEGREE, "left.q right.q left.goal_q right.goal_q"),
-    "Currents [A]": (1.0, "left.current right.current left.goal_current right.goal_current"),
-    "Tick [µs]": (1e6, "compute_s wake_late_s"),
-}
+
+
+class _Plot(NamedTuple):
+    """Lines over time, in ``unit``; ``span`` is the least height of its scale."""
+
+    title: str
+    unit: str
+    factor: float
+    span: float
+    paths: str  # fields of `hand/state`
+    detail: bool = False  # shown on demand
+
+
+_PLOTS = (
+    _Plot("Force", "N", 1.0, 2.0, "left.force right.force goal_force"),
+    _Plot("Object angle", "°", _DEGREE, 4.0, "object.angle goal_angle"),
+    _Plot("Displacement d", "mm", 1e3, 0.5, "left.d right.d"),
+    _Plot("Tilt θ", "°", _DEGREE, 4.0, "left.theta right.theta"),
+    _Plot("Object width", "mm", 1e3, 1.0, "object.width", True),
+    _Plot("Elastic energy", "mJ", 1e3, 2.0, "left.energy right.energy", True),
+    _Plot("Joint angles", "°", _DEGREE, 2.0, "left.q right.q left.goal_q right.goal_q", True),
+    _Plot(
+        "Motor current",
+        "A",
+        1.0,
+        0.2,
+        "left.current right.current left.goal_current right.goal_current",
+        True,
+    ),
+    _Plot("Loop times", "µs", 1e6, 50.0, "compute_s wake_late_s", True),
+)
+_HEADLINE = (  # title, decimals, fields of the plots
+    ("Force", 1, "left.force right.force goal_force"),
+    ("Object angle", 1, "object.angle goal_angle"),
+    ("Object width", 1, "object.width"),
+    ("Displacement d", 2, "left.d right.d"),
+)
 _SERVOS = ("q", "current")  # what a hand without servos lacks
 _DEVIATED = ("force", "d", "theta")  # fields of a finger whose {}_std is drawn, too
 _OTHERS = {  # names and colours of lines that are no finger's
     "object.angle": ("object", OBJECT),
+    "object.width": ("object", OBJECT),
     "compute_s": ("work", OBJECT),
-    "wake_late_s": ("late", _LATE),
+    "wake_late_s": ("late", "late"),
 }
 _BOUNDED = ("force", "d", "current", "temperature")  # of a finger, each by `safety.…_max`
-_PATHS = [path for _, paths in _PLOTS.values() for path in paths.split()]
-_PATHS += [f"{side}.{key}_std" for side in FINGERS for key in _DEVIATED]
-_row = attrgetter("timestamp", "object.valid", *_PATHS)
+_FACTORS = {path: plot.factor for plot in _PLOTS for path in plot.paths.split()}
+_FACTORS |= {
+    f"{path}_std": factor
+    for path, factor in _FACTORS.items()
+    if path.rpartition(".")[2] in _DEVIATED
+}
+_COLUMNS = {path: 3 + k for k, path in enumerate(_FACTORS)}  # after number, time and mode
+_values = attrgetter(*_FACTORS)
+
+
+def _row(number: int, state: HandState) -> list[Any]:
+    """A row of the plots; NaN where the hand has no value."""
+    row = [number, state.timestamp, printable(state.mode)]
+    for value, factor in zip(_values(state), _FACTORS.values(), strict=True):
+        row.append(round(min(max(factor * value, -_MOST), _MOST), 4))
+    if not state.object.valid:
+        row[_COLUMNS["object.angle"]] = row[_COLUMNS["object.width"]] = math.nan
+    return row
+
+
+class Row(NamedTuple):
+    """A row of the plots, as a page gets it. ``number`` counts up."""
+
+    number: int
+    text: str
 
 
 class Pictures:
@@ -92,18 +133,24 @@ class Pictures:
 
     def __init__(
         self,
-        publish: Callable[[str, str], None],
+        publish: Callable[[str, str, list[Row]], None],
         watched: Callable[[], bool],
         say: Callable[[str], None],
         *,
         live: bool = True,
+        period: float = STEP,
         foxglove: Foxglove | None = None,
     ) -> None:
+        """``period`` [s] from one picture to the next."""
         self._publish = publish
         self._watched = watched
         self._say = say
         self._live = live
         self._foxglove = foxglove
+        self._period = period
+        self._number = 0  # of rows so far
+        self._marks: list[Any] = []
+        self.recording: dict[str, Any] = {}  # by the page's recorder
         self._settings_text = ""  # as they came
         self.seen = self.unreadable = 0  # states; messages
         self.clear()
@@ -116,10 +163,12 @@ class Pictures:
         self.time = math.nan  # of the newest state [Unix s]
         self._truth: dict[str, Any] | None = None
         self._gaps = {topic: Gaps() for topic in TOPICS}
-        self._past: deque[tuple[HandState, tuple[float, ...]]] = deque(
-            maxlen=round(SECONDS / _STEP)
-        )
-        self._pressure = heatmap.FullScale(5e3)
+        self._begin_rows()
+
+    def _begin_rows(self) -> None:
+        """Forget the rows: pages drop those before the one that comes next."""
+        self._first = self._number
+        self._past: deque[tuple[HandState, Row]] = deque(maxlen=round(SECONDS / STEP))
 
     def _moment(self) -> float:
         return time.monotonic() if self._live else self.time
@@ -134,9 +183,11 @@ class Pictures:
             return
         if topic == schema.STATE:
             if number(message, "seq") < self.feed.state.seq:
-                self._past.clear()  # another daemon's
-            elif self.states and self.time // _STEP != stamp // _STEP:
-                self._past.append((self.feed.state, _row(self.feed.state)))  # the step's last
+                self._begin_rows()  # another daemon's
+            elif self.states and self.time // STEP != stamp // STEP:
+                last = self.feed.state  # of the step
+                self._past.append((last, Row(self._number, _packed(_row(self._number, last)))))
+                self._number += 1
             self.time = stamp
             self.states += 1
             self.seen += 1
@@ -155,6 +206,7 @@ class Pictures:
     def _know(self, settings: Settings) -> None:
         """Lay out the scene of a hand: panels and plots of what it has, and no others."""
         self._settings, self._fingers = settings, fingers_of(settings)
+        self._pressure = heatmap.FullScale(heatmap.round_up(_SMALLEST * settings.tactile.noise))
         hand, rows, cols = geometry_of(settings), settings.tactile.rows, settings.tactile.cols
         a = hand.tip_radius
         half, top = hand.half_separation + 1.3 * a, hand.reach + 1.9 * a
@@ -174,21 +226,33 @@ class Pictures:
             image = _image(energy.levels, -THETA_END, THETA_END, end, 0.0)
             still = {"image": image, "texts": texts}
             box = -1.3 * THETA_END, 1.05 * THETA_END, 1.05 * end, -0.1 * end
-            title = f"Energy U(d, θ) to {1e3 * energy.highest:.0f} mJ, ∝ ∛U"
+            title = f"Elastic energy U(d, θ), 0 to {1e3 * energy.highest:.0f} mJ"
             panels.append(_panel("landscape", title, *box, still=still))
-        every = {
-            title: (by, [*filter(self._has, of.split())]) for title, (by, of) in _PLOTS.items()
-        }
-        self._plots = {title: (by, paths) for title, (by, paths) in every.items() if paths}
-        scene = {
-            "step": _STEP,
-            "panels": [*panels, *(_panel(title, title) for title in self._plots)],
-            "modes": _MODES,
-            "levels": _LEVELS,
-            "palette": [*heatmap.colour_map(), _OUTSIDE],
+        plots = [(plot, [*filter(self._has, plot.paths.split())]) for plot in _PLOTS]
+        self._scene = {
+            "live": self._live,
+            "period": self._period,
+            "step": STEP,
+            "panels": panels,
+            "plots": [_described(plot, paths) for plot, paths in plots if paths],
+            "headline": [
+                (title, decimals, shown)
+                for title, decimals, paths in _HEADLINE
+                if (shown := [*filter(self._has, paths.split())])
+            ],
+            "columns": _COLUMNS,
+            "palette": heatmap.colour_map(),
+            "modes": [mode.value for mode in Mode],
             "commands": {name: list(modes) for name, (modes, _) in COMMANDS.items()},
+            "force_default": settings.control.force_default,
+            "marks": self._marks,
         }
-        self._scene = _packed(scene)
+        self._scene_text = _packed(self._scene)
+
+    def mark(self, marks: list[Any]) -> None:
+        """Show a recording's ``marks``, from `sources.marks_of`."""
+        self._marks = self._scene["marks"] = marks
+        self._scene_text = _packed(self._scene)
 
     def _has(self, path: str) -> bool:
         """Return whether the hand has what is at this path of the state."""
@@ -197,38 +261,56 @@ class Pictures:
         return not (
             (finger in FINGERS and finger not in self._fingers)
             or (no_servos and key.removeprefix("goal_") in _SERVOS)
-            or (path in ("object.angle", "goal_angle") and len(self._fingers) < 2)
+            or (path in ("object.angle", "object.width", "goal_angle") and len(self._fingers) < 2)
         )
 
-    def draw(self, place: tuple[float, float, bool] | None = None) -> None:
-        """Publish a picture of what has come so far, where anybody looks.
+    def draw(self, place: dict[str, Any] | None = None) -> None:
+        """Publish a picture of what has come so far, if a page waits for one.
 
-        ``place``: of a recording the position and duration [s], and whether it plays.
+        ``place``: of a recording, see `sources.Playback`.
         """
         now, feed, state = self._moment(), self.feed, self.feed.state
         if self._foxglove is not None and self.states:
             self._foxglove.draw(self._settings, state, self._truth)
         if not self._watched():
             return
-        angle = state.goal_angle if math.isfinite(state.goal_angle) else state.object.angle
+        settings = self._settings
         picture = {
             "now": time.monotonic(),
             "time": self.time,
             "seq": state.seq,
             "mode": feed.mode,
-            "status": feed.status(now) if self._live else "recording",
+            "age": feed.age(now),
+            "patience": {
+                "state": max(_PATIENCE, _PERIODS / feed.rate),
+                "frame": max(_PATIENCE, _PERIODS / settings.stream.tactile_rate),
+            },
             "fault": feed.fault,
             "place": place,
-            "angle": math.degrees(angle),
+            "set": self._set(),
             "force_max": feed.force_limit,
-            "limits": self._limits(),
-            "facts": self._facts(now),
-            "panels": self._maps(now)
-            | {"hand": self._planar(), "landscape": self._contacts()}
-            | self._graphs(),
-            "events": [(each.clock(), *each[1:]) for each in feed.events[-_EVENTS:]],
+            "notes": self._notes(),
+            "facts": [part for fact in self._facts(now) for part in fact],
+            "panels": self._maps(now) | {"hand": self._planar(), "landscape": self._contacts()},
+            "events": [
+                (each.timestamp, each.clock(), *each[1:]) for each in feed.events[-_EVENTS:]
+            ],
+            "recording": self.recording,
+            "first": self._first,
+            "row": _row(self._number, state) if self.states else None,
         }
-        self._publish(self._scene, _packed(picture))
+        self._publish(self._scene_text, _packed(picture), [row for _, row in self._past])
+
+    def _set(self) -> dict[str, float]:
+        """The grip's requested force [N] and angle [°], NaN without a grip."""
+        feed, state = self.feed, self.feed.state
+        angle = state.goal_angle if math.isfinite(state.goal_angle) else state.object.angle
+        force = feed.commanded if math.isfinite(feed.commanded) else state.goal_force
+        gripping = feed.mode in GRIPPING
+        return {
+            "force": force if gripping else math.nan,
+            "angle": math.degrees(angle) if gripping else math.nan,
+        }
 
     def _planar(self) -> dict[str, Any]:
         parts = planar.hand_parts(self._settings, self.feed.state, self._truth).values()
@@ -238,26 +320,31 @@ class Pictures:
 
     def _maps(self, now: float) -> dict[str, Any]:
         """Each tip's frame with its rim, and footprint and centroid of the contact."""
-        frames, radius = self.feed.frames, self._settings.tip.radius
+        frames, tip = self.feed.frames, self._settings.tip.radius
         peak = max((float(frame.grid.max()) for frame in frames.values()), default=0.0)
         full = self._pressure.follow(peak, now)
         maps = {}
         for name, frame in frames.items():
-            unit, factor = ("counts", 1.0) if math.isnan(frame.scale) else ("kPa", 1e-3)
+            unit, factor, dark = "kPa", 1e-3, _DARK * self._settings.tactile.noise
+            if math.isnan(frame.scale):
+                unit, factor, dark = "counts", 1.0, 0.0
             lines, dots, (rows, cols) = [], [], frame.grid.shape
             grid, contact = planar.grid_of(frame.source), self.feed.state.finger(name)
             if grid is not None:
-                lines.append((COLOURS[name], 1.0, _flat(planar.tip_circle(grid, radius))))
+                lines.append((name, 1.0, _flat(planar.tip_circle(grid, tip))))
             if grid is not None and touches(contact):
                 tilts = contact.theta, contact.tilt_y if math.isfinite(contact.tilt_y) else 0.0
-                if place := planar.footprint(grid, radius, contact.d, *tilts):
-                    lines.append((_WHITE, 1.5, _flat(place[0])))
-                    dots.append((COLOURS[name], *_flat(place[1])))
+                if place := planar.footprint(grid, tip, contact.d, *tilts):
+                    lines.append(("white", 1.5, _flat(place[0])))
+                    dots.append((name, *_flat(place[1])))
+            levels = heatmap.levels_of(frame.grid - dark, full - dark)
             maps[name] = {
-                "image": _image(heatmap.levels_of(frame.grid, full), 0, cols, 0, rows),
+                "image": _image(levels, 0, cols, 0, rows),
                 "lines": lines,
                 "dots": dots,
-                "note": f"peak {factor * frame.grid.max():.1f} of {factor * full:g} {unit}",
+                "age": now - frame.arrived,
+                "note": f"peak {factor * frame.grid.max():.1f} {unit}",
+                "scale": (f"≤ {factor * dark:.0f}", f"{factor * full:g} {unit}"),
             }
         return maps
 
@@ -268,45 +355,38 @@ class Pictures:
         for name in self._fingers:
             tips = takewhile(touches, (state.finger(name) for state in states))
             if trail := [(_DEGREE * tip.theta, 1e3 * tip.d) for tip in tips]:
-                lines.append((COLOURS[name], 2.0, _flat(np.array(trail))))
-                dots.append((COLOURS[name], *trail[0]))
+                lines.append((name, 2.0, _flat(np.array(trail))))
+                dots.append((name, *trail[0]))
         return {"lines": lines, "dots": dots}
 
-    def _graphs(self) -> dict[str, Any]:
-        """The plots over the last seconds, with a deviation to both sides, and the mode below."""
-        now = self.feed.state, _row(self.feed.state)
-        shown = [each for each in self._past if each[1][0] > self.time - SECONDS] + [now]
-        table = np.array([row for _, row in shown]).T
-        times, valid = table[0] - self.time, table[1] > 0.0
-        columns = dict(zip(_PATHS, np.clip(table[2:], -_MOST, _MOST), strict=True))
-        columns["object.angle"][~valid] = np.nan
-        modes, k = [], 0
-        for mode, run in groupby(state.mode for state, _ in shown):
-            begin, k = k, k + len(list(run))
-            modes.append((_MODES.get(mode, GOAL), times[begin], times[min(k, len(times) - 1)]))
-        return {
-            title: _graph(paths, factor, columns, times, modes)
-            for title, (factor, paths) in self._plots.items()
-        }
-
-    def _limits(self) -> str:
-        """Return what holds the hand back: a recent warning, the grip's goal, the nearest limit."""
-        state, safety = self.feed.state, self._settings.safety
-        last = [each for each in self.feed.events[-1:] if each.level == "warning"]
-        parts = [each.text for each in last if self.time - each.timestamp < _LATELY]
-        parts += filter(None, [self.feed.grip()])
+    def _notes(self) -> list[str]:
+        """Return recent warnings, reasons why a finger is not valid, and near limits."""
+        state, safety, feed = self.feed.state, self._settings.safety, self.feed
+        last = [each for each in feed.events[-1:] if each.level == "warning"]
+        notes = [each.text for each in last if self.time - each.timestamp < _LATELY]
+        notes += filter(None, [why_invalid(state), self._raised()])
         used = [
             (value / getattr(safety, f"{key}_max"), name, key)
             for name in self._fingers
             for key in _BOUNDED
             if math.isfinite(value := abs(getattr(state.finger(name), key)))
         ]
-        for ratio, name, key in sorted(used)[-1:]:
-            parts.append(f"nearest limit: {name} {key} at {ratio:.0%} of safety.{key}_max")
-        return " · ".join(parts)
+        notes += [
+            f"{name} {key} at {ratio:.0%} of safety.{key}_max"
+            for ratio, name, key in sorted(used, reverse=True)
+            if ratio >= _NEAR
+        ]
+        if self.states and state.schema != schema.SCHEMA:
+            notes.append(f"the stream has schema {state.schema}, this page knows {schema.SCHEMA}")
+        return notes
 
-    def _facts(self, now: float) -> list[str]:
-        """Small facts: tick and its times, frames, servos, object, losses, commander."""
+    def _raised(self) -> str:
+        """Return the grip's goal in words when the daemon has raised the force."""
+        grip = self.feed.grip()
+        return grip if "raised" in grip else ""
+
+    def _facts(self, now: float) -> list[tuple[str, str]]:
+        """Names and values of the details: the loop and its times, frames, servos, losses."""
         feed, state, times = self.feed, self.feed.state, self.feed.times
         fingers = [state.finger(name) for name in self._fingers]
 
@@ -314,63 +394,36 @@ class Pictures:
             return " / ".join(short(factor * getattr(finger, key), decimals) for finger in fingers)
 
         facts = [
-            f"map age {each('frame_age_s', 1e3, 0)} ms",
-            f"servos {each('temperature', 1.0, 0)} °C, {each('voltage', 1.0, 1)} V",
-            f"object {short(1e3 * state.object.width, 1)} mm wide",
-            f"{sum(gaps.lost for gaps in self._gaps.values())} lost, {feed.skipped} unreadable",
-            f"{state.overruns} overruns",
+            ("Age of the pressure maps", f"{each('frame_age_s', 1e3, 0)} ms"),
+            ("Servos", f"{each('temperature', 1.0, 0)} °C, {each('voltage', 1.0, 1)} V"),
+            ("Messages lost", f"{sum(gaps.lost for gaps in self._gaps.values())}"),
+            ("Messages unreadable", f"{feed.skipped}"),
+            ("Loop overruns", f"{state.overruns}"),
         ]
         if times is not None:
-            facts.append(f"tick {short(times.rates.tick, 0)} Hz")
-            for name, of in {"work": times.compute, "late": times.wake, "bus": times.bus}.items():
-                facts.append(
-                    f"{name} [µs] {micro(of.p50)}, p99 {micro(of.p99)}, max {micro(of.max)}"
-                )
-        if self.states and state.schema != schema.SCHEMA:
-            facts.append(f"schema {state.schema}, this page knows {schema.SCHEMA}")
+            facts.append(("Loop rate", f"{short(times.rates.tick, 0)} Hz"))
+            named = {"Loop work": times.compute, "Loop late": times.wake, "Servo bus": times.bus}
+            for name, of in named.items():
+                median, tail, most = map(micro, (of.p50, of.p99, of.max))
+                facts.append((name, f"median {median}, p99 {tail}, max {most} µs"))
         if who := feed.commander(now):
-            facts.append(f"{who} commands")
+            facts.append(("Commanded by", who))
         return facts
 
 
-def _graph(
-    paths: list[str],
-    factor: float,
-    columns: dict[str, FloatArray],
-    times: FloatArray,
-    modes: list[tuple[Colour, float, float]],
-) -> dict[str, Any]:
-    """A plot of the columns at ``paths`` over ``times`` [s], with the modes from and to."""
-    values = [factor * columns[path] for path in paths]
-    spreads = [factor * np.nan_to_num(columns.get(f"{path}_std", 0.0 * times)) for path in paths]
-    ends = np.array([np.subtract(values, spreads), np.add(values, spreads)])
-    known = ends[np.isfinite(ends)]
-    low, high = (known.min(), known.max()) if known.size else (0.0, 1.0)
-    slack = max(0.08 * (high - low), 0.02 * max(abs(low), abs(high)), 0.01)
-    low, high = low - slack, high + slack
-    step, foot = heatmap.round_up(0.25 * (high - low)), low - 0.05 * (high - low)
-    lines: list[Any] = [(colour, 4, [begin, foot, end, foot]) for colour, begin, end in modes]
-    texts: list[Any] = []
-    for tick in step * np.arange(math.ceil(low / step), math.floor(high / step) + 1):
-        lines.append((_GRID, 1, [-SECONDS, tick, 0.0, tick]))
-        texts.append((GOAL, -1.07 * SECONDS, tick, f"{tick:.6g}"))
-    for k, (path, value, std) in enumerate(zip(paths, values, spreads, strict=True)):
+def _described(plot: _Plot, paths: list[str]) -> dict[str, Any]:
+    """A plot of the lines at ``paths``, as a page lays it out."""
+    lines = []
+    for path in paths:
         finger, _, key = path.rpartition(".")
-        goal = " goal" * key.startswith("goal")
-        name, colour = _OTHERS.get(path, ((finger + goal).strip(), COLOURS.get(finger, GOAL)))
-        spread = ""
-        if std.any():
-            bars = (times, value - std, times, value + std, times, times * np.nan)
-            lines.append(((*colour, 0.25), 7, _flat(np.column_stack(bars))))
-            spread = f" ± {std[-1]:.2g}"
-        lines.append((colour, 0.8 if goal else 1.8, _flat(np.column_stack((times, value)))))
-        if math.isfinite(value[-1]) and not (goal and finger):
-            place = (k + 0.5) / len(paths) * SECONDS - SECONDS
-            texts.append(
-                (colour, place, low - 0.15 * (high - low), f"{name} {value[-1]:.3g}{spread}")
-            )
-    box = -1.15 * SECONDS, 0.0, high, low - 0.22 * (high - low)
-    return {"box": box, "lines": lines, "texts": texts}
+        goal = key.startswith("goal")
+        name, colour = _OTHERS.get(path, (f"{finger} goal".strip() if goal else finger, finger))
+        spread = _COLUMNS.get(f"{path}_std")
+        lines.append(
+            {"name": name, "colour": colour or GOAL, "column": _COLUMNS[path]}
+            | {"spread": spread, "goal": goal}
+        )
+    return plot._asdict() | {"lines": lines}
 
 
 def _panel(name: str, title: str, *box: float, **more: Any) -> dict[str, Any]:
@@ -383,7 +436,7 @@ def _flat(points: FloatArray) -> FloatArray:
     return np.clip(points, -_MOST, _MOST).round(4).ravel()
 
 
-def _packed(shown: dict[str, Any]) -> str:
+def _packed(shown: dict[str, Any] | list[Any]) -> str:
     return orjson.dumps(shown, option=orjson.OPT_SERIALIZE_NUMPY).decode()
 
 

@@ -25,13 +25,15 @@ from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from softfinger.tools.viewing.known import fingers_of
 
 FloatArray = NDArray[np.float64]
-Colour = tuple[int, int, int]
+GOAL, OBJECT = "goal", "object"  # names of colours, as are the fingers'
 
-# The left finger is blue, the right one orange, goals are grey: distinguishable for colour-blind
-# people, on light and on dark ground.
-COLOURS = {"left": (51, 136, 221), "right": (230, 126, 0)}
-GOAL = (140, 140, 140)
-OBJECT = (0, 158, 115)
+# Distinguishable for colour-blind people on a dark ground. The page has its own for each theme.
+COLOURS = {
+    "left": (51, 136, 221),
+    "right": (230, 126, 0),
+    GOAL: (140, 140, 140),
+    OBJECT: (0, 158, 115),
+}
 
 _ARROW = 1.6e-3  # m of a force's arrow a newton
 _ARROW_LONGEST = 0.045  # m
@@ -43,8 +45,8 @@ _UNIT_CIRCLE = np.column_stack((np.cos(_TURN), np.sin(_TURN)))
 class Drawn(NamedTuple):
     """A part of a picture, empty where it isn't there now."""
 
-    lines: list[tuple[Colour, float, FloatArray]]  # colour, width, points [n, 2]; in m
-    texts: list[tuple[Colour, FloatArray, str]]  # colour, place [2], words
+    lines: list[tuple[str, float, FloatArray]]  # colour's name, width, points [n, 2]; in m
+    texts: list[tuple[str, FloatArray, str]]  # colour's name, place [2], words
 
 
 class FingerLines(NamedTuple):
@@ -157,16 +159,17 @@ def _held(hand: HandGeometry, state: HandState, height: float) -> list[FloatArra
 def _finger(hand: HandGeometry, name: str, state: FingerState) -> Drawn:
     """One finger with its tip, and where it touches the face and the force's arrow."""
     contact = (state.d, state.theta) if touches(state) else ()
-    q, colour = state.q if math.isfinite(state.q) else 0.0, COLOURS[name]
+    q = state.q if math.isfinite(state.q) else 0.0
     link, base, skin, face, push = finger_lines(hand, FINGERS.index(name), q, *contact)
-    part = Drawn([(colour, 5.2e-3, link), (colour, 2.4e-3, base), (colour, 1e-3, skin)], [])
+    part = Drawn([(name, 5.2e-3, link), (name, 2.4e-3, base), (name, 1e-3, skin)], [])
     if face is not None and push is not None:
         force = state.force if math.isfinite(state.force) else 0.0
         at, way = push[0], min(_ARROW * force, _ARROW_LONGEST) * push[1]
         end, back, aside = at + way, -0.2 * way, 0.12 * np.array([way[1], -way[0]])
         arrow = np.array([at, end, end + back + aside, end, end + back - aside])
-        part.lines.extend([(OBJECT, 2e-3, face), (colour, 1.8e-3, arrow)])
-        part.texts.append((colour, at - (0.0, 0.02), f"{force:.1f} N"))
+        part.lines.extend([(OBJECT, 2e-3, face), (name, 1.8e-3, arrow)])
+        outwards = -0.028 if name == FINGERS[0] else 0.028
+        part.texts.append((name, link[2] + (outwards, 0.012), f"{force:.1f} N"))
     return part
 
 

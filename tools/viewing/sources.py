@@ -7,22 +7,26 @@ import contextlib
 import math
 import time
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 import zmq
 
 from softfinger.daemon.client.connection import drain, subscribe, unpack
+from softfinger.daemon.client.stream import read
 from softfinger.daemon.errors import SoftfingerError
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.keys import ClientKeys
 from softfinger.tools.arguments import PATIENCE, no_stream, waiting
 from softfinger.tools.ending import Ending
 from softfinger.tools.recordings.reader import Recording
-from softfinger.tools.terminal.feed import number
+from softfinger.tools.terminal.feed import number, printable
 from softfinger.tools.viewing.pictures import SECONDS, TOPICS, Pictures
 
 _SILENCE = 2.0  # s without a message after which a line says so
 _REST = 1.0  # s between two pictures at most, where drawing is slow
+_MARKS = 2_000  # of a recording, at most
+_SPEEDS = 0.1, 10.0
 _QUEUE = 5_000  # messages that wait meanwhile: 2 s of state and truth at 1 kHz with their frames
 
 
@@ -69,6 +73,22 @@ def follow(
         context.destroy(linger=0)
 
 
+def marks_of(recording: Recording) -> list[tuple[float, str, str, str]]:
+    """Return time [s], level, kind and text of the changes of mode, the warnings and the errors."""
+    marks = []
+    for _, message in recording.messages([schema.EVENT]):
+        event = read(schema.Event, message)
+        if event.again:
+            continue
+        if event.kind == "mode" or event.level != "info":
+            at = event.timestamp - recording.start
+            level, kind, text = map(printable, (event.level, event.kind, event.text))
+            marks.append((round(at, 3), level, kind, text))
+        if len(marks) == _MARKS:
+            break
+    return marks
+
+
 class Playback:
     """A recording's place, and that it is ``playing``. ``run`` is for its own thread."""
 
@@ -78,12 +98,17 @@ class Playback:
         self._period = period  # s between two pictures
         self._target: float | None = 0.0  # where to go, from another thread
         self.playing = True
+        self.speed = 1.0
         self.position = 0.0  # s from the first message on
 
     def ask(self, wish: str) -> None:
-        """Carry out a page's wish: ``play``, ``pause`` or a position [s]; ignore others."""
+        """Carry out a page's wish: ``play``, ``pause``, ``speed N`` or a position [s]."""
+        name, _, value = wish.partition(" ")
         with contextlib.suppress(ValueError):
-            if wish in ("play", "pause"):
+            if name == "speed":
+                if _SPEEDS[0] <= (speed := float(value)) <= _SPEEDS[1]:
+                    self.speed = speed
+            elif wish in ("play", "pause"):
                 self.playing = wish == "play"
                 if self.playing and self.position == self._recording.duration:
                     self._target = 0.0
@@ -93,6 +118,10 @@ class Playback:
     def run(self, ending: Ending) -> None:
         """Play until the end is asked for."""
         recording, pictures = self._recording, self._pictures
+        # A reader of its own: a long recording takes seconds, and the first picture comes before.
+        finder = ThreadPoolExecutor(1)
+        marks: Future[list[Any]] | None = finder.submit(lambda: marks_of(Recording(recording.path)))
+        finder.shutdown(wait=False)
         if recording.count(schema.SETTINGS):  # which may come once, at the beginning
             pictures.take(*next(recording.messages([schema.SETTINGS])))
         while not ending.over:
@@ -106,10 +135,21 @@ class Playback:
                 pictures.take(*ahead)
                 ahead = next(messages, None)
             self.playing &= ahead is not None
-            pictures.draw((self.position, recording.duration, self.playing))
+            if marks is not None and marks.done():
+                pictures.mark(marks.result())
+                marks = None
+            pictures.draw(
+                {
+                    "position": self.position,
+                    "start": recording.start,
+                    "duration": recording.duration,
+                    "playing": self.playing,
+                    "speed": self.speed,
+                }
+            )
             ending.wait(self._period)
             if self.playing:
-                elapsed = time.monotonic() - begun
+                elapsed = self.speed * (time.monotonic() - begun)
                 self.position = min(self.position + elapsed, recording.duration)
 
     def _is_past(self, message: dict[str, Any]) -> bool:

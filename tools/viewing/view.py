@@ -11,12 +11,13 @@ from softfinger.tools.ending import Ending
 from softfinger.tools.extras import require
 
 _EPILOG = """\
-Serves a page on this machine alone. Whoever opens the address with the token, which is printed,
-gets buttons and sliders, and stop on the space key; the one without it only watches.
+Serves a page for browsers on this machine. The address with the token, which is printed, gives
+buttons and sliders, and stop on the space key; the one without it only watches.
 With --foxglove the page's port speaks Foxglove's protocol, too, by default at ws://127.0.0.1:8765;
 the line it prints says where the layout file is. A recording is opened in Foxglove itself.
 Ends with Ctrl-C, or after --duration.
-From another machine: ssh -L 9090:127.0.0.1:9090, with the port printed.
+From another machine: ssh -L 9090:127.0.0.1:9090, with the port printed; or, in a network that you
+trust, --host ADDRESS. Each address that it then prints opens the page in one browser.
 Exit status: 0, or 1 with the reason when nothing could be shown."""
 
 
@@ -33,6 +34,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         const=8765,
         metavar="PORT",
         help="serve the stream to Foxglove (default: 8765; 0: a free port)",
+    )
+    parser.add_argument(
+        "--host",
+        default="127.0.0.1",
+        metavar="ADDRESS",
+        help="serve on this address of the machine; 0.0.0.0: on all (default: 127.0.0.1, for "
+        "browsers on this machine alone)",
     )
     parser.add_argument("--no-browser", action="store_true", help="only print the page's address")
     parser.add_argument(
