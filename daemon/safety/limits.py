@@ -38,6 +38,8 @@ _AT_ONCE = 0.02  # rad that an angle may go beyond the greatest velocity's way i
 _APART = 0.1  # rad that it may be off the way that the velocity says …
 _MEMORY = 0.1  # … over the last so many s: a velocity lags
 _LATE = 0.02  # s between two readings, or 3 ticks, from which on the sum begins again
+_MEAN = 0.72  # s, time constant of the share of failed readings
+_FAILED = 0.75  # which is reported from there on: none was good for a second
 _GAP = 0.1  # s from which on the step is not judged either
 
 
@@ -99,6 +101,8 @@ class View:
         self.fingers = [FINGERS.index(finger) for finger in sorted(settings.scene.fingers)]
         self.grasp = GraspState() if grasp is None else grasp
         self.sensors = sensors
+        self.failed = 0.0  # share of the readings of about the last second
+        self._t = math.nan  # of the last state
         self.motion = JointMotion(self.fingers, self.limits.velocity_max, 1.0 / settings.loop.rate)
         servos = settings.servos  # in current mode the pull is the daemon's own
         self.pull = min(_PULL, 0.5 * servos.stiffness) if servos.mode == "current" else _PULL
@@ -117,6 +121,9 @@ class View:
     def follow(self, state: State) -> None:
         """Remember of this tick's state what checks compare later ones with."""
         self.motion.follow(state.t, state.reading)
+        passed, self._t = state.t - self._t, state.t
+        if passed > 0.0:
+            self.failed += min(passed / _MEAN, 1.0) * ((not state.reading.valid) - self.failed)
         if not self.holds(state):
             self.grip_width = math.nan
         elif math.isnan(self.grip_width):
@@ -207,6 +214,18 @@ def _servos_silent(view: View, state: State, _: float) -> str:
         return ""
     lasted = "yet" if age == math.inf else f"for {age:.3f} s"
     return f"servos: no good reading {lasted}"
+
+
+@Limit("servos.silent", "share of the last second's servo readings that failed, with and without "
+    "torque", "warn", ("servos.reply_timeout",), "servos")  # fmt: skip
+def _servos_late(view: View, _: State, fraction: float) -> str:
+    if view.failed <= fraction * _FAILED:
+        return ""
+    allowed = 1e3 * view.settings.servos.reply_timeout
+    return (
+        f"servos: {view.failed:.0%} of the last second's readings failed: no sound reply within "
+        f"servos.reply_timeout = {allowed:g} ms; `softfinger doctor` times the replies"
+    )
 
 
 @Limit("servos.frozen", "servo whose own clock stands still for 0.1 s: its readings are old",

@@ -197,7 +197,7 @@ def test_factory_servos_together_are_reported_and_not_changed(wired):
     [
         ("overload=2", None, 0, f"{RIGHT}: rebooted, since it had a hardware error: overload"),
         ("", reg.TORQUE_ENABLE, 1, f"{LEFT}: torque off, since EEPROM is locked while it is on"),
-        ("", reg.DRIVE_MODE, 0b1001, f"{LEFT}: drive mode 9 → 1"),
+        ("", reg.DRIVE_MODE, 0b1100, f"{LEFT}: drive mode 12 → 4"),
         ("", reg.STATUS_RETURN_LEVEL, 0, ""),
     ],
 )
@@ -219,4 +219,4 @@ def test_what_can_not_be_set_up_is_reported_beside_what_was(wired):
     missing = f"{RIGHT}: no answer at any rate: check its power and cable"
     assert bus.provision() == (named(LEFT, *MODE_AND_DELAY), [missing])
     _, problems = bus.provision(model="XL330-M288")
-    assert f"{LEFT}: is not an XL330-M288: set servos.model" in problems
+    assert f"{LEFT}: is an XM430-W350, not an XL330-M288: set servos.model" in problems
