@@ -113,6 +113,20 @@ def test_factory_new_servos_fail_and_are_repaired_only_when_asked(hands, capsys)
     assert hand.registers() == before
 
 
+def test_registers_are_stored_before_a_change_and_written_back(hands, capsys, tmp_path):
+    hand, path = hands(factory=True), tmp_path / "before.json"
+    before = [memory[: reg.RAM] for memory in hand.registers()]
+    status, lines = hand.doctor(capsys, "--save", str(path), "--fix")
+    assert status == 0, lines
+    assert f"note   servo 1 (left): 29 registers saved to {path}" in lines
+    assert [memory[: reg.RAM] for memory in hand.registers()] != before
+    status, lines = hand.doctor(capsys, "--restore", str(path))
+    assert "servo 1 (left): operating mode 5 → 3" in with_status(lines, "fixed")
+    assert [memory[: reg.RAM] for memory in hand.registers()] == before
+    status, lines = hand.doctor(capsys, "--restore", str(tmp_path / "none.json"))
+    assert f"{tmp_path}/none.json: No such file or directory" in lines[-1] + "".join(lines)
+
+
 def test_boards_are_listened_to(hands, capsys):
     hand = hands()
     status, lines = hand.doctor(capsys)

@@ -156,6 +156,16 @@ def test_a_search_finds_servos_at_their_rate(wired):
         search("line", (-1,))
 
 
+def test_a_search_recognises_servos_of_protocol_1(wired):
+    bus = wired(baud=57600)
+    bus.servos[0].table.set(reg.PROTOCOL_TYPE, 1)
+    bus.servos[1].silent = True
+    found = search("line", (57600, HOME))
+    assert (found.servos, found.old) == ((), (57600,))
+    _, problems = bus.provision()
+    assert problems[0].startswith("a servo at 57600 baud: answers Protocol 1.0, expected 2.0: ")
+
+
 def test_a_port_that_goes_away_ends_a_search(wired, monkeypatch):
     def gone(*_: object) -> None:
         raise PortGone("the port is gone")
