@@ -58,8 +58,11 @@ class TickReads:
         self.errors = kind(port, handler, reg.HARDWARE_ERROR_STATUS, 1, ids)
 
     def answered(self) -> bool:
-        """Return True if all servos answer a group read of this kind."""
-        return any(self.spans[PRESENT][0].exchange() == COMM_SUCCESS for _ in range(TRIES))
+        """Return True if all servos answer each of these group reads."""
+        return all(
+            any(lengths[0].exchange() == COMM_SUCCESS for _ in range(TRIES))
+            for lengths in self.spans.values()
+        )
 
 
 def choose_reads(

@@ -231,7 +231,8 @@ def required_registers(
         rows.append(_exactly(reg.STARTUP_CONFIGURATION, 0, why))
     if model.pwm_slope is not None:
         why = "the motor's voltage rises at another rate"
-        rows.append(_exactly(reg.PWM_SLOPE, model.pwm_slope, why, "warn"))
+        row = _exactly(reg.PWM_SLOPE, slope := model.pwm_slope, why, "warn")
+        rows.append(row._replace(holds=lambda found: found in (0, slope)))  # 0: has no such one
     rows += armed_registers(model)
     return sorted(rows, key=lambda row: row.register.address)
 
