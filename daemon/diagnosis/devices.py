@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from softfinger.daemon.clock import RealClock
+from softfinger.daemon.clock import RealClock, emulated
 from softfinger.daemon.errors import ServoError, TactileError
 from softfinger.daemon.perception.calibration_file import (
     CalibrationFileError,
@@ -22,10 +23,22 @@ from softfinger.daemon.perception.calibration_file import (
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.base import Finding
-from softfinger.daemon.servos.checks import Examined, check_latency_timer, examine
+from softfinger.daemon.servos.checks import (
+    Examined,
+    check_latency_timer,
+    check_registers,
+    examine,
+)
 from softfinger.daemon.servos.control_table import ServoModel, by_name
+from softfinger.daemon.servos.exchange import (
+    EXCHANGES,
+    choose_reads,
+    judge_exchanges,
+    time_exchanges,
+)
+from softfinger.daemon.servos.joint import GOAL_SIZE
 from softfinger.daemon.servos.port import latency_file
-from softfinger.daemon.servos.protocol import open_line
+from softfinger.daemon.servos.protocol import GroupWrite, ServoLine, open_line
 from softfinger.daemon.servos.provisioning import (
     ALONE,
     FACTORY_ID,
@@ -34,10 +47,10 @@ from softfinger.daemon.servos.provisioning import (
     provision,
     search,
 )
+from softfinger.daemon.servos.torque import goal_address
 from softfinger.daemon.tactile.base import make_sensor
 from softfinger.daemon.types import FINGERS, Frame
 
-_PATIENCE = 5.0  # s for a board: one that its adapter resets when the port is opened starts again
 _LISTEN = 0.5  # s of a board's frames
 _REST_NOISE = 3.0  # of a cell's noise, that a tared board's median cell does not reach at rest
 _OFF_RATE = 0.1  # share of the rate by which a board may be off
@@ -51,22 +64,73 @@ def check_servos(settings: Settings) -> list[Finding]:
     try:
         # The adapter's low-latency mode would be a change, so it is not asked for.
         with open_line(servos.port, servos.baud, low_latency=False) as line:
+            _wait_for(line, settings)
             found = examine(line, settings, model)
+            exchange = _try_exchange(line, settings, model, found)
         results = [line for each in found for line in _judge(each, settings, model)]
-        if not all(each.replies for each in found):
+        results += exchange
+        if not all(each.replies or each.errors for each in found):
             results += _search(settings, model) or _blame_power(found)
     except ServoError as error:
         return [Finding("FAIL", "servos", str(error))]
     return results
 
 
+def _wait_for(line: ServoLine, settings: Settings) -> None:
+    """Wait up to ``servos.open_timeout`` for servos that do not answer yet, as `run` does."""
+    end = time.monotonic() + settings.servos.open_timeout
+    missing = [settings.servos.ids[FINGERS.index(name)] for name in settings.scene.fingers]
+    while missing:
+        missing = [servo_id for servo_id in missing if line.ping(servo_id, tries=1) is None]
+        if time.monotonic() > end:
+            break
+
+
+def _try_exchange(
+    line: ServoLine, settings: Settings, model: ServoModel, found: list[Examined]
+) -> list[Finding]:
+    """Time the tick's own reads and writes where all servos are well; nothing is changed by them.
+
+    The writes are of the tick's length and place, and bring back what is there. They are left out
+    where a servo has torque or might get it by a goal.
+    """
+    if not all(each.table and not each.errors for each in found):
+        return []
+    ids = [each.id for each in found]
+    firmwares = [each.table[reg.FIRMWARE_VERSION] for each in found]
+    try:
+        reads, results = choose_reads(
+            line.port, line.handler, ids, all(map(model.fast_read, firmwares))
+        )
+    except ServoError as error:
+        return [Finding("FAIL", "exchange", str(error))]
+    mode = reg.MODE_NUMBERS[settings.servos.mode]
+    address = goal_address(mode, model, firmwares[0])
+    held = [line.read(servo_id, address, GOAL_SIZE[mode]) for servo_id in ids]
+    limp = not any(each.table[reg.TORQUE_ENABLE] for each in found)
+    write, what = None, f"{EXCHANGES} of a tick's reads (no writes: torque is on)"
+    if limp and len(set(firmwares)) == 1 and None not in held:
+        group = GroupWrite(line.port, address, GOAL_SIZE[mode], ids)
+        write = partial(group.send, [value for value in held if value is not None])
+        what = f"{EXCHANGES} of a tick's reads and writes"
+    times = time_exchanges(line.port, reads, write)
+    return [*results, judge_exchanges(times, settings, what, emulated(settings))]
+
+
 def _judge(servo: Examined, settings: Settings, model: ServoModel) -> list[Finding]:
     name = servo.name
     if not servo.replies:
-        problem = f"no answer at {settings.servos.baud} baud"
+        if servo.errors:
+            return list(servo.errors)
+        waited = settings.servos.open_timeout
+        problem = (
+            f"no answer at {settings.servos.baud} baud within servos.open_timeout = {waited:g} s"
+        )
         fix = "check its power and cable, then see what was found below"
         return [Finding("FAIL", name, problem, fix)]
     results = [*servo.errors, *servo.notices]
+    if servo.table:
+        results += check_registers(name, model, servo.table, settings, servo.finger, "note")
     if servo.table and not servo.errors:
         described = Finding("pass", name, _described(servo, model))
         results.append(servo.misplaced or described)
@@ -86,6 +150,8 @@ def _search(settings: Settings, model: ServoModel) -> list[Finding]:
     """Search the port at every rate of the model and say how to reach what answers."""
     servos = settings.servos
     found = search(servos.port, model.baud_rates, SEARCH_TIME, {FACTORY_ID, *servos.ids})
+    if found.old:
+        return found.old_protocol()
     if not found.servos and not found.garbled:
         problem = f"nothing answers on {servos.port} at any rate"
         return [Finding("FAIL", "servos", problem, "check the bus's power and cable")]
@@ -138,8 +204,6 @@ def check_board(settings: Settings, finger: int) -> Finding:
     """Check that a board sends frames of the settings' grid at their rate."""
     tactile = settings.tactile
     name = f"tactile {FINGERS[finger]}"
-    patient = tactile.model_copy(update={"open_timeout": max(tactile.open_timeout, _PATIENCE)})
-    settings = settings.model_copy(update={"tactile": patient})
     sensor = make_sensor(settings, RealClock(), None, finger)
     assert sensor is not None
     try:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import fcntl
-import grp
 import os
 import re
 import stat
@@ -17,9 +16,9 @@ from softfinger.daemon.client.command_client import NoAnswer, send
 from softfinger.daemon.errors import AddressError, KeyFileError
 from softfinger.daemon.gateway.endpoints import IN_USE, bind
 from softfinger.daemon.own_files import runtime_fault, runtime_folder
+from softfinger.daemon.port_access import bring_it, grant
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.base import Finding
-from softfinger.daemon.servos.port import bring_it
 from softfinger.daemon.wire.keys import load_client
 
 _PROC = Path("/proc")
@@ -66,7 +65,7 @@ def check_port(path: str, key: str, mode_of_daemon: str = "") -> Finding:
     if not stat.S_ISCHR(mode.st_mode):
         return Finding("FAIL", path, "is not a serial port", f"set {key}")
     if not os.access(path, os.R_OK | os.W_OK):
-        return Finding("FAIL", path, "no permission to open it", _permission(path, mode))
+        return Finding("FAIL", path, "no permission to open it", grant(path))
     try:
         descriptor = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
     except OSError as error:
@@ -85,17 +84,6 @@ def check_port(path: str, key: str, mode_of_daemon: str = "") -> Finding:
     if others:
         return _busy(path, mode_of_daemon)
     return Finding("pass", path, "there, may be opened, nobody else has it")
-
-
-def _permission(path: str, mode: os.stat_result) -> str:
-    try:
-        group = grp.getgrgid(mode.st_gid)
-    except KeyError:
-        return f"sudo chmod a+rw {path}"
-    user = os.environ.get("USER", "")
-    if user in group.gr_mem and mode.st_gid not in os.getgroups():
-        return f"log in again: {user} is in {group.gr_name}, this session is not yet"
-    return f"sudo usermod -aG {group.gr_name} $USER, then log in again"
 
 
 def _busy(path: str, mode_of_daemon: str) -> Finding:

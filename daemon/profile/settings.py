@@ -246,7 +246,7 @@ class TactileSettings(Section):
     response: Delay = setting(
         0.0, "s", "Time constant of the cells' first-order lag; the estimate compensates for it."
     )
-    open_timeout: Seconds = setting(2.0, "s", "Longest time to wait for the first valid frame.")
+    open_timeout: Seconds = setting(5.0, "s", "Longest time to wait for the first valid frame.")
     sensor: tuple[str, str] = setting(
         ("", ""), "", "Names of the sensors, such as serial numbers; calibrations state them."
     )

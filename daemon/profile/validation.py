@@ -6,6 +6,7 @@ One function a check; each yields lines of key, found and expected.
 from __future__ import annotations
 
 import math
+import os
 import re
 from collections.abc import Iterator
 from typing import Any
@@ -70,6 +71,28 @@ def _servos(settings: Settings) -> Iterator[str]:
     servos = settings.servos
     if servos.ids[0] == servos.ids[1] and len(settings.scene.fingers) == 2:
         yield f"servos.ids: found {shown(servos.ids)}, expected two different ids"
+
+
+def _ports(settings: Settings) -> Iterator[str]:
+    """One port can't serve two devices. What a plugin opens is its own affair."""
+    ports = []
+    servos = backend("servos", settings.servos.backend)
+    tactile = backend("tactile", settings.tactile.backend)
+    if servos.metal and not servos.source:
+        ports.append(("servos.port", settings.servos.port))
+    if tactile.metal and not tactile.source:
+        for finger in sorted(FINGERS.index(name) for name in settings.scene.fingers):
+            ports.append((f"tactile.port ({FINGERS[finger]})", settings.tactile.port[finger]))
+    taken: dict[str, str] = {}
+    for key, port in ports:
+        place = os.path.realpath(port)
+        if place in taken:
+            same = "" if place == port else f", which leads to {shown(place)}"
+            yield (
+                f"{key}: found {shown(port)}{same}, expected another port than {taken[place]}; "
+                "boards without a serial number of their own have names in /dev/serial/by-path"
+            )
+        taken.setdefault(place, key)
 
 
 def _timing(settings: Settings) -> Iterator[str]:
@@ -286,6 +309,7 @@ _CHECKS = (
     _backends,
     _joints,
     _servos,
+    _ports,
     _timing,
     _material,
     _solid_tip,

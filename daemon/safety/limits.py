@@ -19,13 +19,14 @@ from typing import Literal
 
 import numpy as np
 
-from softfinger.daemon.control.modes import GRIPPING, HELD
+from softfinger.daemon.control.modes import GRIPPING, HELD, Mode
 from softfinger.daemon.perception.frame_channels import ANGLE_JUMP, REJECTED_MAX
 from softfinger.daemon.perception.grasp import GraspState
 from softfinger.daemon.perception.grasp_kernels import ANGLE_BIAS_MIN
 from softfinger.daemon.perception.hand_state import CURRENT_TIME
 from softfinger.daemon.perception.perception import FingerPerception
 from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.safety.wiring import WiringWatch
 from softfinger.daemon.servos.control_table import VOLTAGE_UNIT, by_name, hardware_error_names
 from softfinger.daemon.types import FINGERS, Contact, Reading, State
 
@@ -38,6 +39,8 @@ _AT_ONCE = 0.02  # rad that an angle may go beyond the greatest velocity's way i
 _APART = 0.1  # rad that it may be off the way that the velocity says …
 _MEMORY = 0.1  # … over the last so many s: a velocity lags
 _LATE = 0.02  # s between two readings, or 3 ticks, from which on the sum begins again
+_MEAN = 0.72  # s, time constant of the share of failed readings
+_FAILED = 0.75  # which is reported from there on: none was good for a second
 _GAP = 0.1  # s from which on the step is not judged either
 
 
@@ -99,6 +102,9 @@ class View:
         self.fingers = [FINGERS.index(finger) for finger in sorted(settings.scene.fingers)]
         self.grasp = GraspState() if grasp is None else grasp
         self.sensors = sensors
+        self.wiring = WiringWatch(self.fingers)
+        self.failed = 0.0  # share of the readings of about the last second
+        self._t = math.nan  # of the last state
         self.motion = JointMotion(self.fingers, self.limits.velocity_max, 1.0 / settings.loop.rate)
         servos = settings.servos  # in current mode the pull is the daemon's own
         self.pull = min(_PULL, 0.5 * servos.stiffness) if servos.mode == "current" else _PULL
@@ -117,6 +123,10 @@ class View:
     def follow(self, state: State) -> None:
         """Remember of this tick's state what checks compare later ones with."""
         self.motion.follow(state.t, state.reading)
+        self.wiring.follow(state)
+        passed, self._t = state.t - self._t, state.t
+        if passed > 0.0:
+            self.failed += min(passed / _MEAN, 1.0) * ((not state.reading.valid) - self.failed)
         if not self.holds(state):
             self.grip_width = math.nan
         elif math.isnan(self.grip_width):
@@ -207,6 +217,18 @@ def _servos_silent(view: View, state: State, _: float) -> str:
         return ""
     lasted = "yet" if age == math.inf else f"for {age:.3f} s"
     return f"servos: no good reading {lasted}"
+
+
+@Limit("servos.silent", "share of the last second's servo readings that failed, with and without "
+    "torque", "warn", ("servos.reply_timeout",), "servos")  # fmt: skip
+def _servos_late(view: View, _: State, fraction: float) -> str:
+    if view.failed <= fraction * _FAILED:
+        return ""
+    allowed = 1e3 * view.settings.servos.reply_timeout
+    return (
+        f"servos: {view.failed:.0%} of the last second's readings failed: no sound reply within "
+        f"servos.reply_timeout = {allowed:g} ms; `softfinger doctor` times the replies"
+    )
 
 
 @Limit("servos.frozen", "servo whose own clock stands still for 0.1 s: its readings are old",
@@ -346,6 +368,29 @@ def _joint_stall(view: View, state: State, _: float, i: int) -> str:
         return ""
     off = f"{math.degrees(error):.1f}° off its goal"
     return f"{FINGERS[i]} joint has stalled, {off} at {current:.2f} A"
+
+
+@Limit("joint.swapped", "tip that another finger's joint moves, or a turn against its command",
+    "fault", ("servos.ids",), "sensors")  # fmt: skip
+def _joint_swapped(view: View, _: State, __: float) -> str:
+    return view.wiring.swapped
+
+
+@Limit("joint.blocked", "joint that stands in an approach with all its current for 0.5 s, and its "
+    "tip feels nothing", "warn", ("servos.direction",), "servos", lasts=0.5).each  # fmt: skip
+def _joint_blocked(view: View, state: State, _: float, i: int) -> str:
+    goal, reading, contact = state.goal, state.reading, state.contacts[i]
+    if state.mode != Mode.GRASPING or not goal.valid or not view.sensors or contact.contact:
+        return ""
+    full = reading.current[i] >= _FULL_CURRENT * goal.current[i] > 0.0
+    stands = abs(reading.dq[i]) < _SLOW and goal.q[i] - reading.q[i] > _OFF
+    if not (full and stands):
+        return ""
+    return (
+        f"{FINGERS[i]} joint stands at {math.degrees(reading.q[i]):.0f}° in the approach, and its "
+        "tip feels nothing: something is in its way, or it opens instead of closing: is "
+        "servos.direction right?"
+    )
 
 
 _ALL = 0.95  # of the greatest current there may be: a grip that takes more can't be firmer
@@ -606,9 +651,9 @@ def _hand_angle(view: View, state: State, fraction: float) -> str:
     if abs(apart) <= bound:
         return ""
     return (
-        f"the fingers see the object's angle {math.degrees(abs(apart)):.1f}° apart: the object "
-        "lies askew between the tips or tapers (object.taper), a sensor has shifted, or its centre "
-        "or rotation is wrong"
+        f"the fingers see the object's angle {math.degrees(abs(apart)):.1f}° apart: a joint's zero "
+        "is wrong (servos.zero, or its servo's homing offset), the object lies askew between the "
+        "tips or tapers (object.taper), a sensor has shifted, or its centre or rotation is wrong"
     )
 
 

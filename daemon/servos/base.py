@@ -111,6 +111,14 @@ class JointPlant(Protocol):
         likewise, with the model's own limit) or 0 (current: ``goal_current`` is signed).
         """
 
+    def tune(self, joint: int, stiffness: float, damping: float, duty: float) -> None:
+        """Set a servo's position gains and PWM from now on.
+
+        ``stiffness`` of its position loop is relative to the factory's, ``damping`` [s] of that
+        stiffness comes on top of the factory's, and ``duty`` is the share of the supply's voltage
+        that its motor may get.
+        """
+
 
 def make_servos(settings: Settings, clock: Clock, hand: object) -> Servos | None:
     """Make the settings' servo backend, not yet connected; None in a scene without servos.

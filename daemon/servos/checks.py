@@ -16,16 +16,19 @@ from softfinger.daemon.servos.control_table import ServoModel
 from softfinger.daemon.servos.joint import JointScale, servo_name
 from softfinger.daemon.servos.port import latency_file
 from softfinger.daemon.servos.protocol import ServoLine
+from softfinger.daemon.servos.register_table import required_registers
 from softfinger.daemon.types import FINGERS, GRIP_FRACTION
 
 CHECKED = reg.BACKUP_READY  # registers 0 … 146 are read
-# Return delays of both servos pass within one read; above 50 µs each they eat a 500 Hz tick.
-RETURN_DELAY_MAX = 25
-# Drive mode: a second servo follows this one's; any goal that is written switches the torque on.
-DRIVE_UNFIT = 0b1010
 DRIVE_REVERSE = 0b0001
 FIX = "`softfinger doctor --fix`"
 REBOOT_FIX = "remove the cause, then `softfinger doctor --fix` reboots it"
+LOST_TURN_FIX = "reboot it: switch its supply off and on, or `softfinger doctor --fix`"
+OLD_PROTOCOL = (
+    "answers Protocol 1.0, expected 2.0",
+    "set its protocol to 2.0 with the maker's DYNAMIXEL Wizard (register 13; an MX needs firmware "
+    "for 2.0), or use one that speaks it",
+)
 _WATCHDOG_FIRMWARE = 38
 _LONG = 0.5  # s without an answer, from which on servos.fault_after is worth a notice
 _CONSTANT_OFF = 1.3  # factor by which a torque constant may differ from the data sheet's
@@ -70,18 +73,18 @@ def examine(line: ServoLine, settings: Settings, model: ServoModel) -> list[Exam
     found = []
     for finger in map(FINGERS.index, settings.scene.fingers):
         servo_id = settings.servos.ids[finger]
-        if line.ping(servo_id) is None:
-            found.append(Examined(finger, servo_id, False))
-            continue
         name, misplaced = servo_name(servo_id, finger), None
+        if line.ping(servo_id) is None:
+            old = (Finding("FAIL", name, *OLD_PROTOCOL),) if line.ping_old(servo_id) else ()
+            found.append(Examined(finger, servo_id, False, errors=old))
+            continue
         table = Registers(line.read(servo_id, 0, CHECKED) or b"")
         if table:
             scale = JointScale.of(settings.servos, finger, model)
-            misplaced = check_angle(
-                name, scale.angle(table.long(reg.PRESENT_POSITION)), settings.hand, finger
-            )
+            counts = table.long(reg.PRESENT_POSITION)
+            misplaced = check_angle(name, scale, counts, settings.hand, finger)
             errors = check_servo(name, model, table, settings, finger)
-            notices = notice_servo(name, model, table, settings)
+            notices = notice_servo(name, model, table, settings, finger)
         else:
             why = (
                 "answers a ping but no read (status return level 0, two servos with this ID, or a "
@@ -123,27 +126,12 @@ def check_servo(
 
     number = table.word(reg.MODEL_NUMBER)
     if number != model.number:
-        wrong(f"is an {reg.name_of(number)}, not an {model.name}", "set servos.model")
+        wrong(*other_model(number, model))
         return found
-    required, mode = reg.MODE_NUMBERS[settings.servos.mode], table[reg.OPERATING_MODE]
-    unfit = check_model(name, model, required)
+    unfit = check_model(name, model, reg.MODE_NUMBERS[settings.servos.mode])
     if unfit is not None:
         found.append(unfit)
-    elif mode != required:
-        wrong(
-            f"operating mode is {reg.MODE_NAMES.get(mode, str(mode))} ({mode}), not "
-            f"{reg.MODE_NAMES[required]} ({required})"
-        )
-    drive = table[reg.DRIVE_MODE]
-    if drive & DRIVE_UNFIT:
-        wrong(
-            f"drive mode {drive} switches torque on with any goal, or has it follow another servo"
-        )
-    delay = table[reg.RETURN_DELAY_TIME]
-    if delay > RETURN_DELAY_MAX:
-        wrong(f"return delay is {2 * delay} µs, more than {2 * RETURN_DELAY_MAX} µs")
-    if table[reg.STATUS_RETURN_LEVEL] == 0:
-        wrong("status return level is 0, so reads stay unanswered")
+    found += check_registers(name, model, table, settings, finger, "FAIL")
     status = table[reg.HARDWARE_ERROR_STATUS]
     if status:
         wrong(f"hardware error: {reg.hardware_error_names(status)}", REBOOT_FIX)
@@ -159,29 +147,46 @@ def check_servo(
             f"firmware {firmware} has no bus watchdog",
             f"update it to {_WATCHDOG_FIRMWARE} or later, or set servos.watchdog = 0",
         )
-    limit = table.word(reg.CURRENT_LIMIT) * model.current_unit
-    current_max = settings.safety.current_max
-    if required == reg.POSITION_MODE:
-        # A goal beyond the servo's position limits is refused without a word.
-        scale = JointScale.of(settings.servos, finger, model)
-        ends = (settings.hand.q_min[finger], settings.hand.q_max[finger])
-        first, last = sorted(scale.position_counts(q) for q in ends)
-        lowest, greatest = table.long(reg.MIN_POSITION_LIMIT), table.long(reg.MAX_POSITION_LIMIT)
-        if first < lowest or last > greatest:
-            wrong(
-                f"position limits are {lowest} … {greatest}, the joint needs {first} … {last}",
-                "widen the limits, or `softfinger calibrate joints`, which finds zero and range",
-            )
-    elif model.senses_current and limit < current_max:
+    current_max, greatest = settings.safety.current_max, model.stall_current
+    if model.senses_current and settings.servos.mode != "position" and greatest < current_max:
         wrong(
-            f"current limit is {limit:.3f} A, below safety.current_max {current_max:g} A",
-            "lower safety.current_max or raise the limit",
+            f"safety.current_max is {current_max:g} A, above this model's {greatest:.3g} A",
+            "lower safety.current_max",
         )
     return found
 
 
+def other_model(number: int, model: ServoModel) -> tuple[str, str]:
+    """Return what is wrong with a servo of another model than the settings', and its fix."""
+    if reg.by_number(number) is not None:
+        return f"is an {reg.name_of(number)}, not an {model.name}", "set servos.model"
+    known = ", ".join(reg.MODELS)
+    return (
+        f"has the unknown model number {number}, not {model.number} of an {model.name}",
+        f"use one of the known models: {known}",
+    )
+
+
+def check_registers(
+    name: str,
+    model: ServoModel,
+    table: Registers,
+    settings: Settings,
+    finger: int,
+    status: Status,
+) -> list[Finding]:
+    """Return what registers hold that another program or hand needed, of one status."""
+    found = []
+    for row in required_registers(model, settings, finger, table[reg.FIRMWARE_VERSION]):
+        wrong = row.wrong_in(table)
+        if wrong is not None and row.status == status:
+            fix = f"{FIX}, then {row.then}" if row.then else "" if row.armed else FIX
+            found.append(Finding(row.status, name, row.told(wrong), fix))
+    return found
+
+
 def notice_servo(
-    name: str, model: ServoModel, table: Registers, settings: Settings
+    name: str, model: ServoModel, table: Registers, settings: Settings, finger: int
 ) -> list[Finding]:
     """Return the findings on a servo that can be used."""
     servos, firmware = settings.servos, table[reg.FIRMWARE_VERSION]
@@ -213,6 +218,7 @@ def notice_servo(
         (present >= limit - _NEAR_LIMIT, f"{present} °C, near its limit of {limit} °C"),
     )
     found = [Finding("warn", name, text) for true, text in notices if true]
+    found += check_registers(name, model, table, settings, finger, "warn")
     return found + notice_strength(name, model, settings)
 
 
@@ -236,16 +242,29 @@ def notice_strength(name: str, model: ServoModel, settings: Settings) -> list[Fi
     return found
 
 
-def check_angle(name: str, q: float, hand: GeometrySettings, finger: int) -> Finding | None:
-    """Return what is wrong with a joint's angle [rad]; None when it lies near the hand's limits.
+def check_angle(
+    name: str, scale: JointScale, counts: int, hand: GeometrySettings, finger: int
+) -> Finding | None:
+    """Return what is wrong with a joint's position; None when it lies near the hand's limits.
 
-    Torque on would swing such a joint back at once.
+    Torque on would swing such a joint back at once. After a reboot a servo counts from its first
+    turn again, which brings a lost turn back.
     """
     low, high = hand.q_min[finger], hand.q_max[finger]
-    if low - ANGLE_MARGIN <= q <= high + ANGLE_MARGIN:
+
+    def is_inside(position: int) -> bool:
+        return low - ANGLE_MARGIN <= scale.angle(position) <= high + ANGLE_MARGIN
+
+    if is_inside(counts):
         return None
-    found, lowest, highest = (f"{math.degrees(angle):.0f}°" for angle in (q, low, high))
+    found, lowest, highest = (
+        f"{math.degrees(angle):.0f}°" for angle in (scale.angle(counts), low, high)
+    )
     problem = f"the joint is at {found}, not in {lowest} … {highest}"
+    turns = counts // reg.COUNTS_PER_TURN
+    if turns and is_inside(counts - turns * reg.COUNTS_PER_TURN):
+        problem += f": its servo has counted {turns} turn{'' if turns in (1, -1) else 's'} too many"
+        return Finding("FAIL", name, problem, LOST_TURN_FIX)
     cure = "turn it there by hand, or `softfinger calibrate joints`, which finds its zero"
     return Finding("FAIL", name, problem, cure)
 

@@ -25,11 +25,22 @@ from softfinger.daemon.errors import ServoError, ServosSilent
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.base import Finding
-from softfinger.daemon.servos.checks import check_latency_timer, examine
+from softfinger.daemon.servos.checks import Examined, check_latency_timer, examine
 from softfinger.daemon.servos.control_table import ServoModel, by_name
+from softfinger.daemon.servos.exchange import (
+    CHECK,
+    ENABLED,
+    HEALTH,
+    LENGTHS,
+    PRESENT,
+    Span,
+    TickReads,
+    choose_reads,
+    note_slow_replies,
+)
 from softfinger.daemon.servos.joint import Joint, JointScale
 from softfinger.daemon.servos.port import BITS_PER_BYTE, PortGone, SerialPort
-from softfinger.daemon.servos.protocol import FastGroupRead, GroupRead, PacketHandler, ServoLine
+from softfinger.daemon.servos.protocol import GroupRead, PacketHandler, ServoLine
 from softfinger.daemon.servos.torque import Torque
 from softfinger.daemon.types import FINGERS, Goal, Reading
 
@@ -38,21 +49,12 @@ _log = logging.getLogger(__name__)
 _MOTION = struct.Struct("<hii").unpack_from  # current, velocity, position
 _SUPPLY = struct.Struct("<HB").unpack_from  # voltage, temperature
 _CLOCK = struct.Struct("<H").unpack_from
-# Registers that one exchange reads, first and last: most ticks' own; with the goals and the bus
-# watchdog; with the supply; from torque enable on.
-_PRESENT = (reg.PRESENT_CURRENT, reg.PRESENT_POSITION + 3)
-_CHECK = (reg.BUS_WATCHDOG, reg.PRESENT_POSITION + 3)
-_HEALTH = (reg.PRESENT_CURRENT, reg.PRESENT_TEMPERATURE)
-_ENABLED = (reg.TORQUE_ENABLE, reg.PRESENT_POSITION + 3)
 _HEALTH_EVERY = 0.25  # s
 _CHECK_EVERY = 0.01  # s
 _CHECK_FRACTION = 0.05  # of the line's time that checks may take
 _SENT_LATELY = 0.035  # s for which a goal counts as sent lately
 _FROZEN = 0.1  # s in which a servo's own clock, of 1 ms, must advance
-# A reply may come after its deadline, and be taken for the next request's. So after a request
-# without a reply the next ones ask for spans of different lengths, which distinguishes the replies.
-_LENGTHS = 11  # of each span: the shortest, and up to ten registers before it
-_DOUBTFUL = 32  # requests
+_DOUBTFUL = 32  # requests after one without a reply, whose spans have different lengths
 _PATIENCE = 0.2  # s for a reply while the servos are checked; `clear` holds the loop up for it
 # s for a reply of an emulated hand, which the machine may hold up while the hand's time stands.
 _BUSY = 0.04
@@ -75,8 +77,8 @@ class DynamixelServos:
         self._joints: list[Joint] = []
         self._line: ServoLine | None = None
         self._torque: Torque | None = None
-        self._spans: dict[tuple[int, int], list[GroupRead]] = {}
-        self._errors: GroupRead | None = None
+        self._reads: TickReads | None = None
+        self._waiting: SerialPort | None = None  # open, since the servos did not answer on it yet
         self._turn = 0  # which length was read last
         self._doubtful = 0  # requests to come whose replies may be mistaken for each other's
         self._next_health = self._next_check = -math.inf  # by the clock
@@ -91,8 +93,10 @@ class DynamixelServos:
 
         Raises:
             ServoError: all that is wrong, one line each. The port is closed again.
-            ServosSilent: servos do not answer, and nothing else is wrong.
+            ServosSilent: servos do not answer, and nothing else is wrong. The port stays open for
+                the next call: opening it anew may restart an adapter that is still booting.
         """
+        waiting, self._waiting = self._waiting, None
         self.close()
         servos, profile = self._settings, self._profile
         model = by_name(servos.model)
@@ -101,40 +105,52 @@ class DynamixelServos:
             Joint(f, servos.ids[f], JointScale.of(servos, f, model), sent=deque(maxlen=stored))
             for f in map(FINGERS.index, profile.scene.fingers)
         ]
-        patience = _BUSY if self._clock.waits else 0.0
-        port = SerialPort(servos.port, servos.baud, max(servos.reply_timeout, patience))
-        port.openPort()
+        if waiting is None:
+            patience = _BUSY if self._clock.waits else 0.0
+            port = SerialPort(servos.port, servos.baud, max(servos.reply_timeout, patience))
+            port.openPort()
+        else:
+            port = waiting
         line = ServoLine(port, self._handler)
         torque = Torque(line, model, servos, profile.hand, self._joints)
         try:
-            fast = self._check(line, model)
+            self._reads = self._check(line, model)
+        except ServosSilent:
+            self._waiting = port
+            raise
         except BaseException:
             port.closePort()
             raise
-        ids = [joint.id for joint in self._joints]
-        read = FastGroupRead if fast else GroupRead
-        for span in (_PRESENT, _CHECK, _HEALTH, _ENABLED):
-            first, last = span
-            self._spans[span] = [
-                read(port, self._handler, first - more, last + 1 - first + more, ids)
-                for more in range(_LENGTHS)
-            ]
-        self._errors = read(port, self._handler, reg.HARDWARE_ERROR_STATUS, 1, ids)
-        more = len(ids) * (_PRESENT[0] - _CHECK[0]) * BITS_PER_BYTE / servos.baud
+        more = len(self._joints) * (PRESENT[0] - CHECK[0]) * BITS_PER_BYTE / servos.baud
         self._check_every = max(_CHECK_EVERY, more / _CHECK_FRACTION)
         self._doubtful = 0
         self._next_health = self._next_check = -math.inf
         self._line, self._torque = line, torque
 
-    def _check(self, line: ServoLine, model: ServoModel) -> bool:
-        """Return whether all servos answer fast sync reads; sets the joints' own limits."""
+    def _check(self, line: ServoLine, model: ServoModel) -> TickReads:
+        """Check servos, adapter and group reads; set the joints' own limits and the notices."""
         port = line.port
         allowed, port.reply_timeout = port.reply_timeout, max(port.reply_timeout, _PATIENCE)
         try:
             found = examine(line, self._profile, model)
+            self._judge(found, port, allowed)
+            claims = all(model.fast_read(each.table[reg.FIRMWARE_VERSION]) for each in found)
+            ids = [joint.id for joint in self._joints]
+            reads, told = choose_reads(port, self._handler, ids, claims)
+            told += note_slow_replies(port, reads, self._profile)
         finally:
             port.reply_timeout = allowed
-        if not any(each.replies for each in found):
+        self.notices += tuple(told)
+        for notice in self.notices:
+            _log.warning(notice)
+        return reads
+
+    def _judge(self, found: list[Examined], port: SerialPort, allowed: float) -> None:
+        """Set limits and notices by what was found; a reply may take ``allowed`` s in a tick.
+
+        Raises ServoError with all that is wrong.
+        """
+        if not any(each.replies or each.errors for each in found):
             raise ServosSilent(
                 f"{port.port_name}: no servo answers at {port.baudrate} baud (IDs "
                 f"{', '.join(str(each.id) for each in found)}): check power and wiring; "
@@ -146,11 +162,11 @@ class DynamixelServos:
         for each in found:
             errors += each.errors
             notices += each.notices
-            if not each.replies:
+            if not each.replies and not each.errors:
                 fix = "check its cable and ID; `softfinger doctor` looks for it at every rate"
                 errors.append(Finding("FAIL", each.name, f"no answer at {port.baudrate} baud", fix))
         if errors:
-            silent = sum(not each.replies for each in found)
+            silent = sum(not each.replies and not each.errors for each in found)
             kind = ServosSilent if len(errors) == silent else ServoError
             raise kind("\n".join(map(str, errors)))
         for joint, each in zip(self._joints, found, strict=True):
@@ -164,9 +180,6 @@ class DynamixelServos:
                 fix = f"{each.misplaced.fix}; torque is refused there"
                 notices.append(replace(each.misplaced, fix=fix))
         self.notices = tuple(notices)
-        for notice in notices:
-            _log.warning(notice)
-        return all(model.fast_read(each.table[reg.FIRMWARE_VERSION]) for each in found)
 
     # --- the tick --------------------------------------------------------------------------------
 
@@ -179,27 +192,27 @@ class DynamixelServos:
         now = self._clock.now()
         if now >= self._next_health:
             self._next_health = now + _HEALTH_EVERY
-            found = self._exchange(_HEALTH, reading)
+            found = self._exchange(HEALTH, reading)
             if found is not None:
                 self._take_health(found, reading)
         elif now >= self._next_check:
-            found = self._exchange(_CHECK, reading)
+            found = self._exchange(CHECK, reading)
             if found is not None:
                 self._next_check = now + self._check_every
                 self._check_torque(found, reading, now)
         else:
-            self._exchange(_PRESENT, reading)
+            self._exchange(PRESENT, reading)
 
-    def _exchange(self, span: tuple[int, int], reading: Reading) -> GroupRead | None:
+    def _exchange(self, span: Span, reading: Reading) -> GroupRead | None:
         """Read a span that has the joints' motion in it, and fill ``reading``."""
-        if not self._spans:
+        if self._reads is None:
             raise ServoError("servos: not connected")
         reading.seq += 1
         turn = 0
         if self._doubtful:
             self._doubtful -= 1
-            turn = self._turn = self._turn % (_LENGTHS - 1) + 1
-        group = self._spans[span][turn]
+            turn = self._turn = self._turn % (LENGTHS - 1) + 1
+        group = self._reads.spans[span][turn]
         result = group.exchange()
         if result == COMM_RX_CORRUPT:
             # Once more, with what is left of the first exchange's deadline.
@@ -253,8 +266,9 @@ class DynamixelServos:
 
     def _ask_errors(self, reading: Reading) -> None:
         """Read what the servos' alert means, once."""
-        errors = self._errors
-        if errors is not None and errors.exchange() == COMM_SUCCESS:
+        assert self._reads is not None
+        errors = self._reads.errors
+        if errors.exchange() == COMM_SUCCESS:
             for joint in self._joints:
                 reading.hardware[joint.finger] = errors.data[joint.id][0]
 
@@ -295,7 +309,7 @@ class DynamixelServos:
         if torque is None:
             raise ServoError("servos: not connected")
         torque.ask_off()
-        found = self._exchange(_ENABLED, reading)
+        found = self._exchange(ENABLED, reading)
         if found is None:
             return False
         at = reg.TORQUE_ENABLE - found.start
@@ -326,6 +340,10 @@ class DynamixelServos:
 
         A servo whose torque another program switched on is left as it was found.
         """
+        if self._waiting is not None:
+            with contextlib.suppress(Exception):
+                self._waiting.closePort()
+            self._waiting = None
         line, torque, reading = self._line, self._torque, Reading()
         if line is None or torque is None:
             return
@@ -340,7 +358,6 @@ class DynamixelServos:
             _log.error("servos: the port went away with torque on; their bus watchdog stops them")
         except Exception as error:
             _log.error("servos: torque off not confirmed: %s", error)
-        self._line = self._torque = self._errors = None
-        self._spans.clear()
+        self._line = self._torque = self._reads = None
         with contextlib.suppress(Exception):
             line.port.closePort()

@@ -17,6 +17,7 @@ import serial
 from dynamixel_sdk.port_handler import PortHandler
 
 from softfinger.daemon.errors import ServoError
+from softfinger.daemon.port_access import bring_it, grant
 
 with contextlib.suppress(ModuleNotFoundError):  # Windows: simulated servos alone
     import termios
@@ -135,11 +136,6 @@ class SerialPort(PortHandler):  # type: ignore[misc]
         )
 
 
-def bring_it(path: str) -> str:
-    """Return advice for a port that does not exist: outside /dev it is an emulated hand's."""
-    return "plug the adapter in" if path.startswith("/dev/") else "start `softfinger emulate`"
-
-
 def _why_not(path: str, error: Exception) -> str:
     code = getattr(error, "errno", None)
     if code == errno.ENOENT or not Path(path).exists():
@@ -148,7 +144,7 @@ def _why_not(path: str, error: Exception) -> str:
             "`softfinger doctor` lists the ports there are"
         )
     if code == errno.EACCES:
-        return f"{path}: no permission: `sudo usermod -aG dialout $USER`, then log in again"
+        return f"{path}: no permission: {grant(path)}"
     if code in (errno.EAGAIN, errno.EBUSY, errno.EWOULDBLOCK) or "lock" in str(error).lower():
         return f"{path}: the port is in use by another process: end that one first"
     return f"{path}: can't be opened: {error}"

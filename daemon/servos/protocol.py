@@ -51,6 +51,9 @@ _STUFFED = _HEADER + b"\xfd"
 _MAX_PACKET = 1024
 _STATUS_SIZE = 11  # bytes of a status packet without data
 _FAST_SYNC_READ = 0x8A  # which dynamixel-sdk 3 has no name for
+_OLD_HEADER = b"\xff\xff"  # of Protocol 1.0: header, ID, length, instruction or error, checksum
+_OLD_STATUS = 6  # bytes of its reply to a ping
+_OLD_WAIT = 0.1  # s
 _ERROR = 0x7F  # of a servo's error byte; the bit above is the alert
 
 
@@ -263,6 +266,21 @@ class ServoLine:
             if result == COMM_SUCCESS:
                 return int(number)
         return None
+
+    def ping_old(self, servo_id: int) -> bool:
+        """Return True if a servo answers a ping of Protocol 1.0, which is asked once."""
+        port = self.port
+        body = bytes((servo_id, 2, INST_PING))
+        request = _OLD_HEADER + body + bytes((~sum(body) & 0xFF,))
+        port.send(request, _OLD_STATUS, time.monotonic() + _OLD_WAIT)
+        while True:
+            came = bytes(port.received).replace(request, b"")  # an adapter may echo it
+            reply = came[max(came.find(_OLD_HEADER), 0) :][:_OLD_STATUS]
+            if len(reply) == _OLD_STATUS:
+                sound = ~sum(reply[2:-1]) & 0xFF == reply[-1]
+                return sound and reply[:2] == _OLD_HEADER and reply[2] != BROADCAST_ID
+            if not port.fill():
+                return False
 
     def ping_all(self, wait: float) -> dict[int, tuple[int, int]]:
         """Return (model number, firmware) of each servo that answers a ping within ``wait`` [s].

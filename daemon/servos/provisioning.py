@@ -1,4 +1,4 @@
-"""Finding servos on a port, and setting up those of the settings: ID, rate, mode, return delay.
+"""Finding servos on a port, and setting up those of the settings: ID, rate, and registers.
 
 :func:`provision` is the one place that writes a servo's EEPROM, and only when it is asked to
 (`softfinger doctor --fix`); torque is off meanwhile. IDs and rates are written only where there
@@ -11,18 +11,26 @@ import contextlib
 import time
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from dynamixel_sdk.robotis_def import COMM_RX_TIMEOUT
+from dynamixel_sdk.robotis_def import BROADCAST_ID, COMM_RX_TIMEOUT
 
 from softfinger.daemon.errors import ServoError
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.base import Finding
-from softfinger.daemon.servos.checks import CHECKED, DRIVE_UNFIT, RETURN_DELAY_MAX
+from softfinger.daemon.servos.checks import (
+    CHECKED,
+    LOST_TURN_FIX,
+    OLD_PROTOCOL,
+    Registers,
+    check_angle,
+    other_model,
+)
 from softfinger.daemon.servos.control_table import ServoModel, by_name
-from softfinger.daemon.servos.joint import servo_name
+from softfinger.daemon.servos.joint import JointScale, servo_name
 from softfinger.daemon.servos.protocol import ServoLine, open_line
+from softfinger.daemon.servos.register_table import required_registers
 from softfinger.daemon.types import FINGERS
 
 SEARCH_TIME = 0.8  # s to listen at each rate: 253 servos at 1 Mbaud
@@ -78,6 +86,12 @@ class Found:
 
     servos: tuple[FoundServo, ...]
     garbled: tuple[Garbled, ...]
+    old: tuple[int, ...] = ()  # rates at which something answers Protocol 1.0
+
+    def old_protocol(self) -> list[Finding]:
+        """Return a finding for each rate at which servos speak Protocol 1.0."""
+        problem, fix = OLD_PROTOCOL
+        return [Finding("FAIL", f"a servo at {baud} baud", problem, fix) for baud in self.old]
 
 
 def search(
@@ -96,6 +110,7 @@ def search(
     """
     found: list[FoundServo] = []
     garbled: list[Garbled] = []
+    old: list[int] = []
     opened, refusal = False, None
     for baud in bauds:
         with contextlib.ExitStack() as stack:
@@ -109,9 +124,11 @@ def search(
             ids_asked = {*replies, *(ids if line.handler.damaged else ())}
             found += [FoundServo(each, baud, *what) for each, what in replies.items()]
             garbled += [Garbled(i, baud) for i in sorted(ids_asked) if is_garbled(line, i)]
+            if not replies and line.ping_old(BROADCAST_ID):
+                old.append(baud)
     if refusal is not None and not opened:
         raise refusal
-    return Found(tuple(found), tuple(garbled))
+    return Found(tuple(found), tuple(garbled), tuple(old))
 
 
 def is_garbled(line: ServoLine, servo_id: int) -> bool:
@@ -212,7 +229,7 @@ def plan(found: Found, settings: Settings, model: ServoModel, rates: Sequence[in
 
 
 def provision(settings: Settings) -> list[Finding]:
-    """Set each servo of the scene up: ID, rate, mode, no return delay, reads answered, no errors.
+    """Set each servo of the scene up: ID, rate, all registers that matter, no errors.
 
     Returns what was ``fixed``, and as ``warn`` what could not be.
 
@@ -222,12 +239,9 @@ def provision(settings: Settings) -> list[Finding]:
     servos = settings.servos
     result: list[Finding] = []
     model = by_name(servos.model)
-    names = {
-        servos.ids[finger]: servo_name(servos.ids[finger], finger)
-        for finger in map(FINGERS.index, settings.scene.fingers)
-    }
+    fingers = {servos.ids[f]: f for f in map(FINGERS.index, settings.scene.fingers)}
     with open_line(servos.port, servos.baud) as line:
-        complete = all(line.ping(servo_id) is not None for servo_id in names)
+        complete = all(line.ping(servo_id) is not None for servo_id in fingers)
     if not complete:
         found = search(servos.port, model.baud_rates, SEARCH_TIME, {FACTORY_ID, *servos.ids})
         what = plan(found, settings, model, model.baud_rates)
@@ -235,26 +249,25 @@ def provision(settings: Settings) -> list[Finding]:
             _identify(servos.port, change, model, result)
         result += _unknown(settings, found, what)
     with open_line(servos.port, servos.baud) as line:
-        for servo_id, name in names.items():
-            number = line.ping(servo_id)
+        for servo_id, finger in fingers.items():
+            name, number = servo_name(servo_id, finger), line.ping(servo_id)
             if number is None:
                 if name not in [each.subject for each in result if each.status == "warn"]:
                     result.append(Finding("warn", name, f"no answer at {servos.baud} baud"))
             elif number != model.number:
-                text = f"is not an {model.name}"
-                result.append(Finding("warn", name, text, "set servos.model"))
+                result.append(Finding("warn", name, *other_model(number, model)))
             elif is_garbled(line, servo_id):
                 result.append(Finding("warn", name, "its replies come damaged", ALONE))
             else:
-                mode = reg.MODE_NUMBERS[servos.mode]
-                _set_up(line, servo_id, name, mode if mode in model.modes else None, result)
+                _set_up(line, settings, finger, model, result)
     return result
 
 
 def _unknown(settings: Settings, found: Found, what: Plan) -> list[Finding]:
     """Return why servos that are still missing are not known."""
-    if found.garbled:
-        return [Finding("warn", "servos", str(each), ALONE) for each in found.garbled]
+    if found.garbled or found.old:
+        garbled = [Finding("warn", "servos", str(each), ALONE) for each in found.garbled]
+        return garbled + [replace(each, status="warn") for each in found.old_protocol()]
     names = [servo_name(settings.servos.ids[finger], finger) for finger in what.missing]
     fit = ", ".join(f"ID {each.id} at {each.baud} baud" for each in what.strangers)
     if not fit:
@@ -297,9 +310,15 @@ def _identify(path: str, change: Change, model: ServoModel, result: list[Finding
 
 
 def _set_up(
-    line: ServoLine, servo_id: int, name: str, mode: int | None, result: list[Finding]
+    line: ServoLine,
+    settings: Settings,
+    finger: int,
+    model: ServoModel,
+    result: list[Finding],
 ) -> None:
-    """Write all settings but ID and rate."""
+    """Write all registers that `register_table` requires, and reboot what needs it."""
+    servo_id = settings.servos.ids[finger]
+    name = servo_name(servo_id, finger)
 
     def failed(problem: str) -> None:
         result.append(Finding("warn", name, problem))
@@ -310,28 +329,35 @@ def _set_up(
     table = line.read(servo_id, 0, CHECKED)
     if table is None:
         return failed("its registers could not be read")
-    if table[reg.HARDWARE_ERROR_STATUS]:
-        error = reg.hardware_error_names(table[reg.HARDWARE_ERROR_STATUS])
+    found = Registers(table)
+    error = found[reg.HARDWARE_ERROR_STATUS]
+    scale = JointScale.of(settings.servos, finger, model)
+    counts = found.long(reg.PRESENT_POSITION)
+    misplaced = check_angle(name, scale, counts, settings.hand, finger)
+    why = ""
+    if error:
+        why = f"it had a hardware error: {reg.hardware_error_names(error)}"
+    elif misplaced is not None and misplaced.fix == LOST_TURN_FIX:
+        why = f"its position was a turn off: {counts} counts"
+    if why:
         if not _reboot(line, servo_id):
-            return failed(f"no answer after a reboot ({error})")
-        result.append(Finding("fixed", name, f"rebooted, since it had a hardware error: {error}"))
+            return failed(f"no answer after a reboot, since {why}")
+        result.append(Finding("fixed", name, f"rebooted, since {why}"))
+        table = line.read(servo_id, 0, CHECKED) or table
     elif table[reg.TORQUE_ENABLE] and not _torque_off(line, servo_id, name, result):
         return None
-    now, drive, delay = (
-        table[at] for at in (reg.OPERATING_MODE, reg.DRIVE_MODE, reg.RETURN_DELAY_TIME)
-    )
-    required = [
-        (reg.OPERATING_MODE, now if mode is None else mode, f"operating mode {now}"),
-        (reg.DRIVE_MODE, drive & ~DRIVE_UNFIT, f"drive mode {drive}"),
-        (reg.RETURN_DELAY_TIME, 0 if delay > RETURN_DELAY_MAX else delay, f"return delay {delay}"),
-    ]
-    for address, value, text in required:
-        if value == table[address]:
+    rows = required_registers(model, settings, finger, table[reg.FIRMWARE_VERSION])
+    # The operating mode first, since it resets gains, profiles and goals.
+    for row in sorted(rows, key=lambda row: row.register.address != reg.OPERATING_MODE):
+        raw = line.read(servo_id, row.register.address, row.register.size) or b""
+        wrong = row.wrong_in(raw, row.register.address) if raw else None
+        if wrong is None:
             continue
-        if line.store(address, {servo_id: bytes((value,))}):
-            failed(f"{text} could not be set to {value}")
+        what, value = row.register.name, row.mended(wrong)
+        if line.store(row.register.address, {servo_id: row.register.packed(value)}):
+            failed(f"{what} {wrong} could not be set to {value}")
         else:
-            result.append(Finding("fixed", name, f"{text} → {value}"))
+            result.append(Finding("fixed", name, f"{what} {wrong} → {value}", row.then))
     return None
 
 

@@ -19,6 +19,7 @@ from softfinger.daemon.servos.checks import REBOOT_FIX, check_angle
 from softfinger.daemon.servos.control_table import ServoModel
 from softfinger.daemon.servos.joint import GOAL_SIZE, Joint, goal_in, pack_goal
 from softfinger.daemon.servos.protocol import GroupWrite, ServoLine
+from softfinger.daemon.servos.register_table import armed_registers
 
 _GOAL_BYTES = (
     *range(reg.GOAL_CURRENT, reg.GOAL_CURRENT + 2),
@@ -27,6 +28,15 @@ _GOAL_BYTES = (
 _COPIES = 2  # of each packet of torque off, since nothing is answered
 _ON_WITHIN = 50  # reply timeouts in which torque must be on: the loop stands still meanwhile
 _STILL = 8  # counts by which a limp joint may move between its goal and torque on, 0.7°
+
+
+def goal_address(mode: int, model: ServoModel, firmware: int) -> int:
+    """Return where a tick writes its goals: one register, or indirect data that stand for two."""
+    if mode == reg.CURRENT_MODE:
+        return reg.GOAL_CURRENT
+    if mode == reg.POSITION_MODE:
+        return reg.GOAL_POSITION
+    return model.indirect_blocks(firmware)[0][1]
 
 
 class Torque:
@@ -72,6 +82,7 @@ class Torque:
         self._refuse_hardware_errors()
         # Writing 0 ends a watchdog's stop, in which goals are read-only.
         self._store_all(reg.BUS_WATCHDOG, b"\x00", "watchdog cleared")
+        self._write_registers()
         goals = self._choose_goals()
         if self._mode != reg.POSITION_MODE:
             self._store_all(reg.GOAL_CURRENT, bytes(2), "goal current")
@@ -107,7 +118,7 @@ class Torque:
         while True:
             positions = self._positions()
             strayed = [
-                check_angle(joint.name, joint.scale.angle(positions[i]), self._hand, joint.finger)
+                check_angle(joint.name, joint.scale, positions[i], self._hand, joint.finger)
                 for i, joint in self._joints.items()
             ]
             if any(strayed):
@@ -122,32 +133,44 @@ class Torque:
 
     def _choose_goals(self) -> GroupWrite:
         """The one sync write of a tick: goal current, goal position, or both side by side."""
-        address = {
-            reg.CURRENT_MODE: reg.GOAL_CURRENT,
-            reg.POSITION_MODE: reg.GOAL_POSITION,
-        }.get(self._mode)
-        if address is None:
-            address = self._map_goals()
+        address = goal_address(self._mode, self._model, self._firmware())
+        if self._mode == reg.CURRENT_BASED_POSITION_MODE:
+            self._map_goals()
         return GroupWrite(self._line.port, address, GOAL_SIZE[self._mode], list(self._joints))
 
-    def _map_goals(self) -> int:
-        """Put goal current and goal position side by side in the indirect data; its address."""
-        starts = set()
+    def _map_goals(self) -> None:
+        """Put goal current and goal position side by side in the indirect data."""
+        pointers = struct.pack(f"<{len(_GOAL_BYTES)}H", *_GOAL_BYTES)
+        self._store_all(reg.INDIRECT_ADDRESS, pointers, "indirect addresses")
+
+    def _firmware(self) -> int:
+        """Return the firmware of the servos, which must agree on where indirect data are."""
+        found = set()
         for servo_id, joint in self._joints.items():
-            firmware = self._line.read(servo_id, reg.FIRMWARE_VERSION, 1)
-            if firmware is None:
+            raw = self._line.read(servo_id, reg.FIRMWARE_VERSION, 1)
+            if raw is None:
                 raise ServoError(f"{joint.name}: no answer")
-            address, data, _ = self._model.indirect_blocks(firmware[0])[0]
-            starts.add((address, data))
-        if len(starts) > 1:
+            found.add(raw[0])
+        if len({self._model.indirect_blocks(version)[0] for version in found}) > 1:
             raise ServoError(
                 "servos: their firmwares place indirect data differently: bring both to the same "
                 "version"
             )
-        address, data = starts.pop()
-        pointers = struct.pack(f"<{len(_GOAL_BYTES)}H", *_GOAL_BYTES)
-        self._store_all(address, pointers, "indirect addresses")
-        return data
+        return max(found)
+
+    def _write_registers(self) -> None:
+        """Write the RAM registers that another program may have left otherwise.
+
+        A servo's gains, profiles and PWM bound last until its power is cut or it reboots.
+        """
+        for servo_id, joint in self._joints.items():
+            held = self._line.read(servo_id, reg.RAM, reg.GOAL_POSITION - reg.RAM)
+            if held is None:
+                raise ServoError(f"{joint.name}: its registers could not be read")
+            for row in armed_registers(self._model):
+                if row.wrong_in(held, reg.RAM) is not None:
+                    what, data = row.register.name, row.register.packed(row.mended(0))
+                    self._store(row.register.address, {servo_id: data}, what)
 
     # --- what forbids it -------------------------------------------------------------------------
 

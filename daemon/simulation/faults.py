@@ -26,7 +26,7 @@ LATE = 0.010  # s that a late reply is late by
 
 @dataclass(slots=True)
 class LineFaults:
-    """Probabilities, 0 … 1, for each instruction and each reply."""
+    """Probabilities, 0 … 1, for each instruction and each reply, and the delay of every reply."""
 
     lose: float = 0.0  # an instruction reaches no servo
     lose_writes: float = 0.0  # one that asks for no reading reaches none, besides
@@ -35,6 +35,7 @@ class LineFaults:
     truncate: float = 0.0  # its end is missing
     corrupt: float = 0.0  # one bit is flipped
     duplicate: float = 0.0  # it comes twice
+    delay: float = 0.0  # s that every reply comes later, as behind a slow adapter
 
 
 LINE_FAULTS = tuple(field.name.replace("_", "-") for field in fields(LineFaults))
@@ -61,9 +62,10 @@ class FaultSource:
 
     @property
     def active(self) -> bool:
-        """True if replies may be lost or damaged."""
+        """True if replies may be lost, damaged or delayed."""
         rates = self.rates
-        return bool(rates.drop or rates.late or rates.truncate or rates.corrupt or rates.duplicate)
+        damage = rates.drop or rates.late or rates.truncate or rates.corrupt or rates.duplicate
+        return bool(damage or rates.delay)
 
     def loses(self, reads: bool) -> bool:
         """Draw whether the next instruction reaches no servo; ``reads``: it asks for a reading."""
@@ -77,7 +79,7 @@ class FaultSource:
         rates, chance = self.rates, self._random.random
         if chance() < rates.drop:
             return []
-        delay = LATE if chance() < rates.late else 0.0
+        delay = rates.delay + (LATE if chance() < rates.late else 0.0)
         if chance() < rates.truncate:
             reply = reply[: self._random.randrange(len(reply))]
         if reply and chance() < rates.corrupt:

@@ -17,6 +17,7 @@ import serial
 
 from softfinger.daemon.clock import Clock
 from softfinger.daemon.errors import TactileError
+from softfinger.daemon.port_access import grant
 from softfinger.daemon.profile.settings import TactileSettings
 from softfinger.daemon.tactile.decoder import Decoded, Decoder
 from softfinger.daemon.types import Frame
@@ -158,13 +159,13 @@ class SerialReader:
     def _trouble(self) -> str:
         if self._port_lost:
             return self._error
-        timeout = self.settings.open_timeout
+        within = f"within tactile.open_timeout = {self.settings.open_timeout:g} s"
         if self._bytes == 0:
             return (
-                f"no byte came within {timeout:g} s; is the board powered, is it this port, does "
-                f"it talk at {self.settings.baud} baud?"
+                f"no byte came {within}; is the board powered, is it this port, does it talk at "
+                f"{self.settings.baud} baud?"
             )
-        return f"{self._bytes} bytes within {timeout:g} s, {self._decoder.diagnosis()}"
+        return f"{self._bytes} bytes {within}, {self._decoder.diagnosis()}"
 
     def _run(self, port: int, stop: int) -> None:
         """The thread: waits in the kernel, wakes once or twice a frame."""
@@ -256,7 +257,7 @@ def open_port(path: str, baud: int) -> serial.Serial:
             if not path.startswith("/dev/"):
                 why = "no such port; is `softfinger emulate` running?"
         elif number in (errno.EACCES, errno.EPERM):
-            why = "no permission to open it; is this user in the group that owns the port?"
+            why = f"no permission to open it: {grant(path)}"
         elif number in (errno.EBUSY, errno.EAGAIN) or "exclusively lock" in str(error):
             why = "busy: another program uses this port"
         else:

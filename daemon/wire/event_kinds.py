@@ -115,9 +115,10 @@ KINDS: dict[str, EventKind] = {
         "Check cable and adapter, then `softfinger send clear`.",
     ),
     "servos.silent": EventKind(
-        "error",
-        "No valid reading arrived within `servos.fault_after`.",
-        "Check supply and cables with `softfinger doctor`.",
+        "warning, error",
+        "No valid reading arrived within `servos.fault_after`. The warning, also while disarmed, "
+        "says that most readings of the last second failed.",
+        "`softfinger doctor` times the servos' replies, and checks supply and cables.",
     ),
     "servos.frozen": EventKind(
         "error", "A servo repeats old readings.", "Switch its supply off and on; check the cable."
@@ -183,6 +184,16 @@ KINDS: dict[str, EventKind] = {
         "error",
         "A joint stands off its goal at the highest current.",
         f"Remove what blocks it. {_CALIBRATE_JOINTS}",
+    ),
+    "joint.swapped": EventKind(
+        "error",
+        "One finger's joint moves the other finger's tip, or an object turns against its command.",
+        f"Swap `servos.ids`, with `zero` and `direction`. {_CALIBRATE_JOINTS}",
+    ),
+    "joint.blocked": EventKind(
+        "warning",
+        "A joint stands in the approach with all its current, and its tip feels nothing.",
+        f"Remove what blocks it, or correct `servos.direction`. {_CALIBRATE_JOINTS}",
     ),
     "joint.strained": EventKind(
         "warning",

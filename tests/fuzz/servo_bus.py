@@ -16,6 +16,8 @@ SEEDS = (
     frame(1, framing.READ, struct.pack("<HH", 0, 147)),
     frame(2, framing.WRITE, struct.pack("<HI", reg.GOAL_POSITION, 9)),
     frame(1, framing.WRITE, struct.pack("<HB", reg.OPERATING_MODE, 4)),
+    frame(1, framing.REG_WRITE, struct.pack("<HB", reg.SHADOW_ID, 2)),
+    frame(BROADCAST, framing.ACTION),
     frame(1, framing.REBOOT),
     frame(2, framing.CLEAR, b"\x01DXL\x22"),
     frame(2, framing.FACTORY_RESET, b"\x02"),
@@ -50,5 +52,6 @@ def _answers_alone(bus: ServoBus, servo: EmulatedServo, t: float) -> bool:
     """To a ping, with the others unplugged: by now they may all have one ID."""
     for each in bus.servos:
         each.silent = each is not servo
+    servo.table.set(reg.PROTOCOL_TYPE, 2)  # a write may have set it to 1
     found = PacketParser().feed(bus.feed(frame(BROADCAST, framing.PING), t), 0.0)
     return [packet.id for packet in found] == [servo.id]

@@ -18,6 +18,7 @@ TORQUE_CONSTANT = 1.78  # N·m/A
 CURRENT_LAG = 0.001  # s
 STIFFNESS = 8.0  # A/rad
 DAMPING = 0.10  # A·s/rad
+STALL = 3.21  # A with all of the supply
 
 
 class FreeJoints:
@@ -30,6 +31,7 @@ class FreeJoints:
         self.dq: FloatArray = np.zeros(count)  # rad/s
         self.current: FloatArray = np.zeros(count)  # A
         self._goals = [(False, 0.0, 0.0, 0.0)] * count  # torque on, signed current, angle, bound
+        self._tuned = [(1.0, 0.0, 1.0)] * count  # stiffness, damping, duty, as of `tune`
 
     def measured_current(self, joint: int) -> float:
         """As :meth:`JointPlant.measured_current`."""
@@ -52,11 +54,19 @@ class FreeJoints:
         else:
             self._goals[joint] = torque_on, 0.0, goal_q, abs(goal_current)
 
+    def tune(self, joint: int, stiffness: float, damping: float, duty: float) -> None:
+        """Set a servo's gains and PWM, as :meth:`JointPlant.tune`."""
+        self._tuned[joint] = stiffness, damping, duty
+
     def _advance(self, joint: int, count: int) -> None:
         q, dq, current = (float(each[joint]) for each in (self.q, self.dq, self.current))
         torque_on, fixed, goal, bound = self._goals[joint]
+        stiffness, damping, duty = self._tuned[joint]
+        stiffness, damping = STIFFNESS * stiffness, DAMPING + STIFFNESS * damping
+        most = STALL * duty
         for _ in range(count):
-            wanted = min(max(STIFFNESS * (goal - q) - DAMPING * dq, -bound), bound) + fixed
+            wanted = min(max(stiffness * (goal - q) - damping * dq, -bound), bound) + fixed
+            wanted = min(max(wanted, -most), most)
             current = current + (wanted - current) * STEP / CURRENT_LAG if torque_on else 0.0
             dq += TORQUE_CONSTANT * current * STEP / INERTIA
             dq /= 1.0 + VISCOUS * STEP / INERTIA

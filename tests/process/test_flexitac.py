@@ -112,7 +112,9 @@ def test_what_can_not_be_opened_is_told(tmp_path, board):
 
 def test_a_silent_port_is_told_with_its_name_and_the_timeout(own_threads, board):
     tactile = sensor(board.path, timeout=0.05)
-    with pytest.raises(TactileError, match=rf"{board.path}: no byte came within 0\.05 s"):
+    with pytest.raises(
+        TactileError, match=rf"{board.path}: no byte came within tactile.open_timeout = 0\.05 s"
+    ):
         tactile.open()
     assert not own_threads()
     # And it can be opened once the board talks.

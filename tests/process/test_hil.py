@@ -279,3 +279,23 @@ def test_what_gets_lost_on_the_line_does_not_keep_torque_on(rig):
     if rig.status()["mode"] == "fault":  # by when torque off was confirmed
         rig.does("clear")
     rig.works()
+
+
+@pytest.mark.extended
+def test_swapped_ids_are_a_fault_in_the_approach(tmp_path, addresses):
+    """With zero and direction as `calibrate joints` would find them for each servo."""
+    hand, off = tmp_path / "hand", "simulation.object_position=[0.004, 0.08]"
+    config = tmp_path / "hil.toml"
+    head = f'stream.address = "{addresses[0]}"\ncommands.address = "{addresses[1]}"\n'
+    config.write_text(head + HIL.read_text(encoding="utf-8"), encoding="utf-8")
+    with EmulatorProcess("--dir", hand, "--config", HIL, "--set", off).ready() as emulator:
+        swapped = ("--set", "servos.ids=[2, 1]", "--set", "servos.direction=[-1, 1]")
+        daemon = Running("--config", str(config), "--dir", str(hand), *swapped, *WAITING)
+        ask(addresses[1], "arm")
+        ask(addresses[1], "grasp", force=6.0)
+        until(lambda: ask(addresses[1], "status")["fault"])
+        status = ask(addresses[1], "status")
+        assert status["fault_name"] == "joint.swapped"
+        assert status["fault"].endswith("are servos.ids swapped?")
+        assert daemon.end() == 1
+        emulator.end()

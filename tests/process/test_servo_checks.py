@@ -68,10 +68,10 @@ REBOOT = ": remove the cause, then `softfinger doctor --fix` reboots it"
             ["overload=2"],
             {},
             [
-                f"{LEFT}operating mode is position (3), not current-based position (5){FIX}",
                 f"{LEFT}return delay is 500 µs, more than 50 µs{FIX}",
-                f"{RIGHT}operating mode is position (3), not current-based position (5){FIX}",
+                f"{LEFT}operating mode is position (3), not current-based position (5){FIX}",
                 f"{RIGHT}return delay is 500 µs, more than 50 µs{FIX}",
+                f"{RIGHT}operating mode is position (3), not current-based position (5){FIX}",
                 f"{RIGHT}hardware error: overload{REBOOT}",
             ],
         ),
@@ -81,8 +81,7 @@ REBOOT = ": remove the cause, then `softfinger doctor --fix` reboots it"
             {reg.CURRENT_LIMIT: 100},
             [
                 f"{LEFT}supply is 8.5 V, not in 9.5 … 16.0 V: check the supply",
-                f"{RIGHT}current limit is 0.269 A, below safety.current_max 1.2 A: lower "
-                "safety.current_max or raise the limit",
+                f"{RIGHT}current limit is 0.269 A, below safety.current_max 1.2 A{FIX}",
             ],
         ),
         (

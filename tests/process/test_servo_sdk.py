@@ -74,6 +74,17 @@ def test_the_plain_sdk_is_served_too(bus):
         assert exchange() == OK
         assert [read.getData(servo, reg.PRESENT_POSITION, 4) for servo in (1, 2)] == [2048, 2048]
     assert handler.broadcastPing(port) == ({1: [1020, 48], 2: [1020, 48]}, OK)
+    assert handler.regWriteTxRx(port, 1, reg.LED, 1, [1]) == (OK, 0)
+    assert handler.read1ByteTxRx(port, 1, reg.LED) == (0, OK, 0)
+    assert handler.action(port, sdk.BROADCAST_ID) == OK
+    assert handler.read1ByteTxRx(port, 1, reg.LED) == (1, OK, 0)
+    assert handler.clearMultiTurn(port, 1) == (OK, 0)
+    write = sdk.GroupBulkWrite(port, handler)
+    assert write.addParam(1, reg.LED, 1, [0])
+    assert write.addParam(2, reg.PROFILE_VELOCITY, 4, [7, 0, 0, 0])
+    assert write.txPacket() == OK
+    assert handler.read1ByteTxRx(port, 1, reg.LED) == (0, OK, 0)
+    assert handler.read4ByteTxRx(port, 2, reg.PROFILE_VELOCITY) == (7, OK, 0)
     port.closePort()
 
 

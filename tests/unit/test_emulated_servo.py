@@ -35,8 +35,7 @@ def client(**options: Any) -> BusClient:
         (reg.BAUD_RATE, 8, 1, framing.DATA_RANGE),
         (reg.OPERATING_MODE, 2, 1, framing.DATA_RANGE),
         (reg.OPERATING_MODE, reg.PWM_MODE, 1, framing.DATA_RANGE),
-        (reg.SHADOW_ID, 9, 1, framing.DATA_RANGE),
-        (reg.STARTUP_CONFIGURATION, 1, 1, framing.DATA_RANGE),
+        (reg.STARTUP_CONFIGURATION, 4, 1, framing.DATA_RANGE),
         (reg.ID, 253, 1, framing.DATA_RANGE),
         (reg.GOAL_POSITION, 4096, 4, framing.DATA_LIMIT),
         (reg.GOAL_POSITION, -1, 4, framing.DATA_LIMIT),
@@ -79,8 +78,7 @@ def test_eeprom_is_locked_while_torque_is_on() -> None:
     ("instruction", "parameters"),
     [
         (0x77, b""),
-        (0x04, struct.pack("<HB", reg.LED, 1)),  # registered write
-        (0x05, b""),  # action
+        (0x05, b""),  # action, with nothing registered
         (0x20, b"\x01CTRL"),  # control table backup
     ],
 )
@@ -89,6 +87,98 @@ def test_instructions_that_it_does_not_know(instruction: int, parameters: bytes)
     before = bytes(c.bus.servos[0].table.memory)
     assert c.ask(instruction, parameters) == (framing.INSTRUCTION_ERROR, b"")
     assert bytes(c.bus.servos[0].table.memory) == before
+
+
+def test_a_registered_write_waits_for_the_action() -> None:
+    c = client()
+    led = struct.pack("<HB", reg.LED, 1)
+    assert c.ask(framing.REG_WRITE, led) == (framing.OK, b"")
+    assert (c.read(reg.LED, 1), c.read(reg.REGISTERED_INSTRUCTION, 1)) == (0, 1)
+    assert c.ask(framing.REG_WRITE, struct.pack("<HB", reg.LED, 2)) == (framing.DATA_RANGE, b"")
+    assert c.send(framing.BROADCAST, framing.ACTION) == b""
+    assert (c.read(reg.LED, 1), c.read(reg.REGISTERED_INSTRUCTION, 1)) == (1, 0)
+    assert c.ask(framing.ACTION) == (framing.INSTRUCTION_ERROR, b"")
+    c.ask(framing.REG_WRITE, struct.pack("<HB", reg.LED, 0))
+    c.ask(framing.REBOOT)
+    c.later(REBOOT_TIME + 0.01)
+    assert c.ask(framing.ACTION) == (framing.INSTRUCTION_ERROR, b"")
+
+
+def test_a_shadow_id_is_obeyed_without_an_answer() -> None:
+    c = client()
+    assert c.write(reg.SHADOW_ID, 2, 1) == 0
+    assert c.write(reg.LED, 1, 1, packet_id=2) == 0  # of servo 2 alone
+    assert [servo.table.get(reg.LED) for servo in c.bus.servos] == [1, 1]
+
+
+def test_torque_goes_on_at_power_up_where_that_is_configured() -> None:
+    c = client()
+    assert c.write(reg.STARTUP_CONFIGURATION, 1, 1) == 0
+    c.ask(framing.REBOOT)
+    c.later(REBOOT_TIME + 0.01)
+    assert c.bus.servos[0].torque_on
+
+
+def test_protocol_1_is_spoken_where_it_is_set() -> None:
+    c = client()
+    c.bus.servos[0].table.set(reg.PROTOCOL_TYPE, 1)
+    assert c.send(1, framing.PING) == b""
+    # The example of the e-Manual's page on Protocol 1.0.
+    asked, answered = bytes.fromhex("FFFF010201FB"), bytes.fromhex("FFFF010200FC")
+    assert c.bus.feed(asked, c.t) == answered
+    assert c.bus.feed(bytes.fromhex("FFFF020201FA"), c.t) == b""
+    assert c.bus.feed(bytes.fromhex("FFFF010201FA"), c.t) == b""  # a wrong checksum
+
+
+# Registers that change how a goal is followed.
+
+
+def travelled(*writes: tuple[int, int, int], time: float = 0.1) -> float:
+    """How far [counts] a goal of 300 counts brings the joint in this time."""
+    c = client(prepared=True)
+    for address, value, size in writes:
+        assert c.write(address, value, size) == 0
+    assert c.write(reg.TORQUE_ENABLE, 1, 1) == 0
+    assert c.write(reg.GOAL_POSITION, 300, 4) == 0
+    c.later(time)
+    return abs(c.read(reg.PRESENT_POSITION, 4))
+
+
+@pytest.mark.parametrize(
+    ("address", "value", "size", "share"),
+    [
+        (reg.POSITION_P_GAIN, 80, 2, 0.6),  # a tenth of the factory's
+        (reg.POSITION_D_GAIN, 16_000, 2, 0.6),
+        (reg.GOAL_PWM, 6, 2, 0.6),
+        (reg.PWM_LIMIT, 6, 2, 0.6),
+        (reg.PROFILE_VELOCITY, 5, 4, 0.1),
+    ],
+)
+def test_gains_pwm_and_profile_slow_a_joint_down(address, value, size, share) -> None:
+    assert travelled() > 200.0
+    assert travelled((address, value, size)) < share * travelled()
+
+
+def test_no_position_gain_and_no_pwm_leave_the_joint_where_it_is() -> None:
+    assert travelled((reg.POSITION_P_GAIN, 0, 2)) <= 1
+    assert travelled((reg.GOAL_PWM, 0, 2)) <= 1
+
+
+def test_the_velocity_limit_binds_profile_and_velocity_mode() -> None:
+    profile = (reg.PROFILE_VELOCITY, 200, 4)
+    limited = travelled((reg.VELOCITY_LIMIT, 20, 4), profile)
+    # 20 · 0.229 rpm for 0.1 s, in counts, less the joint's lag.
+    assert limited < 20 * 0.229 / 60.0 * 4096 * 0.1 < travelled(profile)
+    c = client()
+    for address, value, size in (
+        (reg.OPERATING_MODE, reg.VELOCITY_MODE, 1),
+        (reg.TORQUE_ENABLE, 1, 1),
+        (reg.GOAL_VELOCITY, 100, 4),
+    ):
+        assert c.write(address, value, size) == 0
+    c.bus.servos[0].table.set(reg.VELOCITY_LIMIT, 10)
+    c.later(1.0)
+    assert c.read(reg.PRESENT_POSITION, 4) == pytest.approx(10 * 0.229 / 60.0 * 4096, rel=0.1)
 
 
 @pytest.mark.parametrize(

@@ -159,7 +159,7 @@ def test_fingers_that_see_the_object_at_two_angles_warn_and_then_are_a_fault() -
     right.estimate.tilt_x += 0.1
     name, text = judged(judge, state, 0.5)
     assert name == "hand.angle"
-    assert "12.0° apart: the object lies askew" in text
+    assert "12.0° apart: a joint's zero is wrong" in text
     right.estimate.covariance[1, 1] = 0.06**2  # not known well enough to accuse anybody
     assert judged(judge, state, 0.5) == ("", "")
 
@@ -206,6 +206,26 @@ def test_a_warning_is_told_once_until_it_has_been_over(name):
         put(state, changes)
         judged(judge, state, 2.0)
         assert [each.name for each in judge.warnings].count(name) == times
+
+
+@pytest.mark.parametrize(("good", "told"), [(1000, True), (20, True), (3, False)])
+def test_readings_that_fail_for_a_second_are_told_also_while_disarmed(good, told):
+    """Of so many readings one is good."""
+    watch, state = safety(), sound(Mode.DISARMED)
+    state.torque = False
+    first = math.inf
+    for k in range(1, 1000):
+        state.t = 5.0 + 0.002 * k
+        state.reading.valid = k % good == 0
+        watch.judge(state)
+        if watch.warnings:
+            first = min(first, state.t - 5.0)
+    warnings = [each.text for each in watch.warnings if each.name == "servos.silent"]
+    assert len(warnings) == told
+    if told:
+        assert "of the last second's readings failed: no sound reply within" in warnings[0]
+        assert "servos.reply_timeout = 4 ms; `softfinger doctor`" in warnings[0]
+        assert 0.9 < first < 1.5
 
 
 def test_a_warning_at_its_limit_does_not_flicker():

@@ -156,6 +156,16 @@ def test_a_search_finds_servos_at_their_rate(wired):
         search("line", (-1,))
 
 
+def test_a_search_recognises_servos_of_protocol_1(wired):
+    bus = wired(baud=57600)
+    bus.servos[0].table.set(reg.PROTOCOL_TYPE, 1)
+    bus.servos[1].silent = True
+    found = search("line", (57600, HOME))
+    assert (found.servos, found.old) == ((), (57600,))
+    _, problems = bus.provision()
+    assert problems[0].startswith("a servo at 57600 baud: answers Protocol 1.0, expected 2.0: ")
+
+
 def test_a_port_that_goes_away_ends_a_search(wired, monkeypatch):
     def gone(*_: object) -> None:
         raise PortGone("the port is gone")
@@ -197,7 +207,7 @@ def test_factory_servos_together_are_reported_and_not_changed(wired):
     [
         ("overload=2", None, 0, f"{RIGHT}: rebooted, since it had a hardware error: overload"),
         ("", reg.TORQUE_ENABLE, 1, f"{LEFT}: torque off, since EEPROM is locked while it is on"),
-        ("", reg.DRIVE_MODE, 0b1001, f"{LEFT}: drive mode 9 → 1"),
+        ("", reg.DRIVE_MODE, 0b1100, f"{LEFT}: drive mode 12 → 4"),
         ("", reg.STATUS_RETURN_LEVEL, 0, ""),
     ],
 )
@@ -219,4 +229,4 @@ def test_what_can_not_be_set_up_is_reported_beside_what_was(wired):
     missing = f"{RIGHT}: no answer at any rate: check its power and cable"
     assert bus.provision() == (named(LEFT, *MODE_AND_DELAY), [missing])
     _, problems = bus.provision(model="XL330-M288")
-    assert f"{LEFT}: is not an XL330-M288: set servos.model" in problems
+    assert f"{LEFT}: is an XM430-W350, not an XL330-M288: set servos.model" in problems

@@ -247,7 +247,7 @@ def test_position_limits_that_the_joint_does_not_fit_in_are_told(monkeypatch):
     rig = DynamixelRig(monkeypatch, servos={"mode": "position"})
     table = rig.bus.servos[1].table
     table.set(reg.MAX_POSITION_LIMIT, 2100)
-    with pytest.raises(ServoError, match=r"servo 2 .*limits are 0 … 2100, the joint needs"):
+    with pytest.raises(ServoError, match=r"servo 2 .*max position limit is 2100, the joint needs"):
         rig.servos.connect()
     table.set(reg.MAX_POSITION_LIMIT, 4095)
     rig.servos.connect()

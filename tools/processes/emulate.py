@@ -25,7 +25,7 @@ faults, each KIND[=VALUE][@START], given as often as needed:
   tactile boards   torn, noisy (=PROBABILITY a frame), silent, frozen, wrong-size, saturated, zero;
                    both boards, or one: left:silent, right:torn=0.2
   to the servos    lose, lose-writes =PROBABILITY that an instruction reaches none of them
-  servo replies    drop, late, truncate, corrupt, duplicate =PROBABILITY
+  servo replies    drop, late, truncate, corrupt, duplicate =PROBABILITY; delay=S for every reply
   servos           silent, answer, reboot, overheat, overload, undervoltage =ID; their readings:
                    stuck (angle stands, velocity and current read 0), jump (by 0.2 rad), frozen
                    (all registers stand, their time too), refuse (an error for each); recover =ID

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
+from pathlib import Path
 
 from softfinger.daemon.backends import BUILT_IN, backend, plugins, source
 from softfinger.daemon.diagnosis.devices import (
@@ -24,6 +25,8 @@ from softfinger.daemon.diagnosis.ports import (
     daemon_mode,
     note_ports,
 )
+from softfinger.daemon.diagnosis.register_file import restore_registers, save_registers
+from softfinger.daemon.errors import ServoError
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.base import Finding
 from softfinger.daemon.servos.checks import check_latency_timer
@@ -34,9 +37,10 @@ from softfinger.tools.processes.compile import build_kernels, print_event
 _EPILOG = """\
 exit status: 0 when nothing failed (warnings may remain), 1 when something did, 2 for settings that
 can't be used. Without --fix nothing is changed. With it: adapters' latency timers go to 1 ms,
-servos get their ID and rate where there is no doubt which one is meant, their operating mode,
-return delay and status return level, and are rebooted after a hardware error (the hand lets go
-meanwhile), and kernels are compiled. Nothing is ever stiffened or moved.
+servos get their ID and rate where there is no doubt which one is meant, and the values of all
+registers that matter to the hand, and are rebooted after a hardware error or where their position
+is a turn off (the hand lets go meanwhile), and kernels are compiled. Nothing is ever stiffened or
+moved.
 
 factory-new servos all have ID 1, at 57600 baud: connect one alone, then doctor --fix; then the next
 one beside it, and doctor --fix again."""
@@ -45,7 +49,17 @@ one beside it, and doctor --fix again."""
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
     add_profile(parser)
-    parser.add_argument("--fix", action="store_true", help="repair what can be repaired from here")
+    change = parser.add_mutually_exclusive_group()
+    change.add_argument("--fix", action="store_true", help="repair what can be repaired from here")
+    change.add_argument(
+        "--restore",
+        type=Path,
+        metavar="FILE",
+        help="write the servos' registers back as --save stored them",
+    )
+    parser.add_argument(
+        "--save", type=Path, metavar="FILE", help="first store the servos' registers in FILE"
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -53,7 +67,7 @@ def run(arguments: argparse.Namespace) -> int:
     settings = profile(arguments)
     print(f"settings: {arguments.config or 'the built-in simulated hand'}")
     counts = {"FAIL": 0, "warn": 0, "pass": 0}
-    for result in results(settings, arguments.fix):
+    for result in results(settings, arguments.fix, arguments.save, arguments.restore):
         counts[result.status] = counts.get(result.status, 0) + 1
         print(f"{result.status:5}  {result.subject}: {result.text}", flush=True)
         if result.fix:
@@ -62,7 +76,9 @@ def run(arguments: argparse.Namespace) -> int:
     return 1 if counts["FAIL"] else 0
 
 
-def results(settings: Settings, fix: bool) -> Iterator[Finding]:
+def results(
+    settings: Settings, fix: bool, save: Path | None = None, restore: Path | None = None
+) -> Iterator[Finding]:
     """Run all checks, each after those that it needs, with the repairs before them."""
     ports = _ports(settings)
     for kind in BUILT_IN:
@@ -77,6 +93,8 @@ def results(settings: Settings, fix: bool) -> Iterator[Finding]:
         yield found
         if free[path]:
             yield from _latency(settings, path, fix)
+    if free.get(settings.servos.port):
+        yield from _register_files(settings, save, restore)
     yield from _servos(settings, free, fix)
     tactile = settings.tactile
     if not backend("tactile", tactile.backend).metal:
@@ -92,6 +110,18 @@ def results(settings: Settings, fix: bool) -> Iterator[Finding]:
         build_kernels(settings, print_event)
     yield from check_kernels(settings)
     yield from check_addresses(settings)
+
+
+def _register_files(
+    settings: Settings, save: Path | None, restore: Path | None
+) -> Iterator[Finding]:
+    try:
+        if save is not None:
+            yield from save_registers(settings, save)
+        if restore is not None:
+            yield from restore_registers(settings, restore)
+    except (ServoError, OSError) as error:
+        yield Finding("FAIL", "servos", str(error))
 
 
 def _ports(settings: Settings) -> list[tuple[str, str]]:

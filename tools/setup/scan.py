@@ -54,7 +54,9 @@ def run(arguments: argparse.Namespace) -> int:
             print(f"{path}: {servo.told(', '.join(at))}", flush=True)
         for garbled in found.garbled:
             print(f"{path}: {garbled}\n  → {ALONE}", flush=True)
-        if not found.servos and not found.garbled:
+        for old in found.old_protocol():
+            print(f"{path}: {old}", flush=True)
+        if not found.servos and not found.garbled and not found.old:
             print(f"{path}: no servo answers at any of these rates", flush=True)
         count += len(rates)
     return 0 if count else 1

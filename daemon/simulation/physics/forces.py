@@ -28,7 +28,8 @@ from softfinger.kinematics.compiled.simd import Pointer
 def current_reference(plant: Plant, joint: int, q: float, rate: float) -> float:
     """Return current [A] that a servo asks of its motor: its mode's law within all limits.
 
-    The supply's limit falls linearly from the stall current at rest to none at no-load speed.
+    The limit of the supply, or of the share of it that the servo's PWM lets through, falls linearly
+    from the stall current at rest to none at no-load speed.
     """
     p, goals = plant.parameters, plant.goals
     if goals.torque_on[joint] == 0:
@@ -38,12 +39,14 @@ def current_reference(plant: Plant, joint: int, q: float, rate: float) -> float:
     if mode == CURRENT_MODE:
         reference = goals.current[joint]
     else:
-        reference = p.position_gain * (goals.q[joint] - q) - p.rate_gain * rate
+        pull = goals.stiffness[joint] * (goals.q[joint] - q) - goals.damping[joint] * rate
+        reference = p.position_gain * pull - p.rate_gain * rate
         if mode == CURRENT_BASED_POSITION_MODE:
             limit = min(limit, abs(goals.current[joint]))
     reference = min(max(reference, -limit), limit)
     back = p.stall_current * rate / p.no_load_speed
-    current: float = min(max(reference, -p.stall_current - back), p.stall_current - back)
+    most = goals.duty[joint] * p.stall_current
+    current: float = min(max(reference, -most - back), most - back)
     return current
 
 
@@ -62,8 +65,8 @@ def set_motor_slopes(plant: Plant, g: float) -> None:
         if goals.torque_on[joint] != 0:
             by_rate = p.stall_current / p.no_load_speed
             if goals.mode[joint] != CURRENT_MODE:
-                by_q = p.position_gain
-                by_rate = max(by_rate, p.rate_gain)
+                by_q = p.position_gain * goals.stiffness[joint]
+                by_rate = max(by_rate, p.rate_gain + p.position_gain * goals.damping[joint])
             if g * constant * (by_rate + g * by_q) < 0.1 * p.joint_inertia:
                 by_q = 0.0
                 by_rate = 0.0

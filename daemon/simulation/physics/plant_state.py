@@ -146,6 +146,9 @@ class Goals(Record):
     torque_on: Flags
     q: Pair  # [rad]
     current: Pair  # [A]
+    stiffness: Pair  # of the servos' position loops, over the factory's
+    damping: Pair  # that they have more than the factory's [s of its stiffness]
+    duty: Pair  # share of the supply that their motors may get
     load: Three  # external force x, y [N] and torque [N·m] on the object
 
 

@@ -234,6 +234,7 @@ class SimulatedHand:
         self._first_pose = state.position[2:].copy()
         goals = self.plant.goals
         goals.mode[:] = CURRENT_BASED_POSITION_MODE
+        goals.stiffness[:] = goals.duty[:] = 1.0
         # As many as may be on their way to a sensor's reader.
         latest = simulation.tactile_delay + simulation.tactile_jitter
         stored = math.ceil(latest * settings.tactile.rate) + SPARE_SAMPLES
@@ -313,6 +314,12 @@ class SimulatedHand:
         self.torque_on[joint] = torque_on
         self._goal_q[joint] = goal_q
         self._goal_current[joint] = goal_current
+
+    def tune(self, joint: int, stiffness: float, damping: float, duty: float) -> None:
+        """Set a servo's position gains and the share of the supply that its motor may get."""
+        goals = self.plant.goals
+        goals.stiffness[joint], goals.damping[joint] = stiffness, damping
+        goals.duty[joint] = duty
 
     def measured_current(self, joint: int) -> float:
         """Return the motor current [A] that a servo's own sensor shows."""

@@ -17,6 +17,8 @@ BROADCAST: Final = 0xFE
 PING: Final = 0x01
 READ: Final = 0x02
 WRITE: Final = 0x03
+REG_WRITE: Final = 0x04
+ACTION: Final = 0x05
 FACTORY_RESET: Final = 0x06
 REBOOT: Final = 0x08
 CLEAR: Final = 0x10
@@ -60,6 +62,18 @@ def status(packet_id: int, error: int, data: bytes = b"") -> bytes:
 def fast_head(length: int) -> bytes:
     """Return how the one reply to a fast group read begins."""
     return _PREFIX + bytes((BROADCAST, length & 0xFF, length >> 8 & 0xFF, STATUS))
+
+
+def old_status(packet_id: int) -> bytes:
+    """Return a status packet of Protocol 1.0 without an error and data."""
+    body = bytes((packet_id, 2, 0))
+    return b"\xff\xff" + body + bytes((~sum(body) & 0xFF,))
+
+
+def old_pings(data: bytes) -> list[int]:
+    """Return the IDs of the pings of Protocol 1.0 in ``data``."""
+    found = re.finditer(rb"\xff\xff([\x00-\xfe]\x02\x01)(.)", data, re.DOTALL)
+    return [m[1][0] for m in found if ~sum(m[1]) & 0xFF == m[2][0]]
 
 
 class Packet(NamedTuple):

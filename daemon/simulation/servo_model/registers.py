@@ -73,8 +73,8 @@ def _items_of(model: ServoModel, firmware: int) -> list[Item]:
         _setting(reg.RETURN_DELAY_TIME, 1, 250, 0, 254),
         _setting(reg.DRIVE_MODE, 1, 0, 0, model.drive_mode_max),
         _setting(reg.OPERATING_MODE, 1, reg.POSITION_MODE, 0, reg.CURRENT_BASED_POSITION_MODE),
-        _setting(reg.SHADOW_ID, 1, 255, 253, 255),
-        _setting(reg.PROTOCOL_TYPE, 1, 2, 2, 2),
+        _setting(reg.SHADOW_ID, 1, 255, 0, 255),
+        _setting(reg.PROTOCOL_TYPE, 1, 2, 2 if model.small else 1, 2),
         _setting(reg.HOMING_OFFSET, 4, 0, -_OFFSET_MAX, _OFFSET_MAX),
         _setting(reg.MOVING_THRESHOLD, 4, 10, 0, 1023),
         _setting(reg.TEMPERATURE_LIMIT, 1, model.temperature_limit, 0, 100),
@@ -122,7 +122,7 @@ def _items_of(model: ServoModel, firmware: int) -> list[Item]:
     if model.pwm_slope is not None:
         items.append(_setting(reg.PWM_SLOPE, 1, model.pwm_slope, 1, 255))
     if firmware >= _STARTUP_FIRMWARE:
-        items.append(_setting(reg.STARTUP_CONFIGURATION, 1, 0, 0, 0))
+        items.append(_setting(reg.STARTUP_CONFIGURATION, 1, 0, 0, 3))
         items.append(_read_only(reg.BACKUP_READY, 1))
     highest = model.highest_address(firmware)
     for address, data, entries in model.indirect_blocks(firmware):

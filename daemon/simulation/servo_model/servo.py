@@ -1,10 +1,10 @@
 """One emulated Dynamixel X servo: what its registers do, over a joint of a plant.
 
 Torque, operating modes, limits, profiles, bus watchdog, hardware errors and shutdown, reboot;
-packets belong to :mod:`simulation.servo_model.servo_bus`. PWM mode, a secondary ID and a startup
-configuration, which no client is known to set, are out of range here. Choices of our own, where
-the manuals say nothing: a write that breaks any rule changes nothing at all; torque on after a
-shutdown is refused with RESULT_FAIL.
+packets belong to :mod:`simulation.servo_model.servo_bus`. PWM mode, which no client is known to
+set, is out of range here; a startup with the RAM's backup and the integral gain have no effect.
+Choices of our own, where the manuals say nothing: a write that breaks any rule changes nothing at
+all; torque on after a shutdown is refused with RESULT_FAIL.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ REBOOT_TIME = 0.34  # s without an answer
 JUMP = 130  # counts, 0.2 rad at the shaft, by which an encoder's zero jumps
 FAR = 0.05  # rad between goal and present angle at torque on that count as far
 _WATCHED = frozenset((reg.GOAL_CURRENT, reg.GOAL_POSITION))
+_TUNED = (reg.PWM_LIMIT, reg.POSITION_D_GAIN, reg.POSITION_P_GAIN, reg.GOAL_PWM)
 _CLEAR_FIRMWARE = 42
 _CLEAR_KEY = b"\x01DXL\x22"
 
@@ -76,6 +77,7 @@ class EmulatedServo:
         self._boot_at = -math.inf  # a reboot ends then
         self._next_step = math.inf
         self._next_sense = t
+        self._registered: tuple[int, bytes] | None = None  # a write that waits for an action
         for address, value in eeprom.items():
             self.table.set(address, value)
         self._start(t)
@@ -85,6 +87,16 @@ class EmulatedServo:
     @property
     def id(self) -> int:
         return self._memory[reg.ID]
+
+    @property
+    def shadow(self) -> int:
+        """A second ID whose instructions it obeys without an answer; 253 and more are none."""
+        return self._memory[reg.SHADOW_ID]
+
+    @property
+    def old_protocol(self) -> bool:
+        """True if it speaks Protocol 1.0, of which this emulator answers the ping."""
+        return self._memory[reg.PROTOCOL_TYPE] == 1
 
     @property
     def baud(self) -> int:
@@ -200,6 +212,22 @@ class EmulatedServo:
         self._joint.drive()
         return framing.OK
 
+    def register(self, address: int, data: bytes) -> int:
+        """Keep a write until :meth:`action`; the error number."""
+        error, _ = self.table.plan(address, data)
+        if not error:
+            self._registered = address, data
+            self.table.set(reg.REGISTERED_INSTRUCTION, 1)
+        return error
+
+    def action(self, t: float) -> int:
+        """Do the write that was registered last; the error number."""
+        if self._registered is None:
+            return framing.INSTRUCTION_ERROR
+        (address, data), self._registered = self._registered, None
+        self.table.set(reg.REGISTERED_INSTRUCTION, 0)
+        return self.write(address, data, t)
+
     def reboot(self, t: float) -> None:
         """Switch torque off, be silent for REBOOT_TIME, then restore the RAM as after power-up."""
         self.table.set(reg.TORQUE_ENABLE, 0)
@@ -291,6 +319,8 @@ class EmulatedServo:
             self._joint.aim()
         elif address == reg.BUS_WATCHDOG:
             self._watched = t
+        elif address in _TUNED:
+            self._joint.tune()
 
     def _reset_mode(self) -> None:
         table = self.table
@@ -310,6 +340,7 @@ class EmulatedServo:
         if self.model.senses_current:
             table.set(reg.GOAL_CURRENT, table.get(reg.CURRENT_LIMIT))
         table.set(reg.GOAL_POSITION, self._joint.position())
+        self._joint.tune()
 
     def _start(self, t: float) -> None:
         """Power-up, or the end of a reboot."""
@@ -318,7 +349,10 @@ class EmulatedServo:
         self.health.restart()
         self._booted = self._watched = t
         self._joint.forget_turns()
+        self._registered = None
         self._reset_goals()
+        if self._memory[reg.STARTUP_CONFIGURATION] & 1:  # unused where the firmware has it not
+            table.set(reg.TORQUE_ENABLE, 1)
         self._joint.hold()
         self._next_step = math.inf
         self._next_sense = t + SENSE

@@ -3,8 +3,8 @@
 It takes bytes and the time and gives bytes, so that tests and fuzzers need no port; the
 pseudo-terminal around it is :mod:`simulation.emulator.pty_bus`. In group reads a servo answers
 after it has heard the one named before it; so where one is missing, those after it stay silent.
-Registered writes and control table backups, which no client is known to send, are answered with an
-instruction error.
+Control table backups, which no client is known to send, are answered with an instruction error. Of
+Protocol 1.0 the ping is answered, by a servo that is set to it.
 """
 
 from __future__ import annotations
@@ -139,6 +139,13 @@ class ServoBus:
         if t >= self._due or t > self._now + self.lag:
             self.advance(t)
         replies: list[TimedReply] = []
+        for asked in framing.old_pings(data):
+            replies += [
+                TimedReply(servo.return_delay, framing.old_status(servo.id))
+                for servo in self.servos
+                if servo.old_protocol and servo.awake(t) and asked in (servo.id, BROADCAST)
+                if not baud or baud == servo.baud
+            ]
         for packet in self.parser.feed(data, t):
             self.packets += 1
             reads = packet.instruction in _READS
@@ -148,7 +155,8 @@ class ServoBus:
                 self.advance(t)
             listening = []
             for servo in self.servos:
-                if servo.awake(t) and (not baud or baud == servo.baud):
+                heard = not servo.old_protocol and (not baud or baud == servo.baud)
+                if servo.awake(t) and heard:
                     servo.heard(t)
                     listening.append(servo)
             replies += self._answers(packet, listening, t)
@@ -203,6 +211,8 @@ class ServoBus:
                     # The alert bit is taken after the instruction was done.
                     status = framing.status(name, error | servo.alert, data)
                     replies.append(TimedReply(delay, status))
+            elif servo.shadow == packet.id:
+                _execute(servo, instruction, packet.parameters, t)
         return _at_once(replies)
 
     def _broadcast(self, packet: Packet, servos: list[EmulatedServo], t: float) -> list[TimedReply]:
@@ -284,7 +294,7 @@ def _write_each(
     """Write each servo's part of a group write: ID, address, data."""
     for servo_id, address, data in items:
         for servo in servos:
-            if servo.id == servo_id:
+            if servo_id in (servo.id, servo.shadow):
                 servo.write(address, data, t)
 
 
@@ -326,6 +336,12 @@ def _execute(servo: EmulatedServo, instruction: int, data: bytes, t: float) -> t
             if len(data) < 3:
                 return framing.DATA_LENGTH, b""
             return servo.write(data[0] | data[1] << 8, data[2:], t), b""
+        case framing.REG_WRITE:
+            if len(data) < 3:
+                return framing.DATA_LENGTH, b""
+            return servo.register(data[0] | data[1] << 8, data[2:]), b""
+        case framing.ACTION:
+            return servo.action(t), b""
         case framing.FACTORY_RESET:
             return servo.factory_reset(data, t), b""
         case framing.REBOOT:

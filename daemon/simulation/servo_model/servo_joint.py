@@ -116,9 +116,12 @@ class ServoJoint:
             return
         target = float(table.get(reg.GOAL_POSITION))
         acceleration, speed = table.get(reg.PROFILE_ACCELERATION), table.get(reg.PROFILE_VELOCITY)
-        if memory[reg.DRIVE_MODE] & 4:
+        if not speed:
+            profile.hold(target)  # a profile velocity of 0 stands for no profile
+        elif memory[reg.DRIVE_MODE] & 4:
             profile.aim_in(target, speed / 1000.0, acceleration / 1000.0)
         else:
+            speed = min(speed, table.get(reg.VELOCITY_LIMIT))
             profile.aim(target, speed * _PER_VELOCITY, acceleration * _PER_ACCELERATION)
 
     def moves_by_itself(self) -> bool:
@@ -134,11 +137,25 @@ class ServoJoint:
         if mode in POSITION_MODES:
             self.profile.step(STEP)
         elif mode == reg.VELOCITY_MODE:
-            self.profile.velocity = self._table.get(reg.GOAL_VELOCITY) * _PER_VELOCITY
+            limit = self._table.get(reg.VELOCITY_LIMIT)
+            speed = min(max(self._table.get(reg.GOAL_VELOCITY), -limit), limit)
+            self.profile.velocity = speed * _PER_VELOCITY
             self.profile.position += self.profile.velocity * STEP
         self.drive()
 
     # --- plant -------------------------------------------------------------------------------
+
+    def tune(self) -> None:
+        """Give the plant what gains and PWM registers ask for; the integral gain has no effect.
+
+        The servo's torque is K_P·error − K_D·Δposition a millisecond, with K_P = P / 128 and
+        K_D = D / 16 (e-Manual, position PID gain).
+        """
+        get, (d, _, p) = self._table.get, self._model.position_gains
+        stiffness = get(reg.POSITION_P_GAIN) / p
+        damping = (get(reg.POSITION_D_GAIN) - d) / 16.0 / (p / 128.0) * STEP
+        duty = min(abs(get(reg.GOAL_PWM)), get(reg.PWM_LIMIT)) / 885.0
+        self._plant.tune(self._joint, stiffness, damping, duty)
 
     def drive(self) -> None:
         """Command the plant by the registers."""

@@ -1,0 +1,151 @@
+"""A file with the registers of each servo of the scene: saved before a change, restored after it.
+
+JSON: ``{"servos": [{"id": 1, "model": "XM430-W350", "firmware": 48, "registers": {NAME: value}}]}``
+with the names and values of `servos.register_table.REGISTERS`.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pydantic import ValidationError, model_validator
+
+from softfinger.daemon.errors import ServoError
+from softfinger.daemon.own_files import read_file, write_text
+from softfinger.daemon.profile.fields import Section
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.servos import control_table as reg
+from softfinger.daemon.servos.base import Finding
+from softfinger.daemon.servos.checks import CHECKED
+from softfinger.daemon.servos.joint import servo_name
+from softfinger.daemon.servos.protocol import ServoLine, open_line
+from softfinger.daemon.servos.register_table import REGISTERS
+from softfinger.daemon.types import FINGERS
+
+_LARGEST = 1 << 20  # bytes of a file that is read
+_PASSES = 2  # a lower limit may be refused until the upper one is written
+
+
+class StoredServo(Section):
+    """A servo in the file."""
+
+    id: int
+    model: str
+    firmware: int
+    registers: dict[str, int]
+
+    @model_validator(mode="after")
+    def _fit(self) -> StoredServo:
+        known = {each.name: each for each in REGISTERS}
+        for name, value in self.registers.items():
+            if name not in known:
+                raise ValueError(f"there is no register {name!r}")
+            bits = 8 * known[name].size
+            if not -(1 << bits - 1) <= value < 1 << bits:
+                raise ValueError(f"{name}: found {value}, expected {bits} bits")
+        return self
+
+
+class StoredServos(Section):
+    """The file."""
+
+    servos: tuple[StoredServo, ...]
+
+
+def save_registers(settings: Settings, path: Path) -> list[Finding]:
+    """Save all registers of each servo that answers, but for ID and rate."""
+    servos: list[StoredServo] = []
+    found = []
+    with open_line(settings.servos.port, settings.servos.baud) as line:
+        for finger in map(FINGERS.index, settings.scene.fingers):
+            servo_id = settings.servos.ids[finger]
+            table = line.read(servo_id, 0, CHECKED)
+            if table is None:
+                found.append(Finding("FAIL", servo_name(servo_id, finger), "not saved: no answer"))
+                continue
+            number = int.from_bytes(table[reg.MODEL_NUMBER : reg.MODEL_NUMBER + 2], "little")
+            values = {each.name: each.value_in(table) for each in REGISTERS}
+            firmware = table[reg.FIRMWARE_VERSION]
+            servos.append(
+                StoredServo(
+                    id=servo_id, model=reg.name_of(number), firmware=firmware, registers=values
+                )
+            )
+            text = f"{len(values)} registers saved to {path}"
+            found.append(Finding("note", servo_name(servo_id, finger), text))
+    if servos:
+        with write_text(path) as file:
+            file.write(StoredServos(servos=tuple(servos)).model_dump_json(indent=1) + "\n")
+    return found
+
+
+def restore_registers(settings: Settings, path: Path) -> list[Finding]:
+    """Write what :func:`save_registers` stored back into servos of the same ID and model.
+
+    Raises ServoError for a file that holds something else.
+    """
+    stored = _stored(path)
+    result: list[Finding] = []
+    with open_line(settings.servos.port, settings.servos.baud) as line:
+        for finger in map(FINGERS.index, settings.scene.fingers):
+            servo_id = settings.servos.ids[finger]
+            name, kept = servo_name(servo_id, finger), stored.get(servo_id)
+            if kept is None:
+                result.append(Finding("warn", name, f"not restored: {path} has no ID {servo_id}"))
+                continue
+            number = line.ping(servo_id)
+            model = "no answer" if number is None else reg.name_of(number)
+            if model != kept.model:
+                text = f"not restored: {path} is of an {kept.model}, found {model}"
+                result.append(Finding("warn", name, text))
+                continue
+            _restore(line, servo_id, name, kept.registers, result)
+    return result
+
+
+def _restore(
+    line: ServoLine, servo_id: int, name: str, values: dict[str, int], result: list[Finding]
+) -> None:
+    if line.store(reg.TORQUE_ENABLE, {servo_id: b"\0"}):
+        result.append(Finding("warn", name, "not restored: torque could not be switched off"))
+        return
+    tables: list[bytes] = []
+    # The operating mode first, since it resets gains, profiles and goals.
+    order = sorted(REGISTERS, key=lambda each: each.address != reg.OPERATING_MODE)
+    for turn in range(_PASSES + 1):
+        table = line.read(servo_id, 0, CHECKED)
+        if table is None:
+            result.append(Finding("warn", name, "not restored: its registers could not be read"))
+            return
+        tables.append(table)
+        for each in order if turn < _PASSES else ():
+            if each.name in values and each.value_in(table) != values[each.name]:
+                line.store(each.address, {servo_id: each.packed(values[each.name])})
+    for each in REGISTERS:
+        wanted, old, now = (
+            values.get(each.name),
+            each.value_in(tables[0]),
+            each.value_in(tables[-1]),
+        )
+        if wanted is None or wanted == old == now:
+            continue
+        if now == wanted:
+            result.append(Finding("fixed", name, f"{each.name} {old} → {now}"))
+        else:
+            text = f"{each.name} {now} could not be set to {wanted}"
+            result.append(Finding("warn", name, text))
+
+
+def _stored(path: Path) -> dict[int, StoredServo]:
+    """Return the servos of a file by ID. Raises ServoError for a file of another kind."""
+    try:
+        stored = StoredServos.model_validate_json(read_file(path, _LARGEST))
+    except OSError as error:
+        raise ServoError(f"{path}: {error.strerror or error}") from None
+    except ValidationError as error:
+        where = ".".join(str(each) for each in error.errors()[0]["loc"])
+        raise ServoError(
+            f"{path}: {where}: {error.errors()[0]['msg']}; expected a file of `softfinger doctor "
+            "--save`"
+        ) from None
+    return {each.id: each for each in stored.servos}

@@ -1,0 +1,193 @@
+"""The exchanges of a tick: group reads of all servos, the kind that they answer, their duration.
+
+The daemon and `doctor` use the same ones, so that `doctor` tries what the daemon will do.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+from dynamixel_sdk.robotis_def import COMM_SUCCESS
+
+from softfinger.daemon.errors import ServoError
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.servos import control_table as reg
+from softfinger.daemon.servos.base import Finding, Status
+from softfinger.daemon.servos.port import SerialPort
+from softfinger.daemon.servos.protocol import TRIES, FastGroupRead, GroupRead, PacketHandler
+
+Span = tuple[int, int]  # first and last register
+# What one exchange reads: most ticks' own; with the goals and the bus watchdog; with the supply;
+# from torque enable on.
+PRESENT: Span = (reg.PRESENT_CURRENT, reg.PRESENT_POSITION + 3)
+CHECK: Span = (reg.BUS_WATCHDOG, reg.PRESENT_POSITION + 3)
+HEALTH: Span = (reg.PRESENT_CURRENT, reg.PRESENT_TEMPERATURE)
+ENABLED: Span = (reg.TORQUE_ENABLE, reg.PRESENT_POSITION + 3)
+# A reply may come after its deadline, and be taken for the next request's. So after a request
+# without a reply the next ones ask for spans of different lengths, which distinguishes the replies.
+LENGTHS = 11  # of each span: the shortest, and up to ten registers before it
+
+EXCHANGES = 50  # that `doctor` times
+_WAIT = 0.1  # s for a reply that is timed, however little `servos.reply_timeout` allows
+_AT_START = 9  # reads of which the quickest tells what a reply takes at least
+_FULL = 0.8  # of a tick that a reply may take
+_LOST_WARN, _LOST_FAIL = 0.02, 0.2  # share of the exchanges that fail
+
+
+class TickReads:
+    """The group reads of a tick, all of one kind, in all the lengths that they may have."""
+
+    def __init__(
+        self,
+        port: SerialPort,
+        handler: PacketHandler,
+        ids: Sequence[int],
+        kind: type[GroupRead],
+    ) -> None:
+        self.fast = kind is FastGroupRead
+        self.spans = {
+            (first, last): [
+                kind(port, handler, first - more, last + 1 - first + more, ids)
+                for more in range(LENGTHS)
+            ]
+            for first, last in (PRESENT, CHECK, HEALTH, ENABLED)
+        }
+        self.errors = kind(port, handler, reg.HARDWARE_ERROR_STATUS, 1, ids)
+
+    def answered(self) -> bool:
+        """Return True if all servos answer each of these group reads."""
+        return all(
+            any(lengths[0].exchange() == COMM_SUCCESS for _ in range(TRIES))
+            for lengths in self.spans.values()
+        )
+
+
+def choose_reads(
+    port: SerialPort, handler: PacketHandler, ids: Sequence[int], claims_fast: bool
+) -> tuple[TickReads, list[Finding]]:
+    """Return the quickest group reads that the servos do answer, and a notice of a false claim.
+
+    ``claims_fast``: their firmware is new enough for fast sync reads.
+
+    Raises ServoError when they answer no group read at all.
+    """
+    notices: list[Finding] = []
+    if claims_fast:
+        reads = TickReads(port, handler, ids, FastGroupRead)
+        if reads.answered():
+            return reads, notices
+        text = "the firmware should answer a fast sync read and does not"
+        notices.append(Finding("warn", "servos", text, "the slower sync read is used instead"))
+    reads = TickReads(port, handler, ids, GroupRead)
+    if not reads.answered():
+        listed = ", ".join(map(str, ids))
+        raise ServoError(
+            f"{port.port_name}: the servos (IDs {listed}) answer alone, but a sync read of all "
+            "stays without a reply: check the cable from one servo to the next, and lower "
+            "servos.baud"
+        )
+    return reads, notices
+
+
+class ExchangeTimes(NamedTuple):
+    """Durations of exchanges [s], and the share of them that failed."""
+
+    least: float
+    p50: float
+    p99: float
+    failed: float
+
+
+def time_exchanges(
+    port: SerialPort,
+    reads: TickReads,
+    write: Callable[[], None] | None = None,
+    count: int = EXCHANGES,
+) -> ExchangeTimes:
+    """Read and write ``count`` times as a tick does, one exchange right after the other.
+
+    A read waits on the wire for the write before it, so its duration has both. ``write``: None
+    leaves the writes out. A reply is waited for up to 0.1 s.
+    """
+    allowed, port.reply_timeout = port.reply_timeout, max(port.reply_timeout, _WAIT)
+    group, durations, failed = reads.spans[PRESENT][0], [], 0
+    try:
+        for _ in range(count):
+            began = time.monotonic()
+            if group.exchange() == COMM_SUCCESS:
+                durations.append(time.monotonic() - began)
+            else:
+                failed += 1
+            if write is not None:
+                write()
+    finally:
+        port.reply_timeout = allowed
+    durations.sort()
+    if not durations:
+        return ExchangeTimes(math.inf, math.inf, math.inf, 1.0)
+    at = 0.99 * (len(durations) - 1)
+    low = durations[int(at)]
+    high = durations[min(int(at) + 1, len(durations) - 1)]
+    p99 = low + (at - int(at)) * (high - low)
+    return ExchangeTimes(durations[0], durations[len(durations) // 2], p99, failed / count)
+
+
+def judge_exchanges(
+    times: ExchangeTimes, settings: Settings, what: str, emulated: bool = False
+) -> Finding:
+    """Compare the durations of the tick's exchanges with the tick and ``servos.reply_timeout``.
+
+    ``what`` was timed, for the report. The time of an ``emulated`` hand stands still while this
+    machine is late, so that the middle exchange counts and not the slowest.
+    """
+    decisive = times.p50 if emulated else times.p99
+    rate, allowed = settings.loop.rate, settings.servos.reply_timeout
+    failed = f"{times.failed:.0%} failed"
+    if times.failed == 1.0:
+        text = f"{what}: none was answered within {_WAIT * 1e3:g} ms"
+        return Finding("FAIL", "exchange", text, "check the cable, and lower servos.baud")
+    text = f"{what}: p50 {_ms(times.p50)}, p99 {_ms(times.p99)}, {failed}"
+    if decisive > min(1.0 / rate, allowed):
+        text += (
+            f"; a tick takes {_ms(1.0 / rate)} (loop.rate = {rate:g}), and a reply may take "
+            f"{_ms(allowed)} (servos.reply_timeout)"
+        )
+        return Finding("FAIL", "exchange", text, _remedy(decisive, settings))
+    status: Status = "pass"
+    if times.failed > _LOST_WARN:
+        status = "FAIL" if times.failed > _LOST_FAIL else "warn"
+    fix = "" if status == "pass" else "check the cable and its plugs, and lower servos.baud"
+    return Finding(status, "exchange", text, fix)
+
+
+def note_slow_replies(port: SerialPort, reads: TickReads, settings: Settings) -> list[Finding]:
+    """Return a notice if the quickest of a few reads takes most of a tick."""
+    least = time_exchanges(port, reads, count=_AT_START).least
+    rate = settings.loop.rate
+    if least * rate <= _FULL:
+        return []
+    text = (
+        f"a reply of the servos takes at least {_ms(least)}, {least * rate:.0%} of a tick of "
+        f"{_ms(1.0 / rate)} (loop.rate = {rate:g}): ticks will be late"
+    )
+    fix = f"{_remedy(least, settings)}; `softfinger doctor` times {EXCHANGES} exchanges"
+    return [Finding("warn", "servos", text, fix)]
+
+
+def _remedy(duration: float, settings: Settings) -> str:
+    """Return what gives replies of this duration [s] their time."""
+    rate = _FULL / duration
+    digit = 10.0 ** max(len(str(int(rate))) - 2, 0)
+    parts = []
+    if duration > settings.servos.reply_timeout:
+        parts.append(f"servos.reply_timeout = {1.5 * duration:.2g}")
+    if duration * settings.loop.rate > _FULL:
+        parts.append(f"loop.rate = {max(rate // digit * digit, 1.0):g}")
+    return f"set {' and '.join(parts)}; or an adapter that waits less (latency timer 1 ms)"
+
+
+def _ms(seconds: float) -> str:
+    return f"{seconds * 1e3:.3g} ms"

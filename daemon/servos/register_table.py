@@ -1,0 +1,291 @@
+"""The registers of a servo that matter to the hand, with the values that they must have.
+
+One table, :func:`required_registers`, which follows the control table of the e-Manual row by row. A
+servo keeps its EEPROM for ever and its RAM until its power is cut, so another program's values are
+met there. EEPROM is checked at connect and written by `softfinger doctor --fix` alone; RAM that is
+marked ``armed`` is written by `arm`, so that it is right after a reboot, too.
+
+Registers that are left out do not change how a goal is followed, a limit acts or the bus answers in
+the modes that the hand uses: ID and rate are searched for; moving threshold, LED and external ports
+only report; velocity gains and goal velocity serve the velocity mode; goal current, goal position,
+bus watchdog and indirect addresses are written by `servos.torque` at each `arm` anyway.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from typing import Final, NamedTuple
+
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.servos import control_table as reg
+from softfinger.daemon.servos.base import Status
+from softfinger.daemon.servos.control_table import ServoModel
+from softfinger.daemon.servos.joint import JointScale
+
+# Return delays of both servos pass within one read; above 50 µs each they eat a 500 Hz tick.
+RETURN_DELAY_MAX: Final = 25
+# Drive mode: a second servo follows this one's; any goal that is written switches the torque on.
+DRIVE_UNFIT: Final = 0b1010
+PWM_FULL: Final = 885
+_STARTUP_FIRMWARE = 45
+_NO_ID = 253  # a shadow ID from there on is none
+_POSITION_MAX = reg.COUNTS_PER_TURN - 1
+
+
+class Register(NamedTuple):
+    """A register that may be written, as its page of the e-Manual names it."""
+
+    name: str
+    address: int
+    size: int
+    signed: bool = False
+
+    def value_in(self, table: bytes, start: int = 0) -> int:
+        """Return its value in a span of registers from ``start`` on."""
+        at = self.address - start
+        return int.from_bytes(table[at : at + self.size], "little", signed=self.signed)
+
+    def packed(self, value: int) -> bytes:
+        """Return a value as the register's bytes."""
+        return value.to_bytes(self.size, "little", signed=value < 0)
+
+
+# All registers that a table's owner may want back: what `doctor --save` stores. ID, baud rate and
+# protocol are not among them, since a servo that changes them is no longer where it was asked.
+REGISTERS: Final = (
+    Register("return delay", reg.RETURN_DELAY_TIME, 1),
+    Register("drive mode", reg.DRIVE_MODE, 1),
+    Register("operating mode", reg.OPERATING_MODE, 1),
+    Register("shadow ID", reg.SHADOW_ID, 1),
+    Register("homing offset", reg.HOMING_OFFSET, 4, True),
+    Register("moving threshold", reg.MOVING_THRESHOLD, 4),
+    Register("temperature limit", reg.TEMPERATURE_LIMIT, 1),
+    Register("max voltage limit", reg.MAX_VOLTAGE_LIMIT, 2),
+    Register("min voltage limit", reg.MIN_VOLTAGE_LIMIT, 2),
+    Register("PWM limit", reg.PWM_LIMIT, 2),
+    Register("current limit", reg.CURRENT_LIMIT, 2),
+    Register("velocity limit", reg.VELOCITY_LIMIT, 4),
+    Register("max position limit", reg.MAX_POSITION_LIMIT, 4),
+    Register("min position limit", reg.MIN_POSITION_LIMIT, 4),
+    Register("startup configuration", reg.STARTUP_CONFIGURATION, 1),
+    Register("PWM slope", reg.PWM_SLOPE, 1),
+    Register("shutdown", reg.SHUTDOWN, 1),
+    Register("LED", reg.LED, 1),
+    Register("status return level", reg.STATUS_RETURN_LEVEL, 1),
+    Register("velocity I gain", reg.VELOCITY_I_GAIN, 2),
+    Register("velocity P gain", reg.VELOCITY_P_GAIN, 2),
+    Register("position D gain", reg.POSITION_D_GAIN, 2),
+    Register("position I gain", reg.POSITION_I_GAIN, 2),
+    Register("position P gain", reg.POSITION_P_GAIN, 2),
+    Register("feedforward 2nd gain", reg.FEEDFORWARD_2ND_GAIN, 2),
+    Register("feedforward 1st gain", reg.FEEDFORWARD_1ST_GAIN, 2),
+    Register("goal PWM", reg.GOAL_PWM, 2, True),
+    Register("profile acceleration", reg.PROFILE_ACCELERATION, 4),
+    Register("profile velocity", reg.PROFILE_VELOCITY, 4),
+)
+_AT: Final = {register.address: register for register in REGISTERS}
+
+
+class Requirement(NamedTuple):
+    """Value that a register must hold. ``status`` is that of a servo where it does not."""
+
+    register: Register
+    holds: Callable[[int], bool]
+    mended: Callable[[int], int]  # the value to write instead of a wrong one
+    told: Callable[[int], str]  # what is wrong with a value, and what was expected
+    status: Status
+    armed: bool = False  # RAM that `arm` writes
+    then: str = ""  # what is to be done after it is mended
+
+    def wrong_in(self, table: bytes, start: int = 0) -> int | None:
+        """Return the register's value in a span from ``start`` on where it is wrong, else None."""
+        value = self.register.value_in(table, start)
+        return None if self.holds(value) else value
+
+
+def _exactly(
+    address: int, value: int, why: str, status: Status = "FAIL", armed: bool = False
+) -> Requirement:
+    register = _AT[address]
+    return Requirement(
+        register,
+        lambda found: found == value,
+        lambda _: value,
+        lambda found: f"{register.name} is {found}, not {value}: {why}",
+        status,
+        armed,
+    )
+
+
+def _within(address: int, low: int, high: int, unit: str) -> Requirement:
+    """Return the row of a limit beyond which the servo stops itself; ``high`` is the factory's."""
+    register = _AT[address]
+    expected = f"{low}" if low == high else f"{low} … {high}"
+    return Requirement(
+        register,
+        lambda found: low <= found <= high,
+        lambda _: high,
+        lambda found: f"{register.name} is {found} {unit}, not {expected} {unit}",
+        "warn",
+    )
+
+
+def required_registers(
+    model: ServoModel, settings: Settings, finger: int, firmware: int
+) -> list[Requirement]:
+    """Return what the registers of finger 0 (left) or 1 (right) must hold, by address."""
+    servos, safety = settings.servos, settings.safety
+    scale = JointScale.of(servos, finger, model)
+    mode = reg.MODE_NUMBERS[servos.mode]
+    hot = min(math.ceil(safety.temperature_max), model.temperature_limit)
+    slow = min(math.ceil(safety.goal_speed / scale.velocity), model.velocity_limit)
+    rows = [
+        Requirement(
+            _AT[reg.RETURN_DELAY_TIME],
+            lambda found: found <= RETURN_DELAY_MAX,
+            lambda _: 0,
+            lambda found: f"return delay is {2 * found} µs, more than {2 * RETURN_DELAY_MAX} µs",
+            "FAIL",
+        ),
+        Requirement(
+            _AT[reg.DRIVE_MODE],
+            lambda found: not found & DRIVE_UNFIT,
+            lambda found: found & ~DRIVE_UNFIT,
+            lambda found: (
+                f"drive mode {found} switches torque on with any goal, or has it follow another "
+                "servo"
+            ),
+            "FAIL",
+        ),
+        Requirement(
+            _AT[reg.SHADOW_ID],
+            lambda found: found not in servos.ids,
+            lambda _: 255,
+            lambda found: f"shadow ID is {found}: it obeys what the servo with that ID is sent",
+            "FAIL",
+        ),
+        Requirement(
+            _AT[reg.HOMING_OFFSET],
+            lambda found: found == 0,
+            lambda _: 0,
+            lambda found: (
+                f"homing offset is {found} counts, not 0: it turns this joint's zero by "
+                f"{math.degrees(abs(found) * scale.radian):.1f}°"
+            ),
+            "FAIL",
+            then="`softfinger calibrate joints`, unless servos.zero was found without the offset",
+        ),
+        _within(reg.TEMPERATURE_LIMIT, hot, model.temperature_limit, "°C"),
+        _within(reg.MAX_VOLTAGE_LIMIT, model.voltage_max, model.voltage_max, "× 0.1 V"),
+        _within(reg.MIN_VOLTAGE_LIMIT, 0, model.voltage_min, "× 0.1 V"),
+        _exactly(reg.PWM_LIMIT, PWM_FULL, "the motor does not get all of the supply's voltage"),
+        Requirement(
+            _AT[reg.VELOCITY_LIMIT],
+            lambda found: found >= slow,
+            lambda _: model.velocity_limit,
+            lambda found: (
+                f"velocity limit is {found * scale.velocity:.2g} rad/s at the joint, less than "
+                f"{slow * scale.velocity:.2g} rad/s"
+            ),
+            "warn",
+        ),
+        Requirement(
+            _AT[reg.SHUTDOWN],
+            lambda found: found & model.shutdown == model.shutdown,
+            lambda found: found | model.shutdown,
+            lambda found: (
+                f"shutdown is {found}, not {model.shutdown}: it does not stop itself after "
+                f"{reg.hardware_error_names(model.shutdown & ~found)}"
+            ),
+            "warn",
+        ),
+        Requirement(
+            _AT[reg.STATUS_RETURN_LEVEL],
+            lambda found: found > 0,
+            lambda _: 2,
+            lambda _: "status return level is 0, so reads stay unanswered",
+            "FAIL",
+        ),
+    ]
+    if mode in model.modes:
+        told = reg.MODE_NAMES
+        rows.append(
+            Requirement(
+                _AT[reg.OPERATING_MODE],
+                lambda found: found == mode,
+                lambda _: mode,
+                lambda found: (
+                    f"operating mode is {told.get(found, str(found))} ({found}), not {told[mode]} "
+                    f"({mode})"
+                ),
+                "FAIL",
+            )
+        )
+    if mode == reg.POSITION_MODE:
+        rows += _position_limits(scale, settings, finger)
+    elif model.senses_current and safety.current_max <= model.stall_current:
+        rows.append(_current_limit(model, safety.current_max))
+    if firmware >= _STARTUP_FIRMWARE:
+        why = "at power-up it switches torque on (1) or restores a backup of its RAM (2)"
+        rows.append(_exactly(reg.STARTUP_CONFIGURATION, 0, why))
+    if model.pwm_slope is not None:
+        why = "the motor's voltage rises at another rate"
+        row = _exactly(reg.PWM_SLOPE, slope := model.pwm_slope, why, "warn")
+        rows.append(row._replace(holds=lambda found: found in (0, slope)))  # 0: has no such one
+    rows += armed_registers(model)
+    return sorted(rows, key=lambda row: row.register.address)
+
+
+def armed_registers(model: ServoModel) -> list[Requirement]:
+    """Return the rows of RAM that `arm` writes."""
+    why = "another program's; `arm` sets it"
+    d, i, p = model.position_gains
+    values = (
+        (reg.POSITION_D_GAIN, d),
+        (reg.POSITION_I_GAIN, i),
+        (reg.POSITION_P_GAIN, p),
+        (reg.FEEDFORWARD_2ND_GAIN, 0),
+        (reg.FEEDFORWARD_1ST_GAIN, 0),
+        (reg.GOAL_PWM, PWM_FULL),
+        (reg.PROFILE_ACCELERATION, 0),
+        (reg.PROFILE_VELOCITY, 0),
+    )
+    return [_exactly(address, value, why, "note", True) for address, value in values]
+
+
+def _current_limit(model: ServoModel, current_max: float) -> Requirement:
+    unit = model.current_unit
+    needed = math.ceil(current_max / unit - 1e-9)
+    return Requirement(
+        _AT[reg.CURRENT_LIMIT],
+        lambda found: found >= needed,
+        lambda _: needed,
+        lambda found: (
+            f"current limit is {found * unit:.3f} A, below safety.current_max {current_max:g} A"
+        ),
+        "FAIL",
+    )
+
+
+def _position_limits(scale: JointScale, settings: Settings, finger: int) -> Iterable[Requirement]:
+    """Return the rows of position mode: a goal beyond these limits is refused without a word."""
+    ends = (settings.hand.q_min[finger], settings.hand.q_max[finger])
+    first, last = sorted(scale.position_counts(q) for q in ends)
+    needed = f"the joint needs {first} … {last}"
+    if not 0 <= first <= last <= _POSITION_MAX:
+        needed += ", more than a turn has: `softfinger calibrate joints` finds zero and range"
+    yield Requirement(
+        _AT[reg.MIN_POSITION_LIMIT],
+        lambda found: found <= first,
+        lambda _: 0,
+        lambda found: f"min position limit is {found}, {needed}",
+        "FAIL",
+    )
+    yield Requirement(
+        _AT[reg.MAX_POSITION_LIMIT],
+        lambda found: found >= last,
+        lambda _: _POSITION_MAX,
+        lambda found: f"max position limit is {found}, {needed}",
+        "FAIL",
+    )

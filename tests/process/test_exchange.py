@@ -1,0 +1,235 @@
+"""The tick's own exchange: timed by `doctor`, tried at connect, missed while disarmed."""
+
+import contextlib
+import re
+from typing import Any
+
+import pytest
+
+from softfinger.daemon import port_access
+from softfinger.daemon.clock import RealClock
+from softfinger.daemon.diagnosis import devices
+from softfinger.daemon.errors import ServoError, ServosSilent
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.profile.validation import problems
+from softfinger.daemon.servos import control_table as reg
+from softfinger.daemon.servos.base import Finding
+from softfinger.daemon.servos.dynamixel import DynamixelServos
+from softfinger.daemon.servos.exchange import ExchangeTimes, judge_exchanges
+from softfinger.daemon.servos.port import SerialPort
+from softfinger.daemon.servos.protocol import FastGroupRead
+from softfinger.daemon.simulation.emulator.folder import send_words
+from softfinger.daemon.types import Reading
+from tests.conftest import until
+from tests.harness.daemon_process import started
+from tests.harness.descendants import ending
+from tests.harness.emulated import HIL, EmulatorProcess
+from tests.harness.servos import RunningBus, backend_settings, connected
+
+
+def exchange(bus: RunningBus, rate: float = 500.0, **servos: Any) -> Finding:
+    """What `doctor` says of the tick's exchange."""
+    settings = backend_settings(bus.path, **servos)
+    loop = settings.loop.model_copy(update={"rate": rate})
+    settings = settings.model_copy(update={"loop": loop})
+    (found,) = [each for each in devices.check_servos(settings) if each.subject == "exchange"]
+    return found
+
+
+# What doctor times.
+
+
+def test_doctor_reads_and_writes_as_a_tick_does_and_changes_nothing(running):
+    bus = running(servos={"mode": "current-based position"})
+    before = [bus.memory(i)[: reg.REALTIME_TICK] for i in (0, 1)]
+    heard = bytearray()
+    exchanged = bus.bus.exchange
+    bus.bus.exchange = lambda data, *rest: heard.extend(data) or exchanged(data, *rest)
+    found = exchange(bus, 5.0)
+    assert found.status == "pass", found
+    assert found.text.startswith("50 of a tick's reads and writes: p50 ")
+    until(lambda: len(re.findall(rb"\xff\xff\xfd\x00\xfe..\x83", heard, re.DOTALL)) == 50)
+    reads = re.findall(rb"\xff\xff\xfd\x00\xfe..\x8a", heard, re.DOTALL)
+    assert len(reads) == 54  # each of four spans is tried first
+    assert [bus.memory(i)[: reg.REALTIME_TICK] for i in (0, 1)] == before
+
+
+def test_late_replies_fail_with_all_numbers_and_the_settings_that_help(bus):
+    bus.fault("delay=0.02")
+    found = exchange(bus, 100.0, reply_timeout=0.05)
+    assert found.status == "FAIL"
+    assert "a tick takes 10 ms (loop.rate = 100), and a reply may take 50 ms" in found.text
+    assert found.fix.startswith("set loop.rate = ")
+    assert float(found.fix.split()[3].rstrip(";")) < 50.0
+    found = exchange(bus, 5.0, reply_timeout=0.005)
+    assert found.status == "FAIL"
+    assert found.fix.startswith("set servos.reply_timeout = 0.0")
+
+
+def test_the_judgement_of_what_was_timed():
+    def judged(p50: float, p99: float, failed: float = 0.0, **how: bool) -> Finding:
+        return judge_exchanges(ExchangeTimes(p50, p50, p99, failed), Settings(), "50", **how)
+
+    assert judged(0.0004, 0.0009).status == "pass"
+    assert judged(0.0004, 0.0009).text == "50: p50 0.4 ms, p99 0.9 ms, 0% failed"
+    both = judged(0.0028, 0.003)  # less than reply_timeout, and more than a tick
+    assert (both.status, both.fix.split(";")[0]) == ("FAIL", "set loop.rate = 260")
+    assert "a tick takes 2 ms (loop.rate = 500), and a reply may take 4 ms" in both.text
+    slow = judged(0.016, 0.016)
+    assert slow.fix.startswith("set servos.reply_timeout = 0.024 and loop.rate = 50; or")
+    assert judged(0.0004, 0.01).status == "FAIL"
+    assert judged(0.0004, 0.01, emulated=True).status == "pass"
+    assert [judged(0.0004, 0.0009, share).status for share in (0.02, 0.1, 0.3)] == [
+        "pass",
+        "warn",
+        "FAIL",
+    ]
+    assert judge_exchanges(ExchangeTimes(1.0, 1.0, 1.0, 1.0), Settings(), "50").status == "FAIL"
+
+
+# What is tried at connect.
+
+
+def test_a_firmware_that_claims_fast_reads_falsely_gets_sync_reads(bus):
+    for i in (0, 1):
+        bus.servo(i).fast_reads = False  # its firmware number says otherwise
+    backend = connected(bus)
+    (notice,) = [each for each in backend.notices if "fast sync read" in each.text]
+    assert notice.fix == "the slower sync read is used instead"
+    assert not isinstance(backend._reads.errors, FastGroupRead)
+    reading = Reading()
+    backend.read(reading)
+    assert reading.valid
+    backend.close()
+
+
+def test_servos_that_answer_no_group_read_are_refused(bus):
+    for i in (0, 1):
+        bus.servo(i).fast_reads = False
+    answers = bus.servo(1).answers_reads
+    bus.servo(1).answers_reads = lambda servo_id, fast: False
+    with pytest.raises(ServoError, match="answer alone, but a sync read of all stays without"):
+        connected(bus, reply_timeout=0.3)
+    bus.servo(1).answers_reads = answers
+    connected(bus).close()
+
+
+def test_slow_replies_are_told_at_the_start(bus):
+    bus.fault("delay=0.01")
+    backend = connected(bus)
+    (notice,) = [each for each in backend.notices if "ticks will be late" in each.text]
+    assert "of a tick of 2 ms (loop.rate = 500)" in notice.text
+    assert "`softfinger doctor` times 50 exchanges" in notice.fix
+    backend.close()
+
+
+# Patience.
+
+
+def test_a_board_that_boots_is_waited_for_with_its_port_open(running, monkeypatch):
+    """An adapter may restart when its port is opened, so opening it again and again never ends."""
+    bus, opened = running(), []
+    for i in (0, 1):
+        bus.servo(i).silent = True
+    open_port = SerialPort.openPort
+    monkeypatch.setattr(SerialPort, "openPort", lambda self: opened.append(1) or open_port(self))
+    backend = DynamixelServos(backend_settings(bus.path, reply_timeout=0.2), RealClock())
+
+    def connects() -> bool:
+        with contextlib.suppress(ServosSilent):
+            backend.connect()
+            return True
+        return False
+
+    assert not connects()
+    for i in (0, 1):
+        bus.servo(i).silent = False
+    until(connects)
+    assert len(opened) == 1
+    backend.close()
+    connected(bus).close()  # the port is free again
+
+
+def test_doctor_waits_as_long_as_run_does(running):
+    bus = running()
+    bus.servo(1).silent = True
+    settings = backend_settings(bus.path, open_timeout=60.0)
+    pinged: list[int] = []
+
+    def answer_the_third(data: bytes, *rest: Any) -> Any:
+        if data[4:5] + data[7:8] == b"\x02\x01":
+            pinged.append(2)
+            bus.servo(1).silent = len(pinged) < 3
+        return exchanged(data, *rest)
+
+    exchanged, bus.bus.exchange = bus.bus.exchange, answer_the_third
+    found = [each for each in devices.check_servos(settings) if each.subject == "servo 2 (right)"]
+    assert [each.status for each in found] == ["pass"]
+    assert Settings().tactile.open_timeout == Settings().servos.open_timeout == 5.0
+
+
+# Ports.
+
+
+def test_both_fingers_on_one_port_are_an_error_by_their_real_path(tmp_path):
+    (tmp_path / "left").touch()
+    (tmp_path / "again").symlink_to(tmp_path / "left")
+    ports = (str(tmp_path / "left"), str(tmp_path / "again"))
+
+    def told(*fingers: str) -> list[str]:
+        values = {
+            "scene": {"fingers": fingers},
+            "servos": {"backend": "dynamixel", "port": str(tmp_path / "servos")},
+            "tactile": {"backend": "flexitac", "port": ports},
+        }
+        return [each for each in problems(Settings.model_validate(values)) if "port" in each]
+
+    (problem,) = told("left", "right")
+    assert problem.startswith("tactile.port (right): found ")
+    assert "expected another port than tactile.port (left)" in problem
+    assert "/dev/serial/by-path" in problem
+    assert told("right") == []
+
+
+@pytest.mark.parametrize(
+    ("group", "mode", "advice"),
+    [
+        ("uucp", 0o660, "sudo usermod -aG uucp $USER, then log in again"),
+        ("root", 0o660, "sudo chmod a+rw {}, until it is plugged in again; for good, a udev rule"),
+        ("uucp", 0o600, "sudo chmod a+rw {}, until it is plugged in again; for good, a udev rule"),
+    ],
+)
+def test_the_ports_own_group_is_advised(tmp_path, monkeypatch, group, mode, advice):
+    port = tmp_path / "port"
+    port.touch()
+    port.chmod(mode)
+    Group = type("Group", (), {"gr_name": group, "gr_mem": []})
+    monkeypatch.setattr(port_access.grp, "getgrgid", lambda _: Group)
+    assert port_access.grant(str(port)) == advice.format(port)
+    assert port_access.grant(str(tmp_path / "none")) == f"sudo chmod a+rw {tmp_path / 'none'}"
+
+
+# A daemon that gets no readings.
+
+
+def test_run_tells_of_late_replies_at_the_start_and_while_it_is_disarmed(tmp_path, addresses):
+    folder = tmp_path / "hand"
+    with EmulatorProcess("--dir", folder, "--config", HIL).ready() as hand:
+        assert hand.popen.poll() is None
+        send_words(folder, "delay=0.05")
+        words = ["run", "--config", HIL, "--dir", folder, "--set", "loop.clock=real"]
+        for key, address in zip(("stream", "commands"), addresses, strict=True):
+            words += ["--set", f"{key}.address={address}"]
+        with ending(started(*words, stdout=None)) as daemon:
+            told = []
+            for line in daemon.stderr:
+                told.append(line)
+                if "of the last second's readings failed" in line:
+                    break
+            assert any("ticks will be late: set servos.reply_timeout" in line for line in told)
+            assert "within servos.reply_timeout = 4 ms; `softfinger doctor`" in told[-1]
+            assert "running, disarmed" in "".join(told)
+            daemon.terminate()
+            daemon.stderr.read()
+            assert daemon.wait(300) == 0
+        hand.end()

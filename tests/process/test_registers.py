@@ -1,0 +1,185 @@
+"""Registers that another program left: told, written by `arm`, mended, saved and restored."""
+
+import json
+from typing import Any
+
+import pytest
+
+from softfinger.daemon.clock import RealClock
+from softfinger.daemon.diagnosis import devices
+from softfinger.daemon.diagnosis.register_file import restore_registers, save_registers
+from softfinger.daemon.errors import ServoError
+from softfinger.daemon.servos import control_table as reg
+from softfinger.daemon.servos.base import Finding
+from softfinger.daemon.servos.control_table import MODELS
+from softfinger.daemon.servos.dynamixel import DynamixelServos
+from softfinger.daemon.servos.provisioning import provision
+from softfinger.daemon.servos.register_table import required_registers
+from softfinger.daemon.simulation.servo_model.registers import ControlTable
+from tests.conftest import until
+from tests.harness.servos import RunningBus, backend_settings, connected
+
+LEFT = "servo 1 (left)"
+FIX = "`softfinger doctor --fix`"
+# What another program may leave: register, value, status of the finding, its text.
+EEPROM = [
+    (reg.RETURN_DELAY_TIME, 250, "FAIL", "return delay is 500 µs, more than 50 µs"),
+    (reg.SHADOW_ID, 2, "FAIL", "shadow ID is 2: it obeys what the servo with that ID is sent"),
+    (reg.HOMING_OFFSET, 100, "FAIL", "homing offset is 100 counts, not 0: it turns this joint's"),
+    (reg.TEMPERATURE_LIMIT, 50, "warn", "temperature limit is 50 °C, not 70 … 80 °C"),
+    (reg.MAX_VOLTAGE_LIMIT, 130, "warn", "max voltage limit is 130 × 0.1 V, not 160 × 0.1 V"),
+    (reg.MIN_VOLTAGE_LIMIT, 110, "warn", "min voltage limit is 110 × 0.1 V, not 0 … 95 × 0.1 V"),
+    (reg.PWM_LIMIT, 300, "FAIL", "PWM limit is 300, not 885: the motor does not get all of"),
+    (reg.CURRENT_LIMIT, 100, "FAIL", "current limit is 0.269 A, below safety.current_max 1.2 A"),
+    (reg.VELOCITY_LIMIT, 5, "warn", "velocity limit is 0.12 rad/s at the joint, less than 3 rad"),
+    (reg.STARTUP_CONFIGURATION, 1, "FAIL", "startup configuration is 1, not 0: at power-up it sw"),
+    (reg.SHUTDOWN, 20, "warn", "shutdown is 20, not 52: it does not stop itself after overload"),
+]
+RAM = [
+    (reg.POSITION_D_GAIN, 3000),
+    (reg.POSITION_I_GAIN, 50),
+    (reg.POSITION_P_GAIN, 100),
+    (reg.FEEDFORWARD_2ND_GAIN, 7),
+    (reg.FEEDFORWARD_1ST_GAIN, 8),
+    (reg.GOAL_PWM, 200),
+    (reg.PROFILE_ACCELERATION, 2),
+    (reg.PROFILE_VELOCITY, 5),
+]
+
+
+def put(bus: RunningBus, address: int, value: int, servo: int = 0) -> None:
+    """Leave a value in a register, as another program that is gone."""
+    bus.call(lambda: bus.servo(servo).table.set(address, value))
+
+
+def held(bus: RunningBus, address: int, servo: int = 0) -> int:
+    return int(bus.call(lambda: bus.servo(servo).table.get(address)))
+
+
+def told(bus: RunningBus, **servos: Any) -> list[Finding]:
+    """What `doctor` says of the left servo."""
+    settings = backend_settings(bus.path, **servos)
+    return [each for each in devices.check_servos(settings) if each.subject == LEFT]
+
+
+@pytest.mark.parametrize(("address", "value", "status", "text"), EEPROM)
+def test_what_is_left_in_eeprom_is_told_and_mended(bus, address, value, status, text):
+    put(bus, address, value)
+    (found,) = [each for each in told(bus) if each.status == status and each.text.startswith(text)]
+    assert found.fix.startswith(FIX)
+    if status == "FAIL":
+        with pytest.raises(ServoError, match=text[:20]):
+            connected(bus)
+    fixed = [each for each in provision(backend_settings(bus.path)) if each.subject == LEFT]
+    assert [each.status for each in fixed] == ["fixed"]
+    connected(bus).close()
+    assert [each.status for each in told(bus)] == ["pass"]
+
+
+@pytest.mark.parametrize("reboots", [False, True])
+def test_arm_writes_what_is_left_in_ram(bus, connect, reboots):
+    if not reboots:
+        for address, value in RAM:
+            put(bus, address, value)
+        notes = [each for each in told(bus) if each.status == "note"]
+        assert len(notes) == len(RAM)
+        assert notes[-1].text == "profile velocity is 5, not 0: another program's; `arm` sets it"
+    backend = connect(bus)
+    if reboots:
+        backend.torque_on()
+        bus.call(lambda: bus.servo(0).reboot(bus._now()))
+        until(lambda: bus.call(lambda: bus.servo(0).awake(bus._now())))
+        for address, value in RAM:  # and another program writes to it at once
+            put(bus, address, value)
+    backend.torque_on()
+    model = MODELS["XM430-W350"]
+    d, i, p = model.position_gains
+    expected = [d, i, p, 0, 0, 885, 0, 0]
+    assert [held(bus, address) for address, _ in RAM] == expected
+
+
+def test_every_model_meets_its_own_factory_table():
+    """But for the mode and the return delay, which the factory sets for nobody."""
+    for name, model in MODELS.items():
+        mode = "current-based position" if model.senses_current else "position"
+        small = {"current_max": min(1.2, model.stall_current)}
+        settings = backend_settings("none", model=name, mode=mode)
+        safety = settings.safety.model_copy(update=small)
+        settings = settings.model_copy(update={"safety": safety})
+        table = ControlTable(model, model.firmware)
+        table.set(reg.GOAL_PWM, 885)
+        wrong = {
+            row.register.name
+            for row in required_registers(model, settings, 0, model.firmware)
+            if row.wrong_in(bytes(table.memory)) is not None
+        }
+        assert wrong <= {"return delay", "operating mode"}, name
+
+
+def test_registers_are_saved_and_restored(bus, tmp_path):
+    path, settings = tmp_path / "servos.json", backend_settings(bus.path)
+    put(bus, reg.PWM_LIMIT, 300)
+    put(bus, reg.PROFILE_VELOCITY, 5)
+    put(bus, reg.HOMING_OFFSET, -77)
+    before = bus.memory(0)[: reg.RAM]
+    assert [each.status for each in save_registers(settings, path)] == ["note", "note"]
+    stored = json.loads(path.read_text(encoding="utf-8"))["servos"]
+    assert (stored[0]["id"], stored[0]["model"]) == (1, "XM430-W350")
+    assert stored[0]["registers"]["homing offset"] == -77
+    provision(settings)
+    assert held(bus, reg.HOMING_OFFSET) == held(bus, reg.PROFILE_VELOCITY) == 0
+    done = [str(each) for each in restore_registers(settings, path)]
+    assert done == [
+        f"{LEFT}: homing offset 0 → -77",
+        f"{LEFT}: PWM limit 885 → 300",
+        f"{LEFT}: profile velocity 0 → 5",
+    ]
+    assert bus.memory(0)[: reg.RAM] == before
+
+
+def test_files_that_can_not_be_restored(bus, tmp_path):
+    path, settings = tmp_path / "servos.json", backend_settings(bus.path)
+    with pytest.raises(ServoError, match="No such file"):
+        restore_registers(settings, path)
+    strange = '{"servos": [{"id": 1, "model": "X", "firmware": 1, "registers": {"a": 1}}]}'
+    for text in ("{}", "[", strange):
+        path.write_text(text, encoding="utf-8")
+        with pytest.raises(ServoError, match="expected a file of `softfinger doctor --save`"):
+            restore_registers(settings, path)
+    save_registers(settings, path)
+    other = path.read_text(encoding="utf-8").replace("XM430-W350", "XM430-W210", 1)
+    path.write_text(other, encoding="utf-8")
+    left, *right = restore_registers(settings, path)
+    assert left.text.endswith("is of an XM430-W210, found XM430-W350")
+    assert right == []
+
+
+# Servos that are not what is expected.
+
+
+def test_a_lost_turn_is_brought_back_by_a_reboot(bus, connect):
+    bus.call(lambda: setattr(bus.servo(0)._joint, "_turns", -2))
+    (found,) = [each for each in told(bus) if each.status == "FAIL"]
+    assert "its servo has counted 2 turns too many" in found.text
+    assert found.fix == "reboot it: switch its supply off and on, or `softfinger doctor --fix`"
+    (fixed,) = [each for each in provision(backend_settings(bus.path)) if each.subject == LEFT]
+    assert "rebooted, since its position was a turn off" in fixed.text
+    assert [each.status for each in told(bus)] == ["pass"]
+
+
+def test_a_servo_that_speaks_protocol_1_is_recognised(bus):
+    put(bus, reg.PROTOCOL_TYPE, 1)
+    text = "answers Protocol 1.0, expected 2.0"
+    (found,) = told(bus, open_timeout=0.1)
+    assert (found.status, found.text) == ("FAIL", text)
+    backend = DynamixelServos(backend_settings(bus.path, reply_timeout=0.3), RealClock())
+    with pytest.raises(ServoError, match=f"left\\): {text}"):
+        backend.connect()
+    backend.close()
+
+
+def test_an_unknown_model_lists_the_known_ones(bus):
+    put(bus, reg.MODEL_NUMBER, 9999)
+    (found,) = [each for each in told(bus) if each.status == "FAIL"]
+    assert found.text == "has the unknown model number 9999, not 1020 of an XM430-W350"
+    assert all(name in found.fix for name in ("XH540-W270", "MX-64", "XC330-M181"))

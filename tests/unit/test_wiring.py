@@ -1,0 +1,127 @@
+"""Servos wired to the wrong finger, or with the wrong direction: found before they do harm."""
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
+from typing import Any
+
+import pytest
+
+from softfinger.daemon.loop import build
+from softfinger.daemon.loop.build import Daemon
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.servos.simulated import SimulatedServos
+from tests.harness.loop import command, heard
+
+
+class Miswired:
+    """A simulated hand whose servos move each other's finger, or turn the wrong way round."""
+
+    def __init__(self, hand: Any, swapped: bool) -> None:
+        self._hand, self._swapped = hand, swapped
+
+    def __getattr__(self, name: str) -> Any:
+        found = getattr(self._hand, name)
+        if name in ("q", "dq", "current"):
+            return found[::-1] if self._swapped else -found
+        return found
+
+    def measured_current(self, joint: int) -> float:
+        if self._swapped:
+            return self._hand.measured_current(1 - joint)
+        return -self._hand.measured_current(joint)
+
+    def drive(self, joint: int, mode: int, torque: bool, q: float, current: float) -> None:
+        if self._swapped:
+            self._hand.drive(1 - joint, mode, torque, q, current)
+        else:
+            self._hand.drive(joint, mode, torque, -q, current)
+
+
+Make = Callable[..., Daemon]
+
+
+@pytest.fixture
+def make(monkeypatch: pytest.MonkeyPatch) -> Iterator[Make]:
+    """Makes armed daemons on the virtual clock, by how their servos are wired."""
+    with ExitStack() as stack:
+
+        def make(wiring: str, **simulation: Any) -> Daemon:
+            def servos(settings: Settings, clock: Any, hand: Any) -> SimulatedServos:
+                miswired = hand if wiring == "right" else Miswired(hand, wiring == "swapped")
+                return SimulatedServos(settings, miswired, clock)
+
+            monkeypatch.setattr(build, "make_servos", servos)
+            values = {"loop": {"clock": "virtual"}, "simulation": simulation}
+            daemon = stack.enter_context(
+                closing(Daemon(Settings.model_validate(values), wire=False))
+            )
+            daemon.loop.advance(0.2)
+            command(daemon, "arm")
+            daemon.loop.advance(0.1)
+            return daemon
+
+        yield make
+
+
+def greatest_force(daemon: Daemon, seconds: float) -> float:
+    """The greatest true force of a tip in this time, or until a fault."""
+    greatest = 0.0
+    for _ in range(round(seconds / 0.02)):
+        daemon.loop.advance(0.02)
+        greatest = max(greatest, *daemon.hand.force.tolist())
+        if daemon.loop.state.fault:
+            break
+    return greatest
+
+
+OFF = [0.004, -0.006]  # m that the object lies off the middle
+HEAVY = {"object_mass": 0.5, "table_friction": 0.5}
+
+
+@pytest.mark.parametrize("off", OFF)
+@pytest.mark.parametrize("object_", [{}, HEAVY], ids=["light", "heavy"])
+def test_swapped_servos_are_found_in_the_approach(make, off, object_):
+    daemon = make("swapped", object_position=(off, 0.08), **object_)
+    command(daemon, "grasp", force=6.0)
+    assert greatest_force(daemon, 3.0) < 4.0
+    assert daemon.loop.state.fault_name == "joint.swapped"
+    assert "closes: are servos.ids swapped?" in daemon.loop.state.fault
+    assert not daemon.hand.torque_on.any()
+
+
+def test_swapped_servos_are_found_at_the_beginning_of_a_turn(make):
+    daemon = make("swapped")  # in the middle an approach is the same with both
+    command(daemon, "grasp", force=6.0)
+    greatest_force(daemon, 2.0)
+    assert daemon.loop.state.mode == "holding"
+    command(daemon, "rotate", angle=0.2)
+    assert greatest_force(daemon, 1.0) < 10.0
+    assert daemon.loop.state.fault_name == "joint.swapped"
+    assert "against its commanded turn: are servos.ids swapped?" in daemon.loop.state.fault
+
+
+@pytest.mark.parametrize("off", [0.0, *OFF])
+@pytest.mark.parametrize("object_", [{}, HEAVY], ids=["light", "heavy"])
+def test_servos_that_are_wired_right_grasp_and_turn(make, off, object_):
+    daemon = make("right", object_position=(off, 0.08), **object_)
+    events = heard(daemon)
+    command(daemon, "grasp", force=6.0)
+    greatest_force(daemon, 3.0)
+    for angle in (0.1, -0.1):
+        command(daemon, "rotate", angle=angle)
+        greatest_force(daemon, 2.0)
+    assert daemon.loop.state.fault == ""
+    assert daemon.loop.state.mode in ("holding", "rotating")
+    assert not [kind for _, kind, _ in events if kind in ("joint.swapped", "joint.blocked")]
+
+
+def test_fingers_that_open_instead_of_closing_are_told(make):
+    daemon = make("reversed")
+    events = heard(daemon)
+    command(daemon, "grasp", force=6.0)
+    while daemon.hand.q[0] > -0.54:  # until it stands at its stop
+        daemon.loop.advance(0.02)
+    daemon.loop.advance(1.0)
+    (told,) = [text for level, kind, text in events if kind == "joint.blocked"]
+    assert told.startswith("left joint stands at 3")
+    assert told.endswith("is servos.direction right?")
