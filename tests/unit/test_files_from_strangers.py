@@ -224,6 +224,7 @@ BOMBS: dict[str, Callable[[], bytes] | Callable[[Path], None]] = {
     ),
     "holes": recording_of_holes,
     "chunks of holes": chunks_of_holes,
+    "another compression": lambda: chunk("br", b"abcd", 1000),
     "a record of 4 GB": lambda: struct.pack("<BQ", 6, 4 << 30),
 }
 

@@ -373,6 +373,11 @@ def recover(path: Path) -> tuple[int, str]:
     recording = Recording(path)
     if recording.check():
         return recording.total, ""
+    if recording.others:
+        raise RecordingError(
+            f"{path}: has channels of other programs, which would be lost; "
+            "`mcap recover` keeps them"
+        )
     closed = path.with_name(path.name + ".recovered")
     closed.unlink(missing_ok=True)
     writer = RecordingWriter(closed)

@@ -7,6 +7,7 @@ import contextlib
 import math
 import time
 from collections.abc import Callable
+from itertools import islice
 from typing import Any
 
 import zmq
@@ -93,8 +94,8 @@ class Playback:
     def run(self, ending: Ending) -> None:
         """Play until the end is asked for."""
         recording, pictures = self._recording, self._pictures
-        if recording.count(schema.SETTINGS):  # which may come once, at the beginning
-            pictures.take(*next(recording.messages([schema.SETTINGS])))
+        for message in islice(recording.messages([schema.SETTINGS]), 1):  # they may come only once
+            pictures.take(*message)
         while not ending.over:
             begun = time.monotonic()
             if (target := self._target) is not None:
