@@ -158,7 +158,7 @@ def make_estimator(
         alive[row, col] = False
     saturation, threshold, quantum = float(tactile.full_count), float(tactile.threshold), 0.0
     if calibration is not None:
-        converter = Converter(calibration, tactile.pascal_per_count)
+        converter = Converter(calibration, tactile.pascal_per_count, tactile.full_count)
         alive &= converter.live
         saturation, quantum = converter.saturation, converter.quantum
         # The estimator takes half a count off a threshold, in the frame's unit.

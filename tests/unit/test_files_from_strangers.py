@@ -21,7 +21,7 @@ from softfinger.daemon.errors import RecordingError, SettingsError, SoftfingerEr
 from softfinger.daemon.perception.calibration_file import load_calibration
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.tactile.replay import load_recording
+from softfinger.daemon.tactile.frame_files import load_recording
 from softfinger.tools.recordings.export import CsvTable, export
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.record import recover
