@@ -160,6 +160,16 @@ class FingerPerception:
         self._tare_left = 0
 
     @property
+    def noise(self) -> float:
+        """Standard deviation that the cells show [Pa]; 0 where that is not known."""
+        return self._unpressed.scatter * self._quantum
+
+    @property
+    def full_count(self) -> float:
+        """The reading of a saturated cell [counts]."""
+        return self._full
+
+    @property
     def taring(self) -> bool:
         """The zero is being learnt."""
         return self._tare_left > 0

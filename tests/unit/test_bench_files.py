@@ -1,6 +1,9 @@
 """Files of frames as they come from benches: read rightly, or refused for the true reason."""
 
 import itertools
+import re
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +13,14 @@ import pytest
 from softfinger import Fingertip, Material, SensorGrid
 from softfinger.daemon.clock import VirtualClock
 from softfinger.daemon.errors import RecordingError, TactileError
+from softfinger.daemon.perception.finger_model import make_models
+from softfinger.daemon.perception.zero import UnpressedCells
 from softfinger.daemon.profile.settings import Settings, TactileSettings
+from softfinger.daemon.profile.validation import sensor_doubts
 from softfinger.daemon.tactile.frame_files import load_recording
 from softfinger.daemon.tactile.replay import ReplayTactile
 from softfinger.tools.analysis.analyse import analyse, open_source
+from softfinger.tools.recordings.record import RecordingWriter
 
 PITCH, SCALE, NOISE = 0.058 / 44, 4.0, 300.0
 TIP, MATERIAL = Fingertip(0.020), Material.table_i()
@@ -416,3 +423,69 @@ def test_generators_differ():
     texts = [export(frame, **form) for form in LOCALES.values()]
     same = [a == b for a, b in itertools.combinations(texts, 2)]
     assert not any(same)
+
+
+# Before the first grip
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({}, ""),
+        ({"tip.radius": 0.010}, "sensor of 58 × 58 mm for a tip of 20 mm diameter"),
+        ({"tactile.rows": 20}, r"smaller than the tip's footprint at 12 mm, .* mm wide"),
+        ({"tactile.centre": (0.02, 0.0)}, "smaller than the tip's footprint"),
+        ({"tactile.pitch_y": 0.0006}, "sensor of 58 × 26.4 mm, smaller than"),
+    ],
+)
+def test_a_sensor_of_another_size_than_the_tip_wants_is_told(changes, told):
+    tables: dict[str, dict[str, Any]] = {}
+    for key, value in changes.items():
+        section, name = key.split(".")
+        tables.setdefault(section, {})[name] = value
+    settings = Settings.model_validate(tables)
+    doubts = sensor_doubts(settings)
+    events: list[tuple[str, str, str]] = []
+    make_models(settings, lambda *event: events.append(event))
+    warned = [text for level, _, text in events if level == "warning"]
+    assert warned == doubts
+    assert len(doubts) == bool(told)
+    assert re.search(told, " ".join(doubts))
+
+
+def test_a_solid_tips_sensor_covers_its_base():
+    solid = {"tip": {"physics": "solid"}, "material": {"law": "constant"}}
+    settings = Settings.model_validate({**solid, "tactile": {"rows": 28}})
+    (doubt,) = sensor_doubts(settings)
+    assert "smaller than the tip's base, 40 mm wide" in doubt
+
+
+@pytest.mark.parametrize("zero", [0.0, 50.0, 3000.0])
+@pytest.mark.parametrize("noise", [0.7, 5.0, 40.0])
+def test_the_noise_of_a_sensor_no_larger_than_its_tip_is_seen_from_frame_to_frame(zero, noise):
+    rng = np.random.default_rng(5)
+    grid = SensorGrid(24, 24, PITCH)
+    cells = UnpressedCells(grid, 0.020, np.ones(grid.shape, bool))
+    press = 2000.0 * (np.hypot(*(np.indices(grid.shape) - 11.5)) < 5.0)
+    for _ in range(60):
+        frame = zero + press + noise * rng.standard_normal(grid.shape)
+        cells.follow(np.clip(np.round(frame), 0, 65535).astype(np.uint16))
+    assert cells.noise == 0.0
+    assert cells.scatter == pytest.approx(noise, rel=0.2, abs=0.4)
+
+
+def test_a_recording_goes_into_a_folder_that_exists(tmp_path):
+    with pytest.raises(RecordingError, match="its folder does not exist; make it first"):
+        RecordingWriter(tmp_path / "no" / "a.mcap")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("limit", [60_000, 300_000])  # kB
+def test_too_little_memory_is_told_in_a_line(press, tmp_path, limit):
+    np.save(tmp_path / "a.npy", press[:1])
+    words = [sys.executable, "-m", "softfinger", "analyse", str(tmp_path / "a.npy")]
+    words = ["prlimit", f"--as={limit * 1024}", *words, "--config", "paper"]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 1
+    assert done.stderr.startswith("softfinger: not enough memory for this process")
+    assert len(done.stderr.splitlines()) == 1

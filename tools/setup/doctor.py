@@ -25,6 +25,7 @@ from softfinger.daemon.diagnosis.ports import (
     note_ports,
 )
 from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.profile.validation import sensor_doubts
 from softfinger.daemon.servos.base import Finding
 from softfinger.daemon.servos.checks import check_latency_timer
 from softfinger.daemon.types import FINGERS
@@ -78,6 +79,8 @@ def results(settings: Settings, fix: bool) -> Iterator[Finding]:
         if free[path]:
             yield from _latency(settings, path, fix)
     yield from _servos(settings, free, fix)
+    for doubt in sensor_doubts(settings):
+        yield Finding("warn", "sensor", doubt, "set tactile.rows, cols and pitch, or tip.radius")
     tactile = settings.tactile
     if not backend("tactile", tactile.backend).metal:
         yield Finding("note", "tactile", f"{tactile.backend}: no board to ask")
