@@ -149,6 +149,4 @@ def _restored(
         else:
             if path[-1] in place and place[path[-1]] is None:
                 place[path[-1]] = math.nan
-    if not isinstance(message.get("timestamp", 0.0), int | float):
-        raise ValueError(f"{topic.decode()}: a message without its time")
     return message
