@@ -139,8 +139,34 @@ def make_parser(imported: Collection[str]) -> tuple[Parser, dict[str, tuple[Any,
     return parser, made
 
 
+# What the loader of shared libraries says where the process may have no more memory.
+_NO_MEMORY = ("failed to map segment", "Cannot allocate memory", "libllvmlite")
+
+
+def _lacks_memory(error: BaseException | None) -> bool:
+    while error is not None:
+        if isinstance(error, MemoryError) or any(text in str(error) for text in _NO_MEMORY):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point of ``softfinger``; returns the exit status."""
+    try:
+        return _main(argv)
+    except (MemoryError, ImportError, OSError) as error:
+        if not _lacks_memory(error):
+            raise
+        print(
+            "softfinger: not enough memory for this process, which needs about 1 GB of addresses: "
+            "see `ulimit -v` and what else runs",
+            file=sys.stderr,
+        )
+        return 1
+
+
+def _main(argv: Sequence[str] | None) -> int:
     # While modules are imported Ctrl-C ends the process as it ends any other: no traceback.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     _open_standard_streams()

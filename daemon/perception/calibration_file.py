@@ -236,15 +236,20 @@ def save_calibration(path: Path, calibration: Calibration) -> None:
 class Converter:
     """Counts → Pa of one sensor."""
 
-    def __init__(self, calibration: Calibration, pascal_per_count: float) -> None:
-        """``pascal_per_count`` is taken where no curve was measured."""
+    def __init__(
+        self, calibration: Calibration, pascal_per_count: float, full_count: int | None = None
+    ) -> None:
+        """``pascal_per_count`` is taken where no curve was measured.
+
+        ``full_count``: the reading of saturated cells; None: the sensor's.
+        """
         sensor = calibration.sensor
         shape = (sensor.rows, sensor.cols)
         tare, gain, curve = calibration.tare, calibration.equilibrate, calibration.curve
         self.zero: FloatArray = np.array(tare.zero) if tare else np.zeros(shape)
         self.gain: FloatArray = np.array(gain.gain) if gain else np.ones(shape)
         self._curve = np.array(curve.coefficients if curve else (1.0, pascal_per_count, 0.0, 0.0))
-        self._full = sensor.full_count
+        self._full = sensor.full_count if full_count is None else full_count
         self.live: NDArray[np.bool_] = self.gain > 0.0
         with np.errstate(over="ignore", invalid="ignore"):
             finite = math.isfinite(self.largest)

@@ -20,6 +20,7 @@ from softfinger.daemon.profile.factory import (
     make_tip,
 )
 from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.profile.validation import sensor_doubts
 from softfinger.daemon.types import FINGERS
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
@@ -55,6 +56,9 @@ def make_models(
     A finger that takes no part, or has no sensor, goes by the settings alone. Raises as
     `profile.factory.make_table` and `calibration_file.calibration_for`.
     """
+    if on_event is not None:
+        for doubt in sensor_doubts(settings):
+            on_event("warning", "tactile", doubt)
     measured = settings.tip.physics == "measured"
     made: dict[int, FingerModel] = {}
     common: tuple[Material, ContactTable] | None = None
@@ -158,7 +162,7 @@ def make_estimator(
         alive[row, col] = False
     saturation, threshold, quantum = float(tactile.full_count), float(tactile.threshold), 0.0
     if calibration is not None:
-        converter = Converter(calibration, tactile.pascal_per_count)
+        converter = Converter(calibration, tactile.pascal_per_count, tactile.full_count)
         alive &= converter.live
         saturation, quantum = converter.saturation, converter.quantum
         # The estimator takes half a count off a threshold, in the frame's unit.

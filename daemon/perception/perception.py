@@ -120,6 +120,12 @@ class FingerPerception:
         self, sensor: TactileSensor, model: FingerModel, settings: Settings, events: list[Event]
     ) -> None:
         """``events`` takes a tare that failed."""
+        full = getattr(sensor, "full_count", None)  # of a recording that has its own
+        if full is not None and full < settings.tactile.full_count:
+            own = settings.tactile.model_copy(update={"full_count": full})
+            settings = settings.model_copy(update={"tactile": own})
+        for note in getattr(sensor, "notes", ()):
+            events.append(("warning", "tactile", note))
         tactile, calibration = settings.tactile, model.calibration
         self.finger = model.finger
         self.sensor = sensor
@@ -139,7 +145,7 @@ class FingerPerception:
         self._quantum = tactile.pascal_per_count  # of a count where nothing presses
         self._converter: Converter | None = None
         if calibration is not None:
-            self._converter = Converter(calibration, tactile.pascal_per_count)
+            self._converter = Converter(calibration, tactile.pascal_per_count, tactile.full_count)
             self._scale = 1.0
             self._quantum = self._converter.quantum
         self._readings: NDArray[Any] | None = None  # of the newest frame: counts over zero, or Pa
@@ -152,6 +158,16 @@ class FingerPerception:
         self._noise = tactile.noise  # of a cell, as set [Pa]
         self._tare_sum: NDArray[np.uint32] | int = 0
         self._tare_left = 0
+
+    @property
+    def noise(self) -> float:
+        """Standard deviation that the cells show [Pa]; 0 where that is not known."""
+        return self._unpressed.scatter * self._quantum
+
+    @property
+    def full_count(self) -> float:
+        """The reading of a saturated cell [counts]."""
+        return self._full
 
     @property
     def taring(self) -> bool:

@@ -18,6 +18,8 @@ from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 _BESIDE = 2.0  # pitches from the tip's rim, from which on a cell feels nothing of it
 _FEWEST = 50  # cells: below, nothing is said
 _AVERAGED = 8  # frames of which the noise is averaged
+_CLIPPED = 0.25  # share of cells that read 0, from which on noise round 0 is cut in half …
+_CLIPPED_VARIANCE = 0.5 - 0.5 / math.pi  # … which leaves so much of its variance
 
 
 class UnpressedCells:
@@ -32,6 +34,10 @@ class UnpressedCells:
         reach = radius + _BESIDE * max(grid.pitches) + 3.0 * grid.blur
         cells = np.flatnonzero(live & (distance > reach))
         self._cells = cells if cells.size >= _FEWEST else cells[:0]
+        self._live = np.flatnonzero(live)
+        self._before: NDArray[np.float64] | None = None  # what these read
+        self._squares: NDArray[np.float64] | None = None  # of their changes, averaged
+        self._zeros = 0.0  # share of them that read 0
         self._reference: float | None = None  # median of these cells at the tare
         self._variance: float | None = None
         self.shift = 0  # counts that the zero has risen since the tare
@@ -41,6 +47,17 @@ class UnpressedCells:
         """Standard deviation of a cell [counts]; 0 where nothing shows it."""
         return 0.0 if self._variance is None else math.sqrt(self._variance)
 
+    @property
+    def scatter(self) -> float:
+        """Noise by what all cells do from frame to frame [counts], where none is out of reach.
+
+        Most of them rest, except while a tip moves. 0 where nothing shows it.
+        """
+        if self._squares is None:
+            return self.noise
+        variance = 0.5 * float(np.median(self._squares))
+        return math.sqrt(variance / (_CLIPPED_VARIANCE if self._zeros > _CLIPPED else 1.0))
+
     def forget_zero(self) -> None:
         """The zero is learnt anew."""
         self.shift = 0
@@ -49,6 +66,7 @@ class UnpressedCells:
     def follow(self, counts: NDArray[np.uint16]) -> None:
         """Take in a frame of raw ``counts``."""
         if not self._cells.size:
+            self._compare(counts.ravel()[self._live].astype(np.float64))
             return
         read = counts.ravel()[self._cells].astype(np.float64)
         level = float(np.median(read))
@@ -63,6 +81,15 @@ class UnpressedCells:
         square = max(square, 0.0)
         before = square if self._variance is None else self._variance
         self._variance = before + (square - before) / _AVERAGED
+
+    def _compare(self, read: NDArray[np.float64]) -> None:
+        before, self._before = self._before, read
+        if before is None:
+            return
+        squares = np.square(read - before)
+        last = squares if self._squares is None else self._squares
+        self._squares = last + (squares - last) / _AVERAGED
+        self._zeros = 1.0 - np.count_nonzero(read) / read.size
 
     def corrected(self, counts: NDArray[np.uint16], full: int) -> NDArray[np.uint16]:
         """Return the counts less what the zero has moved by; ``full`` ones stay."""

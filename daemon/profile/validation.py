@@ -26,6 +26,35 @@ def problems(settings: Settings) -> list[str]:
     return [problem for check in _CHECKS for problem in check(settings)]
 
 
+_WIDE = 2.0  # times the tip's diameter, from which on a sensor is likely another tip's
+
+
+def sensor_doubts(settings: Settings) -> list[str]:
+    """Return what looks wrong with the sensors' size under these tips, a line each."""
+    tip, tactile = settings.tip, settings.tactile
+    if tactile.backend == "none":
+        return []
+    sides = tactile.cols * tactile.pitch, tactile.rows * (tactile.pitch_y or tactile.pitch)
+    size = f"{sides[0] * 1e3:.4g} × {sides[1] * 1e3:.4g} mm"
+    doubts = []
+    if min(sides) > _WIDE * 2.0 * tip.radius:
+        doubts.append(
+            f"tactile.rows, cols, pitch: found a sensor of {size} for a tip of "
+            f"{tip.radius * 2e3:.4g} mm diameter; is it another tip's, or tip.radius wrong?"
+        )
+    # A solid tip presses with all of its base, springs with the footprint alone.
+    d = min(settings.safety.d_max, tip.radius)
+    reach = tip.radius if tip.physics == "solid" else math.sqrt(d * (2.0 * tip.radius - d))
+    half = min(0.5 * side - abs(at) for side, at in zip(sides, tactile.centre, strict=True))
+    if half < reach:
+        what = "base" if tip.physics == "solid" else f"footprint at {d * 1e3:.3g} mm"
+        doubts.append(
+            f"tactile.rows, cols, pitch: found a sensor of {size}, smaller than the tip's {what}, "
+            f"{reach * 2e3:.3g} mm wide: what is pressed beyond it is not felt"
+        )
+    return doubts
+
+
 def shown(value: Any) -> str:
     """Return value as it stands in TOML, short enough for a line and without control characters."""
     if isinstance(value, tuple):

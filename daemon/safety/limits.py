@@ -30,6 +30,7 @@ from softfinger.daemon.safety.wiring import WiringWatch
 from softfinger.daemon.servos.control_table import VOLTAGE_UNIT, by_name, hardware_error_names
 from softfinger.daemon.types import FINGERS, Contact, Reading, State
 
+_NOISY = 1.5  # times the noise that is set, from which on that is named
 _NEAR = 0.9  # of a fault's bound: warned from there on
 _PULL = 2.0  # A/rad with which a joint off its goal must be pulled: less than any model's own loop
 _SLOW = 0.05  # rad/s below which a joint stands
@@ -503,8 +504,14 @@ def _tactile_silent(view: View, state: State, _: float, i: int) -> str:
         return ""
     what = "frame" if contact.t_arrival == contact.t_valid else "sound estimate"
     cure = ""
-    if any(each.finger == i and each.sensor.counters().get("port_lost") for each in view.sensors):
-        cure = ": its port is gone, and `clear`, or `disarm` and `arm`, opens it again"
+    for sensor in (each for each in view.sensors if each.finger == i):
+        if sensor.sensor.counters().get("port_lost"):
+            cure = ": its port is gone, and `clear`, or `disarm` and `arm`, opens it again"
+        elif what != "frame":
+            cure = f": {sensor.estimate.invalid.text}" if sensor.estimate.invalid else ""
+            noise = view.settings.tactile.noise
+            if sensor.noise > _NOISY * noise:
+                cure += f"; its cells' noise is {sensor.noise:.0f} Pa, tactile.noise is {noise:g}"
     return (
         _doubt(view, state, i)
         or f"tactile: no {what} of the {FINGERS[i]} sensor for {age:.3f} s{cure}"
@@ -605,12 +612,12 @@ def _tactile_frozen(view: View, state: State, _: float) -> str:
 @Limit("tactile.saturated", "share of full cells", "warn", ("safety.saturated",), "sensors",
     in_turn=True, lasts=0.1)  # fmt: skip
 def _tactile_saturated(view: View, _: State, fraction: float) -> str:
-    full, limit = view.settings.tactile.full_count, fraction * view.limits.saturated
+    limit = fraction * view.limits.saturated
     for sensor in view.sensors:
         if sensor.frame is None:
             continue
         data = sensor.frame.data
-        saturated = np.count_nonzero(data >= full) / data.size
+        saturated = np.count_nonzero(data >= sensor.full_count) / data.size
         if saturated > limit:
             return (
                 f"tactile: {saturated:.0%} of the {FINGERS[sensor.finger]} sensor's cells are full"

@@ -1,188 +1,55 @@
-"""Recorded frames instead of a sensor's: read from files, at their own times, or set by the caller.
-
-Files:
-- ``.npz`` with ``frames`` [n, rows, cols] and optionally ``t`` [n] s, ``live`` [rows, cols] bool,
-  and the true contact at each frame, where known: ``d`` [m], ``theta`` [rad], ``force`` [N], each
-  [n].
-- ``.npy``, one frame [rows, cols] or several [n, rows, cols]; or a folder of such files, in the
-  order of their names with numbers read as numbers, and ``t.npy`` [n] s among them.
-- a Tekscan-style ASCII export, any other file.
-
-Frames of whole numbers are counts; others are Pa, and become counts by ``pascal_per_count``.
-"""
+"""Recorded frames instead of a sensor's: at their own times, or set by the caller."""
 
 from __future__ import annotations
 
 import bisect
 import math
-import re
-import zipfile
-import zlib
-from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from softfinger.daemon.clock import Clock
 from softfinger.daemon.errors import RecordingError, TactileError
-from softfinger.daemon.own_files import open_regular, read_file, unpacked_most
 from softfinger.daemon.profile.settings import TactileSettings
-from softfinger.daemon.tactile import tekscan
+from softfinger.daemon.tactile.frame_files import FrameRecording, load_recording
 from softfinger.daemon.types import FINGERS, Frame
 
-FloatArray = NDArray[np.float64]
-TRUTHS = ("d", "theta", "force")
-_FULL = 65535
+_PITCH_OFF = 0.01  # relative, by which a file's pitch may differ from the settings'
 
 
-@dataclass(frozen=True)
-class FrameRecording:
-    """Counts uint16 [n, rows, cols] at times t float64 [n], rising from 0 [s].
+def pitch_difference(recording: FrameRecording, pitch: tuple[float, float]) -> str:
+    """Return how a file's cell sizes contradict ``pitch`` (x, y) [m], y = 0 for the same.
 
-    ``live`` [rows, cols] is False where the sensor has no cell; ``truths`` is the true contact.
+    Empty where they agree, or the file has none.
     """
-
-    counts: NDArray[np.uint16]
-    t: FloatArray
-    live: NDArray[np.bool_]
-    truths: dict[str, FloatArray] = field(default_factory=dict)
-    pitch: tuple[float, float] | None = None  # x and y [m], where the file has it
-
-
-def load_recording(path: Path, pascal_per_count: float, rate: float) -> FrameRecording:
-    """Read a recording; without times its frames come at ``rate`` [Hz]. Raises RecordingError."""
-    try:
-        if path.is_dir():
-            return _folder(path, pascal_per_count, rate)
-        if path.suffix == ".npz":
-            return _checked(_archive(path), pascal_per_count, rate)
-        if path.suffix == ".npy":
-            return _checked({"frames": _frames(path)}, pascal_per_count, rate)
-        return _export(path, pascal_per_count, rate)
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        reason = error.strerror if isinstance(error, OSError) and error.strerror else error
-        raise RecordingError(f"{path}: {reason}") from None
-
-
-def _folder(path: Path, scale: float, rate: float) -> FrameRecording:
-    def order(file: Path) -> list[tuple[int, str]]:
-        parts = re.findall(r"\d+|\D+", file.stem)
-        return [(int(part), "") if part.isdigit() else (-1, part) for part in parts]
-
-    parts = []
-    arrays: dict[str, NDArray[Any]] = {}
-    for file in sorted(path.glob("*.npy"), key=order):
-        if file.stem in ("t", "live", *TRUTHS):
-            arrays[file.stem] = _array(file)
-        else:
-            parts.append(_frames(file))
-    if not parts:
-        raise ValueError("no .npy file with a frame in this folder")
-    if len({part.shape[1:] for part in parts}) > 1:
-        raise ValueError("frames of different shapes in this folder")
-    return _checked({"frames": np.concatenate(parts), **arrays}, scale, rate)
-
-
-def _frames(path: Path) -> NDArray[Any]:
-    """The frames of one .npy file, [n, rows, cols]."""
-    array = _array(path)
-    if array.ndim not in (2, 3):
-        raise ValueError(f"{path.name}: found shape {array.shape}, expected [n, rows, cols]")
-    return array.reshape(-1, *array.shape[-2:])
-
-
-def _archive(path: Path) -> dict[str, NDArray[Any]]:
-    """The arrays of an .npz file that are ours."""
-    held = {}
-    with open_regular(path) as file, zipfile.ZipFile(file) as archive:
-        left = unpacked_most(file)
-        for name in ("frames", "t", "live", *TRUTHS):
-            if f"{name}.npy" in archive.namelist():
-                part = archive.getinfo(f"{name}.npy")
-                # As NumPy packs them: others unpack beyond what they claim.
-                if part.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-                    raise ValueError(f"{name}: found another compression than deflate")
-                left -= part.file_size
-                if left < 0:
-                    raise ValueError(f"{name}: unpacks to more than a recording of this size does")
-                with archive.open(part) as unpacked:
-                    held[name] = _read_array(unpacked, part.file_size)
-    return held
-
-
-def _array(path: Path) -> NDArray[Any]:
-    with open_regular(path) as file:
-        return _read_array(file, min(path.stat().st_size, unpacked_most(file)))
-
-
-def _read_array(file: IO[bytes], size: int) -> NDArray[Any]:
-    """The array of a .npy file of so many bytes. Raises ValueError where it claims to be larger."""
-    lib = np.lib.format
-    header = {(1, 0): lib.read_array_header_1_0, (2, 0): lib.read_array_header_2_0}
-    version = lib.read_magic(file)
-    if version not in header:
-        raise ValueError(f"found version {version} of .npy, expected 1.0 or 2.0")
-    shape, _, kind = header[version](file)
-    if math.prod(shape) * kind.itemsize > size:
-        raise ValueError(f"claims to hold {shape} of {kind}, more than the file has")
-    file.seek(0)
-    return np.asarray(lib.read_array(file, allow_pickle=False))
-
-
-def _export(path: Path, scale: float, rate: float) -> FrameRecording:
-    export = tekscan.parse(read_file(path).decode("latin-1"), 1.0 / rate)
-    arrays: dict[str, NDArray[Any]] = {"frames": export.values, "t": export.t, "live": export.live}
-    recording = _checked(arrays, 1.0 if export.raw else scale, rate)
-    return recording if math.isnan(sum(export.pitch)) else replace(recording, pitch=export.pitch)
-
-
-def _checked(arrays: dict[str, NDArray[Any]], scale: float, rate: float) -> FrameRecording:
-    if "frames" not in arrays:
-        raise ValueError("no array 'frames' in it")
-    frames = arrays["frames"]
-    if frames.ndim != 3 or frames.size == 0:
-        raise ValueError(f"frames: found shape {frames.shape}, expected [n, rows, cols]")
-    if frames.dtype.kind not in "uif":
-        raise ValueError(f"frames: found {frames.dtype}, expected numbers")
-    if frames.dtype.kind == "f":
-        with np.errstate(over="ignore"):
-            frames = np.round(frames / scale)
-    if not (frames >= 0).all() or (frames > _FULL).any():
-        raise ValueError(f"frames: found readings outside 0 to {_FULL} counts")
-    count = len(frames)
-    t = _row(arrays, "t", count) if "t" in arrays else np.arange(count) / rate
-    if (np.diff(t) <= 0.0).any():
-        raise ValueError("t: the times must rise")
-    live = np.ones(frames.shape[1:], np.bool_)
-    if "live" in arrays:
-        live = arrays["live"].astype(np.bool_)
-        if live.shape != frames.shape[1:]:
-            raise ValueError(f"live: found shape {live.shape}, expected {frames.shape[1:]}")
-    truths = {name: _row(arrays, name, count) for name in TRUTHS if name in arrays}
-    return FrameRecording(np.ascontiguousarray(frames, np.uint16), t - t[0], live, truths)
-
-
-def _row(arrays: dict[str, NDArray[Any]], name: str, count: int) -> FloatArray:
-    array = arrays[name]
-    if array.shape != (count,) or array.dtype.kind not in "uif":
-        raise ValueError(f"{name}: found shape {array.shape}, expected {count} numbers")
-    values = array.astype(np.float64)
-    if not np.isfinite(values).all():
-        raise ValueError(f"{name}: not finite")
-    return values
+    if recording.pitch is None:
+        return ""
+    wanted = pitch[0], pitch[1] or pitch[0]
+    pairs = zip(recording.pitch, wanted, strict=True)
+    if all(abs(found / each - 1.0) < _PITCH_OFF for found, each in pairs):
+        return ""
+    x, y = (each * 1e3 for each in recording.pitch)
+    return (
+        f"its header has cells of {x:.4g} × {y:.4g} mm, tactile.pitch of {wanted[0] * 1e3:.4g} × "
+        f"{wanted[1] * 1e3:.4g} mm: set tactile.pitch = {x * 1e-3:.6g}, "
+        f"tactile.pitch_y = {y * 1e-3:.6g}"
+    )
 
 
 class GivenFrames:
     """A sensor whose newest frame the caller sets in ``frame``.
 
-    ``live`` [rows, cols] is False where the sensor has no cell; None: it has all.
+    ``live`` [rows, cols] is False where the sensor has no cell; None: it has all. ``full_count`` is
+    the reading of saturated cells; None: the settings'.
     """
 
-    def __init__(self, live: NDArray[np.bool_] | None = None) -> None:
+    def __init__(
+        self, live: NDArray[np.bool_] | None = None, full_count: int | None = None
+    ) -> None:
         self.frame: Frame | None = None
         self.live = live
+        self.full_count = full_count
 
     def open(self) -> None:
         """Do nothing: there is no port."""
@@ -204,7 +71,8 @@ class ReplayTactile:
 
     After its last frame and one mean interval it starts again, or, with ``tactile.replay_again``
     false, repeats that frame once with ``valid`` False.
-    ``live`` [rows, cols] is False where the recording has no cell.
+    ``live`` [rows, cols] is False where the recording has no cell; ``full_count`` is the reading of
+    saturated cells, where the recording has it; ``notes`` say what looks wrong with it.
     """
 
     def __init__(self, settings: TactileSettings, clock: Clock, finger: int) -> None:
@@ -213,7 +81,13 @@ class ReplayTactile:
         if not path:
             raise TactileError(f"tactile.recording: found none for the {FINGERS[finger]} finger")
         try:
-            recording = load_recording(Path(path), settings.pascal_per_count, settings.rate)
+            recording = load_recording(
+                Path(path),
+                settings.pascal_per_count,
+                settings.rate,
+                settings.noise,
+                settings.full_count,
+            )
         except RecordingError as error:
             raise TactileError(str(error)) from None
         if recording.counts.shape[1:] != (settings.rows, settings.cols):
@@ -222,6 +96,10 @@ class ReplayTactile:
                 f"{path}: frames of {rows} × {cols} cells, {settings.rows} × {settings.cols} "
                 f"expected: set tactile.rows and tactile.cols"
             )
+        if wrong := pitch_difference(recording, (settings.pitch, settings.pitch_y)):
+            raise TactileError(f"{path}: {wrong}")
+        self.notes = tuple(f"{path}: {note}" for note in recording.notes)
+        self.full_count = recording.full_count
         self.live: NDArray[np.bool_] = recording.live
         self._recording: FrameRecording = recording
         self._again = settings.replay_again

@@ -1,15 +1,18 @@
 """Parses Tekscan-style ASCII exports: text in, pressure frames out.
 
 Such a file starts with lines ``KEY value``, up to ``ASCII_DATA @@``. Then each frame is a line
-``Frame n`` (more may stand behind it) and its rows, cells separated by commas, ``B`` where the
-sensor has no cell; a line ``@@`` may end it. The export of a single frame has no ``Frame`` line.
-Lengths come in mm, cm, m or in, abbreviated or spelt out, readings raw or in a unit of pressure.
-Below ``COMMENTS:`` stands free text, in which only words in capitals are keys; a spreadsheet leaves
-commas at the lines' ends.
+``Frame n`` (more may stand behind it) and its rows, ``B`` where the sensor has no cell; a line
+``@@`` may end it. The export of a single frame has no ``Frame`` line. The exporting machine's
+locale decides on encoding, decimal sign and separator, so all of these are found out from the file.
+Lengths come in mm, cm, m or in, abbreviated or spelt out, readings raw, in a unit of pressure or of
+force on a cell. Below ``COMMENTS:`` stands free text, in which only words in capitals are keys; a
+spreadsheet leaves separators at the lines' ends, and quotation marks.
 """
 
 from __future__ import annotations
 
+import codecs
+import csv
 import math
 import re
 from dataclasses import dataclass
@@ -22,29 +25,34 @@ from softfinger.daemon.errors import SoftfingerError
 _MOST = 1024  # rows or cols
 _HEADER_MOST = 1000  # lines
 _LARGEST = 1e12  # of any reading, in its unit
+_RAW_FULL = 255  # the maker's electronics has 8 bits
+_NEARLY = 0.995  # of the saturation pressure, which is rounded as well
+_EDGES = ' \t,;"'  # what a spreadsheet leaves at a line's ends
 _LENGTHS = {
     **dict.fromkeys(("", "mm", "millimeters", "millimetres", "millimeter", "millimetre"), 1e-3),
     **dict.fromkeys(("cm", "centimeters", "centimetres", "centimeter", "centimetre"), 1e-2),
     **dict.fromkeys(("m", "meters", "metres", "meter", "metre"), 1.0),
     **dict.fromkeys(("in", "inch", "inches"), 0.0254),
 }
-_RAW = ("raw", "rawsum", "counts", "")
+_TIMES = {**dict.fromkeys(("", "s", "sec", "seconds"), 1.0), "ms": 1e-3, "msec": 1e-3}
+_RAW = ("raw", "rawsum", "rawdata", "counts", "count", "")
 _PRESSURES = {
-    "pa": 1.0,
-    "hpa": 1e2,
-    "kpa": 1e3,
-    "mpa": 1e6,
-    "bar": 1e5,
-    "mbar": 1e2,
-    "psi": 6894.757293168,
-    "mmhg": 133.322387415,
-    "n/m2": 1.0,
-    "n/cm2": 1e4,
-    "n/mm2": 1e6,
-    "g/cm2": 98.0665,
-    "kg/cm2": 98066.5,
-    "kgf/cm2": 98066.5,
+    **{"pa": 1.0, "hpa": 1e2, "kpa": 1e3, "mpa": 1e6, "bar": 1e5, "mbar": 1e2},
+    **{"psi": 6894.757293168, "ksi": 6894757.293168, "psf": 47.88025898},
+    **{"atm": 101325.0, "at": 98066.5, "torr": 133.322368421},
+    **{"mmhg": 133.322387415, "cmhg": 1333.22387415, "inhg": 3386.389},
+    **{"mmh2o": 9.80665, "cmh2o": 98.0665, "inh2o": 249.08891},
 }
+_FORCES = {
+    **{"n": 1.0, "mn": 1e-3, "kn": 1e3, "dyn": 1e-5},
+    **dict.fromkeys(("g", "gf", "gram", "grams", "p"), 9.80665e-3),
+    **dict.fromkeys(("kg", "kgf", "kp"), 9.80665),
+    **dict.fromkeys(("lb", "lbs", "lbf", "pounds"), 4.4482216152605),
+    **dict.fromkeys(("oz", "ozf"), 0.27801385095),
+}
+_AREAS = {"m2": 1.0, "cm2": 1e-4, "mm2": 1e-6, "in2": 0.0254**2, "ft2": 0.3048**2}
+# As they come from Latin-1, UTF-8 and the code pages of DOS.
+_SQUARES = str.maketrans({"²": "2", "ý": "2", "^": "", ".": "", "*": ""})
 
 
 class TekscanError(SoftfingerError, ValueError):
@@ -57,7 +65,8 @@ class Export:
 
     ``values`` float64 [frames, rows, cols]: Pa, or counts where ``raw``; 0 where ``live`` [rows,
     cols] is False. ``t`` float64 [frames] from the first frame on [s]; ``pitch`` (x, y) [m], NaN
-    where the header lacks it.
+    where the header lacks it. ``full``: the reading from which on a cell is saturated, inf where
+    that is not known.
     """
 
     values: NDArray[np.float64]
@@ -65,6 +74,21 @@ class Export:
     t: NDArray[np.float64]
     raw: bool
     pitch: tuple[float, float]
+    full: float
+
+
+def decode(data: bytes) -> str:
+    """Return a file's text, in UTF-8, UTF-16 or a single-byte code, with or without a mark."""
+    for mark, code in ((codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16")):
+        if data.startswith(mark):
+            return data.decode(code, "replace")
+    zeros = data[:200].count(0)
+    if zeros > 0.3 * len(data[:200]):
+        return data.decode("utf-16-le" if data[1:2] == b"\0" else "utf-16-be", "replace")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return data.decode("latin-1")
 
 
 def parse(text: str, seconds_per_frame: float = 0.01) -> Export:
@@ -72,92 +96,175 @@ def parse(text: str, seconds_per_frame: float = 0.01) -> Export:
     lines = text.splitlines()
     header, first = _header(lines)
     rows, cols = _count(header, "ROWS"), _count(header, "COLS")
-    numbers, frames = _frames(lines, first, rows, cols)
-    values = np.array(frames)
-    wrong = (values < 0.0) | (values > _LARGEST)
-    if wrong.any():
-        k, i, j = (int(x) for x in np.argwhere(wrong)[0])
+    numbers, frames, places = _frames(lines, first, rows, cols)
+    values, live = _live_cells(np.array(frames), places)
+    pitch = _pitch(header)
+    factor = _unit(header, pitch)
+    raw = factor == 0.0
+    wrong = np.argwhere((np.abs(values) > _LARGEST) | (raw & (values < 0.0)))
+    if wrong.size:
+        k, i, j = wrong[0].tolist()
         raise TekscanError(f"frame {numbers[k]}: row {i + 1}, cell {j + 1} is {values[k, i, j]}")
-    live: NDArray[np.bool_] = np.logical_not(np.isnan(values).any(axis=0))
-    values[:, ~live] = 0.0
-    unit = re.sub(r"[\s^]", "", header.get("UNITS", "")).lower()
-    if unit not in _RAW and unit not in _PRESSURES:
-        raise TekscanError(f"UNITS: found {header['UNITS']!r}, expected RAW or a pressure's unit")
+    full = _RAW_FULL if raw and values.max() <= _RAW_FULL else math.inf
+    if not raw:
+        rounding = 0.5 * factor * 10.0 ** -_digits(values)
+        values *= factor
+        if "SATURATION_PRESSURE" in header:
+            units = {**_PRESSURES, "": factor, **_per_area()}
+            full = _NEARLY * _quantity(header, "SATURATION_PRESSURE", units) - rounding
     step = seconds_per_frame
     if "SECONDS_PER_FRAME" in header:
-        step = _quantity(header, "SECONDS_PER_FRAME", {"": 1.0, "s": 1.0, "ms": 1e-3})
+        step = _quantity(header, "SECONDS_PER_FRAME", _TIMES)
     if not step > 0.0:
         raise TekscanError("SECONDS_PER_FRAME: expected a time above 0")
     t = (np.array(numbers, np.float64) - numbers[0]) * step
-    raw = unit in _RAW
-    if not raw:
-        values *= _PRESSURES[unit]
-    return Export(values, live, t, raw, _pitch(header))
+    return Export(values, live, t, raw, pitch, full if full > 0.0 else math.inf)
+
+
+def _live_cells(
+    values: NDArray[np.float64], places: list[list[int]]
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Return the values, 0 in cells that are missing or never a number, and the other cells.
+
+    Raises TekscanError for a cell that is no number in some frames.
+    """
+    unknown = np.isnan(values)
+    live: NDArray[np.bool_] = ~np.any([np.isneginf(values).any(0), unknown.all(0)], axis=0)
+    wrong = np.argwhere(unknown & live)
+    if wrong.size:
+        k, i, _ = wrong[0].tolist()
+        raise TekscanError(f"line {places[k][i]}: a cell that is no number")
+    if not live.any():
+        raise TekscanError("no cell in it")
+    return np.where(live, values, 0.0), live
+
+
+def _digits(values: NDArray[np.float64]) -> int:
+    """Return the number of decimals that the readings have."""
+    for digits in range(9):
+        if np.allclose(values, np.round(values, digits), rtol=1e-12, atol=0.0):
+            return digits
+    return 9
 
 
 def _header(lines: list[str]) -> tuple[dict[str, str], int]:
     header: dict[str, str] = {}
     in_comments = False
     for number, line in enumerate(lines[:_HEADER_MOST]):
-        key, _, value = line.strip().rstrip(",").partition(" ")
-        if key.upper() == "ASCII_DATA":
+        match = re.match(r"(\w+)[\s,;:=]*(.*)", line.strip(_EDGES))
+        if match is None:
+            continue
+        key, value = match[1].upper(), match[2].strip(_EDGES)
+        if key == "ASCII_DATA":
             return header, number + 1
-        if key and (key.isupper() or not in_comments):
-            header[key.upper()] = value.strip()
-            in_comments |= key.upper().startswith("COMMENT")
-    raise TekscanError("no line ASCII_DATA: this is no Tekscan-style export")
+        if in_comments and match[1].isupper():
+            header.setdefault(key, value)
+        elif not in_comments:
+            header[key] = value
+            in_comments = key.startswith("COMMENT")
+    raise TekscanError(
+        "no line ASCII_DATA: this is no Tekscan-style export; expected one, .npz or .npy files"
+    )
 
 
 def _frames(
     lines: list[str], first: int, rows: int, cols: int
-) -> tuple[list[int], list[list[NDArray[np.float64]]]]:
-    """Numbers of the frames and their rows, from line ``first`` on."""
+) -> tuple[list[int], list[list[NDArray[np.float64]]], list[list[int]]]:
+    """Numbers of the frames, their rows and the rows' lines, from line ``first`` on."""
     numbers: list[int] = []
     frames: list[list[NDArray[np.float64]]] = []
+    places: list[list[int]] = []
+    separator = ""
     for number, text in enumerate(lines[first:], first + 1):
         line = text.strip()
-        if not line:
+        if not line.strip(_EDGES):
             continue
-        if line.startswith("@@"):
+        if line.lstrip(_EDGES).startswith("@@"):
             break
-        if line[:5].lower() == "frame":
-            match = re.match(r"frame\s+(\d{1,9})\b", line, re.IGNORECASE)
+        if re.match(r'"?[^\W\d]{2}', line):  # a row starts with a number or a lonely B
+            match = re.match(r'"?[^\W\d]+[\s:#,;]*(\d{1,9})\b', line)
             if match is None:
-                raise TekscanError(f"line {number}: found {line[:40]!r}, expected Frame n")
-            if frames and len(frames[-1]) < rows:
-                had = f"{len(frames[-1])} rows of {rows}"
-                raise TekscanError(f"line {number}: frame {numbers[-1]} has {had}")
-            if numbers and int(match[1]) <= numbers[-1]:
-                raise TekscanError(f"line {number}: frame {match[1]} after frame {numbers[-1]}")
-            numbers.append(int(match[1]))
-            frames.append([])
-            continue
+                if re.match(r'"?(nan|inf)', line, re.IGNORECASE) is None:
+                    raise TekscanError(f"line {number}: found {line[:40]!r}, expected Frame n")
+            else:
+                if frames and len(frames[-1]) < rows:
+                    had = f"{len(frames[-1])} rows of {rows}"
+                    raise TekscanError(f"line {number}: frame {numbers[-1]} has {had}")
+                if numbers and int(match[1]) <= numbers[-1]:
+                    raise TekscanError(f"line {number}: frame {match[1]} after frame {numbers[-1]}")
+                numbers.append(int(match[1]))
+                frames.append([])
+                places.append([])
+                continue
         if not frames:  # the export of a single frame
             numbers.append(1)
             frames.append([])
+            places.append([])
         if len(frames[-1]) == rows:
             raise TekscanError(f"line {number}: found {line[:40]!r}, expected Frame n")
-        frames[-1].append(_row(line, cols, number))
+        separator = separator or _separator(line, cols)
+        frames[-1].append(_row(line, separator, cols, number))
+        places[-1].append(number)
     if not frames:
         raise TekscanError("no frame in it")
     if len(frames[-1]) < rows:
         raise TekscanError(
             f"the file ends in frame {numbers[-1]}: {len(frames[-1])} rows of {rows}"
         )
-    return numbers, frames
+    return numbers, frames, places
 
 
-def _row(line: str, cols: int, number: int) -> NDArray[np.float64]:
-    cells = [cell.strip().upper() for cell in line.rstrip(",").split(",", _MOST)]
+def _separator(line: str, cols: int) -> str:
+    """Return what stands between the cells, by their number in a row."""
+    for separator in ("\t", ";", ", ", ",", " "):
+        if separator in line and len(_cells(line, separator, cols)) == cols:
+            return separator
+    return next((each for each in "\t;," if each in line), " ")
+
+
+def _cells(line: str, separator: str, cols: int) -> list[str]:
+    if separator == " ":
+        return line.split(None, _MOST)
+    if '"' in line:
+        cells = next(csv.reader([line], delimiter=separator[0], skipinitialspace=True))
+    else:
+        cells = line.split(separator, 2 * _MOST)
+    while len(cells) > cols and not cells[-1].strip(_EDGES):
+        cells.pop()
+    return cells
+
+
+def _row(line: str, separator: str, cols: int, number: int) -> NDArray[np.float64]:
+    """A row's readings: −inf where the sensor has no cell."""
+    cells = [cell.strip(' "').upper() for cell in _cells(line, separator, cols)]
+    missing = cells.count("B")
+    if separator == "," and len(cells) != cols:
+        # Each number has its decimals, or it's not known which do.
+        if len(cells) == 2 * cols - missing:
+            parts = iter(cells)
+            cells = [part if part == "B" else f"{part}.{next(parts)}" for part in parts]
+        elif cols < len(cells) < 2 * cols and all(each.isdigit() or each == "B" for each in cells):
+            raise TekscanError(
+                f"line {number}: {len(cells)} cells, expected {cols}: commas stand between the "
+                "cells and in the numbers; export with decimal points or another separator"
+            )
     if len(cells) != cols:
         raise TekscanError(f"line {number}: {len(cells)} cells, expected {cols}")
     try:
-        values = np.array([math.nan if cell == "B" else float(cell) for cell in cells])
+        values = np.array([-math.inf if cell == "B" else _number(cell) for cell in cells])
     except ValueError as error:
         raise TekscanError(f"line {number}: {error}") from None
-    if np.count_nonzero(np.isnan(values)) != cells.count("B"):
+    if np.count_nonzero(np.isneginf(values)) != missing:
         raise TekscanError(f"line {number}: a cell that is no number")
     return values
+
+
+def _number(text: str) -> float:
+    """A number with a decimal point or comma; of both the last one, the other groups digits."""
+    if "," in text:
+        text = text.replace("," if text.rfind(",") < text.rfind(".") else ".", "")
+        text = text.replace(",", ".")
+    return float(text)
 
 
 def _count(header: dict[str, str], key: str) -> int:
@@ -171,12 +278,12 @@ def _count(header: dict[str, str], key: str) -> int:
 
 def _quantity(header: dict[str, str], key: str, units: dict[str, float]) -> float:
     """A number with its unit, in SI."""
-    match = re.fullmatch(r"([-+0-9.eE]+)\s*([A-Za-z]*)", header[key])
+    match = re.fullmatch(r"([-+0-9.,eE]+)[\s,;]*(.*)", header[key])
     try:
-        value = float(match[1]) if match else math.nan
+        value = _number(match[1].rstrip(",")) if match else math.nan
     except ValueError:
         value = math.nan
-    unit = match[2].lower() if match else ""
+    unit = _plain(match[2]) if match else ""
     if not math.isfinite(value) or unit not in units:
         known = ", ".join(name for name in units if 0 < len(name) <= 4)
         raise TekscanError(f"{key}: found {header[key]!r}, expected a number in one of {known}")
@@ -192,3 +299,34 @@ def _pitch(header: dict[str, str]) -> tuple[float, float]:
             raise TekscanError(f"{key}: expected a length above 0")
         found.append(value)
     return found[0], found[1]
+
+
+def _unit(header: dict[str, str], pitch: tuple[float, float]) -> float:
+    """Return the unit of the readings [Pa], 0 for raw ones."""
+    text = header.get("UNITS", "")
+    unit = _plain(text)
+    if unit in _RAW:
+        return 0.0
+    if unit in _PRESSURES or unit in _per_area():
+        return (_PRESSURES | _per_area())[unit]
+    if unit in _FORCES:  # on a cell
+        area = _quantity(header, "SENSEL_AREA", _AREAS) if "SENSEL_AREA" in header else math.nan
+        area = pitch[0] * pitch[1] if math.isnan(area) else area
+        if area > 0.0:
+            return _FORCES[unit] / area
+        raise TekscanError(f"UNITS: found {text!r}, a force, which needs SENSEL_AREA")
+    raise TekscanError(f"UNITS: found {text!r}, expected RAW or a pressure's unit")
+
+
+def _per_area() -> dict[str, float]:
+    return {
+        f"{force}/{area}": newton / square
+        for force, newton in _FORCES.items()
+        for area, square in _AREAS.items()
+    }
+
+
+def _plain(unit: str) -> str:
+    """A unit without the ways to write a square."""
+    plain = re.sub(r"[\s\[\]()]", "", unit.translate(_SQUARES)).lower()
+    return re.sub(r"(sq|square)([a-z]+)", r"\g<2>2", plain)

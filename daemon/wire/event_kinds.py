@@ -218,13 +218,15 @@ KINDS: dict[str, EventKind] = {
     ),
     "tactile": EventKind(
         "info, warning",
-        "A sensor was opened again. The warning says why it could not be.",
-        "Check its cable and `tactile.port`.",
+        "A sensor was opened again. The warning says why it could not be, or that the size of the "
+        "sensor does not fit the tip, or what looks wrong with a replayed file.",
+        "Check its cable and `tactile.port`; or `tactile.rows`, `cols`, `pitch` and `tip.radius`.",
     ),
     "tactile.silent": EventKind(
         "error",
         "No valid frame arrived within `safety.frame_age_fault`.",
-        "Check the board and its cable with `softfinger doctor`.",
+        "The text gives the reason, and the cells' noise if it is more than `tactile.noise`. Check "
+        "the board and its cable with `softfinger doctor`.",
     ),
     "tactile.frozen": EventKind(
         "error",

@@ -22,7 +22,7 @@ from softfinger.kinematics.sensing.footprint import (
     set_face,
 )
 
-_STRONG = 6.0  # noise: above it the largest cell is looked at first
+STRONG = 6.0  # noise: above it the largest cell is looked at first
 
 
 @inner_kernel
@@ -71,7 +71,7 @@ def activity(state: EstimatorState, frame: Pointer, height: Pointer) -> None:
     level = state.options.peak_level * signal.noise
     patch = signal.patch_level * signal.noise
     if signal.finite and peak >= level:
-        if peak > _STRONG * signal.noise:
+        if peak > STRONG * signal.noise:
             cell = next_above(frame, height, state.region.first, last, peak)
             contact = neighbourhood(frame, height, grid, cell) > patch
         at = last if contact else next_above(frame, height, state.region.first, last, level)

@@ -11,6 +11,7 @@ from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 from softfinger.kinematics.compiled.layout import Records
 from softfinger.kinematics.compiled.simd import Pointer, address, further
 from softfinger.kinematics.estimation.detection import (
+    STRONG,
     presses_outside,
     restore_outliers,
     without_outliers,
@@ -172,6 +173,10 @@ def _estimate(
     """Estimate a frame with a contact; returns why that can't be used."""
     estimate = state.estimate
     reason = _likelihood(solid, state, frame, scratch, indices)
+    if solid is not None and reason == Invalid.UNSETTLED:
+        # A contact of this tip settles within the data, and is explained at their end.
+        unexplained = state.fit.sums.misfit > (1.0 - state.options.r_squared_min) * solid.square
+        reason = Invalid.MODEL if unexplained or not solid.limited else reason
     if reason == Invalid.NONE and not GAIN_MIN < estimate.gain < GAIN_MAX:
         reason = Invalid.MODEL
     if reason == Invalid.NONE and not estimate.d < D_MAX * state.grid.radius:
@@ -247,11 +252,17 @@ def estimate_frame(
     _begin(state, scale, step)
     rejected = without_outliers(state, readings, cells, centres)
     signal = state.signal
+    unexplained = False
     if solid is not None and signal.finite:
+        # Every contact shows the first image. A strong signal without it is no contact of this tip;
+        # a small shift of all zeros is no signal.
+        level = max(signal.mean, signal.peak - signal.mean)
+        strong = signal.contact and level > STRONG * signal.noise
         signal.contact = presses(state, solid, readings, whole, address(indices))
+        unexplained = strong and not signal.contact
     estimate.peak = signal.peak * scale
     estimate.rejected = rejected
-    estimate.contact = signal.contact
+    estimate.contact = signal.contact or unexplained
     reason = Invalid.NONE
     if signal.contact:
         reason = _estimate(solid, state, readings, whole, indices)
@@ -262,6 +273,8 @@ def estimate_frame(
         estimate.gain = 1.0
         estimate.covariance[0, 0] = state.options.undetected**2
         estimate.systematic[0, 0] = state.options.undetected**2
+        if unexplained:
+            reason = _cause(state, readings, centres, Invalid.MODEL)
     estimate.warm = signal.contact and reason == Invalid.NONE
     if not signal.finite:
         reason = Invalid.NOT_FINITE

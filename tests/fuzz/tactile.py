@@ -112,7 +112,7 @@ def fuzz_ascii(count: int, seed: int) -> Report:
         except TekscanError:
             continue
         frames += 1
-        if not (np.isfinite(export.values).all() and (export.values >= 0).all()):
+        if not np.isfinite(export.values).all():
             wrong.append(f"input {k}: readings that are no pressures")
         if not (np.diff(export.t) > 0).all() or export.live.shape != export.values.shape[1:]:
             wrong.append(f"input {k}: times or cells")

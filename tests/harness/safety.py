@@ -11,6 +11,7 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.safety.limits import LIMITS
 from softfinger.daemon.safety.safety import Safety
 from softfinger.daemon.servos.base import Servos
+from softfinger.daemon.tactile.base import TactileSensor
 from softfinger.daemon.types import Contact, Frame, Goal, State
 from softfinger.kinematics.estimation.estimator import ContactEstimate
 from softfinger.kinematics.estimation.invalid import Invalid
@@ -28,6 +29,9 @@ class Sensor:
         self.changed = 0.0
         self.repeats = Repeats(100.0)
         self.estimate = ContactEstimate()
+        self.full_count = SETTINGS.tactile.full_count
+        self.noise = 0.0
+        self.sensor: TactileSensor | None = None
 
     def give(self, t: float, data: Any) -> None:
         last, self.frame = self.frame, Frame(0, t, t, True, np.array(data, np.uint16))

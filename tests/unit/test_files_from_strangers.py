@@ -21,7 +21,7 @@ from softfinger.daemon.errors import RecordingError, SettingsError, SoftfingerEr
 from softfinger.daemon.perception.calibration_file import load_calibration
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.tactile.replay import load_recording
+from softfinger.daemon.tactile.frame_files import load_recording
 from softfinger.tools.recordings.export import CsvTable, export
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.record import recover
@@ -224,6 +224,7 @@ BOMBS: dict[str, Callable[[], bytes] | Callable[[Path], None]] = {
     ),
     "holes": recording_of_holes,
     "chunks of holes": chunks_of_holes,
+    "another compression": lambda: chunk("br", b"abcd", 1000),
     "a record of 4 GB": lambda: struct.pack("<BQ", 6, 4 << 30),
 }
 

@@ -11,6 +11,7 @@ from softfinger.daemon.control.modes import Mode
 from softfinger.daemon.perception.grasp import GraspState
 from softfinger.daemon.profile.settings import SafetySettings as Limits
 from softfinger.daemon.safety.limits import LIMITS, View
+from softfinger.daemon.tactile.replay import GivenFrames
 from softfinger.daemon.types import State
 from softfinger.kinematics.estimation.estimator import ContactEstimate
 from softfinger.kinematics.estimation.invalid import Invalid
@@ -348,3 +349,18 @@ def test_every_row_is_named_once_a_level_and_its_settings_exist():
     told = {key for row in LIMITS for key in row.keys}
     missing = {f"safety.{name}" for name in Limits.model_fields} - told
     assert missing == {"safety.current_move"}, "every limit that can be set stands in the table"
+
+
+def test_a_sensor_without_a_sound_estimate_is_told_with_its_reason_and_noise():
+    sensor = Sensor(0)
+    sensor.sensor = GivenFrames()
+    sensor.estimate = ContactEstimate(invalid=Invalid.MODEL)
+    judge, state = safety(sensors=[sensor]), sound()
+    state.contacts[0].t_valid = OLD
+    sensor.noise = 1.2 * SETTINGS.tactile.noise
+    _, text = judged(judge, state)
+    assert text.endswith("s: not this tip")
+    sensor.noise = 2.6 * SETTINGS.tactile.noise
+    judge = safety(sensors=[sensor])
+    _, text = judged(judge, state)
+    assert text.endswith("not this tip; its cells' noise is 3952 Pa, tactile.noise is 1520")

@@ -6,7 +6,8 @@ import pytest
 from softfinger.daemon.clock import VirtualClock
 from softfinger.daemon.errors import RecordingError, TactileError
 from softfinger.daemon.profile.settings import TactileSettings
-from softfinger.daemon.tactile.replay import ReplayTactile, load_recording
+from softfinger.daemon.tactile.frame_files import load_recording
+from softfinger.daemon.tactile.replay import ReplayTactile
 
 FRAMES = np.arange(5 * 4 * 6, dtype=np.uint16).reshape(5, 4, 6)
 
@@ -88,7 +89,10 @@ def test_cells_and_true_contacts_of_an_archive_are_read(tmp_path):
 @pytest.mark.parametrize(
     ("held", "told"),
     [
-        ({"other": FRAMES}, "no array 'frames'"),
+        ({"other": FRAMES[0]}, r"no array 'frames' in it; found other \(4, 6\)"),
+        ({"a": FRAMES, "b": FRAMES}, r"found a \(5, 4, 6\), b \(5, 4, 6\): name the one"),
+        ({"other": np.array(["x"])}, "no array 'frames'"),
+        ({}, "found no array"),
         ({"frames": FRAMES[0]}, r"expected \[n, rows, cols\]"),
         ({"frames": FRAMES[:0]}, "shape"),
         ({"frames": FRAMES.astype(complex)}, "expected numbers"),

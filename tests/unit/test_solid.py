@@ -14,6 +14,7 @@ from softfinger.daemon.loop.build import facts
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
 from softfinger.kinematics.estimation.estimator import Readings
+from softfinger.kinematics.estimation.invalid import Invalid
 from softfinger.kinematics.sensing.solid_pressure import SolidPressure
 from tests.harness.loop import command, grasped
 
@@ -275,3 +276,47 @@ def test_a_profile_that_no_solid_tip_has_is_refused():
         assert wrong(**sound, tactile=tactile) == ["tactile.pitch, tactile.centre"]
     with pytest.raises(ValueError, match="9 active cells within its rim, got 4"):
         ContactEstimator(TIPS[0], RUBBER, SensorGrid(44, 44, 0.01), NOISE)
+
+
+def _odd_frames() -> dict[str, np.ndarray]:
+    """Strong signals that no contact of a solid tip makes."""
+    (pitch, _), shape = GRID.pitches, GRID.shape
+    y, x = (np.indices(shape) - 0.5 * (np.array(shape)[:, None, None] - 1.0)) * pitch
+    radius = np.hypot(x, y)
+    frames = {"uniform pressure": np.full(shape, 1e5)}
+    for at in (0.008, 0.012, 0.016):
+        frames[f"a ring of {at * 1e3:g} mm"] = np.where(np.abs(radius - at) < 0.0025, 3e4, 0.0)
+    for at in (0.007, 0.010, 0.014):
+        for height in (1e4, 1e5):
+            blobs = [np.exp(-((x - side * at) ** 2 + y**2) / 1.25e-5) for side in (1.0, -1.0)]
+            frames[f"two of {height:g} Pa at {at * 1e3:g} mm"] = height * (blobs[0] + blobs[1])
+    return frames
+
+
+ODD = _odd_frames()
+
+
+@pytest.mark.parametrize("frame", ODD.values(), ids=ODD)
+def test_a_strong_signal_is_never_no_contact(frame):
+    rng = np.random.default_rng(6)
+    estimator = ContactEstimator(TIPS[0], RUBBER, GRID, NOISE)
+    for _ in range(20):
+        found = estimator.update(frame + NOISE * rng.standard_normal(GRID.shape))
+        assert found.contact
+        assert found.invalid in (Invalid.MODEL, Invalid.ABOVE_ZERO)
+
+
+@pytest.mark.parametrize(("kind", "scale"), [(np.uint8, 300.0), (np.uint16, 4.0)])
+def test_a_sensor_that_is_full_everywhere_is_saturated(kind, scale):
+    estimator = ContactEstimator(TIPS[0], RUBBER, GRID, NOISE)
+    found = estimator(np.full(GRID.shape, np.iinfo(kind).max, kind), scale)
+    assert (found.contact, found.invalid) == (True, Invalid.SATURATED)
+
+
+@pytest.mark.parametrize("times", [4.0, 6.0, 10.0])
+def test_heavy_noise_is_not_taken_for_a_free_tip(times):
+    rng = np.random.default_rng(7)
+    estimator = ContactEstimator(TIPS[0], RUBBER, GRID, NOISE)
+    found = [estimator(times * NOISE * rng.standard_normal(GRID.shape)).invalid for _ in range(50)]
+    assert set(found) <= {Invalid.MODEL, Invalid.OUTLIERS, Invalid.NONE}
+    assert found.count(Invalid.NONE) < 10

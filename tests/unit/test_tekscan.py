@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from softfinger.daemon.errors import RecordingError
-from softfinger.daemon.tactile.replay import load_recording
+from softfinger.daemon.tactile.frame_files import load_recording
 from softfinger.daemon.tactile.tekscan import TekscanError, parse
 
 EXPORT = """\

@@ -23,8 +23,10 @@ from numpy.typing import NDArray
 
 from softfinger.daemon.errors import RecordingError, SettingsError, SoftfingerError
 from softfinger.daemon.own_files import write_text
-from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.tactile.replay import GivenFrames, load_recording
+from softfinger.daemon.profile.settings import Settings, TactileSettings
+from softfinger.daemon.profile.validation import sensor_doubts
+from softfinger.daemon.tactile.frame_files import FrameRecording, load_recording
+from softfinger.daemon.tactile.replay import GivenFrames, pitch_difference
 from softfinger.daemon.types import FINGERS, Frame, State
 from softfinger.daemon.wire import schema
 from softfinger.kinematics.estimation.invalid import REASONS, Invalid
@@ -99,8 +101,41 @@ def _analysed(arguments: argparse.Namespace, settings: Settings, path: Path) -> 
         f"{frames} frames in {elapsed:.2f} s ({frames / max(elapsed, 1e-9):.0f} a second): "
         f"{touching} with contact, {reasons.total()} not usable; {table}\n"
     )
+    if source.recording is not None and not touching and not reasons:
+        told += _silence(source.recording, source.settings.tactile)
     told += "".join(f"  {n} not usable: {reason}\n" for reason, n in reasons.most_common())
     return told
+
+
+_EIGHT_BITS = 255
+
+
+def _silence(recording: FrameRecording, tactile: TactileSettings) -> str:
+    """Return a line on frames without any contact: largest reading, threshold, likely cause."""
+    from softfinger.kinematics.estimation.estimator import PEAK_LEVEL
+
+    scale = tactile.pascal_per_count if recording.whole else 1.0
+    pressure, level = recording.largest * scale, PEAK_LEVEL * tactile.noise
+    found = f"{recording.largest:.4g} counts, " if recording.whole else ""
+    if pressure == 0.0:
+        cause = "no cell ever read more than 0: look at the sensor's cable"
+    elif not recording.whole and recording.largest <= 1.0:
+        cause = (
+            "floats of 0 to 1 are shares of the sensor's range, not Pa: multiply them by its "
+            "largest pressure"
+        )
+    elif pressure < level and not recording.whole:
+        cause = "floats are read as Pa: convert kPa, and save counts as integers"
+    elif pressure < level:
+        cause = "nothing pressed, or tactile.pascal_per_count is not this sensor's"
+        if recording.largest <= _EIGHT_BITS < tactile.full_count:
+            cause = "counts of 8 bits need a larger tactile.pascal_per_count"
+    else:
+        cause = "no such cells beside each other: single cells are outliers"
+    return (
+        f"  no contact in any frame: largest reading {found}{pressure:.4g} Pa, threshold "
+        f"{level:.4g} Pa ({PEAK_LEVEL:g} times tactile.noise); {cause}\n"
+    )
 
 
 def _compile(settings: Settings) -> None:
@@ -120,8 +155,8 @@ class Source:
     """Frames of the sensors in one file: ``frames(progress)`` yields (finger, t [s], counts).
 
     Kernels are loaded where ``models`` is called, not for a file that can't be read.
-    ``t`` counts from the first frame; ``total`` is the end of ``progress``. ``truths`` is the true
-    contact at each frame, by name, where a file of one sensor has it.
+    ``t`` counts from the first frame; ``total`` is the end of ``progress``. A file of frames alone
+    is ``recording``.
     """
 
     settings: Settings
@@ -129,8 +164,12 @@ class Source:
     fingers: tuple[int, ...]
     total: int
     frames: Callable[[OnProgress], Iterator[tuple[int, float, Counts]]]
-    truths: dict[str, NDArray[np.float64]]
-    live: NDArray[np.bool_] | None = None
+    recording: FrameRecording | None = None
+
+    @property
+    def truths(self) -> dict[str, NDArray[np.float64]]:
+        """The true contact at each frame, by name, where a file of one sensor has it."""
+        return {} if self.recording is None else self.recording.truths
 
 
 def open_source(path: Path, settings: Settings, own: bool) -> Source:
@@ -165,18 +204,23 @@ def _stream(path: Path, settings: Settings, own: bool) -> Source:
             first = message["timestamp"] if first is None else first
             yield FINGERS.index(message["finger"]), message["timestamp"] - first, counts
 
-    return Source(settings, models, present, recording.size, frames, {})
+    return Source(settings, models, present, recording.size, frames)
 
 
 def _frames_alone(path: Path, settings: Settings, own: bool) -> Source:
     tactile = settings.tactile
-    recording = load_recording(path, tactile.pascal_per_count, tactile.rate)
+    recording = load_recording(
+        path, tactile.pascal_per_count, tactile.rate, tactile.noise, tactile.full_count
+    )
     if own:
         raise SettingsError(
             f"{path}: no settings in it: name the tip and the sensor by --config PROFILE, as "
             "--config paper, or by --set"
         )
     count, rows, cols = recording.counts.shape
+    for note in (*recording.notes, pitch_difference(recording, (tactile.pitch, tactile.pitch_y))):
+        if note:
+            to_stderr("analyse")(f"{path}: {note}")
     changes: dict[str, float] = {"rows": rows, "cols": cols}
     if recording.pitch is not None:
         changes["pitch"], changes["pitch_y"] = recording.pitch
@@ -186,6 +230,8 @@ def _frames_alone(path: Path, settings: Settings, own: bool) -> Source:
             "set tactile.rows, tactile.cols and tactile.pitch"
         )
     settings = settings.model_copy(update={"tactile": tactile.model_copy(update=changes)})
+    for doubt in sensor_doubts(settings):
+        to_stderr("analyse")(f"{path}: {doubt}")
 
     def frames(progress: OnProgress) -> Iterator[tuple[int, float, Counts]]:
         for k, t in enumerate(recording.t.tolist()):
@@ -193,7 +239,7 @@ def _frames_alone(path: Path, settings: Settings, own: bool) -> Source:
             yield 0, t, recording.counts[k]
 
     models = partial(_models_of, settings)
-    return Source(settings, models, (0,), count, frames, recording.truths, recording.live)
+    return Source(settings, models, (0,), count, frames, recording)
 
 
 def _models_of(settings: Settings) -> tuple[FingerModel, FingerModel]:
@@ -244,7 +290,8 @@ class _Pass:
     ) -> None:
         from softfinger.daemon.perception.perception import Perception
 
-        self._sensor = GivenFrames(source.live)
+        own = source.recording
+        self._sensor = GivenFrames() if own is None else GivenFrames(own.live, own.full_count)
         self._perception = Perception(source.settings, {finger: self._sensor}, models)
         self._state = State()
         self._contact = self._state.contacts[finger]

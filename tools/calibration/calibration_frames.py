@@ -11,7 +11,8 @@ import sys
 from collections import deque
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,11 +21,13 @@ from numpy.typing import NDArray
 from softfinger.daemon.clock import RealClock
 from softfinger.daemon.errors import RecordingError, TactileError
 from softfinger.daemon.perception.calibration_file import Calibration
-from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.profile.settings import Settings, TactileSettings
 from softfinger.daemon.tactile.base import TactileSensor, make_sensor
-from softfinger.daemon.tactile.replay import TRUTHS, load_recording
+from softfinger.daemon.tactile.frame_files import TRUTHS, FrameRecording, load_recording
+from softfinger.daemon.tactile.replay import pitch_difference
 from softfinger.daemon.types import FINGERS, Frame
 from softfinger.kinematics.calibration.calibration import CalibrationError
+from softfinger.tools.arguments import to_stderr
 
 _UNITS = {"force": 1.0, "d": 1e-3, "theta": math.pi / 180.0}
 _PATIENCE = 10.0  # s without a new frame
@@ -50,16 +53,15 @@ def gather(arguments: argparse.Namespace, settings: Settings, calibration: Calib
     }
     tactile = settings.tactile
     if arguments.recording:
-        runs = [
-            load_recording(path, tactile.pascal_per_count, tactile.rate)
-            for path in arguments.recording
-        ]
+        runs = [_read(path, tactile, sensor.full_count) for path in arguments.recording]
         for path, recording in zip(arguments.recording, runs, strict=True):
             if recording.counts.shape[1:] != (sensor.rows, sensor.cols):
                 found = " × ".join(map(str, recording.counts.shape[1:]))
                 raise RecordingError(
                     f"{path}: frames of {found} cells, {sensor.rows} × {sensor.cols} expected"
                 )
+            if wrong := pitch_difference(recording, sensor.pitch):
+                raise RecordingError(f"{path}: {wrong}")
         whole = runs[0]
         if len(runs) == 1 and whole.truths:
             # A run: each pressed frame is a load.
@@ -70,6 +72,19 @@ def gather(arguments: argparse.Namespace, settings: Settings, calibration: Calib
     count = max([arguments.loads, 1, *(len(values) for values in given.values())])
     truths = _spread(given, count)
     return Loads(_live(arguments, settings, sensor.finger, truths, count), truths)
+
+
+def _read(path: Path, tactile: TactileSettings, full: int) -> FrameRecording:
+    """Read a recording in which saturated cells read ``full``; say what looks wrong with it."""
+    found = load_recording(
+        path, tactile.pascal_per_count, tactile.rate, tactile.noise, tactile.full_count
+    )
+    for note in found.notes:
+        to_stderr("calibrate")(f"{path}: {note}")
+    if found.full_count is None:
+        return found
+    counts = np.where(found.counts >= found.full_count, full, found.counts).astype(np.uint16)
+    return replace(found, counts=counts)
 
 
 def _spread(given: dict[str, Any], count: int) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """`Recording`: an MCAP file's summary, and its messages in the order in which they came.
 
-A recording may come from anywhere, and what it claims is not believed: memory and time go with the
-room that it takes on the disk.
+A recording may come from any writer of the format: with or without chunks, indexes, statistics and
+other channels. Its claims are not trusted: memory and time are bounded by its size on the disk.
 `read_recording` gives its states as NumPy columns.
 """
 
@@ -23,17 +23,21 @@ from softfinger.tools.extras import require
 from softfinger.tools.recordings.channels import ENCODING, PROFILE, Converter, from_json, topic_of
 
 if TYPE_CHECKING:
-    from mcap.records import Chunk, Statistics
+    from mcap.records import Statistics
     from numpy.typing import NDArray
 
 _MESSAGE_MOST = 1 << 20  # bytes; the largest grid's frame has 0.2 MB
 _SETTINGS_MOST = 4 << 20  # with the calibrations of each cell
+_CHUNK_MOST = 64 << 20  # unpacked; writers' usual chunks have 1 to 8 MB
 _RECORD_LEAST = 512  # bytes that a channel or a message counts for: each takes time
 _CHANNELS_MOST = 64
+_OTHERS_SHOWN = 3  # channels of other writers
 _FIELDS_MOST = 500  # of a message
 _HEADER, _FOOTER, _CHANNEL, _MESSAGE, _CHUNK, _STATISTICS, _DATA_END = 1, 2, 4, 5, 6, 11, 15
 _RECORD = struct.Struct("<BQ")  # what each begins with: its kind, the bytes of its content
 _BEFORE_DATA = struct.Struct("<HIQQ")  # channel, number, log time and publish time of a message
+_BEFORE_CHUNK = struct.Struct("<QQQII")  # first and last time, size, CRC, length of a name
+_LENGTH = struct.Struct("<Q")
 _MAGIC = b"\x89MCAP0\r\n"
 _END = struct.Struct("<BQQQI8s")  # footer and magic
 
@@ -71,9 +75,10 @@ class Recording:
     """A recording that exists. Raises RecordingError for another file.
 
     ``counts`` messages by channel, and ``start`` and ``end`` [Unix s] (NaN when empty) come from
-    the summary at the file's end. A file without one, as a killed recorder leaves it, is
-    ``truncated``: it is read through once instead. Damaged chunks are left out. ``say`` is called
-    once with what is wrong with the file, as soon as it is known.
+    the summary at the file's end. A file without a full summary, or with channels of other writers,
+    is read through once instead. A killed recorder leaves a file without an end: it is
+    ``truncated``. Damaged chunks are left out. ``others`` counts the messages of other writers'
+    channels, which are ignored. ``say`` is called once with each of these findings.
     """
 
     def __init__(self, path: Path, say: Callable[[str], None] | None = None) -> None:
@@ -83,25 +88,43 @@ class Recording:
         self.damage = ""  # what is wrong with it, as far as it was read
         self._say = say
         self.counts: dict[str, int] = {}
+        self.others: dict[str, int] = {}  # messages of channels that are not the stream's
         self.start = math.nan
         self.end = math.nan
         self.chunks = 0
         self._first = 0  # log time of the earliest message [ns]
         self._left = 0  # bytes that may yet be unpacked
         self._names: dict[int, str] = {}  # of the channels, by number
+        self._other_names: dict[int, str] = {}
         try:
             with open_regular(path) as file:
                 self.size = os.fstat(file.fileno()).st_size
                 if self.size == 0:
                     raise RecordingError(f"{path}: empty")
-                whole = self._summary(file)
+                self._profile = self._begin(file)
+                statistics = self._summary(file)
         except OSError as error:
             raise RecordingError(f"{path}: {error.strerror}") from None
-        if not whole:
-            self.truncated = True
+        if statistics is None or self._other_names:
             self._scan()
-            if not self.damage:
-                self._damaged(None)
+        else:
+            self._take(statistics)
+        if self.truncated and not self.damage:
+            self._damaged(None)
+        if self._profile != PROFILE and not self._names:
+            names = ", ".join(sorted(self._other_names.values())[:_OTHERS_SHOWN]) or "none"
+            damage = f"; {self.damage}" if self.damage else ""
+            raise RecordingError(
+                f"{path}: profile {self._profile!r}, expected {PROFILE!r} or channels of this "
+                f"stream, such as hand/state in JSON; its channels: {names}{damage}"
+            )
+        if self.others and self._say is not None:
+            names = ", ".join([*self.others][:_OTHERS_SHOWN])
+            more = ", …" if len(self.others) > _OTHERS_SHOWN else ""
+            self._say(
+                f"{path}: {sum(self.others.values())} messages of {len(self.others)} channels of "
+                f"other programs are left out ({names}{more})"
+            )
 
     @property
     def duration(self) -> float:
@@ -146,58 +169,79 @@ class Recording:
             topic = topic_of(name)
             if topics is None or topic in topics:
                 selected[number] = topic, from_json(topic)
-        for chunk in self._chunks(progress):
-            if chunk.message_end_time < begin or chunk.message_start_time > finish:
+        for channel, log_time, data in self._messages((begin, finish), progress):
+            if channel not in selected or not begin <= log_time <= finish:
                 continue
-            for channel, log_time, data in self._messages_in(chunk):
-                if channel not in selected or not begin <= log_time <= finish:
-                    continue
-                topic, convert = selected[channel]
-                try:
-                    if len(data) > (_SETTINGS_MOST if topic == schema.SETTINGS else _MESSAGE_MOST):
-                        raise ValueError(f"a message of {len(data) >> 20} MB")
-                    message = convert(_plain(loads(data)))
-                except (ValueError, TypeError, AttributeError) as error:
-                    self._damaged(error)
-                    continue
-                yield topic, message
+            topic, convert = selected[channel]
+            try:
+                if len(data) > (_SETTINGS_MOST if topic == schema.SETTINGS else _MESSAGE_MOST):
+                    raise ValueError(f"a message of {len(data) >> 20} MB")
+                message = convert(_plain(loads(data)))
+            except ValueError as error:
+                self._damaged(error)
+                continue
+            except (TypeError, AttributeError):
+                self._damaged(ValueError(f"a message that is none of {topic.decode()}"))
+                continue
+            yield topic, message
 
-    def _chunks(self, progress: Callable[[int], None] | None = None) -> Iterator[Chunk]:
-        from mcap.data_stream import ReadDataStream
-        from mcap.records import Chunk
+    def _messages(
+        self, times: tuple[int, int] = (0, 2**64), progress: Callable[[int], None] | None = None
+    ) -> Iterator[tuple[int, int, bytes]]:
+        """Yield number of the channel, log time [ns] and data of each message; learn channels.
 
+        Chunks outside ``times`` are passed over.
+        """
+        self.chunks = 0
         with open_regular(self.path) as file:
             file.seek(len(_MAGIC))
             self._left = unpacked_most(file)
             try:
-                for kind, content in _records(file, (_CHUNK, _DATA_END)):
+                for kind, content in _records(file, (_CHANNEL, _MESSAGE, _CHUNK, _DATA_END)):
                     if kind == _DATA_END:
                         return
-                    chunk = Chunk.read(ReadDataStream(io.BytesIO(content)))
-                    self._count(chunk.uncompressed_size)
+                    if kind == _CHUNK:
+                        self.chunks += 1
+                        yield from self._messages_in(content, times)
+                    elif (message := self._take_record(kind, content)) is not None:
+                        yield message
                     if progress is not None:
                         progress(file.tell())
-                    yield chunk
             except Exception as error:
                 self._damaged(error)
             else:
                 self._damaged(None)
 
-    def _messages_in(self, chunk: Chunk, learn: bool = False) -> Iterator[tuple[int, int, bytes]]:
-        """Yield a chunk's messages: number of the channel, log time [ns], data.
-
-        ``learn``: take over its channels, too. Where it is damaged nothing comes.
-        """
+    def _messages_in(
+        self, chunk: bytes, times: tuple[int, int]
+    ) -> Iterator[tuple[int, int, bytes]]:
+        """Yield a chunk's messages up to where it is damaged."""
+        first, last, size, crc, length = _BEFORE_CHUNK.unpack_from(chunk)
+        self._count(size)
+        if last < times[0] or first > times[1]:
+            return
+        at = _BEFORE_CHUNK.size + length
+        method = chunk[at - length : at].decode("latin-1")
+        (length,) = _LENGTH.unpack_from(chunk, at)
+        at += _LENGTH.size
         try:
-            for kind, content in _records(io.BytesIO(_unpacked(chunk)), (_CHANNEL, _MESSAGE)):
-                self._count(max(0, _RECORD_LEAST - len(content)))
-                if kind == _MESSAGE:
-                    channel, _, log_time, _ = _BEFORE_DATA.unpack_from(content)
-                    yield channel, log_time, content[_BEFORE_DATA.size :]
-                elif learn:
-                    self._learn(content)
+            data = _unpacked(method, memoryview(chunk)[at : at + length], size, crc)
+            for kind, content in _records(io.BytesIO(data), (_CHANNEL, _MESSAGE)):
+                if (message := self._take_record(kind, content)) is not None:
+                    yield message
         except Exception as error:  # the format's, the compression's and more kinds
             self._damaged(error)
+
+    def _take_record(self, kind: int, content: bytes) -> tuple[int, int, bytes] | None:
+        """Take in a channel, None, or a message."""
+        if kind == _CHANNEL:
+            self._count(max(0, _RECORD_LEAST - len(content)))
+            self._learn(content)
+            return None
+        channel, _, log_time, _ = _BEFORE_DATA.unpack_from(content)
+        if channel not in self._other_names:
+            self._count(max(0, _RECORD_LEAST - len(content)))
+        return channel, log_time, content[_BEFORE_DATA.size :]
 
     def _count(self, unpacked: int) -> None:
         self._left -= unpacked
@@ -209,16 +253,20 @@ class Recording:
         from mcap.records import Channel
 
         channel = Channel.read(ReadDataStream(io.BytesIO(content)))
-        if channel.message_encoding == ENCODING:
-            self._names[channel.id] = channel.topic
+        name = channel.topic.removeprefix("/")
+        known = topic_of(name) in schema.TOPICS
+        # In the stream's own profile unknown topics are those of a newer version.
+        if channel.message_encoding != ENCODING or not (known or self._profile == PROFILE):
+            self._other_names[channel.id] = channel.topic
+            return
+        self._names[channel.id] = name if known else channel.topic
         if len(self._names) > _CHANNELS_MOST:
             raise ValueError(f"more than {_CHANNELS_MOST} channels")
 
     def check(self) -> bool:
-        """Read every chunk; whether the file is whole and sound."""
-        for chunk in self._chunks():
-            for _ in self._messages_in(chunk):
-                pass
+        """Read every message; whether the file is whole and sound."""
+        for _ in self._messages():
+            pass
         return not self.truncated and not self.damage
 
     def _damaged(self, error: Exception | None) -> None:
@@ -230,50 +278,56 @@ class Recording:
             what = "cut short" if self.truncated else "damaged"
             self._say(f"{self.path}: {what} ({self.damage}); what is sound in it is read")
 
-    def _summary(self, file: BinaryIO) -> bool:
-        """Take the summary at the file's end; False where it has none."""
+    def _begin(self, file: BinaryIO) -> str:
+        """Return the profile in the header, empty where that is damaged; and see the file's end."""
         from mcap.data_stream import ReadDataStream
-        from mcap.records import Header, Statistics
+        from mcap.records import Header
 
         if file.read(5) != _MAGIC[:5]:
             raise RecordingError(f"{self.path}: not an MCAP file")
+        file.seek(max(0, self.size - _END.size))
+        end = file.read(_END.size)
+        self.truncated = len(end) < _END.size or (end[0], end[-8:]) != (_FOOTER, _MAGIC)
         file.seek(len(_MAGIC))
         try:
             _, content = next(_records(file, (_HEADER,)))
-            profile = Header.read(ReadDataStream(io.BytesIO(content))).profile
-            if profile != PROFILE:
-                raise RecordingError(
-                    f"{self.path}: profile {profile!r}, expected {PROFILE!r}: "
-                    "not a recording of this stream"
-                )
-            file.seek(max(0, self.size - _END.size))
-            kind, _, start, _, _, magic = _END.unpack(file.read(_END.size))
-            if (kind, magic) != (_FOOTER, _MAGIC) or start == 0:
-                return False  # cut short
+            return str(Header.read(ReadDataStream(io.BytesIO(content))).profile)
+        except Exception:
+            self.truncated = True
+            return PROFILE
+
+    def _summary(self, file: BinaryIO) -> Statistics | None:
+        """Return the summary's statistics, None where they or their channels are missing."""
+        from mcap.data_stream import ReadDataStream
+        from mcap.records import Statistics
+
+        if self.truncated:
+            return None
+        try:
+            file.seek(self.size - _END.size)
+            start = _END.unpack(file.read(_END.size))[2]
+            if start == 0:
+                return None
             file.seek(start)
-            statistics: Statistics | None = None
+            found: Statistics | None = None
             for kind, content in _records(file, (_CHANNEL, _STATISTICS, _FOOTER)):
                 if kind == _CHANNEL:
                     self._learn(content)
                 elif kind == _STATISTICS:
-                    statistics = Statistics.read(ReadDataStream(io.BytesIO(content)))
+                    found = Statistics.read(ReadDataStream(io.BytesIO(content)))
                 else:
                     break
-        except (EOFError, StopIteration, struct.error):
-            return False
-        except RecordingError:
-            raise
         except Exception as error:
             self.truncated = True
             self._damaged(error)
-            return False
-        if statistics is not None:
-            self._take(statistics)
-        return statistics is not None
+            return None
+        known = self._names.keys() | self._other_names.keys()
+        return None if found is None or found.channel_message_counts.keys() - known else found
 
     def _take(self, statistics: Statistics) -> None:
         for number, name in self._names.items():
-            self.counts[name] = statistics.channel_message_counts.get(number, 0)
+            count = statistics.channel_message_counts.get(number, 0)
+            self.counts[name] = self.counts.get(name, 0) + count
         self.chunks = statistics.chunk_count
         if statistics.message_count:
             self._first = statistics.message_start_time
@@ -281,16 +335,17 @@ class Recording:
             self.end = statistics.message_end_time * 1e-9
 
     def _scan(self) -> None:
-        names = self._names
-        start, end = 2**63, 0
-        for chunk in self._chunks():
-            self.chunks += 1
-            for channel, log_time, _ in self._messages_in(chunk, learn=True):
-                if channel in names:
-                    name = names[channel]
-                    self.counts[name] = self.counts.get(name, 0) + 1
-                    start, end = min(start, log_time), max(end, log_time)
-        if end:
+        """Count the messages and find their times by reading all of them."""
+        start, end = 2**64, -1
+        for channel, log_time, _ in self._messages():
+            if channel in self._names:
+                name = self._names[channel]
+                self.counts[name] = self.counts.get(name, 0) + 1
+                start, end = min(start, log_time), max(end, log_time)
+            else:
+                name = self._other_names.get(channel, "a channel without a name")
+                self.others[name] = self.others.get(name, 0) + 1
+        if end >= 0:
             self._first = start
             self.start, self.end = start * 1e-9, end * 1e-9
 
@@ -298,7 +353,8 @@ class Recording:
 def _records(file: IO[bytes], wanted: Collection[int]) -> Iterator[tuple[int, bytes]]:
     """Yield kind and content of the records that are ``wanted``, until the end.
 
-    Raises EOFError for one that is cut short, ValueError for an invalid or too long one.
+    Of a message that is too long only the part before its data. Raises EOFError for a record that
+    is cut short, ValueError for an invalid or too long one.
     """
     while head := file.read(_RECORD.size):
         if len(head) < _RECORD.size:
@@ -309,11 +365,15 @@ def _records(file: IO[bytes], wanted: Collection[int]) -> Iterator[tuple[int, by
         if kind not in wanted:
             file.seek(length, os.SEEK_CUR)
             continue
-        if length > MOST:
+        skipped = 0
+        if length > MOST and kind == _MESSAGE:
+            length, skipped = _BEFORE_DATA.size, length - _BEFORE_DATA.size
+        elif length > (_CHUNK_MOST if kind == _CHUNK else MOST):
             raise ValueError(f"a record of {length >> 20} MB")
         content = file.read(length)
         if len(content) < length:
             raise EOFError
+        file.seek(skipped, os.SEEK_CUR)
         yield kind, content
 
 
@@ -335,21 +395,24 @@ def _plain(message: dict[str, Any]) -> dict[str, Any]:
     raise ValueError("a message with more fields than any topic's")
 
 
-def _unpacked(chunk: Chunk) -> bytes:
+def _unpacked(method: str, data: memoryview, size: int, crc: int) -> bytes:
     """A chunk's records. Raises ValueError where it claims too much, or isn't what it claims."""
-    data, size = chunk.data, chunk.uncompressed_size
-    if size > MOST:
+    if size > _CHUNK_MOST:
         raise ValueError(f"a chunk of {size >> 20} MB")
-    if chunk.compression == "zstd":
+    if method == "zstd":
         import zstandard
 
         if zstandard.frame_content_size(data) not in (-1, size):
             raise ValueError("a chunk that is larger than it claims")
-        data = zstandard.ZstdDecompressor().decompress(data, max_output_size=size)
-    elif chunk.compression == "lz4":
+        unpacked = zstandard.ZstdDecompressor().decompress(data, max_output_size=size)
+    elif method == "lz4":
         import lz4.frame
 
-        data = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1)
-    if len(data) != size or chunk.uncompressed_crc not in (0, zlib.crc32(data)):
+        unpacked = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1)
+    elif method == "":
+        unpacked = bytes(data)
+    else:
+        raise ValueError(f"a chunk compressed by {method[:20]!r}, expected zstd, lz4 or none")
+    if len(unpacked) != size or crc not in (0, zlib.crc32(unpacked)):
         raise ValueError("a chunk that is not what it claims")
-    return data
+    return unpacked

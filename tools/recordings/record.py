@@ -90,6 +90,8 @@ class RecordingWriter:
             self._file = path.open("xb", buffering=4 * CHUNK)  # a chunk goes out in one write
         except FileExistsError:
             raise RecordingError(f"{path}: exists already; nothing is written over it") from None
+        except FileNotFoundError:
+            raise RecordingError(f"{path}: its folder does not exist; make it first") from None
         except OSError as error:
             raise RecordingError(f"{path}: {error.strerror}") from None
         try:
@@ -373,6 +375,11 @@ def recover(path: Path) -> tuple[int, str]:
     recording = Recording(path)
     if recording.check():
         return recording.total, ""
+    if recording.others:
+        raise RecordingError(
+            f"{path}: has channels of other programs, which would be lost; "
+            "`mcap recover` keeps them"
+        )
     closed = path.with_name(path.name + ".recovered")
     closed.unlink(missing_ok=True)
     writer = RecordingWriter(closed)

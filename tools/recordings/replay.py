@@ -92,6 +92,8 @@ def _publish(arguments: argparse.Namespace, recording: Recording) -> None:
         for topic, message in recording.messages(start=arguments.start, end=arguments.end):
             if message.get("again") is not True:  # a repeated one is older than the recording
                 stamp = message.get("timestamp", 0.0)
+                if not isinstance(stamp, int | float):
+                    continue  # no message of this stream
                 if first is None:
                     began, first = time.monotonic(), stamp
                 due = began + (stamp - first) / arguments.speed

@@ -8,6 +8,7 @@ import math
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from itertools import islice
 from typing import Any
 
 import zmq
@@ -122,8 +123,8 @@ class Playback:
         finder = ThreadPoolExecutor(1)
         marks: Future[list[Any]] | None = finder.submit(lambda: marks_of(Recording(recording.path)))
         finder.shutdown(wait=False)
-        if recording.count(schema.SETTINGS):  # which may come once, at the beginning
-            pictures.take(*next(recording.messages([schema.SETTINGS])))
+        for message in islice(recording.messages([schema.SETTINGS]), 1):  # they may come only once
+            pictures.take(*message)
         while not ending.over:
             begun = time.monotonic()
             if (target := self._target) is not None:

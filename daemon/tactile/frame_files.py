@@ -1,0 +1,368 @@
+"""Reads recorded pressure frames from files.
+
+Files:
+- ``.npz`` with ``frames`` [n, rows, cols], or a single array of three dimensions by another name;
+  optionally ``t`` [n], ``live`` [rows, cols] bool, and the true contact at each frame, where known:
+  ``d`` [m], ``theta`` [rad], ``force`` [N], each [n].
+- ``.npy``, one frame [rows, cols] or several [n, rows, cols]; or a folder of such files, in the
+  order of their names with numbers read as numbers, and ``t.npy`` [n] among them.
+- a Tekscan-style ASCII export, any other file.
+
+Frames of whole numbers are counts; others are Pa, and become counts by ``pascal_per_count``.
+A cell that is NaN in all frames is dead. Readings below 0 become 0 where noise round a tared zero
+explains them. Times are s, or another unit that their step or their date shows.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import zipfile
+import zlib
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softfinger.daemon.errors import RecordingError
+from softfinger.daemon.own_files import open_regular, read_file, unpacked_most
+from softfinger.daemon.tactile import tekscan
+
+FloatArray = NDArray[np.float64]
+TRUTHS = ("d", "theta", "force")
+_TIMES = ("t", "time", "times", "timestamp", "timestamps")
+_FULL = 65535
+_OUTSIDE = f"frames: found readings outside 0 to {_FULL} counts"
+_SHOWN = 8  # arrays of a file that are named
+_SAMPLE = 200  # frames at most by which zero and noise are judged
+_NOISE_MOST = 6.0  # standard deviations that noise takes a reading below 0
+_CLIPPED_LEAST = 3  # cells that share the largest reading
+_UNITS = {1e-3: "ms", 1e-6: "µs", 1e-9: "ns"}  # of times that are not s
+_DATES = (1e9, 4e9)  # Unix s, from 2001 to 2096
+_OFF_MOST = 100.0  # times the expected interval, up to which times are s
+_OFF_NAMED = 10.0  # from which on that is said
+
+
+@dataclass(frozen=True)
+class FrameRecording:
+    """Counts uint16 [n, rows, cols] at times t float64 [n], rising from 0 [s].
+
+    ``live`` [rows, cols] is False where the sensor has no cell; ``truths`` is the true contact.
+    ``largest`` reading as the file has it: counts where ``whole``, else Pa. ``notes`` say what was
+    changed or looks wrong, a line each.
+    """
+
+    counts: NDArray[np.uint16]
+    t: FloatArray
+    live: NDArray[np.bool_]
+    truths: dict[str, FloatArray] = field(default_factory=dict)
+    pitch: tuple[float, float] | None = None  # x and y [m], where the file has it
+    full_count: int | None = None  # from which on cells are saturated, where the file has it
+    largest: float = 0.0
+    whole: bool = True
+    notes: tuple[str, ...] = ()
+
+
+def load_recording(
+    path: Path,
+    pascal_per_count: float,
+    rate: float,
+    noise: float = 0.0,
+    full_count: int = _FULL,
+) -> FrameRecording:
+    """Read a recording; without times its frames come at ``rate`` [Hz].
+
+    ``noise`` [Pa] is a cell's expected standard deviation, ``full_count`` the reading of saturated
+    cells. Raises RecordingError.
+    """
+    try:
+        found = _loaded(path, pascal_per_count, rate, noise)
+        if found.full_count is None and (clipped := _clipped(found, pascal_per_count, full_count)):
+            found = replace(found, notes=(*found.notes, clipped))
+        return found
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else error
+        raise RecordingError(f"{path}: {reason}") from None
+
+
+def _loaded(path: Path, scale: float, rate: float, noise: float) -> FrameRecording:
+    notes: list[str] = []
+    if path.is_dir():
+        arrays = _folder(path)
+    elif path.suffix == ".npz":
+        arrays = _archive(path, notes)
+    elif path.suffix == ".npy":
+        arrays = {"frames": _frames(path)}
+    else:
+        return _export(path, scale, rate, noise)
+    return replace(_checked(arrays, scale, rate, noise, notes), notes=tuple(notes))
+
+
+def _folder(path: Path) -> dict[str, NDArray[Any]]:
+    def order(file: Path) -> list[tuple[int, str]]:
+        parts = re.findall(r"\d+|\D+", file.stem)
+        return [(int(part), "") if part.isdigit() else (-1, part) for part in parts]
+
+    parts = []
+    arrays: dict[str, NDArray[Any]] = {}
+    for file in sorted(path.glob("*.npy"), key=order):
+        if file.stem in (*_TIMES, "live", *TRUTHS):
+            arrays["t" if file.stem in _TIMES else file.stem] = _array(file)
+        else:
+            parts.append(_frames(file))
+    if not parts:
+        raise ValueError("no .npy file with a frame in this folder")
+    if len({part.shape[1:] for part in parts}) > 1:
+        raise ValueError("frames of different shapes in this folder")
+    return {"frames": np.concatenate(parts), **arrays}
+
+
+def _frames(path: Path) -> NDArray[Any]:
+    """The frames of one .npy file, [n, rows, cols]."""
+    array = _array(path)
+    if array.ndim not in (2, 3):
+        raise ValueError(f"{path.name}: found shape {array.shape}, expected [n, rows, cols]")
+    return array.reshape(-1, *array.shape[-2:])
+
+
+def _archive(path: Path, notes: list[str]) -> dict[str, NDArray[Any]]:
+    """The arrays of an .npz file that are ours."""
+    held: dict[str, NDArray[Any]] = {}
+    with open_regular(path) as file, zipfile.ZipFile(file) as archive:
+        names = [name[:-4] for name in archive.namelist() if name.endswith(".npy")]
+        wanted = {"frames": _frames_among(archive, names, notes)}
+        wanted |= {name: name for name in ("live", *TRUTHS) if name in names}
+        if times := next((name for name in _TIMES if name in names), None):
+            wanted["t"] = times
+        left = unpacked_most(file)
+        for ours, name in wanted.items():
+            part = _part(archive, name)
+            left -= part.file_size
+            if left < 0:
+                raise ValueError(f"{name}: unpacks to more than a recording of this size does")
+            with archive.open(part) as unpacked:
+                held[ours] = _read_array(unpacked, part.file_size)
+    return held
+
+
+def _frames_among(archive: zipfile.ZipFile, names: list[str], notes: list[str]) -> str:
+    """Return the name of the array of frames. Raises ValueError where it isn't clear which."""
+    if "frames" in names:
+        return "frames"
+    shapes = {name: _shape(archive, name) for name in names[: 4 * _SHOWN]}
+    stacks = [name for name, (shape, kind) in shapes.items() if len(shape) == 3 and kind in "uif"]
+    if len(stacks) == 1:
+        notes.append(f"no array 'frames' in it; the frames are {stacks[0]!r}, its only 3-d array")
+        return stacks[0]
+    described = [f"{name} {shape}" for name, (shape, _) in [*shapes.items()][:_SHOWN]]
+    described += ["…"] * (len(names) > _SHOWN)
+    raise ValueError(
+        f"no array 'frames' in it; found {', '.join(described) or 'no array'}: name the one "
+        "[n, rows, cols] frames"
+    )
+
+
+def _part(archive: zipfile.ZipFile, name: str) -> zipfile.ZipInfo:
+    part = archive.getinfo(f"{name}.npy")
+    # As NumPy packs them: others unpack beyond what they claim.
+    if part.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise ValueError(f"{name}: found another compression than deflate")
+    return part
+
+
+def _shape(archive: zipfile.ZipFile, name: str) -> tuple[tuple[int, ...], str]:
+    """Return shape and kind of an array without reading it."""
+    with archive.open(_part(archive, name)) as unpacked:
+        shape, _, kind = _read_header(unpacked)
+    return shape, kind.kind
+
+
+def _array(path: Path) -> NDArray[Any]:
+    with open_regular(path) as file:
+        return _read_array(file, min(path.stat().st_size, unpacked_most(file)))
+
+
+def _read_header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    lib = np.lib.format
+    header = {(1, 0): lib.read_array_header_1_0, (2, 0): lib.read_array_header_2_0}
+    version = lib.read_magic(file)
+    if version not in header:
+        raise ValueError(f"found version {version} of .npy, expected 1.0 or 2.0")
+    return header[version](file)
+
+
+def _read_array(file: IO[bytes], size: int) -> NDArray[Any]:
+    """The array of a .npy file of so many bytes. Raises ValueError where it claims to be larger."""
+    shape, _, kind = _read_header(file)
+    if math.prod(shape) * kind.itemsize > size:
+        raise ValueError(f"claims to hold {shape} of {kind}, more than the file has")
+    file.seek(0)
+    return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
+
+
+def _export(path: Path, scale: float, rate: float, noise: float) -> FrameRecording:
+    export = tekscan.parse(tekscan.decode(read_file(path)), 1.0 / rate)
+    scale = 1.0 if export.raw else scale
+    notes: list[str] = []
+    arrays: dict[str, NDArray[Any]] = {"frames": export.values, "live": export.live}
+    found = replace(_checked(arrays, scale, rate, noise, notes), t=export.t, whole=export.raw)
+    if not math.isnan(sum(export.pitch)):
+        found = replace(found, pitch=export.pitch)
+    if math.isfinite(export.full):
+        found = replace(found, full_count=max(min(int(export.full / scale), _FULL), 1))
+    return replace(found, notes=tuple(notes))
+
+
+def _checked(
+    arrays: dict[str, NDArray[Any]], scale: float, rate: float, noise: float, notes: list[str]
+) -> FrameRecording:
+    frames = arrays["frames"]
+    if frames.ndim != 3 or frames.size == 0:
+        raise ValueError(f"frames: found shape {frames.shape}, expected [n, rows, cols]")
+    if frames.dtype.kind not in "uif":
+        raise ValueError(f"frames: found {frames.dtype}, expected numbers")
+    live = np.ones(frames.shape[1:], np.bool_)
+    if "live" in arrays:
+        live = arrays["live"].astype(np.bool_)
+        if live.shape != frames.shape[1:]:
+            raise ValueError(f"live: found shape {live.shape}, expected {frames.shape[1:]}")
+    whole = frames.dtype.kind != "f"
+    scale = 1.0 if whole else scale
+    frames, live = _without_dead(frames, live, _FULL * scale)
+    _check_below(frames, live, noise / scale if whole else noise, notes)
+    largest = float(frames[:, live].max())
+    if largest > _FULL * scale:
+        k, i, j = np.unravel_index(int(frames.argmax()), frames.shape)
+        expected = f"at most {_FULL} counts"
+        if not whole and math.isfinite(largest):
+            expected += f", set tactile.pascal_per_count to {largest / _FULL:.3g} or more"
+        raise ValueError(_place(frames, int(k), int(i), int(j), expected))
+    count = len(frames)
+    t = np.arange(count) / rate
+    if "t" in arrays:
+        t = _seconds(_row(arrays, "t", count), rate, notes)
+    truths = {name: _row(arrays, name, count).astype(np.float64) for name in TRUTHS & arrays.keys()}
+    counts = np.maximum(frames if whole else np.round(frames / scale), 0).astype(np.uint16)
+    return FrameRecording(counts, t, live, truths, None, None, largest, whole)
+
+
+def _without_dead(
+    frames: NDArray[Any], live: NDArray[np.bool_], most: float
+) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+    """Take cells that are NaN in all frames for dead; let dead ones read 0 where out of range."""
+    if frames.dtype.kind == "f":
+        unknown = np.isnan(frames)
+        live = live & ~unknown.all(axis=0)
+        if not live.any():
+            raise ValueError(f"{_OUTSIDE}: every cell is NaN in all frames")
+        wrong = np.argwhere((unknown | np.isinf(frames)) & live)
+        if wrong.size:
+            k, i, j = wrong[0].tolist()
+            raise ValueError(_place(frames, k, i, j, "a number, or NaN in all frames"))
+    if not live.all():
+        usable = live | ((frames >= 0) & (frames <= most))
+        frames = np.where(usable, frames, np.zeros((), frames.dtype))
+    return frames, live
+
+
+def _check_below(
+    frames: NDArray[Any], live: NDArray[np.bool_], noise: float, notes: list[str]
+) -> None:
+    """Note readings below 0 that noise round a zero explains. Raises ValueError for others."""
+    lowest = float(frames.min())
+    if lowest >= 0.0:
+        return
+    sample = frames[:: max(len(frames) // _SAMPLE, 1)][:, live].astype(np.float64)
+    middle = float(np.median(sample))
+    noise = max(noise, 1.4826 * float(np.median(np.abs(sample - middle))))
+    k, i, j = np.unravel_index(int(frames.argmin()), frames.shape)
+    if middle < -noise:
+        expected = f"0 or noise; half of the cells read {middle:.3g} or less: tare them"
+        raise ValueError(_place(frames, int(k), int(i), int(j), expected))
+    if lowest < -_NOISE_MOST * noise:
+        expected = f"0 or more, or noise, which reaches to {-_NOISE_MOST * noise:.3g}"
+        raise ValueError(_place(frames, int(k), int(i), int(j), expected))
+    share = np.count_nonzero(frames < 0) / (len(frames) * np.count_nonzero(live))
+    notes.append(
+        f"{share:.0%} of the readings are below 0, down to {lowest:.4g}: noise round a tared zero, "
+        "taken as 0"
+    )
+
+
+def _place(frames: NDArray[Any], k: int, i: int, j: int, expected: str) -> str:
+    value = frames[k, i, j].item()
+    return (
+        f"{_OUTSIDE}: frame {k + 1} of {len(frames)}, row "
+        f"{i + 1}, cell {j + 1} (frames[{k}, {i}, {j}]) is {value:.10g}, expected {expected}"
+    )
+
+
+def _row(arrays: dict[str, NDArray[Any]], name: str, count: int) -> NDArray[Any]:
+    array = arrays[name]
+    if name == "t" and array.dtype.kind in "mM":
+        array = array.astype(f"{array.dtype.kind}8[ns]").astype(np.int64)
+    if array.shape != (count,) or array.dtype.kind not in "uif":
+        raise ValueError(f"{name}: found shape {array.shape}, expected {count} numbers")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name}: not finite")
+    return array
+
+
+def _seconds(t: NDArray[Any], rate: float, notes: list[str]) -> FloatArray:
+    """Return times from the first on [s], whatever their unit. Raises ValueError."""
+    first = t[0].item()
+    since: FloatArray = (t - t[0]).astype(np.float64)
+    steps = np.diff(since)
+    if (steps <= 0.0).any():
+        k = int(np.argmax(steps <= 0.0))
+        raise ValueError(f"t: the times must rise; t[{k}] is {t[k]}, t[{k + 1}] is {t[k + 1]}")
+    if not steps.size:
+        return since
+    step = float(np.median(steps))
+    for factor in (1.0, *_UNITS):
+        if _DATES[0] <= first * factor < _DATES[1]:  # a date
+            break
+    else:
+        factor = _factor(t, step, rate)
+    if factor in _UNITS:
+        notes.append(
+            f"t: taken as {_UNITS[factor]}: a frame comes every {step * factor:.4g} s, by "
+            f"tactile.rate every {1.0 / rate:.4g} s"
+        )
+    elif not 1.0 / _OFF_NAMED < step * rate < _OFF_NAMED:
+        notes.append(
+            f"t: taken as s: a frame comes every {step:.4g} s, by tactile.rate every "
+            f"{1.0 / rate:.4g} s"
+        )
+    return np.multiply(since, factor)
+
+
+def _factor(t: NDArray[Any], step: float, rate: float) -> float:
+    """Return the unit [s] of times without a date, by their step. Raises ValueError."""
+    whole = t.dtype.kind in "ui"
+    if whole and (np.diff(t) == 1).all() and len(t) > 2:
+        raise ValueError("t: whole numbers that rise by 1, expected times in s, or no t")
+    if not whole and step * rate <= _OFF_MOST:
+        return 1.0
+    return min((1.0, *_UNITS)[whole:], key=lambda factor: abs(math.log(step * factor * rate)))
+
+
+def _clipped(found: FrameRecording, scale: float, full: int) -> str:
+    """Return a warning where several cells share the largest reading as clipped ones do."""
+    counts = np.where(found.live, found.counts, 0)
+    top = int(counts.max())
+    at_top = counts == top
+    cells = np.count_nonzero(at_top.any(axis=0))
+    if top == 0 or top >= full or cells < _CLIPPED_LEAST:
+        return ""
+    # Where readings are round numbers the next one below is as frequent.
+    below = int(counts[~at_top].max(initial=0))
+    if below and np.count_nonzero(at_top) <= 2 * np.count_nonzero(counts == below):
+        return ""
+    unit = "counts" if found.whole else f"counts of {scale:g} Pa"
+    return (
+        f"{cells} cells share the largest reading, {top} {unit}: if they are saturated, set "
+        f"tactile.full_count = {top}; d is too large otherwise"
+    )

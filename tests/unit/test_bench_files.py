@@ -1,0 +1,491 @@
+"""Files of frames as they come from benches: read rightly, or refused for the true reason."""
+
+import itertools
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from softfinger import Fingertip, Material, SensorGrid
+from softfinger.daemon.clock import VirtualClock
+from softfinger.daemon.errors import RecordingError, TactileError
+from softfinger.daemon.perception.finger_model import make_models
+from softfinger.daemon.perception.zero import UnpressedCells
+from softfinger.daemon.profile.settings import Settings, TactileSettings
+from softfinger.daemon.profile.validation import sensor_doubts
+from softfinger.daemon.tactile.frame_files import load_recording
+from softfinger.daemon.tactile.replay import ReplayTactile
+from softfinger.tools.analysis.analyse import analyse, open_source
+from softfinger.tools.recordings.record import RecordingWriter
+
+PITCH, SCALE, NOISE = 0.058 / 44, 4.0, 300.0
+TIP, MATERIAL = Fingertip(0.020), Material.table_i()
+DEPTHS = (0.0, 0.0, 0.001, 0.002, 0.003, 0.004, 0.004, 0.004)
+SETTINGS = Settings.model_validate(
+    {"tactile": {"pascal_per_count": SCALE, "pitch": PITCH, "noise": NOISE, "smooth_error": 0.0}}
+)
+
+
+@pytest.fixture(scope="module")
+def tared() -> np.ndarray:
+    """Presses [Pa] with a sensor's noise round its zero."""
+    grid = SensorGrid(44, 44, PITCH)
+    clean = np.stack([grid.pressure(TIP, MATERIAL, d, 0.1 if d else 0.0, 0.0) for d in DEPTHS])
+    return clean + np.random.default_rng(3).normal(0.0, NOISE, clean.shape)
+
+
+@pytest.fixture(scope="module")
+def press(tared) -> np.ndarray:
+    return np.maximum(tared, 0.0)
+
+
+def export(frames: np.ndarray, unit: str = "kPa", scale: float = 1e-3, **form: Any) -> bytes:
+    """Write an export: ``form`` has header lines, separator, decimal sign, digits, encoding, …"""
+    point, digits = form.get("point", "."), form.get("digits", 3)
+    header = [
+        *("DATA_TYPE MOVIE", "SENSOR_TYPE 5051", "ROWS 44", "COLS 44", "NOISE_THRESHOLD 3"),
+        *(f"{name}_SPACING {PITCH * 1e3:.6f} mm" for name in ("ROW", "COL")),
+        *(f"SENSEL_AREA {PITCH**2 * 1e6:.6f} mm2", "SECONDS_PER_FRAME 0.01", f"UNITS {unit}"),
+        *form.get("header", ()),
+        "ASCII_DATA @@",
+    ]
+    lines = [line.replace(".", point).replace(" ", form.get("gap", " "), 1) for line in header]
+    for k, frame in enumerate(frames):
+        lines.append(f"{form.get('word', 'Frame')} {k + 1}")
+        for row in frame:
+            cells = (f"{value * scale:.{digits}f}".replace(".", point) for value in row)
+            quote = form.get("quote", "")
+            lines.append(form.get("separator", ",").join(f"{quote}{each}{quote}" for each in cells))
+        lines.append("")
+    return form.get("end", "\r\n").join([*lines, "@@"]).encode(form.get("encoding", "latin-1"))
+
+
+def depths(path: Path, settings: Settings = SETTINGS) -> np.ndarray:
+    (contacts,) = analyse(open_source(path, settings, own=False), lambda _: None)
+    assert contacts.valid.all()
+    return contacts.values["d"]
+
+
+def check(path: Path, settings: Settings = SETTINGS, within: float = 3e-5) -> None:
+    assert depths(path, settings) == pytest.approx(DEPTHS, abs=within)
+
+
+# Cells that saturate
+
+
+def clipped(frames: np.ndarray) -> tuple[np.ndarray, float]:
+    full = 0.75 * frames.max()
+    return np.minimum(frames, full), full
+
+
+@pytest.mark.parametrize(
+    ("unit", "pascal", "digits"),
+    [("kPa", 1e3, 3), ("kPa", 1e3, 0), ("psi", 6894.757293168, 4), ("MPa", 1e6, 5)],
+)
+@pytest.mark.parametrize("told", [True, False])
+def test_cells_above_the_headers_saturation_pressure_are_left_out(
+    press, tmp_path, unit, pascal, digits, told
+):
+    frames, full = clipped(press)
+    name = f" {unit}" if told else ""  # else in the readings' unit
+    line = f"SATURATION_PRESSURE {full / pascal:.6f}{name}"
+    path = tmp_path / "a.asf"
+    path.write_bytes(export(frames, unit, 1.0 / pascal, digits=digits, header=[line]))
+    settings, within = SETTINGS, 3e-5
+    if digits == 0:  # whole kPa: a third of one is more noise
+        tactile = SETTINGS.tactile.model_copy(update={"noise": 600.0})
+        settings, within = SETTINGS.model_copy(update={"tactile": tactile}), 6e-5
+    check(path, settings, within)
+    assert not load_recording(path, SCALE, 100.0).notes
+
+
+def test_a_replayed_export_has_its_own_saturation(press, tmp_path):
+    frames, full = clipped(press)
+    path = tmp_path / "a.asf"
+    path.write_bytes(export(frames, header=[f"SATURATION_PRESSURE {full * 1e-3:.3f} kPa"]))
+    tactile = SETTINGS.tactile.model_copy(update={"recording": (str(path), "")})
+    sensor = ReplayTactile(tactile, VirtualClock(), 0)
+    assert sensor.full_count == pytest.approx(full / SCALE, rel=0.006)
+    assert sensor.notes == ()
+
+
+def test_without_a_saturation_pressure_cells_that_share_the_largest_reading_are_told(
+    press, tmp_path, inline
+):
+    frames, full = clipped(press)
+    path = tmp_path / "a.asf"
+    path.write_bytes(export(frames))
+    done = inline("analyse", path, "--config", "paper")
+    assert "cells share the largest reading" in done.stderr
+    assert f"set tactile.full_count = {round(full / SCALE)}" in done.stderr
+    np.save(tmp_path / "b.npy", np.round(frames / 400.0).astype(np.uint8))
+    full_count = round(full / 400.0)
+    assert "share the largest" in load_recording(tmp_path / "b.npy", 400.0, 100.0).notes[0]
+    assert not load_recording(tmp_path / "b.npy", 400.0, 100.0, full_count=full_count).notes
+
+
+@pytest.mark.parametrize("step", [4.0, 300.0, 3000.0])
+def test_readings_that_are_round_numbers_are_not_taken_for_saturated(press, tmp_path, step):
+    np.save(tmp_path / "a.npy", np.round(press / step).astype(np.uint16))
+    assert not load_recording(tmp_path / "a.npy", step, 100.0).notes
+    upright = SensorGrid(44, 44, PITCH).pressure(TIP, MATERIAL, 0.004)
+    np.save(tmp_path / "b.npy", upright)  # four cells in the middle read the same
+    assert not load_recording(tmp_path / "b.npy", SCALE, 100.0).notes
+
+
+def test_raw_readings_end_at_255(press, tmp_path):
+    path = tmp_path / "a.asf"
+    counts = np.minimum(np.round(press / 60.0), 255)
+    assert np.count_nonzero(counts == 255) > 20
+    path.write_bytes(export(counts, "RAW", 1.0, digits=0))
+    assert load_recording(path, 60.0, 100.0).full_count == 255
+    tactile = SETTINGS.tactile.model_copy(update={"pascal_per_count": 60.0})
+    check(path, SETTINGS.model_copy(update={"tactile": tactile}))
+
+
+# Zeros and dead cells
+
+
+@pytest.mark.parametrize("kind", [np.float64, np.float32, np.int16, np.int32])
+def test_a_tared_sensors_noise_below_zero_becomes_zero_and_is_told(tared, tmp_path, kind):
+    frames = tared if np.dtype(kind).kind == "f" else np.round(tared / SCALE)
+    np.savez(tmp_path / "a.npz", frames=frames.astype(kind))
+    (note,) = load_recording(tmp_path / "a.npz", SCALE, 100.0).notes
+    assert "of the readings are below 0, down to -" in note
+    check(tmp_path / "a.npz")
+
+
+def test_a_tared_export_is_read_as_well(tared, tmp_path):
+    (tmp_path / "a.asf").write_bytes(export(tared))
+    assert "below 0" in load_recording(tmp_path / "a.asf", SCALE, 100.0).notes[0]
+    check(tmp_path / "a.asf")
+
+
+@pytest.mark.parametrize("value", [-5e4, np.nan, np.inf, -np.inf])
+def test_a_reading_that_is_none_is_told_with_its_place(press, tmp_path, value):
+    frames = press.copy()
+    frames[4, 10, 12] = value
+    np.save(tmp_path / "a.npy", frames)
+    with pytest.raises(RecordingError, match="outside") as caught:
+        load_recording(tmp_path / "a.npy", SCALE, 100.0, 1520.0)
+    place = "frame 5 of 8, row 11, cell 13 (frames[4, 10, 12])"
+    assert f"{place} is {value:.10g}" in str(caught.value)
+
+
+def test_a_zero_that_has_sunk_is_no_noise(tared, tmp_path):
+    np.save(tmp_path / "a.npy", tared - 4.0 * NOISE)
+    with pytest.raises(RecordingError, match=r"half of the cells read -1\.\d+e\+03 or less: tare"):
+        load_recording(tmp_path / "a.npy", SCALE, 100.0, NOISE)
+
+
+def test_more_pressure_than_counts_hold_is_told_with_the_setting(press, tmp_path):
+    np.save(tmp_path / "a.npy", press * 12.0)
+    with pytest.raises(RecordingError, match=r"set tactile\.pascal_per_count to \d.* or more"):
+        load_recording(tmp_path / "a.npy", SCALE, 100.0)
+
+
+def test_a_cell_that_is_nan_in_all_frames_is_dead(press, tmp_path):
+    frames = press.copy()
+    frames[:, 20:22, 25] = np.nan
+    np.save(tmp_path / "a.npy", frames)
+    assert np.argwhere(~load_recording(tmp_path / "a.npy", SCALE, 100.0).live).tolist() == [
+        [20, 25],
+        [21, 25],
+    ]
+    check(tmp_path / "a.npy")
+    (tmp_path / "a.asf").write_bytes(export(frames))
+    check(tmp_path / "a.asf")
+
+
+# Exports of other locales
+
+LOCALES = {
+    "decimal commas, semicolons": {"point": ",", "separator": ";"},
+    "decimal commas, tabs": {"point": ",", "separator": "\t"},
+    "decimal commas, spaces": {"point": ",", "separator": "  "},
+    "decimal commas, commas": {"point": ","},
+    "decimal commas, commas with spaces": {"point": ",", "separator": ", "},
+    "decimal commas in quotes": {"point": ",", "quote": '"'},
+    "semicolons": {"separator": ";"},
+    "semicolons at the ends": {"separator": ";", "end": ";;;\r\n"},
+    "tabs": {"separator": "\t"},
+    "spaces": {"separator": " "},
+    "commas with spaces": {"separator": ", "},
+    "quotes": {"quote": '"'},
+    "a header of cells": {"gap": ",", "separator": ","},
+    "a header of other cells": {"gap": ";", "separator": ";", "point": ","},
+    "a header with colons": {"gap": ": "},
+    "UTF-16": {"encoding": "utf-16"},
+    "UTF-16 without a mark": {"encoding": "utf-16-le"},
+    "UTF-16, the other way round": {"encoding": "utf-16-be"},
+    "UTF-8 with a mark": {"encoding": "utf-8-sig"},
+    "lines that end as on a Mac": {"end": "\r"},
+    "another word for a frame": {"word": "Trame"},
+    "an umlaut": {"header": ["COMMENTS Prüfstand"]},
+    "an umlaut in UTF-8": {"header": ["COMMENTS Prüfstand"], "encoding": "utf-8"},
+}
+
+
+@pytest.mark.parametrize("form", LOCALES.values(), ids=LOCALES)
+def test_every_locale_reads_the_same(press, tmp_path, form):
+    frames = press[[1, 4, 5]]
+    (tmp_path / "a.asf").write_bytes(export(frames, **form))
+    (tmp_path / "b.asf").write_bytes(export(frames))
+    read, plain = (load_recording(tmp_path / name, SCALE, 100.0) for name in ("a.asf", "b.asf"))
+    assert np.array_equal(read.counts, plain.counts)
+    assert read.t.tolist() == plain.t.tolist() == [0.0, 0.01, 0.02]
+    assert read.pitch == plain.pitch == pytest.approx((PITCH, PITCH), rel=1e-5)
+
+
+def test_commas_between_and_within_numbers_are_the_reason_where_they_can_not_be_told(tmp_path):
+    text = "ROWS 1\nCOLS 3\nUNITS kPa\nASCII_DATA @@\nFrame 1\n0,0,0\nFrame 2\n0,1,25,0\n@@\n"
+    (tmp_path / "a.asf").write_text(text)
+    with pytest.raises(RecordingError, match="line 8: 4 cells, expected 3: commas stand between"):
+        load_recording(tmp_path / "a.asf", SCALE, 100.0)
+
+
+UNITS = {
+    **{"N/cm²": 1e4, "N/cm^2": 1e4, "N / sq cm": 1e4, "kg/cm²": 98066.5, "kgf/cm2": 98066.5},
+    **{"g/cm2": 98.0665, "lb/in2": 6894.757, "lbf/in²": 6894.757, "PSI": 6894.757, "mbar": 100.0},
+    **{"hPa": 100.0, "MPa": 1e6, "inHg": 3386.389, "cmH2O": 98.0665, "kN/m2": 1e3, "Torr": 133.322},
+    **{"N": 1.0 / PITCH**2, "g": 9.80665e-3 / PITCH**2, "lbf": 4.448222 / PITCH**2},
+}
+
+
+@pytest.mark.parametrize("encoding", ["latin-1", "utf-8", "cp437"])
+@pytest.mark.parametrize("unit", UNITS)
+def test_units_of_pressure_and_of_force_on_a_cell(press, tmp_path, unit, encoding):
+    path = tmp_path / "a.asf"
+    frames = press[:6]
+    path.write_bytes(export(frames, unit, 1.0 / UNITS[unit], digits=9, encoding=encoding))
+    pressures = load_recording(path, SCALE, 100.0).counts * SCALE
+    assert pressures == pytest.approx(frames, rel=1e-4, abs=SCALE)
+
+
+@pytest.mark.parametrize("unit", ["stone", "mm", "N/m"])
+def test_another_unit_is_told(press, tmp_path, unit):
+    (tmp_path / "a.asf").write_bytes(export(press[:1], unit))
+    with pytest.raises(RecordingError, match=f"UNITS: found '{unit}', expected RAW or a pressure"):
+        load_recording(tmp_path / "a.asf", SCALE, 100.0)
+
+
+def test_another_file_is_told_what_is_read(tmp_path):
+    (tmp_path / "a.csv").write_text("t,force\n0,1\n")
+    with pytest.raises(RecordingError, match=r"expected one, \.npz or \.npy"):
+        load_recording(tmp_path / "a.csv", SCALE, 100.0)
+
+
+# Times
+
+STEPS = np.cumsum([0, 10, 10, 11, 9, 10, 10, 10])  # ms
+
+
+@pytest.mark.parametrize("start", [0, 123456, 1_700_000_000_000], ids=["0", "since boot", "a date"])
+@pytest.mark.parametrize("rate", [25.0, 100.0, 400.0])
+@pytest.mark.parametrize(("name", "factor"), [("ms", 1), ("µs", 1000), ("ns", 1_000_000)])
+@pytest.mark.parametrize("kind", [np.int64, np.float64])
+def test_times_in_other_units_are_converted_and_told_once(
+    press, tmp_path, start, rate, name, factor, kind
+):
+    t = ((STEPS + start) * factor).astype(kind)
+    np.savez(tmp_path / "a.npz", frames=press, t=t)
+    read = load_recording(tmp_path / "a.npz", SCALE, rate)
+    assert read.t == pytest.approx(STEPS * 1e-3, abs=1e-6)
+    (note,) = read.notes
+    assert note.startswith(f"t: taken as {name}: a frame comes every 0.01 s")
+
+
+@pytest.mark.parametrize("key", ["t", "time", "timestamps"])
+@pytest.mark.parametrize("start", [0.0, 3600.0, 1.7e9])
+def test_times_in_seconds_are_as_they_are(press, tmp_path, start, key):
+    np.savez(tmp_path / "a.npz", frames=press, **{key: STEPS * 1e-3 + start})
+    read = load_recording(tmp_path / "a.npz", SCALE, 25.0)
+    assert read.t == pytest.approx(STEPS * 1e-3, abs=1e-6)
+    assert not read.notes
+
+
+def test_numpys_own_times_have_their_unit(press, tmp_path):
+    for k, unit in enumerate(("ms", "us", "ns")):
+        t = np.datetime64("2024-05-01") + STEPS.astype("m8[ms]").astype(f"m8[{unit}]")
+        np.savez(tmp_path / f"{k}.npz", frames=press, t=t)
+        assert load_recording(tmp_path / f"{k}.npz", SCALE, 25.0).t == pytest.approx(STEPS * 1e-3)
+
+
+def test_a_slow_recording_is_read_as_it_is_and_that_is_told(press, tmp_path):
+    np.savez(tmp_path / "a.npz", frames=press, t=np.arange(8) * 0.5)
+    read = load_recording(tmp_path / "a.npz", SCALE, 100.0)
+    assert read.t.tolist() == (np.arange(8) * 0.5).tolist()
+    assert read.notes == ("t: taken as s: a frame comes every 0.5 s, by tactile.rate every 0.01 s",)
+
+
+def test_frame_numbers_are_no_times(press, tmp_path):
+    np.savez(tmp_path / "a.npz", frames=press, t=np.arange(8))
+    with pytest.raises(RecordingError, match="t: whole numbers that rise by 1, expected times"):
+        load_recording(tmp_path / "a.npz", SCALE, 100.0)
+
+
+def test_times_that_do_not_rise_are_told_with_their_place(press, tmp_path):
+    np.savez(tmp_path / "a.npz", frames=press, t=np.array([0, 1, 2, 3, 3, 4, 5, 6]) * 0.01)
+    with pytest.raises(RecordingError, match=r"must rise; t\[3\] is 0\.03, t\[4\] is 0\.03"):
+        load_recording(tmp_path / "a.npz", SCALE, 100.0)
+
+
+# Readings of another scale
+
+
+@pytest.mark.parametrize(
+    ("scale", "kind", "cause"),
+    [
+        (1.0 / 4e4, np.float32, "floats of 0 to 1 are shares"),
+        (1e-3, np.float64, "convert kPa"),
+        (1.0 / 200.0, np.uint8, "counts of 8 bits"),
+        (1.0 / 200.0, np.uint16, "counts of 8 bits"),
+        (1.0 / 40.0, np.uint16, "tactile.pascal_per_count is not this sensor's"),
+        (0.0, np.uint16, "sensor's cable"),
+    ],
+)
+def test_frames_without_a_contact_are_told_with_the_largest_reading(
+    press, tmp_path, inline, scale, kind, cause
+):
+    path = tmp_path / "a.npz"
+    np.savez(path, frames=(press * scale).astype(kind))
+    done = inline("analyse", path, "--config", "paper")
+    (line,) = [each for each in done.stdout.splitlines() if "no contact in any frame" in each]
+    assert cause in line
+    assert "threshold 4560 Pa (3 times tactile.noise)" in line
+    with np.load(path) as held:
+        assert f"largest reading {held['frames'].max():.4g} " in line
+
+
+def test_frames_with_a_contact_say_nothing_of_it(press, tmp_path, inline):
+    np.savez(tmp_path / "a.npz", frames=press)
+    done = inline("analyse", tmp_path / "a.npz", "--config", "paper")
+    assert "no contact" not in done.stdout
+    assert done.stderr == ""
+
+
+# Archives
+
+
+@pytest.mark.parametrize("name", ["arr_0", "pressure", "left/frames"])
+def test_a_single_stack_of_an_archive_is_taken_and_told(press, tmp_path, name):
+    held = {name: press, "time": STEPS * 1e-3, "serial": np.array("A1"), "zero": press[0]}
+    np.savez(tmp_path / "a.npz", **held)
+    read = load_recording(tmp_path / "a.npz", SCALE, 100.0)
+    assert read.t == pytest.approx(STEPS * 1e-3)
+    assert read.notes == (f"no array 'frames' in it; the frames are {name!r}, its only 3-d array",)
+    check(tmp_path / "a.npz")
+
+
+def test_an_archive_without_frames_is_described(press, tmp_path):
+    np.savez(tmp_path / "a.npz", left=press, right=press, note=np.array("x"))
+    with pytest.raises(RecordingError, match=r"found left \(8, 44, 44\), right .*, note \(\)"):
+        load_recording(tmp_path / "a.npz", SCALE, 100.0)
+    many = {f"a{k}": np.zeros(k + 1) for k in range(30)}
+    np.savez(tmp_path / "b.npz", **many)
+    with pytest.raises(RecordingError, match=r"a7 \(8,\), …: name the one"):
+        load_recording(tmp_path / "b.npz", SCALE, 100.0)
+
+
+# Cells of another size
+
+
+def test_a_pitch_that_contradicts_the_header_is_told(press, tmp_path, inline):
+    path = tmp_path / "a.asf"
+    path.write_bytes(export(press))
+    tactile = {"rows": 44, "cols": 44, "recording": (str(path), ""), "pitch": 0.00127}
+    wanted = r"cells of 1\.318 × 1\.318 mm, tactile\.pitch of 1\.27 × 1\.27 mm: set tactile\.pitch"
+    with pytest.raises(TactileError, match=wanted):
+        ReplayTactile(TactileSettings.model_validate(tactile), VirtualClock(), 0)
+    done = inline("analyse", path, "--config", "paper", "--set", "tactile.pitch=0.00127")
+    assert "its header has cells of 1.318 × 1.318 mm" in done.stderr
+    assert "6 with contact, 0 not usable" in done.stdout
+    words = ("--recording", path, "--config", "paper", "--set", "tactile.pitch=0.00127")
+    done = inline("calibrate", "tare", tmp_path / "left.json", *words, "--no-plot")
+    assert (done.returncode, "its header has cells of" in done.stderr) == (1, True)
+
+
+def test_a_calibration_says_what_looks_wrong_with_its_recording(tared, tmp_path, inline):
+    np.save(tmp_path / "a.npy", tared[:2])
+    words = ("--recording", tmp_path / "a.npy", "--config", "paper", "--no-plot")
+    done = inline("calibrate", "tare", tmp_path / "left.json", *words)
+    assert done.returncode == 0
+    assert "noise round a tared zero, taken as 0" in done.stderr
+
+
+def test_generators_differ():
+    """Each locale's bytes are others."""
+    frame = np.full((1, 44, 44), 1234.5)
+    texts = [export(frame, **form) for form in LOCALES.values()]
+    same = [a == b for a, b in itertools.combinations(texts, 2)]
+    assert not any(same)
+
+
+# Before the first grip
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({}, ""),
+        ({"tip.radius": 0.010}, "sensor of 58 × 58 mm for a tip of 20 mm diameter"),
+        ({"tactile.rows": 20}, r"smaller than the tip's footprint at 12 mm, .* mm wide"),
+        ({"tactile.centre": (0.02, 0.0)}, "smaller than the tip's footprint"),
+        ({"tactile.pitch_y": 0.0006}, "sensor of 58 × 26.4 mm, smaller than"),
+    ],
+)
+def test_a_sensor_of_another_size_than_the_tip_wants_is_told(changes, told):
+    tables: dict[str, dict[str, Any]] = {}
+    for key, value in changes.items():
+        section, name = key.split(".")
+        tables.setdefault(section, {})[name] = value
+    settings = Settings.model_validate(tables)
+    doubts = sensor_doubts(settings)
+    events: list[tuple[str, str, str]] = []
+    make_models(settings, lambda *event: events.append(event))
+    warned = [text for level, _, text in events if level == "warning"]
+    assert warned == doubts
+    assert len(doubts) == bool(told)
+    assert re.search(told, " ".join(doubts))
+
+
+def test_a_solid_tips_sensor_covers_its_base():
+    solid = {"tip": {"physics": "solid"}, "material": {"law": "constant"}}
+    settings = Settings.model_validate({**solid, "tactile": {"rows": 28}})
+    (doubt,) = sensor_doubts(settings)
+    assert "smaller than the tip's base, 40 mm wide" in doubt
+
+
+@pytest.mark.parametrize("zero", [0.0, 50.0, 3000.0])
+@pytest.mark.parametrize("noise", [0.7, 5.0, 40.0])
+def test_the_noise_of_a_sensor_no_larger_than_its_tip_is_seen_from_frame_to_frame(zero, noise):
+    rng = np.random.default_rng(5)
+    grid = SensorGrid(24, 24, PITCH)
+    cells = UnpressedCells(grid, 0.020, np.ones(grid.shape, bool))
+    press = 2000.0 * (np.hypot(*(np.indices(grid.shape) - 11.5)) < 5.0)
+    for _ in range(60):
+        frame = zero + press + noise * rng.standard_normal(grid.shape)
+        cells.follow(np.clip(np.round(frame), 0, 65535).astype(np.uint16))
+    assert cells.noise == 0.0
+    assert cells.scatter == pytest.approx(noise, rel=0.2, abs=0.4)
+
+
+def test_a_recording_goes_into_a_folder_that_exists(tmp_path):
+    with pytest.raises(RecordingError, match="its folder does not exist; make it first"):
+        RecordingWriter(tmp_path / "no" / "a.mcap")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("limit", [60_000, 300_000])  # kB
+def test_too_little_memory_is_told_in_a_line(press, tmp_path, limit):
+    np.save(tmp_path / "a.npy", press[:1])
+    words = [sys.executable, "-m", "softfinger", "analyse", str(tmp_path / "a.npy")]
+    words = ["prlimit", f"--as={limit * 1024}", *words, "--config", "paper"]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 1
+    assert done.stderr.startswith("softfinger: not enough memory for this process")
+    assert len(done.stderr.splitlines()) == 1
