@@ -340,7 +340,7 @@ class CommandSettings(Section):
     on_silence: Literal["hold", "release", "stop"] = setting(
         "hold", "", "Action when the client in control falls silent."
     )
-    max_bytes: int = setting(4096, "bytes", "Longest command.", ge=64, le=1_000_000)
+    max_bytes: int = setting(4096, "bytes", "Longest command.", ge=64, le=65_536)
     per_second: float = setting(
         200.0, "Hz", "Rate of commands that one client may send; `stop` is always accepted.",
         ge=1, le=10_000

@@ -19,7 +19,7 @@ import msgpack
 
 from softfinger.daemon.types import HandFacts
 from softfinger.daemon.wire.fields import FieldSource, Getter, members
-from softfinger.daemon.wire.loop_link import Link, Topics
+from softfinger.daemon.wire.loop_link import Link
 from softfinger.daemon.wire.schema import COMMAND, EVENT, INPUT, SETTINGS, STATE, TOPICS
 
 Pack = Callable[[Any], bytes]
@@ -76,9 +76,8 @@ def _packer(record: type[Any], kinds: dict[type, Pack]) -> Pack:
 
 
 _INDEX = {topic: index for index, topic in enumerate(TOPICS)}
-GATEWAY_TOPICS = Topics(
-    tuple(topic.decode() for topic in TOPICS), settings=_INDEX[SETTINGS], events=_INDEX[EVENT]
-)
+GATEWAY_TOPICS = [topic.decode() for topic in TOPICS]
+KEPT = {SETTINGS: 1, EVENT: 50}  # messages that late subscribers get again
 
 
 def bit(topic: bytes) -> int:
@@ -113,7 +112,7 @@ class Publisher:
     def event(self, wall: float, t: float, level: str, kind: str, text: str) -> None:
         """Publish ``hand/event``."""
         packed = self._pack[EVENT](self._count(EVENT), wall, t, level, kind, text)
-        self._link.publish(_INDEX[EVENT], packed, keep=True)
+        self._link.publish(_INDEX[EVENT], packed, KEPT[EVENT])
 
     def command(
         self, wall: float, t: float, tick: int, request: dict[str, Any], error: str
@@ -125,7 +124,7 @@ class Publisher:
     def settings(self, wall: float, t: float, facts: HandFacts) -> None:
         """Publish ``hand/settings``, once."""
         packed = self._pack[SETTINGS](self._count(SETTINGS), wall, t, facts)
-        self._link.publish_lasting(_INDEX[SETTINGS], packed)
+        self._link.publish(_INDEX[SETTINGS], packed, KEPT[SETTINGS])
 
     def _count(self, topic: bytes) -> int:
         self._counts[topic] += 1

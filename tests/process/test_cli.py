@@ -134,8 +134,8 @@ def stalled(daemon: Any, context: Any, *requests: dict[str, Any]) -> list[dict[s
     daemon.running.process.send_signal(signal.SIGSTOP)
     for request in requests:
         socket.send_multipart([b"", msgpack.packb(request)])
-    socket.send_multipart([b"", b"no command"])  # which the gateway refuses by itself:
-    assert socket.poll(60_000)  # it has those before it, too
+    socket.send_multipart([b"", b"x" * 5000])  # too long: the gateway refuses it by itself
+    assert socket.poll(60_000)  # and has those before it, too
     assert msgpack.unpackb(socket.recv_multipart()[-1])["reason"] == "request"
     select.select([], [], [], 0.5)  # the stall itself
     daemon.running.process.send_signal(signal.SIGCONT)
