@@ -1,7 +1,7 @@
 """The publisher: messages of the stream, packed as the schema says and given to the gateway.
 
-The integers of the two topics that may go out at every tick, `hand/state` and `hand/input`, take 64
-bits whatever their value, so that a message keeps its length while its texts stay.
+Integers take msgpack's smallest form, so that JavaScript clients get numbers wherever one can hold
+the value. Floats always take 64 bits.
 
 A subscriber that comes late, stops reading or dies changes nothing here: the gateway sends to all
 of them, and repeats the settings and the last events, with ``again`` true, for late ones. Topics
@@ -20,7 +20,7 @@ import msgpack
 from softfinger.daemon.types import HandFacts
 from softfinger.daemon.wire.fields import FieldSource, Getter, members
 from softfinger.daemon.wire.loop_link import Link
-from softfinger.daemon.wire.schema import COMMAND, EVENT, INPUT, SETTINGS, STATE, TOPICS
+from softfinger.daemon.wire.schema import COMMAND, EVENT, SETTINGS, TOPICS
 
 Pack = Callable[[Any], bytes]
 
@@ -28,17 +28,16 @@ pack = msgpack.Packer(use_bin_type=True).pack
 _float = partial(struct.Struct(">Bd").pack, 0xCB)
 _bool = (b"\xc2", b"\xc3").__getitem__
 _PACK: dict[type, Pack] = {int: pack, float: _float, bool: _bool, str: pack, bytes: pack}
-_WIDE: dict[type, Pack] = _PACK | {int: partial(struct.Struct(">Bq").pack, 0xD3)}
 
 
 def packer(topic: bytes) -> Callable[..., bytes]:
     """Return the function that packs a topic's messages from its source's arguments."""
     source = TOPICS[topic].source
-    pack_map = _packer(TOPICS[topic].record, _WIDE if topic in (STATE, INPUT) else _PACK)
+    pack_map = _packer(TOPICS[topic].record)
     return lambda *arguments: pack_map(source(*arguments))
 
 
-def _packer(record: type[Any], kinds: dict[type, Pack]) -> Pack:
+def _packer(record: type[Any]) -> Pack:
     """Return the function that packs a record's map from what it is taken from."""
     # Sources behind the first are each had from an earlier one, values each from one of them.
     sources: list[tuple[int, Getter]] = []
@@ -57,7 +56,7 @@ def _packer(record: type[Any], kinds: dict[type, Pack]) -> Pack:
             pack(each.name),
             index(each.source),
             each.get,
-            kinds.get(each.type) or _packer(each.type, kinds),
+            _PACK.get(each.type) or _packer(each.type),
         )
         for each in members(record)
     ]

@@ -27,8 +27,8 @@ a test keeps it true.
 
 Schema {SCHEMA}. Two frames a message, topic and msgpack map with text keys, in SI units. Fields are
 only ever added, none is left out, and none changes its type: a float is always sent as a float. A
-field named `left.q` is `q` in the map `left`. The integers of `hand/state` and `hand/input` take 64
-bits whatever their value.
+field named `left.q` is `q` in the map `left`. Integers are sent in msgpack's
+smallest form: JavaScript reads those below 2³² as numbers, and `mono_ns` perhaps as BigInt.
 
 `timestamp` is the machine's Unix time. `mono_ns` is the daemon's clock, for differences: the
 machine's monotonic clock or, of a hand simulated in the daemon, one that waits while the machine is
