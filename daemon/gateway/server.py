@@ -23,11 +23,12 @@ from softfinger.daemon.errors import AddressError, KeyFileError
 from softfinger.daemon.gateway import bounds
 from softfinger.daemon.gateway.bounds import Config
 from softfinger.daemon.gateway.commands import CommandEndpoint
-from softfinger.daemon.gateway.endpoints import Admission, StartAnew, StreamEndpoint
+from softfinger.daemon.gateway.endpoints import NOW, Admission, Endpoint, StartAnew, StreamEndpoint
 from softfinger.daemon.wire import loop_link
 from softfinger.daemon.wire.loop_link import Channel
 
 _STEPS = 0.5  # s between two words that it lives
+_LATEST = 0  # index of the topic that goes out in one frame, too
 _TURN = 5e-4  # s that the authenticator waits for the interpreter while requests flood
 
 
@@ -50,6 +51,7 @@ class Server:
         self._context: zmq.Context[Any] = zmq.Context()
         self._admission = Admission(self._context, Path(config.keys) if config.keys else None)
         self.stream: StreamEndpoint | None = None
+        self._latest: Endpoint | None = None
         self.commands: CommandEndpoint | None = None
         self._poller = zmq.Poller()
         self._poller.register(channel, zmq.POLLIN)
@@ -57,6 +59,11 @@ class Server:
             if config.stream:
                 self.stream = StreamEndpoint(self._admission, config)
                 self._poller.register(self.stream.socket, zmq.POLLIN)
+            if config.latest:
+                place = config.latest, "stream.latest"
+                self._latest = Endpoint(
+                    self._admission, zmq.PUB, *place, config, bounds.SUBSCRIPTION
+                )
             if config.commands:
                 self.commands = CommandEndpoint(self._admission, config, channel.send, clock)
                 self._poller.register(self.commands.socket, zmq.POLLIN)
@@ -72,6 +79,8 @@ class Server:
         for kind, *fields in self.channel.receive():
             if kind == loop_link.PUBLISH and self.stream is not None:
                 self.stream.publish(*fields)
+                if self._latest is not None and fields[0] == _LATEST:
+                    self._latest.socket.send(fields[2], NOW)
             elif kind == loop_link.REPLY and self.commands is not None:
                 self.commands.reply(*fields)
             elif kind == loop_link.FENCE and self.commands is not None:
@@ -79,7 +88,7 @@ class Server:
         wanted = refused = stops = 0
         if self.stream is not None:
             self.stream.read(now)
-            wanted = self.stream.wanted
+            wanted = self.stream.wanted | (self._latest is not None) << _LATEST
         if self.commands is not None:
             self.commands.read()
             refused, stops = self.commands.refused, self.commands.stops
@@ -90,7 +99,7 @@ class Server:
 
     def close(self) -> None:
         """Let subscribers take what waits, for a moment, and disconnect all."""
-        for endpoint in (self.stream, self.commands):
+        for endpoint in (self.stream, self._latest, self.commands):
             if endpoint is not None:
                 endpoint.close()
         self._admission.stop()

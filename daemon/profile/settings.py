@@ -322,6 +322,9 @@ class StreamSettings(Section):
     """The published stream. A topic is sent every n-th tick, with the n nearest to its rate."""
 
     address: str = setting(STREAM_ADDRESS, "", "Address of the stream, tcp or ipc.")
+    latest: str = setting(
+        "", "", "Address where each state is sent in one frame, for `ZMQ_CONFLATE`; empty: none."
+    )
     state_rate: Rate = setting(100.0, "Hz", "Rate of the state.")
     tactile_rate: Rate = setting(100.0, "Hz", "Rate of each finger's frames.")
     tactile_unit: Literal["count", "Pa"] = setting(

@@ -31,12 +31,14 @@ class Served:
         per_second: float = 1e6,
         ipc_mode: int = 0o600,
         keys: str = "",
+        latest: str = "",
         clock: VirtualClock | None = None,
     ) -> None:
         self.link = loop_link.Link()
         ours, theirs = loop_link.pair()
         config = Config(
-            stream, commands, GATEWAY_TOPICS, queue, max_bytes, per_second, ipc_mode, keys
+            *(stream, commands, GATEWAY_TOPICS, queue, max_bytes, per_second, ipc_mode, keys),
+            latest=latest,
         )
         try:
             now = loop_link.machine_time if clock is None else clock.now
