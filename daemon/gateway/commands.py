@@ -20,7 +20,7 @@ from collections.abc import Callable
 import msgpack
 import zmq
 
-from softfinger.daemon.errors import Reason, Refused
+from softfinger.daemon.errors import Reason
 from softfinger.daemon.gateway import bounds
 from softfinger.daemon.gateway.bounds import Config
 from softfinger.daemon.gateway.endpoints import NOW, Admission, Endpoint
@@ -28,10 +28,12 @@ from softfinger.daemon.wire.command_server import refusal
 from softfinger.daemon.wire.loop_link import ASK, Ask
 
 _STOP = msgpack.packb("command") + msgpack.packb("stop")  # no text can hold this
-_FORM = (
+_FORM = refusal(
     "envelope: expected the command in one frame, alone or behind an empty frame that ends an "
-    f"envelope of at most {bounds.PARTS - 2} frames and {bounds.ENVELOPE} bytes"
+    f"envelope of at most {bounds.PARTS - 2} frames and {bounds.ENVELOPE} bytes",
+    Reason.REQUEST,
 )
+_FULL = refusal("too many commands wait already", Reason.BUSY)
 
 
 class Client:
@@ -69,6 +71,8 @@ class CommandEndpoint(Endpoint):
         """Bind the socket. Raises AddressError."""
         self._admission = admission
         self._config = config
+        text = f"too many commands: at most {config.per_second:g} a second"
+        self._too_many = refusal(text, Reason.BUSY)
         self._send_to_loop = send_to_loop
         self._clock = clock
         self.refused = 0  # because too many came
@@ -140,21 +144,22 @@ class CommandEndpoint(Endpoint):
         # As with a REP socket, all up to the first empty frame goes back with the reply.
         ends = parts.index(b"", 1) + 1 if b"" in parts[1:-1] else 1
         route, payload = parts[:ends], parts[-1]
-        is_long = len(parts) > bounds.PARTS or sum(map(len, route)) > bounds.ENVELOPE
+        if sum(map(len, route)) > bounds.ENVELOPE or len(parts) > bounds.PARTS:
+            ends, route = 0, parts[:1]
         client = self._client(parts[0], now)
         self._came += b"status" not in payload
         self._left -= 1
         if self._left < 0:  # more than can have waited
             self._dated = None
-        is_urgent = _STOP in payload and not client.urgent
+        is_urgent = _STOP in payload and len(payload) <= bounds.URGENT_BYTES and not client.urgent
         if client.floods(self._share(parts[0], now), now) and not is_urgent:
-            text = f"too many commands: at most {self._config.per_second:g} a second"
-            self._refuse(parts[:1] if is_long else route, text, Reason.BUSY)
-        elif ends + 1 != len(parts) or is_long:
-            self._refuse(parts[:1] if is_long else route, _FORM, Reason.REQUEST)
+            self.refused += 1
+            self._answer(route, self._too_many)
+        elif ends + 1 != len(parts):
+            self._answer(route, _FORM)
         elif len(payload) > self._config.max_bytes:
             text = f"message of {len(payload)} bytes; at most {self._config.max_bytes}"
-            self._refuse(route, text, Reason.REQUEST)
+            self._answer(route, refusal(text, Reason.REQUEST))
         else:
             came = now if self._dated is None else self._dated
             self._queue(client, Ask(came, self.stops, is_urgent, name, route, payload))
@@ -164,7 +169,8 @@ class CommandEndpoint(Endpoint):
             client.urgent = True
             self._urgent.append(ask)
         elif len(client.waiting) >= bounds.WAITING_EACH or self.count >= bounds.WAITING:
-            self._refuse(ask.route, "too many commands wait already", Reason.BUSY)
+            self.refused += 1
+            self._answer(ask.route, _FULL)
         else:
             if not client.waiting:
                 self._turns.append(client)
@@ -198,10 +204,6 @@ class CommandEndpoint(Endpoint):
         if urgent and route[0] in self._clients:
             self._clients[route[0]].urgent = False
         self._answer(route, reply)
-
-    def _refuse(self, route: list[bytes], text: str, reason: Reason) -> None:
-        self.refused += reason is Reason.BUSY
-        self._answer(route, refusal(Refused(text, reason)))
 
     def _answer(self, route: list[bytes], reply: bytes) -> None:
         """Send a reply, once what came before a stop has been read."""

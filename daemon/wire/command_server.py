@@ -101,7 +101,7 @@ class CommandServer:
                 if ask.urgent and request["command"] != "stop":  # the map names two commands
                     raise _malformed('expected one text under "command"')
             except Refused as refused:
-                self._link.reply(ask, refusal(refused))
+                self._link.reply(ask, refusal(str(refused), refused.reason))
                 continue
             if ask.name:
                 request["client"] = ask.name
@@ -115,7 +115,7 @@ class CommandServer:
             if mine and _replaces(request, mine[-1][1]):
                 waiting.remove(mine[-1])
                 text = "hold: a newer one of this connection replaced it"
-                self._link.reply(mine[-1][0], refusal(Refused(text, Reason.SUPERSEDED)))
+                self._link.reply(mine[-1][0], refusal(text, Reason.SUPERSEDED))
             waiting.append((ask, request))
 
     def _answer(self, ask: Ask, request: dict[str, Any], handler: Handler) -> bytes:
@@ -136,7 +136,7 @@ class CommandServer:
                 reply = accepted(handler(request, self._clock() - ask.came))
                 self._changes += name != "status"
             except Refused as refused:
-                reply, late = refusal(refused), refused.reason == Reason.LATE
+                reply, late = refusal(str(refused), refused.reason), refused.reason == Reason.LATE
         if keyed:
             self._outcomes[place] = first._replace(reply=b"" if late else reply)
             if len(self._outcomes) > _KEYS:
@@ -168,10 +168,9 @@ def accepted(reply: dict[str, Any]) -> bytes:
     return packed
 
 
-def refusal(refused: Refused) -> bytes:
+def refusal(error: str, reason: str) -> bytes:
     """Return the packed reply to a command that is not carried out."""
-    reply = {"ok": False, "error": str(refused), "reason": str(refused.reason)}
-    packed: bytes = msgpack.packb(reply)
+    packed: bytes = msgpack.packb({"ok": False, "error": error, "reason": str(reason)})
     return packed
 
 

@@ -3,6 +3,7 @@
 import os
 import select
 import stat
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -100,7 +101,7 @@ def test_multipart_nonsense_and_clients_that_go_away_change_nothing(server, cont
     assert send(addresses[1], {"command": "arm"}, 60.0)["ok"] is True
 
 
-@pytest.mark.parametrize("under_way", [1, 8])  # the second request waits in the queue, or the link
+@pytest.mark.parametrize("under_way", [1, 16])  # the second request waits in the queue, or the link
 def test_what_came_before_a_fence_is_refused_and_what_comes_after_is_not(
     context, addresses, monkeypatch, under_way
 ):
@@ -116,6 +117,35 @@ def test_what_came_before_a_fence_is_refused_and_what_comes_after_is_not(
         assert asking.told() == {"ok": True, "heard": "status"}, "it harms nobody"
         early.send("arm")
         assert early.told() == {"ok": True, "heard": "arm"}
+
+
+def test_a_request_takes_a_short_way(context, addresses):
+    """From the socket to the handler, which `Loop.command` and `Requests.carry_out` follow."""
+    passed: set[str] = set()
+    heard = []
+
+    def note(frame: Any, event: str, _: object) -> None:
+        code = frame.f_code
+        is_ours = "/daemon/" in code.co_filename
+        if event == "call" and not heard and is_ours and code.co_name[0] != "<":
+            passed.add(code.co_qualname)
+
+    def hear(request: dict[str, Any], age: float) -> dict[str, Any]:
+        heard.append(request)
+        return {}
+
+    with Served(commands=addresses[1]) as served:
+        asking = Asking(context, served, addresses[1], "arm")
+        asking.told()
+        asking.send("arm")
+        until(lambda: served.service.commands.socket.poll(0))
+        sys.setprofile(note)
+        try:
+            until(lambda: [served.serve(hear), heard][1])
+        finally:
+            sys.setprofile(None)
+    assert {"CommandEndpoint.read", "Link.look", "CommandServer.serve"} < passed
+    assert len(passed) <= 25 - 2, sorted(passed)
 
 
 ARM = msgpack.packb({"command": "arm"})
@@ -347,7 +377,7 @@ def test_of_setpoints_that_wait_only_the_newest_is_carried_out(context, addresse
         until(lambda: [served.settle(1), commands.count + len(served.link.asked) == 40][1])
         until(lambda: [served.serve(note), collected()][1])
         assert {19, 119} <= set(forces), "the newest of each connection"
-        assert len(forces) <= 2 * 40 / bounds.UNDER_WAY, "of those that the loop has at a time"
+        assert len(forces) <= 2 * -(-40 // bounds.UNDER_WAY), "of those that the loop has at a time"
         refused = {each["reason"] for found in replies for each in found if not each["ok"]}
         assert refused == {"superseded"}
 
