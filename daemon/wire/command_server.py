@@ -30,6 +30,7 @@ Handler = Callable[[dict[str, Any], float], dict[str, Any]]  # request, its age 
 
 _PAST_WITHIN = 0.4  # s that a local stop's answer waits for a gateway that may have died
 _A_TICK = 2  # commands carried out at one, a stop not counted
+_UNPACKED = 4096  # bytes after which no more requests are unpacked at a tick
 _KEYS = 256  # requests whose outcome is kept
 _KEY_LENGTH = 64
 _VALUES = (str, int, float)  # and bool, which is an int
@@ -94,8 +95,10 @@ class CommandServer:
     def _unpack(self, handler: Handler) -> None:
         """Take in what has come; carry out a stop, several at once as one."""
         stopped, waiting = b"", self._link.unpacked
-        while self._link.asked:
+        size = 0  # bytes
+        while self._link.asked and size < _UNPACKED:
             ask = self._link.asked.popleft()
+            size += len(ask.payload)
             try:
                 request = decode(ask.payload)
                 if ask.urgent and request["command"] != "stop":  # the map names two commands

@@ -127,7 +127,7 @@ class Link:
         self.wanted = 0  # topics as bits
         self.refused = 0  # requests that the gateway refused because too many came
         self.stops = 0  # stops before which all that comes now cannot have come
-        self.asked: deque[Ask] = deque()
+        self.asked: deque[Ask] = deque()  # urgent ones first
         self.unpacked: deque[tuple[Ask, dict[str, Any]]] = deque()  # that wait for their tick
         self.notices: deque[str] = deque(maxlen=_NOTICES)  # the gateway's warnings
         self.called = False  # something came at the descriptor of `watch`
@@ -160,7 +160,8 @@ class Link:
         if has_more or self._channel.fileno() in ready:
             for kind, *fields in self._channel.receive():
                 if kind == ASK:
-                    self.asked.append(Ask(*fields))
+                    ask = Ask(*fields)
+                    (self.asked.appendleft if ask.urgent else self.asked.append)(ask)
                 elif kind == REPORT:
                     self.wanted, self.refused, self.stops = fields
                 else:

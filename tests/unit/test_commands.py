@@ -389,6 +389,40 @@ def test_a_stop_is_one_whatever_it_holds_besides():
         decode(msgpack.packb({"command": "arm", "how": ["now"]}))
 
 
+def test_long_requests_are_unpacked_over_several_ticks_and_a_stop_before_them(context, addresses):
+    heard = []
+
+    def note(request: dict[str, Any], age: float) -> dict[str, Any]:
+        heard.append(request["command"])
+        return {}
+
+    with Served(commands=addresses[1], max_bytes=4096) as served:
+        client, stopper = context.socket(zmq.DEALER), context.socket(zmq.DEALER)
+        for socket in (client, stopper):
+            socket.setsockopt(zmq.LINGER, 0)
+            socket.connect(addresses[1])
+        long = msgpack.packb({"command": "move", "x": [[[1]] * 60] * 20})
+        for _ in range(bounds.UNDER_WAY):
+            client.send(long)
+        asked = served.link.asked
+        until(lambda: [served.settle(1), len(asked) == bounds.UNDER_WAY][1])
+        stopper.send(msgpack.packb({"command": "stop"}))
+        until(lambda: [served.settle(1), len(asked) == bounds.UNDER_WAY + 1][1])
+        served.server.serve(note)
+        assert heard == ["stop"]
+        assert len(asked) == bounds.UNDER_WAY - -(-4096 // len(long))
+        replies: list[str] = []
+
+        def answered() -> bool:
+            served.serve(note)
+            while client.poll(0):
+                replies.append(msgpack.unpackb(client.recv())["reason"])
+            return len(replies) == bounds.UNDER_WAY
+
+        until(answered)
+        assert set(replies) == {"request"}
+
+
 class Flood:
     """Clients that send without waiting for answers; nothing serves yet."""
 
