@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import difflib
 import importlib
+import io
 import os
 import re
 import signal
@@ -76,12 +77,18 @@ Exit status: 0 done; 1 it could not be done, with the reason; 2 wrong arguments 
 
 
 def _open_standard_streams() -> None:
-    """Open /dev/null for closed standard streams, so that no other file takes their place."""
+    """Open /dev/null for closed standard streams, so that no other file takes their place.
+
+    Characters that a terminal or pipe can't encode, such as θ, are replaced.
+    """
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:
             descriptor = os.open(os.devnull, os.O_RDWR)
             os.set_inheritable(descriptor, True)  # so that a child has them, too
             setattr(sys, name, os.fdopen(descriptor, mode))
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
 
 
 class Parser(argparse.ArgumentParser):
@@ -185,7 +192,11 @@ def _main(argv: Sequence[str] | None) -> int:
             file=sys.stderr,
         )
         return 1
-    parser, made = make_parser([called])
+    try:
+        parser, made = make_parser([called])
+    except SoftfingerError as error:
+        print(f"{called}: {error}", file=sys.stderr)
+        return 1
     if not called and words[0] not in _OPTIONS:
         near = difflib.get_close_matches(words[0], [*SUBCOMMANDS, *_OPTIONS], n=1)
         hint = f"nearest: {near[0]}" if near else "`softfinger help` lists them"

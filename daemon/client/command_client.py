@@ -6,6 +6,7 @@ import logging
 import math
 import secrets
 import time
+from numbers import Real
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -126,6 +127,22 @@ def send_once(address: str, attempts: Attempts, keys: ClientKeys | None = None) 
     return reply
 
 
+def _number(what: str, value: Any) -> float:
+    """Return a number as msgpack takes it, NumPy's scalars and 0-d arrays included.
+
+    Raises Refused for all else.
+    """
+    if getattr(value, "shape", None) == ():
+        value = value.item()
+    try:
+        if isinstance(value, Real) and not isinstance(value, bool):
+            return float(value)
+    except OverflowError:
+        pass  # an integer beyond the largest float
+    text = f"{what}: expected a number, found {type(value).__name__} {str(value)[:40]!r}"
+    raise Refused(text, Reason.REQUEST)
+
+
 def accepted(reply: dict[str, Any]) -> dict[str, Any]:
     """Return the reply without ``ok``. Raises Refused with the reason when it is not ok.
 
@@ -190,7 +207,11 @@ class HandClient(Generic[_Done]):
 
     def _request(self, name: str, numbers: dict[str, float | None]) -> dict[str, Any]:
         self._require_open()
-        given = {key: value for key, value in numbers.items() if value is not None}
+        given = {
+            key: _number(f"{name}: {key}", value)
+            for key, value in numbers.items()
+            if value is not None
+        }
         envelope = {"client": self.client} if self.client else {}
         return {"command": name, **given, **envelope}
 

@@ -101,4 +101,4 @@ def unpack(frames: list[bytes]) -> tuple[bytes, dict[str, Any]]:
 
 def still_waiting(what: str, timeout: float) -> str:
     """Return the warning about something that has not come yet."""
-    return f"no {what} yet, waiting up to {timeout:g} s"
+    return f"no {what} yet, waiting up to {round(timeout, 2):g} s"

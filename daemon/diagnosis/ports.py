@@ -162,12 +162,17 @@ _PATIENCE = 0.5  # s for a daemon to answer
 
 
 def check_addresses(settings: Settings) -> list[Finding]:
-    """Check that the stream's and the commands' address can be bound; name the holder if not."""
-    return [_check(settings, "stream"), _check(settings, "commands")]
+    """Check that all addresses can be bound; name the holder if not."""
+    found = [
+        _check(settings, "stream.address", settings.stream.address),
+        _check(settings, "commands.address", settings.commands.address),
+    ]
+    if settings.stream.latest:
+        found.append(_check(settings, "stream.latest", settings.stream.latest))
+    return found
 
 
-def _check(settings: Settings, section: str) -> Finding:
-    address, key = getattr(settings, section).address, f"{section}.address"
+def _check(settings: Settings, key: str, address: str) -> Finding:
     subject, trouble = f"socket {address}", why_not_free(address)
     if not trouble:
         return Finding("pass", subject, "free")

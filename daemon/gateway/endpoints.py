@@ -1,23 +1,16 @@
-"""The two addresses where clients come in: a ROUTER for commands, an XPUB for the stream.
+"""The addresses where clients come in, and who is let in.
 
-libzmq's own thread reads ahead of us, so what arrived before a stop is known by time alone. After
-it all requests are refused for a moment, and on while they come thicker than clients may send them,
-as those do that have waited. The stop's own answer waits as long, within a bound. If the socket was
-not polled for more than `bounds.GAP`, requests that are then found are dated by the poll before.
-
-Without keys everybody is let in, but libzmq hangs up on all who don't greet it as ZMTP 3 does: web
-pages among them, whose POST older versions take for messages.
+Without keys everybody is, but libzmq hangs up on all who don't greet it as ZMTP 3 does: web pages
+among them, whose POST older versions take for messages.
 """
 
 from __future__ import annotations
 
 import contextlib
 import errno
-import math
 import os
 import socket
-from collections import OrderedDict
-from collections.abc import Callable
+from collections import deque
 from pathlib import Path
 from typing import Any
 
@@ -28,15 +21,12 @@ from zmq.auth.thread import ThreadAuthenticator
 from softfinger.daemon.errors import AddressError, KeyFileError, NoDescriptor, SoftfingerError
 from softfinger.daemon.gateway import bounds
 from softfinger.daemon.gateway.bounds import Config
-from softfinger.daemon.gateway.request_queue import Client, RequestQueue
 from softfinger.daemon.wire.keys import ServerKeys, load_server
+from softfinger.daemon.wire.loop_link import repeated
 
-_NOW = int(zmq.NOBLOCK)
-_PARTS = bounds.PARTS + 1  # and the client's route
-_DOMAIN = "softfinger"
+NOW = int(zmq.NOBLOCK)
 IN_USE = "is in use; is another softfinger running?"
-
-Late = Callable[[int], list[tuple[int, bytes]]]
+_DOMAIN = "softfinger"
 
 
 class StartAnew(SoftfingerError):
@@ -152,26 +142,21 @@ class Endpoint:
         # These hold only for connections made after they were set, so before bind.
         self.socket.setsockopt(zmq.LINGER, int(1e3 * bounds.LAST_WORDS))
         self.socket.setsockopt(zmq.MAXMSGSIZE, limit)
-        queue = config.queue if kind == zmq.XPUB else bounds.QUEUE
-        self.socket.setsockopt(zmq.SNDHWM, queue)
+        self.socket.setsockopt(zmq.SNDHWM, bounds.QUEUE if kind == zmq.ROUTER else config.queue)
         self.socket.setsockopt(zmq.RCVHWM, bounds.QUEUE)
         admission.guard(self.socket)
         try:
             self._path = bind(self.socket, address, config.ipc_mode)
-        except BaseException as error:
+        except AddressError as error:
             self.socket.close()
-            if isinstance(error, AddressError):
-                raise AddressError(f"{key}: {error}") from None
-            raise
+            raise AddressError(f"{key}: {error}") from None
 
-    def _parts(self) -> list[zmq.Frame] | None:
-        """The next message's first few parts; None when there is none."""
+    def _parts(self) -> list[zmq.Frame]:
+        """The next message's first parts, one more than are allowed; empty when there is none."""
         found: list[zmq.Frame] = []
-        try:
+        with contextlib.suppress(zmq.Again):
             while not found or found[-1].more:
-                found[_PARTS:] = [self.socket.recv(_NOW, copy=False)]
-        except zmq.Again:
-            return None
+                found[bounds.PARTS :] = [self.socket.recv(NOW, copy=False)]
         return found
 
     def close(self) -> None:
@@ -181,138 +166,27 @@ class Endpoint:
                 Path(self._path).unlink()
 
 
-class CommandEndpoint(Endpoint):
-    """The socket by which requests come in and answers go out.
-
-    After a fence it reads what may have come before; `past` is the time from when on all that
-    comes came after it.
-    """
-
-    def __init__(
-        self,
-        admission: Admission,
-        config: Config,
-        requests: RequestQueue,
-        clock: Callable[[], float],
-    ) -> None:
-        """Raises AddressError."""
-        self._clock = clock
-        self._admission = admission
-        self._requests = requests
-        self._clients: OrderedDict[bytes, Client] = OrderedDict()
-        self.past = -math.inf
-        self._looked = clock()  # time of the last poll; nothing came before the socket was bound
-        # Time of the last poll before a gap; None once all requests from the gap have been read.
-        self._gap_began: float | None = None
-        self._gap_ended = 0.0
-        self._gap_left = 0  # requests that may still be from the gap
-        self._since = 0.0  # a fence was raised, or last looked at; since then …
-        self._came = 0  # … so many requests came that change something
-        self._replies: list[list[bytes]] = []  # held back until the fence is passed
-        self._held = 0.0  # s, of which each step counts PURGE at most: a stall doesn't use it up
-        limit = bounds.FRAMES * config.max_bytes
-        super().__init__(admission, zmq.ROUTER, config.commands, "commands.address", config, limit)
-
-    def raise_fence(self) -> None:
-        """Refuse what has arrived until now: it takes a moment to read that."""
-        self.past = self._requests.past = math.inf
-        self._since = self._clock()
-        self._came = 0
-
-    def read(self) -> None:
-        """Take in requests, for as long as others may wait."""
-        began = self._clock()
-        if began - self._looked > bounds.GAP:
-            if self._gap_began is None:
-                self._gap_began = self._looked
-            self._gap_ended = began
-            self._gap_left = bounds.CLIENTS * bounds.QUEUE
-        self._held += min(began - self._looked, bounds.PURGE)
-        self._looked = began
-        if self.past < math.inf or self._held > bounds.LONGEST_HELD:
-            self._answer_held()
-        while (now := self._clock()) < began + bounds.TURN:
-            parts = self._parts()
-            if parts is None:
-                self._has_read_all(now)
-                return
-            *route, payload = (part.bytes for part in parts)
-            self._came += b"status" not in payload
-            self._gap_left -= 1
-            if self._gap_left < 0:  # more than can have waited
-                self._gap_began = None
-            if len(route) < _PARTS:
-                came = now if self._gap_began is None else self._gap_began
-                client = self._client(route[0], self._admission.name(parts[-1]), now)
-                self._requests.take(client, route, payload, now, came)
-
-    def _has_read_all(self, now: float) -> None:
-        """Note that nothing waits: perhaps all has been read that came before a gap or a fence.
-
-        libzmq's thread may still hand on a message. So both take `PURGE` without a further gap.
-        """
-        if now - self._gap_ended > bounds.PURGE:
-            self._gap_began = None
-        if self.past == math.inf and now - self._since > bounds.PURGE:
-            if self._gap_began is None and self._came <= bounds.ALL_RATE * bounds.PURGE:
-                self.past = self._requests.past = now
-            self._since = now
-            self._came = 0
-
-    def _client(self, identity: bytes, name: str, now: float) -> Client:
-        client = self._clients.get(identity)
-        if client is None:
-            client = self._clients[identity] = self._requests.new_client(name, now)
-            if len(self._clients) > bounds.CLIENTS:
-                self._clients.popitem(last=False)
-        return client
-
-    def answer(self, route: list[bytes], reply: bytes) -> None:
-        """Send a reply, once what came before a fence has been read."""
-        message = [*route, reply]
-        if self.past < math.inf:
-            self._send(message)
-            return
-        if not self._replies:
-            self._held = 0.0
-        self._replies.append(message)
-
-    def _answer_held(self) -> None:
-        replies, self._replies = self._replies, []
-        for reply in replies:
-            self._send(reply)
-
-    def _send(self, message: list[bytes]) -> None:
-        try:
-            self.socket.send_multipart(message, _NOW)
-        except zmq.ZMQError:
-            pass  # the client has gone
-
-
 class StreamEndpoint(Endpoint):
     """The socket of the subscribers."""
 
-    def __init__(self, admission: Admission, config: Config, late: Late) -> None:
-        """``late`` gives what late subscribers to these topics (as bits) are told.
-
-        Raises AddressError.
-        """
-        self._names = tuple(name.encode() for name in config.topics.names)
-        self._matching = config.topics.matching
-        self._late = late
+    def __init__(self, admission: Admission, config: Config) -> None:
+        """Raises AddressError."""
+        self._topics = [name.encode() for name in config.topics]
         self._prefixes: set[bytes] = set()
+        self._kept: dict[int, deque[bytes]] = {}  # for late subscribers, by topic
         self._came_late = 0  # topics that are to be told again, as bits …
         self._tell_at = 0.0  # … then
         self.wanted = 0  # topics that somebody subscribes to, as bits
-        limit = bounds.SUBSCRIPTION
-        super().__init__(admission, zmq.XPUB, config.stream, config.stream_key, config, limit)
+        super().__init__(
+            *(admission, zmq.XPUB, config.stream, config.stream_key, config, bounds.SUBSCRIPTION)
+        )
         self.socket.setsockopt(zmq.XPUB_VERBOSE, 1)  # reports each subscriber of a topic
 
     def read(self, now: float) -> None:
         """Learn who came and went; tell all again what those who came have missed."""
         for _ in range(bounds.SUBSCRIPTIONS):
             parts = self._parts()
-            if parts is None:
+            if not parts:
                 break
             change = parts[0].bytes
             matching = self._matching(change[1:])
@@ -323,11 +197,22 @@ class StreamEndpoint(Endpoint):
                 self._prefixes.discard(change[1:])
         self.wanted = self._matching(*self._prefixes)
         if self._came_late and now >= self._tell_at:
-            for topic, message in self._late(self._came_late):
-                self.publish(topic, message)
+            for topic, kept in self._kept.items():
+                for message in kept if self._came_late >> topic & 1 else ():
+                    self._send(topic, message)
             self._came_late = 0
             self._tell_at = now + bounds.TELL_AGAIN
 
-    def publish(self, topic: int, message: bytes) -> None:
+    def _matching(self, *prefixes: bytes) -> int:
+        """Return the topics that begin with any of these, as bits."""
+        return sum(1 << k for k, name in enumerate(self._topics) if name.startswith(prefixes))
+
+    def publish(self, topic: int, keep: int, message: bytes) -> None:
+        """Send a message, and keep the last few for late subscribers."""
+        if keep:
+            self._kept.setdefault(topic, deque(maxlen=keep)).append(repeated(message))
+        self._send(topic, message)
+
+    def _send(self, topic: int, message: bytes) -> None:
         """One message to all who want its topic; a slow one's is dropped."""
-        self.socket.send_multipart((self._names[topic], message), _NOW)
+        self.socket.send_multipart((self._topics[topic], message), NOW)

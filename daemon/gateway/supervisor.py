@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
+import json
 import os
 import select
-import socket
 import subprocess
 import sys
 import threading
@@ -15,6 +14,7 @@ from pathlib import Path
 from softfinger.daemon.errors import AddressError
 from softfinger.daemon.gateway.bounds import Config
 from softfinger.daemon.wire import loop_link
+from softfinger.daemon.wire.loop_link import Channel, Link
 
 _ROOT = Path(__file__).parents[3]  # where the package is found
 _PATIENCE = 60.0  # s for a gateway to bind its sockets; one that ended is not waited for
@@ -28,11 +28,11 @@ class Gateway:
 
     def __init__(self, config: Config) -> None:
         """It starts beside whatever is done until `wait`."""
-        self.link = loop_link.Link()
+        self.link = Link()
         self._config = config
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
-        self._process, self._end = self._start()
+        self._process, self._channel = self._start()
 
     def wait(self) -> Gateway:
         """Be ready. Raises AddressError when the sockets can't be bound."""
@@ -45,16 +45,14 @@ class Gateway:
     def process(self) -> int:
         return self._process.pid
 
-    def _start(self) -> tuple[subprocess.Popen[bytes], socket.socket]:
+    def _start(self) -> tuple[subprocess.Popen[bytes], Channel]:
         ours, theirs = loop_link.pair()
         paths = [str(_ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
         with theirs:
+            # -P: a folder named daemon where this was started is not ours.
+            words = [sys.executable, "-P", "-m", f"{__package__}.server", str(theirs.fileno())]
             process = subprocess.Popen(
-                # -P: a folder named daemon where this was started is not ours.
-                [
-                    *(sys.executable, "-P", "-m", f"{__package__}.server"),
-                    *(str(theirs.fileno()), self._config.to_json()),
-                ],
+                [*words, json.dumps(self._config)],
                 pass_fds=(theirs.fileno(),),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
@@ -62,24 +60,17 @@ class Gateway:
                 start_new_session=True,
                 env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
             )
-        return process, ours
+        return process, Channel(ours)
 
     def _meet(self) -> None:
-        """Wait until its sockets are bound, and give it what lasts. Raises AddressError."""
-        ours = self._end
-        first = b""
-        if select.select([ours], [], [], _PATIENCE)[0]:
-            with contextlib.suppress(OSError):
-                first = ours.recv(loop_link.LARGEST)
-        if first[:1] == loop_link.FAILED:
-            raise AddressError(first[1:].decode())
-        if first[:1] != loop_link.READY:
-            raise AddressError("the process that serves clients could not be started")
-        try:
-            loop_link.send_all(ours, self.link.lasting)
-        except OSError as error:
-            raise AddressError(f"the process that serves clients: {error}") from None
-        self.link.offer(ours)
+        """Wait until its sockets are bound. Raises AddressError."""
+        select.select([self._channel], [], [], _PATIENCE)
+        for kind, *fields in self._channel.receive():
+            if kind == loop_link.READY:
+                self.link.offer(self._channel)
+                return
+            raise AddressError(*fields)
+        raise AddressError("the process that serves clients could not be started")
 
     def _watch(self) -> None:
         wait, longest = _AGAIN
@@ -89,28 +80,25 @@ class Gateway:
             if self._closing.is_set():
                 return
             if status != loop_link.ANEW:
-                self.link.notices.append(
-                    f"the process that serves clients ended ({_cause(status)})"
-                )
+                cause = f"signal {-status}" if status < 0 else f"status {status}"
+                self.link.notices.append(f"the process that serves clients ended ({cause})")
             if time.monotonic() - began > _LASTED:
                 wait = _AGAIN[0]
             error_before = ""
             while not self._closing.wait(wait):
                 wait = min(2.0 * wait, longest)
                 try:
-                    self._process, self._end = self._start()
+                    self._process, self._channel = self._start()
                     self._meet()
                 except (AddressError, OSError) as error:
-                    self._end.close()
-                    self._process.kill()
-                    self._process.wait()
+                    self._kill()
                     if str(error) != error_before:
                         error_before = str(error)
                         self.link.notices.append(f"clients can't be served: {error}")
                 else:
                     break
             if self._closing.is_set():  # while it was started
-                self._end.close()
+                self._channel.close()
 
     def _wait(self) -> int:
         """Wait for its end; one that is stopped is ended: its own timers don't run then."""
@@ -124,16 +112,20 @@ class Gateway:
                 self.link.notices.append("the process that serves clients was stopped")
                 process.kill()
 
+    def _kill(self) -> None:
+        self._channel.close()
+        self._process.kill()
+        self._process.wait()
+
     def close(self) -> None:
         """Disconnect, and wait until all has been sent."""
         self._closing.set()
         self.link.close()
-        self._end.close()
+        self._channel.close()
         try:
             self._process.wait(2.0)
         except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+            self._kill()
         if self._thread is not None:
             self._thread.join(2.0)
 
@@ -144,7 +136,3 @@ def _is_stopped(process: int) -> bool:
     except OSError:  # it has ended
         return False
     return state.split()[0] in "Tt"
-
-
-def _cause(status: int) -> str:
-    return f"signal {-status}" if status < 0 else f"status {status}"

@@ -118,6 +118,7 @@ class Daemon:
                 commands.per_second,
                 int(access.ipc_mode, 8),
                 access.keys,
+                latest=stream.latest,
             )
         )
         self._closers.append(gateway.close)

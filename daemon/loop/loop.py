@@ -57,9 +57,6 @@ class Commands(Protocol):
     def serve(self, handler: Handler) -> None:
         """Carry out through ``handler`` what is due at this tick."""
 
-    def start(self) -> None:
-        """Wait until commands are accepted."""
-
     def raise_fence(self) -> None:
         """Refuse all commands that arrived before now, except stop and status: the hand stopped."""
 
@@ -141,8 +138,6 @@ class Loop:
         """Tick until `end` is called or ``duration`` s have passed; torque is off afterwards."""
         self.state.t = self._clock.now()
         self.state.wall = self._clock.wall()
-        if self._server is not None:
-            self._server.start()
         self.emit("info", "start", "running, disarmed")
         try:
             self.advance(duration)

@@ -170,9 +170,6 @@ class _Commands:
                 pass  # carried out when it was recorded: the comparison will show it
         self.waiting = []
 
-    def start(self) -> None:
-        pass
-
     def raise_fence(self) -> None:
         pass
 

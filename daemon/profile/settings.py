@@ -322,6 +322,9 @@ class StreamSettings(Section):
     """The published stream. A topic is sent every n-th tick, with the n nearest to its rate."""
 
     address: str = setting(STREAM_ADDRESS, "", "Address of the stream, tcp or ipc.")
+    latest: str = setting(
+        "", "", "Address where each state is sent in one frame, for `ZMQ_CONFLATE`; empty: none."
+    )
     state_rate: Rate = setting(100.0, "Hz", "Rate of the state.")
     tactile_rate: Rate = setting(100.0, "Hz", "Rate of each finger's frames.")
     tactile_unit: Literal["count", "Pa"] = setting(
@@ -340,7 +343,7 @@ class CommandSettings(Section):
     on_silence: Literal["hold", "release", "stop"] = setting(
         "hold", "", "Action when the client in control falls silent."
     )
-    max_bytes: int = setting(4096, "bytes", "Longest command.", ge=64, le=1_000_000)
+    max_bytes: int = setting(4096, "bytes", "Longest command.", ge=64, le=65_536)
     per_second: float = setting(
         200.0, "Hz", "Rate of commands that one client may send; `stop` is always accepted.",
         ge=1, le=10_000

@@ -313,13 +313,19 @@ def address_problem(address: str, lacking: str) -> str:
 
 
 def _addresses(settings: Settings) -> Iterator[str]:
-    stream, commands = settings.stream.address, settings.commands.address
-    for key, address in (("stream.address", stream), ("commands.address", commands)):
+    addresses = {
+        "stream.address": settings.stream.address,
+        "commands.address": settings.commands.address,
+    }
+    if settings.stream.latest:
+        addresses["stream.latest"] = settings.stream.latest
+    for key, address in addresses.items():
         problem = address_problem(address, "" if settings.access.keys else "access.keys")
         if problem:
             yield f"{key}: {problem}"
-    if stream == commands:
-        yield f"commands.address: found {shown(commands)}, expected another than stream.address"
+        first = next(other for other in addresses if addresses[other] == address)
+        if first != key:
+            yield f"{key}: found {shown(address)}, expected another than {first}"
 
 
 def _folder(settings: Settings) -> Iterator[str]:

@@ -1,7 +1,8 @@
-"""The loop's side of commands: takes requests from the gateway, and has them carried out.
+"""The loop's side of commands: unpacks requests that the gateway passes on, and answers them.
 
-It runs in the loop's thread, once a tick, without a lock. A ``stop`` goes first; what came before
-one is refused, wherever it waits (see `gateway.request_queue`), but for a ``status``.
+It runs in the loop's thread, once a tick, without a lock. A ``stop`` goes first. What came before
+one is refused, wherever it waited, but for a ``status``: its stamp counts fewer stops. A ``hold``
+takes the place of the one that waits just before it.
 
 A client may give a request a ``key`` that no other request has, and send the same map again when it
 was refused as late. The command is then carried out once at most, and only if no other command was
@@ -11,7 +12,6 @@ carried out since that refusal: the newest command prevails. What can only make 
 
 from __future__ import annotations
 
-import math
 import time
 from collections import OrderedDict
 from collections.abc import Callable
@@ -30,6 +30,7 @@ Handler = Callable[[dict[str, Any], float], dict[str, Any]]  # request, its age 
 
 _PAST_WITHIN = 0.4  # s that a local stop's answer waits for a gateway that may have died
 _A_TICK = 2  # commands carried out at one, a stop not counted
+_UNPACKED = 4096  # bytes after which no more requests are unpacked at a tick
 _KEYS = 256  # requests whose outcome is kept
 _KEY_LENGTH = 64
 _VALUES = (str, int, float)  # and bool, which is an int
@@ -59,7 +60,8 @@ class CommandServer:
         self._clock = clock
         self._stops = 0
         self._changes = 0  # commands carried out that may change the hand, but for stops
-        self._outcomes: OrderedDict[bytes, _Outcome] = OrderedDict()  # by request, oldest first
+        # By the key's client and the request, oldest first.
+        self._outcomes: OrderedDict[tuple[str, bytes], _Outcome] = OrderedDict()
         self._stopped: bytes | None = None  # answer to a local stop, until the gateway knows it
         self._answer_by = 0.0
         if local is not None:
@@ -75,57 +77,71 @@ class CommandServer:
 
         It raises Refused with the reason.
         """
-        link = self._link
-        link.look()
-        if self._local is not None and (link.called or self._stopped is not None):
-            self._serve_local(self._local, handler)
-        while link.stops:
-            stop = link.stops.popleft()
-            reply = _accepted(handler(msgpack.unpackb(stop.packed), 0.0))
-            self.raise_fence()  # before the answer, after which its client may go on
-            link.reply(stop.number, reply)
-        for _ in range(_A_TICK):
-            while link.asked and link.asked[0].came < link.past:
-                ask = link.asked.popleft()
-                link.reply(ask.number, self._answer(ask, _refuse_stopped))
-            if not link.asked:
-                return
-            ask = link.asked.popleft()
-            link.reply(ask.number, self._answer(ask, handler))
-
-    def start(self) -> None:
-        """Wait until commands are accepted: not for a tick."""
-        ready_by = time.monotonic() + _PAST_WITHIN
         self._link.look()
-        while self._link.past == math.inf and time.monotonic() < ready_by:
-            self._link.wait(_PAST_WITHIN)
+        if self._local is not None and (self._link.called or self._stopped is not None):
+            self._serve_local(self._local, handler)
+        self._unpack(handler)
+        waiting, done = self._link.unpacked, 0
+        while waiting and done < _A_TICK:
+            ask, request = waiting.popleft()
+            done += ask.stops == self._stops
+            self._link.reply(ask, self._answer(ask, request, handler))
 
     def raise_fence(self) -> None:
         """Refuse all commands that arrived before now, except stop and status: the hand stopped."""
         self._stops += 1
-        self._link.raise_fence()
+        self._link.fence(self._stops)
 
-    def _answer(self, ask: Ask, handler: Handler) -> bytes:
+    def _unpack(self, handler: Handler) -> None:
+        """Take in what has come; carry out a stop, several at once as one."""
+        stopped, waiting = b"", self._link.unpacked
+        size = 0  # bytes
+        while self._link.asked and size < _UNPACKED:
+            ask = self._link.asked.popleft()
+            size += len(ask.payload)
+            try:
+                request = decode(ask.payload)
+                if ask.urgent and request["command"] != "stop":  # the map names two commands
+                    raise _malformed('expected one text under "command"')
+            except Refused as refused:
+                self._link.reply(ask, refusal(str(refused), refused.reason))
+                continue
+            if ask.name:
+                request["client"] = ask.name
+            if request["command"] == "stop":
+                if not stopped:
+                    stopped = accepted(handler({"command": "stop", "client": ask.name}, 0.0))
+                    self.raise_fence()  # before the answer, after which its client may go on
+                self._link.reply(ask, stopped)
+                continue
+            mine = [other for other in waiting if other[0].route[0] == ask.route[0]]
+            if mine and _replaces(request, mine[-1][1]):
+                waiting.remove(mine[-1])
+                text = "hold: a newer one of this connection replaced it"
+                self._link.reply(mine[-1][0], refusal(text, Reason.SUPERSEDED))
+            waiting.append((ask, request))
+
+    def _answer(self, ask: Ask, request: dict[str, Any], handler: Handler) -> bytes:
         """Return the reply to a request; one that has a key is carried out once at most."""
-        request = msgpack.unpackb(ask.packed)
-        name = request["command"]
+        name, place = request["command"], (ask.name, ask.payload)
         keyed = request.pop("key", None) is not None and name not in UNLEASED
         present = _Outcome(self._stops, self._changes, b"")
-        first = self._outcomes.pop(ask.packed, present) if keyed else present
+        first = self._outcomes.pop(place, present) if keyed else present
         reply, late = first.reply, False
         if not reply:
             try:
-                if first.stops != self._stops:
-                    raise stopped()
+                if first.stops != self._stops or (ask.stops != self._stops and name != "status"):
+                    text = "not carried out: it came before a stop, or too soon after it"
+                    raise Refused(text, Reason.STOPPED)
                 if first.changes != self._changes:
                     text = f"{name}: another command was carried out since this one was late"
                     raise Refused(text, Reason.SUPERSEDED)
-                reply = _accepted(handler(request, self._clock() - ask.came))
+                reply = accepted(handler(request, self._clock() - ask.came))
                 self._changes += name != "status"
             except Refused as refused:
-                reply, late = refusal(refused), refused.reason == Reason.LATE
+                reply, late = refusal(str(refused), refused.reason), refused.reason == Reason.LATE
         if keyed:
-            self._outcomes[ask.packed] = first._replace(reply=b"" if late else reply)
+            self._outcomes[place] = first._replace(reply=b"" if late else reply)
             if len(self._outcomes) > _KEYS:
                 self._outcomes.popitem(last=False)
         return reply
@@ -133,34 +149,31 @@ class CommandServer:
     def _serve_local(self, local: LocalStop, handler: Handler) -> None:
         self._link.called = False
         if local.take():
-            self._stopped = _accepted(handler({"command": "stop"}, 0.0))
+            self._stopped = accepted(handler({"command": "stop"}, 0.0))
             self.raise_fence()
             self._answer_by = time.monotonic() + _PAST_WITHIN
         if self._stopped is not None and (
-            self._link.past < math.inf or time.monotonic() > self._answer_by
+            self._link.stops == self._stops or time.monotonic() > self._answer_by
         ):
             local.answer(self._stopped)
             self._stopped = None
 
 
-def _accepted(reply: dict[str, Any]) -> bytes:
+def _replaces(request: dict[str, Any], other: dict[str, Any]) -> bool:
+    """Return True if a hold sets all that another one before it does."""
+    is_hold = request["command"] == other["command"] == "hold"
+    return is_hold and other.keys() - {"key"} <= request.keys()
+
+
+def accepted(reply: dict[str, Any]) -> bytes:
+    """Return the packed reply to a command that is carried out."""
     packed: bytes = msgpack.packb({"ok": True, **reply})
     return packed
 
 
-def _refuse_stopped(*_: object) -> dict[str, Any]:
-    raise stopped()
-
-
-def stopped() -> Refused:
-    """Return the refusal of a command that may have been sent before a stop."""
-    return Refused("not carried out: it came before a stop, or too soon after it", Reason.STOPPED)
-
-
-def refusal(refused: Refused) -> bytes:
+def refusal(error: str, reason: str) -> bytes:
     """Return the packed reply to a command that is not carried out."""
-    reply = {"ok": False, "error": str(refused), "reason": str(refused.reason)}
-    packed: bytes = msgpack.packb(reply)
+    packed: bytes = msgpack.packb({"ok": False, "error": error, "reason": str(reason)})
     return packed
 
 

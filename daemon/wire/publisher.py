@@ -1,7 +1,7 @@
 """The publisher: messages of the stream, packed as the schema says and given to the gateway.
 
-The integers of the two topics that may go out at every tick, `hand/state` and `hand/input`, take 64
-bits whatever their value, so that a message keeps its length while its texts stay.
+Integers take msgpack's smallest form, so that JavaScript clients get numbers wherever one can hold
+the value. Floats always take 64 bits.
 
 A subscriber that comes late, stops reading or dies changes nothing here: the gateway sends to all
 of them, and repeats the settings and the last events, with ``again`` true, for late ones. Topics
@@ -19,8 +19,8 @@ import msgpack
 
 from softfinger.daemon.types import HandFacts
 from softfinger.daemon.wire.fields import FieldSource, Getter, members
-from softfinger.daemon.wire.loop_link import Link, Topics
-from softfinger.daemon.wire.schema import COMMAND, EVENT, INPUT, SETTINGS, STATE, TOPICS
+from softfinger.daemon.wire.loop_link import Link
+from softfinger.daemon.wire.schema import COMMAND, EVENT, SETTINGS, TOPICS
 
 Pack = Callable[[Any], bytes]
 
@@ -28,17 +28,16 @@ pack = msgpack.Packer(use_bin_type=True).pack
 _float = partial(struct.Struct(">Bd").pack, 0xCB)
 _bool = (b"\xc2", b"\xc3").__getitem__
 _PACK: dict[type, Pack] = {int: pack, float: _float, bool: _bool, str: pack, bytes: pack}
-_WIDE: dict[type, Pack] = _PACK | {int: partial(struct.Struct(">Bq").pack, 0xD3)}
 
 
 def packer(topic: bytes) -> Callable[..., bytes]:
     """Return the function that packs a topic's messages from its source's arguments."""
     source = TOPICS[topic].source
-    pack_map = _packer(TOPICS[topic].record, _WIDE if topic in (STATE, INPUT) else _PACK)
+    pack_map = _packer(TOPICS[topic].record)
     return lambda *arguments: pack_map(source(*arguments))
 
 
-def _packer(record: type[Any], kinds: dict[type, Pack]) -> Pack:
+def _packer(record: type[Any]) -> Pack:
     """Return the function that packs a record's map from what it is taken from."""
     # Sources behind the first are each had from an earlier one, values each from one of them.
     sources: list[tuple[int, Getter]] = []
@@ -57,7 +56,7 @@ def _packer(record: type[Any], kinds: dict[type, Pack]) -> Pack:
             pack(each.name),
             index(each.source),
             each.get,
-            kinds.get(each.type) or _packer(each.type, kinds),
+            _PACK.get(each.type) or _packer(each.type),
         )
         for each in members(record)
     ]
@@ -76,9 +75,8 @@ def _packer(record: type[Any], kinds: dict[type, Pack]) -> Pack:
 
 
 _INDEX = {topic: index for index, topic in enumerate(TOPICS)}
-GATEWAY_TOPICS = Topics(
-    tuple(topic.decode() for topic in TOPICS), settings=_INDEX[SETTINGS], events=_INDEX[EVENT]
-)
+GATEWAY_TOPICS = [topic.decode() for topic in TOPICS]
+KEPT = {SETTINGS: 1, EVENT: 50}  # messages that late subscribers get again
 
 
 def bit(topic: bytes) -> int:
@@ -113,7 +111,7 @@ class Publisher:
     def event(self, wall: float, t: float, level: str, kind: str, text: str) -> None:
         """Publish ``hand/event``."""
         packed = self._pack[EVENT](self._count(EVENT), wall, t, level, kind, text)
-        self._link.publish(_INDEX[EVENT], packed, keep=True)
+        self._link.publish(_INDEX[EVENT], packed, KEPT[EVENT])
 
     def command(
         self, wall: float, t: float, tick: int, request: dict[str, Any], error: str
@@ -125,7 +123,7 @@ class Publisher:
     def settings(self, wall: float, t: float, facts: HandFacts) -> None:
         """Publish ``hand/settings``, once."""
         packed = self._pack[SETTINGS](self._count(SETTINGS), wall, t, facts)
-        self._link.publish_lasting(_INDEX[SETTINGS], packed)
+        self._link.publish(_INDEX[SETTINGS], packed, KEPT[SETTINGS])
 
     def _count(self, topic: bytes) -> int:
         self._counts[topic] += 1

@@ -27,8 +27,20 @@ a test keeps it true.
 
 Schema {SCHEMA}. Two frames a message, topic and msgpack map with text keys, in SI units. Fields are
 only ever added, none is left out, and none changes its type: a float is always sent as a float. A
-field named `left.q` is `q` in the map `left`. The integers of `hand/state` and `hand/input` take 64
-bits whatever their value.
+field named `left.q` is `q` in the map `left`. Integers are sent in msgpack's
+smallest form: JavaScript reads those below 2³² as numbers, and `mono_ns` perhaps as BigInt.
+
+A subscriber that wants the newest state alone can set `ZMQ_CONFLATE`, which drops messages of two
+frames. Set `stream.latest = "tcp://127.0.0.1:9874"` in the profile: each `hand/state` then also
+goes out on that address, as one frame that holds the map alone. Subscribe there to everything:
+
+```python
+newest = zmq.Context.instance().socket(zmq.SUB)
+newest.setsockopt(zmq.CONFLATE, 1)
+newest.subscribe(b"")
+newest.connect("tcp://127.0.0.1:9874")
+state = msgpack.unpackb(newest.recv())
+```
 
 `timestamp` is the machine's Unix time. `mono_ns` is the daemon's clock, for differences: the
 machine's monotonic clock or, of a hand simulated in the daemon, one that waits while the machine is
@@ -49,6 +61,11 @@ one of these texts:
 """
 
 _KEYS = """\
+
+Any socket may send a command that may talk to a REP socket: REQ, also with `REQ_CORRELATE`, and
+DEALER. The reply begins with all frames up to the first empty one. A DEALER may leave out the empty
+frame; its reply has none either. A command in several frames, or in an envelope of more than 14
+frames or 1,024 bytes, is refused as `request`.
 
 After a stall of the daemon, the commands that waited are older than their clients expected. `arm`
 and all commands that move the hand or change its grip are then refused as `late` if they are older

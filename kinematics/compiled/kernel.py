@@ -14,6 +14,7 @@ from typing import Any, TypeVar, cast
 
 import numba
 
+from softfinger import SoftfingerError
 from softfinger.kinematics.compiled import plain
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -25,8 +26,16 @@ _OPTIONS: dict[str, Any] = {"error_model": "numpy"}
 _SUMS = {"reassoc", "contract", "nsz", "arcp"}
 
 
+class JitDisabled(SoftfingerError):
+    """Numba is told not to compile. The message says what mends it."""
+
+
 def _chosen() -> tuple[ModuleType, str]:
     """Return what compiles, and why it is Numba alone, else an empty text."""
+    if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
+        raise JitDisabled(
+            "NUMBA_DISABLE_JIT is set: the kernels run compiled only; unset it to go on"
+        )
     if ".".join(numba.__version__.split(".")[:2]) not in TESTED:
         return plain, f"Numba {numba.__version__} is not one of {', '.join(TESTED)}"
     try:

@@ -189,6 +189,9 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     def _act(self, action: NDArray[np.float64]) -> None:
         first, second = action.tolist()
         self._refused = ""
+        if not np.isfinite(action).all():
+            self._refused = f"action: found {[first, second]}, expected finite numbers"
+            return
         if not self._by_law:
             low, high = self._settings.hand.q_min, self._settings.hand.q_max
             for i, share in enumerate((first, second)):

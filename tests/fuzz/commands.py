@@ -117,12 +117,11 @@ class CommandTarget:
         raise AssertionError("no reply")
 
     def _directly(self, message: bytes) -> dict[str, Any]:
-        queue, replies = self.served.service.requests, []
+        commands, replies = self.served.service.commands, []
         with patch.object(
-            queue, "_answer", lambda _, reply: replies.append(msgpack.unpackb(reply))
+            commands, "_answer", lambda _, reply: replies.append(msgpack.unpackb(reply))
         ):
-            now = machine_time()
-            queue.take(queue.new_client("", now), [], message, now, now)
+            commands._take([b"%d" % self.asked, message], "", machine_time())
             for _ in range(3):
                 self.served.serve(self.loop.command)
                 if replies:

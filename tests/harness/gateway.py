@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+import select
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -31,21 +31,23 @@ class Served:
         per_second: float = 1e6,
         ipc_mode: int = 0o600,
         keys: str = "",
+        latest: str = "",
         clock: VirtualClock | None = None,
     ) -> None:
         self.link = loop_link.Link()
         ours, theirs = loop_link.pair()
         config = Config(
-            stream, commands, GATEWAY_TOPICS, queue, max_bytes, per_second, ipc_mode, keys
+            *(stream, commands, GATEWAY_TOPICS, queue, max_bytes, per_second, ipc_mode, keys),
+            latest=latest,
         )
         try:
             now = loop_link.machine_time if clock is None else clock.now
-            self.service = Server(theirs, config, now)
+            self.service = Server(loop_link.Channel(theirs), config, now)
         except BaseException:
             ours.close()
             theirs.close()
             raise
-        self.link.offer(ours)
+        self.link.offer(loop_link.Channel(ours))
         self.publisher = Publisher(self.link)
         self.server = CommandServer(self.link, clock=now)
         self._clock = clock
@@ -57,14 +59,14 @@ class Served:
         if self._clock is not None:
             self._clock.sleep_until(self._clock.now() + bounds.PURGE)
         self.settle()
-        return self.link.past < math.inf
+        return self.link.stops == self.server._stops
 
     def settle(self, times: int = 3) -> None:
         """Let the link carry what is on the way."""
         for _ in range(times):
             self.service.step(0.0)
             self.link.look()
-        while self.service._unsent:  # on a busy machine one turn isn't enough
+        while select.select([self.service.channel], [], [], 0)[0]:  # long messages take more
             self.service.step(0.0)
 
     def serve(self, handler: Handler) -> None:
@@ -94,6 +96,7 @@ class Served:
     def close(self) -> None:
         self.link.close()
         self.service.close()
+        self.service.channel.close()
 
     def __enter__(self) -> Served:
         return self

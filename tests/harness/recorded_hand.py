@@ -38,9 +38,6 @@ class Script:
             except Refused:
                 self.refused += 1
 
-    def start(self) -> None:
-        pass
-
     def raise_fence(self) -> None:
         pass
 
@@ -53,10 +50,8 @@ class Keeping(Link):
         self._taken = taken
         self.wanted = -1
 
-    def publish(self, topic: int, message: bytes, keep: bool = False) -> None:
-        self._taken.append((GATEWAY_TOPICS.names[topic].encode(), msgpack.unpackb(message)))
-
-    publish_lasting = publish
+    def publish(self, topic: int, message: bytes, keep: int = 0) -> None:
+        self._taken.append((GATEWAY_TOPICS[topic].encode(), msgpack.unpackb(message)))
 
 
 def published(

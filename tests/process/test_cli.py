@@ -1,6 +1,7 @@
 """The command line, as real processes: run, send, signals, a second daemon, bad settings."""
 
 import json
+import os
 import select
 import signal
 from concurrent.futures import ThreadPoolExecutor
@@ -134,8 +135,8 @@ def stalled(daemon: Any, context: Any, *requests: dict[str, Any]) -> list[dict[s
     daemon.running.process.send_signal(signal.SIGSTOP)
     for request in requests:
         socket.send_multipart([b"", msgpack.packb(request)])
-    socket.send_multipart([b"", b"no command"])  # which the gateway refuses by itself:
-    assert socket.poll(60_000)  # it has those before it, too
+    socket.send_multipart([b"", b"x" * 5000])  # too long: the gateway refuses it by itself
+    assert socket.poll(60_000)  # and has those before it, too
     assert msgpack.unpackb(socket.recv_multipart()[-1])["reason"] == "request"
     select.select([], [], [], 0.5)  # the stall itself
     daemon.running.process.send_signal(signal.SIGCONT)
@@ -184,3 +185,22 @@ def test_an_ipc_address_never_replaces_a_file(tmp_path, profile, inline):
     assert done.returncode == 1
     assert "is there already and is no socket" in done.stderr
     assert file.read_text(encoding="utf-8") == "kept"
+
+
+@pytest.mark.parametrize("words", [("limits",), ("config", "reference"), ("help", "run")])
+def test_characters_that_a_pipe_cannot_encode_are_replaced(words):
+    plain, ascii_alone = (
+        softfinger(*words, env=os.environ | {"PYTHONIOENCODING": encoding})
+        for encoding in ("utf-8", "ascii")
+    )
+    assert (ascii_alone.returncode, ascii_alone.stderr) == (0, "")
+    assert ascii_alone.stdout == plain.stdout.encode("ascii", "replace").decode()
+
+
+def test_a_compiler_that_is_switched_off_is_told_in_one_line():
+    done = softfinger("limits", env=os.environ | {"NUMBA_DISABLE_JIT": "1"})
+    assert done.returncode == 1
+    assert done.stdout == ""
+    assert done.stderr == (
+        "limits: NUMBA_DISABLE_JIT is set: the kernels run compiled only; unset it to go on\n"
+    )

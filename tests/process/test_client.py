@@ -6,6 +6,8 @@ import json
 import math
 import re
 from collections.abc import Iterator
+from fractions import Fraction
+from typing import Any
 
 import msgpack
 import numpy as np
@@ -15,7 +17,7 @@ from softfinger import AsyncHand, Hand, HandFault, HandState, NoAnswer, NoStream
 from softfinger.daemon.client import command_client
 from softfinger.daemon.client.asynchronous import AsyncSubscription
 from softfinger.daemon.client.command_client import UNCONFIRMED
-from softfinger.daemon.client.connection import SILENCE
+from softfinger.daemon.client.connection import SILENCE, still_waiting
 from softfinger.daemon.client.hand import Subscription
 from softfinger.daemon.client.stream import Gaps, read, to_columns
 from softfinger.daemon.errors import HandClosed, SettingsError
@@ -119,6 +121,49 @@ def test_who_waits_for_a_daemon_says_for_what(addresses, caplog):
         f"no answer to arm from {commands} yet, waiting up to 1.05 s",
     ]
     assert caplog.messages == said + said
+
+
+def test_a_time_that_is_waited_for_is_rounded():
+    assert still_waiting("state", 9.99947).endswith("waiting up to 10 s")
+    assert still_waiting("state", 86400.0).endswith("waiting up to 86400 s")
+
+
+@pytest.mark.parametrize(
+    ("given", "sent"),
+    [
+        (np.float32(0.5), 0.5),
+        (np.float64(0.1), 0.1),
+        (np.int64(3), 3.0),
+        (np.uint8(3), 3.0),
+        (np.array(0.25), 0.25),
+        (np.array(2), 2.0),
+        (Fraction(1, 4), 0.25),
+        (5, 5.0),
+    ],
+)
+def test_whatever_is_a_number_is_sent_as_one(fake, hand, given, sent):
+    hand.grasp(force=given)
+    assert fake.requests[-1] == {"command": "grasp", "force": sent}
+    asyncio.run(grasp_async(fake, given))
+    assert fake.requests[-1] == {"command": "grasp", "force": sent}
+
+
+async def grasp_async(fake: FakeDaemon, force: Any) -> None:
+    async with AsyncHand(fake.state_address, fake.command_address, timeout=60.0) as hand:
+        await hand.grasp(force=force)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [True, np.bool_(True), "5", np.array([5.0]), [5.0], 1j, np.array("5"), 10**400, object(), b"5"],
+)
+def test_what_is_no_number_is_refused_by_its_parameters_name(fake, hand, given):
+    with pytest.raises(Refused, match="hold: angle: expected a number, found") as caught:
+        hand.hold(force=5.0, angle=given)
+    assert caught.value.reason == "request"
+    with pytest.raises(Refused, match="grasp: force: expected a number, found"):
+        asyncio.run(grasp_async(fake, given))
+    assert all(request == {"command": "status"} for request in fake.requests)
 
 
 LATE = {"ok": False, "error": "arm: 0.40 s old when its turn came", "reason": "late"}

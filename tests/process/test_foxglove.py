@@ -223,7 +223,8 @@ def test_a_client_that_takes_nothing_makes_room_for_another(stranger):
             client = stack.enter_context(
                 socket.create_connection(place(address.removeprefix("ws://")), timeout=WAIT)
             )
-            client.sendall(REQUEST)
+            host = address.removeprefix("ws://").encode()
+            client.sendall(REQUEST.replace(b"HOST", host))
             answer = b""
             while b'"advertise"' not in answer:
                 answer += client.recv(65536)
@@ -252,7 +253,7 @@ def test_what_asks_for_nothing_or_what_isnt_is_ended(stranger):
 
 
 REQUEST = (
-    b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+    b"GET / HTTP/1.1\r\nHost: HOST\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
     b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: MDEyMzQ1Njc4OWFiY2RlZg==\r\n\r\n"
 )
 

@@ -6,9 +6,11 @@ import http.client
 import math
 import select
 import signal
+import socket
 import threading
+import time
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
@@ -94,6 +96,77 @@ def ask(host: str, query: str, asked: Any, **more: Any) -> str:
     with connect(f"ws://{host}/command{query}", proxy=None, open_timeout=WAIT, **more) as line:
         line.send(orjson.dumps(asked).decode())
         return str(line.recv(timeout=WAIT))
+
+
+ANSWERS = [("/", {}, 200), ("/nothing", {}, 404), ("/", {"Host": "evil.example"}, 403)]
+
+
+@pytest.mark.parametrize(("path", "headers", "status"), ANSWERS)
+def test_no_answer_is_kept_framed_or_told_to_others(served, path, headers, status):
+    _, viewed = served
+    connection = http.client.HTTPConnection(viewed.host, timeout=WAIT)
+    connection.request("GET", path, headers=headers)
+    answer = connection.getresponse()
+    connection.close()
+    assert answer.status == status
+    assert answer.headers["Referrer-Policy"] == "no-referrer"
+    assert answer.headers["Cache-Control"] == "no-store"
+    assert "frame-ancestors 'none'" in answer.headers["Content-Security-Policy"]
+
+
+ODD = ["[" * 30_000, '{"command": ' + "[" * 30_000, '{"command":"a","x":' + "9" * 40 + "}"]
+ODD += ['{"command": "\\ud800"}', "{"]
+
+
+@pytest.mark.parametrize("odd", ODD)
+def test_what_is_no_command_is_answered(served, odd):
+    fake, viewed = served
+    query = viewed.commanding.partition("/?")[2]
+    address = f"ws://{viewed.host}/command?{query}"
+    with connect(address, proxy=None, open_timeout=WAIT) as line:
+        for _ in range(2):  # the page may go on
+            line.send(odd)
+            assert str(line.recv(timeout=WAIT)).startswith("✗ no command: ")
+    assert fake.requests == []
+
+
+def test_ctrl_c_ends_it_while_the_daemon_does_not_answer(addresses):
+    with Viewed("--address", ",".join(addresses), "--timeout", "100000") as viewed:
+        query = viewed.commanding.partition("/?")[2]
+        address = f"ws://{viewed.host}/command?{query}"
+        with connect(address, proxy=None, open_timeout=WAIT) as line:
+            line.send(orjson.dumps({"command": "arm", "seen": time.monotonic()}).decode())
+            assert any("no answer to arm" in line for line in viewed.process.stderr)  # it waits
+            viewed.process.send_signal(signal.SIGINT)
+            assert viewed.process.wait(WAIT) == 1  # nothing was shown
+
+
+def test_ctrl_c_ends_it_while_a_page_takes_nothing(served):
+    with FakeDaemon() as fake, view(fake) as viewed:
+        host, _, port = viewed.host.partition(":")
+        with socket.socket() as page:
+            page.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            page.connect((host, int(port)))
+            page.settimeout(WAIT)
+            page.sendall(WATCH.format(host=viewed.host).encode())
+            wish = bytes([0x81, 0x80, 0, 0, 0, 0])  # an empty text frame
+            page.setblocking(False)
+            begun = fake.published
+
+            def is_stuck() -> bool:
+                with suppress(BlockingIOError):
+                    page.send(wish)
+                return fake.published > begun + 500  # pictures of 5 s wait for the page
+
+            until(is_stuck)
+            viewed.process.send_signal(signal.SIGINT)
+            assert viewed.process.wait(WAIT) == 0
+
+
+WATCH = (
+    "GET /pictures HTTP/1.1\r\nHost: {host}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+    "Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: MDEyMzQ1Njc4OWFiY2RlZg==\r\n\r\n"
+)
 
 
 # What is shown
@@ -229,7 +302,9 @@ def test_other_hosts_and_origins_are_refused_and_nothing_else_listens(served):
     port = viewed.host.rpartition(":")[2]
     assert got(viewed.host, "/")[0] == 200
     assert got(viewed.host, "/", Host=f"localhost:{port}")[0] == 200
-    for host in ("evil.example", f"evil.example:{port}", "127.0.0.1.evil.example", ""):
+    hosts = ("evil.example", f"evil.example:{port}", "127.0.0.1.evil.example", "")
+    inexact = ("127.0.0.1", "localhost:1", f"{viewed.host}:evil", f"{viewed.host}@evil.example")
+    for host in (*hosts, *inexact):
         assert got(viewed.host, "/", Host=host)[0] == 403
     for origin in (
         "http://evil.example",

@@ -139,7 +139,7 @@ class Listener(Link):
     def gaps(self) -> int:
         return sum(each.lost for each in self._gaps.values())
 
-    def publish(self, topic: int, message: bytes, keep: bool = False) -> None:
+    def publish(self, topic: int, message: bytes, keep: int = 0) -> None:
         name = self._topics[topic]
         content = msgpack.unpackb(message)
         read(TOPICS[name].record, content)

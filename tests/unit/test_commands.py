@@ -1,9 +1,9 @@
 """Command server and client on real sockets; what is heard when, and how a request must look."""
 
-import math
 import os
 import select
 import stat
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,6 @@ from softfinger.daemon.control.modes import COMMANDS, Mode
 from softfinger.daemon.errors import Reason, Refused
 from softfinger.daemon.gateway import bounds
 from softfinger.daemon.gateway.bounds import Config
-from softfinger.daemon.gateway.request_queue import RequestQueue
 from softfinger.daemon.gateway.supervisor import Gateway
 from softfinger.daemon.loop import build
 from softfinger.daemon.loop.loop import start_age
@@ -96,13 +95,13 @@ def test_malformed_commands_are_refused_and_the_server_lives_on(context, address
 def test_multipart_nonsense_and_clients_that_go_away_change_nothing(server, context, addresses):
     socket = context.socket(zmq.DEALER)
     socket.connect(addresses[1])
-    socket.send_multipart([b"", b"a", b"b", b"c"])  # no client's form: passed over
+    socket.send_multipart([b"", b"a", b"b", b"c"])  # no client's form
     socket.send(msgpack.packb({"command": "arm"}))
     socket.close(linger=1000)
     assert send(addresses[1], {"command": "arm"}, 60.0)["ok"] is True
 
 
-@pytest.mark.parametrize("under_way", [1, 4])  # the second request waits in the queue, or the link
+@pytest.mark.parametrize("under_way", [1, 16])  # the second request waits in the queue, or the link
 def test_what_came_before_a_fence_is_refused_and_what_comes_after_is_not(
     context, addresses, monkeypatch, under_way
 ):
@@ -111,13 +110,110 @@ def test_what_came_before_a_fence_is_refused_and_what_comes_after_is_not(
         early = Asking(context, served, addresses[1], "arm")
         until(lambda: [served.settle(1), served.link.asked][1])
         asking = Asking(context, served, addresses[1], "status")
-        queue = served.service.requests
-        until(lambda: [served.settle(1), len(served.link.asked) + queue._count == 2][1])
+        queue = served.service.commands
+        until(lambda: [served.settle(1), len(served.link.asked) + queue.count == 2][1])
         served.server.raise_fence()
         assert early.told()["reason"] == "stopped"
         assert asking.told() == {"ok": True, "heard": "status"}, "it harms nobody"
         early.send("arm")
         assert early.told() == {"ok": True, "heard": "arm"}
+
+
+def test_a_request_takes_a_short_way(context, addresses):
+    """From the socket to the handler, which `Loop.command` and `Requests.carry_out` follow."""
+    passed: set[str] = set()
+    heard = []
+
+    def note(frame: Any, event: str, _: object) -> None:
+        code = frame.f_code
+        is_ours = "/daemon/" in code.co_filename
+        if event == "call" and not heard and is_ours and code.co_name[0] != "<":
+            passed.add(code.co_qualname)
+
+    def hear(request: dict[str, Any], age: float) -> dict[str, Any]:
+        heard.append(request)
+        return {}
+
+    with Served(commands=addresses[1]) as served:
+        asking = Asking(context, served, addresses[1], "arm")
+        asking.told()
+        asking.send("arm")
+        until(lambda: served.service.commands.socket.poll(0))
+        sys.setprofile(note)
+        try:
+            until(lambda: [served.serve(hear), heard][1])
+        finally:
+            sys.setprofile(None)
+    assert {"CommandEndpoint.read", "Link.look", "CommandServer.serve"} < passed
+    assert len(passed) <= 25 - 2, sorted(passed)
+
+
+ARM = msgpack.packb({"command": "arm"})
+
+
+def test_a_req_that_correlates_gets_its_answer(context, addresses):
+    with Served(commands=addresses[1]) as served:
+        client = context.socket(zmq.REQ)
+        client.setsockopt(zmq.REQ_CORRELATE, 1)
+        client.setsockopt(zmq.REQ_RELAXED, 1)
+        client.connect(addresses[1])
+        for name in ("arm", "status"):
+            client.send(msgpack.packb({"command": name}))
+            until(lambda: [served.serve(echo), client.poll(0)][1])
+            assert msgpack.unpackb(client.recv()) == {"ok": True, "heard": name}
+
+
+def test_a_proxy_may_stand_between(context, addresses):
+    with Served(commands=addresses[1]) as served:
+        front, back = context.socket(zmq.ROUTER), context.socket(zmq.DEALER)
+        port = front.bind_to_random_port("tcp://127.0.0.1")
+        back.connect(addresses[1])
+        client = context.socket(zmq.REQ)
+        client.connect(f"tcp://127.0.0.1:{port}")
+        client.send(ARM)
+
+        def answered() -> int:
+            for one, other in ((front, back), (back, front)):
+                if one.poll(0):
+                    other.send_multipart(one.recv_multipart())
+            served.serve(echo)
+            return client.poll(0)
+
+        until(answered)
+        assert msgpack.unpackb(client.recv()) == {"ok": True, "heard": "arm"}
+
+
+@pytest.mark.parametrize(
+    ("frames", "envelope", "heard"),
+    [
+        ([ARM], 0, True),
+        ([b"", ARM], 1, True),
+        ([b"id", b"", ARM], 2, True),
+        ([*[b"hop"] * (bounds.PARTS - 3), b"", ARM], bounds.PARTS - 2, True),
+        ([*[b"hop"] * (bounds.PARTS - 2), b"", ARM], 0, False),
+        ([b"x" * 700, b"x" * 400, b"", ARM], 0, False),
+        ([b"", ARM, ARM], 1, False),  # a REQ socket that sends two frames
+        ([b"id", ARM], 0, False),
+        ([ARM, b""], 0, False),
+        ([b"part"] * 500, 0, False),
+    ],
+)
+def test_an_envelope_goes_back_with_the_reply_and_a_malformed_one_is_answered(
+    context, addresses, frames, envelope, heard
+):
+    with Served(commands=addresses[1]) as served:
+        client = context.socket(zmq.DEALER)
+        client.setsockopt(zmq.LINGER, 0)
+        client.connect(addresses[1])
+        client.send_multipart(frames)
+        until(lambda: [served.serve(echo), client.poll(0)][1])
+        *back, reply = client.recv_multipart()
+        assert back == frames[:envelope]
+        if heard:
+            assert msgpack.unpackb(reply) == {"ok": True, "heard": "arm"}
+        else:
+            assert msgpack.unpackb(reply)["reason"] == "request"
+            assert "expected the command in one frame" in msgpack.unpackb(reply)["error"]
 
 
 class Aged:
@@ -139,7 +235,7 @@ def pass_time(clock: VirtualClock, seconds: float) -> None:
 
 def on_the_link(served: Served) -> None:
     """Wait until the gateway has handed something on."""
-    link = [served.link._socket]
+    link = [served.link._channel]
     until(lambda: [served.service.step(0.0), select.select(link, [], [], 0)[0]][1])
 
 
@@ -152,7 +248,7 @@ def test_age_is_counted_from_before_a_stall_of_either_process(context, addresses
             on_the_link(served)
         elif stalled == "gateway":
             # libzmq has taken it in, or will in a moment: nobody knows since when it waits.
-            until(lambda: served.service._commands.socket.poll(0))
+            until(lambda: served.service.commands.socket.poll(0))
         pass_time(clock, 0.5)
         # libzmq's own thread may come later than the gateway's look after the stall.
         until(lambda: [served.serve(aged), asking.socket.poll(0)][1])
@@ -226,25 +322,33 @@ def test_a_fence_is_passed_only_after_some_time_without_a_gap(context, addresses
         served.settle()
         pass_time(clock, 2.0 * bounds.GAP)
         served.settle()
-        assert served.link.past == math.inf
+        assert served.link.stops == 0
         until(lambda: served._is_open())
         asking = Asking(context, served, addresses[1], "arm")
         until(lambda: [served.serve(aged), asking.socket.poll(0)][1])
         assert msgpack.unpackb(asking.socket.recv())["ok"]
 
 
-def test_a_setpoint_replaces_only_one_that_sets_no_more_than_it_does():
-    answered = []
-    queue = RequestQueue(200, 100.0, lambda *_: False, lambda route, _: answered.append(route[0]))
-    client = queue.new_client("", 0.0)
-    for name, numbers in (
-        (b"force", {"force": 8.0}),
-        (b"angle", {"angle": 0.1}),
-        (b"both", {"force": 5.0, "angle": 0.1}),
-        (b"later", {"force": 4.0, "angle": 0.2}),
-    ):
-        queue.take(client, [name], msgpack.packb({"command": "hold", **numbers}), 0.0, 0.0)
-    assert answered == [b"angle", b"both"]
+def test_a_setpoint_replaces_only_one_that_sets_no_more_than_it_does(context, addresses):
+    with Served(commands=addresses[1]) as served:
+        stream = context.socket(zmq.DEALER)
+        stream.connect(addresses[1])
+        for name, numbers in (
+            (b"force", {"force": 8.0}),
+            (b"angle", {"angle": 0.1}),
+            (b"both", {"force": 5.0, "angle": 0.1, "key": "k"}),
+            (b"later", {"force": 4.0, "angle": 0.2}),
+        ):
+            stream.send_multipart([name, b"", msgpack.packb({"command": "hold", **numbers})])
+        until(lambda: [served.settle(1), len(served.link.asked) == 4][1])
+        reasons = {}
+        while len(reasons) < 4:
+            served.serve(echo)
+            while stream.poll(0):
+                name, _, reply = stream.recv_multipart()
+                reasons[name] = msgpack.unpackb(reply).get("reason")
+        superseded = dict.fromkeys((b"angle", b"both"), "superseded")
+        assert reasons == {b"force": None, b"later": None, **superseded}
 
 
 def test_of_setpoints_that_wait_only_the_newest_is_carried_out(context, addresses):
@@ -269,13 +373,11 @@ def test_of_setpoints_that_wait_only_the_newest_is_carried_out(context, addresse
             return all(len(found) == 20 for found in replies)
 
         # All have come in before the loop goes on.
-        settled = bounds.UNDER_WAY + 1
-        until(
-            lambda: [served.settle(1), collected(), sum(map(len, replies)) >= 40 - settled - 1][2]
-        )
+        commands = served.service.commands
+        until(lambda: [served.settle(1), commands.count + len(served.link.asked) == 40][1])
         until(lambda: [served.serve(note), collected()][1])
         assert {19, 119} <= set(forces), "the newest of each connection"
-        assert len(forces) <= settled + 1
+        assert len(forces) <= 2 * -(-40 // bounds.UNDER_WAY), "of those that the loop has at a time"
         refused = {each["reason"] for found in replies for each in found if not each["ok"]}
         assert refused == {"superseded"}
 
@@ -285,6 +387,40 @@ def test_a_stop_is_one_whatever_it_holds_besides():
     assert decode(msgpack.packb({"command": "stop", **more})) == {"command": "stop", "client": "a"}
     with pytest.raises(Refused, match="numbers and texts as values"):
         decode(msgpack.packb({"command": "arm", "how": ["now"]}))
+
+
+def test_long_requests_are_unpacked_over_several_ticks_and_a_stop_before_them(context, addresses):
+    heard = []
+
+    def note(request: dict[str, Any], age: float) -> dict[str, Any]:
+        heard.append(request["command"])
+        return {}
+
+    with Served(commands=addresses[1], max_bytes=4096) as served:
+        client, stopper = context.socket(zmq.DEALER), context.socket(zmq.DEALER)
+        for socket in (client, stopper):
+            socket.setsockopt(zmq.LINGER, 0)
+            socket.connect(addresses[1])
+        long = msgpack.packb({"command": "move", "x": [[[1]] * 60] * 20})
+        for _ in range(bounds.UNDER_WAY):
+            client.send(long)
+        asked = served.link.asked
+        until(lambda: [served.settle(1), len(asked) == bounds.UNDER_WAY][1])
+        stopper.send(msgpack.packb({"command": "stop"}))
+        until(lambda: [served.settle(1), len(asked) == bounds.UNDER_WAY + 1][1])
+        served.server.serve(note)
+        assert heard == ["stop"]
+        assert len(asked) == bounds.UNDER_WAY - -(-4096 // len(long))
+        replies: list[str] = []
+
+        def answered() -> bool:
+            served.serve(note)
+            while client.poll(0):
+                replies.append(msgpack.unpackb(client.recv())["reason"])
+            return len(replies) == bounds.UNDER_WAY
+
+        until(answered)
+        assert set(replies) == {"request"}
 
 
 class Flood:
@@ -311,13 +447,13 @@ def test_a_stop_goes_before_all_that_waits(context, addresses):
     with Served(commands=addresses[1], clock=clock) as served:
         flood = Flood(context, addresses[1], clients=4, each=40)
         order: list[str] = []
-        link, queue = served.link, served.service.requests
+        link, queue = served.link, served.service.commands
 
         def note(request: dict[str, Any], age: float) -> dict[str, Any]:
             order.append(request["command"])
             return {}
 
-        until(lambda: [served.settle(1), len(link.asked) + queue._count == 160][1])
+        until(lambda: [served.settle(1), len(link.asked) + queue.count == 160][1])
         served.serve(note)  # the flood is being worked on
         carried_out = len(order)
         assert carried_out > 0
@@ -325,7 +461,7 @@ def test_a_stop_goes_before_all_that_waits(context, addresses):
         stopper.setsockopt(zmq.LINGER, 0)
         stopper.connect(addresses[1])
         stopper.send_multipart([b"", msgpack.packb({"command": "stop"})])
-        until(lambda: [served.settle(1), link.stops][1])
+        until(lambda: [served.settle(1), any(ask.urgent for ask in link.asked)][1])
 
         def serve() -> None:
             clock.sleep_until(clock.now() + 1e-3)
@@ -377,7 +513,7 @@ def test_clients_that_flood_leave_others_a_place(context, addresses):
     with Served(commands=addresses[1], per_second=600.0) as served:
         flood = Flood(context, addresses[1], clients=4, each=500)
         # No place is left.
-        until(lambda: [served.service.step(0.0), served.service.requests.refused > 10][1])
+        until(lambda: [served.service.step(0.0), served.service.commands.refused > 10][1])
         other = Asking(context, served, addresses[1], "grasp").socket
         until(lambda: [served.serve(note), other.poll(0)][1])
         assert msgpack.unpackb(other.recv())["ok"]

@@ -83,3 +83,20 @@ def test_the_baseline_closes_each_finger_by_its_own_features():
     assert free[0] == free[1] > 0.7
     assert pressed[0] < -0.4
     assert pressed[1] == free[1]
+
+
+@pytest.mark.parametrize("control", ["joints", "law"])
+def test_an_action_that_is_no_number_is_refused_and_the_episode_goes_on(control):
+    task = "grasp" if control == "joints" else "rotate"
+    env = SoftFingerEnv(task, control)
+    env.reset(seed=1)
+    good, bad = np.array([0.3, 0.2], np.float32), np.array([np.nan, 0.2], np.float32)
+    *_, info = env.step(bad)
+    assert info["refused"].startswith("action: found [nan, ")
+    for _ in range(3):
+        observation, reward, ended, _, info = env.step(good)
+    assert info["refused"] == info["fault"] == ""
+    assert np.isfinite(observation["joints"]).all()
+    assert np.isfinite(reward)
+    assert not ended
+    env.close()

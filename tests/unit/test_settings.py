@@ -214,6 +214,8 @@ def test_an_unknown_model_is_told_beside_what_else_is_wrong(tmp_path):
         ('[stream]\naddress = "tcp://127.0.0.1:99999"', "stream.address: found"),
         ('[stream]\naddress = "tcp://*:9872"', "stream.address: found"),
         ('[stream]\naddress = "inproc://x"', "stream.address: found"),
+        ('[stream]\nlatest = "tcp://10.0.0.2:9874"', "stream.latest: found"),
+        ('[stream]\nlatest = "tcp://127.0.0.1:9872"', "stream.latest: found"),
         ('[commands]\naddress = "tcp://10.0.0.2:9873"', "commands.address: found"),
         ('access.ipc_mode = "0777"', "access.ipc_mode: found"),
         ('[commands]\naddress = "ipc://"', "commands.address: found"),

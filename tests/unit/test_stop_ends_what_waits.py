@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from softfinger.daemon.clock import VirtualClock
 from softfinger.daemon.errors import Reason, Refused
 from softfinger.daemon.gateway import bounds
-from softfinger.daemon.gateway.endpoints import CommandEndpoint
+from softfinger.daemon.gateway.commands import CommandEndpoint
 from tests.harness.gateway import Served
 
 action = st.one_of(
@@ -45,10 +45,10 @@ class Scene:
         self.carried_out: set[float] = set()
         self.busy = False
 
-    def read(self) -> list[zmq.Frame] | None:
+    def read(self) -> list[zmq.Frame]:
         """In the place of libzmq's socket."""
         self.pass_time(self.reading)
-        return self.arrived.popleft() if self.arrived else None
+        return self.arrived.popleft() if self.arrived else []
 
     def send(self, message: list[bytes]) -> None:
         self.replies.append(msgpack.unpackb(message[-1]))
@@ -153,12 +153,12 @@ def test_a_backlog_that_libzmq_hands_on_bit_by_bit_dies_with_a_stop():
 def test_a_flood_does_not_date_commands_by_a_gap_for_ever():
     """No more can have waited than the connections hold, though the socket is never empty."""
     with patch.object(bounds, "CLIENTS", 1), patch.object(bounds, "QUEUE", 20), played() as scene:
-        door = scene.served.service._commands
+        door = scene.served.service.commands
         scene.pass_time(0.5)
         for _ in range(100):
             scene.ask(0, command="status")
         scene.act("gateway")
-        assert door._gap_began is not None
+        assert door._dated is not None
         while len(scene.arrived) > 70:
             scene.act("gateway")
-        assert door._gap_began is None
+        assert door._dated is None

@@ -120,6 +120,35 @@ def test_a_stuck_subscriber_holds_up_nobody_and_its_queue_is_bounded(context, ad
         assert kept < 10_000, "the stuck subscriber's queue has no bound"
 
 
+def test_a_subscriber_that_keeps_the_newest_state_alone_gets_it_in_one_frame(
+    context, addresses, tmp_path_factory
+):
+    latest = f"ipc://{tmp_path_factory.mktemp('s')}/latest"
+    with Served(addresses[0], latest=latest) as served:
+        both = subscribe(context, addresses[0])
+        newest = context.socket(zmq.SUB)
+        newest.setsockopt(zmq.CONFLATE, 1)
+        newest.subscribe(b"")
+        newest.connect(latest)
+        state = State()
+
+        def published() -> dict[str, Any]:
+            state.seq += 1
+            served.publisher.send(STATE, state, BOTH)
+            served.settle()
+            return msgpack.unpackb(newest.recv()) if newest.poll(0) else {}
+
+        until(published)
+        for _ in range(50):
+            served.publisher.event(0.0, 0.0, "info", "test", "goes out on the other address alone")
+        until(lambda: published().get("seq") == state.seq)
+        assert published().keys() <= receive(both, served)[1].keys(), "the whole map, or nothing"
+        topics = set()
+        while both.poll(0):
+            topics.add(receive(both)[0])
+        assert topics == {STATE, EVENT}
+
+
 def test_who_comes_late_is_told_settings_and_events_again(context, addresses, served):
     publisher = served.publisher
     publisher.settings(98.0, 0.5, HandFacts("0.1.0", "{}", "", "", "{}", "{}"))

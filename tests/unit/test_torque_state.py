@@ -162,8 +162,8 @@ def test_a_stop_by_signal_goes_before_what_waits_and_lets_none_of_it_arm_the_han
         client.connect(addresses[1])
         for _ in range(20):
             client.send(msgpack.packb({"command": "arm"}))
-        queue = served.service.requests
-        until(lambda: [served.settle(1), len(served.link.asked) + queue._count == 20][1])
+        queue = served.service.commands
+        until(lambda: [served.settle(1), len(served.link.asked) + queue.count == 20][1])
         daemon.loop.stop()
         told = []
 

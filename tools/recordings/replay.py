@@ -13,7 +13,7 @@ from softfinger.daemon.gateway.supervisor import Gateway
 from softfinger.daemon.profile.settings import StreamSettings
 from softfinger.daemon.profile.validation import address_problem
 from softfinger.daemon.wire import schema
-from softfinger.daemon.wire.publisher import GATEWAY_TOPICS, pack
+from softfinger.daemon.wire.publisher import GATEWAY_TOPICS, KEPT, pack
 from softfinger.tools.arguments import add_range, number, to_stderr
 from softfinger.tools.ending import Ending
 
@@ -173,13 +173,9 @@ class Wire:
         """Publish one message, as soon as the gateway has room for it."""
         if topic not in schema.TOPICS:  # of another version
             return
-        index = GATEWAY_TOPICS.names.index(topic.decode())
-        packed = pack(message)
-        if topic == schema.SETTINGS:
-            self._link.publish_lasting(index, packed)
-            return
         self._link.wait_for_room(_PATIENCE)
-        self._link.publish(index, packed, keep=topic == schema.EVENT)
+        index = GATEWAY_TOPICS.index(topic.decode())
+        self._link.publish(index, pack(message), KEPT.get(topic, 0))
 
     def __enter__(self) -> Wire:
         return self

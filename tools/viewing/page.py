@@ -20,12 +20,12 @@ import threading
 import time
 import webbrowser
 from collections.abc import Awaitable, Callable
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import parse_qs, urlsplit
 
+import msgpack
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.http11 import Request, Response
 
@@ -49,8 +49,16 @@ _PORT = 9090  # where nobody says another
 _NICE = 5  # everything real-time goes first
 _AT_ONCE = 40  # commands that wait for their answers, of all pages
 _PATIENCE = 5.0  # s for a request's head, of a busy browser, too
+_NAME = 40  # characters of a command's name that are shown
+_NO_COMMAND = (ValueError, TypeError, LookupError, AttributeError, OverflowError, RecursionError)
 _BUFFER = 256 << 10  # bytes that wait for a page or a client of Foxglove
 _LARGEST = 65536  # bytes of what a page or a client of Foxglove sends
+_HEADERS = {
+    "Cache-Control": "no-store",  # the page may hold a token, and a new daemon's is another
+    "Content-Security-Policy": "frame-ancestors 'none'; base-uri 'none'; form-action 'none'",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+}
 _say = to_stderr("view")
 
 
@@ -78,7 +86,7 @@ class _Published(NamedTuple):
 class Site:
     """The page, the pictures and commands of all pages, and what Foxglove connects to.
 
-    Lets in what names this machine as its host, and pages of this very server: a name that an
+    Lets in what names this server as its host, and pages of this very server: a name that an
     attacker's DNS leads here is another host; a foreign page's requests carry its own origin.
     Pages with the ``token`` may command, by ``send``; without it they play a recording, by
     ``wish``. Where other machines can reach it, even looking needs the token, and a browser gets
@@ -105,6 +113,8 @@ class Site:
         self._send = send
         self._stale = stale
         self._ended = asyncio.Event()
+        self._hosts: set[str] = set()  # names of this server
+        self._at_once = asyncio.Semaphore(_AT_ONCE)
         self.waiting: list[asyncio.Future[_Published]] = []  # pages, for the next picture
         self.record: Callable[[], str] = lambda: ""  # begins a recording, or ends it
         self.wish: Callable[[str], None] = lambda _: None  # what pages ask with each picture
@@ -133,10 +143,12 @@ class Site:
         """Serve on ``listener`` until the end."""
         quiet = logging.getLogger("softfinger.view")
         quiet.disabled = True  # what strangers do wrong is nobody's business here
-        await serve(
+        self._hosts = {f"{name}:{listener.getsockname()[1]}" for name in (_LOOPBACK, "localhost")}
+        server = await serve(
             self._serve,
             sock=listener,
             process_request=self._admit,
+            process_response=_add_headers,
             subprotocols=PROTOCOLS,
             select_subprotocol=lambda _, offered: next(
                 (each for each in offered if each in PROTOCOLS), None
@@ -147,6 +159,8 @@ class Site:
             logger=quiet,
         )
         await self._ended.wait()
+        for connection in server.connections:  # one that takes nothing would never be closed
+            connection.transport.abort()
         others = asyncio.all_tasks() - {asyncio.current_task()}
         for each in others:
             each.cancel()
@@ -159,12 +173,12 @@ class Site:
         known = [[], *([f"http://{host}"] for host in hosts)]
         if upgrade and path == "/":
             known += [[origin] for origin in ORIGINS]
-        here = [host.partition(":")[0] in (_LOOPBACK, "localhost") for host in hosts]
+        here = len(hosts) == 1 and hosts[0] in self._hosts
         if self._announce is not None:  # each request has a secret; its host may have any name
-            here = [True]
+            here = True
             if not self._allows(request):
                 return self._exchange(connection, request)
-        if here != [True] or origins not in known:
+        if not here or origins not in known:
             return connection.respond(403, "only for pages of this machine")
         if upgrade and path in self._routes:
             return None
@@ -226,8 +240,23 @@ class Site:
         async for text in page:
             answer = "✗ needs the token that the terminal prints"
             if allowed:
-                answer = await self._loop.run_in_executor(None, self._answer, text)
+                async with self._at_once:
+                    answer = await self._in_thread(text)
             await page.send(answer)
+
+    def _in_thread(self, text: str | bytes) -> asyncio.Future[str]:
+        """Return the coming `_answer`, from a thread that does not outlive the process."""
+        future: asyncio.Future[str] = self._loop.create_future()
+
+        def give(answer: str) -> None:
+            if not future.done():  # the page has gone
+                future.set_result(answer)
+
+        def work() -> None:
+            self._loop.call_soon_threadsafe(give, self._answer(text))
+
+        threading.Thread(target=work, daemon=True).start()
+        return future
 
     def _answer(self, text: str | bytes) -> str:
         """Carry out the daemon's request ``text``, which it checks; what is said of it.
@@ -236,9 +265,10 @@ class Site:
         """
         try:
             asked = json.loads(text)
-            name = str(asked["command"])
+            name = str(asked["command"])[:_NAME]
             age = time.monotonic() - float(asked.pop("seen", "nan"))
-        except (ValueError, TypeError, LookupError, AttributeError) as error:
+            msgpack.packb(asked)  # which holds less than JSON: no deep nesting, no long integers
+        except _NO_COMMAND as error:
             return f"✗ no command: {error!r}"
         if name == "record":
             return self.record()
@@ -251,6 +281,10 @@ class Site:
         except NoAnswer as error:
             return f"✗ {name}: {error}"
         return f"{'✓' if reply.ok else '✗'} {reply.text}"
+
+
+def _add_headers(_: ServerConnection, __: Request, response: Response) -> None:
+    response.headers.update(_HEADERS)
 
 
 def _has(request: Request, name: str, secret: str) -> bool:
@@ -284,7 +318,6 @@ def show(arguments: argparse.Namespace, ending: Ending) -> None:
     build_kernels(Settings(), lambda _level, _kind, text: _say(text), LANDSCAPE)
     keys = client_keys(arguments.keys)
     loop = asyncio.new_event_loop()
-    loop.set_default_executor(ThreadPoolExecutor(_AT_ONCE))
     foxglove = Foxglove(loop) if arguments.foxglove is not None else None
     live, away = recording is None, arguments.host not in (_LOOPBACK, "localhost", "::1")
     token = secrets.token_urlsafe(16)
