@@ -80,6 +80,10 @@ class Contact:
     sensor_gain_std: float = 0.0
     torque_scale: float = 1.0  # … and of the joint's torque constant over the settings'
     torque_scale_std: float = 0.0
+    # Averaged normalised innovations squared of the sensor's channels, about 1 if consistent
+    nis_angle: float = 1.0
+    nis_footprint: float = 1.0
+    nis_amplitude: float = 1.0
     misfit: bool = False  # the frame fits no contact of the model: d and theta may be biased
     force: float = 0.0  # modulus_scale · F(d, total tilt of theta and tilt_y) by the table [N]
     energy: float = 0.0  # modulus_scale · U(d, total tilt) [J]
@@ -101,6 +105,8 @@ class ObjectPose:
     valid: bool = False
     angle: float = 0.0
     width: float = 0.0
+    nis_torque: float = 1.0  # averaged normalised innovation squared of the joint torques …
+    nis_balance: float = 1.0  # … and of the balance of both tips
 
 
 @dataclass(slots=True)

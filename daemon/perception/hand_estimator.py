@@ -218,6 +218,8 @@ class HandEstimator:
             self._has_news = False
             for finger in self._fingers:
                 self._write_factors(contacts[finger], finger)
+            pose.nis_torque = self.grasp.nis.item(states.TORQUES)
+            pose.nis_balance = self.grasp.nis.item(states.BALANCE)
         oldest = t - self._age_max
         for finger in self._fingers:
             contact = contacts[finger]
@@ -237,7 +239,7 @@ class HandEstimator:
                 contact.invalid, pose.valid = contact.invalid or Invalid.STALE, False
 
     def _write_factors(self, contact: Contact, finger: int) -> None:
-        """Write the calibration factors."""
+        """Write the calibration factors and the consistency of the channels."""
         state, grasp = self._state, self.grasp
         at = states.MODULUS + finger
         contact.modulus_scale = modulus = math.exp(state.mean.item(at))
@@ -247,6 +249,10 @@ class HandEstimator:
         at = states.TORQUE + finger
         contact.torque_scale = 1.0 + state.mean.item(at)
         contact.torque_scale_std = math.sqrt(max(state.covariance.item(at, at), 0.0))
+        nis = grasp.nis
+        contact.nis_angle = nis.item(states.ANGLE_CHANNEL + finger)
+        contact.nis_footprint = nis.item(states.FOOTPRINT + finger)
+        contact.nis_amplitude = nis.item(states.AMPLITUDE + finger)
 
 
 def _commanded_current(goal: Goal, finger: int, q: float) -> float:

@@ -168,6 +168,11 @@ class FingerState:
     sensor_gain_std: float = _contact("", "its standard deviation")
     torque_scale: float = _contact("", "of the joint's torque constant over the settings'")
     torque_scale_std: float = _contact("", "its standard deviation")
+    nis_angle: float = _contact(
+        "", "consistency of the sensor's angle: normalised innovation squared, averaged; about 1"
+    )
+    nis_footprint: float = _contact("", "likewise of d by the footprint")
+    nis_amplitude: float = _contact("", "likewise of the pressure's amplitude")
     misfit: bool = _contact("", "the frame fits no contact of the model: d, theta may be biased")
     contact: bool = _contact("", "something touches the tip")
     frame_seq: int = _contact(
@@ -195,6 +200,10 @@ class ObjectState:
         "the contacts of a disc",
     )
     width: float = _pose("m", "the object's width between the tips")
+    nis_torque: float = _pose(
+        "", "consistency of joint torques and forces: normalised innovation squared, averaged"
+    )
+    nis_balance: float = _pose("", "likewise of the balance between both tips")
 
 
 @topic(

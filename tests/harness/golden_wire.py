@@ -58,6 +58,8 @@ def sample_state() -> State:
         contact.modulus_scale, contact.modulus_scale_std = 1.125, 0.0625 + finger
         contact.sensor_gain, contact.sensor_gain_std = 0.875, 0.09375 + finger
         contact.torque_scale, contact.torque_scale_std = 1.03125, 0.046875 + finger
+        contact.nis_angle, contact.nis_footprint = 1.25 + finger, 0.9375 + finger
+        contact.nis_amplitude = 1.0625 + finger
         contact.shear_x, contact.shear_y = 0.75 * sign, 0.03125 * sign
         contact.force, contact.energy = 10.5 + finger, 0.0125 + finger
         heat = state.heat[finger]
@@ -66,6 +68,7 @@ def sample_state() -> State:
         heat.time_to_limit = 1800.5 + finger
     state.goal.force, state.goal.angle = 11.25, 0.0625
     state.object.valid, state.object.angle, state.object.width = True, 0.05, 0.04
+    state.object.nis_torque, state.object.nis_balance = 0.84375, 1.15625
     return state
 
 

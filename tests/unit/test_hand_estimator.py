@@ -65,6 +65,21 @@ def test_a_measurement_that_is_not_finite_corrects_nothing(innovation):
     assert (hand.slopes == 0.0).all()
 
 
+def test_the_consistency_of_a_channel_is_one_for_noise_as_modelled_and_four_for_twice_of_it():
+    rng = np.random.default_rng(3)
+    for factor in (1.0, 2.0):
+        hand, found = some_hand(rng), []
+        covariance, slopes = hand.covariance.copy(), rng.normal(size=STATES)
+        std = math.sqrt(slopes @ covariance @ slopes + 1e-4)
+        for _ in range(4000):
+            hand.covariance[:], hand.slopes[:] = covariance, slopes
+            corrected(hand.array, factor * std * rng.normal(), 1e-4, math.inf)
+            found.append(hand.grasp.nis[0])
+        # 4000 squares of mean 1 have a standard error of 0.022, and the first 500 settle.
+        assert np.mean(found[500:]) == pytest.approx(factor**2, rel=0.15)
+        assert not hand.grasp.nis[1:].any()
+
+
 @pytest.fixture
 def estimator() -> HandEstimator:
     table = make_table(SETTINGS, make_material(SETTINGS.material))
