@@ -18,7 +18,8 @@ from softfinger.kinematics.compiled.layout import Record, Records
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.solid_data import solid_data
-from softfinger.kinematics.contact.solid_lookup import SolidTable, energy_lanes, solid_table
+from softfinger.kinematics.contact.solid_lookup import energy_lanes, solid_table
+from softfinger.kinematics.contact.table_record import Table
 from softfinger.kinematics.sensing.blur import axis_points, mean_matrix
 from softfinger.kinematics.sensing.footprint import FloatArray, Grid, IntArray
 
@@ -34,7 +35,7 @@ _INSIDE, _CUT, _BLURRED = 6, 24, 12
 class Weights(Record):
     """Weights of the images in one contact: their sum is the pressure over E; see `set_weights`."""
 
-    table: SolidTable
+    table: Table
     modes: int
     images: int
     harmonics: Annotated[IntArray, MODES]
