@@ -130,8 +130,8 @@ _RESULTS = (
 # Of the fit and the activity test; `ContactEstimator.state` has them, should others be tried.
 _TOLERANCE = 16.0  # of the squared step, in noise floors, that ends the iteration
 _ITERATIONS = 20
-_PEAK_LEVEL = 3.0  # noise, of a cell and of its neighbours: see `detection.activity`
-_PATCH_LEVEL = 4.9
+PEAK_LEVEL = 3.0  # noise, of a cell and of its neighbours: see `detection.activity`
+PATCH_LEVEL = 4.9
 _R_SQUARED_MIN = (
     0.8  # fraction of the frame's squared pressure below which an estimate is not valid
 )
@@ -221,7 +221,7 @@ class ContactEstimator:
         options.floor = max(readings.threshold - 0.5, 0.0)
         options.free_gain = not is_solid if free_gain is None else free_gain
         options.tolerance, options.iterations = _TOLERANCE, _ITERATIONS
-        options.peak_level, options.patch_level = _PEAK_LEVEL, _PATCH_LEVEL
+        options.peak_level, options.patch_level = PEAK_LEVEL, PATCH_LEVEL
         options.r_squared_min = _R_SQUARED_MIN
         options.modulus = material.reference_modulus
         options.blur, options.rotation = grid.blur, grid.rotation
