@@ -45,8 +45,8 @@ from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand, s
 from softfinger.daemon.simulation.physics.tip import clear_contact, contact_forces, stiffen_by_rim
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 from softfinger.kinematics.compiled.layout import Record, Records
-from softfinger.kinematics.compiled.simd import address
 from softfinger.kinematics.contact.table import ContactTable
+from softfinger.kinematics.contact.table_record import Table
 
 Work = tuple[FloatArray, FloatArray, FloatArray]
 
@@ -94,7 +94,7 @@ def _set_frame(touch: Touch, geometry: FloatArray) -> None:
 
 
 @inner_kernel
-def _set_forces(p: Parameters, table: Any, touch: Touch, rate_across: float) -> float:
+def _set_forces(p: Parameters, table: Table, touch: Touch, rate_across: float) -> float:
     """Evaluate the law for a shear in two directions; return the force across, with its loss."""
     tip = touch.contact
     stiffness = limit = 0.0
@@ -117,7 +117,7 @@ def _set_forces(p: Parameters, table: Any, touch: Touch, rate_across: float) -> 
 
 @kernel
 def press(
-    touches: Records[Touch], parameters: Records[Parameters], table: FloatArray,
+    touches: Records[Touch], parameters: Records[Parameters], tables: Records[Table],
     geometry: FloatArray, jacobians: FloatArray, velocity: FloatArray, dt: float, work: Work,
 ) -> None:  # fmt: skip
     """Evaluate all tips into ``work``: rows R [4n, nv], force along each, B of the step.
@@ -125,7 +125,7 @@ def press(
     ``geometry`` [n, 10]: d, centre, axis, foremost point; ``jacobians`` [n, 4, 3, nv]: of the tip,
     then of what it touches, each of place and of rotation; ``dt`` [s]: since the last call.
     """
-    p, data, rates = parameters[0], address(table), np.zeros(_ROWS)
+    p, data, rates = parameters[0], tables[0], np.zeros(_ROWS)
     rows, force, implicit = work
     rows[:] = force[:] = implicit[:] = 0.0
     for k in range(len(touches)):

@@ -222,9 +222,10 @@ def make() -> Iterator[Make]:
 @pytest.fixture
 def exact_solid_data(monkeypatch: pytest.MonkeyPatch) -> None:
     """A solid tip's data have no error of their own, as for frames that are made of them."""
-    from softfinger.kinematics.estimation import solid_budget
+    from softfinger.kinematics.estimation import error_budget, estimator
 
-    data = solid_budget.solid_data
+    data = estimator.solid_data
     monkeypatch.setattr(
-        solid_budget, "solid_data", lambda tip: replace(data(tip), error=0.0, pressure_error=0.0)
+        estimator, "solid_data", lambda tip: replace(data(tip), error=0.0, pressure_error=0.0)
     )
+    monkeypatch.setattr(error_budget, "_LEAN", 0.0)

@@ -214,6 +214,4 @@ def uncertainty(settings: Settings, calibration: Calibration | None) -> Uncertai
         gain=tactile.gain_error,
         smooth=tactile.smooth_error,
         rotation=tactile.rotation_error,
-        radius=settings.tip.radius_error,
-        skew=tactile.skew_error,
     )

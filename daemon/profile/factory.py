@@ -9,9 +9,9 @@ import numpy as np
 from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.profile.settings import MaterialSettings, Settings
 from softfinger.kinematics.contact.closed_form import Fingertip
-from softfinger.kinematics.contact.lookup import TableError
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.table import ContactTable
+from softfinger.kinematics.contact.table_record import TableError
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
 

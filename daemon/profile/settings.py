@@ -79,9 +79,6 @@ class TipSettings(Section):
     """
 
     radius: Length = setting(0.020, "m", "Radius of the hemisphere.")
-    radius_error: float = setting(
-        0.0, "", "Relative standard deviation of the radius.", ge=0, le=0.1
-    )
     physics: Literal["springs", "solid", "measured"] = setting(
         "springs", "", "Contact model: the paper's springs, solid rubber, or measured curves."
     )
@@ -122,7 +119,7 @@ class TableSettings(Section):
     """The contact table, a lookup of force, energy and their partial derivatives."""
 
     tolerance: float = setting(
-        1e-9, "", "Largest relative error of the looked-up values.", ge=1e-13, le=1e-2
+        1e-9, "", "Largest relative error of the looked-up values.", ge=1e-9, le=1e-2
     )
 
 
@@ -228,9 +225,6 @@ class TactileSettings(Section):
     )
     pitch_error: float = setting(0.0, "", "Relative standard deviation of the pitch.", ge=0, le=0.1)
     rotation_error: float = setting(0.0, "rad", "Standard deviation of `rotation`.", ge=0, le=0.5)
-    skew_error: float = setting(
-        0.0, "m", "Standard deviation of the object's motion during one scan.", ge=0, le=0.01
-    )
     # Crosstalk is below 3.3 % with a good read-out (arXiv 2508.20959), linearity ± 3 %
     # (FlexiForce's manual).
     smooth_error: float = setting(

@@ -179,7 +179,7 @@ def _cells_under(settings: Settings) -> Iterator[str]:
     """A solid tip's contact is told from all of its base."""
     from softfinger.daemon.profile.factory import make_grid, make_tip
     from softfinger.kinematics.estimation.error_budget import Uncertainty
-    from softfinger.kinematics.estimation.solid_fit import CELLS_MIN, within_rim
+    from softfinger.kinematics.estimation.estimator import CELLS_MIN, within_rim
 
     known = Uncertainty(centre=settings.tactile.centre_error, pitch=settings.tactile.pitch_error)
     cells = within_rim(make_grid(settings), make_tip(settings), known).sum()

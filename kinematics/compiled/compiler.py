@@ -161,16 +161,6 @@ class BitcodeKernel(plain.InnerKernel):
             tuple(types.unliteral(each) for each in args), kws
         )
 
-    def also(self, other: plain.InnerKernel, takes: Callable[[Any], bool]) -> None:
-        """Let ``other`` be compiled instead where ``takes`` the type of the first argument."""
-        assert isinstance(other, BitcodeKernel)
-        mine, others = self.dispatcher, other.dispatcher
-        template, overload = mine.get_call_template, mine.get_overload
-        mine.get_call_template = lambda args, kws: (
-            others.get_call_template if takes(args[0]) else template
-        )(args, kws)
-        mine.get_overload = lambda sig: (others.get_overload if takes(sig[0]) else overload)(sig)
-
     @property
     def _numba_type_(self) -> Any:
         """Numba's type of the kernel, which a compiled caller asks for."""

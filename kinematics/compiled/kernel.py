@@ -13,6 +13,7 @@ from types import ModuleType
 from typing import Any, TypeVar, cast
 
 import numba
+import numpy as np
 
 from softfinger import SoftfingerError
 from softfinger.kinematics.compiled import plain
@@ -21,6 +22,10 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 # Minor versions of Numba with whose private parts `compiler` was tested.
 TESTED = ("0.63", "0.64", "0.65", "0.66", "0.67", "0.68")
+
+# index(k): k as an index that Numba need not look at whether it is negative, and so counts from the
+# end, which would keep a loop over it out of SIMD lanes. Added to others of its kind alone.
+index: Callable[[int], int] = cast(Any, np.uint64)
 
 _OPTIONS: dict[str, Any] = {"error_model": "numpy"}
 _SUMS = {"reassoc", "contract", "nsz", "arcp"}

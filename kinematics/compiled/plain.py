@@ -29,22 +29,11 @@ class InnerKernel:
         self.__name__ = function.__name__
         self.__doc__ = function.__doc__
         self.__module__ = function.__module__
-        self._others: list[tuple[InnerKernel, Callable[[Any], bool]]] = []
         self._register(options)
 
     def _register(self, options: dict[str, Any]) -> None:
         """Let Numba know what a compiled caller means."""
-        _overload(self, jit_options=options, strict=False)(self._chosen)
-
-    def _chosen(self, *kinds: Any) -> Callable[..., Any]:
-        for other, takes in self._others:
-            if takes(kinds[0]):
-                return other.py_func
-        return self.py_func
-
-    def also(self, other: InnerKernel, takes: Callable[[Any], bool]) -> None:
-        """Let ``other`` be compiled instead where ``takes`` the type of the first argument."""
-        self._others.append((other, takes))
+        _overload(self, jit_options=options, strict=False)(lambda *_: self.py_func)
 
     def __call__(self, *values: Any) -> Any:
         """Refuse: inner kernels are compiled for kernels. Raises TypeError."""

@@ -1,8 +1,7 @@
 """Contact tables: force, energy and their partials by lookup, within a tolerance.
 
-A table is one flat float64 array, header and coefficients, which is the kernel's argument. How one
-is built is in `table_build`, with the bound of a table's error; the lookup itself and the array's
-layout are in `lookup`.
+A table is one record, `table_record.Table`, whatever the tip's law. How springs' is built is in
+`table_build`, with the bound of its error; the lookup itself is in `lookup`.
 """
 
 from __future__ import annotations
@@ -14,17 +13,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from softfinger.kinematics.compiled.simd import SHAPES
 from softfinger.kinematics.contact.closed_form import Fingertip, flatten
-from softfinger.kinematics.contact.lookup import (
-    CLOSED,
-    header_of,
-    lookup,
-    lookups,
-)
+from softfinger.kinematics.contact.lookup import lookup, lookups
 from softfinger.kinematics.contact.material import Material
-from softfinger.kinematics.contact.solid_lookup import SolidTable, solid_table
+from softfinger.kinematics.contact.solid_lookup import solid_table
 from softfinger.kinematics.contact.table_build import build
+from softfinger.kinematics.contact.table_record import Table
 
 FloatArray = NDArray[np.float64]
 
@@ -67,33 +61,33 @@ _LAW_ERROR = 0.05  # of F, by a law's misfit of its points
 class ContactTable:
     """Force, energy and first partials of one tip of one material, by lookup.
 
-    ``data`` is the flat float64 array that :func:`lookup` takes, ``max_error`` the bound of the
-    relative error of any output. The domain is 0 < d ≤ 7/8 a and |θ| ≤ asin((a − d)/a). A solid
-    tip's ``data`` is a :class:`SolidTable`, which is exact for the data of `solid_data`, so that
+    ``data`` is the array of one record that :func:`lookup` takes, ``header`` its fields by name,
+    ``max_error`` the bound of the relative error of any output. The domain is 0 < d ≤ 7/8 a and
+    |θ| ≤ asin((a − d)/a). A solid tip's table is exact for the data of `solid_data`, so that
     ``max_error`` is theirs, and the domain what they cover.
     """
 
-    def __init__(self, data: Any) -> None:
-        self.data: Any = data
-        self.is_solid = bool(self.data.dtype == SolidTable.dtype)
-        self.header: Any = SolidTable(self.data) if self.is_solid else header_of(self.data)
-        self.max_error = self.header.max_error
+    def __init__(self, table: Table) -> None:
+        self.header = table
+        self.data: Any = table.array
+        self.is_solid = table.is_solid
+        self.max_error = table.max_error
         self._error = (self.max_error,)
 
     @classmethod
     def build(cls, tip: Fingertip, material: Material, tolerance: float = 1e-9) -> ContactTable:
-        """Build the table of least degree within ``tolerance``, relative, on all outputs.
+        """Build the table of fewest pieces within ``tolerance``, relative, on all outputs.
 
         ∂F/∂θ, which passes through zero for some laws, counts relative to F tan θ if that is more.
 
         The tolerance is that of the arithmetic alone: a modulus that is 1 % off makes F 1 % off.
         Warns where the law misses the points that it was made from by more than 5 % of F.
-        Raises TableError, with the best that was reached, when the highest degree can't meet it.
+        Raises TableError, with the best that was reached, when the most pieces can't meet it.
         For a solid tip it says nothing; a solid tip raises MaterialError unless the modulus is
         constant. A measured tip has its own curves: neither tolerance nor material count.
         """
         if tip.physics != "springs":
-            return cls(solid_table(tip, material).array)
+            return cls(solid_table(tip, material))
         if material.worst_force_error > _LAW_ERROR:
             warnings.warn(
                 f"the smooth law misses its points by up to {material.fit_error:.4g} Pa, which "
@@ -116,11 +110,10 @@ class ContactTable:
 
     @property
     def form(self) -> str:
-        """Its representation: closed, slab with its degrees in h and in y, or solid."""
+        """Its representation: closed, springs with its pieces of a slab, or solid."""
         if self.is_solid:
             return "solid"
-        shape = SHAPES[int(self.header.form)]
-        return f"slab {shape[0] - 1}-{len(shape) - 1}" if self.header.form != CLOSED else "closed"
+        return "closed" if self.header.is_closed else f"springs, {self.header.splits} a slab"
 
     @property
     def tip(self) -> Fingertip:

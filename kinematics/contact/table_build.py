@@ -1,9 +1,10 @@
-"""Fit of contact tables to the reference integrals, chosen by degree, with certified error.
+"""Fit of contact tables to the reference integrals, with certified error.
 
 A table's error is bounded piece by piece, over the whole domain with its edges: by the sum of the
 Chebyshev coefficients that the piece leaves out, what lies beyond them, and rounding. What it rests
 on: that the integrals' own error is rounding, and that coefficients beyond those computed go on
-falling. Both hold for every law here, since it is one polynomial.
+falling. Both hold for every law here, since it is one polynomial. Pieces are halved until the bound
+is within the tolerance.
 """
 
 from __future__ import annotations
@@ -19,19 +20,8 @@ import numpy as np
 from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
-from softfinger.kinematics.compiled.simd import LANES, SHAPES, SIZES, STRIDE
 from softfinger.kinematics.contact.closed_form import Fingertip
-from softfinger.kinematics.contact.lookup import (
-    CLOSED,
-    LOWEST,
-    OCTAVES,
-    SLAB_BITS,
-    SLABS,
-    START,
-    TableError,
-    aligned,
-    header_of,
-)
+from softfinger.kinematics.contact.lookup import LOWEST
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.quadrature import (
     circle_rule,
@@ -40,11 +30,22 @@ from softfinger.kinematics.contact.quadrature import (
     ratios_at,
 )
 from softfinger.kinematics.contact.solid_data import to_powers
+from softfinger.kinematics.contact.table_record import (
+    LANES,
+    OCTAVES,
+    POWERS_U,
+    POWERS_V,
+    SLAB_BITS,
+    SPLITS_MAX,
+    Table,
+    TableError,
+    set_piece,
+)
 
 FloatArray = NDArray[np.float64]
 
 ROUNDING = 16.0 * np.finfo(float).eps  # of the closed forms and the kernel's last products
-_MORE_ROWS, _MORE_COLUMNS = 4, 6  # Chebyshev coefficients in h and y beyond those kept
+_MORE_V, _MORE_U = 4, 6  # Chebyshev coefficients in h and y beyond those kept
 _SLAB_ENDS = np.arange(1, 1 + (1 << SLAB_BITS)) / (1 << SLAB_BITS)
 # Of the slabs over h, from LOWEST to 1.
 _EDGES = [
@@ -83,59 +84,66 @@ class LawTerms:
         )
 
 
-def build(tip: Fingertip, material: Material, tolerance: float) -> FloatArray:
-    """Build the table of least degree within ``tolerance``; see ContactTable.build."""
+def build(tip: Fingertip, material: Material, tolerance: float) -> Table:
+    """Build the table of fewest pieces within ``tolerance``; see ContactTable.build."""
     if not (0.0 < tolerance < 1.0):
         raise TableError(f"the tolerance must lie between 0 and 1, not {tolerance!r}")
-    law = LawTerms.of(material)
-    forms = (CLOSED,) if material.is_linear else SLABS
-    for form in forms:
-        limit = math.inf if form == forms[-1] else tolerance
-        data = _made(tip, law, form, tolerance, limit)
-        best = header_of(data).max_error
-        if best <= tolerance:
-            return data
+    law, splits = LawTerms.of(material), 1
+    while True:
+        last = material.is_linear or splits == SPLITS_MAX
+        table = _made(tip, law, tolerance, splits, math.inf if last else tolerance)
+        if table.max_error <= tolerance:
+            return table
+        if last:
+            break
+        splits *= 2
     raise TableError(
-        f"no contact table of this material reaches {tolerance:.3g}; the best reached {best:.4g}"
+        f"no contact table of this material reaches {tolerance:.3g}; the best reached "
+        f"{table.max_error:.4g}"
     )
 
 
-def _made(tip: Fingertip, law: LawTerms, form: int, tolerance: float, limit: float) -> FloatArray:
-    """The array of one form, left unfinished where its error's bound passes ``limit``."""
-    data = aligned(START + len(_EDGES[1:]) * SIZES[form])
-    header = header_of(data)
-    header.form, header.tolerance = form, tolerance
-    header.radius, header.modulus = tip.radius, law.modulus
-    header.inverse_radius = 1.0 / tip.radius
+def _made(tip: Fingertip, law: LawTerms, tolerance: float, splits: int, limit: float) -> Table:
+    """The table of so many pieces, left unfinished where its error's bound passes ``limit``."""
+    table = Table()
+    table.is_closed, table.splits, table.tolerance = law.material.is_linear, splits, tolerance
+    table.radius, table.modulus = tip.radius, law.modulus
+    table.inverse_radius = 1.0 / tip.radius
+    table.deepest = (1.0 - LOWEST) * tip.radius
     worst = _Worst(ROUNDING, 0.5, 0.0)
-    for found in _filled(data, law, form) if form != CLOSED else ():
+    for found in () if table.is_closed else _filled(table, law):
         worst = max(worst, found)
         if worst.bound > limit:
             break
-    header.max_error = worst.bound
-    header.worst_d, header.worst_theta = tip.radius * (1.0 - worst.h), _tilt(worst)
-    return data
+    table.max_error = worst.bound
+    table.worst_d, table.worst_theta = tip.radius * (1.0 - worst.h), _tilt(worst)
+    return table
 
 
-def _filled(data: FloatArray, law: LawTerms, form: int) -> Iterator[_Worst]:
-    """Fill in the coefficients slab by slab; yields the bound of each one's error."""
-    columns = SHAPES[form]
+def _filled(table: Table, law: LawTerms) -> Iterator[_Worst]:
+    """Fill in the coefficients piece by piece; yields the bound of each one's error."""
     # More than needed in each direction, for what is left out.
-    rows, width = columns[0] + _MORE_ROWS, len(columns) + _MORE_COLUMNS
+    rows, width = POWERS_V + _MORE_V, POWERS_U + _MORE_U
     mask = np.zeros((rows, width), dtype=np.bool_)
-    for j, count in enumerate(columns):
-        mask[:count, j] = True
-    x, y = _nodes(rows)[0], 0.5 * (_nodes(width)[0] + 1.0)
-    at = START
-    for low, high in pairwise(_EDGES):
+    mask[:POWERS_V, :POWERS_U] = True
+    x, u = _nodes(rows)[0], 0.5 * (_nodes(width)[0] + 1.0)
+    splits = table.splits
+    for slab, (low, high) in enumerate(pairwise(_EDGES)):
         h = 0.5 * (low + high) + 0.5 * (high - low) * x
-        values = _ratios_at(law, h[:, None], y[None, :])
-        terms = _terms(values)
-        numbers = _powers(terms * mask, columns)
-        data[at : at + numbers.size] = numbers
-        at += numbers.size
-        rounding = _rounding(terms * mask, (high + low) / (high - low), low)
-        yield _bound(values, terms * ~mask, rounding, h, y)
+        for split in range(splits):
+            y = (split + u) / splits
+            values = _ratios_at(law, h[:, None], y[None, :])
+            terms = _terms(values)
+            powers = np.einsum(
+                "ai,bj,kij->kba",
+                to_powers(POWERS_V),
+                to_powers(POWERS_U),
+                terms[:, :POWERS_V, :POWERS_U],
+                optimize=True,
+            )
+            set_piece(table, slab * splits + split, powers)
+            rounding = _rounding(terms * mask, (high + low) / (high - low), low, splits)
+            yield _bound(values, terms * ~mask, rounding, h, y)
 
 
 def _bound(
@@ -163,20 +171,22 @@ def _bound(
     return _Worst(float(bounds[k]) + ROUNDING, float(h[-1 - i // 4]), float(y[-1 - j // 4]))
 
 
-def _rounding(terms: FloatArray, steep: float, low: float) -> FloatArray:
+def _rounding(terms: FloatArray, steep: float, low: float, splits: int) -> FloatArray:
     """Bound of what rounding does to a piece's five ratios, from their Chebyshev ``terms``.
 
     Sums of powers, each over some 32 roundings at most; h, off by two ulps, ``steep`` being h over
     half the piece's width; and y², off by 4 ulps over h² as cos² θ − ρ² cancels towards the limit
-    of θ. The ratios' slope in y is 0 there, so that the second derivative bounds that in y².
+    of θ. The ratios' slope in y is 0 there, so that the second derivative bounds that in y²; y is
+    off by as many ulps as there are pieces of it.
     """
     i, j = np.arange(terms.shape[1])[:, None], np.arange(terms.shape[2])
     size = np.abs(terms)
     powers = np.abs(to_powers(len(i))), np.abs(to_powers(len(j)))
     sums = 32.0 * np.einsum("ai,bj,kij->k", *powers, size, optimize=True)
     by_h = 2.0 * (steep + 1.0) * (i**2 * size).sum(axis=(1, 2))
-    second = 4.0 * (j**2 * (j**2 - 1.0) / 3.0 * size).sum(axis=(1, 2))
-    total: FloatArray = np.finfo(float).eps * (sums + by_h + 2.0 * second / low**2)
+    by_y = 4.0 * splits * (j**2 * size).sum(axis=(1, 2))
+    second = 4.0 * splits**2 * (j**2 * (j**2 - 1.0) / 3.0 * size).sum(axis=(1, 2))
+    total: FloatArray = np.finfo(float).eps * (sums + by_h + by_y + 2.0 * second / low**2)
     return total
 
 
@@ -198,23 +208,6 @@ def _nodes(count: int) -> tuple[FloatArray, FloatArray]:
 def _dense(count: int) -> FloatArray:
     """``count`` Chebyshev polynomials at points between which none of them does anything new."""
     return np.asarray(chebyshev.chebvander(np.cos(np.linspace(np.pi, 0.0, 4 * count)), count - 1))
-
-
-def _powers(terms: FloatArray, columns: tuple[int, ...]) -> FloatArray:
-    """Chebyshev coefficients [5, x, y] as the numbers that `compiled.simd` evaluates."""
-    rising = np.einsum(
-        "ai,bj,kij->kab",
-        to_powers(terms.shape[1]),
-        to_powers(terms.shape[2]),
-        terms,
-        optimize=True,
-    )
-    out = np.zeros((sum(columns), STRIDE))
-    at = 0
-    for j, count in enumerate(columns):
-        out[at : at + count, :LANES] = rising[:, count - 1 :: -1, j].T
-        at += count
-    return out.reshape(-1)
 
 
 def _tilt(at: _Worst) -> float:

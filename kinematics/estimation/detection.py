@@ -9,28 +9,27 @@ from __future__ import annotations
 import math
 
 from softfinger.kinematics.compiled.kernel import inner_kernel
-from softfinger.kinematics.compiled.simd import Pointer
 from softfinger.kinematics.estimation.cell_centres import next_above, totals
-from softfinger.kinematics.estimation.solid_projection import SolidFit
-from softfinger.kinematics.estimation.state import OUTLIERS_MAX, EstimatorState
-from softfinger.kinematics.sensing.cell_integrals import ACTIVE, CELL_PLANES
+from softfinger.kinematics.estimation.state import OUTLIERS_MAX, Cells, EstimatorState
 from softfinger.kinematics.sensing.footprint import (
+    FloatArray,
     Grid,
-    band_columns,
     line_span,
-    set_extremes,
+    set_around,
     set_face,
+    steps,
 )
 
+_HYSTERESIS = 0.5  # of the level for a first contact: one that is just felt doesn't flicker
 STRONG = 6.0  # noise: above it the largest cell is looked at first
 
 
 @inner_kernel
-def neighbourhood(frame: Pointer, height: Pointer, grid: Grid, at: int) -> float:
+def neighbourhood(frame: FloatArray, height: FloatArray, grid: Grid, at: int) -> float:
     """Return how far the 5 × 5 cells round the cell ``at``, itself left out, stand above noise 1.
 
     Weights (1, 2, 2, 2, 1) both ways; the sum over its standard deviation. ``height`` is the plane
-    of :mod:`estimation.cell_centres`: cells that are dead or outside the region don't count.
+    of :mod:`estimation.cell_centres`: cells that are dead or out of reach don't count.
     """
     cols = grid.cols
     i = at // cols
@@ -48,7 +47,7 @@ def neighbourhood(frame: Pointer, height: Pointer, grid: Grid, at: int) -> float
 
 
 @inner_kernel
-def activity(state: EstimatorState, frame: Pointer, height: Pointer) -> None:
+def activity(state: EstimatorState, frame: FloatArray, height: FloatArray) -> None:
     """Test the frame for a contact, cheaply, into ``state.signal``.
 
     A contact is a cell of ``peak_level`` · noise or more whose neighbours' weighted sum, itself
@@ -60,11 +59,11 @@ def activity(state: EstimatorState, frame: Pointer, height: Pointer) -> None:
     """
     signal = state.signal
     grid = state.grid
-    last = state.region.last
-    total, energy, peak = totals(frame, height, state.region.first, last)
+    last = frame.shape[0]
+    total, energy, peak = totals(frame, height)
     signal.finite = math.isfinite(total) and math.isfinite(peak)
     signal.peak = peak
-    signal.mean = total / max(float(state.region.number), 1.0)
+    signal.mean = total / max(float(signal.number), 1.0)
     signal.energy = energy
     contact = False
     cell = -1
@@ -72,9 +71,9 @@ def activity(state: EstimatorState, frame: Pointer, height: Pointer) -> None:
     patch = signal.patch_level * signal.noise
     if signal.finite and peak >= level:
         if peak > STRONG * signal.noise:
-            cell = next_above(frame, height, state.region.first, last, peak)
+            cell = next_above(frame, height, 0, last, peak)
             contact = neighbourhood(frame, height, grid, cell) > patch
-        at = last if contact else next_above(frame, height, state.region.first, last, level)
+        at = last if contact else next_above(frame, height, 0, last, level)
         while at < last:
             cell = at if frame[at] == peak else cell
             contact = contact or neighbourhood(frame, height, grid, at) > patch
@@ -85,8 +84,23 @@ def activity(state: EstimatorState, frame: Pointer, height: Pointer) -> None:
 
 
 @inner_kernel
+def shows_pattern(state: EstimatorState, frame: FloatArray, cells: Cells) -> bool:
+    """Return whether a solid tip's frame shows a contact: its pattern, by ``patch_level``.
+
+    Much of a solid tip's pressure is spread over its base: a weak contact shows in all cells
+    together long before it does in any neighbourhood. The pattern has a mean of 0 and squares that
+    sum to 1, so that neither a shift of all cells' zeros nor noise that ends at 0 is a contact.
+    """
+    projection = 0.0
+    for k in range(frame.shape[0]):
+        projection += cells.pattern[k] * frame[k] if cells.height[k] >= 0.0 else 0.0
+    level = state.options.patch_level * state.signal.noise
+    return bool(projection > (_HYSTERESIS if state.estimate.warm else 1.0) * level)
+
+
+@inner_kernel
 def presses_outside(
-    solid: SolidFit | None, state: EstimatorState, frame: Pointer, height: Pointer, level: float
+    state: EstimatorState, frame: FloatArray, height: FloatArray, level: float
 ) -> bool:
     """Return whether cells of ``level`` or more, not one alone, lie two cells off the footprint.
 
@@ -96,20 +110,16 @@ def presses_outside(
     grid = state.grid
     a = grid.radius
     cols = grid.cols
-    d = state.estimate.d
-    rho = math.sqrt(max(d * (2.0 * a - d), 0.0)) + 2.0 * math.hypot(grid.pitch_x, grid.pitch_y)
-    rho += 3.0 * state.options.blur
-    if rho >= 0.99 * a:
-        return False
     face = state.around
-    set_face(face, a, a - math.sqrt(a * a - rho * rho), state.estimate.n_x, state.estimate.n_y)
-    set_extremes(face, a)
-    for i in range(state.region.first // cols, state.region.last // cols):
-        y0 = grid.y + i * grid.pitch_y
-        y1 = y0 + grid.pitch_y
-        below = line_span(face.u, face.v, face.w, a, y0)
-        above = line_span(face.u, face.v, face.w, a, y1)
-        first, _, _, last = band_columns(face, grid, below, above, y0, y1)
+    estimate = state.estimate
+    margin = 2.0 * math.hypot(grid.pitch_x, grid.pitch_y) + 3.0 * state.options.blur
+    if math.sqrt(max(estimate.d * (2.0 * a - estimate.d), 0.0)) + margin >= 0.99 * a:
+        return False
+    set_face(face, a, estimate.d, estimate.n_x, estimate.n_y)
+    set_around(face, face, a, margin)
+    for i in range(grid.rows):
+        left, right = line_span(face, a, grid.y + (i + 0.5) * grid.pitch_y)
+        first, last = steps(left, right, grid.x, grid.pitch_x, cols)
         start = i * cols
         at = next_above(frame, height, start, start + cols, level)
         while at < start + cols:
@@ -126,7 +136,7 @@ _DEAD = 1e3  # m below: no face is ever there
 
 
 @inner_kernel
-def _is_outlier(state: EstimatorState, frame: Pointer, height: Pointer) -> bool:
+def _is_outlier(state: EstimatorState, frame: FloatArray, height: FloatArray) -> bool:
     """Return whether the largest cell stands alone as no contact can.
 
     A contact about as wide as a cell could press ``signal.confined`` at most: a wider one never has
@@ -152,7 +162,7 @@ def _is_outlier(state: EstimatorState, frame: Pointer, height: Pointer) -> bool:
 
 
 @inner_kernel
-def without_outliers(state: EstimatorState, frame: Pointer, cells: Pointer, height: Pointer) -> int:
+def without_outliers(state: EstimatorState, frame: FloatArray, height: FloatArray) -> int:
     """Return the number of outliers; ``state.signal`` is what :func:`activity` finds without them.
 
     They are marked dead until :func:`restore_outliers`.
@@ -167,10 +177,9 @@ def without_outliers(state: EstimatorState, frame: Pointer, cells: Pointer, heig
         and rejected < OUTLIERS_MAX
         and _is_outlier(state, frame, height)
     ):
-        cells[(signal.row * CELL_PLANES + ACTIVE) * cols + signal.col] = 0.0
         at = signal.row * cols + signal.col
         height[at] -= _DEAD
-        state.region.number -= 1
+        signal.number -= 1
         state.outliers[rejected] = at
         rejected += 1
         activity(state, frame, height)
@@ -178,12 +187,8 @@ def without_outliers(state: EstimatorState, frame: Pointer, cells: Pointer, heig
 
 
 @inner_kernel
-def restore_outliers(state: EstimatorState, rejected: int, cells: Pointer, height: Pointer) -> None:
+def restore_outliers(state: EstimatorState, rejected: int, height: FloatArray) -> None:
     """Make the outliers live again."""
-    cols = state.grid.cols
     for k in range(rejected):
-        at = state.outliers[k]
-        row = at // cols
-        cells[(row * CELL_PLANES + ACTIVE) * cols + at - row * cols] = 1.0
-        height[at] += _DEAD
-        state.region.number += 1
+        height[state.outliers[k]] += _DEAD
+        state.signal.number += 1

@@ -1,28 +1,24 @@
 """Errors that one frame doesn't show as noise from cell to cell, carried into its covariance.
 
-With J the Jacobian by (gain, u, v, w), JᵀJ = L Lᵀ, white noise of σ² leaves σ² (JᵀJ)⁻¹. Besides:
+With J the Jacobian of the fit, white noise of σ² leaves σ² (JᵀJ)⁻¹. Besides, each straight in it:
 
-    correlated noise   σ² L⁻ᵀ K L⁻¹,   K(d) = L⁻¹ Jᵀ C J L⁻ᵀ                     (`correlate`)
-    shared error q     m mᵀ,   m = size (JᵀJ)⁻¹ Jᵀq                              (`systematic`)
-      of second order  (0.7 d Δ²)² + (0.8 d ω²)² + (1.6 ω² d²/a)² in d, … (`add_second_order`)
+    shared error q     m mᵀ,   m = size (JᵀJ)⁻¹ Jᵀq                        (`set_shared_errors`)
       it leaves        Σ size² qᵀq − m·(size Jᵀq)
-    smooth error       W (JᵀJ)⁻¹ W smooth² Σ p², p the model's pressures      (`systematic`)
-    radius             m of the pitch, and d size in depth                       (`deepen`)
-    rotation, scan     (n × z) rotation, and in w the way over the rows' length    (`turn`)
-    smooth misfit      Σ r_k r_(k−1) − n ρ₁ σ² − decrement             (`undetected_misfit`)
+    smooth error       W (JᵀJ)⁻¹ W smooth² Σ p², p the model's pressures         (likewise)
+    rotation           (n × z) rotation                                          (likewise)
+    solid tip's data   n lean d/a                                                (likewise)
+    correlated noise   standard deviations times √(C_ii/(JᵀJ)⁻¹_ii),
+                       C = (JᵀJ)⁻¹ JᵀRJ (JᵀJ)⁻¹, at no tilt                      (`widen`)
+    smooth misfit      Σ r_k r_(k−1) − n ρ₁ σ² − decrement                 (`undetected_misfit`)
 
-C is the noise's correlation by lag, as `calibrate` measures it: K, the ``variance_factor``, depends
-on the footprint's size beside the correlation's and is tabulated over d. The q are images of what
-is the same in every frame: a shift of all cells, its slopes in x and y, the tip's centre in x and
-y, the pitch, and the modulus or gain, ``size`` their standard deviations; Δ is m's part in depth
-over d, ω² = ``rotated`` its rotation squared. W² are the fractions of a smooth error's square that
-look like a change of d and the gain, and of a tilt: the errors of real cells are nearly as
-symmetric as the pressure. r_k are the residuals of the packed cells: single cells' noise adds
-nothing to the product of neighbours on average, a misfit that is smooth over the footprint all of
-it.
-
-Kernels that take ``solid`` first depend on the tip: those here are of springs, and `solid_budget`
-has a solid tip's, of which a scene compiles the ones it needs.
+The q are patterns of what is the same in every frame: a shift of all cells, its slopes in x and y,
+the tip's centre in x and y, the pitch, and the modulus or gain, ``size`` their standard deviations.
+What moves the tip under the cells has the modelled pressure's own differences between neighbours
+for a pattern. R is the noise's correlation by lag, as `calibrate` measures it; how much it widens
+depends on the footprint's size, over which it is tabulated. W² are the fractions of a smooth
+error's square that look like a change of d and the gain, and of a tilt: the errors of real cells
+are nearly as symmetric as the pressure. r_k are the residuals: single cells' noise adds nothing to
+the product of neighbours on average, a misfit that is smooth over the footprint all of it.
 """
 
 from __future__ import annotations
@@ -32,45 +28,40 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from softfinger.kinematics.compiled.kernel import fast_inner_kernel, inner_kernel
-from softfinger.kinematics.compiled.simd import Pointer, address, further
+from softfinger.kinematics.compiled.kernel import fast_inner_kernel, index, inner_kernel
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
-from softfinger.kinematics.estimation.likelihood import BY_U, BY_V, BY_W, STRESS
-from softfinger.kinematics.estimation.solid_projection import SolidFit
 from softfinger.kinematics.estimation.state import (
+    DEPTH,
     DEPTHS,
+    GAIN,
+    PARAMETERS,
     PLACE_X,
     PLACE_Y,
-    READING,
+    PRESSURE,
     SCALING,
     SHIFT,
     SLOPE_X,
     SLOPE_Y,
     SOURCES,
-    WEIGHT,
-    Budget,
+    TILT_X,
+    TILT_Y,
+    Cells,
     EstimatorState,
-    Four,
-    Matrix,
 )
 from softfinger.kinematics.sensing.footprint import FloatArray
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
-_DEEPEST = 0.75  # of the radius: the end of the table over d
 NEIGHBOURS = np.outer((1.0, 2.0, 2.0, 2.0, 1.0), (1.0, 2.0, 2.0, 2.0, 1.0))  # see `detection`
 NEIGHBOURS[2, 2] = 0.0
 _PEAK = 4.5  # standard deviations of the cell that noise alone makes the largest
 _FEW = 48.0  # cells within which nothing is smooth or rough
-# What the fit makes of a motion besides its straight answer, as fractions of d and of the gain by
-# the square of the motion in depth over d and of the turn, and by that of the turn times d/a in any
-# direction: measured over the envelope, with shifts of 1 kPa, of 0.5 mm, of 1 % of the pitch and 5
-# % of the modulus.
-_D_BY_DEPTH, _GAIN_BY_DEPTH = 0.7, 0.6
-_D_BY_ROTATION, _GAIN_BY_ROTATION, _BY_ROTATION_AT_DEPTH = 0.8, 2.0, 1.6
 # Of an error's squares, smooth over a footprint: what d (and the gain), each tilt, and no parameter
 # has. Curves, hysteresis and crosstalk are nearly as symmetric as the pressure.
 _SMOOTH_IN_DEPTH, _SMOOTH_IN_TILT, _SMOOTH_LEFT = 0.15, 0.06, 0.2
+# Of a solid tip's tilt, over d/a: what the model's is off on frames of independent elements, up to
+# 20° and 7 mm (4 % of a bonded tip's there, and hardly anything of a lying one's).
+_LEAN = 0.1
 _SURE = 6.0  # standard deviations that noise alone hardly makes of neighbours' products
 
 
@@ -80,12 +71,10 @@ class Uncertainty:
 
     ``baseline``: of a shift of all cells [Pa], ``slope``: of the same from the tip's middle to its
     rim, in x and in y [Pa]; ``centre``: of the tip's place on the sensor, in x and in y [m];
-    ``rotation``: of the sensor [rad]; ``pitch``, ``radius``, ``modulus`` and ``gain`` (of all cells
-    alike): relative; ``smooth``: of a cell's pressure, relative, where neighbours share it, by
-    another curve, hysteresis or crosstalk; ``skew``: of the way [m] that the face goes during one
-    scan of the rows. ``correlation`` [rows, cols] is that of two
-    cells' noise by their distance in rows and columns, 1 at [0, 0] and 0 beyond; None for white
-    noise.
+    ``rotation``: of the sensor [rad]; ``pitch``, ``modulus`` and ``gain`` (of all cells alike):
+    relative; ``smooth``: of a cell's pressure, relative, where neighbours share it, by another
+    curve, hysteresis or crosstalk. ``correlation`` [rows, cols] is that of two cells' noise by
+    their distance in rows and columns, 1 at [0, 0] and 0 beyond; None for white noise.
     """
 
     baseline: float = 0.0
@@ -97,8 +86,6 @@ class Uncertainty:
     gain: float = 0.0
     smooth: float = 0.0
     rotation: float = 0.0
-    radius: float = 0.0
-    skew: float = 0.0
 
     def __post_init__(self) -> None:
         for name in (each.name for each in fields(self) if each.name != "correlation"):
@@ -111,46 +98,45 @@ class Uncertainty:
             object.__setattr__(self, "correlation", rho)
 
 
-def set_errors(state: EstimatorState, known: Uncertainty, grid: SensorGrid, law: float) -> None:
-    """Fill in what depends on no tip.
+def set_budget(
+    state: EstimatorState,
+    known: Uncertainty,
+    grid: SensorGrid,
+    tip: Fingertip,
+    material: Material,
+    pattern: FloatArray | None,
+) -> None:
+    """Fill in the budget, and raise the activity test's level to what the errors alone may make.
 
-    ``law`` [Pa] is how far the material's law is off the points that it was made from: to the
-    cells that it presses that is like a shift.
+    The material's ``fit_error`` [Pa], how far the law is off the points that it was made from, is
+    like a shift to the cells that it presses. ``pattern`` [rows, cols] is a solid tip's, by which
+    its contact is noticed.
     """
-    budget = state.budget
-    budget.shift = math.hypot(known.baseline, law)
+    budget, options = state.budget, state.options
+    modulus = 0.0 if options.free_gain else math.hypot(known.modulus, known.gain)
+    budget.sizes[[SHIFT, SLOPE_X, SLOPE_Y]] = known.baseline, known.slope, known.slope
+    budget.sizes[[PLACE_X, PLACE_Y, SCALING]] = known.centre, known.centre, known.pitch
+    budget.sizes[SHIFT] = math.hypot(known.baseline, material.fit_error)
+    budget.sizes[PRESSURE] = modulus
     budget.baseline, budget.slope = known.baseline, known.slope
-    budget.centre, budget.pitch, budget.radius = known.centre, known.pitch, known.radius
-    budget.modulus = 0.0 if state.options.free_gain else math.hypot(known.modulus, known.gain)
     budget.smooth, budget.rotation = known.smooth, known.rotation
-    budget.skew = known.skew / (grid.rows * grid.pitches[1])
-    sizes = budget.shift, budget.slope, budget.centre, budget.pitch, budget.radius, budget.modulus
-    budget.systematic = max(*sizes, budget.smooth, budget.rotation, budget.skew) > 0.0
+    budget.lean = _LEAN if options.is_solid else 0.0
+    budget.systematic = max(*budget.sizes, budget.smooth, budget.rotation, budget.lean) > 0.0
     budget.cells_per_sample = 1.0
+    level, weights = options.patch_level, NEIGHBOURS if pattern is None else pattern
+    norm = float(np.sqrt((weights**2).sum()))
     if known.correlation is not None and known.correlation.size > 1:
         rho = both_ways(known.correlation)
         budget.correlated = True
         budget.cells_per_sample = float((rho**2).sum())
         budget.along = float(known.correlation[0, 1]) if known.correlation.shape[1] > 1 else 0.0
-
-
-def set_budget(
-    state: EstimatorState, known: Uncertainty, grid: SensorGrid, tip: Fingertip, law: float
-) -> None:
-    """Fill in the budget, and raise the activity test's level to what the errors alone may make."""
-    set_errors(state, known, grid, law)
-    budget, options = state.budget, state.options
-    level = options.patch_level
-    weights = NEIGHBOURS
-    norm = float(np.sqrt((weights**2).sum()))
-    if budget.correlated:
-        rho = both_ways(known.correlation)
-        _set_variance_factor(budget, rho, grid, tip, options.free_gain)
-        with_centre = float((weights * _fitted(rho, 5)).sum())
+        _set_widening(state, rho, grid, tip, material)
+        with_centre = float((weights * _fitted(rho, 5)).sum()) if pattern is None else 0.0
         variance = float(quadratic(weights, rho)) - with_centre**2
         level = (level * math.sqrt(max(variance, 0.0)) + _PEAK * max(with_centre, 0.0)) / norm
     # A shift of twice the baseline's standard deviation is no contact.
-    options.patch_level = level + 2.0 * known.baseline / options.noise * weights.sum() / norm
+    shift = 2.0 * known.baseline / options.noise * weights.sum() / norm
+    options.patch_level = level + max(shift, 0.0)
 
 
 def both_ways(correlation: FloatArray | None) -> FloatArray:
@@ -187,111 +173,88 @@ def quadratic(fields: FloatArray, rho: FloatArray) -> FloatArray:
     return np.asarray(out if fields.ndim == 3 else out[0, 0])
 
 
-def _set_variance_factor(
-    budget: Budget, rho: FloatArray, grid: SensorGrid, tip: Fingertip, free: bool
+def _set_widening(
+    state: EstimatorState, rho: FloatArray, grid: SensorGrid, tip: Fingertip, material: Material
 ) -> None:
-    """K = L⁻¹ JᵀCJ L⁻ᵀ over d, J by (gain, u, v, w) at no tilt, JᵀJ = LLᵀ, C the correlation.
-
-    For a constant modulus: how smooth J is hardly depends on the law, nor on the tilt.
-    """
-    material, a = Material.constant(1.0), tip.radius
+    """Tabulate what correlated noise widens at no tilt, and the cells that the fit takes off."""
+    options = state.options
+    first = 0 if options.free_gain else 1
     for k in range(DEPTHS):
-        d = _DEEPEST * a * ((k + 1) / DEPTHS) ** 2
+        d = options.deepest * ((k + 1) / DEPTHS) ** 2
 
         def at(d: float, x: float = 0.0, y: float = 0.0) -> FloatArray:
             return grid.pressure(tip, material, d, x, y)
 
-        step = 1e-4
+        step = 1e-3
+        less = d * (1.0 - step)
         columns = [
             at(d),
-            (at(d * (1.0 - step)) - at(d * (1.0 + step))) / (2.0 * step * d),  # by u = a − d
+            (at(d) - at(less)) / (d - less),
             (at(d, step) - at(d, -step)) / (2.0 * step),
             (at(d, 0.0, step) - at(d, 0.0, -step)) / (2.0 * step),
-        ][0 if free else 1 :]
-        jacobian = np.stack(columns, axis=2)
+        ]
+        jacobian = np.stack(columns[first:], axis=2)
         jacobian /= np.sqrt((jacobian**2).sum(axis=(0, 1)))
-        white = np.einsum("xyi,xyj->ij", jacobian, jacobian)
-        inverse = np.linalg.inv(np.linalg.cholesky(white))
-        first = 4 - len(columns)
-        budget.variance_factor[k, first:, first:] = inverse @ quadratic(jacobian, rho) @ inverse.T
+        white = np.linalg.inv(np.einsum("xyi,xyj->ij", jacobian, jacobian))
+        correlated = white @ quadratic(jacobian, rho)
+        state.budget.widening[k, 4] = np.trace(correlated)
+        wider = np.sqrt(np.diag(correlated @ white) / np.diag(white))
+        state.budget.widening[k, first:4] = wider
 
 
 @inner_kernel
-def correlate(solid: SolidFit | None, state: EstimatorState, d: float) -> float:
-    """Make ``fit.inverse`` the covariance under correlated noise of variance 1; the trace of K."""
-    fit = state.fit
-    budget = state.budget
-    first = 0 if state.options.free_gain else 1
-    t = DEPTHS * math.sqrt(d / (_DEEPEST * state.grid.radius)) - 1.0
+def widen(state: EstimatorState) -> float:
+    """Widen ``fit.inverse`` by correlated noise; return how many cells' noise the fit takes off."""
+    inverse = state.fit.inverse
+    table = state.budget.widening
+    t = DEPTHS * math.sqrt(state.fit.d / state.options.deepest) - 1.0
     t = min(max(t, 0.0), DEPTHS - 1.001)
     k = int(t)
     t -= k
-    work = budget.work
-    trace = 0.0
-    for i in range(first, 4):
-        for j in range(first, 4):
-            work[i, j] = (1.0 - t) * budget.variance_factor[k, i, j] + t * budget.variance_factor[
-                k + 1, i, j
-            ]
-        trace += work[i, i]
-    # (JᵀJ)⁻¹ = AᵀA with A = lower · scale.
-    half = fit.matrix
-    for i in range(first, 4):
-        for j in range(first, 4):
-            value = 0.0
-            for m in range(j, 4):
-                value += work[i, m] * fit.lower[m, j]
-            half[i, j] = value * fit.scale[j]
-    for i in range(first, 4):
-        for j in range(first, 4):
-            value = 0.0
-            for m in range(i, 4):
-                value += fit.lower[m, i] * half[m, j]
-            fit.inverse[i, j] = value * fit.scale[i]
-    return trace
+    for i in range(4):
+        factor = (1.0 - t) * table[k, i] + t * table[k + 1, i]
+        for j in range(PARAMETERS):
+            inverse[i, j] *= factor
+            inverse[j, i] *= factor
+    lost: float = (1.0 - t) * table[k, 4] + t * table[k + 1, 4]
+    return lost
 
 
 @fast_inner_kernel
-def smooth_misfit(
-    solid: SolidFit | None, state: EstimatorState, packed: Pointer
-) -> tuple[float, float]:
-    """Return Σ over neighbouring packed cells of the product of residuals [Pa²], and their number.
+def _neighbours_products(cells: Cells, lowest: float, first: int, last: int) -> tuple[float, float]:
+    """Return Σ over neighbours in a row of the product of residuals [Pa²], and their number.
 
-    Noise of single cells adds nothing to it on average, what is smooth over the footprint all.
+    Of cells that read more than ``lowest`` [Pa] by the model.
     """
-    gain = state.fit.gain
-    saturation = state.signal.saturation
-    # Nearer to the floor, readings that end there are more than the pressure.
-    floor = state.signal.floor + 2.0 * state.fit.clip
-    size = state.model.rows * state.model.cols
     total = 0.0
     number = 0.0
-    for k in range(1, state.fit.count):
-        here = gain * packed[STRESS * size + k]
-        before = gain * packed[STRESS * size + k - 1]
-        y = packed[READING * size + k]
-        z = packed[READING * size + k - 1]
-        weight = packed[WEIGHT * size + k] * packed[WEIGHT * size + k - 1]
-        counts = (max(here, before) < saturation) & (min(here, before) > floor)
-        weight = weight if counts else 0.0
-        total += weight * (y - here) * (z - before)
-        number += weight
+    one = index(1)
+    for k in range(first + one, last):
+        before = k - one
+        both = (cells.factor[k] > 0.0) & (cells.factor[before] > 0.0)
+        both &= min(cells.model[k], cells.model[before]) > lowest
+        total += cells.residual[k] * cells.residual[before] if both else 0.0
+        number += 1.0 if both else 0.0
     return total, number
 
 
 @inner_kernel
-def undetected_misfit(
-    solid: SolidFit | None, state: EstimatorState, packed: Pointer, beyond: float
-) -> float:
+def undetected_misfit(state: EstimatorState, cells: Cells, beyond: float) -> float:
     """Return the square sum [Pa²] of misfit smooth over the footprint; 0 within the noise.
 
     ``beyond`` [Pa²] is all that it leaves beyond what is expected: in a footprint of few cells no
     part of that can be told from smooth.
     """
-    total, number = smooth_misfit(solid, state, packed)
+    fit = state.fit
     variance = state.signal.variance
-    # What the last step takes off is not in the packed cells yet.
-    total -= number * variance * state.budget.along + state.fit.decrement
+    cols = state.grid.cols
+    # Nearer to the floor, readings that end there are more than the pressure.
+    lowest = max(state.signal.floor, 0.0) + 2.0 * fit.clip
+    total, number = _neighbours_products(
+        cells, lowest, index(fit.first_row * cols), index(fit.last_row * cols)
+    )
+    # What the last step takes off is not in the residuals yet.
+    total -= number * variance * state.budget.along + fit.decrement
     total = beyond if number < _FEW else min(total, beyond)
     if total <= _SURE * variance * math.sqrt(number * state.budget.cells_per_sample):
         return 0.0
@@ -299,196 +262,109 @@ def undetected_misfit(
 
 
 @fast_inner_kernel
-def project_shared_errors(solid: SolidFit | None, state: EstimatorState, packed: Pointer) -> None:
-    """Set Jᵀq and qᵀq of the shared errors q."""
-    face = state.fit.face
-    u = face.u
-    v = face.v
-    w = face.w
-    a2 = state.model.radius * state.model.radius
-    per_radius = 1.0 / state.model.radius
-    # Variances of x and of y in a cell, times 4.
-    xx_cell = state.model.pitch_x * state.model.pitch_x / 3.0
-    yy_cell = state.model.pitch_y * state.model.pitch_y / 3.0
-    size = state.model.rows * state.model.cols
-    responses = address(state.budget.responses)
-    squares = address(state.budget.squares)
-    for column in range(4):
-        plane = column * size  # STRESS, BY_U, BY_V, BY_W stand first
-        shift = slope_x = slope_y = along_x = along_y = scaling = 0.0
-        n = nx = ny = xx = yy = ss = 0.0
-        for k in range(state.fit.count):
-            g = packed[BY_U * size + k]
-            per_g = 1.0 / g if g > 0.0 else 0.0
-            x = packed[BY_V * size + k] * per_g
-            y = packed[BY_W * size + k] * per_g
-            # The strain is 1 − (u − v x − w y) g with g = 1/√(a² − x² − y²), so ∂g/∂x = x g³.
-            q = max(a2 - x * x - y * y, 0.01 * a2)
-            # Near the rim the mean of g³ over a cell is more than its middle's.
-            wide = (xx_cell * x * x + yy_cell * y * y) / (q * q)
-            steep = (u - v * x - w * y) * (1.0 + 0.5 * min(wide, 1.0)) / q
-            by_x = g * (v - steep * x)
-            by_y = g * (w - steep * y)
-            own = packed[WEIGHT * size + k] * packed[plane + k]
-            whole = 1.0 if g > 0.0 else 0.0
-            by_pitch = x * by_x + y * by_y
-            shift += own * whole
-            slope_x += own * x
-            slope_y += own * y
-            along_x += own * by_x
-            along_y += own * by_y
-            scaling += own * by_pitch
-            n += whole
-            nx += x * x
-            ny += y * y
-            xx += by_x * by_x
-            yy += by_y * by_y
-            ss += by_pitch * by_pitch
-        out = further(responses, SOURCES * column)
-        out[SHIFT] = shift
-        out[SLOPE_X] = per_radius * slope_x
-        out[SLOPE_Y] = per_radius * slope_y
-        out[PLACE_X] = along_x
-        out[PLACE_Y] = along_y
-        out[SCALING] = scaling
-        squares[SHIFT] = n
-        squares[SLOPE_X] = nx / a2
-        squares[SLOPE_Y] = ny / a2
-        squares[PLACE_X] = xx
-        squares[PLACE_Y] = yy
-        squares[SCALING] = ss
-
-
-@inner_kernel
-def add_second_order(solid: SolidFit | None, state: EstimatorState, d: float, out: Matrix) -> None:
-    """Add the second-order error of the shift ``budget.displacement`` to the covariance ``out``."""
-    fit = state.fit
-    displacement = state.budget.displacement
-    gain = fit.gain
-    u = fit.face.u
-    v = fit.face.v
-    w = fit.face.w
-    n_z = 1.0 / math.sqrt(1.0 + v * v + w * w)
-    deeper = (
-        n_z * (u * n_z * n_z * (v * displacement[2] + w * displacement[3]) - displacement[1]) / d
-    )
-    square = min(deeper * deeper, 1.0)
-    rotated = min(displacement[2] * displacement[2] + displacement[3] * displacement[3], 1.0)
-    d_by_rotation = _D_BY_ROTATION * d * rotated
-    tilted = _BY_ROTATION_AT_DEPTH * rotated * d / state.grid.radius
-    out[1, 1] += (_D_BY_DEPTH * d * square) ** 2 + d_by_rotation * d_by_rotation + (tilted * d) ** 2
-    out[2, 2] += tilted * tilted
-    out[3, 3] += tilted * tilted
-    if state.options.free_gain:
-        gain_by_rotation = _GAIN_BY_ROTATION * gain * rotated
-        out[0, 0] += (_GAIN_BY_DEPTH * gain * square) ** 2 + gain_by_rotation * gain_by_rotation
-        out[0, 0] += (tilted * gain) ** 2
-        out[0, 1] += d_by_rotation * gain_by_rotation
-        out[1, 0] += d_by_rotation * gain_by_rotation
-
-
-@inner_kernel
-def deepen(solid: SolidFit | None, state: EstimatorState, change: float) -> None:
-    """Add a ``change`` of d [m] to the shift ``budget.displacement``."""
-    v = state.fit.face.v
-    w = state.fit.face.w
-    state.budget.displacement[1] -= change * math.sqrt(1.0 + v * v + w * w)
-
-
-@inner_kernel
-def turn(
-    solid: SolidFit | None, state: EstimatorState, rotation: float, skew: float, out: Matrix
+def _project(
+    state: EstimatorState, cells: Cells, column: int, values: FloatArray, first: int, last: int
 ) -> None:
-    """Add what a rotated grid and a face that goes on during a scan do to the covariance ``out``.
-
-    The first turns the tilt with it. The second's change, y ∂p/∂u, is that of w to springs.
-    """
-    v = state.fit.face.v
-    w = state.fit.face.w
-    add_turned(v, w, rotation, out)
-    out[3, 3] += skew * skew * (1.0 + v * v + w * w)
+    """Set Jᵀq of one column of the Jacobian, and qᵀq, for each pattern but the pressure itself."""
+    one = index(1)
+    two = index(2)
+    cols = index(state.grid.cols)
+    both = cols + cols
+    per_x = 1.0 / (12.0 * state.grid.pitch_x)
+    per_y = 1.0 / (12.0 * state.grid.pitch_y)
+    per_radius = 1.0 / state.grid.radius
+    end = index(cells.stress.shape[0]) - both
+    p = cells.stress
+    q0 = q1 = q2 = q3 = q4 = q5 = n0 = n1 = n2 = n3 = n4 = n5 = 0.0
+    for k in range(max(first, both), min(last, end)):
+        counts = cells.factor[k] > 0.0
+        own = cells.factor[k] * values[k]
+        x = cells.x[k] if counts else 0.0
+        y = cells.y[k] if counts else 0.0
+        by_x = per_x * (8.0 * (p[k + one] - p[k - one]) - p[k + two] + p[k - two])
+        by_y = per_y * (8.0 * (p[k + cols] - p[k - cols]) - p[k + both] + p[k - both])
+        by_x = by_x if counts else 0.0
+        by_y = by_y if counts else 0.0
+        by_pitch = x * by_x + y * by_y
+        q0 += own
+        q1 += own * x
+        q2 += own * y
+        q3 += own * by_x
+        q4 += own * by_y
+        q5 += own * by_pitch
+        n0 += 1.0 if counts else 0.0
+        n1 += x * x
+        n2 += y * y
+        n3 += by_x * by_x
+        n4 += by_y * by_y
+        n5 += by_pitch * by_pitch
+    responses = state.budget.responses
+    squares = state.budget.squares
+    responses[column, SHIFT], squares[SHIFT] = q0, n0
+    responses[column, SLOPE_X], squares[SLOPE_X] = per_radius * q1, per_radius * per_radius * n1
+    responses[column, SLOPE_Y], squares[SLOPE_Y] = per_radius * q2, per_radius * per_radius * n2
+    responses[column, PLACE_X], squares[PLACE_X] = q3, n3
+    responses[column, PLACE_Y], squares[PLACE_Y] = q4, n4
+    responses[column, SCALING], squares[SCALING] = q5, n5
 
 
 @inner_kernel
-def add_turned(x: float, y: float, rotation: float, out: Matrix) -> None:
-    """Add the covariance of a vector (x, y), the last two of ``out``, by its ``rotation``."""
-    square = rotation * rotation
-    out[2, 2] += square * y * y
-    out[2, 3] -= square * x * y
-    out[3, 2] -= square * x * y
-    out[3, 3] += square * x * x
-
-
-@inner_kernel
-def smooth_square(solid: SolidFit | None, state: EstimatorState) -> float:
-    """Return the square of the relative error of a cell's pressure that neighbours share."""
-    return state.budget.smooth * state.budget.smooth
-
-
-@inner_kernel
-def add_square(displacement: Four, out: Matrix) -> None:
-    """Add the covariance of a shift by ``displacement``."""
-    for i in range(4):
-        for j in range(4):
-            out[i, j] += displacement[i] * displacement[j]
-
-
-@inner_kernel
-def systematic(
-    solid: SolidFit | None, state: EstimatorState, packed: Pointer, d: float, out: Matrix
-) -> float:
-    """Compute the covariance of (gain, u, v, w) by what all frames share, into ``out``.
+def set_shared_errors(state: EstimatorState, cells: Cells) -> float:
+    """Set the covariance by what all frames share, ``budget.shared``, of the fit's parameters.
 
     ``fit.inverse`` is that of white noise of variance 1 [Pa²]. Returns the square sum [Pa²] that
     the fit leaves of it where each is twice its standard deviation.
     """
     fit = state.fit
     budget = state.budget
+    shared = budget.shared
+    inverse = fit.inverse
     gain = fit.gain
-    project_shared_errors(solid, state, packed)
-    factor = (1.0, -gain, gain, gain)
-    # The pattern of the modulus is the pressure itself, that of the radius the pitch's.
-    sizes = (
-        budget.shift,
-        budget.slope,
-        budget.slope,
-        gain * budget.centre,
-        gain * budget.centre,
-        gain * budget.pitch,
-        gain * budget.radius,
-        gain * budget.modulus,
-    )
-    displacement = budget.displacement
-    pressure = fit.sums.normal[0]
-    smooth = smooth_square(solid, state) * gain * gain * pressure
+    first = index(fit.first_row * state.grid.cols)
+    last = index(fit.last_row * state.grid.cols)
+    _project(state, cells, GAIN, cells.stress, first, last)
+    _project(state, cells, DEPTH, cells.by_d, first, last)
+    _project(state, cells, TILT_X, cells.by_x, first, last)
+    _project(state, cells, TILT_Y, cells.by_y, first, last)
+    pressure: float = fit.normal[GAIN, GAIN]
+    budget.squares[PRESSURE] = pressure
+    for i in range(PARAMETERS):
+        factor = gain if i > GAIN else 1.0
+        for source in range(PRESSURE):
+            budget.responses[i, source] *= factor
+        budget.responses[i, PRESSURE] = fit.normal[i, GAIN]
+    smooth = budget.smooth * budget.smooth * gain * gain * pressure
     deep = math.sqrt(_SMOOTH_IN_DEPTH * smooth)
     tilted = math.sqrt(_SMOOTH_IN_TILT * smooth)
     parts = (deep, deep, tilted, tilted)
     for i in range(4):
         for j in range(4):
-            out[i, j] = parts[i] * parts[j] * fit.inverse[i, j]
-    remaining: float = _SMOOTH_LEFT * smooth
-    for source in range(SOURCES + 2):
-        size = sizes[source]
+            shared[i, j] = parts[i] * parts[j] * inverse[i, j]
+    remaining = _SMOOTH_LEFT * smooth
+    displacement = budget.displacement
+    for source in range(SOURCES):
+        size = budget.sizes[source]
         if size == 0.0:
             continue
-        image = min(source, SCALING)
-        own = source <= SOURCES
-        remaining += size * size * (budget.squares[image] if own else pressure)
-        for i in range(4):
+        # What moves or scales the pressure goes with the gain; a shift of zeros does not.
+        size *= gain if source >= PLACE_X else 1.0
+        remaining += size * size * budget.squares[source]
+        for i in range(PARAMETERS):
             displacement[i] = 0.0
-        for j in range(4):
-            response = budget.responses[j, image] if own else fit.sums.normal[j]
-            response *= factor[j] * size
-            for i in range(4):
-                displacement[i] += fit.inverse[i, j] * response
-        for j in range(4):
-            response = budget.responses[j, image] if own else fit.sums.normal[j]
-            remaining -= displacement[j] * response * factor[j] * size
-        add_second_order(solid, state, d, out)
-        if source == SOURCES:
-            # A wider tip looks like finer cells, and then its d is as much more.
-            deepen(solid, state, d * budget.radius)
-        add_square(displacement, out)
-    turn(solid, state, budget.rotation, budget.skew, out)
+            for j in range(PARAMETERS):
+                displacement[i] += inverse[i, j] * budget.responses[j, source] * size
+        for i in range(PARAMETERS):
+            remaining -= displacement[i] * budget.responses[i, source] * size
+            for j in range(PARAMETERS):
+                shared[i, j] += displacement[i] * displacement[j]
+    along = budget.lean * fit.d / state.grid.radius
+    for i in range(2):
+        for j in range(2):
+            # The tilt's direction, and across it.
+            n_i = fit.n_y if i else fit.n_x
+            n_j = fit.n_y if j else fit.n_x
+            m_i = fit.n_x if i else -fit.n_y
+            m_j = fit.n_x if j else -fit.n_y
+            more = along * along * n_i * n_j + budget.rotation * budget.rotation * m_i * m_j
+            shared[TILT_X + i, TILT_X + j] += more
     return 4.0 * max(remaining, 0.0)

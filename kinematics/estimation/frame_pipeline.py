@@ -9,19 +9,28 @@ import math
 
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 from softfinger.kinematics.compiled.layout import Records
-from softfinger.kinematics.compiled.simd import Pointer, address, further
 from softfinger.kinematics.estimation.detection import (
     STRONG,
     presses_outside,
     restore_outliers,
+    shows_pattern,
     without_outliers,
 )
 from softfinger.kinematics.estimation.gauss_newton import energy_of, fit
 from softfinger.kinematics.estimation.invalid import Invalid
 from softfinger.kinematics.estimation.moments import start
-from softfinger.kinematics.estimation.solid_projection import SolidFit, presses
-from softfinger.kinematics.estimation.state import OUTLIERS_MAX, EstimatorState, Matrix
-from softfinger.kinematics.sensing.footprint import FloatArray, IntArray
+from softfinger.kinematics.estimation.state import (
+    OUTLIERS_MAX,
+    Cells,
+    EstimatorState,
+    Images,
+    Matrix,
+    Model,
+    cells_in,
+)
+from softfinger.kinematics.sensing.footprint import FloatArray
+from softfinger.kinematics.sensing.solid_pressure import Weights
+from softfinger.kinematics.sensing.springs_pressure import points_in
 
 # Noise that ends at 0 raises its neighbourhoods' sums: so much more makes alarms as rare again.
 CLIPPED_MORE = 0.5
@@ -42,13 +51,7 @@ SHARED_MAX = 0.5  # standard deviation of d by known uncertainties, over d: beyo
 
 
 @inner_kernel
-def _likelihood(
-    solid: SolidFit | None,
-    state: EstimatorState,
-    frame: Pointer,
-    scratch: Pointer,
-    indices: IntArray | None,
-) -> Invalid:
+def _likelihood(state: EstimatorState, model: Model, frame: FloatArray, cells: Cells) -> Invalid:
     """Maximum likelihood from the last estimate, or from the frame alone if that fails."""
     estimate = state.estimate
     options = state.options
@@ -60,22 +63,22 @@ def _likelihood(
             continue
         estimate.second = False
         if attempt == 1:
-            start(solid, state, frame, scratch, indices)
+            start(state, frame, cells)
         if not options.free_gain:
             estimate.gain = 1.0
         tolerance = options.tolerance if attempt == 0 else min(options.tolerance, 1.0)
-        if fit(solid, state, frame, scratch, indices, tolerance):
+        if fit(state, model, frame, cells, tolerance):
             misfit, scatter = _set_r_squared(state)
             if estimate.r_squared < options.r_squared_min:
                 reason = Invalid.MODEL
                 continue
             # Only pressure beyond the footprint beyond noise and a small fraction calls for a
             # search.
-            if misfit > 8.0 * scatter + 0.003 * energy:
+            # A solid tip's base is all pressed.
+            if not options.is_solid and misfit > 8.0 * scatter + 0.003 * energy:
                 level = max(5.0 * signal.noise, 0.15 * estimate.peak / signal.scale)
                 level += 2.0 * state.budget.baseline / signal.scale
-                height = further(scratch, state.at.centres)
-                estimate.second = presses_outside(solid, state, frame, height, level)
+                estimate.second = presses_outside(state, frame, cells.height, level)
             if not estimate.second:
                 return _tip_problem(state)
             reason = Invalid.SECOND
@@ -104,7 +107,7 @@ def _set_r_squared(state: EstimatorState) -> tuple[float, float]:
     energy = energy_of(state)
     budget = state.budget
     estimate = state.estimate
-    number = float(state.region.number)
+    number = float(state.signal.number)
     shift = budget.baseline * budget.baseline
     noise = number * (state.signal.variance + shift)
     scatter = (
@@ -147,42 +150,39 @@ def _to_tilts(state: EstimatorState, covariance: Matrix, rotated: Matrix) -> Non
 
 
 @inner_kernel
-def _cause(state: EstimatorState, frame: Pointer, height: Pointer, reason: Invalid) -> Invalid:
+def _cause(
+    state: EstimatorState, frame: FloatArray, height: FloatArray, reason: Invalid
+) -> Invalid:
     """Return what in the readings keeps a frame from being estimated; ``reason`` for nothing."""
     signal = state.signal
     level = max(ABOVE_NOISE * signal.noise, ABOVE_PEAK * signal.peak)
     above = pressed = full = 0
-    for k in range(state.region.first, state.region.last):
+    for k in range(frame.shape[0]):
         if height[k] >= 0.0:
             above += frame[k] > level
             pressed += frame[k] > 0.5 * signal.peak
             full += frame[k] * signal.scale >= signal.saturation
     if full > FULL_MOST * pressed:
         return Invalid.SATURATED
-    return Invalid.ABOVE_ZERO if above > ABOVE_MOST * state.region.number else reason
+    return Invalid.ABOVE_ZERO if above > ABOVE_MOST * state.signal.number else reason
 
 
 @inner_kernel
-def _estimate(
-    solid: SolidFit | None,
-    state: EstimatorState,
-    frame: Pointer,
-    scratch: Pointer,
-    indices: IntArray | None,
-) -> Invalid:
+def _estimate(state: EstimatorState, model: Model, frame: FloatArray, cells: Cells) -> Invalid:
     """Estimate a frame with a contact; returns why that can't be used."""
     estimate = state.estimate
-    reason = _likelihood(solid, state, frame, scratch, indices)
-    if solid is not None and reason == Invalid.UNSETTLED:
+    reason = _likelihood(state, model, frame, cells)
+    fit = state.fit
+    if state.options.is_solid and reason == Invalid.UNSETTLED:
         # A contact of this tip settles within the data, and is explained at their end.
-        unexplained = state.fit.sums.misfit > (1.0 - state.options.r_squared_min) * solid.square
-        reason = Invalid.MODEL if unexplained or not solid.limited else reason
+        unexplained = fit.misfit > (1.0 - state.options.r_squared_min) * fit.readings
+        reason = Invalid.MODEL if unexplained or not fit.limited else reason
     if reason == Invalid.NONE and not GAIN_MIN < estimate.gain < GAIN_MAX:
         reason = Invalid.MODEL
     if reason == Invalid.NONE and not estimate.d < D_MAX * state.grid.radius:
         reason = Invalid.BEYOND
     if reason != Invalid.NONE:
-        reason = _cause(state, frame, further(scratch, state.at.centres), reason)
+        reason = _cause(state, frame, cells.height, reason)
     _to_tilts(state, state.fit.covariance, estimate.covariance)
     if state.budget.systematic or estimate.undetected > 0.0:
         _to_tilts(state, state.budget.covariance, estimate.systematic)
@@ -231,41 +231,45 @@ def estimate_frame(
     frame: FloatArray,
     scale: float,
     step: float,
-    scratch: FloatArray,
-    indices: IntArray | None,
-    solids: Records[SolidFit] | None = None,
+    rows: FloatArray,
+    pixels: FloatArray,
+    weights: Records[Weights],
+    line: FloatArray,
+    inverse: FloatArray,
+    y: FloatArray,
+    across: FloatArray,
+    along: FloatArray,
+    law: FloatArray,
+    sums: FloatArray,
 ) -> None:
     """Estimate one frame into the state. The only compiled entry of the estimator.
 
-    ``frame`` float64 [rows, cols] in counts, contiguous, ``scale`` Pa a count, ``step`` the width
-    of a count's quantum [Pa], 0 for none. ``scratch`` as `state.Offsets` says; ``indices`` is
-    scratch for a blur, None without one, and then nothing for a blur is compiled. A solid tip has
-    ``solids``, and the active cells' numbers in ``indices``; any other tip None, likewise.
+    ``frame`` float64 [cells] in counts, ``scale`` Pa a count, ``step`` the width of a count's
+    quantum [Pa], 0 for none. ``rows`` are those of `state.Cells`; ``pixels`` and ``weights`` a
+    solid tip's `state.Images`; the rest are the `PointArrays` of springs.
     """
     state = states[0]
-    solid = None if solids is None else solids[0]
+    cells = cells_in(rows, state.grid)
+    points = points_in(line, inverse, y, across, along, law, sums)
+    model = Model(points, Images(pixels, weights[0]))
     estimate = state.estimate
-    readings = address(frame)
-    whole = address(scratch)
-    centres = further(whole, state.at.centres)
-    cells = further(whole, state.at.cells)
-    _begin(state, scale, step)
-    rejected = without_outliers(state, readings, cells, centres)
     signal = state.signal
+    _begin(state, scale, step)
+    rejected = without_outliers(state, frame, cells.height)
     unexplained = False
-    if solid is not None and signal.finite:
-        # Every contact shows the first image. A strong signal without it is no contact of this tip;
-        # a small shift of all zeros is no signal.
+    if state.options.is_solid and signal.finite:
+        # Every contact shows the pattern. A strong signal without it is no contact of this tip; a
+        # small shift of all zeros is no signal.
         level = max(signal.mean, signal.peak - signal.mean)
         strong = signal.contact and level > STRONG * signal.noise
-        signal.contact = presses(state, solid, readings, whole, address(indices))
+        signal.contact = shows_pattern(state, frame, cells)
         unexplained = strong and not signal.contact
     estimate.peak = signal.peak * scale
     estimate.rejected = rejected
     estimate.contact = signal.contact or unexplained
     reason = Invalid.NONE
     if signal.contact:
-        reason = _estimate(solid, state, readings, whole, indices)
+        reason = _estimate(state, model, frame, cells)
     else:
         estimate.d = 0.0
         estimate.n_x = 0.0
@@ -274,7 +278,7 @@ def estimate_frame(
         estimate.covariance[0, 0] = state.options.undetected**2
         estimate.systematic[0, 0] = state.options.undetected**2
         if unexplained:
-            reason = _cause(state, readings, centres, Invalid.MODEL)
+            reason = _cause(state, frame, cells.height, Invalid.MODEL)
     estimate.warm = signal.contact and reason == Invalid.NONE
     if not signal.finite:
         reason = Invalid.NOT_FINITE
@@ -284,5 +288,4 @@ def estimate_frame(
     elif rejected == OUTLIERS_MAX:
         reason = Invalid.OUTLIERS
     estimate.invalid = reason
-    if rejected > 0:
-        restore_outliers(state, rejected, cells, centres)
+    restore_outliers(state, rejected, cells.height)

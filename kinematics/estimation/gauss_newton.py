@@ -1,127 +1,107 @@
 """Gauss-Newton on the likelihood of one pressure frame, as kernels.
 
-The solution of the normal equations, the iteration with its stopping rule, and the covariance of
-what comes out. Parameters are (gain, u, v, w) inside and (d, n_x, n_y, gain) outside; see
-footprint.py for (u, v, w).
+Parameters are the gain, d, n_x, n_y and, of a solid tip, the shear along x and y on its face. Each
+step takes the forward model's pressures and partials, whichever the tip's law is.
 """
 
 from __future__ import annotations
 
 import math
 
-from softfinger.kinematics.compiled.kernel import inner_kernel
-from softfinger.kinematics.compiled.simd import Pointer, address, further
-from softfinger.kinematics.estimation.blurred_cells import blur_cells
-from softfinger.kinematics.estimation.error_budget import correlate, systematic, undetected_misfit
-from softfinger.kinematics.estimation.likelihood import accumulate, compress, footprint_energy
-from softfinger.kinematics.estimation.packing import pack
-from softfinger.kinematics.estimation.solid_projection import SolidFit
-from softfinger.kinematics.estimation.state import EstimatorState, Fit, Matrix
-from softfinger.kinematics.sensing.footprint import IntArray, set_face
+from softfinger.kinematics.compiled.kernel import fast_inner_kernel, index, inner_kernel
+from softfinger.kinematics.estimation.error_budget import (
+    set_shared_errors,
+    undetected_misfit,
+    widen,
+)
+from softfinger.kinematics.estimation.state import (
+    DEPTH,
+    GAIN,
+    PARAMETERS,
+    SHEAR_X,
+    SHEAR_Y,
+    TILT_X,
+    TILT_Y,
+    Cells,
+    EstimatorState,
+    Fit,
+    Images,
+    Matrix,
+    Model,
+    Normal,
+    Options,
+)
+from softfinger.kinematics.sensing.footprint import FloatArray, set_face
+from softfinger.kinematics.sensing.solid_pressure import own_shear, press_solid
+from softfinger.kinematics.sensing.springs_pressure import press_springs
 
 # Of the covariance with the gain free, in (σ_d/d)²: measured over the envelope, where the errors'
 # square over what a straight model gives rises so.
-GAIN_CURVATURE = 6.0
+_GAIN_CURVATURE = 6.0
 _HALVINGS_MAX = 5
-# tan of the largest tilt of the face that the iteration goes to, 71.57°: beyond it the footprint of
-# any d that matters has left the tip, and a step there would not come back.
-TAN_TILT_MAX = 3.0
+_LIMITED_MAX = 4  # steps that may end where the model does, one after the other
+# Least pivot of a scaled normal matrix: the smallest of 2 × 2 is its determinant over the product
+# of its diagonal, 1e-12 of which is rounding.
+_PIVOT_MIN = 1e-11
+
+# A cell that can't read below its floor (0, or the smallest count sent) reads more than the
+# pressure on average, by E[max(z + e, 0)] − z standard deviations at a pressure of z above it,
+# e ~ N(0, 1). Fitted as (1 − z/CLIP_END)² times this polynomial, within 3e-4. E[max(e − z, 0)] is
+# the same number. Cells more than CLIP_BELOW below the floor carry next to no information.
+CLIP_END = 3.5
+CLIP_BELOW = 2.0
+CLIP = (0.399207, -0.275277, 0.0188358, 0.0260713, -0.00538491)
 
 
 @inner_kernel
-def solve(fit: Fit, free: bool) -> bool:
-    """Return the step in (gain, u, v, w), the inverse normal matrix and the decrement.
+def parameters(options: Options) -> tuple[int, int]:
+    """Return the first parameter that is fitted, and the one behind the last."""
+    return GAIN if options.free_gain else DEPTH, PARAMETERS if options.is_solid else SHEAR_X
 
-    Without a ``free`` gain its row is left out. False where a pivot of the scaled matrix is below
-    1e-11: the frame doesn't determine every parameter.
-    """
-    first = 0 if free else 1
-    matrix = fit.matrix
-    lower = fit.lower
-    right = fit.right
-    scale = fit.scale
-    gain = fit.gain
-    factor = (1.0, -gain, gain, gain)
-    k = 0
-    for i in range(4):
-        for j in range(i, 4):
-            matrix[j, i] = fit.sums.normal[k] * factor[i] * factor[j]
-            k += 1
-        right[i] = fit.sums.right[i] * factor[i]
-    for i in range(first, 4):
-        if not matrix[i, i] > 0.0:
-            return False
-        scale[i] = 1.0 / math.sqrt(matrix[i, i])
-    for i in range(first, 4):
-        for j in range(first, i + 1):
-            matrix[i, j] *= scale[i] * scale[j]
-    # Cholesky in the lower triangle, its inverse in ``lower``.
-    for j in range(first, 4):
-        pivot = matrix[j, j]
-        for k in range(first, j):
-            pivot -= matrix[j, k] * matrix[j, k]
-        if not pivot > 1e-11:
-            return False
-        pivot = math.sqrt(pivot)
-        matrix[j, j] = pivot
-        lower[j, j] = 1.0 / pivot
-        for i in range(j + 1, 4):
-            value = matrix[i, j]
-            for k in range(first, j):
-                value -= matrix[i, k] * matrix[j, k]
-            matrix[i, j] = value / pivot
-    for j in range(first, 4):
-        for i in range(j + 1, 4):
-            value = 0.0
-            for k in range(j, i):
-                value -= matrix[i, k] * lower[k, j]
-            lower[i, j] = value * lower[i, i]
-    inverse = fit.inverse
-    step = fit.step
-    inverse[:] = 0.0
-    step[:] = 0.0
-    decrement = 0.0
-    for i in range(first, 4):
-        for j in range(first, 4):
-            value = 0.0
-            for k in range(max(i, j), 4):
-                value += lower[k, i] * lower[k, j]
-            inverse[i, j] = value * scale[i] * scale[j]
-            step[i] += inverse[i, j] * right[j]
-        decrement += step[i] * right[i]
-    fit.decrement = decrement
-    return math.isfinite(decrement)
+
+@fast_inner_kernel
+def _set_model(gain: float, cells: Cells, first: int, last: int) -> None:
+    for k in range(first, last):
+        cells.model[k] = gain * cells.stress[k]
+
+
+@fast_inner_kernel
+def _add_shear(images: Images, x: float, y: float, cells: Cells, image: int, count: int) -> None:
+    for k in range(index(0), count):
+        cells.model[k] += x * images.pixels[image + k] + y * images.pixels[image + count + k]
 
 
 @inner_kernel
-def set_covariance(
-    solid: SolidFit | None, fit: Fit, inverse: Matrix, variance: float, out: Matrix
-) -> None:
-    """Transform the covariance of (gain, u, v, w) over variance to (d, n_x, n_y, gain)."""
-    u = fit.face.u
-    v = fit.face.v
-    w = fit.face.w
-    n_z = 1.0 / math.sqrt(1.0 + v * v + w * w)
-    cube = n_z * n_z * n_z
-    # d = a − u n_z, n_x = v n_z, n_y = w n_z, ∂n_z/∂v = −v n_z³. Rows by (u, v, w).
-    rows = (
-        (-n_z, u * v * cube, u * w * cube),
-        (0.0, n_z - v * v * cube, -v * w * cube),
-        (0.0, -v * w * cube, n_z - w * w * cube),
-    )
-    for i in range(3):
-        p, q, r = rows[i]
-        # One row of the Jacobian times the matrix.
-        by_gain = p * inverse[1, 0] + q * inverse[2, 0] + r * inverse[3, 0]
-        by_u = p * inverse[1, 1] + q * inverse[2, 1] + r * inverse[3, 1]
-        by_v = p * inverse[1, 2] + q * inverse[2, 2] + r * inverse[3, 2]
-        by_w = p * inverse[1, 3] + q * inverse[2, 3] + r * inverse[3, 3]
-        for j in range(3):
-            x, y, z = rows[j]
-            out[i, j] = (by_u * x + by_v * y + by_w * z) * variance
-        out[i, 3] = by_gain * variance
-        out[3, i] = by_gain * variance
-    out[3, 3] = inverse[0, 0] * variance
+def press(state: EstimatorState, model: Model, cells: Cells) -> tuple[int, int]:
+    """Set the model's pressures and partials at the fit's contact; return the cells touched."""
+    fit = state.fit
+    if state.options.is_solid:
+        images = model.images
+        count = cells.stress.shape[0]
+        weights = images.weights
+        press_solid(weights, images.pixels, fit.d, fit.n_x, fit.n_y, cells.planes)
+        _set_model(fit.gain, cells, index(0), index(count))
+        shear = index(weights.images * count)
+        _add_shear(images, fit.shear[0], fit.shear[1], cells, shear, index(count))
+        return 0, count
+    set_face(fit.face, state.grid.radius, fit.d, fit.n_x, fit.n_y)
+    first, last = press_springs(model.points, state.grid, fit.face, state.around, cells.planes)
+    first *= state.grid.cols
+    last *= state.grid.cols
+    _set_model(fit.gain, cells, index(first), index(last))
+    return first, last
+
+
+@fast_inner_kernel
+def _energy_inside(frame: FloatArray, cells: Cells, first: int, last: int) -> tuple[float, float]:
+    """Return Σ p² and the number of cells that the model presses."""
+    energy = 0.0
+    number = 0.0
+    for k in range(first, last):
+        inside = (cells.stress[k] != 0.0) & (cells.height[k] >= 0.0)
+        energy += frame[k] * frame[k] if inside else 0.0
+        number += 1.0 if inside else 0.0
+    return energy, number
 
 
 @inner_kernel
@@ -149,51 +129,248 @@ def free_noise(square: float, floor: float) -> float:
 
 @inner_kernel
 def energy_of(state: EstimatorState) -> float:
-    """Return Σ p² [Pa²] of the cells in the region."""
+    """Return Σ p² [Pa²] of all cells."""
     energy: float = state.signal.energy * state.signal.scale * state.signal.scale
     return energy
 
 
 @inner_kernel
-def _clip_noise(state: EstimatorState, packed: Pointer) -> float:
+def _clip_noise(
+    state: EstimatorState, frame: FloatArray, cells: Cells, first: int, last: int
+) -> float:
     """Noise [Pa] of the cells that end at the floor, by those that nothing presses.
 
     These show how much of the noise there is; where a board sends none at all there is nothing to
     correct.
     """
-    inside, inside_number = footprint_energy(state, packed)
-    clip = math.sqrt(state.signal.variance)
-    number = float(state.region.number)
-    if number - inside_number >= 16.0:
-        free_square = max(energy_of(state) - inside, 0.0) / (number - inside_number)
-        clip = min(clip, free_noise(free_square, state.signal.floor))
+    signal = state.signal
+    inside, inside_number = _energy_inside(frame, cells, index(first), index(last))
+    clip = math.sqrt(signal.variance)
+    number = float(signal.number) - inside_number
+    if number >= 16.0:
+        free_square = max(energy_of(state) - inside * signal.scale * signal.scale, 0.0) / number
+        clip = min(clip, free_noise(free_square, signal.floor))
     return clip
 
 
-@inner_kernel
-def _apply_step(fit: Fit, a: float) -> bool:
-    """Go on by the step, the face kept between the tip's top and its base plate; False if kept."""
-    face = fit.face
-    shallow = a - face.u / math.sqrt(1.0 + face.v**2 + face.w**2)
-    fit.gain = max(fit.gain + fit.step[0], 0.2 * fit.gain)
-    u = face.u + fit.step[1]
-    v = face.v + fit.step[2]
-    w = face.w + fit.step[3]
-    tilt = math.hypot(v, w)
-    if tilt > TAN_TILT_MAX:
-        v *= TAN_TILT_MAX / tilt
-        w *= TAN_TILT_MAX / tilt
-    n_z = 1.0 / math.sqrt(1.0 + v * v + w * w)
-    d = a - u * n_z
-    limited = min(max(d, 0.3 * shallow, 1e-4 * a), 0.95 * a)
-    face.u = u if limited == d else (a - limited) / n_z
-    face.v = v
-    face.w = w
-    return bool(limited == d)
+@fast_inner_kernel
+def compare(state: EstimatorState, frame: FloatArray, cells: Cells, first: int, last: int) -> None:
+    """Compare the readings with the model: ``residual`` and ``factor``, and their sums.
+
+    A cell reads no less than 0, which solid rubber may pull, and no less than the floor. A full
+    cell counts only while the model stays below its end. With ``fit.clip`` > 0 noise ends at the
+    floor; without it a cell that the model puts below the floor doesn't count.
+    """
+    fit = state.fit
+    saturation = state.signal.saturation
+    scale = state.signal.scale
+    floor = state.signal.floor
+    clip = fit.clip
+    clipped = clip > 0.0
+    per_clip = 1.0 / clip if clipped else 0.0
+    # Where the floor is none it is far below every reading.
+    lower = floor - CLIP_BELOW * clip
+    misfit = readings = weight = 0.0
+    for k in range(first, last):
+        raw = frame[k] * scale
+        model = cells.model[k]
+        pressure = max(model, 0.0)
+        response = 1.0 if model > 0.0 else 0.0
+        reading = max(raw, floor)
+        residual = reading - pressure
+        if clipped:
+            # As much below the floor as above it, a cell reads as much more than the larger.
+            depth = (pressure - floor) * per_clip
+            z = min(abs(depth), CLIP_END)
+            above = 1.0 - z * (1.0 / CLIP_END)
+            base = CLIP[0] + z * (CLIP[1] + z * (CLIP[2] + z * (CLIP[3] + z * CLIP[4])))
+            rise = CLIP[1] + z * (2.0 * CLIP[2] + z * (3.0 * CLIP[3] + z * 4.0 * CLIP[4]))
+            rise = above * (above * rise - (2.0 / CLIP_END) * base)
+            residual = reading - max(pressure, floor) - clip * above * above * base
+            response *= 1.0 + rise if depth >= 0.0 else -rise
+        inside = (cells.stress[k] != 0.0) & (cells.height[k] >= 0.0)
+        counts = inside & ((raw < saturation) | (model < saturation)) & (pressure >= lower)
+        residual = residual if counts else 0.0
+        cells.residual[k] = residual
+        cells.factor[k] = response if counts else 0.0
+        misfit += residual * residual
+        readings += raw * raw if inside else 0.0
+        weight += 1.0 if counts else 0.0
+    fit.misfit = misfit
+    fit.readings = readings
+    fit.weight = weight
+
+
+@fast_inner_kernel
+def _accumulate(fit: Fit, cells: Cells, first: int, last: int) -> None:
+    """Sum JᵀJ and Jᵀr over the cells, of the gain, d and the tilts."""
+    gain = fit.gain
+    s00 = s01 = s02 = s03 = s11 = s12 = s13 = s22 = s23 = s33 = 0.0
+    r0 = r1 = r2 = r3 = 0.0
+    for k in range(first, last):
+        factor = cells.factor[k]
+        residual = cells.residual[k]
+        a0 = factor * cells.stress[k]
+        a1 = factor * cells.by_d[k]
+        a2 = factor * cells.by_x[k]
+        a3 = factor * cells.by_y[k]
+        s00 += a0 * a0
+        s01 += a0 * a1
+        s02 += a0 * a2
+        s03 += a0 * a3
+        s11 += a1 * a1
+        s12 += a1 * a2
+        s13 += a1 * a3
+        s22 += a2 * a2
+        s23 += a2 * a3
+        s33 += a3 * a3
+        r0 += a0 * residual
+        r1 += a1 * residual
+        r2 += a2 * residual
+        r3 += a3 * residual
+    g2 = gain * gain
+    fit.right[0], fit.right[1], fit.right[2], fit.right[3] = r0, gain * r1, gain * r2, gain * r3
+    fit.normal[0, 0], fit.normal[1, 0], fit.normal[2, 0] = s00, gain * s01, gain * s02
+    fit.normal[3, 0], fit.normal[1, 1], fit.normal[2, 1] = gain * s03, g2 * s11, g2 * s12
+    fit.normal[3, 1], fit.normal[2, 2], fit.normal[3, 2] = g2 * s13, g2 * s22, g2 * s23
+    fit.normal[3, 3] = g2 * s33
+
+
+@fast_inner_kernel
+def _accumulate_shear(
+    fit: Fit, images: Images, cells: Cells, row: int, first: int, second: int
+) -> None:
+    """Sum the products of one of shear's images, which starts at ``first``."""
+    t0 = t1 = t2 = t3 = own = other = right = 0.0
+    for k in range(index(0), index(cells.factor.shape[0])):
+        factor = cells.factor[k]
+        image = factor * images.pixels[first + k]
+        along = factor * image
+        t0 += along * cells.stress[k]
+        t1 += along * cells.by_d[k]
+        t2 += along * cells.by_x[k]
+        t3 += along * cells.by_y[k]
+        own += image * image
+        other += along * images.pixels[second + k]
+        right += image * cells.residual[k]
+    gain = fit.gain
+    normal = fit.normal
+    normal[row, 0], normal[row, 1], normal[row, 2] = t0, gain * t1, gain * t2
+    normal[row, 3], normal[row, row] = gain * t3, own
+    normal[SHEAR_Y, SHEAR_X] = other
+    fit.right[row] = right
 
 
 @inner_kernel
-def check_fit(solid: SolidFit | None, state: EstimatorState, packed: Pointer) -> float:
+def linearise(state: EstimatorState, model: Model, frame: FloatArray, cells: Cells) -> float:
+    """Sum the normal equations at the fit's contact; return the cost [Pa²], less the readings'.
+
+    Shear counts by its prior, too: what it may be is a fraction of the normal force.
+    """
+    fit = state.fit
+    images = model.images
+    first, last = press(state, model, cells)
+    fit.first_row = first // state.grid.cols
+    fit.last_row = last // state.grid.cols
+    fit.clip = _clip_noise(state, frame, cells, first, last) if state.signal.clipped else 0.0
+    compare(state, frame, cells, index(first), index(last))
+    _accumulate(fit, cells, index(first), index(last))
+    cost: float = fit.misfit - fit.readings
+    if state.options.is_solid:
+        weights = images.weights
+        one = index(weights.images * last)
+        two = index((weights.images + 1) * last)
+        _accumulate_shear(fit, images, cells, SHEAR_X, one, two)
+        _accumulate_shear(fit, images, cells, SHEAR_Y, two, one)
+        likely = state.options.shear_prior * max(fit.gain * weights.value[0], 1e-9)
+        prior = state.signal.variance / (likely * likely)
+        for k in range(2):
+            fit.normal[SHEAR_X + k, SHEAR_X + k] += prior
+            fit.right[SHEAR_X + k] -= prior * fit.shear[k]
+            cost += prior * fit.shear[k] * fit.shear[k]
+    return cost
+
+
+@inner_kernel
+def solve(fit: Fit, first: int, last: int) -> bool:
+    """Solve the normal equations of the parameters first … last: step, inverse and decrement.
+
+    False where a pivot of the scaled matrix is too small: the frame doesn't determine every
+    parameter.
+    """
+    normal = fit.normal
+    lower = fit.lower
+    scale = fit.scale
+    for i in range(first, last):
+        if not normal[i, i] > 0.0:
+            return False
+        scale[i] = 1.0 / math.sqrt(normal[i, i])
+    # Cholesky, and the factor's inverse in its place.
+    for j in range(first, last):
+        pivot = 1.0
+        for k in range(first, j):
+            pivot -= lower[j, k] * lower[j, k]
+        if not pivot > _PIVOT_MIN:
+            return False
+        lower[j, j] = math.sqrt(pivot)
+        for i in range(j + 1, last):
+            value = normal[i, j] * scale[i] * scale[j]
+            for k in range(first, j):
+                value -= lower[i, k] * lower[j, k]
+            lower[i, j] = value / lower[j, j]
+    for j in range(first, last):
+        lower[j, j] = 1.0 / lower[j, j]
+        for i in range(j + 1, last):
+            value = 0.0
+            for k in range(j, i):
+                value -= lower[i, k] * lower[k, j]
+            lower[i, j] = value / lower[i, i]
+    fit.inverse[:] = 0.0
+    fit.step[:] = 0.0
+    fit.decrement = 0.0
+    for i in range(first, last):
+        for j in range(first, last):
+            value = 0.0
+            for k in range(max(i, j), last):
+                value += lower[k, i] * lower[k, j]
+            fit.inverse[i, j] = value * scale[i] * scale[j]
+            fit.step[i] += fit.inverse[i, j] * fit.right[j]
+        fit.decrement += fit.step[i] * fit.right[i]
+    return math.isfinite(fit.decrement)
+
+
+@inner_kernel
+def _apply_step(state: EstimatorState) -> bool:
+    """Go on by the step, kept within what the model holds; False if it was kept."""
+    fit = state.fit
+    options = state.options
+    shallow = fit.d
+    fit.gain = max(fit.gain + fit.step[GAIN], 0.2 * fit.gain)
+    fit.n_x += fit.step[TILT_X]
+    fit.n_y += fit.step[TILT_Y]
+    fit.shear[0] += fit.step[SHEAR_X]
+    fit.shear[1] += fit.step[SHEAR_Y]
+    tilt = math.hypot(fit.n_x, fit.n_y)
+    fit.limited = tilt > options.step_sine
+    if fit.limited:
+        fit.n_x *= options.step_sine / tilt
+        fit.n_y *= options.step_sine / tilt
+    d = fit.d + fit.step[DEPTH]
+    fit.limited = fit.limited or d > options.step_deepest
+    fit.d = min(max(d, 0.3 * shallow, 1e-4 * state.grid.radius), options.step_deepest)
+    return bool(d == fit.d)
+
+
+@inner_kernel
+def set_covariance(inverse: Normal, variance: float, out: Matrix) -> None:
+    """Take the covariance of (d, n_x, n_y, gain) from that of the fit's parameters."""
+    for i in range(4):
+        for j in range(4):
+            out[(i + 3) % 4, (j + 3) % 4] = variance * inverse[i, j]
+
+
+@inner_kernel
+def _check_fit(state: EstimatorState, model: Model, cells: Cells) -> float:
     """Compute χ² of the solved fit, and the covariance by shared errors and by a smooth misfit.
 
     The noise's variance [Pa²] is returned, widened by a misfit beyond its own scatter; after that
@@ -203,139 +380,117 @@ def check_fit(solid: SolidFit | None, state: EstimatorState, packed: Pointer) ->
     estimate = state.estimate
     budget = state.budget
     variance = state.signal.variance
-    d = estimate.d
-    freedom = fit.sums.weight - (4.0 if state.options.free_gain else 3.0)
-    misfit = max(fit.sums.misfit - fit.decrement, 0.0)
-    estimate.cells = int(fit.sums.weight)
-    estimate.residual = misfit - fit.sums.readings
+    first, last = parameters(state.options)
+    freedom = fit.weight - (last - first)
+    misfit = max(fit.misfit - fit.decrement, 0.0)
+    estimate.cells = int(fit.weight)
+    estimate.residual = misfit - fit.readings
     expected = undetected = 0.0
+    budget.shared[:] = 0.0
     if budget.systematic:
-        expected = systematic(solid, state, packed, d, budget.shared)
-        set_covariance(solid, fit, budget.shared, 1.0, budget.covariance)
-        estimate.shared = math.sqrt(budget.covariance[0, 0]) / d
+        expected = set_shared_errors(state, cells)
+        estimate.shared = math.sqrt(budget.shared[DEPTH, DEPTH]) / fit.d
     beyond = misfit - expected - variance * freedom
     if beyond > variance * math.sqrt(2.0 * max(freedom, 0.0)):
-        undetected = undetected_misfit(solid, state, packed, beyond)
-    if undetected > 0.0:
-        if not budget.systematic:
-            budget.shared[:] = 0.0
-        for i in range(4):
-            for j in range(4):
+        undetected = undetected_misfit(state, cells, beyond)
+        estimate.undetected = math.sqrt(undetected * fit.inverse[DEPTH, DEPTH]) / fit.d
+        for i in range(PARAMETERS):
+            for j in range(PARAMETERS):
                 budget.shared[i, j] += undetected * fit.inverse[i, j]
-        set_covariance(solid, fit, fit.inverse, undetected, budget.covariance)
-        estimate.undetected = math.sqrt(budget.covariance[0, 0]) / d
-        set_covariance(solid, fit, budget.shared, 1.0, budget.covariance)
     if budget.correlated:
-        freedom = fit.sums.weight - correlate(solid, state, d)
+        freedom = fit.weight - widen(state) - (last - first - 4.0)
     freedom = max(freedom, 1.0)
     estimate.chi2 = misfit / (variance * freedom + expected)
     excess = max(estimate.chi2 - 3.0 * math.sqrt(2.0 * budget.cells_per_sample / freedom), 1.0)
-    return variance * excess if fit.sums.weight > 4.0 else -1.0
+    return variance * excess if fit.weight > 4.0 else -1.0
 
 
 @inner_kernel
-def _finish(state: EstimatorState, packed: Pointer, iterations: int) -> bool:
+def _finish(state: EstimatorState, model: Model, cells: Cells, iterations: int) -> bool:
     """The estimate and its covariance at the fit's end; whether there are cells enough."""
     fit = state.fit
     estimate = state.estimate
-    v = fit.face.v
-    w = fit.face.w
-    n_z = 1.0 / math.sqrt(1.0 + v * v + w * w)
-    estimate.d = state.grid.radius - fit.face.u * n_z
-    estimate.n_x = v * n_z
-    estimate.n_y = w * n_z
-    return conclude(None, state, packed, iterations)
-
-
-@inner_kernel
-def conclude(
-    solid: SolidFit | None, state: EstimatorState, packed: Pointer, iterations: int
-) -> bool:
-    """Return the covariance and χ² at the fit's end; whether there are cells enough."""
-    fit = state.fit
-    estimate = state.estimate
+    options = state.options
+    square = fit.n_x * fit.n_x + fit.n_y * fit.n_y
+    if options.is_solid:
+        area = state.grid.radius * state.grid.radius
+        along = area * math.cos(options.rotation)
+        across = area * math.sin(options.rotation)
+        own = fit.gain * own_shear(model.images.weights, fit.d, square)
+        x = fit.shear[0] + own * fit.n_x
+        y = fit.shear[1] + own * fit.n_y
+        estimate.shear_x = along * x - across * y
+        estimate.shear_y = across * x + along * y
+    # Noise's own share beyond the model's ends is none of the contact.
+    within = min(1.0, options.sine_max / max(math.sqrt(square), 1e-9))
+    estimate.d = min(fit.d, options.deepest)
+    estimate.n_x = within * fit.n_x
+    estimate.n_y = within * fit.n_y
     estimate.gain = fit.gain
+    estimate.shear[:] = fit.shear
     estimate.iterations = iterations
-    variance = check_fit(solid, state, packed)
-    set_covariance(solid, fit, fit.inverse, variance, fit.covariance)
-    if state.options.free_gain:
+    variance = _check_fit(state, model, cells)
+    wider = 1.0
+    if options.free_gain:
         # The more d is uncertain, the less straight it is in the gain.
-        covariance = fit.covariance
-        shared = state.budget.covariance
-        uncertain = (covariance[0, 0] + shared[0, 0]) / (estimate.d * estimate.d)
-        wider = 1.0 + GAIN_CURVATURE * min(uncertain, 1.0)
-        for i in range(4):
-            for j in range(4):
-                covariance[i, j] *= wider
-                shared[i, j] *= wider
+        uncertain = variance * fit.inverse[DEPTH, DEPTH] + state.budget.shared[DEPTH, DEPTH]
+        wider += _GAIN_CURVATURE * min(uncertain / (fit.d * fit.d), 1.0)
+    set_covariance(fit.inverse, wider * variance, fit.covariance)
+    set_covariance(state.budget.shared, wider, state.budget.covariance)
     return bool(variance > 0.0)
 
 
 @inner_kernel
-def linearise(
-    state: EstimatorState, frame: Pointer, scratch: Pointer, indices: IntArray | None
-) -> None:
-    """Pack the cells of the fit's face, press them, and sum up the normal equations."""
-    packed = further(scratch, state.at.packed)
-    if indices is None:
-        pack(state, further(scratch, state.at.cells), frame, scratch, None)
-    else:
-        # Parts have no readings of their own; those taken from ``fine`` are not used.
-        pieces = further(scratch, state.at.pieces)
-        pack(state, pieces, further(scratch, state.at.fine), scratch, address(indices))
-    compress(state, packed)
-    if indices is not None:
-        blur_cells(state, frame, scratch, address(indices))
-    state.fit.clip = _clip_noise(state, packed) if state.signal.clipped else 0.0
-    accumulate(state, packed)
-
-
-@inner_kernel
 def fit(
-    solid: SolidFit | None,
-    state: EstimatorState,
-    frame: Pointer,
-    scratch: Pointer,
-    indices: IntArray | None,
-    tolerance: float,
+    state: EstimatorState, model: Model, frame: FloatArray, cells: Cells, tolerance: float
 ) -> bool:
     """Run Gauss-Newton from the contact in ``state.estimate`` and leave the new estimate there.
 
     Stops when the promised decrement is below ``tolerance`` · variance, that is the step is that
-    part of the noise floor, squared. False when the frame doesn't determine the contact or the
-    iteration doesn't settle.
+    part of the noise floor, squared. False when the frame doesn't determine the contact, the
+    iteration doesn't settle, or the contact is beyond what the model holds.
     """
     fit = state.fit
-    face = fit.face
-    a = state.grid.radius
+    estimate = state.estimate
     variance = state.signal.variance
-    packed = further(scratch, state.at.packed)
-    set_face(face, a, state.estimate.d, state.estimate.n_x, state.estimate.n_y)
-    fit.gain = state.estimate.gain
-    u = v = w = gain = 0.0  # before the last step
-    cost = math.inf
+    first, last = parameters(state.options)
+    fit.d = min(estimate.d, state.options.deepest)
+    fit.n_x = estimate.n_x
+    fit.n_y = estimate.n_y
+    fit.gain = estimate.gain
+    fit.shear[:] = estimate.shear
+    d = n_x = n_y = gain = shear_x = shear_y = 0.0  # before the last step
+    before = math.inf
     halvings = 0
+    limited = 0
     solved = False
     for iteration in range(state.options.iterations):
-        linearise(state, frame, scratch, indices)
-        now = fit.sums.misfit - fit.sums.readings
-        if solved and not now <= cost + variance and halvings < _HALVINGS_MAX:
+        cost = linearise(state, model, frame, cells)
+        if solved and not cost <= before + variance and halvings < _HALVINGS_MAX:
             # Too far: half way back.
-            face.u = 0.5 * (face.u + u)
-            face.v = 0.5 * (face.v + v)
-            face.w = 0.5 * (face.w + w)
+            fit.d = 0.5 * (fit.d + d)
+            fit.n_x = 0.5 * (fit.n_x + n_x)
+            fit.n_y = 0.5 * (fit.n_y + n_y)
             fit.gain = 0.5 * (fit.gain + gain)
+            fit.shear[0] = 0.5 * (fit.shear[0] + shear_x)
+            fit.shear[1] = 0.5 * (fit.shear[1] + shear_y)
             halvings += 1
             continue
-        cost = now
-        solved = solve(fit, state.options.free_gain)
+        before = cost
+        solved = solve(fit, first, last)
         if not solved:
             return False
-        u = face.u
-        v = face.v
-        w = face.w
+        d = fit.d
+        n_x = fit.n_x
+        n_y = fit.n_y
         gain = fit.gain
+        shear_x = fit.shear[0]
+        shear_y = fit.shear[1]
         halvings = 0
-        if _apply_step(fit, a) and fit.decrement <= tolerance * variance:
-            return _finish(state, packed, iteration + 1)
+        kept = not _apply_step(state)
+        limited = limited + 1 if fit.limited else 0
+        if limited == _LIMITED_MAX:
+            return False
+        if fit.decrement <= tolerance * variance and not kept:
+            return _finish(state, model, cells, iteration + 1)
     return False

@@ -1,36 +1,30 @@
-"""The estimator's memory, with names: options, one frame, the estimate, a step of the fit, scratch.
-
-What depends on the grid's size stands in one array of floats, the scratch; `Offsets` says where.
-"""
+"""The estimator's memory, with names: options, one frame, estimate, a step of the fit, cells."""
 
 from __future__ import annotations
 
-from typing import Annotated, TypeAlias
+from typing import Annotated, NamedTuple, TypeAlias
 
-from softfinger.kinematics.compiled.layout import Record, Records
+from softfinger.kinematics.compiled.kernel import inner_kernel
+from softfinger.kinematics.compiled.layout import Pair, Record
 from softfinger.kinematics.sensing.footprint import Face, FloatArray, Grid, IntArray
+from softfinger.kinematics.sensing.solid_pressure import Weights
+from softfinger.kinematics.sensing.springs_pressure import SpringPoints
 
-# Planes of the packed cells of a footprint: the fraction of a cell that lies in it, over that
-# fraction the means of g, x g, y g (g = 1/√(a² − x² − y²)) and the strain's variance; reading and
-# weight.
-FRACTION, PLAIN, ALONG_X, ALONG_Y, VARIANCE, READING, WEIGHT = range(7)
-PLANES = 7
-
-LEVELS = 3  # how near the rim a cut cell is
-STRIPS = 264  # of cut cells integrated at once, of each level
-OWNERS = 128  # cut cells at once, of each level
 OUTLIERS_MAX = 6  # left out of one frame
-RATIO_POINTS = 33
-LAW_TERMS = 12
-# Images of shared errors: a shift of all cells, its slopes in x and y, the tip's place in x and y,
-# and the pitch.
-SHIFT, SLOPE_X, SLOPE_Y, PLACE_X, PLACE_Y, SCALING = range(6)
-SOURCES = 6
-DEPTHS = 12  # at which the covariance under correlated noise is tabulated
+# Parameters of the fit; shear, the last two, is a solid tip's alone.
+GAIN, DEPTH, TILT_X, TILT_Y, SHEAR_X, SHEAR_Y = range(6)
+PARAMETERS = 6
+START_POINTS = 17  # depths of the table from which a fit starts
+DEPTHS = 12  # at which the effect of correlated noise is tabulated
+# Patterns of shared errors: a shift of all cells, its slopes in x and y, the tip's place in x and
+# y, the pitch, and the pressure itself.
+SHIFT, SLOPE_X, SLOPE_Y, PLACE_X, PLACE_Y, SCALING, PRESSURE = range(7)
+SOURCES = 7
 
-Four: TypeAlias = Annotated[FloatArray, 4]
 Matrix: TypeAlias = Annotated[FloatArray, 4, 4]
-Strip: TypeAlias = Annotated[FloatArray, STRIPS]
+Column: TypeAlias = Annotated[FloatArray, PARAMETERS]
+Normal: TypeAlias = Annotated[FloatArray, PARAMETERS, PARAMETERS]
+Depths: TypeAlias = Annotated[FloatArray, START_POINTS]
 
 
 class Options(Record):
@@ -49,21 +43,12 @@ class Options(Record):
     rotation: float  # of the sensor [rad]
     iterations: int
     free_gain: bool
-
-
-class Law(Record):
-    """The material's σ(ε), a polynomial."""
-
-    polynomial: Annotated[FloatArray, LAW_TERMS]  # lowest first
-    bent: bool  # curved, so that the strain's variance counts
-
-
-class Region(Record):
-    """Cells that a contact can press: the flat range of their rows, and their number."""
-
-    first: int
-    last: int
-    number: int
+    is_solid: bool
+    deepest: float  # d that the model holds [m]
+    sine_max: float  # sin of the tilt that it holds
+    step_deepest: float  # d and sin of the tilt that a step may go to
+    step_sine: float
+    shear_prior: float  # standard deviation of shear over the normal force
 
 
 class Signal(Record):
@@ -76,6 +61,7 @@ class Signal(Record):
     patch_level: float
     saturation: float  # [Pa]
     floor: float  # [Pa]; −inf for none
+    number: int  # cells that a contact can press
     peak: float  # largest cell [counts], and its indices, −1 for none above the level
     row: int
     col: int
@@ -107,6 +93,7 @@ class Estimate(Record):
     shear_y: float
     n_x: float
     n_y: float
+    shear: Pair  # of the model, over the radius squared [Pa]
     residual: float  # Σ over the footprint of (reading − model)² − reading² [Pa²]
     undetected: float  # what a smooth misfit may hide of d, over d
     shared: float  # standard deviation of d by the known uncertainties, over d
@@ -126,123 +113,117 @@ class Moments(Record):
     n_x: float
     n_y: float
     gain: float
-    ratios: Annotated[FloatArray, RATIO_POINTS, 3]  # to a constant modulus, over d
-    face: Face
-
-
-class Sums(Record):
-    """Sums over the cells for one step, columns of the Jacobian by (gain, u, v, w)."""
-
-    normal: Annotated[FloatArray, 10]  # upper triangle of JᵀWJ by rows
-    right: Four  # JᵀWr
-    misfit: float  # rᵀWr
-    readings: float  # yᵀWy
-    weight: float  # ΣW
+    # Of the model, over the depths deepest · (k/(START_POINTS − 1))²:
+    force: Depths  # Σ p, upright [Pa]
+    extent: Depths  # trace of the pressure's covariance, upright [m²]
+    lever: Depths  # centroid over sin of the tilt [m]
 
 
 class Fit(Record):
-    """Gauss-Newton at one face and gain."""
+    """Gauss-Newton at one contact and gain."""
 
     face: Face
     gain: float
+    d: float
+    n_x: float
+    n_y: float
+    shear: Pair
+    first_row: int  # of cells that the model presses
+    last_row: int
     clip: float  # noise of cells that end at the floor [Pa]; 0 where none do
     decrement: float  # fall of the sum of squares that the step promises
-    count: int  # packed cells
-    sums: Sums
-    step: Four  # in (gain, u, v, w), as the matrices
-    right: Four
-    scale: Four
-    matrix: Matrix
-    lower: Matrix
-    inverse: Matrix
+    misfit: float  # Σ (reading − model)²
+    readings: float  # Σ reading²
+    weight: float  # cells that count
+    limited: bool  # the last step ended where the model does
+    normal: Normal  # JᵀJ
+    right: Column  # Jᵀr
+    step: Column
+    scale: Column
+    lower: Normal
+    inverse: Normal
     covariance: Matrix  # of (d, n_x, n_y, gain)
 
 
 class Budget(Record):
     """Errors beside single cells' noise, see `error_budget`, and scratch for them."""
 
-    baseline: float  # standard deviations: of a shift of all cells [Pa]
-    shift: float  # the same, and of the pressed ones by the law's misfit
+    sizes: Annotated[FloatArray, SOURCES]  # standard deviations of the patterns' factors
+    baseline: float  # standard deviation of a shift of all cells [Pa]
     slope: float  # of the zero, at the radius [Pa]
-    centre: float  # of the tip's place [m]
-    pitch: float  # relative
-    modulus: float  # of modulus and gain, relative; 0 with a free gain
     smooth: float  # of pressure, relative
     rotation: float  # of the sensor [rad]
-    radius: float  # relative
-    skew: float  # of the face over a scan of all rows, in w [–]
+    lean: float  # of a solid tip's tilt, relative, over d/a
     along: float  # correlation of neighbours in a row
     cells_per_sample: float  # Σρ²: cells for each that is independent
     systematic: bool  # any of those but the correlation
     correlated: bool
-    variance_factor: Annotated[FloatArray, DEPTHS, 4, 4]
-    work: Matrix
-    responses: Annotated[FloatArray, 4, SOURCES]  # Jᵀq
+    widening: Annotated[FloatArray, DEPTHS, 5]  # standard deviations' factors; lost cells
+    responses: Annotated[FloatArray, PARAMETERS, SOURCES]  # Jᵀq
     squares: Annotated[FloatArray, SOURCES]  # qᵀq
-    displacement: Four
-    shared: Matrix  # covariance by what all frames share, of (gain, u, v, w)
+    displacement: Column
+    shared: Normal  # covariance by what all frames share
     covariance: Matrix  # the same of (d, n_x, n_y, gain)
 
 
-class Strips(Record):
-    """Strips of cut cells that wait to be integrated side by side."""
-
-    start: Strip  # lower end in y
-    length: Strip
-    cell_x: Strip  # the cell's left side
-    side: Strip  # 1 where the rim is on the cell's left, else 0
-    left: Strip  # of the line at work
-    width: Strip
-    area: Strip
-    sum_g: Strip
-    sum_x: Strip
-    sum_y: Strip
-    sum_square: Strip
-    count: int
-    owners: int  # cells that they belong to
-    indices: Annotated[IntArray, OWNERS]  # of these among the packed cells
-    ends: Annotated[IntArray, OWNERS]  # of their strips
-
-
-class Blur(Record):
-    """Model of a blurred grid: pieces of cells, blurred by weights."""
-
-    pieces_x: int  # of a cell
-    pieces_y: int
-    weights_x: int
-    weights_y: int
-
-
-class Offsets(Record):
-    """Offsets of the arrays in the scratch."""
-
-    centres: int  # planes of cell_centres [3, cells]
-    cells: int  # planes of cell_integrals [rows, CELL_PLANES, cols]
-    columns: int  # spans on the lines between columns, [2, cols + 1]
-    lines: int  # and on those between rows
-    packed: int  # [PLANES, cells]
-    pieces: int  # planes of the pieces of cells; the following ones are for a blur alone
-    across: int  # weights [n]
-    along: int
-    fine: int  # [rows, cols] of pieces
-    half: int  # [cols]
-
-
 class EstimatorState(Record):
-    """All of it."""
+    """All of it, but the arrays."""
 
     options: Options
-    law: Law
-    grid: Grid
-    model: Grid  # what is modelled: the grid, or its pieces with a blur
-    region: Region
+    grid: Grid  # the part of the sensor's that a contact can press
     signal: Signal
     estimate: Estimate
     moments: Moments
     fit: Fit
     budget: Budget
-    strips: Annotated[Records[Strips], LEVELS]
     around: Face  # a little beyond the footprint
     outliers: Annotated[IntArray, OUTLIERS_MAX]  # cells
-    blur: Blur
-    at: Offsets
+
+
+class Cells(NamedTuple):
+    """Arrays of the cells of `EstimatorState.grid`, one after the other, float64 [cells].
+
+    ``planes`` [4, rows, cols] are ``stress`` to ``by_y`` in one: the model's pressure at a gain of
+    1, and its partials.
+    """
+
+    planes: FloatArray
+    stress: FloatArray
+    by_d: FloatArray
+    by_x: FloatArray
+    by_y: FloatArray
+    height: FloatArray  # √(a² − x² − y²) [m], see `cell_centres`; below 0 for a cell not to be used
+    x: FloatArray  # of the centre [m]
+    y: FloatArray
+    pattern: FloatArray  # by which a solid tip's contact is noticed
+    model: FloatArray  # pressure [Pa], gain and shear in it
+    residual: FloatArray  # reading − model [Pa], 0 for cells that do not count
+    factor: FloatArray  # how far a reading answers to pressure, likewise
+
+
+STRESS, BY_D, BY_X, BY_Y, HEIGHT, X, Y, PATTERN, MODEL, RESIDUAL, FACTOR = range(11)  # rows of them
+ROWS = 11
+
+
+@inner_kernel
+def cells_in(rows: FloatArray, grid: Grid) -> Cells:
+    """Return the cells whose arrays are ``rows`` [ROWS, cells]."""
+    planes = rows[:HEIGHT].reshape((HEIGHT, grid.rows, grid.cols))
+    return Cells(
+        planes, rows[STRESS], rows[BY_D], rows[BY_X], rows[BY_Y], rows[HEIGHT], rows[X], rows[Y],
+        rows[PATTERN], rows[MODEL], rows[RESIDUAL], rows[FACTOR],
+    )  # fmt: skip
+
+
+class Images(NamedTuple):
+    """A solid tip's images of `EstimatorState.grid`, one after the other, and their weights."""
+
+    pixels: FloatArray  # [images · cells], shear's two last
+    weights: Weights
+
+
+class Model(NamedTuple):
+    """The forward model: of springs by points, of solid rubber by images; the other is empty."""
+
+    points: SpringPoints
+    images: Images

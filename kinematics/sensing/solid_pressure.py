@@ -13,30 +13,33 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softfinger.kinematics.compiled.kernel import fast_inner_kernel, inner_kernel, kernel
+from softfinger.kinematics.compiled.kernel import fast_inner_kernel, index, inner_kernel, kernel
 from softfinger.kinematics.compiled.layout import Record, Records
-from softfinger.kinematics.compiled.simd import Pointer, address, further
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.solid_data import solid_data
-from softfinger.kinematics.contact.solid_lookup import SolidTable, energy_lanes, solid_table
+from softfinger.kinematics.contact.solid_lookup import energy_lanes, solid_table
+from softfinger.kinematics.contact.table_record import Table
+from softfinger.kinematics.sensing.blur import axis_points, mean_matrix
 from softfinger.kinematics.sensing.footprint import FloatArray, Grid, IntArray
 
 MODES = 32
-IMAGES = 2 * MODES  # with shear's two
+IMAGES = 2 * MODES
+_AT_ONCE = 4  # images added together, IMAGES being a multiple of it
 ROOT_TERMS, SQUARE_TERMS = 12, 6  # of a mode's polynomial, at most
 
-_INSIDE, _CUT = 6, 24  # points a side of a cell, and of one that the rim cuts
+# Points a side of a cell, of one that the rim cuts, and of each where there is a blur.
+_INSIDE, _CUT, _BLURRED = 6, 24, 12
 
 
 class Weights(Record):
     """Weights of the images in one contact: their sum is the pressure over E; see `set_weights`."""
 
-    table: SolidTable
+    table: Table
     modes: int
     images: int
     harmonics: Annotated[IntArray, MODES]
-    ratios: Annotated[FloatArray, SQUARE_TERMS, ROOT_TERMS, MODES]  # by powers of x and y
+    ratios: Annotated[FloatArray, SQUARE_TERMS * ROOT_TERMS * MODES]  # by powers of y, x; modes
     q: Annotated[FloatArray, MODES]
     q_x: Annotated[FloatArray, MODES]
     q_y: Annotated[FloatArray, MODES]
@@ -55,7 +58,7 @@ def weights_of(tip: Fingertip, material: Material) -> Weights:
     count, i, j = data.ratios.shape
     weights.modes, weights.images = count, image_count(data.harmonics)
     weights.harmonics[:count] = data.harmonics
-    weights.ratios[:j, :i, :count] = data.ratios.T
+    weights.ratios.reshape(SQUARE_TERMS, ROOT_TERMS, MODES)[:j, :i, :count] = data.ratios.T
     return weights
 
 
@@ -64,8 +67,10 @@ def image_count(harmonics: IntArray) -> int:
     return int(len(harmonics) + np.count_nonzero(harmonics))
 
 
-def images(tip: Fingertip, cells: Grid) -> FloatArray:
+def images(tip: Fingertip, cells: Grid, blur: float) -> FloatArray:
     """Return modes' means over each cell, then shear's along x and y, float64 [·, rows · cols]."""
+    if blur > 0.0:
+        return _blurred_images(tip, cells, blur)
     data = solid_data(tip)
     out = np.zeros((image_count(data.harmonics) + 2, cells.rows * cells.cols))
     x, y = (
@@ -87,6 +92,18 @@ def images(tip: Fingertip, cells: Grid) -> FloatArray:
         z = (at_x + 1j * at_y).reshape(len(rows), points**2)
         out[:, rows * cells.cols + cols] = _means(tip, z)
     return out
+
+
+def _blurred_images(tip: Fingertip, cells: Grid, blur: float) -> FloatArray:
+    x, across = axis_points(cells.x, cells.pitch_x, cells.cols, _BLURRED, blur)
+    y, along = axis_points(cells.y, cells.pitch_y, cells.rows, _BLURRED, blur)
+    z: Any = (x.T.ravel() + 1j * y.T.ravel()[:, None]) / cells.radius
+    columns, lines = mean_matrix(across, cells.cols).T, mean_matrix(along, cells.rows)
+    whole: Any = 0.0
+    for some in np.array_split(np.arange(len(z)), max(z.size // 2**15, 1)):
+        fine = _means(tip, z[some].reshape(-1, 1)).reshape(-1, len(some), z.shape[1])
+        whole = whole + lines[:, some] @ (fine @ columns)
+    return np.ascontiguousarray(whole.reshape(len(whole), -1))
 
 
 def _nearest(low: NDArray[Any], width: float) -> NDArray[Any]:
@@ -186,22 +203,22 @@ def own_shear(weights: Weights, d: float, square: float) -> float:
 @fast_inner_kernel
 def _evaluate_ratios(weights: Weights, x: float, y: float) -> None:
     """q of each mode, and its partials by x and y, all modes side by side in SIMD lanes."""
-    ratios = address(weights.ratios)
-    q = address(weights.q)
-    q_x = address(weights.q_x)
-    q_y = address(weights.q_y)
-    row = address(weights.row)
-    slope = address(weights.slope)
+    ratios = weights.ratios
+    q = weights.q
+    q_x = weights.q_x
+    q_y = weights.q_y
+    row = weights.row
+    slope = weights.slope
     for k in range(MODES):
         q[k] = q_x[k] = q_y[k] = 0.0
     for j in range(SQUARE_TERMS - 1, -1, -1):
         for k in range(MODES):
             row[k] = slope[k] = 0.0
         for i in range(ROOT_TERMS - 1, -1, -1):
-            c = further(ratios, (j * ROOT_TERMS + i) * MODES)
-            for k in range(MODES):
+            at = index((j * ROOT_TERMS + i) * MODES)
+            for k in range(index(0), index(MODES)):
                 slope[k] = slope[k] * x + row[k]
-                row[k] = row[k] * x + c[k]
+                row[k] = row[k] * x + ratios[at + k]
         for k in range(MODES):
             q_y[k] = q_y[k] * y + q[k]
             q[k] = q[k] * y + row[k]
@@ -209,10 +226,55 @@ def _evaluate_ratios(weights: Weights, x: float, y: float) -> None:
 
 
 @fast_inner_kernel
-def add_image(image: Pointer, weight: float, first: int, last: int, out: Pointer) -> None:
-    """Add ``weight`` times the image's cells first..last to ``out``."""
-    for k in range(first, last):
-        out[k] += weight * image[k]
+def _add_images(
+    weights: FloatArray,
+    first: int,
+    pixels: FloatArray,
+    image: int,
+    count: int,
+    out: FloatArray,
+) -> None:
+    """Add four images, the ``first`` and on, times their weights; the pixels are at ``image``."""
+    a, b, c, d = weights[first], weights[first + 1], weights[first + 2], weights[first + 3]
+    second = image + count
+    third = second + count
+    fourth = third + count
+    for k in range(index(0), count):
+        out[k] += (
+            a * pixels[image + k]
+            + b * pixels[second + k]
+            + c * pixels[third + k]
+            + d * pixels[fourth + k]
+        )
+
+
+@inner_kernel
+def add_images(weights: Weights, of: FloatArray, pixels: FloatArray, out: FloatArray) -> None:
+    """Add all images [cells], one after the other in ``pixels``, times the weights ``of``.
+
+    The last of them may be shear's, whose weight is 0 here.
+    """
+    count = out.shape[0]
+    for j in range(0, weights.images, _AT_ONCE):
+        _add_images(of, j, pixels, index(j * count), index(count), out)
+
+
+@inner_kernel
+def press_solid(
+    weights: Weights, pixels: FloatArray, d: float, n_x: float, n_y: float, planes: FloatArray
+) -> None:
+    """Set the pressure of a contact and its partials by d, n_x and n_y, [4, rows, cols].
+
+    Without the cells' ends: below 0 where the rubber pulls.
+    """
+    set_weights(weights, d, n_x, n_y)
+    count = planes.shape[1] * planes.shape[2]
+    flat = planes.reshape(-1)
+    flat[:] = 0.0
+    add_images(weights, weights.value, pixels, flat[:count])
+    add_images(weights, weights.by_d, pixels, flat[count : 2 * count])
+    add_images(weights, weights.by_x, pixels, flat[2 * count : 3 * count])
+    add_images(weights, weights.by_y, pixels, flat[3 * count :])
 
 
 @kernel
@@ -245,19 +307,20 @@ def render_solid(
     d = min(d, table.deepest)
     set_weights(each, d, n_x, n_y)
     own = own_shear(each, d, n_x * n_x + n_y * n_y) if whole else 0.0
-    cells = out.size
-    start = address(out)
-    for k in range(each.images):
-        image = further(address(basis), k * cells)
-        add_image(image, gain * each.value[k], 0, cells, start)
+    add_images(each, each.value, basis, out)
     area = table.radius * table.radius
     x = shear[0] / area - own * n_x
     y = shear[1] / area - own * n_y
-    image = further(address(basis), each.images * cells)
-    add_image(image, gain * x, 0, cells, start)
-    add_image(further(image, cells), gain * y, 0, cells, start)
+    cells = out.shape[0]
+    along = each.images * cells
     for k in range(cells):
-        start[k] = max(start[k], 0.0)
+        pressure = out[k] + x * basis[along + k] + y * basis[along + cells + k]
+        out[k] = max(gain * pressure, 0.0)
+
+
+def padded(images: FloatArray) -> FloatArray:
+    """Return images [·, cells] one after the other, with room behind for `add_images` to read."""
+    return np.concatenate([images.ravel(), np.zeros((_AT_ONCE - 1) * images.shape[1])])
 
 
 class SolidPressure:
@@ -265,7 +328,7 @@ class SolidPressure:
 
     def __init__(self, tip: Fingertip, material: Material, basis: FloatArray) -> None:
         self._weights = weights_of(tip, material).array
-        self._basis = basis
+        self._basis = padded(basis)
 
     def __call__(
         self,
@@ -276,4 +339,6 @@ class SolidPressure:
     ) -> None:
         """Render as :func:`render_solid`; ``shear`` is that of a straight press if not given."""
         whole = shear is not None
-        render_solid(self._weights, self._basis, contact, shear or (0.0, 0.0), whole, gain, out)
+        render_solid(
+            self._weights, self._basis, contact, shear or (0.0, 0.0), whole, gain, out.reshape(-1)
+        )

@@ -10,7 +10,8 @@ from softfinger.daemon.profile.factory import make_material
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.sensor.simulated_tactile import make_sensor_model
 from softfinger.kinematics.estimation.estimator import ContactEstimator
-from softfinger.kinematics.sensing.pressure_grid import SensorGrid, stencil
+from softfinger.kinematics.sensing.blur import stencil
+from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from tests.harness.paper_tip import LINEAR, MEASURED, PITCH, TIP, E, dense, tilts
 
 NOISE = 0.002

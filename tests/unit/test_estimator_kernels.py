@@ -6,43 +6,38 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from softfinger.kinematics.compiled.kernel import kernel
+from softfinger.kinematics.compiled.kernel import index, kernel
 from softfinger.kinematics.compiled.layout import Records
-from softfinger.kinematics.compiled.simd import address
-from softfinger.kinematics.contact.material import Material
-from softfinger.kinematics.estimation import detection, likelihood
+from softfinger.kinematics.estimation import detection, gauss_newton
 from softfinger.kinematics.estimation.cell_centres import cell_centres
 from softfinger.kinematics.estimation.estimator import ContactEstimator, Readings
-from softfinger.kinematics.estimation.gauss_newton import free_noise
-from softfinger.kinematics.estimation.likelihood import CLIP_BELOW, set_law
-from softfinger.kinematics.estimation.state import PLANES, EstimatorState, Law
+from softfinger.kinematics.estimation.gauss_newton import CLIP_BELOW, free_noise
+from softfinger.kinematics.estimation.state import (
+    FACTOR,
+    MODEL,
+    ROWS,
+    STRESS,
+    EstimatorState,
+    cells_in,
+)
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from tests.harness.called import called
-from tests.harness.paper_tip import LINEAR, MEASURED, PITCH, TIP, E
+from tests.harness.paper_tip import LINEAR, PITCH, TIP, E
 
 FloatArray = NDArray[np.float64]
 
 
-def state_for(packed: FloatArray) -> EstimatorState:
-    """A state whose model has as many cells as ``packed`` [PLANES, n], all of them packed."""
-    assert len(packed) == PLANES
-    state = EstimatorState()
-    state.model.rows, state.model.cols = 1, packed.shape[1]
-    state.fit.count = packed.shape[1]
-    return state
-
-
 @kernel
-def activity(states: Records[EstimatorState], frame: FloatArray, centres: FloatArray) -> None:
+def activity(states: Records[EstimatorState], frame: FloatArray, height: FloatArray) -> None:
     """:func:`detection.activity`."""
-    detection.activity(states[0], address(frame), address(centres))
+    detection.activity(states[0], frame, height)
 
 
 @kernel
-def press_and_accumulate(states: Records[EstimatorState], packed: FloatArray) -> None:
-    """:func:`likelihood.compress`, then :func:`likelihood.accumulate`."""
-    likelihood.compress(states[0], address(packed))
-    likelihood.accumulate(states[0], address(packed))
+def compare(states: Records[EstimatorState], frame: FloatArray, rows: FloatArray) -> None:
+    """:func:`gauss_newton.compare` of all cells."""
+    cells = cells_in(rows, states[0].grid)
+    gauss_newton.compare(states[0], frame, cells, index(0), index(frame.shape[0]))
 
 
 def test_activity_matches_its_plain_twin():
@@ -56,8 +51,9 @@ def test_activity_matches_its_plain_twin():
     grid = state.grid
     grid.radius, grid.pitch_x, grid.pitch_y, grid.rows, grid.cols = 1.0, 0.01, 0.01, 20, 24
     state.options.peak_level, state.signal.patch_level, state.signal.noise = 3.0, 4.0, 1.0
-    centres = cell_centres(grid, active, 2.0, state.region)
-    assert state.region.number == active.sum()
+    height, _, _ = cell_centres(grid, active, 2.0)
+    state.signal.number = int((height >= 0.0).sum())
+    assert state.signal.number == active.sum()
     seen = set()
     for k in range(200):
         frame = rng.normal(0.0, 1.0, (20, 24))
@@ -69,7 +65,7 @@ def test_activity_matches_its_plain_twin():
             w = weights * active[part]
             expected |= (w * frame[part]).sum() / math.sqrt((w**2).sum()) > 4.0
         frame[0, 5], frame[3, 0] = math.nan, 1e9
-        activity(state.array, frame, centres)
+        activity(state.array, frame.ravel(), height)
         found = state.signal
         assert found.contact == expected
         assert found.finite
@@ -81,22 +77,6 @@ def test_activity_matches_its_plain_twin():
             assert frame[found.row, found.col] == found.peak
         seen.add(expected)
     assert seen == {True, False}
-
-
-def test_the_estimators_law_follows_any_material():
-    points = Material.from_points(
-        np.linspace(0.0, 1.0, 12),
-        1e5 * np.linspace(0.0, 1.0, 12) ** 1.3 + 5e4 * np.linspace(0, 1, 12),
-    )
-    for material in (LINEAR, MEASURED, points):
-        law = Law()
-        set_law(law, material)
-        strain = np.linspace(0.0, 0.999999, 3001)
-        value = np.polynomial.Polynomial(law.polynomial)(strain)
-        np.testing.assert_allclose(
-            value, material.stress(strain), atol=1e-12 * material.reference_modulus
-        )
-        assert law.bent == (material is not LINEAR)
 
 
 # An inner kernel, made callable.
@@ -115,32 +95,26 @@ def mean_of(model, floor, noise):
 
 @pytest.mark.parametrize("floor", [0.0, 2000.0, 3250.0])
 def test_cells_near_the_floor_are_compared_with_what_they_read_on_average(floor):
-    noise, gain, g = 1500.0, 1.1, 40.0
+    noise = 1500.0
+    state = EstimatorState()
+    state.grid.rows = state.grid.cols = 1
+    state.signal.scale, state.signal.saturation, state.signal.floor = 1.0, math.inf, floor
+    state.fit.clip = noise
+    rows = np.zeros((ROWS, 1))
     for model in np.linspace(max(floor - 1.9 * noise, 20.0), floor + 6.0 * noise, 9):
-        packed = np.zeros((PLANES, 1))
-        packed[0], packed[1], packed[6] = 1.0, g, 1.0
-        packed[5] = 3300.0
-        u = (1.0 - model / gain / E) / g
-        state = state_for(packed)
-        set_law(state.law, LINEAR)
-        state.signal.saturation, state.signal.floor = math.inf, floor
-        state.fit.face.u, state.fit.gain, state.fit.clip = u, gain, noise
-        press_and_accumulate(state.array, packed.copy())
-        sums = state.fit.sums
+        rows[STRESS] = rows[MODEL] = model
+        compare(state.array, np.array([3300.0]), rows)
         mean, response = mean_of(np.array(model), floor, noise)
         residual = 3300.0 - mean
-        assert sums.misfit == pytest.approx(residual**2, abs=2 * abs(residual) * 1e-3 * noise)
-        # The Jacobian's column by (u, …) is σ' g times the response.
-        assert math.sqrt(sums.normal[4]) == pytest.approx(E * g * response, abs=5e-3 * E * g)
-        assert sums.weight == 1.0
-    far = np.array([[1.0], [g], [0.0], [0.0], [0.0], [0.0], [1.0]])
-    packed[: len(far)] = far
+        misfit = pytest.approx(residual**2, abs=2 * abs(residual) * 1e-3 * noise)
+        assert state.fit.misfit == misfit
+        assert rows[FACTOR, 0] == pytest.approx(float(response), abs=5e-3)
+        assert state.fit.weight == 1.0
     below = floor - (CLIP_BELOW + 0.1) * noise
     if below > 0.0:
-        u = (1.0 - below / gain / E) / g
-        state.fit.face.u = u
-        press_and_accumulate(state.array, packed.copy())
-        assert sums.weight == 0.0
+        rows[STRESS] = rows[MODEL] = below
+        compare(state.array, np.array([3300.0]), rows)
+        assert state.fit.weight == 0.0
 
 
 @pytest.mark.parametrize("ratio", [0.0, 0.3, 1.0, 2.0, 2.8])

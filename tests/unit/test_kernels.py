@@ -7,7 +7,7 @@ import sys
 import types
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any, cast
+from typing import Annotated, Any
 
 import numba
 import numpy as np
@@ -18,7 +18,7 @@ from softfinger import daemon, kinematics
 from softfinger.kinematics import compiled
 from softfinger.kinematics.compiled import kernel as decorators
 from softfinger.kinematics.compiled import plain
-from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
+from softfinger.kinematics.compiled.kernel import kernel
 from softfinger.kinematics.compiled.kernel_folder import kernel_sources
 from softfinger.kinematics.compiled.layout import Pair, Record, Records, _kind
 from softfinger.kinematics.contact.closed_form import theta_limit
@@ -34,29 +34,6 @@ def test_an_inner_kernel_works_in_kernels_and_refuses_python():
     assert limit_twice(0.02, 0.0) == pytest.approx(math.pi)
     with pytest.raises(TypeError, match=r"closed_form\.theta_limit is an inner kernel"):
         theta_limit(0.02, 0.0)
-
-
-@inner_kernel
-def _half(x: Any) -> Any:
-    return 0.5 * x
-
-
-@inner_kernel
-def _half_of_none(_: Any) -> float:
-    return -1.0
-
-
-cast(Any, _half).also(_half_of_none, lambda kind: isinstance(kind, numba.types.NoneType))
-
-
-@kernel
-def half(x: Any) -> Any:
-    return _half(x)
-
-
-def test_which_inner_kernel_is_compiled_depends_on_the_first_arguments_type():
-    assert half(3.0) == 1.5
-    assert half(None) == -1.0
 
 
 @pytest.mark.parametrize("why", ["99.0", "compiler"])

@@ -11,7 +11,6 @@ from softfinger.daemon.simulation.physics.plant_state import TipContact
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.daemon.simulation.physics.tip import touch_object
 from softfinger.kinematics.compiled.kernel import kernel
-from softfinger.kinematics.compiled.simd import address
 from tests.fuzz.plant import abuse, random_hand
 from tests.harness.plant import MODULUS, PAPER, TABLE_I, make, place
 
@@ -19,11 +18,11 @@ from tests.harness.plant import MODULUS, PAPER, TABLE_I, make, place
 
 
 @kernel
-def evaluate_one(plants, table, finger, turn):
+def evaluate_one(plants, tables, finger, turn):
     plant = plants[0]
     place_finger(plant, finger, plant.state.position[finger])
     tip = plant.stages[0].on_object[finger]
-    touch_object(plant, address(table), tip, finger, plant.state, math.cos(turn), math.sin(turn))
+    touch_object(plant, tables[0], tip, finger, plant.state, math.cos(turn), math.sin(turn))
 
 
 def tip_at(hand: SimulatedHand, finger: int, q, pose, shear: float) -> TipContact:

@@ -15,6 +15,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
+from importlib import import_module
+from importlib.util import find_spec
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -88,7 +90,7 @@ def lookups(rounds: int, count: int = 512) -> Report:
     d = np.where(np.arange(count) % 2 == 0, even, spread)
     theta = rng.uniform(-_STEEPEST, _STEEPEST, count)
     exact = np.stack(integrate(TIP, _LAW, d, theta, 40))
-    tables = {f"table to {each:g}": ContactTable.build(TIP, _LAW, each) for each in (1e-9, 1e-12)}
+    tables = {f"table to {each:g}": ContactTable.build(TIP, _LAW, each) for each in (1e-6, 1e-9)}
     single = list(zip(d[:_SINGLE].tolist(), theta[:_SINGLE].tolist(), strict=True))
     rows = []
     for way, chosen, points, aim in (
@@ -106,7 +108,20 @@ def lookups(rounds: int, count: int = 512) -> Report:
                 for found, true in zip(table(d, theta), exact, strict=False)
             )
             rows.append(figure(name, "ns", taken / points, aim, **{LOOKUP_ERROR: error}))
+    if find_spec("scipy"):
+        rows.append(_spline(d, theta, exact[0], rounds))
     return Report("lookup", rows)
+
+
+def _spline(d: FloatArray, theta: FloatArray, force: FloatArray, rounds: int) -> dict[str, Any]:
+    """Return the time of a point, and the error, of SciPy's bicubic spline of F alone."""
+    interpolate: Any = import_module("scipy.interpolate")
+    at = np.linspace(0.0, _DEEPEST, 129), np.linspace(-_STEEPEST, _STEEPEST, 65)
+    spline = interpolate.RectBivariateSpline(*at, integrate(TIP, _LAW, *np.meshgrid(*at)).force.T)
+    name = "SciPy's RectBivariateSpline, F alone"
+    taken = interleave({name: partial(spline.ev, d, theta)}, rounds)[name]
+    error = float(np.max(np.abs(spline.ev(d, theta) / force - 1.0)))
+    return figure(name, "ns", taken / len(d), None, **{LOOKUP_ERROR: error})
 
 
 def frames_to_contacts(rounds: int) -> Report:
@@ -126,6 +141,7 @@ def frames_to_contacts(rounds: int) -> Report:
         "solid: at 1 mm, warm": solid(_LIGHT),
         "solid: warm": solid(TRUTH),
         "solid: at (8 mm, 30°), warm": solid(_CORNER),
+        "centroid and extent, NumPy": (partial(centroid_and_extent, frames), TRUTH, None),
         "no contact": (estimates(empty), None, None),
     }
     subjects: dict[str, Callable[[], object]] = {name: run for name, (run, _, _) in cases.items()}
@@ -144,6 +160,40 @@ def frames_to_contacts(rounds: int) -> Report:
         found = settled(Settings.model_validate(flaws), TRUTH)
         rows.append({"name": f"ml: sensor {sensor}", **rms_errors(found, TRUTH)})
     return Report("frame to contact", rows)
+
+
+def centroid_and_extent(frames: FloatArray) -> FloatArray:
+    """Return d, tilts [n, 3] from each frame's centroid and extent over its footprint, by NumPy.
+
+    For a constant modulus the centroid is (a − d/3)(n_x, n_y), and the trace of the covariance
+    d (4a − d)/6 − sin² θ d (12a − 5d)/36. The footprint is where a cell and its neighbours stand
+    above the noise, at first, and then the one of the last d and tilts.
+    """
+    cells, a = GRID.on(TIP), TIP.radius
+    x = cells.x + cells.pitch_x * (np.arange(SIZE) + 0.5)
+    y = (cells.y + cells.pitch_y * (np.arange(SIZE) + 0.5))[:, None]
+    found = np.empty((len(frames), 3))
+    for k, frame in enumerate(frames):
+        inside = frame > max(4.0 * NOISE, 0.15 * float(frame.max()))
+        d = s_x = s_y = 0.0
+        for _ in range(3):
+            pressure = np.where(inside, frame, 0.0)
+            total = pressure.sum()
+            m_x, m_y = (pressure * x).sum() / total, (pressure * y).sum() / total
+            trace = (pressure * (x * x + y * y)).sum() / total - m_x * m_x - m_y * m_y
+            trace -= (cells.pitch_x**2 + cells.pitch_y**2) / 12.0
+            for _ in range(4):
+                square = (m_x * m_x + m_y * m_y) / (a - d / 3.0) ** 2
+                # In powers of d: (24a − 12a s²) d/36 − (6 − 5 s²) d²/36.
+                b, c = a * (24.0 - 12.0 * square), 6.0 - 5.0 * square
+                d = float((b - math.sqrt(max(b * b - 144.0 * c * trace, 0.0))) / (2.0 * c))
+            s_x, s_y = m_x / (a - d / 3.0), m_y / (a - d / 3.0)
+            radius = math.sqrt(d * (2.0 * a - d)) + 0.75 * math.hypot(cells.pitch_x, cells.pitch_y)
+            h, c_z = math.sqrt(max(a * a - radius * radius, 0.0)), math.sqrt(1 - s_x**2 - s_y**2)
+            height = np.sqrt(np.maximum(a * a - x * x - y * y, 0.0))
+            inside = height * c_z > h - s_x * x - s_y * y
+        found[k] = d, math.asin(s_x), math.asin(s_y)
+    return found
 
 
 def settled(settings: Settings, truth: Truth, count: int = _FRAMES) -> FloatArray:

@@ -17,8 +17,8 @@ from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.profile.factory import make_material, make_tip
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS
-from softfinger.kinematics.contact.lookup import TableError
 from softfinger.kinematics.contact.table import ContactTable
+from softfinger.kinematics.contact.table_record import TableError
 from softfinger.tools.terminal import heatmap
 
 WIDTH, HEIGHT = 240, 200  # pixels of the landscape

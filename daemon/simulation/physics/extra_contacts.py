@@ -41,7 +41,7 @@ from softfinger.daemon.simulation.physics.tip import (
     stiffen_by_rim,
 )
 from softfinger.kinematics.compiled.kernel import inner_kernel
-from softfinger.kinematics.compiled.simd import Pointer
+from softfinger.kinematics.contact.table_record import Table
 
 STIFFNESS = 1e5  # N/m, of each corner up and along the palm
 LOSS = 1e-3  # s, damping over stiffness
@@ -139,7 +139,7 @@ def tips_are_far(plant: Plant) -> bool:
 
 
 @inner_kernel
-def tip_on_tip(plant: Plant, table: Pointer, now: Motion, stage: Stage) -> bool:
+def tip_on_tip(plant: Plant, table: Table, now: Motion, stage: Stage) -> bool:
     """Evaluate both tips on each other and add their torques to the forces; may they touch?"""
     p = plant.parameters
     left, right = plant.fingers[0], plant.fingers[1]
@@ -209,9 +209,7 @@ def tip_on_tip(plant: Plant, table: Pointer, now: Motion, stage: Stage) -> bool:
 
 
 @inner_kernel
-def touch_each_other(
-    plant: Plant, table: Pointer, now: Motion, stage: Stage, is_first: bool
-) -> None:
+def touch_each_other(plant: Plant, table: Table, now: Motion, stage: Stage, is_first: bool) -> None:
     """Add the tips' torques on each other where they may meet; without an object always.
 
     The first stage also hands their rows to the full matrix.

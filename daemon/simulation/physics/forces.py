@@ -21,7 +21,7 @@ from softfinger.daemon.simulation.physics.plant_state import (
 )
 from softfinger.daemon.simulation.physics.tip import touch_object
 from softfinger.kinematics.compiled.kernel import inner_kernel
-from softfinger.kinematics.compiled.simd import Pointer
+from softfinger.kinematics.contact.table_record import Table
 
 
 @inner_kernel
@@ -188,7 +188,7 @@ def place_finger(plant: Plant, finger: int, q: float) -> None:
 
 
 @inner_kernel
-def evaluate_hand(plant: Plant, table: Pointer, now: Motion, stage: Stage, is_first: bool) -> None:
+def evaluate_hand(plant: Plant, table: Table, now: Motion, stage: Stage, is_first: bool) -> None:
     """Evaluate all contacts of ``now`` into the ``stage``, and all forces but the motors'.
 
     The drag is viscous friction over velocity, in the forces already.
@@ -223,7 +223,7 @@ def evaluate_hand(plant: Plant, table: Pointer, now: Motion, stage: Stage, is_fi
 
 
 @inner_kernel
-def evaluate_state(plant: Plant, table: Pointer) -> None:
+def evaluate_state(plant: Plant, table: Table) -> None:
     """Evaluate all contacts and forces of the state as it is."""
     evaluate_hand(plant, table, plant.state, plant.stages[0], True)
 

@@ -40,7 +40,6 @@ from softfinger.daemon.simulation.physics.plant_state import (
     CORNERS,
     NO_OBJECT,
     SHEARS,
-    FloatArray,
     Motion,
     Plant,
     Sample,
@@ -57,7 +56,7 @@ from softfinger.daemon.simulation.physics.solver import (
 from softfinger.daemon.simulation.physics.tip import relax_shears, relax_tips
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 from softfinger.kinematics.compiled.layout import Records
-from softfinger.kinematics.compiled.simd import Pointer, address
+from softfinger.kinematics.contact.table_record import Table
 
 _GAMMA = 1.0 - math.sqrt(0.5)
 
@@ -190,7 +189,7 @@ def go_on(plant: Plant, h: float) -> None:
 
 
 @inner_kernel
-def go_back(plant: Plant, table: Pointer) -> None:
+def go_back(plant: Plant, table: Table) -> None:
     """Shorten a step that leads uphill, until it doesn't, or all of it."""
     for _ in range(HALVINGS):
         shorten(plant, 0.5)
@@ -273,15 +272,15 @@ def settle(plant: Plant, ring: Records[Sample]) -> None:
 
 
 @kernel
-def step(plants: Records[Plant], table: FloatArray, ring: Records[Sample], count: int) -> None:
+def step(plants: Records[Plant], tables: Records[Table], ring: Records[Sample], count: int) -> None:
     """Advance the plant by ``count`` sub-steps; what the tips feel is then current.
 
-    ``table`` is the contact table's data; ``ring`` takes the samples that fall due.
+    ``tables`` is the contact table's data; ``ring`` takes the samples that fall due.
     """
     plant = plants[0]
     p, state = plant.parameters, plant.state
     # A bare address from here on: an array argument costs a reference count at each call.
-    data = address(table)
+    data = tables[0]
     h = p.step
     g = _GAMMA * h
     scripted = p.object_held and p.script_speed > 0.0

@@ -32,7 +32,6 @@ from softfinger.daemon.simulation.physics.plant_state import (
 from softfinger.daemon.simulation.physics.shapes import shape_of
 from softfinger.daemon.simulation.servo_model.servo_joint import ServoHeat
 from softfinger.daemon.types import FINGERS
-from softfinger.kinematics.contact.lookup import LOWEST
 from softfinger.kinematics.contact.table import ContactTable
 from softfinger.kinematics.hand.geometry import HandGeometry
 
@@ -65,7 +64,7 @@ def geometry_of(settings: Settings) -> HandGeometry:
 def stiff_step(settings: Settings, table: ContactTable) -> float:
     """Return the sub-step [s] for the stiffest oscillation of the object on deeply pressed tips."""
     simulation = settings.simulation
-    d = min(settings.safety.d_max, 0.6 * settings.tip.radius, _deepest(settings, table))
+    d = min(settings.safety.d_max, 0.6 * settings.tip.radius, table.header.deepest)
     c = table(d, 0.0)
     # Normal stiffness ∂F/∂d and shear stiffness 2F/d are of one size; both tips push.
     stiffness = 2.0 * simulation.modulus_scale * max(float(c.force_d), 2.0 * float(c.force) / d)
@@ -81,19 +80,14 @@ def stiff_step(settings: Settings, table: ContactTable) -> float:
     return 1e-3 / math.ceil(1e-3 / step - 1e-9)
 
 
-def _deepest(settings: Settings, table: ContactTable) -> float:
-    """d [m] up to which the tips' law holds."""
-    return float(table.header.deepest if table.is_solid else (1.0 - LOWEST) * settings.tip.radius)
-
-
 def set_parameters(p: Parameters, settings: Settings, table: ContactTable, step: float) -> None:
     """Set the plant's parameters. Raises SettingsError for an unknown servo."""
     simulation = settings.simulation
     p.step = step
     p.sample_period = 1.0 / settings.tactile.rate
-    p.modulus = float(table.header.modulus) * simulation.modulus_scale
+    p.modulus = table.header.modulus * simulation.modulus_scale
     p.radius = settings.tip.radius
-    p.deepest = _deepest(settings, table)
+    p.deepest = table.header.deepest
     p.scale = simulation.modulus_scale
     p.friction = simulation.tip_friction
     p.loss = simulation.tip_loss

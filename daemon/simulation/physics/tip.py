@@ -64,8 +64,8 @@ from softfinger.daemon.simulation.physics.plant_state import (
     TipContact,
 )
 from softfinger.kinematics.compiled.kernel import inner_kernel
-from softfinger.kinematics.compiled.simd import Pointer
 from softfinger.kinematics.contact.lookup import lookup_at, normal_at, stiffness_ahead
+from softfinger.kinematics.contact.table_record import Table
 
 D_MIN = 1e-9  # m, less is no contact
 _FADE_FROM = 1.15  # rad, where w(θ) begins to fade
@@ -124,7 +124,7 @@ def clear_contact(tip: TipContact) -> None:
 
 
 @inner_kernel
-def contact_forces(p: Parameters, table: Pointer, tip: TipContact, factor: float) -> None:
+def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) -> None:
     """Compute forces, stiffness and losses of a ``tip`` along d, θ and d_t.
 
     With ζ the shear d_t, v its variance, γ = ``gain`` = w(θ) κ, ρ = ``ratio`` = s cos θ/d and
@@ -304,7 +304,7 @@ def stiffen_by_rim(p: Parameters, tip: TipContact) -> None:
 
 @inner_kernel
 def touch_object(
-    plant: Plant, table: Pointer, tip: TipContact, finger: int, now: Motion, nx: float, ny: float
+    plant: Plant, table: Table, tip: TipContact, finger: int, now: Motion, nx: float, ny: float
 ) -> None:
     """Evaluate a finger's ``tip`` on the object where ``now`` is; (nx, ny) is the object's n."""
     p = plant.parameters

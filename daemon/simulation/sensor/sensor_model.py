@@ -26,20 +26,15 @@ from softfinger.daemon.profile.simulation_settings import SimulationSettings
 from softfinger.daemon.simulation.faults import MeasurementFaults
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
-from softfinger.kinematics.sensing.pressure_grid import (
-    Rendering,
-    SensorGrid,
-    average,
-    blur_pieces,
-    render,
-)
+from softfinger.kinematics.sensing.blur import axis_points, mean_matrix
+from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from softfinger.kinematics.sensing.solid_pressure import SolidPressure
+from softfinger.kinematics.sensing.springs_pressure import SpringsPressure, count_for
 
 FloatArray = NDArray[np.float64]
 
 PLAYS = 4
-_PIECES_MAX = 3  # of a cell's side for the blur: within 2.5e-4 of the modulus
-_POINTS = 4  # of a cell's side: within 5e-4 of the modulus up to d = a/5, 2e-3 near the rim
+_FINENESS = 60.0  # points of the model to the tip's radius, or more
 
 
 class SensorModel:
@@ -64,7 +59,7 @@ class SensorModel:
         self.grid = grid
         self._flaws = flaws
         self._per_count = board.pascal_per_count
-        self._material, self._radius = material, tip.radius
+        self._material, self._cells = material, grid.on(tip)
         self._ends = (board.threshold, board.full_count)
         self._generator = np.random.Generator(np.random.SFC64(seed))
         shape = grid.shape
@@ -77,23 +72,16 @@ class SensorModel:
         if flaws.tactile_dead > 0.0:
             sensitivity[self._generator.random(shape) < flaws.tactile_dead] = 0.0
         self._sensitivity = sensitivity
-        self._pressure = self._rendered = np.zeros(shape)
-        cells, self._pieces = grid, (1, 1)
-        if flaws.tactile_blur > 0.0:
-            n_x, n_y = (
-                min(blur_pieces(flaws.tactile_blur / pitch), _PIECES_MAX) for pitch in grid.pitches
-            )
-            self._pieces = n_x, n_y
-            self._stencils, cells = replace(grid, blur=flaws.tactile_blur).finer(self._pieces)
-            self._rendered = np.zeros(cells.shape)
-        self._columns = np.empty((cells.cols + 1, 2))
+        self._pressure = np.zeros(shape)
+        self._count = count_for(self._cells, _FINENESS)
+        self._springs: SpringsPressure | None = None
         self._solid: SolidPressure | None = None
         if tip.physics == "solid":
             blurred = replace(grid, blur=flaws.tactile_blur)
             self._solid = SolidPressure(tip, material, blurred.images(tip))
-        self._cells, self._plane = cells, Rendering()
-        self._plane.grid.assign(cells.on(tip))
-        self._plane.gain = 1.0
+        else:
+            blur = flaws.tactile_blur
+            self._springs = SpringsPressure(self._cells, material, blur, self._count)
         self._plays = np.zeros((PLAYS if flaws.tactile_hysteresis > 0.0 else 0, *shape))
         self._creep_lag, self._response_lag = np.zeros((2, 2, *shape))
         self._offset = np.zeros(shape)  # counts
@@ -158,18 +146,11 @@ class SensorModel:
         elapsed = 0.0 if self._t is None else max(t - self._t, 0.0)
         self._t = t
         if self._solid is not None:
-            along = self.grid.to_sensor(shear, 0.0)
-            self._solid((d, n_x, n_y), fraction, pressure, along)
-        else:
-            if curvature > 0.0:
-                self._render_curved(d, n_x, n_y, 1.0 / curvature)
-            else:
-                self._plane.d, self._plane.n_x, self._plane.n_y = d, n_x, n_y
-                render(self._plane.array, self._material.law, self._columns, self._rendered)
-            if fraction != 1.0:
-                self._rendered *= fraction
-            if flaws.tactile_blur > 0.0:
-                pressure[:] = average(self._rendered, *self._stencils, self._pieces)
+            self._solid((d, n_x, n_y), fraction, pressure, self.grid.to_sensor(shear, 0.0))
+        elif curvature > 0.0:
+            pressure[:] = fraction * self._curved(d, n_x, n_y, 1.0 / curvature)
+        elif self._springs is not None:
+            self._springs((d, n_x, n_y), fraction, pressure)
         if flaws.tactile_hysteresis > 0.0:
             hysteresis(pressure, flaws.tactile_hysteresis, self._plays)
         if flaws.tactile_creep > 0.0:
@@ -187,27 +168,23 @@ class SensorModel:
             drift(self._warmer, flaws.tactile_gain_drift, flaws.tactile_drift_time, elapsed, normal)
 
     @cached_property
-    def _points(self) -> tuple[FloatArray, FloatArray, NDArray[np.intp], int]:
-        """Points spread evenly in the cells under the hemisphere, and how many are in a cell.
+    def _points(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Points in the cells: their place across the cylinder's axis, and the hemisphere's height.
 
-        Of each: its place across the cylinder's axis, the hemisphere's height there [m], its cell.
+        [lines, points of a line], in m, the height 0 beyond the rim. Then the matrices that take a
+        cell's mean, blurred, along y and x.
         """
-        cells, side = self._cells, -(-_POINTS // min(self._pieces))
-        x, y = (
-            (np.arange(count * side) + 0.5) * pitch / side - 0.5 * count * pitch - centre
-            for count, pitch, centre in zip(
-                (cells.cols, cells.rows), cells.pitches, cells.centre, strict=True
-            )
-        )
-        square = self._radius**2 - x**2 - y[:, None] ** 2
-        inside = square > 0.0
+        cells, blur = self._cells, self._flaws.tactile_blur
+        x, along_x = axis_points(cells.x, cells.pitch_x, cells.cols, self._count[0], blur)
+        y, along_y = axis_points(cells.y, cells.pitch_y, cells.rows, self._count[1], blur)
+        x, y = x.T.ravel(), y.T.ravel()[:, None]
+        height = np.sqrt(np.maximum(cells.radius**2 - x**2 - y**2, 0.0))
         across_x, across_y = self.grid.to_sensor(1.0, 0.0)
-        across = across_x * x + across_y * y[:, None]
-        cell = np.arange(len(y))[:, None] // side * cells.cols + np.arange(len(x)) // side
-        return across[inside], np.sqrt(square[inside]), cell[inside], side * side
+        means = mean_matrix(along_y, cells.rows), mean_matrix(along_x, cells.cols).T
+        return across_x * x + across_y * y, height, *means
 
-    def _render_curved(self, d: float, n_x: float, n_y: float, roundness: float) -> None:
-        """Render the pressure [Pa] of a cylinder of radius R = ``roundness`` [m] on each cell.
+    def _curved(self, d: float, n_x: float, n_y: float, roundness: float) -> FloatArray:
+        """Return the pressure [Pa] of a cylinder of radius R = ``roundness`` [m] on each cell.
 
         The normal (n_x, n_y, …) leads from the tip's centre to the axis, a − d + R away. With p the
         way across the axis
@@ -216,21 +193,21 @@ class SensorModel:
 
         The mean over a cell is that of its points.
         """
-        out = self._rendered
         tilted = n_x * n_x + n_y * n_y
         if not (d > 0.0 and tilted < 1.0):
-            out[:] = 0.0
-            return
-        across, height, cell, count = self._points
+            return np.zeros(self.grid.shape)
+        across, height, along_y, along_x = self._points
         across_x, across_y = self.grid.to_sensor(1.0, 0.0)
-        away = self._radius - d + roundness
+        away = self._cells.radius - d + roundness
         off = across - away * (n_x * across_x + n_y * across_y)
         under = roundness * roundness - off * off
         z = away * math.sqrt(1.0 - tilted) - np.sqrt(np.maximum(under, 0.0))
         touched = (z < height) & (under > 0.0)
-        strain = 1.0 - np.maximum(z[touched], 0.0) / height[touched]
-        sums = np.bincount(cell[touched], self._material.stress(strain), out.size)
-        out[:] = sums.reshape(out.shape) / count
+        pressure = np.zeros(across.shape)
+        pressure[touched] = self._material.stress(
+            1.0 - np.maximum(z[touched], 0.0) / height[touched]
+        )
+        return np.asarray(along_y @ pressure @ along_x)
 
     def press_evenly(self, pressure: float) -> None:
         """Let all cells feel this pressure [Pa], as under a bladder, in the last press' place."""

@@ -1,0 +1,352 @@
+"""Forward model of a tip of springs on a grid of cells: the pressure, and its partials.
+
+A cell reads the mean over its points, which are spread evenly. Over a point (x, y) of the base the
+spring is ℓ = √(a² − x² − y²) long and its strain ε = 1 − z/ℓ with z = u − v x − w y, see
+`footprint`. A point stands for a small rectangle, over which ε takes its mean: within the footprint
+by the means of 1/ℓ, x/ℓ and y/ℓ, which are tabulated. Where the outline cuts the rectangle, that
+part counts where f = ℓ² − z² is above 0, f being taken for a plane and spread evenly.
+A sensor's blur is in the weights of a cell's points, see `blur`.
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softfinger.kinematics.compiled.kernel import index, inlined_kernel, inner_kernel, kernel
+from softfinger.kinematics.compiled.layout import Records
+from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.sensing.blur import axis_points
+from softfinger.kinematics.sensing.footprint import (
+    Face,
+    Grid,
+    Span,
+    extremes,
+    line_span,
+    set_around,
+    steps,
+)
+
+FloatArray = NDArray[np.float64]
+
+STRESS, BY_D, BY_X, BY_Y = range(4)  # planes: pressure [Pa], its partials by d, n_x and n_y
+PLANES = 4
+Cells = tuple[int, int]  # first, and behind the last
+_LEAST_SPREAD = 1e-12
+# Gauss-Legendre's rule within a point's rectangle, of a width of 1.
+_NODES, _WEIGHTS = (0.5 * each for each in np.polynomial.legendre.leggauss(3))
+
+
+class SpringPoints(NamedTuple):
+    """Points of a grid's cells under a tip, as kernels use them.
+
+    A row of points is one array: those that have the first place in their cells, cell after cell,
+    then those of the second place. Cells beyond the grid are there as far as the blur reaches.
+    Arrays have one dimension where loops over them are to run in SIMD lanes.
+    """
+
+    x: FloatArray  # from the tip's centre [m], of a row
+    strain: FloatArray  # scratch, of a row
+    slope: FloatArray
+    factor: FloatArray
+    stress: FloatArray
+    inverse: FloatArray  # means of 1/ℓ, all rows one after the other
+    inverse_x: FloatArray  # of x/ℓ
+    inverse_y: FloatArray
+    y: FloatArray  # of each row
+    across: FloatArray  # weights along x, [places, cells from the first that counts on]
+    along: FloatArray  # likewise along y
+    law: FloatArray  # the material's σ(ε) in rising powers
+    sums: FloatArray  # scratch, a row of cells three times
+
+
+class PointArrays(NamedTuple):
+    """The same as few arrays, since each that a kernel takes from Python costs time."""
+
+    line: FloatArray  # [5, row]
+    inverse: FloatArray  # [3, all rows]
+    y: FloatArray
+    across: FloatArray
+    along: FloatArray
+    law: FloatArray
+    sums: FloatArray
+
+
+@inner_kernel
+def points_in(
+    line: FloatArray, inverse: FloatArray, y: FloatArray, across: FloatArray, along: FloatArray,
+    law: FloatArray, sums: FloatArray,
+) -> SpringPoints:  # fmt: skip
+    """Return the points in the arrays of :class:`PointArrays`."""
+    return SpringPoints(
+        line[0], line[1], line[2], line[3], line[4], inverse[0], inverse[1], inverse[2],
+        y, across, along, law, sums,
+    )  # fmt: skip
+
+
+def points_of(cells: Grid, material: Material, blur: float, count: tuple[int, int]) -> PointArrays:
+    """Return ``count`` (x, y) points a side of each cell."""
+    a = cells.radius
+    x, across = axis_points(cells.x, cells.pitch_x, cells.cols, count[0], blur)
+    y, along = axis_points(cells.y, cells.pitch_y, cells.rows, count[1], blur)
+    x, y = x.ravel(), np.ascontiguousarray(y.T).ravel()
+    size_x, size_y = cells.pitch_x / count[0], cells.pitch_y / count[1]
+    inverse = np.zeros((3, len(y), len(x)))
+    inside = np.zeros((len(y), len(x)))
+    for (at_x, weight_x), (at_y, weight_y) in product(zip(_NODES, _WEIGHTS, strict=True), repeat=2):
+        right, up = x + at_x * size_x, (y + at_y * size_y)[:, None]
+        square = a * a - right * right - up * up
+        weight = np.where(square > 0.0, weight_x * weight_y, 0.0)
+        inside += weight
+        each = weight / np.sqrt(np.where(square > 0.0, square, 1.0))
+        inverse += each, each * right, each * up
+    inverse /= np.where(inside > 0.0, inside, 1.0)
+    line = np.zeros((5, len(x)))
+    line[0] = x
+    flat = inverse.reshape(3, -1)
+    return PointArrays(line, flat, y, across, along, material.law, np.zeros(3 * cells.cols))
+
+
+@inlined_kernel
+def _set_strains(
+    points: SpringPoints,
+    row: int,
+    first: int,
+    last: int,
+    y: float,
+    face: Face,
+    a2: float,
+    half: Span,
+) -> None:
+    """Set ε and −∂ε/∂u of the points ``first`` … ``last`` of a row, which begins at ``row``.
+
+    ``half`` are half of a point's sides in x and y. Indices are unsigned, since Numba looks whether
+    others are negative, which keeps loops out of SIMD lanes.
+    """
+    u = face.u
+    v = face.v
+    w = face.w
+    size_x, size_y = half
+    rim = a2 - y * y
+    least = _LEAST_SPREAD * a2 * math.sqrt(a2)
+    for k in range(first, last):
+        x = points.x[k]
+        # ε > 0 where f = ℓ² − z² > 0, which is straight enough up to the rim and beyond.
+        z = max(u - v * x - w * y, 0.0)
+        f = rim - x * x - z * z
+        # f's spread over the rectangle: in the outline's middle the mean of max(f, 0) is exact.
+        by_x = abs(size_x * (x - z * v))
+        by_y = abs(size_y * (y - z * w))
+        big = max(by_x, by_y)
+        small = min(by_x, by_y)
+        spread = 4.0 * max(big, max(0.963 * big + 0.222 * small, 0.77 * big + 0.556 * small))
+        part = min(max(f + 0.5 * spread, 0.0), spread)
+        # z in the middle of the part where f > 0; f falls along (p, q).
+        p = x - z * v
+        q = y - z * w
+        away = 0.5 * max(0.5 * part - f, 0.0) / (p * p + q * q + least)
+        z = max(z + away * (v * p + w * q), 0.0)
+        # Means of ε and of 1/ℓ where f is spread evenly from 0 to ``part``.
+        length = math.sqrt(z * z + part)
+        mean = part / (spread * (length + z) + least)
+        g = points.inverse[row + k]
+        whole = 1.0 - (u * g - v * points.inverse_x[row + k] - w * points.inverse_y[row + k])
+        cut = part < spread
+        strain = (length - z) * mean if cut else whole
+        slope = 2.0 * mean if cut else g
+        points.strain[k] = min(max(strain, 0.0), 1.0)
+        points.slope[k] = slope if (strain < 1.0) & (z > 0.0) else 0.0
+
+
+@inlined_kernel
+def _start_stresses(points: SpringPoints, first: int, last: int, highest: float) -> None:
+    for k in range(first, last):
+        points.stress[k] = highest
+        points.factor[k] = 0.0
+
+
+@inlined_kernel
+def _raise_power(points: SpringPoints, first: int, last: int, coefficient: float) -> None:
+    """Take a step of Horner's scheme for σ(ε) and its slope."""
+    for k in range(first, last):
+        strain = points.strain[k]
+        points.factor[k] = points.factor[k] * strain + points.stress[k]
+        points.stress[k] = points.stress[k] * strain + coefficient
+
+
+@inlined_kernel
+def _sum_points(
+    points: SpringPoints, first: int, last: int, ahead: int, cols: int, weight: float
+) -> None:
+    """Add to cells first … last the points that stand ``ahead`` of them.
+
+    Stress, its partial by −u, and that times x.
+    """
+    for k in range(first, last):
+        slope = weight * points.slope[ahead + k] * points.factor[ahead + k]
+        points.sums[k] += weight * points.stress[ahead + k]
+        points.sums[cols + k] += slope
+        points.sums[cols + cols + k] += slope * points.x[ahead + k]
+
+
+@inlined_kernel
+def _press_line(
+    points: SpringPoints, i: int, first: int, last: int, face: Face, a2: float, half: Span
+) -> Cells:
+    """Press cells ``first`` … ``last`` of a line of points; sum it over the cells that it reaches.
+
+    Their range is returned.
+    """
+    places, reach = points.across.shape
+    wide = points.x.shape[0] // places
+    cols = points.sums.shape[0] // 3
+    law = points.law
+    order = law.shape[0]
+    low = max(first - reach + 1, 0)
+    high = min(last, cols)
+    for j in range(low, high):
+        points.sums[j] = points.sums[cols + j] = points.sums[2 * cols + j] = 0.0
+    row = index(i * places * wide)
+    for m in range(places):
+        begin = index(m * wide + first)
+        end = index(m * wide + last)
+        _set_strains(points, row, begin, end, points.y[i], face, a2, half)
+        _start_stresses(points, begin, end, law[order - 1])
+        for j in range(order - 2, -1, -1):
+            _raise_power(points, begin, end, law[j])
+        for q in range(reach):
+            start = max(first - q, 0)
+            count = min(last - q, cols) - start
+            _sum_points(
+                points,
+                index(start),
+                index(start + count),
+                index(m * wide + q),
+                index(cols),
+                points.across[m, q],
+            )
+    return low, high
+
+
+@inlined_kernel
+def _add_row(
+    points: SpringPoints,
+    low: int,
+    high: int,
+    weight: float,
+    y: float,
+    face: Face,
+    row: int,
+    out: FloatArray,
+) -> None:
+    """Add the row's sums to a row of cells; partials are by d, n_x and n_y."""
+    u = face.u
+    v = face.v
+    w = face.w
+    c = weight * math.sqrt(1.0 + v * v + w * w)
+    cols = points.sums.shape[0] // 3
+    for j in range(low, high):
+        # The pressure's partials by −u, v and w.
+        by_u = points.sums[cols + j]
+        by_v = points.sums[2 * cols + j]
+        by_w = y * by_u
+        along = v * by_v + w * by_w - u * by_u
+        out[STRESS, row, j] += weight * points.sums[j]
+        out[BY_D, row, j] += c * by_u
+        out[BY_X, row, j] += c * (by_v + v * along)
+        out[BY_Y, row, j] += c * (by_w + w * along)
+
+
+@inner_kernel
+def press_springs(
+    points: SpringPoints, grid: Grid, face: Face, around: Face, out: FloatArray
+) -> Cells:
+    """Set the pressure at the face and its partials, [PLANES, rows, cols]; return the rows touched.
+
+    Other rows are left as they are; ``around`` is scratch.
+    """
+    a = grid.radius
+    count_x = points.across.shape[0]
+    count_y, reach = points.along.shape
+    size_x = 0.5 * grid.pitch_x / count_x
+    size_y = 0.5 * grid.pitch_y / count_y
+    # A rectangle that the outline cuts may have its middle beyond it.
+    set_around(around, face, a, math.hypot(size_x, size_y))
+    low, high = extremes(around, a)
+    lines = points.y.shape[0]
+    first_line, last_line = steps(low, high, points.y[0] - size_y, 2.0 * size_y, lines)
+    first_row = min(max(first_line // count_y - reach + 1, 0), grid.rows)
+    last_row = min((last_line + count_y - 1) // count_y, grid.rows)
+    if not first_row < last_row or first_line == last_line:
+        return 0, 0
+    for plane in range(PLANES):
+        for i in range(first_row, last_row):
+            for j in range(grid.cols):
+                out[plane, i, j] = 0.0
+    start = points.x[0] - size_x
+    wide = points.x.shape[0] // count_x
+    for i in range(first_line, last_line):
+        y = points.y[i]
+        left, right = line_span(around, a, y)
+        first, last = steps(left, right, start, grid.pitch_x, wide)
+        if first == last:
+            continue
+        begin, end = _press_line(points, i, first, last, face, a * a, (size_x, size_y))
+        for q in range(reach):
+            row = i // count_y - q
+            if first_row <= row < last_row:
+                weight = points.along[i % count_y, q]
+                _add_row(points, begin, end, weight, y, face, row, out)
+    return first_row, last_row
+
+
+@kernel
+def render(
+    faces: Records[Face], grids: Records[Grid], planes: FloatArray, line: FloatArray,
+    inverse: FloatArray, y: FloatArray, across: FloatArray, along: FloatArray, law: FloatArray,
+    sums: FloatArray,
+) -> Cells:  # fmt: skip
+    """Evaluate :func:`press_springs` at the first of ``faces``; the second is scratch."""
+    points = points_in(line, inverse, y, across, along, law, sums)
+    return press_springs(points, grids[0], faces[0], faces[1], planes)
+
+
+def count_for(cells: Grid, fineness: float) -> tuple[int, int]:
+    """Return the points a side (x, y) of a cell that make ``fineness`` points to the radius."""
+    per_length = fineness / cells.radius
+    x, y = (
+        max(math.ceil(pitch * per_length - 1e-9), 1) for pitch in (cells.pitch_x, cells.pitch_y)
+    )
+    return x, y
+
+
+class SpringsPressure:
+    """Pressure of one tip of springs on a grid of cells, by ``count`` (x, y) points of each."""
+
+    def __init__(
+        self, cells: Grid, material: Material, blur: float, count: tuple[int, int]
+    ) -> None:
+        self._radius = cells.radius
+        self._grid = cells.array
+        self._points = points_of(cells, material, blur, count)
+        self._faces = np.zeros(2, Face.dtype)
+        self._planes = np.zeros((PLANES, cells.rows, cells.cols))
+
+    def __call__(self, contact: tuple[float, float, float], gain: float, out: FloatArray) -> None:
+        """Write the pressure [Pa] of a ``contact`` (d, n_x, n_y), times ``gain``, into ``out``.
+
+        d ≤ 0 gives zeros. Beyond the domain's limit the footprint ends at the rim.
+        """
+        d, n_x, n_y = contact
+        out[:] = 0.0
+        n_z = 1.0 - n_x * n_x - n_y * n_y
+        if not (d > 0.0 and n_z > 0.0):
+            return
+        n_z = math.sqrt(n_z)
+        self._faces[0] = (self._radius - min(d, self._radius)) / n_z, n_x / n_z, n_y / n_z
+        first, last = render(self._faces, self._grid, self._planes, *self._points)
+        np.multiply(gain, self._planes[STRESS, first:last], out=out[first:last])
