@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import grp
 import os
 from pathlib import Path
 
@@ -16,6 +15,8 @@ def bring_it(path: str) -> str:
 
 def grant(path: str) -> str:
     """Return the command that gives this user a port: membership of the port's own group."""
+    import grp  # not on every system that runs a client
+
     try:
         status = Path(path).stat()
         group = grp.getgrgid(status.st_gid)

@@ -16,6 +16,7 @@ import platform
 import re
 import shutil
 import sys
+import time
 import warnings
 from collections.abc import Iterator
 from functools import cache
@@ -31,9 +32,8 @@ from softfinger.kinematics.compiled.own_folder import OwnFolder, user_cache
 ROOT = Path(__file__).resolve().parents[2]  # what `softfinger.` stands for in a name
 _PACKAGES = ("kinematics", "daemon")
 _FOLDER = re.compile(r"kernels-[0-9a-f]{16}")
-_FOLDERS_MAX = (
-    4  # folders of other sources or compilers that stay: other checkouts, the last release
-)
+_FOLDERS_MAX = 4  # folders of other sources or compilers that stay: other checkouts, a release
+_RECENT = 600.0  # s; a folder used since then stays too, because its program may still run
 _DECORATED = re.compile(rb"^@\w*kernel\b", re.MULTILINE)
 _IMPORT = re.compile(
     rb"^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+import[ \t]+(\([^)]*\)|[^\n]+)|import[ \t]+([\w., \t]+))",
@@ -136,7 +136,8 @@ def mark(folder: OwnFolder, part: str) -> None:
 
 
 def _prune(base: Path, current: Path) -> None:
-    """Remove all but the last used of the other folders that were made here."""
+    """Remove the other folders that were made here, except recent ones and the last used."""
+    oldest = time.time() - _RECENT
     others = [
         each
         for each in base.iterdir()
@@ -144,7 +145,8 @@ def _prune(base: Path, current: Path) -> None:
     ]
     others.sort(key=lambda each: each.lstat().st_mtime, reverse=True)
     for old in others[_FOLDERS_MAX:]:
-        shutil.rmtree(old, ignore_errors=True)
+        if old.lstat().st_mtime < oldest:
+            shutil.rmtree(old, ignore_errors=True)
 
 
 @cache

@@ -15,7 +15,7 @@ from softfinger.kinematics.compiled.own_folder import OwnFolder
 from tests.harness.daemon_process import python
 
 FILES = {
-    "softfinger/__init__.py": "",
+    "softfinger/__init__.py": "class SoftfingerError(Exception): ...\n",
     "softfinger/kinematics/__init__.py": "",
     "softfinger/kinematics/compiled/__init__.py": "",
     "softfinger/kinematics/layout.py": "OFFSET = 1.0\n",
@@ -150,6 +150,15 @@ def test_the_folder_is_the_users_own_and_those_not_used_for_longest_go(package):
     oldest = {f"kernels-{age:016x}" for age in range(4)}
     assert oldest | others < kept
     assert len(kept) == 7
+    in_use = {f"kernels-{number:016x}" for number in range(7, 13)}
+    for name in in_use:
+        (base / name).mkdir()
+    package.write("softfinger/kinematics/layout.py", "OFFSET = 2.0\n")
+    package.run()
+    assert in_use < {each.name for each in base.iterdir()}
+    for name in in_use:
+        (base / name).rmdir()
+    package.write("softfinger/kinematics/layout.py", "OFFSET = 1.0\n")
     (new,) = kept - oldest - others
     assert (base / new).stat().st_mode & 0o777 == 0o700
     (base / new).chmod(0o777)
