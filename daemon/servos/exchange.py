@@ -140,10 +140,10 @@ def judge_exchanges(
 ) -> Finding:
     """Compare the durations of the tick's exchanges with the tick and ``servos.reply_timeout``.
 
-    ``what`` was timed, for the report. The time of an ``emulated`` hand stands still while this
-    machine is late, so that the middle exchange counts and not the slowest.
+    ``what`` was timed, for the report. An ``emulated`` hand shares the processors with its
+    clients, so only its fastest exchange shows its own delay.
     """
-    decisive = times.p50 if emulated else times.p99
+    decisive = times.least if emulated else times.p99
     rate, allowed = settings.loop.rate, settings.servos.reply_timeout
     failed = f"{times.failed:.0%} failed"
     if times.failed == 1.0:
