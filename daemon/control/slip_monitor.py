@@ -59,6 +59,7 @@ _GATE = 4.0  # standard deviations of torques and angle beyond which a jump is n
 _JUMP_MIN = 0.01  # N·m, least jump
 _SHEAR_JUMP = 0.6  # N, least jump of solid tips' shear: six standard deviations
 _YIELD_SPEED = 0.01  # rad/s, half a unit of velocity
+_STANDS = 1e-3  # rad that a standing joint may be off its average of _SETTLING: below a count
 _AGREEMENT = 0.25  # part of the mean that each joint and each tip must show
 _FRICTION_MAX = 0.3  # N·m; a larger torque in the free approach was no friction
 _SHARE_UNCONFIRMED = 0.3  # of the commanded force
@@ -91,6 +92,7 @@ class SlipState(Record):
     residual: Pair  # of the joints' torques, averaged [N·m]
     variance: Pair  # of the mean residual and of half the difference [N²·m²]
     speed: Pair  # of the joints, averaged [rad/s]
+    q: Pair  # joint angles, averaged over _SETTLING [rad]
     torque: float  # mean torque of both joints in the last tick [N·m]
     is_watched: bool  # the residual at the begin of holding is known
     offset: float  # residual without a load [N·m]
@@ -129,7 +131,7 @@ def reset(s: SlipState) -> None:
     """Reset everything but the law and the torque: there is no object, or a new one."""
     s.is_watched = s.is_confirmed = s.turned = s.reflex = False
     s.friction = s.offset = s.start = s.age = s.load = s.guarded = s.pull = s.twist = 0.0
-    s.residual[:] = s.variance[:] = s.speed[:] = 0.0
+    s.residual[:] = s.variance[:] = s.speed[:] = s.q[:] = 0.0
     s.rotation_seen[:] = s.rotation[:] = 0.0
     s.needed = s.force_limit = s.idle = 0.0
 
@@ -144,6 +146,7 @@ def begin(s: SlipState, grasp: GraspState) -> None:
     s.start = s.offset - clip(s.offset, s.friction)
     s.rotation_seen[:] = grasp.unexplained_rotation
     s.rotation[:] = 0.0
+    s.q[:] = grasp.q
     s.age = _AVERAGE_TIME
 
 
@@ -190,7 +193,7 @@ def update(
     sudden = _follow_shear(s, pull, grasp.twist_shear, is_held, sudden_min) or sudden
     s.turned = False
     if is_held:
-        _estimate_load(s, grasp, mean(torques) - s.torque, dq)
+        _estimate_load(s, grasp, mean(torques) - s.torque)
         s.turned = _has_turned(s, grasp)
     s.rotation_seen[:] = grasp.unexplained_rotation
     s.torque = mean(torques)
@@ -295,7 +298,7 @@ def _follow_shear(
 
 
 @inner_kernel
-def _estimate_load(s: SlipState, grasp: GraspState, torque_change: float, dq: Two) -> None:
+def _estimate_load(s: SlipState, grasp: GraspState, torque_change: float) -> None:
     """Estimate the load from the part of the residual that friction does not explain."""
     law = s.law
     smaller = 0.0
@@ -303,7 +306,11 @@ def _estimate_load(s: SlipState, grasp: GraspState, torque_change: float, dq: Tw
         smaller = min(abs(s.residual[0]), abs(s.residual[1]))
     residual = clip(mean(s.residual), 2.0 * smaller + s.friction)  # a load shows in both joints
     s.age = min(s.age + law.dt, _SETTLING)
-    if max(abs(dq[0]), abs(dq[1])) < _YIELD_SPEED:
+    stands = True
+    for k in range(2):
+        s.q[k] += (grasp.q[k] - s.q[k]) * law.dt / _SETTLING
+        stands = stands and abs(grasp.q[k] - s.q[k]) < _STANDS
+    if stands:
         s.offset += torque_change
     relaxed = _RELAXATION * mean(grasp.normal) * mean(grasp.moment_arm)
     off = residual - s.offset

@@ -118,7 +118,10 @@ def _update_by_torques(h: HandFilter, dt: float) -> None:
         h.slopes[FRICTION] = 1.0
         # After the torque has decreased, the gears hold between nothing and all of the decrease.
         held = min(h.torque_max - torque, h.load_held * torque)
-        correct(h, TORQUES, innovation, _TORQUE_NOISE * _TORQUE_NOISE + held * held, GATE)
+        variance = _TORQUE_NOISE * _TORQUE_NOISE + held * held
+        if innovation < -GATE * math.sqrt(expected_variance(h) + variance):
+            h.covariance[FRICTION, FRICTION] += innovation * innovation  # a load has gone
+        correct(h, TORQUES, innovation, variance, GATE)
     h.slopes[:] = 0.0
     normal = h.grasp.normal
     least = min(normal[0], normal[1])

@@ -13,7 +13,7 @@ A disc has no faces: φ is then the direction of the line between the contacts, 
 on this line. It turns by 2 L sin q/(2R + 2a − d1 − d2) per joint angle, 0.4 for a radius R of
 20 mm and the default hand, where the prediction for faces is 1.5. The frames correct the rest, so
 turning takes longer and the disc rolls further than commanded. A curved contact looks less tilted
-than it is, which makes φ one fifth too small. If the fingers stand straight or lean outwards, the
+than it is, which makes φ some 5 % too small. If the fingers stand straight or lean outwards, the
 line does not follow the joints: a disc with R ≥ 30 mm can be held, but turning it ends at the
 limits of the tips.
 """

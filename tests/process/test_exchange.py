@@ -1,6 +1,7 @@
 """The tick's own exchange: timed by `doctor`, tried at connect, missed while disarmed."""
 
 import contextlib
+import grp
 import re
 from typing import Any
 
@@ -204,7 +205,7 @@ def test_the_ports_own_group_is_advised(tmp_path, monkeypatch, group, mode, advi
     port.touch()
     port.chmod(mode)
     Group = type("Group", (), {"gr_name": group, "gr_mem": []})
-    monkeypatch.setattr(port_access.grp, "getgrgid", lambda _: Group)
+    monkeypatch.setattr(grp, "getgrgid", lambda _: Group)
     assert port_access.grant(str(port)) == advice.format(port)
     assert port_access.grant(str(tmp_path / "none")) == f"sudo chmod a+rw {tmp_path / 'none'}"
 

@@ -175,7 +175,7 @@ def test_a_grip_shows_how_late_frames_are(tmp_path, capsys, profile, latency, ha
     [
         (None, ARM, (), "found a ramp of 0.0 mm by the joints"),
         (None, FORCES, ("simulation.object_angle=0.3",), "neither slides nor tilts"),
-        (VELOSTAT, GRASP, (), "found a standard deviation of 16"),
+        (VELOSTAT, GRASP, (), "found a standard deviation of 1"),
     ],
 )
 def test_a_grip_that_shows_no_latency_is_refused(tmp_path, capsys, profile, due, hand, why):

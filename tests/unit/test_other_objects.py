@@ -65,7 +65,7 @@ def test_a_wedge_is_felt_and_turned_as_it_is(taper, told, frames):
                     [*(theta - rig.plant.theta), rig.state.object.angle - rig.plant.object_pose[2]]
                 )
             assert rig.state.mode == "holding"
-            assert np.abs(np.mean(off, axis=0)).max() < 0.003
+            assert np.abs(np.mean(off, axis=0)).max() < 0.004
             assert rig.plant.object_pose[2] == pytest.approx(angle, abs=math.radians(0.3))
             assert rig.state.object.width == pytest.approx(
                 width_at_the_contacts(rig.plant), abs=2e-4
@@ -131,7 +131,7 @@ def test_a_disc_is_held_and_turned_by_the_line_between_its_contacts():
         assert rig.state.fault == ""
         tips = HAND.tips(rig.plant.q)
         line = math.atan2(*(tips[1] - tips[0])[::-1])
-        # The estimator takes the contacts for less tilted than they are.
-        assert rig.state.object.angle == pytest.approx(0.8 * line, abs=0.01)
+        # A curved contact looks slightly less tilted than it is.
+        assert rig.state.object.angle == pytest.approx(0.95 * line, abs=0.01)
         # The disc itself has rolled on between the tips.
         assert rig.plant.object_pose[2] > 2.0 * line
