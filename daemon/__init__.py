@@ -1,1 +1,1 @@
-"""The daemon: everything that touches time or the world."""
+"""Daemon: all code that depends on time, hardware or the network."""

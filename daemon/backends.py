@@ -1,14 +1,15 @@
-"""Backends by name: what serves each name of the settings, imported when a scene needs it.
+"""Look up servo, tactile and shape backends by name, and import them on demand.
 
-Built-in ones are entries of a dict; others are entry points of installed packages, in the groups
-``softfinger.servos``, ``softfinger.tactile`` and ``softfinger.shapes``. A plugin is a class (a
-function for a shape) that is called as the built-in ones are. It may have
+Built-in backends are entries of a dict. Plugins are entry points of installed packages, in the
+groups ``softfinger.servos``, ``softfinger.tactile`` and ``softfinger.shapes``. A plugin is a class,
+or a function for a shape, with the same arguments as the built-in ones. It may define these
+attributes:
 
-- ``metal``: it is real hardware (True unless it says otherwise),
-- ``hand``: it needs the simulated hand, which it then is given as the built-in ones are; servos
-  may name the class that is made in the place of `SimulatedHand`, with its arguments,
-- ``Settings``: a pydantic model, best derived from `profile.fields.Section`, of the profile's
-  table ``[plugins.NAME]``; the validated settings are its last argument.
+- ``metal``: True if it is real hardware, which is the default.
+- ``hand``: True if it needs the simulated hand, which is then passed as to the built-in backends. A
+  servo plugin may give a class here, which replaces `SimulatedHand` and takes its arguments.
+- ``Settings``: a pydantic model of the profile's table ``[plugins.NAME]``, preferably derived from
+  `profile.fields.Section`. The validated settings are passed as the last argument.
 """
 
 from __future__ import annotations
@@ -29,21 +30,21 @@ Kind = Literal["servos", "tactile", "shapes"]
 
 
 class Backend(NamedTuple):
-    """A backend's class, and what it needs beside its settings and the clock."""
+    """Hold a backend's loader and its requirements."""
 
     load: Callable[[], Any]
-    metal: bool = True  # it drives or reads real hardware
-    hand: Any = False  # it needs the simulated hand; of servos also the hand's class
-    source: str = ""  # of a plugin: its name, package and version
-    section: type[BaseModel] | None = None  # of a plugin: its own settings
+    metal: bool = True  # True for real hardware
+    hand: Any = False  # True, or for servos the hand's class, if it needs a simulated hand
+    source: str = ""  # name, package and version of a plugin
+    section: type[BaseModel] | None = None  # settings model of a plugin
 
     @property
     def name(self) -> str:
-        """A plugin's name, empty for a built-in backend."""
+        """Name of a plugin, empty for a built-in backend."""
         return self.source.partition(" ")[0]
 
     def options(self, tables: Mapping[str, Any]) -> tuple[BaseModel, ...]:
-        """Return the last argument of a plugin with settings, its table validated; else none."""
+        """Return a plugin's validated settings as a tuple of one, empty if it has none."""
         if self.section is None:
             return ()
         return (self.section.model_validate(tables.get(self.name, {})),)
@@ -71,7 +72,7 @@ BUILT_IN: dict[Kind, dict[str, Backend]] = {
         "replay": _built_in("tactile.replay:ReplayTactile", metal=False),
         "none": _NONE,
     },
-    "shapes": {  # of the simulated object
+    "shapes": {  # shapes of the simulated object
         "rectangle": _built_in(f"{_SHAPES}:rectangle"),
         "disc": _built_in(f"{_SHAPES}:disc"),
         "wedge": _built_in(f"{_SHAPES}:wedge"),
@@ -81,32 +82,32 @@ BUILT_IN: dict[Kind, dict[str, Backend]] = {
 
 
 def backend(kind: Kind, name: str) -> Backend:
-    """Return the backend of that name.
+    """Return the backend with this name.
 
-    Raises KeyError where there is none, PluginError where it can't be used.
+    Raises KeyError for an unknown name, and PluginError for an unusable plugin.
     """
     return BUILT_IN[kind].get(name) or _plugin(kind, name)
 
 
 def needs_hand(servos: str, tactile: str) -> bool:
-    """Return whether servos or sensors of those names are parts of the simulated hand."""
+    """Return True if the named servos or sensors are parts of the simulated hand."""
     return bool(backend("servos", servos).hand or backend("tactile", tactile).hand)
 
 
 def known(kind: Kind) -> list[str]:
-    """Return the names of a kind, the built-in ones first."""
+    """Return the names of all backends of a kind, built-in ones first."""
     return list(dict.fromkeys([*BUILT_IN[kind], *(entry.name for entry in plugins(kind))]))
 
 
 def plugins(kind: Kind) -> list[EntryPoint]:
-    """Return the entry points of a kind, each once."""
-    from importlib.metadata import entry_points  # takes its time, and few scenes need it
+    """Return the entry points of a kind without duplicates."""
+    from importlib.metadata import entry_points  # slow to import, and rarely needed
 
     return list(dict.fromkeys(entry_points(group=f"softfinger.{kind}")))
 
 
 def source(entry: EntryPoint) -> str:
-    """Return a plugin's name with the package it comes from."""
+    """Return a plugin's name with the package that provides it."""
     package = f"{entry.dist.name} {entry.dist.version}" if entry.dist is not None else "no package"
     return f"{entry.name} of {package}"
 
@@ -121,7 +122,7 @@ def _plugin(kind: Kind, name: str) -> Backend:
     (entry,) = entries
     try:
         made = entry.load()
-    except Exception as error:  # whatever a stranger's module does
+    except Exception as error:  # a plugin may raise anything
         why = f"{type(error).__name__}: {error}"
         raise PluginError(f"{source(entry)} fails to load: {why}") from error
     metal, hand = getattr(made, "metal", True), getattr(made, "hand", False)
@@ -129,7 +130,7 @@ def _plugin(kind: Kind, name: str) -> Backend:
 
 
 def known_servo_models(name: str) -> str:
-    """Return an empty text for a servo model with a control table, else the names of all."""
+    """Return an empty text for a known servo model, otherwise the names of all models."""
     table = import_module("softfinger.daemon.servos.control_table")
     try:
         table.by_name(name)

@@ -1,4 +1,7 @@
-"""Whose time the hand lives in. The pipeline asks its clock and never the system itself."""
+"""Provide the clocks of the pipeline: real, simulated and virtual time.
+
+The pipeline reads time only from its clock, never from the system.
+"""
 
 from __future__ import annotations
 
@@ -16,29 +19,32 @@ from softfinger.daemon.types import FINGERS
 class Clock(Protocol):
     """Time for the pipeline, in seconds."""
 
-    waits: bool  # the hand's time stands still while this machine is late
+    waits: bool  # the hand's time pauses while this machine is late
 
     def now(self) -> float:
-        """Monotonic time [s]."""
+        """Return the monotonic time [s]."""
 
     def wall(self) -> float:
-        """Unix time [s] that belongs to now."""
+        """Return the Unix time [s] that corresponds to `now`."""
 
     def sleep_until(self, t: float) -> float:
-        """Return at monotonic time ``t``, at once if that has passed: how late it woke up [s]."""
+        """Sleep until monotonic time ``t``; return the lateness of the wake-up [s].
+
+        Return at once if ``t`` has passed.
+        """
 
 
 class LoopClock(Clock, Protocol):
-    """Clock of the loop, which also tells the machine's own time that things take."""
+    """Clock of the loop, which also measures the machine's own time."""
 
-    behind: float  # s that `now` has been kept back since the clock was made
+    behind: float  # s by which `now` lags the machine since the clock was created
 
     def host(self) -> float:
-        """The machine's monotonic time [s], by which work and lateness are measured."""
+        """Return the machine's monotonic time [s], which measures work and lateness."""
 
 
 def make_clock(settings: Settings) -> LoopClock:
-    """The clock that ``loop.clock`` names."""
+    """Return the clock selected by ``loop.clock``."""
     name = settings.loop.clock
     if name == "auto":
         name = "hand" if settings.simulated or emulated(settings) else "real"
@@ -51,20 +57,21 @@ def make_clock(settings: Settings) -> LoopClock:
 
 
 def emulated(settings: Settings) -> bool:
-    """Return whether all ports are those of a `softfinger emulate` that runs."""
+    """Return True if all ports belong to a running `softfinger emulate`."""
     ports = []
     if backend("servos", settings.servos.backend).metal:
         ports.append(settings.servos.port)
     if backend("tactile", settings.tactile.backend).metal:
         ports += [settings.tactile.port[FINGERS.index(name)] for name in settings.scene.fingers]
-    # Its links and its control socket share a folder.
+    # The emulator's port links and its control socket are in one folder.
     return bool(ports) and all(Path(port).with_name("control").is_socket() for port in ports)
 
 
 class Deadline:
-    """Time of a daemon's next tick [s, by its clock], for the emulated hand to go no further.
+    """Time of a daemon's next tick [s], beyond which an emulated hand does not advance.
 
-    It is in a file beside the emulator's ports that both have mapped.
+    The value, by the daemon's clock, is in a file beside the emulator's ports, which both processes
+    map into memory.
     """
 
     NAME = ".deadline"
@@ -80,7 +87,7 @@ class Deadline:
 
     @classmethod
     def of(cls, port: str) -> Deadline | None:
-        """Return that of the emulator whose ``port`` this is; None where there is none."""
+        """Return the deadline of the emulator that owns ``port``, or None without one."""
         try:
             return cls(Path(port).with_name(cls.NAME))
         except OSError:
@@ -88,7 +95,7 @@ class Deadline:
 
     @property
     def t(self) -> float:
-        """The time that was set last [s]; 0 before."""
+        """Time that was set last [s], initially 0."""
         return self._value[0]
 
     @t.setter
@@ -99,8 +106,8 @@ class Deadline:
 class RealClock:
     """The machine's monotonic clock.
 
-    The last ``spin`` s before the end of a sleep are waited awake: the system's own wake-up takes
-    tens of microseconds, which the spin covers. That time is lost to others on the processor.
+    The last ``spin`` s of a sleep are a busy wait, which hides the system's wake-up latency of tens
+    of microseconds. That processor time is not available to other threads.
     """
 
     now = staticmethod(time.monotonic)
@@ -113,7 +120,7 @@ class RealClock:
         self._spin = spin
 
     def sleep_until(self, t: float) -> float:
-        """Sleep; a signal handler may run meanwhile, and the sleep goes on after it."""
+        """Sleep until ``t``; a signal handler may run meanwhile without ending the sleep."""
         now = time.monotonic
         delay = t - self._spin - now()
         if delay > 0.0:
@@ -124,12 +131,12 @@ class RealClock:
 
 
 class HandClock:
-    """Time of a simulated or emulated hand: the machine's, but it waits for it.
+    """Clock of a simulated or emulated hand, which waits for a late machine.
 
-    Time stands between two sleeps, and a sleep ends at its deadline to the bit however late the
-    machine wakes up. What that takes from the time to the next deadline is made up for; what goes
-    beyond never happens for the hand, and adds to ``behind``. An emulated hand learns by ``due``
-    how far its time may go.
+    The time is constant between two sleeps, and each sleep ends exactly at its deadline, however
+    late the machine wakes up. Lateness shorter than the time to the next deadline is caught up. Any
+    further lateness does not exist for the hand and is added to ``behind``. An emulated hand reads
+    from ``due`` how far its time may advance.
     """
 
     waits = True
@@ -141,19 +148,19 @@ class HandClock:
         self.behind = 0.0
 
     def now(self) -> float:
-        """The hand's time [s]: the machine's less ``behind`` when the last sleep was to end."""
+        """Return the hand's time [s]: the deadline of the last sleep."""
         return self._now
 
     def wall(self) -> float:
-        """The machine's Unix time [s]."""
+        """Return the machine's Unix time [s]."""
         return self._machine.wall()
 
     def host(self) -> float:
-        """The machine's monotonic time [s]."""
+        """Return the machine's monotonic time [s]."""
         return self._machine.host()
 
     def sleep_until(self, t: float) -> float:
-        """Sleep until the machine has come to ``t``; a deadline that it has missed is now."""
+        """Sleep until the hand's time is ``t``; if that is past, add the delay to ``behind``."""
         self._now = max(t, self._now)
         if self._due is not None:
             self._due.t = self._now
@@ -166,9 +173,9 @@ class HandClock:
 
 
 class VirtualClock:
-    """Time that moves only when the loop waits for it, as fast as the machine can.
+    """Clock that advances only when the loop sleeps, as fast as the machine allows.
 
-    All its times start at ``start``, so that two runs with one seed are the same to the bit.
+    All its times start at ``start``, so two runs with the same seed are identical.
     """
 
     behind = 0.0
@@ -178,14 +185,14 @@ class VirtualClock:
         self._now = start
 
     def now(self) -> float:
-        """Virtual time [s]."""
+        """Return the virtual time [s]."""
         return self._now
 
-    wall = now  # its epoch is 1970
-    host = now  # whatever is done takes no time
+    wall = now
+    host = now  # computation takes no virtual time
 
     def sleep_until(self, t: float) -> float:
-        """Move time to ``t`` unless it is there already; never late."""
+        """Advance the time to ``t`` unless it has passed; return 0, as it is never late."""
         if t > self._now:
             self._now = t
         return 0.0

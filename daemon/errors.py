@@ -1,7 +1,7 @@
-"""Every exception of this project has one root; here are those that cross from room to room.
+"""Define the exceptions that several packages share, all derived from `SoftfingerError`.
 
-An exception that only one room knows stands there, derived from the root. This module imports
-neither Numba nor ZeroMQ.
+An exception used by only one package is defined there, from the same base class. This module
+imports neither Numba nor ZeroMQ.
 """
 
 from __future__ import annotations
@@ -12,46 +12,49 @@ from softfinger import SoftfingerError as SoftfingerError
 
 
 class SettingsError(SoftfingerError):
-    """The settings can't be used. The message lists every error: file, key, found, expected."""
+    """Unusable settings. The message lists every error with file, key, found and expected."""
 
 
 class PluginError(SoftfingerError):
-    """A backend of an installed package can't be used. The message names both and the reason."""
+    """Unusable plugin. The message names the backend, its package and the reason."""
 
 
 class AddressError(SoftfingerError):
-    """A socket can't be bound: the address is in use or can't be had."""
+    """Socket that cannot be bound because its address is in use or not available."""
 
 
 class KeyFileError(SoftfingerError):
-    """Keys can't be made or read. The message says which file, and what mends it."""
+    """Keys that cannot be created or read. The message names the file and the remedy."""
 
 
 class NoDescriptor(KeyFileError):
-    """Keys can't be read since no more files can be opened, which says nothing of the keys."""
+    """Keys that cannot be read because the limit of open files is reached.
+
+    The keys themselves may be valid.
+    """
 
 
 class ServoError(SoftfingerError):
-    """The servos can't be used: port missing or busy, a servo absent or set up wrongly.
+    """Unusable servos: port missing or busy, or a servo absent or misconfigured.
 
-    The message lists everything that was found wrong, one line each, with what mends it.
+    The message lists every problem on its own line, with its remedy.
     """
 
 
 class ServosSilent(ServoError):
-    """Servos did not answer, and nothing else was found wrong: they may still be starting."""
+    """Servos that do not answer, with no other problem found; they may still be starting."""
 
 
 class TactileError(SoftfingerError):
-    """The sensor can't be used: port missing, busy, silent, or a grid of another size."""
+    """Unusable tactile sensor: port missing, busy or silent, or a wrong grid size."""
 
 
 class RecordingError(SoftfingerError):
-    """The recording can't be written or read. The message names the file and what is wrong."""
+    """Recording that cannot be written or read. The message names the file and the problem."""
 
 
 class Reason(StrEnum):
-    """Why a command was not carried out, for programs: ``reason`` in the reply."""
+    """Reason for rejecting a command, for programs: ``reason`` in the reply."""
 
     LATE = "late"
     STOPPED = "stopped"
@@ -66,7 +69,7 @@ class Reason(StrEnum):
 
     @property
     def meaning(self) -> str:
-        """Describe the reason in a sentence, for the documentation."""
+        """Explanation of the reason in a sentence, for the documentation."""
         return _MEANINGS[self]
 
 
@@ -89,25 +92,25 @@ _MEANINGS = {
 
 
 class Refused(SoftfingerError):
-    """A command that was not carried out. The message goes into the reply to the client."""
+    """Rejected command. The message is sent to the client in the reply."""
 
     def __init__(self, text: str, reason: Reason | str = Reason.STATE) -> None:
-        """``reason`` is one of `Reason`, or what a daemon of another version sent."""
+        """``reason`` is a `Reason`, or any text from a daemon of another version."""
         super().__init__(text)
         self.reason = reason
 
 
 class NoStream(SoftfingerError):
-    """Nothing came from the stream's address in time. The message names it."""
+    """Timeout without a message from the stream. The message names the address."""
 
 
 class NotInTime(SoftfingerError, TimeoutError):
-    """A condition did not come about in time. The message gives the last state."""
+    """Timeout while waiting for a condition. The message contains the last state."""
 
 
 class HandClosed(SoftfingerError):
-    """A `Hand` or a subscription was used after it had been closed."""
+    """Use of a `Hand` or a subscription after it was closed."""
 
 
 class HandFault(SoftfingerError):
-    """The hand latched a fault during a wait. The message is its reason."""
+    """Fault that the hand latched during a wait. The message is the fault's text."""

@@ -1,8 +1,8 @@
-"""Files that a person or another file names, read within bounds; and files that only we write.
+"""Read files named by users within size limits, and write files safely in shared folders.
 
-A name may lead to a device, to a pipe that nobody fills, to more than memory holds. In a folder
-such as /tmp anybody may have put a link or a file where one of ours is to be: what is written would
-go into whatever that leads to.
+A path from a user or another file may be a device, a pipe without a writer, or a file larger than
+memory. In a shared folder such as /tmp, another user may have placed a link or a file at the path
+that we write to, and the link's target would be overwritten.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from softfinger.kinematics.compiled.own_folder import (
     user_cache,
 )
 
-MOST = 16 << 20  # bytes of a file that is read at once, or of what a part of one unpacks to
+MOST = 16 << 20  # bytes, largest file read at once, and largest unpacked part of a file
 
 _SHARED = stat.S_IWOTH
 
 
 def open_regular(path: Path) -> BinaryIO:
-    """Open a file to be read. Raises OSError as `open`, and for a device or a pipe."""
-    mode = path.stat().st_mode  # opening alone may act on a device
+    """Open a regular file for reading. Raises OSError also for a device or a pipe."""
+    mode = path.stat().st_mode  # because opening a device may already act on it
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
         raise OSError(errno.EINVAL, "a device or a pipe, expected a file", str(path))
     no_wait = getattr(os, "O_NONBLOCK", 0)
@@ -36,7 +36,7 @@ def open_regular(path: Path) -> BinaryIO:
 
 
 def read_file(path: Path, most: int = MOST) -> bytes:
-    """Return a file's bytes. Raises OSError as `open_regular`, and for more than ``most`` bytes."""
+    """Return a file's bytes. Raises OSError as `open_regular`, or for more than ``most`` bytes."""
     with open_regular(path) as file:
         data = file.read(most + 1)
     if len(data) > most:
@@ -45,9 +45,9 @@ def read_file(path: Path, most: int = MOST) -> bytes:
 
 
 def unpacked_most(file: BinaryIO) -> int:
-    """Return how many bytes a file may unpack to: 32 times the room that it takes on its disk.
+    """Return the limit of a file's unpacked size: 32 times its size on disk, at least 8 MiB.
 
-    Recordings take a third to a tenth of what they hold; holes in a file take no room.
+    Recordings compress to between a third and a tenth. Holes in a sparse file do not count as size.
     """
     found = os.fstat(file.fileno())
     room = 512 * found.st_blocks if JUDGED else found.st_size
@@ -55,10 +55,11 @@ def unpacked_most(file: BinaryIO) -> int:
 
 
 def runtime_folder() -> Path:
-    """The user's own runtime folder, where an emulated hand links its ports by default.
+    """Return the user's runtime folder, where an emulated hand links its ports by default.
 
-    Without one (XDG_RUNTIME_DIR, /run/user), a folder named after the user where temporary files
-    are, or at home where another user has made that. Raises RuntimeError without a home, too.
+    The folder is in XDG_RUNTIME_DIR or /run/user. Otherwise it is named after the user in the
+    folder of temporary files, or in the home folder if another user owns that name. Raises
+    RuntimeError if there is no home folder either.
     """
     named = os.environ.get("XDG_RUNTIME_DIR", "")
     for folder in (Path(named), Path(f"/run/user/{os.geteuid()}")):
@@ -75,7 +76,7 @@ def runtime_folder() -> Path:
 
 
 def runtime_fault() -> str:
-    """Return why the runtime folder can't be used and what mends it; empty where it can."""
+    """Explain why the runtime folder is unusable, with the remedy; empty if it is usable."""
     try:
         require_own(runtime_folder())
     except FileNotFoundError:
@@ -86,27 +87,27 @@ def runtime_fault() -> str:
 
 
 def shared_folder() -> Path:
-    """The folder where temporary files are, which another user may have made before."""
+    """Return the user's folder among temporary files, which another user may have created."""
     return Path(tempfile.gettempdir()) / f"softfinger-{os.geteuid()}"
 
 
 def home_folder() -> Path:
-    """The folder at home for want of another. Raises RuntimeError without a home."""
+    """Return the fallback folder in the user's home. Raises RuntimeError without a home."""
     return user_cache() / "run"
 
 
 def write_text(path: Path, append: bool = False, newline: str | None = None) -> TextIO:
-    """Open a file of text, UTF-8, that a person named, to be overwritten or appended to.
+    """Open a UTF-8 text file at a user's path for overwriting or appending.
 
-    Raises OSError as `open` does, and PermissionError for what another user has put there: a link,
-    or in a folder that all may write in any file.
+    Raises OSError as `open`. Raises PermissionError if another user owns the path and it is a link,
+    or a file in a world-writable folder.
     """
     mode: Literal["a", "w"] = "a" if append else "w"
     return open(path, mode, encoding="utf-8", newline=newline, opener=_open)
 
 
 def write_bytes(path: Path) -> BinaryIO:
-    """The same for bytes."""
+    """Open a binary file for overwriting, with the checks of `write_text`."""
     return open(path, "wb", opener=_open)
 
 
@@ -114,7 +115,7 @@ def _open(path: str, flags: int) -> int:
     try:
         there = os.lstat(path)
         _refuse_strange(path, there)
-        # Our own link may be followed; none may appear from here on.
+        # Follow an existing link of our own, but no link that is created after this check.
         follow = stat.S_ISLNK(there.st_mode)
     except FileNotFoundError:
         follow = False

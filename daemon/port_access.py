@@ -1,21 +1,21 @@
-"""Why a serial port can't be opened, and how to get it: shared by servos, boards and `doctor`."""
+"""Explain why a serial port cannot be opened and how to get access to it."""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
 
-_NO_USERS = ("root", "wheel")  # groups that nobody should join for the sake of a port
+_NO_USERS = ("root", "wheel")  # groups that a user should not join only to open a port
 
 
 def bring_it(path: str) -> str:
-    """Return advice for a port that does not exist: outside /dev it is an emulated hand's."""
+    """Return advice for a missing port; a port outside /dev belongs to an emulated hand."""
     return "plug the adapter in" if path.startswith("/dev/") else "start `softfinger emulate`"
 
 
 def grant(path: str) -> str:
-    """Return the command that gives this user a port: membership of the port's own group."""
-    import grp  # not on every system that runs a client
+    """Return the command that gives this user access, usually membership of the port's group."""
+    import grp  # missing on some systems that run a client
 
     try:
         status = Path(path).stat()

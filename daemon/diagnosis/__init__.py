@@ -1,4 +1,5 @@
-"""Checks of `softfinger doctor`: one module an area, each a few functions that return findings.
+"""Checks of `softfinger doctor`: one module per area, with functions that return findings.
 
-Nothing here changes, stiffens or moves anything, but for `repair`, which `--fix` asks for.
+Only the `repair` functions, which `--fix` calls, change anything. No function stiffens or moves the
+hand.
 """

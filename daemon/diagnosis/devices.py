@@ -1,7 +1,8 @@
-"""The hand itself: each servo of the scene, asked without a change, and each board's frames.
+"""Check the hand's devices: the servos of the scene and the frames of each tactile board.
 
-The functions named `repair` are what `softfinger doctor --fix` changes in adapters and servos. The
-hand lets go where a servo's EEPROM has to be written; nothing is ever stiffened or moved.
+The checks change nothing. `softfinger doctor --fix` calls the functions named `repair`, which
+configure adapters and servos. The hand goes limp if a servo's EEPROM must be written; it is never
+stiffened or moved.
 """
 
 from __future__ import annotations
@@ -51,18 +52,18 @@ from softfinger.daemon.servos.torque import goal_address
 from softfinger.daemon.tactile.base import make_sensor
 from softfinger.daemon.types import FINGERS, Frame
 
-_LISTEN = 0.5  # s of a board's frames
-_REST_NOISE = 3.0  # of a cell's noise, that a tared board's median cell does not reach at rest
-_OFF_RATE = 0.1  # share of the rate by which a board may be off
-_SAME_POISSON = 0.02  # by which ν may differ: presses tell it no better
+_LISTEN = 0.5  # s, time to receive a board's frames
+_REST_NOISE = 3.0  # times a cell's noise, limit of a tared board's median cell at rest
+_OFF_RATE = 0.1  # allowed relative error of a board's rate
+_SAME_POISSON = 0.02  # tolerance of ν, limited by the accuracy of the presses
 
 
 def check_servos(settings: Settings) -> list[Finding]:
-    """Check each servo of the scene; where one does not answer, search every rate for one."""
+    """Check each servo of the scene; if one does not answer, search for it at every rate."""
     servos = settings.servos
     model = by_name(servos.model)
     try:
-        # The adapter's low-latency mode would be a change, so it is not asked for.
+        # Low-latency mode is not requested, because it would change the adapter.
         with open_line(servos.port, servos.baud, low_latency=False) as line:
             _wait_for(line, settings)
             found = examine(line, settings, model)
@@ -89,10 +90,10 @@ def _wait_for(line: ServoLine, settings: Settings) -> None:
 def _try_exchange(
     line: ServoLine, settings: Settings, model: ServoModel, found: list[Examined]
 ) -> list[Finding]:
-    """Time the tick's own reads and writes where all servos are well; nothing is changed by them.
+    """Time the reads and writes of a tick if all servos are usable, without changing registers.
 
-    The writes are of the tick's length and place, and bring back what is there. They are left out
-    where a servo has torque or might get it by a goal.
+    The writes have the length and address of a tick's writes and repeat the present values. They
+    are omitted if a servo has torque or could switch it on when a goal is written.
     """
     if not all(each.table and not each.errors for each in found):
         return []
@@ -147,7 +148,7 @@ def _described(servo: Examined, model: ServoModel) -> str:
 
 
 def _search(settings: Settings, model: ServoModel) -> list[Finding]:
-    """Search the port at every rate of the model and say how to reach what answers."""
+    """Search the port at every rate of the model, and explain how to use the servos found."""
     servos = settings.servos
     found = search(servos.port, model.baud_rates, SEARCH_TIME, {FACTORY_ID, *servos.ids})
     if found.old:
@@ -169,7 +170,7 @@ def _search(settings: Settings, model: ServoModel) -> list[Finding]:
 
 
 def _blame_power(examined: list[Examined]) -> list[Finding]:
-    """Report the likeliest cause of missing servos where no other ones answer instead."""
+    """Report the most likely cause of missing servos if no other servos answer."""
     at = reg.PRESENT_INPUT_VOLTAGE
     volts = [each.table.word(at) * reg.VOLTAGE_UNIT for each in examined if each.table]
     problem = "no other servo answers at any rate"
@@ -180,7 +181,7 @@ def _blame_power(examined: list[Examined]) -> list[Finding]:
 
 
 def check_law(settings: Settings, finger: int) -> Finding:
-    """Compare a tip's contact law with the one that the presses of `calibrate law` want."""
+    """Compare a tip's contact law with the result of `calibrate law`."""
     name, tip = f"tip {FINGERS[finger]}", settings.tip
     try:
         calibration = calibration_for(settings, finger)
@@ -201,7 +202,7 @@ def check_law(settings: Settings, finger: int) -> Finding:
 
 
 def check_board(settings: Settings, finger: int) -> Finding:
-    """Check that a board sends frames of the settings' grid at their rate."""
+    """Check that a board sends frames with the grid and rate of the settings."""
     tactile = settings.tactile
     name = f"tactile {FINGERS[finger]}"
     sensor = make_sensor(settings, RealClock(), None, finger)
@@ -216,7 +217,7 @@ def check_board(settings: Settings, finger: int) -> Finding:
     try:
         before, start = sensor.counters(), time.monotonic()
         time.sleep(_LISTEN)
-        frame = sensor.latest()  # a plugin's board may read only when it is asked
+        frame = sensor.latest()  # a plugin may read its board only in this call
         after, spent = sensor.counters(), time.monotonic() - start
     finally:
         sensor.close()
@@ -232,7 +233,7 @@ def check_board(settings: Settings, finger: int) -> Finding:
         text = f"{found}, but half of them read {rest / 1e3:.1f} kPa or more, expected 0 at rest"
         fix = "`softfinger calibrate tare`, or `softfinger send tare` at each start"
         return Finding("warn", name, text, fix)
-    # One frame more or less falls into the time that was listened for.
+    # The measuring time may contain one frame more or less.
     if abs(frames - tactile.rate * spent) > max(_OFF_RATE * tactile.rate * spent, 1.5):
         text = f"{found}, not {tactile.rate:g}"
         fix = f"set tactile.rate = {rate:.0f}, unless this machine is busy"
@@ -241,7 +242,7 @@ def check_board(settings: Settings, finger: int) -> Finding:
 
 
 def _rest(settings: Settings, finger: int, frame: Frame) -> float:
-    """Return the pressure [Pa] that half of the cells reach; no contact presses so many."""
+    """Return the median pressure of the cells [Pa]; a contact loads fewer than half of them."""
     calibration = calibration_for(settings, finger)
     scale = settings.tactile.pascal_per_count
     if calibration is None:
@@ -251,7 +252,7 @@ def _rest(settings: Settings, finger: int, frame: Frame) -> float:
 
 
 def repair_latency_timer(path: str, *sysfs: Path) -> Finding | None:
-    """Set the adapter's latency timer to 1 ms; None when there is nothing to do."""
+    """Set the adapter's latency timer to 1 ms; return None if that is unnecessary."""
     place = latency_file(path, *sysfs)
     found = check_latency_timer(path, 1.0, *sysfs)
     if place is None or found is None or found.status == "pass":
@@ -266,7 +267,7 @@ def repair_latency_timer(path: str, *sysfs: Path) -> Finding | None:
 
 
 def repair_servos(settings: Settings) -> list[Finding]:
-    """Set the scene's servos up as the daemon needs them; one line for each thing done."""
+    """Configure the scene's servos for the daemon; return one finding for each change."""
     try:
         found = provision(settings)
     except ServoError as error:

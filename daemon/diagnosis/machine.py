@@ -1,7 +1,7 @@
-"""Checks that this machine can keep a steady tick: scheduling, memory, idle states, clock.
+"""Check that this machine can keep a steady tick: scheduling, memory, idle states, clock.
 
-All of it makes the tick worse at most, so nothing here fails; limits are this process's own, as
-the daemon started from the same shell has them.
+Problems found here only degrade the tick, so no check fails. Limits are those of this process,
+which a daemon started from the same shell shares.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.base import Finding
 from softfinger.kinematics.compiled.kernel_folder import damaged, find_folder
 
-_MEMORY = 1 << 30  # bytes: what the daemon has mapped, with room
+_MEMORY = 1 << 30  # bytes, more than the daemon maps
 _WAKE_UPS = 100
 _PERIOD = 0.002  # s
-_OLDEST = 1_700_000_000.0  # Unix s: a clock that says less was never set
+_OLDEST = 1_700_000_000.0  # Unix time [s], an earlier clock was never set
 
 
 def check_machine() -> list[Finding]:
@@ -35,7 +35,7 @@ def check_machine() -> list[Finding]:
 
 
 def check_scheduling() -> Finding:
-    """Check that SCHED_FIFO is allowed; it is tried for an instant, on this thread alone."""
+    """Check that SCHED_FIFO is allowed by setting it briefly for this thread."""
     before = os.sched_getscheduler(0), os.sched_getparam(0)
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(1))
@@ -48,7 +48,7 @@ def check_scheduling() -> Finding:
 
 
 def check_memory_lock(limit: int) -> Finding:
-    """Judge RLIMIT_MEMLOCK [bytes], RLIM_INFINITY for none."""
+    """Check RLIMIT_MEMLOCK [bytes], which is RLIM_INFINITY if unlimited."""
     if os.geteuid() == 0:
         return Finding("pass", "memory lock", "not limited for root")
     if limit == resource.RLIM_INFINITY:
@@ -61,7 +61,7 @@ def check_memory_lock(limit: int) -> Finding:
 
 
 def check_idle_states(path: Path) -> Finding:
-    """Check that the processors can be kept out of deep idle states, which they leave slowly."""
+    """Check that the processors can be kept out of deep idle states, which take long to leave."""
     name = str(path)
     if not path.exists():
         return Finding("warn", name, "this kernel has none: wake-ups take what idle states take")
@@ -72,7 +72,7 @@ def check_idle_states(path: Path) -> Finding:
 
 
 def check_wall_clock(now: float) -> Finding:
-    """Check that Unix time ``now`` [s] can be one: it stands in every published message."""
+    """Check that Unix time ``now`` [s], which is in every published message, is plausible."""
     if now >= _OLDEST:
         return Finding("pass", "wall clock", time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(now)))
     date = time.strftime("%Y-%m-%d", time.gmtime(now))
@@ -81,7 +81,7 @@ def check_wall_clock(now: float) -> Finding:
 
 
 def wake_ups() -> list[float]:
-    """Return how late sleeps until a deadline end [s], as the daemon's ticks do."""
+    """Measure the lateness [s] of sleeps until a deadline, like those of the daemon's ticks."""
     late = []
     deadline = time.monotonic()
     for _ in range(_WAKE_UPS):
@@ -92,7 +92,7 @@ def wake_ups() -> list[float]:
 
 
 def check_wake_ups(late: list[float]) -> Finding:
-    """Judge how late wake-ups were [s]: half a tick's period is too late."""
+    """Check the lateness of wake-ups [s]; a median above a quarter of the period is a warning."""
     worst = max(late)
     middle = sorted(late)[len(late) // 2]
     text = f"late by {middle * 1e6:.0f} µs, at most {worst * 1e6:.0f} µs in {len(late)} ticks"
@@ -103,7 +103,7 @@ def check_wake_ups(late: list[float]) -> Finding:
 
 
 def check_kernels(settings: Settings) -> list[Finding]:
-    """Check that compiled kernels can be stored, and those of this scene are there."""
+    """Check that compiled kernels can be stored and that those of this scene are present."""
     try:
         with find_folder() as folder:
             place, spoilt = folder.path, len(damaged(folder))

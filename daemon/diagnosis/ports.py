@@ -1,4 +1,4 @@
-"""Serial ports and sockets: which there are, whether they can be had, and who has them."""
+"""Check serial ports and sockets: existence, access, and the processes that use them."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ _PROC = Path("/proc")
 
 
 def serial_ports() -> list[tuple[str, str]]:
-    """Return (path, what it is) of every serial port of this machine, by path."""
+    """Return (path, description) of every serial port of this machine, sorted by path."""
     return sorted((port.device, port.description) for port in list_ports.comports())
 
 
 def note_ports() -> Finding:
-    """Return the existing ports, in one line."""
+    """Report the existing ports in one line."""
     found = [
         f"{path} ({text})" if text not in ("", "n/a") else path for path, text in serial_ports()
     ]
@@ -38,7 +38,7 @@ def note_ports() -> Finding:
 
 
 def check_runtime_folder() -> Finding:
-    """Check the folder of emulated hands' ports and of the local stop: nobody else may fill it."""
+    """Check that only this user can write to the folder of emulated ports and the local stop."""
     what, _, fix = runtime_fault().partition(": chmod ")
     if what:
         return Finding("warn", "runtime folder", what, fix and f"chmod {fix}")
@@ -50,10 +50,10 @@ def check_runtime_folder() -> Finding:
 
 
 def check_port(path: str, key: str, mode_of_daemon: str = "") -> Finding:
-    """Check that a port is there, may be opened, and nobody else has it; it is not kept open.
+    """Check that a port exists, can be opened, and is not used by another process.
 
-    ``key`` is the setting that names it, ``mode_of_daemon`` that of the daemon which answers
-    commands here, if one does: it may have the port and shall keep it.
+    The port is closed again. ``key`` is the setting that names it. ``mode_of_daemon`` is the mode
+    of the daemon that answers commands here, which may use the port, or empty.
     """
     try:
         mode = Path(path).stat()
@@ -100,7 +100,7 @@ def _busy(path: str, mode_of_daemon: str) -> Finding:
 
 
 def _is_daemon(process: int) -> bool:
-    """Return whether it was started as ``softfinger run``."""
+    """Return True if the process was started as ``softfinger run``."""
     try:
         words = (_PROC / str(process) / "cmdline").read_bytes().split(b"\0")
     except OSError:
@@ -111,9 +111,9 @@ def _is_daemon(process: int) -> bool:
 
 
 def users(path: str) -> list[tuple[int, str]]:
-    """Return (process, its name) of all that have the port open, as far as this user may see.
+    """Return (process, name) of all processes that have the port open, as far as visible.
 
-    Who holds the other end of a pseudo-terminal is no user of it.
+    The process that owns the other end of a pseudo-terminal is not included.
     """
     try:
         device = Path(path).stat().st_rdev
@@ -134,7 +134,7 @@ def users(path: str) -> list[tuple[int, str]]:
 
 
 def _uses(folder: Path, device: int) -> bool:
-    """Return whether the process has the device open, and does not own it as a pseudo-terminal."""
+    """Return True if the process has the device open and is not its pseudo-terminal's owner."""
     opened = False
     for link in (folder / "fd").iterdir():
         try:
@@ -151,7 +151,7 @@ def _uses(folder: Path, device: int) -> bool:
 
 
 def _pseudo_terminal(folder: Path, link: Path) -> int:
-    """The number of the pseudo-terminal whose master this descriptor is, -1 for another thing."""
+    """Return the number of the pseudo-terminal whose master this descriptor is, otherwise -1."""
     if not str(link.readlink()).endswith("ptmx"):
         return -1
     match = re.search(r"^tty-index:\s*(\d+)", (folder / "fdinfo" / link.name).read_text(), re.M)
@@ -162,7 +162,7 @@ _PATIENCE = 0.5  # s for a daemon to answer
 
 
 def check_addresses(settings: Settings) -> list[Finding]:
-    """Check that all addresses can be bound; name the holder if not."""
+    """Check that all addresses can be bound, and name the holder of those in use."""
     found = [
         _check(settings, "stream.address", settings.stream.address),
         _check(settings, "commands.address", settings.commands.address),
@@ -186,9 +186,9 @@ def _check(settings: Settings, key: str, address: str) -> Finding:
 
 
 def daemon_mode(address: str, keys: str = "") -> str:
-    """Return the mode of the daemon that answers commands at ``address``; empty when none does.
+    """Return the mode of the daemon that answers commands at ``address``, or an empty text.
 
-    ``keys`` is the folder of `softfinger keys`, where the daemon wants some.
+    ``keys`` is the folder of `softfinger keys` if the daemon requires keys.
     """
     try:
         own = load_client(Path(keys)) if keys else None
@@ -199,7 +199,7 @@ def daemon_mode(address: str, keys: str = "") -> str:
 
 
 def why_not_free(address: str) -> str:
-    """Return why ``address`` can't be bound, empty if it can: it is bound for an instant."""
+    """Try to bind ``address``; return the error, or an empty text if it succeeds."""
     with zmq.Context() as context, context.socket(zmq.REP) as trial:
         try:
             path = bind(trial, address, 0o600)

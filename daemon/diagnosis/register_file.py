@@ -1,4 +1,4 @@
-"""A file with the registers of each servo of the scene: saved before a change, restored after it.
+"""Save the registers of the scene's servos to a file before a change, and restore them.
 
 JSON: ``{"servos": [{"id": 1, "model": "XM430-W350", "firmware": 48, "registers": {NAME: value}}]}``
 with the names and values of `servos.register_table.REGISTERS`.
@@ -22,12 +22,12 @@ from softfinger.daemon.servos.protocol import ServoLine, open_line
 from softfinger.daemon.servos.register_table import REGISTERS
 from softfinger.daemon.types import FINGERS
 
-_LARGEST = 1 << 20  # bytes of a file that is read
-_PASSES = 2  # a lower limit may be refused until the upper one is written
+_LARGEST = 1 << 20  # bytes, largest file that is read
+_PASSES = 2  # a lower limit may be rejected until the upper one is written
 
 
 class StoredServo(Section):
-    """A servo in the file."""
+    """One servo in the file."""
 
     id: int
     model: str
@@ -47,13 +47,13 @@ class StoredServo(Section):
 
 
 class StoredServos(Section):
-    """The file."""
+    """Contents of the file."""
 
     servos: tuple[StoredServo, ...]
 
 
 def save_registers(settings: Settings, path: Path) -> list[Finding]:
-    """Save all registers of each servo that answers, but for ID and rate."""
+    """Save all registers of each servo that answers, except ID and baud rate."""
     servos: list[StoredServo] = []
     found = []
     with open_line(settings.servos.port, settings.servos.baud) as line:
@@ -80,9 +80,9 @@ def save_registers(settings: Settings, path: Path) -> list[Finding]:
 
 
 def restore_registers(settings: Settings, path: Path) -> list[Finding]:
-    """Write what :func:`save_registers` stored back into servos of the same ID and model.
+    """Write registers stored by :func:`save_registers` to servos of the same ID and model.
 
-    Raises ServoError for a file that holds something else.
+    Raises ServoError for a file with other content.
     """
     stored = _stored(path)
     result: list[Finding] = []
@@ -110,7 +110,7 @@ def _restore(
         result.append(Finding("warn", name, "not restored: torque could not be switched off"))
         return
     tables: list[bytes] = []
-    # The operating mode first, since it resets gains, profiles and goals.
+    # Write the operating mode first, because it resets gains, profiles and goals.
     order = sorted(REGISTERS, key=lambda each: each.address != reg.OPERATING_MODE)
     for turn in range(_PASSES + 1):
         table = line.read(servo_id, 0, CHECKED)

@@ -1,4 +1,4 @@
-"""The tick and what makes it run: building the daemon, requests, publishing, timing, warm-up.
+"""Real-time loop: start-up of the daemon, the tick, client requests, publishing and timing.
 
-It joins the other rooms; no control law, limit or protocol stands here.
+This package connects the others. It contains no control law, limit or protocol.
 """

@@ -1,7 +1,7 @@
-"""Settings become a running daemon: everything is built, connected and warmed up, in safe order.
+"""Build, connect and warm up a daemon from its settings.
 
-Sockets are bound before any hardware is touched, so that a second daemon ends without. Kernels
-are compiled and warm before the loop exists, and so before torque can be on.
+Sockets are bound before any hardware is touched, so a second daemon exits without disturbing the
+first. All kernels are compiled before the loop exists and therefore before torque can be on.
 """
 
 from __future__ import annotations
@@ -32,17 +32,20 @@ from softfinger.daemon.wire.local_stop import LocalStop
 from softfinger.daemon.wire.publisher import GATEWAY_TOPICS, Publisher
 from softfinger.kinematics.contact.table import ContactTable
 
-_LOOK_AGAIN = 0.2  # s between two looks for servos that do not answer yet
+_LOOK_AGAIN = 0.2  # s between two connection attempts
 
 if TYPE_CHECKING:
     from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 
 
 class Daemon:
-    """A hand that is ready to run: ``with Daemon(settings) as daemon: daemon.loop.run()``.
+    """Hold a hand that is ready to run: ``with Daemon(settings) as daemon: daemon.loop.run()``.
 
-    Raises SettingsError, AddressError (keys included), ServoError or TactileError when it can't be
-    made ready, with everything closed again that was opened until then.
+    Raises
+    ------
+    SettingsError, AddressError, ServoError, TactileError
+        The hand cannot be made ready. AddressError also reports unusable keys. Everything opened
+        so far is closed again.
     """
 
     def __init__(
@@ -53,7 +56,14 @@ class Daemon:
         wire: bool = True,
         hand: Settings | None = None,
     ) -> None:
-        """``hand``: what a simulated hand is made of, where that is not what the daemon assumes."""
+        """Build and connect the daemon.
+
+        Parameters
+        ----------
+        on_event : called with the level, kind and text of each event
+        wire : serve clients over ZeroMQ
+        hand : settings of the simulated hand if they differ from those the daemon assumes
+        """
         self.settings = settings
         self._hand_settings = settings if hand is None else hand
         self.clock: LoopClock = make_clock(settings)
@@ -76,7 +86,7 @@ class Daemon:
         self.servos = make_servos(settings, self.clock, self.hand)
         perception = Perception(settings, self._make_sensors(), self.models)
         if self.gateway is not None:
-            self.gateway.wait()  # a second daemon touches no hardware
+            self.gateway.wait()  # a second daemon exits here, before it touches hardware
         if self.servos is not None:
             self._closers.append(self.servos.close)
             self._connect(self.servos, on_event)
@@ -89,7 +99,7 @@ class Daemon:
             publisher.settings(self.clock.wall(), self.clock.now(), facts(settings, self.models))
 
     def _connect(self, servos: Servos, on_event: EventSink | None) -> None:
-        """Connect, and wait up to ``servos.open_timeout`` for servos that do not answer yet."""
+        """Connect, retrying for up to ``servos.open_timeout`` while servos do not answer."""
         patience = self.settings.servos.open_timeout
         began = time.monotonic()
         told = False
@@ -129,9 +139,9 @@ class Daemon:
         return Publisher(gateway.link), CommandServer(gateway.link, local)
 
     def _make_hand(self) -> SimulatedHand | None:
-        """The simulated hand, where a backend wants one.
+        """Return the simulated hand, or None if no backend needs one.
 
-        Its tips are of the material in the settings, whatever a calibration says of them.
+        Its tips use the material from the settings, even if a calibration has its own material.
         """
         settings = self.settings
         if not needs_hand(settings.servos.backend, settings.tactile.backend):
@@ -160,16 +170,16 @@ class Daemon:
 
     @property
     def tables(self) -> tuple[ContactTable, ContactTable]:
-        """The contact tables of both tips; one and the same where their material is."""
+        """Contact tables of both tips; the same object if the tips share a material."""
         return self.models[0].table, self.models[1].table
 
     def close(self) -> None:
-        """Torque off, then everything closed, last opened first. Never raises."""
+        """Turn torque off and close everything in reverse order of opening. Never raises."""
         while self._closers:
             closer = self._closers.pop()
             try:
                 closer()
-            except Exception as error:  # the others, torque off among them, must still run
+            except Exception as error:  # the other closers, including torque off, must still run
                 logging.getLogger(__name__).error("closing: %s", error)
 
     def __enter__(self) -> Daemon:
@@ -180,7 +190,7 @@ class Daemon:
 
 
 def facts(settings: Settings, models: tuple[FingerModel, FingerModel]) -> HandFacts:
-    """Published once for each subscriber: settings, calibrations, the tables' errors."""
+    """Return the settings, calibrations and table errors that each subscriber receives once."""
     calibrations = [
         "" if model.calibration is None else model.calibration.model_dump_json() for model in models
     ]

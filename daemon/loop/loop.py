@@ -1,7 +1,7 @@
-"""The tick, and nothing else: read, feel, decide, bound, write, publish.
+"""Run the control tick: read, estimate, decide, limit, write, publish.
 
-The loop owns the order of the stages; the clock owns the time. Everything it calls has been built,
-connected and warmed up before (`loop.build`).
+The loop defines the order of the stages and the clock defines the time. `loop.build` has built,
+connected and warmed up everything that the loop calls.
 """
 
 from __future__ import annotations
@@ -31,15 +31,14 @@ from softfinger.daemon.wire.publisher import Publisher
 
 EventSink = Callable[[str, str, str], None]
 
-_START_AGE = 0.2  # s; an older command stiffens or moves nothing, except a hold during a grip
+_START_AGE = 0.2  # s, age limit of commands that stiffen or move the hand, except holds in a grip
 
 
 def start_age(settings: Settings, waits: bool) -> float:
-    """Return the age [s] up to which a command that stiffens or moves the hand is carried out.
+    """Return the maximum age [s] of a command that stiffens or moves the hand.
 
-    An older command may have been sent before the servos' watchdog stopped them, when the hand was
-    in another state.
-    ``waits``: the servos' time stands still while this machine is late, and with it the watchdog.
+    An older command may predate a stop by the servo watchdog, which leaves the hand in another
+    state. With ``waits``, the servos' time and their watchdog pause while this machine is late.
     """
     watchdog = 0.0 if settings.simulated or waits else settings.servos.watchdog
     return min(_START_AGE, watchdog or _START_AGE)
@@ -48,21 +47,21 @@ def start_age(settings: Settings, waits: bool) -> float:
 class Commands(Protocol):
     """A source of commands: `wire.command_server.CommandServer`, or a recording."""
 
-    notices: deque[str]  # news of the process that serves clients, for events
+    notices: deque[str]  # messages from the gateway process, emitted as events
 
     @property
     def refused_by_pace(self) -> int:
-        """Commands refused because too many came."""
+        """Number of commands that exceeded the rate limit."""
 
     def serve(self, handler: Handler) -> None:
-        """Carry out through ``handler`` what is due at this tick."""
+        """Pass each request that is due at this tick to ``handler``."""
 
     def raise_fence(self) -> None:
-        """Refuse all commands that arrived before now, except stop and status: the hand stopped."""
+        """Reject all commands received so far, except stop and status, after a stop."""
 
 
 class Loop:
-    """Runs the pipeline on a clock. All of it happens in the thread that calls `run`."""
+    """Run the pipeline on a clock, entirely in the thread that calls `run`."""
 
     def __init__(
         self,
@@ -100,42 +99,42 @@ class Loop:
             self.emit,
             start_age(settings, clock.waits),
         )
-        self._after_opening: Breach | None = None  # a fault for when the hand is open
+        self._after_opening: Breach | None = None  # fault to latch once the hand is open
         self.statistics = Statistics()
         self._lateness = Lateness(settings, self.state.timing, clock.waits)
         self._publishing = None
         if publisher is not None:
             self._publishing = Publishing(settings, publisher, sensors, self.statistics)
-        self.heartbeat: Callable[[float], None] | None = None  # called after each tick with its end
+        self.heartbeat: Callable[[float], None] | None = None  # called with each tick's end time
         self._reports: deque[tuple[str, str, str]] = deque()  # events from outside the tick
         self._ending = False
         self._stopping = False
-        self._began = -math.inf  # the present tick, in the machine's time
-        self._commanded = False  # a command was carried out at this tick, which may take long
+        self._began = -math.inf  # start of the current tick, machine time [s]
+        self._commanded = False  # a command ran in this tick and may have taken long
 
-    # From outside the tick, a signal handler included
+    # The following methods may be called from outside the tick, also by a signal handler.
 
     def end(self) -> None:
-        """Leave `run` after this tick, with torque off."""
+        """Leave `run` after this tick and turn torque off."""
         self._ending = True
 
     def stop(self) -> None:
-        """Turn torque off at the next tick, as the command does."""
+        """Turn torque off at the next tick, like the ``stop`` command."""
         self._stopping = True
 
     def report(self, level: str, kind: str, text: str) -> None:
-        """Emit an event at the next tick; any thread may call it."""
+        """Emit an event at the next tick. Thread-safe."""
         self._reports.append((level, kind, text))
 
     def publish_truth(self, truth: Truth | None) -> None:
-        """Publish what a simulated hand knows of itself, where somebody subscribes to it."""
+        """Publish the true state of a simulated hand to subscribers of ``hand/truth``."""
         if self._publishing is not None:
             self._publishing.truth = truth
 
     # Time
 
     def run(self, duration: float | None = None) -> None:
-        """Tick until `end` is called or ``duration`` s have passed; torque is off afterwards."""
+        """Tick until `end` is called or ``duration`` s have passed, then turn torque off."""
         self.state.t = self._clock.now()
         self.state.wall = self._clock.wall()
         self.emit("info", "start", "running, disarmed")
@@ -150,13 +149,14 @@ class Loop:
                 self.emit("info", "end", "ended, torque off")
 
     def advance(self, duration: float | None = None) -> None:
-        """Tick for ``duration`` s of the machine, or until `end`, and leave the hand as it is then.
+        """Tick for ``duration`` s of machine time or until `end`, and leave torque unchanged.
 
-        Deadlines are absolute. After a late tick the next deadline is now, so there is no burst:
-        real time has gone on meanwhile, a simulated hand's own has waited.
+        Deadlines are absolute. After a late tick the next deadline is set to now, so that no burst
+        of ticks follows. Real hardware has moved on by then, whereas the time of a simulated hand
+        has paused.
         """
         clock, timing = self._clock, self.state.timing
-        clock.sleep_until(clock.now())  # what went before does not count as late
+        clock.sleep_until(clock.now())  # time before the first tick does not count as lateness
         before = clock.behind - timing.behind_s
         deadline = clock.now()
         last = clock.host() - self.period
@@ -189,7 +189,7 @@ class Loop:
     # The tick
 
     def tick(self, now: float) -> float:
-        """One pass of the pipeline at clock time ``now``; the machine's time at its end."""
+        """Run one pass of the pipeline at clock time ``now``; return its end in machine time."""
         state, clock, statistics = self.state, self._clock, self.statistics
         began = self._began = clock.host()
         state.seq += 1
@@ -294,9 +294,20 @@ class Loop:
     def command(
         self, request: dict[str, Any], age: float = 0.0, by_task: bool = False
     ) -> dict[str, Any]:
-        """Carry out one request at the present tick. Raises Refused with the reason.
+        """Execute one request in the current tick.
 
-        ``age`` [s] is how long ago it arrived. A request that is not the task's own ends the task.
+        A request that does not come from the running task ends that task.
+
+        Parameters
+        ----------
+        request : command with its parameters
+        age : time since the request arrived [s]
+        by_task : the request comes from the running task
+
+        Raises
+        ------
+        Refused
+            The request was rejected. The message gives the reason.
         """
         name = request["command"]
         if name == "status":
@@ -324,7 +335,7 @@ class Loop:
             self._publisher.command(state.wall, state.t, state.seq, request, error)
 
     def _follow(self, task: Task) -> None:
-        """Carry out what the task says is due; one that can't go on ends, or begins again."""
+        """Execute the task's next request; if the task fails, end it or restart it."""
         try:
             request = task.next(self.state, self.period)
             if request is not None:
@@ -340,14 +351,14 @@ class Loop:
         self.emit("warning", "task", f"task over: {reason}")
 
     def emit(self, level: str, kind: str, text: str) -> None:
-        """Publish an event and hand it to the log."""
+        """Publish an event and pass it to the log."""
         if self._publisher is not None:
             self._publisher.event(self.state.wall, self.state.t, level, kind, text)
         if self._on_event is not None:
             self._on_event(level, kind, text)
 
     def _with_cause(self, name: str, text: str) -> str:
-        # A command may keep the bus busy for long by itself.
+        # A command may occupy the bus for long, which is not a busy machine.
         at_work = 0.0 if self._commanded else self._clock.host() - self._began
         return self._lateness.with_cause(name, text, at_work)
 
@@ -361,5 +372,5 @@ class Loop:
             self.state.mode = self._control.mode
 
     def _latch(self, reason: str, name: str) -> None:
-        """The one place that writes the state's fault; empty texts clear it."""
+        """Write the latched fault; empty texts clear it. All other code only reads it."""
         self.state.fault, self.state.fault_name = reason, name

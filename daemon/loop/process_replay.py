@@ -1,8 +1,8 @@
-"""Re-run of a recording through today's code: its readings, frames and commands, tick by tick.
+"""Re-run a recording's readings, frames and commands through the current code, tick by tick.
 
-Servos, sensors, clock and commands are the recording's; estimator, tables, filter, control and
-limits are today's. All inputs from the first tick on, with the same code and settings, give the
-same states to the last bit.
+The servos, sensors, clock and commands come from the recording. The estimator, tables, filter,
+control and limits are the installed code. With all inputs from the first tick on and the same code
+and settings, the states are reproduced bit for bit.
 """
 
 from __future__ import annotations
@@ -26,10 +26,21 @@ from softfinger.daemon.wire.command_server import Handler
 
 
 class ProcessReplay:
-    """A loop on recorded inputs; ``calibrations`` as JSON, empty where there was none."""
+    """Run a loop on recorded inputs."""
 
     def __init__(self, settings: Settings, calibrations: Sequence[str]) -> None:
-        """Raises SettingsError or TactileError when settings and calibrations don't fit."""
+        """Build the loop from recorded settings.
+
+        Parameters
+        ----------
+        settings : settings of the recording
+        calibrations : calibration of each finger as JSON text, empty without one
+
+        Raises
+        ------
+        SettingsError, TactileError
+            The settings and calibrations do not match.
+        """
         with tempfile.TemporaryDirectory() as folder:
             settings = with_calibrations(settings, calibrations, Path(folder))
             models = make_models(settings)
@@ -52,7 +63,7 @@ class ProcessReplay:
 
     @property
     def fingers(self) -> tuple[int, ...]:
-        """The fingers whose frames are wanted."""
+        """Fingers whose frames must be supplied."""
         return tuple(self._sensors)
 
     def tick(
@@ -61,9 +72,13 @@ class ProcessReplay:
         frames: Mapping[int, Frame],
         commands: Sequence[dict[str, Any]],
     ) -> State:
-        """Return the state after one tick: its ``hand/input``, new frames by finger, its commands.
+        """Run one tick and return the loop's own state, which the next call changes.
 
-        The state is the loop's own, and changes with the next call.
+        Parameters
+        ----------
+        taken : the tick's ``hand/input`` message
+        frames : new frames by finger index
+        commands : commands that were executed in the tick
         """
         loop = self._loop
         self._clock.sleep_until(taken["t"])
@@ -81,7 +96,7 @@ class ProcessReplay:
 
 
 def with_calibrations(settings: Settings, calibrations: Sequence[str], folder: Path) -> Settings:
-    """Return settings whose calibrations are files in ``folder``, made of these texts of JSON."""
+    """Write calibrations (JSON texts) to ``folder`` and return settings that name these files."""
     files = ["", ""]
     for finger, text in enumerate(calibrations):
         if text:
@@ -93,7 +108,7 @@ def with_calibrations(settings: Settings, calibrations: Sequence[str], folder: P
 
 
 class _Clock(VirtualClock):
-    """The recorded time."""
+    """Clock that returns the recorded times."""
 
     unix = 0.0
 
@@ -103,7 +118,7 @@ class _Clock(VirtualClock):
 
 
 class _Servos:
-    """The recorded readings and failures; what is written goes nowhere."""
+    """Servos that replay recorded readings and failures, and discard everything written."""
 
     def __init__(self) -> None:
         self.taken: Mapping[str, Any] = {}
@@ -154,7 +169,7 @@ class _Servos:
 
 
 class _Commands:
-    """The commands of a tick, in the place of the command server."""
+    """Command source that replays the commands of a tick."""
 
     refused_by_pace = 0
 
@@ -167,7 +182,7 @@ class _Commands:
             try:
                 handler(request, 0.0)
             except Refused:
-                pass  # carried out when it was recorded: the comparison will show it
+                pass  # the comparison of states shows the difference
         self.waiting = []
 
     def raise_fence(self) -> None:

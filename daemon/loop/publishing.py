@@ -1,8 +1,9 @@
-"""Publishing: a topic's ticks, and the rates that really came of it.
+"""Decide which topics to publish at a tick, and measure the actual rates.
 
-A topic goes out on exactly every n-th tick, counted by ``seq``, with the n whose rate is nearest to
-the wanted one; statistics on ticks of their own where n allows it, so that no tick carries all. Of
-every n frames one is published. What is sent, `wire.publisher` sends; nothing is changed here.
+Each topic is published on every n-th tick, counted by ``seq``, where n gives the rate closest to
+the requested one. Statistics are offset by a few ticks where n allows it, so that no tick publishes
+everything. One of every n frames is published. `wire.publisher` does the sending; this module
+changes no state.
 """
 
 from __future__ import annotations
@@ -18,17 +19,17 @@ from softfinger.daemon.wire.schema import Rates
 _STATE, _TACTILE, _STATS, _INPUT, _TRUTH = map(
     bit, (schema.STATE, schema.TACTILE, schema.STATS, schema.INPUT, schema.TRUTH)
 )
-_STATS_RATE = 1.0  # Hz of the loop's own statistics
-_STATS_PHASE = 3  # ticks after those of the state
+_STATS_RATE = 1.0  # Hz
+_STATS_PHASE = 3  # ticks after the state, so that both rarely share a tick
 
 
 def every(rate: float, wanted: float) -> int:
-    """Return of how many at ``rate`` one comes nearest to the ``wanted`` rate."""
+    """Return the decimation factor n for which rate/n is closest to ``wanted``."""
     return max(round(rate / wanted), 1)
 
 
 def parts(settings: Settings) -> Parts:
-    """Return what the scene of these settings has."""
+    """Return the parts that the scene of these settings has."""
     return Parts(
         fingers=("left" in settings.scene.fingers, "right" in settings.scene.fingers),
         servos=settings.servos.backend != "none",
@@ -37,7 +38,7 @@ def parts(settings: Settings) -> Parts:
 
 
 class Publishing:
-    """Publishes what is due at a tick and wanted by somebody."""
+    """Publish the topics that are due at a tick and have subscribers."""
 
     def __init__(
         self,
@@ -56,23 +57,23 @@ class Publishing:
         self._stats_phase = _STATS_PHASE % self._stats_every
         self._frames_every = every(settings.tactile.rate, stream.tactile_rate)
         self._scene = parts(settings)
-        self.truth: Truth | None = None  # a simulated hand's
-        self._numbers = [0, 0]  # frames of each finger that went out
-        self._seen: list[Frame | None] = [None, None]  # newest of each finger
-        self._published = [-1, -1]  # of which n frames one went out, for each finger
-        self._states = self._maps = 0  # messages that went out
+        self.truth: Truth | None = None  # of a simulated hand
+        self._numbers = [0, 0]  # published frames by finger
+        self._seen: list[Frame | None] = [None, None]  # newest frame by finger
+        self._published = [-1, -1]  # last published group of n frames, by finger
+        self._states = self._maps = 0  # published messages
         # Time [s] and counts when the rates were last published.
         self._counted: tuple[float, ...] = (0.0,) * 6
 
     def __call__(self, state: State) -> None:
-        """All that is due at this tick."""
+        """Publish everything that is due at this tick."""
         publisher, seq = self._publisher, state.seq
         wanted = publisher.wanted
         if wanted & _TACTILE:
             for perception in self._perceptions:
                 if perception.frame is not self._seen[perception.finger]:
                     self._frame(state, perception)
-        if wanted & _INPUT:  # behind the frames, which it refers to
+        if wanted & _INPUT:  # after the frames that it refers to
             frames: list[Frame | None] = [None, None]
             for perception in self._perceptions:
                 frames[perception.finger] = perception.frame
@@ -105,7 +106,7 @@ class Publishing:
         self._publisher.send(schema.TACTILE, frame, data, *sensor, wall, n, number)
 
     def _rates(self, state: State) -> Rates:
-        """Rates [Hz] since they were last asked for, by the machine's time."""
+        """Return the rates [Hz] since the previous call, by machine time."""
         frames = [0, 0]
         for perception in self._perceptions:
             frames[perception.finger] = perception.frames

@@ -1,8 +1,9 @@
-"""Requests to the system: scheduling, memory and timers for a steady tick, and systemd.
+"""Configure scheduling, memory and timers for a steady tick, and notify systemd.
 
-The measures of the section ``[realtime]`` are taken once, after warm-up. None is needed: one that
-the system refuses is reported, with what is lost and the command that grants it. The spin before a
-deadline is `daemon.clock`'s. systemd is told (sd_notify) that the daemon is ready, alive, stopping.
+The measures of the ``[realtime]`` settings are applied once, after warm-up. All of them are
+optional: if the system refuses one, a warning states the consequence and the command that grants
+it. `daemon.clock` implements the spin before a deadline. The `Service` class reports ready, alive
+and stopping to systemd with sd_notify.
 """
 
 from __future__ import annotations
@@ -21,11 +22,11 @@ from functools import partial
 from softfinger.daemon.profile.settings import Settings
 
 _SWITCH_INTERVAL = 2e-4  # s
-_SHARE = 0.25  # of the watchdog's time between two signs of life
+_SHARE = 0.25  # interval of keep-alive messages, as a fraction of the watchdog time
 _NEVER = float("inf")
 _LATENCY = "/dev/cpu_dma_latency"
 
-# The commands that grant a user what is asked of the system.
+# Commands that grant a user the requested permissions.
 _LIMITS = "/etc/security/limits.d/softfinger.conf"
 _RULE = "/etc/udev/rules.d/99-softfinger.rules"
 _LATENCY_RULE = 'KERNEL=="cpu_dma_latency", GROUP="dialout", MODE="0660"'
@@ -41,24 +42,24 @@ GRANT_LATENCY = (
 _PR_SET_TIMERSLACK = 29
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 
-# The system calls sched_setattr and sched_getattr, which the C library lacks, by machine; and their
-# argument, struct sched_attr: size, policy, flags, nice, priority, runtime, deadline, period.
+# System calls sched_setattr and sched_getattr by machine, which the C library does not wrap, and
+# their argument struct sched_attr: size, policy, flags, nice, priority, runtime, deadline, period.
 _ATTRIBUTE_CALLS = {"x86_64": (314, 315), "aarch64": (274, 275)}
 _ATTRIBUTES = struct.Struct("=IIQiIQQQ")
-_SHORTEST, _LONGEST = 100_000, 100_000_000  # ns, between which the kernel takes a slice
+_SHORTEST, _LONGEST = 100_000, 100_000_000  # ns, range of slices that the kernel accepts
 
 
 class RealTime:
-    """The measures, held while this is open: ``with RealTime(settings): loop.run()``.
+    """Apply the real-time measures while open: ``with RealTime(settings): loop.run()``.
 
-    To be opened in the thread that ticks, after warm-up. Never raises; ``granted`` and ``refused``
-    say what came of each. On virtual time only the collector and other threads are kept from the
-    tick.
+    Open it after warm-up, in the thread that ticks. It never raises; ``granted`` and ``refused``
+    list the outcome of each measure. On virtual time, only the garbage collector and the thread
+    switch interval are adjusted.
     """
 
     def __init__(self, settings: Settings) -> None:
         self.granted: list[str] = []
-        self.refused: list[str] = []  # with what is lost, and the command that grants it
+        self.refused: list[str] = []  # with the consequence and the command that grants it
         self._undo: list[Callable[[], object]] = []
         wanted = settings.realtime
         self._keep_interpreter(wanted.freeze_collector)
@@ -80,17 +81,17 @@ class RealTime:
             self._granted(f"spin of {wanted.spin * 1e6:g} µs before each tick")
 
     def events(self) -> list[tuple[str, str, str]]:
-        """Return the loop's events: one with all that was granted, one for each refusal."""
+        """Return events: one for all granted measures and one for each refusal."""
         events = [("info", "realtime", ", ".join(self.granted))] if self.granted else []
         return events + [("warning", "realtime", text) for text in self.refused]
 
     def close(self) -> None:
-        """Give everything back. Never raises."""
+        """Undo all measures. Never raises."""
         while self._undo:
             try:
                 self._undo.pop()()
             except OSError:
-                pass  # a thread that has ended, say
+                pass  # for example, the thread has ended
 
     def __enter__(self) -> RealTime:
         return self
@@ -106,10 +107,11 @@ class RealTime:
         self.refused.append(f"{text}; to grant it: {remedy}" if remedy else text)
 
     def _keep_interpreter(self, freeze: bool) -> None:
-        """Keep the collector and other threads from delaying the loop.
+        """Keep the garbage collector and other threads from delaying the loop.
 
-        A full collection over all of numpy and numba takes tens of milliseconds: what exists now is
-        frozen out of it. A thread may keep the interpreter for a switch interval, 5 ms by default.
+        A full collection over all objects of numpy and numba takes tens of milliseconds, so
+        existing objects are frozen. Another thread may hold the interpreter for one switch
+        interval, which is 5 ms by default.
         """
         self._undo += [gc.unfreeze, partial(sys.setswitchinterval, sys.getswitchinterval())]
         if freeze:
@@ -119,10 +121,11 @@ class RealTime:
         sys.setswitchinterval(_SWITCH_INTERVAL)
 
     def _schedule(self, priority: int) -> None:
-        """SCHED_FIFO for the loop, one step below it for the threads that share its interpreter.
+        """Set SCHED_FIFO for the loop, and one level lower for the interpreter's other threads.
 
-        A reader thread that is preempted while it has the interpreter would hold up the loop for as
-        long. Threads without it, as ZeroMQ's, and child processes keep the usual scheduling.
+        A reader thread that is preempted while it holds the interpreter lock delays the loop.
+        Threads outside the interpreter, such as ZeroMQ's, and child processes keep normal
+        scheduling.
         """
         undo: list[Callable[[], object]] = []
         policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
@@ -145,9 +148,10 @@ class RealTime:
             self._granted(f"SCHED_FIFO {priority}", *undo)
 
     def _shorten_slice(self, nanoseconds: int) -> None:
-        """Without SCHED_FIFO, a short slice for the loop and the threads of its interpreter.
+        """Without SCHED_FIFO, shorten the time slice of the interpreter's threads.
 
-        Linux (from 6.12 on) runs the thread whose slice would end first: a short one runs sooner.
+        Since version 6.12, Linux runs the thread whose slice ends first, so a thread with a short
+        slice is scheduled sooner.
         """
         usual = os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_OTHER
         calls = _ATTRIBUTE_CALLS.get(os.uname().machine)
@@ -155,12 +159,12 @@ class RealTime:
             return
         threads = _threads()
         shortened = [_set_slice(calls, thread, nanoseconds) for thread in threads]
-        if any(shortened):  # not by an older kernel
+        if any(shortened):  # older kernels ignore the request
             undo = [partial(_set_slice, calls, thread, 0) for thread in threads]
             self._granted(f"slices of {nanoseconds * 1e-6:g} ms", *undo)
 
     def _keep_to_processors(self, cpus: tuple[int, ...]) -> None:
-        """The loop's thread alone: others may run beside it."""
+        """Pin the loop's thread to processors; other threads may also run on them."""
         names = ", ".join(map(str, cpus))
         before = os.sched_getaffinity(0)
         try:
@@ -175,10 +179,11 @@ class RealTime:
             self._granted(f"processor {names}", partial(os.sched_setaffinity, 0, before))
 
     def _lock_memory(self) -> None:
-        """Lock pages in memory once they have been touched, as after warm-up they are.
+        """Lock pages in memory once they are touched, which warm-up has done for the loop's pages.
 
-        Two thirds of a compiler's libraries never are, and reading them in takes most of a second.
-        Under a limit only what is mapped now is locked, or later mappings would fail.
+        Two thirds of the compiler libraries' pages are never touched, and loading them would take
+        most of a second. Under a memory limit only existing mappings are locked, because later
+        mappings would fail otherwise.
         """
         limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
         flags = _MCL_CURRENT | _MCL_ONFAULT
@@ -193,7 +198,7 @@ class RealTime:
             self._granted("memory locked", libc.munlockall)
 
     def _hold_latency(self) -> None:
-        """Keep processors out of states that take time to leave, as long as the file is open."""
+        """Keep processors out of deep idle states while the file stays open."""
         try:
             descriptor = os.open(_LATENCY, os.O_WRONLY | os.O_CLOEXEC)
         except OSError as error:
@@ -209,23 +214,23 @@ class RealTime:
             self._granted("idle states held off", partial(os.close, descriptor))
 
     def _sharpen_timer(self, nanoseconds: int) -> None:
-        """The kernel may put off a wake-up by this thread's slack, to make one of several."""
+        """Reduce the timer slack, by which the kernel may delay a wake-up to merge several."""
         libc = ctypes.CDLL(None, use_errno=True)
         if libc.prctl(_PR_SET_TIMERSLACK, nanoseconds, 0, 0, 0) != 0:
             why = os.strerror(ctypes.get_errno())
             self._refused(f"timer slack refused ({why}): wake-ups come 50 µs later")
-        else:  # 0 stands for what the thread began with
+        else:  # 0 restores the thread's initial slack
             undo = partial(libc.prctl, _PR_SET_TIMERSLACK, 0, 0, 0, 0)
             self._granted(f"timer slack {nanoseconds} ns", undo)
 
 
 def _threads() -> list[int]:
-    """The system's numbers of the threads that share this interpreter."""
+    """Return the system's thread IDs of all threads of this interpreter."""
     return [each.native_id for each in threading.enumerate() if each.native_id is not None]
 
 
 def _set_slice(calls: tuple[int, int], thread: int, nanoseconds: int) -> bool:
-    """Return whether the thread has slices of that length afterwards; 0 stands for the system's."""
+    """Set the thread's time slice (0: system default). Return True if it took effect."""
     set_call, get_call = calls
     libc = ctypes.CDLL(None, use_errno=True)
     size = _ATTRIBUTES.size
@@ -240,15 +245,18 @@ def _set_slice(calls: tuple[int, int], thread: int, nanoseconds: int) -> bool:
 
 
 class Service:
-    """Notifies systemd at the socket in ``NOTIFY_SOCKET``. Nothing here waits, and nothing raises.
+    """Notify systemd through the socket in ``NOTIFY_SOCKET``. Never blocks and never raises.
 
-    Each is one datagram. The loop calls `alive` at every tick, which sends a few times within the
-    watchdog's time and is a comparison otherwise.
+    Each notification is one datagram. The loop calls `alive` at every tick; most calls only compare
+    times, and a few messages are sent within each watchdog period.
     """
 
     def __init__(self, address: str, watchdog: float = 0.0) -> None:
-        """``watchdog`` [s] is the time without a sign of life after which systemd acts; 0: none."""
-        # A name that begins with @ is abstract: its first byte is zero.
+        """Open the socket.
+
+        ``watchdog`` [s] is the time without a message after which systemd acts; 0 disables it.
+        """
+        # A name that begins with @ denotes an abstract socket, whose first byte is zero.
         self._address = "\0" + address[1:] if address.startswith("@") else address
         self._every = watchdog * _SHARE if watchdog > 0.0 else _NEVER
         self._due = -_NEVER
@@ -258,7 +266,7 @@ class Service:
 
     @classmethod
     def of_environment(cls, environment: Mapping[str, str] = os.environ) -> Service | None:
-        """Return the service that this process is, None when it is none."""
+        """Return the systemd service described by the environment, or None outside systemd."""
         address = environment.get("NOTIFY_SOCKET", "")
         if address[:1] not in ("/", "@") or len(address) < 2:
             return None
@@ -268,7 +276,7 @@ class Service:
         return cls(address, watchdog)
 
     def alive(self, t: float) -> None:
-        """Send a sign of life at time ``t`` [s] when one is due; the first one says ready."""
+        """Send a keep-alive message if one is due at time ``t`` [s]; the first reports ready."""
         if t < self._due:
             return
         self._due = t + self._every
@@ -277,7 +285,7 @@ class Service:
         self._send(message)
 
     def stopping(self) -> None:
-        """Say that the end has begun."""
+        """Report that shutdown has begun."""
         self._send(b"STOPPING=1")
 
     def close(self) -> None:
@@ -287,4 +295,4 @@ class Service:
         try:
             self._socket.sendto(message, self._address)
         except OSError:
-            pass  # nobody listens, or not now
+            pass  # systemd is not listening or its queue is full

@@ -1,8 +1,8 @@
-"""Requests to a running hand: the one place that checks what a request asks, and carries it out.
+"""Validate requests to a running hand and execute them.
 
-The gateway has seen to a request's size, pace and form (`gateway.request_queue`). Which command is
-heard in which mode stands in `control.modes`; what it makes the hand do, in
-`control.state_machine`.
+The gateway has already limited the size and rate of requests (`gateway.commands`), and
+`wire.command_server` has unpacked them. `control.modes` lists the commands allowed in each mode,
+and `control.state_machine` defines the resulting motion.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from softfinger.daemon.safety.safety import Safety
 from softfinger.daemon.safety.torque_state import TorqueState
 from softfinger.daemon.types import FINGERS, GRIP_FRACTION, UNLEASED, State
 
-LONGEST_AGE = 1.0  # s; an older command is not carried out, except status and stop
+LONGEST_AGE = 1.0  # s, age limit of every command except status and stop
 _COMPLIANCE = (0.01, 1.0)  # rad/(N·m)
 _ENVELOPE = frozenset({"command", "client"})
 _FIRST = {Mode.DISARMED: "arm first", Mode.FAULT: "clear the fault first"}
 
 
 class Command(NamedTuple):
-    """A request of the right form, heard in the present mode."""
+    """Hold a well-formed request that is allowed in the current mode."""
 
     name: str
     numbers: dict[str, float]
@@ -37,7 +37,7 @@ class Command(NamedTuple):
 
 
 def parse(request: dict[str, Any], mode: Mode) -> Command:
-    """Check a request against the table of commands. Raises Refused with found and expected."""
+    """Validate a request against the command table. Raises Refused with found and expected."""
     name = request["command"]
     if name not in COMMANDS:
         raise _malformed(f"unknown command {name[:40]!r}; known: {', '.join(COMMANDS)}")
@@ -74,9 +74,10 @@ def _malformed(text: str) -> Refused:
 
 
 class Lease:
-    """One commander at a time: a client keeps the hand for a while after its last command.
+    """Give one client exclusive command for a time after its last command.
 
-    Clients that give no name share one. What can only make the hand safer needs no lease.
+    All clients without a name share one lease. Commands that can only make the hand safer need no
+    lease.
     """
 
     def __init__(self, seconds: float) -> None:
@@ -85,7 +86,7 @@ class Lease:
         self._until = -math.inf
 
     def check(self, command: Command, now: float) -> None:
-        """Raise Refused while somebody else has the lease."""
+        """Raise Refused while another client has the lease."""
         if command.name in UNLEASED:
             return
         if now < self._until and command.client != self._owner:
@@ -94,21 +95,24 @@ class Lease:
             raise Refused(text, Reason.LEASE)
 
     def lapses(self, now: float) -> str:
-        """Return, once, who has been silent for the whole lease; empty where nobody has."""
+        """Return the name of the client whose lease just expired, otherwise an empty text.
+
+        Each expiry is returned once.
+        """
         if not -math.inf < self._until <= now:
             return ""
         self._until = -math.inf
         return self._owner or "the commander"
 
     def renew(self, command: Command, now: float) -> None:
-        """Take or prolong the lease, once the command has been carried out."""
+        """Take or extend the lease after a command was executed."""
         if command.name not in UNLEASED:
             self._owner = command.client
             self._until = now + self.seconds
 
 
 class Requests:
-    """Carries out requests between two stages of a tick. One thread, the loop's, may call it."""
+    """Execute requests between two stages of a tick. Only the loop's thread may call it."""
 
     def __init__(
         self,
@@ -121,12 +125,12 @@ class Requests:
         emit: Callable[[str, str, str], None],
         start_age: float = math.inf,
     ) -> None:
-        """Prepare to carry out requests.
+        """Prepare to execute requests.
 
         Parameters
         ----------
         emit : sends an event
-        start_age : age [s] up to which a command that can stiffen or move the hand is carried out
+        start_age : maximum age [s] of a command that can stiffen or move the hand
         """
         self._start_age = start_age
         self._settings = settings
@@ -147,19 +151,27 @@ class Requests:
             "release": control.release,
             "set": control.set,
             "clear": control.disarm,
-            "demo": lambda: None,  # the loop begins its task
+            "demo": lambda: None,  # the loop starts its task
             "status": lambda: None,
         }
         self._lease = Lease(settings.commands.lease)
         self._envelope = Envelope(settings)
 
     def carry_out(self, request: dict[str, Any], age: float = 0.0) -> dict[str, Any]:
-        """Do what is asked at the present tick, and return the reply.
+        """Execute a request in the current tick and return the reply.
 
-        ``age`` [s] is how long ago the request arrived. Raises Refused with the reason.
+        Parameters
+        ----------
+        request : command with its parameters
+        age : time since the request arrived [s]
+
+        Raises
+        ------
+        Refused
+            The request was rejected. The message gives the reason.
         """
         state, control = self._state, self._control
-        if request["command"] == "stop":  # in every mode, from everyone, whatever else it says
+        if request["command"] == "stop":  # in every mode, from every client, with any fields
             control.stop()
             return {"mode": control.mode.value, "torque_off": self._torque.off()}
         command = name, numbers, _ = parse(request, control.mode)
@@ -189,7 +201,7 @@ class Requests:
         return reply
 
     def watch_silence(self) -> None:
-        """Release or stop the hand, as the settings say, when its commander has fallen silent."""
+        """Apply ``commands.on_silence`` when the lease of the commanding client expires."""
         action = self._settings.commands.on_silence
         if action == "hold" or not (silent := self._lease.lapses(self._state.t)):
             return
@@ -198,7 +210,7 @@ class Requests:
             self._emit("warning", "silence", text)
 
     def end_grip(self, action: str) -> bool:
-        """Do ``stop`` or ``release``; return whether there was anything to do."""
+        """Perform ``stop`` or ``release``. Return False if it does not apply in this state."""
         control = self._control
         if action == "stop" and control.torque:
             control.stop()
@@ -293,16 +305,19 @@ class Requests:
                 raise Refused(f"move: {name}: {off_range(q, low, high)}", Reason.BOUNDS)
 
     def _reconnect(self) -> None:
-        """Connect servos that have gone silent anew: only on command.
+        """Reconnect servos that have stopped answering. Only a ``clear`` command does this.
 
-        Raises Refused with all that is wrong with them.
+        Raises
+        ------
+        Refused
+            The servos cannot be connected. The message lists all problems found.
         """
         state = self._state
         silent = state.t - state.reading.t > self._settings.servos.fault_after
         if self._torque.servos is None or not silent:
             return
         if self._torque.pending and not state.read_error:
-            return  # the port is there: connecting would only disturb the silence on it
+            return  # the port works; connecting would end the bus silence that stops the servos
         try:
             self._torque.reconnect()
         except ServoError as error:
@@ -310,9 +325,12 @@ class Requests:
         self._emit("info", "servos", "connected anew")
 
     def _reopen(self, name: str) -> None:
-        """Open sensors anew whose port was lost: only on command and with torque off.
+        """Reopen sensors whose port was lost. Only ``clear`` and ``arm`` with torque off do this.
 
-        Raises Refused for ``clear`` where one can't be; without sensors a hand may be armed.
+        Raises
+        ------
+        Refused
+            A sensor cannot be opened on ``clear``. A hand may be armed without sensors.
         """
         if self._state.torque:
             return

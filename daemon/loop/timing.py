@@ -1,11 +1,11 @@
-"""The loop's own times: histograms, read out once a second; and how late its ticks are.
+"""Measure the loop's timing: histograms of its stages, and the lateness of its ticks.
 
-Histograms take one kernel call a tick. Each octave from 1 ns up is cut into 32 bins, so that a
-quantile, given as its bin's upper edge, is never understated and at most 3.2 % too great; the
-largest value is kept as it is.
+One kernel call per tick updates the histograms, which are published once a second. Each octave from
+1 ns is divided into 32 bins. A quantile is reported as the upper edge of its bin, so it is never
+too small and at most 3.2 % too large. The maximum is exact.
 
-Lateness is reported by an event now and then, and as a fault's cause. Its times are the machine's.
-Meanwhile a hand on real time was left alone; a simulated one on its own time has waited
+Lateness is reported by an occasional event and as the possible cause of a fault, in machine time.
+While a tick is late, real hardware is uncontrolled, whereas a simulated hand on its own clock waits
 (`daemon.clock.HandClock`).
 """
 
@@ -23,18 +23,18 @@ from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 TIMES = ("wake", "compute", "bus", "publish")
 QUANTILES = (0.5, 0.99, 0.999)
 
-_LOWEST = -29  # 2^-30 s = 0.93 ns is the first bin's lower edge; shorter times fall into it, too
-_OCTAVES = 36  # up to 64 s; longer times fall into the last bin
-_PARTS = 32  # bins an octave
+_LOWEST = -29  # lower edge of the first bin, 2^-30 s = 0.93 ns; shorter times are counted there
+_OCTAVES = 36  # up to 64 s; longer times are counted in the last bin
+_PARTS = 32  # bins per octave
 _BINS = _OCTAVES * _PARTS
 _EDGES = np.ldexp(
     0.5 + 0.5 * np.arange(1, _PARTS + 1) / _PARTS, np.arange(_OCTAVES)[:, None] + _LOWEST
 )
-_UPPER = np.append(_EDGES.ravel()[:-1], np.inf)  # edge of each bin; the last one has none
+_UPPER = np.append(_EDGES.ravel()[:-1], np.inf)  # upper edge of each bin; the last bin is unbounded
 
-LATE = 0.05  # s of lateness that is reported
-EVERY = 60.0  # s between two reports, of which each is of twice as much
-RECENT = 0.25  # s after a late tick in which it may be a fault's cause
+LATE = 0.05  # s, smallest lateness that is reported
+EVERY = 60.0  # s, minimum time between reports; the reported lateness at least doubles each time
+RECENT = 0.25  # s after a late tick during which a fault may be attributed to it
 # Limits that a late tick alone can break.
 _BY_TIME = frozenset({"servos.bus", "servos.silent", "tactile.silent", "loop.overruns"})
 
@@ -54,9 +54,9 @@ def _bin(value: float) -> int:
 
 @kernel
 def record(counts: Counts, largest: FloatArray, times: tuple[float, float, float, float]) -> None:
-    """Count one tick's times [s], in the order of `TIMES`.
+    """Count the times [s] of one tick, in the order of `TIMES`.
 
-    ``counts`` int64 [times, bins] and ``largest`` float64 [times] change in place.
+    ``counts`` int64 [times, bins] and ``largest`` float64 [times] are updated in place.
     """
     for i in range(len(times)):
         counts[i, _bin(times[i])] += 1
@@ -64,21 +64,21 @@ def record(counts: Counts, largest: FloatArray, times: tuple[float, float, float
 
 
 class Statistics:
-    """The histograms of one loop. `record` is called with its two arrays once a tick."""
+    """Hold the histograms of one loop. The loop passes both arrays to `record` once per tick."""
 
     def __init__(self) -> None:
         self.counts: Counts = np.zeros((len(TIMES), _BINS), np.int64)
         self.largest: FloatArray = np.zeros(len(TIMES))
-        record(self.counts, self.largest, (0.0, 0.0, 0.0, 0.0))  # compiles; no tick does
+        record(self.counts, self.largest, (0.0, 0.0, 0.0, 0.0))  # compiles before the first tick
         self.counts[:] = 0
 
     @property
     def ticks(self) -> int:
-        """The number of ticks that were counted."""
+        """Number of counted ticks."""
         return int(self.counts[0].sum())
 
     def spreads(self) -> dict[str, TimeSpread]:
-        """Return what was counted, by the names in `TIMES`; all 0 before the first tick."""
+        """Return quantiles and maximum by the names in `TIMES`; all 0 before the first tick."""
         spreads = {}
         for name, until, largest in zip(
             TIMES, self.counts.cumsum(axis=1), self.largest, strict=True
@@ -89,7 +89,7 @@ class Statistics:
         return spreads
 
     def table(self) -> list[str]:
-        """Return the same for people, in µs."""
+        """Return the spreads as a readable table in µs."""
         lines = [f"{'':8} {'p50':>9} {'p99':>9} {'p99.9':>9} {'max':>9}  µs"]
         for name, spread in self.spreads().items():
             cells = " ".join(f"{1e6 * value:9.1f}" for value in spread)
@@ -98,24 +98,25 @@ class Statistics:
 
 
 class Lateness:
-    """Follows one loop's ticks."""
+    """Track the lateness of one loop's ticks."""
 
     def __init__(self, settings: Settings, timing: Timing, waits: bool) -> None:
-        """``timing`` is the loop's own; what is written there is ``busy_s`` alone.
+        """Start tracking; only ``timing.busy_s`` of the loop's ``timing`` is written.
 
-        ``waits``: the hand's time stands still while the machine is late.
+        ``waits`` is True if the hand's time pauses while the machine is late.
         """
         self._timing = timing
         self._period = 1.0 / settings.loop.rate
         self._waits = waits
-        self._sum = 0.0  # s that ticks came late in all, or that the hand has waited
-        self._reported = (0.0, -math.inf)  # that sum, and when
+        self._sum = 0.0  # total lateness of ticks, or total time that the hand has waited [s]
+        self._reported = (0.0, -math.inf)  # total lateness and time of the last report [s]
         self._busy_until = -math.inf
 
     def look(self, t: float, own_doing: bool) -> Event | None:
-        """Take in the tick that began at ``t`` [s] and whose ``timing`` is up to its start.
+        """Evaluate the tick that began at ``t`` [s]; return an event to emit, or None.
 
-        ``own_doing``: the last one was late because of a command. The event to emit, if any.
+        ``timing`` must be filled in up to the start of this tick. ``own_doing`` is True if a
+        command delayed the previous tick.
         """
         timing = self._timing
         gap = 0.0 if own_doing else timing.tick_s - self._period
@@ -123,7 +124,7 @@ class Lateness:
             timing.busy_s, self._busy_until = gap, t + RECENT
         elif t > self._busy_until:
             timing.busy_s = 0.0
-        if self._waits:  # and will have waited for this tick's lateness when the next is due
+        if self._waits:  # the hand will also wait for this tick's lateness before the next one
             self._sum = timing.behind_s + max(timing.wake_late_s - self._period, 0.0)
         elif gap > LATE:
             self._sum += gap
@@ -138,9 +139,13 @@ class Lateness:
         return f"this machine is busy: {did}, {self._sum:.1f} s in all"
 
     def with_cause(self, name: str, text: str, at_work: float) -> str:
-        """Return a finding's text, after "this machine was busy" where it was so a moment ago.
+        """Return the fault's text, prefixed with "this machine was busy" if that may be its cause.
 
-        ``name`` is the broken limit's; ``at_work`` [s] how long the present tick has taken so far.
+        Parameters
+        ----------
+        name : name of the broken limit
+        text : description of the fault
+        at_work : time that the current tick has taken so far [s]
         """
         timing = self._timing
         if self._waits or name not in _BY_TIME:

@@ -1,9 +1,9 @@
-"""The kernels that a scene needs, by parts of the pipeline: run once, so that no tick compiles any.
+"""Compile the kernels of a scene by running each part of the pipeline once before the first tick.
 
-`loop.build` runs every part before there is a loop, and so before torque can be on. Where a
-part was never compiled, `processes.compile` runs it before in a process of its own. A part
-builds what it needs, runs it on a made-up contact, and throws it away; what a scene lacks has no
-part.
+`loop.build` runs all parts before the loop exists and therefore before torque can be on. On first
+use, `processes.compile` compiles parts in parallel processes beforehand. A part builds the objects
+it needs, runs them on an invented contact and discards them. Components that a scene lacks are
+skipped.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from softfinger.kinematics.hand.servo_heat import (
 
 
 class WantedScene:
-    """A scene whose kernels are wanted; ``on_event`` takes what is to be said of its models."""
+    """Describe a scene to compile for; ``on_event`` receives events about its finger models."""
 
     def __init__(
         self, settings: Settings, on_event: Callable[[str, str, str], None] | None = None
@@ -44,32 +44,32 @@ class WantedScene:
 
     @cached_property
     def models(self) -> tuple[FingerModel, FingerModel]:
-        """Both fingers' models."""
+        """Models of both fingers."""
         return make_models(self.settings, self._on_event)
 
     @property
     def sensing(self) -> list[int]:
-        """The fingers with a sensor."""
+        """Indices of the fingers that have a sensor."""
         if self.settings.tactile.backend == "none":
             return []
         return sorted(FINGERS.index(name) for name in self.settings.scene.fingers)
 
 
 class Part(NamedTuple):
-    """One part of the pipeline and its kernels."""
+    """Describe one part of the pipeline and its kernels."""
 
     name: str
-    kernels: int  # that it compiles, about: for a progress bar
+    kernels: int  # approximate number of kernels, for a progress bar
     run: Callable[[WantedScene], None]
-    after: str = ""  # the part whose result it needs, if that is to be built as well
+    after: str = ""  # part that must be built before this one
 
 
 def parts(settings: Settings) -> list[Part]:
-    """Return what ``settings`` has kernels for, in the order that suits two processes.
+    """Return the parts with kernels that ``settings`` need, in an order that suits two processes.
 
-    One has the estimator and then the simulated sensor, whose kernels it has compiled in part by
-    then; the other the contact table, then the simulated hand and the filter, which look up in it;
-    the shorter ones even out what is left.
+    One process compiles the estimator and then the simulated sensor, which shares kernels with it.
+    The other compiles the contact table and then the simulated hand and the filter, which use the
+    table. The shorter parts balance the two.
     """
     simulated = needs_hand(settings.servos.backend, settings.tactile.backend)
     servos, sensors = settings.servos.backend != "none", settings.tactile.backend != "none"
@@ -86,18 +86,18 @@ def parts(settings: Settings) -> list[Part]:
 
 
 def named(name: str) -> Part:
-    """Return a part by its name. Raises KeyError when there is none."""
+    """Return a part by its name. Raises KeyError for an unknown name."""
     return {each.name: each for each in ALL}[name]
 
 
 def is_built(part: Part, settings: Settings) -> bool:
-    """Return whether ``part`` was compiled from the present sources, for such tips, and is kept."""
+    """Return True if ``part`` is cached, compiled from the current sources for this tip type."""
     folder = kernel_folder()
     return folder is not None and is_marked(folder, _kind(part, settings))
 
 
 def mark_built(part: Part, settings: Settings) -> None:
-    """Note that ``part`` was compiled and is kept, where anything can be."""
+    """Mark ``part`` as compiled and cached; does nothing without a cache folder."""
     folder = kernel_folder()
     if folder is not None:
         mark(folder, _kind(part, settings))
@@ -108,7 +108,7 @@ def _kind(part: Part, settings: Settings) -> str:
 
 
 def warm_up(scene: WantedScene) -> None:
-    """Run every part of ``scene``. Raises as `profile.factory` for settings that can't be met."""
+    """Run every part of ``scene``. Raises the errors of `profile.factory` for unusable settings."""
     for part in parts(scene.settings):
         part.run(scene)
         mark_built(part, scene.settings)
@@ -214,6 +214,6 @@ _GRIP = Part("grip", 26, _grip)
 _JOINTS = Part("joints and timing", 13, _joints)
 _MANY = Part("lookup of many points", 3, _many, after=_TABLE.name)
 ALL = (_TABLE, _ESTIMATOR, _HAND, _SENSOR, _FILTER, _GRIP, _JOINTS, _MANY)
-EMULATED = (_TABLE, _HAND, _SENSOR)  # what `softfinger emulate` needs
-LANDSCAPE = (_TABLE, _MANY)  # what a picture of the energy needs
-FRAMES = (_TABLE, _ESTIMATOR, _MANY)  # what frames are analysed with
+EMULATED = (_TABLE, _HAND, _SENSOR)  # for `softfinger emulate`
+LANDSCAPE = (_TABLE, _MANY)  # for a plot of the energy
+FRAMES = (_TABLE, _ESTIMATOR, _MANY)  # for the analysis of frames

@@ -1,4 +1,4 @@
-"""Profiles: TOML files to checked settings, and settings to the models they describe.
+"""Profiles: validated settings from TOML files, and the models that the settings describe.
 
-Nothing here acts on the hand.
+This package does not act on the hand.
 """

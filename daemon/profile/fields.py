@@ -1,4 +1,4 @@
-"""Fields of settings: the types of numbers with their bounds, and the base of all sections."""
+"""Define the number types of settings with their bounds, and the base class of sections."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from pydantic_core import PydanticCustomError
 from softfinger.daemon.backends import Kind, backend, known, known_servo_models
 from softfinger.daemon.errors import PluginError
 
-# Every number has an end on both sides: implausible values are typing errors, and must not reach
-# an integral. Bounds are closed or open as the quantity is.
+# Every number is bounded on both sides, because implausible values are typing errors and must not
+# reach an integral. Bounds are open or closed as the quantity requires.
 Positive = Annotated[float, Field(ge=1e-9, le=1e9, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False)]
 Finite = Annotated[float, Field(ge=-1e9, le=1e9, allow_inf_nan=False)]
@@ -36,7 +36,7 @@ Processor = Annotated[int, Field(ge=0, le=1023)]
 def setting(default: Any, unit: str, description: str, **options: Any) -> Any:
     """Declare a key of a section.
 
-    Profile reference, documentation and JSON schema are generated from these declarations.
+    The profile reference, documentation and JSON schema are generated from these declarations.
 
     Parameters
     ----------
@@ -55,16 +55,16 @@ def setting(default: Any, unit: str, description: str, **options: Any) -> Any:
 
 
 class Section(BaseModel):
-    """Base of all sections: unknown keys are errors, values are not converted, nothing changes.
+    """Base of all sections: immutable, without type conversion, and unknown keys are errors.
 
-    A whole number is accepted where a float is asked for; a string never is.
+    An integer is accepted for a float; a string is never converted.
     """
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
 
 def names_backend(kind: Kind) -> AfterValidator:
-    """Check that a text names a backend; the error has the words of pydantic's for a Literal."""
+    """Validate the name of a backend, with errors worded like pydantic's for a Literal."""
 
     def check(name: str) -> str:
         try:

@@ -1,7 +1,7 @@
-"""Profiles: a TOML file in, validated `Settings` out, or one report with everything that is wrong.
+"""Load a profile from TOML into validated `Settings`, or report all of its errors at once.
 
-What each key allows stands in `profile.settings`, what they don't allow together in
-`profile.validation`.
+`profile.settings` defines the values that each key allows, and `profile.validation` the
+combinations of keys.
 """
 
 from __future__ import annotations
@@ -24,22 +24,30 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.profile.validation import problems, shown
 
 _PROFILES = Path(softfinger.__file__).parent / "config"
-_MOST = 256 << 10  # bytes; the reference, which names every key, has 21 kB
-_DEEPEST = 8  # tables and arrays in each other
-_TOLD = 20  # errors of one profile
-# A key of so many parts: one of thousands takes tomllib minutes.
+_MOST = 256 << 10  # bytes; the reference, which contains every key, has 21 kB
+_DEEPEST = 8  # nesting depth of tables and arrays
+_TOLD = 20  # largest number of reported errors
+# A dotted key of 16 parts or more. tomllib needs minutes for a key of thousands of parts.
 _DEEP_KEY = re.compile(r"""(?<![\w-])(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*){16}""")
-_LEAD = re.compile(r"\w+ should (be |have )?")  # of pydantic's messages
+_LEAD = re.compile(r"\w+ should (be |have )?")  # start of pydantic's messages
 
 
 def load(
     path: Path | None = None, directory: Path | None = None, changes: Sequence[str] = ()
 ) -> Settings:
-    """Read and check a profile, a file's path or one of `names`; None: the built-in simulated hand.
+    """Load and validate a profile.
 
-    ``directory`` replaces ``{dir}`` in the ports. ``changes``, as ``loop.rate=1000``, go over the
-    file. Raises SettingsError with one line for every unknown key, wrong type and broken bound; if
-    there is none, for every contradiction.
+    Parameters
+    ----------
+    path : file, or one of `names`; None for the built-in simulated hand
+    directory : replaces ``{dir}`` in the ports
+    changes : settings such as ``loop.rate=1000``, which override the file
+
+    Raises
+    ------
+    SettingsError
+        One line for every unknown key, wrong type and violated bound. If there are none, one line
+        for every contradiction between keys.
     """
     name = str(path) if path else "built-in settings"
     data = _read(find(path), name) if path else {}
@@ -53,7 +61,7 @@ def checked(
     changed: Collection[str] = (),
     directory: Path | None = None,
 ) -> Settings:
-    """Return settings that sections ``data`` of a profile ``name`` make, otherwise as `load`."""
+    """Validate the sections ``data`` of the profile ``name``; the rest is as for `load`."""
     try:
         settings = Settings.model_validate(data)
     except ValidationError as error:
@@ -74,14 +82,14 @@ def checked(
 
 
 def names() -> list[str]:
-    """Return the profiles that come with the package."""
+    """Return the names of the profiles in the package."""
     return sorted(path.stem for path in _PROFILES.glob("*.toml"))
 
 
 def find(path: Path) -> Path:
-    """Return the file of a profile: of a bare name the package's, else the path as it is.
+    """Return the file of a profile: a bare name is one of the package, other paths are unchanged.
 
-    Raises SettingsError for a bare name that neither is one of `names` nor a file here.
+    Raises SettingsError for a bare name that is neither one of `names` nor an existing file.
     """
     if path.suffix or path.parent != Path() or (path.exists() and not path.is_dir()):
         return path
@@ -95,8 +103,10 @@ def find(path: Path) -> Path:
 
 
 def profile_text(path: Path) -> str:
-    """Return a profile's text. Raises OSError as `read_file`, UnicodeDecodeError; RecursionError
-    for keys of too many parts.
+    """Return a profile's text.
+
+    Raises OSError as `read_file`, UnicodeDecodeError, and RecursionError for keys with too many
+    parts.
     """
     text = read_file(path, _MOST).decode("utf-8-sig")
     if _DEEP_KEY.search(text):
@@ -105,7 +115,7 @@ def profile_text(path: Path) -> str:
 
 
 def without_files(settings: Settings) -> Settings:
-    """Return settings that another's file tells, without the files that they name."""
+    """Remove the paths of files from settings that were loaded from another user's file."""
     changes = {
         "tactile": {"calibration": ("", ""), "recording": ("", "")},
         "control": {"envelope": ""},
@@ -129,12 +139,12 @@ def _read(path: Path, name: str) -> dict[str, Any]:
         raise SettingsError(f"{name}: not UTF-8 text: {error.reason}") from None
     except RecursionError:
         raise SettingsError(f"{name}: nested too deeply") from None
-    except ValueError as error:  # TOMLDecodeError is one; a number of 5000 digits another
+    except ValueError as error:  # TOMLDecodeError, or a number of 5000 digits
         raise SettingsError(f"{name}: not TOML: {error}") from None
 
 
 def _change(data: dict[str, Any], change: str) -> str:
-    """Put one ``section.key=value`` into ``data`` and return its key. Raises SettingsError."""
+    """Apply one ``section.key=value`` to ``data`` and return its key. Raises SettingsError."""
     key, equals, text = change.partition("=")
     *sections, inner = key.strip().split(".")
     if not (equals and sections and all(sections) and inner):
@@ -142,7 +152,7 @@ def _change(data: dict[str, Any], change: str) -> str:
     try:
         value = _tuples(tomllib.loads(f"value = {text}")["value"])
     except (ValueError, RecursionError):
-        value = text.strip()  # a text needs no quotes of its own: the shell has taken them
+        value = text.strip()  # text without quotes, which the shell has removed
     held = data
     for section in sections:
         held = held.setdefault(section, {})
@@ -154,9 +164,10 @@ def _change(data: dict[str, Any], change: str) -> str:
 
 
 def _tuples(value: Any, depth: int = 0) -> Any:
-    """Lists as tuples, tables as they are.
+    """Convert lists to tuples and keep tables.
 
-    Raises RecursionError beyond any profile's depth, ValueError for integers beyond TOML's.
+    Raises RecursionError beyond the depth of any profile, and ValueError for integers beyond TOML's
+    range.
     """
     if depth > _DEEPEST:
         raise RecursionError
@@ -164,7 +175,7 @@ def _tuples(value: Any, depth: int = 0) -> Any:
         return {key: _tuples(item, depth + 1) for key, item in value.items()}
     if isinstance(value, list):
         return tuple(_tuples(item, depth + 1) for item in value)
-    if isinstance(value, int) and value.bit_length() > 63:  # one of 5000 digits can't be printed
+    if isinstance(value, int) and value.bit_length() > 63:  # one of 5000 digits cannot be printed
         raise ValueError("an integer beyond 64 bits")
     return value
 
@@ -192,7 +203,7 @@ def _plugin_problems(settings: Settings) -> Iterator[str]:
 def _line(
     details: ErrorDetails, above: Sequence[str] = (), model: type[BaseModel] | None = Settings
 ) -> str:
-    """One error; ``above`` is the place of ``model``'s table in the profile."""
+    """Format one error; ``above`` is the location of ``model``'s table in the profile."""
     inside = [str(part) for part in details["loc"]]
     location = [*above, *inside]
     key = shown(".".join(location))[1:-1]
@@ -216,7 +227,7 @@ def _is_length(location: list[str]) -> bool:
 
 
 def _model(location: list[str], model: Any = Settings) -> Any:
-    """The section at that place within ``model``."""
+    """Return the section at this location within ``model``."""
     for part in location:
         model = model.model_fields[part].annotation
         assert issubclass(model, BaseModel)

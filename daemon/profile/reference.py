@@ -1,4 +1,4 @@
-"""The reference of all settings, generated from their declarations.
+"""Generate the reference of all settings from their declarations.
 
 ``python -m softfinger.daemon.profile.reference`` writes ``config/sim.toml``, the built-in simulated
 hand with every key explained, and ``config/schema.json``, the JSON schema for editors.
@@ -20,7 +20,7 @@ from softfinger.daemon.profile.fields import Section
 from softfinger.daemon.profile.settings import Settings
 
 _WIDTH = 100  # columns of sim.toml
-_NO_BOUND = 1e9  # bounds this large only catch typing errors
+_NO_BOUND = 1e9  # larger bounds only catch typing errors
 _HEAD = """\
 #:schema ./schema.json
 # The built-in simulated hand, with every setting: `softfinger run` without a profile is the same as
@@ -30,13 +30,13 @@ _HEAD = """\
 
 
 class Key(NamedTuple):
-    """One setting, as the reference shows it."""
+    """One setting as shown in the reference."""
 
     section: str
     name: str
-    default: str  # as in TOML
+    default: str  # in TOML syntax
     unit: str
-    allowed: str  # values: bounds, or names in quotation marks
+    allowed: str  # bounds, or quoted names
     meaning: str
 
     def lines(self, prefix: str = "") -> Iterator[str]:
@@ -47,14 +47,14 @@ class Key(NamedTuple):
 
 
 class _WithoutTitles(GenerateJsonSchema):
-    """A schema without titles, which would only repeat the names of the keys."""
+    """A schema without titles, which would repeat the names of the keys."""
 
     def field_title_should_be_set(self, schema: Any) -> bool:
         return False
 
 
 def schema_text() -> str:
-    """Return the JSON schema of a profile, in one line since only programs read it."""
+    """Return the JSON schema of a profile in a single line, because only programs read it."""
     schema = {
         "$schema": GenerateJsonSchema.schema_dialect,
         "title": "softfinger profile",
@@ -69,12 +69,12 @@ def schema_text() -> str:
 
 
 def sections() -> dict[str, type[Section]]:
-    """Return the sections of a profile by their names."""
+    """Return the sections of a profile by name."""
     return {name: type(section) for name, section in Settings()}
 
 
 def about(section: type[Section]) -> str:
-    """Return what a section is for, in Markdown."""
+    """Return the purpose of a section in Markdown."""
     return inspect.cleandoc(section.__doc__ or "").replace("``", "`")
 
 

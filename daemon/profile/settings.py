@@ -1,7 +1,7 @@
-"""Settings: the sections of a profile, with defaults, bounds, units and meanings.
+"""Define the sections of a profile, with defaults, bounds, units and meanings.
 
-The defaults are the built-in simulated hand. `profile.load` reads and checks a file;
-`profile.reference` writes ``config/sim.toml`` and the JSON schema from these declarations. Pairs
+The defaults describe the built-in simulated hand. `profile.load` reads and validates a file.
+`profile.reference` generates ``config/sim.toml`` and the JSON schema from these declarations. Pairs
 are (left, right).
 """
 
@@ -423,15 +423,16 @@ class ControlSettings(Section):
 
     @property
     def driving(self) -> float:
-        """Return the motor's torque over the tip's where the joint closes, (1 + μ)/(1 − μ).
+        """Ratio of motor torque to tip torque while the joint closes, (1 + μ)/(1 − μ).
 
-        Gears bear both torques, and a share μ of each is friction. Where it opens, the inverse.
+        Gears transmit both torques, and a fraction μ of each is lost to friction. The ratio is
+        inverted while the joint opens.
         """
         return (1.0 + self.joint_load_friction) / (1.0 - self.joint_load_friction)
 
     @property
     def load_held(self) -> float:
-        """Return the fraction of a tip's moment that gears hold until the joint opens."""
+        """Fraction of a tip's moment that gear friction holds before the joint opens."""
         return 1.0 - self.driving**-2
 
 
@@ -525,7 +526,7 @@ class PluginSettings(Section):
 
     @property
     def tables(self) -> dict[str, Any]:
-        """The tables by the plugins' names, as they stand in the profile."""
+        """Tables of the plugins by name, as in the profile."""
         return self.model_extra or {}
 
 
@@ -554,6 +555,6 @@ class Settings(Section):
 
     @property
     def simulated(self) -> bool:
-        """Neither real servos nor real sensors take part."""
+        """True if neither servos nor sensors are real hardware."""
         servos, tactile = self.servos.backend, self.tactile.backend
         return not (backend("servos", servos).metal or backend("tactile", tactile).metal)

@@ -1,6 +1,6 @@
-"""Cross-field validation of a profile: what its keys don't allow together.
+"""Check a profile for keys that contradict each other.
 
-One function a check; each yields lines of key, found and expected.
+Each check is one function that yields lines with key, found and expected.
 """
 
 from __future__ import annotations
@@ -15,22 +15,22 @@ from softfinger.daemon.backends import backend
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS, GRIP_FRACTION
 
-_LONGEST = 60  # characters of a value that are shown
-_DITHER_TICKS = 8  # a period of the dither, at least: with fewer it is no oscillation of its own
+_LONGEST = 60  # longest value in a message, in characters
+_DITHER_TICKS = 8  # ticks per period of the dither; fewer give no separate oscillation
 _TCP = re.compile(r"tcp://(127(?:\.\d{1,3}){3}|localhost|\[::1\]):(\d{1,5})")
 _ANY_TCP = re.compile(r"tcp://([\w.-]+|\*|\[[0-9a-fA-F:.]+(?:%\w+)?\]):(\d{1,5})")
 
 
 def problems(settings: Settings) -> list[str]:
-    """Return the settings that contradict each other."""
+    """Return the contradictions between settings."""
     return [problem for check in _CHECKS for problem in check(settings)]
 
 
-_WIDE = 2.0  # times the tip's diameter, from which on a sensor is likely another tip's
+_WIDE = 2.0  # tip diameters, a larger sensor probably belongs to another tip
 
 
 def sensor_doubts(settings: Settings) -> list[str]:
-    """Return what looks wrong with the sensors' size under these tips, a line each."""
+    """Return warnings about the sensors' size under these tips, one per line."""
     tip, tactile = settings.tip, settings.tactile
     if tactile.backend == "none":
         return []
@@ -42,7 +42,7 @@ def sensor_doubts(settings: Settings) -> list[str]:
             f"tactile.rows, cols, pitch: found a sensor of {size} for a tip of "
             f"{tip.radius * 2e3:.4g} mm diameter; is it another tip's, or tip.radius wrong?"
         )
-    # A solid tip presses with all of its base, springs with the footprint alone.
+    # A solid tip presses with its whole base, springs only with the footprint.
     d = min(settings.safety.d_max, tip.radius)
     reach = tip.radius if tip.physics == "solid" else math.sqrt(d * (2.0 * tip.radius - d))
     half = min(0.5 * side - abs(at) for side, at in zip(sides, tactile.centre, strict=True))
@@ -56,7 +56,7 @@ def sensor_doubts(settings: Settings) -> list[str]:
 
 
 def shown(value: Any) -> str:
-    """Return value as it stands in TOML, short enough for a line and without control characters."""
+    """Format a value as in TOML, short enough for a line and without control characters."""
     if isinstance(value, tuple):
         text = "[" + ", ".join(shown(item) for item in value[:20]) + "]"
     elif isinstance(value, dict):
@@ -103,7 +103,7 @@ def _servos(settings: Settings) -> Iterator[str]:
 
 
 def _ports(settings: Settings) -> Iterator[str]:
-    """One port can't serve two devices. What a plugin opens is its own affair."""
+    """Check that no two devices share a port. Ports of plugins are not checked."""
     ports = []
     servos = backend("servos", settings.servos.backend)
     tactile = backend("tactile", settings.tactile.backend)
@@ -147,7 +147,7 @@ def _measured_tip(settings: Settings) -> Iterator[str]:
 
 
 def _lacking(settings: Settings, key: str, expected: str) -> Iterator[str]:
-    """A text of the tactile settings that a finger of the scene must have."""
+    """Check a text in the tactile settings that each finger of the scene needs."""
     for name in settings.scene.fingers:
         if not getattr(settings.tactile, key)[FINGERS.index(name)]:
             yield f'tactile.{key}: found "" for {name}, expected {expected}'
@@ -176,7 +176,7 @@ def _solid_tip(settings: Settings) -> Iterator[str]:
 
 
 def _cells_under(settings: Settings) -> Iterator[str]:
-    """A solid tip's contact is told from all of its base."""
+    """Check the number of cells under a solid tip, whose whole base shows the contact."""
     from softfinger.daemon.profile.factory import make_grid, make_tip
     from softfinger.kinematics.estimation.error_budget import Uncertainty
     from softfinger.kinematics.estimation.estimator import CELLS_MIN, within_rim
@@ -292,10 +292,10 @@ def _forces(settings: Settings) -> Iterator[str]:
 
 
 def address_problem(address: str, lacking: str) -> str:
-    """Return why no socket may be bound to ``address``; empty where one may.
+    """Explain why a socket must not be bound to ``address``; empty if it may.
 
-    Without keys only this machine's addresses may be bound; ``lacking`` says where keys would be
-    named, and is empty where they are.
+    Without keys only this machine's addresses are allowed. ``lacking`` is the setting that would
+    name the keys, or empty if keys are set.
     """
     here = _TCP if lacking else _ANY_TCP
     tcp = here.fullmatch(address)

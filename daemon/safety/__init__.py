@@ -1,5 +1,5 @@
-"""Every limit of the hand, how it is checked each tick, and the torque state it ends in.
+"""Limits of the hand, their checks at each tick, and the torque state.
 
-A new limit is a row of `safety.limits.LIMITS` above its check; nothing here decides where the hand
-goes.
+A new limit is a row of `safety.limits.LIMITS` placed above its check function. This package does
+not decide where the hand moves.
 """

@@ -1,9 +1,10 @@
-"""Each servo's heat foreseen: told before it shuts down, and a grip eased to what lasts.
+"""Predict when each servo overheats, and reduce the grip force to a sustainable value in time.
 
-Where a servo comes to ``safety.temperature_max`` within ``heat_warn``, `safety.limits` warns, and a
-grip is eased to the force with which it never would, but not below what its load needs with the
-margin against slip. Where that is not enough it is told _AHEAD, and ``heat_action`` is done in the
-last _LAST. A grip that was eased stays so until it ends, whatever force is asked for.
+If a servo is predicted to reach ``safety.temperature_max`` within ``heat_warn``, `safety.limits`
+warns and a grip is reduced to the largest force that never reaches the limit. The force stays at or
+above the value that the load needs, including the slip margin. If that is not enough, an error is
+reported _AHEAD seconds before the limit, and ``heat_action`` is performed in the last _LAST
+seconds. The reduction lasts until the grip ends, even if another force is commanded.
 """
 
 from __future__ import annotations
@@ -27,19 +28,24 @@ from softfinger.kinematics.hand.servo_heat import (
     winding_std,
 )
 
-_EVERY = 0.5  # s between two looks
-_SMOOTH = 5.0  # s over which the current's square is averaged
-_STEP = 0.5  # °C: a reading comes to the limit so much before the case
-_BELOW = 3.0  # °C below the limit, where an eased grip is to settle
-_EASED = 0.97  # of the force before: less is no easing
-_AT_ONCE = 0.6  # of it at least, since what lasts is not known well at first
-_SETTLES = 10.0  # s after which an eased grip is judged again
+_EVERY = 0.5  # s between two updates of the thermal model
+_SMOOTH = 5.0  # s, averaging time of the squared current
+_STEP = 0.5  # °C, half a step of the thermometer, whose rounded reading reaches the limit early
+_BELOW = 3.0  # °C below the limit, target temperature of a reduced grip
+_EASED = 0.97  # a reduction to more than this fraction of the force is skipped
+_AT_ONCE = 0.6  # smallest fraction in one reduction, because the first estimate is uncertain
+_SETTLES = 10.0  # s after a reduction until the next evaluation
 _AHEAD, _LAST = 30.0, 3.0  # s
-_WINDING, _COUPLING = 0.04, 0.4  # of a servo's heat capacity, and of its thermal resistance
+_WINDING, _COUPLING = 0.04, 0.4  # the winding's share of heat capacity and thermal resistance
 
 
 def set_law(law: HeatLaw, settings: Settings) -> tuple[float, float]:
-    """Fill in what the servo's model, or its own calibration, has: what [K/A²] in what time [s]."""
+    """Fill in the thermal law from the servo model or its calibration.
+
+    Returns
+    -------
+    Temperature rise of the case [K/A²] and its time constant [s].
+    """
     servos = settings.servos
     model = by_name(servos.model)
     rise = servos.heat_rise or model.case_resistance * model.resistance
@@ -52,10 +58,10 @@ def set_law(law: HeatLaw, settings: Settings) -> tuple[float, float]:
 
 
 class HeatWatch:
-    """Heat of a scene's servos. One thread, the loop's, may call it."""
+    """Follow the temperatures of a scene's servos. Only the loop's thread may call it."""
 
     def __init__(self, settings: Settings, state: State) -> None:
-        """``state``: its readings are read, its ``heat`` is written."""
+        """``state`` provides the readings; its ``heat`` is updated."""
         self._limits = settings.safety
         self._state = state
         self._fingers = [FINGERS.index(name) for name in sorted(settings.scene.fingers)]
@@ -63,16 +69,16 @@ class HeatWatch:
         if settings.servos.backend != "none":
             for each in self._states:
                 set_law(each.law, settings)
-        self._heat = [0.0, 0.0]  # ∫ I² since the last look [A² s]
-        self._square = [0.0, 0.0]  # its mean, averaged [A²]
-        self._t = math.nan  # of the last reading [s]
-        self._passed = 0.0  # s since the last look
-        self._eased = -math.inf  # when [s]
-        self._told = False  # that easing is not enough
-        self.due = False  # it was looked at this tick
+        self._heat = [0.0, 0.0]  # ∫ I² dt since the last update [A² s]
+        self._square = [0.0, 0.0]  # smoothed mean square of the current [A²]
+        self._t = math.nan  # time of the last reading [s]
+        self._passed = 0.0  # s since the last update
+        self._eased = -math.inf  # time of the last force reduction [s]
+        self._told = False  # the error that a reduction is not enough was reported
+        self.due = False  # the model was updated in this tick
 
     def follow(self) -> None:
-        """Take in this tick's reading."""
+        """Add this tick's reading, and update the model when an update is due."""
         reading = self._state.reading
         dt = reading.t - self._t
         self._t = reading.t
@@ -92,8 +98,9 @@ class HeatWatch:
             square, self._heat[i] = self._heat[i] / passed, 0.0
             self._square[i] += (square - self._square[i]) * min(passed / _SMOOTH, 1.0)
             if not self._state.reading.temperature[i]:
-                continue  # not known yet
-            # In steps that suit the winding's time, however long nothing was read.
+                continue  # no temperature has been read yet
+            # Limit the step to suit the winding's time constant, also after a long gap without
+            # readings.
             for _ in range(max(round(passed / _EVERY), 1)):
                 step = min(passed, _EVERY)
                 follow(self._states[i].array, square, step, self._state.reading.temperature[i])
@@ -105,7 +112,7 @@ class HeatWatch:
             told.time_to_limit = time_to_limit(heat.array, self._square[i], limit)
 
     def act(self, control: Control, events: list[Event]) -> str:
-        """Ease a grip that gets too hot; return what `heat_action` wants done now, else ''."""
+        """Reduce the force of a grip that gets too hot; return a ``heat_action`` due now, or ''."""
         state = self._state
         if state.mode not in GRIPPING:
             self._told = False
@@ -117,7 +124,7 @@ class HeatWatch:
             return ""
         who = f"{FINGERS[i]} servo at {self._limits.temperature_max:g} °C in {left:.0f} s"
         if state.t - self._eased < _SETTLES and left > _LAST:
-            return ""  # what easing brings is not seen yet
+            return ""  # the last reduction has not taken effect yet
         now = state.goal.force
         square = lasting_square(self._states[i].array, self._limits.temperature_max - _BELOW)
         lasts = now * math.sqrt(square / max(self._square[i], 1e-6))

@@ -1,13 +1,13 @@
-"""Every limit of the hand in one table, ``LIMITS``: what is judged, how, and what follows.
+"""Define every limit of the hand in one table, ``LIMITS``: its check and its consequence.
 
-- ``warn``: reported once on ``hand/event``, again only after it has been over for a while.
-- ``limit``: the goal is changed before it reaches the bus; ``status`` counts the ticks.
-- ``fault``: torque off, latched until ``clear``, which is refused as long as the cause stands.
+- ``warn``: reported once on ``hand/event``, and again only after it has cleared for a while.
+- ``limit``: the goal is changed before it is sent; ``status`` counts the affected ticks.
+- ``fault``: torque off, latched until ``clear``, which is refused while the cause persists.
 
-A row stands above the function that checks it, and the table has them in the order of this file:
-where several faults stand, the first names the fault. ``softfinger limits`` prints the table with
-a profile's numbers. A limit's name is the ``kind`` of its events and the ``fault_name`` of
-``hand/state``. When a row is checked stands in `safety.safety`.
+Each row stands above its check function, and the table keeps the order of this file. If several
+faults are present, the first one is reported. ``softfinger limits`` prints the table with a
+profile's numbers. A limit's name is the ``kind`` of its events and the ``fault_name`` of
+``hand/state``. `safety.safety` defines when each row is checked.
 """
 
 from __future__ import annotations
@@ -30,47 +30,47 @@ from softfinger.daemon.safety.wiring import WiringWatch
 from softfinger.daemon.servos.control_table import VOLTAGE_UNIT, by_name, hardware_error_names
 from softfinger.daemon.types import FINGERS, Contact, Reading, State
 
-_NOISY = 1.5  # times the noise that is set, from which on that is named
-_NEAR = 0.9  # of a fault's bound: warned from there on
-_PULL = 2.0  # A/rad with which a joint off its goal must be pulled: less than any model's own loop
-_SLOW = 0.05  # rad/s below which a joint stands
-_RISE = 0.2  # share by which the force asked for must rise, and of that the force felt
-_DEAF = 0.3  # s
-_AT_ONCE = 0.02  # rad that an angle may go beyond the greatest velocity's way in one reading
-_APART = 0.1  # rad that it may be off the way that the velocity says …
-_MEMORY = 0.1  # … over the last so many s: a velocity lags
-_LATE = 0.02  # s between two readings, or 3 ticks, from which on the sum begins again
-_MEAN = 0.72  # s, time constant of the share of failed readings
-_FAILED = 0.75  # which is reported from there on: none was good for a second
-_GAP = 0.1  # s from which on the step is not judged either
+_NOISY = 1.5  # times ``tactile.noise``; more noise is mentioned in the message
+_NEAR = 0.9  # fraction of a fault's bound at which a warning starts
+_PULL = 2.0  # A/rad, expected pull towards the goal; every servo model's own loop is stiffer
+_SLOW = 0.05  # rad/s, below which a joint counts as standing still
+_RISE = 0.2  # relative rise of the commanded force, and fraction of it that must be measured
+_DEAF = 0.3  # s in which the measured force must follow
+_AT_ONCE = 0.02  # rad, tolerance of one step beyond the distance at maximum velocity
+_APART = 0.1  # rad, allowed difference between the angle and the integrated velocity
+_MEMORY = 0.1  # s, time window of that difference, because the velocity lags
+_LATE = 0.02  # s between two readings, or 3 ticks, after which the window restarts
+_MEAN = 0.72  # s, time constant of the fraction of failed readings
+_FAILED = 0.75  # fraction that is reported; reached after 1 s without a good reading
+_GAP = 0.1  # s between two readings, after which the step is not checked either
 
 
 class JointMotion:
-    """Checks joints' angles against their velocities, and against the speed that a joint can have.
+    """Check joint angles against measured velocities and against the maximum velocity.
 
-    An encoder whose zero jumps, that stands still while the joint turns or drifts while it rests,
-    gives angles that contradict their velocity: then ``jumped`` has a finger's bit.
+    An encoder may jump, stand still while the joint turns, or drift while the joint rests. Its
+    angles then contradict its velocity, and the finger's bit is set in ``jumped``.
     """
 
     def __init__(self, fingers: Sequence[int], velocity_max: float, period: float) -> None:
-        """``period`` [s] of the ticks."""
+        """``period`` is the tick period [s]."""
         self.jumped = 0
         self._fingers = tuple(fingers)
         self._velocity_max = velocity_max
         self._late = max(_LATE, 3.0 * period)
         self._gap = max(_GAP, self._late)
-        self._requested = -math.inf  # when the last good reading was asked for [s]
-        self._t = -math.inf  # and had come
+        self._requested = -math.inf  # time of the request of the last good reading [s]
+        self._t = -math.inf  # time of the last good reading [s]
         self._q = [0.0, 0.0]
-        self._apart = [0.0, 0.0]  # rad
+        self._apart = [0.0, 0.0]  # angle less integrated velocity [rad]
 
     def follow(self, requested: float, reading: Reading) -> None:
-        """Take a reading in that was asked for at the time ``requested``."""
+        """Check a reading that was requested at time ``requested``."""
         self.jumped = 0
         t = reading.t
         if not reading.valid or t == self._t:
             return
-        # Each was taken somewhere between question and answer.
+        # Each reading was measured at some time between request and reply.
         longest, dt = t - self._requested, t - self._t
         q, before, apart = reading.q, self._q, self._apart
         if longest < self._gap:
@@ -90,7 +90,7 @@ class JointMotion:
 
 
 class View:
-    """Scene that the limits judge the state by, and the memory of a few of them."""
+    """Hold the scene that the limits are checked in, and the history that some checks need."""
 
     def __init__(
         self,
@@ -104,16 +104,16 @@ class View:
         self.grasp = GraspState() if grasp is None else grasp
         self.sensors = sensors
         self.wiring = WiringWatch(self.fingers)
-        self.failed = 0.0  # share of the readings of about the last second
-        self._t = math.nan  # of the last state
+        self.failed = 0.0  # fraction of failed readings in about the last second
+        self._t = math.nan  # time of the last state [s]
         self.motion = JointMotion(self.fingers, self.limits.velocity_max, 1.0 / settings.loop.rate)
-        servos = settings.servos  # in current mode the pull is the daemon's own
+        servos = settings.servos  # in current mode the daemon's own stiffness sets the pull
         self.pull = min(_PULL, 0.5 * servos.stiffness) if servos.mode == "current" else _PULL
-        self.bad_goal = False  # a goal was not finite since the last judgement
-        self.grip_width = math.nan  # of the object when it was gripped [m]
-        self._target = math.nan  # force of the grip at the last tick [N]
-        self.rise_t = math.inf  # when it rose and was not felt to since [s]
-        self.rise_felt = 0.0  # what was felt then [N]
+        self.bad_goal = False  # a goal since the last check was not finite
+        self.grip_width = math.nan  # object width at the start of the grip [m]
+        self._target = math.nan  # commanded grip force at the last tick [N]
+        self.rise_t = math.inf  # time of a rise of the commanded force that is not measured yet [s]
+        self.rise_felt = 0.0  # measured force at that time [N]
         low, high = settings.safety.voltage_min, settings.safety.voltage_max
         if settings.servos.backend != "none":
             model = by_name(settings.servos.model)
@@ -122,7 +122,7 @@ class View:
         self.voltage = (low, high)
 
     def follow(self, state: State) -> None:
-        """Remember of this tick's state what checks compare later ones with."""
+        """Record the parts of this tick's state that later checks compare with."""
         self.motion.follow(state.t, state.reading)
         self.wiring.follow(state)
         passed, self._t = state.t - self._t, state.t
@@ -146,12 +146,12 @@ class View:
             self.rise_t = math.inf
 
     def touched(self, state: State) -> bool:
-        """Return whether both tips validly touch an object of known angle and width."""
+        """Return True if both tips have valid contacts and the object's pose is valid."""
         left, right = state.contacts
         return state.object.valid and _touches(left) and _touches(right)
 
     def holds(self, state: State) -> bool:
-        """Return whether they do so in a grip that has settled."""
+        """Return True if `touched` is true in a grip that has settled."""
         return state.mode in HELD and self.touched(state)
 
 
@@ -159,37 +159,41 @@ def _touches(contact: Contact) -> bool:
     return contact.valid and contact.contact
 
 
-# From the share of the bound to judge by to what is wrong, or an empty text. A check changes
-# nothing; NaN is past any bound.
+# A check receives the fraction of the bound to apply. It returns a description of the violation, or
+# an empty text. Checks change nothing, and NaN violates every bound.
 Check = Callable[[View, State, float], str]
 FingerCheck = Callable[[View, State, float, int], str]
 
 
 @dataclass(frozen=True, slots=True)
 class Limit:
-    """A row of the table, entered with the check that it decorates.
+    """Describe one row of the table. Calling it adds the row with the check that it decorates.
 
-    A row without a check is entered by hand, and met elsewhere: in `Safety.write`, on the bus.
+    A row without a check is added directly. Its limit is applied elsewhere: in `Safety.write`, on
+    the bus or in the gateway.
     """
 
     name: str
     quantity: str
     level: Literal["warn", "limit", "fault"]
-    keys: tuple[str, ...] = ()  # the settings that it depends on
+    keys: tuple[str, ...] = ()  # settings that it depends on
     needs: Literal["", "servos", "sensors"] = ""
     check: Check | None = None
-    lasts: float | str = 0.0  # s that it must stand, or the setting that says so
-    fraction: float = 1.0  # of the bound
-    in_turn: bool = False  # one such row is checked a tick; the others at each
-    gripping: bool = False  # stands only while the hand grips
+    lasts: float | str = 0.0  # s that a violation must last, or the name of a setting
+    fraction: float = 1.0  # fraction of the bound that is applied
+    in_turn: bool = False  # one of these rows is checked per tick, the others at every tick
+    gripping: bool = False  # applies only while the hand grips
 
     def __call__(self, check: Check) -> Check:
-        """Enter the row with its check. Several rows may decorate one, the lowest comes first."""
+        """Add the row with its check.
+
+        If several rows decorate one check, the lowest row is added first.
+        """
         LIMITS.append(replace(self, check=check))
         return check
 
     def each(self, check: FingerCheck) -> FingerCheck:
-        """Enter the row with a check of one finger, of which the first that is wrong is told."""
+        """Add the row with a check of one finger; the first violation found is reported."""
 
         def judge(view: View, state: State, fraction: float) -> str:
             for i in view.fingers:
@@ -286,7 +290,7 @@ def _servos_voltage(view: View, state: State, _: float, i: int) -> str:
 
 # --- joints ---------------------------------------------------------------------------------------
 
-_PAST_STOP = 0.1  # rad beyond a joint limit that a push may take a joint
+_PAST_STOP = 0.1  # rad, tolerance for a joint that is pushed beyond its limit
 
 
 @Limit("joint.angle", "joint angle, 0.1 rad past its limits", "fault", ("hand.q_min", "hand.q_max"),
@@ -315,17 +319,18 @@ def _joint_jump(view: View, _: State, __: float) -> str:
     )
 
 
-_OFF = 0.05  # rad off its goal from which on a joint must be pulled there
-_FELT = 0.04  # A that must be expected for that to be judged
-_PULLED = 0.25  # of what is expected
+_OFF = 0.05  # rad, position error above which a current must pull the joint
+_FELT = 0.04  # A, smallest expected current that is checked
+_PULLED = 0.25  # required fraction of the expected current
 
 
 @Limit("joint.dead", "joint that stands 0.05 rad off its goal without current for 0.05 s", "fault",
     needs="servos", in_turn=True, lasts=0.05).each  # fmt: skip
 def _joint_dead(view: View, state: State, _: float, i: int) -> str:
-    """Off its goal it stands, and no current pulls it there. A joint that is held back takes some.
+    """Report a joint that stands off its goal while no current pulls it there.
 
-    In position mode nothing is known of the current that it should take.
+    A joint that is held back by a load draws current. In position mode the expected current is
+    unknown, so the check is skipped.
     """
     goal, reading = state.goal, state.reading
     if not (state.torque and goal.valid) or view.settings.servos.mode == "position":
@@ -351,7 +356,7 @@ def _joint_current(view: View, state: State, _: float, i: int) -> str:
     return "" if well else f"{FINGERS[i]} joint takes {current:.2f} A, above {bound:g} A"
 
 
-_FULL_CURRENT = 0.9  # of a goal's bound: a joint that takes more has no reserve
+_FULL_CURRENT = 0.9  # fraction of a goal's current limit at which no reserve is left
 
 
 @Limit("joint.stall", "current at its bound, off the goal, and standing", "fault",
@@ -394,7 +399,7 @@ def _joint_blocked(view: View, state: State, _: float, i: int) -> str:
     )
 
 
-_ALL = 0.95  # of the greatest current there may be: a grip that takes more can't be firmer
+_ALL = 0.95  # fraction of the maximum current at which the grip force cannot rise
 
 
 @Limit("joint.strained", "grip that takes all the current there may be", "warn",
@@ -469,8 +474,8 @@ _TILT = "|θ| against asin(1 − d/a) less a margin"
 def _tip_tilt(view: View, state: State, fraction: float, i: int) -> str:
     """|θ| ≤ fraction·(asin(1 − d/a) − margin).
 
-    At asin(1 − d/a) the object's plane reaches the rim of the tip's backing plate. Checked with
-    sin, which is defined for every finite angle.
+    At asin(1 − d/a) the object's plane reaches the rim of the tip's backing plate. The check uses
+    the sine, which is defined for every finite angle.
     """
     radius, margin = view.settings.tip.radius, view.limits.theta_margin
     contact = state.contacts[i]
@@ -519,7 +524,7 @@ def _tactile_silent(view: View, state: State, _: float, i: int) -> str:
 
 
 def _doubt(view: View, state: State, finger: int) -> str:
-    """Return why a sensor's frames are refused, or an empty text."""
+    """Explain why a sensor's frames are rejected; empty text if they are accepted."""
     side, found = FINGERS[finger], view.grasp
     if found.rejected_count[finger] > REJECTED_MAX:
         turned, deeper = found.angle_innovation[finger], 1e3 * found.d_innovation[finger]
@@ -546,11 +551,11 @@ def _doubt(view: View, state: State, finger: int) -> str:
     return ""
 
 
-_GAIN_DOUBTED = 1.5  # prior standard deviations off, a sensor's gain is reported
+_GAIN_DOUBTED = 1.5  # prior standard deviations of gain error at which it is reported
 
 
 def _gain_doubt(view: View, finger: int) -> str:
-    """Say what a sensor reads where its gain is off by more than is usual, or an empty text."""
+    """Describe a gain error that is larger than usual; empty text if there is none."""
     grasp = view.grasp
     off, unsure = grasp.gain_change[finger], grasp.gain_std[finger]
     if not abs(off) - unsure > _GAIN_DOUBTED * grasp.gain_prior_std[finger]:
@@ -567,7 +572,8 @@ def _enter_witnesses(finger: int, side: str) -> None:
     def _sensor(view: View, state: State, _: float) -> str:
         if finger not in view.fingers:
             return ""
-        # The cells of a tip that is let go may follow more slowly than their shape says.
+        # Check the gain only in a grip: after release the cells may relax more slowly than the
+        # shape.
         return _doubt(view, state, finger) or (
             _gain_doubt(view, finger) if view.holds(state) else ""
         )
@@ -638,7 +644,7 @@ def _tactile_misfit(_: View, state: State, __: float, i: int) -> str:
 
 # --- the hand and its grip ------------------------------------------------------------------------
 
-_SURE = 4.0  # standard deviations of both tips' tilts that they must be apart
+_SURE = 4.0  # smallest significant difference, in summed standard deviations of both tilts
 _ANGLE = "object's angle by one finger against the other's"
 _ANGLE_KEYS = ("safety.residual_angle", "object.taper")
 
@@ -648,7 +654,7 @@ _ANGLE_KEYS = ("safety.residual_angle", "object.taper")
 def _hand_angle(view: View, state: State, fraction: float) -> str:
     if not view.touched(state) or len(view.sensors) < 2:
         return ""
-    left, right = (sensor.estimate for sensor in view.sensors)  # of the newest frames alone
+    left, right = (sensor.estimate for sensor in view.sensors)  # of the newest frames only
     if not (left.contact and right.contact):
         return ""
     unsure = _SURE * (left.tilt_x_std + right.tilt_x_std)

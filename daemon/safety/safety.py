@@ -1,8 +1,8 @@
-"""The last stage before the servos: judges every state, bounds every goal, and sends it.
+"""Check every state, limit every goal and send it to the servos.
 
-`Safety.write` is the only way from a goal to the bus, and bounds what it sends. What is judged
-stands in one table, `safety.limits.LIMITS`; here stands when, that a warning is reported once, and
-how long something must last to be a fault.
+Goals reach the bus only through `Safety.write`, which limits them. The table `safety.limits.LIMITS`
+defines the checks. This module schedules them, reports each warning once, and requires a violation
+to last before it becomes a fault.
 """
 
 from __future__ import annotations
@@ -20,36 +20,36 @@ from softfinger.daemon.safety.limits import LIMITS, Check, Limit, View
 from softfinger.daemon.servos.base import Servos
 from softfinger.daemon.types import Goal, State
 
-_AGAIN = 1.0  # s after which a warning that was over may be reported again
-_EASE = 0.95  # hysteresis: what was reported stands until it falls below so much of its bound
+_AGAIN = 1.0  # s without violation before a warning may be repeated
+_EASE = 0.95  # hysteresis: a reported warning clears below this fraction of its bound
 
-BUS = "servos.bus"  # the limit of what the servo backend itself refuses
-TORQUE_OFF = "torque.off"  # of torque off that is not confirmed, `safety.torque_state`
+BUS = "servos.bus"  # limit for errors raised by the servo backend
+TORQUE_OFF = "torque.off"  # limit for unconfirmed torque off, see `safety.torque_state`
 
 
 class Breach(NamedTuple):
-    """A limit that is broken: its name, and what was found."""
+    """Name a broken limit and describe the violation."""
 
     name: str
     text: str
 
 
 class _Watch:
-    """One limit of a scene, and since when it is broken."""
+    """Track one limit of a scene and the time since when it is broken."""
 
     def __init__(self, limit: Limit, check: Check, view: View) -> None:
         self.limit = limit
         self.check = check
         lasts = limit.lasts
         self.lasts = getattr(view.limits, lasts) if isinstance(lasts, str) else lasts
-        self.since = math.inf  # broken since then, inf: it is not
+        self.since = math.inf  # start of the violation [s], inf without one
         self.reported = False
         self._ended = -math.inf
 
     def check_limit(
         self, view: View, state: State, faults: dict[_Watch, str], warnings: list[Breach]
     ) -> None:
-        """Enter what stands at this tick and has for long enough; keeps count of how long."""
+        """Run the check, and record a violation that has lasted long enough."""
         limit = self.limit
         found = self.check(view, state, limit.fraction * (_EASE if self.reported else 1.0))
         if not found:
@@ -71,7 +71,7 @@ class _Watch:
 
 
 class Safety:
-    """Judges states and bounds goals. One thread, the loop's, may call it."""
+    """Check states and limit goals. Only the loop's thread may call it."""
 
     def __init__(
         self,
@@ -81,7 +81,7 @@ class Safety:
         grasp: GraspState | None = None,
         sensors: Sequence[FingerPerception] = (),
     ) -> None:
-        """``grasp`` and ``sensors`` are the loop's own, looked at and never changed."""
+        """``grasp`` and ``sensors`` belong to the loop and are only read."""
         view = self._view = View(settings, grasp, sensors)
         limits, hand = settings.safety, settings.hand
         self._limits = limits
@@ -94,17 +94,17 @@ class Safety:
         ]
         self._each_tick = [watch for watch in watches if not watch.limit.in_turn]
         self._in_turn = [watch for watch in watches if watch.limit.in_turn]
-        # In the table's order: the first one that stands is the fault's name.
+        # In the order of the table, because the first violation names the fault.
         self._faults = [watch for watch in watches if watch.limit.level == "fault"]
         self._turn = 0
-        self._found: dict[_Watch, str] = {}  # faults that stand
-        self.must_hold = False  # frames are late in a grip: nothing is moved on
-        self.warnings: list[Breach] = []  # to be reported; the loop empties it
+        self._found: dict[_Watch, str] = {}  # current violations of fault limits
+        self.must_hold = False  # frames are late in a grip, so the goal is held
+        self.warnings: list[Breach] = []  # new warnings, which the loop reports and removes
         self.limited: Counter[str] = Counter()  # ticks in which a goal was changed, by limit
         self._hold_age = limits.frame_age_hold / settings.tactile.rate
         dt = 1.0 / settings.loop.rate
         self._step = limits.goal_speed * dt
-        # In position mode no current bounds what a jump does.
+        # In position mode no current limit bounds the effect of a jump of the goal.
         self._travel = 0.0 if settings.servos.mode == "position" else limits.goal_reach
         self._rise = limits.current_rate * dt
         self._ends = [(i, hand.q_min[i], hand.q_max[i]) for i in view.fingers]
@@ -112,12 +112,12 @@ class Safety:
         self._sent_current = [0.0, 0.0]
         self._sent_seq = -2
 
-    # Judging
+    # Checks of the state
 
     def judge(self, state: State) -> Breach | None:
-        """Look at this tick's state; the first fault that stands, if any.
+        """Check this tick's state and return the first fault, or None.
 
-        Warnings that are new are added to ``warnings``.
+        New warnings are appended to ``warnings``.
         """
         view, found = self._view, self._found
         view.follow(state)
@@ -140,9 +140,9 @@ class Safety:
         return None
 
     def cause(self, state: State, gripping: bool = False) -> str:
-        """Return the first fault in this state, or an empty text: what refuses a command.
+        """Return the first fault in this state, which blocks a command, or an empty text.
 
-        With ``gripping`` the limits of a grip are judged, whatever the mode. Nothing is changed.
+        With ``gripping``, the limits of a grip are checked in every mode. Nothing is changed.
         """
         gripping = gripping or state.mode in GRIPPING
         view = self._view
@@ -155,21 +155,21 @@ class Safety:
         return ""
 
     def opens_first(self, breach: Breach, mode: Mode | str) -> bool:
-        """Return whether the hand opens before this fault takes its torque."""
+        """Return True if the hand opens before this fault turns its torque off."""
         commanded = self._limits.frame_age_action == "open"
         return commanded and breach.name == "tactile.silent" and mode in GRIPPING
 
     # Goals
 
     def write(self, servos: Servos, state: State) -> None:
-        """Bound the state's goal in place and send it; a non-finite one is invalid, and not sent.
+        """Limit the state's goal in place and send it; a non-finite goal becomes invalid instead.
 
         Raises ServoError as `Servos.write` does.
         """
         goal = state.goal
         q, current = goal.q, goal.current
         present = state.reading.q
-        if state.seq - self._sent_seq != 1:  # torque was off: from the present angle, no current
+        if state.seq - self._sent_seq != 1:  # torque was off: start here, without current
             self._sent_q[:] = present
             self._sent_current[:] = (0.0, 0.0)
         self._sent_seq = state.seq
@@ -197,7 +197,7 @@ class Safety:
         near = min(max(inside, lowest), highest)
         if near != inside:
             self._count("goal.step")
-        # The joint's limits have the last word.
+        # Apply the joint limits last, so that they always hold.
         goal.q[i] = min(max(near, low), high)
         limit = min(max(current, 0.0), self._limits.current_max)
         if limit != current:

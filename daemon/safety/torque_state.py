@@ -1,8 +1,9 @@
-"""Tracks the confirmed torque state: on from the request on, off once the servos confirm it.
+"""Track the torque state: on from the request, off only after the servos confirm it.
 
-Off is sent at every tick until the servos' own registers say so. Where they do not within half of
-their bus watchdog's time, nothing is sent for as long as that watchdog takes to stop the motors: a
-servo that receives read requests but loses all writes would drive on. Then it is tried again.
+Torque off is sent at every tick until the servos' registers confirm it. If they do not confirm
+within half of the bus watchdog's time, nothing is sent for as long as the watchdog needs to stop
+the motors. Otherwise a servo that receives read requests but loses all writes would keep driving.
+Afterwards torque off is tried again.
 """
 
 from __future__ import annotations
@@ -17,13 +18,13 @@ from softfinger.daemon.servos.base import Servos
 from softfinger.daemon.servos.control_table import WATCHDOG_UNIT
 from softfinger.daemon.types import Reading, State
 
-_TRY = 0.5  # of the watchdog's time in which torque off is tried before the bus falls silent
-_TRY_UNGUARDED = 0.05  # s of tries before a report, with servos.watchdog = 0
-_LAST_TRIES = 15  # when the daemon ends
+_TRY = 0.5  # fraction of the watchdog time for tries before the bus falls silent
+_TRY_UNGUARDED = 0.05  # s of tries before a report if servos.watchdog = 0
+_LAST_TRIES = 15  # tries when the daemon ends
 
 
 class TorqueState:
-    """Torque of one hand's servos. Writes ``state.torque``, ``torque_off`` and ``write_error``."""
+    """Control torque; write ``torque``, ``torque_off`` and ``write_error`` of the state."""
 
     def __init__(
         self,
@@ -34,7 +35,7 @@ class TorqueState:
         fail: Callable[[str, str], None],
         emit: Callable[[str, str, str], None],
     ) -> None:
-        """``fail`` latches a fault by reason and limit, ``emit`` sends an event."""
+        """``fail`` latches a fault by reason and limit; ``emit`` sends an event."""
         self.servos = servos
         self._state = state
         self._safety = safety
@@ -42,24 +43,27 @@ class TorqueState:
         self._emit = emit
         watchdog = settings.watchdog
         self._patience = _TRY * watchdog or _TRY_UNGUARDED
-        # The servo counts in whole units, and may be one late.
+        # The servo counts in whole units and may react one unit late.
         units = math.ceil(watchdog / WATCHDOG_UNIT - 1e-9) + 1 if watchdog else 0
         self._silence = units * WATCHDOG_UNIT
-        self._tried_since = math.inf  # torque off is wanted and not confirmed since then
+        self._tried_since = math.inf  # start of the current series of tries [s]
         self._silent_until = -math.inf
-        self._first = math.inf  # when off was first asked for
+        self._first = math.inf  # time of the first request for torque off [s]
         self._reported = False
-        self._gone = False  # the port: nothing can be sent
+        self._gone = False  # the port is gone, so nothing can be sent
         self._last_try = -1  # seq of the tick with the last try
-        self._unused = Reading()  # takes what is read after the tick has decided
+        self._unused = Reading()  # buffer for readings that this tick no longer uses
 
     @property
     def pending(self) -> bool:
-        """True while torque off is requested and not confirmed."""
+        """True while torque off is requested but not confirmed."""
         return self._tried_since < math.inf
 
     def read(self, reading: Reading) -> None:
-        """Read the servos; request a pending torque off on the way. Raises ServoError."""
+        """Read the servos, repeating a pending torque off in the same exchange.
+
+        Raises ServoError as `Servos.read` does.
+        """
         state, servos = self._state, self.servos
         state.torque_off = False
         if servos is None:
@@ -72,7 +76,7 @@ class TorqueState:
             self._try(servos, reading)
 
     def write(self, requested: bool, now: float) -> None:
-        """Bring torque to what is ``requested`` at this tick, and the goal to the servos."""
+        """Switch torque as ``requested`` for this tick, and send the goal while torque is on."""
         state, servos = self._state, self.servos
         if servos is None:
             return
@@ -90,16 +94,17 @@ class TorqueState:
                 self._fall(error)
 
     def off(self) -> str:
-        """Ask for torque off now, whatever the state says; "confirmed" by the servos, or not.
+        """Request torque off now and return "confirmed" or "unconfirmed".
 
-        It waits for one reply at most. Where that does not come, each tick tries again.
+        The call waits for at most one reply. Until the servos confirm, each tick repeats the
+        request.
         """
         state, servos = self._state, self.servos
         if servos is None:
             return "confirmed"
         first = not self.pending
         if first:
-            state.torque = True  # as far as is known: another program may have put it on
+            state.torque = True  # assume torque is on, because another program may have enabled it
             self._first = self._tried_since = state.t
             self._silent_until = -math.inf
         if self._last_try != state.seq and (first or not self._is_silent()):
@@ -110,7 +115,7 @@ class TorqueState:
         return "unconfirmed" if state.torque else "confirmed"
 
     def end(self) -> None:
-        """Turn torque off now if it may be on; where that fails, the end is the bus's silence."""
+        """Turn torque off if it may be on; if that fails, the silent bus trips the watchdogs."""
         for _ in range(_LAST_TRIES):
             if not self._state.torque:
                 return
@@ -118,18 +123,18 @@ class TorqueState:
             self.off()
 
     def reconnect(self) -> None:
-        """Connect servos again that have gone silent, as after an unplug. Raises ServoError."""
+        """Reconnect servos that stopped answering, as after an unplug. Raises ServoError."""
         if self.servos is None:
             return
         self.servos.connect()
         self.servos.read(self._state.reading)
         if self._state.torque:
-            # It may still be on where the port went away before it could be turned off.
+            # Torque may still be on if the port was lost before it could be turned off.
             self._last_try = -1
             self.off()
 
     def _on(self, servos: Servos) -> None:
-        self._state.torque = True  # from here on it may be on, whatever the servos answer
+        self._state.torque = True  # from here on torque may be on, whatever the servos reply
         try:
             servos.torque_on()
         except ServoError as error:
@@ -158,7 +163,7 @@ class TorqueState:
             )
 
     def _is_silent(self) -> bool:
-        """Return whether nothing may be sent at this tick, so that the servos' watchdogs act."""
+        """Return True if nothing may be sent in this tick so that the servos' watchdogs act."""
         t = self._state.t
         if t < self._silent_until:
             return True
@@ -170,7 +175,7 @@ class TorqueState:
         return silence > 0.0
 
     def _report(self) -> None:
-        """Report once that torque off is not confirmed, as a fault where none is latched."""
+        """Report once that torque off is unconfirmed, as a fault unless one is latched."""
         if self._reported:
             return
         self._reported = True

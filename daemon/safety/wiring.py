@@ -1,8 +1,8 @@
-"""Signs that the servos' IDs are swapped: a joint of one finger moves the other finger's tip.
+"""Detect swapped servo IDs: a joint of one finger moves the tip of the other finger.
 
-Joint angles and currents are consistent then, since each servo reports on itself. Only a sensor
-shows it: where a joint stands and the other one moves, the wrong tip tilts or is pressed, and a
-turn goes the wrong way.
+Joint angles and currents are consistent in this case, because each servo reports its own. Only a
+tactile sensor shows the error. If a joint stands still while the other one moves, the wrong tip
+tilts or is pressed, and a commanded turn goes the wrong way.
 """
 
 from __future__ import annotations
@@ -13,35 +13,36 @@ from collections.abc import Sequence
 from softfinger.daemon.control.modes import Mode
 from softfinger.daemon.types import FINGERS, State
 
-_STILL = 0.02  # rad by which a joint that waits for the other one may move
-_MOVED = 0.05  # rad that the other joint must have closed
-# Share of that by which the tip must have tilted: a finger that turns by an angle tilts its tip by
-# about as much on an object that slides (0.9 in the simulated hand, 0.25 with the right wiring).
+_STILL = 0.02  # rad, largest motion of a joint that waits for the other one
+_MOVED = 0.05  # rad, smallest closing motion of the other joint
+# Smallest tilt of the tip as a fraction of that motion. With swapped IDs a tip tilts by about the
+# angle that its finger turns: 0.9 of it on a sliding object in the simulated hand. With correct
+# wiring the fraction is 0.25.
 _TILTED = 0.5
-_SURE = 2.0  # standard deviations of the tilt besides
-_PRESSED = 1.0  # N by which the tip's force must have risen
-_SETTLED = 0.07  # s after a touch: the frames' latency, and what the joint needs to stop
-_AGAINST = math.radians(4.0)  # that an object has turned against its commanded turn
-_SENSES = (1.0, -1.0)  # of a tip's tilt when its finger closes
+_SURE = 2.0  # standard deviations of the tilt, added to the threshold
+_PRESSED = 1.0  # N, smallest rise of the tip's force
+_SETTLED = 0.07  # s after a touch, for the frames' latency and the joint's stopping time
+_AGAINST = math.radians(4.0)  # rad, rotation opposite to the command
+_SENSES = (1.0, -1.0)  # sign of a tip's tilt when its finger closes
 
 
 class WiringWatch:
-    """Compares which joint moves with which tip feels it, in an approach and in a turn."""
+    """Compare joint motion with the tip that responds, in an approach and in a turn."""
 
     def __init__(self, fingers: Sequence[int]) -> None:
-        self.swapped = ""  # what was found, empty while all is well
+        self.swapped = ""  # description of the swap, empty if none was found
         self._both = len(fingers) == len(FINGERS)
-        self._touching = -1  # the one finger that touches, -1: none or both
-        self._since = 0.0  # [s]
-        self._q = [0.0, 0.0]  # when it had touched [rad]
-        self._tilt = math.nan  # likewise [rad]
-        self._force = 0.0  # greatest in the first moment [N]
-        self._turn = math.nan  # object's angle at the start of a turn [rad]
-        self._goal = math.nan  # angle that the object is to be turned to [rad]
-        self._sense = 0.0  # of that turn
+        self._touching = -1  # the only finger in contact, -1 for none or both
+        self._since = 0.0  # start of that contact [s]
+        self._q = [0.0, 0.0]  # joint angles after the touch [rad]
+        self._tilt = math.nan  # tilt after the touch [rad]
+        self._force = 0.0  # force after the touch [N]
+        self._turn = math.nan  # object angle at the start of a turn [rad]
+        self._goal = math.nan  # commanded object angle [rad]
+        self._sense = 0.0  # direction of that turn
 
     def follow(self, state: State) -> None:
-        """Take in a tick's state."""
+        """Check one tick's state."""
         self.swapped = ""
         if not self._both or not state.reading.valid:
             return
@@ -80,7 +81,7 @@ class WiringWatch:
 
     def _follow_turn(self, state: State) -> None:
         angle, goal = state.object.angle, state.goal.angle
-        if goal != self._goal:  # also for NaN; a stream's goal moves on at each tick
+        if goal != self._goal:  # also true for NaN; a streamed goal changes at each tick
             self._goal, self._turn = goal, math.nan
         if math.isnan(self._turn):
             if state.object.valid and abs(goal - angle) > 0.5 * _AGAINST:

@@ -1,4 +1,4 @@
-"""Servos: the interface of every backend, the simulated one, and Dynamixel's on a serial port.
+"""Servo backends: their common interface, simulated servos, and Dynamixel servos on a serial port.
 
-`daemon.backends` maps the settings' names to them.
+`daemon.backends` maps the names in the settings to them.
 """

@@ -1,4 +1,4 @@
-"""Interface of every servo backend to the loop, and the backend that the settings name."""
+"""Define the interface between servo backends and the loop, and create the selected backend."""
 
 from __future__ import annotations
 
@@ -21,13 +21,14 @@ Status = Literal["pass", "note", "fixed", "warn", "FAIL"]
 class Finding:
     """Result of a check of one device or of the machine, and how to fix it.
 
-    ``FAIL`` keeps the daemon from working, ``warn`` makes it work worse, the others are well.
+    ``FAIL`` keeps the daemon from working and ``warn`` degrades it. The other statuses need no
+    action.
     """
 
     status: Status
-    subject: str  # as ``servo 1 (left)``
+    subject: str  # such as ``servo 1 (left)``
     text: str  # what was found, and what was expected
-    fix: str = ""  # a command or an action; empty when nothing is to be done
+    fix: str = ""  # a command or an action, empty if no action is needed
 
     def __str__(self) -> str:
         text = f"{self.subject}: {self.text}"
@@ -37,62 +38,62 @@ class Finding:
 class Servos(Protocol):
     """Joints of the hand, in one of three operating modes (``servos.mode``).
 
-    In each of them ``goal.q`` is the goal angle of a joint:
+    In each mode ``goal.q`` is the goal angle of a joint:
 
-    - *current-based position* (5): the servo's own position loop, with the motor's current within
+    - *current-based position* (5): the servo's own position loop, with the motor current limited to
       ± ``goal.current``.
-    - *current* (0): the same meaning, but the loop runs here, once a tick, on the newest reading:
-      ``servos.stiffness`` and ``servos.damping`` within ± ``goal.current``. Without readings the
-      current stays what it was, until the servo's bus watchdog ends it.
-    - *position* (3): the servo's own loop with all the current it has. ``goal.current`` is
-      ignored, and torque on holds at once; it suits moving and no grasp.
+    - *current* (0): the daemon computes the position loop once per tick from the newest reading,
+      with ``servos.stiffness`` and ``servos.damping`` and limited to ± ``goal.current``. Without
+      readings the current stays constant until the servo's bus watchdog stops it.
+    - *position* (3): the servo's own position loop without a current limit. ``goal.current`` is
+      ignored, and torque on holds the joint at once. This mode suits moving but not grasping.
 
-    ``connect`` checks and never stiffens or moves the hand. ``read`` and ``write`` are called
-    once a tick; a failed exchange shows in ``valid`` and in the counters and raises nothing,
-    unless the port itself is gone.
+    ``connect`` checks the servos and never stiffens or moves the hand. ``read`` and ``write`` are
+    called once per tick. A failed exchange is reported by ``valid`` and the counters, and raises an
+    error only if the port itself is lost.
     """
 
     def connect(self) -> None:
-        """Open and check everything. Raises ServoError with the whole list of what is wrong."""
+        """Open the port and check all servos. Raises ServoError with a list of all problems."""
 
     def read(self, reading: Reading) -> None:
-        """Fill ``reading`` in place.
+        """Update ``reading`` in place.
 
-        After a failed exchange ``valid`` is False and everything but ``seq`` stays, so that
-        ``reading.t`` is the time of the last good one.
-        Temperature and voltage need not be fresher than a second.
+        After a failed exchange ``valid`` is False and all other fields except ``seq`` keep their
+        values, so ``reading.t`` is the time of the last good reading. Temperature and voltage may
+        be up to one second old.
         """
 
     def torque_on(self) -> None:
-        """Switch torque on and verify it; the goal is set to the present angle first.
+        """Set the goal to the present angle, switch torque on and verify it.
 
-        Raises ServoError when it could not be done or not be verified: it may be on then.
+        Raises ServoError if this fails or cannot be verified; torque may be on in that case.
         """
 
     def torque_off(self, reading: Reading) -> bool:
-        """Ask once for torque off and read, as `read` does; True once all servos confirm it.
+        """Request torque off once and read as `read` does; return True if all servos confirm it.
 
-        It waits no longer than `read`, so that the loop can ask at every tick until it is True.
-        Raises ServoError when the port is gone.
+        It waits no longer than `read`, so the loop can repeat it at every tick until it returns
+        True. Raises ServoError if the port is gone.
         """
 
     def write(self, goal: Goal) -> None:
-        """Send the goal angle and the current bound of each joint."""
+        """Send the goal angle and the current limit of each joint."""
 
     def counters(self) -> dict[str, int]:
-        """Return exchanges that went wrong since connect, by kind: ``timeouts``, ``crc``, …"""
+        """Return the number of failed exchanges since connect by kind: ``timeouts``, ``crc``, …"""
 
     def close(self) -> None:
-        """Switch torque off as far as the bus allows, then close. Never raises."""
+        """Switch torque off as far as the bus allows, and close the port. Never raises."""
 
 
 class JointPlant(Protocol):
-    """Simulated joints with their motors, behind the simulated and the emulated servos.
+    """Simulated joints with their motors, used by the simulated and the emulated servos.
 
-    Index 0 is the left finger's joint; positive closes.
+    Index 0 is the left finger's joint. Positive closes.
     """
 
-    q: FloatArray  # true joint angles [rad] at the time last advanced to
+    q: FloatArray  # true joint angles [rad] at the time of the last `advance`
     dq: FloatArray  # true joint velocities [rad/s]
     current: FloatArray  # true motor currents [A]
 
@@ -100,30 +101,34 @@ class JointPlant(Protocol):
         """Return the motor current [A] of a joint as its servo measures it."""
 
     def advance(self, t: float) -> None:
-        """Advance to time t [s]; a time that is past does nothing."""
+        """Advance to time t [s]; do nothing if t has passed."""
 
     def drive(
         self, joint: int, mode: int, torque_on: bool, goal_q: float, goal_current: float
     ) -> None:
         """Command a joint's servo from now on.
 
-        ``mode`` is 5 (current-based position: ``goal_current`` bounds the magnitude), 3 (position:
-        likewise, with the model's own limit) or 0 (current: ``goal_current`` is signed).
+        ``mode`` is 5 (current-based position), 3 (position) or 0 (current). In modes 5 and 3
+        ``goal_current`` limits the magnitude of the current; mode 3 uses the model's own limit. In
+        mode 0 it is the signed current.
         """
 
     def tune(self, joint: int, stiffness: float, damping: float, duty: float) -> None:
-        """Set a servo's position gains and PWM from now on.
+        """Set a servo's position gains and PWM limit from now on.
 
-        ``stiffness`` of its position loop is relative to the factory's, ``damping`` [s] of that
-        stiffness comes on top of the factory's, and ``duty`` is the share of the supply's voltage
-        that its motor may get.
+        Parameters
+        ----------
+        stiffness : stiffness of the position loop relative to the factory value
+        damping : damping added to the factory value, per unit of that stiffness [s]
+        duty : largest fraction of the supply voltage that the motor may receive
         """
 
 
 def make_servos(settings: Settings, clock: Clock, hand: object) -> Servos | None:
-    """Make the settings' servo backend, not yet connected; None in a scene without servos.
+    """Create the servo backend of the settings, unconnected; None in a scene without servos.
 
-    ``hand``: the simulated hand, for backends that need it. Raises as the backend does.
+    ``hand`` is the simulated hand, for backends that need it. Raises the errors of the backend's
+    constructor.
     """
     found = backend("servos", settings.servos.backend)
     if settings.servos.backend == "none":

@@ -1,6 +1,7 @@
-"""Checks of the servos before they are used: who answers, how each is set up, what is wrong.
+"""Check the servos before use: their replies, their registers and their limits.
 
-Everything is read and nothing changed; the findings of all servos come in one list, with fixes.
+The checks read registers and change nothing. The findings of all servos are collected in one list,
+with fixes.
 """
 
 from __future__ import annotations
@@ -30,37 +31,37 @@ OLD_PROTOCOL = (
     "for 2.0), or use one that speaks it",
 )
 _WATCHDOG_FIRMWARE = 38
-_LONG = 0.5  # s without an answer, from which on servos.fault_after is worth a notice
-_CONSTANT_OFF = 1.3  # factor by which a torque constant may differ from the data sheet's
+_LONG = 0.5  # s, value of servos.fault_after above which a notice is given
+_CONSTANT_OFF = 1.3  # allowed ratio of a torque constant to the data sheet's
 _NEAR_LIMIT = 10  # °C below the temperature limit
-# rad beyond the hand's limits at which a joint's angle is not believed: a wrong zero, or a servo
-# that forgot its turns when it was switched off.
+# rad beyond the hand's limits at which an angle is implausible. The cause is a wrong zero, or a
+# servo that lost its turn count when it was switched off.
 ANGLE_MARGIN = 0.25
 
 
 class Registers(bytes):
-    """A servo's registers from address 0 on; empty when they could not be read."""
+    """A servo's registers from address 0 on; empty if they could not be read."""
 
     def word(self, address: int) -> int:
         """Return a register of two bytes."""
         return int.from_bytes(self[address : address + 2], "little")
 
     def long(self, address: int) -> int:
-        """Return a register of four bytes, signed."""
+        """Return a signed register of four bytes."""
         return int.from_bytes(self[address : address + 4], "little", signed=True)
 
 
 @dataclass(frozen=True, slots=True)
 class Examined:
-    """One servo of the scene. ``errors`` keep it from being used, ``notices`` don't."""
+    """Result of the checks of one servo. It is unusable if ``errors`` is not empty."""
 
     finger: int
     id: int
-    replies: bool  # to a ping
+    replies: bool  # answers a ping
     table: Registers = field(default_factory=Registers)
     errors: tuple[Finding, ...] = ()
     notices: tuple[Finding, ...] = ()
-    misplaced: Finding | None = None  # its joint's angle can't be right
+    misplaced: Finding | None = None  # set if the joint angle is implausible
 
     @property
     def name(self) -> str:
@@ -98,7 +99,7 @@ def examine(line: ServoLine, settings: Settings, model: ServoModel) -> list[Exam
 
 
 def check_model(name: str, model: ServoModel, mode: int) -> Finding | None:
-    """Return why this model can't run in an operating mode; None when it can."""
+    """Return a finding if the model lacks an operating mode, otherwise None."""
     if mode in model.modes:
         return None
     problem = f"an {model.name} has no {reg.MODE_NAMES[mode]} mode"
@@ -110,14 +111,15 @@ def check_model(name: str, model: ServoModel, mode: int) -> Finding | None:
 def check_servo(
     name: str, model: ServoModel, table: Registers, settings: Settings, finger: int
 ) -> list[Finding]:
-    """Return the findings that keep a servo from being used.
+    """Return the findings that prevent the use of a servo.
 
-    Args:
-        name: how reports call it.
-        model: the model that the settings name.
-        table: its registers, at least up to the present temperature.
-        settings: how it must be set up.
-        finger: 0 left, 1 right.
+    Parameters
+    ----------
+    name : name of the servo in reports
+    model : model named in the settings
+    table : registers, at least up to the present temperature
+    settings : required configuration
+    finger : 0 left, 1 right
     """
     found: list[Finding] = []
 
@@ -157,7 +159,7 @@ def check_servo(
 
 
 def other_model(number: int, model: ServoModel) -> tuple[str, str]:
-    """Return what is wrong with a servo of another model than the settings', and its fix."""
+    """Describe a servo whose model differs from the settings', and the fix."""
     if reg.by_number(number) is not None:
         return f"is an {reg.name_of(number)}, not an {model.name}", "set servos.model"
     known = ", ".join(reg.MODELS)
@@ -175,7 +177,7 @@ def check_registers(
     finger: int,
     status: Status,
 ) -> list[Finding]:
-    """Return what registers hold that another program or hand needed, of one status."""
+    """Return findings of one status about registers that do not hold the required value."""
     found = []
     for row in required_registers(model, settings, finger, table[reg.FIRMWARE_VERSION]):
         wrong = row.wrong_in(table)
@@ -188,7 +190,7 @@ def check_registers(
 def notice_servo(
     name: str, model: ServoModel, table: Registers, settings: Settings, finger: int
 ) -> list[Finding]:
-    """Return the findings on a servo that can be used."""
+    """Return notices about a usable servo."""
     servos, firmware = settings.servos, table[reg.FIRMWARE_VERSION]
     if table.word(reg.MODEL_NUMBER) != model.number:
         return []
@@ -223,7 +225,7 @@ def notice_servo(
 
 
 def notice_strength(name: str, model: ServoModel, settings: Settings) -> list[Finding]:
-    """Return the findings on forces, torque constant and friction that a model can't have."""
+    """Return warnings about forces, torque constant and friction that do not fit the model."""
     gear, lever = settings.servos.gear_ratio, settings.hand.finger_length
     force = GRIP_FRACTION * settings.safety.force_max
     bound, constant = gear * model.stall[0] / lever, gear * model.torque_constant
@@ -245,10 +247,10 @@ def notice_strength(name: str, model: ServoModel, settings: Settings) -> list[Fi
 def check_angle(
     name: str, scale: JointScale, counts: int, hand: GeometrySettings, finger: int
 ) -> Finding | None:
-    """Return what is wrong with a joint's position; None when it lies near the hand's limits.
+    """Return a finding if a joint is far outside the hand's limits, otherwise None.
 
-    Torque on would swing such a joint back at once. After a reboot a servo counts from its first
-    turn again, which brings a lost turn back.
+    Torque on would move such a joint back at once. After a reboot a servo counts from its first
+    turn again, which corrects a lost turn.
     """
     low, high = hand.q_min[finger], hand.q_max[finger]
 
@@ -270,9 +272,9 @@ def check_angle(
 
 
 def check_latency_timer(path: str, reply_timeout: float, *sysfs: Path) -> Finding | None:
-    """Judge a USB adapter's latency timer against the time [s] a reply may take; None without one.
+    """Compare a USB adapter's latency timer with the allowed reply time [s]; None without a timer.
 
-    A reply waits in the adapter until the timer is over, so 16 ms hold a read to 60 Hz.
+    The adapter holds a reply until the timer expires, so 16 ms limit reads to 60 Hz.
     """
     place = latency_file(path, *sysfs)
     if place is None:

@@ -1,8 +1,8 @@
-"""The Dynamixel X series' control table: addresses, units, operating modes and models.
+"""Define the control table of Dynamixel X servos: addresses, units, modes and models.
 
-Plain data from the servo maker's manuals; what a joint's counts are in rad, rad/s and A is in
-`servos.joint`. The client and the emulated servos both read it, and share the CRC of their packets;
-nothing here talks to a servo.
+The data come from the manufacturer's manuals. `servos.joint` converts a joint's counts to rad,
+rad/s and A. The client and the emulated servos share this table and the packet CRC. This module
+does not communicate with servos.
 """
 
 from __future__ import annotations
@@ -77,13 +77,13 @@ INDIRECT_ADDRESS: Final = 168
 
 BAUD_RATES: Final = (9600, 57600, 115200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000)
 COUNTS_PER_TURN: Final = 4096
-VELOCITY_UNIT: Final = 0.229 * 2.0 * math.pi / 60.0  # rad/s a count
-ACCELERATION_UNIT: Final = 214.577 * 2.0 * math.pi / 3600.0  # rad/s² a count
-VOLTAGE_UNIT: Final = 0.1  # V a count
+VELOCITY_UNIT: Final = 0.229 * 2.0 * math.pi / 60.0  # rad/s per count
+ACCELERATION_UNIT: Final = 214.577 * 2.0 * math.pi / 3600.0  # rad/s² per count
+VOLTAGE_UNIT: Final = 0.1  # V per count
 RETURN_DELAY_UNIT: Final = 2e-6  # s a count
 WATCHDOG_UNIT: Final = 0.020  # s a count
 WATCHDOG_MAX: Final = 127
-WATCHDOG_ERROR: Final = 0xFF  # register 98 reads -1: goals are refused until 0 is written there
+WATCHDOG_ERROR: Final = 0xFF  # register 98 reads -1: goals are rejected until 0 is written
 
 # --- operating modes, register 11 ----------------------------------------------------------------
 
@@ -124,20 +124,20 @@ def hardware_error_names(status: int) -> str:
 
 # --- models --------------------------------------------------------------------------------------
 
-_SPECIFIC_HEAT = 0.9  # J/(g K), of plastic, aluminium and steel alike
-_CONVECTION = 10.0  # W/(m² K), of a body this small in still air
-SAG: Final = 0.35  # Ω of a simulated supply and its cable
+_SPECIFIC_HEAT = 0.9  # J/(g K), approximation for plastic, aluminium and steel
+_CONVECTION = 10.0  # W/(m² K), a small body in still air
+SAG: Final = 0.35  # Ω, simulated supply with its cable
 
 
 @dataclass(frozen=True, slots=True)
 class ServoModel:
-    """One model, in the registers' counts where no unit is given; defaults are factory values."""
+    """Data of one servo model, in register counts unless a unit is given, with factory defaults."""
 
     name: str
     number: int
     firmware: int  # the version the emulated servo reports
     highest_baud: int  # index into BAUD_RATES
-    current_unit: float  # A a count; 0 without a current sensor
+    current_unit: float  # A per count, 0 without a current sensor
     current_limit: int  # default and upper bound
     velocity_limit: int  # default
     velocity_max: int  # upper bound of the velocity limit
@@ -148,59 +148,59 @@ class ServoModel:
     position_gains: tuple[int, int, int]  # D, I, P
     shutdown: int
     drive_mode_max: int
-    fast_read_firmware: int  # first version that answers fast sync and fast bulk read
-    stall: tuple[float, float, float]  # N·m and A at a stall, at V
+    fast_read_firmware: int  # first version with fast sync read and fast bulk read
+    stall: tuple[float, float, float]  # stall torque [N·m] and current [A] at a voltage [V]
     mass: float  # g
     size: tuple[float, float, float]  # mm
     modes: tuple[int, ...] = tuple(MODE_NAMES)
-    pwm_slope: int | None = None  # default of register 62, where the model has it
-    small: bool = False  # X330 frame: its indirect map moved with firmware 53
-    gear_loss: float = 0.0  # share of the gears' torque that is friction, if published
+    pwm_slope: int | None = None  # default of register 62, None if the model lacks it
+    small: bool = False  # X330 frame, whose indirect map moved with firmware 53
+    gear_loss: float = 0.0  # fraction of the gear torque lost to friction, if published
 
     @property
     def senses_current(self) -> bool:
-        """True if the model measures and bounds motor current."""
+        """True if the model measures and limits motor current."""
         return self.current_unit > 0.0
 
     @property
     def baud_rates(self) -> tuple[int, ...]:
-        """The rates that register 8 can choose."""
+        """Baud rates that register 8 can select."""
         return BAUD_RATES[: self.highest_baud + 1]
 
     @property
     def stall_current(self) -> float:
-        """A: the greatest current the model allows (1 A where it can't sense current)."""
+        """Largest current that the model allows [A]; 1 A without a current sensor."""
         return self.current_limit * self.current_unit if self.senses_current else 1.0
 
     @property
     def torque_constant(self) -> float:
-        """N·m per A at the shaft; 0 without a current sensor."""
+        """Torque constant at the shaft [N·m/A]; 0 without a current sensor."""
         torque, current, _ = self.stall
         return torque / current if self.senses_current else 0.0
 
     @property
     def no_load_speed(self) -> float:
-        """rad/s at the shaft with full PWM and no load; the default velocity limit is about it."""
+        """Approximate no-load speed at full PWM [rad/s], taken from the default velocity limit."""
         return self.velocity_limit * VELOCITY_UNIT
 
     @property
     def supply(self) -> float:
-        """V: the middle of the supply's range."""
+        """Middle of the supply voltage range [V]."""
         return (self.voltage_min + self.voltage_max) / 2.0 * VOLTAGE_UNIT
 
     @property
     def resistance(self) -> float:
-        """Ω that the stall's current meets, the driver's included."""
+        """Electrical resistance at stall [Ω], including the driver."""
         return self.stall[2] / self.stall[1]
 
     @property
     def heat_capacity(self) -> float:
-        """J/K: of its mass."""
+        """Heat capacity [J/K], estimated from the mass."""
         return _SPECIFIC_HEAT * self.mass
 
     @property
     def case_resistance(self) -> float:
-        """K/W between case and still air: of its surface."""
+        """Thermal resistance between case and still air [K/W], estimated from the surface area."""
         a, b, c = (1e-3 * side for side in self.size)
         return 1.0 / (_CONVECTION * 2.0 * (a * b + b * c + c * a))
 
@@ -213,7 +213,7 @@ class ServoModel:
         return ((INDIRECT_ADDRESS, 224, 28),)
 
     def fast_read(self, firmware: int) -> bool:
-        """Return whether this firmware answers fast sync read and fast bulk read."""
+        """Return True if this firmware supports fast sync read and fast bulk read."""
         return firmware >= self.fast_read_firmware
 
     def highest_address(self, firmware: int) -> int:
@@ -223,13 +223,14 @@ class ServoModel:
 
 _ALL = tuple(MODE_NAMES)
 _WITHOUT_CURRENT = (VELOCITY_MODE, POSITION_MODE, EXTENDED_POSITION_MODE, PWM_MODE)
-# A row a model, as ServoModel's fields follow each other: name, number, firmware, highest baud, A a
-# count, current limit, velocity limit and its bound, °C, 0.1 V; then gains, shutdown and the rest.
+# One row per model, in the order of ServoModel's fields: name, number, firmware, highest baud, A
+# per count, current limit, velocity limit and its bound, °C, 0.1 V, gains, shutdown and the rest.
 # Sources: the model's page of ROBOTIS' e-Manual, emanual.robotis.com/docs/en/dxl/x/NAME/ or
-# …/mx/NAME-2/ (specifications and both areas of the control table), and the numbers of
-# dynamixel-sdk's control_table/dynamixel.model, where they differ (XD430). The velocity limits of
-# XH430-V, XH540-V270, XM540-W150, MX-64 and MX-106 are their no-load speeds: the manual's are of
-# firmware before 42. The XW430-T200 is left out: its page prints another model's stall.
+# …/mx/NAME-2/ (specifications and both areas of the control table), and for differing model numbers
+# (XD430) dynamixel-sdk's control_table/dynamixel.model. The velocity limits of XH430-V, XH540-V270,
+# XM540-W150, MX-64 and MX-106 are their no-load speeds, because the manual's values apply to
+# firmware before 42. The XW430-T200 is omitted because its page prints another model's stall
+# torque.
 _430 = 82, (28.5, 46.5, 34.0)  # g, mm
 _540 = 165, (33.5, 58.5, 44.0)
 _XW540 = 185, (33.5, 58.5, 45.9)
@@ -299,10 +300,12 @@ MODELS: Final = {row[0]: ServoModel(*row) for row in _MODELS}
 
 
 def by_name(name: str) -> ServoModel:
-    """Return the model of that name; a connector suffix (``-T``, ``-R``) is not needed.
+    """Return the model with this name; a connector suffix (``-T``, ``-R``) is optional.
 
-    Raises:
-        KeyError: no such model; the message names the known ones.
+    Raises
+    ------
+    KeyError
+        The model is unknown. The message lists the known models.
     """
     plain = name.upper().removesuffix("-T").removesuffix("-R")
     model = MODELS.get(plain)
@@ -312,13 +315,13 @@ def by_name(name: str) -> ServoModel:
 
 
 def name_of(number: int) -> str:
-    """Return the name of the model with this ``number`` in its ping; the number if unknown."""
+    """Return the name of the model with this ``number``, or the number if it is unknown."""
     names = [model.name for model in MODELS.values() if model.number == number]
     return names[0] if names else f"model number {number}"
 
 
 def by_number(number: int) -> ServoModel | None:
-    """Return the model with this ``number`` in its ping; None if unknown."""
+    """Return the model with this ``number``, or None if it is unknown."""
     return next((model for model in MODELS.values() if model.number == number), None)
 
 
@@ -333,7 +336,7 @@ _CRCS: Final = [_crc_of(byte) for byte in range(256)]
 
 
 def crc16(data: bytes, crc: int = 0) -> int:
-    """Return CRC-16 (polynomial 0x8005, initial 0) that ends every packet."""
+    """Return the CRC-16 (polynomial 0x8005, initial value 0) that ends every packet."""
     for byte in data:
         crc = crc << 8 & 0xFF00 ^ _CRCS[crc >> 8 ^ byte]
     return crc

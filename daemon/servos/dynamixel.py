@@ -1,11 +1,14 @@
-"""The hand's joints through dynamixel-sdk: check at connect, one read and one write a tick.
+"""Drive the joints through dynamixel-sdk: check at connect, then one read and one write per tick.
 
-Current, velocity, position and the alert bit of all servos come in one fast sync read (sync read
-where a firmware is older). Now and then that read reaches further, which costs no exchange: every
-10 ms to the goals the servo holds, its bus watchdog and its own clock, 28 bytes a servo more, and
-four times a second to supply voltage and temperature, 11 bytes. Goal current and goal position go
-in one sync write, side by side (:mod:`servos.torque`); in current and position mode there is
-one goal and no indirection. What a servo must be set to in EEPROM is checked and never changed.
+One fast sync read returns the current, velocity, position and alert bit of all servos; older
+firmware uses the normal sync read. Some of these reads cover more registers, without an additional
+exchange. Every 10 ms a read includes the goals held by the servo, its bus watchdog and its own
+clock, which are 28 more bytes per servo. Four times a second a read includes supply voltage and
+temperature, which are 11 more bytes.
+
+One sync write sends goal current and goal position side by side (:mod:`servos.torque`). Current and
+position mode have a single goal and need no indirect addresses. Required EEPROM values are checked
+and never changed.
 """
 
 from __future__ import annotations
@@ -51,20 +54,20 @@ _SUPPLY = struct.Struct("<HB").unpack_from  # voltage, temperature
 _CLOCK = struct.Struct("<H").unpack_from
 _HEALTH_EVERY = 0.25  # s
 _CHECK_EVERY = 0.01  # s
-_CHECK_FRACTION = 0.05  # of the line's time that checks may take
-_SENT_LATELY = 0.035  # s for which a goal counts as sent lately
-_FROZEN = 0.1  # s in which a servo's own clock, of 1 ms, must advance
-_DOUBTFUL = 32  # requests after one without a reply, whose spans have different lengths
-_PATIENCE = 0.2  # s for a reply while the servos are checked; `clear` holds the loop up for it
-# s for a reply of an emulated hand, which the machine may hold up while the hand's time stands.
+_CHECK_FRACTION = 0.05  # largest fraction of the line's capacity used by checks
+_SENT_LATELY = 0.035  # s for which a goal counts as recent
+_FROZEN = 0.1  # s in which a servo's 1 ms clock must advance
+_DOUBTFUL = 32  # requests with varying span lengths after a missing reply
+_PATIENCE = 0.2  # s for a reply during the checks; `clear` blocks the loop for this time
+# s for a reply of an emulated hand, which the machine may delay while the hand's time pauses
 _BUSY = 0.04
-_LAST_TRIES = 10  # of torque off, at the end
+_LAST_TRIES = 10  # tries of torque off when closing
 
 
 class DynamixelServos:
     """Servo backend over a serial port; see :class:`servos.base.Servos`.
 
-    One thread, one owner. ``notices`` holds what connect found worth saying and not wrong.
+    It must be used by a single thread. ``notices`` holds findings of `connect` that are not errors.
     """
 
     def __init__(self, settings: Settings, clock: Clock) -> None:
@@ -78,10 +81,10 @@ class DynamixelServos:
         self._line: ServoLine | None = None
         self._torque: Torque | None = None
         self._reads: TickReads | None = None
-        self._waiting: SerialPort | None = None  # open, since the servos did not answer on it yet
-        self._turn = 0  # which length was read last
-        self._doubtful = 0  # requests to come whose replies may be mistaken for each other's
-        self._next_health = self._next_check = -math.inf  # by the clock
+        self._waiting: SerialPort | None = None  # open port, waiting for the servos to answer
+        self._turn = 0  # index of the last span length
+        self._doubtful = 0  # coming requests whose replies could be confused
+        self._next_health = self._next_check = -math.inf  # clock time of the next reads
         self._check_every = _CHECK_EVERY
         self._retries = 0
         self._alerts = 0
@@ -89,12 +92,15 @@ class DynamixelServos:
     # --- connect ---------------------------------------------------------------------------------
 
     def connect(self) -> None:
-        """Open the port, again if it is open, and check every servo; changes nothing in them.
+        """Open or reopen the port and check every servo, without changing any register.
 
-        Raises:
-            ServoError: all that is wrong, one line each. The port is closed again.
-            ServosSilent: servos do not answer, and nothing else is wrong. The port stays open for
-                the next call: opening it anew may restart an adapter that is still booting.
+        Raises
+        ------
+        ServoError
+            Problems were found; the message has one line for each. The port is closed again.
+        ServosSilent
+            Servos do not answer, with no other problem. The port stays open for the next call,
+            because reopening may restart an adapter that is still booting.
         """
         waiting, self._waiting = self._waiting, None
         self.close()
@@ -146,9 +152,9 @@ class DynamixelServos:
         return reads
 
     def _judge(self, found: list[Examined], port: SerialPort, allowed: float) -> None:
-        """Set limits and notices by what was found; a reply may take ``allowed`` s in a tick.
+        """Set limits and notices from the results; ``allowed`` is the reply time in a tick [s].
 
-        Raises ServoError with all that is wrong.
+        Raises ServoError with a list of all problems.
         """
         if not any(each.replies or each.errors for each in found):
             raise ServosSilent(
@@ -184,10 +190,12 @@ class DynamixelServos:
     # --- the tick --------------------------------------------------------------------------------
 
     def read(self, reading: Reading) -> None:
-        """Fill ``reading`` from one group read; a damaged reply is asked for once more in time.
+        """Update ``reading`` from one group read, repeated once in time after a damaged reply.
 
-        Raises:
-            ServoError: the port is gone, or a servo's bus watchdog has stopped it.
+        Raises
+        ------
+        ServoError
+            The port is gone, or a servo's bus watchdog has stopped it.
         """
         now = self._clock.now()
         if now >= self._next_health:
@@ -204,7 +212,7 @@ class DynamixelServos:
             self._exchange(PRESENT, reading)
 
     def _exchange(self, span: Span, reading: Reading) -> GroupRead | None:
-        """Read a span that has the joints' motion in it, and fill ``reading``."""
+        """Read a span that includes the joints' motion, and update ``reading``."""
         if self._reads is None:
             raise ServoError("servos: not connected")
         reading.seq += 1
@@ -215,7 +223,7 @@ class DynamixelServos:
         group = self._reads.spans[span][turn]
         result = group.exchange()
         if result == COMM_RX_CORRUPT:
-            # Once more, with what is left of the first exchange's deadline.
+            # Repeat the read within the deadline of the first exchange.
             deadline = group.port.deadline
             if time.monotonic() < deadline:
                 self._retries += 1
@@ -250,7 +258,7 @@ class DynamixelServos:
             reading.temperature[joint.finger] = float(temperature)
 
     def _check_torque(self, group: GroupRead, reading: Reading, now: float) -> None:
-        """Check that each servo's own clock advances, and that it holds a goal that was sent."""
+        """Check that each servo's clock advances and that it holds a recently sent goal."""
         start, torque = group.start, self._torque
         assert torque is not None
         reading.lost = reading.frozen = 0
@@ -265,7 +273,7 @@ class DynamixelServos:
                 reading.lost |= 1 << joint.finger
 
     def _ask_errors(self, reading: Reading) -> None:
-        """Read what the servos' alert means, once."""
+        """Read the hardware error registers that explain an alert."""
         assert self._reads is not None
         errors = self._reads.errors
         if errors.exchange() == COMM_SUCCESS:
@@ -273,10 +281,12 @@ class DynamixelServos:
                 reading.hardware[joint.finger] = errors.data[joint.id][0]
 
     def write(self, goal: Goal) -> None:
-        """Send goal angles and current bounds; nothing while torque was not switched on here.
+        """Send goal angles and current limits; does nothing unless torque was switched on here.
 
-        Raises:
-            ServoError: the port is gone.
+        Raises
+        ------
+        ServoError
+            The port is gone.
         """
         torque = self._torque
         if torque is None or torque.goals is None:
@@ -290,20 +300,24 @@ class DynamixelServos:
         torque.goals.send(values)
 
     def torque_on(self) -> None:
-        """Switch torque on and verify it: at the present angle, with no current yet.
+        """Switch torque on at the present angle with zero current, and verify it.
 
-        Raises:
-            ServoError: it could not be done or not be verified, and may be on.
+        Raises
+        ------
+        ServoError
+            Torque on failed or could not be verified. Torque may be on.
         """
         if self._torque is None:
             raise ServoError("servos: not connected")
         self._torque.on()
 
     def torque_off(self, reading: Reading) -> bool:
-        """Ask for torque off, and read; whether every servo's register confirms it.
+        """Request torque off and read; return True if every servo's register confirms it.
 
-        Raises:
-            ServoError: the port is gone.
+        Raises
+        ------
+        ServoError
+            The port is gone.
         """
         torque = self._torque
         if torque is None:
@@ -319,10 +333,10 @@ class DynamixelServos:
         reading.lost = 0
         return True
 
-    # --- the end ---------------------------------------------------------------------------------
+    # --- closing ---------------------------------------------------------------------------------
 
     def counters(self) -> dict[str, int]:
-        """Return exchanges that went wrong since connect, by kind."""
+        """Return the number of failed exchanges since connect, by kind."""
         handler = self._handler
         return {
             "timeouts": handler.timeouts,
@@ -336,9 +350,9 @@ class DynamixelServos:
         }
 
     def close(self) -> None:
-        """Switch torque off and verify it as far as the bus allows, then close. Never raises.
+        """Switch torque off, verify it as far as the bus allows, and close. Never raises.
 
-        A servo whose torque another program switched on is left as it was found.
+        Torque that another program switched on is left unchanged.
         """
         if self._waiting is not None:
             with contextlib.suppress(Exception):

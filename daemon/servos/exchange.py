@@ -1,6 +1,6 @@
-"""The exchanges of a tick: group reads of all servos, the kind that they answer, their duration.
+"""Perform the group reads of a tick, choose their kind, and measure their duration.
 
-The daemon and `doctor` use the same ones, so that `doctor` tries what the daemon will do.
+The daemon and `doctor` share this code, so `doctor` tests the exchanges that the daemon uses.
 """
 
 from __future__ import annotations
@@ -20,25 +20,25 @@ from softfinger.daemon.servos.port import SerialPort
 from softfinger.daemon.servos.protocol import TRIES, FastGroupRead, GroupRead, PacketHandler
 
 Span = tuple[int, int]  # first and last register
-# What one exchange reads: most ticks' own; with the goals and the bus watchdog; with the supply;
-# from torque enable on.
+# Spans of one exchange: most ticks; with the goals and the bus watchdog; with the supply; from
+# torque enable on.
 PRESENT: Span = (reg.PRESENT_CURRENT, reg.PRESENT_POSITION + 3)
 CHECK: Span = (reg.BUS_WATCHDOG, reg.PRESENT_POSITION + 3)
 HEALTH: Span = (reg.PRESENT_CURRENT, reg.PRESENT_TEMPERATURE)
 ENABLED: Span = (reg.TORQUE_ENABLE, reg.PRESENT_POSITION + 3)
-# A reply may come after its deadline, and be taken for the next request's. So after a request
-# without a reply the next ones ask for spans of different lengths, which distinguishes the replies.
-LENGTHS = 11  # of each span: the shortest, and up to ten registers before it
+# A late reply could be mistaken for the reply to the next request. After a request without a reply,
+# the next requests therefore use spans of different lengths, which distinguishes the replies.
+LENGTHS = 11  # per span: the shortest one and up to ten registers before it
 
-EXCHANGES = 50  # that `doctor` times
-_WAIT = 0.1  # s for a reply that is timed, however little `servos.reply_timeout` allows
-_AT_START = 9  # reads of which the quickest tells what a reply takes at least
-_FULL = 0.8  # of a tick that a reply may take
-_LOST_WARN, _LOST_FAIL = 0.02, 0.2  # share of the exchanges that fail
+EXCHANGES = 50  # number that `doctor` times
+_WAIT = 0.1  # s for a timed reply, even if `servos.reply_timeout` is shorter
+_AT_START = 9  # reads at connect, of which the fastest gives the minimum reply time
+_FULL = 0.8  # largest fraction of a tick for a reply
+_LOST_WARN, _LOST_FAIL = 0.02, 0.2  # fraction of failed exchanges
 
 
 class TickReads:
-    """The group reads of a tick, all of one kind, in all the lengths that they may have."""
+    """Hold the group reads of a tick, all of one kind, in all their span lengths."""
 
     def __init__(
         self,
@@ -68,11 +68,11 @@ class TickReads:
 def choose_reads(
     port: SerialPort, handler: PacketHandler, ids: Sequence[int], claims_fast: bool
 ) -> tuple[TickReads, list[Finding]]:
-    """Return the quickest group reads that the servos do answer, and a notice of a false claim.
+    """Return the fastest group reads that all servos answer, and notices.
 
-    ``claims_fast``: their firmware is new enough for fast sync reads.
-
-    Raises ServoError when they answer no group read at all.
+    ``claims_fast`` is True if the firmware should support fast sync reads. If these fail, the
+    normal sync read is used and a notice is returned. Raises ServoError if no group read is
+    answered.
     """
     notices: list[Finding] = []
     if claims_fast:
@@ -93,7 +93,7 @@ def choose_reads(
 
 
 class ExchangeTimes(NamedTuple):
-    """Durations of exchanges [s], and the share of them that failed."""
+    """Durations of exchanges [s] and the fraction that failed."""
 
     least: float
     p50: float
@@ -107,10 +107,10 @@ def time_exchanges(
     write: Callable[[], None] | None = None,
     count: int = EXCHANGES,
 ) -> ExchangeTimes:
-    """Read and write ``count`` times as a tick does, one exchange right after the other.
+    """Time ``count`` exchanges, reading and writing as a tick does, without pauses.
 
-    A read waits on the wire for the write before it, so its duration has both. ``write``: None
-    leaves the writes out. A reply is waited for up to 0.1 s.
+    A read waits on the wire for the preceding write, so its duration includes both. With ``write``
+    None only reads are timed. Each reply may take up to 0.1 s.
     """
     allowed, port.reply_timeout = port.reply_timeout, max(port.reply_timeout, _WAIT)
     group, durations, failed = reads.spans[PRESENT][0], [], 0
@@ -138,10 +138,10 @@ def time_exchanges(
 def judge_exchanges(
     times: ExchangeTimes, settings: Settings, what: str, emulated: bool = False
 ) -> Finding:
-    """Compare the durations of the tick's exchanges with the tick and ``servos.reply_timeout``.
+    """Compare the duration of exchanges with the tick and with ``servos.reply_timeout``.
 
-    ``what`` was timed, for the report. An ``emulated`` hand shares the processors with its
-    clients, so only its fastest exchange shows its own delay.
+    ``what`` names the timed exchanges in the report. An ``emulated`` hand shares the processors
+    with its clients, so the fastest exchange is compared instead of the 99th percentile.
     """
     decisive = times.least if emulated else times.p99
     rate, allowed = settings.loop.rate, settings.servos.reply_timeout
@@ -164,7 +164,7 @@ def judge_exchanges(
 
 
 def note_slow_replies(port: SerialPort, reads: TickReads, settings: Settings) -> list[Finding]:
-    """Return a notice if the quickest of a few reads takes most of a tick."""
+    """Return a notice if the fastest of a few reads takes most of a tick."""
     least = time_exchanges(port, reads, count=_AT_START).least
     rate = settings.loop.rate
     if least * rate <= _FULL:
@@ -178,7 +178,7 @@ def note_slow_replies(port: SerialPort, reads: TickReads, settings: Settings) ->
 
 
 def _remedy(duration: float, settings: Settings) -> str:
-    """Return what gives replies of this duration [s] their time."""
+    """Return the settings that allow replies of this duration [s]."""
     rate = _FULL / duration
     digit = 10.0 ** max(len(str(int(rate))) - 2, 0)
     parts = []

@@ -1,4 +1,4 @@
-"""One joint and its servo: counts in SI units, bounds, last reading, goals for the registers."""
+"""Represent one joint and its servo: unit conversion, limits, last reading and packed goals."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.control_table import ServoModel, by_name
 from softfinger.daemon.types import FINGERS
 
-_GOAL_LIMIT = 1_048_575  # counts: the furthest goal the multi-turn modes take
+_GOAL_LIMIT = 1_048_575  # counts, largest goal that the multi-turn modes accept
 _CURRENT_AND_POSITION = struct.Struct("<hi")
 _CURRENT = struct.Struct("<h")
 _POSITION = struct.Struct("<i")
@@ -25,16 +25,16 @@ GOAL_SIZE: Final = {
 
 
 def servo_name(servo_id: int, finger: int) -> str:
-    """Return ``servo 1 (left)``, as reports call it."""
+    """Return the name of a servo in reports, such as ``servo 1 (left)``."""
     return f"servo {servo_id} ({FINGERS[finger]})"
 
 
 def current_toward(
     servos: ServoSettings, goal_q: float, bound: float, q: float, dq: float
 ) -> float:
-    """Return the current [A], positive closing, of current mode's position loop.
+    """Return the current [A], positive closing, of the position loop in current mode.
 
-    stiffness · (goal_q − q) − damping · dq, within ± ``bound``.
+    stiffness · (goal_q − q) − damping · dq, limited to ± ``bound``.
     """
     bound = abs(bound)
     current = servos.stiffness * (goal_q - q) - servos.damping * dq
@@ -46,21 +46,23 @@ class JointScale:
     """Conversion of one joint's counts to rad, rad/s and A.
 
     q = direction · (counts − zero) · 2π / 4096 / gear_ratio, and likewise for velocity. Currents
-    keep the motor's own ampere; only the sign follows the joint, so that positive closes.
+    remain motor currents; only their sign follows the joint, so that positive closes.
     """
 
     direction: int  # +1 or -1: sign of the counts when the joint closes
     zero: int  # counts at q = 0
-    radian: float  # rad of the joint a position count, always > 0
-    velocity: float  # rad/s of the joint a velocity count, always > 0
-    current_unit: float  # A a current count
+    radian: float  # rad of the joint per position count, always > 0
+    velocity: float  # rad/s of the joint per velocity count, always > 0
+    current_unit: float  # A per current count
 
     @classmethod
     def of(cls, servos: ServoSettings, joint: int, model: ServoModel | None = None) -> JointScale:
-        """Return the scale of joint 0 (left) or 1 (right) under the settings.
+        """Return the scale of joint 0 (left) or 1 (right) for these settings.
 
-        Raises:
-            KeyError: the settings name a model that is not in the table.
+        Raises
+        ------
+        KeyError
+            The servo model in the settings is unknown.
         """
         model = by_name(servos.model) if model is None else model
         return cls(
@@ -72,57 +74,57 @@ class JointScale:
         )
 
     def angle(self, counts: float) -> float:
-        """Return joint angle [rad] of a position in counts."""
+        """Convert a position in counts to a joint angle [rad]."""
         return self.direction * (counts - self.zero) * self.radian
 
     def rate(self, counts: float) -> float:
-        """Return joint velocity [rad/s] of a velocity in counts."""
+        """Convert a velocity in counts to a joint velocity [rad/s]."""
         return self.direction * counts * self.velocity
 
     def amperes(self, counts: float) -> float:
-        """Return motor current [A], positive closing, of a signed current in counts."""
+        """Convert a signed current in counts to a motor current [A], positive closing."""
         return self.direction * counts * self.current_unit
 
     def position_counts(self, q: float) -> int:
-        """Return the count nearest to the joint angle q [rad] within a goal's range."""
+        """Convert a joint angle [rad] to the nearest count within the range of goals."""
         counts = self.zero + self.direction * q / self.radian
         return round(min(max(counts, -_GOAL_LIMIT), _GOAL_LIMIT))
 
     def velocity_counts(self, dq: float) -> int:
-        """Return velocity in counts nearest to dq [rad/s]."""
+        """Convert a joint velocity [rad/s] to the nearest count."""
         return round(self.direction * dq / self.velocity)
 
     def current_counts(self, current: float) -> int:
-        """Return the signed current in counts nearest to a motor current [A], positive closing."""
+        """Convert a motor current [A], positive closing, to the nearest signed count."""
         return round(self.direction * current / self.current_unit) if self.current_unit else 0
 
     def bound_counts(self, current: float) -> int:
-        """Return the counts of a bound on the current's magnitude [A], rounded down."""
+        """Convert a current limit [A] to counts, rounded down."""
         return int(abs(current) / self.current_unit + 1e-9) if self.current_unit else 0
 
 
 @dataclass(slots=True)
 class Joint:
-    """A finger's joint on the bus."""
+    """State of a finger's joint on the bus."""
 
     finger: int
     id: int
     scale: JointScale
-    bound: int = 0  # greatest goal current in counts
+    bound: int = 0  # largest goal current in counts
     ends: tuple[int, int] = (0, 0)  # position limits in counts
-    q: float = 0.0  # of the last good reading [rad]
+    q: float = 0.0  # angle of the last good reading [rad]
     dq: float = 0.0  # [rad/s]
-    sent: deque[bytes] = field(default_factory=deque)  # the last goals, as registers hold them
-    ticks: int = -1  # of the servo's own clock, when that was last read
-    ticked: float = math.inf  # when that was last seen to advance, by the hand's clock
+    sent: deque[bytes] = field(default_factory=deque)  # recent goals as register bytes
+    ticks: int = -1  # servo's own clock at the last check
+    ticked: float = math.inf  # time when that clock last advanced [s]
 
     @property
     def name(self) -> str:
-        """Name of its servo in reports."""
+        """Name of the joint's servo in reports."""
         return servo_name(self.id, self.finger)
 
     def goal(self, servos: ServoSettings, mode: int, q: float, current: float) -> bytes:
-        """Return a goal [rad, A] as the registers of this mode hold it."""
+        """Return the register bytes of a goal [rad, A] in this mode."""
         scale, position = self.scale, self.scale.position_counts(q)
         counts = bound = min(scale.bound_counts(current), self.bound)
         if mode == reg.POSITION_MODE:
@@ -134,7 +136,7 @@ class Joint:
 
 
 def pack_goal(mode: int, current: int, position: int) -> bytes:
-    """Return a goal in counts as the registers of this mode hold it."""
+    """Return the register bytes of a goal in counts in this mode."""
     if mode == reg.POSITION_MODE:
         return _POSITION.pack(position)
     if mode == reg.CURRENT_MODE:
@@ -143,7 +145,7 @@ def pack_goal(mode: int, current: int, position: int) -> bytes:
 
 
 def goal_in(mode: int, table: bytes, start: int) -> bytes:
-    """Return the goal that a servo holds; ``table`` has its registers from ``start`` on."""
+    """Extract the goal that a servo holds from its registers ``table``, starting at ``start``."""
     current = table[reg.GOAL_CURRENT - start : reg.GOAL_CURRENT - start + _CURRENT.size]
     position = table[reg.GOAL_POSITION - start : reg.GOAL_POSITION - start + _POSITION.size]
     if mode == reg.POSITION_MODE:

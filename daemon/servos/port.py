@@ -1,6 +1,6 @@
-"""The SDK's port over pyserial, exclusive, with a monotonic deadline for each exchange.
+"""Open a serial port exclusively for the SDK, with a monotonic deadline for each exchange.
 
-Why the SDK's own port is not used is listed in :mod:`servos.protocol`.
+:mod:`servos.protocol` lists the reasons for not using the SDK's own port.
 """
 
 from __future__ import annotations
@@ -19,39 +19,39 @@ from dynamixel_sdk.port_handler import PortHandler
 from softfinger.daemon.errors import ServoError
 from softfinger.daemon.port_access import bring_it, grant
 
-with contextlib.suppress(ModuleNotFoundError):  # Windows: simulated servos alone
+with contextlib.suppress(ModuleNotFoundError):  # Windows supports only simulated servos
     import termios
 
 BITS_PER_BYTE = 10
-# s for a reply where nothing hurries (setting up, calibrating): a factory-new servo with its return
-# delay, behind a slow adapter, on a busy machine.
+# s for a reply outside the loop (setup, calibration). It covers a new servo with its factory return
+# delay behind a slow adapter on a busy machine.
 UNHURRIED = 0.5
 _READ_SIZE = 4096
 _SYSFS = Path("/sys/class/tty")
 
 
 def latency_file(path: str, sysfs: Path = _SYSFS) -> Path | None:
-    """Return where the kernel keeps a USB adapter's latency timer [ms]; None where it has none."""
+    """Return the kernel's file of a USB adapter's latency timer [ms], or None without one."""
     place = sysfs / Path(os.path.realpath(path)).name / "device" / "latency_timer"
     return place if place.exists() else None
 
 
 class PortGone(ServoError):
-    """The port went away while it was open: adapter unplugged, or its power lost."""
+    """The open port disappeared: adapter unplugged or without power."""
 
 
 class SerialPort(PortHandler):  # type: ignore[misc]
     """An exclusive serial port for one thread.
 
-    A reply may take ``reply_timeout`` seconds, and more only where the bytes alone take longer on
-    the wire. ``received`` holds bytes that came and are not taken as a packet yet, ``deadline``
-    the time.monotonic() at which the exchange under way ends.
+    A reply may take ``reply_timeout`` seconds, or longer if the transmission of its bytes alone
+    takes longer. ``received`` holds received bytes that are not decoded yet. ``deadline`` is the
+    time.monotonic() at which the current exchange ends.
     """
 
     def __init__(
         self, path: str, baud: int, reply_timeout: float, low_latency: bool = True
     ) -> None:
-        """``low_latency``: ask an adapter for its low-latency mode when the port is opened."""
+        """``low_latency`` requests the adapter's low-latency mode when the port is opened."""
         super().__init__(path)
         self._low_latency = low_latency
         self.baudrate = baud
@@ -74,23 +74,24 @@ class SerialPort(PortHandler):  # type: ignore[misc]
             if self._low_latency:
                 self.ser.set_low_latency_mode(True)
         except (OSError, ValueError, NotImplementedError, AttributeError):
-            pass  # a pseudo-terminal or an adapter without that mode; see latency_file()
+            pass  # pseudo-terminals and some adapters lack this mode; see latency_file()
         self.received.clear()
         self.ser.reset_input_buffer()
         return True
 
     def closePort(self) -> None:
-        """Close the port; harmless when it is closed."""
+        """Close the port. Does nothing if it is closed."""
         if self.ser is not None:
             self.ser.close()
         self.is_open = False
         self._descriptor = -1
 
     def send(self, packet: bytes, reply: int = 0, until: float = math.inf) -> bool:
-        """Send a packet; whether all of it went out.
+        """Send a packet; return True if it was sent completely.
 
-        With ``reply`` bytes to come, older input is dropped first, so that it isn't taken for the
-        answer, and their deadline starts, not later than ``until`` [s, time.monotonic()].
+        If ``reply`` bytes are expected, older input is discarded first, so that it is not mistaken
+        for the reply, and the reply's deadline starts. The deadline is not later than ``until`` [s,
+        time.monotonic()].
         """
         remaining = packet
         try:
@@ -111,13 +112,13 @@ class SerialPort(PortHandler):  # type: ignore[misc]
         return True
 
     def setPacketTimeout(self, packet_length: int) -> None:
-        """Start the deadline of a reply of so many bytes."""
+        """Start the deadline of a reply of ``packet_length`` bytes."""
         wire = (packet_length + self._sent) * BITS_PER_BYTE / self.baudrate
-        # Where a slow rate alone eats the deadline: twice the wire's time and the return delays.
+        # At slow baud rates, allow twice the transmission time and the return delays.
         self.deadline = time.monotonic() + max(self.reply_timeout, 2.0 * wire + 0.001)
 
     def fill(self) -> bool:
-        """Wait for bytes into ``received``; False when the deadline came first."""
+        """Wait for bytes and append them to ``received``; return False at the deadline."""
         try:
             remaining = max(0.0, self.deadline - time.monotonic())
             if not select.select((self._descriptor,), (), (), remaining)[0]:

@@ -1,18 +1,18 @@
-"""The client's side of Protocol 2.0: the SDK's packet handler, group exchanges, single servos.
+"""Implement the client side of Protocol 2.0: packet handler, group exchanges, single servos.
 
-What the SDK (3.7.31 to 4.1.0) does otherwise than the daemon needs, with its consequence; each is
-overridden here or in :mod:`servos.port`, and everything else of the SDK is used as it is:
+This module and :mod:`servos.port` override the following behaviour of the SDK (3.7.31 to 4.1.0) and
+use the rest of it unchanged:
 
-- ``txPacket`` drops the stuffed packet: FF FF FD within goals is sent unstuffed and misread.
-- ``removeStuffing`` loses a byte of FF FF FD 12 FF FD FD: 3-8 % of group reads were seen to fail.
-- ``rxPacket`` spins on non-blocking reads: a processor is busy for the whole wire's time.
-- ``txPacket`` leaves ``is_using`` set when the port raises: every later call returns −1000.
-- ``readTxRx`` takes a reply of another length: an old reply's CRC is returned as data.
-- ``GroupSyncRead`` drops the servos' error bytes and reads 0 after a failure: an alert is lost,
-  and a joint seems to be at 0.
-- ``broadcastPing`` always waits for 253 servos: 0.8 s at 1 Mbaud.
-- ``PortHandler`` measures deadlines on the wall clock and adds 34 ms: a missing servo costs 35 ms,
-  a clock that is set any time. It also opens a port that another process already uses.
+- ``txPacket`` drops the stuffed packet, so FF FF FD within goals is sent unstuffed and misread.
+- ``removeStuffing`` loses a byte of FF FF FD 12 FF FD FD; 3-8 % of group reads failed in tests.
+- ``rxPacket`` polls non-blocking reads, which keeps a processor busy during the transmission.
+- ``txPacket`` leaves ``is_using`` set if the port raises, so every later call returns −1000.
+- ``readTxRx`` accepts replies of a wrong length, so the CRC of a late reply is returned as data.
+- ``GroupSyncRead`` drops the servos' error bytes and returns 0 after a failure. An alert is lost,
+  and a joint appears to be at 0.
+- ``broadcastPing`` always waits for 253 servos, which takes 0.8 s at 1 Mbaud.
+- ``PortHandler`` measures deadlines on the wall clock and adds 34 ms. A missing servo costs 35 ms,
+  and setting the clock changes the deadline. It also opens a port that another process uses.
 """
 
 from __future__ import annotations
@@ -44,21 +44,21 @@ from dynamixel_sdk.robotis_def import (
 from softfinger.daemon.servos.control_table import crc16
 from softfinger.daemon.servos.port import UNHURRIED, SerialPort
 
-TRIES = 3  # of an exchange outside the tick
+TRIES = 3  # tries of an exchange outside the tick
 _HEADER = b"\xff\xff\xfd"
 _PREFIX = _HEADER + b"\x00"
 _STUFFED = _HEADER + b"\xfd"
 _MAX_PACKET = 1024
 _STATUS_SIZE = 11  # bytes of a status packet without data
-_FAST_SYNC_READ = 0x8A  # which dynamixel-sdk 3 has no name for
-_OLD_HEADER = b"\xff\xff"  # of Protocol 1.0: header, ID, length, instruction or error, checksum
-_OLD_STATUS = 6  # bytes of its reply to a ping
+_FAST_SYNC_READ = 0x8A  # not defined by dynamixel-sdk 3
+_OLD_HEADER = b"\xff\xff"  # Protocol 1.0: header, ID, length, instruction or error, checksum
+_OLD_STATUS = 6  # bytes of a reply to a ping in Protocol 1.0
 _OLD_WAIT = 0.1  # s
-_ERROR = 0x7F  # of a servo's error byte; the bit above is the alert
+_ERROR = 0x7F  # error code in a servo's error byte; the highest bit is the alert
 
 
 def packed(packet_id: int, instruction: int, parameters: bytes = b"") -> bytes:
-    """Return a whole packet: stuffed, and closed with the CRC."""
+    """Return a complete packet with byte stuffing and CRC."""
     body = bytes((instruction,)) + parameters
     if _HEADER in body:
         body = body.replace(_HEADER, _STUFFED)
@@ -67,23 +67,23 @@ def packed(packet_id: int, instruction: int, parameters: bytes = b"") -> bytes:
 
 
 class PacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
-    """The SDK's packet handler with its traps closed, counting what went wrong."""
+    """The SDK's packet handler with corrections and error counters."""
 
     def __init__(self) -> None:
-        self.timeouts = 0  # replies that did not come at all
-        self.crc_errors = 0  # replies that came damaged
-        self.torn = 0  # replies of which only a part came
-        self.late = 0  # replies to an earlier question
-        self.refused = 0  # readings answered with an error
-        self.skipped_bytes = 0  # bytes that belonged to no reply
+        self.timeouts = 0  # missing replies
+        self.crc_errors = 0  # replies with a wrong CRC
+        self.torn = 0  # incomplete replies
+        self.late = 0  # replies to an earlier request
+        self.refused = 0  # reads answered with an error
+        self.skipped_bytes = 0  # bytes outside any reply
 
     @property
     def damaged(self) -> int:
-        """Number of times that bytes came that were no whole reply."""
+        """Sum of the counters of damaged, incomplete and unexpected input."""
         return self.crc_errors + self.torn + self.skipped_bytes
 
     def txPacket(self, port: SerialPort, txpacket: list[int]) -> int:
-        """Stuff, close with the CRC and send the packet that ``txpacket`` holds unstuffed."""
+        """Add byte stuffing and CRC to the packet in ``txpacket``, and send it."""
         packet = packed(txpacket[4], txpacket[7], bytes(txpacket[8:-2]))
         if len(packet) > _MAX_PACKET:
             return int(COMM_TX_ERROR)
@@ -92,10 +92,10 @@ class PacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
     def readTxRx(
         self, port: SerialPort, dxl_id: int, address: int, length: int
     ) -> tuple[list[int], int, int]:
-        """Read a span: (data, result code, error byte). With an error the data are zeros.
+        """Read a span; return (data, result code, error byte), with zeros as data after an error.
 
-        A reply of another length is an old one (the SDK does not wait for an action's) and is
-        skipped.
+        A reply of another length is a late reply, because the SDK does not wait for the reply to an
+        action, and is skipped.
         """
         if dxl_id >= BROADCAST_ID:
             return [], int(COMM_NOT_AVAILABLE), 0
@@ -114,10 +114,10 @@ class PacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
                 return [0] * length, result, packet[8]
 
     def rxPacket(self, port: SerialPort, fast_option: bool = False) -> tuple[Any, int]:
-        """Return the next status packet, unstuffed, and the result code.
+        """Return the next status packet without byte stuffing, and the result code.
 
-        A fast reply is not stuffed and comes from the broadcast ID. A damaged packet ends the
-        wait at once: what was lost does not come again.
+        A fast reply has no byte stuffing and comes from the broadcast ID. A damaged packet ends the
+        wait at once, because it is not sent again.
         """
         buffer = port.received
         while True:
@@ -131,7 +131,7 @@ class PacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
                 known = sender == BROADCAST_ID if fast_option else sender <= MAX_ID
                 if not known or not 4 <= length <= _MAX_PACKET - 7 or buffer[7] != INST_STATUS:
                     self.skipped_bytes += 1
-                    del buffer[0]  # an echo of what we sent, or noise
+                    del buffer[0]  # an echo of the request, or noise
                     continue
                 end = 7 + length
                 if len(buffer) >= end:
@@ -159,8 +159,8 @@ class PacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
 class GroupRead:
     """A sync read of one span of several servos.
 
-    After :meth:`exchange` returned success, ``data[id]`` has the span's bytes and ``errors[id]``
-    the servo's error byte; after a failure neither is to be used.
+    After a successful :meth:`exchange`, ``data[id]`` has the span's bytes and ``errors[id]`` the
+    servo's error byte. After a failure their contents are undefined.
     """
 
     instruction = INST_SYNC_READ
@@ -184,16 +184,16 @@ class GroupRead:
         self._reply = (_STATUS_SIZE + length) * len(ids)
 
     def exchange(self, until: float = math.inf) -> int:
-        """Ask, and wait at most ``until`` [s, time.monotonic()]; a result code of the SDK."""
+        """Request and wait at most ``until`` [s, time.monotonic()]; return an SDK result code."""
         if not self.port.send(self._request, self._reply, until):
             return int(COMM_TX_FAIL)
         handler = self._handler
-        for servo_id in self.data:  # each answers for itself, in their order
+        for servo_id in self.data:  # each servo sends its own reply, in this order
             while True:
                 packet, result = handler.rxPacket(self.port, False)
                 if result != COMM_SUCCESS:
                     return result
-                if packet[8] & _ERROR:  # its data are no reading
+                if packet[8] & _ERROR:  # data of an error reply are invalid
                     handler.refused += 1
                     return int(COMM_RX_CORRUPT)
                 if len(packet) != _STATUS_SIZE + self._length:
@@ -206,12 +206,12 @@ class GroupRead:
 
 
 class FastGroupRead(GroupRead):
-    """The same as a fast sync read: one reply of all, whose last CRC covers every byte of it."""
+    """A fast sync read: all servos share one reply, whose last CRC covers all of its bytes."""
 
     instruction = _FAST_SYNC_READ
 
     def exchange(self, until: float = math.inf) -> int:
-        """Ask, and wait at most ``until`` [s, time.monotonic()]; a result code of the SDK."""
+        """Request and wait at most ``until`` [s, time.monotonic()]; return an SDK result code."""
         if not self.port.send(self._request, self._reply, until):
             return int(COMM_TX_FAIL)
         handler, length = self._handler, self._length
@@ -226,7 +226,7 @@ class FastGroupRead(GroupRead):
         for servo_id in self.data:
             if packet[at + 1] != servo_id:
                 return int(COMM_RX_CORRUPT)
-            if packet[at] & _ERROR:  # its data are no reading
+            if packet[at] & _ERROR:  # data of an error reply are invalid
                 handler.refused += 1
                 return int(COMM_RX_CORRUPT)
             self.errors[servo_id] = packet[at]
@@ -244,7 +244,7 @@ class GroupWrite:
         self.ids = [bytes((servo_id,)) for servo_id in ids]
 
     def send(self, values: Sequence[bytes]) -> None:
-        """Write each servo's bytes, in the order of their IDs; nothing is answered."""
+        """Write each servo's bytes in the order of the IDs, without a reply."""
         body = b"".join(name + value for name, value in zip(self.ids, values, strict=True))
         self._port.send(packed(BROADCAST_ID, INST_SYNC_WRITE, self._span + body))
 
@@ -253,14 +253,14 @@ class GroupWrite:
 
 
 class ServoLine:
-    """Exchanges with single servos on an open port, each tried a few times."""
+    """Exchanges with single servos on an open port, each with a few tries."""
 
     def __init__(self, port: SerialPort, handler: PacketHandler | None = None) -> None:
         self.port = port
         self.handler = handler or PacketHandler()
 
     def ping(self, servo_id: int, tries: int = TRIES) -> int | None:
-        """Return the servo's model number, None when it does not answer."""
+        """Return the servo's model number, or None without a reply."""
         for _ in range(tries):
             number, result, _ = self.handler.ping(self.port, servo_id)
             if result == COMM_SUCCESS:
@@ -268,13 +268,13 @@ class ServoLine:
         return None
 
     def ping_old(self, servo_id: int) -> bool:
-        """Return True if a servo answers a ping of Protocol 1.0, which is asked once."""
+        """Return True if a servo answers one ping in Protocol 1.0."""
         port = self.port
         body = bytes((servo_id, 2, INST_PING))
         request = _OLD_HEADER + body + bytes((~sum(body) & 0xFF,))
         port.send(request, _OLD_STATUS, time.monotonic() + _OLD_WAIT)
         while True:
-            came = bytes(port.received).replace(request, b"")  # an adapter may echo it
+            came = bytes(port.received).replace(request, b"")  # an adapter may echo the request
             reply = came[max(came.find(_OLD_HEADER), 0) :][:_OLD_STATUS]
             if len(reply) == _OLD_STATUS:
                 sound = ~sum(reply[2:-1]) & 0xFF == reply[-1]
@@ -285,7 +285,7 @@ class ServoLine:
     def ping_all(self, wait: float) -> dict[int, tuple[int, int]]:
         """Return (model number, firmware) of each servo that answers a ping within ``wait`` [s].
 
-        Servos answer one after the other in the order of their IDs; 253 of them need 0.8 s.
+        Servos answer one after the other in the order of their IDs; 253 servos need 0.8 s.
         """
         found: dict[int, tuple[int, int]] = {}
         port = self.port
@@ -298,7 +298,7 @@ class ServoLine:
         return found
 
     def read(self, servo_id: int, address: int, length: int) -> bytes | None:
-        """Return a span of registers, None when no sound answer came."""
+        """Return a span of registers, or None without a valid reply."""
         for _ in range(TRIES):
             data, result, error = self.handler.readTxRx(self.port, servo_id, address, length)
             if result == COMM_SUCCESS:
@@ -306,15 +306,15 @@ class ServoLine:
         return None
 
     def write(self, address: int, values: Mapping[int, bytes]) -> None:
-        """Write each servo's bytes, all of one length, unanswered and unverified.
+        """Write bytes of equal length to each servo, without a reply or verification.
 
-        As a sync write, which works at any status return level.
+        It uses a sync write, which works at every status return level.
         """
         length = len(next(iter(values.values())))
         GroupWrite(self.port, address, length, list(values)).send(list(values.values()))
 
     def store(self, address: int, values: Mapping[int, bytes]) -> list[int]:
-        """Write each servo's bytes and read them back; the IDs where that did not succeed."""
+        """Write each servo's bytes and read them back; return the IDs of servos that failed."""
         waiting = dict(values)
         for _ in range(TRIES):
             self.write(address, waiting)

@@ -1,8 +1,8 @@
-"""Finding servos on a port, and setting up those of the settings: ID, rate, and registers.
+"""Find servos on a port, and configure the hand's servos: ID, baud rate and registers.
 
-:func:`provision` is the one place that writes a servo's EEPROM, and only when it is asked to
-(`softfinger doctor --fix`); torque is off meanwhile. IDs and rates are written only where there
-is no doubt which servo is meant (:func:`plan`).
+:func:`provision` is the only code that writes a servo's EEPROM. It runs only on request
+(`softfinger doctor --fix`) and with torque off. IDs and baud rates are written only to servos that
+are identified without ambiguity (:func:`plan`).
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ from softfinger.daemon.servos.protocol import ServoLine, open_line
 from softfinger.daemon.servos.register_table import required_registers
 from softfinger.daemon.types import FINGERS
 
-SEARCH_TIME = 0.8  # s to listen at each rate: 253 servos at 1 Mbaud
+SEARCH_TIME = 0.8  # s to listen at each rate, enough for 253 servos at 1 Mbaud
 FACTORY_ID = 1
 ALONE = (
     "connect one servo alone, then `softfinger doctor --fix`; then the next one beside it, and the "
     "same again"
 )
 _PROBES = 8  # reads of the whole table
-_REBOOT_LIMIT = 2.0  # s that a servo may take to answer again
-_WRITTEN = 0.05  # s in which a packet has left an adapter and is in a servo's EEPROM
+_REBOOT_LIMIT = 2.0  # s until a servo must answer after a reboot
+_WRITTEN = 0.05  # s for a packet to leave the adapter and be stored in EEPROM
 
 
 # --- finding servos ------------------------------------------------------------------------------
@@ -60,14 +60,14 @@ class FoundServo:
         return self.told(str(self.baud))
 
     def told(self, rates: str) -> str:
-        """Return the line of a servo that answers at these rates [baud]."""
+        """Return the report line of a servo that answers at these rates [baud]."""
         name = reg.name_of(self.number)
         return f"ID {self.id} at {rates} baud: {name}, firmware {self.firmware}"
 
 
 @dataclass(frozen=True, slots=True)
 class Garbled:
-    """An ID whose replies come damaged: several servos have it, or the line is bad."""
+    """An ID with damaged replies: several servos share it, or the line is bad."""
 
     id: int
     baud: int
@@ -82,14 +82,14 @@ class Garbled:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """All that a port has. A servo may be in ``servos`` and its ID in ``garbled``."""
+    """Result of a search. A servo may be in ``servos`` and its ID also in ``garbled``."""
 
     servos: tuple[FoundServo, ...]
     garbled: tuple[Garbled, ...]
-    old: tuple[int, ...] = ()  # rates at which something answers Protocol 1.0
+    old: tuple[int, ...] = ()  # rates at which a servo answers in Protocol 1.0
 
     def old_protocol(self) -> list[Finding]:
-        """Return a finding for each rate at which servos speak Protocol 1.0."""
+        """Return a finding for each rate at which a servo uses Protocol 1.0."""
         problem, fix = OLD_PROTOCOL
         return [Finding("FAIL", f"a servo at {baud} baud", problem, fix) for baud in self.old]
 
@@ -100,13 +100,15 @@ def search(
     wait: float = SEARCH_TIME,
     ids: Iterable[int] = (FACTORY_ID,),
 ) -> Found:
-    """Search the port for servos at each of the rates, ``wait`` s for each; changes nothing.
+    """Search the port for servos at each rate for ``wait`` s, without changing registers.
 
-    Rates that the adapter has not are skipped. Where damaged bytes came, ``ids`` are asked one by
-    one.
+    Rates that the adapter lacks are skipped. If damaged bytes arrive, ``ids`` are probed
+    individually.
 
-    Raises:
-        ServoError: the port can't be opened at any of the rates.
+    Raises
+    ------
+    ServoError
+        The port can't be opened at any of the rates.
     """
     found: list[FoundServo] = []
     garbled: list[Garbled] = []
@@ -132,9 +134,10 @@ def search(
 
 
 def is_garbled(line: ServoLine, servo_id: int) -> bool:
-    """Return whether several servos answer to this ID at once, as far as their registers differ.
+    """Return True if several servos reply to this ID and their registers differ.
 
-    Supply voltage, position and running time do, a reply of a ping does not.
+    Supply voltage, position and running time differ between servos, whereas ping replies may be
+    equal.
     """
     handler, damaged, silent = line.handler, 0, 0
     for _ in range(_PROBES):
@@ -143,16 +146,16 @@ def is_garbled(line: ServoLine, servo_id: int) -> bool:
         damaged += handler.damaged > before
         silent += result == COMM_RX_TIMEOUT
         if silent > 1 and not damaged:
-            break  # nobody has it
-    return damaged > 1  # one alone may be a disturbance
+            break  # no servo has this ID
+    return damaged > 1  # a single one may be interference
 
 
-# --- which servo is meant ------------------------------------------------------------------------
+# --- identifying servos --------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """A servo that is to get the ID and rate of a finger's."""
+    """A servo that will receive the ID and baud rate of a finger's servo."""
 
     servo: FoundServo
     finger: int
@@ -161,7 +164,7 @@ class Change:
 
     @property
     def name(self) -> str:
-        """Name in reports afterwards."""
+        """Name in reports after the change."""
         return servo_name(self.id, self.finger)
 
     def __str__(self) -> str:
@@ -175,24 +178,24 @@ class Change:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """``changes`` that leave no doubt, and what else differs from the settings."""
+    """Unambiguous ``changes``, and the remaining differences from the settings."""
 
     changes: tuple[Change, ...]
-    missing: tuple[int, ...]  # fingers whose servo is not known yet
-    strangers: tuple[FoundServo, ...]  # that answer and are no finger's
+    missing: tuple[int, ...]  # fingers whose servo is not identified
+    strangers: tuple[FoundServo, ...]  # answering servos that belong to no finger
 
 
 def plan(found: Found, settings: Settings, model: ServoModel, rates: Sequence[int]) -> Plan:
     """Assign the servos found at ``rates`` to the joints.
 
-    A servo of the settings' model that has a missing servo's ID, at another rate, is that servo.
-    Failing that, a single servo that is no finger's is the single missing one. Whatever is garbled
-    stays as it is.
+    A servo of the right model with a missing servo's ID at another rate is that servo. Otherwise, a
+    single unassigned servo is assigned to a single missing one. Servos with damaged replies are not
+    changed.
     """
     servos = settings.servos
     ids = {servos.ids[FINGERS.index(name)]: FINGERS.index(name) for name in settings.scene.fingers}
     seen = Counter(each.id for each in found.servos)
-    # An unpaced emulator answers at whatever rate it is asked.
+    # An emulator without line timing answers at every rate.
     anywhere = {servo_id for servo_id, count in seen.items() if 1 < count == len(rates)}
     home = {each.id for each in found.servos if each.baud == servos.baud and each.id in ids}
     bad = {(each.id, each.baud) for each in found.garbled}
@@ -203,7 +206,8 @@ def plan(found: Found, settings: Settings, model: ServoModel, rates: Sequence[in
         and not (each.id in anywhere and each.baud != servos.baud)
         and (each.id, each.baud) not in bad
     ]
-    # At the settings' rate an ID of theirs is that finger's, although the scene leaves it out.
+    # A servo with a configured ID and rate belongs to that finger even if the scene omits the
+    # finger.
     others = {each for each in strangers if each.baud == servos.baud and each.id in servos.ids}
     fit = [each for each in strangers if each.number == model.number and each not in others]
     missing = [servo_id for servo_id in ids if servo_id not in home]
@@ -225,16 +229,20 @@ def plan(found: Found, settings: Settings, model: ServoModel, rates: Sequence[in
     )
 
 
-# --- setting them up -----------------------------------------------------------------------------
+# --- configuring servos --------------------------------------------------------------------------
 
 
 def provision(settings: Settings) -> list[Finding]:
-    """Set each servo of the scene up: ID, rate, all registers that matter, no errors.
+    """Configure each servo of the scene: ID, baud rate, required registers and error state.
 
-    Returns what was ``fixed``, and as ``warn`` what could not be.
+    Returns
+    -------
+    Findings with status ``fixed`` for each change and ``warn`` for each failure.
 
-    Raises:
-        ServoError: the port can't be opened.
+    Raises
+    ------
+    ServoError
+        The port can't be opened.
     """
     servos = settings.servos
     result: list[Finding] = []
@@ -264,7 +272,7 @@ def provision(settings: Settings) -> list[Finding]:
 
 
 def _unknown(settings: Settings, found: Found, what: Plan) -> list[Finding]:
-    """Return why servos that are still missing are not known."""
+    """Explain why the missing servos could not be identified."""
     if found.garbled or found.old:
         garbled = [Finding("warn", "servos", str(each), ALONE) for each in found.garbled]
         return garbled + [replace(each, status="warn") for each in found.old_protocol()]
@@ -277,7 +285,7 @@ def _unknown(settings: Settings, found: Found, what: Plan) -> list[Finding]:
 
 
 def _identify(path: str, change: Change, model: ServoModel, result: list[Finding]) -> None:
-    """Give a servo its ID and rate."""
+    """Set the ID and baud rate of a servo."""
     old, new, name = change.servo.id, change.id, change.name
 
     def failed(problem: str, fix: str = "") -> None:
@@ -316,14 +324,14 @@ def _set_up(
     model: ServoModel,
     result: list[Finding],
 ) -> None:
-    """Write all registers that `register_table` requires, and reboot what needs it."""
+    """Write all registers that `register_table` requires, and reboot the servo if needed."""
     servo_id = settings.servos.ids[finger]
     name = servo_name(servo_id, finger)
 
     def failed(problem: str) -> None:
         result.append(Finding("warn", name, problem))
 
-    # A level of 0 leaves reads unanswered, so it is set before anything is read.
+    # At level 0 reads are not answered, so the level is set before the first read.
     if line.store(reg.STATUS_RETURN_LEVEL, {servo_id: b"\x02"}):
         return failed("answers a ping but no read")
     table = line.read(servo_id, 0, CHECKED)
@@ -347,7 +355,7 @@ def _set_up(
     elif table[reg.TORQUE_ENABLE] and not _torque_off(line, servo_id, name, result):
         return None
     rows = required_registers(model, settings, finger, table[reg.FIRMWARE_VERSION])
-    # The operating mode first, since it resets gains, profiles and goals.
+    # Write the operating mode first, because it resets gains, profiles and goals.
     for row in sorted(rows, key=lambda row: row.register.address != reg.OPERATING_MODE):
         raw = line.read(servo_id, row.register.address, row.register.size) or b""
         wrong = row.wrong_in(raw, row.register.address) if raw else None
@@ -373,7 +381,7 @@ def _reboot(line: ServoLine, servo_id: int) -> bool:
     line.handler.reboot(line.port, servo_id)
     end = time.monotonic() + _REBOOT_LIMIT
     while time.monotonic() < end:
-        # Each ping waits for its deadline, and so paces this.
+        # Each ping waits for its deadline, which paces this loop.
         if line.ping(servo_id, tries=1) is not None:
             return line.read(servo_id, reg.HARDWARE_ERROR_STATUS, 1) == b"\x00"
     return False

@@ -1,14 +1,14 @@
-"""The registers of a servo that matter to the hand, with the values that they must have.
+"""List the servo registers that affect the hand, with their required values.
 
-One table, :func:`required_registers`, which follows the control table of the e-Manual row by row. A
-servo keeps its EEPROM for ever and its RAM until its power is cut, so another program's values are
-met there. EEPROM is checked at connect and written by `softfinger doctor --fix` alone; RAM that is
-marked ``armed`` is written by `arm`, so that it is right after a reboot, too.
+The table is :func:`required_registers`, in the order of the e-Manual's control table. A servo keeps
+its EEPROM permanently and its RAM until power is cut, so both may contain values of another
+program. EEPROM is checked at connect and written only by `softfinger doctor --fix`. RAM registers
+marked ``armed`` are written by `arm`, so they are also correct after a reboot.
 
-Registers that are left out do not change how a goal is followed, a limit acts or the bus answers in
-the modes that the hand uses: ID and rate are searched for; moving threshold, LED and external ports
-only report; velocity gains and goal velocity serve the velocity mode; goal current, goal position,
-bus watchdog and indirect addresses are written by `servos.torque` at each `arm` anyway.
+Omitted registers do not affect goal tracking, limits or bus replies in the modes that the hand
+uses. ID and baud rate are found by a search. Moving threshold, LED and external ports only report.
+Velocity gains and goal velocity apply to velocity mode. `servos.torque` writes goal current, goal
+position, bus watchdog and indirect addresses at each `arm`.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from softfinger.daemon.servos.base import Status
 from softfinger.daemon.servos.control_table import ServoModel
 from softfinger.daemon.servos.joint import JointScale
 
-# Return delays of both servos pass within one read; above 50 µs each they eat a 500 Hz tick.
+# The return delays of both servos add up in one read; above 50 µs each they exceed a 500 Hz tick.
 RETURN_DELAY_MAX: Final = 25
-# Drive mode: a second servo follows this one's; any goal that is written switches the torque on.
+# Drive mode bits: follow another servo; switch torque on when a goal is written.
 DRIVE_UNFIT: Final = 0b1010
 PWM_FULL: Final = 885
 _STARTUP_FIRMWARE = 45
-_NO_ID = 253  # a shadow ID from there on is none
+_NO_ID = 253  # shadow IDs from here on are disabled
 _POSITION_MAX = reg.COUNTS_PER_TURN - 1
 
 
 class Register(NamedTuple):
-    """A register that may be written, as its page of the e-Manual names it."""
+    """A writable register with the name that the e-Manual gives it."""
 
     name: str
     address: int
@@ -42,7 +42,7 @@ class Register(NamedTuple):
     signed: bool = False
 
     def value_in(self, table: bytes, start: int = 0) -> int:
-        """Return its value in a span of registers from ``start`` on."""
+        """Return the register's value from ``table``, a span of registers starting at ``start``."""
         at = self.address - start
         return int.from_bytes(table[at : at + self.size], "little", signed=self.signed)
 
@@ -51,8 +51,8 @@ class Register(NamedTuple):
         return value.to_bytes(self.size, "little", signed=value < 0)
 
 
-# All registers that a table's owner may want back: what `doctor --save` stores. ID, baud rate and
-# protocol are not among them, since a servo that changes them is no longer where it was asked.
+# Registers that `doctor --save` stores for a later restore. ID, baud rate and protocol are
+# excluded, because a servo that changes them no longer answers at its address.
 REGISTERS: Final = (
     Register("return delay", reg.RETURN_DELAY_TIME, 1),
     Register("drive mode", reg.DRIVE_MODE, 1),
@@ -88,18 +88,18 @@ _AT: Final = {register.address: register for register in REGISTERS}
 
 
 class Requirement(NamedTuple):
-    """Value that a register must hold. ``status`` is that of a servo where it does not."""
+    """Required value of a register. ``status`` is the finding's status if it does not hold."""
 
     register: Register
     holds: Callable[[int], bool]
-    mended: Callable[[int], int]  # the value to write instead of a wrong one
-    told: Callable[[int], str]  # what is wrong with a value, and what was expected
+    mended: Callable[[int], int]  # value to write instead of a wrong one
+    told: Callable[[int], str]  # description of a wrong value and of the expected one
     status: Status
-    armed: bool = False  # RAM that `arm` writes
-    then: str = ""  # what is to be done after it is mended
+    armed: bool = False  # RAM written by `arm`
+    then: str = ""  # action required after the value is corrected
 
     def wrong_in(self, table: bytes, start: int = 0) -> int | None:
-        """Return the register's value in a span from ``start`` on where it is wrong, else None."""
+        """Return the value from ``table``, which begins at ``start``, if it is wrong; else None."""
         value = self.register.value_in(table, start)
         return None if self.holds(value) else value
 
@@ -119,7 +119,7 @@ def _exactly(
 
 
 def _within(address: int, low: int, high: int, unit: str) -> Requirement:
-    """Return the row of a limit beyond which the servo stops itself; ``high`` is the factory's."""
+    """Return the row of a limit at which the servo stops itself; ``high`` is the factory value."""
     register = _AT[address]
     expected = f"{low}" if low == high else f"{low} … {high}"
     return Requirement(
@@ -134,7 +134,7 @@ def _within(address: int, low: int, high: int, unit: str) -> Requirement:
 def required_registers(
     model: ServoModel, settings: Settings, finger: int, firmware: int
 ) -> list[Requirement]:
-    """Return what the registers of finger 0 (left) or 1 (right) must hold, by address."""
+    """Return the requirements for finger 0 (left) or 1 (right), sorted by address."""
     servos, safety = settings.servos, settings.safety
     scale = JointScale.of(servos, finger, model)
     mode = reg.MODE_NUMBERS[servos.mode]
@@ -232,7 +232,7 @@ def required_registers(
     if model.pwm_slope is not None:
         why = "the motor's voltage rises at another rate"
         row = _exactly(reg.PWM_SLOPE, slope := model.pwm_slope, why, "warn")
-        rows.append(row._replace(holds=lambda found: found in (0, slope)))  # 0: has no such one
+        rows.append(row._replace(holds=lambda found: found in (0, slope)))  # 0: not implemented
     rows += armed_registers(model)
     return sorted(rows, key=lambda row: row.register.address)
 
@@ -269,7 +269,7 @@ def _current_limit(model: ServoModel, current_max: float) -> Requirement:
 
 
 def _position_limits(scale: JointScale, settings: Settings, finger: int) -> Iterable[Requirement]:
-    """Return the rows of position mode: a goal beyond these limits is refused without a word."""
+    """Return the rows of position mode, where a servo silently rejects goals beyond its limits."""
     ends = (settings.hand.q_min[finger], settings.hand.q_max[finger])
     first, last = sorted(scale.position_counts(q) for q in ends)
     needed = f"the joint needs {first} … {last}"

@@ -1,4 +1,4 @@
-"""Servos of the simulated hand, in this process: the plant behind the real ones' resolution."""
+"""Simulate the hand's servos in this process, with the resolution of real ones."""
 
 from __future__ import annotations
 
@@ -17,34 +17,34 @@ from softfinger.daemon.servos.joint import JointScale, current_toward
 from softfinger.daemon.types import FINGERS, Goal, Reading
 
 _HEALTH_EVERY = 0.25  # s between two readings of temperature and supply
-_OVERLOAD = 2.0  # s of all the current allowed
+_OVERLOAD = 2.0  # s at the current limit until an overload error
 
 
 class MotorHeat(Protocol):
-    """Heat of one motor."""
+    """Thermal model of one motor."""
 
-    sensed: float  # what its thermometer shows [°C]
+    sensed: float  # thermometer reading [°C]
 
     def step(self, current: float, seconds: float) -> None:
-        """Go on by ``seconds`` with this ``current`` [A]."""
+        """Advance by ``seconds`` at this ``current`` [A]."""
 
 
 class HandPlant(JointPlant, Protocol):
-    """The joints of the simulated hand, which knows of the servos' watchdog and their heat."""
+    """Joints of the simulated hand, including the servos' watchdog and temperatures."""
 
     @property
     def servo_heat(self) -> Sequence[MotorHeat]:
-        """Heat of each joint's motor."""
+        """Thermal model of each joint's motor."""
 
     def hold_torque_until(self, t: float) -> None:
-        """Hold torque until time t [s], when it ends by itself."""
+        """Keep torque on until time t [s], when it ends by itself."""
 
 
 class SimulatedServos:
-    """The joints of a simulated hand, in the configured model's counts.
+    """The joints of a simulated hand, in counts of the configured model.
 
-    Every exchange brings the hand to the clock's time first. With a watchdog set, torque goes off
-    by itself that long after the last exchange, and only :meth:`torque_on` brings it back.
+    Every exchange first advances the hand to the clock's time. With a watchdog set, torque ends by
+    itself that long after the last exchange, and only :meth:`torque_on` restores it.
     """
 
     def __init__(self, settings: Settings, hand: HandPlant, clock: Clock) -> None:
@@ -58,20 +58,20 @@ class SimulatedServos:
         self._watchdog = settings.servos.watchdog or math.inf
         self._connected = False
         self._torque = False
-        self._tripped = False  # the watchdog took the torque that was switched on here
+        self._tripped = False  # the watchdog ended torque that was switched on here
         self._trips = 0
         self._last = -math.inf  # time of the last exchange
         self._goal_q = [0.0, 0.0]
         self._goal_current = [0.0, 0.0]
-        self._q = [0.0, 0.0]  # of the last reading [rad, rad/s]
+        self._q = [0.0, 0.0]  # last reading [rad, rad/s]
         self._dq = [0.0, 0.0]
         self._seq = 0
         self._errors = [0, 0]  # hardware error bits
-        self._pressed = [0.0, 0.0]  # s of all the current that is allowed
+        self._pressed = [0.0, 0.0]  # time at the current limit [s]
         self._health_read = -math.inf
 
     def connect(self) -> None:
-        """Take the servos, torque off. Raises ServoError when the model can't do the job."""
+        """Connect the servos with torque off. Raises ServoError if the model lacks the mode."""
         unfit = check_model("servos.model", self._model, self._mode)
         if unfit is not None:
             raise ServoError(str(unfit))
@@ -80,12 +80,12 @@ class SimulatedServos:
         self._switch(False)
 
     def read(self, reading: Reading) -> None:
-        """Fill ``reading`` with angle, velocity and current, each to the servo's own count."""
+        """Update ``reading`` with angle, velocity and current, rounded to the servo's counts."""
         if not self._connected:
             reading.valid = False
             return
         reading.t = self._exchange()
-        # As Python floats, which are faster one by one.
+        # Python floats are faster to access one at a time.
         q, dq = self._hand.q.tolist(), self._hand.dq.tolist()
         for joint in self._joints:
             scale = self._scales[joint]
@@ -125,7 +125,7 @@ class SimulatedServos:
             self._drive()
 
     def torque_on(self) -> None:
-        """Switch torque on, the goal at the present count, no current until a goal is written."""
+        """Switch torque on with the goal at the present count and zero current."""
         if not self._connected:
             raise ServoError("the simulated servos are not connected")
         self._exchange()
@@ -136,7 +136,7 @@ class SimulatedServos:
         self._switch(True)
 
     def torque_off(self, reading: Reading) -> bool:
-        """Switch torque off, which is certain here, and return a reading."""
+        """Switch torque off, which always succeeds here, and read."""
         if not self._connected:
             raise ServoError("the simulated servos are not connected")
         self._exchange()
@@ -145,7 +145,7 @@ class SimulatedServos:
         return True
 
     def write(self, goal: Goal) -> None:
-        """Give each servo its goal angle and current bound, rounded to what a register holds."""
+        """Set each servo's goal angle and current limit, rounded to register counts."""
         if not self._connected:
             return
         self._exchange()
@@ -169,7 +169,7 @@ class SimulatedServos:
         self._drive()
 
     def counters(self) -> dict[str, int]:
-        """Return ``timeouts`` and ``crc``, always 0, and ``watchdog``: its torque stops."""
+        """Return ``timeouts`` and ``crc``, always 0, and the number of ``watchdog`` stops."""
         return {"timeouts": 0, "crc": 0, "watchdog": self._trips}
 
     def close(self) -> None:
@@ -180,7 +180,7 @@ class SimulatedServos:
             self._connected = False
 
     def _exchange(self) -> float:
-        """Bring the hand to now, with the watchdog's stop on the way, and restart the watchdog."""
+        """Advance the hand to now, including a watchdog stop, and restart the watchdog."""
         now = self._clock.now()
         if self._torque and now > self._last + self._watchdog:
             self._torque = False
@@ -201,5 +201,5 @@ class SimulatedServos:
     def _drive(self) -> None:
         for joint in self._joints:
             goal_q, goal_current = self._goal_q[joint], self._goal_current[joint]
-            torque = self._torque and not self._errors[joint]  # as after a shutdown
+            torque = self._torque and not self._errors[joint]  # as a real servo after a shutdown
             self._hand.drive(joint, self._mode, torque, goal_q, goal_current)

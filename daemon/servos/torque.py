@@ -1,7 +1,7 @@
-"""Torque on, each step verified, torque off, and the servos' own bus watchdog behind both.
+"""Switch torque on with each step verified, switch it off, and manage the servos' bus watchdog.
 
-Torque goes on at the present angle with no current. Goal current and goal position are put side
-by side through indirect addresses, which live in RAM and so are set each time.
+Torque is switched on at the present angle with zero current. Goal current and goal position are
+placed side by side through indirect addresses, which are in RAM and are therefore set each time.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ _GOAL_BYTES = (
     *range(reg.GOAL_CURRENT, reg.GOAL_CURRENT + 2),
     *range(reg.GOAL_POSITION, reg.GOAL_POSITION + 4),
 )
-_COPIES = 2  # of each packet of torque off, since nothing is answered
-_ON_WITHIN = 50  # reply timeouts in which torque must be on: the loop stands still meanwhile
-_STILL = 8  # counts by which a limp joint may move between its goal and torque on, 0.7°
+_COPIES = 2  # copies of each torque-off packet, because it has no reply
+_ON_WITHIN = 50  # reply timeouts allowed for torque on, which blocks the loop
+_STILL = 8  # counts, allowed motion of a limp joint before torque on (0.7°)
 
 
 def goal_address(mode: int, model: ServoModel, firmware: int) -> int:
-    """Return where a tick writes its goals: one register, or indirect data that stand for two."""
+    """Return the address of the goals written in a tick: a register, or indirect data for two."""
     if mode == reg.CURRENT_MODE:
         return reg.GOAL_CURRENT
     if mode == reg.POSITION_MODE:
@@ -40,10 +40,10 @@ def goal_address(mode: int, model: ServoModel, firmware: int) -> int:
 
 
 class Torque:
-    """The torque of all joints on one line.
+    """Torque of all joints on one line.
 
-    ``goals`` takes goals while it is on and is None else. ``may_be_on`` is True from before it is
-    switched on until the servos have confirmed that it is off.
+    ``goals`` writes the goals while torque is on and is None otherwise. ``may_be_on`` is True from
+    before torque is switched on until the servos have confirmed that it is off.
     """
 
     def __init__(
@@ -63,7 +63,7 @@ class Torque:
         self._mode = reg.MODE_NUMBERS[servos.mode]
         ticks = math.ceil(servos.watchdog / reg.WATCHDOG_UNIT - 1e-9)
         self._ticks = min(ticks, reg.WATCHDOG_MAX)
-        self._not_after = math.inf  # time.monotonic() at which switching on is given up
+        self._not_after = math.inf  # time.monotonic() deadline for switching on
         ids = list(self._joints)
         self._offs = [
             GroupWrite(line.port, reg.TORQUE_ENABLE, 1, each) for each in (ids, *([i] for i in ids))
@@ -73,21 +73,24 @@ class Torque:
     # --- on and off ------------------------------------------------------------------------------
 
     def on(self) -> None:
-        """Switch torque on at the present angle, with no current yet.
+        """Switch torque on at the present angle with zero current.
 
-        Raises:
-            ServoError: it could not be done or not be verified, and may be on.
+        Raises
+        ------
+        ServoError
+            Torque on failed or could not be verified. Torque may be on.
         """
         self._not_after = time.monotonic() + _ON_WITHIN * self._line.port.reply_timeout
         self._refuse_hardware_errors()
-        # Writing 0 ends a watchdog's stop, in which goals are read-only.
+        # Writing 0 ends a watchdog stop, during which goals are read-only.
         self._store_all(reg.BUS_WATCHDOG, b"\x00", "watchdog cleared")
         self._write_registers()
         goals = self._choose_goals()
         if self._mode != reg.POSITION_MODE:
             self._store_all(reg.GOAL_CURRENT, bytes(2), "goal current")
         self.may_be_on = True
-        # It measures from torque on, and must stop what can't be verified to be on.
+        # The watchdog must already run when torque is switched on, to stop servos whose state
+        # cannot be verified.
         if self._ticks:
             self._store_all(reg.BUS_WATCHDOG, bytes((self._ticks,)), "watchdog armed")
         positions = self._aim_here()
@@ -98,9 +101,9 @@ class Torque:
         self.goals = goals
 
     def ask_off(self) -> None:
-        """Ask the servos to switch torque off: all in one packet, and each in one of its own.
+        """Request torque off from all servos in one packet and from each in a packet of its own.
 
-        Nothing is answered; the caller reads the registers.
+        There is no reply; the caller reads the registers.
         """
         self.goals = None
         for _ in range(_COPIES):
@@ -108,13 +111,13 @@ class Torque:
                 group.send([b"\x00"] * len(group.ids))
 
     def confirmed_off(self) -> None:
-        """Note that the servos have confirmed torque off: their watchdogs have nothing to stop."""
+        """Disable the watchdogs after the servos have confirmed torque off."""
         if self.may_be_on:
             self._watchdog_off.send([b"\x00"] * len(self._joints))
         self.may_be_on = False
 
     def _aim_here(self) -> dict[int, int]:
-        """Set the goal positions to where the joints are, until these rest there [counts]."""
+        """Set the goal positions to the present positions until the joints rest there [counts]."""
         while True:
             positions = self._positions()
             strayed = [
@@ -132,19 +135,19 @@ class Torque:
                 return positions
 
     def _choose_goals(self) -> GroupWrite:
-        """The one sync write of a tick: goal current, goal position, or both side by side."""
+        """Return the sync write of a tick: goal current, goal position, or both side by side."""
         address = goal_address(self._mode, self._model, self._firmware())
         if self._mode == reg.CURRENT_BASED_POSITION_MODE:
             self._map_goals()
         return GroupWrite(self._line.port, address, GOAL_SIZE[self._mode], list(self._joints))
 
     def _map_goals(self) -> None:
-        """Put goal current and goal position side by side in the indirect data."""
+        """Map goal current and goal position side by side into the indirect data."""
         pointers = struct.pack(f"<{len(_GOAL_BYTES)}H", *_GOAL_BYTES)
         self._store_all(reg.INDIRECT_ADDRESS, pointers, "indirect addresses")
 
     def _firmware(self) -> int:
-        """Return the firmware of the servos, which must agree on where indirect data are."""
+        """Return the servos' firmware; all must place indirect data at the same address."""
         found = set()
         for servo_id, joint in self._joints.items():
             raw = self._line.read(servo_id, reg.FIRMWARE_VERSION, 1)
@@ -159,9 +162,9 @@ class Torque:
         return max(found)
 
     def _write_registers(self) -> None:
-        """Write the RAM registers that another program may have left otherwise.
+        """Write RAM registers that another program may have changed.
 
-        A servo's gains, profiles and PWM bound last until its power is cut or it reboots.
+        A servo keeps gains, profiles and the PWM limit until power is cut or it reboots.
         """
         for servo_id, joint in self._joints.items():
             held = self._line.read(servo_id, reg.RAM, reg.GOAL_POSITION - reg.RAM)
@@ -172,7 +175,7 @@ class Torque:
                     what, data = row.register.name, row.register.packed(row.mended(0))
                     self._store(row.register.address, {servo_id: data}, what)
 
-    # --- what forbids it -------------------------------------------------------------------------
+    # --- preconditions ---------------------------------------------------------------------------
 
     def _positions(self) -> dict[int, int]:
         positions = {}
@@ -195,15 +198,17 @@ class Torque:
         if found:
             raise ServoError("\n".join(map(str, found)))
 
-    # --- while it is on --------------------------------------------------------------------------
+    # --- checks while torque is on ---------------------------------------------------------------
 
     def holds_goal(self, joint: Joint, table: bytes, start: int) -> bool:
-        """Return whether a servo holds a goal sent lately, or torque was not switched on here.
+        """Return True if a servo holds a recent goal, or torque was not switched on here.
 
-        ``table`` has its registers from ``start`` on.
+        ``table`` contains its registers from ``start`` on.
 
-        Raises:
-            ServoError: its bus watchdog has stopped it, or is no longer armed.
+        Raises
+        ------
+        ServoError
+            Its bus watchdog has stopped it, or is no longer armed.
         """
         if self.goals is None:
             return True

@@ -1,4 +1,4 @@
-"""Tactile sensors: the interface of every backend, boards on serial ports, recordings.
+"""Tactile backends: their common interface, boards on serial ports, and recordings.
 
-Which name in the settings is which backend stands in `daemon.backends`.
+`daemon.backends` maps the names in the settings to them.
 """

@@ -1,4 +1,4 @@
-"""The interface of every tactile backend, and the one that settings name."""
+"""Define the interface of tactile backends, and create the selected backend."""
 
 from __future__ import annotations
 
@@ -11,13 +11,16 @@ from softfinger.daemon.types import Frame
 
 
 class TactileSensor(Protocol):
-    """The pressure grid under one fingertip. Reading runs outside the tick."""
+    """The pressure grid under one fingertip. It is read outside the tick."""
 
     def open(self) -> None:
-        """Open the sensor and wait for a first good frame. Raises TactileError if none comes."""
+        """Open the sensor and wait for a first valid frame. Raises TactileError if none arrives."""
 
     def latest(self) -> Frame | None:
-        """Return the newest complete frame, the same object until a newer one; None before any."""
+        """Return the newest complete frame, or None before the first.
+
+        The same object is returned until a newer frame arrives.
+        """
 
     def counters(self) -> dict[str, int]:
         """Return counts since open: ``frames``, ``resyncs``, ``skipped_bytes``, …"""
@@ -29,9 +32,10 @@ class TactileSensor(Protocol):
 def make_sensor(
     settings: Settings, clock: Clock, hand: object, finger: int
 ) -> TactileSensor | None:
-    """Make the settings' backend for one finger, not yet open; None in a scene without sensors.
+    """Create the tactile backend of one finger, not yet open; None in a scene without sensors.
 
-    ``hand``: the simulated hand, for backends that need it. Raises as the backend does.
+    ``hand`` is the simulated hand, for backends that need it. Raises the errors of the backend's
+    constructor.
     """
     found = backend("tactile", settings.tactile.backend)
     if settings.tactile.backend == "none":

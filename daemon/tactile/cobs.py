@@ -1,39 +1,40 @@
-"""Our framing for do-it-yourself boards and 44 × 44 sensors, and the backend that reads one.
+"""Read boards with the COBS framing, intended for custom boards and 44 × 44 sensors.
 
-What a board's firmware has to do, at any baud (USB boards may ignore it), for each scan, unasked:
+The firmware sends each scan without a request, at any baud rate (USB boards may ignore it):
 
 1. Build the message, all numbers little-endian:
 
    ======  ====== =====================================================================
-   offset  type   what
+   offset  type   content
    ======  ====== =====================================================================
    0       uint8  bytes per count: 1 (uint8 counts) or 2 (uint16 counts)
    1       uint8  0, reserved
-   2       uint16 sequence number: one more each scan, 0 after 65535, also for scans not sent
+   2       uint16 sequence number: incremented by every scan, sent or not; 0 after 65535
    4       uint32 the board's clock at the middle of the scan [µs]; wraps at 2³²
    8       uint16 rows
    10      uint16 cols
    12      …      rows × cols counts, row after row
    ======  ====== =====================================================================
 
-2. Append the CRC-16 of all of it, low byte first: polynomial 0x1021, start 0xFFFF, highest bit
-   first, no inversion (CRC-16/IBM-3740, also called CCITT-FALSE; "123456789" gives 0x29B1)::
+2. Append the CRC-16 of the message, low byte first: polynomial 0x1021, initial value 0xFFFF,
+   highest bit first, no inversion (CRC-16/IBM-3740, also called CCITT-FALSE; "123456789" gives
+   0x29B1)::
 
        crc = 0xFFFF
        for each byte:  crc ^= byte << 8
                        eight times:  crc = (crc << 1) ^ (crc & 0x8000 ? 0x1021 : 0)   in 16 bits
 
-3. Stuff it with COBS, which leaves no zero byte: cut the message at its zero bytes (drop those);
-   write each piece as one byte, its length + 1, and then the piece. A piece of 254 bytes or more
-   goes out in blocks of 254 with the byte 255 before each; the rest of it, which may be empty,
-   follows as a piece of its own. (An empty one at the message's end may be left out.)
+3. Encode it with COBS, which removes all zero bytes: split the message at its zero bytes and drop
+   them; write each piece as one byte, its length + 1, followed by the piece. Split a piece of 254
+   bytes or more into blocks of 254, each preceded by the byte 255; the remainder, which may be
+   empty, follows as its own piece. (An empty piece at the end of the message may be omitted.)
 
-4. Send a zero byte. One more before the first frame does no harm.
+4. Send a zero byte. An additional zero byte before the first frame is allowed.
 
-A 44 × 44 frame of uint16 is 3903 bytes on the wire at most. `encode` is the reference. A reader
-that starts in the middle is in step at the next zero byte; a torn or damaged frame is dropped (the
-CRC detects every error of up to 16 adjacent bits, and all but 1 in 65536 of the others); gaps in
-the sequence numbers count the frames that never came.
+A 44 × 44 frame of uint16 takes at most 3903 bytes on the wire. `encode` is the reference
+implementation. A reader that starts within a frame synchronises at the next zero byte. Incomplete
+and damaged frames are dropped: the CRC detects every error of up to 16 adjacent bits, and all but
+1 in 65536 of the others. Gaps in the sequence numbers give the number of missed frames.
 """
 
 from __future__ import annotations
@@ -51,14 +52,14 @@ from softfinger.kinematics.compiled.kernel import kernel
 _HEADER = struct.Struct("<BBHIHH")
 _CRC = struct.Struct("<H")
 _CRC_START = 0xFFFF
-_TICK = 1e-6  # s of the board's clock
-_BLOCK = 254  # bytes that a COBS code can announce
+_TICK = 1e-6  # s per tick of the board's clock
+_BLOCK = 254  # longest block of a COBS code, in bytes
 
 
 def encode(counts: NDArray[np.uint8] | NDArray[np.uint16], seq: int, t: float) -> bytes:
-    """Encode one frame for the wire: counts [rows, cols], its number, the board's time ``t`` [s].
+    """Encode a frame for the wire: counts [rows, cols], sequence number, board time ``t`` [s].
 
-    The reference for firmware. Raises ValueError for other types of counts.
+    This is the reference for firmware. Raises ValueError for other types of counts.
     """
     if counts.dtype not in (np.uint8, np.uint16) or counts.ndim != 2:
         raise ValueError(f"counts must be uint8 or uint16 [rows, cols], got {counts.dtype}")
@@ -76,20 +77,21 @@ def encode(counts: NDArray[np.uint8] | NDArray[np.uint16], seq: int, t: float) -
 
 
 def longest_frame(rows: int, cols: int) -> int:
-    """Return the most bytes of a uint16 frame on the wire, with the delimiter."""
+    """Return the largest size of a uint16 frame on the wire in bytes, including the delimiter."""
     message = _HEADER.size + 2 * rows * cols + _CRC.size
     return message + 1 + message // _BLOCK + 1
 
 
 @kernel
 def unstuff(packet: NDArray[np.uint8], out: NDArray[np.uint8]) -> int:
-    """Undo COBS: write the message of ``packet``, which holds no zero byte, into ``out``.
+    """Decode COBS: write the message of ``packet``, which contains no zero byte, into ``out``.
 
-    ``out`` needs the packet's length. Returns the message's, or -1 where the packet ends within a
-    block. No branch depends on the bytes, whose zeros nothing foresees.
+    ``out`` must be as long as the packet. Returns the length of the message, or -1 if the packet
+    ends within a block. The code has no branches that depend on the bytes, because they would be
+    unpredictable.
     """
-    code = np.int64(_BLOCK + 1)  # of the block at work
-    left = np.int64(0)  # bytes of it still to come
+    code = np.int64(_BLOCK + 1)  # code of the current block
+    left = np.int64(0)  # remaining bytes of that block
     size = 0
     for byte in packet:
         value = np.int64(byte)
@@ -102,17 +104,17 @@ def unstuff(packet: NDArray[np.uint8], out: NDArray[np.uint8]) -> int:
 
 
 class CobsDecoder(DelimitedDecoder):
-    """Bytes of our framing in, frames of counts with number and board's time out."""
+    """Decoder of the COBS framing, with the board's sequence number and time."""
 
     def __init__(self, rows: int, cols: int) -> None:
         super().__init__(rows, cols, b"\0", longest_frame(rows, cols))
-        # Compiled here, and not when the first frame comes.
+        # Compile the kernel here and not at the first frame.
         unstuff(np.frombuffer(bytearray(b"\1"), np.uint8), np.zeros(1, np.uint8))
         self._bad_crc = 0
         self._missed = 0
         self._seq: int | None = None
         self._ticks = 0
-        self._wraps = 0  # of the board's clock
+        self._wraps = 0  # overflows of the board's clock
 
     def parse(self, packet: bytearray, t: float) -> Decoded | None:
         """Parse as :meth:`DelimitedDecoder.parse` does, with the board's own number and time."""
@@ -139,26 +141,26 @@ class CobsDecoder(DelimitedDecoder):
             self._reason = f"frames of {rows} × {cols} cells in {size} bytes"
             return None
         steps = 1 if self._seq is None else (seq - self._seq - 1) % 65536 + 1
-        if steps > 32768:  # it went back: the board restarted
+        if steps > 32768:  # the number decreased, so the board restarted
             steps = 1
         self._missed += steps - 1
         self._seq = seq
-        # The clock wrapped, or the board restarted, which SensorClock notices.
+        # The clock wrapped, or the board restarted, which SensorClock detects.
         self._wraps += ticks < self._ticks
         self._ticks = ticks
-        # Counts of two bytes stay where they are: the message is this frame's own.
+        # Counts of two bytes are not copied, because the buffer belongs to this frame alone.
         cells = message[_HEADER.size : size].view(f"<u{kind}")
         counts = cells.astype(np.uint16, copy=False)
         t_sensor = (self._wraps * 2.0**32 + ticks) * _TICK
         return Decoded(counts.reshape(rows, cols), t, steps, t_sensor)
 
     def counters(self) -> dict[str, int]:
-        """Return the usual counters, ``bad_crc``, and ``missed``: frames that never came."""
+        """Return the common counters, ``bad_crc``, and ``missed``, the number of missing frames."""
         return {**super().counters(), "bad_crc": self._bad_crc, "missed": self._missed}
 
 
 class Cobs(SerialReader):
-    """A board with our framing under one fingertip."""
+    """A board with the COBS framing under one fingertip."""
 
     def make_decoder(self) -> CobsDecoder:
         return CobsDecoder(self.settings.rows, self.settings.cols)

@@ -1,6 +1,6 @@
-"""Decoders from a serial board's bytes to frames: the interface of framings and their common code.
+"""Decode bytes of serial boards to frames: interface of the framings and common code.
 
-A decoder is pure and incremental: no port, no clock, no thread.
+A decoder works incrementally and uses no port, clock or thread.
 """
 
 from __future__ import annotations
@@ -11,32 +11,32 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-_LOST_AFTER = 10  # frames' worth of bytes without a frame
+_LOST_AFTER = 10  # frame lengths without a frame, after which the stream counts as lost
 
 
 @dataclass(slots=True)
 class Decoded:
-    """A decoded frame: fresh counts [rows, cols] and the time of its last byte [s]."""
+    """A decoded frame: newly allocated counts [rows, cols] and the time of its last byte [s]."""
 
     data: NDArray[np.uint16]
     t: float
-    steps: int = 1  # frames since the last one by the board's own number
+    steps: int = 1  # increase of the board's sequence number since the last frame
     t_sensor: float | None = None  # the board's clock at the middle of the scan [s]
-    behind: int = 0  # bytes that came after its last one in the same read
+    behind: int = 0  # bytes after the frame's last byte in the same read
 
 
 class Decoder(ABC):
-    """Bytes in, frames [rows, cols] out.
+    """Convert bytes to frames [rows, cols].
 
-    Every byte fed is part of a frame, counted in ``skipped_bytes``, or still in the buffer.
-    ``frame_bytes`` is a frame's length on the wire; the last one's where lengths vary.
+    Every byte is part of a frame, counted in ``skipped_bytes``, or still in the buffer.
+    ``frame_bytes`` is the length of a frame on the wire, or of the last frame if lengths vary.
     """
 
     def __init__(self, rows: int, cols: int, frame_bytes: int) -> None:
         self.rows = rows
         self.cols = cols
         self.frame_bytes = frame_bytes
-        self.locked = False  # the buffer starts where a frame starts
+        self.locked = False  # the buffer starts at the start of a frame
         self._buffer = bytearray()
         self._frames = 0
         self._resyncs = 0
@@ -45,35 +45,35 @@ class Decoder(ABC):
 
     @abstractmethod
     def feed(self, data: bytes, t: float) -> Decoded | None:
-        """Take the next bytes, read at time ``t`` [s]; the newest frame they completed, if any."""
+        """Add bytes read at time ``t`` [s]; return the newest frame they complete, or None."""
 
     @abstractmethod
     def diagnosis(self) -> str:
-        """Return what is wrong with a stream that gives no frames, in one line."""
+        """Explain in one line why a stream gives no frames."""
 
     @property
     def pending(self) -> bool:
-        """True if ``settle`` may yield a frame: a whole one waits for the bytes after it."""
+        """True if ``settle`` may return a frame that is complete but not yet confirmed."""
         return False
 
     def settle(self) -> Decoded | None:
-        """Return the pending frame, once the line has been quiet since the last byte."""
+        """Return the pending frame, called when the line has been quiet since the last byte."""
         return None
 
     @property
     def missing(self) -> int:
-        """Bytes until the frame in the buffer is whole; 0 when that is unknown."""
+        """Number of bytes that complete the frame in the buffer; 0 if unknown."""
         held = len(self._buffer)
         return max(self.frame_bytes - held, 0) if self.locked and held else 0
 
     @property
     def lost(self) -> bool:
-        """No frame within the last ten frames' worth of bytes."""
+        """True if the bytes of the last ten frames contained no frame."""
         behind = self._skipped - self._skipped_at_frame + len(self._buffer)
         return behind > _LOST_AFTER * self.frame_bytes
 
     def counters(self) -> dict[str, int]:
-        """Return ``frames``, ``resyncs`` (lost synchronisations), ``skipped_bytes``, and others."""
+        """Return ``frames``, ``resyncs`` (synchronisation losses), ``skipped_bytes`` and others."""
         return {
             "frames": self._frames,
             "resyncs": self._resyncs,
@@ -85,25 +85,25 @@ class Decoder(ABC):
 
 
 class DelimitedDecoder(Decoder):
-    """Frames in packets that end with a byte which occurs nowhere else.
+    """Decode packets that end with a byte that occurs nowhere else.
 
-    A packet is whole with its delimiter, and after any damage the next one is in step again. At
-    most the longest packet is buffered.
+    A packet is complete at its delimiter. After any damage the decoder is synchronised at the next
+    packet. The buffer is at most as long as the longest packet.
     """
 
     def __init__(self, rows: int, cols: int, delimiter: bytes, longest: int) -> None:
-        """``longest``: bytes of a frame on the wire at most, with its delimiter."""
+        """``longest`` is the largest size of a frame on the wire in bytes, with its delimiter."""
         super().__init__(rows, cols, longest)
         self.longest = longest
         self._delimiter = delimiter
-        self._scanned = 0  # bytes of the buffer known to hold no delimiter
-        self._reason = ""  # why the last packet was no frame, in a few words
+        self._scanned = 0  # bytes of the buffer already searched for a delimiter
+        self._reason = ""  # why the last packet was rejected, in a few words
 
     @abstractmethod
     def parse(self, packet: bytearray, t: float) -> Decoded | None:
-        """Return the frame of a packet without its delimiter; None, with ``_reason`` set, if none.
+        """Return the frame of a packet without its delimiter, or None after setting ``_reason``.
 
-        ``t`` [s] is when its last byte was read.
+        ``t`` [s] is the time when its last byte was read.
         """
 
     def feed(self, data: bytes, t: float) -> Decoded | None:
@@ -122,7 +122,7 @@ class DelimitedDecoder(Decoder):
                 self.frame_bytes = end + 1
                 self._skipped_at_frame = self._skipped
             else:
-                # Whatever stands before the first delimiter may be a frame's tail.
+                # Bytes before the first delimiter may be the end of a frame.
                 self._resyncs += bool(packet) and self.locked
                 self._skipped += end + 1
             self.locked = True

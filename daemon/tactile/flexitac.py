@@ -1,7 +1,7 @@
-"""FlexiTac boards: their framing, and the backend that reads one over a serial port.
+"""Read FlexiTac boards over a serial port.
 
-The stream, at 2,000,000 baud: ``AA 55``, then rows × cols bytes, row-major, one count each, frame
-after frame. There is no length, number or checksum, and ``AA 55`` may occur among the counts.
+The stream, at 2,000,000 baud, repeats ``AA 55`` followed by rows × cols bytes in row-major order,
+one count each. It has no length, number or checksum, and ``AA 55`` may also occur among the counts.
 """
 
 from __future__ import annotations
@@ -17,40 +17,40 @@ from softfinger.daemon.tactile.decoder import Decoded, Decoder
 from softfinger.daemon.tactile.serial_reader import BITS_PER_BYTE, SerialReader
 
 MARKER = b"\xaa\x55"
-_LEVELS = 12  # frames that a search may look back on before it drops the oldest
-_MARKERS_KEPT = 96  # for recognising a grid of another size
-_GAP = 1e-3  # s; a line quiet for longer has gaps between frames
-_SMALLEST_GRID = 16  # cells; closer markers are an image's own pattern
+_LEVELS = 12  # frames that a search compares before it drops the oldest
+_MARKERS_KEPT = 96  # to recognise a grid of another size
+_GAP = 1e-3  # s, a longer pause is a gap between frames
+_SMALLEST_GRID = 16  # cells, closer markers are a pattern in the image
 
 
 class FlexiTacDecoder(Decoder):
-    """Bytes of a FlexiTac stream in, frames out.
+    """Decode a FlexiTac stream to frames.
 
-    *Lock.* Nothing tells a marker from two counts ``AA 55`` but its place. So the search asks for
-    two markers one frame apart, and as long as other ``AA 55`` between them recur at that distance
-    too it waits for more frames, until only one place is left. An image that is constant to the
-    last bit and contains ``AA 55`` can't be locked on: it is counted as ``ambiguous``.
+    *Lock.* A marker differs from two counts ``AA 55`` only by its position. The search requires two
+    markers one frame apart. If other ``AA 55`` between them recur at the same distance, it waits
+    for more frames until a single position remains. A constant image that contains ``AA 55`` cannot
+    be locked and is counted as ``ambiguous``.
 
-    *Hold.* Once locked, a frame is handed over when the next marker stands where it must, which
-    proves that no byte of the frame was lost. On a line with gaps between frames that would cost a
-    frame's period. There a whole frame is handed over at once if it can't be spliced from a torn
-    frame and the next one: its counts contain no ``AA 55``, and it came in the time its bytes take.
-    Else it waits for the next marker, or for ``settle``.
+    *Hold.* After locking, a frame is returned when the next marker is found at its expected
+    position, which proves that no byte of the frame was lost. On a line with gaps between frames
+    this would delay every frame by one period. There a complete frame is returned at once if it
+    cannot combine parts of two frames: its counts contain no ``AA 55``, and its bytes arrived in
+    their transmission time. Otherwise it waits for the next marker, or for ``settle``.
 
-    *Loss.* A marker that isn't where it must be drops the frame before it and starts the search
-    again.
+    *Loss.* If a marker is not at its expected position, the preceding frame is dropped and the
+    search restarts.
     """
 
     def __init__(self, rows: int, cols: int, byte_time: float = 5e-6) -> None:
-        """``byte_time`` [s]: what a byte takes on the wire."""
+        """``byte_time`` is the transmission time of a byte [s]."""
         super().__init__(rows, cols, len(MARKER) + rows * cols)
-        self._longest = 1.25 * self.frame_bytes * byte_time + _GAP  # s for one frame's bytes
-        self._t_whole = -math.inf  # when the last frame handed over was whole
-        self._start = 0  # place of the buffer's first byte in the stream
-        # Where in the stream each piece in the buffer ended, and when it was read.
+        self._longest = 1.25 * self.frame_bytes * byte_time + _GAP  # s, for one frame
+        self._t_whole = -math.inf  # time when the last returned frame was complete
+        self._start = 0  # position of the buffer's first byte in the stream
+        # End position in the stream and read time of each piece in the buffer.
         self._pieces: deque[tuple[int, float]] = deque()
         self._ambiguous = 0
-        self._markers: deque[int] = deque(maxlen=_MARKERS_KEPT)  # places in the stream, no lock
+        self._markers: deque[int] = deque(maxlen=_MARKERS_KEPT)  # in the stream, while not locked
 
     def feed(self, data: bytes, t: float) -> Decoded | None:
         self._buffer += data
@@ -68,7 +68,7 @@ class FlexiTacDecoder(Decoder):
         return newest
 
     def settle(self) -> Decoded | None:
-        """Settle as :meth:`Decoder.settle` does; None while the counts could hide a marker."""
+        """Settle as :meth:`Decoder.settle` does; None if the counts could contain a marker."""
         return self._take() if self.pending and not self._may_be_spliced() else None
 
     @property
@@ -77,14 +77,14 @@ class FlexiTacDecoder(Decoder):
 
     @property
     def found_cells(self) -> int:
-        """Cells of a frame by the commonest distance of markers while there is no lock, else 0."""
+        """Cells per frame from the most common marker distance while not locked, otherwise 0."""
         apart = Counter(b - a for a, b in combinations(self._markers, 2))
         spacings = [each for each in apart if each >= _SMALLEST_GRID + len(MARKER)]
         spacing = max(spacings, key=lambda each: (apart[each], -each), default=0)
         return spacing - len(MARKER) if apart[spacing] > 2 and spacing != self.frame_bytes else 0
 
     def counters(self) -> dict[str, int]:
-        """Return the usual counters and ``ambiguous``: searches that found no certain marker."""
+        """Return the common counters and ``ambiguous``, the number of searches without a result."""
         return {**super().counters(), "ambiguous": self._ambiguous}
 
     def diagnosis(self) -> str:
@@ -101,7 +101,7 @@ class FlexiTacDecoder(Decoder):
         return f"no marker AA 55 among them; frames of {expected} expected: another board or baud?"
 
     def _search(self) -> bool:
-        """Bring the buffer's start to a marker that is one for sure; False when more is needed."""
+        """Move the buffer's start to a confirmed marker; return False if more bytes are needed."""
         buffer, stride = self._buffer, self.frame_bytes
         while True:
             marker = buffer.find(MARKER)
@@ -126,10 +126,10 @@ class FlexiTacDecoder(Decoder):
             self._skip(stride)
 
     def _only_place(self) -> Literal["yes", "no", "undecided", "ambiguous"]:
-        """Decide if the marker at the buffer's start is the frames', and no other as good.
+        """Decide if the marker at the buffer's start is the only consistent one.
 
-        Level by level, one frame further each, so that the answer depends on the stream alone and
-        not on how it was cut into pieces.
+        Each level adds one frame, so the result depends only on the stream and not on how it was
+        split into pieces.
         """
         buffer, stride = self._buffer, self.frame_bytes
         rivals = self._between()
@@ -147,7 +147,7 @@ class FlexiTacDecoder(Decoder):
         return "ambiguous"
 
     def _between(self) -> list[int]:
-        """Places of ``AA 55`` between the marker at the buffer's start and the next one."""
+        """Return positions of ``AA 55`` between the first marker in the buffer and the next one."""
         markers = []
         marker = self._buffer.find(MARKER, len(MARKER), self.frame_bytes)
         while marker >= 0:
@@ -156,19 +156,19 @@ class FlexiTacDecoder(Decoder):
         return markers
 
     def _misplaced(self, marker: int) -> bool:
-        """The buffer's bytes at ``marker``, as far as they came, are not a marker's."""
+        """Return True if the bytes received so far at ``marker`` are not a marker."""
         return not MARKER.startswith(self._buffer[marker : marker + len(MARKER)])
 
     def _may_be_spliced(self) -> bool:
-        """The whole frame at the buffer's start shows the marker of another one inside."""
+        """Return True if the frame at the buffer's start may contain the marker of another one."""
         first, end = len(MARKER), self.frame_bytes
-        # The last count and the byte after it may be the two halves of a marker as well.
+        # The last count and the byte after it may also form a marker.
         return self._buffer.find(MARKER, first) >= 0 or self._buffer.endswith(
             MARKER[:1], first, end
         )
 
     def _in_one_go(self) -> bool:
-        """The whole frame at the buffer's start came after a gap and without one."""
+        """Return True if the frame at the buffer's start arrived after a gap and without one."""
         first, whole = self._pieces[0][1], self._pieces[-1][1]
         return first - self._t_whole > _GAP and whole - first < self._longest
 
@@ -185,7 +185,7 @@ class FlexiTacDecoder(Decoder):
     def _lose(self) -> None:
         self.locked = False
         self._resyncs += 1
-        if self._buffer.startswith(MARKER):  # of a torn frame
+        if self._buffer.startswith(MARKER):  # marker of an incomplete frame
             self._note(0)
             self._skip(len(MARKER))
 

@@ -1,16 +1,17 @@
-"""Reads recorded pressure frames from files.
+"""Read recorded pressure frames from files.
 
-Files:
-- ``.npz`` with ``frames`` [n, rows, cols], or a single array of three dimensions by another name;
-  optionally ``t`` [n], ``live`` [rows, cols] bool, and the true contact at each frame, where known:
-  ``d`` [m], ``theta`` [rad], ``force`` [N], each [n].
-- ``.npy``, one frame [rows, cols] or several [n, rows, cols]; or a folder of such files, in the
-  order of their names with numbers read as numbers, and ``t.npy`` [n] among them.
-- a Tekscan-style ASCII export, any other file.
+Supported files:
 
-Frames of whole numbers are counts; others are Pa, and become counts by ``pascal_per_count``.
-A cell that is NaN in all frames is dead. Readings below 0 become 0 where noise round a tared zero
-explains them. Times are s, or another unit that their step or their date shows.
+- ``.npz`` with ``frames`` [n, rows, cols], or with a single three-dimensional array of another
+  name. Optional arrays are ``t`` [n], ``live`` [rows, cols] bool, and the true contact of each
+  frame if known: ``d`` [m], ``theta`` [rad] and ``force`` [N], each [n].
+- ``.npy`` with one frame [rows, cols] or several [n, rows, cols], or a folder of such files, sorted
+  by name with numbers in numerical order, which may contain ``t.npy`` [n].
+- Any other file is read as a Tekscan-style ASCII export.
+
+Frames of integers are counts. Other frames are in Pa and are converted with ``pascal_per_count``. A
+cell that is NaN in all frames is dead. Negative readings are set to 0 if noise around a tared zero
+explains them. Times are in s unless their step or date indicates another unit.
 """
 
 from __future__ import annotations
@@ -35,31 +36,31 @@ TRUTHS = ("d", "theta", "force")
 _TIMES = ("t", "time", "times", "timestamp", "timestamps")
 _FULL = 65535
 _OUTSIDE = f"frames: found readings outside 0 to {_FULL} counts"
-_SHOWN = 8  # arrays of a file that are named
-_SAMPLE = 200  # frames at most by which zero and noise are judged
-_NOISE_MOST = 6.0  # standard deviations that noise takes a reading below 0
-_CLIPPED_LEAST = 3  # cells that share the largest reading
-_UNITS = {1e-3: "ms", 1e-6: "µs", 1e-9: "ns"}  # of times that are not s
-_DATES = (1e9, 4e9)  # Unix s, from 2001 to 2096
-_OFF_MOST = 100.0  # times the expected interval, up to which times are s
-_OFF_NAMED = 10.0  # from which on that is said
+_SHOWN = 8  # arrays listed in a message
+_SAMPLE = 200  # largest number of frames used to estimate zero and noise
+_NOISE_MOST = 6.0  # standard deviations, largest negative noise
+_CLIPPED_LEAST = 3  # cells that must share the largest reading
+_UNITS = {1e-3: "ms", 1e-6: "µs", 1e-9: "ns"}  # units of times that are not in s
+_DATES = (1e9, 4e9)  # Unix time [s], from 2001 to 2096
+_OFF_MOST = 100.0  # times the expected interval, up to which times are in s
+_OFF_NAMED = 10.0  # times the expected interval, from which a note is given
 
 
 @dataclass(frozen=True)
 class FrameRecording:
-    """Counts uint16 [n, rows, cols] at times t float64 [n], rising from 0 [s].
+    """Counts uint16 [n, rows, cols] at times t float64 [n], increasing from 0 [s].
 
-    ``live`` [rows, cols] is False where the sensor has no cell; ``truths`` is the true contact.
-    ``largest`` reading as the file has it: counts where ``whole``, else Pa. ``notes`` say what was
-    changed or looks wrong, a line each.
+    ``live`` [rows, cols] is False where the sensor has no cell. ``truths`` contains the true
+    contact. ``largest`` is the largest reading in the file's unit: counts if ``whole``, otherwise
+    Pa. ``notes`` list corrections and suspicious values, one per line.
     """
 
     counts: NDArray[np.uint16]
     t: FloatArray
     live: NDArray[np.bool_]
     truths: dict[str, FloatArray] = field(default_factory=dict)
-    pitch: tuple[float, float] | None = None  # x and y [m], where the file has it
-    full_count: int | None = None  # from which on cells are saturated, where the file has it
+    pitch: tuple[float, float] | None = None  # x and y [m], None if the file has none
+    full_count: int | None = None  # reading of saturated cells, None if the file has none
     largest: float = 0.0
     whole: bool = True
     notes: tuple[str, ...] = ()
@@ -72,10 +73,20 @@ def load_recording(
     noise: float = 0.0,
     full_count: int = _FULL,
 ) -> FrameRecording:
-    """Read a recording; without times its frames come at ``rate`` [Hz].
+    """Read a recording.
 
-    ``noise`` [Pa] is a cell's expected standard deviation, ``full_count`` the reading of saturated
-    cells. Raises RecordingError.
+    Parameters
+    ----------
+    path : file or folder
+    pascal_per_count : pressure of one count [Pa]
+    rate : frame rate [Hz] of a recording without times
+    noise : expected standard deviation of a cell [Pa]
+    full_count : reading of saturated cells [counts]
+
+    Raises
+    ------
+    RecordingError
+        The recording cannot be read. The message names the file and the problem.
     """
     try:
         found = _loaded(path, pascal_per_count, rate, noise)
@@ -120,7 +131,7 @@ def _folder(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def _frames(path: Path) -> NDArray[Any]:
-    """The frames of one .npy file, [n, rows, cols]."""
+    """Return the frames of one .npy file, [n, rows, cols]."""
     array = _array(path)
     if array.ndim not in (2, 3):
         raise ValueError(f"{path.name}: found shape {array.shape}, expected [n, rows, cols]")
@@ -128,7 +139,7 @@ def _frames(path: Path) -> NDArray[Any]:
 
 
 def _archive(path: Path, notes: list[str]) -> dict[str, NDArray[Any]]:
-    """The arrays of an .npz file that are ours."""
+    """Return the known arrays of an .npz file."""
     held: dict[str, NDArray[Any]] = {}
     with open_regular(path) as file, zipfile.ZipFile(file) as archive:
         names = [name[:-4] for name in archive.namelist() if name.endswith(".npy")]
@@ -148,7 +159,7 @@ def _archive(path: Path, notes: list[str]) -> dict[str, NDArray[Any]]:
 
 
 def _frames_among(archive: zipfile.ZipFile, names: list[str], notes: list[str]) -> str:
-    """Return the name of the array of frames. Raises ValueError where it isn't clear which."""
+    """Return the name of the array with the frames. Raises ValueError if it is ambiguous."""
     if "frames" in names:
         return "frames"
     shapes = {name: _shape(archive, name) for name in names[: 4 * _SHOWN]}
@@ -166,14 +177,14 @@ def _frames_among(archive: zipfile.ZipFile, names: list[str], notes: list[str]) 
 
 def _part(archive: zipfile.ZipFile, name: str) -> zipfile.ZipInfo:
     part = archive.getinfo(f"{name}.npy")
-    # As NumPy packs them: others unpack beyond what they claim.
+    # NumPy uses only these; other methods may unpack to more than the stated size.
     if part.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise ValueError(f"{name}: found another compression than deflate")
     return part
 
 
 def _shape(archive: zipfile.ZipFile, name: str) -> tuple[tuple[int, ...], str]:
-    """Return shape and kind of an array without reading it."""
+    """Return the shape and kind of an array without reading it."""
     with archive.open(_part(archive, name)) as unpacked:
         shape, _, kind = _read_header(unpacked)
     return shape, kind.kind
@@ -194,7 +205,7 @@ def _read_header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]
 
 
 def _read_array(file: IO[bytes], size: int) -> NDArray[Any]:
-    """The array of a .npy file of so many bytes. Raises ValueError where it claims to be larger."""
+    """Read the array of a .npy file of ``size`` bytes. Raises ValueError if it claims more."""
     shape, _, kind = _read_header(file)
     if math.prod(shape) * kind.itemsize > size:
         raise ValueError(f"claims to hold {shape} of {kind}, more than the file has")
@@ -251,7 +262,7 @@ def _checked(
 def _without_dead(
     frames: NDArray[Any], live: NDArray[np.bool_], most: float
 ) -> tuple[NDArray[Any], NDArray[np.bool_]]:
-    """Take cells that are NaN in all frames for dead; let dead ones read 0 where out of range."""
+    """Mark cells that are NaN in all frames as dead; clear out-of-range readings of dead cells."""
     if frames.dtype.kind == "f":
         unknown = np.isnan(frames)
         live = live & ~unknown.all(axis=0)
@@ -270,7 +281,7 @@ def _without_dead(
 def _check_below(
     frames: NDArray[Any], live: NDArray[np.bool_], noise: float, notes: list[str]
 ) -> None:
-    """Note readings below 0 that noise round a zero explains. Raises ValueError for others."""
+    """Note negative readings that noise explains. Raises ValueError for other negative readings."""
     lowest = float(frames.min())
     if lowest >= 0.0:
         return
@@ -311,7 +322,7 @@ def _row(arrays: dict[str, NDArray[Any]], name: str, count: int) -> NDArray[Any]
 
 
 def _seconds(t: NDArray[Any], rate: float, notes: list[str]) -> FloatArray:
-    """Return times from the first on [s], whatever their unit. Raises ValueError."""
+    """Convert times to s since the first one. Raises ValueError if they do not increase."""
     first = t[0].item()
     since: FloatArray = (t - t[0]).astype(np.float64)
     steps = np.diff(since)
@@ -322,7 +333,7 @@ def _seconds(t: NDArray[Any], rate: float, notes: list[str]) -> FloatArray:
         return since
     step = float(np.median(steps))
     for factor in (1.0, *_UNITS):
-        if _DATES[0] <= first * factor < _DATES[1]:  # a date
+        if _DATES[0] <= first * factor < _DATES[1]:  # the times are dates
             break
     else:
         factor = _factor(t, step, rate)
@@ -340,7 +351,7 @@ def _seconds(t: NDArray[Any], rate: float, notes: list[str]) -> FloatArray:
 
 
 def _factor(t: NDArray[Any], step: float, rate: float) -> float:
-    """Return the unit [s] of times without a date, by their step. Raises ValueError."""
+    """Return the unit [s] of times without a date, from their step. Raises ValueError."""
     whole = t.dtype.kind in "ui"
     if whole and (np.diff(t) == 1).all() and len(t) > 2:
         raise ValueError("t: whole numbers that rise by 1, expected times in s, or no t")
@@ -350,14 +361,14 @@ def _factor(t: NDArray[Any], step: float, rate: float) -> float:
 
 
 def _clipped(found: FrameRecording, scale: float, full: int) -> str:
-    """Return a warning where several cells share the largest reading as clipped ones do."""
+    """Return a warning if several cells share the largest reading, which indicates saturation."""
     counts = np.where(found.live, found.counts, 0)
     top = int(counts.max())
     at_top = counts == top
     cells = np.count_nonzero(at_top.any(axis=0))
     if top == 0 or top >= full or cells < _CLIPPED_LEAST:
         return ""
-    # Where readings are round numbers the next one below is as frequent.
+    # If readings are round numbers, the next smaller one is just as frequent.
     below = int(counts[~at_top].max(initial=0))
     if below and np.count_nonzero(at_top) <= 2 * np.count_nonzero(counts == below):
         return ""

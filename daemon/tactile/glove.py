@@ -1,12 +1,13 @@
-"""The 32 × 32 glove-style board: its framing, and the backend that polls one.
+"""Read the 32 × 32 glove-style board, which is polled over a serial port.
 
-At 1,000,000 baud. The host writes ``a``; the board answers with one frame of 2 + 2 · rows · cols
-bytes: index + 11, then for each cell, row-major, the high 5 bits + 11 and the low 5 bits + 11, then
-a newline (10). No byte but the last can be a newline, so the stream is found again at the next one.
-There is no checksum: a byte that turned into another one of 11 … 42 goes unseen.
+The board runs at 1,000,000 baud. The host writes ``a`` and the board replies with one frame of 2 +
+2 · rows · cols bytes: index + 11, then for each cell in row-major order the high 5 bits + 11 and
+the low 5 bits + 11, then a newline (10). Only the last byte can be a newline, so the decoder
+resynchronises at the next one. There is no checksum, so a byte corrupted to another value of 11 …
+42 is not detected.
 
-Boards with a 12-bit converter send the same with 6 bits in each half; ``tactile.full_count`` above
-1023, up to 4095, tells them.
+Boards with a 12-bit converter use the same framing with 6 bits in each half. They are selected by
+``tactile.full_count`` from 1024 to 4095.
 """
 
 from __future__ import annotations
@@ -17,15 +18,15 @@ from softfinger.daemon.tactile.decoder import Decoded, DelimitedDecoder
 from softfinger.daemon.tactile.serial_reader import SerialReader
 
 _OFFSET = 11
-_BITS = 5  # of each half of a count
+_BITS = 5  # bits in each half of a count
 
 
 class GloveDecoder(DelimitedDecoder):
-    """Bytes of a glove-style board in, frames of counts with twice ``bits`` bits out."""
+    """Decoder of a glove-style board, whose counts have twice ``bits`` bits."""
 
     def __init__(self, rows: int = 32, cols: int = 32, bits: int = _BITS) -> None:
         super().__init__(rows, cols, b"\n", 2 + 2 * rows * cols)
-        self._values = 1 << bits  # of each half
+        self._values = 1 << bits  # number of values of each half
 
     def parse(self, packet: bytearray, t: float) -> Decoded | None:
         if len(packet) != self.longest - 1:
@@ -33,7 +34,7 @@ class GloveDecoder(DelimitedDecoder):
             self._reason = f"lines of {len(packet)} bytes, which is {cells} cells"
             return None
         halves = np.frombuffer(packet, np.uint8, len(packet) - 1, 1) - np.uint8(_OFFSET)
-        # Bytes below the offset wrap round to large ones.
+        # Bytes below the offset wrap around to large values.
         if packet[0] < _OFFSET or halves.max() >= self._values:
             self._reason = "a byte that is no half of a count (tactile.full_count = 4095?)"
             return None
@@ -44,12 +45,12 @@ class GloveDecoder(DelimitedDecoder):
 
 
 def bits_of(full_count: int) -> int:
-    """Return bits in each half of a count, by the largest count of the board."""
+    """Return the bits in each half of a count, given the board's largest count."""
     return _BITS + 1 if 1 << 2 * _BITS <= full_count < 1 << 2 * (_BITS + 1) else _BITS
 
 
 class Glove(SerialReader):
-    """The glove-style board under one fingertip, asked for its next frame after each one."""
+    """The glove-style board under one fingertip; a new frame is requested after each one."""
 
     request = b"a"
 

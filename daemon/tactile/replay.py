@@ -1,4 +1,4 @@
-"""Recorded frames instead of a sensor's: at their own times, or set by the caller."""
+"""Provide recorded frames in place of a sensor, at recorded times or set by the caller."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from softfinger.daemon.profile.settings import TactileSettings
 from softfinger.daemon.tactile.frame_files import FrameRecording, load_recording
 from softfinger.daemon.types import FINGERS, Frame
 
-_PITCH_OFF = 0.01  # relative, by which a file's pitch may differ from the settings'
+_PITCH_OFF = 0.01  # relative tolerance between the pitch in a file and in the settings
 
 
 def pitch_difference(recording: FrameRecording, pitch: tuple[float, float]) -> str:
-    """Return how a file's cell sizes contradict ``pitch`` (x, y) [m], y = 0 for the same.
+    """Describe how a file's cell sizes differ from ``pitch`` (x, y) [m]; y = 0 means y = x.
 
-    Empty where they agree, or the file has none.
+    The text is empty if they agree or the file states none.
     """
     if recording.pitch is None:
         return ""
@@ -40,8 +40,8 @@ def pitch_difference(recording: FrameRecording, pitch: tuple[float, float]) -> s
 class GivenFrames:
     """A sensor whose newest frame the caller sets in ``frame``.
 
-    ``live`` [rows, cols] is False where the sensor has no cell; None: it has all. ``full_count`` is
-    the reading of saturated cells; None: the settings'.
+    ``live`` [rows, cols] is False where the sensor has no cell; None means that all cells exist.
+    ``full_count`` is the reading of saturated cells; None means the settings' value.
     """
 
     def __init__(
@@ -59,7 +59,7 @@ class GivenFrames:
         return self.frame
 
     def counters(self) -> dict[str, int]:
-        """Return no counts: nothing can go wrong."""
+        """Return an empty dict, as there are no errors to count."""
         return {}
 
     def close(self) -> None:
@@ -69,14 +69,14 @@ class GivenFrames:
 class ReplayTactile:
     """Frames of a recording at its own times, counted from ``open``.
 
-    After its last frame and one mean interval it starts again, or, with ``tactile.replay_again``
-    false, repeats that frame once with ``valid`` False.
-    ``live`` [rows, cols] is False where the recording has no cell; ``full_count`` is the reading of
-    saturated cells, where the recording has it; ``notes`` say what looks wrong with it.
+    One mean interval after its last frame the recording restarts. If ``tactile.replay_again`` is
+    false, the last frame is repeated once with ``valid`` False instead. ``live`` [rows, cols] is
+    False where the recording has no cell. ``full_count`` is the reading of saturated cells, None if
+    the recording does not state it. ``notes`` describe suspicious properties of the recording.
     """
 
     def __init__(self, settings: TactileSettings, clock: Clock, finger: int) -> None:
-        """Raises TactileError when the recording can't be read or has another grid."""
+        """Load the recording. Raises TactileError if it is unreadable or has another grid."""
         path = settings.recording[finger]
         if not path:
             raise TactileError(f"tactile.recording: found none for the {FINGERS[finger]} finger")
@@ -114,14 +114,14 @@ class ReplayTactile:
         self._frame: Frame | None = None
 
     def open(self) -> None:
-        """Start with the recording's first frame, now."""
+        """Start with the recording's first frame now."""
         self._start = self._due = self._clock.now()
         self._frame = None
         self.latest()
 
     def latest(self) -> Frame | None:
-        """Return the newest frame that is due, None when not open."""
-        now = self._clock.now() + 1e-9  # a frame due now counts as come
+        """Return the newest frame that is due, or None if the sensor is not open."""
+        now = self._clock.now() + 1e-9  # include a frame that is due now
         if now < self._due:
             return self._frame
         turn = math.floor((now - self._start) / self._period)
@@ -138,12 +138,12 @@ class ReplayTactile:
         return self._frame
 
     def counters(self) -> dict[str, int]:
-        """Return ``frames`` that were due since open; ``resyncs`` and ``skipped_bytes`` stay 0."""
+        """Return the number of ``frames`` since open; ``resyncs`` and ``skipped_bytes`` stay 0."""
         frames = 0 if self._frame is None else self._frame.seq
         return {"frames": frames, "resyncs": 0, "skipped_bytes": 0}
 
     def close(self) -> None:
-        """Deliver nothing more."""
+        """Deliver no more frames."""
         self._due = math.inf
 
     def _end(self) -> Frame | None:

@@ -1,7 +1,7 @@
-"""Reads a tactile board's serial port in a thread and offers its newest complete frame.
+"""Read a tactile board's serial port in a thread, and provide its newest complete frame.
 
-Shared by every framing that comes over a serial port: here are the port, the thread and the time,
-which a :class:`Decoder` doesn't know.
+All framings over serial ports share this module. It handles the port, the thread and the times,
+which a :class:`Decoder` does not need.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ from softfinger.daemon.profile.settings import TactileSettings
 from softfinger.daemon.tactile.decoder import Decoded, Decoder
 from softfinger.daemon.types import Frame
 
-_CHUNK = 65536  # bytes taken at once: all that a Linux tty can hold
+_CHUNK = 65536  # bytes per read, the capacity of a Linux tty
 BITS_PER_BYTE = 10  # start bit, eight data bits, stop bit
-_SETTLE = 5e-4  # s without a byte that are a gap between frames
-_PATIENCE = 0.1  # s over a frame's time on the wire until a board is asked again
-_SHORTEST_WAIT = 3e-4  # s; below this a timed wait costs more than the wake-ups it saves
-_LONGEST_WAIT = 2e-3  # s; bounds what a wrong guess of the missing bytes can delay
+_SETTLE = 5e-4  # s without a byte, counts as a gap between frames
+_PATIENCE = 0.1  # s beyond the transmission time of a frame until the request is repeated
+_SHORTEST_WAIT = 3e-4  # s, shorter timed waits cost more than the wake-ups they save
+_LONGEST_WAIT = 2e-3  # s, limits the delay if the number of missing bytes is wrong
 
 
 class SensorClock:
-    """Conversion of a board's clock to ours: frames are late by varying times, never early.
+    """Convert a board's clock to the local clock, using the smallest recent delay as offset.
 
-    So the smallest recent delay is the offset, and t_sample doesn't jitter with the port. The
-    offset may rise by 200 ppm, more than two quartzes differ; a jump of more than a second is a
-    restarted board.
+    Frames arrive with varying delays but never early, so the smallest delay removes the port's
+    jitter from t_sample. The offset may rise by 200 ppm, which exceeds the difference of two
+    quartzes. A jump of more than a second is treated as a restart of the board.
     """
 
     _DRIFT = 2e-4
@@ -46,8 +46,9 @@ class SensorClock:
         self._t = -math.inf
 
     def arrival(self, t_sensor: float, t: float) -> float:
-        """Return when the frame of ``t_sensor`` [s], read at ``t`` [s], would have come undelayed
-        [s].
+        """Return the undelayed arrival time [s] of a frame.
+
+        ``t_sensor`` [s] is the frame's board time and ``t`` [s] the local time when it was read.
         """
         offset = t - t_sensor
         risen = self._offset + self._DRIFT * (t - self._t)
@@ -57,26 +58,26 @@ class SensorClock:
 
 
 class SerialReader:
-    """A board on a serial port: all of its backend but the framing, which a subclass makes.
+    """Backend of a board on a serial port, except for the framing, which a subclass provides.
 
-    Times: a frame's ``t_arrival`` is when its last byte was read. ``t_sample`` is the middle of the
-    board's scan as well as it can be known: ``t_arrival`` less the time that the frame's bytes, and
-    those behind it in the same read, take on the wire, less ``latency`` [s], from the middle of the
-    scan to the frame's first byte; never before the last frame's. Where frames carry the board's
-    time, :class:`SensorClock` takes the port's jitter out.
+    A frame's ``t_arrival`` is the time when its last byte was read. ``t_sample`` estimates the
+    middle of the board's scan: ``t_arrival`` minus the transmission time of the frame's bytes and
+    of later bytes in the same read, minus ``latency`` [s] from the middle of the scan to the
+    frame's first byte. It is never earlier than that of the last frame. If frames carry the board's
+    time, :class:`SensorClock` removes the port's jitter.
 
-    A board that must be asked gets ``request`` at first, after each frame, and again when none came
-    in 0.1 s more than its bytes take.
+    A polled board receives ``request`` at the start, after each frame, and again if no frame
+    arrives within 0.1 s more than its transmission time.
 
-    ``latest`` may be called from any thread. Each frame has an array of its own, which is never
-    written again. When the port is lost, or the stream can't be read any more, one last frame with
-    ``valid`` False and the old data comes.
+    ``latest`` may be called from any thread. Each frame has its own array, which is not modified
+    later. If the port is lost or the stream becomes unreadable, one last frame with the old data
+    and ``valid`` False is provided.
     """
 
     request = b""
 
     def __init__(self, settings: TactileSettings, clock: Clock, finger: int) -> None:
-        """``finger`` 0 is the left one; it chooses the port."""
+        """``finger`` selects the port; 0 is the left finger."""
         self.settings = settings
         self._path = settings.port[finger]
         self._decoder = self.make_decoder()
@@ -88,17 +89,17 @@ class SerialReader:
         self._bytes = 0
         self._error = ""
         self._port_lost = False
-        self._event = threading.Event()  # a first frame, or the port's end
+        self._event = threading.Event()  # set by the first frame or by loss of the port
         self._thread: threading.Thread | None = None
         self._port: serial.Serial | None = None
         self._stop: tuple[int, int] | None = None
 
     def make_decoder(self) -> Decoder:
-        """Return a fresh decoder of the board's framing, for each time the port is opened."""
+        """Return a new decoder of the board's framing, called each time the port is opened."""
         raise NotImplementedError
 
     def open(self) -> None:
-        """Open the port, start reading, wait for a good frame; TactileError says what is wrong."""
+        """Open the port, start reading and wait for a valid frame. Raises TactileError."""
         if self._port is not None:
             raise TactileError(f"{self._path}: is open already")
         self._decoder = self.make_decoder()
@@ -123,11 +124,14 @@ class SerialReader:
             raise TactileError(f"{self._path}: {trouble}")
 
     def latest(self) -> Frame | None:
-        """Return the newest complete frame, the same object until a newer one; None before any."""
+        """Return the newest complete frame, or None before the first.
+
+        The same object is returned until a newer frame arrives.
+        """
         return self._latest
 
     def counters(self) -> dict[str, int]:
-        """Return ``bytes`` read, the framing's counters, ``port_lost``: 1 until reopened."""
+        """Return ``bytes`` read, the decoder's counters, and ``port_lost``, 1 until reopened."""
         return {
             "bytes": self._bytes,
             "port_lost": int(self._port_lost),
@@ -136,11 +140,11 @@ class SerialReader:
 
     @property
     def error(self) -> str:
-        """Reason why no more frames come (port lost, stream unreadable); empty while they do."""
+        """Reason for missing frames (port lost, stream unreadable); empty while frames arrive."""
         return self._error
 
     def close(self) -> None:
-        """Stop the thread and close the port. Never raises; more than once is fine."""
+        """Stop the thread and close the port. Never raises, and may be called repeatedly."""
         stop, thread, port = self._stop, self._thread, self._port
         self._stop = self._thread = self._port = None
         if stop is not None:
@@ -168,7 +172,7 @@ class SerialReader:
         return f"{self._bytes} bytes {within}, {self._decoder.diagnosis()}"
 
     def _run(self, port: int, stop: int) -> None:
-        """The thread: waits in the kernel, wakes once or twice a frame."""
+        """Read in the thread, which blocks in the kernel and wakes once or twice per frame."""
         decoder = self._decoder
         timeout = self._ask(port)
         while True:
@@ -198,7 +202,7 @@ class SerialReader:
             else:
                 timeout = self._patience if decoded is None else self._ask(port)
             wait = decoder.missing * self._byte_time
-            # The rest of this frame is on its way: wait for its end instead of for its next byte.
+            # The remaining bytes are being sent: wait for the frame's end instead of its next byte.
             if (
                 wait > _SHORTEST_WAIT
                 and select.select((stop,), (), (), min(wait, _LONGEST_WAIT))[0]
@@ -207,15 +211,15 @@ class SerialReader:
 
     @property
     def _patience(self) -> float | None:
-        """Time to wait for an answer to a request [s]; None for boards that send unasked."""
+        """Longest time to wait for a requested frame [s]; None for boards that are not polled."""
         if not self.request:
             return None
         return self._decoder.frame_bytes * self._byte_time + _PATIENCE
 
     def _ask(self, port: int) -> float | None:
-        """Request a frame where the board wants that; how long to wait for it [s]."""
+        """Request a frame from a polled board; return the longest time to wait for it [s]."""
         if self.request:
-            with contextlib.suppress(OSError):  # the next read reports a port that is gone
+            with contextlib.suppress(OSError):  # the next read reports a lost port
                 os.write(port, self.request)
         return self._patience
 
@@ -247,7 +251,7 @@ class SerialReader:
 
 
 def open_port(path: str, baud: int) -> serial.Serial:
-    """Open ``path`` for this process alone, raw, eight data bits, no parity; else TactileError."""
+    """Open ``path`` exclusively: raw, eight data bits, no parity. Raises TactileError."""
     try:
         return serial.Serial(path, baud, timeout=0, exclusive=True)
     except serial.SerialException as error:

@@ -1,12 +1,13 @@
-"""Parses Tekscan-style ASCII exports: text in, pressure frames out.
+"""Parse Tekscan-style ASCII exports of pressure frames.
 
-Such a file starts with lines ``KEY value``, up to ``ASCII_DATA @@``. Then each frame is a line
-``Frame n`` (more may stand behind it) and its rows, ``B`` where the sensor has no cell; a line
-``@@`` may end it. The export of a single frame has no ``Frame`` line. The exporting machine's
-locale decides on encoding, decimal sign and separator, so all of these are found out from the file.
-Lengths come in mm, cm, m or in, abbreviated or spelt out, readings raw, in a unit of pressure or of
-force on a cell. Below ``COMMENTS:`` stands free text, in which only words in capitals are keys; a
-spreadsheet leaves separators at the lines' ends, and quotation marks.
+Such a file starts with lines ``KEY value``, up to the line ``ASCII_DATA @@``. Each frame is a line
+``Frame n``, which may have more text, followed by the rows, with ``B`` where the sensor has no
+cell. A line ``@@`` may end the file. The export of a single frame has no ``Frame`` line.
+
+Encoding, decimal sign and separator depend on the locale of the exporting machine and are detected
+from the file. Lengths are in mm, cm, m or in, abbreviated or spelt out. Readings are raw, in a unit
+of pressure, or in a unit of force per cell. Free text follows ``COMMENTS:``, where only words in
+capitals are keys. A spreadsheet may add separators at the ends of lines and quotation marks.
 """
 
 from __future__ import annotations
@@ -22,12 +23,12 @@ from numpy.typing import NDArray
 
 from softfinger.daemon.errors import SoftfingerError
 
-_MOST = 1024  # rows or cols
-_HEADER_MOST = 1000  # lines
-_LARGEST = 1e12  # of any reading, in its unit
-_RAW_FULL = 255  # the maker's electronics has 8 bits
-_NEARLY = 0.995  # of the saturation pressure, which is rounded as well
-_EDGES = ' \t,;"'  # what a spreadsheet leaves at a line's ends
+_MOST = 1024  # largest number of rows or cols
+_HEADER_MOST = 1000  # largest number of header lines
+_LARGEST = 1e12  # largest reading, in its unit
+_RAW_FULL = 255  # the manufacturer's electronics has 8 bits
+_NEARLY = 0.995  # fraction of the saturation pressure, which is also rounded
+_EDGES = ' \t,;"'  # characters that a spreadsheet adds at the ends of lines
 _LENGTHS = {
     **dict.fromkeys(("", "mm", "millimeters", "millimetres", "millimeter", "millimetre"), 1e-3),
     **dict.fromkeys(("cm", "centimeters", "centimetres", "centimeter", "centimetre"), 1e-2),
@@ -51,22 +52,22 @@ _FORCES = {
     **dict.fromkeys(("oz", "ozf"), 0.27801385095),
 }
 _AREAS = {"m2": 1.0, "cm2": 1e-4, "mm2": 1e-6, "in2": 0.0254**2, "ft2": 0.3048**2}
-# As they come from Latin-1, UTF-8 and the code pages of DOS.
+# Squares as encoded by Latin-1, UTF-8 and DOS code pages.
 _SQUARES = str.maketrans({"²": "2", "ý": "2", "^": "", ".": "", "*": ""})
 
 
 class TekscanError(SoftfingerError, ValueError):
-    """The text is no such export; the message names the line."""
+    """Text that is not such an export. The message names the line."""
 
 
 @dataclass(frozen=True)
 class Export:
     """A parsed export.
 
-    ``values`` float64 [frames, rows, cols]: Pa, or counts where ``raw``; 0 where ``live`` [rows,
-    cols] is False. ``t`` float64 [frames] from the first frame on [s]; ``pitch`` (x, y) [m], NaN
-    where the header lacks it. ``full``: the reading from which on a cell is saturated, inf where
-    that is not known.
+    ``values`` float64 [frames, rows, cols] are in Pa, or counts if ``raw``, and 0 where ``live``
+    [rows, cols] is False. ``t`` float64 [frames] is the time since the first frame [s]. ``pitch``
+    (x, y) [m] is NaN if the header lacks it. ``full`` is the reading at which a cell is saturated,
+    inf if unknown.
     """
 
     values: NDArray[np.float64]
@@ -78,7 +79,7 @@ class Export:
 
 
 def decode(data: bytes) -> str:
-    """Return a file's text, in UTF-8, UTF-16 or a single-byte code, with or without a mark."""
+    """Decode a file as UTF-8, UTF-16 or a single-byte code, with or without a byte order mark."""
     for mark, code in ((codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16")):
         if data.startswith(mark):
             return data.decode(code, "replace")
@@ -92,7 +93,10 @@ def decode(data: bytes) -> str:
 
 
 def parse(text: str, seconds_per_frame: float = 0.01) -> Export:
-    """Read an export; ``seconds_per_frame`` [s] where its header has none. Raises TekscanError."""
+    """Parse an export. Raises TekscanError.
+
+    ``seconds_per_frame`` [s] is used if the header states none.
+    """
     lines = text.splitlines()
     header, first = _header(lines)
     rows, cols = _count(header, "ROWS"), _count(header, "COLS")
@@ -124,9 +128,9 @@ def parse(text: str, seconds_per_frame: float = 0.01) -> Export:
 def _live_cells(
     values: NDArray[np.float64], places: list[list[int]]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Return the values, 0 in cells that are missing or never a number, and the other cells.
+    """Return the values, with 0 in missing and never numeric cells, and a mask of the other cells.
 
-    Raises TekscanError for a cell that is no number in some frames.
+    Raises TekscanError for a cell that is not a number in some frames.
     """
     unknown = np.isnan(values)
     live: NDArray[np.bool_] = ~np.any([np.isneginf(values).any(0), unknown.all(0)], axis=0)
@@ -140,7 +144,7 @@ def _live_cells(
 
 
 def _digits(values: NDArray[np.float64]) -> int:
-    """Return the number of decimals that the readings have."""
+    """Return the number of decimals of the readings."""
     for digits in range(9):
         if np.allclose(values, np.round(values, digits), rtol=1e-12, atol=0.0):
             return digits
@@ -170,7 +174,7 @@ def _header(lines: list[str]) -> tuple[dict[str, str], int]:
 def _frames(
     lines: list[str], first: int, rows: int, cols: int
 ) -> tuple[list[int], list[list[NDArray[np.float64]]], list[list[int]]]:
-    """Numbers of the frames, their rows and the rows' lines, from line ``first`` on."""
+    """Return the frames' numbers, their rows and the rows' line numbers, from line ``first`` on."""
     numbers: list[int] = []
     frames: list[list[NDArray[np.float64]]] = []
     places: list[list[int]] = []
@@ -181,7 +185,7 @@ def _frames(
             continue
         if line.lstrip(_EDGES).startswith("@@"):
             break
-        if re.match(r'"?[^\W\d]{2}', line):  # a row starts with a number or a lonely B
+        if re.match(r'"?[^\W\d]{2}', line):  # a row starts with a number or a single B
             match = re.match(r'"?[^\W\d]+[\s:#,;]*(\d{1,9})\b', line)
             if match is None:
                 if re.match(r'"?(nan|inf)', line, re.IGNORECASE) is None:
@@ -196,7 +200,7 @@ def _frames(
                 frames.append([])
                 places.append([])
                 continue
-        if not frames:  # the export of a single frame
+        if not frames:  # export of a single frame
             numbers.append(1)
             frames.append([])
             places.append([])
@@ -215,7 +219,7 @@ def _frames(
 
 
 def _separator(line: str, cols: int) -> str:
-    """Return what stands between the cells, by their number in a row."""
+    """Detect the separator of the cells from their number in a row."""
     for separator in ("\t", ";", ", ", ",", " "):
         if separator in line and len(_cells(line, separator, cols)) == cols:
             return separator
@@ -235,11 +239,11 @@ def _cells(line: str, separator: str, cols: int) -> list[str]:
 
 
 def _row(line: str, separator: str, cols: int, number: int) -> NDArray[np.float64]:
-    """A row's readings: −inf where the sensor has no cell."""
+    """Parse the readings of a row; −inf where the sensor has no cell."""
     cells = [cell.strip(' "').upper() for cell in _cells(line, separator, cols)]
     missing = cells.count("B")
     if separator == "," and len(cells) != cols:
-        # Each number has its decimals, or it's not known which do.
+        # The commas are decimal signs only if every number has one.
         if len(cells) == 2 * cols - missing:
             parts = iter(cells)
             cells = [part if part == "B" else f"{part}.{next(parts)}" for part in parts]
@@ -260,7 +264,10 @@ def _row(line: str, separator: str, cols: int, number: int) -> NDArray[np.float6
 
 
 def _number(text: str) -> float:
-    """A number with a decimal point or comma; of both the last one, the other groups digits."""
+    """Parse a number with a decimal point or comma.
+
+    If both occur, the last one is the decimal sign and the other groups digits.
+    """
     if "," in text:
         text = text.replace("," if text.rfind(",") < text.rfind(".") else ".", "")
         text = text.replace(",", ".")
@@ -277,7 +284,7 @@ def _count(header: dict[str, str], key: str) -> int:
 
 
 def _quantity(header: dict[str, str], key: str, units: dict[str, float]) -> float:
-    """A number with its unit, in SI."""
+    """Parse a number with its unit and convert it to SI."""
     match = re.fullmatch(r"([-+0-9.,eE]+)[\s,;]*(.*)", header[key])
     try:
         value = _number(match[1].rstrip(",")) if match else math.nan
@@ -291,7 +298,7 @@ def _quantity(header: dict[str, str], key: str, units: dict[str, float]) -> floa
 
 
 def _pitch(header: dict[str, str]) -> tuple[float, float]:
-    """(x, y) from the spacings."""
+    """Return (x, y) from the spacings in the header [m]."""
     found = []
     for key in ("COL_SPACING", "ROW_SPACING"):
         value = _quantity(header, key, _LENGTHS) if key in header else math.nan
@@ -309,7 +316,7 @@ def _unit(header: dict[str, str], pitch: tuple[float, float]) -> float:
         return 0.0
     if unit in _PRESSURES or unit in _per_area():
         return (_PRESSURES | _per_area())[unit]
-    if unit in _FORCES:  # on a cell
+    if unit in _FORCES:  # force on one cell
         area = _quantity(header, "SENSEL_AREA", _AREAS) if "SENSEL_AREA" in header else math.nan
         area = pitch[0] * pitch[1] if math.isnan(area) else area
         if area > 0.0:
@@ -327,6 +334,6 @@ def _per_area() -> dict[str, float]:
 
 
 def _plain(unit: str) -> str:
-    """A unit without the ways to write a square."""
+    """Normalise a unit, including the notations of a square."""
     plain = re.sub(r"[\s\[\]()]", "", unit.translate(_SQUARES)).lower()
     return re.sub(r"(sq|square)([a-z]+)", r"\g<2>2", plain)
