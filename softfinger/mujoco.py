@@ -122,10 +122,11 @@ def press(
     touches: Records[Touch], parameters: Records[Parameters], tables: Records[Table],
     geometry: FloatArray, jacobians: FloatArray, velocity: FloatArray, dt: float, work: Work,
 ) -> None:  # fmt: skip
-    """Evaluate all tips into ``work``: rows R [4n, nv], force along each, B of the step.
+    """Evaluate all tips into ``work``: rows R [4n, nv], the force along each row, and B.
 
-    ``geometry`` [n, 10]: d, centre, axis, foremost point; ``jacobians`` [n, 4, 3, nv]: of the tip,
-    then of what it touches, each of place and of rotation; ``dt`` [s]: since the last call.
+    ``geometry`` [n, 10] holds d, centre, axis and foremost point of each tip. ``jacobians``
+    [n, 4, 3, nv] holds the position and rotation Jacobians of the tip, then those of the touched
+    geom. ``dt`` [s] is the time since the last call.
     """
     p, data, rates = parameters[0], tables[0], np.zeros(_ROWS)
     rows, force, implicit = work
@@ -150,7 +151,7 @@ def press(
             touch.shear[:] = rows[first : first + _ROWS] = 0.0
             continue
         tip.rate_d, tip.rate_theta, tip.slip_rate = rates[0], rates[1], rates[2]
-        # The shear turns into today's face, as long as it was, and grows.
+        # Rotate the shear into the current face, keep its length, and add this step's motion.
         along, across = (touch.shear * touch.along).sum(), (touch.shear * touch.across).sum()
         within = along * along + across * across
         scale = math.sqrt((touch.shear**2).sum() / within) if within > 0.0 else 0.0
@@ -176,10 +177,11 @@ def solve(
     touches: Records[Touch], parameters: Records[Parameters], work: Work, inertial: FloatArray,
     acceleration: FloatArray, passive: FloatArray, own: FloatArray,
 ) -> None:  # fmt: skip
-    """Solve for the forces f of the step's end; add −Rᵀf to ``passive``, write its M⁻¹ to ``own``.
+    """Solve for the forces f at the end of the step.
 
-    ``inertial`` is M⁻¹Rᵀ as rows [4n, nv], ``acceleration`` [nv] that of the last step. Tips don't
-    pull, and friction stays on its cone.
+    Adds −Rᵀf to ``passive`` and writes the acceleration −M⁻¹Rᵀf to ``own``. ``inertial`` is M⁻¹Rᵀ
+    stored as rows [4n, nv], ``acceleration`` [nv] is the acceleration of the last step. The normal
+    forces are kept non-negative and the friction forces within the friction cone.
     """
     p = parameters[0]
     rows, force, implicit = work
@@ -414,7 +416,7 @@ class MujocoHand(SimulatedHand):
                 set_currents(plant.array, data.ctrl)
                 data.qfrc_applied[2:] = plant.goals.load
                 mujoco.mj_step2(self.model, data)
-                mujoco.mj_step1(self.model, data)  # after mj_step2, so that the contacts are up to date
+                mujoco.mj_step1(self.model, data)  # updates the contacts for feel
                 state.position[:], state.velocity[:] = data.qpos, data.qvel
                 state.current[:] = data.act
                 self._done = plant.steps = self._done + 1
