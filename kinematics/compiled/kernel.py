@@ -25,7 +25,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 TESTED = ("0.63", "0.64", "0.65", "0.66", "0.67", "0.68")
 
 # index(k) converts k to an unsigned index. Numba checks signed indices for negative values, which
-# count from the end, and this check prevents vectorisation. Only add unsigned to unsigned indices.
+# count from the end, and this check prevents vectorisation. Do not mix both kinds in a sum.
 index: Callable[[int], int] = cast(Any, np.uint64)
 
 _OPTIONS: dict[str, Any] = {"error_model": "numpy"}

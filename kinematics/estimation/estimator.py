@@ -38,8 +38,12 @@ class ContactEstimate:
         True if a contact is detected.
     invalid
         The reason for which the estimate cannot be used, or `Invalid.NONE`.
-    d, tilt_x, tilt_y, gain
-        Displacement, tilts, and the ratio of measured to modelled pressure.
+    d
+        Displacement [m].
+    tilt_x, tilt_y
+        Tilts of the object's normal [rad].
+    gain
+        Ratio of measured to modelled pressure.
     covariance
         Covariance of (d, tilt_x, tilt_y, gain). The row of a fixed gain is zero.
     systematic
