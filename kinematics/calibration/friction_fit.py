@@ -36,7 +36,7 @@ class FrictionFit(NamedTuple):
     coulomb_std: float
     viscous: float  # [N·m·s/rad]
     viscous_std: float
-    stiction: float  # at break-away; NaN if fewer than three slow strokes began from rest
+    stiction: float  # at break-away; NaN with fewer than three slow starts from rest
     stiction_std: float
 
 
@@ -48,15 +48,15 @@ def fit_friction(
     inertia: float,
     step: float,
 ) -> FrictionFit:
-    """Fit a joint's motion there and back in air by least squares.
+    """Fit the friction of a joint to reciprocating motion in free air by least squares.
 
     While the joint moves, its motor gives
 
         torque = F sign(q̇) + b q̇ + J q̈ + c0 + c1 q + c2 q²
 
-    with the Coulomb friction F and the viscous friction b ≥ 0. The polynomial is the part that the
-    direction of motion does not change: weight, cables, an offset of the current. Friction at
-    break-away is the largest torque of a start from rest behind a slow goal.
+    with the Coulomb friction F and the viscous friction b ≥ 0. The polynomial covers torques that
+    do not depend on the direction of motion: weight, cables and the offset of the current. The
+    break-away friction is the largest torque during a start from rest with a slow goal.
 
     Parameters
     ----------

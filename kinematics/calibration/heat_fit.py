@@ -11,7 +11,7 @@ from softfinger.kinematics.calibration.calibration import CalibrationError
 from softfinger.kinematics.hand.servo_heat import COPPER, HeatLaw
 
 _DOUBT = (0.4, 0.4, 3.0)  # prior standard deviations of rise and time (relative), ambient [°C]
-_READING = 0.4  # °C, error of a reading in whole degrees, including similar errors
+_READING = 0.4  # °C, error of a reading in whole degrees, including other errors of that kind
 _STEP = 1.0  # s
 _LEAST = 8.0  # °C, smallest temperature rise of the case
 _ROUNDS = 12

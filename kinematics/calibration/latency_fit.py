@@ -25,7 +25,7 @@ _ROUNDS = 3  # alternating iterations for the touch and the fit
 
 
 class LatencyFit(NamedTuple):
-    """Delay of the frames beyond the latency in their times, with its standard deviation [s]."""
+    """Delay of the frames in addition to the configured latency, with standard deviation [s]."""
 
     delay: float
     std: float

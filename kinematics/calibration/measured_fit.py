@@ -22,7 +22,7 @@ from softfinger.kinematics.contact.tip_curves import (
 from softfinger.kinematics.estimation.measured import sum_weights
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
-_FEWEST = 6  # presses
+_FEWEST = 6  # smallest number of presses
 _UPRIGHT = math.radians(1.0)
 _TILTED = math.radians(5.0)
 _POOR = 0.05  # largest error of the curves over the force, and over the radius

@@ -10,12 +10,12 @@ A record is declared once as a class; Python code and kernels then access the sa
 
     tip = Tip()               # zeros
     tip.d = 1e-3              # Python: reads and writes by name
-    press(tip.array, 0.1)     # a kernel that Python calls takes the array of one record …
+    press(tip.array, 0.1)     # a kernel called from Python takes the array of one record
 
     @kernel
     def press(tips: Records[Tip], more: float) -> None:
-        tip = tips[0]         # … and works on its first: a reference, not a copy
-        deeper(tip, more)     # inner kernels take the record itself
+        tip = tips[0]         # a reference to the record, not a copy
+        deeper(tip, more)     # an inner kernel takes the record itself
 
 Fields are `float`, `int` (64 bit), `bool`, another record, or an array of fixed shape by
 :data:`Annotated`. Arrays whose size depends on a grid are not fields, because kernels would be

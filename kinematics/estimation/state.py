@@ -61,7 +61,7 @@ class Signal(Record):
     patch_level: float
     saturation: float  # [Pa]
     floor: float  # [Pa]; −inf for none
-    number: int  # cells that a contact can press
+    number: int  # number of cells that a contact can press
     peak: float  # largest cell [counts]; its indices are −1 if it is below the level
     row: int
     col: int
@@ -113,14 +113,14 @@ class Moments(Record):
     n_x: float
     n_y: float
     gain: float
-    # Of the model, over the depths deepest · (k/(START_POINTS − 1))²:
+    # Moments of the model at the depths deepest · (k/(START_POINTS − 1))²:
     force: Depths  # Σ p, upright [Pa]
     extent: Depths  # trace of the pressure's covariance, upright [m²]
     lever: Depths  # centroid over sin of the tilt [m]
 
 
 class Fit(Record):
-    """Gauss-Newton at one contact and gain."""
+    """Gauss-Newton step at one contact and gain."""
 
     face: Face
     gain: float
@@ -150,7 +150,7 @@ class Budget(Record):
 
     sizes: Annotated[FloatArray, SOURCES]  # standard deviations of the patterns' factors
     baseline: float  # standard deviation of a shift of all cells [Pa]
-    slope: float  # of the zero, at the radius [Pa]
+    slope: float  # standard deviation of a slope of the zeros, at the rim [Pa]
     smooth: float  # relative pressure error
     rotation: float  # of the sensor [rad]
     lean: float  # relative tilt error of a solid tip over d/a
@@ -193,7 +193,7 @@ class Cells(NamedTuple):
     by_x: FloatArray
     by_y: FloatArray
     height: FloatArray  # √(a² − x² − y²) [m], see `cell_centres`; negative for unused cells
-    x: FloatArray  # of the centre [m]
+    x: FloatArray  # centre of the cell [m]
     y: FloatArray
     pattern: FloatArray  # for the detection of a solid tip's contact
     model: FloatArray  # pressure [Pa] with gain and shear

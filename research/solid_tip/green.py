@@ -49,7 +49,7 @@ def graded(last: float, widest: float, growth: float, length: float) -> FloatArr
 
 
 class Meridian:
-    """Mesh of the quarter disc: ``rings`` elements along the arc where contact may be."""
+    """Mesh of the quarter disc with ``rings`` elements along the arc where contact may occur."""
 
     def __init__(self, rings: int, finer: float = 8.0, widest: float = 0.08) -> None:
         step = np.pi / 2 / rings
