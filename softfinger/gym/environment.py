@@ -55,7 +55,7 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         - ``law``: The action sets the built-in grip law's force (1 to 12 N) and object angle
           (−0.25 to 0.25 rad).
     profile
-        A profile of the simulated hand; the default profile if None.
+        Profile of the simulated hand; the default settings if None.
     changes
         Settings to change, in the form of ``--set``.
     shaped
