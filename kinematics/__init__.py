@@ -1,5 +1,5 @@
 """Contact mechanics of soft hemispherical fingertips and the planar two-fingered hand.
 
-Pure mathematics: no clock, no thread, no settings, and no file but the solid tip's data and the
-kernels' cache. SI units.
+The modules are pure mathematics in SI units. They use no clocks, threads or settings, and the only
+files are the data of the solid tip and the cache of compiled kernels.
 """

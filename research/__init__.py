@@ -1,1 +1,1 @@
-"""Programs that computed what the package only reads; run from the tree, never installed."""
+"""Programs that computed the package's data files. They run from the source tree only."""

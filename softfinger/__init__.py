@@ -1,7 +1,7 @@
-"""softfinger: real-time control of two rotational fingers with soft hemispherical tips.
+"""Real-time control of two rotational fingers with soft hemispherical tips.
 
-The names below are the public ones; each is imported when it is first asked for, so that a program
-that only talks to a running hand (`Hand`, `AsyncHand`) loads neither Numba nor the control loop.
+This module exports the public API. Each name is imported on first access, so a client program that
+uses only `Hand` or `AsyncHand` loads neither Numba nor the control loop.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ _MODULES = {
 
 
 class SoftfingerError(Exception):
-    """The root of all exceptions of this package."""
+    """Base class of all exceptions raised by this package."""
 
 
 def __getattr__(name: str) -> Any:

@@ -1,4 +1,4 @@
-"""``python -m softfinger``: the command line."""
+"""Command line entry point: ``python -m softfinger``."""
 
 import sys
 

@@ -1,17 +1,19 @@
-"""The soft tips in MuJoCo: this package's contact law and pressure grids in a scene of MuJoCo's.
+"""Soft tips in MuJoCo: the contact law and the pressure grids of this package in a MuJoCo scene.
 
-:class:`SoftTips` makes spheres of any model soft hemispheres: a passive force (`mjcb_passive`) from
-the contact table, with friction, and the pressure under each tip as a user sensor.
-:class:`MujocoHand` is a profile's hand, for the daemon by ``servos.backend = "mujoco"``.
+:class:`SoftTips` turns spheres of any MuJoCo model into soft hemispheres. A passive-force callback
+(`mjcb_passive`) applies the contact table's force with friction, and a user sensor holds the
+pressure under each tip. :class:`MujocoHand` is the hand of a profile; the daemon uses it with
+``servos.backend = "mujoco"``.
 
-The law is the simulated hand's own kernel (`simulation.physics.tip`). Shear is a vector in the face
-here: that along the tilt is its d_t, that across enters as variance, U having ρ(ζ² + v). Forces are
-those of a step's end (docs/mujoco.md), linearly implicit along the rows R of d, θ and both shears
+The law is the kernel of the simulated hand (`simulation.physics.tip`). In 3D the shear is a vector
+in the face: its component along the tilt is d_t, and its component across the tilt enters as a
+variance, because U contains ρ(ζ² + v). The forces f are those at the end of the step
+(docs/mujoco.md). They are linearly implicit along the rows R of d, θ and both shears:
 
     (1 + hBA) f = f(t) + h K w + h B R a     A = R M⁻¹ Rᵀ    B = D + h K    w = R q̇
 
-with the law's stiffness K and losses D, and a the acceleration that all else gave in the last step:
-at rest f is the law's own.
+K and D are the law's stiffness and damping, h is the time step, and a is the acceleration due to
+all other forces in the last step. At rest, f equals the law's force.
 """
 
 from __future__ import annotations
@@ -50,10 +52,10 @@ from softfinger.kinematics.contact.table_record import Table
 
 Work = tuple[FloatArray, FloatArray, FloatArray]
 
-_ROWS = 4  # of a tip: d, θ, shear along the tilt and across it
-_NEAR = 0.005  # m from a tip within which a step may bring a touch
-_LEAST = 1e-9  # m of a touch, N; sin θ of a tilt, below it any direction on the face is along it
-_SHEAR = 2  # the row of the shear along the tilt
+_ROWS = 4  # rows per tip: d, θ, shear along and across the tilt
+_NEAR = 0.005  # m, gap within which a contact may begin in the next step
+_LEAST = 1e-9  # smallest contact depth [m], friction force [N] and sin θ with a tilt direction
+_SHEAR = 2  # row of the shear along the tilt
 _LEFT_OUT = (
     "tip_relaxation",
     "tip_micro_slip",
@@ -61,17 +63,17 @@ _LEFT_OUT = (
     "joint_load_friction",
     "joint_stribeck",
 )
-_IMPEDANCE = 0.9999  # of the joints' friction, MuJoCo's highest: with its 0.9 they creep by mrad/s
+_IMPEDANCE = 0.9999  # for joint friction; with MuJoCo's default 0.9 joints creep by mrad/s
 
 
 class Touch(Record):
-    """One tip on a face, in space; vectors are the world's."""
+    """One tip on a face in 3D; vectors are in world coordinates."""
 
     contact: TipContact
-    normal: Three  # m, from the tip's centre into the face
-    along: Three  # t, on the face, against the lean of the tip's axis
-    across: Three  # m × t, which θ turns about
-    shear: Three  # of the face against the tip [m]
+    normal: Three  # m, unit vector from the tip's centre into the face
+    along: Three  # t, unit vector in the face, opposite to the lean of the tip's axis
+    across: Three  # m × t, the rotation axis of θ
+    shear: Three  # displacement of the face relative to the tip [m]
     shear_across: float  # [m]
 
 
@@ -95,7 +97,7 @@ def _set_frame(touch: Touch, geometry: FloatArray) -> None:
 
 @inner_kernel
 def _set_forces(p: Parameters, table: Table, touch: Touch, rate_across: float) -> float:
-    """Evaluate the law for a shear in two directions; return the force across, with its loss."""
+    """Evaluate the law for a two-dimensional shear; return the force across, damping included."""
     tip = touch.contact
     stiffness = limit = 0.0
     for _ in range(2):
@@ -106,7 +108,7 @@ def _set_forces(p: Parameters, table: Table, touch: Touch, rate_across: float) -
         total = math.hypot(tip.tangential, stiffness * touch.shear_across)
         if total <= limit * (1.0 + 1e-9):
             break
-        # Slip: both shears come back on the cone, T and they falling alike.
+        # Slip: scale both shears, and with them the force, back onto the friction cone.
         tip.shear += (limit / total - 1.0) * tip.tangential / stiffness
         touch.shear_across *= limit / total
     touch.shear[:] = tip.shear * touch.along + touch.shear_across * touch.across
@@ -120,10 +122,11 @@ def press(
     touches: Records[Touch], parameters: Records[Parameters], tables: Records[Table],
     geometry: FloatArray, jacobians: FloatArray, velocity: FloatArray, dt: float, work: Work,
 ) -> None:  # fmt: skip
-    """Evaluate all tips into ``work``: rows R [4n, nv], force along each, B of the step.
+    """Evaluate all tips into ``work``: rows R [4n, nv], the force along each row, and B.
 
-    ``geometry`` [n, 10]: d, centre, axis, foremost point; ``jacobians`` [n, 4, 3, nv]: of the tip,
-    then of what it touches, each of place and of rotation; ``dt`` [s]: since the last call.
+    ``geometry`` [n, 10] holds d, centre, axis and foremost point of each tip. ``jacobians``
+    [n, 4, 3, nv] holds the position and rotation Jacobians of the tip, then those of the touched
+    geom. ``dt`` [s] is the time since the last call.
     """
     p, data, rates = parameters[0], tables[0], np.zeros(_ROWS)
     rows, force, implicit = work
@@ -148,7 +151,7 @@ def press(
             touch.shear[:] = rows[first : first + _ROWS] = 0.0
             continue
         tip.rate_d, tip.rate_theta, tip.slip_rate = rates[0], rates[1], rates[2]
-        # The shear turns into today's face, as long as it was, and grows.
+        # Rotate the shear into the current face, keep its length, and add this step's motion.
         along, across = (touch.shear * touch.along).sum(), (touch.shear * touch.across).sum()
         within = along * along + across * across
         scale = math.sqrt((touch.shear**2).sum() / within) if within > 0.0 else 0.0
@@ -174,20 +177,21 @@ def solve(
     touches: Records[Touch], parameters: Records[Parameters], work: Work, inertial: FloatArray,
     acceleration: FloatArray, passive: FloatArray, own: FloatArray,
 ) -> None:  # fmt: skip
-    """Solve for the forces f of the step's end; add −Rᵀf to ``passive``, write its M⁻¹ to ``own``.
+    """Solve for the forces f at the end of the step.
 
-    ``inertial`` is M⁻¹Rᵀ as rows [4n, nv], ``acceleration`` [nv] that of the last step. Tips don't
-    pull, and friction stays on its cone.
+    Adds −Rᵀf to ``passive`` and writes the acceleration −M⁻¹Rᵀf to ``own``. ``inertial`` is M⁻¹Rᵀ
+    stored as rows [4n, nv], ``acceleration`` [nv] is the acceleration of the last step. The normal
+    forces are kept non-negative and the friction forces within the friction cone.
     """
     p = parameters[0]
     rows, force, implicit = work
     n = len(force)
-    matrix = np.eye(n, n + 1)  # the last column is the right-hand side
+    matrix = np.eye(n, n + 1)  # last column: right-hand side
     for i in range(n):
         push = p.step * implicit[i] * rows[i]
         matrix[i, :n] += (push * inertial).sum(axis=1)
         matrix[i, n] = force[i] + (push * (acceleration - own)).sum()
-    # No pivoting: B ≥ 0 is diagonal and A positive, so that all leading minors are above 0.
+    # Pivoting is not needed: B ≥ 0 is diagonal and A positive, so all leading minors are positive.
     for i in range(n):
         matrix[i] /= matrix[i, i]
         for k in range(n):
@@ -204,13 +208,31 @@ def solve(
 
 
 class SoftTips:
-    """Makes spheres of a MuJoCo model soft tips, for as long as it is open (a context manager).
+    """Context manager that turns spheres of a MuJoCo model into soft tips.
 
-    ``tips`` are geoms: spheres of ``settings.tip.radius`` whose z axis is the hemisphere's, out of
-    the finger. Each feels the nearest of the geoms ``touching``, by its tangent plane. None of them
-    may collide by MuJoCo's own contacts. A user sensor ``TIP_pressure`` of ``needstage="vel"`` gets
-    the pressure [Pa] on the grid's cells, ``tactile.rate`` times a second. ``mjcb_passive`` and
-    ``mjcb_sensor`` are taken, one model at a time. Raises SettingsError for what it can't do.
+    While it is open it occupies MuJoCo's global callbacks ``mjcb_passive`` and ``mjcb_sensor``, so
+    only one model at a time can have soft tips. A user sensor named ``TIP_pressure`` with
+    ``needstage="vel"`` receives the cell pressures [Pa], updated ``tactile.rate`` times per second.
+
+    Parameters
+    ----------
+    model, data
+        The MuJoCo scene.
+    settings
+        Settings of the tip, its material, the pressure grid and friction.
+    tips
+        Names of sphere geoms of radius ``settings.tip.radius``. The z axis of each geom is the axis
+        of the hemisphere and points out of the finger.
+    touching
+        Names of the geoms that the tips touch. Each tip contacts the nearest one, represented by
+        its tangent plane. Disable MuJoCo's own collisions for these geoms and for the tips.
+    table
+        Contact table of the tip; built from the settings if None.
+
+    Raises
+    ------
+    SettingsError
+        If the scene or the settings use a feature that is not supported here.
     """
 
     def __init__(
@@ -243,7 +265,7 @@ class SoftTips:
         self._grids = [make_grid(settings, k % 2) for k in range(n)]
         self._sensors: list[tuple[int, FloatArray, FloatArray]] = []
         for k, name in enumerate(tips):
-            with suppress(KeyError):  # there is none
+            with suppress(KeyError):  # the sensor is optional
                 cells = data.sensor(f"{name}_pressure").data.reshape(self._grids[k].shape)
                 self._sensors.append((k, cells, np.zeros(cells.shape)))
         self._t, self._period, self._due = data.time, 1.0 / settings.tactile.rate, -math.inf
@@ -258,7 +280,7 @@ class SoftTips:
         mujoco.set_mjcb_sensor(None)
 
     def pressure(self, k: int, out: FloatArray | None = None) -> FloatArray:
-        """Return the pressure [Pa] on tip ``k``'s cells, float64 [rows, cols]."""
+        """Return the cell pressures [Pa] of tip ``k``, float64 [rows, cols]."""
         touch, tip = self.touches[k], self.touches[k].contact
         frame = self.data.geom_xmat[self._tips[k]].reshape(3, 3)
         d = min(max(tip.d, 0.0), self._parameters.deepest)
@@ -266,12 +288,12 @@ class SoftTips:
         return self._grids[k].pressure(*self._law, d, x, y, self._scale * tip.gain, out)
 
     def add_forces(self, model: Any, data: Any) -> None:
-        """Add the tips' forces to ``qfrc_passive``: `mjcb_passive`."""
+        """Add the tip forces to ``qfrc_passive`` (callback `mjcb_passive`)."""
         if data is not self.data:
             return
         geometry, touching, fromto = self._geometry, self._touching, np.zeros(6)
         dt, self._t = data.time - self._t, data.time
-        if dt < 0.0:  # it was reset
+        if dt < 0.0:  # the scene was reset
             self._all["shear"] = self._own[:] = dt = 0.0
             self._due = -math.inf
         for k, tip in enumerate(self._tips):
@@ -289,7 +311,7 @@ class SoftTips:
         solve(*law, work, self._inertial, data.qacc, data.qfrc_passive, self._own)
 
     def fill_sensors(self, _: Any, data: Any, stage: int) -> None:
-        """Fill the pressure sensors, which MuJoCo clears in each step: `mjcb_sensor`."""
+        """Fill the pressure sensors, which MuJoCo clears in each step (callback `mjcb_sensor`)."""
         if data is self.data and stage == mujoco.mjtStage.mjSTAGE_VEL:
             is_due = data.time >= self._due
             self._due = data.time + self._period - 1e-9 if is_due else self._due
@@ -298,9 +320,11 @@ class SoftTips:
 
 
 def hand_mjcf(settings: Settings, p: Parameters) -> str:
-    """Return the profile's hand and a box before it as MJCF, in its plane, z towards the reader.
+    """Return the profile's hand and a box in front of it as MJCF.
 
-    ``p`` is what `set_parameters` gives. Raises SettingsError for another scene.
+    The hand moves in the xy plane; z points towards the viewer. ``p`` are the parameters from
+    `set_parameters`. Raises SettingsError unless the object is a rectangle and the hand has two
+    fingers.
     """
     shape, count = settings.simulation.object_shape, len(settings.scene.fingers)
     if shape != "rectangle" or count != 2:
@@ -308,8 +332,8 @@ def hand_mjcf(settings: Settings, p: Parameters) -> str:
     fingers = sensors = ""
     for k, (name, side) in enumerate((("left", 1), ("right", -1))):
         end = f"{side * p.offset:.9g} {p.length:.9g} 0"
-        # The hemisphere's axis is z; the sensor's x leads away from the palm on the left finger and
-        # towards it on the right one, its y to the reader.
+        # z is the hemisphere's axis. The sensor's x points away from the palm on the left finger
+        # and towards it on the right one; its y points towards the viewer.
         fingers += f"""
 <body pos="{-side * p.half_separation:.9g} 0 0">
 <joint name="{name}" axis="0 0 {-side}" range="{p.stop_low[k]:.9g} {p.stop_high[k]:.9g}"
@@ -340,7 +364,7 @@ def hand_mjcf(settings: Settings, p: Parameters) -> str:
 
 @kernel
 def set_currents(plants: Records[Plant], control: FloatArray) -> None:
-    """Set the currents [A] that both servos ask of their motors, which follow with a lag."""
+    """Set the current references [A] of both servos; the motor currents follow with a lag."""
     state = plants[0].state
     for j in range(2):
         control[j] = current_reference(plants[0], j, state.position[j], state.velocity[j])
@@ -348,30 +372,30 @@ def set_currents(plants: Records[Plant], control: FloatArray) -> None:
 
 @kernel
 def feel(plants: Records[Plant], touches: Records[Touch], ring: Records[Sample]) -> None:
-    """Let the plant's tips feel what MuJoCo's do, and take the samples that are due."""
+    """Copy the contacts of the MuJoCo tips into the plant and record the samples that are due."""
     plant = plants[0]
     for k in range(2):
         plant.stages[0].on_object[k] = touches[k].contact
         tip = plant.stages[0].on_object[k]
-        if touches[k].across[2] < 0.0:  # in the plane θ has a sign, and what goes with it
+        if touches[k].across[2] < 0.0:  # planar θ, shear and force are signed
             tip.theta, tip.sine = -tip.theta, -tip.sine
             tip.tangential, tip.shear = -tip.tangential, -tip.shear
     settle(plant, ring)
 
 
 class Options(Section):
-    """The profile's table ``[plugins.mujoco]``."""
+    """Settings in the profile's table ``[plugins.mujoco]``."""
 
-    timestep: Annotated[float, Field(ge=1e-4, le=0.002)] = 0.001  # s, of MuJoCo
+    timestep: Annotated[float, Field(ge=1e-4, le=0.002)] = 0.001  # s, MuJoCo's time step
 
 
 class MujocoHand(SimulatedHand):
-    """The simulated hand with MuJoCo for its mechanics; the motors are as there, `energy` is 0."""
+    """Simulated hand with MuJoCo mechanics and the usual motor model; `energy` is always 0."""
 
     def __init__(
         self, settings: Settings, start: float = 0.0, table: ContactTable | None = None
     ) -> None:
-        """Build the scene at rest. Raises SettingsError for what it can't have."""
+        """Build the scene at rest. Raises SettingsError for unsupported settings."""
         step = Options.model_validate(settings.plugins.tables.get("mujoco", {})).timestep
         table = table or make_table(settings, make_material(settings.material))
         parameters = Parameters()
@@ -392,7 +416,7 @@ class MujocoHand(SimulatedHand):
                 set_currents(plant.array, data.ctrl)
                 data.qfrc_applied[2:] = plant.goals.load
                 mujoco.mj_step2(self.model, data)
-                mujoco.mj_step1(self.model, data)  # last, so that what the tips feel is current
+                mujoco.mj_step1(self.model, data)  # updates the contacts for feel
                 state.position[:], state.velocity[:] = data.qpos, data.qvel
                 state.current[:] = data.act
                 self._done = plant.steps = self._done + 1
@@ -400,11 +424,11 @@ class MujocoHand(SimulatedHand):
 
 
 class MujocoServos(SimulatedServos):
-    """``servos.backend = "mujoco"``: the daemon's servos, on the joints of :class:`MujocoHand`."""
+    """Servo backend ``"mujoco"``: simulated servos on the joints of :class:`MujocoHand`."""
 
     metal = False
     hand = MujocoHand
     Settings = Options
 
     def __init__(self, *scene: Any) -> None:
-        super().__init__(*scene[:3])  # the options, last, are the hand's
+        super().__init__(*scene[:3])  # the last one, the options, belongs to the hand

@@ -1,8 +1,8 @@
-"""Checks of a backend of one's own, for its author to run.
+"""Conformance checks for authors of backend plugins.
 
-Each takes a profile's settings that name the backend, as
-``check_tactile(load(Path("profile.toml")))``, makes it as the daemon would, and raises
-AssertionError with what was found and expected.
+Each check takes the settings of a profile that names the backend, for example
+``check_tactile(load(Path("profile.toml")))``. It creates the backend as the daemon would and raises
+AssertionError with the value found and the value expected.
 """
 
 from __future__ import annotations
@@ -22,26 +22,26 @@ from softfinger.daemon.types import FINGERS, Frame, Goal, Reading
 
 __all__ = ["check_servos", "check_shape", "check_tactile", "load"]
 
-_POLL = 1e-3  # s, as a tick
+_POLL = 1e-3  # s, one control tick
 
 
 def check_tactile(settings: Settings, frames: int = 20, patience: float = 10.0) -> None:
-    """Open the board under each finger, twice, and check ``frames`` of its frames.
+    """Open the tactile board of each finger twice and check ``frames`` of its frames.
 
-    ``patience`` [s] bounds the wait for them. No object is needed.
+    ``patience`` [s] limits the wait for them. The hand needs no object.
     """
     clock = make_clock(settings)
     for name in settings.scene.fingers:
         sensor = make_sensor(settings, clock, None, FINGERS.index(name))
         assert sensor is not None, "tactile.backend: found none, expected a board"
-        for _ in range(2):  # a board is opened again when its port was lost
+        for _ in range(2):  # the daemon reopens a board after losing its port
             sensor.open()
             try:
                 _check_frames(settings, sensor, frames, time.monotonic() + patience)
                 _check_counters(sensor)
             finally:
                 sensor.close()
-            sensor.latest()  # raises nothing
+            sensor.latest()  # must not raise
         sensor.close()
 
 
@@ -66,14 +66,14 @@ def _check_frames(settings: Settings, sensor: TactileSensor, frames: int, deadli
 
 
 def check_servos(settings: Settings, torque: bool = False, patience: float = 2.0) -> None:
-    """Connect to the servos, twice, and read them.
+    """Connect to the servos twice and read them.
 
-    With ``torque`` they are also stiffened where they stand and let go again: the joints must not
-    move by more than 0.05 rad. ``patience`` [s] bounds each wait.
+    With ``torque`` the servos are also switched on at their present position and off again; the
+    joints must not move by more than 0.05 rad. ``patience`` [s] limits each wait.
     """
     servos = make_servos(settings, make_clock(settings), None)
     assert servos is not None, "servos.backend: found none, expected servos"
-    for _ in range(2):  # they are connected again when they had gone silent
+    for _ in range(2):  # the daemon reconnects to servos that stopped answering
         servos.connect()
         try:
             reading = Reading()
@@ -114,7 +114,7 @@ def _check_counters(backend: Servos | TactileSensor) -> None:
 
 
 def check_shape(settings: Settings) -> None:
-    """Make the object's shape, and compare its facts with what its corners say."""
+    """Create the object's shape and compare its properties with those of its corners."""
     shape = shape_of(settings)
     assert isinstance(shape, Shape), f"found {type(shape).__name__}, expected a Shape"
     if shape.kind == DISC:

@@ -1,4 +1,4 @@
 """Calibration of sensors and tips: curves, centre, modulus and laws from frames and test presses.
 
-Numbers alone: files and steps are in `tools.calibration`.
+This package contains only the mathematics; files and the procedure are in `tools.calibration`.
 """

@@ -1,9 +1,15 @@
-"""The mathematics of calibrating a pressure sensor under a soft tip. No files, no sensors.
+"""Calibration of a pressure sensor under a soft tip.
 
-In the order in which it is done: tare (what the cells read unloaded), equilibration (what makes
-the cells alike), curve (alike readings → pressure), centre (where the tip stands on the sensor and
-how that is turned), modulus (the tip's own law), relaxation (how its force falls in a hold). Each
-returns its result with the residuals.
+The steps, in order, are
+
+1. tare: zero and noise of each cell without a load,
+2. equilibration: gains that make all cells respond alike,
+3. curve: conversion from equilibrated readings to pressure,
+4. centre: position of the tip on the sensor and rotation of the sensor,
+5. modulus: the tip's own law,
+6. relaxation: decrease of the tip's force during a hold.
+
+Each step returns its result with the residuals.
 """
 
 from __future__ import annotations
@@ -34,31 +40,33 @@ from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 FloatArray = NDArray[np.float64]
 Kind = Literal["power", "cubic"]
 
-DEAD = 0.2  # of the median response: cells below are dead
+DEAD = 0.2  # of the median response; cells below it are dead
 _EXPONENTS = (0.3, 3.0)
-_RESTLESS = 8.0  # times the usual noise
-_FEW_CELLS = 4  # may be faulty
-_TILT_MIN = math.radians(3.0)  # tilts that differ by less show no direction
+_RESTLESS = 8.0  # times the median noise, above which a cell is not at rest
+_FEW_CELLS = 4  # number of cells not at rest at which the tare fails; fewer may be faulty
+_TILT_MIN = math.radians(3.0)  # smallest range of tilts that determines the rotation
 _UPRIGHT = math.radians(0.5)
-_PRESSED = 6.0  # times the noise: some cell reads more under a tip
-_LAGS = 8  # cells over which noise may be correlated
-_SEEN = 4.0  # standard errors
-_ENDED = 4.0  # of noise: a zero below it is touched by the end at 0
-_HELD = 2.0  # times the longest term to be found, at least, that a hold must last
-_ROUNDS = 25  # in which strengths and press are found in turns
+_PRESSED = 6.0  # times the noise; the largest cell under a contact reads more
+_LAGS = 8  # cells, largest lag of the noise correlation
+_SEEN = 4.0  # standard errors for a significant result
+_ENDED = 4.0  # standard deviations of the noise; a zero below it is affected by clipping at 0
+_HELD = 2.0  # shortest hold, over the longest time constant
+_ROUNDS = 25  # alternating iterations for strengths and press
 
 
 class CalibrationError(SoftfingerError, ValueError):
-    """The data don't determine the result. The message says what is missing or wrong."""
+    """Error raised if the data do not determine the result."""
 
 
 @dataclass(frozen=True)
 class Tare:
-    """``zero``: mean count unloaded; ``noise``: standard deviation; both float64 [rows, cols].
+    """Result of `tare`.
 
-    ``correlation`` [k, m] is that of two cells' noise by their distance in rows and columns, empty
-    where the frames show none; ``drift`` [counts] the standard deviation of what all cells do
-    together; ``excess`` [counts] the mean of what a reading is over the zero, none being below.
+    ``zero`` and ``noise`` are the mean and the standard deviation of the unloaded counts, both
+    float64 [rows, cols]. ``correlation`` [k, m] is the correlation of the noise of two cells by
+    their distance in rows and columns, or empty if it is not significant. ``drift`` [counts] is the
+    standard deviation of the common motion of all cells. ``excess`` [counts] is the mean of
+    max(reading − zero, 0).
     """
 
     zero: FloatArray
@@ -69,9 +77,9 @@ class Tare:
 
 
 def tare(frames: ArrayLike) -> Tare:
-    """Return the zero of each cell from unloaded frames [n, rows, cols].
+    """Determine the zero and noise of each cell from unloaded frames [n, rows, cols].
 
-    Raises CalibrationError when some cells vary far more than most: something presses meanwhile.
+    Raises CalibrationError if some cells vary much more than most, which indicates a contact.
     """
     stack = _stack(frames, "tare")
     if len(stack) < 2:
@@ -88,7 +96,7 @@ def tare(frames: ArrayLike) -> Tare:
 def noise_correlation(stack: FloatArray) -> tuple[FloatArray, float]:
     """Return ``correlation`` and ``drift`` of a :class:`Tare` from unloaded frames [n, rows, cols].
 
-    What is within four standard errors of none counts as none.
+    Correlations within four standard errors of zero count as zero.
     """
     n, rows, cols = stack.shape
     noise = stack - stack.mean(axis=0)
@@ -102,7 +110,7 @@ def noise_correlation(stack: FloatArray) -> tuple[FloatArray, float]:
     shape = rows + _LAGS, cols + _LAGS
     power = (np.abs(np.fft.fft2(noise, shape)) ** 2).sum(axis=0)
     products = np.fft.ifft2(power).real
-    # Both signs of one of the lags: what the noise does along one diagonal and the other.
+    # Average over both signs of one lag, that is, over both diagonal directions.
     both = 0.5 * (products + np.roll(products[:, ::-1], 1, axis=1))[:_LAGS, :_LAGS]
     pairs = (n - 1.0) * np.outer(rows - np.arange(_LAGS), cols - np.arange(_LAGS))
     if rows < _LAGS or cols < _LAGS or not both[0, 0] > 0.0:
@@ -122,9 +130,10 @@ def noise_correlation(stack: FloatArray) -> tuple[FloatArray, float]:
 
 @dataclass(frozen=True)
 class Equilibration:
-    """``gain`` float64 [rows, cols] makes all cells read alike, 0 for dead ones.
+    """Result of `equilibrate`.
 
-    ``spread`` is the cells' relative rms round the mean before, ``residual`` after.
+    ``gain`` float64 [rows, cols] makes all cells respond alike and is 0 for dead cells. ``spread``
+    and ``residual`` are the relative rms deviations of the cells from their mean before and after.
     """
 
     gain: FloatArray
@@ -133,10 +142,11 @@ class Equilibration:
 
 
 def equilibrate(loads: Sequence[ArrayLike], zero: FloatArray) -> Equilibration:
-    """Return gains from frames [n, rows, cols] under each of several uniform pressures.
+    """Determine the gains from frames [n, rows, cols] under each of several uniform pressures.
 
-    Least squares of each cell's readings against the mean of all live ones. Cells that respond by
-    less than a fifth of the median are dead. Raises CalibrationError when nothing presses.
+    The gain of a cell is the least-squares fit of its readings to the mean of all working cells.
+    Cells with less than a fifth of the median response are dead. Raises CalibrationError if the
+    frames show no pressure.
     """
     if not loads:
         raise CalibrationError("equilibrate: no uniform pressure was given")
@@ -160,9 +170,10 @@ def equilibrate(loads: Sequence[ArrayLike], zero: FloatArray) -> Equilibration:
 
 @dataclass(frozen=True)
 class SensorCurve:
-    """``coefficients`` (exponent b, c_1, c_2, c_3) of p = c_1 x^b + c_2 x² + c_3 x³ [Pa].
+    """Result of `fit_curve`: p = c_1 x^b + c_2 x² + c_3 x³ [Pa].
 
-    ``errors`` [n]: relative error of each known force; ``residual`` their rms.
+    ``coefficients`` are (b, c_1, c_2, c_3). ``errors`` [n] are the relative errors of the known
+    forces, ``residual`` is their rms.
     """
 
     kind: Kind
@@ -174,12 +185,29 @@ class SensorCurve:
 def fit_curve(
     kind: Kind, readings: ArrayLike, force: ArrayLike, area: float, full: float
 ) -> SensorCurve:
-    """Return the curve whose pressure over all cells makes the known forces.
+    """Fit the pressure curve of the cells to known forces.
 
-    ``readings`` float64 [n, rows, cols]: x = (counts − zero)·gain, ≥ 0 and free of noise far from
-    the contact (see :func:`cleared`); ``force`` [n] N; ``area`` of a cell [m²]; ``full`` the
-    largest x there is, up to which a cubic has to rise. Least squares of the relative errors.
-    Raises CalibrationError for too few forces or a curve that falls.
+    The sum of pressure times cell area over all cells is fitted to the forces by least squares of
+    the relative errors.
+
+    Parameters
+    ----------
+    kind
+        "power" or "cubic".
+    readings
+        x = (counts − zero)·gain, float64 [n, rows, cols]; non-negative and without noise far from
+        the contact, see :func:`cleared`.
+    force
+        Known forces [n] [N].
+    area
+        Area of a cell [m²].
+    full
+        Largest possible x; a cubic curve must increase up to it.
+
+    Raises
+    ------
+    CalibrationError
+        If there are too few forces, or the curve decreases.
     """
     x = _stack(readings, "curve")
     x = x.reshape(len(x), -1)
@@ -228,7 +256,7 @@ def _power(
         errors = fit(exponent)[1]
         return float(errors @ errors)
 
-    # The best of a coarse grid, then golden section round it.
+    # Search a coarse grid, then refine the best point by golden section.
     grid = np.linspace(*_EXPONENTS, 28)
     best = int(np.argmin([cost(float(b)) for b in grid]))
     low, high = float(grid[max(best - 1, 0)]), float(grid[min(best + 1, len(grid) - 1)])
@@ -240,19 +268,20 @@ def _power(
 
 
 def cleared(readings: FloatArray, noise: FloatArray, frames: int) -> FloatArray:
-    """Set those of the mean readings [rows, cols] of so many frames to 0 that are within 4 σ of it.
+    """Set mean readings [rows, cols] over ``frames`` frames to 0 if they are within 4 σ of it.
 
-    Clipped noise has a positive mean, which over all the cells would weigh as much as a contact.
+    Clipped noise has a positive mean, whose sum over all cells may be as large as a contact.
     """
     level = 4.0 * noise / math.sqrt(frames)
     return np.where(readings > level, readings, 0.0)
 
 
 def without_end(means: FloatArray, zero: FloatArray, noise: float) -> FloatArray:
-    """Return the mean counts of many frames as they would be if noise did not end at 0.
+    """Correct the mean counts of many frames for noise that is clipped at 0.
 
-    ``zero`` and ``noise`` are a tare's mean counts and their standard deviation. Of max(x + n, 0)
-    with Gaussian n both rise with x, and so does their ratio, which tells what n is.
+    ``zero`` and ``noise`` are the mean and the standard deviation of the counts of a tare. For
+    max(x + n, 0) with Gaussian n, both increase with x, and so does their ratio. The ratio
+    determines the standard deviation of n.
     """
     z = np.linspace(-3.0, 6.0, 1801)
     above = 0.5 * (1.0 + np.array([math.erf(each) for each in z / math.sqrt(2.0)]))
@@ -273,10 +302,10 @@ def without_end(means: FloatArray, zero: FloatArray, noise: float) -> FloatArray
 
 @dataclass(frozen=True)
 class Centre:
-    """The tip's centre in the sensor's axes (x, y) [m], and the sensor's rotation [rad].
+    """Result of `fit_centre`: the tip's centre in the sensor's axes [m] and the rotation [rad].
 
-    ``rotation`` is None where no press was tilted. ``residual`` is what the last step changed [m],
-    ``std`` the centre's standard deviation in x and in y [m].
+    ``rotation`` is None if no press was tilted. ``residual`` is the change in the last iteration
+    [m], ``std`` the standard deviation of the centre in x and in y [m].
     """
 
     centre: tuple[float, float]
@@ -294,11 +323,11 @@ def fit_centre(
     noise: float,
     active: NDArray[np.bool_] | None = None,
 ) -> Centre:
-    """Return centre and rotation from presses of known tilt θ [n] in the finger's plane [rad].
+    """Determine centre and rotation from presses at known tilts ``theta`` [n] [rad].
 
-    ``frames`` [n, rows, cols] Pa. Whole frames are fitted; a springs' modulus need not be known.
-    Raises CalibrationError when a frame shows no contact, and for tilts that are all alike but not
-    upright.
+    The tilts are in the finger's plane. All cells of the ``frames`` [n, rows, cols] [Pa] are
+    fitted; the modulus of a spring tip need not be known. Raises CalibrationError if a frame shows
+    no contact, or if all tilts are equal but not upright.
     """
     stack = _stack(frames, "centre")
     s = np.sin(np.asarray(theta, np.float64))
@@ -317,7 +346,7 @@ def fit_centre(
     force = (stack * used).sum(axis=(1, 2)) * math.prod(grid.pitches)
     presses = Presses(stack, depth_of_force(tip, material, force), np.arcsin(s), noise, used)
     found, residual, std = fit_place(presses, tip, material, grid, tilted)
-    # A press is as upright as it can be told to be: how far a turn moves the centroid.
+    # Add the uncertainty of the upright orientation, which moves the centroid by lever times angle.
     lever = (0.5 if tip.physics == "solid" else 1.0) * tip.radius
     std = math.hypot(std, lever * _UPRIGHT / math.sqrt(3.0 * len(s)))
     return Centre(found.centre, found.rotation if tilted else None, residual, std)
@@ -325,9 +354,10 @@ def fit_centre(
 
 @dataclass(frozen=True)
 class Modulus:
-    """E [Pa] of the tip's F(d − d₀, θ); ``offset`` d₀ [m]; ``errors`` [n] relative, of the force.
+    """Result of `fit_modulus` for the tip's F(d − d₀, θ).
 
-    ``trend``: E of each load alone.
+    ``modulus`` is E [Pa], ``offset`` is d₀ [m], ``errors`` [n] are the relative errors of the
+    force, and ``trend`` holds E of each load alone.
     """
 
     modulus: float
@@ -338,10 +368,11 @@ class Modulus:
 
 
 def fit_modulus(d: ArrayLike, theta: ArrayLike, force: ArrayLike, tip: Fingertip) -> Modulus:
-    """Fit a constant modulus of ``tip``, and the run's own zero of d, to a compression run.
+    """Fit a constant modulus of ``tip`` and the zero of d to a compression run.
 
-    By least relative squares. ``d`` [m], ``theta`` [rad], ``force`` [N] by the sensor, all [n].
-    Raises CalibrationError for too few points, and for a force that does not rise with d.
+    The fit minimises the squared relative errors. ``d`` [m], ``theta`` [rad] and the force measured
+    by the sensor, ``force`` [N], all have shape [n]. Raises CalibrationError for too few points, or
+    if the force does not increase with d.
     """
     depth, tilt, load = (np.asarray(each, np.float64) for each in (d, theta, force))
     if not depth.shape == tilt.shape == load.shape:
@@ -369,19 +400,20 @@ def fit_modulus(d: ArrayLike, theta: ArrayLike, force: ArrayLike, tip: Fingertip
 
 @dataclass(frozen=True, eq=False)
 class Relaxation:
-    """Strengths r of F = c F∞ (1 + Σ r_i (1 − h_i/F∞)), ḣ_i = (F∞ − h_i)/τ_i.
+    """Result of `fit_relaxation`: F = c F∞ (1 + Σ r_i (1 − h_i/F∞)), ḣ_i = (F∞ − h_i)/τ_i.
 
-    ``residual`` is the r.m.s. of F's relative errors in the hold, ``elastic`` that without any r.
+    The strengths are r_i. ``residual`` is the rms relative error of F during the hold, ``elastic``
+    the same without relaxation.
     """
 
     strengths: tuple[float, ...]
     residual: float
     elastic: float
-    model: FloatArray  # F by the fit [N], in the press as measured
+    model: FloatArray  # fitted F [N]; measured F during the press
 
 
 def follow(t: FloatArray, lasting: FloatArray, time: float) -> FloatArray:
-    """Return h of ḣ = (F∞ − h)/τ, 0 at first, for a ``lasting`` F∞ straight between the ``t``."""
+    """Integrate ḣ = (F∞ − h)/τ from 0 for ``lasting`` F∞, linear between the times ``t``."""
     out = np.zeros_like(lasting)
     for k in range(1, t.size):
         step = (t[k] - t[k - 1]) / time
@@ -392,18 +424,30 @@ def follow(t: FloatArray, lasting: FloatArray, time: float) -> FloatArray:
 
 
 def fit_relaxation(t: ArrayLike, force: ArrayLike, times: tuple[float, ...]) -> Relaxation:
-    """Fit the strengths, none below 0, to the ``force`` [N] over ``t`` [s] of a press and its hold.
+    """Fit non-negative relaxation strengths to the force of a press and the following hold.
 
-    ``times`` [s] are the terms'. The press is as fast and as deep as it likes; it begins clear of
-    the tip, or what relaxed before is not found. What F∞ is in the press follows from F and the
-    strengths, so both are found in turns; in the hold it is constant. A term shorter than two
-    frames can't be told and is left 0. Raises CalibrationError for too short a hold.
+    F∞ is constant during the hold. During the press it follows from F and the strengths, so both
+    are determined alternately.
+
+    Parameters
+    ----------
+    t, force
+        Time [s] and force [N]. The press may have any speed and depth, but it must begin without
+        contact, because earlier relaxation would not be included.
+    times
+        Time constants τ_i [s]. The strength of a term shorter than two frames cannot be determined
+        and is 0.
+
+    Raises
+    ------
+    CalibrationError
+        If the hold is too short.
     """
     at, load = np.asarray(t, np.float64), np.asarray(force, np.float64)
     if at.size < 8 or not load.max() > 0.0:
         raise CalibrationError("relaxation: expected at least eight frames of one press and hold")
     noise = float(np.std(np.diff(load[at.size // 2 :]))) / math.sqrt(2.0)
-    held = int(np.argmax(load >= load.max() - _SEEN * noise))  # the deepest: from there it falls
+    held = int(np.argmax(load >= load.max() - _SEEN * noise))  # start of the hold
     told = [k for k, time in enumerate(times) if time > 2.0 * (at[-1] - at[0]) / (at.size - 1)]
     if told and at[-1] - at[held] < _HELD * max(times[k] for k in told):
         raise CalibrationError(
@@ -416,7 +460,7 @@ def fit_relaxation(t: ArrayLike, force: ArrayLike, times: tuple[float, ...]) -> 
         memory = np.array([follow(at, lasting, times[k]) for k in told]).reshape(-1, at.size)
         columns = np.stack([lasting, *(lasting - memory)], axis=1)[held:]
         fits = []
-        # Of so few terms each choice is tried: the best of those whose strengths are all above 0.
+        # With so few terms, try every subset and keep the best with positive strengths.
         for chosen in itertools.product((False, True), repeat=len(told)):
             used = np.flatnonzero((True, *chosen))
             found = np.linalg.lstsq(columns[:, used], load[held:], rcond=None)[0]

@@ -1,4 +1,4 @@
-"""Friction of a joint that moves there and back in air: Coulomb, viscous, and at break-away."""
+"""Coulomb, viscous and break-away friction of a joint from reciprocating motion in free air."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from softfinger.kinematics.calibration.calibration import CalibrationError
 
 FloatArray = NDArray[np.float64]
 
-RUN_MAX = 3600.0  # s of data: a grid of more is not worth its memory
-_STEP = 0.01  # s of the grid on which motion and torque are compared
-_AROUND = 6  # steps to either side over which velocity and acceleration are fitted
-_GAP = 0.035  # s without data, which nothing is interpolated across
-_MOVES = 0.2  # rad/s, above which the friction at rest has mostly gone (XL330: 0.12 rad/s)
-_RESTS = 0.02  # rad/s, below which a joint stands: one count of 1.5 mrad in 0.08 s
-_AWAY = 5e-3  # rad from where it stood: three counts, ten times what gears give way
-_SLOW = 0.1, 20  # rad/s of a goal over so many steps: it breaks a joint away with little inertia
-_SECONDS = 0.5  # of motion in each direction, at least
-_SHARED = 0.2  # s for which remaining errors are alike
-_FEWEST = 3  # break-aways for a mean
-# N·m·s/rad, mean and standard deviation: identified for such servos are 0.015 to 0.051 (model M4 of
-# Rhoban's BAM, arXiv 2410.08650).
+RUN_MAX = 3600.0  # s, longest recording; limits memory
+_STEP = 0.01  # s, time grid for motion and torque
+_AROUND = 6  # steps on either side for the fit of velocity and acceleration
+_GAP = 0.035  # s, longest gap in the data to interpolate across
+_MOVES = 0.2  # rad/s, above which static friction is mostly gone (XL330: 0.12 rad/s)
+_RESTS = 0.02  # rad/s, below which a joint is at rest; one count of 1.5 mrad in 0.08 s
+_AWAY = 5e-3  # rad from rest at break-away: three counts, ten times the compliance of the gears
+_SLOW = 0.1, 20  # rad/s, number of steps: fastest goal for a break-away with little inertia
+_SECONDS = 0.5  # s, shortest motion in each direction
+_SHARED = 0.2  # s, correlation time of the remaining errors
+_FEWEST = 3  # break-aways needed for a mean
+# N·m·s/rad, mean and standard deviation of the prior. Values identified for such servos are 0.015
+# to 0.051 (model M4 of Rhoban's BAM, arXiv 2410.08650).
 _VISCOUS = 0.02, 0.02
-_INERTIA_ERROR = 0.5  # relative, of the inertia that is set
+_INERTIA_ERROR = 0.5  # relative error of the configured inertia
 
 
 class FrictionFit(NamedTuple):
@@ -36,7 +36,7 @@ class FrictionFit(NamedTuple):
     coulomb_std: float
     viscous: float  # [N·m·s/rad]
     viscous_std: float
-    stiction: float  # at break-away; NaN if fewer than three slow strokes began from rest
+    stiction: float  # at break-away; NaN with fewer than three slow starts from rest
     stiction_std: float
 
 
@@ -48,15 +48,15 @@ def fit_friction(
     inertia: float,
     step: float,
 ) -> FrictionFit:
-    """Fit a joint's motion there and back in air by least squares.
+    """Fit the friction of a joint to reciprocating motion in free air by least squares.
 
     While the joint moves, its motor gives
 
         torque = F sign(q̇) + b q̇ + J q̈ + c0 + c1 q + c2 q²
 
-    with the Coulomb friction F and the viscous friction b ≥ 0. The polynomial is the part that the
-    direction of motion does not change: weight, cables, an offset of the current. Friction at
-    break-away is the largest torque of a start from rest behind a slow goal.
+    with the Coulomb friction F and the viscous friction b ≥ 0. The polynomial covers torques that
+    do not depend on the direction of motion: weight, cables and the offset of the current. The
+    break-away friction is the largest torque during a start from rest with a slow goal.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ def fit_friction(
     place, rate, acceleration = _motion(shown)
     after = np.clip(np.searchsorted(at, grid, "right"), 1, at.size - 1)
     whole = at[after] - at[after - 1] < _GAP
-    # The joint moves one way all around an instant, so smoothing blurs no reversal.
+    # Use only instants with one direction of motion throughout the smoothing window.
     closes, opens = (_throughout(whole & (sign * rate > _MOVES)) for sign in (1.0, -1.0))
     seconds = [float(np.count_nonzero(each)) * _STEP for each in (closes, opens)]
     if min(seconds) < _SECONDS:
@@ -105,7 +105,7 @@ def fit_friction(
 
 
 def too_long(seconds: float) -> str:
-    """Return the message for data of so many ``seconds``."""
+    """Return the error message for a recording of ``seconds`` that is too long."""
     return f"found {seconds:.0f} s of data, expected {RUN_MAX:g} s at most"
 
 
@@ -117,7 +117,7 @@ def _too_little(closing: float, opening: float) -> str:
 
 
 def _motion(q: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return angle, velocity and acceleration by a parabola through each instant's neighbours."""
+    """Return angle, velocity and acceleration from a parabola fitted around each instant."""
     offsets = _STEP * np.arange(-_AROUND, _AROUND + 1)
     fits = np.linalg.pinv(np.stack([offsets**0, offsets, 0.5 * offsets**2], axis=1))
     padded = np.pad(q, _AROUND, mode="edge")
@@ -126,7 +126,7 @@ def _motion(q: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def _throughout(holds: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return True where something holds at each of an instant's neighbours."""
+    """Return True where the condition holds at all neighbours of an instant."""
     size = 2 * _AROUND + 1
     return np.convolve(np.pad(holds, _AROUND), np.ones(size), "valid") > size - 0.5
 
@@ -134,29 +134,29 @@ def _throughout(holds: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def _least_squares(
     columns: FloatArray, values: FloatArray, inertia: float, step: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return solution and standard deviations."""
+    """Return the least-squares solution and its standard deviations."""
     prior = np.array([0.0, _VISCOUS[0], inertia, 0.0, 0.0, 0.0])
     weight = np.diag([0.0, _VISCOUS[1] ** -2, (_INERTIA_ERROR * inertia) ** -2, 0.0, 0.0, 0.0])
     rounding = step * step / 12.0
     variance = rounding
-    for _ in range(2):  # the second with the noise that the first finds
+    for _ in range(2):  # the second pass uses the noise found by the first
         per_sample = _STEP / _SHARED / variance
         covariance = np.linalg.inv(per_sample * columns.T @ columns + weight)
         found = covariance @ (per_sample * columns.T @ values + weight @ prior)
         variance = max(float(np.mean((values - columns @ found) ** 2)), rounding)
     std = np.sqrt(np.diag(covariance))
-    if found[1] < 0.0:  # friction that falls with the speed: the solution for b = 0
+    if found[1] < 0.0:  # b cannot be negative: use the solution for b = 0
         found = found - covariance[:, 1] * (found[1] / covariance[1, 1])
-    # A current that rests between two counts is off by the same part of a count throughout.
+    # A constant current between two counts has the same quantisation error throughout.
     std[0] = math.hypot(float(std[0]), math.sqrt(rounding))
     return found, std
 
 
 def _break_aways(q: FloatArray, rate: FloatArray, push: FloatArray, goal: FloatArray) -> FloatArray:
-    """Return torque and standard deviation of each start from rest behind a slow goal, [n, 2].
+    """Return torque and standard deviation of each start from rest with a slow goal, [n, 2].
 
-    A goal rises by whole counts, and the torque with it: break-away is between the largest torque
-    and the one before.
+    The goal and the torque rise by whole counts, so the break-away torque is between the largest
+    torque and the one before.
     """
     found = []
     speed, steps = _SLOW

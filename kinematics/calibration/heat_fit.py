@@ -1,4 +1,4 @@
-"""Heat of a servo, from a hold of minutes: what its case warms by in the end, and in what time."""
+"""Thermal model of a servo, its temperature rise and time constant, fitted to a hold of minutes."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from numpy.typing import ArrayLike, NDArray
 from softfinger.kinematics.calibration.calibration import CalibrationError
 from softfinger.kinematics.hand.servo_heat import COPPER, HeatLaw
 
-_DOUBT = (0.4, 0.4, 3.0)  # before: of rise and time relative, of the ambient [°C]
-_READING = 0.4  # °C by which a reading in whole degrees is off, with what is like it beside it
+_DOUBT = (0.4, 0.4, 3.0)  # prior standard deviations of rise and time (relative), ambient [°C]
+_READING = 0.4  # °C, error of a reading in whole degrees, including other errors of that kind
 _STEP = 1.0  # s
-_LEAST = 8.0  # °C by which the case must warm
+_LEAST = 8.0  # °C, smallest temperature rise of the case
 _ROUNDS = 12
 
 
 class HeatFit(NamedTuple):
-    """Factors of the model's ``rise`` and ``time`` with deviations, and what they leave."""
+    """Factors on the model's ``rise`` and ``time``, their standard deviations and the residual."""
 
     rise: float
     rise_std: float
     time: float
     time_std: float
     ambient: float  # °C
-    residual: float  # r.m.s. of the readings [°C]
+    residual: float  # rms error of the readings [°C]
 
 
 def forecast(
@@ -36,9 +36,10 @@ def forecast(
     start: float,
     ambient: float,
 ) -> NDArray[np.float64]:
-    """Return the case [°C] at each of ``squares`` [A²], _STEP apart, as `hand.servo_heat` has it.
+    """Predict the case temperature [°C] for each of ``squares`` [A²], _STEP apart.
 
-    Both temperatures are ``start`` [°C] first; ``rise`` and ``time`` are factors of the law's.
+    The model is that of `hand.servo_heat`. Winding and case start at ``start`` [°C]; ``rise`` and
+    ``time`` are factors on the constants of the law.
     """
     winding = case = start
     heating, inner, outer = law.heating * rise / time, law.winding_time * time, law.case_time * time
@@ -52,10 +53,11 @@ def forecast(
 
 
 def fit_heat(law: HeatLaw, t: ArrayLike, current: ArrayLike, reading: ArrayLike) -> HeatFit:
-    """Fit a hold: ``current`` [A] and ``reading`` [°C] over ``t`` [s], begun as warm as the room.
+    """Fit the thermal model to a hold that starts at room temperature.
 
-    ``law`` has the model's own constants, which count as known to 40 %. By Gauss-Newton on the
-    logarithms. Raises CalibrationError for a hold that hardly warms the servo.
+    ``current`` [A] and ``reading`` [°C] are given over ``t`` [s]. ``law`` contains the constants of
+    the servo model, known to 40 %. The fit uses Gauss-Newton on the logarithms of the factors.
+    Raises CalibrationError if the case warms by less than 8 °C.
     """
     at, square, shown = (np.asarray(each, np.float64) for each in (t, np.square(current), reading))
     warmed = float(shown.max() - shown[0]) if shown.size else 0.0
@@ -70,7 +72,7 @@ def fit_heat(law: HeatLaw, t: ArrayLike, current: ArrayLike, reading: ArrayLike)
 
     def rows(x: NDArray[np.float64]) -> NDArray[np.float64]:
         case = forecast(law, squares, np.exp(x[0]), np.exp(x[1]), shown[0], x[2])
-        # Whole degrees are alike for as long as they stay: each counts once, and not every second.
+        # Equal readings share one rounding error, so each degree counts once, not every second.
         weight = np.sqrt(warmed / grid.size) / _READING
         return np.concatenate([(case - readings) * weight, (x - prior) / _DOUBT])
 

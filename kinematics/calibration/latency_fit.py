@@ -1,4 +1,4 @@
-"""Latency of tactile frames: the time by which the tips' d follows the joints' closing."""
+"""Latency of tactile frames: the delay of the tips' d relative to the closing of the joints."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from softfinger.kinematics.calibration.friction_fit import RUN_MAX, too_long
 
 FloatArray = NDArray[np.float64]
 
-_STEP = 1e-3  # s of the grid on which the closing is compared, and of the delays tried first
-_LONGEST, _EARLY = 0.2, 0.02  # s of latency at most, and below none, for a minimum to be inside
-_MOVES, _SMOOTHED = 2e-3, 0.05  # m/s of closing, averaged over so many s: a ramp, which …
-_BESIDE = 0.2  # … with so many s before and after it is compared, …
-_LEAST = 8e-4  # … if it closes by so many m: seven counts of an encoder
-_FEWEST = 8  # frames
+_STEP = 1e-3  # s, time grid, and spacing of the delays tried first
+_LONGEST, _EARLY = 0.2, 0.02  # s, range of latencies tried: up to 0.2, from −0.02
+_MOVES, _SMOOTHED = 2e-3, 0.05  # m/s, s: a ramp closes faster than this, averaged over this time
+_BESIDE = 0.2  # s, time before and after a ramp that belongs to it
+_LEAST = 8e-4  # m, smallest closing of a ramp, seven encoder counts
+_FEWEST = 8  # smallest number of frames
 _CLOCKS = 1e-3  # s, standard deviation of the times of ticks, readings and frames
-_WIDER, _SPREAD_MAX = 1.4, 0.1  # of a footprint that grows, as in `perception.frame_channels`
-_ROUNDS = 3  # in which the touch and the fit are found in turns
+_WIDER, _SPREAD_MAX = 1.4, 0.1  # widening of a growing footprint, see `perception.frame_channels`
+_ROUNDS = 3  # alternating iterations for the touch and the fit
 
 
 class LatencyFit(NamedTuple):
-    """Delay of the frames beyond the latency in their times, with its standard deviation [s]."""
+    """Delay of the frames in addition to the configured latency, with standard deviation [s]."""
 
     delay: float
     std: float
-    scale: float  # of d by frames over d by joints
-    residual: float  # r.m.s. of d that the fit leaves [m]
+    scale: float  # d from frames over d from joints
+    residual: float  # rms residual of d [m]
     ramps: int
 
 
@@ -41,11 +41,11 @@ def fit_latency(
     latency: float,
     response: float = 0.0,
 ) -> LatencyFit:
-    """Fit frames of a grip whose force rises or falls, by least squares over its ramps k.
+    """Fit the delay of the frames of a grip with rising or falling force, over its ramps k.
 
         d(t) = scale · closing(t − delay) + offset_k
 
-    Cells with a response show the closing after a first-order lag, on a footprint that is wider
+    Cells with a response time follow the closing with a first-order lag, and the footprint is wider
     while it grows.
 
     Parameters
@@ -88,14 +88,14 @@ def fit_latency(
         shown, spread = _shown(np.maximum(closing, touch), response)
         fit, offset = _fit(data, grid, shown, spread, scale_error, latency)
         touch = -offset / fit.scale
-    # At rest an encoder is off by the same throughout, and half of that shifts the ramp.
+    # The error of an encoder at rest is constant, and half of it shifts the ramp.
     speed = float(np.abs(np.interp(data.t, grid, rate)).max())
     held = 0.5 * encoder / speed / math.sqrt(ramps.shape[1])
     return fit._replace(std=math.hypot(fit.std, held))
 
 
 class _Ramps(NamedTuple):
-    """Frames of the ramps: times, d and standard deviations, and which ramp is theirs."""
+    """Frames of the ramps: times, d, standard deviations, and the ramp of each frame."""
 
     t: FloatArray
     d: FloatArray
@@ -111,7 +111,7 @@ def _fit(
     scale_error: float,
     latency: float,
 ) -> tuple[LatencyFit, float]:
-    """Fit to what the cells would show of the closing; also return the offset of d [m]."""
+    """Fit d to the closing as shown by the cells; also return the offset of d [m]."""
 
     def solve(delay: float) -> tuple[FloatArray, FloatArray]:
         at = data.t - delay
@@ -148,7 +148,7 @@ def _too_little(widest: float) -> str:
 
 
 def _shown(closing: FloatArray, response: float) -> tuple[FloatArray, FloatArray]:
-    """Return what cells with a first-order lag show of ``closing``, and its spread [m²]."""
+    """Return ``closing`` as shown by cells with a first-order lag, and its spread [m²]."""
     if response == 0.0:
         return closing, np.zeros_like(closing)
     share = -math.expm1(-_STEP / response)
@@ -172,9 +172,9 @@ def _rate(closing: FloatArray) -> FloatArray:
 def _ramps(
     t: FloatArray, grid: FloatArray, closing: FloatArray, rate: FloatArray
 ) -> tuple[NDArray[np.bool_], float]:
-    """Return which of the ramps each frame belongs to, [n, ramps], and the widest one [m]."""
+    """Return a mask of the frames of each ramp, [n, ramps], and the largest closing [m]."""
     near = np.convolve(np.abs(rate) > _MOVES, np.ones(2 * round(_BESIDE / _STEP) + 1), "same") > 0.5
-    number = np.cumsum(near & ~np.append(False, near[:-1])) * near  # of a ramp, 0: none
+    number = np.cumsum(near & ~np.append(False, near[:-1])) * near  # number of the ramp, 0 for none
     index = np.clip(np.searchsorted(grid, t), 0, grid.size - 1)
     widths = {
         k: float(np.ptp(closing[index[number[index] == k]]))

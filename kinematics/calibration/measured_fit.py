@@ -1,4 +1,4 @@
-"""Calibration presses → the curves of a `TipCurves`."""
+"""Fit the curves of a measured tip law, `TipCurves`, to calibration presses."""
 
 from __future__ import annotations
 
@@ -22,24 +22,25 @@ from softfinger.kinematics.contact.tip_curves import (
 from softfinger.kinematics.estimation.measured import sum_weights
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
-_FEWEST = 6  # presses
+_FEWEST = 6  # smallest number of presses
 _UPRIGHT = math.radians(1.0)
 _TILTED = math.radians(5.0)
-_POOR = 0.05  # of the force, and of the radius, that curves may miss by
-_STAGE = 2e-3  # relative, that no stage and sensor do better
+_POOR = 0.05  # largest error of the curves over the force, and over the radius
+_STAGE = 2e-3  # smallest relative error of a stage and sensor
 
 
 class CurvesError(SoftfingerError, ValueError):
-    """The presses make no law. The message says what is missing or wrong."""
+    """Error raised if the presses do not determine a valid law."""
 
 
 @dataclass(frozen=True)
 class PressSums:
-    """Presses of d [n] m and θ [n] rad in the finger's plane.
+    """Presses at d [n] [m] and θ [n] [rad] in the finger's plane.
 
-    ``frames``: of each press [k, rows, cols] Pa, as the daemon will see them; ``pressures`` their
-    mean without what noise that ends at 0 adds, [n, rows, cols]; ``rest`` [rows, cols] is that
-    addition where nothing presses. ``gain``: true force over the sensor's.
+    ``frames`` holds the frames of each press [k, rows, cols] [Pa], as the daemon will receive them.
+    ``pressures`` [n, rows, cols] are their means, corrected for the bias of noise clipped at 0;
+    ``rest`` [rows, cols] is this bias without a contact. ``gain`` is the true force over the
+    sensor's force.
     """
 
     d: FloatArray
@@ -52,7 +53,7 @@ class PressSums:
 
 
 def fit_measured(presses: PressSums, radius: float, grid: SensorGrid) -> TipCurves:
-    """Return the law of a tip of ``radius``, whose place on the ``grid`` is found along.
+    """Fit the law of a tip of ``radius`` together with its position on the ``grid``.
 
     Raises CurvesError.
     """
@@ -90,7 +91,7 @@ def fit_measured(presses: PressSums, radius: float, grid: SensorGrid) -> TipCurv
     ) -> Curve:
         def valid(found: FloatArray) -> bool:
             if name == "lever":
-                found = np.concatenate([np.zeros((1, SQUARES)), found[:-1]])  # t · lever rises
+                found = np.concatenate([np.zeros((1, SQUARES)), found[:-1]])  # t · lever increases
             return name == "extent" or rises(found, root, square)
 
         best = _best((t, q, times), y, np.hypot(sigma, _STAGE * np.abs(y)), powers, squares, valid)
@@ -141,19 +142,19 @@ def fit_measured(presses: PressSums, radius: float, grid: SensorGrid) -> TipCurv
 
 
 def _beyond(misses: FloatArray, noise: FloatArray, smallest: float) -> float:
-    """Standard deviation of what misses beyond its noise; those that are least noisy count most."""
+    """Return the standard deviation of residuals in excess of their noise, weighted by noise."""
     weight = 1.0 / (noise**2 + smallest**2)
     return math.sqrt(max(float(weight @ (misses**2 - noise**2)) / float(weight.sum()), 0.0))
 
 
 def _sums(frames: Sequence[FloatArray], weights: FloatArray, rest: FloatArray) -> FloatArray:
-    """Each press' sums over the rest's, [4, presses]."""
+    """Return the sums of each press minus those at rest, [4, presses]."""
     means = np.stack([each.mean(axis=0) for each in frames]) - rest
     return np.asarray(weights @ means.reshape(len(frames), -1).T)
 
 
 def _noise(frames: Sequence[FloatArray], weights: FloatArray) -> FloatArray:
-    """Covariance of one frame's sums [4, 4], from the frames of each press."""
+    """Return the covariance of the sums of one frame [4, 4] from the frames of each press."""
     if min(map(len, frames)) < 5:
         raise CurvesError("expected at least five frames of each press: their noise counts")
     each = [weights @ every.reshape(len(every), -1).T for every in frames]
@@ -161,13 +162,13 @@ def _noise(frames: Sequence[FloatArray], weights: FloatArray) -> FloatArray:
 
 
 def _place(sums: FloatArray, theta: FloatArray) -> tuple[tuple[float, float], float]:
-    """The tip's centre [m] by upright presses, and the sensor's rotation [rad] by tilted ones."""
+    """Return the tip's centre [m] from upright presses and the rotation [rad] from tilted ones."""
     x, y = sums[1:3] / sums[0]
     weight = np.where(np.abs(theta) < _UPRIGHT, sums[0], 0.0)
     weight /= weight.sum()
     centre = float(weight @ x), float(weight @ y)
     along = np.sin(theta) * sums[0]
-    # The finger's x axis in the sensor's: (cos, −sin) of the rotation.
+    # The finger's x axis in the sensor's axes is (cos, −sin) of the rotation.
     return centre, math.atan2(-float(along @ (y - centre[1])), float(along @ (x - centre[0])))
 
 
@@ -179,7 +180,7 @@ def _best(
     squares: int,
     valid: Callable[[FloatArray], bool],
 ) -> FloatArray | None:
-    """The curve of least χ² + n log presses among the valid ones; y = times · curve(t, q)."""
+    """Return the valid curve with the smallest χ² + n log presses, for y = times · curve(t, q)."""
     t, q, times = points
     best, smallest = None, math.inf
     for count in range(1, len(powers) + 1):

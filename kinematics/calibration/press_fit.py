@@ -1,6 +1,6 @@
-"""Fit of a tip's physics, modulus and place to presses at known depths and tilts.
+"""Fit a tip's physics, modulus and position to presses at known depths and tilts.
 
-Least squares over all cells of all frames, for whichever tip, by the forward model alone.
+All cells of all frames are fitted by least squares with the forward model of the tip.
 """
 
 from __future__ import annotations
@@ -21,22 +21,23 @@ from softfinger.kinematics.sensing.footprint import FloatArray
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
 _UNIT = Material.constant(1.0)
-_STEP = 1e-5  # m of a derivative
-_SHIFT = 2e-4  # m of one by the place: cells at the rim change by the points that are in it
+_STEP = 1e-5  # m, step of numerical derivatives
+_SHIFT = 2e-4  # m, step in position; larger because rim cells change by whole sample points
 _ROTATION_STEP = 1e-4  # rad
-_TURNS = 8  # rotations that are tried first
+_TURNS = 8  # initial rotations to try
 _GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
-_NARROW = 4e-3  # of ν
-_SAME_D, _SAME_THETA = 5e-5, 0.009  # m, rad: presses that differ by less are one repeated
-_DRIFT_MIN = 0.02  # of E, that a fit may hide: presses and tables are no better
+_NARROW = 4e-3  # tolerance of ν
+_SAME_D, _SAME_THETA = 5e-5, 0.009  # m, rad; presses that differ by less are repetitions
+_DRIFT_MIN = 0.02  # smallest significant drift of E, relative; the accuracy of presses and tables
 
 
 @dataclass(frozen=True)
 class Presses:
-    """Frames float64 [n, rows, cols] Pa of presses of d [n] m and θ [n] rad in the finger's plane.
+    """Frames of presses at known d and θ.
 
-    ``noise`` [Pa] is a cell's in these frames; ``used`` [n, rows, cols] leaves out dead and
-    saturated cells.
+    ``frames`` are float64 [n, rows, cols] [Pa]; d [n] is in m, and θ [n] in rad in the finger's
+    plane. ``noise`` [Pa] is the standard deviation of a cell in these frames. ``used``
+    [n, rows, cols] excludes dead and saturated cells.
     """
 
     frames: FloatArray
@@ -48,7 +49,7 @@ class Presses:
     def of(
         self, tip: Fingertip, grid: SensorGrid, d: FloatArray, law: Material = _UNIT
     ) -> FloatArray:
-        """Return the model's frames of these presses for a modulus of 1, [used cells]."""
+        """Return the modelled pressures of these presses for a modulus of 1 Pa, [used cells]."""
         made = [
             grid.pressure(tip, law, float(depth), float(tilt))
             for depth, tilt in zip(np.maximum(d, 1e-9), self.theta, strict=True)
@@ -58,10 +59,10 @@ class Presses:
 
 @dataclass(frozen=True)
 class Trend:
-    """E [n] Pa of each press alone, over its d [n] m: what one E for all of them may hide.
+    """Modulus E [n] [Pa] of each press alone over d [n] [m], to check that one E fits all presses.
 
-    ``drift`` is what a line through them gains from the least d to the largest, relative, and
-    ``std`` its standard deviation by the scatter round the line.
+    ``drift`` is the relative change of a line through the values from the smallest to the largest
+    d, and ``std`` its standard deviation from the scatter about the line.
     """
 
     d: FloatArray
@@ -71,19 +72,19 @@ class Trend:
 
     @property
     def drifts(self) -> bool:
-        """E drifts by more than scatter makes of it: this is not the tip's law."""
+        """True if E drifts by more than its scatter explains, so the law does not fit the tip."""
         return abs(self.drift) > max(2.0 * self.std, _DRIFT_MIN)
 
     @property
     def cause(self) -> str:
-        """Return what makes E drift that way."""
+        """Return the probable cause of the drift."""
         if self.drift > 0.0:
             return "the tip stiffens more than this law: another base or face, or springs"
         return "the tip stiffens less than this law: another base or face, or solid, or it softens"
 
 
 def trend(d: FloatArray, modulus: FloatArray, force: FloatArray) -> Trend:
-    """Lay a line through ``modulus`` [n] Pa over ``d`` [n] m, each as sure as its ``force`` [n]."""
+    """Fit a line to ``modulus`` [n] [Pa] over ``d`` [n] [m], weighted by ``force`` [n]."""
     weight = force / force.max()
     span = np.ptp(d)
     rows = weight[:, None] * np.stack([np.ones(len(d)), (d - d.min()) / span], axis=1)
@@ -95,10 +96,11 @@ def trend(d: FloatArray, modulus: FloatArray, force: FloatArray) -> Trend:
 
 
 def first_cycle(d: FloatArray, theta: FloatArray, force: FloatArray) -> float | None:
-    """Return by how much the first press [n] is firmer than later ones of its d and θ, relative.
+    """Return the mean relative excess force of first presses over their repetitions.
 
-    Filled rubber softens over its first cycles (Mullins, 1948), and what is fitted to both is
-    neither's. The mean over all d [m] and θ [rad] that are pressed again; None without any.
+    Filled rubber softens over its first cycles (Mullins, 1948), so a fit to both would describe
+    neither. The mean is over all pairs of ``d`` [n] [m] and ``theta`` [n] [rad] that are pressed
+    more than once; the result is None if there are none.
     """
     poses = np.round(np.stack([d / _SAME_D, theta / _SAME_THETA], axis=1))
     _, which = np.unique(poses, axis=0, return_inverse=True)
@@ -109,13 +111,14 @@ def first_cycle(d: FloatArray, theta: FloatArray, force: FloatArray) -> float | 
 
 @dataclass(frozen=True)
 class TipFit:
-    """Fit of one kind of tip to the presses.
+    """Fit of one tip model to the presses.
 
-    ``law`` is that of its material for a modulus of 1 at no strain. ``modulus`` [Pa] and the run's
-    zero of d ``offset`` [m] are fitted, and a solid tip's ν; ``chi2`` is the squared misfit a cell
-    over the noise's. What is left when the estimator takes this tip: rms errors of d [m], θ [rad]
-    and of the force against the sensor's sum, over the rms force; ``valid`` is the fraction of
-    frames whose estimate can be used, and they are over those. ``trend``: E of each press alone.
+    ``law`` is the material law for a modulus of 1 Pa at zero strain. The fitted values are
+    ``modulus`` [Pa], the zero of d ``offset`` [m] and, for a solid tip, ν. ``chi2`` is the mean
+    squared residual per cell over the noise variance. The errors are those of the estimator with
+    this tip: the rms errors of d [m] and θ [rad], and the rms error of the force relative to the
+    sum of the frame, over the rms force. They include only the fraction ``valid`` of frames with a
+    valid estimate. ``trend`` holds E of each press alone.
     """
 
     tip: Fingertip
@@ -131,7 +134,7 @@ class TipFit:
 
     @property
     def material(self) -> Material:
-        """The tip's."""
+        """Fitted material of the tip."""
         return _scaled(self.law, self.modulus)
 
 
@@ -140,7 +143,7 @@ def _scaled(law: Material, factor: float) -> Material:
 
 
 def fit_tip(presses: Presses, tip: Fingertip, grid: SensorGrid, law: Material = _UNIT) -> TipFit:
-    """Return modulus and zero of d of one kind of ``tip`` by Gauss-Newton."""
+    """Fit the modulus and the zero of d of one ``tip`` model by Gauss-Newton."""
     readings = presses.frames[presses.used]
     offset = 0.0
     for _ in range(6):
@@ -165,10 +168,11 @@ def compare_tips(
     active: NDArray[np.bool_],
     material: Material = _UNIT,
 ) -> list[TipFit]:
-    """Fit springs, and solid rubber on either base at its best ν; return the best fit first.
+    """Fit spring and solid models of the tip and return the fits, the best one first.
 
-    With the face frictionless, and on the better base sticking. Springs of a constant modulus, and
-    of the ``material``'s law where that is another one.
+    Springs are fitted with a constant modulus and, if it differs, with the law of ``material``.
+    Solid rubber is fitted with its best ν on either base with a frictionless face, and on the
+    better base with a sticking face.
     """
     fits = [fit_tip(presses, Fingertip(radius), grid)]
     if not material.is_linear:
@@ -192,7 +196,7 @@ def _best_poisson(presses: Presses, tip: Fingertip, grid: SensorGrid) -> TipFit:
 
 
 def golden_section(cost: Callable[[float], float], low: float, high: float, within: float) -> float:
-    """Return where ``cost`` is least between ``low`` and ``high``, ``within`` so much."""
+    """Return the minimum of ``cost`` between ``low`` and ``high`` to the tolerance ``within``."""
     left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
     at_left, at_right = cost(left), cost(right)
     while high - low > within:
@@ -210,7 +214,7 @@ def golden_section(cost: Callable[[float], float], low: float, high: float, with
 def _with_errors(
     presses: Presses, fit: TipFit, grid: SensorGrid, active: NDArray[np.bool_]
 ) -> TipFit:
-    """The fit with what the estimator leaves."""
+    """Return the fit with the errors of the estimator added."""
     table = ContactTable.build(fit.tip, fit.material)
     estimator = ContactEstimator(fit.tip, fit.material, grid, presses.noise, active=active)
     area = math.prod(grid.pitches)
@@ -248,10 +252,11 @@ def _with_errors(
 def fit_place(
     presses: Presses, tip: Fingertip, material: Material, grid: SensorGrid, rotate: bool
 ) -> tuple[SensorGrid, float, float]:
-    """Fit the tip's centre, rotation if ``rotate``; return grid, last step [m], centre's std [m].
+    """Fit the tip's centre and, with ``rotate``, the sensor's rotation.
 
-    Gauss-Newton on place, rotation, each press' own depth, begun at ``presses.d``, and for springs
-    the modulus; the tilts are known.
+    The tilts are known. Gauss-Newton fits the position, the rotation, the depth of each press
+    (starting at ``presses.d``) and, for springs, the modulus. Returns the grid, the last step [m]
+    and the standard deviation of the centre [m].
     """
     gain, free_gain = 1.0, tip.physics == "springs"
     readings = presses.frames[presses.used] / material.reference_modulus
@@ -302,6 +307,6 @@ def fit_place(
 
 
 def depth_of_force(tip: Fingertip, material: Material, force: FloatArray) -> FloatArray:
-    """Return d [m] of an upright tip by its ``force`` [N], from the table."""
+    """Return d [m] of an upright tip under ``force`` [N] from its contact table."""
     d = np.linspace(0.0, 0.4 * tip.radius, 401)
     return np.interp(force, ContactTable.build(tip, material)(d, 0.0).force, d)

@@ -1,4 +1,4 @@
-"""Compilation and storage of kernels, and the SIMD and memory helpers they share.
+"""Compilation and storage of kernels, and their record types.
 
-Nothing here knows what a kernel computes.
+The package is independent of the computations in the kernels.
 """

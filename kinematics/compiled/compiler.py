@@ -1,21 +1,21 @@
-"""Compile kernels with Numba and store them; the only module that uses Numba's private parts.
+"""Compile and cache kernels with Numba; the only module that uses Numba's private interfaces.
 
-It is imported with the versions of Numba it was tested with; with others `plain` replaces it.
-`KernelCompiler` runs the passes that kernels need and no others: passes for closures, `with`,
-parallel loops, branches on constants (LLVM removes those) and the listing of types, which filled
-the cache, are left out. It remembers the result types of operations and the sizes of LLVM's types:
-for each operation in the source Numba would search dozens of candidates, and for each size have
-LLVM parse a module.
+The module is imported only with tested versions of Numba. With other versions, `plain` replaces it.
 
-`BitcodeKernel`s, which only kernels call, are compiled to LLVM bitcode alone, never to machine
-code. Numba compiles every function that a kernel calls as if Python might call it, too: it is
-optimised with its callees, made into machine code, wrapped twice and cached, and its callers then
-link the bitcode and repeat the work. Bitcode alone takes a third off the compile time and leaves a
-quarter of the cache.
+`KernelCompiler` runs only the passes that kernels need. It omits the passes for closures, `with`,
+parallel loops, branches on constants (LLVM removes those) and the type listing, which filled the
+cache. It also caches the result types of operations and the sizes of LLVM types. Otherwise Numba
+would search dozens of candidates for each operation and let LLVM parse a module for each size.
 
-`KernelCache` stores a kernel's machine code without bitcode, which kernels that call this one would
-need; they compile it again. To load a kernel Numba first imports all that it could compile: a third
-of a second, 50 MB; this cache does not.
+`BitcodeKernel`s are called only by other kernels. They are compiled to LLVM bitcode and never to
+machine code. By default Numba compiles each function called by a kernel as if Python might call
+it: the function is optimised with its callees, compiled to machine code, wrapped twice and cached,
+and its callers then link the bitcode and repeat the work. Bitcode alone reduces the compile time by
+a third and the cache to a quarter.
+
+`KernelCache` stores the machine code of a kernel without bitcode. Other kernels that call this
+kernel would need the bitcode; they compile it again. To load a kernel, Numba normally imports
+everything that it can compile, which takes a third of a second and 50 MB; this cache avoids that.
 """
 
 from __future__ import annotations
@@ -62,10 +62,10 @@ from softfinger.kinematics.compiled.own_folder import OwnFolder
 
 _operation: Any = types.Function
 _resolve = _operation.get_call_type
-_SIGNATURES: dict[Any, Any] = {}  # of operations, by their arguments' types and the arithmetic
+_SIGNATURES: dict[Any, Any] = {}  # of operations, by argument types and arithmetic flags
 _context: Any = BaseContext
 _size = _context.get_abi_sizeof
-_SIZES: dict[Any, int] = {}  # of LLVM's types [bytes]
+_SIZES: dict[Any, int] = {}  # of LLVM types [bytes]
 
 
 class KernelCompiler(CompilerBase):
@@ -83,8 +83,8 @@ class KernelCompiler(CompilerBase):
             return super().compile_extra(func)
 
     def define_pipelines(self) -> list[Any]:
-        """Return the passes, in their order."""
-        # Under `if blur is None` nothing has a type unless it is: pruned, and again what follows.
+        """Return the compiler passes in order."""
+        # Prune branches such as `if blur is None` that cannot be typed for a given argument.
         nones = types.none in self.state.args
         passes: list[Any] = [TranslateByteCode, FixupArgs, IRProcessing]
         passes += [RewriteSemanticConstants, DeadBranchPrune] if nones else []
@@ -100,7 +100,7 @@ class KernelCompiler(CompilerBase):
 
 
 class _Arguments(tuple[Any, ...]):
-    """Arguments' types without their text, which Numba makes for each pass; a record's is long."""
+    """Argument types without their text form, which Numba builds in each pass; records are long."""
 
     __slots__ = ()
 
@@ -110,7 +110,7 @@ class _Arguments(tuple[Any, ...]):
 
 @contextmanager
 def _remembering(flags: Any) -> Iterator[None]:
-    """Meanwhile Numba remembers signatures of its own functions, and sizes."""
+    """Let Numba cache the signatures of its own functions and type sizes within this context."""
     arithmetic = frozenset(flags.fastmath.flags), flags.error_model
 
     def signature(function: Any, context: Any, arguments: Any, named: Any) -> Any:
@@ -123,7 +123,7 @@ def _remembering(flags: Any) -> Iterator[None]:
                 return None
             _SIGNATURES[key] = found, function._impl_keys[found.args]
         found, body = _SIGNATURES[key]
-        function._impl_keys[found.args] = body  # by which Numba finds what to compile
+        function._impl_keys[found.args] = body  # where Numba looks up the implementation
         return found
 
     def size(context: Any, kind: Any) -> int:
@@ -144,7 +144,7 @@ _make_function: Any = numba._dynfunc.make_function  # type: ignore[attr-defined]
 
 
 class BitcodeKernel(plain.InnerKernel):
-    """An inner kernel that is compiled to bitcode alone."""
+    """Inner kernel that is compiled only to bitcode."""
 
     dispatcher: Any
 
@@ -155,7 +155,7 @@ class BitcodeKernel(plain.InnerKernel):
             no_cfunc_wrapper=True,
             **options,
         )(self.py_func)
-        # Numba would compile it again for each literal among the arguments; LLVM folds them anyway.
+        # Without this, Numba recompiles for each literal argument. LLVM folds literals anyway.
         resolve = self.dispatcher.get_call_template
         self.dispatcher.get_call_template = lambda args, kws: resolve(
             tuple(types.unliteral(each) for each in args), kws
@@ -163,15 +163,15 @@ class BitcodeKernel(plain.InnerKernel):
 
     @property
     def _numba_type_(self) -> Any:
-        """Numba's type of the kernel, which a compiled caller asks for."""
+        """Numba type of the kernel, requested by compiled callers."""
         return self.dispatcher._numba_type_
 
 
 class _Bitcode(JITCodeLibrary):
-    """A library that is linked into those of its callers and never becomes machine code."""
+    """Code library that is linked into its callers and never compiled to machine code."""
 
     def _optimize_functions(self, ll_module: Any) -> None:
-        # Numba does this for what is only declared here, too.
+        # As Numba does for its own libraries, including functions that are only declared here.
         ll_module.data_layout = self._codegen._data_layout
         for function in ll_module.functions:
             if not function.is_declaration:
@@ -188,7 +188,7 @@ class _Bitcode(JITCodeLibrary):
 
 @register_pass(mutates_CFG=True, analysis_only=False)
 class _InnerLowering(NativeLowering):
-    """Lowering into such a library, with an entry point that stands for the kernel, but is null."""
+    """Lowering into a bitcode library, with a null entry point as placeholder for the kernel."""
 
     _name = "inner_lowering"
 
@@ -202,7 +202,7 @@ class _InnerLowering(NativeLowering):
             state.flags.no_compile = False
         lowered = state["cr"]
         fndesc, env = lowered.fndesc, lowered.env
-        # Numba knows an overload by its entry point, so each has one of its own.
+        # Numba identifies an overload by its entry point, so each overload needs its own.
         entry = _make_function(fndesc.lookup_module(), name, "", 0, env, (state.library,))
         state.targetctx.insert_user_function(entry, fndesc, [state.library])
         state["cr"] = _LowerResult(fndesc, lowered.call_helper, cfunc=entry, env=env)
@@ -210,7 +210,7 @@ class _InnerLowering(NativeLowering):
 
 
 class _InnerCompiler(KernelCompiler):
-    """The compiler with that lowering."""
+    """Kernel compiler that lowers to bitcode."""
 
     lowering = _InnerLowering
 
@@ -219,7 +219,7 @@ _llvm: Any = llvmlite.binding
 
 
 class KernelFolder:
-    """Tells Numba where a kernel is kept: one of its cache locators."""
+    """Numba cache locator for the kernel folder."""
 
     def __init__(self, function: Callable[..., Any], file: str) -> None:
         self._py_file = file
@@ -227,24 +227,24 @@ class KernelFolder:
 
     @classmethod
     def from_function(cls, function: Callable[..., Any], file: str) -> KernelFolder | None:
-        """Return the locator, or None where there is no folder: then nothing is stored."""
+        """Return the locator, or None if there is no folder and kernels are not stored."""
         return None if kernel_folder() is None else cls(function, file)
 
     def get_cache_path(self) -> str:
-        """Return the one folder."""
+        """Return the path of the kernel folder."""
         folder = kernel_folder()
         assert folder is not None
         return str(folder.path)
 
     def ensure_cache_path(self) -> None:
-        """Do nothing: `kernel_folder` has made and checked it."""
+        """Do nothing; `kernel_folder` has created and checked the folder."""
 
     def get_source_stamp(self) -> str:
-        """Return the digest of the kernel's own file; the folder's name covers the others."""
+        """Return the digest of the kernel's own file; the folder name covers all other files."""
         return hashlib.sha256(text(Path(self._py_file))).hexdigest()
 
     def get_disambiguator(self) -> str:
-        """Return a text that differs for kernels of the same name in modules of the same name."""
+        """Return a text that distinguishes kernels with equal kernel and module names."""
         file = Path(self._py_file)
         inside = file.is_relative_to(ROOT)
         place = file.relative_to(ROOT).parent if inside else file.parent
@@ -252,12 +252,12 @@ class KernelFolder:
 
 
 class _MachineCode(CompileResultCacheImpl):
-    """A compiled kernel as it is kept."""
+    """Serialisation of a compiled kernel."""
 
     _locator_classes: Any = (KernelFolder,)
 
     def reduce(self, cres: Any) -> Any:
-        """Replace the bitcode by the names of what it defines, by which Numba finds it."""
+        """Replace the bitcode by the names of its symbols, with which Numba finds the code."""
         (name, kind, (code, bitcode)), *rest = super().reduce(cres)
         module = _llvm.parse_bitcode(bitcode)
         defined = (*module.functions, *module.global_variables)
@@ -267,7 +267,7 @@ class _MachineCode(CompileResultCacheImpl):
 
 
 class _Files:
-    """Files of a kernel's overloads, one each, in the place of Numba's index and data files."""
+    """Storage of one file per overload, which replaces Numba's index and data files."""
 
     def __init__(self, folder: OwnFolder, name: str, stamp: str) -> None:
         self._folder, self._name, self._stamp = folder, name, stamp
@@ -284,7 +284,7 @@ class _Files:
 
 
 class KernelCache(FunctionCache):
-    """Numba's cache with machine code alone. Raises RuntimeError where there is no folder."""
+    """Numba cache that stores only machine code. Raises RuntimeError without a folder."""
 
     _impl_class = _MachineCode
 
@@ -296,14 +296,14 @@ class KernelCache(FunctionCache):
         self._cache_file: Any = _Files(folder, self._impl.filename_base, stamp)
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Load an overload without importing first all that Numba can compile."""
+        """Load an overload without importing everything that Numba can compile."""
         _add_symbols()
         return self._load_overload(sig, target_context)
 
 
 @cache
 def _add_symbols() -> None:
-    """Tell LLVM of Numba's memory functions, which machine code calls."""
+    """Register Numba's memory functions, which the machine code calls, with LLVM."""
     for name, address in nrt._nrt.c_helpers.items():  # type: ignore[attr-defined]
         _llvm.add_symbol(name if name.startswith("_") else f"NRT_{name}", address)
 
@@ -312,13 +312,13 @@ inner = BitcodeKernel
 
 
 def compiled(function: Callable[..., Any], options: dict[str, Any]) -> Any:
-    """Return ``function`` as one that Numba compiles and keeps, where there is a folder."""
+    """Return ``function`` compiled by Numba, cached on disk if there is a folder."""
     dispatcher = _njit(no_cfunc_wrapper=True, pipeline_class=KernelCompiler, **options)(function)
     try:
         dispatcher._cache = KernelCache(function)
     except RuntimeError:
-        pass  # no folder: `kernel_folder` has warned
-    called = inner(function, options).dispatcher  # by kernels: what is kept has no bitcode
+        pass  # no folder; `kernel_folder` has issued a warning
+    called = inner(function, options).dispatcher  # the cache has no bitcode
     dispatcher.get_call_template = called.get_call_template
     dispatcher.get_overload = called.get_overload
     return dispatcher

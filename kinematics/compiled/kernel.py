@@ -1,9 +1,10 @@
-"""The decorators behind every compiled kernel, and which way they are compiled.
+"""Decorators for compiled kernels.
 
-A kernel takes arrays, records and scalars and is pure. One that Python calls is a ``kernel``:
-compiled by Numba at its first call, with all it calls, and kept in the folder of
-`compiled.kernel_folder`. One that only kernels call is an ``inner_kernel`` (``fast_inner_kernel``,
-``inlined_kernel``), which costs a fraction to compile and can't be called from Python.
+A kernel is a pure function of arrays, records and scalars. A ``kernel`` can be called from Python.
+Numba compiles it at its first call, together with all functions that it calls, and stores it in the
+folder of `compiled.kernel_folder`. An ``inner_kernel`` (also ``fast_inner_kernel`` and
+``inlined_kernel``) can only be called from other kernels, and takes a fraction of the time to
+compile.
 """
 
 from __future__ import annotations
@@ -20,11 +21,11 @@ from softfinger.kinematics.compiled import plain
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-# Minor versions of Numba with whose private parts `compiler` was tested.
+# Minor versions of Numba with which `compiler`, which uses private interfaces, was tested.
 TESTED = ("0.63", "0.64", "0.65", "0.66", "0.67", "0.68")
 
-# index(k): k as an index that Numba need not look at whether it is negative, and so counts from the
-# end, which would keep a loop over it out of SIMD lanes. Added to others of its kind alone.
+# index(k) converts k to an unsigned index. Numba checks signed indices for negative values, which
+# count from the end, and this check prevents vectorisation. Do not mix both kinds in a sum.
 index: Callable[[int], int] = cast(Any, np.uint64)
 
 _OPTIONS: dict[str, Any] = {"error_model": "numpy"}
@@ -32,11 +33,11 @@ _SUMS = {"reassoc", "contract", "nsz", "arcp"}
 
 
 class JitDisabled(SoftfingerError):
-    """Numba is told not to compile. The message says what mends it."""
+    """Error raised if Numba's compilation is disabled."""
 
 
 def _chosen() -> tuple[ModuleType, str]:
-    """Return what compiles, and why it is Numba alone, else an empty text."""
+    """Return the compiling module, and the reason if it is `plain`, else an empty text."""
     if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
         raise JitDisabled(
             "NUMBA_DISABLE_JIT is set: the kernels run compiled only; unset it to go on"
@@ -54,31 +55,32 @@ _compiler, why_plain = _chosen()
 
 
 def kernel(function: Function) -> Function:
-    """Compile ``function`` with Numba: cached on disk, IEEE arithmetic, the GIL kept.
+    """Compile ``function`` with Numba, with a cache on disk and IEEE arithmetic.
 
-    The GIL is kept because reacquiring it in the loop can cost a whole switch interval.
+    The kernel keeps the GIL, because reacquiring it in the control loop can take a whole switch
+    interval.
     """
     return cast(Function, _compiler.compiled(function, _OPTIONS))
 
 
 def inner_kernel(function: Function) -> Function:
-    """Compile ``function`` for kernels alone; a call from Python raises TypeError."""
+    """Compile ``function`` for calls from kernels; a call from Python raises TypeError."""
     return _inner(function)
 
 
 def fast_inner_kernel(function: Function) -> Function:
-    """Compile an :func:`inner_kernel` whose sums may be reordered and fused to run in SIMD lanes.
+    """Compile an :func:`inner_kernel` whose sums may be reordered and fused for vectorisation.
 
-    For finite numbers only: NaN and infinity have no defined result there.
+    Results are undefined for NaN and infinity.
     """
     return _inner(function, fastmath=_SUMS)
 
 
 def inlined_kernel(function: Function) -> Function:
-    """Compile an :func:`inner_kernel` into each of its callers; products and sums may be fused.
+    """Compile an :func:`inner_kernel` inline into its callers; products and sums may be fused.
 
-    For the innermost functions of a hot path, where a call costs as much as the work. Its code is
-    repeated in each caller, so it should be short.
+    Use it for the innermost functions of a hot path, where a call costs as much as the work. The
+    code is repeated in each caller, so it should be short.
     """
     return _inner(function, fastmath={"contract"}, forceinline=True)
 

@@ -1,10 +1,9 @@
-"""Folder of compiled kernels between runs: one for each state of sources and compiler.
+"""Cache folder of compiled kernels, one for each state of the sources and the compiler.
 
-The folder's name is a digest of every source that a kernel of this package may depend on, of
-Python, Numba, llvmlite and NumPy, and of the processor, so nothing compiled from something else is
-ever loaded. What is found there is unpickled and run: the folder is the user's own, or it is not
-used. Each kernel's file begins with a digest of the rest: a file that is torn or has rotted is
-compiled anew.
+The folder's name is a digest of all sources that a kernel may depend on, the versions of Python,
+Numba, llvmlite and NumPy, and the processor. Kernels compiled from anything else are therefore
+never loaded. The files are unpickled and executed, so the folder is only used if it belongs to the
+user alone. Each file begins with a digest of its content; damaged files are compiled again.
 """
 
 from __future__ import annotations
@@ -29,11 +28,11 @@ import numpy as np
 
 from softfinger.kinematics.compiled.own_folder import OwnFolder, user_cache
 
-ROOT = Path(__file__).resolve().parents[2]  # what `softfinger.` stands for in a name
+ROOT = Path(__file__).resolve().parents[2]  # directory of the package `softfinger`
 _PACKAGES = ("kinematics", "daemon")
 _FOLDER = re.compile(r"kernels-[0-9a-f]{16}")
-_FOLDERS_MAX = 4  # folders of other sources or compilers that stay: other checkouts, a release
-_RECENT = 600.0  # s; a folder used since then stays too, because its program may still run
+_FOLDERS_MAX = 4  # other cache folders to keep, of other checkouts or the last release
+_RECENT = 600.0  # s; folders used since then are also kept, because their program may still run
 _DECORATED = re.compile(rb"^@\w*kernel\b", re.MULTILINE)
 _IMPORT = re.compile(
     rb"^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+import[ \t]+(\([^)]*\)|[^\n]+)|import[ \t]+([\w., \t]+))",
@@ -47,7 +46,7 @@ _KERNEL, _MARK = ".kernel", ".built"
 
 @cache
 def kernel_folder() -> OwnFolder | None:
-    """Return this state's folder, made when absent; warn and return None if that fails."""
+    """Return the current cache folder, created if absent; warn and return None if that fails."""
     try:
         return find_folder()
     except (OSError, RuntimeError) as error:
@@ -61,9 +60,9 @@ def kernel_folder() -> OwnFolder | None:
 
 
 def find_folder() -> OwnFolder:
-    """Return this state's folder in NUMBA_CACHE_DIR if set, else in the user's cache directory.
+    """Return the current folder in NUMBA_CACHE_DIR if set, else in the user's cache directory.
 
-    Raises as :class:`OwnFolder`, and RuntimeError where there is no home.
+    Raises the exceptions of :class:`OwnFolder`, and RuntimeError without a home directory.
     """
     given = os.environ.get("NUMBA_CACHE_DIR")
     base = Path(given) if given else user_cache()
@@ -72,14 +71,14 @@ def find_folder() -> OwnFolder:
     path = base / f"kernels-{digest()}"
     fresh = not path.exists()
     folder = OwnFolder(path)
-    os.utime(folder.path)  # by which pruning knows what is in use
+    os.utime(folder.path)  # marks the folder as in use for pruning
     if fresh:
         _prune(base, path)
     return folder
 
 
 def keep(folder: OwnFolder, name: str, content: bytes) -> None:
-    """Keep a kernel; where that fails, warn: it is compiled anew at the next start."""
+    """Store a kernel; on failure issue a warning, and the next start compiles it again."""
     try:
         folder.write(name + _KERNEL, hashlib.sha256(content).digest() + content)
     except OSError as error:
@@ -87,7 +86,7 @@ def keep(folder: OwnFolder, name: str, content: bytes) -> None:
 
 
 def kept(folder: OwnFolder, name: str) -> bytes | None:
-    """Return a kernel that was kept, None where there is none or, with a warning, no sound one."""
+    """Return a stored kernel, or None if it is missing or (with a warning) damaged."""
     try:
         return _sound(folder.read(name + _KERNEL))
     except FileNotFoundError:
@@ -105,7 +104,7 @@ def _sound(data: bytes) -> bytes:
 
 
 def damaged(folder: OwnFolder) -> list[str]:
-    """Return the names of files that hold no sound kernel, or can't be read: some ms for all."""
+    """Return the names of damaged or unreadable kernel files; takes a few ms for all files."""
     found = []
     for name in folder.names():
         if name.endswith(_KERNEL):
@@ -117,7 +116,10 @@ def damaged(folder: OwnFolder) -> list[str]:
 
 
 def remove_damaged(folder: OwnFolder) -> int:
-    """Remove such files, and what says which parts are built; their number. Raises OSError."""
+    """Remove damaged files and the marks of compiled parts; return the number of damaged files.
+
+    Raises OSError.
+    """
     names = damaged(folder)
     for name in [*names, *(each for each in folder.names() if names and each.endswith(_MARK))]:
         folder.remove(name)
@@ -125,18 +127,18 @@ def remove_damaged(folder: OwnFolder) -> int:
 
 
 def is_marked(folder: OwnFolder, part: str) -> bool:
-    """Return whether the kernels of ``part`` were marked as compiled."""
+    """Return True if the kernels of ``part`` are marked as compiled."""
     return part + _MARK in folder.names()
 
 
 def mark(folder: OwnFolder, part: str) -> None:
-    """Mark the kernels of ``part`` as compiled; where that fails they are looked for anew."""
+    """Mark the kernels of ``part`` as compiled; on failure the next start checks them again."""
     with contextlib.suppress(OSError):  # another process may have pruned the folder meanwhile
         folder.write(part + _MARK, b"")
 
 
 def _prune(base: Path, current: Path) -> None:
-    """Remove the other folders that were made here, except recent ones and the last used."""
+    """Remove other cache folders except recent ones and the most recently used."""
     oldest = time.time() - _RECENT
     others = [
         each
@@ -151,7 +153,7 @@ def _prune(base: Path, current: Path) -> None:
 
 @cache
 def digest() -> str:
-    """Return a name for this state of sources, Python, Numba, llvmlite, NumPy and processor."""
+    """Return the digest of the sources, Python, Numba, llvmlite, NumPy and the processor."""
     state = hashlib.sha256()
     packages = (numba.__version__, llvmlite.__version__, np.__version__)
     versions = (sys.version, *packages, platform.machine())
@@ -168,7 +170,7 @@ def digest() -> str:
 
 @cache
 def kernel_sources() -> tuple[Path, ...]:
-    """Return every module of ours with a kernel in it, and all that these import."""
+    """Return all modules of this package that contain kernels, and their imports."""
     files = (each for name in _PACKAGES for each in (ROOT / name).rglob("*.py"))
     waiting = [file for file in files if _DECORATED.search(text(file))]
     seen: set[Path] = set()
@@ -181,7 +183,7 @@ def kernel_sources() -> tuple[Path, ...]:
 
 
 def _imported(source: Path) -> Iterator[Path]:
-    """Modules of ours that ``source`` names: `import a.b`, `from a import b`, b a module or not."""
+    """Yield this package's modules imported by ``source``, also in the form `from a import b`."""
     for module, names, modules in _IMPORT.findall(text(source)):
         found = [each.split()[0] for each in modules.split(b",")] if modules else [module]
         parts = [name.split()[0] for name in names.strip(b"()").split(b",") if name.split()]
@@ -202,5 +204,5 @@ def _files(name: str) -> tuple[Path, ...]:
 
 @cache
 def text(path: Path) -> bytes:
-    """Return a file's source, read once."""
+    """Return the content of a source file, read only once."""
     return path.read_bytes()

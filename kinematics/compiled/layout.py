@@ -1,4 +1,6 @@
-"""Named state of kernels: a record is declared once, as a class, and both sides use its fields.
+"""Records with named fields that are shared between Python and kernels.
+
+A record is declared once as a class; Python code and kernels then access the same fields.
 
     class Tip(Record):
         d: float              # [m]
@@ -8,15 +10,16 @@
 
     tip = Tip()               # zeros
     tip.d = 1e-3              # Python: reads and writes by name
-    press(tip.array, 0.1)     # a kernel that Python calls takes the array of one record …
+    press(tip.array, 0.1)     # a kernel called from Python takes the array of one record
 
     @kernel
     def press(tips: Records[Tip], more: float) -> None:
-        tip = tips[0]         # … and works on its first: a reference, not a copy
-        deeper(tip, more)     # inner kernels take the record itself
+        tip = tips[0]         # a reference to the record, not a copy
+        deeper(tip, more)     # an inner kernel takes the record itself
 
 Fields are `float`, `int` (64 bit), `bool`, another record, or an array of fixed shape by
-:data:`Annotated`. What depends on a grid's size is no field: each size would be compiled again.
+:data:`Annotated`. Arrays whose size depends on a grid are not fields, because kernels would be
+compiled again for each size.
 """
 
 from __future__ import annotations
@@ -33,7 +36,7 @@ _SCALARS: dict[Any, Any] = {float: np.float64, int: np.int64, bool: np.bool_}
 
 
 class Records(Protocol, Generic[Each]):
-    """A structured array of one record class, as kernels index it."""
+    """Type of a structured array of one record class, as indexed by kernels."""
 
     def __getitem__(self, index: int, /) -> Each: ...
     def __setitem__(self, index: int, record: Any, /) -> None: ...  # copies
@@ -41,30 +44,30 @@ class Records(Protocol, Generic[Each]):
 
 
 class _Slotted(type):
-    """Leaves a record no place for attributes that are no fields: a misspelt one is an error."""
+    """Metaclass that restricts attributes to fields, so that a misspelt name is an error."""
 
     def __new__(meta, name: str, bases: tuple[type, ...], names: dict[str, Any]) -> _Slotted:
         return super().__new__(meta, name, bases, {"__slots__": (), **names})
 
 
 class Record(metaclass=_Slotted):
-    """State with names. A subclass's annotations are its fields; see the module."""
+    """Base class of records; the annotations of a subclass are its fields. See the module."""
 
     __slots__ = ("_fields", "array")
 
     dtype: np.dtype[np.void]
-    array: Records[Self]  # of one record: what a kernel takes
+    array: Records[Self]  # array of one record, the argument of kernels
 
     def __init_subclass__(cls) -> None:
         hints = get_type_hints(cls, include_extras=True)
         kinds = {name: _kind(hints[name]) for name in cls.__annotations__}
-        # Aligned as C has it, or Numba reads each field as if it might lie anywhere.
+        # C alignment; otherwise Numba uses slow unaligned access for each field.
         cls.dtype = np.dtype([(name, *kind) for name, (_, *kind) in kinds.items()], align=True)
         for name, (inner, _, shape) in kinds.items():
             setattr(cls, name, _field(name, inner, shape))
 
     def __init__(self, array: NDArray[np.void] | None = None) -> None:
-        """A record of zeros, or the first of ``array``."""
+        """Create a record of zeros, or a view of the first record of ``array``."""
         one: Any = np.zeros(1, self.dtype) if array is None else array
         if one.dtype != self.dtype:
             raise TypeError(f"{type(self).__name__}: expected {self.dtype}, found {one.dtype}")
@@ -72,13 +75,13 @@ class Record(metaclass=_Slotted):
         self._fields = _Views(type(self), one)
 
     def assign(self, other: Self) -> None:
-        """Take over every field of ``other``."""
+        """Copy all fields from ``other``."""
         mine: Any = self.array
         mine[:] = other.array
 
 
 class _Views(dict[str, Any]):
-    """A record's fields, views that are kept: to make one takes ten times as long as to use it."""
+    """Cached views of a record's fields; creating a view takes ten times as long as using it."""
 
     def __init__(self, kind: type[Record], one: Any) -> None:
         self._kind = kind
@@ -95,7 +98,7 @@ class _Views(dict[str, Any]):
 
 
 class _Many(list[Any]):
-    """An array of records inside a record: their views, and the array for kernels."""
+    """Views of an array of records inside a record, and the array itself for kernels."""
 
     def __init__(self, kind: type[Record], array: Any) -> None:
         super().__init__(kind(array[k : k + 1]) for k in range(len(array)))
@@ -134,7 +137,7 @@ def _field(name: str, inner: Any, shape: tuple[int, ...]) -> Any:
 
 
 def _kind(hint: Any) -> tuple[Any, Any, tuple[int, ...]]:
-    """(record class or None, type of one element, shape) of an annotation."""
+    """Return (record class or None, type of one element, shape) of an annotation."""
     shape = getattr(hint, "__metadata__", ())
     base = hint.__origin__ if shape else hint
     if base in _SCALARS:
@@ -144,5 +147,5 @@ def _kind(hint: Any) -> tuple[Any, Any, tuple[int, ...]]:
     inner = base.__args__[-1]
     if isinstance(inner, type) and issubclass(inner, Record):
         return inner, inner.dtype, shape
-    # Of NDArray[np.float64]: dtype[float64], or float64 itself since NumPy 2.5.
+    # The argument of NDArray[np.float64] is dtype[float64], or float64 itself since NumPy 2.5.
     return None, getattr(inner, "__args__", (inner,))[0], shape

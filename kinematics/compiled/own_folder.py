@@ -1,7 +1,8 @@
-"""Folders that this user alone fills, judged with every folder above them; files written whole.
+"""Folders that only the current user can modify, and atomic file writes.
 
-Whoever may write in a folder above may put another in its place, also between a check and a use: so
-a folder is opened once, files are read through that descriptor, and each file's owner is checked.
+Anyone who can write to a parent folder may replace the folder, even between a check and its use.
+Therefore all parent folders are checked, a folder is opened once, files are read through its
+descriptor, and the owner of each file is checked.
 """
 
 from __future__ import annotations
@@ -12,24 +13,24 @@ import stat
 from functools import cache
 from pathlib import Path
 
-# Windows has neither owners nor modes that tell who may write, nor folders that stay open: there
-# nothing is judged, and the access lists of the user's profile have to do.
+# Windows has no owners or modes that show who may write, and folders cannot be held open. Nothing
+# is checked there; the access control lists of the user's profile protect the folder.
 JUDGED = hasattr(os, "geteuid")
 NO_FOLLOW: int = getattr(os, "O_NOFOLLOW", 0)
 _PLAIN: int = NO_FOLLOW | getattr(os, "O_BINARY", 0)
 
 
 def user_cache() -> Path:
-    """Return this program's cache directory of the user. Raises RuntimeError without a home."""
+    """Return the user's cache directory of this program. Raises RuntimeError without a home."""
     base = os.environ.get("XDG_CACHE_HOME")
     return Path(base) / "softfinger" if base else Path.home() / ".cache" / "softfinger"
 
 
 def fault(path: Path, found: os.stat_result) -> str:
-    """Return why others may change what is at ``path``, of status ``found``; empty if they may not.
+    """Return the reason for which other users can modify ``path``, or an empty text if they cannot.
 
-    It is this user's or root's. In a folder with the sticky bit, as /tmp, nobody can replace what
-    isn't his.
+    ``found`` is the status of the path. The owner must be this user or root. Folders with the
+    sticky bit, such as /tmp, are allowed: their entries can only be replaced by the entry's owner.
     """
     if not JUDGED:
         return ""
@@ -50,7 +51,7 @@ def _written_by_others(path: Path, found: os.stat_result) -> str:
 
 @cache
 def _alone_in(group: int) -> bool:
-    """Return whether a group is this user's private one: of its name, with nobody else in it."""
+    """Return True if the group is this user's private group: same name and no other members."""
     import grp
     import pwd
 
@@ -62,16 +63,19 @@ def _alone_in(group: int) -> bool:
 
 
 def check_above(path: Path) -> None:
-    """Judge all folders above ``path``. Raises PermissionError, and OSError as `Path.stat`."""
+    """Check all parent folders of ``path``.
+
+    Raises PermissionError if other users can modify one, and the OSError of `Path.stat`.
+    """
     for folder in path.resolve().parents:
         if wrong := fault(folder, folder.stat()):
             raise PermissionError(wrong)
 
 
 def require_own(folder: Path) -> None:
-    """Raises PermissionError unless this folder, no link, is this user's and nobody else's to fill.
+    """Check that only this user can modify the folder and that it is not a link.
 
-    Raises FileNotFoundError and NotADirectoryError, too.
+    Raises PermissionError, FileNotFoundError or NotADirectoryError.
     """
     _judge(folder, folder.lstat())
 
@@ -87,9 +91,9 @@ def _judge(folder: Path, found: os.stat_result) -> None:
 def write_whole(
     path: str | Path, data: bytes, mode: int = 0o666, folder: int | None = None
 ) -> None:
-    """Write a file beside its place and move it there: it appears whole, or not at all.
+    """Write a file atomically, through a temporary file in the same directory.
 
-    ``path`` is of the open directory ``folder`` where there is one. Raises OSError.
+    ``path`` is relative to the open directory ``folder`` if given. Raises OSError.
     """
     part = f"{path}.{os.getpid()}.part"
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | _PLAIN
@@ -111,9 +115,10 @@ def _remove(path: str, folder: int | None) -> None:
 
 
 class OwnFolder:
-    """A context of a folder that is this user's alone, made (0700) if absent, and kept open.
+    """Context manager of an open folder that only this user can modify.
 
-    Raises OSError as :func:`require_own`, or where it can't be made.
+    The folder is created with mode 0700 if absent. Raises the exceptions of :func:`require_own`, or
+    OSError if it cannot be created.
     """
 
     def __init__(self, path: Path) -> None:
@@ -135,11 +140,14 @@ class OwnFolder:
             raise
 
     def names(self) -> list[str]:
-        """Return the names of what is in it."""
+        """Return the names of the entries."""
         return os.listdir(self.path if self.descriptor is None else self.descriptor)  # noqa: PTH208
 
     def read(self, name: str) -> bytes:
-        """Return a file's bytes. Raises OSError as `open`, PermissionError for another user's."""
+        """Return the content of a file.
+
+        Raises the OSError of `open`, or PermissionError if the file belongs to another user.
+        """
         flags = os.O_RDONLY | _PLAIN
         descriptor = os.open(self._at(name), flags, dir_fd=self.descriptor)
         with os.fdopen(descriptor, "rb") as file:
@@ -148,18 +156,18 @@ class OwnFolder:
             return file.read()
 
     def write(self, name: str, data: bytes) -> None:
-        """Write a file as :func:`write_whole`, for this user alone. Raises OSError."""
+        """Write a file with :func:`write_whole`, readable only by this user. Raises OSError."""
         write_whole(self._at(name), data, 0o600, self.descriptor)
 
     def remove(self, name: str) -> None:
-        """Remove a file, if it is there. Raises OSError."""
+        """Remove a file if it exists. Raises OSError."""
         _remove(self._at(name), self.descriptor)
 
     def _at(self, name: str) -> str:
         return str(self.path / name) if self.descriptor is None else name
 
     def close(self) -> None:
-        """Give it back."""
+        """Close the folder."""
         if self.descriptor is not None:
             os.close(self.descriptor)
 

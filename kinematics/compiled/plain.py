@@ -1,8 +1,8 @@
-"""Kernels compiled by Numba's public interface alone: what `compiler` does, with any Numba.
+"""Replacement of `compiler` that uses only Numba's public interface and works with any version.
 
-Results are the same; a first start takes twice as long, and later ones import all that Numba can
-compile. Kernels are kept in the same folder, which names their sources and Numba's version, but by
-Numba, without a digest.
+The results are the same. The first start takes twice as long, and later starts import everything
+that Numba can compile. Numba stores the kernels, without a digest, in the same folder, whose name
+depends on the sources and the version of Numba.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _config: Any = config
 
 
 class InnerKernel:
-    """Stands for an inner kernel in Python: Numba sees the kernel, a call is refused."""
+    """Inner kernel as seen from Python: Numba can compile it, and a call from Python fails."""
 
     def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
         self.py_func = function
@@ -32,11 +32,11 @@ class InnerKernel:
         self._register(options)
 
     def _register(self, options: dict[str, Any]) -> None:
-        """Let Numba know what a compiled caller means."""
+        """Register the kernel's type with Numba for compiled callers."""
         _overload(self, jit_options=options, strict=False)(lambda *_: self.py_func)
 
     def __call__(self, *values: Any) -> Any:
-        """Refuse: inner kernels are compiled for kernels. Raises TypeError."""
+        """Raise TypeError; only kernels can call inner kernels."""
         raise TypeError(
             f"{self.__module__}.{self.__name__} is an inner kernel, which only kernels may call; "
             "what Python calls is marked @kernel"
@@ -47,9 +47,9 @@ inner = InnerKernel
 
 
 def compiled(function: Callable[..., Any], options: dict[str, Any]) -> Any:
-    """Return ``function`` as one that Numba compiles and keeps, where there is a folder."""
+    """Return ``function`` compiled by Numba, cached on disk if there is a folder."""
     folder = kernel_folder()
-    # Through the folder as it was opened and judged, whatever its path leads to by now.
+    # Use the descriptor of the checked folder, because the path may have been replaced since.
     place = f"/proc/self/fd/{folder.descriptor}" if folder else ""
     before, _config.CACHE_DIR = _config.CACHE_DIR, place
     try:

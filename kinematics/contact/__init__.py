@@ -1,4 +1,4 @@
 """One soft tip against a plane: material laws, closed forms, reference integrals, lookup tables.
 
-What a tip and its material do belongs here; what a sensor under the tip reads of it doesn't.
+The package covers the tip and its material. The sensor under the tip is in `kinematics.sensing`.
 """

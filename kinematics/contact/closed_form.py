@@ -1,14 +1,15 @@
-"""One soft hemispherical fingertip of constant modulus against a plane: the exact formulas.
+"""Exact contact formulas of a soft hemispherical fingertip of constant modulus against a plane.
 
-The fingertip's geometry, and force, energy and their partials over arrays and as kernels. The tip
-is a hemisphere of radius a on a rigid base; a spring stands on each point of the base, normal to
-it. The object's face is pressed in by d along its normal, which is tilted by θ against the base's
-normal. With h = a − d:
+The module holds the fingertip's geometry and its force, energy and partial derivatives, both for
+arrays and as kernels. The tip is a hemisphere of radius a on a rigid base, with an independent
+spring normal to the base at each of its points. The object's face is displaced by d along its
+normal, which is tilted by θ from the base's normal. With h = a − d:
 
     F = πE d²/cos θ,    U = πE d³/(3 cos² θ),    ∂U/∂d = F/cos θ,    |θ| ≤ asin(h/a).
 
-They hold because strain × area is an axisymmetric measure about the face's normal on the spherical
-cap, so that all its moments are elementary. Beyond the limit of θ the face meets the base plate.
+The formulas are exact because strain × area is an axisymmetric measure about the face's normal on
+the spherical cap, so all its moments are elementary. Beyond the limit of θ, the face touches the
+base plate.
 """
 
 from __future__ import annotations
@@ -26,8 +27,8 @@ from softfinger.kinematics.contact.tip_curves import TipCurves
 FloatArray = NDArray[np.float64]
 
 HALF_PI = math.pi / 2
-LARGEST = 1.0  # m of radius; a larger number is one of millimetres
-POISSON = (0.45, 0.4995)  # of a solid tip: what its data cover
+LARGEST = 1.0  # m, largest radius; a larger value was probably given in millimetres
+POISSON = (0.45, 0.4995)  # range of Poisson's ratio covered by the solid tip's data
 
 
 Physics = Literal["springs", "solid", "measured"]
@@ -37,13 +38,28 @@ Face = Literal["frictionless", "sticking"]
 
 @dataclass(frozen=True)
 class Fingertip:
-    """A hemispherical soft tip of ``radius`` a [m].
+    """Hemispherical soft fingertip.
 
-    ``physics`` says how it gives way: as independent "springs", or as "solid" rubber, linear
-    elastic with the ratio ``poisson``, its ``base`` "bonded" to the sensor or "lying" on it, its
-    ``face`` "frictionless" or "sticking" to what it touches; the last three are for solid tips
-    alone; or as its ``law`` says, as "measured". Raises ValueError for values out of their range; a
-    radius is at most 1 m.
+    Parameters
+    ----------
+    radius
+        Radius a [m], at most 1 m.
+    physics
+        Deformation model: "springs" for independent springs, "solid" for linear elastic rubber, or
+        "measured" for curves from calibration presses.
+    poisson
+        Poisson's ratio of a solid tip, 0.45 to 0.4995.
+    base
+        A solid tip is "bonded" to the sensor or "lying" on it.
+    face
+        The surface of a solid tip is "frictionless" or "sticking" on the object.
+    law
+        Measured curves; required if ``physics`` is "measured", and None otherwise.
+
+    Raises
+    ------
+    ValueError
+        If a value is out of range.
     """
 
     radius: float
@@ -77,19 +93,19 @@ class Fingertip:
     def theta_limit(self, d: ArrayLike) -> FloatArray:
         """Return the largest |θ| [rad] at d [m], asin((a − d)/a); π/2 for d ≤ 0, 0 for d ≥ a."""
         h = np.clip(self.radius - np.asarray(d, np.float64), 0.0, self.radius)
-        # The angle's cosine is the footprint's radius over a: exact near d → 0, unlike asin(h/a).
+        # cos θ is the footprint radius over a, which is accurate near d → 0, unlike asin(h/a).
         depth = np.clip(d, 0.0, self.radius)
         return np.asarray(np.arctan2(h, np.sqrt(depth * (self.radius + h))))
 
 
 class Closed(NamedTuple):
-    """Closed forms; arrays of the broadcast shape of d and θ, NumPy numbers for floats."""
+    """Results of the closed forms: arrays of the broadcast shape of d and θ, or NumPy scalars."""
 
     force: FloatArray  # F [N]
     energy: FloatArray  # U [J]
     force_d: FloatArray  # ∂F/∂d [N/m]
     force_theta: FloatArray  # ∂F/∂θ [N/rad]
-    energy_d: FloatArray  # ∂U/∂d [N], the push along the face's normal
+    energy_d: FloatArray  # ∂U/∂d [N], force along the face's normal
     energy_theta: FloatArray  # ∂U/∂θ [N·m/rad]
 
 
@@ -101,14 +117,14 @@ def theta_limit(radius: float, d: float) -> float:
     if d >= radius:
         return 0.0
     h = radius - d
-    # The angle's cosine is the footprint's radius over a: exact near d → 0, unlike asin(h/a).
+    # cos θ is the footprint radius over a, which is accurate near d → 0, unlike asin(h/a).
     return math.atan2(h, math.sqrt(d * (radius + h)))
 
 
 def flatten(*values: ArrayLike) -> tuple[tuple[int, ...], list[FloatArray]]:
-    """Broadcast to one shape; returns it and each argument flat, contiguous and in float64.
+    """Broadcast the arguments; return the shape and each argument as a flat float64 array.
 
-    Raises TypeError for what is no real number.
+    Raises TypeError for arguments that are not real numbers.
     """
     arrays = np.broadcast_arrays(*map(_real, values))
     shape = arrays[0].shape
@@ -122,15 +138,16 @@ def _real(value: ArrayLike) -> FloatArray:
     return np.asarray(array, dtype=np.float64)
 
 
-# A value that is no number makes a NaN, without a warning.
+# NaN and infinite inputs give NaN without a warning.
 _quiet = np.errstate(invalid="ignore", divide="ignore", over="ignore")
 
 
 @_quiet
 def closed_forms(modulus: float, d: ArrayLike, theta: ArrayLike) -> Closed:
-    """Return force, energy and partials of a constant ``modulus`` [Pa]; d [m], θ [rad] broadcast.
+    """Return force, energy and partials for a constant ``modulus`` [Pa].
 
-    Zeros for d ≤ 0; NaN in gives NaN out. Valid up to θ's limit, continued past it.
+    ``d`` [m] and ``theta`` [rad] broadcast. The results are zero for d ≤ 0 and NaN for NaN. The
+    formulas hold up to the limit of θ and are evaluated unchanged beyond it.
     """
     depth, tilt = np.broadcast_arrays(_real(d), _real(theta))
     inverse, slope = 1.0 / np.cos(tilt), np.tan(tilt)
@@ -139,5 +156,5 @@ def closed_forms(modulus: float, d: ArrayLike, theta: ArrayLike) -> Closed:
     energy_d = force * inverse
     energy = energy_d * depth / 3.0
     six = force, energy, force_d, force * slope, energy_d, 2.0 * energy * slope
-    nothing = 0.0 * tilt + np.where(np.isnan(depth), depth, 0.0)  # NaN for NaN
+    nothing = 0.0 * tilt + np.where(np.isnan(depth), depth, 0.0)  # propagates NaN
     return Closed(*(np.where(depth > 0.0, each, nothing)[()] for each in six))

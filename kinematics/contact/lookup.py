@@ -1,13 +1,16 @@
-"""The lookup kernels of contact tables, and what is tabulated of springs.
+"""Lookup kernels of contact tables, and the tabulated form of spring tips.
 
-That is the ratio of each quantity to its closed form for the modulus at zero strain:
-smooth, near 1, finite at d → 0, and exact for a constant modulus, which has no coefficients. The
-coordinates make it analytic up to the edges of the domain: the height h = (a − d)/a, and y = u/h
-with u = √(1 − ρ²/(a² cos² θ)), which is 1 at θ = 0, 0 at the limit, even in θ, and the peak strain
-is 1 − u. The domain is cut into slabs of h, 16 to an octave, and each into pieces of y, as many
-as the tolerance needs. It ends at h = 1/8, short of h = 0, towards which the ratios grow as log h.
+A spring tip's table holds the ratio of each quantity to its closed form for the modulus at zero
+strain. The ratios are smooth, close to 1 and finite as d → 0. For a constant modulus they are
+exactly 1 and the table has no coefficients.
 
-Kernels take the record of any tip; a solid or a measured one's lookup is in `solid_lookup`.
+The coordinates make the ratios analytic up to the edges of the domain: the height h = (a − d)/a,
+and y = u/h with u = √(1 − ρ²/(a² cos² θ)). The coordinate y is even in θ, 1 at θ = 0 and 0 at the
+limit of θ; the peak strain is 1 − u. The domain is divided into slabs of h, 16 per octave, and each
+slab into as many pieces of y as the tolerance requires. The domain ends at h = 1/8, because the
+ratios grow as log h towards h = 0.
+
+The kernels accept the record of any tip. Solid and measured tips are evaluated by `solid_lookup`.
 """
 
 from __future__ import annotations
@@ -39,22 +42,22 @@ FloatArray = NDArray[np.float64]
 
 HALF_PI = math.pi / 2
 _NEAR = 0.25 * math.pi
-LOWEST = 0.5**OCTAVES  # h where the domain ends
-_H_MIN = LOWEST * (1.0 + 2.0**-52)  # the first number above it
-_END = LOWEST * (1.0 - 1e-12)  # h that is outside, not by rounding alone
+LOWEST = 0.5**OCTAVES  # h at the end of the domain
+_H_MIN = LOWEST * (1.0 + 2.0**-52)  # smallest number above LOWEST
+_END = LOWEST * (1.0 - 1e-12)  # h below this is outside by more than rounding
 
 _MANTISSA = 52
 _FRACTION = (1 << _MANTISSA) - 1
-_ONE = 1023 << _MANTISSA  # the bits of 1.0
-_FIRST = ((1023 - OCTAVES) << _MANTISSA) + 1  # those of the first number above LOWEST
+_ONE = 1023 << _MANTISSA  # bits of 1.0
+_FIRST = ((1023 - OCTAVES) << _MANTISSA) + 1  # bits of the smallest number above LOWEST
 
 
 @inlined_kernel
 def _slab(h: float) -> tuple[int, float]:
-    """Number of the slab of h in (LOWEST, 1], and h's position in it from −1 to 1.
+    """Return the slab index of h in (LOWEST, 1] and h's position in the slab from −1 to 1.
 
-    From the float's own bits: its exponent is the octave, its mantissa the slab and the position. A
-    slab has its upper end, not its lower one.
+    Both come from the bits of the float: the exponent gives the octave, and the mantissa gives the
+    slab and the position. A slab includes its upper end but not its lower end.
     """
     number = int(np.float64(h).view(np.int64)) - _FIRST
     fraction = ((number << SLAB_BITS) & _FRACTION) | _ONE
@@ -74,7 +77,7 @@ def _ratios(table: Table, h: float, y: float) -> Lanes:
 
 @inner_kernel
 def _springs_lookup(table: Table, d: float, theta: float) -> Six:
-    """Evaluate :func:`lookup` for springs."""
+    """Evaluate :func:`lookup` for a spring tip."""
     if math.isnan(d) or math.isnan(theta):
         nan = math.nan
         return nan, nan, nan, nan, nan, nan, False
@@ -91,7 +94,7 @@ def _springs_lookup(table: Table, d: float, theta: float) -> Six:
     gap = c * c - d * table.inverse_radius * (1.0 + h)
     if not (gap >= 0.0 and abs(theta) <= HALF_PI):
         limit = theta_limit(radius, d)
-        # At the limit itself, rounding may have led here.
+        # Rounding may bring a point exactly at the limit here.
         inside = inside and abs(theta) <= limit * (1.0 + 1e-12)
         angle = min(max(theta, -limit), limit)
         s = math.sin(angle)
@@ -120,7 +123,7 @@ def _springs_lookup(table: Table, d: float, theta: float) -> Six:
 
 @inner_kernel
 def lookup_at(table: Table, d: float, theta: float) -> Six:
-    """Evaluate :func:`lookup` in a table's record."""
+    """Evaluate :func:`lookup` for one table record."""
     if table.is_solid:
         return solid_lookup(table, d, theta)
     return _springs_lookup(table, d, theta)
@@ -130,7 +133,10 @@ def lookup_at(table: Table, d: float, theta: float) -> Six:
 def normal_at(
     table: Table, d: float, theta: float, forces: Triple, tangent: float, inverse_cosine: float
 ) -> Triple:
-    """Return N = ∂U/∂d in the domain, ∂N/∂d and ∂N/∂θ, for ``forces``: F, ∂F/∂d and ∂F/∂θ there."""
+    """Return N = ∂U/∂d, ∂N/∂d and ∂N/∂θ within the domain.
+
+    ``forces`` are F, ∂F/∂d and ∂F/∂θ at the same d and θ.
+    """
     if table.sticks:
         return solid_normal(table, d, theta)
     force, force_d, force_theta = forces
@@ -140,9 +146,9 @@ def normal_at(
 
 @inner_kernel
 def stiffness_ahead(table: Table, scale: float, depth: float) -> float:
-    """Return ∂F/∂d [N/m] of an upright tip at d = ``depth`` [m]; ``scale`` is 2πE [Pa].
+    """Return ∂F/∂d [N/m] of an upright tip at d = ``depth`` [m].
 
-    E is the modulus at no strain.
+    ``scale`` is 2πE [Pa] with the modulus E at zero strain.
     """
     return solid_stiffness_ahead(table, scale, depth) if table.is_solid else scale * depth
 
@@ -151,8 +157,8 @@ def stiffness_ahead(table: Table, scale: float, depth: float) -> float:
 def lookup(tables: Records[Table], d: float, theta: float) -> Six:
     """Return (F, U, ∂F/∂d, ∂F/∂θ, ∂U/∂d, ∂U/∂θ, inside) at displacement d [m] and tilt θ [rad].
 
-    Zeros for d ≤ 0. Outside the domain d and θ are clamped to it and ``inside`` is False; NaN in
-    gives NaN out.
+    The values are zero for d ≤ 0 and NaN for NaN. Outside the domain, d and θ are clamped to the
+    domain and ``inside`` is False.
     """
     return lookup_at(tables[0], d, theta)
 

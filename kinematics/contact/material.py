@@ -1,7 +1,7 @@
-"""Stress-strain laws of the tip's material, and nothing of its shape.
+"""Stress-strain laws of the tip's material.
 
-A law σ(ε) is one polynomial on strain ε ∈ [0, 1] with σ(0) = 0 and a positive slope everywhere, so
-it is smooth and monotone, and every integral over it converges fast.
+A law σ(ε) is one polynomial on strain ε ∈ [0, 1] with σ(0) = 0 and a positive slope everywhere. It
+is smooth and monotone, so quadrature of its integrals converges fast.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from softfinger.kinematics.contact.material_fit import MaterialError, fit_law
 
 FloatArray = NDArray[np.float64]
 
-# Slopes of the measured stress-strain curve of the polyurethane tip [Pa] by strain; the paper also
-# gives the greatest slope met, beyond 100 %: 0.304 MPa.
+# Measured tangent modulus [Pa] of the polyurethane tip over strain, from Table I of the paper. The
+# paper also gives the largest modulus, 0.304 MPa at a strain above 100 %.
 TABLE_I_STRAIN = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 TABLE_I_MODULUS = (0.135e6, 0.149e6, 0.182e6, 0.201e6, 0.207e6, 0.255e6)
 TABLE_I_MAXIMUM = 0.304e6
-# Of σ, by the integral of the polynomial of least degree that has these slopes and starts with none
-# of its own: c_1, c_2, … [Pa], exact.
+# Exact coefficients c_1, c_2, … [Pa] of σ. The modulus is the polynomial of lowest degree through
+# these values that starts with zero slope; σ is its integral.
 _TABLE_I = "135000 0 610000/9 4671875/12 -3015625/3 14453125/18 -4296875/21"
 
 
 @inner_kernel
 def stress_at(law: FloatArray, strain: float) -> float:
-    """Return σ(ε) [Pa] of ``law`` [order]; 0 for ε ≤ 0, continued linearly beyond ε = 1."""
+    """Return σ(ε) [Pa] of ``law`` [order]; 0 for ε ≤ 0, extrapolated linearly beyond ε = 1."""
     if strain <= 0.0:
         return 0.0
     order = law.shape[0]
@@ -52,9 +52,10 @@ def stress_at(law: FloatArray, strain: float) -> float:
 
 @dataclass(frozen=True)
 class Material:
-    """A stress-strain law σ(ε) = Σ c_j ε^j, c_0 = 0. Made by the class methods.
+    """Stress-strain law σ(ε) = Σ c_j ε^j with c_0 = 0.
 
-    ``coefficients`` are c_1, c_2, … [Pa], exact. Equal coefficients make equal materials.
+    Create a material with `constant`, `table_i` or `from_points`. ``coefficients`` are the exact
+    values c_1, c_2, … [Pa]. Materials with equal coefficients compare equal.
     """
 
     coefficients: tuple[Fraction, ...]
@@ -94,44 +95,58 @@ class Material:
     @classmethod
     @cache
     def table_i(cls) -> Material:
-        """Return the measured polyurethane of the paper's Table I, as a smooth law.
+        """Return a smooth law of the polyurethane measured in Table I of the paper.
 
-        The paper's numbers are slopes of the stress-strain curve ('Young's modulus, which
-        corresponds to the slope'), so they are taken as the tangent modulus dσ/dε: 0.135 MPa (the
-        least) at zero strain, 0.149, 0.182, 0.201, 0.207 and 0.255 MPa at 20 … 100 %. The greatest,
-        0.304 MPa, lies beyond 100 %. Through them goes the polynomial of least degree that starts
-        with zero slope, as its least value must; it never falls on [0, 1].
+        The paper gives slopes of the stress-strain curve ('Young's modulus, which corresponds to
+        the slope'). They are used as the tangent modulus dσ/dε: 0.135 MPa at zero strain, then
+        0.149, 0.182, 0.201, 0.207 and 0.255 MPa at 20 to 100 %. The modulus is interpolated by the
+        polynomial of lowest degree that has zero slope at zero strain, because the paper calls the
+        first value the smallest. This polynomial increases on [0, 1]. The largest modulus in the
+        paper, 0.304 MPa, occurs beyond 100 % and is not used.
         """
         return cls(tuple(map(Fraction, _TABLE_I.split())), name="table_i")
 
     @classmethod
     def from_points(cls, strain: ArrayLike, stress: ArrayLike) -> Material:
-        """Fit a smooth monotone law to measured points of strain (a ratio) and stress [Pa].
+        """Fit a smooth monotone law to measured points.
 
-        The origin belongs to every curve and need not be given. Points beyond strain 1 are not
-        used; short of it the curve goes on with its last slope. ``misfits`` [2, n] are the points'
-        strains and the law's distances from them [Pa]. Raises MaterialError, with everything that
-        is wrong, for points that are too few, not finite, not rising, start off zero, or that no
-        such law comes near to.
+        Parameters
+        ----------
+        strain, stress
+            Strain (a ratio) and stress [Pa]. The origin is implied. Points beyond strain 1 are
+            ignored. If the points end before strain 1, the law continues with their last slope.
+
+        Returns
+        -------
+        Material
+            Its ``misfits`` [2, n] hold the strains of the points and the distances of the law from
+            them [Pa].
+
+        Raises
+        ------
+        MaterialError
+            If the points are too few, not finite, not increasing, not zero at the origin, or too
+            far from any such law. The message lists all problems.
         """
         coefficients, misfits = fit_law(strain, stress)
         return cls(tuple(coefficients), name="points", misfits=misfits)
 
     @property
     def reference_modulus(self) -> float:
-        """E₀ = dσ/dε at zero strain [Pa]."""
+        """Modulus at zero strain, E₀ = dσ/dε [Pa]."""
         return float(self.coefficients[0])
 
     @property
     def fit_error(self) -> float:
-        """The law's largest distance from the points that it was made from [Pa]; 0 without."""
+        """Largest distance of the law from the fitted points [Pa]; 0 without points."""
         return 0.0 if self.misfits is None else float(self.misfits[1].max())
 
     def force_error(self, ratio: ArrayLike) -> FloatArray:
-        """Return F's relative error, upright, by the law's misfit, over displacements by radius.
+        """Return the relative error of an upright tip's force due to the misfit of the law.
 
-        F/(2π h²) = ∫ σ(ε)/(1 − ε)³ dε up to ε = d/a, with h = a − d: the misfits, between the
-        points on straight lines from 0 at no strain, against the law. ``ratio`` in (0, 1].
+        The force is F = 2π h² ∫ σ(ε)/(1 − ε)³ dε up to ε = d/a, with h = a − d. The error is the
+        same integral of the misfits, interpolated linearly from 0 at zero strain, relative to F.
+        ``ratio`` is d/a in (0, 1].
         """
         ratios = np.asarray(ratio, np.float64)
         if self.misfits is None:
@@ -145,12 +160,12 @@ class Material:
 
     @property
     def worst_force_error(self) -> float:
-        """F's largest relative error by the law's misfit, from a twentieth of the radius on."""
+        """Largest relative force error due to the misfit of the law, for d/a from 0.05 to 1."""
         return float(self.force_error(np.linspace(0.05, 1.0, 20)).max())
 
     @property
     def is_linear(self) -> bool:
-        """True for Hooke's law, where the closed forms are exact."""
+        """True for Hooke's law, for which the closed forms are exact."""
         return len(self.coefficients) == 1
 
     @property
@@ -159,19 +174,19 @@ class Material:
         return len(self.coefficients)
 
     def stress(self, strain: ArrayLike) -> FloatArray:
-        """Return σ(ε) [Pa], shape of ``strain``; 0 for ε ≤ 0, linear beyond 1, NaN for NaN."""
+        """Return σ(ε) [Pa]; 0 for ε ≤ 0, linear beyond 1, NaN for NaN."""
         return _evaluate(self.law, strain, 1)
 
     def energy_density(self, strain: ArrayLike) -> FloatArray:
-        """Return w(ε) = ∫₀^ε σ [J/m³], shape of ``strain``; 0 for ε ≤ 0, NaN for NaN."""
+        """Return the energy density w(ε) = ∫₀^ε σ [J/m³]; 0 for ε ≤ 0, NaN for NaN."""
         return _evaluate(self.energy_law, strain, 2)
 
     def expansions(self) -> FloatArray:
-        """Expand the law over E₀ for the quadrature: float64 [7, order].
+        """Return the expansions of the law over E₀ for the quadrature, float64 [7, order].
 
-        With S = σ/ε, W = 2w/ε², T = dσ/dε, each 1 at ε = 0, and X_1 = (X − X(0))/ε,
-        X_2 = (X_1 − X_1(0))/ε: the rows are S_1, W_1, T_1, S_2, S_2′, T_2, T_2′. They are
-        polynomials, so nothing cancels at small strain.
+        Let S = σ/ε, W = 2w/ε² and T = dσ/dε, each divided by E₀ and therefore 1 at ε = 0. With
+        X_1 = (X − X(0))/ε and X_2 = (X_1 − X_1(0))/ε, the rows are S_1, W_1, T_1, S_2, S_2′, T_2
+        and T_2′. All are polynomials, so there is no cancellation at small strain.
         """
         unit = [value / self.coefficients[0] for value in self.coefficients]
         secant = unit[1:] or [Fraction(0)]
@@ -187,7 +202,7 @@ class Material:
 
 
 def _evaluate(law: FloatArray, strain: ArrayLike, order: int) -> FloatArray:
-    """``law`` at ``strain``; 0 below 0, beyond 1 Taylor's series to ``order``."""
+    """Return ``law`` at ``strain``: 0 below 0, and a Taylor series to ``order`` beyond 1."""
     x = np.asarray(strain, dtype=np.float64)
     u = np.clip(x, 0.0, 1.0)
     value = law[-1]

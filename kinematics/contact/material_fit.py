@@ -1,7 +1,7 @@
-"""Fit of smooth monotone stress-strain laws, and of a modulus, to measured points.
+"""Fit smooth monotone stress-strain laws, or a modulus, to measured points.
 
-The tangent modulus is a Bernstein polynomial on [0, 1] with positive coefficients, which makes it
-positive everywhere; the coefficients come from least squares under that bound.
+The tangent modulus is a Bernstein polynomial on [0, 1]. Its coefficients are found by bounded least
+squares; positive coefficients make it positive everywhere.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ from softfinger import SoftfingerError
 FloatArray = NDArray[np.float64]
 
 MIN_POINTS = 4
-_DEGREES = range(11)  # of the modulus
-_GOOD = 1e-9  # of the greatest stress: a misfit that is none
-_NEAR = 1.5  # times the least misfit of any degree is near enough for a lower one
-_BAD = 0.05  # of the greatest stress: a misfit that no law is made of
-_FLOOR = 1e-3  # least modulus over the mean one
-_BEYOND = 0.1  # weight of the points that only continue the curve
-_SMOOTHING = 1e-7  # weight of the modulus's second differences, against wiggles between points
+_DEGREES = range(11)  # degrees of the modulus to try
+_GOOD = 1e-9  # negligible misfit, relative to the largest stress
+_NEAR = 1.5  # a lower degree is accepted up to this multiple of the smallest misfit
+_BAD = 0.05  # misfit at which the fit fails, relative to the largest stress
+_FLOOR = 1e-3  # smallest modulus, relative to the mean
+_BEYOND = 0.1  # weight of the points that extend the curve
+_SMOOTHING = 1e-7  # weight of the modulus's second differences; prevents oscillation between points
 
 
 class MaterialError(SoftfingerError, ValueError):
-    """The data make no usable stress-strain law. The message says what is wrong and where."""
+    """Error raised if the data do not give a usable stress-strain law."""
 
 
 def _checked(strain: ArrayLike, stress: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """The points up to strain 1, without the origin. Raises MaterialError with all errors."""
+    """Return the points up to strain 1 without the origin; raise MaterialError for bad points."""
     x = np.asarray(strain, dtype=np.float64)
     y = np.asarray(stress, dtype=np.float64)
     if x.ndim != 1 or x.shape != y.shape:
@@ -71,10 +71,10 @@ def _checked(strain: ArrayLike, stress: ArrayLike) -> tuple[FloatArray, FloatArr
 
 
 def fit_law(strain: ArrayLike, stress: ArrayLike) -> tuple[list[Fraction], FloatArray]:
-    """Return c_1, c_2, … of σ(ε) [Pa], and [2, n] the points' strains and misfits [Pa].
+    """Fit σ(ε); return c_1, c_2, … [Pa], and the strains and misfits [Pa] of the points [2, n].
 
-    The lowest degree is taken that comes about as near to the points as any. Beyond the last point
-    the law goes on about straight.
+    The fit uses the lowest degree whose misfit is close to the smallest of all degrees. Beyond the
+    last point the law is approximately linear.
     """
     x, y = _checked(strain, stress)
     top = float(y[-1])
@@ -99,10 +99,10 @@ def fit_law(strain: ArrayLike, stress: ArrayLike) -> tuple[list[Fraction], Float
 
 
 def _continued(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The points, and more up to strain 1 along the slope that they end with."""
+    """Extend the points to strain 1 with their final slope."""
     if x[-1] > 0.95:
         return x, y
-    # The end of a parabola through the last third, kept near the slope of the last quarter.
+    # Use the end slope of a parabola fitted to the last third, limited to near the last quarter's.
     last = max(3, x.size // 3)
     back = x[-last:] - x[-1]
     slope = float(np.polyfit(back, y[-last:], 2)[1])
@@ -114,7 +114,7 @@ def _continued(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _positive_modulus(x: FloatArray, y: FloatArray, weights: FloatArray, degree: int) -> FloatArray:
-    """Bernstein coefficients ≥ _FLOOR of the modulus whose integral runs nearest to the points."""
+    """Return the modulus's Bernstein coefficients, at least _FLOOR, that best fit the points."""
     matrix = _integrals(x, degree) * weights[:, None]
     smooth = np.zeros((max(degree - 1, 0), degree + 1))
     for i in range(degree - 1):
@@ -126,7 +126,7 @@ def _positive_modulus(x: FloatArray, y: FloatArray, weights: FloatArray, degree:
 
 
 def _integrals(x: FloatArray, degree: int) -> FloatArray:
-    """∫₀^x of each Bernstein polynomial, [len(x), degree + 1]."""
+    """Return the integral from 0 to x of each Bernstein polynomial, [len(x), degree + 1]."""
     n = degree + 1
     above = np.stack([math.comb(n, j) * x**j * (1.0 - x) ** (n - j) for j in range(n + 1)], axis=1)
     sums = np.cumsum(above[:, ::-1], axis=1)[:, ::-1]
@@ -134,7 +134,7 @@ def _integrals(x: FloatArray, degree: int) -> FloatArray:
 
 
 def _monomials(bernstein: list[Fraction]) -> list[Fraction]:
-    """Exact change from Bernstein coefficients to those of rising powers."""
+    """Convert Bernstein coefficients exactly to coefficients of increasing powers."""
     n = len(bernstein) - 1
     out = []
     for j in range(n + 1):
@@ -146,7 +146,7 @@ def _monomials(bernstein: list[Fraction]) -> list[Fraction]:
 
 
 def nonnegative(matrix: FloatArray, right: FloatArray) -> FloatArray:
-    """Solve least squares under x ≥ 0 by the active-set method of Lawson and Hanson."""
+    """Solve least squares subject to x ≥ 0 by the active-set method of Lawson and Hanson."""
     count = matrix.shape[1]
     x = np.zeros(count)
     free = np.zeros(count, dtype=np.bool_)

@@ -1,17 +1,19 @@
-"""Reference integrals of force and energy for any material: the truth that tables are held to.
+"""Reference integrals of force and energy for any material law.
 
-Springs stand on the base plane and the face of the object cuts the spherical cap, so
+Contact tables are fitted to these integrals and checked against them. The springs stand on the base
+plane, and the face of the object cuts the spherical cap, so
 
     F = ∬ σ(ε) dx dy,   U = ∬ z w(ε) dx dy,   ε = (n·P − h)/(z cos θ),   P = (x, y, z) on the cap.
 
-In coordinates t = n·P and the angle φ about the normal n, dx dy = z dt dφ (lengths over a). What is
-integrated is the ratio of each quantity to its closed form for a constant modulus E₀, which is 1
-plus a term that the material's nonlinearity makes; so nothing cancels when d → 0.
+In the coordinates t = n·P and the angle φ about the normal n, dx dy = z dt dφ (lengths over a). The
+integrals give the ratio of each quantity to its closed form for a constant modulus E₀. The ratio is
+1 plus a term due to the material's nonlinearity, so there is no cancellation as d → 0.
 
-The integral over φ is made exact: with ε dφ = (t − h)/(p cos θ) dχ, p = √(t² − sin² θ), ε is linear
-in cos χ and a polynomial law needs few nodes. The integral over t runs in y = √(t − sin θ), where
-the integrand is analytic but for poles at and near y = 0, in pieces of at most an octave; their
-number grows, by the logarithm, as the face comes near the rim.
+The integral over φ is exact: with ε dφ = (t − h)/(p cos θ) dχ and p = √(t² − sin² θ), ε is linear
+in cos χ, and a polynomial law needs few nodes. The integral over t is evaluated in
+y = √(t − sin θ), in which the integrand is analytic except for poles at and near y = 0. The range
+is divided into pieces of at most an octave, whose number grows logarithmically as the face
+approaches the rim.
 """
 
 from __future__ import annotations
@@ -33,9 +35,9 @@ from softfinger.kinematics.contact.material import Material
 
 FloatArray = NDArray[np.float64]
 
-_NODES = 18  # Gauss points a piece: 14 leave 1e-10 in ∂F/∂θ, 18 only rounding
-_MORE_NODES = 26  # for laws of a degree above 8, where 18 may leave 1e-11 in ∂F/∂θ
-_DEEPEST = 2.0**-14  # where grading stops, over the singular point's own scale
+_NODES = 18  # Gauss points per piece; 14 give an error of 1e-10 in ∂F/∂θ, 18 only rounding
+_MORE_NODES = 26  # for laws of degree above 8, where 18 points may give an error of 1e-11
+_DEEPEST = 2.0**-14  # smallest graded piece, relative to the scale of the singular point
 
 
 def gauss_rule(nodes: int = _NODES) -> FloatArray:
@@ -45,14 +47,14 @@ def gauss_rule(nodes: int = _NODES) -> FloatArray:
 
 
 def circle_rule(degree: int) -> FloatArray:
-    """Return cos χ and sin² χ, float64 [2, m]: equal weights, exact for laws to this ``degree``."""
+    """Return the nodes cos χ and sin² χ [2, m] of the equal-weight rule exact up to ``degree``."""
     count = max(1, degree // 2 + 1)
     angles = np.pi * (np.arange(count) + 0.5) / count
     return np.stack([np.cos(angles), np.sin(angles) ** 2])
 
 
 def nodes_for(degree: int) -> int:
-    """Return Gauss points a piece for a law of this ``degree``."""
+    """Return the number of Gauss points per piece for a law of ``degree``."""
     return _NODES if degree <= 8 else _MORE_NODES
 
 
@@ -75,7 +77,7 @@ def ratios(
     s: float,
     c: float,
 ) -> tuple[float, float, float, float, float]:
-    """Return ratios to the closed forms of modulus E₀: of F, U, ∂F/∂d, ∂F/∂θ and ∂U/∂θ.
+    """Return the ratios of F, U, ∂F/∂d, ∂F/∂θ and ∂U/∂θ to their closed forms for modulus E₀.
 
     With v = (t − h)/δ, q = t − h, r² = 1 − t², p² = t² − s², ``middle`` = r² c/(t c + p), ⟨·⟩ the
     mean over χ at the strain ε = ``mean`` + ``amplitude`` cos χ = q (t + s r cos χ/c)/p², and the
@@ -88,17 +90,17 @@ def ratios(
 
     over v from 0 to 1, with k = ``curvature`` = sin² χ t q/p². In y, t = sin θ + y².
 
-    gauss: [2, n] points and weights on [0, 1]. circle: [2, m] cos χ and sin² χ of the equidistant
-    angles. polynomials: the law's expansions. delta = d/a in (0, 1], h = 1 − delta given beside it
-    so that both keep their digits; s = |sin θ| ≤ h, c = cos θ.
+    ``gauss`` [2, n] are points and weights on [0, 1], ``circle`` [2, m] the values cos χ and sin² χ
+    at equidistant angles, and ``polynomials`` the law's expansions. delta = d/a is in (0, 1];
+    h = 1 − delta is passed separately to keep full precision. s = |sin θ| ≤ h, and c = cos θ.
     """
-    # h − s without cancellation: near 1, by h² − s² = c² − ρ².
+    # Near 1, h − s is computed without cancellation from h² − s² = c² − ρ².
     gap = h - s if h < 0.5 else (c * c - delta * (1.0 + h)) / (h + s)
     y0 = 0.0
     if gap > 0.0:
         y0 = math.sqrt(gap)
     else:
-        # At the limit, up to θ's rounding.
+        # θ is at its limit, up to rounding.
         s = h
         c = math.sqrt(delta * (1.0 + h))
     y1 = math.sqrt(c * c / (1.0 + s))
@@ -107,14 +109,14 @@ def ratios(
     first_t = polynomials[2, 0]
     count = circle.shape[1]
     nodes = gauss.shape[1]
-    # Poles lie at y = 0, unless y0 = 0, and at y² = −2 sin θ; there are none when h = 0.
+    # There are poles at y = 0 (unless y0 = 0) and at y² = −2 sin θ, and none if h = 0.
     start = max(2.0 * y0, _DEEPEST * min(y1, math.sqrt(h))) if h > 0.0 else y1
     sum_f = 0.0
     sum_u = 0.0
     sum_fd = 0.0
     sum_ft = 0.0
     sum_ut = 0.0
-    low = 0.0  # y − y0 at the piece's ends
+    low = 0.0  # y − y0 at the ends of the piece
     while low < span:
         high = max(start, 2.0 * (y0 + low)) - y0
         if not high < 0.75 * span:
@@ -190,10 +192,11 @@ def ratios_at(
 def integrate(
     tip: Fingertip, material: Material, d: ArrayLike, theta: ArrayLike, nodes: int | None = None
 ) -> Closed:
-    """Return force, energy and first partials of any material by integration, to 1e-14 relative.
+    """Integrate force, energy and first partials for any material, to a relative error of 1e-14.
 
-    d [m] and θ [rad] broadcast. Zeros for d ≤ 0; NaN outside the domain d ≤ a, |θ| ≤ θ's limit.
-    ``nodes`` is the number of Gauss points a piece, chosen by the law's degree when not given.
+    ``d`` [m] and ``theta`` [rad] broadcast. The results are zero for d ≤ 0, and NaN outside the
+    domain d ≤ a, |θ| ≤ θ's limit. ``nodes`` is the number of Gauss points per piece; by default it
+    depends on the degree of the law.
     """
     shape, (depth, tilt) = flatten(d, theta)
     radius = tip.radius

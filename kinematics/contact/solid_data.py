@@ -1,21 +1,24 @@
-"""A tip of solid rubber, computed once by finite elements: elasticity and base pressure, scaled.
+"""Precomputed finite element data of a solid rubber tip: energy and base pressure.
 
-The rubber is neo-Hookean, of strain energy W = μ/2 (J^(−2/3) tr FᵀF − 3) + κ/2 (J − 1)² with the
-μ = E/(2 + 2ν) and κ = E/(3 − 6ν) of small strains, and contact is made in the deformed state.
-The file has them as polynomials in t = √(d/a), sin² θ and Poisson's ratio ν, with Young's modulus E
-and the radius a taken out; its ``notes`` say how it was made and how far off it is. Here ν is put
-in. The energy is U = E a³ t⁵ g(t, sin² θ), whose partials are the push along the face's normal
-N = ∂U/∂d and the moment ∂U/∂θ. With the force F on the base,
+The rubber is neo-Hookean with strain energy W = μ/2 (J^(−2/3) tr FᵀF − 3) + κ/2 (J − 1)², where
+μ = E/(2 + 2ν) and κ = E/(3 − 6ν) are the small-strain moduli. Contact is computed in the deformed
+state.
+
+The data file holds polynomials in t = √(d/a), sin² θ and Poisson's ratio ν, scaled by Young's
+modulus E and the radius a. Its ``notes`` describe the computation and the remaining errors. This
+module evaluates the polynomials at one ν. The energy is U = E a³ t⁵ g(t, sin² θ). Its partials are
+the force along the face's normal, N = ∂U/∂d, and the moment ∂U/∂θ. With the force F on the base,
+the base pressure is
 
     p(r, φ) = F/a² B_0(r) + N/a² Σ_k q_k(t, sin² θ) Re((n_x + i n_y)^m e^{−i m φ}) B_k(r).
 
-Without friction F = N cos θ. A face that sticks holds each point of the tip where it touched, the
-plane coming straight along its normal from first touch on. Then N = ∂U/∂d still, ∂U/∂θ compares
-such presses, a shear T = −N sin θ cos θ q_0 pulls the tip up the slope, and
-F = N cos θ (1 − sin² θ q_0).
+Without friction, F = N cos θ. A sticking face holds each point of the tip where it first touched,
+while the plane moves straight along its normal. N = ∂U/∂d still holds, and ∂U/∂θ is the difference
+between such presses at neighbouring tilts. A shear T = −N sin θ cos θ q_0 pulls the tip up the
+slope, and F = N cos θ (1 − sin² θ q_0).
 
-A shear force T on the face, towards φ_T, adds T/a² B_T(r) cos(φ − φ_T), where T counts as if it
-were at the height a: its moment about the base's middle is T a.
+A shear force T on the face in direction φ_T adds T/a² B_T(r) cos(φ − φ_T). T is taken to act at
+height a, so its moment about the centre of the base is T a.
 """
 
 from __future__ import annotations
@@ -38,27 +41,27 @@ _FILE = Path(__file__).with_name("solid_tip.npz")
 
 @dataclass(frozen=True, eq=False)
 class SolidData:
-    """A solid tip of E = a = 1 and one ν.
+    """Data of a solid tip at one ν, for E = a = 1.
 
-    Polynomials are by powers of x = 2 t/``root`` − 1, then of y = 2 sin² θ/``square`` − 1.
+    Polynomials are stored by powers of x = 2 t/``root`` − 1, then of y = 2 sin² θ/``square`` − 1.
     """
 
     root: float  # largest t
     square: float  # largest sin² θ
-    energy: FloatArray  # g, and its partials by t, t twice, sin² θ, and both [5, i, j]
-    harmonics: NDArray[np.int64]  # m of each mode [k]; 0 of the first
+    energy: FloatArray  # g, ∂g/∂t, ∂²g/∂t², ∂g/∂sin² θ, ∂²g/∂t ∂sin² θ [5, i, j]
+    harmonics: NDArray[np.int64]  # m of each mode [k]; the first is 0
     ratios: FloatArray  # q [k, i, j]
-    stick: FloatArray  # q_0, and its partials by t and sin² θ [3, i, j]
-    edges: FloatArray  # of the rings in r/a [rings + 1]
-    modes: FloatArray  # B [k, rings], means over the rings
+    stick: FloatArray  # q_0, ∂q_0/∂t, ∂q_0/∂sin² θ [3, i, j]
+    edges: FloatArray  # of the rings, r/a [rings + 1]
+    modes: FloatArray  # B averaged over each ring [k, rings]
     shear: FloatArray  # B_T [rings]
-    error: float  # of N, relative, against other meshes
-    pressure_error: float  # of the base pressure, likewise: rms over its rms
+    error: float  # relative error of N, against other meshes
+    pressure_error: float  # rms error over rms of the base pressure, against other meshes
 
 
 @lru_cache(maxsize=8)
 def solid_data(tip: Fingertip) -> SolidData:
-    """Return the data of a solid ``tip``'s ν, base and face."""
+    """Return the data for the ν, base and face of a solid ``tip``."""
     block = tip.base if tip.face == "frictionless" else f"{tip.base}-{tip.face}"
     with np.load(_FILE) as file:
         stored: dict[str, Any] = {
@@ -100,7 +103,7 @@ def solid_data(tip: Fingertip) -> SolidData:
 
 
 def with_partials(energy: FloatArray, root: float, square: float) -> FloatArray:
-    """Return g [i, j] and its partials, as `SolidData.energy` has them."""
+    """Return g [i, j] and its partials in the layout of `SolidData.energy`."""
     by_t = 2.0 / root * _slope(energy)
     by_square = 2.0 / square * _slope(energy.T).T
     by_both = 2.0 / square * _slope(by_t.T).T
@@ -108,19 +111,19 @@ def with_partials(energy: FloatArray, root: float, square: float) -> FloatArray:
 
 
 def powers(terms: FloatArray) -> FloatArray:
-    """Return Chebyshev coefficients [i, j] as those of powers."""
+    """Convert Chebyshev coefficients [i, j] to coefficients of powers."""
     in_t, in_square = (to_powers(count) for count in terms.shape)
     return np.asarray(in_t @ terms @ in_square.T)
 
 
 @cache
 def to_powers(count: int) -> FloatArray:
-    """Return the matrix from ``count`` Chebyshev coefficients to those of rising powers."""
+    """Return the matrix that converts ``count`` Chebyshev coefficients to increasing powers."""
     columns = [chebyshev.cheb2poly(row) for row in np.eye(count)]
     return np.stack([np.pad(column, (0, count - len(column))) for column in columns], axis=1)
 
 
 def _slope(rising: FloatArray) -> FloatArray:
-    """The derivative of polynomials of columns, as many powers."""
+    """Return the derivatives of polynomials stored in columns, with the same number of powers."""
     factors = np.arange(1.0, len(rising))[:, None]
     return np.concatenate([rising[1:] * factors, np.zeros((1, rising.shape[1]))])

@@ -1,8 +1,8 @@
-"""The lookup kernel of a solid or measured tip's contact table, and how it is made.
+"""Contact tables of solid and measured tips, and their lookup kernels.
 
-One polynomial g(t, sin² θ), t = √(d/a), and its partials give all six outputs from one energy
-U = E a³ t⁵ g (see `solid_data`), so that they agree with each other to rounding. What a sticking
-face takes off the force on the base is a second one, q_0.
+All six outputs follow from one energy U = E a³ t⁵ g (see `solid_data`) with the polynomial
+g(t, sin² θ), t = √(d/a), and its partials. They are therefore consistent to rounding. For a
+sticking face, a second polynomial q_0 gives the reduction of the force on the base.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from softfinger.kinematics.contact.table_record import (
 )
 from softfinger.kinematics.contact.tip_curves import TipCurves
 
-ENERGY, STICK = range(2)  # pieces: g and its partials by t, t twice, sin² θ, both; q_0 and its
+ENERGY, STICK = range(2)  # pieces of the table: g with its partials, q_0 with its partials
 
 
 def solid_table(tip: Fingertip, material: Material) -> Table:
-    """Return the table of a solid ``tip``, or of a measured one, whose material says nothing.
+    """Return the table of a solid or measured ``tip``; a measured tip ignores the material.
 
-    Raises MaterialError unless a solid tip's is linear.
+    Raises MaterialError if the tip is solid and the material is not linear.
     """
     if tip.law is not None:
         return _measured_table(tip.law)
@@ -74,7 +74,7 @@ def energy_lanes(table: Table, t: float, square: float) -> Lanes:
 
 @inlined_kernel
 def _held(table: Table, t: float, square: float) -> Triple:
-    """F over N cos θ, which is 1 − sin² θ q_0, and its partials by t and sin² θ."""
+    """Return F/(N cos θ) = 1 − sin² θ q_0 and its partials by t and sin² θ."""
     if not table.sticks:
         return 1.0, 0.0, 0.0
     x = t * table.by_root - 1.0
@@ -85,9 +85,10 @@ def _held(table: Table, t: float, square: float) -> Triple:
 
 @inner_kernel
 def solid_lookup(table: Table, d: float, theta: float) -> Six:
-    """Evaluate `lookup.lookup`; with |θ| beyond the data the energy stays with θ at fixed d.
+    """Evaluate `lookup.lookup`.
 
-    The partials are those of that energy, and the force goes on with cos θ.
+    For |θ| beyond the data, the energy is constant in θ at fixed d, the partials are those of that
+    energy, and the force continues to vary with cos θ.
     """
     if math.isnan(d) or math.isnan(theta):
         nan = math.nan
@@ -102,7 +103,7 @@ def solid_lookup(table: Table, d: float, theta: float) -> Six:
     t = math.sqrt(min(d, table.deepest) * table.inverse_radius)
     square = s * s if within else 2.0 / table.by_square
     g, g_t, g_tt, g_s, g_ts = energy_lanes(table, t, square)
-    # Before t³ and its like; the chain from sin² θ to θ is 2 sin θ cos θ.
+    # The chain rule from sin² θ to θ gives 2 sin θ cos θ.
     chain = 2.0 * s * c if within else 0.0
     a = table.radius
     size = table.modulus * a * a * t * t * t
@@ -124,14 +125,14 @@ def solid_lookup(table: Table, d: float, theta: float) -> Six:
 
 @inner_kernel
 def solid_stiffness_ahead(table: Table, scale: float, depth: float) -> float:
-    """Evaluate `lookup.stiffness_ahead`: Hertz's ∂N/∂d at d = ``depth``."""
+    """Evaluate `lookup.stiffness_ahead` with Hertz's ∂N/∂d at d = ``depth``."""
     stiffness = 0.5 * scale / math.pi * 3.75 * table.at_first
     return stiffness * math.sqrt(depth * table.radius)
 
 
 @inner_kernel
 def solid_normal(table: Table, d: float, theta: float) -> Triple:
-    """Evaluate `lookup.normal_at` for a face that sticks."""
+    """Evaluate `lookup.normal_at` for a sticking face."""
     within = abs(theta) <= table.tilt
     s = math.sin(theta)
     t = math.sqrt(d * table.inverse_radius)

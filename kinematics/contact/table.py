@@ -1,7 +1,7 @@
-"""Contact tables: force, energy and their partials by lookup, within a tolerance.
+"""Contact tables: fast lookup of force, energy and their partials within a certified tolerance.
 
-A table is one record, `table_record.Table`, whatever the tip's law. How springs' is built is in
-`table_build`, with the bound of its error; the lookup itself is in `lookup`.
+A table is one record, `table_record.Table`, for every tip model. Module `table_build` builds the
+tables of spring tips and bounds their error; `lookup` evaluates tables.
 """
 
 from __future__ import annotations
@@ -24,25 +24,24 @@ FloatArray = NDArray[np.float64]
 
 
 class ContactForces(NamedTuple):
-    """Values of a table: arrays of the broadcast shape of d and θ, plain numbers for floats."""
+    """Result of a lookup: arrays of the broadcast shape of d and θ, or floats."""
 
     force: FloatArray  # F [N]
     energy: FloatArray  # U [J]
     force_d: FloatArray  # ∂F/∂d [N/m]
     force_theta: FloatArray  # ∂F/∂θ [N/rad]
-    energy_d: (
-        FloatArray  # ∂U/∂d [N], F/cos θ unless the face sticks: the push along the face's normal
-    )
+    energy_d: FloatArray  # ∂U/∂d [N], force along the normal; F/cos θ unless the face sticks
     energy_theta: FloatArray  # ∂U/∂θ [N·m/rad]
-    inside: NDArray[np.bool_]  # False where d or θ was clamped to the domain
-    max_error: float  # bound of the relative error of any of the six, see Certificate
+    inside: NDArray[np.bool_]  # False if d or θ was clamped to the domain
+    max_error: float  # bound on the relative error of the six values, see Certificate
 
 
 class Certificate(NamedTuple):
-    """A bound of the relative error of any output, and where about the table errs most.
+    """Bound on the relative error of all outputs, and the approximate place of the largest error.
 
-    Over the whole domain with its edges and with rounding; `table_build` says what it rests on.
-    ∂F/∂θ may pass through zero where a law softens: it counts relative to F tan θ if that is more.
+    The bound covers the whole domain, its edges and rounding; `table_build` lists its assumptions.
+    For softening laws ∂F/∂θ may pass through zero, so its error is taken relative to F tan θ if
+    that is larger.
     """
 
     max_error: float
@@ -50,21 +49,30 @@ class Certificate(NamedTuple):
     theta: float  # [rad]
 
 
-# Of numbers, which the fields' types do not name, in a quarter of the time of ContactForces(…).
+# Builds a ContactForces of plain floats in a quarter of the time of ContactForces(…).
 _numbers: Any = tuple.__new__
 
-_EDGE = 1.0 - 1e-12  # of d and θ: what is outside by rounding alone is inside with it
+_EDGE = 1.0 - 1e-12  # scales d and θ so that rounding does not put edge points outside
 
-_LAW_ERROR = 0.05  # of F, by a law's misfit of its points
+_LAW_ERROR = 0.05  # relative force error due to the law's misfit, above which build warns
 
 
 class ContactTable:
-    """Force, energy and first partials of one tip of one material, by lookup.
+    """Lookup table of force, energy and their first partials for one tip and material.
 
-    ``data`` is the array of one record that :func:`lookup` takes, ``header`` its fields by name,
-    ``max_error`` the bound of the relative error of any output. The domain is 0 < d ≤ 7/8 a and
-    |θ| ≤ asin((a − d)/a). A solid tip's table is exact for the data of `solid_data`, so that
-    ``max_error`` is theirs, and the domain what they cover.
+    Attributes
+    ----------
+    data
+        Array with the single table record that :func:`lookup` takes.
+    header
+        The same record with named fields.
+    max_error
+        Bound on the relative error of all outputs. For a solid tip it is the error of its data.
+
+    Notes
+    -----
+    The domain of a spring tip is 0 < d ≤ 7/8 a and |θ| ≤ asin((a − d)/a). A solid tip's domain is
+    the range covered by the data in `solid_data`; the table reproduces the data exactly.
     """
 
     def __init__(self, table: Table) -> None:
@@ -76,15 +84,31 @@ class ContactTable:
 
     @classmethod
     def build(cls, tip: Fingertip, material: Material, tolerance: float = 1e-9) -> ContactTable:
-        """Build the table of fewest pieces within ``tolerance``, relative, on all outputs.
+        """Build the smallest table within a relative ``tolerance`` on all outputs.
 
-        ∂F/∂θ, which passes through zero for some laws, counts relative to F tan θ if that is more.
+        Parameters
+        ----------
+        tip
+            The fingertip.
+        material
+            Its stress-strain law. A solid tip requires a constant modulus; a measured tip has its
+            own curves and ignores the material.
+        tolerance
+            Largest relative numerical error, for spring tips only. The error of ∂F/∂θ is relative
+            to F tan θ if that is larger. Errors of the material law are not included: a modulus
+            that is off by 1 % changes F by 1 %.
 
-        The tolerance is that of the arithmetic alone: a modulus that is 1 % off makes F 1 % off.
-        Warns where the law misses the points that it was made from by more than 5 % of F.
-        Raises TableError, with the best that was reached, when the most pieces can't meet it.
-        For a solid tip it says nothing; a solid tip raises MaterialError unless the modulus is
-        constant. A measured tip has its own curves: neither tolerance nor material count.
+        Raises
+        ------
+        TableError
+            If the tolerance cannot be met with the largest table.
+        MaterialError
+            If the tip is solid and the modulus is not constant.
+
+        Warns
+        -----
+        RuntimeWarning
+            If the misfit of a spring tip's law changes F by more than 5 %.
         """
         if tip.physics != "springs":
             return cls(solid_table(tip, material))
@@ -99,32 +123,42 @@ class ContactTable:
 
     @property
     def tolerance(self) -> float:
-        """The tolerance it was built to."""
+        """Tolerance given to `build`."""
         tolerance: float = self.header.tolerance
         return tolerance
 
     @property
     def certificate(self) -> Certificate:
-        """Bound of the relative error, and the d and θ where the table errs most."""
+        """Bound on the relative error, and the d and θ of the largest error."""
         return Certificate(self.max_error, self.header.worst_d, self.header.worst_theta)
 
     @property
     def form(self) -> str:
-        """Its representation: closed, springs with its pieces of a slab, or solid."""
+        """Representation: "closed", "springs" with the number of pieces per slab, or "solid"."""
         if self.is_solid:
             return "solid"
         return "closed" if self.header.is_closed else f"springs, {self.header.splits} a slab"
 
     @property
     def tip(self) -> Fingertip:
-        """The tip that it was built for."""
+        """Tip of springs with the table's radius."""
         return Fingertip(self.header.radius)
 
     def __call__(self, d: ArrayLike, theta: ArrayLike, edge: bool = False) -> ContactForces:
-        """Look up at displacement d [m] and tilt θ [rad]; they broadcast.
+        """Look up the forces at displacement ``d`` [m] and tilt ``theta`` [rad].
 
-        Zeros for d ≤ 0, NaN for NaN; outside the domain the nearest inside, flagged, and with a
-        RuntimeWarning unless ``edge`` asks for that. Raises TypeError for what is no real number.
+        Parameters
+        ----------
+        d, theta
+            Numbers or arrays, which broadcast. Results are zero for d ≤ 0 and NaN for NaN.
+        edge
+            If True, clamp points outside the domain without a RuntimeWarning. Clamped points have
+            ``inside`` False in either case.
+
+        Raises
+        ------
+        TypeError
+            If an argument is not a real number.
         """
         if type(d) is float and type(theta) is float:
             found = lookup(self.data, d, theta)
@@ -144,7 +178,7 @@ class ContactTable:
         )
 
     def _warn(self, d: FloatArray, theta: FloatArray) -> None:
-        """Warn the caller's caller of points outside the domain, but for NaN."""
+        """Issue a RuntimeWarning, in the user's code, for points outside the domain except NaN."""
         within = np.empty(d.size, dtype=np.bool_)
         lookups(self.data, d * _EDGE, theta * _EDGE, np.empty((6, d.size)), within)
         outside = np.flatnonzero(~(within | np.isnan(d) | np.isnan(theta)))

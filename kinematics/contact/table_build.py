@@ -1,10 +1,10 @@
-"""Fit of contact tables to the reference integrals, with certified error.
+"""Fit contact tables to the reference integrals with a certified error.
 
-A table's error is bounded piece by piece, over the whole domain with its edges: by the sum of the
-Chebyshev coefficients that the piece leaves out, what lies beyond them, and rounding. What it rests
-on: that the integrals' own error is rounding, and that coefficients beyond those computed go on
-falling. Both hold for every law here, since it is one polynomial. Pieces are halved until the bound
-is within the tolerance.
+The error is bounded for each piece of the table, over the whole domain and its edges. The bound is
+the sum of the Chebyshev coefficients that the piece omits, an estimate of the higher coefficients,
+and rounding. It assumes that the error of the reference integrals is rounding alone and that the
+coefficients beyond the computed ones keep decreasing. Both hold for every law here, since each law
+is one polynomial. Pieces are halved until the bound is within the tolerance.
 """
 
 from __future__ import annotations
@@ -44,10 +44,10 @@ from softfinger.kinematics.contact.table_record import (
 
 FloatArray = NDArray[np.float64]
 
-ROUNDING = 16.0 * np.finfo(float).eps  # of the closed forms and the kernel's last products
-_MORE_V, _MORE_U = 4, 6  # Chebyshev coefficients in h and y beyond those kept
+ROUNDING = 16.0 * np.finfo(float).eps  # rounding of the closed forms and the kernel's last products
+_MORE_V, _MORE_U = 4, 6  # computed Chebyshev coefficients in h and y beyond those stored
 _SLAB_ENDS = np.arange(1, 1 + (1 << SLAB_BITS)) / (1 << SLAB_BITS)
-# Of the slabs over h, from LOWEST to 1.
+# Edges of the slabs in h, from LOWEST to 1.
 _EDGES = [
     LOWEST,
     *(LOWEST * 2.0**k * (1.0 + piece) for k in range(OCTAVES) for piece in _SLAB_ENDS),
@@ -55,7 +55,7 @@ _EDGES = [
 
 
 class _Worst(NamedTuple):
-    """Bound of the relative error of a piece, and where it errs most."""
+    """Bound on the relative error of a piece, and the place of its largest error."""
 
     bound: float
     h: float
@@ -64,7 +64,7 @@ class _Worst(NamedTuple):
 
 @dataclass(frozen=True)
 class LawTerms:
-    """A material as the quadrature's kernels take it."""
+    """Material law in the form that the quadrature kernels take."""
 
     material: Material
     gauss: FloatArray
@@ -74,7 +74,7 @@ class LawTerms:
 
     @classmethod
     def of(cls, material: Material) -> LawTerms:
-        """Return rules and expansions for ``material``."""
+        """Return the quadrature rules and expansions of ``material``."""
         return cls(
             material,
             gauss_rule(nodes_for(material.degree)),
@@ -85,7 +85,7 @@ class LawTerms:
 
 
 def build(tip: Fingertip, material: Material, tolerance: float) -> Table:
-    """Build the table of fewest pieces within ``tolerance``; see ContactTable.build."""
+    """Build the smallest table within ``tolerance``; see ContactTable.build."""
     if not (0.0 < tolerance < 1.0):
         raise TableError(f"the tolerance must lie between 0 and 1, not {tolerance!r}")
     law, splits = LawTerms.of(material), 1
@@ -104,7 +104,7 @@ def build(tip: Fingertip, material: Material, tolerance: float) -> Table:
 
 
 def _made(tip: Fingertip, law: LawTerms, tolerance: float, splits: int, limit: float) -> Table:
-    """The table of so many pieces, left unfinished where its error's bound passes ``limit``."""
+    """Build a table with ``splits`` pieces per slab; stop when its error exceeds ``limit``."""
     table = Table()
     table.is_closed, table.splits, table.tolerance = law.material.is_linear, splits, tolerance
     table.radius, table.modulus = tip.radius, law.modulus
@@ -121,8 +121,8 @@ def _made(tip: Fingertip, law: LawTerms, tolerance: float, splits: int, limit: f
 
 
 def _filled(table: Table, law: LawTerms) -> Iterator[_Worst]:
-    """Fill in the coefficients piece by piece; yields the bound of each one's error."""
-    # More than needed in each direction, for what is left out.
+    """Set the coefficients piece by piece; yield the error bound of each piece."""
+    # Extra coefficients in each direction give the truncation error.
     rows, width = POWERS_V + _MORE_V, POWERS_U + _MORE_U
     mask = np.zeros((rows, width), dtype=np.bool_)
     mask[:POWERS_V, :POWERS_U] = True
@@ -149,12 +149,13 @@ def _filled(table: Table, law: LawTerms) -> Iterator[_Worst]:
 def _bound(
     values: FloatArray, lost: FloatArray, rounding: FloatArray, h: FloatArray, y: FloatArray
 ) -> _Worst:
-    """Bound of a piece's relative error, and where in ``h`` and ``y`` about most is lost.
+    """Return the bound on a piece's relative error and the approximate place of the largest.
 
-    ``values`` [5, h, y] are the ratios at the piece's nodes, ``lost`` the Chebyshev coefficients of
-    what the table leaves of them. Their sum bounds that; what lies beyond the coefficients is less
-    than twice the last two in each direction, as they fall to less than half each, the ratios being
-    analytic well beyond the piece. ``rounding`` [5] is absolute.
+    ``values`` [5, h, y] are the ratios at the nodes of the piece; ``lost`` are the Chebyshev
+    coefficients of the ratios minus the table. The sum of their magnitudes bounds this difference.
+    The coefficients beyond the computed ones add less than twice the last two in each direction:
+    each is less than half of the one before, because the ratios are analytic well beyond the piece.
+    ``rounding`` [5] is absolute.
     """
     everywhere = _dense(len(h)) @ _terms(values) @ _dense(len(y)).T
     size = np.abs(everywhere)
@@ -167,17 +168,17 @@ def _bound(
     k = int(np.argmax(bounds))
     here = np.abs(_dense(len(h)) @ lost[k] @ _dense(len(y)).T)
     i, j = np.unravel_index(int(np.argmax(here)), here.shape)
-    # The dense points run upwards, four to a node, and the nodes downwards.
+    # Dense points are in increasing order, four per node; the nodes are in decreasing order.
     return _Worst(float(bounds[k]) + ROUNDING, float(h[-1 - i // 4]), float(y[-1 - j // 4]))
 
 
 def _rounding(terms: FloatArray, steep: float, low: float, splits: int) -> FloatArray:
-    """Bound of what rounding does to a piece's five ratios, from their Chebyshev ``terms``.
+    """Return bounds on the rounding errors of a piece's five ratios from their Chebyshev ``terms``.
 
-    Sums of powers, each over some 32 roundings at most; h, off by two ulps, ``steep`` being h over
-    half the piece's width; and y², off by 4 ulps over h² as cos² θ − ρ² cancels towards the limit
-    of θ. The ratios' slope in y is 0 there, so that the second derivative bounds that in y²; y is
-    off by as many ulps as there are pieces of it.
+    There are three sources. Each sum of powers has at most about 32 roundings. h is off by two
+    ulps, and ``steep`` is h over half the width of the piece. y² is off by 4 ulps over h², because
+    cos² θ − ρ² cancels near the limit of θ. There the slope of the ratios in y is 0, so the second
+    derivative bounds the error due to y². In addition y is off by ``splits`` ulps.
     """
     i, j = np.arange(terms.shape[1])[:, None], np.arange(terms.shape[2])
     size = np.abs(terms)
@@ -191,14 +192,14 @@ def _rounding(terms: FloatArray, steep: float, low: float, splits: int) -> Float
 
 
 def _terms(values: FloatArray) -> FloatArray:
-    """Chebyshev coefficients [5, i, j] of ``values`` [5, i, j] at the nodes of both directions."""
+    """Return the Chebyshev coefficients [5, i, j] of ``values`` [5, i, j] at the nodes."""
     in_x, in_y = _nodes(values.shape[1])[1], _nodes(values.shape[2])[1]
     return np.asarray(np.einsum("ai,bj,kij->kab", in_x, in_y, values, optimize=True))
 
 
 @cache
 def _nodes(count: int) -> tuple[FloatArray, FloatArray]:
-    """Chebyshev nodes on [−1, 1] and the matrix from values there to Chebyshev coefficients."""
+    """Return Chebyshev nodes on [−1, 1] and the matrix from values there to coefficients."""
     nodes: FloatArray = np.cos(np.pi * (np.arange(count) + 0.5) / count)
     inverse = np.linalg.inv(chebyshev.chebvander(nodes, count - 1))
     return nodes, np.asarray(inverse, dtype=np.float64)
@@ -206,21 +207,21 @@ def _nodes(count: int) -> tuple[FloatArray, FloatArray]:
 
 @cache
 def _dense(count: int) -> FloatArray:
-    """``count`` Chebyshev polynomials at points between which none of them does anything new."""
+    """Return ``count`` Chebyshev polynomials at points dense enough to resolve all of them."""
     return np.asarray(chebyshev.chebvander(np.cos(np.linspace(np.pi, 0.0, 4 * count)), count - 1))
 
 
 def _tilt(at: _Worst) -> float:
-    """θ [rad] at h and y."""
+    """Return θ [rad] at the h and y of ``at``."""
     complement = 1.0 - (at.h * at.y) ** 2
     return math.asin(min(at.h * math.sqrt((1.0 - at.y) * (1.0 + at.y) / complement), 1.0))
 
 
 def _ratios_at(law: LawTerms, h: FloatArray, y: FloatArray) -> FloatArray:
-    """Ratios [5, …] at the table's broadcast coordinates h in (0, 1) and y in [0, 1]."""
+    """Return the ratios [5, …] at broadcast coordinates h in (0, 1) and y in [0, 1]."""
     h, y = np.broadcast_arrays(h, y)
     delta = 1.0 - h
-    # 1 − u² with u = h y, written so that nothing cancels when h and y near 1.
+    # 1 − u² with u = h y, written without cancellation for h and y near 1.
     complement = (1.0 - y + delta * y) * (1.0 + h * y)
     c = np.sqrt(delta * (1.0 + h) / complement)
     s = h * np.sqrt((1.0 - y) * (1.0 + y) / complement)

@@ -1,7 +1,8 @@
-"""The record behind every contact table, and its polynomials.
+"""Record type of contact tables, and the evaluation of their polynomials.
 
-A table is pieces of five polynomials in two variables, the lanes, evaluated together. What they
-mean, and of which variables they are, depends on the tip's law: see `lookup` and `solid_lookup`.
+A table consists of pieces. Each piece has five polynomials in two variables (the lanes), which are
+evaluated together. Their meaning and variables depend on the tip's law; see `lookup` and
+`solid_lookup`.
 """
 
 from __future__ import annotations
@@ -21,43 +22,43 @@ Six: TypeAlias = tuple[float, float, float, float, float, float, bool]
 Triple: TypeAlias = tuple[float, float, float]
 
 LANES = 5
-POWERS_U, POWERS_V = 12, 6  # terms of a polynomial in either variable
-PIECE = POWERS_V * POWERS_U * LANES  # numbers of a piece
-OCTAVES = 3  # of the height over a face, which springs' pieces span
-SLAB_BITS = 4  # 2^4 slabs to an octave
-SPLITS_MAX = 4  # pieces of a slab
+POWERS_U, POWERS_V = 12, 6  # terms in each variable
+PIECE = POWERS_V * POWERS_U * LANES  # coefficients per piece
+OCTAVES = 3  # octaves of the height h covered by the pieces of a spring tip
+SLAB_BITS = 4  # 2^4 slabs per octave
+SPLITS_MAX = 4  # largest number of pieces per slab
 PIECES = OCTAVES * 2**SLAB_BITS * SPLITS_MAX
 
 
 class TableError(SoftfingerError):
-    """A table can't be built to the tolerance."""
+    """Error raised if a table cannot be built to the tolerance."""
 
 
 class Table(Record):
-    """Force and energy of one tip of one material."""
+    """Contact table of one tip and material."""
 
-    is_solid: bool  # or measured: one energy, see `solid_lookup`; else springs
-    is_closed: bool  # springs of a constant modulus, without pieces
+    is_solid: bool  # solid or measured tip, evaluated by `solid_lookup`; otherwise springs
+    is_closed: bool  # springs of constant modulus; the table has no pieces
     sticks: bool
-    splits: int  # pieces of a slab
+    splits: int  # pieces per slab
     radius: float  # [m]
     inverse_radius: float
-    modulus: float  # at no strain [Pa]
-    deepest: float  # d up to which it holds [m]
-    tilt: float  # of a solid tip: |θ| likewise [rad]
+    modulus: float  # at zero strain [Pa]
+    deepest: float  # largest d [m]
+    tilt: float  # largest |θ| of a solid tip [rad]
     by_root: float  # 2/largest t
     by_square: float  # 2/largest sin² θ
-    at_first: float  # g at t = 0: Hertz's
+    at_first: float  # g at t = 0, Hertz's value
     tolerance: float
-    max_error: float  # bound of the relative error; of a solid tip, of the data
-    worst_d: float  # where the piece errs most that has the largest [m]
+    max_error: float  # bound on the relative error; for a solid tip, error of the data
+    worst_d: float  # place of the largest error [m]
     worst_theta: float  # [rad]
     coefficients: Annotated[FloatArray, PIECES * PIECE]
 
 
 @inlined_kernel
 def lanes(table: Table, piece: int, u: float, v: float) -> Lanes:
-    """Return the five polynomials of a ``piece`` at u and v, both from −1 to 1."""
+    """Evaluate the five polynomials of a ``piece`` at u and v, both from −1 to 1."""
     c = table.coefficients
     at = index((piece + 1) * PIECE)
     step = index(LANES)
@@ -80,7 +81,7 @@ def lanes(table: Table, piece: int, u: float, v: float) -> Lanes:
 
 
 def set_piece(table: Table, piece: int, powers: FloatArray) -> None:
-    """Store polynomials by rising powers, [lanes, u, v]."""
+    """Store the polynomials of a piece, given by increasing powers [lanes, u, v]."""
     count, in_u, in_v = powers.shape
     place = table.coefficients[piece * PIECE : (piece + 1) * PIECE]
     place.reshape(POWERS_V, POWERS_U, LANES)[:in_v, :in_u, :count] = powers.T

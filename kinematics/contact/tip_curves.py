@@ -1,12 +1,14 @@
-"""The law of a tip that fits no model: curves through calibration presses, and its contact table.
+"""Measured tip law: polynomial curves fitted to calibration presses, and their contact table.
 
 With t = √(d/a) and q = sin² θ each curve is a polynomial Σ c_ij t^i q^j:
 
-    N = push, the force along the face's normal [N]; the force on the base is N cos θ,
-    sums of the frame as the sensor shows them: shown [N],
-    their centroid towards the tilt over sin θ: lever [m], and mean squared radius: extent [m²].
+    push     N, the force along the face's normal [N]; the force on the base is N cos θ
+    shown    force summed over the sensor's frame [N]
+    lever    centroid of the frame in the direction of the tilt, over sin θ [m]
+    extent   mean squared radius of the frame [m²]
 
-The push has no power of t below 3, so that its energy U = ∫ N dd is a polynomial, too.
+The lowest power of t in the push is 3, so its energy U = ∫ N dd has the polynomial form of a solid
+tip.
 """
 
 from __future__ import annotations
@@ -20,9 +22,9 @@ from numpy.polynomial.polynomial import polyval2d
 from numpy.typing import ArrayLike, NDArray
 
 FloatArray = NDArray[np.float64]
-POWERS = 6  # of t
-SQUARES = 3  # of q
-FIRST = 3  # power of t in the push
+POWERS = 6  # number of powers of t
+SQUARES = 3  # number of powers of q
+FIRST = 3  # lowest power of t in the push
 _value: Any = polyval2d
 
 Curve: TypeAlias = tuple[tuple[float, ...], ...]  # c [POWERS][SQUARES]
@@ -30,14 +32,15 @@ Curve: TypeAlias = tuple[tuple[float, ...], ...]  # c [POWERS][SQUARES]
 
 @dataclass(frozen=True)
 class TipCurves:
-    """Curves of one tip on its sensor, of ``presses``; see the module.
+    """Measured curves of one tip on its sensor; the module defines the four curves.
 
-    They hold to ``deepest`` [m] and ``tilt`` [rad]. ``centre`` [m] and ``rotation`` [rad] are the
-    tip's place, as of a `SensorGrid`. A frame's sums are its cells' pressures times their area, and
-    those times x, y [N·m] and their squared radius [N·m²]; ``rest`` are the sums of a tip that
-    nothing touches, ``noise`` [4][4] is their covariance from frame to frame. What the curves
-    leave: ``force_error`` relative, of push and shown; ``lever_error`` [m]. Raises ValueError for
-    curves that are no law.
+    The curves are valid up to ``deepest`` [m] and ``tilt`` [rad]. ``centre`` [m] and ``rotation``
+    [rad] locate the tip on the sensor, as in `SensorGrid`; ``presses`` is the number of presses
+    used. The four sums of a frame are over its cell forces, pressure times area: the force [N], the
+    first moments in x and y [N·m] and the second moment [N·m²]. ``rest`` are the sums of an
+    untouched tip, ``noise`` [4][4] is the covariance of the sums of one frame. ``force_error``
+    (relative, of push and shown) and ``lever_error`` [m] are the residuals of the curves. Raises
+    ValueError for curves that are not a valid law.
     """
 
     radius: float
@@ -70,21 +73,21 @@ class TipCurves:
 
     @property
     def root(self) -> float:
-        """Largest t."""
+        """Largest t of the curves."""
         return math.sqrt(self.deepest / self.radius)
 
     @property
     def square(self) -> float:
-        """Largest q."""
+        """Largest q of the curves."""
         return math.sin(self.tilt) ** 2
 
     def at(self, curve: Curve, d: ArrayLike, theta: ArrayLike) -> FloatArray:
-        """Return one of the curves at d [m] and θ [rad]; they broadcast."""
+        """Evaluate one of the curves at d [m] and θ [rad], which broadcast."""
         t, q = np.sqrt(np.asarray(d) / self.radius), np.sin(theta) ** 2
         return np.asarray(_value(*np.broadcast_arrays(t, q), np.array(curve)))
 
     def energy(self) -> FloatArray:
-        """Return g of U = a³ t⁵ g(t, q) [Pa] in powers of 2 t/root − 1, 2 q/square − 1: [i, j]."""
+        """Return g [Pa] of U = a³ t⁵ g(t, q) by powers of 2 t/root − 1, 2 q/square − 1, [i, j]."""
         powers = np.arange(POWERS - FIRST)
         g = np.array(self.push)[FIRST:] * (2.0 / (5.0 + powers))[:, None] / self.radius**2
         return np.asarray(
@@ -93,14 +96,14 @@ class TipCurves:
 
 
 def _shifted(count: int, end: float) -> FloatArray:
-    """Powers of u = end/2 (1 + x) by powers of x, [power of u, power of x]."""
+    """Return the powers of u = end/2 (1 + x) by powers of x, [power of u, power of x]."""
     return np.array(
         [[(0.5 * end) ** i * math.comb(i, k) for k in range(count)] for i in range(count)]
     )
 
 
 def rises(curve: ArrayLike, root: float, square: float) -> bool:
-    """Return whether the curve is above 0 and rises with t all over (0, root] × [0, square]."""
+    """Return True if the curve is positive and rises with t on (0, root] × [0, square]."""
     t, q = np.meshgrid(np.linspace(0.0, root, 41), np.linspace(0.0, square, 9), indexing="ij")
     values = _value(t, q, np.asarray(curve))
     return bool((np.diff(values, axis=0) > 0.0).all() and (values[0] >= 0.0).all())

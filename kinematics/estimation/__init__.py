@@ -1,4 +1,5 @@
-"""Estimation of a contact from one frame of pressures: displacement, tilts, gain, covariance.
+"""Estimation of displacement, tilts, gain and their covariance from one pressure frame.
 
-The estimator's stages, mostly kernels, and the calibration that uses it; `estimator` is public.
+`estimator` holds the public class. The other modules are the stages of the estimator, mostly as
+kernels.
 """

@@ -1,6 +1,7 @@
-"""A grid's cells by their centres: those that may be touched, and sums over them, as kernels.
+"""Geometry of cell centres, and kernels for sums over cells.
 
-Indices are unsigned where a loop is to run in SIMD lanes: Numba looks whether others are negative.
+Loops that should be vectorised use unsigned indices, because Numba checks signed ones for negative
+values.
 """
 
 from __future__ import annotations
@@ -18,11 +19,11 @@ from softfinger.kinematics.sensing.footprint import FloatArray, Grid
 def cell_centres(
     grid: Grid, active: NDArray[np.bool_], radius: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return height, x and y [cells] of a grid's cells with the mask ``active`` [rows, cols].
+    """Return height, x and y of the cells as flat arrays; ``active`` [rows, cols] masks cells.
 
-    The height is √(a² − x² − y²) over the centre, or over the nearest corner where the centre lies
-    beyond the rim; −∞ for a cell that is dead, or that the disc of ``radius`` [m] round the tip's
-    centre does not touch.
+    The height is √(a² − x² − y²) at the cell's centre, or at its nearest corner if the centre lies
+    beyond the rim. It is −∞ for inactive cells and for cells outside the disc of ``radius`` [m]
+    around the tip's centre.
     """
     a, pitch_x, pitch_y = grid.radius, grid.pitch_x, grid.pitch_y
     rows, cols = active.shape
@@ -40,7 +41,7 @@ def cell_centres(
 
 @fast_inner_kernel
 def totals(frame: FloatArray, height: FloatArray) -> tuple[float, float, float]:
-    """Return Σ p (not finite where a cell is not), Σ p² and the largest p ≥ 0."""
+    """Return Σ p, Σ p² and the largest p ≥ 0; Σ p is not finite if any cell is not."""
     total = 0.0
     energy = 0.0
     peak = np.int64(0)
@@ -48,7 +49,7 @@ def totals(frame: FloatArray, height: FloatArray) -> tuple[float, float, float]:
         value = frame[k] if height[k] >= 0.0 else 0.0
         total += value
         energy += value * value
-        # Numbers that are not negative rank as their bits do, and those have no NaN.
+        # Non-negative floats have the same order as their bits; comparing bits avoids NaN rules.
         bits = np.float64(value).view(np.int64)
         peak = bits if bits > peak else peak
     return total, energy, np.int64(peak).view(np.float64)
@@ -56,7 +57,7 @@ def totals(frame: FloatArray, height: FloatArray) -> tuple[float, float, float]:
 
 @fast_inner_kernel
 def sums_above(m: Moments, frame: FloatArray, cells: Cells, level: float) -> None:
-    """Sum p, p x, p y and the number of the cells with p above ``level``, into ``m``."""
+    """Sum p, p x, p y and the count of cells with p above ``level`` into ``m``."""
     total = sum_x = sum_y = number = 0.0
     for k in range(index(0), index(frame.shape[0])):
         counts = (cells.height[k] >= 0.0) & (frame[k] > level)
@@ -73,7 +74,7 @@ def sums_above(m: Moments, frame: FloatArray, cells: Cells, level: float) -> Non
 
 @fast_inner_kernel
 def sums_inside(m: Moments, frame: FloatArray, cells: Cells, u: float, v: float, w: float) -> None:
-    """Sum p, p x, p y and p (x² + y²) of the cells whose centre the face u, v, w presses."""
+    """Sum p, p x, p y and p (x² + y²) of the cells whose centre is pressed by the face u, v, w."""
     total = sum_x = sum_y = square = 0.0
     for k in range(index(0), index(frame.shape[0])):
         x = cells.x[k]
@@ -91,7 +92,7 @@ def sums_inside(m: Moments, frame: FloatArray, cells: Cells, u: float, v: float,
 
 @inner_kernel
 def next_above(frame: FloatArray, height: FloatArray, start: int, last: int, level: float) -> int:
-    """Return the first cell in start..last that reads ``level`` or more; ``last`` if none does."""
+    """Return the first cell in start..last reading at least ``level``, or ``last`` if none does."""
     while start < last and not (frame[start] >= level and height[start] >= 0.0):
         start += 1
     return start

@@ -1,6 +1,7 @@
-"""Errors that one frame doesn't show as noise from cell to cell, carried into its covariance.
+"""Error budget: errors other than white cell noise, propagated into the covariance of an estimate.
 
-With J the Jacobian of the fit, white noise of σ² leaves σ² (JᵀJ)⁻¹. Besides, each straight in it:
+White noise of variance σ² gives the covariance σ² (JᵀJ)⁻¹, where J is the Jacobian of the fit. The
+other errors are propagated linearly:
 
     shared error q     m mᵀ,   m = size (JᵀJ)⁻¹ Jᵀq                        (`set_shared_errors`)
       it leaves        Σ size² qᵀq − m·(size Jᵀq)
@@ -11,14 +12,17 @@ With J the Jacobian of the fit, white noise of σ² leaves σ² (JᵀJ)⁻¹. Be
                        C = (JᵀJ)⁻¹ JᵀRJ (JᵀJ)⁻¹, at no tilt                      (`widen`)
     smooth misfit      Σ r_k r_(k−1) − n ρ₁ σ² − decrement                 (`undetected_misfit`)
 
-The q are patterns of what is the same in every frame: a shift of all cells, its slopes in x and y,
-the tip's centre in x and y, the pitch, and the modulus or gain, ``size`` their standard deviations.
-What moves the tip under the cells has the modelled pressure's own differences between neighbours
-for a pattern. R is the noise's correlation by lag, as `calibrate` measures it; how much it widens
-depends on the footprint's size, over which it is tabulated. W² are the fractions of a smooth
-error's square that look like a change of d and the gain, and of a tilt: the errors of real cells
-are nearly as symmetric as the pressure. r_k are the residuals: single cells' noise adds nothing to
-the product of neighbours on average, a misfit that is smooth over the footprint all of it.
+The patterns q are errors that are the same in every frame: a shift of all cells, its slopes in x
+and y, the tip's centre in x and y, the pitch, and the modulus or gain. ``size`` is the standard
+deviation of each. Patterns that move the tip relative to the cells are the differences of the
+modelled pressure between neighbouring cells.
+
+R is the correlation of the noise by lag, as measured by `calibrate`. Its widening effect depends on
+the size of the footprint and is tabulated over it. W² are the fractions of a smooth error's square
+that look like a change of d and gain, and like a tilt. They are small because the errors of real
+cells are nearly as symmetric as the pressure. r_k are the residuals. Products of neighbouring
+residuals average to zero for independent noise, but a misfit that is smooth over the footprint
+contributes fully to them.
 """
 
 from __future__ import annotations
@@ -54,27 +58,44 @@ from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
 NEIGHBOURS = np.outer((1.0, 2.0, 2.0, 2.0, 1.0), (1.0, 2.0, 2.0, 2.0, 1.0))  # see `detection`
 NEIGHBOURS[2, 2] = 0.0
-_PEAK = 4.5  # standard deviations of the cell that noise alone makes the largest
-_FEW = 48.0  # cells within which nothing is smooth or rough
-# Of an error's squares, smooth over a footprint: what d (and the gain), each tilt, and no parameter
-# has. Curves, hysteresis and crosstalk are nearly as symmetric as the pressure.
+_PEAK = 4.5  # largest cell under noise alone, in standard deviations
+_FEW = 48.0  # cells, below which smooth and rough misfits cannot be distinguished
+# Fractions of a smooth error's square that appear in d (and the gain), in each tilt, and in the
+# residuals. Errors of curves, hysteresis and crosstalk are nearly as symmetric as the pressure.
 _SMOOTH_IN_DEPTH, _SMOOTH_IN_TILT, _SMOOTH_LEFT = 0.15, 0.06, 0.2
-# Of a solid tip's tilt, over d/a: what the model's is off on frames of independent elements, up to
-# 20° and 7 mm (4 % of a bonded tip's there, and hardly anything of a lying one's).
+# Relative tilt error of the solid model over d/a, from frames of independent finite elements up to
+# 20° and 7 mm. There the error is 4 % for a bonded tip and negligible for a lying one.
 _LEAN = 0.1
-_SURE = 6.0  # standard deviations that noise alone hardly makes of neighbours' products
+_SURE = 6.0  # threshold of the neighbours' products in standard deviations of the noise
 
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """Standard deviations of what a sensor's frames have in common, and how its noise correlates.
+    """Standard deviations of a sensor's common errors, and the correlation of its noise.
 
-    ``baseline``: of a shift of all cells [Pa], ``slope``: of the same from the tip's middle to its
-    rim, in x and in y [Pa]; ``centre``: of the tip's place on the sensor, in x and in y [m];
-    ``rotation``: of the sensor [rad]; ``pitch``, ``modulus`` and ``gain`` (of all cells alike):
-    relative; ``smooth``: of a cell's pressure, relative, where neighbours share it, by another
-    curve, hysteresis or crosstalk. ``correlation`` [rows, cols] is that of two cells' noise by
-    their distance in rows and columns, 1 at [0, 0] and 0 beyond; None for white noise.
+    Parameters
+    ----------
+    baseline
+        Common shift of all cells [Pa].
+    centre
+        Position of the tip on the sensor, in x and in y [m].
+    pitch, modulus, gain
+        Relative errors of the cell pitch, the tip's modulus and the common gain of all cells.
+    correlation
+        Correlation of the noise of two cells by their distance in rows and columns, [rows, cols],
+        with 1 at [0, 0]; it is 0 at larger distances. None for white noise.
+    slope
+        Shift of the zero from the tip's centre to its rim, in x and in y [Pa].
+    smooth
+        Relative pressure error of a cell that is shared by its neighbours, due to curve errors,
+        hysteresis or crosstalk.
+    rotation
+        Rotation of the sensor [rad].
+
+    Raises
+    ------
+    ValueError
+        If a value is out of range.
     """
 
     baseline: float = 0.0
@@ -106,11 +127,11 @@ def set_budget(
     material: Material,
     pattern: FloatArray | None,
 ) -> None:
-    """Fill in the budget, and raise the activity test's level to what the errors alone may make.
+    """Set the error budget, and raise the level of the activity test above the common errors.
 
-    The material's ``fit_error`` [Pa], how far the law is off the points that it was made from, is
-    like a shift to the cells that it presses. ``pattern`` [rows, cols] is a solid tip's, by which
-    its contact is noticed.
+    The material's ``fit_error`` [Pa], the distance of the law from the fitted points, acts like a
+    shift on the pressed cells. ``pattern`` [rows, cols] is the pattern by which a solid tip's
+    contact is detected.
     """
     budget, options = state.budget, state.options
     modulus = 0.0 if options.free_gain else math.hypot(known.modulus, known.gain)
@@ -134,13 +155,13 @@ def set_budget(
         with_centre = float((weights * _fitted(rho, 5)).sum()) if pattern is None else 0.0
         variance = float(quadratic(weights, rho)) - with_centre**2
         level = (level * math.sqrt(max(variance, 0.0)) + _PEAK * max(with_centre, 0.0)) / norm
-    # A shift of twice the baseline's standard deviation is no contact.
+    # A shift of up to twice the baseline's standard deviation must not be detected as a contact.
     shift = 2.0 * known.baseline / options.noise * weights.sum() / norm
     options.patch_level = level + max(shift, 0.0)
 
 
 def both_ways(correlation: FloatArray | None) -> FloatArray:
-    """Return the correlation [2 rows − 1, 2 cols − 1] by lags of both signs."""
+    """Extend a correlation to lags of both signs, [2 rows − 1, 2 cols − 1]."""
     assert correlation is not None
     rows, cols = correlation.shape
     return np.asarray(
@@ -149,7 +170,7 @@ def both_ways(correlation: FloatArray | None) -> FloatArray:
 
 
 def _fitted(rho: FloatArray, size: int) -> FloatArray:
-    """The middle [size, size] of ``rho``, with zeros where it has none."""
+    """Return the centre [size, size] of ``rho``, padded with zeros."""
     out = np.zeros((size, size))
     for i in range(size):
         for j in range(size):
@@ -166,7 +187,7 @@ def quadratic(fields: FloatArray, rho: FloatArray) -> FloatArray:
     kernel = np.zeros(shape)
     kernel[: rho.shape[0], : rho.shape[1]] = rho
     kernel = np.roll(kernel, (-(rho.shape[0] // 2), -(rho.shape[1] // 2)), (0, 1))
-    # A measured correlation may want a negative power at some frequency, which no noise has.
+    # A measured correlation may imply negative power at some frequencies; clip it to zero.
     power = np.maximum(np.fft.fft2(kernel).real, 0.0)
     waves = np.fft.fft2(several, shape, axes=(0, 1))
     out = np.einsum("xyi,xy,xyj->ij", waves.conj(), power, waves).real / power.size
@@ -176,7 +197,7 @@ def quadratic(fields: FloatArray, rho: FloatArray) -> FloatArray:
 def _set_widening(
     state: EstimatorState, rho: FloatArray, grid: SensorGrid, tip: Fingertip, material: Material
 ) -> None:
-    """Tabulate what correlated noise widens at no tilt, and the cells that the fit takes off."""
+    """Tabulate the widening by correlated noise at zero tilt, and the cells used up by the fit."""
     options = state.options
     first = 0 if options.free_gain else 1
     for k in range(DEPTHS):
@@ -204,7 +225,7 @@ def _set_widening(
 
 @inner_kernel
 def widen(state: EstimatorState) -> float:
-    """Widen ``fit.inverse`` by correlated noise; return how many cells' noise the fit takes off."""
+    """Widen ``fit.inverse`` by correlated noise; return the number of cells used up by the fit."""
     inverse = state.fit.inverse
     table = state.budget.widening
     t = DEPTHS * math.sqrt(state.fit.d / state.options.deepest) - 1.0
@@ -222,9 +243,9 @@ def widen(state: EstimatorState) -> float:
 
 @fast_inner_kernel
 def _neighbours_products(cells: Cells, lowest: float, first: int, last: int) -> tuple[float, float]:
-    """Return Σ over neighbours in a row of the product of residuals [Pa²], and their number.
+    """Return the sum of products of neighbouring residuals in rows [Pa²], and their number.
 
-    Of cells that read more than ``lowest`` [Pa] by the model.
+    Only cells with a modelled pressure above ``lowest`` [Pa] count.
     """
     total = 0.0
     number = 0.0
@@ -240,20 +261,20 @@ def _neighbours_products(cells: Cells, lowest: float, first: int, last: int) -> 
 
 @inner_kernel
 def undetected_misfit(state: EstimatorState, cells: Cells, beyond: float) -> float:
-    """Return the square sum [Pa²] of misfit smooth over the footprint; 0 within the noise.
+    """Return the square sum [Pa²] of the misfit that is smooth over the footprint.
 
-    ``beyond`` [Pa²] is all that it leaves beyond what is expected: in a footprint of few cells no
-    part of that can be told from smooth.
+    It is 0 if the noise explains it. ``beyond`` [Pa²] is the total misfit in excess of the expected
+    one. In a footprint of few cells the smooth part cannot be separated, so all of it is returned.
     """
     fit = state.fit
     variance = state.signal.variance
     cols = state.grid.cols
-    # Nearer to the floor, readings that end there are more than the pressure.
+    # Near the floor, clipping biases the readings above the pressure.
     lowest = max(state.signal.floor, 0.0) + 2.0 * fit.clip
     total, number = _neighbours_products(
         cells, lowest, index(fit.first_row * cols), index(fit.last_row * cols)
     )
-    # What the last step takes off is not in the residuals yet.
+    # The residuals do not include the decrement of the last step yet.
     total -= number * variance * state.budget.along + fit.decrement
     total = beyond if number < _FEW else min(total, beyond)
     if total <= _SURE * variance * math.sqrt(number * state.budget.cells_per_sample):
@@ -265,7 +286,7 @@ def undetected_misfit(state: EstimatorState, cells: Cells, beyond: float) -> flo
 def _project(
     state: EstimatorState, cells: Cells, column: int, values: FloatArray, first: int, last: int
 ) -> None:
-    """Set Jᵀq of one column of the Jacobian, and qᵀq, for each pattern but the pressure itself."""
+    """Set Jᵀq of one column of the Jacobian, and qᵀq, for all patterns except the pressure."""
     one = index(1)
     two = index(2)
     cols = index(state.grid.cols)
@@ -310,10 +331,10 @@ def _project(
 
 @inner_kernel
 def set_shared_errors(state: EstimatorState, cells: Cells) -> float:
-    """Set the covariance by what all frames share, ``budget.shared``, of the fit's parameters.
+    """Set ``budget.shared``, the covariance of the fit's parameters due to common errors.
 
-    ``fit.inverse`` is that of white noise of variance 1 [Pa²]. Returns the square sum [Pa²] that
-    the fit leaves of it where each is twice its standard deviation.
+    ``fit.inverse`` must be the covariance for white noise of variance 1 Pa². Returns the square sum
+    of the residuals [Pa²] if each common error is twice its standard deviation.
     """
     fit = state.fit
     budget = state.budget
@@ -346,7 +367,7 @@ def set_shared_errors(state: EstimatorState, cells: Cells) -> float:
         size = budget.sizes[source]
         if size == 0.0:
             continue
-        # What moves or scales the pressure goes with the gain; a shift of zeros does not.
+        # Patterns that move or scale the pressure are proportional to the gain; zero errors aren't.
         size *= gain if source >= PLACE_X else 1.0
         remaining += size * size * budget.squares[source]
         for i in range(PARAMETERS):
@@ -360,7 +381,7 @@ def set_shared_errors(state: EstimatorState, cells: Cells) -> float:
     along = budget.lean * fit.d / state.grid.radius
     for i in range(2):
         for j in range(2):
-            # The tilt's direction, and across it.
+            # Components along the tilt and across it.
             n_i = fit.n_y if i else fit.n_x
             n_j = fit.n_y if j else fit.n_x
             m_i = fit.n_x if i else -fit.n_y

@@ -1,7 +1,7 @@
-"""Pressure grid → displacement, tilt, gain and their covariance.
+"""Estimate displacement, tilt, gain and their covariance from a frame of a pressure grid.
 
-Holds `ContactEstimator` and its result. What happens to a frame, in one compiled call, is in
-frame_pipeline.py.
+This module holds `ContactEstimator` and its result `ContactEstimate`. The processing of a frame,
+one compiled call, is in `frame_pipeline`.
 """
 
 from __future__ import annotations
@@ -30,26 +30,47 @@ from softfinger.kinematics.sensing.springs_pressure import count_for, points_of
 
 @dataclass(slots=True)
 class ContactEstimate:
-    """Estimate of the contact in one frame; SI units, angles in rad.
+    """Estimate of the contact in one frame, in SI units with angles in rad.
 
-    ``contact``: something presses. ``invalid`` says why the estimate can't be used; without a
-    reason it is ``valid``, which promises one contact that the model describes: the
-    fit settled at d below 3/4 of the radius and a gain of 1/20 to 20, it accounts for 80 % of the
-    frame's squared pressure, nothing else presses, and what it leaves smoothly over the footprint
-    could hide no more than 60 % of d (one standard deviation), or 3 % with a gain beyond 1/2 to 2,
-    where both say that this is another tip. Such a misfit, as of a curved face, and the known
-    uncertainties are in the covariance; where together they leave more than half of d uncertain
-    (one standard deviation), that is not valid either. Without contact d and the tilts are 0 and
-    that is valid; d_std is then the d of a contact that is only just felt, since a smaller one
-    could hide. It can't promise what no frame shows: a wrong modulus with a fixed gain, a tip
-    that stands elsewhere on the sensor.
+    Attributes
+    ----------
+    contact
+        True if a contact is detected.
+    invalid
+        The reason for which the estimate cannot be used, or `Invalid.NONE`.
+    d
+        Displacement [m].
+    tilt_x, tilt_y
+        Tilts of the object's normal [rad].
+    gain
+        Ratio of measured to modelled pressure.
+    covariance
+        Covariance of (d, tilt_x, tilt_y, gain). The row of a fixed gain is zero.
+    systematic
+        The part of the covariance that is common to all frames and not reduced by averaging.
+    chi2
+        Mean squared residual per cell over the noise variance; 0 without a fit.
+    r_squared
+        Fraction of the frame's squared pressure explained by the model; 0 without a fit.
+    misfit
+        True if χ² is larger than noise causes once in 3.5 million frames. Then the model does not
+        describe the contact well, or the noise is larger than given.
 
-    ``covariance`` is of (d, tilt_x, tilt_y, gain), ``systematic`` the part of it that all frames
-    share and averaging does not lessen; a fixed gain has a zero row. ``chi2`` is the misfit's
-    square a cell over the noise's, ``r_squared`` the fraction of the frame's squared pressure that
-    the model accounts for; both are 0 where nothing was fitted.
-    ``misfit``: χ² is beyond what the noise makes once in 3.5 million frames, so that the model does
-    not describe the contact well, or the noise is larger than given.
+    Notes
+    -----
+    A ``valid`` estimate with a contact fulfils these conditions:
+
+    - The fit converged with d below 3/4 of the radius and a gain from 1/20 to 20.
+    - The model explains at least 80 % of the frame's squared pressure.
+    - There is no second contact.
+    - The smooth part of the residual could change d by at most 60 % (one standard deviation), or by
+      3 % if the gain is outside 1/2 to 2, since both together indicate a different tip.
+    - The smooth residual (for example of a curved face) and the known uncertainties, both included
+      in the covariance, leave a standard deviation of d of at most half of d.
+
+    Without a contact, d and the tilts are 0, the estimate is valid, and ``d_std`` is the d of the
+    smallest detectable contact. Some errors cannot be detected from a frame: a wrong modulus with a
+    fixed gain, and a tip that is displaced on the sensor.
     """
 
     contact: bool = False
@@ -63,18 +84,18 @@ class ContactEstimate:
     peak: float = 0.0  # largest cell [Pa]
     cells: int = 0  # cells in the fit
     iterations: int = 0
-    rejected: int = 0  # outliers left out
-    second: bool = False  # something else presses too, off the footprint
+    rejected: int = 0  # outliers excluded
+    second: bool = False  # a second contact presses outside the footprint
     misfit: bool = False
-    shear_x: float = 0.0  # force along the face [N], which a solid tip's base feels
+    shear_x: float = 0.0  # force along the face [N], for solid tips
     shear_y: float = 0.0
-    cells_per_sample: float = 1.0  # cells for each whose noise is independent
+    cells_per_sample: float = 1.0  # cells per independent noise sample
     covariance: FloatArray = field(default_factory=lambda: np.zeros((4, 4)))
     systematic: FloatArray = field(default_factory=lambda: np.zeros((4, 4)))
 
     @property
     def valid(self) -> bool:
-        """The estimate can be used; see the class."""
+        """True if the estimate can be used; see the class notes."""
         return not self.invalid
 
     @property
@@ -93,7 +114,7 @@ class ContactEstimate:
         return math.sqrt(self.covariance.item(10))
 
 
-# Accepted frame types and the reading at which a cell is full.
+# Accepted frame types and their saturation readings.
 _FULL = {
     np.dtype(np.uint8): 255.0,
     np.dtype(np.uint16): 65535.0,
@@ -104,12 +125,23 @@ _FULL = {
 
 @dataclass(frozen=True, slots=True)
 class Readings:
-    """Range of a board's readings. Raises ValueError for values out of their range.
+    """Range and resolution of a board's readings.
 
-    ``saturation`` is the reading [counts, or Pa for float frames] at which a cell is full; None: an
-    integer type's largest value. ``threshold`` is the smallest count the board sends, 0 stands for
-    all below; for integer frames. ``quantum`` [Pa] is the width of a count where float frames are
-    made of counts, which end at 0; 0 where they are not.
+    Parameters
+    ----------
+    saturation
+        Reading at which a cell saturates [counts, or Pa for float frames]. None stands for the
+        largest value of an integer type.
+    threshold
+        Smallest nonzero count that the board sends; smaller readings are sent as 0. Used for
+        integer frames.
+    quantum
+        Width of a count [Pa] if float frames were converted from counts that end at 0; otherwise 0.
+
+    Raises
+    ------
+    ValueError
+        If a value is out of range.
     """
 
     saturation: float | None = None
@@ -127,32 +159,30 @@ _RESULTS = (
     "contact", "second", "shear_x", "shear_y", "invalid",
 )  # fmt: skip
 
-# Of the fit and the activity test; `ContactEstimator.state` has them, should others be tried.
-_TOLERANCE = 16.0  # of the squared step, in noise floors, that ends the iteration
+# Parameters of the fit and the activity test. They can be changed in `ContactEstimator.state`.
+_TOLERANCE = 16.0  # squared step over the noise floor's square at which the iteration ends
 _ITERATIONS = 20
-PEAK_LEVEL = 3.0  # noise, of a cell and of its neighbours: see `detection.activity`
+PEAK_LEVEL = 3.0  # in noise standard deviations, see `detection.activity`
 PATCH_LEVEL = 4.9
-_R_SQUARED_MIN = (
-    0.8  # fraction of the frame's squared pressure below which an estimate is not valid
-)
-# Points of the model to the tip's radius, or more; and of a law that is no straight line. The bias
-# that they leave is a quarter of the noise floor, at 0.2 % of the modulus, at most up to 25°;
-# within 4° of the domain's limit it is up to four times that floor.
+_R_SQUARED_MIN = 0.8  # smallest explained fraction of the squared pressure for a valid estimate
+# Smallest number of model points per tip radius, for linear and for nonlinear laws. Up to 25° the
+# bias is at most a quarter of the noise floor at a noise of 0.2 % of the modulus. Within 4° of the
+# domain's limit it is up to four times that floor.
 _FINENESS, _BENT = 22.0, 31.0
-_DEEPEST, _SINE_MAX = 0.95, 3.0 / math.sqrt(10.0)  # of the radius; tan 3: ends of springs' fit
-_OVER = 1.01  # of a solid tip's ends, in d and sin θ: so far noise may take a fit at them
-_SHEAR_PRIOR = 0.1  # of a solid tip's normal force
-_RIM = {"bonded": 0.03, "lying": 0.05}  # of the radius: nearer to a solid tip's rim none counts
-CELLS_MIN = 9  # that a solid tip's contact and shear can be told from
+_DEEPEST, _SINE_MAX = 0.95, 3.0 / math.sqrt(10.0)  # limits of d/a and sin θ in a spring fit
+_OVER = 1.01  # a fit near the limits of a solid tip's data may exceed them by this factor
+_SHEAR_PRIOR = 0.1  # standard deviation of a solid tip's shear over its normal force
+_RIM = {"bonded": 0.03, "lying": 0.05}  # width of the excluded rim of a solid tip over the radius
+CELLS_MIN = 9  # smallest number of cells to estimate a solid tip's contact and shear
 
 
 def within_rim(grid: SensorGrid, tip: Fingertip, known: Uncertainty) -> NDArray[np.bool_]:
-    """Return the cells [rows, cols] within a solid tip's rim, at which the model may be wrong.
+    """Return a mask [rows, cols] of the cells away from a solid tip's rim.
 
-    A bonded base's stress is singular there, which no two meshes have alike: from independent
-    elements' frames the model's differ by 3 % rms with those cells, and 0.6 % without. Under a
-    tilt a lying base pulls there, where real rubber lifts. And where the tip's place is uncertain,
-    the rim may be elsewhere.
+    The model may be wrong at the rim. The stress of a bonded base is singular there and depends on
+    the mesh: compared with frames of independent finite elements, the model is off by 3 % rms with
+    these cells and by 0.6 % without them. A tilted lying base pulls at the rim in the model, where
+    real rubber lifts off. The mask also allows for an uncertain position of the tip.
     """
     margin = max(_RIM[tip.base] * tip.radius, 2.0 * (known.centre + known.pitch * tip.radius))
     cells = grid.on(tip)
@@ -167,17 +197,35 @@ def within_rim(grid: SensorGrid, tip: Fingertip, known: Uncertainty) -> NDArray[
 
 
 class ContactEstimator:
-    """Estimates the contact under one tip from frames of a pressure grid.
+    """Estimator of the contact under one tip from frames of a pressure grid.
 
-    Takes the tip, its material, the grid, and ``noise``, a cell's standard deviation [Pa].
-    ``free_gain`` also estimates measured over modelled pressure, by default for a tip of springs
-    alone: a solid tip's frame hardly changes its shape with d, which then shows in the force only.
-    Otherwise it is 1. ``active`` [rows, cols] bool masks dead cells. ``readings`` says where the
-    board's readings end. ``known`` are the sensor's other uncertainties, none by default: they
-    widen the covariance, and make the activity test as much less sensitive. A material's own
-    ``fit_error`` counts among them. The fit goes up to a tilt of 71.57° (tan 3), and no further.
+    Parameters
+    ----------
+    tip, material, grid
+        The fingertip (springs or solid), its stress-strain law, and the sensor.
+    noise
+        Standard deviation of a cell's noise [Pa].
+    free_gain
+        If True, also estimate the gain, the ratio of measured to modelled pressure. Otherwise the
+        gain is 1. The default is True for springs and False for solid tips: the shape of a solid
+        tip's frame hardly depends on d, so d can only be found from the force.
+    active
+        Mask of working cells, bool [rows, cols]; all cells if None.
+    readings
+        Range and resolution of the readings.
+    known
+        Other uncertainties of the sensor. They widen the covariance and reduce the sensitivity of
+        the contact detection. The ``fit_error`` of the material is added to them.
 
-    Raises ValueError for arguments out of their range.
+    Raises
+    ------
+    ValueError
+        If an argument is out of range.
+
+    Notes
+    -----
+    Tilts of a spring tip are estimated up to 71.57° (tan θ = 3); those of a solid tip up to the
+    limits of its data.
     """
 
     def __init__(
@@ -201,7 +249,7 @@ class ContactEstimator:
             raise ValueError(f"active must have shape {grid.shape}, got {np.shape(active)}")
         readings = readings or Readings()
         self.grid = grid
-        self._full = math.nan  # of the last frame's type
+        self._full = math.nan  # saturation of the last frame's type
         self.saturation = readings.saturation
         self._quantum = readings.quantum
         known = known or Uncertainty()
@@ -217,7 +265,7 @@ class ContactEstimator:
         options = self._options = state.options
         self.noise = noise
         options.saturation = math.inf
-        # Counts are rounded, so the smallest one sent stands for half a count less and up.
+        # Counts are rounded, so the smallest count includes readings down to half a count less.
         options.floor = max(readings.threshold - 0.5, 0.0)
         options.free_gain = not is_solid if free_gain is None else free_gain
         options.tolerance, options.iterations = _TOLERANCE, _ITERATIONS
@@ -245,7 +293,7 @@ class ContactEstimator:
         )
 
     def _lay_out(self, tip: Fingertip, material: Material, alive: NDArray[np.bool_]) -> None:
-        """Set the window of the frame that a contact can press, its cells, and the model of it."""
+        """Set the window of cells that a contact can press, their arrays, and the forward model."""
         grid, state, options = self.grid, self.state, self.state.options
         reach = cell_centres(grid.on(tip), alive, tip.radius + 3.0 * grid.blur)[0] >= 0.0
         rows, cols = (np.flatnonzero(reach.reshape(grid.shape).any(axis=k)) for k in (1, 0))
@@ -280,11 +328,11 @@ class ContactEstimator:
 
         fineness = _FINENESS if material.is_linear else _BENT
         points = points_of(fewest, material, grid.blur, count_for(cells, fineness))
-        # What the kernel takes besides state and frame.
+        # Arguments of the kernel other than the state and the frame.
         self._arrays = self._rows, pixels, weights.array, *points
 
     def _pattern(self, tip: Fingertip, alive: NDArray[np.bool_]) -> FloatArray:
-        """Set a solid tip's pattern of a contact: the image that any shows most; [rows, cols]."""
+        """Set and return the contact pattern [rows, cols] of a solid tip, its dominant image."""
         pattern = self.grid.images(tip)[0].reshape(self.grid.shape) * alive
         pattern = np.where(alive, pattern - pattern.sum() / alive.sum(), 0.0)
         pattern /= math.sqrt((pattern**2).sum())
@@ -292,9 +340,10 @@ class ContactEstimator:
         return np.asarray(pattern)
 
     def _undetected(self, tip: Fingertip, material: Material, pattern: FloatArray | None) -> float:
-        """Return the d [m] of an upright contact that the activity test only just feels.
+        """Return the d [m] of the smallest upright contact that the activity test detects.
 
-        By the ``pattern`` that it compares with a frame; None: by the cells round the largest.
+        The test compares a frame with the ``pattern`` or, if it is None, examines the cells around
+        the largest reading.
         """
         options = self._options
         whole = pattern is not None
@@ -318,10 +367,10 @@ class ContactEstimator:
 
     @property
     def saturation(self) -> float | None:
-        """The reading at which a cell is full; None for an integer type's largest value.
+        """Reading at which a cell saturates; None stands for the largest value of an integer type.
 
-        Set it again where another zero is taken off the readings. Raises ValueError for one that is
-        not positive.
+        Update it when a different zero is subtracted from the readings. Setting a value that is not
+        positive raises ValueError.
         """
         return self._saturation
 
@@ -333,7 +382,7 @@ class ContactEstimator:
 
     @property
     def noise(self) -> float:
-        """Standard deviation of a cell [Pa]. Raises ValueError for one that is not positive."""
+        """Standard deviation of a cell's noise [Pa]; it must be positive."""
         return float(self._options.noise)
 
     @noise.setter
@@ -343,9 +392,9 @@ class ContactEstimator:
         self._options.noise = noise
 
     def __call__(self, frame: NDArray[Any], pascal_per_count: float = 1.0) -> ContactEstimate:
-        """Estimate from this frame alone: a new result, whatever frames came before.
+        """Estimate the contact from this frame alone and return a new result.
 
-        Frames as for :meth:`update`. Raises ValueError for a wrong shape or type.
+        Earlier frames have no influence. The arguments and exceptions are those of :meth:`update`.
         """
         estimate = self.state.estimate
         before, seq, last = self._estimate.copy(), self._seq, self._last
@@ -362,12 +411,27 @@ class ContactEstimator:
     def update(
         self, frame: NDArray[Any], pascal_per_count: float = 1.0, seq: int | None = None
     ) -> ContactEstimate:
-        """Estimate from this frame, starting from the last; the one result object is reused.
+        """Estimate the contact from this frame, starting the fit at the last estimate.
 
-        ``frame`` [rows, cols] is uint8, uint16, float32 or float64; its values times
-        ``pascal_per_count`` are Pa. The quantum's noise of integer frames is added to the cells'
-        noise. A ``seq`` equal to the last frame's returns at once. Raises ValueError for a wrong
-        shape or type, or a pascal_per_count that is not positive.
+        Parameters
+        ----------
+        frame
+            Readings [rows, cols] of type uint8, uint16, float32 or float64. For integer types, the
+            quantisation noise is added to the noise of the cells.
+        pascal_per_count
+            Factor from readings to Pa.
+        seq
+            Sequence number. If it equals that of the last frame, the last result is returned.
+
+        Returns
+        -------
+        ContactEstimate
+            The estimate. The same object is returned and overwritten by each call.
+
+        Raises
+        ------
+        ValueError
+            If the frame has a wrong shape or type, or ``pascal_per_count`` is not positive.
         """
         if seq is not None and seq == self._seq:
             return self._last
@@ -382,7 +446,7 @@ class ContactEstimator:
         if full != self._full:
             self._full = full
             self._options.saturation = full if self._saturation is None else self._saturation
-        # One copy makes every type, layout and read-only frame the same to the compiled entry.
+        # The copy lets the compiled entry handle frames of any type, layout and writability.
         self._frame[...] = frame[self._window]
         step = self._quantum if full == math.inf else pascal_per_count
         estimate_frame(
@@ -393,23 +457,23 @@ class ContactEstimator:
         for name, value in zip(_RESULTS, self._results.item(), strict=True):
             setattr(result, name, value)
         result.invalid = REASONS[result.invalid]
-        # By Wilson-Hilferty, 5 σ.
+        # Threshold of χ² at 5 σ, by the Wilson-Hilferty approximation.
         variance = 2.0 / (9.0 * max(result.cells / result.cells_per_sample - 4, 1))
         result.misfit = result.chi2 > (1.0 - variance + 5.0 * math.sqrt(variance)) ** 3
         self._seq = seq
         return result
 
     def reset(self) -> None:
-        """Forget the last estimate: the next frame starts cold."""
+        """Discard the last estimate, so that the next frame is estimated from scratch."""
         self.state.estimate.warm = False
         self._seq = None
 
 
 def _with_data_errors(known: Uncertainty, tip: Fingertip, free_gain: bool) -> Uncertainty:
-    """Return the uncertainties, with how far a solid tip's data are off other elements'.
+    """Add the errors of a solid tip's data, relative to independent finite elements.
 
-    Upright an error of the pressure is as symmetric as the pressure is, and with a known gain it
-    hardly moves d.
+    The pressure error counts only with a free gain: it is as symmetric as the pressure itself, so
+    with a known gain it hardly changes d.
     """
     data = solid_data(tip)
     smooth = data.pressure_error if free_gain else 0.0

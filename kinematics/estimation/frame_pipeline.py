@@ -1,6 +1,7 @@
-"""The estimator's one compiled entry: the order of the steps for one pressure frame.
+"""Processing of one pressure frame, with the estimator's only compiled entry point.
 
-Activity test, outliers, then maximum likelihood, from the last estimate or from the frame alone.
+The steps are the activity test, outlier rejection, and a maximum likelihood fit that starts from
+the last estimate or from the frame alone.
 """
 
 from __future__ import annotations
@@ -32,27 +33,29 @@ from softfinger.kinematics.sensing.footprint import FloatArray
 from softfinger.kinematics.sensing.solid_pressure import Weights
 from softfinger.kinematics.sensing.springs_pressure import points_in
 
-# Noise that ends at 0 raises its neighbourhoods' sums: so much more makes alarms as rare again.
+# Noise clipped at 0 raises the sums of neighbourhoods. This increase of the level restores the
+# false alarm rate.
 CLIPPED_MORE = 0.5
-GAIN_MIN, GAIN_MAX = 0.05, 20.0  # outside it's not this tip on this sensor
-D_MAX = 0.75  # of the radius
-# What a misfit smooth over the footprint may hide of d, over d: as much as a disc's curved face
-# does, which the covariance covers; hardly anything with a gain that is far from 1, where both say
-# that this is another tip, and the covariance doesn't cover it.
+GAIN_MIN, GAIN_MAX = 0.05, 20.0  # outside, the contact is not of this tip on this sensor
+D_MAX = 0.75  # largest valid d over the radius
+# Largest relative error of d that a smooth misfit may cause. The curved face of a disc causes this
+# much, which the covariance includes. With a gain far from 1 the limit is small, because both
+# together indicate a different tip, which the covariance does not include.
 UNDETECTED_MAX = 0.6
 UNDETECTED_MAX_FAR = 0.03
 GAIN_FAR = 2.0
-# Of the cells under the tip, above noise and above this fraction of the peak: a sensor that has no
-# zero. A solid tip's contact, that presses all of them, has 5 % of them below 0.32 of its peak.
+# If at least the fraction ABOVE_MOST of the cells under the tip exceeds both levels (in noise and
+# over the peak), the sensor needs a tare. A solid tip presses all cells, but 5 % of them are below
+# 0.32 of the peak.
 ABOVE_MOST, ABOVE_NOISE, ABOVE_PEAK = 0.95, 3.0, 0.4
-FULL_MOST = 0.5  # full cells of those above half of the peak, which leave no shape to fit
-ZERO_MAX = 0.22  # known error of the cells' zeros over the peak: beyond, none of it is straight
-SHARED_MAX = 0.5  # standard deviation of d by known uncertainties, over d: beyond, it's anything
+FULL_MOST = 0.5  # largest fraction of saturated cells among those above half of the peak
+ZERO_MAX = 0.22  # largest zero error over the peak for which linear propagation holds
+SHARED_MAX = 0.5  # largest standard deviation of d due to known uncertainties, over d
 
 
 @inner_kernel
 def _likelihood(state: EstimatorState, model: Model, frame: FloatArray, cells: Cells) -> Invalid:
-    """Maximum likelihood from the last estimate, or from the frame alone if that fails."""
+    """Fit by maximum likelihood from the last estimate, or from the frame alone if that fails."""
     estimate = state.estimate
     options = state.options
     signal = state.signal
@@ -72,9 +75,8 @@ def _likelihood(state: EstimatorState, model: Model, frame: FloatArray, cells: C
             if estimate.r_squared < options.r_squared_min:
                 reason = Invalid.MODEL
                 continue
-            # Only pressure beyond the footprint beyond noise and a small fraction calls for a
-            # search.
-            # A solid tip's base is all pressed.
+            # Search for a second contact only if the residual exceeds the noise and a small
+            # fraction of the energy. A solid tip presses its whole base, so it is not searched.
             if not options.is_solid and misfit > 8.0 * scatter + 0.003 * energy:
                 level = max(5.0 * signal.noise, 0.15 * estimate.peak / signal.scale)
                 level += 2.0 * state.budget.baseline / signal.scale
@@ -87,7 +89,7 @@ def _likelihood(state: EstimatorState, model: Model, frame: FloatArray, cells: C
 
 @inner_kernel
 def _tip_problem(state: EstimatorState) -> Invalid:
-    """Check that the misfit allows the model to be the tip's, and d to be known at all."""
+    """Check that the misfit is compatible with the tip's model and that d is certain enough."""
     estimate = state.estimate
     zero = math.hypot(state.budget.baseline, state.budget.slope)
     if estimate.shared > SHARED_MAX or zero > ZERO_MAX * estimate.peak:
@@ -100,9 +102,9 @@ def _tip_problem(state: EstimatorState) -> Invalid:
 
 @inner_kernel
 def _set_r_squared(state: EstimatorState) -> tuple[float, float]:
-    """Set the fraction of the frame's squared pressure, noise apart, that the model accounts for.
+    """Set r², the fraction of the frame's squared pressure, less noise, explained by the model.
 
-    Returns what it doesn't account for [Pa²], and noise's own scatter.
+    Returns the unexplained part [Pa²] and the scatter of the noise.
     """
     energy = energy_of(state)
     budget = state.budget
@@ -121,9 +123,9 @@ def _set_r_squared(state: EstimatorState) -> tuple[float, float]:
 
 @inner_kernel
 def _to_tilts(state: EstimatorState, covariance: Matrix, rotated: Matrix) -> None:
-    """Turn the estimate from normals in the sensor's axes to tilts in the finger's.
+    """Convert the estimate from normals in the sensor's axes to tilts in the finger's axes.
 
-    And a ``covariance``, which is changed, into ``rotated``.
+    The ``covariance``, which is overwritten, is converted into ``rotated``.
     """
     estimate = state.estimate
     c = math.cos(state.options.rotation)
@@ -132,7 +134,7 @@ def _to_tilts(state: EstimatorState, covariance: Matrix, rotated: Matrix) -> Non
     n_y = s * estimate.n_x + c * estimate.n_y
     estimate.tilt_x = math.asin(n_x)
     estimate.tilt_y = math.asin(n_y)
-    # ∂tilt/∂n = 1/cos tilt. Only the two middle rows and columns turn.
+    # ∂tilt/∂n = 1/cos tilt. Only the two middle rows and columns are rotated.
     per_x = 1.0 / math.sqrt(1.0 - n_x * n_x)
     per_y = 1.0 / math.sqrt(1.0 - n_y * n_y)
     for j in range(4):
@@ -153,7 +155,7 @@ def _to_tilts(state: EstimatorState, covariance: Matrix, rotated: Matrix) -> Non
 def _cause(
     state: EstimatorState, frame: FloatArray, height: FloatArray, reason: Invalid
 ) -> Invalid:
-    """Return what in the readings keeps a frame from being estimated; ``reason`` for nothing."""
+    """Return the fault in the readings that explains a failed estimate, or else ``reason``."""
     signal = state.signal
     level = max(ABOVE_NOISE * signal.noise, ABOVE_PEAK * signal.peak)
     above = pressed = full = 0
@@ -169,12 +171,12 @@ def _cause(
 
 @inner_kernel
 def _estimate(state: EstimatorState, model: Model, frame: FloatArray, cells: Cells) -> Invalid:
-    """Estimate a frame with a contact; returns why that can't be used."""
+    """Estimate a frame with a contact and return the reason for which it is invalid, if any."""
     estimate = state.estimate
     reason = _likelihood(state, model, frame, cells)
     fit = state.fit
     if state.options.is_solid and reason == Invalid.UNSETTLED:
-        # A contact of this tip settles within the data, and is explained at their end.
+        # A contact of this tip converges within the data or is explained at their limit.
         unexplained = fit.misfit > (1.0 - state.options.r_squared_min) * fit.readings
         reason = Invalid.MODEL if unexplained or not fit.limited else reason
     if reason == Invalid.NONE and not GAIN_MIN < estimate.gain < GAIN_MAX:
@@ -194,7 +196,7 @@ def _estimate(state: EstimatorState, model: Model, frame: FloatArray, cells: Cel
 
 @inner_kernel
 def _begin(state: EstimatorState, scale: float, step: float) -> None:
-    """Take the frame's unit and clear what the last one left but the contact."""
+    """Set the unit of the frame and clear the last results except the contact."""
     options = state.options
     signal = state.signal
     grid = state.grid
@@ -205,7 +207,7 @@ def _begin(state: EstimatorState, scale: float, step: float) -> None:
     signal.saturation = options.saturation * scale
     signal.floor = options.floor * scale if step > 0.0 or options.floor > 0.0 else -math.inf
     signal.patch_level = options.patch_level + (CLIPPED_MORE if step > 0.0 else 0.0)
-    # A contact no wider than a cell strains it by about pitch²/2a² at most; gains up to 3.
+    # A contact no wider than a cell strains it by at most about pitch²/2a²; allow gains up to 3.
     pitch = max(grid.pitch_x, grid.pitch_y)
     signal.confined = 6.0 * options.modulus * (pitch / grid.radius) ** 2 / scale
     estimate = state.estimate
@@ -242,11 +244,12 @@ def estimate_frame(
     law: FloatArray,
     sums: FloatArray,
 ) -> None:
-    """Estimate one frame into the state. The only compiled entry of the estimator.
+    """Estimate one frame and store the result in the state; the estimator's compiled entry point.
 
-    ``frame`` float64 [cells] in counts, ``scale`` Pa a count, ``step`` the width of a count's
-    quantum [Pa], 0 for none. ``rows`` are those of `state.Cells`; ``pixels`` and ``weights`` a
-    solid tip's `state.Images`; the rest are the `PointArrays` of springs.
+    ``frame`` is float64 [cells] in counts, ``scale`` is Pa per count, and ``step`` is the width of
+    the quantum [Pa] or 0. ``rows`` is the storage of `state.Cells`; ``pixels`` and ``weights`` are
+    the `state.Images` of a solid tip; the remaining arguments are the `PointArrays` of a spring
+    tip.
     """
     state = states[0]
     cells = cells_in(rows, state.grid)
@@ -258,8 +261,8 @@ def estimate_frame(
     rejected = without_outliers(state, frame, cells.height)
     unexplained = False
     if state.options.is_solid and signal.finite:
-        # Every contact shows the pattern. A strong signal without it is no contact of this tip; a
-        # small shift of all zeros is no signal.
+        # Every contact matches the pattern. A strong signal without it is not a contact of this
+        # tip, and a small shift of all zeros is not a signal.
         level = max(signal.mean, signal.peak - signal.mean)
         strong = signal.contact and level > STRONG * signal.noise
         signal.contact = shows_pattern(state, frame, cells)
@@ -283,7 +286,7 @@ def estimate_frame(
     if not signal.finite:
         reason = Invalid.NOT_FINITE
     elif not signal.mean > -3.0 * signal.noise:
-        # A baseline far below zero is a sensor to tare, not a tip in the air.
+        # A baseline far below zero means that the sensor needs a tare.
         reason = Invalid.BELOW_ZERO
     elif rejected == OUTLIERS_MAX:
         reason = Invalid.OUTLIERS

@@ -1,7 +1,7 @@
-"""Gauss-Newton on the likelihood of one pressure frame, as kernels.
+"""Gauss-Newton fit of a contact to one pressure frame, as kernels.
 
-Parameters are the gain, d, n_x, n_y and, of a solid tip, the shear along x and y on its face. Each
-step takes the forward model's pressures and partials, whichever the tip's law is.
+The parameters are the gain, d, n_x, n_y and, for solid tips, the shear on the face along x and y.
+Each step uses the pressures and partials of the forward model of the tip's law.
 """
 
 from __future__ import annotations
@@ -35,19 +35,20 @@ from softfinger.kinematics.sensing.footprint import FloatArray, set_face
 from softfinger.kinematics.sensing.solid_pressure import own_shear, press_solid
 from softfinger.kinematics.sensing.springs_pressure import press_springs
 
-# Of the covariance with the gain free, in (σ_d/d)²: measured over the envelope, where the errors'
-# square over what a straight model gives rises so.
+# For a free gain the covariance grows by this times (σ_d/d)². Measured on simulated frames over the
+# operating range, as the ratio of the squared errors to the linear prediction.
 _GAIN_CURVATURE = 6.0
 _HALVINGS_MAX = 5
-_LIMITED_MAX = 4  # steps that may end where the model does, one after the other
-# Least pivot of a scaled normal matrix: the smallest of 2 × 2 is its determinant over the product
-# of its diagonal, 1e-12 of which is rounding.
+_LIMITED_MAX = 4  # largest number of consecutive steps clamped to the limits of the model
+# Smallest pivot of a scaled normal matrix. For 2 × 2 it is the determinant over the product of the
+# diagonal, with a rounding error of 1e-12.
 _PIVOT_MIN = 1e-11
 
-# A cell that can't read below its floor (0, or the smallest count sent) reads more than the
-# pressure on average, by E[max(z + e, 0)] − z standard deviations at a pressure of z above it,
-# e ~ N(0, 1). Fitted as (1 − z/CLIP_END)² times this polynomial, within 3e-4. E[max(e − z, 0)] is
-# the same number. Cells more than CLIP_BELOW below the floor carry next to no information.
+# A cell that cannot read below its floor (0, or the smallest count sent) reads more than the
+# pressure on average. At a pressure z standard deviations above the floor, the excess in standard
+# deviations is E[max(z + e, 0)] − z = E[max(e − z, 0)] with e ~ N(0, 1). It is approximated by
+# (1 − z/CLIP_END)² times this polynomial, within 3e-4. Cells more than CLIP_BELOW below the floor
+# carry almost no information.
 CLIP_END = 3.5
 CLIP_BELOW = 2.0
 CLIP = (0.399207, -0.275277, 0.0188358, 0.0260713, -0.00538491)
@@ -55,7 +56,7 @@ CLIP = (0.399207, -0.275277, 0.0188358, 0.0260713, -0.00538491)
 
 @inner_kernel
 def parameters(options: Options) -> tuple[int, int]:
-    """Return the first parameter that is fitted, and the one behind the last."""
+    """Return the half-open range of the fitted parameters."""
     return GAIN if options.free_gain else DEPTH, PARAMETERS if options.is_solid else SHEAR_X
 
 
@@ -73,7 +74,7 @@ def _add_shear(images: Images, x: float, y: float, cells: Cells, image: int, cou
 
 @inner_kernel
 def press(state: EstimatorState, model: Model, cells: Cells) -> tuple[int, int]:
-    """Set the model's pressures and partials at the fit's contact; return the cells touched."""
+    """Evaluate the model at the fit's contact; return the range of cells touched."""
     fit = state.fit
     if state.options.is_solid:
         images = model.images
@@ -94,7 +95,7 @@ def press(state: EstimatorState, model: Model, cells: Cells) -> tuple[int, int]:
 
 @fast_inner_kernel
 def _energy_inside(frame: FloatArray, cells: Cells, first: int, last: int) -> tuple[float, float]:
-    """Return Σ p² and the number of cells that the model presses."""
+    """Return Σ p² and the number of cells over the cells pressed by the model."""
     energy = 0.0
     number = 0.0
     for k in range(first, last):
@@ -106,10 +107,11 @@ def _energy_inside(frame: FloatArray, cells: Cells, first: int, last: int) -> tu
 
 @inner_kernel
 def free_noise(square: float, floor: float) -> float:
-    """Return a cell's noise [Pa] from the mean ``square`` [Pa²] of cells that nothing presses.
+    """Return a cell's noise σ [Pa] from the mean ``square`` [Pa²] of unpressed cells.
 
-    They read it from ``floor`` [Pa] on and 0 below, so E[y²] = σ²(τ φ(τ) + Q(τ)) with τ = floor/σ:
-    half of the variance without a floor. Where none is above it the noise is below a third of it.
+    These cells read 0 below ``floor`` [Pa], so E[y²] = σ²(τ φ(τ) + Q(τ)) with τ = floor/σ. This is
+    half of the variance for a floor of 0. If no cell is above the floor, σ is less than a third of
+    it.
     """
     if not floor > 0.0:
         return math.sqrt(2.0 * square)
@@ -138,10 +140,9 @@ def energy_of(state: EstimatorState) -> float:
 def _clip_noise(
     state: EstimatorState, frame: FloatArray, cells: Cells, first: int, last: int
 ) -> float:
-    """Noise [Pa] of the cells that end at the floor, by those that nothing presses.
+    """Estimate the noise [Pa] of cells clipped at the floor from the unpressed cells.
 
-    These show how much of the noise there is; where a board sends none at all there is nothing to
-    correct.
+    A board that sends no noise needs no correction.
     """
     signal = state.signal
     inside, inside_number = _energy_inside(frame, cells, index(first), index(last))
@@ -155,11 +156,11 @@ def _clip_noise(
 
 @fast_inner_kernel
 def compare(state: EstimatorState, frame: FloatArray, cells: Cells, first: int, last: int) -> None:
-    """Compare the readings with the model: ``residual`` and ``factor``, and their sums.
+    """Compute ``residual`` and ``factor`` of each cell, and their sums, from readings and model.
 
-    A cell reads no less than 0, which solid rubber may pull, and no less than the floor. A full
-    cell counts only while the model stays below its end. With ``fit.clip`` > 0 noise ends at the
-    floor; without it a cell that the model puts below the floor doesn't count.
+    A cell cannot read below 0, even where solid rubber pulls, or below the floor. A saturated cell
+    counts only if the model is below saturation. With ``fit.clip`` > 0 the noise is clipped at the
+    floor. Otherwise cells with a model below the floor do not count.
     """
     fit = state.fit
     saturation = state.signal.saturation
@@ -168,7 +169,7 @@ def compare(state: EstimatorState, frame: FloatArray, cells: Cells, first: int, 
     clip = fit.clip
     clipped = clip > 0.0
     per_clip = 1.0 / clip if clipped else 0.0
-    # Where the floor is none it is far below every reading.
+    # Without a floor, ``floor`` is far below every reading.
     lower = floor - CLIP_BELOW * clip
     misfit = readings = weight = 0.0
     for k in range(first, last):
@@ -179,7 +180,7 @@ def compare(state: EstimatorState, frame: FloatArray, cells: Cells, first: int, 
         reading = max(raw, floor)
         residual = reading - pressure
         if clipped:
-            # As much below the floor as above it, a cell reads as much more than the larger.
+            # The excess over max(pressure, floor) is symmetric about the floor.
             depth = (pressure - floor) * per_clip
             z = min(abs(depth), CLIP_END)
             above = 1.0 - z * (1.0 / CLIP_END)
@@ -203,7 +204,7 @@ def compare(state: EstimatorState, frame: FloatArray, cells: Cells, first: int, 
 
 @fast_inner_kernel
 def _accumulate(fit: Fit, cells: Cells, first: int, last: int) -> None:
-    """Sum JᵀJ and Jᵀr over the cells, of the gain, d and the tilts."""
+    """Sum JᵀJ and Jᵀr over the cells for the gain, d and the tilts."""
     gain = fit.gain
     s00 = s01 = s02 = s03 = s11 = s12 = s13 = s22 = s23 = s33 = 0.0
     r0 = r1 = r2 = r3 = 0.0
@@ -240,7 +241,7 @@ def _accumulate(fit: Fit, cells: Cells, first: int, last: int) -> None:
 def _accumulate_shear(
     fit: Fit, images: Images, cells: Cells, row: int, first: int, second: int
 ) -> None:
-    """Sum the products of one of shear's images, which starts at ``first``."""
+    """Sum the products of one shear image, which starts at ``first``."""
     t0 = t1 = t2 = t3 = own = other = right = 0.0
     for k in range(index(0), index(cells.factor.shape[0])):
         factor = cells.factor[k]
@@ -263,9 +264,9 @@ def _accumulate_shear(
 
 @inner_kernel
 def linearise(state: EstimatorState, model: Model, frame: FloatArray, cells: Cells) -> float:
-    """Sum the normal equations at the fit's contact; return the cost [Pa²], less the readings'.
+    """Set up the normal equations at the fit's contact; return the cost [Pa²] less Σ reading².
 
-    Shear counts by its prior, too: what it may be is a fraction of the normal force.
+    The shear has a prior with a standard deviation proportional to the normal force.
     """
     fit = state.fit
     images = model.images
@@ -293,10 +294,10 @@ def linearise(state: EstimatorState, model: Model, frame: FloatArray, cells: Cel
 
 @inner_kernel
 def solve(fit: Fit, first: int, last: int) -> bool:
-    """Solve the normal equations of the parameters first … last: step, inverse and decrement.
+    """Solve the normal equations of the parameters first to last for step, inverse and decrement.
 
-    False where a pivot of the scaled matrix is too small: the frame doesn't determine every
-    parameter.
+    Returns False if a pivot of the scaled matrix is too small, that is, if the frame does not
+    determine every parameter.
     """
     normal = fit.normal
     lower = fit.lower
@@ -305,7 +306,7 @@ def solve(fit: Fit, first: int, last: int) -> bool:
         if not normal[i, i] > 0.0:
             return False
         scale[i] = 1.0 / math.sqrt(normal[i, i])
-    # Cholesky, and the factor's inverse in its place.
+    # Cholesky factorisation, with the inverse of the factor stored in place.
     for j in range(first, last):
         pivot = 1.0
         for k in range(first, j):
@@ -341,7 +342,7 @@ def solve(fit: Fit, first: int, last: int) -> bool:
 
 @inner_kernel
 def _apply_step(state: EstimatorState) -> bool:
-    """Go on by the step, kept within what the model holds; False if it was kept."""
+    """Apply the step, clamped to the limits of the model; return False if it was clamped."""
     fit = state.fit
     options = state.options
     shallow = fit.d
@@ -363,7 +364,7 @@ def _apply_step(state: EstimatorState) -> bool:
 
 @inner_kernel
 def set_covariance(inverse: Normal, variance: float, out: Matrix) -> None:
-    """Take the covariance of (d, n_x, n_y, gain) from that of the fit's parameters."""
+    """Set the covariance of (d, n_x, n_y, gain) from that of the fit's parameters."""
     for i in range(4):
         for j in range(4):
             out[(i + 3) % 4, (j + 3) % 4] = variance * inverse[i, j]
@@ -371,10 +372,11 @@ def set_covariance(inverse: Normal, variance: float, out: Matrix) -> None:
 
 @inner_kernel
 def _check_fit(state: EstimatorState, model: Model, cells: Cells) -> float:
-    """Compute χ² of the solved fit, and the covariance by shared errors and by a smooth misfit.
+    """Compute χ² of the solved fit, and the covariance due to common errors and a smooth misfit.
 
-    The noise's variance [Pa²] is returned, widened by a misfit beyond its own scatter; after that
-    ``fit.inverse`` is times it the covariance under the noise. Negative with too few cells.
+    Returns the variance of the noise [Pa²], widened if the misfit exceeds its scatter, or a
+    negative number if there are too few cells. The returned variance times ``fit.inverse`` is the
+    covariance due to noise.
     """
     fit = state.fit
     estimate = state.estimate
@@ -407,7 +409,7 @@ def _check_fit(state: EstimatorState, model: Model, cells: Cells) -> float:
 
 @inner_kernel
 def _finish(state: EstimatorState, model: Model, cells: Cells, iterations: int) -> bool:
-    """The estimate and its covariance at the fit's end; whether there are cells enough."""
+    """Set the estimate and its covariance after the fit; return False with too few cells."""
     fit = state.fit
     estimate = state.estimate
     options = state.options
@@ -421,7 +423,7 @@ def _finish(state: EstimatorState, model: Model, cells: Cells, iterations: int) 
         y = fit.shear[1] + own * fit.n_y
         estimate.shear_x = along * x - across * y
         estimate.shear_y = across * x + along * y
-    # Noise's own share beyond the model's ends is none of the contact.
+    # Noise may carry the fit beyond the limits of the model; clamp the result.
     within = min(1.0, options.sine_max / max(math.sqrt(square), 1e-9))
     estimate.d = min(fit.d, options.deepest)
     estimate.n_x = within * fit.n_x
@@ -432,7 +434,7 @@ def _finish(state: EstimatorState, model: Model, cells: Cells, iterations: int) 
     variance = _check_fit(state, model, cells)
     wider = 1.0
     if options.free_gain:
-        # The more d is uncertain, the less straight it is in the gain.
+        # The more uncertain d is, the less linear is its dependence on the gain.
         uncertain = variance * fit.inverse[DEPTH, DEPTH] + state.budget.shared[DEPTH, DEPTH]
         wider += _GAIN_CURVATURE * min(uncertain / (fit.d * fit.d), 1.0)
     set_covariance(fit.inverse, wider * variance, fit.covariance)
@@ -444,11 +446,12 @@ def _finish(state: EstimatorState, model: Model, cells: Cells, iterations: int) 
 def fit(
     state: EstimatorState, model: Model, frame: FloatArray, cells: Cells, tolerance: float
 ) -> bool:
-    """Run Gauss-Newton from the contact in ``state.estimate`` and leave the new estimate there.
+    """Run Gauss-Newton from the contact in ``state.estimate`` and store the new estimate there.
 
-    Stops when the promised decrement is below ``tolerance`` · variance, that is the step is that
-    part of the noise floor, squared. False when the frame doesn't determine the contact, the
-    iteration doesn't settle, or the contact is beyond what the model holds.
+    The iteration stops if the predicted decrement is below ``tolerance`` · variance, where
+    ``tolerance`` is the squared ratio of the step to the noise floor. Returns False if the frame
+    does not determine the contact, the iteration does not converge, or the contact is beyond the
+    limits of the model.
     """
     fit = state.fit
     estimate = state.estimate
@@ -467,7 +470,7 @@ def fit(
     for iteration in range(state.options.iterations):
         cost = linearise(state, model, frame, cells)
         if solved and not cost <= before + variance and halvings < _HALVINGS_MAX:
-            # Too far: half way back.
+            # The cost increased: halve the step.
             fit.d = 0.5 * (fit.d + d)
             fit.n_x = 0.5 * (fit.n_x + n_x)
             fit.n_y = 0.5 * (fit.n_y + n_y)

@@ -1,4 +1,4 @@
-"""Reasons for which an estimate is not valid, from the cells' readings to the daemon's frames."""
+"""Reasons for invalid contact estimates."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ from enum import IntEnum
 
 
 class Invalid(IntEnum):
-    """Why an estimate is not valid; ``NONE`` for one that is. Its ``text`` is what people read.
+    """Reason for which an estimate is invalid, or ``NONE`` if it is valid.
 
-    The first that applies, a cause in the readings before what the fit makes of it.
+    ``text`` is the message for users. If several reasons apply, the first one is used: a fault in
+    the readings comes before its effect on the fit.
     """
 
     text: str
@@ -30,7 +31,7 @@ class Invalid(IntEnum):
     MODEL = 8, "not this tip"
     BEYOND = 9, "deeper or steeper than the model holds"
     UNCERTAIN = 10, "too uncertain: press more, or calibrate"
-    # Of the daemon, which carries estimates on from frame to frame.
+    # Set by the daemon, which tracks estimates over time.
     NO_FRAME = 11, "no frame yet"
     FRAME = 12, "the board is gone, or its frames repeat"
     STALE = 13, "no valid frame for too long"

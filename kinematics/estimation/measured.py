@@ -1,6 +1,7 @@
-"""Frame → contact by a measured law: force from the sum, tilt from the centroid, d from the force.
+"""Estimate a contact from a measured tip law.
 
-Needs no model of the pressure under the tip, and takes a tenth of a millisecond.
+The force follows from the sum of the frame, the tilt from its centroid, and d from the force. The
+method needs no model of the pressure distribution and takes about 0.1 ms.
 """
 
 from __future__ import annotations
@@ -20,11 +21,11 @@ from softfinger.kinematics.estimation.invalid import Invalid
 from softfinger.kinematics.sensing.footprint import FloatArray
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
-_TOUCHED = 5.0  # standard deviations of the sum, from which something touches
-_BEYOND = 1.02  # of the measured depth and tilt, to which the curves are followed
-_EXTENT = 0.08  # relative, by which a contact's extent may be off what its force says
-_TURNS = 20  # of the iteration between d and θ
-_NEAR = 1e-7  # of its range, where it ends
+_TOUCHED = 5.0  # contact threshold of the sum, in standard deviations
+_BEYOND = 1.02  # extrapolation limit of the curves over the measured depth and tilt
+_EXTENT = 0.08  # largest relative difference between measured and expected extent
+_TURNS = 20  # largest number of iterations between d and θ
+_NEAR = 1e-7  # convergence tolerance over the range
 
 
 def sum_weights(
@@ -32,9 +33,10 @@ def sum_weights(
     radius: float,
     active: NDArray[np.bool_],
 ) -> FloatArray:
-    """Return the weights of a frame's sums [4, cells]: area, area times x, y and r².
+    """Return the weights of a frame's sums [4, cells]: area, and area times x, y and r².
 
-    Over the ``active`` cells under the tip; x and y are along the finger's axes.
+    The weights are zero except for ``active`` cells under the tip. x and y are in the finger's
+    axes.
     """
     x, y = (
         pitch * (np.arange(count) - 0.5 * (count - 1)) - at
@@ -48,7 +50,7 @@ def sum_weights(
 
 
 def _curve(curve: Curve, t: float, q: float) -> tuple[float, float, float]:
-    """A curve's value and partials by t and q."""
+    """Return the value of a curve and its partials by t and q."""
     value = by_t = by_q = 0.0
     for a, b, c in reversed(curve):
         by_t = by_t * t + value
@@ -58,18 +60,34 @@ def _curve(curve: Curve, t: float, q: float) -> tuple[float, float, float]:
 
 
 class MeasuredEstimator:
-    """`ContactEstimator` for a tip whose ``physics`` is "measured". Each frame stands alone.
+    """Contact estimator for a tip whose ``physics`` is "measured"; frames are independent.
 
-    ``grid`` has the tip where the law found it. ``active`` [rows, cols] bool masks dead cells;
-    ``known`` are the sensor's other uncertainties: baseline, slope, and gain, centre and rotation
-    since the curves were measured. An estimate is ``valid`` where the curves were
-    measured, and where the frame's extent is within 8 % of what its force says. Raises ValueError
-    for arguments out of their range.
+    Parameters
+    ----------
+    tip
+        The measured tip.
+    grid
+        The sensor, with the position of the tip from its law.
+    active
+        Mask of working cells, bool [rows, cols]; all cells if None.
+    known
+        Uncertainties of the sensor: baseline and slope, and the changes of gain, centre and
+        rotation since the curves were measured.
+
+    Raises
+    ------
+    ValueError
+        If an argument is out of range.
+
+    Notes
+    -----
+    An estimate is ``valid`` within the measured range of the curves if the extent of the frame is
+    within 8 % of the value expected from its force.
     """
 
-    saturation: float | None = None  # a full cell counts as it reads
+    saturation: float | None = None  # saturated cells count as they read
 
-    noise = 0.0  # of a cell [Pa]: this one goes by what its tip's curves have measured
+    noise = 0.0  # unused here: the curves contain the measured noise
 
     def __init__(
         self,
@@ -89,17 +107,17 @@ class MeasuredEstimator:
         self._weights = sum_weights(grid, tip.radius, alive)
         self._under = self._weights[0] > 0.0
         self._rest, self._noise = np.array(law.rest), np.array(law.noise)
-        # The sums of all cells' common error, and the moment of a slope of their zeros [N·m].
+        # Sums due to a common shift of all cells, and the moment due to a slope of the zeros [N·m].
         self._shift = known.baseline * self._weights.sum(axis=1)
         self._zero_moment = known.slope / tip.radius * 0.5 * self._weights[3].sum()
         self._felt = _TOUCHED * math.hypot(math.sqrt(self._noise[0, 0]), self._shift[0])
-        # What could hide: the d whose force is only just felt.
+        # Largest undetected d: its force is at the contact threshold.
         self._hidden = tip.radius * self._root_of(self._felt, 0.0, self._root) ** 2
         self._seq: int | None = None
         self._last = ContactEstimate()
 
     def __call__(self, frame: NDArray[Any], pascal_per_count: float = 1.0) -> ContactEstimate:
-        """A new result; frames as for :meth:`update`."""
+        """Estimate the contact and return a new result; the arguments are those of `update`."""
         before, self._last = self._last, ContactEstimate()
         try:
             return self.update(frame, pascal_per_count)
@@ -109,9 +127,10 @@ class MeasuredEstimator:
     def update(
         self, frame: NDArray[Any], pascal_per_count: float = 1.0, seq: int | None = None
     ) -> ContactEstimate:
-        """Return the one result object, from a frame [rows, cols] of any number type.
+        """Estimate the contact from a frame [rows, cols] of any numeric type.
 
-        Its values times ``pascal_per_count`` are Pa. Raises ValueError for another shape.
+        ``pascal_per_count`` converts readings to Pa. The same result object is returned by each
+        call. Raises ValueError for a wrong shape.
         """
         result = self._last
         if seq is not None and seq == self._seq:
@@ -128,7 +147,7 @@ class MeasuredEstimator:
         result.invalid = Invalid.NONE if finite else Invalid.NOT_FINITE
         if result.contact:
             result.invalid = self._contact(sums, result)
-            # About all cells read as they do where nothing was tared.
+            # If nearly all cells read high, the sensor has not been tared.
             above = np.count_nonzero(readings > ABOVE_PEAK * result.peak)
             if result.invalid and above > ABOVE_MOST * readings.size:
                 result.invalid = Invalid.ABOVE_ZERO
@@ -138,11 +157,11 @@ class MeasuredEstimator:
         return result
 
     def reset(self) -> None:
-        """Forget the last frame's number."""
+        """Forget the sequence number of the last frame."""
         self._seq = None
 
     def _root_of(self, force: float, q: float, t: float) -> float:
-        """t at which ``shown``, which rises, is ``force``: Newton's iteration from ``t``."""
+        """Solve ``shown`` = ``force`` for t by Newton's method from ``t``; ``shown`` increases."""
         for _ in range(24):
             value, by_t, _ = _curve(self._law.shown, t, q)
             before = t
@@ -152,7 +171,7 @@ class MeasuredEstimator:
         return t
 
     def _contact(self, sums: FloatArray, result: ContactEstimate) -> Invalid:
-        """Set the contact that the sums say; check that the curves hold and its extent agrees."""
+        """Set the contact from the sums; check its extent and that it is within the curves."""
         force, along, across, square = sums.tolist()
         moment = math.hypot(along, across)
         s_max = _BEYOND * self._slope
@@ -179,7 +198,7 @@ class MeasuredEstimator:
         for found, out in zip(covariances, (result.covariance, result.systematic), strict=True):
             out[:3, :3] = found * np.outer(per_tilt, per_tilt)
         extent = force * _curve(self._law.extent, t, s * s)[0]
-        # The sums' r² is 0.08 of itself off, or by its noise, where something else presses.
+        # A second contact changes the mean squared radius by more than 8 % and its noise.
         agrees = abs(square - extent) < _EXTENT * extent + _TOUCHED * math.sqrt(self._noise[3, 3])
         if not (t < _BEYOND * self._root * (1.0 - 1e-9) and target < s_max + 3.0 * std):
             return Invalid.BEYOND
@@ -188,18 +207,20 @@ class MeasuredEstimator:
     def _covariances(
         self, t: float, s: float, c_x: float, c_y: float
     ) -> tuple[float, tuple[FloatArray, FloatArray]]:
-        """Return sin θ's standard deviation by the sums alone; covariances of (d, n_x, n_y).
+        """Return sin θ's standard deviation due to the sums, and two covariances of (d, n_x, n_y).
 
-        Of all errors, and of those that all frames share. In axes along the tilt and across: the
-        sum's errors and both moments', through the partials. A tilt that the centroid hardly shows
-        is more likely one of those that were measured, some ``slope``: it is drawn to 0 as a Kalman
-        filter would, which all frames share.
+        The covariances are those of all errors and of the errors common to all frames. The errors
+        of the sum and of both moments are propagated through the partials, in axes along and across
+        the tilt. If the centroid hardly determines the tilt, the tilts of the calibration presses
+        (``slope``) serve as a prior. Like a Kalman update, the prior draws the tilt towards 0; this
+        error is common to all frames.
         """
         law, known, q = self._law, self._known, s * s
         shown, shown_t, shown_q = _curve(law.shown, t, q)
         lever, lever_t, lever_q = _curve(law.lever, t, q)
         per_d = 1.0 / (2.0 * law.radius * t)  # dt/dd
-        # Partials of (sum, moment along) by (d, s); of the moment across by the turn across.
+        # Partials of (sum, moment along the tilt) by (d, s), and of the moment across by the tilt
+        # across.
         by_d = shown_t * per_d, s * (shown_t * per_d * lever + shown * lever_t * per_d)
         b = 2.0 * s * shown_q
         by_s = b, shown * lever + s * (b * lever + shown * 2.0 * s * lever_q)

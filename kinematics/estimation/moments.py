@@ -1,7 +1,7 @@
-"""First estimate of a contact from a pressure grid's sum, centroid and extent, as kernels.
+"""Initial estimate of a contact from the sum, centroid and extent of a frame, as kernels.
 
-The model's own moments, tabulated over d, are compared with those of the pressure over the
-footprint: the force or the extent gives d, the centroid the tilt.
+The moments of the pressure over the footprint are compared with those of the model, which are
+tabulated over d. The force or the extent gives d, and the centroid gives the tilt.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from softfinger.kinematics.estimation.state import START_POINTS, Cells, Estimato
 from softfinger.kinematics.sensing.footprint import FloatArray, Grid, set_around, set_face
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
-# How much wider than the footprint the cells' centres are looked for, in a cell's diagonals: so all
-# that touch it are in, even where the contact moved a little.
+# Margin around the footprint for cell centres, in cell diagonals. It includes all cells that touch
+# the footprint, even if the contact has moved slightly.
 _MARGIN = 0.75
-_BLUR_MARGIN = 2.0  # and in standard deviations of the blur
-_TILT = 0.2  # rad at which the lever is taken; it hardly depends on it
-_WEAK = 15.0  # noise: a largest cell below is looked for together with its neighbours
+_BLUR_MARGIN = 2.0  # additional margin, in standard deviations of the blur
+_TILT = 0.2  # rad, tilt at which the lever is computed; it hardly depends on the tilt
+_WEAK = 15.0  # peak in noise standard deviations, below which neighbourhoods are used
 _SINE_MAX = 0.95
 _ANY = -1e300  # a level below every reading
 
@@ -32,7 +32,7 @@ _ANY = -1e300  # a level below every reading
 def set_start(
     m: Moments, grid: SensorGrid, tip: Fingertip, material: Material, deepest: float
 ) -> None:
-    """Tabulate the model's moments over d up to ``deepest`` [m]."""
+    """Tabulate the moments of the model over d up to ``deepest`` [m]."""
     cells = grid.on(tip)
     x = (cells.x + cells.pitch_x * (np.arange(cells.cols) + 0.5))[None, :]
     y = (cells.y + cells.pitch_y * (np.arange(cells.rows) + 0.5))[:, None]
@@ -52,14 +52,14 @@ def set_start(
 
 @inner_kernel
 def _at(values: FloatArray, t: float) -> float:
-    """A table's value at the place t."""
+    """Interpolate a table at the position t."""
     k = min(int(t), START_POINTS - 2)
     return float(values[k] + (t - k) * (values[k + 1] - values[k]))
 
 
 @inner_kernel
 def _place_of(values: FloatArray, value: float) -> float:
-    """The place at which a rising table has a value; its ends beyond."""
+    """Return the position at which an increasing table has ``value``, clamped to its ends."""
     for k in range(START_POINTS - 1):
         if value < values[k + 1]:
             rise = values[k + 1] - values[k]
@@ -69,12 +69,12 @@ def _place_of(values: FloatArray, value: float) -> float:
 
 @inner_kernel
 def start(state: EstimatorState, frame: FloatArray, cells: Cells) -> None:
-    """Estimate from the frame alone: its strongest cells, then twice their moments."""
+    """Estimate from the frame alone: from its strongest cells, then twice from moments."""
     m = state.moments
     signal = state.signal
     estimate = state.estimate
     if state.options.is_solid:
-        # All of its base is pressed, and its extent hardly depends on d.
+        # A solid tip presses its whole base, and its extent hardly depends on d.
         sums_above(m, frame, cells, _ANY)
         m.gain = 1.0
         if m.total > 0.0:
@@ -90,7 +90,7 @@ def start(state: EstimatorState, frame: FloatArray, cells: Cells) -> None:
         if not m.total > 0.0:
             at = signal.row * state.grid.cols + signal.col
             m.total, m.x, m.y, m.number = 1.0, cells.x[at], cells.y[at], 1.0
-        # Of a weak contact's cells about three quarters pass.
+        # About three quarters of a weak contact's cells exceed the level.
         _set_from_area(m, state.grid, 1.3 * m.number if weak else m.number)
         _refine(state, frame, cells)
         _refine(state, frame, cells)
@@ -103,10 +103,10 @@ def start(state: EstimatorState, frame: FloatArray, cells: Cells) -> None:
 
 @inner_kernel
 def _sums_of_weak(state: EstimatorState, frame: FloatArray, cells: Cells) -> None:
-    """Sum as :func:`sums_above` does, over weak pressures of a few times the noise.
+    """Compute the sums of :func:`sums_above` for pressures of a few times the noise.
 
-    Lone cells mislead there: the sums are over cells of twice the noise whose neighbourhood stands
-    out as a contact's.
+    Single noisy cells would distort these sums. Only cells of at least twice the noise whose
+    neighbourhood is significant count.
     """
     m = state.moments
     level = 2.0 * state.signal.noise
@@ -129,9 +129,9 @@ def _sums_of_weak(state: EstimatorState, frame: FloatArray, cells: Cells) -> Non
 
 @inner_kernel
 def _set_from_area(m: Moments, grid: Grid, number: float) -> None:
-    """(d, n_x, n_y) of a contact of ``number`` cells about the centroid of the sums."""
+    """Set (d, n_x, n_y) of a contact of ``number`` cells around the centroid of the sums."""
     a = grid.radius
-    # The footprint's area is π ρ² cos θ with ρ² = 2 a d − d².
+    # The area of the footprint is π ρ² cos θ with ρ² = 2 a d − d².
     rho2 = min(number * grid.pitch_x * grid.pitch_y / math.pi, 0.75 * a * a)
     m.d = max(a - math.sqrt(a * a - rho2), 1e-3 * a)
     distance = m.total * (a - m.d / 3.0)
@@ -140,7 +140,7 @@ def _set_from_area(m: Moments, grid: Grid, number: float) -> None:
 
 @inner_kernel
 def _set_normal(m: Moments, n_x: float, n_y: float) -> None:
-    """Take (n_x, n_y), shortened where they make no normal."""
+    """Set (n_x, n_y), shortened if it is too long for a unit normal."""
     shorter = min(1.0, _SINE_MAX / max(math.hypot(n_x, n_y), 1e-9))
     m.n_x = shorter * n_x
     m.n_y = shorter * n_y
@@ -148,7 +148,7 @@ def _set_normal(m: Moments, n_x: float, n_y: float) -> None:
 
 @inner_kernel
 def _refine(state: EstimatorState, frame: FloatArray, cells: Cells) -> None:
-    """Refine the contact in ``state.moments`` by the moments over its footprint, a cell wider."""
+    """Refine the contact in ``state.moments`` from the moments over its widened footprint."""
     m = state.moments
     grid = state.grid
     face = state.around
@@ -167,7 +167,10 @@ def _refine(state: EstimatorState, frame: FloatArray, cells: Cells) -> None:
 
 @inner_kernel
 def _set_contact(state: EstimatorState, by_extent: bool) -> None:
-    """Set the contact from the moments: d from the extent, and the gain from the force; or d."""
+    """Set the contact from the moments.
+
+    With ``by_extent`` the extent gives d and the force gives the gain; otherwise the force gives d.
+    """
     m = state.moments
     force = m.total * state.signal.scale
     t = _place_of(m.extent, m.trace) if by_extent else _place_of(m.force, force)

@@ -1,4 +1,4 @@
-"""The estimator's memory, with names: options, one frame, estimate, a step of the fit, cells."""
+"""Record types of the estimator's state: options, frame, estimate, fit and cells."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from softfinger.kinematics.sensing.footprint import Face, FloatArray, Grid, IntA
 from softfinger.kinematics.sensing.solid_pressure import Weights
 from softfinger.kinematics.sensing.springs_pressure import SpringPoints
 
-OUTLIERS_MAX = 6  # left out of one frame
-# Parameters of the fit; shear, the last two, is a solid tip's alone.
+OUTLIERS_MAX = 6  # largest number of outliers excluded from a frame
+# Parameters of the fit; only solid tips have the last two.
 GAIN, DEPTH, TILT_X, TILT_Y, SHEAR_X, SHEAR_Y = range(6)
 PARAMETERS = 6
-START_POINTS = 17  # depths of the table from which a fit starts
-DEPTHS = 12  # at which the effect of correlated noise is tabulated
-# Patterns of shared errors: a shift of all cells, its slopes in x and y, the tip's place in x and
-# y, the pitch, and the pressure itself.
+START_POINTS = 17  # depths in the table for the initial estimate
+DEPTHS = 12  # depths in the table of the effect of correlated noise
+# Patterns of common errors: a shift of all cells, its slopes in x and y, the tip's position in x
+# and y, the pitch, and the pressure itself.
 SHIFT, SLOPE_X, SLOPE_Y, PLACE_X, PLACE_Y, SCALING, PRESSURE = range(7)
 SOURCES = 7
 
@@ -28,41 +28,41 @@ Depths: TypeAlias = Annotated[FloatArray, START_POINTS]
 
 
 class Options(Record):
-    """Constants of one estimator; see `ContactEstimator`."""
+    """Options of an estimator; see `ContactEstimator`."""
 
-    noise: float  # of a cell [Pa]
-    undetected: float  # d [m] of a contact that is only just felt
+    noise: float  # standard deviation of a cell [Pa]
+    undetected: float  # d of the smallest detectable contact [m]
     saturation: float  # [counts]
-    floor: float  # least count sent, less a half
+    floor: float  # smallest count sent, less a half
     tolerance: float
     peak_level: float  # [noise]
     patch_level: float
     r_squared_min: float
-    modulus: float  # at no strain [Pa]
+    modulus: float  # at zero strain [Pa]
     blur: float  # standard deviation [m]
     rotation: float  # of the sensor [rad]
     iterations: int
     free_gain: bool
     is_solid: bool
-    deepest: float  # d that the model holds [m]
-    sine_max: float  # sin of the tilt that it holds
-    step_deepest: float  # d and sin of the tilt that a step may go to
+    deepest: float  # largest d of the model [m]
+    sine_max: float  # largest sin of the tilt of the model
+    step_deepest: float  # limits of d [m] and sin of the tilt for a step
     step_sine: float
-    shear_prior: float  # standard deviation of shear over the normal force
+    shear_prior: float  # standard deviation of the shear over the normal force
 
 
 class Signal(Record):
-    """One frame: its unit, noise and limits, and what the activity test finds."""
+    """One frame: its unit, noise and limits, and the result of the activity test."""
 
-    scale: float  # Pa a count
-    variance: float  # of a cell [Pa²]
-    noise: float  # of a cell [counts]
-    confined: float  # upper limit of a contact as wide as a cell [counts]
+    scale: float  # Pa per count
+    variance: float  # noise of a cell [Pa²]
+    noise: float  # standard deviation of a cell [counts]
+    confined: float  # largest reading of a contact as wide as a cell [counts]
     patch_level: float
     saturation: float  # [Pa]
     floor: float  # [Pa]; −inf for none
-    number: int  # cells that a contact can press
-    peak: float  # largest cell [counts], and its indices, −1 for none above the level
+    number: int  # number of cells that a contact can press
+    peak: float  # largest cell [counts]; its indices are −1 if it is below the level
     row: int
     col: int
     mean: float  # [counts]
@@ -73,7 +73,7 @@ class Signal(Record):
 
 
 class Estimate(Record):
-    """Estimate of one frame and start of the next: in the sensor's axes, then the finger's."""
+    """Estimate of one frame and start of the next, in the sensor's and then the finger's axes."""
 
     d: float
     gain: float
@@ -89,20 +89,20 @@ class Estimate(Record):
     invalid: int  # an `Invalid`
     second: bool
     warm: bool
-    shear_x: float  # force on the face [N], of a solid tip
+    shear_x: float  # force on the face [N], for solid tips
     shear_y: float
     n_x: float
     n_y: float
-    shear: Pair  # of the model, over the radius squared [Pa]
+    shear: Pair  # in the model, over the radius squared [Pa]
     residual: float  # Σ over the footprint of (reading − model)² − reading² [Pa²]
-    undetected: float  # what a smooth misfit may hide of d, over d
-    shared: float  # standard deviation of d by the known uncertainties, over d
+    undetected: float  # relative error of d that a smooth misfit may cause
+    shared: float  # relative standard deviation of d due to the known uncertainties
     covariance: Matrix  # of (d, tilt_x, tilt_y, gain)
-    systematic: Matrix  # the part of it that all frames share
+    systematic: Matrix  # the part common to all frames
 
 
 class Moments(Record):
-    """Sums over the footprint, and the contact that they make."""
+    """Sums over the footprint, and the contact estimated from them."""
 
     total: float  # Σ p
     x: float  # centroid
@@ -113,14 +113,14 @@ class Moments(Record):
     n_x: float
     n_y: float
     gain: float
-    # Of the model, over the depths deepest · (k/(START_POINTS − 1))²:
+    # Moments of the model at the depths deepest · (k/(START_POINTS − 1))²:
     force: Depths  # Σ p, upright [Pa]
     extent: Depths  # trace of the pressure's covariance, upright [m²]
     lever: Depths  # centroid over sin of the tilt [m]
 
 
 class Fit(Record):
-    """Gauss-Newton at one contact and gain."""
+    """Gauss-Newton step at one contact and gain."""
 
     face: Face
     gain: float
@@ -128,14 +128,14 @@ class Fit(Record):
     n_x: float
     n_y: float
     shear: Pair
-    first_row: int  # of cells that the model presses
+    first_row: int  # range of cells pressed by the model
     last_row: int
-    clip: float  # noise of cells that end at the floor [Pa]; 0 where none do
-    decrement: float  # fall of the sum of squares that the step promises
+    clip: float  # noise of cells clipped at the floor [Pa]; 0 without clipping
+    decrement: float  # predicted decrease of the sum of squares
     misfit: float  # Σ (reading − model)²
     readings: float  # Σ reading²
-    weight: float  # cells that count
-    limited: bool  # the last step ended where the model does
+    weight: float  # number of cells that count
+    limited: bool  # the last step was clamped to the limits of the model
     normal: Normal  # JᵀJ
     right: Column  # Jᵀr
     step: Column
@@ -146,45 +146,45 @@ class Fit(Record):
 
 
 class Budget(Record):
-    """Errors beside single cells' noise, see `error_budget`, and scratch for them."""
+    """Errors other than white cell noise, and scratch arrays for them; see `error_budget`."""
 
     sizes: Annotated[FloatArray, SOURCES]  # standard deviations of the patterns' factors
     baseline: float  # standard deviation of a shift of all cells [Pa]
-    slope: float  # of the zero, at the radius [Pa]
-    smooth: float  # of pressure, relative
+    slope: float  # standard deviation of a slope of the zeros, at the rim [Pa]
+    smooth: float  # relative pressure error
     rotation: float  # of the sensor [rad]
-    lean: float  # of a solid tip's tilt, relative, over d/a
+    lean: float  # relative tilt error of a solid tip over d/a
     along: float  # correlation of neighbours in a row
-    cells_per_sample: float  # Σρ²: cells for each that is independent
-    systematic: bool  # any of those but the correlation
+    cells_per_sample: float  # Σρ², cells per independent noise sample
+    systematic: bool  # True if any error other than the correlation is set
     correlated: bool
-    widening: Annotated[FloatArray, DEPTHS, 5]  # standard deviations' factors; lost cells
+    widening: Annotated[FloatArray, DEPTHS, 5]  # factors of the standard deviations, used-up cells
     responses: Annotated[FloatArray, PARAMETERS, SOURCES]  # Jᵀq
     squares: Annotated[FloatArray, SOURCES]  # qᵀq
     displacement: Column
-    shared: Normal  # covariance by what all frames share
+    shared: Normal  # covariance due to common errors
     covariance: Matrix  # the same of (d, n_x, n_y, gain)
 
 
 class EstimatorState(Record):
-    """All of it, but the arrays."""
+    """Complete state of an estimator except its cell arrays."""
 
     options: Options
-    grid: Grid  # the part of the sensor's that a contact can press
+    grid: Grid  # the part of the sensor that a contact can press
     signal: Signal
     estimate: Estimate
     moments: Moments
     fit: Fit
     budget: Budget
-    around: Face  # a little beyond the footprint
+    around: Face  # widened footprint
     outliers: Annotated[IntArray, OUTLIERS_MAX]  # cells
 
 
 class Cells(NamedTuple):
-    """Arrays of the cells of `EstimatorState.grid`, one after the other, float64 [cells].
+    """Arrays over the cells of `EstimatorState.grid`, float64 [cells].
 
-    ``planes`` [4, rows, cols] are ``stress`` to ``by_y`` in one: the model's pressure at a gain of
-    1, and its partials.
+    ``planes`` [4, rows, cols] holds ``stress`` to ``by_y`` in one array: the modelled pressure at a
+    gain of 1 and its partials.
     """
 
     planes: FloatArray
@@ -192,22 +192,22 @@ class Cells(NamedTuple):
     by_d: FloatArray
     by_x: FloatArray
     by_y: FloatArray
-    height: FloatArray  # √(a² − x² − y²) [m], see `cell_centres`; below 0 for a cell not to be used
-    x: FloatArray  # of the centre [m]
+    height: FloatArray  # √(a² − x² − y²) [m], see `cell_centres`; negative for unused cells
+    x: FloatArray  # centre of the cell [m]
     y: FloatArray
-    pattern: FloatArray  # by which a solid tip's contact is noticed
-    model: FloatArray  # pressure [Pa], gain and shear in it
+    pattern: FloatArray  # for the detection of a solid tip's contact
+    model: FloatArray  # pressure [Pa] with gain and shear
     residual: FloatArray  # reading − model [Pa], 0 for cells that do not count
-    factor: FloatArray  # how far a reading answers to pressure, likewise
+    factor: FloatArray  # sensitivity of the reading to pressure, likewise
 
 
-STRESS, BY_D, BY_X, BY_Y, HEIGHT, X, Y, PATTERN, MODEL, RESIDUAL, FACTOR = range(11)  # rows of them
+STRESS, BY_D, BY_X, BY_Y, HEIGHT, X, Y, PATTERN, MODEL, RESIDUAL, FACTOR = range(11)  # row indices
 ROWS = 11
 
 
 @inner_kernel
 def cells_in(rows: FloatArray, grid: Grid) -> Cells:
-    """Return the cells whose arrays are ``rows`` [ROWS, cells]."""
+    """Return the cell arrays stored in ``rows`` [ROWS, cells]."""
     planes = rows[:HEIGHT].reshape((HEIGHT, grid.rows, grid.cols))
     return Cells(
         planes, rows[STRESS], rows[BY_D], rows[BY_X], rows[BY_Y], rows[HEIGHT], rows[X], rows[Y],
@@ -216,14 +216,14 @@ def cells_in(rows: FloatArray, grid: Grid) -> Cells:
 
 
 class Images(NamedTuple):
-    """A solid tip's images of `EstimatorState.grid`, one after the other, and their weights."""
+    """Images of a solid tip on `EstimatorState.grid`, and their weights."""
 
-    pixels: FloatArray  # [images · cells], shear's two last
+    pixels: FloatArray  # [images · cells]; the last two images are those of shear
     weights: Weights
 
 
 class Model(NamedTuple):
-    """The forward model: of springs by points, of solid rubber by images; the other is empty."""
+    """Forward model: points for springs or images for solid rubber; the other one is empty."""
 
     points: SpringPoints
     images: Images

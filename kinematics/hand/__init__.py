@@ -1,4 +1,4 @@
 """Two rotational fingers and the object between them: geometry, grasp state, external loads.
 
-Plane mechanics without time.
+The mechanics is planar. Servo temperatures are also estimated here.
 """

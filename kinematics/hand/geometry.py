@@ -1,19 +1,20 @@
-"""Two rotational fingers and the object between them: pure planar geometry, nothing with force.
+"""Planar geometry of two rotational fingers and the object between them.
 
-The hand's plane has its origin midway between the pivots, x from the left pivot to the right one, y
-away from the palm. Pivots stand at (∓B, 0); a positive joint angle q closes; the tip centres are
+The origin of the hand's plane is midway between the pivots. x points from the left pivot to the
+right one, y away from the palm. The pivots are at (∓B, 0), and positive joint angles q close the
+fingers. The tip centres are
 
     O1 = (−B + L sin q1 + e cos q1,  L cos q1 − e sin q1)       O2 mirrors it
 
-with finger length L and offset e (towards the object at q = 0). The object has its centre G, width
-W and angle φ; n = (cos φ, sin φ) points from its left face to its right one, t = (−sin φ, cos φ).
-A tip of radius a touches its face with
+with finger length L and offset e (towards the object at q = 0). The object has centre G, width W
+and angle φ; n = (cos φ, sin φ) points from its left face to its right face, and
+t = (−sin φ, cos φ). The contact variables of a tip of radius a are
 
     d1 = a + W/2 + (O1 − G)·n     θ1 = φ + q1     s1 = (O1 − G)·t
     d2 = a + W/2 − (O2 − G)·n     θ2 = φ − q2     s2 = (O2 − G)·t
 
-d is the normal displacement (contact where it is positive), θ the tilt of the object against the
-tip and s the tip's place along the face.
+where d is the normal displacement (positive during contact), θ the tilt of the object relative to
+the tip, and s the position of the tip along the face.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ FloatArray = NDArray[np.float64]
 def tip_position(
     q: float, side: float, half_separation: float, length: float, offset: float
 ) -> tuple[float, float]:
-    """Return centre (x, y) [m] of one tip at joint angle ``q`` [rad].
+    """Return the centre (x, y) [m] of one tip at joint angle ``q`` [rad].
 
     ``side`` is +1 for the left finger and −1 for the right one.
     """
@@ -45,7 +46,7 @@ def tip_position(
 
 @kernel
 def tip_velocity(q: float, side: float, length: float, offset: float) -> tuple[float, float]:
-    """Return the tip centre's derivative (∂x/∂q, ∂y/∂q) [m/rad]; ``side`` as in tip_position."""
+    """Return (∂x/∂q, ∂y/∂q) [m/rad] of a tip's centre; ``side`` is as in `tip_position`."""
     sine = math.sin(q)
     cosine = math.cos(q)
     return side * (length * cosine - offset * sine), -(length * sine + offset * cosine)
@@ -53,7 +54,7 @@ def tip_velocity(q: float, side: float, length: float, offset: float) -> tuple[f
 
 @dataclass(frozen=True)
 class ContactVariables:
-    """d [m], θ [rad] and s [m] of both tips, each of shape (2,), left first."""
+    """Contact variables d [m], θ [rad] and s [m] of both tips, each of shape (2,), left first."""
 
     d: FloatArray
     theta: FloatArray
@@ -62,7 +63,7 @@ class ContactVariables:
 
 @dataclass(frozen=True)
 class HandGeometry:
-    """Lengths of the hand [m]: pivots 2B apart, finger length L, offset e, tip radius a."""
+    """Lengths of the hand [m]: pivot separation 2B, finger length L, offset e, tip radius a."""
 
     pivot_separation: float = 0.100
     finger_length: float = 0.080
@@ -79,12 +80,12 @@ class HandGeometry:
 
     @property
     def half_separation(self) -> float:
-        """B, half the pivots' separation [m]."""
+        """Half the separation of the pivots, B [m]."""
         return 0.5 * self.pivot_separation
 
     @property
     def reach(self) -> float:
-        """Distance from a pivot to its tip's centre, √(L² + e²) [m]."""
+        """Distance from a pivot to the centre of its tip, √(L² + e²) [m]."""
         return math.hypot(self.finger_length, self.finger_offset)
 
     def tips(self, q: ArrayLike) -> FloatArray:
@@ -94,7 +95,7 @@ class HandGeometry:
         return np.array([tip_position(q1, 1.0, *lengths), tip_position(q2, -1.0, *lengths)])
 
     def contacts(self, q: ArrayLike, pose: ArrayLike, width: float) -> ContactVariables:
-        """Return contact variables at joint angles ``q`` (2,) and object ``pose`` (x, y, φ)."""
+        """Return the contact variables at joint angles ``q`` (2,) and object ``pose`` (x, y, φ)."""
         x, y, angle = vector(pose, 3, "pose")
         sign = np.array([1.0, -1.0])
         normal = np.array([math.cos(angle), math.sin(angle)])
@@ -108,7 +109,7 @@ class HandGeometry:
 
 
 def vector(values: ArrayLike, length: int, name: str) -> FloatArray:
-    """Return ``values`` as float64 (length,). Raises ValueError for another shape."""
+    """Return ``values`` as float64 (length,). Raises ValueError for a different shape."""
     out = np.asarray(values, dtype=np.float64)
     if out.shape != (length,):
         raise ValueError(f"{name} must have shape ({length},), not {out.shape}")

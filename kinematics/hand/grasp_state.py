@@ -1,11 +1,13 @@
-"""An object held by two rotational fingers: how joint motions move it, what holds it, its load.
+"""Kernels for an object held by two rotational fingers: its motion, holding torques and load.
 
-Pure kernels on the coordinates and signs of :mod:`hand.geometry`; the tips stick and roll, the
-joints are at rest. What loads the object along its faces is told from the joints' torques: a
-pressure grid feels no shear, the joints do. What the normal forces and the tips' turning moments
-don't explain of their torques is shear, times its lever about the pivot. The object's faces may
-lean towards each other by a taper α, above 0 where the object is wider at the palm: the left tip's
-θ is then φ + q1 − α/2, the right one's φ − q2 + α/2, with φ the angle of the faces' bisector.
+Coordinates and signs are those of :mod:`hand.geometry`. The tips stick and roll, and the joints are
+at rest. A load along the faces is estimated from the joint torques, because a pressure grid does
+not measure shear. The part of the torques that the normal forces and the turning moments of the
+tips do not explain is shear times its moment arm about the pivot.
+
+The object's faces may be inclined by a taper α, which is positive if the object is wider at the
+palm. θ is then φ + q1 − α/2 at the left tip and φ − q2 + α/2 at the right tip, where φ is the angle
+of the bisector of the faces.
 """
 
 from __future__ import annotations
@@ -20,14 +22,14 @@ from softfinger.kinematics.contact.lookup import lookup
 from softfinger.kinematics.hand.geometry import tip_position, tip_velocity
 
 Two = tuple[float, float]  # (left, right)
-Motion = tuple[float, float, float, float, float, float, float]  # as `held_motion` says
+Motion = tuple[float, float, float, float, float, float, float]  # result of `held_motion`
 
-_SHEAR_STEPS = 3  # of the fixed point for the shears; each brings two digits
+_SHEAR_STEPS = 3  # fixed-point iterations for the shears; each adds two digits
 
 
 @kernel
 def total_tilt(tilt_x: float, tilt_y: float) -> float:
-    """Return the angle between normal and tip's axis: sin² θ = sin² tilt_x + sin² tilt_y."""
+    """Return the angle θ of the normal to the tip's axis, sin² θ = sin² tilt_x + sin² tilt_y."""
     return math.asin(min(math.hypot(math.sin(tilt_x), math.sin(tilt_y)), 1.0))
 
 
@@ -37,23 +39,23 @@ def held_motion(
 ) -> Motion:
     """Return (arm1, arm2, turn1, turn2, slide, width, across) of a held object.
 
-    ``lengths`` [m] of the hand: half the pivots' separation, a finger's length and offset, and the
-    tip's radius.
-
-    Rolling without slip, both tips pressed deeper alike, gives with the tips' velocities v_i by q_i
+    ``lengths`` [m] are half the pivot separation, the finger's length and offset, and the tip's
+    radius. v_i is the derivative of the position of tip i by q_i. If the tips roll without slip and
+    both displacements change equally,
 
         φ̇ = turn1 q̇1 − turn2 q̇2      turn_i W = a − d_i − v_i·t/cos(α/2)
         ḋ1 + ḋ2 = arm1 q̇1 + arm2 q̇2 + slide φ̇
         arm_i = ±v_i·n/cos(α/2) − tan(α/2) (a − d_i)
         slide = (O1 − O2)·t/cos(α/2) + tan(α/2) (d1 − d2)
 
-    with n, t of the bisector's ``angle`` φ and α the ``taper`` [rad]; the object goes out along t
-    as tips roll and come nearer to each other. Between parallel faces arm [m] is the lever of the
+    with n and t at the bisector's ``angle`` φ, and α the ``taper`` [rad]. The object moves along t
+    as the tips roll and approach each other. For parallel faces, arm [m] is the moment arm of the
     normal force about the pivot, and in the symmetric grasp turn1 + turn2 is
-    2 (a − d + L sin q + e cos q)/W. ``across`` is W = d1 + d2 − 2a + (O2 − O1)·n/cos(α/2) [m],
-    ``width`` the distance of the contacts along n, W cos(α/2). A W under half a tip's radius is
-    taken for that in turn_i: so thin an object is slower than rolling says, by its inertia and the
-    tips' shear, and a prediction that takes it at its word runs away.
+    2 (a − d + L sin q + e cos q)/W. ``across`` is W = d1 + d2 − 2a + (O2 − O1)·n/cos(α/2) [m], and
+    ``width`` is the distance of the contacts along n, W cos(α/2).
+
+    In turn_i, W is at least half the tip's radius. The inertia of a thinner object and the shear of
+    the tips make it turn more slowly than ideal rolling, so an unlimited prediction would diverge.
     """
     q1, q2 = q
     d1, d2 = d
@@ -86,13 +88,14 @@ def sheared_gradient(
     theta: float,
     tangential: float,
 ) -> tuple[float, float]:
-    """Return (∂U/∂d, ∂U/∂θ) of a tip with shear force ``tangential`` [N] and a looked-up
-    ``contact``.
+    """Return (∂U/∂d, ∂U/∂θ) of a tip under the shear force ``tangential`` [N].
+
+    ``contact`` is the result of a table lookup at ``d`` and ``theta``.
     """
     force, _, force_d, force_theta, energy_d, energy_theta, _ = contact
     sine = math.sin(theta)
     cosine = math.cos(theta)
-    # T = F (sin θ + 2 cos θ d_t/d), solved for d_t/d
+    # Solve T = F (sin θ + 2 cos θ d_t/d) for d_t/d.
     shear_ratio = 0.5 * (tangential / force - sine) / cosine
     shear = shear_ratio * d
     depth_change = shear * (sine + cosine * shear_ratio)
@@ -111,19 +114,20 @@ def holding_levers(
     taper: float,
     motion: Motion,
 ) -> tuple[float, float, float, float, float]:
-    """Return (τ1/F, τ2/F, T, N1, N2): what holds the object in balance, by both tips' tables.
+    """Return (τ1/F, τ2/F, T, N1, N2) of an object held in equilibrium.
 
-    The torques are the energy's gradient along the rolling increments, ``motion`` as
-    :func:`held_motion` gives it,
+    The torques are the gradient of the energy along the rolling motion, where ``motion`` is the
+    result of :func:`held_motion`:
 
         τ1 = N arm1 + ∂U1/∂θ1 + T W turn1      τ2 = N arm2 − ∂U2/∂θ2 − T W turn2
 
-    and the object's balance gives T W = N slide + ∂U1/∂θ1 + ∂U2/∂θ2 for the mean T of both tips'
-    shear forces: T ∓ N tan(α/2), left first, with α the ``taper`` [rad], since faces that lean
-    press the object out. F is the mean of both tips' forces, so that the levers τ/F [m] don't
-    depend on a modulus that both tips share; N is that of the normal forces N1 and N2 [N], which
-    differ where the object rubs on something. ``data1`` and ``data2`` are the tables' data. All
-    zero without two contacts.
+    Equilibrium of the object gives T W = N slide + ∂U1/∂θ1 + ∂U2/∂θ2 for the mean shear force T.
+    The shear forces of the tips are T − N tan(α/2) at the left and T + N tan(α/2) at the right,
+    since tapered faces push the object out; α is the ``taper`` [rad]. F is the mean force of both
+    tips, so the levers τ/F [m] do not depend on a common modulus. N is the mean of the normal
+    forces N1 and N2 [N], which differ if friction with the surroundings acts on the object.
+    ``data1`` and ``data2`` are the data of the contact tables. All results are zero unless both
+    tips are in contact.
     """
     d1, d2 = d
     theta1, theta2 = theta
@@ -155,7 +159,7 @@ def holding_levers(
     )
 
 
-_SLOPE_MIN = 0.1  # of what it is without a load
+_SLOPE_MIN = 0.1  # smallest slope, relative to the slope without a load
 
 
 @inner_kernel
@@ -169,8 +173,9 @@ def _unexplained(
     arm: float,
     moment_arm: float,
 ) -> tuple[float, float, float]:
-    """Return the torque of side τ [N·m] that one tip's N, ∂U/∂θ and T leave, and its fall with T,
-    T².
+    """Return the residual torque of one finger [N·m] and its decrease with T and T².
+
+    The residual is the joint torque, signed by ``side``, minus the torques of N, ∂U/∂θ and T.
     """
     contact = lookup(data, d, theta)
     force, _, force_d, force_theta, _, _, _ = contact
@@ -209,26 +214,28 @@ def load_torques(
     rolled: Two,
     torques: Two,
 ) -> tuple[float, float, float, float]:
-    """Return (δ1, δ2, lever, bow): what of both torques [N·m] nothing but a load along t explains.
+    """Return the residual torques and the load model (δ1, δ2, lever, bow) of a held object.
 
-    Where each tip bears a part L [N] of a load 2 L along the object's t, both torques are
+    δ1 and δ2 [N·m] are the parts of the joint torques that only a load along the object's t can
+    explain. If each tip carries L [N] of a load 2 L, the torques are
 
         τ1 = N1 v1·n1 + ∂U1/∂θ1 + T1 lever1      T1 = rolled1 + L      lever_i = a − d_i − v_i·t_i
         τ2 = −N2 v2·n2 − ∂U2/∂θ2 − T2 lever2     T2 = rolled2 − L
 
-    with n_i, t_i of each tip's face, ``rolled`` [N] the shears that rolling, the turning moments
-    and the ``taper`` [rad] cause without a load (:func:`hand.grasp_state.holding_levers`), and N
-    and ∂U/∂θ as the shears change them. Between parallel faces ±v_i·n is arm_i and lever_i is W
-    turn_i; ``motion`` is what :func:`hand.grasp_state.held_motion` gives. δ_i is what is left of
-    τ_i at L = 0; a load makes (δ1 + δ2)/2 = lever L + bow L², exactly. Zeros without two contacts,
-    or where no load would show.
+    with n_i and t_i of the face at each tip. ``rolled`` [N] are the shears that rolling, the
+    turning moments and the ``taper`` [rad] cause without a load (:func:`holding_levers`). N and
+    ∂U/∂θ include the effect of the shears. ``motion`` is the result of :func:`held_motion`; for
+    parallel faces ±v_i·n is arm_i and lever_i is W turn_i.
+
+    δ_i is the residual of τ_i at L = 0. A load gives exactly (δ1 + δ2)/2 = lever L + bow L². All
+    results are zero unless both tips are in contact, and if a load would not change the torques.
     """
     d1, d2 = d
     theta1, theta2 = theta
     if not (d1 > 0.0 and d2 > 0.0):
         return 0.0, 0.0, 0.0, 0.0
     arm1, arm2, turn1, turn2, _, _, across = motion
-    # What rolls the object out along its bisector is no lever of each force: taken back here.
+    # The motion along the bisector is not part of the moment arms of the forces; remove it.
     face_slope = math.tan(0.5 * taper)
     scale = 1.0 / (1.0 + face_slope * face_slope)
     moment_arm1 = scale * (across * turn1 - face_slope * arm1)
@@ -249,9 +256,9 @@ def load_torques(
 
 @inner_kernel
 def load_of(torque: float, moment_arm: float, curvature: float) -> tuple[float, float]:
-    """Return (L, slope): load [N] of a torque = lever L + bow L² [N·m], and the torque's slope [m].
+    """Solve torque = lever L + bow L² [N·m]; return the load L [N] and the slope ∂torque/∂L [m].
 
-    Beyond the parabola's end, to which no load leads, L goes on with the least slope.
+    Torques beyond the vertex of the parabola, which no load can cause, use the smallest slope.
     """
     slope_min = _SLOPE_MIN * moment_arm
     slope = math.sqrt(

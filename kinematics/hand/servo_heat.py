@@ -1,13 +1,14 @@
-"""Heat of a servo's motor: winding and case, followed by a Kalman filter on its own thermometer.
+"""Temperatures of a servo's winding and case, estimated by a Kalman filter.
 
     Ẇ = k r I² (1 + α (W − 25 °C)) − (W − C)/τ_w      winding
-    Ċ = s (W − C)/τ_w − g (C − A)/τ_c                 case, which the servo reads in steps of 1 °C
-    A, k wander                                       ambient; heating over the model's
+    Ċ = s (W − C)/τ_w − g (C − A)/τ_c                 case, measured by the servo in steps of 1 °C
+    A, k random walks                                 ambient; heating relative to the model
 
-r = R/C_w, s = C_w/C_c, τ_w = C_w R_wc, τ_c = C_c R_ca, of resistance, heat capacities and thermal
-resistances; α is copper's, and g = ((C − A)/30 K)^(1/4) of a body that air cools by rising from it.
-With I² known all else is linear; these two are taken at the estimate. A reading says little while
-it stays, and where the case is when it steps.
+Here r = R/C_w, s = C_w/C_c, τ_w = C_w R_wc and τ_c = C_c R_ca, from the electrical resistance, the
+heat capacities and the thermal resistances. α is the temperature coefficient of copper, and
+g = ((C − A)/30 K)^(1/4) describes natural convection. For known I² the model is linear except for α
+and g, which are evaluated at the estimate. A constant reading carries little information; a step of
+the reading gives the temperature of the case accurately.
 """
 
 from __future__ import annotations
@@ -24,19 +25,19 @@ from softfinger.kinematics.compiled.layout import Record, Records
 FloatArray = NDArray[np.float64]
 
 WINDING, CASE, AMBIENT, HEATING = range(4)
-COPPER = 0.0039  # 1/K, of a winding's resistance
-LONGEST = 3600.0  # s, the longest time to a limit that is told
+COPPER = 0.0039  # 1/K, temperature coefficient of the winding's resistance
+LONGEST = 3600.0  # s, largest time to a limit that is reported
 _ROOM = 25.0  # °C
-_STILL = 30.0  # K over the air for which τ_c holds
-_FIRST = (6.0, 0.5, 8.0, 0.35)  # standard deviations at the first reading [°C], of k relative
-_WANDER = (0.03, 0.01, 0.2, 0.01)  # and what they gain in a second's square root
-_STEP_STD = 0.12  # °C, of the case where its reading steps
-_STAY_STD = 6.0  # °C, of a reading a second that stays: as likely anywhere in its step
-_COUPLING = 0.25  # of W − C that τ_w may be off by: nothing shows it
+_STILL = 30.0  # K above ambient at which τ_c is defined
+_FIRST = (6.0, 0.5, 8.0, 0.35)  # initial standard deviations of W, C, A [°C] and k
+_WANDER = (0.03, 0.01, 0.2, 0.01)  # random walks of W, C, A [°C/√s] and k [1/√s]
+_STEP_STD = 0.12  # °C, standard deviation of the case temperature at a step of the reading
+_STAY_STD = 6.0  # °C, standard deviation of a constant reading over 1 s
+_COUPLING = 0.25  # unobservable error of τ_w, as a fraction of W − C
 
 
 class HeatLaw(Record):
-    """Constants of one servo."""
+    """Thermal constants of one servo."""
 
     heating: float  # r [K/(A² s)]
     winding_time: float  # τ_w [s]
@@ -45,19 +46,19 @@ class HeatLaw(Record):
 
 
 class HeatState(Record):
-    """Estimate of one servo's temperatures."""
+    """Temperature estimate of one servo."""
 
     law: HeatLaw
-    known: bool  # a reading has come
-    reading: float  # the last one [°C]
+    known: bool  # True after the first reading
+    reading: float  # last reading [°C]
     x: Annotated[FloatArray, 4]  # W, C, A [°C], k
-    p: Annotated[FloatArray, 4, 4]  # their covariance
+    p: Annotated[FloatArray, 4, 4]  # covariance of x
     scratch: Annotated[FloatArray, 4, 4]
 
 
 @kernel
 def follow(states: Records[HeatState], square: float, dt: float, reading: float) -> None:
-    """Go on by ``dt`` [s] with the mean ``square`` of the current [A²], then take a ``reading``."""
+    """Predict over ``dt`` [s] with the mean squared current [A²], then use a ``reading`` [°C]."""
     s = states[0]
     if not s.known:
         s.known = True
@@ -70,7 +71,7 @@ def follow(states: Records[HeatState], square: float, dt: float, reading: float)
         return
     _predict(s, square, dt)
     stepped = reading - s.reading
-    if abs(stepped) > 1.0:  # missed steps, or another thermometer
+    if abs(stepped) > 1.0:  # missed steps or a different sensor
         _correct(s, reading, 1.0)
     elif stepped != 0.0:
         _correct(s, reading - 0.5 * stepped, _STEP_STD * _STEP_STD)
@@ -81,7 +82,7 @@ def follow(states: Records[HeatState], square: float, dt: float, reading: float)
 
 @inner_kernel
 def _draught(over: float) -> float:
-    """Return g of a case ``over`` K warmer than the air; some air always moves."""
+    """Return g of a case ``over`` K above ambient, at least that of 1 K."""
     return math.sqrt(math.sqrt(max(over, 1.0) / _STILL))
 
 
@@ -104,11 +105,11 @@ def _predict(s: HeatState, square: float, dt: float) -> None:
     f[CASE, AMBIENT] = dt * 1.25 * loss
     x[WINDING] += dt * (x[HEATING] * heating - flow)
     x[CASE] += dt * (law.share * flow - (x[CASE] - x[AMBIENT]) * loss)
-    for i in range(4):  # P Fᵀ, a row in place
+    for i in range(4):  # P Fᵀ in place, row by row
         row0, row1, row2, row3 = p[i, 0], p[i, 1], p[i, 2], p[i, 3]
         for j in range(4):
             p[i, j] = row0 * f[j, 0] + row1 * f[j, 1] + row2 * f[j, 2] + row3 * f[j, 3]
-    for j in range(4):  # F of that, a column in place
+    for j in range(4):  # F (P Fᵀ) in place, column by column
         row0, row1, row2, row3 = p[0, j], p[1, j], p[2, j], p[3, j]
         for i in range(4):
             p[i, j] = f[i, 0] * row0 + f[i, 1] * row1 + f[i, 2] * row2 + f[i, 3] * row3
@@ -133,7 +134,7 @@ def _correct(s: HeatState, case: float, variance: float) -> None:
 
 @kernel
 def winding_std(states: Records[HeatState]) -> float:
-    """Return the standard deviation of the winding's temperature [°C]."""
+    """Return the standard deviation of the winding temperature [°C]."""
     s = states[0]
     coupling = _COUPLING * (s.x[WINDING] - s.x[CASE])
     return math.sqrt(max(s.p[WINDING, WINDING], 0.0) + coupling * coupling)
@@ -141,9 +142,9 @@ def winding_std(states: Records[HeatState]) -> float:
 
 @kernel
 def time_to_limit(states: Records[HeatState], square: float, limit: float) -> float:
-    """Return when the case comes to ``limit`` [°C] with a mean ``square`` of the current [A²]; s.
+    """Return the time [s] until the case reaches ``limit`` [°C] at a mean squared current [A²].
 
-    LONGEST where it does not within that. The winding is stepped implicitly, so steps may grow.
+    The result is at most LONGEST. The winding is integrated implicitly, so the steps may grow.
     """
     s = states[0]
     law = s.law
@@ -169,7 +170,7 @@ def time_to_limit(states: Records[HeatState], square: float, limit: float) -> fl
 
 @kernel
 def lasting_square(states: Records[HeatState], limit: float) -> float:
-    """Return the mean square of the current [A²] with which the case settles at ``limit`` [°C]."""
+    """Return the mean squared current [A²] at which the case settles at ``limit`` [°C]."""
     s = states[0]
     law = s.law
     over = max(limit - s.x[AMBIENT], 0.0)

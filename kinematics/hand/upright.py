@@ -1,25 +1,25 @@
-"""The angle at which stuck tips let a held object rest, and the spring that keeps it upright.
+"""Virtual spring between the joints that keeps a held object upright despite sticking tips.
 
-Two fingers that mirror each other hold an object of width W between parallel faces, both tips d
-deep. Small motions that don't mirror are its angle φ and the fingers' lean δ = (q1 − q2)/2, with
-ψ = φ + δ what each tip's tilt changes by and σ what its shear does. Let joint 1 have kδ less torque
-than the mean of both, and joint 2 as much more: a virtual spring k between the fingers. Then, with
-the force N of each tip, its law to first order T/N = ψ + 2σ/d, (∂U/∂θ)/N = cdψ + σ (c is 2/3 for
-the paper's springs), and b = k/(N B) for pivots 2B apart,
+Two mirrored fingers hold an object of width W between parallel faces with a displacement d at each
+tip. The small antisymmetric motions are the object's angle φ and the antisymmetric joint angle
+δ = (q1 − q2)/2. They change the tilt of each tip by ψ = φ + δ and its shear by σ. A virtual spring
+k between the fingers reduces the torque of joint 1 by kδ and increases that of joint 2 by kδ. For
+the force N of each tip, the linearised tip law is T/N = ψ + 2σ/d and (∂U/∂θ)/N = cdψ + σ, where c
+is 2/3 for the springs of the paper. With b = k/(N B) for pivots 2B apart,
 
-    T = N (φ − bδ)                                       both fingers' forces are on one line
-    W T = N ((W + 2(a − d))φ − 2ℓδ) + 2 ∂U/∂θ            the object's moments
-    σ = (a − d + ℓ)δ − W(φ − φ0)/2                       rolling, from where the tips stuck
+    T = N (φ − bδ)                                       the forces of both fingers are collinear
+    W T = N ((W + 2(a − d))φ − 2ℓδ) + 2 ∂U/∂θ            moment balance of the object
+    σ = (a − d + ℓ)δ − W(φ − φ0)/2                       rolling since the tips stuck
 
-with ℓ = L sin q + e cos q. The last is an integral of the stick condition while d and q change, so
-that the way there doesn't matter. It follows, for an object that was at φ0 when the tips met it,
+with ℓ = L sin q + e cos q. The last equation is an integral of the stick condition over changing d
+and q, so the result does not depend on the path. For an object at angle φ0 at first contact,
 
     φ/φ0 = W D/(W D − 4 (a − d + cd) M)
     D = 2ℓ + (1 − 2c)d − b(W − d)        M = a − d + ℓ + (1 + b)d/2
 
-which vanishes with D: there is one spring with which the object stands upright whatever is stuck,
-b = (2ℓ + (1 − 2c)d)/(W − d). Left out are the tilt q of the tips against the faces (of second
-order), and all friction but the tips'.
+which vanishes for D = 0. The spring b = (2ℓ + (1 − 2c)d)/(W − d) therefore keeps the object upright
+for any φ0. The model neglects the tilt q of the tips relative to the faces, which is of second
+order, and all friction except at the tips.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ import math
 
 from softfinger.kinematics.compiled.kernel import inner_kernel
 
-_WIDTH_MIN = 0.1  # of the tip's radius, that W − d is not taken for less than
+_WIDTH_MIN = 0.1  # lower limit of W − d over the tip's radius
 
 
 @inner_kernel
@@ -41,8 +41,8 @@ def upright_spring(
 ) -> float:
     """Return the spring k [N·m/rad] between joints at ``q`` [rad] that keeps the object upright.
 
-    ``d`` [m] and ``force`` [N] are the means of both tips, ``turning`` is their c; ``lengths`` [m]
-    as in :func:`hand.grasp_state.held_motion`.
+    ``d`` [m] and ``force`` [N] are the means of both tips, ``turning`` is their c, and ``lengths``
+    [m] are those of :func:`hand.grasp_state.held_motion`.
     """
     half_separation, length, offset, radius = lengths
     inward = length * math.sin(q) + offset * math.cos(q)

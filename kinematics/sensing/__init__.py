@@ -1,4 +1,4 @@
-"""Pressure sensor under a tip: the forward model, and counts to pressures.
+"""Forward model of the pressure sensor under a tip.
 
-Numbers alone: no files, no ports.
+The modules compute with arrays only and use no files or ports.
 """

@@ -1,8 +1,8 @@
-"""Points of cells along one axis, and the weights by which a cell takes their mean.
+"""Sample points of cells along one axis, and the weights of their mean over a cell.
 
-The elastomer over a sensor spreads a point's pressure, a Gaussian blur. It is a weighted sum over
-neighbouring points, along one axis and then along the other, so it goes into the weights by which a
-cell takes the mean of points: without a blur it has its own alone, all of one weight.
+The elastomer over a sensor spreads pressure like a Gaussian blur. The blur is a weighted sum over
+neighbouring points along one axis and then along the other, so it is included in the weights with
+which a cell averages its points. Without a blur, a cell averages its own points with equal weights.
 """
 
 from __future__ import annotations
@@ -14,17 +14,18 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 
-_MATCHED = 0.75  # points: below it weights that match moments, above it samples of the Gaussian
-_CUTOFF = 4.5  # standard deviations of the blur
+_MATCHED = 0.75  # points; narrower blurs use moment-matching weights, wider ones Gaussian samples
+_CUTOFF = 4.5  # standard deviations at which the Gaussian is truncated
 
 
 def axis_points(
     start: float, pitch: float, number: int, count: int, blur: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the places of points [count, cells] and the weights of a cell's mean over them.
+    """Return the positions of points [count, cells] and the weights of a cell's mean over them.
 
-    There are ``number`` cells of ``pitch`` from ``start`` on, and as many more on both sides as the
-    blur reaches: cell j is the sum over m and q of weights[m, q] times point m of cell j + q.
+    There are ``number`` cells of ``pitch``, beginning at ``start``, and additional cells on both
+    sides within the range of the blur. The value of cell j is the sum over m and q of weights[m, q]
+    times point m of cell j + q.
     """
     mean = np.convolve(stencil(blur * count / pitch), np.full(count, 1.0 / count))
     half = (len(mean) - count) // 2
@@ -37,7 +38,7 @@ def axis_points(
 
 
 def mean_matrix(weights: FloatArray, number: int) -> FloatArray:
-    """Return the weights of :func:`axis_points` as a matrix [cells, points], cell after cell."""
+    """Return the weights of :func:`axis_points` as a matrix [cells, points]."""
     count, reach = weights.shape
     matrix = np.zeros((number, (number + reach - 1) * count))
     for j in range(number):
@@ -46,11 +47,11 @@ def mean_matrix(weights: FloatArray, number: int) -> FloatArray:
 
 
 def stencil(width: float) -> FloatArray:
-    """Return the blur's weights over neighbouring points, float64 [2 n + 1]; ``width`` in points.
+    """Return the weights of a blur of ``width`` w, in points, over neighbouring points [2 n + 1].
 
-    Samples of the Gaussian: the trapezoid rule, whose error falls like exp(−2π² w²). Below
-    three quarters of a point five weights of the Gaussian's moments up to the fifth, which are
-    exact for polynomials of that degree. One weight of 1 without a blur.
+    The weights are samples of the Gaussian (trapezoid rule), whose error decreases like
+    exp(−2π² w²). Below 0.75 points there are five weights that match the Gaussian's moments up to
+    the fifth, and so are exact for polynomials of degree five. Without a blur the only weight is 1.
     """
     if width == 0.0:
         return np.ones(1)

@@ -1,14 +1,14 @@
 """Outline of the footprint on a grid of cells, as kernels.
 
-The geometry that the forward model and the estimator share; no pressure. Lengths are m in the
-sensor's axes, from the tip's centre. The object's face is the plane ``n·(x, y, z) = h`` with
-``h = a − d``; over the base point (x, y) it stands at ``z = u − v x − w y`` where
+The forward model and the estimator share this geometry. Lengths are in m, in the sensor's axes,
+from the tip's centre. The object's face is the plane ``n·(x, y, z) = h`` with ``h = a − d``; above
+the base point (x, y) its height is ``z = u − v x − w y``, where
 
     u = h/n_z,  v = n_x/n_z,  w = n_y/n_z,
 
 and the strain of the spring there is ``ε = 1 − (u − v x − w y)/√(a² − x² − y²)`` (eq. 2 of the
-parallel-distributed model). The footprint {ε > 0} is the projection of a flat disc: an ellipse, or,
-beyond the domain's limit, an ellipse cut by the rim; convex in both cases.
+parallel-distributed model). The footprint {ε > 0} is the projection of a flat disc. It is an
+ellipse or, beyond the domain's limit, an ellipse cut by the rim; both are convex.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ Span = tuple[float, float]
 
 
 class Grid(Record):
-    """A tip on a grid of cells: lengths [m] in the sensor's axes, from the tip's centre."""
+    """Grid of cells under a tip; lengths [m] in the sensor's axes, from the tip's centre."""
 
     radius: float
-    x: float  # of the first cell's corner
+    x: float  # corner of the first cell
     y: float
     pitch_x: float
     pitch_y: float
@@ -39,7 +39,7 @@ class Grid(Record):
 
 
 class Face(Record):
-    """The object's face over the base, z = u − v x − w y."""
+    """Height of the object's face above the base, z = u − v x − w y."""
 
     u: float
     v: float
@@ -48,7 +48,7 @@ class Face(Record):
 
 @inner_kernel
 def set_face(face: Face, a: float, d: float, n_x: float, n_y: float) -> None:
-    """Set the face pressed in by ``d``; the z component of its normal (n_x, n_y, …) is positive."""
+    """Set the face at displacement ``d`` with the normal (n_x, n_y, n_z), n_z > 0."""
     n_z = math.sqrt(1.0 - n_x * n_x - n_y * n_y)
     face.u = (a - d) / n_z
     face.v = n_x / n_z
@@ -57,9 +57,9 @@ def set_face(face: Face, a: float, d: float, n_x: float, n_y: float) -> None:
 
 @inner_kernel
 def set_around(out: Face, face: Face, a: float, margin: float) -> None:
-    """Set a face parallel to ``face`` whose footprint, before the tilt, is wider by ``margin``.
+    """Set ``out`` parallel to ``face`` with a footprint disc that is larger by ``margin`` [m].
 
-    The wider one ends at the tip's rim.
+    The larger footprint ends at the tip's rim.
     """
     c = math.sqrt(1.0 + face.v * face.v + face.w * face.w)
     h = face.u / c
@@ -71,9 +71,10 @@ def set_around(out: Face, face: Face, a: float, margin: float) -> None:
 
 @inner_kernel
 def extremes(face: Face, a: float) -> Span:
-    """Return y of the footprint's lowest and highest point; (inf, −inf) for none.
+    """Return the smallest and largest y of the footprint, or (inf, −inf) if it is empty.
 
-    Beyond the limit, where the face cuts the base plane within the rim, both are the rim's.
+    Beyond the domain's limit, where the face cuts the base plane within the rim, both values are
+    those of the rim.
     """
     u = face.u
     w = face.w
@@ -89,7 +90,7 @@ def extremes(face: Face, a: float) -> Span:
 
 @inner_kernel
 def line_span(face: Face, a: float, y: float) -> Span:
-    """Return the footprint's ends (left, right) in x on the line ``y``; (inf, −inf) for none."""
+    """Return the footprint's ends (left, right) in x on the line ``y``, or (inf, −inf) if empty."""
     v = face.v
     rim = a * a - y * y
     if rim <= 0.0:
@@ -103,13 +104,16 @@ def line_span(face: Face, a: float, y: float) -> Span:
     root = math.sqrt(root)
     left = (v * q - root) / e
     right = (v * q + root) / e
-    # A root under the base plane is no edge: there the spring is gone and the rim is the edge.
+    # A root below the base plane is not an edge; there the footprint ends at the rim.
     return -edge if q < v * left else left, edge if q < v * right else right
 
 
 @inner_kernel
 def steps(low: float, high: float, start: float, pitch: float, count: int) -> tuple[int, int]:
-    """Return the range of the intervals of ``pitch`` from ``start`` on that low … high touches."""
+    """Return the index range of the ``count`` intervals that overlap the span low to high.
+
+    The intervals have width ``pitch`` and begin at ``start``.
+    """
     if not low < high:
         return 0, 0
     first = min(max(math.floor((low - start) / pitch), 0), count)

@@ -1,7 +1,8 @@
-"""The forward model: what a pressure grid of given cells under a soft tip would read.
+"""Forward model of a pressure grid under a soft tip.
 
-Holds the sensor's geometry (`SensorGrid`) and the rendering of a contact on it. Every cell reads
-the pressure averaged over its area; sensor imperfections (noise, counts, dead cells) are not here.
+`SensorGrid` describes the geometry of the sensor and renders the pressure of a contact on it. Each
+cell reads the pressure averaged over its area. Sensor imperfections (noise, quantisation, dead
+cells) are not included.
 """
 
 from __future__ import annotations
@@ -18,19 +19,32 @@ from softfinger.kinematics.sensing.footprint import FloatArray, Grid
 from softfinger.kinematics.sensing.solid_pressure import SolidPressure, images
 from softfinger.kinematics.sensing.springs_pressure import SpringsPressure, count_for
 
-_PITCH_MAX = 0.1  # m; a greater one is in millimetres
-_FINE = 150.0  # points of the forward model to the tip's radius, or more
+_PITCH_MAX = 0.1  # m; a larger value was probably given in millimetres
+_FINE = 150.0  # smallest number of sample points per tip radius
 
 
 @dataclass(frozen=True)
 class SensorGrid:
-    """Rows × cols cells of a pressure sensor under a tip; rows run along y, columns along x.
+    """Grid of rows × cols pressure cells under a tip; row indices grow along y, columns along x.
 
-    ``pitch`` [m] is one number or (x, y). ``centre`` [m] is the tip's centre in the sensor's axes,
-    counted from the middle of the grid. ``rotation`` [rad] turns the sensor's axes against the
-    finger's, counter-clockwise seen along +z. ``blur`` [m] is the standard deviation with which
-    the elastomer over the cells spreads a point's pressure. Raises ValueError for values that make
-    no grid.
+    Parameters
+    ----------
+    rows, cols
+        Number of cells along y and x.
+    pitch
+        Cell size [m], one number or (x, y).
+    centre
+        Position of the tip's centre in the sensor's axes [m], from the middle of the grid.
+    rotation
+        Rotation of the sensor's axes relative to the finger's [rad], counter-clockwise seen along
+        +z.
+    blur
+        Standard deviation with which the elastomer over the cells spreads pressure [m].
+
+    Raises
+    ------
+    ValueError
+        If a value is out of range.
     """
 
     rows: int
@@ -63,20 +77,20 @@ class SensorGrid:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(rows, cols)."""
+        """Shape of a frame, (rows, cols)."""
         return self.rows, self.cols
 
     def on(self, tip: Fingertip) -> Grid:
-        """Return the cells as kernels take them, counted from this tip's centre."""
+        """Return the grid as a record for kernels, with lengths from the tip's centre."""
         pitch_x, pitch_y = self.pitches
         x = -0.5 * self.cols * pitch_x - self.centre[0]
         y = -0.5 * self.rows * pitch_y - self.centre[1]
-        # In the order of the fields; at once, as setting each takes ten times as long.
+        # In the order of the record's fields; setting them one by one takes ten times as long.
         fields = (tip.radius, x, y, pitch_x, pitch_y, self.rows, self.cols)
         return Grid(np.array([fields], Grid.dtype))
 
     def to_sensor(self, n_x: float, n_y: float) -> tuple[float, float]:
-        """Rotate a vector's components from the finger's axes to the sensor's."""
+        """Rotate vector components from the finger's axes to the sensor's axes."""
         if self.rotation == 0.0:
             return n_x, n_y
         c, s = math.cos(self.rotation), math.sin(self.rotation)
@@ -92,14 +106,34 @@ class SensorGrid:
         gain: float = 1.0,
         out: FloatArray | None = None,
     ) -> FloatArray:
-        """Return the pressure [Pa] averaged over each cell, float64 [rows, cols].
+        """Return the pressure [Pa] of a contact, averaged over each cell.
 
-        ``d`` [m] is the displacement, the tilts [rad] give the object's normal
-        (sin tilt_x, sin tilt_y, …). Accurate to 1e-5 of the modulus, cut cells included, to 1e-4
-        from 30° on and 1e-3 where the outline all but meets the rim. A solid tip's is as exact as
-        `solid_data` say, and ends where they do. ``out`` is written and returned if given. Raises
-        ValueError for a d that is not finite or exceeds the radius, and for tilts whose normal
-        would point into the tip.
+        The error for a spring tip is at most 1e-5 of the modulus, including cells at the outline,
+        1e-4 above 30° and 1e-3 where the outline almost reaches the rim. A solid tip is as accurate
+        as `solid_data`, and contacts beyond its data are clamped.
+
+        Parameters
+        ----------
+        tip, material
+            The tip and its stress-strain law.
+        d
+            Displacement [m].
+        tilt_x, tilt_y
+            Tilts [rad] of the object's normal (sin tilt_x, sin tilt_y, …).
+        gain
+            Factor on all pressures.
+        out
+            Array to write to and return; a new one if None.
+
+        Returns
+        -------
+        ndarray
+            Pressures, float64 [rows, cols].
+
+        Raises
+        ------
+        ValueError
+            If d is not finite or exceeds the radius, or if the normal would point into the tip.
         """
         n_x, n_y = normal(d, tilt_x, tilt_y, tip.radius)
         if out is None:
@@ -114,11 +148,11 @@ class SensorGrid:
         return out
 
     def images(self, tip: Fingertip) -> FloatArray:
-        """Return cells' means of a solid tip's modes and shear [·, cells], see `solid_pressure`."""
+        """Return the images of a solid tip's modes and shear [·, cells]; see `solid_pressure`."""
         return _images(replace(self, rotation=0.0), tip)
 
 
-@lru_cache(maxsize=16)  # two fingers' grids, and those that an uncertain place makes of them
+@lru_cache(maxsize=16)  # the grids of two fingers and their shifted copies for the error budget
 def _images(grid: SensorGrid, tip: Fingertip) -> FloatArray:
     return images(tip, grid.on(tip), grid.blur)
 
@@ -130,7 +164,7 @@ def _springs(grid: SensorGrid, tip: Fingertip, material: Material) -> SpringsPre
 
 
 def normal(d: float, tilt_x: float, tilt_y: float, radius: float) -> tuple[float, float]:
-    """Return (n_x, n_y) of tilts [rad]. Raises ValueError for tilts of no contact."""
+    """Return (n_x, n_y) for tilts [rad]. Raises ValueError if d or the tilts are out of range."""
     if not (math.isfinite(d) and math.isfinite(tilt_x) and math.isfinite(tilt_y)):
         raise ValueError(f"d and tilts must be finite, got {d}, {tilt_x}, {tilt_y}")
     if d > radius:

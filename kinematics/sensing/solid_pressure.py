@@ -1,8 +1,9 @@
-"""The forward model of a solid tip: a frame is a sum of fixed images, the modes of `solid_data`.
+"""Forward model of a solid tip: a frame is a weighted sum of fixed images.
 
-A mode makes one image of a grid's cells, or two where it has a direction: B(r) cos mφ and
-B(r) sin mφ, averaged over each cell. What each counts in a contact are its weights, smooth in
-(d, n_x, n_y). The sensor feels no pull: where the sum is below 0 a cell reads 0.
+The images are the modes of `solid_data`. A mode gives one image of the grid, or two if it is
+directional: B(r) cos mφ and B(r) sin mφ, averaged over each cell. The weights of the images are
+smooth functions of (d, n_x, n_y). The sensor cannot measure tension, so a cell reads 0 where the
+sum is negative.
 """
 
 from __future__ import annotations
@@ -25,21 +26,21 @@ from softfinger.kinematics.sensing.footprint import FloatArray, Grid, IntArray
 
 MODES = 32
 IMAGES = 2 * MODES
-_AT_ONCE = 4  # images added together, IMAGES being a multiple of it
-ROOT_TERMS, SQUARE_TERMS = 12, 6  # of a mode's polynomial, at most
+_AT_ONCE = 4  # images added per pass; IMAGES is a multiple of it
+ROOT_TERMS, SQUARE_TERMS = 12, 6  # largest number of terms of a mode's polynomial
 
-# Points a side of a cell, of one that the rim cuts, and of each where there is a blur.
+# Sample points per side of a cell: inside, cut by the rim, and with blur.
 _INSIDE, _CUT, _BLURRED = 6, 24, 12
 
 
 class Weights(Record):
-    """Weights of the images in one contact: their sum is the pressure over E; see `set_weights`."""
+    """Weights of the images for one contact, set by `set_weights`."""
 
     table: Table
     modes: int
     images: int
     harmonics: Annotated[IntArray, MODES]
-    ratios: Annotated[FloatArray, SQUARE_TERMS * ROOT_TERMS * MODES]  # by powers of y, x; modes
+    ratios: Annotated[FloatArray, SQUARE_TERMS * ROOT_TERMS * MODES]  # [y, x, mode]
     q: Annotated[FloatArray, MODES]
     q_x: Annotated[FloatArray, MODES]
     q_y: Annotated[FloatArray, MODES]
@@ -52,7 +53,10 @@ class Weights(Record):
 
 
 def weights_of(tip: Fingertip, material: Material) -> Weights:
-    """Return a solid tip's modes, without a contact yet. Raises MaterialError unless linear."""
+    """Return the modes of a solid tip, before any contact is set.
+
+    Raises MaterialError unless the material is linear.
+    """
     data, weights = solid_data(tip), Weights()
     weights.table.assign(solid_table(tip, material))
     count, i, j = data.ratios.shape
@@ -63,12 +67,12 @@ def weights_of(tip: Fingertip, material: Material) -> Weights:
 
 
 def image_count(harmonics: IntArray) -> int:
-    """Return how many images the modes make."""
+    """Return the number of images of the modes."""
     return int(len(harmonics) + np.count_nonzero(harmonics))
 
 
 def images(tip: Fingertip, cells: Grid, blur: float) -> FloatArray:
-    """Return modes' means over each cell, then shear's along x and y, float64 [·, rows · cols]."""
+    """Return the images of the modes, then of shear along x and y, float64 [·, rows · cols]."""
     if blur > 0.0:
         return _blurred_images(tip, cells, blur)
     data = solid_data(tip)
@@ -111,7 +115,7 @@ def _nearest(low: NDArray[Any], width: float) -> NDArray[Any]:
 
 
 def _means(tip: Fingertip, z: NDArray[np.complex128]) -> FloatArray:
-    """Means of all images over the points x + i y [cells, points], 0 beyond the data's rings."""
+    """Return the mean of each image over the points x + i y [cells, points]; 0 beyond the rings."""
     data = solid_data(tip)
     middle = 0.5 * (data.edges[1:] + data.edges[:-1])
     r = np.abs(z)
@@ -121,7 +125,7 @@ def _means(tip: Fingertip, z: NDArray[np.complex128]) -> FloatArray:
     modes = zip([*data.harmonics.tolist(), 1], [*data.modes, data.shear], strict=True)
     powers = {m: phase**m for m in {*data.harmonics.tolist(), 1}}
     for m, mode in modes:
-        # Where m > 0 a mode goes to 0 at the middle.
+        # Modes with m > 0 vanish at the centre.
         start = 0.0 if m else 1.5 * mode[0] - 0.5 * mode[1]
         value = np.interp(r, [0.0, *middle], [start, *mode]) * inside
         found.append((value * powers[m].real).sum(axis=1))
@@ -132,14 +136,14 @@ def _means(tip: Fingertip, z: NDArray[np.complex128]) -> FloatArray:
 
 @inner_kernel
 def set_weights(weights: Weights, d: float, n_x: float, n_y: float) -> None:
-    """Set a contact's weights and their partials by d [m], n_x and n_y, for pressures in Pa."""
+    """Set the weights of a contact, for pressures in Pa, and their partials by d, n_x and n_y."""
     table = weights.table
     square = n_x * n_x + n_y * n_y
     t = math.sqrt(d * table.inverse_radius)
     x = t * table.by_root - 1.0
     y = square * table.by_square - 1.0
     g, g_t, g_tt, g_s, g_ts = energy_lanes(table, t, square)
-    # The normal force over a², and its partials by t and sin² θ.
+    # Normal force over a², and its partials by t and sin² θ.
     normal = table.modulus * t * t * t * (2.5 * g + 0.5 * t * g_t)
     normal_t = 0.5 * table.modulus * t * t * (15.0 * g + t * (9.0 * g_t + t * g_tt))
     normal_s = table.modulus * t * t * t * (2.5 * g_s + 0.5 * t * g_ts)
@@ -150,7 +154,7 @@ def set_weights(weights: Weights, d: float, n_x: float, n_y: float) -> None:
     by_x = weights.by_x
     by_y = weights.by_y
     _evaluate_ratios(weights, x, y)
-    # F over N cos θ is not 1 where the face sticks.
+    # F/(N cos θ) differs from 1 for a sticking face.
     held = 1.0 - square * weights.q[0]
     held_t = -square * weights.q_x[0] * table.by_root
     held_s = -weights.q[0] - square * weights.q_y[0] * table.by_square
@@ -159,7 +163,7 @@ def set_weights(weights: Weights, d: float, n_x: float, n_y: float) -> None:
     both = 2.0 * (normal_s * held + normal * held_s) * cosine - normal * held / cosine
     by_x[0] = n_x * both
     by_y[0] = n_y * both
-    # (n_x + i n_y)^m and its derivative over m; modes stand in the order of m.
+    # (n_x + i n_y)^m, and its derivative divided by m; the modes are in the order of m.
     m = 0
     power = 1.0 + 0.0j
     below = 0.0j
@@ -190,9 +194,10 @@ def set_weights(weights: Weights, d: float, n_x: float, n_y: float) -> None:
 
 @inner_kernel
 def own_shear(weights: Weights, d: float, square: float) -> float:
-    """Return shear over sin θ and a² [Pa] of a straight press on a sticking face, at the height a.
+    """Return the shear of a straight press on a sticking face, over sin θ and a² [Pa].
 
-    The modes have it already. ``weights`` are those of the contact.
+    The shear acts at height a and is already contained in the modes. ``weights`` are those of the
+    contact.
     """
     q = weights.q[0]
     normal = weights.value[0] / (1.0 - square * q)
@@ -202,7 +207,7 @@ def own_shear(weights: Weights, d: float, square: float) -> float:
 
 @fast_inner_kernel
 def _evaluate_ratios(weights: Weights, x: float, y: float) -> None:
-    """q of each mode, and its partials by x and y, all modes side by side in SIMD lanes."""
+    """Evaluate q of each mode and its partials by x and y, with one SIMD lane per mode."""
     ratios = weights.ratios
     q = weights.q
     q_x = weights.q_x
@@ -234,7 +239,7 @@ def _add_images(
     count: int,
     out: FloatArray,
 ) -> None:
-    """Add four images, the ``first`` and on, times their weights; the pixels are at ``image``."""
+    """Add four weighted images, beginning with the ``first``; its pixels start at ``image``."""
     a, b, c, d = weights[first], weights[first + 1], weights[first + 2], weights[first + 3]
     second = image + count
     third = second + count
@@ -250,9 +255,9 @@ def _add_images(
 
 @inner_kernel
 def add_images(weights: Weights, of: FloatArray, pixels: FloatArray, out: FloatArray) -> None:
-    """Add all images [cells], one after the other in ``pixels``, times the weights ``of``.
+    """Add all images, stored consecutively in ``pixels``, times the weights ``of``.
 
-    The last of them may be shear's, whose weight is 0 here.
+    The last group may include the images of shear, whose weights are 0 here.
     """
     count = out.shape[0]
     for j in range(0, weights.images, _AT_ONCE):
@@ -265,7 +270,7 @@ def press_solid(
 ) -> None:
     """Set the pressure of a contact and its partials by d, n_x and n_y, [4, rows, cols].
 
-    Without the cells' ends: below 0 where the rubber pulls.
+    The pressure is not clipped and is negative where the rubber pulls.
     """
     set_weights(weights, d, n_x, n_y)
     count = planes.shape[1] * planes.shape[2]
@@ -289,9 +294,10 @@ def render_solid(
 ) -> None:
     """Write the pressure [Pa] of a ``contact`` (d, n_x, n_y), times ``gain``, into ``out``.
 
-    ``shear`` [N] is the force along x and y on the face, as at the height a: the ``whole``, or what
-    is more than a press straight has. ``basis`` are the grid's images. d ≤ 0 gives zeros; beyond
-    what the data cover the deepest and the most tilted contact of that azimuth.
+    ``shear`` [N] is the force on the face along x and y, acting at height a. It is the total shear
+    if ``whole`` is True, and otherwise the excess over that of a straight press. ``basis`` holds
+    the images of the grid. The result is zero for d ≤ 0; contacts beyond the data are clamped to
+    the largest depth and tilt at the same azimuth.
     """
     each = weights[0]
     table = each.table
@@ -319,12 +325,12 @@ def render_solid(
 
 
 def padded(images: FloatArray) -> FloatArray:
-    """Return images [·, cells] one after the other, with room behind for `add_images` to read."""
+    """Return images [·, cells] as one flat array, padded so that `add_images` can read past it."""
     return np.concatenate([images.ravel(), np.zeros((_AT_ONCE - 1) * images.shape[1])])
 
 
 class SolidPressure:
-    """Pressure of one tip of one material on the cells of given ``basis`` images."""
+    """Pressure of one solid tip on the cells of the ``basis`` images."""
 
     def __init__(self, tip: Fingertip, material: Material, basis: FloatArray) -> None:
         self._weights = weights_of(tip, material).array
@@ -337,7 +343,7 @@ class SolidPressure:
         out: FloatArray,
         shear: tuple[float, float] | None = None,
     ) -> None:
-        """Render as :func:`render_solid`; ``shear`` is that of a straight press if not given."""
+        """Render with :func:`render_solid`; without ``shear``, that of a straight press is used."""
         whole = shear is not None
         render_solid(
             self._weights, self._basis, contact, shear or (0.0, 0.0), whole, gain, out.reshape(-1)

@@ -1,11 +1,13 @@
-"""Forward model of a tip of springs on a grid of cells: the pressure, and its partials.
+"""Forward model of a spring tip on a grid of cells: pressure and its partials.
 
-A cell reads the mean over its points, which are spread evenly. Over a point (x, y) of the base the
-spring is ℓ = √(a² − x² − y²) long and its strain ε = 1 − z/ℓ with z = u − v x − w y, see
-`footprint`. A point stands for a small rectangle, over which ε takes its mean: within the footprint
-by the means of 1/ℓ, x/ℓ and y/ℓ, which are tabulated. Where the outline cuts the rectangle, that
-part counts where f = ℓ² − z² is above 0, f being taken for a plane and spread evenly.
-A sensor's blur is in the weights of a cell's points, see `blur`.
+A cell reads the mean over sample points that are spread evenly over it. Above a point (x, y) of the
+base, the spring has length ℓ = √(a² − x² − y²) and strain ε = 1 − z/ℓ with z = u − v x − w y; see
+`footprint`. Each point represents a small rectangle and uses the mean strain over it. Inside the
+footprint, the mean strain follows from the tabulated means of 1/ℓ, x/ℓ and y/ℓ. Where the outline
+cuts the rectangle, only the part with f = ℓ² − z² > 0 counts; f is treated as a plane whose values
+are evenly distributed over the rectangle.
+
+The weights of the points include the sensor's blur; see `blur`.
 """
 
 from __future__ import annotations
@@ -33,39 +35,39 @@ from softfinger.kinematics.sensing.footprint import (
 
 FloatArray = NDArray[np.float64]
 
-STRESS, BY_D, BY_X, BY_Y = range(4)  # planes: pressure [Pa], its partials by d, n_x and n_y
+STRESS, BY_D, BY_X, BY_Y = range(4)  # planes: pressure [Pa] and its partials by d, n_x and n_y
 PLANES = 4
-Cells = tuple[int, int]  # first, and behind the last
+Cells = tuple[int, int]  # half-open range
 _LEAST_SPREAD = 1e-12
-# Gauss-Legendre's rule within a point's rectangle, of a width of 1.
+# Gauss-Legendre rule on the rectangle of a point, scaled to width 1.
 _NODES, _WEIGHTS = (0.5 * each for each in np.polynomial.legendre.leggauss(3))
 
 
 class SpringPoints(NamedTuple):
-    """Points of a grid's cells under a tip, as kernels use them.
+    """Sample points of a grid under a tip, in the layout used by kernels.
 
-    A row of points is one array: those that have the first place in their cells, cell after cell,
-    then those of the second place. Cells beyond the grid are there as far as the blur reaches.
-    Arrays have one dimension where loops over them are to run in SIMD lanes.
+    A row of points is one array: first the points at the first position of each cell, then those at
+    the second position, and so on. The array includes cells outside the grid within the range of
+    the blur. Arrays are one-dimensional so that loops over them can be vectorised.
     """
 
-    x: FloatArray  # from the tip's centre [m], of a row
-    strain: FloatArray  # scratch, of a row
+    x: FloatArray  # from the tip's centre [m], one row
+    strain: FloatArray  # scratch, one row
     slope: FloatArray
     factor: FloatArray
     stress: FloatArray
-    inverse: FloatArray  # means of 1/ℓ, all rows one after the other
-    inverse_x: FloatArray  # of x/ℓ
+    inverse: FloatArray  # means of 1/ℓ, all rows
+    inverse_x: FloatArray  # means of x/ℓ
     inverse_y: FloatArray
-    y: FloatArray  # of each row
-    across: FloatArray  # weights along x, [places, cells from the first that counts on]
-    along: FloatArray  # likewise along y
-    law: FloatArray  # the material's σ(ε) in rising powers
-    sums: FloatArray  # scratch, a row of cells three times
+    y: FloatArray  # one value per row
+    across: FloatArray  # weights along x [position, cell offset], see `blur.axis_points`
+    along: FloatArray  # weights along y
+    law: FloatArray  # σ(ε) of the material by increasing powers
+    sums: FloatArray  # scratch, three rows of cells
 
 
 class PointArrays(NamedTuple):
-    """The same as few arrays, since each that a kernel takes from Python costs time."""
+    """Storage of `SpringPoints` in few arrays, since each array argument of a kernel costs time."""
 
     line: FloatArray  # [5, row]
     inverse: FloatArray  # [3, all rows]
@@ -81,7 +83,7 @@ def points_in(
     line: FloatArray, inverse: FloatArray, y: FloatArray, across: FloatArray, along: FloatArray,
     law: FloatArray, sums: FloatArray,
 ) -> SpringPoints:  # fmt: skip
-    """Return the points in the arrays of :class:`PointArrays`."""
+    """Return the points stored in the arrays of :class:`PointArrays`."""
     return SpringPoints(
         line[0], line[1], line[2], line[3], line[4], inverse[0], inverse[1], inverse[2],
         y, across, along, law, sums,
@@ -89,7 +91,7 @@ def points_in(
 
 
 def points_of(cells: Grid, material: Material, blur: float, count: tuple[int, int]) -> PointArrays:
-    """Return ``count`` (x, y) points a side of each cell."""
+    """Return the sample points of the cells, ``count`` (x, y) per side of a cell."""
     a = cells.radius
     x, across = axis_points(cells.x, cells.pitch_x, cells.cols, count[0], blur)
     y, along = axis_points(cells.y, cells.pitch_y, cells.rows, count[1], blur)
@@ -122,10 +124,10 @@ def _set_strains(
     a2: float,
     half: Span,
 ) -> None:
-    """Set ε and −∂ε/∂u of the points ``first`` … ``last`` of a row, which begins at ``row``.
+    """Set ε and −∂ε/∂u of the points ``first`` to ``last`` of the row that begins at ``row``.
 
-    ``half`` are half of a point's sides in x and y. Indices are unsigned, since Numba looks whether
-    others are negative, which keeps loops out of SIMD lanes.
+    ``half`` are half the side lengths of a point's rectangle. Indices are unsigned because Numba
+    checks signed ones for negative values, which prevents vectorisation.
     """
     u = face.u
     v = face.v
@@ -135,22 +137,22 @@ def _set_strains(
     least = _LEAST_SPREAD * a2 * math.sqrt(a2)
     for k in range(first, last):
         x = points.x[k]
-        # ε > 0 where f = ℓ² − z² > 0, which is straight enough up to the rim and beyond.
+        # ε > 0 where f = ℓ² − z² > 0; f is close to linear up to the rim and beyond.
         z = max(u - v * x - w * y, 0.0)
         f = rim - x * x - z * z
-        # f's spread over the rectangle: in the outline's middle the mean of max(f, 0) is exact.
+        # Spread of f over the rectangle; makes the mean of max(f, 0) exact for a centred outline.
         by_x = abs(size_x * (x - z * v))
         by_y = abs(size_y * (y - z * w))
         big = max(by_x, by_y)
         small = min(by_x, by_y)
         spread = 4.0 * max(big, max(0.963 * big + 0.222 * small, 0.77 * big + 0.556 * small))
         part = min(max(f + 0.5 * spread, 0.0), spread)
-        # z in the middle of the part where f > 0; f falls along (p, q).
+        # z at the middle of the part with f > 0; f decreases along (p, q).
         p = x - z * v
         q = y - z * w
         away = 0.5 * max(0.5 * part - f, 0.0) / (p * p + q * q + least)
         z = max(z + away * (v * p + w * q), 0.0)
-        # Means of ε and of 1/ℓ where f is spread evenly from 0 to ``part``.
+        # Means of ε and 1/ℓ for f evenly distributed from 0 to ``part``.
         length = math.sqrt(z * z + part)
         mean = part / (spread * (length + z) + least)
         g = points.inverse[row + k]
@@ -171,7 +173,7 @@ def _start_stresses(points: SpringPoints, first: int, last: int, highest: float)
 
 @inlined_kernel
 def _raise_power(points: SpringPoints, first: int, last: int, coefficient: float) -> None:
-    """Take a step of Horner's scheme for σ(ε) and its slope."""
+    """Do one step of Horner's scheme for σ(ε) and its slope."""
     for k in range(first, last):
         strain = points.strain[k]
         points.factor[k] = points.factor[k] * strain + points.stress[k]
@@ -182,9 +184,9 @@ def _raise_power(points: SpringPoints, first: int, last: int, coefficient: float
 def _sum_points(
     points: SpringPoints, first: int, last: int, ahead: int, cols: int, weight: float
 ) -> None:
-    """Add to cells first … last the points that stand ``ahead`` of them.
+    """Add the points at the index offset ``ahead`` to the sums of cells ``first`` to ``last``.
 
-    Stress, its partial by −u, and that times x.
+    The sums are the stress, its partial by −u, and that partial times x.
     """
     for k in range(first, last):
         slope = weight * points.slope[ahead + k] * points.factor[ahead + k]
@@ -197,9 +199,9 @@ def _sum_points(
 def _press_line(
     points: SpringPoints, i: int, first: int, last: int, face: Face, a2: float, half: Span
 ) -> Cells:
-    """Press cells ``first`` … ``last`` of a line of points; sum it over the cells that it reaches.
+    """Evaluate one line of points over cells ``first`` to ``last`` and sum it over the cells.
 
-    Their range is returned.
+    Returns the range of cells affected.
     """
     places, reach = points.across.shape
     wide = points.x.shape[0] // places
@@ -243,14 +245,14 @@ def _add_row(
     row: int,
     out: FloatArray,
 ) -> None:
-    """Add the row's sums to a row of cells; partials are by d, n_x and n_y."""
+    """Add the sums of a line to a row of cells, converting the partials to d, n_x and n_y."""
     u = face.u
     v = face.v
     w = face.w
     c = weight * math.sqrt(1.0 + v * v + w * w)
     cols = points.sums.shape[0] // 3
     for j in range(low, high):
-        # The pressure's partials by −u, v and w.
+        # Partials of the pressure by −u, v and w.
         by_u = points.sums[cols + j]
         by_v = points.sums[2 * cols + j]
         by_w = y * by_u
@@ -265,16 +267,16 @@ def _add_row(
 def press_springs(
     points: SpringPoints, grid: Grid, face: Face, around: Face, out: FloatArray
 ) -> Cells:
-    """Set the pressure at the face and its partials, [PLANES, rows, cols]; return the rows touched.
+    """Set the pressure and its partials [PLANES, rows, cols]; return the range of rows touched.
 
-    Other rows are left as they are; ``around`` is scratch.
+    Other rows are left unchanged. ``around`` is scratch.
     """
     a = grid.radius
     count_x = points.across.shape[0]
     count_y, reach = points.along.shape
     size_x = 0.5 * grid.pitch_x / count_x
     size_y = 0.5 * grid.pitch_y / count_y
-    # A rectangle that the outline cuts may have its middle beyond it.
+    # The centre of a rectangle cut by the outline may lie outside the outline.
     set_around(around, face, a, math.hypot(size_x, size_y))
     low, high = extremes(around, a)
     lines = points.y.shape[0]
@@ -310,13 +312,13 @@ def render(
     inverse: FloatArray, y: FloatArray, across: FloatArray, along: FloatArray, law: FloatArray,
     sums: FloatArray,
 ) -> Cells:  # fmt: skip
-    """Evaluate :func:`press_springs` at the first of ``faces``; the second is scratch."""
+    """Evaluate :func:`press_springs` for the first of ``faces``; the second is scratch."""
     points = points_in(line, inverse, y, across, along, law, sums)
     return press_springs(points, grids[0], faces[0], faces[1], planes)
 
 
 def count_for(cells: Grid, fineness: float) -> tuple[int, int]:
-    """Return the points a side (x, y) of a cell that make ``fineness`` points to the radius."""
+    """Return the points per side (x, y) of a cell for ``fineness`` points per tip radius."""
     per_length = fineness / cells.radius
     x, y = (
         max(math.ceil(pitch * per_length - 1e-9), 1) for pitch in (cells.pitch_x, cells.pitch_y)
@@ -325,7 +327,7 @@ def count_for(cells: Grid, fineness: float) -> tuple[int, int]:
 
 
 class SpringsPressure:
-    """Pressure of one tip of springs on a grid of cells, by ``count`` (x, y) points of each."""
+    """Pressure of one spring tip on a grid of cells with ``count`` (x, y) points per cell."""
 
     def __init__(
         self, cells: Grid, material: Material, blur: float, count: tuple[int, int]
@@ -339,7 +341,7 @@ class SpringsPressure:
     def __call__(self, contact: tuple[float, float, float], gain: float, out: FloatArray) -> None:
         """Write the pressure [Pa] of a ``contact`` (d, n_x, n_y), times ``gain``, into ``out``.
 
-        d ≤ 0 gives zeros. Beyond the domain's limit the footprint ends at the rim.
+        The result is zero for d ≤ 0. Beyond the domain's limit, the footprint ends at the rim.
         """
         d, n_x, n_y = contact
         out[:] = 0.0

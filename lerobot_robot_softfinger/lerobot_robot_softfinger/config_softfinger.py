@@ -1,4 +1,4 @@
-"""What ``--robot.…`` sets."""
+"""Settings of the robot, set by ``--robot.NAME``."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,22 +11,22 @@ from lerobot_robot_softfinger.features import FULL_SCALE
 @RobotConfig.register_subclass("softfinger")
 @dataclass(kw_only=True)
 class SoftfingerConfig(RobotConfig):
-    """How to reach a running ``softfinger``, and what an action is.
+    """Connection to a running ``softfinger``, and the meaning of actions.
 
-    ``control``: ``joints``, actions are the joints' goals; ``law``, the built-in law's force and
-    the object's angle.
+    With ``control`` set to ``joints``, actions are joint goals. With ``law``, they are the force
+    and the object angle of the built-in grip law.
     """
 
-    address: str | None = None  # tcp://HOST or STREAM,COMMANDS; SOFTFINGER_ADDRESS when None
-    keys: Path | None = None  # folder of this client's keys, where the daemon wants some
+    address: str | None = None  # tcp://HOST or STREAM,COMMANDS; SOFTFINGER_ADDRESS if None
+    keys: Path | None = None  # folder of this client's keys, if the daemon requires keys
     control: str = "joints"
-    rows: int = 44  # of the tactile grids
+    rows: int = 44  # size of the tactile grids
     cols: int = 44
-    full_scale: float = FULL_SCALE  # Pa at which a grid's image is white
-    least_force: float = 0.5  # N; an action `grip.force` below it opens the hand
-    timeout: float = 5.0  # s for an answer, a state or a frame
-    start_timeout: float = 120.0  # s for a first state: the daemon may still compile
-    disarm_on_disconnect: bool = True  # torque off; the hand drops what it holds
+    full_scale: float = FULL_SCALE  # Pa, pressure shown as white in an image
+    least_force: float = 0.5  # N; a smaller `grip.force` opens the hand
+    timeout: float = 5.0  # s, for a reply, a state or a frame
+    start_timeout: float = 120.0  # s, for the first state; the daemon may still compile
+    disarm_on_disconnect: bool = True  # switches the torque off; the hand drops the object
 
     def __post_init__(self) -> None:
         super().__post_init__()

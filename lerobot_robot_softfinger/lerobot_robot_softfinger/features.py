@@ -1,4 +1,4 @@
-"""LeRobot's names for a state and its frames; imports nothing of LeRobot's."""
+"""Conversion of hand states and tactile frames to LeRobot features, independent of LeRobot."""
 
 from __future__ import annotations
 
@@ -12,21 +12,22 @@ from softfinger.daemon.types import FINGERS
 from softfinger.daemon.wire.schema import HandState, TactileFrame
 
 _PLAIN = {"pos": "q", "vel": "dq", "current": "current", "contact": "contact"}
-_FELT = ("d", "theta", "force")  # 0 while nothing touches the tip
-_OBJECT = ("angle", "width")  # 0 while the object's pose is not known
+_FELT = ("d", "theta", "force")  # 0 without a contact
+_OBJECT = ("angle", "width")  # 0 while the object's pose is unknown
 STATE = tuple(
     [f"{name}.{each}" for name in FINGERS for each in (*_PLAIN, *_FELT, "touch_age")]
     + [f"object.{each}" for each in _OBJECT]
 )
 JOINTS = tuple(f"{name}.pos" for name in FINGERS)
 IMAGES = {name: f"{name}_touch" for name in FINGERS}
-FULL_SCALE = 127.5e3  # Pa, 500 Pa a step of an 8-bit image
+FULL_SCALE = 127.5e3  # Pa, 500 Pa per step of an 8-bit image
 
 
 def observation(state: HandState, frames: Mapping[str, TactileFrame]) -> dict[str, float]:
-    """Return the numbers of `STATE`, in SI units; ``frames`` are the newest by finger.
+    """Return the values of the `STATE` features in SI units.
 
-    ``touch_age`` [s] is how long before the state its finger's frame was sampled.
+    ``frames`` are the latest frames by finger. ``touch_age`` [s] is the time from the sampling of a
+    finger's frame to the state.
     """
     values: list[float] = []
     for name in FINGERS:
@@ -40,6 +41,6 @@ def observation(state: HandState, frames: Mapping[str, TactileFrame]) -> dict[st
 
 
 def image(frame: TactileFrame, full_scale: float = FULL_SCALE) -> NDArray[np.uint8]:
-    """Return a frame's pressure as an image [rows, cols, 3], white from ``full_scale`` [Pa] on."""
+    """Convert a frame to an image [rows, cols, 3]; ``full_scale`` [Pa] and more is white."""
     grey = np.clip(np.rint(frame.pressure() * (255.0 / full_scale)), 0.0, 255.0)
     return np.repeat(grey.astype(np.uint8)[:, :, np.newaxis], 3, axis=2)

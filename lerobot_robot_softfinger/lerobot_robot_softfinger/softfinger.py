@@ -1,4 +1,4 @@
-"""`Softfinger`: LeRobot's `Robot` over the wire of a running ``softfinger``."""
+"""LeRobot `Robot` that controls a running ``softfinger``."""
 
 from __future__ import annotations
 
@@ -16,9 +16,10 @@ from softfinger.daemon.wire.schema import TactileFrame
 
 
 class Softfinger(Robot):
-    """Both fingers. Connecting neither stiffens nor moves the hand; the first action arms it.
+    """Softfinger hand as a LeRobot robot.
 
-    A hand that is disarmed, or in fault, after that stays so: the next action raises Refused.
+    Connecting does not switch on the torque or move the hand; the first action arms it. If the hand
+    is disarmed or in a fault state after that, it stays so, and the next action raises Refused.
     """
 
     config_class = SoftfingerConfig
@@ -27,7 +28,7 @@ class Softfinger(Robot):
     def __init__(self, config: SoftfingerConfig) -> None:
         super().__init__(config)
         self.config = config
-        self.cameras: dict[str, Any] = {}  # lerobot-record counts them; the grids need none
+        self.cameras: dict[str, Any] = {}  # required by lerobot-record; the grids are not cameras
         self._hand: Hand | None = None
 
     @property
@@ -46,11 +47,15 @@ class Softfinger(Robot):
 
     @check_if_already_connected
     def connect(self, calibrate: bool = True) -> None:
-        """Raises NoStream or NoAnswer without a daemon, ValueError for grids of another size."""
+        """Connect to the daemon.
+
+        Raises NoStream or NoAnswer if there is no daemon, and ValueError if the size of the grids
+        differs from the settings.
+        """
         config = self.config
         hand = Hand(config.address, client="lerobot", timeout=config.timeout, keys=config.keys)
         try:
-            hand.state(config.start_timeout)  # logged while it waits: a first start compiles
+            hand.state(config.start_timeout)  # logs while waiting, since a first start compiles
             hand.status()
             self._waiting = hand.frames()
             self._frames: dict[str, TactileFrame] = {}
@@ -73,20 +78,20 @@ class Softfinger(Robot):
 
     @property
     def is_calibrated(self) -> bool:
-        """The daemon holds the calibration, of ``softfinger calibrate``."""
+        """Always True; the daemon holds the calibration made by ``softfinger calibrate``."""
         return True
 
     @check_if_not_connected
     def calibrate(self) -> None:
-        """Take what the grids read now as unloaded. Raises Refused when something touches a tip."""
+        """Tare the tactile grids. Raises Refused if something touches a tip."""
         self._hand.tare()
 
     def configure(self) -> None:
-        """Nothing to do: the daemon's settings are its own."""
+        """Do nothing; the daemon has its own settings."""
 
     @check_if_not_connected
     def get_observation(self) -> dict[str, Any]:
-        """The next state, and the newest frame of each finger."""
+        """Return the next state and the latest frame of each finger."""
         state = self._hand.state()
         with contextlib.suppress(NoStream):
             while True:
@@ -99,9 +104,9 @@ class Softfinger(Robot):
 
     @check_if_not_connected
     def send_action(self, action: dict[str, Any]) -> dict[str, float]:
-        """Goals for the joints [rad], or the grip's force [N] and object angle [rad].
+        """Command joint goals [rad], or the grip force [N] and object angle [rad].
 
-        Returns what the hand was asked for. Raises Refused for what is out of the hand's limits.
+        Returns the commanded values. Raises Refused for values outside the hand's limits.
         """
         numbers = {name: float(np.asarray(action[name]).item()) for name in self.action_features}
         if not self._armed:

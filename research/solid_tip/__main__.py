@@ -1,6 +1,6 @@
-"""``python -m research.solid_tip``: the linear law of a solid tip, from which `strain` goes on.
+"""Compute the linear law of a solid tip: ``python -m research.solid_tip``.
 
-A file of its own, of the form that `strain`'s notes tell.
+The result is the input file of `strain`, in the format described in the notes of `strain`'s file.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ Arrays = dict[str, NDArray[Any]]
 BASES = ("bonded", "lying")
 STICKING = "-sticking"
 BLOCKS = tuple(base + face for face in ("", STICKING) for base in BASES)
-HELD_OUT = (0.458, 0.49, 0.4995)  # values of ν that are not fitted
+HELD_OUT = (0.458, 0.49, 0.4995)  # values of ν for validation, not fitted
 
 
 def presses(which: tuple[str, int, float], folder: Path) -> fit.Samples:
-    """Presses of one block, mesh and ν over the whole domain; kept in ``folder``."""
+    """Compute the presses of one block, mesh and ν over the whole domain, cached in ``folder``."""
     block, rings, poisson = which
     base, sticking = block.removesuffix(STICKING), block.endswith(STICKING)
     file = folder / f"{block}-{rings}-{poisson:.6f}.npz"
@@ -45,7 +45,7 @@ def presses(which: tuple[str, int, float], folder: Path) -> fit.Samples:
 
 
 def differences(tip: SolidTip, samples: fit.Samples) -> str:
-    """N, U and p of the file against presses, over three ranges of depth."""
+    """Return the errors of the file's N, U and p against presses, over three ranges of depth."""
     areas = np.sqrt(np.diff(tip.edges**2))
     rows = []
     for d, theta, push, energy, _, base in zip(*samples, strict=True):
@@ -61,7 +61,7 @@ def differences(tip: SolidTip, samples: fit.Samples) -> str:
 
 
 def mesh_errors(arrays: Arrays, other: Arrays, block: str) -> tuple[float, float]:
-    """Largest relative difference of two files in N, and in the frame of a sensor's cells."""
+    """Return the largest relative differences of two files in N and in a sensor's frame."""
     force, pressure = [], []
     for poisson in (*fit.NU, 0.49):
         tip, second = SolidTip(arrays, block, poisson), SolidTip(other, block, poisson)
@@ -75,7 +75,7 @@ def mesh_errors(arrays: Arrays, other: Arrays, block: str) -> tuple[float, float
 
 
 def main() -> None:
-    """Compute, fit, write, and print how far the file is from the presses."""
+    """Compute the presses, fit and write the file, and print its errors."""
     parser = argparse.ArgumentParser(prog="python -m research.solid_tip", description=__doc__)
     parser.add_argument("out", type=Path, help="file to write, .npz")
     parser.add_argument("--rings", type=int, default=64, help="elements along the arc")

@@ -1,11 +1,13 @@
-"""A rigid plane pressed on the hemisphere: a linear complementarity problem on its surface's cells.
+"""Contact of a rigid plane with the hemisphere as a linear complementarity problem.
 
-Without friction a cell's unknown is its push q ≥ 0 along the plane's normal n = (sin θ, 0, cos θ),
-both mirror images y and −y together. With the compliance C the cells move by C q; the plane
-overlaps them by δ = X·n − (a − d); so q ≥ 0, C q − δ ≥ 0, q·(C q − δ) = 0. Sticking adds two
-forces along the plane to each cell, which keep it where it was when it came to touch. Then the
-way counts: here the plane comes straight along n, so that the held points never move along it, the
-forces along it do no work, and N = ∂U/∂d holds as without friction.
+Without friction, the unknown of each surface cell is its normal force q ≥ 0 along the plane's
+normal n = (sin θ, 0, cos θ), for the two mirror images y and −y together. The cells move by C q,
+where C is the compliance, and the plane overlaps them by δ = X·n − (a − d). Contact therefore
+requires q ≥ 0, C q − δ ≥ 0 and q·(C q − δ) = 0.
+
+Sticking adds two forces along the plane to each cell, which hold the cell where it first touched.
+The result then depends on the path. Here the plane moves straight along n, so the held points do
+not move along the plane, the tangential forces do no work, and N = ∂U/∂d holds as without friction.
 """
 
 from __future__ import annotations
@@ -17,22 +19,22 @@ from scipy.linalg import cho_factor, cho_solve
 
 from research.solid_tip.green import FloatArray, Green
 
-BEYOND = 0.06  # cells may touch that far outside of the undeformed overlap [a]
+BEYOND = 0.06  # cells may touch this far outside the undeformed overlap [a]
 
 
 class Press(NamedTuple):
-    """One press, for E = a = 1."""
+    """Result of one press, for E = a = 1."""
 
     d: float
     theta: float
     push: float  # N along the plane's normal
     energy: float  # U
-    base: FloatArray  # (H, B) base pressure's cosine harmonics at the base's nodes
+    base: FloatArray  # (H, B) cosine harmonics of the base pressure at the nodes of the base
     shear: float  # force along (cos θ, 0, −sin θ), against the tip; 0 without friction
 
 
 class TiltedPlane:
-    """The plane at tilt θ [rad]; presses up to depth ``d_max`` [a], with or without sticking."""
+    """Plane at tilt θ [rad] for presses up to depth ``d_max`` [a], with or without sticking."""
 
     def __init__(self, green: Green, theta: float, d_max: float, sticking: bool = False) -> None:
         self.green, self.theta = green, theta
@@ -41,14 +43,14 @@ class TiltedPlane:
         self.axes = axes = axes if sticking else axes[:1]
         m = np.arange(len(green.rings))[:, None, None]
         rings, places = [], []
-        self.parts = []  # of each ring: slice of forces, loads (3, M, n), shares (M, 1)
+        self.parts = []  # per ring: slice of forces, loads (3, M, n), shares (M, 1)
         count = 0
         for ring, (cells, (r, z)) in enumerate(zip(green.cells, green.place, strict=True)):
             phi = 2 * np.pi * (np.arange(cells // 2) + 0.5) / cells
             height = r * np.cos(phi) * sine + z * cosine
             near = height > 1 - d_max - BEYOND
             phi, half = phi[near, None], cells // 2
-            # The axes in cylindrical components, and harmonics up to what the ring's cells resolve.
+            # The axes in cylindrical components, and the harmonics resolved by the ring's cells.
             x, y, upright = axes.T
             load = np.stack(
                 np.broadcast_arrays(
@@ -84,10 +86,11 @@ class TiltedPlane:
         self.depth = 0.0
 
     def press(self, d: float) -> Press:
-        """Solve at depth ``d``, beginning with the cells that touched at the last press.
+        """Solve at depth ``d``, starting from the cells in contact at the last press.
 
-        Sticking depends on the way: press deeper in small steps. A cell that comes to touch within
-        one sticks where it was in between. Raises RuntimeError where the active sets do not settle.
+        Sticking depends on the path, so press deeper in small steps. A cell that comes into contact
+        within a step sticks at an interpolated position. Raises RuntimeError if the active sets do
+        not converge.
         """
         overlap, step = self.reach - (1 - d), len(self.axes)
         before = self.moved

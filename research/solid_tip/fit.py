@@ -1,10 +1,10 @@
-"""From presses to the data file: one polynomial for the energy, a few modes for the base pressure.
+"""Fit of the data file to presses: a polynomial for the energy, a few modes for the base pressure.
 
-The energy's ratio to Hertz is fitted to energies and pushes together, so that N = ∂U/∂d holds
-exactly. The base pressure over N is split by singular values, one harmonic after the other; the
-modes' amplitudes are polynomials, too. Variables: s = √(d/a), sin²θ and ν, each by Chebyshev
-polynomials; the file's own notes say how they are put together.
-`SolidTip` reads it, in plain NumPy.
+The ratio of the energy to Hertz is fitted to energies and pushes together, so N = ∂U/∂d holds
+exactly. The base pressure over N is decomposed by singular values, one harmonic at a time, and the
+amplitudes of the modes are polynomials as well. All polynomials are Chebyshev series in s = √(d/a),
+sin²θ and ν; the notes in the file describe their layout. `SolidTip` reads the file with plain
+NumPy.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ NU = (0.45, 0.4995)
 S_MAX = np.sqrt(D_MAX)
 ORDERS = (11, 6)  # coefficients in s and sin²θ
 HARMONICS = 9
-RIM = 0.95  # from there on a bonded base is singular and a lying one ends: no cells count there
+RIM = 0.95  # cells beyond are ignored: a bonded base is singular there, and a lying one ends
 
 
 def chebyshev_nodes(low: float, high: float, count: int) -> FloatArray:
-    """Chebyshev points of the first kind on [low, high], rising."""
+    """Return Chebyshev points of the first kind on [low, high] in increasing order."""
     return (low + high) / 2 - (high - low) / 2 * np.cos(np.pi * (np.arange(count) + 0.5) / count)
 
 
 class Samples(NamedTuple):
-    """Presses of one base at one ν, as arrays over the presses."""
+    """Arrays over the presses of one base at one ν."""
 
     d: FloatArray
     theta: FloatArray
@@ -45,7 +45,7 @@ class Samples(NamedTuple):
 
     @classmethod
     def of(cls, presses: list[Press], base_radius: FloatArray) -> Samples:
-        """Collects ``presses``; ``base_radius`` are the nodes of their base pressure."""
+        """Collect ``presses``, whose base pressure is given at the nodes ``base_radius``."""
         rings = ring_means(base_radius)
         d, theta, push, energy, shear = (
             np.array([getattr(each, name) for each in presses])
@@ -56,7 +56,7 @@ class Samples(NamedTuple):
 
 
 def ring_means(base_radius: FloatArray) -> FloatArray:
-    """(R, B): area means over the rings of quadratic elements with nodes at ``base_radius``."""
+    """Return the matrix (R, B) of area means over rings from quadratic elements at the nodes."""
     points, gauss = GAUSS
     ends = base_radius[::2]
     cuts = np.unique(np.concatenate([RING_EDGES, ends]))
@@ -75,7 +75,7 @@ def ring_means(base_radius: FloatArray) -> FloatArray:
 def terms(
     s: FloatArray, theta: FloatArray, orders: tuple[int, int]
 ) -> tuple[FloatArray, FloatArray]:
-    """Products T_i T_j at each point, (n, I·J), and their derivatives by s."""
+    """Return the products T_i T_j at each point, (n, I·J), and their derivatives by s."""
     x, w = 2 * s / S_MAX - 1, 2 * (np.sin(theta) / np.sin(THETA_MAX)) ** 2 - 1
     first, second = chebyshev.chebvander(x, orders[0] - 1), chebyshev.chebvander(w, orders[1] - 1)
     slope = chebyshev.chebval(x, chebyshev.chebder(np.eye(orders[0]))).T * (2 / S_MAX)
@@ -84,17 +84,17 @@ def terms(
 
 
 def energy_terms(s: FloatArray, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """What the energy's coefficients add to U/U_Hertz and to N/N_Hertz at each point."""
+    """Return the contributions of the energy's coefficients to U/U_Hertz and N/N_Hertz."""
     value, slope = terms(s, theta, ORDERS)
     return s[:, None] * value, s[:, None] * (1.2 * value + 0.2 * s[:, None] * slope)
 
 
 def fit_energy(samples: Samples, poisson: float, step: float) -> FloatArray:
-    """(I, J) coefficients of V in U = U_Hertz (1 + s V); ``step`` is the cells' width."""
+    """Fit the coefficients (I, J) of V in U = U_Hertz (1 + s V); ``step`` is the cell width."""
     s = np.sqrt(samples.d)
     hertz = 4 / (3 * (1 - poisson**2)) * s**3
     of_energy, of_push = energy_terms(s, samples.theta)
-    # A contact of radius s of cells of that width: the scatter of both, seen between meshes.
+    # Scatter of U and N between meshes, for a contact of radius s and this cell width.
     scatter = 1e-4 + np.concatenate([0.05 * (step / s) ** 2, 0.2 * (step / s) ** 2 + 5e-4])
     right = np.concatenate([samples.energy / (0.4 * hertz * s**2) - 1, samples.push / hertz - 1])
     left = np.concatenate([of_energy, of_push])
@@ -103,7 +103,7 @@ def fit_energy(samples: Samples, poisson: float, step: float) -> FloatArray:
 
 
 def push_of(energy: FloatArray) -> FloatArray:
-    """Coefficients of Q in N = N_Hertz (1 + s Q), for those of V: Q = 6/5 V + s/5 ∂V/∂s."""
+    """Convert coefficients of V to those of Q = 6/5 V + s/5 ∂V/∂s in N = N_Hertz (1 + s Q)."""
     slope = chebyshev.chebder(energy, axis=0) * (2 / S_MAX)
     s = np.array([S_MAX / 2, S_MAX / 2])  # s itself, as a Chebyshev series
     product = np.apply_along_axis(lambda row: chebyshev.chebmul(s, row), 0, slope)
@@ -111,7 +111,7 @@ def push_of(energy: FloatArray) -> FloatArray:
 
 
 def over_nu(values: FloatArray) -> FloatArray:
-    """Chebyshev coefficients along a last axis from values at the nodes of ν, the first axis."""
+    """Convert values at the nodes of ν (first axis) to Chebyshev coefficients (last axis)."""
     count = len(values)
     x = chebyshev_nodes(-1, 1, count)
     inverse = np.linalg.inv(chebyshev.chebvander(x, count - 1))
@@ -121,7 +121,7 @@ def over_nu(values: FloatArray) -> FloatArray:
 def fit(
     all_samples: list[Samples], nodes: FloatArray, step: float, tolerance: float
 ) -> dict[str, FloatArray]:
-    """The arrays of one base; ``nodes`` are the samples' values of ν, Chebyshev points."""
+    """Fit the arrays of one base; ``nodes`` are the samples' values of ν, Chebyshev points."""
     energy = np.array(
         [fit_energy(one, nu, step) for one, nu in zip(all_samples, nodes, strict=True)]
     )
@@ -130,7 +130,7 @@ def fit(
     patterns = np.array([one.base / one.push[:, None, None] for one in all_samples])
     s, theta = np.sqrt(all_samples[0].d), all_samples[0].theta
     design = terms(s, theta, ORDERS)[0]
-    # Of the shear along the plane T = N sin θ cos θ Q, for F = N cos θ (1 − sin² θ Q).
+    # The shear along the plane is T = N sin θ cos θ Q, so that F = N cos θ (1 − sin² θ Q).
     slope = np.sin(theta) * np.cos(theta)
     ratio = np.array([one.shear / one.push for one in all_samples])
     stick = np.linalg.lstsq(design * slope[:, None], ratio.T, rcond=None)[0].T
@@ -144,11 +144,11 @@ def fit(
     for m in range(HARMONICS):
         weight = np.sqrt(areas * (1.0 if m == 0 else 0.5)) * np.where(RING_EDGES[1:] > RIM, 0.05, 1)
         flat = patterns[:, :, m] * weight
-        # The moment on the base, too, so that the modes have it although the rim counts little.
+        # Include the moment on the base, so that the modes carry it despite the rim's low weight.
         moment = (m == 1) * 2.0 * patterns[:, :, m] @ levers
         flat = np.concatenate([flat, moment[..., None]], axis=-1)
         _, size, rows = np.linalg.svd(flat.reshape(-1, areas.size + 1), full_matrices=False)
-        # Root mean squares of what is cut.
+        # Rms of the truncated modes.
         left = np.sqrt(np.cumsum(size[::-1] ** 2)[::-1] / flat[..., 0].size) / scale
         turned = design * np.sin(theta)[:, None] ** m
         for row in rows[: int(np.sum(left > tolerance))]:
@@ -166,7 +166,7 @@ def fit(
 
 
 class SolidTip:
-    """One block of the file's arrays at one ν, for E = a = 1."""
+    """Solid tip from one block of the file at one ν, for E = a = 1."""
 
     def __init__(
         self, arrays: Mapping[str, NDArray[np.generic]], block: str, poisson: float
@@ -184,7 +184,7 @@ class SolidTip:
         self.edges = arrays["ring_edges"].astype(float)
 
     def press(self, d: float, theta: float) -> tuple[float, float, FloatArray]:
-        """Push N, energy U and the base pressure's harmonics (H, R) as means over the rings."""
+        """Return push N, energy U and the harmonics (H, R) of the base pressure over the rings."""
         s = np.sqrt(d)
         x = 2 * s / self.s_max - 1
         w = 2 * (np.sin(theta) / np.sin(self.theta_max)) ** 2 - 1
@@ -200,15 +200,15 @@ class SolidTip:
         return push, energy, pressure
 
     def shear(self, d: float, theta: float) -> float:
-        """T over N, along (cos θ, 0, −sin θ) against the tip, of a sticking face."""
+        """Return T/N of a sticking face, along (cos θ, 0, −sin θ) against the tip."""
         x = 2 * np.sqrt(d) / self.s_max - 1
         w = 2 * (np.sin(theta) / np.sin(self.theta_max)) ** 2 - 1
         stick = float(chebyshev.chebval2d(x, w, self.coef[0]))
         return stick * float(np.sin(theta) * np.cos(theta))
 
     def frame(self, pressure: FloatArray, pitch: float, cells: int) -> FloatArray:
-        """Means over a square grid of cells centred under the tip, rows along y."""
-        parts, turns = 10, 2000  # each ring goes to the cells in so many pieces
+        """Average the pressure over a square grid of cells centred under the tip, rows along y."""
+        parts, turns = 10, 2000  # radial and angular pieces of each ring
         edges = np.interp(
             np.arange(parts * (self.edges.size - 1) + 1) / parts,
             np.arange(self.edges.size),
@@ -229,5 +229,5 @@ class SolidTip:
 
 
 def rms_difference(one: ArrayLike, other: ArrayLike) -> float:
-    """Root mean square of the difference over that of ``other``."""
+    """Return the rms of the difference over the rms of ``other``."""
     return float(np.linalg.norm(np.subtract(one, other)) / np.linalg.norm(other))

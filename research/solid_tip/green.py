@@ -1,12 +1,14 @@
-"""Surface Green's functions of the hemisphere: what loads on its rings do to rings and base.
+"""Surface Green's functions of the hemisphere: response of its rings and base to ring loads.
 
-A ring is one element of the arc. A traction that is constant along the ring's arc and of harmonic m
-around the axis moves every ring (mean over its arc), and presses on the base.
-Finite elements of the linear elastic hemisphere give that, one Fourier harmonic at a time: a
-displacement of harmonic m is (U cos mφ, V sin mφ, W cos mφ) with U, V, W on the meridian plane
-(r, z): a quarter disc. Elements are quadrilaterals with nine nodes; the volume strain is projected
-on linear functions inside each (the pair Q2/P1, discontinuous pressure, eliminated), which does not
-lock towards ν = ½.
+A ring is one element of the arc. The load is a traction that is constant along the ring's arc and
+of harmonic m around the axis. The response is the mean displacement of every ring and the pressure
+on the base.
+
+The functions are computed by finite elements of the linear elastic hemisphere, one Fourier harmonic
+at a time. A displacement of harmonic m is (U cos mφ, V sin mφ, W cos mφ) with U, V, W on the
+meridian plane (r, z), a quarter disc. The elements are quadrilaterals with nine nodes. The volume
+strain is projected onto linear functions in each element (the Q2/P1 pair with the discontinuous
+pressure eliminated), which avoids locking as ν approaches ½.
 """
 
 from __future__ import annotations
@@ -22,8 +24,8 @@ from scipy.sparse.linalg import splu
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-# Rings of the base: fine at the rim, where a bonded base is singular, and mirrored to where a lying
-# one spreads.
+# Rings of the base: fine at the rim, where a bonded base is singular, and mirrored beyond the rim,
+# where a lying base spreads.
 RING_EDGES = np.sin(np.linspace(0, np.pi / 2, 97))
 RING_EDGES = np.concatenate([RING_EDGES, 2 - RING_EDGES[RING_EDGES > 0.8][-2::-1]])
 MIDDLES = (RING_EDGES[1:] + RING_EDGES[:-1]) / 2
@@ -32,13 +34,13 @@ GAUSS = np.polynomial.legendre.leggauss(3)
 
 
 def quadratic(x: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The three quadratic shape functions on [−1, 1] at ``x``, and their derivatives: (n, 3)."""
+    """Return the quadratic shape functions on [−1, 1] at ``x`` and their derivatives, (n, 3)."""
     values = np.stack([x * (x - 1) / 2, 1 - x * x, x * (x + 1) / 2], axis=-1)
     return values, np.stack([x - 0.5, -2 * x, x + 0.5], axis=-1)
 
 
 def graded(last: float, widest: float, growth: float, length: float) -> FloatArray:
-    """Ends of elements on [0, length], ``last`` wide at its far end and ``widest`` elsewhere."""
+    """Return graded element ends on [0, length]; widths fall from ``widest`` to ``last``."""
     widths = [last]
     while sum(widths) < length:
         widths.append(min(widths[-1] * growth, widest))
@@ -47,18 +49,18 @@ def graded(last: float, widest: float, growth: float, length: float) -> FloatArr
 
 
 class Meridian:
-    """Mesh of the quarter disc: ``rings`` elements along the arc where contact may be."""
+    """Mesh of the quarter disc with ``rings`` elements along the arc where contact may occur."""
 
     def __init__(self, rings: int, finer: float = 8.0, widest: float = 0.08) -> None:
         step = np.pi / 2 / rings
-        # Towards the rim both directions get finer: a bonded base has singular stress there.
+        # Refine both directions towards the rim, where the stress of a bonded base is singular.
         radii = graded(step / finer, min(2.5 * step, widest), 1.6, 1.0)
         angles = graded(step / finer, step, 2.0, np.pi / 2)
         self.layers, self.arcs = len(radii) - 1, len(angles) - 1
         radius, angle = (
             np.sort(np.concatenate([ends, (ends[1:] + ends[:-1]) / 2])) for ends in (radii, angles)
         )
-        # Node (i, j) is at radius i and polar angle j; all j of i = 0 are the origin, node 0.
+        # Node (i, j) is at radius i and polar angle j; all nodes with i = 0 are the origin, node 0.
         number = np.arange(radius.size * angle.size).reshape(radius.size, angle.size)
         number = np.maximum(number - angle.size + 1, 0)
         self.number = number
@@ -79,7 +81,7 @@ class Meridian:
 
     @cached_property
     def _geometry(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Shape values (9, 9), their gradients (e, q, 9, 2), r (e, q) and weights r dA (e, q)."""
+        """Return shape values (9, 9), gradients (e, q, 9, 2), r (e, q) and weights r dA (e, q)."""
         points, weights = GAUSS
         value, slope = quadratic(points)
         shape = np.einsum("pa,qb->pqab", value, value).reshape(9, 9)
@@ -94,9 +96,10 @@ class Meridian:
         return shape, gradient, r, area * r
 
     def stiffness(self, m: int, poisson: float) -> sparse.csc_matrix:
-        """Stiffness of harmonic ``m`` for E = 1; degrees of freedom are 3 node + (0 U, 1 V, 2 W).
+        """Return the stiffness of harmonic ``m`` for E = 1.
 
-        The energy is integrated over r and z alone: π (2π for m = 0) is left out, as in the loads.
+        The degrees of freedom are 3 node + (0 U, 1 V, 2 W). The energy is integrated over r and z
+        only; the factor π (2π for m = 0) is omitted, as in the loads.
         """
         shear, lame = 0.5 / (1 + poisson), poisson / ((1 + poisson) * (1 - 2 * poisson))
         shape, gradient, r, weight = self._geometry
@@ -129,13 +132,13 @@ class Meridian:
         return sparse.csc_matrix((matrices.ravel(), (row.ravel(), column.ravel())), (size, size))
 
 
-STIFF = 1e4  # of the springs (in E) that hold what harmonic 1 would leave free
-CONTACT_END = np.radians(85.0)  # rings nearer to the rim carry no contact
-CAP = 0.2  # polar angle of the cap that a shear force acts on [rad]
+STIFF = 1e4  # stiffness [E] of the springs that constrain the free motions of harmonic 1
+CONTACT_END = np.radians(85.0)  # polar angle beyond which rings carry no contact
+CAP = 0.2  # polar angle of the cap on which a shear force acts [rad]
 
 
 class Green(NamedTuple):
-    """Response of rings and base; components are (r, φ, z), rings go from the pole outwards."""
+    """Response of rings and base; components are (r, φ, z), rings are ordered from the pole."""
 
     place: FloatArray  # (R, 2) mean r and z of each ring [a]
     weight: FloatArray  # (R,) ∫ r ds of each ring [a²]
@@ -146,7 +149,7 @@ class Green(NamedTuple):
 
 
 def arc_loads(mesh: Meridian) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Of each ring: place (R, 2), ∫ r ds (R,), nodal weights ∫ N r ds (R, 3), and the angle."""
+    """Return position (R, 2), ∫ r ds (R,), nodal weights ∫ N r ds (R, 3) and angle of each ring."""
     points, gauss = GAUSS
     value, slope = quadratic(points)
     arc = mesh.number[-1]
@@ -160,7 +163,7 @@ def arc_loads(mesh: Meridian) -> tuple[FloatArray, FloatArray, FloatArray, Float
 
 
 def base_mass(radius: FloatArray) -> sparse.csc_matrix:
-    """∫ N N r dr of the base's quadratic elements, whose nodes are at ``radius``."""
+    """Return ∫ N N r dr of the base's quadratic elements, whose nodes are at ``radius``."""
     points, gauss = GAUSS
     value, slope = quadratic(points)
     rows, columns, entries = [], [], []
@@ -176,7 +179,7 @@ def base_mass(radius: FloatArray) -> sparse.csc_matrix:
 
 
 def fixed(mesh: Meridian, m: int, bonded: bool) -> IntArray:
-    """Degrees of freedom that are zero: base, axis, and the twist that no symmetric load turns."""
+    """Return the fixed degrees of freedom: base, axis, and the twist of symmetric loads."""
     base = 3 * mesh.base[:, None] + (np.arange(3) if bonded else np.array([2]))
     axis = 3 * mesh.axis[:, None] + {0: [0, 1], 1: [2]}.get(m, [0, 1, 2])
     twist = 3 * np.arange(len(mesh.nodes) if m == 0 else 0) + 1
@@ -184,7 +187,7 @@ def fixed(mesh: Meridian, m: int, bonded: bool) -> IntArray:
 
 
 def supports(mesh: Meridian, m: int, bonded: bool) -> sparse.csc_matrix | float:
-    """Springs of harmonic 1: U + V = 0 on the axis; a lying base keeps its mean place."""
+    """Return the springs of harmonic 1: U + V = 0 on the axis, and the mean of a lying base."""
     if m != 1:
         return 0.0
     size = 3 * len(mesh.nodes)
@@ -204,7 +207,7 @@ def supports(mesh: Meridian, m: int, bonded: bool) -> sparse.csc_matrix | float:
 
 
 def green(rings: int, poisson: float, bonded: bool, base_harmonics: int = 12) -> Green:
-    """Green's functions for ``rings`` elements along the arc; a cell is as long as it is wide."""
+    """Compute the Green's functions for ``rings`` elements along the arc, with square cells."""
     mesh = Meridian(rings)
     place, weight, nodal, angle = arc_loads(mesh)
     count = int(np.sum(angle < CONTACT_END))
@@ -241,7 +244,7 @@ def green(rings: int, poisson: float, bonded: bool, base_harmonics: int = 12) ->
 
 
 def shear_response(rings: int, poisson: float, bonded: bool) -> tuple[FloatArray, FloatArray]:
-    """Nodes of the base, and its pressure's harmonic 1 for a unit shear force on the pole's cap."""
+    """Return the base's nodes and harmonic 1 of its pressure for a unit shear force on the cap."""
     mesh = Meridian(rings)
     _, _, nodal, angle = arc_loads(mesh)
     load = np.zeros(3 * len(mesh.nodes))

@@ -1,12 +1,15 @@
 """Neo-Hookean finite elements of the hemisphere under a rigid plane, in the deformed state.
 
-W = μ/2 (J^(−2/3) tr FᵀF − 3) + κ/2 (J − 1)² with the E and ν of small strains: μ = E/(2 + 2ν),
-κ = E/(3 − 6ν). Elements have 27 nodes, and J − 1 in the volume's part is projected on linear
-functions inside each (mean dilatation to first order), which does not lock towards ν = ½. The mesh
-is that of a meridian, revolved: over half a turn (y = 0 is a plane of symmetry) for a tilted plane,
-or over one thin wedge, whose nodes move along r and z alike, for an upright one.
-The plane touches nodes: an active one lies in it, pushes, and is free along it unless the face
-sticks. All steps are Newton's, and each brings the active set up to date. pypardiso solves.
+The strain energy is W = μ/2 (J^(−2/3) tr FᵀF − 3) + κ/2 (J − 1)² with μ = E/(2 + 2ν) and
+κ = E/(3 − 6ν), from E and ν at small strains. Elements have 27 nodes. In the volumetric part, J − 1
+is projected onto linear functions in each element (mean dilatation to first order), which avoids
+locking as ν approaches ½. The mesh is a revolved meridian mesh. For a tilted plane it covers half a
+turn, with the symmetry plane y = 0. For an upright plane it is one thin wedge whose nodes have
+equal motions along r and z.
+
+Contact is between the plane and nodes. An active node lies in the plane, transmits a normal force,
+and moves freely along the plane unless the face sticks. Each Newton step also updates the active
+set. The linear solver is pypardiso.
 """
 
 from __future__ import annotations
@@ -32,37 +35,37 @@ from research.solid_tip.green import (
     quadratic,
 )
 
-WEDGE = 0.1  # its angle [rad]
-STIFF = 1e3  # of the spring (in E) that holds a lying base's mean place
+WEDGE = 0.1  # angle of the wedge [rad]
+STIFF = 1e3  # stiffness [E] of the spring that holds the mean position of a lying base
 HARMONICS = 9
-AZIMUTHS = 48  # at which base pressures are read
+AZIMUTHS = 48  # number of azimuths at which base pressures are evaluated
 SLICES = 8
 ROOTS = np.linspace(0.2, np.sqrt(0.4), 8)  # √(d/a) of the presses
-REACHED = 0.5  # lowest nodes of the face that the plane may touch, undeformed [a]
-CHUNK = 64  # elements worked on at once
+REACHED = 0.5  # lowest height of nodes that the plane may touch, undeformed [a]
+CHUNK = 64  # elements processed at once
 
 
 class Strained(NamedTuple):
-    """One press of the elements, for E = a = 1, and of their linear kind as well."""
+    """Result of one press for E = a = 1, with nonlinear or linear elements."""
 
     d: float
     push: float  # N along the plane's normal
     shear: float  # force along (cos θ, 0, −sin θ), against the tip
     energy: float
-    base: FloatArray  # (H, R) harmonics of the base pressure in the sensor's place, at radii
+    base: FloatArray  # (H, R) harmonics of the base pressure at radii on the sensor
 
 
 class State(NamedTuple):
-    """Where a press has come to."""
+    """Current state of a press."""
 
     depth: float
-    motion: FloatArray  # of the dofs
+    motion: FloatArray  # displacement of each dof
     touching: NDArray[np.bool_]  # nodes of the face
-    held: FloatArray  # where they stick along the plane
+    held: FloatArray  # their positions along the plane while sticking
 
 
 class Body:
-    """The meshed tip at one ν, for a plane at ``theta`` [rad]; None is upright and axisymmetric."""
+    """Meshed tip at one ν for a plane at ``theta`` [rad]; None means upright and axisymmetric."""
 
     def __init__(
         self,
@@ -84,7 +87,7 @@ class Body:
         self._revolve(mesh, phis)
         gradient = self._geometry()
         turns = self._free_nodes(bonded) if whole else self._axisymmetric(mesh, bonded)
-        # From an element's dofs to the displacement's gradient at its points.
+        # Matrix from an element's dofs to the displacement gradient at its quadrature points.
         size = self.places.shape[1]
         self.strain = np.zeros((len(self.elements), 243, size))
         for k in range(3):
@@ -109,7 +112,7 @@ class Body:
             self.moves = self.solve(rest, loads, known)
 
     def _revolve(self, mesh: Meridian, phis: FloatArray) -> None:
-        """Nodes and elements of ``mesh`` turned to every angle; nodes on the axis are one."""
+        """Create the nodes and elements of ``mesh`` at every angle; axis nodes are shared."""
         count = len(mesh.nodes)
         on_axis = mesh.nodes[:, 0] < 1e-12
         number = np.zeros((count, phis.size), dtype=np.int64)
@@ -137,10 +140,10 @@ class Body:
         self.below = np.unique(self.base)
         face = np.setdiff1d(np.unique(number[mesh.number[-1]]), self.below)
         self.face = face[self.nodes[face] @ self.axes[0] > REACHED]
-        self.lines = number[mesh.base].T  # nodes of the base from the middle to the rim
+        self.lines = number[mesh.base].T  # nodes of the base from the centre to the rim
 
     def _geometry(self) -> FloatArray:
-        """Gradients (e, q, 27, 3) of the shape functions; sets weights and the linear functions."""
+        """Set weights and linear functions; return shape function gradients (e, q, 27, 3)."""
         points, gauss = GAUSS
         value, slope = quadratic(points)
 
@@ -169,7 +172,7 @@ class Body:
         return np.asarray(gradient)
 
     def _free_nodes(self, bonded: bool) -> FloatArray:
-        """Three dofs a node: along the plane's axes on the face, along x, y, z elsewhere."""
+        """Define three dofs per node: along the plane's axes on the face, else along x, y, z."""
         frames = np.tile(np.eye(3), (len(self.nodes), 1, 1))
         frames[self.face] = self.axes.T
         turns = np.zeros((len(self.elements), 27, 3, 27, 3))
@@ -194,7 +197,7 @@ class Body:
         return turns
 
     def _axisymmetric(self, mesh: Meridian, bonded: bool) -> FloatArray:
-        """Two dofs a node of the meridian: along z, and along r."""
+        """Define two dofs per node of the meridian, along z and r."""
         self.frames = np.zeros((len(self.nodes), 3, 2))
         phi = np.arctan2(self.nodes[:, 1], self.nodes[:, 0])
         self.frames[:, 2, 0] = 1.0
@@ -213,7 +216,7 @@ class Body:
         return turns
 
     def _sparsity(self) -> None:
-        """Upper triangle of the tangent, and where each element's numbers go in it."""
+        """Set the sparsity of the tangent's upper triangle and the positions of element entries."""
         size = self.places.shape[1]
         row, column = np.repeat(self.places, size, 1).ravel(), np.tile(self.places, size).ravel()
         self.upper = np.flatnonzero(row <= column)
@@ -233,12 +236,12 @@ class Body:
         self.analysed = False
 
     def _strain(self, part: slice, motion: FloatArray) -> FloatArray:
-        """The displacement's gradient (e, q, 3, 3) at all points of some elements."""
+        """Return the displacement gradient (e, q, 3, 3) at the points of some elements."""
         moved = self.strain[part] @ motion[self.places[part]][..., None]
         return np.asarray(moved.reshape(-1, 27, 3, 3))
 
     def pressures(self, motion: FloatArray, change: FloatArray) -> FloatArray:
-        """What the linear functions of p become by a ``change``, to first order."""
+        """Return the linear functions of p after a ``change`` of motion, to first order."""
         moved = self._strain(slice(None), motion)
         more = self._strain(slice(None), change)
         f = moved + np.eye(3)
@@ -247,17 +250,17 @@ class Body:
         return np.asarray(self.bulk * (self.project @ volume[..., None])[..., 0])
 
     def least_volume(self, motion: FloatArray) -> float:
-        """The least J of all points."""
+        """Return the smallest J of all points."""
         return float(np.linalg.det(self._strain(slice(None), motion) + np.eye(3)).min())
 
     def forces(
         self, motion: FloatArray, pressures: FloatArray | None = None
     ) -> tuple[float, FloatArray, FloatArray | None]:
-        """Energy, forces on the dofs, and with ``pressures`` the tangent's upper triangle.
+        """Return the energy, the forces on the dofs and, with ``pressures``, the upper tangent.
 
-        These are the linear functions' coefficients (e, 4) of each element, as Newton's steps of a
-        mixed method have them: what a step does to the volume in second order, times κ, would
-        spoil the next one's tangent.
+        ``pressures`` are the coefficients (e, 4) of the linear functions of each element, updated
+        as in the Newton steps of a mixed method. Otherwise the second-order change of volume in a
+        step, multiplied by κ, would distort the next tangent.
         """
         if self.at_rest is not None:
             out = self.times_tangent(self.at_rest, motion)
@@ -293,7 +296,7 @@ class Body:
     def _material(
         self, part: slice, moved: FloatArray, given: FloatArray | None
     ) -> tuple[FloatArray, FloatArray, FloatArray | None, FloatArray]:
-        """First Piola-Kirchhoff stress, W, its second derivative less the projected part, ∂J/∂F."""
+        """Return first Piola-Kirchhoff stress, W, ∂²W/∂F² without the projected part, and ∂J/∂F."""
         count, f = len(moved), moved + np.eye(3)
         j, g = np.linalg.det(f), np.linalg.inv(f).transpose(0, 1, 3, 2)
         means = self.project[part] @ (j - 1)[..., None]
@@ -311,13 +314,13 @@ class Body:
         four -= both + both.transpose(0, 1, 3, 2)
         one = g[..., :, None] * g[..., None, :]
         four += (2 / 9 * scale * first + bent)[..., None, None] * one
-        # F^−T dFᵀ F^−T: both second indices change their places.
+        # F^−T dFᵀ F^−T: swap the two second indices.
         turned = one.reshape(count, 27, 3, 3, 3, 3).transpose(0, 1, 2, 5, 4, 3)
         four += (scale * first / 3 - bent)[..., None, None] * turned.reshape(count, 27, 9, 9)
         return stress, density, four, swell
 
     def solve(self, numbers: FloatArray, right: FloatArray, known: FloatArray) -> FloatArray:
-        """Dofs for forces ``right``; ``known`` are those given, NaN where they are sought."""
+        """Solve for the dofs under forces ``right``; ``known`` dofs are given, NaN if unknown."""
         if self.moves is not None:
             return self._solve_at_rest(right, known)
         given = ~np.isnan(known)
@@ -334,9 +337,9 @@ class Body:
         return np.asarray(found).squeeze()
 
     def _solve_at_rest(self, right: FloatArray, known: FloatArray) -> FloatArray:
-        """As `solve` for the linear kind, by what forces on each dof of the face do."""
+        """Solve the linear elements as in `solve`, from the response to forces on the face."""
         assert self.moves is not None
-        # All forces but those on the face are in balance from the start.
+        # All forces except those on the face are in equilibrium from the start.
         given = ~np.isnan(known[self.pushed])
         load = right[self.pushed]
         if given.any():
@@ -347,13 +350,13 @@ class Body:
         return np.asarray(self.moves @ load)
 
     def times_tangent(self, numbers: FloatArray, vector: FloatArray) -> FloatArray:
-        """The tangent, of which the upper triangle is known, times a vector."""
+        """Multiply the tangent, given by its upper triangle, with a vector."""
         matrix = sparse.csr_matrix((numbers, self.columns, self.starts), (self.count, self.count))
         diagonal = numbers[self.rows == self.columns]
         return np.asarray(matrix @ vector + matrix.T @ vector - diagonal * vector)
 
     def press(self, depths: Iterable[float]) -> Iterator[Strained]:
-        """Press to rising ``depths``, each from the one before, up to where none is found."""
+        """Press to increasing ``depths``, each from the last; stop where there is no solution."""
         state = State(
             0.0,
             np.zeros(self.count),
@@ -376,7 +379,7 @@ class Body:
             )
 
     def _go(self, state: State, d: float) -> State:
-        """The state at depth ``d``, by as many steps as it takes."""
+        """Advance to depth ``d`` in as many steps as needed and return the state."""
         try:
             return self._step(state, d)
         except RuntimeError:
@@ -388,7 +391,7 @@ class Body:
         depth, before, touching, held = state
         held = held.copy()
         target = (1 - d) - self.reach
-        room = before[self.normal] - ((1 - depth) - self.reach)  # ≤ 0; the plane takes d − depth
+        room = before[self.normal] - ((1 - depth) - self.reach)  # ≤ 0; the plane moves by d − depth
         motion, pressures = before.copy(), self.pressures(before, 0 * before)
         touching = touching | (target < 0.3 * target.min()) if not touching.any() else touching
         size = 1.0
@@ -411,7 +414,7 @@ class Body:
             reaction = (forces + self.times_tangent(numbers, change))[self.normal]
             gap = motion[self.normal] - target
             now = np.where(touching, reaction < 0, gap > 1e-10)
-            if attempt > 15:  # a node that comes and goes stays
+            if attempt > 15:  # nodes that alternate stay active
                 now |= touching
             still = np.abs(change).max() < 1e-6 and size == 1.0
             if still and (now == touching).all():
@@ -425,9 +428,9 @@ class Body:
         raise RuntimeError(f"no contact found at d = {d} a, θ = {self.theta} rad")
 
     def base_pressure(self, motion: FloatArray, forces: FloatArray) -> FloatArray:
-        """Cosine harmonics at `MIDDLES`; rubber that slides presses where it has come to."""
+        """Return cosine harmonics of the base pressure at `MIDDLES`, at the deformed positions."""
         place = self.nodes.copy()
-        if self.at_rest is not None:  # small motions
+        if self.at_rest is not None:  # linear elements
             motion = 0 * motion
         if self.frames.shape[2] == 3:
             place += np.einsum("nij,nj->ni", self.frames, motion.reshape(-1, 3))
@@ -464,7 +467,7 @@ class Body:
         return np.asarray(np.where(m == 0, 1.0, 2.0) / AZIMUTHS * (np.cos(m * phi) @ at))
 
     def _between(self) -> FloatArray:
-        """From the lines of nodes to four times as many azimuths."""
+        """Return the interpolation from the lines of nodes to four times as many azimuths."""
         count = len(self.lines)
         local = np.linspace(0, count - 1, 4 * (count - 1) + 1)
         first = 2 * np.minimum(local // 2, count // 2 - 1).astype(int)
@@ -475,7 +478,7 @@ class Body:
         return out
 
     def _base_shares(self, nodes: FloatArray) -> FloatArray:
-        """∫ N dA of each node of the base's facets."""
+        """Return ∫ N dA of each node of the base's facets."""
         return np.asarray(self._base_mass(nodes).sum(axis=2))
 
     def _base_mass(self, nodes: FloatArray) -> FloatArray:
@@ -493,7 +496,7 @@ class Body:
 def strained(
     block: str, poisson: float, theta: float | None, mesh: Meridian, file: Path
 ) -> dict[str, FloatArray]:
-    """Presses of both kinds, the linear one first, as arrays (2, n, …); kept in ``file``."""
+    """Return linear and nonlinear presses as arrays (2, n, …), linear first; cached in ``file``."""
     if not file.exists():
         base, sticking = block.removesuffix("-sticking"), block.endswith("-sticking")
         found = []

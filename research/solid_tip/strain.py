@@ -1,9 +1,10 @@
 """Finite strain: ``python -m research.solid_tip.strain LINEAR OUT --folder FOLDER``.
 
-Takes the linear law's file (``python -m research.solid_tip``) and writes the neo-Hookean one, of
-the same form. What strain changes comes from `rubber`'s elements, of both kinds on the same mesh,
-so that the mesh's error goes with it: energies by their ratio, base pressures over the push by
-their difference. Upright a fine mesh does that; for a tilt a coarse one, over itself upright.
+The program reads the file of the linear law (``python -m research.solid_tip``) and writes the
+neo-Hookean one in the same format. The effect of finite strain is computed with the linear and the
+neo-Hookean elements of `rubber` on the same mesh, so the mesh error cancels. Energies are scaled by
+the ratio of both kinds, and base pressures over the push are changed by their difference. Upright
+presses use a fine mesh. Tilted presses use a coarse mesh, relative to upright presses on that mesh.
 """
 
 from __future__ import annotations
@@ -26,15 +27,15 @@ from research.solid_tip.rubber import HARMONICS, strained
 NU = fit.chebyshev_nodes(*fit.NU, 3)
 SINES = np.sin(fit.THETA_MAX) ** 2 * (1 - np.cos(np.pi * np.arange(5) / 4)) / 2  # sin²θ
 AREAS = np.pi * np.diff(RING_EDGES**2)
-# Of each block the numbers of sin²θ in `SINES` that are pressed, and at which ν. Lying rubber is
-# crushed at the far corner of the domain, where elements find no balance; it is continued there.
+# Indices of sin²θ in `SINES` to press for each block, with their values of ν. At the far corner of
+# the domain, lying rubber is crushed and the elements do not converge; the fit extrapolates there.
 TILTS = {
     "bonded": {1: NU[1:2], 2: NU[1:2], 4: NU[1:2]},
     "lying": {1: NU[1:2], 2: NU[1:2]},
     "bonded-sticking": {2: NU[1:2], 4: NU[1:2]},
     "lying-sticking": {2: NU[1:2]},
 }
-IN_ROOT = 5  # terms in √(d/a) of what strain changes, all of which begin with d/a
+IN_ROOT = 5  # terms in √(d/a) of the effect of strain, which begin with d/a
 
 
 NOTES = """Hemisphere of neo-Hookean rubber, W = μ/2 (J^(−2/3) tr FᵀF − 3) + κ/2 (J − 1)², pressed
@@ -53,16 +54,17 @@ that carries the tip's own; it presses where it has slid to, beyond 1, too. forc
 pressure_error: of N, and of the base pressure where it is smooth (within 0.95 a), against elements
 of other meshes, d to 0.35 a, θ to 20°. Largest and rms differences of what was fitted:
 {errors}"""
-# By tests/harness/solid_reference.py's presses. A coarse mesh hardly tells a tilted bonded rim.
+# From the presses of tests/harness/solid_reference.py. A coarse mesh hardly resolves a tilted
+# bonded rim.
 FORCE_ERROR = 0.005
 PRESSURE_ERROR = {"bonded": 0.01, "lying": 0.004}
 
 
 class Change(NamedTuple):
-    """What strain changes in presses of one θ and ν: of d, as it was sampled."""
+    """Effect of strain on presses at one θ and ν, over the sampled d."""
 
     s: FloatArray
-    energy: FloatArray  # ratio to the linear one, less 1 (n,)
+    energy: FloatArray  # ratio to the linear energy, minus 1 (n,)
     push: FloatArray
     lever: FloatArray  # linear U/(N d)
     shear: FloatArray  # over the push
@@ -70,7 +72,7 @@ class Change(NamedTuple):
 
 
 def change(arrays: Mapping[str, FloatArray], theta: float) -> Change:
-    """Compare `rubber.strained`'s two kinds."""
+    """Compare the linear and nonlinear presses of `rubber.strained`."""
     d, push, shear, energy = (arrays[name] for name in ("d", "push", "shear", "energy"))
     force = push * np.cos(theta) - shear * np.sin(theta)
     found = arrays["base"][:, :, 0] @ AREAS
@@ -87,7 +89,7 @@ def change(arrays: Mapping[str, FloatArray], theta: float) -> Change:
 
 
 def in_root(s: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Terms d/a T_i(s), each of them at each s (n, i), and their derivatives by d/a."""
+    """Return the terms d/a T_i(s) at each s (n, i), and their derivatives by d/a."""
     x = 2 * s / fit.S_MAX - 1
     value = chebyshev.chebvander(x, IN_ROOT - 1)
     slope = chebyshev.chebval(x, chebyshev.chebder(np.eye(IN_ROOT))).T * (2 / fit.S_MAX)
@@ -95,7 +97,10 @@ def in_root(s: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def coefficients(each: Change, step: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Of U's ratio (i,), T (i,), and the base pressure (i, H, R); ``step``: the cells' width."""
+    """Fit coefficients of U's ratio (i,), T (i,) and base pressure (i, H, R).
+
+    ``step`` is the width of the cells.
+    """
     value, slope = in_root(each.s)
     scatter = 0.001 + 0.05 * (step / each.s) ** 2
     left = np.concatenate([value, value + (each.lever * each.s**2)[:, None] * slope])
@@ -111,7 +116,7 @@ def coefficients(each: Change, step: float) -> tuple[FloatArray, FloatArray, Flo
 
 
 def through(points: FloatArray, values: FloatArray) -> Callable[[float], FloatArray]:
-    """The polynomial through ``values`` (their first axis) at ``points``."""
+    """Return the polynomial through ``values`` (first axis) at ``points``."""
 
     def at(point: float) -> FloatArray:
         weights = [
@@ -124,10 +129,10 @@ def through(points: FloatArray, values: FloatArray) -> Callable[[float], FloatAr
 
 
 class Strain:
-    """What strain changes in one block, of any d, θ and ν."""
+    """Effect of strain in one block for any d, θ and ν."""
 
     def __init__(self, block: str, tilts: Mapping[int, FloatArray], folder: Path) -> None:
-        """``tilts``: by the number of sin²θ in `SINES`, values of ν of the coarse presses."""
+        """Set up a block; ``tilts`` maps indices of `SINES` to the coarse presses' values of ν."""
         fine, coarse = Meridian(16), Meridian(8, finer=2, widest=0.2)
 
         def of(name: str, poisson: float, mesh: Meridian, theta: float | None) -> Any:
@@ -156,7 +161,10 @@ class Strain:
         self.energy, self.shear, self.base, self.first = energy, shear, base, first
 
     def at(self, poisson: float) -> Callable[[float], tuple[FloatArray, FloatArray, FloatArray]]:
-        """Of sin²θ: coefficients of U's ratio, T over N sin θ cos θ, and the base pressure."""
+        """Return a function of sin²θ for the coefficients at one ν.
+
+        The coefficients are those of U's ratio, T over N sin θ cos θ, and the base pressure.
+        """
         energy, _, base = (each(poisson) for each in self.upright)
         rises, shears, bases, firsts = (
             np.array([of(poisson) for of in each])
@@ -165,7 +173,7 @@ class Strain:
         rise = through(np.append(0.0, self.sines), np.concatenate([[0 * rises[0]], rises]))
         first = through(np.append(0.0, self.sines), np.concatenate([[0 * firsts[0]], firsts]))
         shear, harmonics = through(self.sines, shears), through(self.sines, bases)
-        # A small tilt hardly has the higher ones: over sin^m θ the mesh's error is all it shows.
+        # At small tilts the higher harmonics are tiny; over sin^m θ only the mesh error would show.
         least = len(self.sines) > 1
         higher = through(self.sines[least:], bases[least:])
 
@@ -179,7 +187,7 @@ class Strain:
         return of
 
     def strain(self, tip: SolidTip) -> fit.Samples:
-        """The linear ``tip``'s presses over the whole domain, strained."""
+        """Return the presses of the linear ``tip`` over the whole domain with finite strain."""
         rows = []
         at = self.at(tip.poisson)
         for square in fit.chebyshev_nodes(0, np.sin(fit.THETA_MAX) ** 2, 9):
@@ -201,7 +209,7 @@ class Strain:
 
 
 def main() -> None:
-    """Compute what is not in the folder yet, and write the file."""
+    """Compute the presses that are not in the folder yet, and write the file."""
     parser = argparse.ArgumentParser(
         prog="python -m research.solid_tip.strain", description=__doc__
     )

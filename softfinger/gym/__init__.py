@@ -1,7 +1,8 @@
-"""Gymnasium's environments of the simulated hand; `environment` has them.
+"""Gymnasium environments of the simulated hand.
 
-Importing this registers them, and the hand is loaded when the first is made:
-``gymnasium.make("softfinger.gym:SoftFinger-Grasp-v0")``, ``…-Rotate-v0`` and ``…-Push-v0``.
+Importing this package registers ``SoftFinger-Grasp-v0``, ``SoftFinger-Rotate-v0`` and
+``SoftFinger-Push-v0``. Create one with ``gymnasium.make("softfinger.gym:SoftFinger-Grasp-v0")``;
+the simulated hand is loaded only then.
 """
 
 from __future__ import annotations
@@ -10,11 +11,11 @@ from softfinger.tools.extras import require
 
 require("gym")
 
-from gymnasium.envs.registration import register  # noqa: E402 - after what says how to install it
+from gymnasium.envs.registration import register  # noqa: E402 - require() explains a missing install
 
 TASKS = ("grasp", "rotate", "push")
-SECONDS = 4.0  # of an episode
-STEP = 0.02  # s
+SECONDS = 4.0  # s, longest episode
+STEP = 0.02  # s, simulated time per step
 
 for _task in TASKS:
     register(

@@ -1,6 +1,7 @@
-"""Returns of a random agent and of the built-in law in each task.
+"""Measure the returns of a random agent and of the built-in grip law in each task.
 
-``python -m softfinger.gym [EPISODES [PROFILE]]``; ``--processes`` and ``--scheduler`` say where.
+Usage: ``python -m softfinger.gym [EPISODES [PROFILE]]``. Episodes run in parallel; choose the
+workers with ``--processes`` or ``--scheduler``.
 """
 
 from __future__ import annotations
@@ -20,14 +21,14 @@ from softfinger.gym import SECONDS, STEP, TASKS
 from softfinger.gym.environment import ANGLE, FORCE, FORCES, Observation
 from softfinger.tools.sweep import Sweep, add_sweep
 
-AGENTS = {"random": "joints", "law": "law"}  # what each controls
+AGENTS = {"random": "joints", "law": "law"}  # agent: its ``control`` argument
 Policy = Callable[[Observation], NDArray[np.float32]]
 
 
 def main(
     episodes: int, profile: str, processes: int | None = None, scheduler: str | None = None
 ) -> None:
-    """Print a line for each task and agent; the seeds are 0 to ``episodes`` - 1."""
+    """Print the mean return of each task and agent over the seeds 0 to ``episodes`` - 1."""
     print(f"{'task':8}{'agent':8}return of {SECONDS / STEP:.0f} steps      x real time")
     rows = list(itertools.product(TASKS, AGENTS))
     cases = [(task, agent, seed) for task, agent in rows for seed in range(episodes)]
@@ -40,7 +41,7 @@ def main(
 
 
 def _tried(profile: str, case: tuple[str, str, int]) -> tuple[float, float]:
-    """An episode's return, and how long it took [s]."""
+    """Run one episode; return its return and its run time [s]."""
     task, agent, seed = case
     name = f"SoftFinger-{task.capitalize()}-v0"
     env = gymnasium.make(name, control=AGENTS[agent], profile=profile)
@@ -53,7 +54,7 @@ def _tried(profile: str, case: tuple[str, str, int]) -> tuple[float, float]:
 
 
 def episode(env: gymnasium.Env[Any, Any], policy: Policy, seed: int) -> float:
-    """One episode's return."""
+    """Run one episode and return the sum of its rewards."""
     observation, _ = env.reset(seed=seed)
     env.action_space.seed(seed)
     total, over = 0.0, False
@@ -65,20 +66,20 @@ def episode(env: gymnasium.Env[Any, Any], policy: Policy, seed: int) -> float:
 
 
 def at_random(env: gymnasium.Env[Any, Any]) -> Policy:
-    """Any action."""
+    """Return a policy that draws uniform random actions."""
     return lambda _: env.action_space.sample()
 
 
 def by_law(observation: Observation) -> NDArray[np.float32]:
-    """The built-in law's setpoints: the wanted force, and in ``rotate`` the goal."""
+    """Return the action that sets the grip law to the target force and, in ``rotate``, the goal."""
     least, most = FORCES
     goal = float(observation["goal"][0])
-    angle = goal / ANGLE if abs(goal) < ANGLE else 0.0  # a goal in N is no angle
+    angle = goal / ANGLE if abs(goal) < ANGLE else 0.0  # other tasks have a goal in N
     return np.array([2.0 * (FORCE - least) / (most - least) - 1.0, angle], np.float32)
 
 
 if __name__ == "__main__":
-    # Other processes find what is imported by its name, not what only runs under this one.
+    # Import by name: worker processes cannot unpickle functions defined in ``__main__``.
     from softfinger.gym.__main__ import main
 
     parser = argparse.ArgumentParser(description="Returns of a random agent and of the law.")

@@ -1,9 +1,11 @@
-"""A baseline that learns: the cross-entropy method on ``SoftFinger-Grasp-v0``, reward shaped.
+"""Learning baseline: the cross-entropy method on ``SoftFinger-Grasp-v0`` with shaped rewards.
 
-``python -m softfinger.gym.baseline [GENERATIONS]`` prints the returns without the shaping after
-each, and ``--plot`` draws them; ``--processes`` and ``--scheduler`` say where the rows are tried.
-The policy is one row of weights for both fingers, each with its own features; a generation draws
-rows around the best ones of the last. For minutes.
+``python -m softfinger.gym.baseline [GENERATIONS]`` prints the return without shaping after each
+generation and runs for several minutes. ``--plot`` draws the returns. Choose the workers with
+``--processes`` or ``--scheduler``.
+
+The policy is one weight vector shared by both fingers, applied to the features of each finger. Each
+generation samples weight vectors from a normal distribution fitted to the best of the previous one.
 """
 
 from __future__ import annotations
@@ -22,17 +24,17 @@ from softfinger.gym.environment import FORCE, Observation, SoftFingerEnv
 from softfinger.tools import style
 from softfinger.tools.sweep import Sweep, add_sweep
 
-DRAWN, KEPT, EPISODES = 24, 6, 2  # rows of a generation, the best of them, objects that each meets
+DRAWN, KEPT, EPISODES = 24, 6, 2  # samples, elites, episodes per sample
 STEPS = 200
 FEATURES = 5
-_GENTLE = 0.2  # of a row of ones: an action of 1 is 1 rad/s
-_FRESH = 0.2  # added to the deviation, which falls to nothing: it would settle too soon
+_GENTLE = 0.2  # scales the weights, since an action of 1 is a fast 1 rad/s
+_FRESH = 0.2  # added to the standard deviation against premature convergence
 
 Weights = NDArray[np.float64]
 
 
 def policy(weights: Weights) -> Policy:
-    """Return what ``weights`` [FEATURES] do."""
+    """Return the policy with the given ``weights`` [FEATURES]."""
 
     def act(observation: Observation) -> NDArray[np.float32]:
         contacts, joints = observation["contacts"].reshape(2, 3), observation["joints"]
@@ -48,7 +50,7 @@ def policy(weights: Weights) -> Policy:
 
 
 def returns(seed: int, shaped: bool, weights: Weights) -> float:
-    """Return the mean of EPISODES episodes from ``seed`` on."""
+    """Return the mean return of EPISODES episodes with consecutive seeds from ``seed``."""
     env = SoftFingerEnv("grasp", shaped=shaped)
     limited = gymnasium.wrappers.TimeLimit(env, STEPS)
     try:
@@ -61,7 +63,10 @@ def returns(seed: int, shaped: bool, weights: Weights) -> float:
 def learn(
     generations: int, processes: int | None = None, scheduler: str | None = None
 ) -> list[float]:
-    """Learn, a line a generation, and the mean of the last one's best rows: the returns."""
+    """Train the policy and return the unshaped return of each generation.
+
+    Prints one line per generation and the final mean weights.
+    """
     rng, curve = np.random.default_rng(0), []
     mean, std = np.zeros(FEATURES), np.ones(FEATURES)
     began = time.monotonic()
@@ -79,7 +84,10 @@ def learn(
 
 
 def draw(curve: list[float], path: Path) -> None:
-    """Draw the returns over the generations. Raises MissingExtra without matplotlib, OSError."""
+    """Plot the returns over the generations to ``path``.
+
+    Raises MissingExtra if matplotlib is not installed, and OSError if the file cannot be written.
+    """
     with style.settings():
         figure = style.new_figure(4.2, 2.2)
         axes = figure.subplots()

@@ -1,7 +1,7 @@
-"""The simulated hand as an environment: the daemon's own loop on virtual time, step by step.
+"""Gymnasium environment of the simulated hand: the daemon's control loop on virtual time.
 
-An action is a client's command, so that an agent can do nothing that a client can't, within the
-same limits. Everything random follows from the seed, to the bit.
+Each action is sent as a client command, so an agent has the same abilities and limits as a client.
+Episodes are reproducible bit for bit from their seed.
 """
 
 from __future__ import annotations
@@ -26,44 +26,59 @@ from softfinger.tools.processes.compile import build_kernels, print_event
 
 Observation = dict[str, NDArray[Any]]
 
-FORCE = 6.0  # N, of the grip that is wanted
-REACH = 0.02  # rad that a joint's goal moves in a step at most
-FORCES = 1.0, 12.0  # N, what an action of -1 and of 1 asks the grip for, …
-ANGLE = 0.25  # rad, … and to what angle it turns the object
-WHITE = 50e3  # Pa, at which an image is white
-LOST = 0.03  # m off its first place: the object is lost
-_DEEP = 0.004  # m, to which the joints alone press into the object when an episode begins with it
-_PATIENCE = 3.0  # s
-_MOST = 200.0  # of any observation: N, A, rad/s
+FORCE = 6.0  # N, target grip force
+REACH = 0.02  # rad, largest change of a joint goal per step
+FORCES = 1.0, 12.0  # N, grip force for an action of -1 and of 1
+ANGLE = 0.25  # rad, object angle for an action of 1
+WHITE = 50e3  # Pa, pressure shown as white (255) in an image
+LOST = 0.03  # m, displacement at which the object counts as lost
+_DEEP = 0.004  # m, tip displacement when an episode starts with a grip by the joints alone
+_PATIENCE = 3.0  # s, longest wait for that grip
+_MOST = 200.0  # bound of every float observation, in SI units
 
 
 class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
-    """A hand and an object whose size, mass, friction and place are drawn for each episode.
+    """Two-fingered hand with an object of random size, mass, friction and position.
 
-    ``task``:
+    Parameters
+    ----------
+    task
+        - ``grasp``: The hand starts open; hold the object with 6 N. The reward of a step is
+          exp(−e/1 N) for the larger force error e of the two tips.
+        - ``rotate``: The hand starts holding the object; turn it to ``goal`` [rad]. The reward is
+          exp(−e/0.05 rad) for the angle error e.
+        - ``push``: The hand starts holding the object, and a force of up to 3 N pushes the object
+          along its faces for a while. The reward is exp(−s/2 mm) for the slip s.
+    control
+        - ``joints``: An action [2] in −1 to 1 moves the goals of the left and the right joint by
+          up to 0.02 rad; positive values close the fingers.
+        - ``law``: The action sets the built-in grip law's force (1 to 12 N) and object angle
+          (−0.25 to 0.25 rad).
+    profile
+        Profile of the simulated hand; the default settings if None.
+    changes
+        Settings to change, in the form of ``--set``.
+    shaped
+        Add potential-based shaping to the reward of ``grasp``: up to 10 for closing the fingers
+        and up to 10 for both forces. It rewards progress before the first touch and leaves the
+        optimal policy unchanged [1]_.
 
-    - ``grasp``: the hand is open; hold the object with 6 N. A step's reward is 1 where both tips'
-      forces are right, and falls to 1/e where they are 1 N off.
-    - ``rotate``: the hand holds the object; turn it to ``goal`` [rad]. The reward is 1 at the goal
-      and falls to 1/e at 0.05 rad off it.
-    - ``push``: the hand holds the object, which is pushed with up to 3 N along the tips' faces for
-      a while; the reward is 1 and falls to 1/e where it has slid by 2 mm.
+    Notes
+    -----
+    Observations are float32 in SI units unless noted, the left finger first:
 
-    ``control``: ``joints``, an action [2] in −1 to 1 moves the left and the right joint's goal by
-    up to 0.02 rad, positive closes; ``law``, it sets what the built-in law grips with (1 to 12 N)
-    and turns to (−0.25 to 0.25 rad).
+    - ``joints`` [6]: angles, velocities and currents,
+    - ``contacts`` [6]: displacement d, tilt θ and force of each tip,
+    - ``pressure`` [2, rows, cols]: the latest frames, uint16 counts,
+    - ``goal`` [1]: target in N, or in rad for ``rotate``.
 
-    Observation, float32 in SI units, counts uint16: ``joints`` [6], angles, velocities and
-    currents, left before right; ``contacts`` [6], d, θ and force of each tip; ``pressure`` [2,
-    rows, cols], uint16, the newest frames; ``goal`` [1], N or rad.
+    An episode terminates when the object is lost or the hand is in a fault state. ``info`` holds
+    ``truth`` (the object's x, y [m] and angle [rad]), ``fault``, and ``refused``: the reason for
+    which the daemon refused a command, or an empty string.
 
-    ``shaped`` adds to each reward of ``grasp`` by how much a potential has grown: 10 for fingers
-    that have closed as far as they go, 10 for both forces. What is best to do stays the same (Ng,
-    Harada & Russell, 1999), and there is something to learn from before the first touch.
-
-    An episode ends when the object is lost or the hand is in fault. ``profile`` is a profile of
-    the simulated hand, ``changes`` are settings as ``--set`` takes them. ``info`` has ``truth``:
-    the object's x, y [m] and angle [rad]; ``fault``; and ``refused``, why a command was.
+    References
+    ----------
+    .. [1] Ng, Harada & Russell, "Policy invariance under reward transformations", ICML 1999.
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012
@@ -80,7 +95,7 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             raise ValueError(f"task: found {task!r}, expected one of {', '.join(TASKS)}")
         if control not in ("joints", "law"):
             raise ValueError(f"control: found {control!r}, expected 'joints' or 'law'")
-        # A joint's goal alone presses as hard as the law may.
+        # Joint goals may press as hard as the grip law.
         ours = ("loop.clock=virtual", "safety.current_move=1.2")
         file = None if profile is None else Path(profile)
         self._settings = load(file, changes=(*ours, *changes))
@@ -105,7 +120,7 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """A new object, before the open hand or held by it. ``options`` has ``goal`` if wanted."""
+        """Start an episode with a new object; ``options`` may contain a ``goal``."""
         super().reset(seed=seed)
         self.close()
         daemon = Daemon(self._drawn(), wire=False)
@@ -132,7 +147,7 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         return self._observation(), self._info()
 
     def _drawn(self) -> Settings:
-        """The settings with an object of this episode."""
+        """Return the settings with a randomly drawn object."""
         draw = self.np_random.uniform
         simulation = self._settings.simulation
         drawn = {
@@ -146,7 +161,7 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         return self._settings.model_copy(update={"simulation": simulation.model_copy(update=drawn)})
 
     def _take_hold(self) -> None:
-        """Hold the object, by the law or by the joints alone."""
+        """Grip the object, with the grip law or with joint goals alone."""
         state = self._loop.state
         if self._by_law:
             self._command("grasp", force=FORCE)
@@ -172,7 +187,7 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     def step(
         self, action: NDArray[np.float32]
     ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """0.02 s of the hand's time."""
+        """Apply an action and advance the simulation by 0.02 s."""
         self._act(np.clip(np.asarray(action, np.float64), -1.0, 1.0))
         if self._push:
             on = self._push_at <= self._loop.state.t < self._push_until
@@ -217,7 +232,7 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         return math.exp(-off)
 
     def _closed(self) -> float:
-        """Return the potential: how far both fingers have closed, and what they press with."""
+        """Return the shaping potential: progress in closing both fingers and in both forces."""
         q, most = self._loop.state.reading.q, self._settings.hand.q_max
         force = sum(min(float(each) / FORCE, 1.0) for each in self._hand.force)
         return 5.0 * (q[0] / most[0] + q[1] / most[1] + force)
@@ -242,14 +257,17 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         }
 
     def close(self) -> None:
-        """Torque off; the hand is gone."""
+        """Switch the torque off and discard the simulated hand."""
         if self._daemon is not None:
             self._daemon.close()
             self._daemon = None
 
 
 class Images(gymnasium.ObservationWrapper[Observation, NDArray[np.float32], Observation]):
-    """``pressure`` as Stable-Baselines3 takes images: uint8 [2, rows, cols], 255 from 50 kPa on."""
+    """Convert ``pressure`` to images for Stable-Baselines3.
+
+    Images are uint8 [2, rows, cols]; 50 kPa and more is 255.
+    """
 
     def __init__(self, env: gymnasium.Env[Observation, NDArray[np.float32]]) -> None:
         super().__init__(env)
@@ -260,6 +278,6 @@ class Images(gymnasium.ObservationWrapper[Observation, NDArray[np.float32], Obse
         self.observation_space: Any = spaces.Dict({**known.spaces, "pressure": image})
 
     def observation(self, observation: Observation) -> Observation:
-        """Return it with the grids of 8 bits."""
+        """Return the observation with ``pressure`` as 8-bit images."""
         grey = np.minimum(observation["pressure"] * (255.0 / self._full), 255.0)
         return observation | {"pressure": grey.astype(np.uint8)}
