@@ -1,4 +1,4 @@
-"""``softfinger emulate``: the emulated hand's process. Arguments, signals and exit status."""
+"""Run ``softfinger emulate``, the process of an emulated hand: arguments, signals, exit status."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from softfinger.tools.ending import Interrupted, Signals
 if TYPE_CHECKING:
     from softfinger.daemon.profile.settings import Settings
 
-_LOOK = 0.1  # s between two looks at a plate's way
+_LOOK = 0.1  # s between two queries about the motion of a plate or joint
 _FAULTS = """\
 faults, each KIND[=VALUE][@START], given as often as needed:
   tactile boards   torn, noisy (=PROBABILITY a frame), silent, frozen, wrong-size, saturated, zero;
@@ -131,7 +131,7 @@ def _ids(text: str) -> tuple[int, ...]:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Emulate until SIGINT, SIGTERM or SIGHUP; 1 with one line when it can't be set up."""
+    """Emulate until SIGINT, SIGTERM or SIGHUP; return 1 with a message if the set-up fails."""
     arguments.dir = arguments.dir or own_runtime_folder()
     if arguments.dir is None:
         raise SettingsError(f"{runtime_fault()}; or name another folder by --dir")
@@ -148,10 +148,10 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _serve(settings: Settings, arguments: argparse.Namespace, signals: Signals) -> int:
-    # What follows imports numpy and numba: wrong settings are reported without waiting for them.
+    # The following imports load numpy and numba; report wrong settings before this delay.
     from softfinger.daemon.loop.realtime import RealTime
 
-    gc.disable()  # collections over half-imported modules are a tenth of the start-up
+    gc.disable()  # garbage collections during imports take a tenth of the start-up time
     from softfinger.daemon.loop.warm_up import EMULATED
     from softfinger.daemon.simulation.emulator.emulator import (
         EmulatedServos,
@@ -184,10 +184,11 @@ def _serve(settings: Settings, arguments: argparse.Namespace, signals: Signals) 
 
 
 def _unhurried(settings: Settings, paced: bool) -> Settings:
-    """``settings`` with the real-time measures that suit a pseudo-terminal.
+    """Return the settings with the real-time measures that suit a pseudo-terminal.
 
-    Not SCHED_FIFO, which holds up the kernel's worker that carries the bytes across. Idle states
-    are held off where servos have a wire's time, since they sleep as little as a wire does.
+    SCHED_FIFO is not used, because it delays the kernel worker that transfers the bytes. Idle
+    states are disabled only if the servos reproduce wire timing, because they then sleep for times
+    as short as on a wire.
     """
     changes = {"priority": 0, "cpus": (), "spin": 0.0, "lock_memory": False}
     held = paced and settings.realtime.hold_latency
@@ -201,7 +202,8 @@ def _send(folder: Path, words: str) -> int:
 
     try:
         reply = send_words(folder, words)
-        # The way takes the emulated hand's time, which stands still while that is held up.
+        # The motion is timed by the emulated hand's clock, which stops while the emulator is
+        # suspended, so ask again for the remaining time.
         kind = words.partition(" ")[0]
         while kind in ("press", "turn") and reply.startswith("{"):
             left = json.loads(reply)["wait"]

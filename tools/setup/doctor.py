@@ -1,6 +1,7 @@
-"""``softfinger doctor``: checks ports, servos, boards, machine; one line each, with its fix.
+"""Run ``softfinger doctor``: check ports, servos, boards and machine, and name fixes.
 
-Arguments, order, printing and exit status; the checks are :mod:`softfinger.daemon.diagnosis`'s.
+Each check prints one line. This module handles arguments, order, printing and exit status; the
+checks are in :mod:`softfinger.daemon.diagnosis`.
 """
 
 from __future__ import annotations
@@ -51,20 +52,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
     add_profile(parser)
     change = parser.add_mutually_exclusive_group()
-    change.add_argument("--fix", action="store_true", help="repair what can be repaired from here")
+    change.add_argument("--fix", action="store_true", help="repair what softfinger can repair")
     change.add_argument(
         "--restore",
         type=Path,
         metavar="FILE",
-        help="write the servos' registers back as --save stored them",
+        help="write the servo registers back that --save stored in FILE",
     )
     parser.add_argument(
-        "--save", type=Path, metavar="FILE", help="first store the servos' registers in FILE"
+        "--save", type=Path, metavar="FILE", help="first store the servo registers in FILE"
     )
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Check, print, and tell by the exit status. Raises SettingsError."""
+    """Run the checks, print their results and return the exit status. Raises SettingsError."""
     settings = profile(arguments)
     print(f"settings: {arguments.config or 'the built-in simulated hand'}")
     counts = {"FAIL": 0, "warn": 0, "pass": 0}
@@ -80,7 +81,7 @@ def run(arguments: argparse.Namespace) -> int:
 def results(
     settings: Settings, fix: bool, save: Path | None = None, restore: Path | None = None
 ) -> Iterator[Finding]:
-    """Run all checks, each after those that it needs, with the repairs before them."""
+    """Run all checks in the order of their dependencies, after the requested repairs."""
     ports = _ports(settings)
     for kind in BUILT_IN:
         yield from (Finding("note", f"softfinger.{kind}", source(each)) for each in plugins(kind))
@@ -128,7 +129,7 @@ def _register_files(
 
 
 def _ports(settings: Settings) -> list[tuple[str, str]]:
-    """(key, path) of every port that the scene needs; what a plugin opens is not known."""
+    """Return (key, path) of every port that the scene needs; ports of plugins are unknown."""
     ports = []
     servos = backend("servos", settings.servos.backend)
     tactile = backend("tactile", settings.tactile.backend)
@@ -146,7 +147,7 @@ def _latency(settings: Settings, path: str, fix: bool) -> Iterator[Finding]:
         if repaired is not None:
             yield repaired
     servos = path == settings.servos.port
-    # A board sends by itself: the timer makes its frames late and none of them fail.
+    # A board sends on its own: the latency timer delays its frames but does not cause failures.
     found = check_latency_timer(path, settings.servos.reply_timeout if servos else 1.0)
     if found is not None:
         yield found

@@ -1,4 +1,4 @@
-"""``softfinger keys FOLDER [CLIENT …]``: keys for sockets that other machines may reach."""
+"""Run ``softfinger keys FOLDER [CLIENT …]``: make keys for access from other machines."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Make keys. Raises KeyFileError."""
+    """Make the keys; raise KeyFileError if that fails."""
     for folder in make_keys(arguments.folder, arguments.clients):
         print(folder)
     return 0
