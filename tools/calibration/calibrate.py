@@ -1,4 +1,4 @@
-"""``softfinger calibrate``: one step of calibrating the hand, or the sensor under one tip."""
+"""Run ``softfinger calibrate``: one calibration step of the hand or of one tip's sensor."""
 
 from __future__ import annotations
 
@@ -32,9 +32,12 @@ STEPS = (
     "relaxation",
     "scales",
 )
-_OF_PROFILE = STEPS[: STEPS.index("tare")]  # the others are of a tip
-_LEARNT = 0.8  # of the settings' doubt about a sensor's gain: with more, no grip has told of it
-_LEAST = 0.02  # relative, of each scale: rubber and joints are not the same from day to day
+_OF_PROFILE = STEPS[: STEPS.index("tare")]  # the other steps calibrate a tip
+# fraction of the prior standard deviation of a sensor's gain; above it, no grip has measured the
+# gain
+_LEARNT = 0.8
+# lower limit of each factor's relative standard deviation: rubber and joints change day by day
+_LEAST = 0.02
 _EPILOG = """\
 the profile; FILE is one, made of --config's if absent:
   joints       with torque off each finger is closed, opened and put upright by hand: its servo,
@@ -73,7 +76,7 @@ scales: they depend on it.
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
     parser.add_argument("step", choices=STEPS)
-    parser.add_argument("file", type=Path, metavar="FILE", help="what is written; made if absent")
+    parser.add_argument("file", type=Path, metavar="FILE", help="output file, made if absent")
     parser.add_argument("--finger", choices=("left", "right"), default="left")
     add_profile(parser)
     parser.add_argument(
@@ -82,13 +85,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         default=[],
         metavar="R",
-        help="recordings, instead of the live sensor",
+        help="recordings to use instead of the live sensor",
     )
     parser.add_argument(
-        "--frames", type=_frames, default=64, help="live frames of each load (default 64)"
+        "--frames", type=_frames, default=64, help="live frames for each load (default 64)"
     )
     parser.add_argument(
-        "--loads", type=int, default=0, help="equilibrate, live: number of pressures"
+        "--loads", type=int, default=0, help="equilibrate, live: the number of pressures"
     )
     for name, unit in (("force", "N"), ("d", "mm"), ("theta", "degrees")):
         parser.add_argument(
@@ -108,16 +111,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--move",
         metavar="COMMAND",
-        help="live: a program that brings each load on and ends when it is there, as of a stage, "
-        "instead of Enter; {force}, {d} and {theta} stand for the load's, {finger} and {pose} "
-        "(closed, open, zero) for a joint's",
+        help="live: instead of Enter, run a program that applies each load and exits when done; "
+        "{force}, {d} and {theta} are replaced by the load's values, {finger} and {pose} "
+        "(closed, open, zero) by those of a joint",
     )
     parser.add_argument("--no-plot", action="store_true", help="draw no picture")
-    add_daemon(parser, addresses)  # of friction, latency and scales
+    add_daemon(parser, addresses)  # for friction, latency and scales
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Do one step. Raises SoftfingerError or OSError; then the file is unchanged."""
+    """Run one step.
+
+    Raises
+    ------
+    SoftfingerError, OSError
+        The file is then unchanged.
+    """
     step = arguments.step
     if step in _OF_PROFILE and arguments.config is None:
         arguments.config = arguments.file
@@ -170,12 +179,19 @@ def _frames(text: str) -> int:
 
 
 def calibrate_scales(arguments: argparse.Namespace, settings: Settings) -> str:
-    """Write a finger's scales into its file and return the line to print.
+    """Write a finger's calibration factors to its file and return the line to print.
 
-    A sensor's gain changes when the sensor is mounted again, and a tip's modulus may be known only
-    by the name of its rubber. A grip shows both (`daemon.perception.hand_channels`), and a daemon
-    that starts with them reaches the right force in its first grip. Raises CalibrationError if no
-    grip has shown them, NoStream without a daemon, and CalibrationFileError.
+    A sensor's gain changes when the sensor is mounted again, and the modulus of a tip may be known
+    only roughly. A grip measures both (`daemon.perception.hand_channels`), and a daemon that starts
+    with these factors reaches the right force in its first grip.
+
+    Raises
+    ------
+    CalibrationError
+        If no grip has measured the factors.
+    NoStream
+        Without a daemon.
+    CalibrationFileError
     """
     from softfinger.daemon.perception.calibration_file import ScalesStep, now, save_calibration
     from softfinger.kinematics.calibration.calibration import CalibrationError
