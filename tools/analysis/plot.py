@@ -77,7 +77,7 @@ def run(arguments: argparse.Namespace) -> int:
     require("plot")  # before a long recording is read
     path: Path = arguments.file
     folder = arguments.out or path.with_name(path.name + ".plots")
-    # fails for other files before kernels are loaded
+    # This fails for other files before kernels are loaded.
     recording = Recording(path, to_stderr("plot"))
     from softfinger.daemon.loop.warm_up import FRAMES
     from softfinger.tools.processes.compile import build_kernels, print_event
@@ -212,7 +212,7 @@ def _against_angle(
 
     depths = _depths(seen["d"])
     widest = max(1.1 * float(np.abs(seen["theta"]).max()), 5.0 / DEGREES)
-    # the yellow end of the colour map is too faint in print
+    # The yellow end of the colour map is too faint in print.
     scale = Normalize(0.0, depths[-1] * 1e3 / 0.85)
     for depth in depths:
         limit = float(table.tip.theta_limit(depth))
@@ -292,11 +292,11 @@ def draw_map(panel: Axes, table: ContactTable, deepest: float, widest: float) ->
     lines = panel.contour(
         theta * DEGREES, d * 1e3, energy, levels[1:-1], colors=style.GREY, linewidths=0.5
     )
-    # labels of higher levels would leave the frame
+    # Labels of higher levels would leave the frame.
     low = [level for level in levels[1:-1] if level < 0.65 * largest]
     panel.clabel(lines, low, fmt=lambda level: f"{level:.3g} mJ", fontsize=6.5)
     minima = theta[np.argmin(energy, axis=1)]
-    # the energy of a bonded solid tip falls towards the sides
+    # The energy of a bonded solid tip falls towards the sides.
     local = np.abs(minima) < 0.99 * widest
     if local.any():
         panel.plot(

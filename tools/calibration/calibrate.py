@@ -33,10 +33,10 @@ STEPS = (
     "scales",
 )
 _OF_PROFILE = STEPS[: STEPS.index("tare")]  # the other steps calibrate a tip
-# fraction of the prior standard deviation of a sensor's gain; above it, no grip has measured the
-# gain
+# Fraction of the prior standard deviation of a sensor's gain. Above it, no grip has measured the
+# gain.
 _LEARNT = 0.8
-# lower limit of each factor's relative standard deviation: rubber and joints change day by day
+# Lower limit of each factor's relative standard deviation: rubber and joints change day by day.
 _LEAST = 0.02
 _EPILOG = """\
 the profile; FILE is one, made of --config's if absent:

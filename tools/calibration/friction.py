@@ -26,7 +26,7 @@ from softfinger.tools.recordings.reader import read_recording
 _SWEEPS = ((0.05, 0.06, 2), (0.3, 0.4, 2), (0.6, 0.4, 2))
 _WIDEST = max(wide for _, wide, _ in _SWEEPS)
 _FROM_ENDS = 0.05  # rad at each end of the joint's range that the sweeps avoid
-# rad, accepted error at the start of a sweep: friction may stop a joint before its goal
+# rad, accepted error at the start of a sweep: friction may stop a joint before its goal.
 _ARRIVED = 0.05
 _REST = 0.3  # s of rest between two strokes, in addition to the smoothing time of the setpoints
 _TOUCHED = 0.2  # s discarded before and after a contact, which may not be detected immediately

@@ -29,7 +29,7 @@ FloatArray = NDArray[np.float64]
 _STEPS = (1.0, 0.5, 1.25, 0.5)  # successive forces, as multiples of the first force
 _HELD = 0.5  # s for which each force is held
 _STD_MAX = 5e-3  # s, largest accepted standard deviation of the latency
-# accepted ratio of d from frames to d from joints; outside, frames do not follow the joints
+# Accepted ratio of d from frames to d from joints; outside, frames do not follow the joints.
 _SCALE = 0.5, 2.0
 _MISFIT_MAX = 0.3e-3  # m RMS; more indicates that the object slides or tilts, or a second contact
 # Relative errors of d from frames, if d is estimated from the frame's shape or from its amplitude.

@@ -64,9 +64,9 @@ from softfinger.tools.calibration.calibration_plot import Map, Panel, Points
 
 FloatArray = NDArray[np.float64]
 _UNDONE: dict[str, Any] = {"modulus": None, "law": None, "scales": None, "wants": {}}
-# relative softening after first presses that is reported; plates and noise cause up to this
+# Relative softening after first presses above which it is reported; plates and noise cause less.
 _SOFTENS = 0.03
-# new calibration, line to print, panels of the picture
+# New calibration, line to print, panels of the picture.
 Done = tuple[Calibration, str, tuple[Panel, ...]]
 
 

@@ -118,7 +118,7 @@ class Site:
         self._at_once = asyncio.Semaphore(_AT_ONCE)
         self.waiting: list[asyncio.Future[_Published]] = []  # pages waiting for the next picture
         self.record: Callable[[], str] = lambda: ""  # starts or ends a recording
-        # receives the request that comes with each picture
+        # Receives the text by which a page requests each picture.
         self.wish: Callable[[str], None] = lambda _: None
         self._routes: dict[str, Callable[[ServerConnection], Awaitable[None]]] = {
             "/pictures": self._show,
@@ -161,7 +161,7 @@ class Site:
             logger=quiet,
         )
         await self._ended.wait()
-        # connections that do not read would never close by themselves
+        # Connections that do not read would never close by themselves.
         for connection in server.connections:
             connection.transport.abort()
         others = asyncio.all_tasks() - {asyncio.current_task()}
@@ -177,7 +177,7 @@ class Site:
         if upgrade and path == "/":
             known += [[origin] for origin in ORIGINS]
         here = len(hosts) == 1 and hosts[0] in self._hosts
-        # the secret replaces the check of the host, which may have any name
+        # Each request contains a secret, so the host may have any name.
         if self._announce is not None:
             here = True
             if not self._allows(request):
@@ -271,7 +271,7 @@ class Site:
             asked = json.loads(text)
             name = str(asked["command"])[:_NAME]
             age = time.monotonic() - float(asked.pop("seen", "nan"))
-            # fails if msgpack cannot represent it: deep nesting, long integers
+            # This fails for values that msgpack cannot represent: deep nesting, long integers.
             msgpack.packb(asked)
         except _NO_COMMAND as error:
             return f"✗ no command: {error!r}"

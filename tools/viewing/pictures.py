@@ -97,7 +97,7 @@ _OTHERS = {  # names and colours of lines that do not belong to a finger
     "compute_s": ("work", OBJECT),
     "wake_late_s": ("late", "late"),
 }
-# fields of a finger with a limit `safety.…_max`
+# Fields of a finger with a limit `safety.…_max`.
 _BOUNDED = ("force", "d", "current", "temperature")
 _FACTORS = {path: plot.factor for plot in _PLOTS for path in plot.paths.split()}
 _FACTORS |= {
@@ -430,7 +430,7 @@ def _described(plot: _Plot, paths: list[str]) -> dict[str, Any]:
 
 
 def _panel(name: str, title: str, *box: float, **more: Any) -> dict[str, Any]:
-    """Describe a panel; ``box``: left, right, top, bottom; ``scaled``: line widths have its unit."""
+    """Describe a panel; ``box``: left, right, top, bottom; ``scaled``: widths in its unit."""
     return {"name": name, "title": title, "box": box, **more}
 
 

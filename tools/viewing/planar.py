@@ -57,7 +57,7 @@ class FingerLines(NamedTuple):
     base: FloatArray
     skin: FloatArray
     face: FloatArray | None  # contact line with the object's face, end to end
-    # point where the tip pushes on the object, unit vector of the direction
+    # Point where the tip pushes on the object, unit vector of the direction.
     push: FloatArray | None
 
 
@@ -120,7 +120,7 @@ def held_outline(
 
 
 def _true_outline(settings: Settings, truth: dict[str, Any]) -> list[FloatArray]:
-    """Return the simulated object's closed outline [n, 2] m from ``hand/truth``, or an empty list."""
+    """Return the simulated object's closed outline [n, 2] m by ``hand/truth``; empty without."""
     pose = read(TrueState, truth).true_object
     try:
         shape = shape_of(settings)

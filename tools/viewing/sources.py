@@ -124,7 +124,7 @@ class Playback:
         finder = ThreadPoolExecutor(1)
         marks: Future[list[Any]] | None = finder.submit(lambda: marks_of(Recording(recording.path)))
         finder.shutdown(wait=False)
-        # settings may occur only once
+        # Settings may occur only once.
         for message in islice(recording.messages([schema.SETTINGS]), 1):
             pictures.take(*message)
         while not ending.over:
