@@ -31,50 +31,50 @@ GROUPS = {  # for each subcommand: its package in tools/, and its description
         "emulate": ("processes", "emulate a hand: servos and tactile boards on ptys"),
     },
     "hand": {
-        "status": ("terminal", "say in one line what the running hand does"),
+        "status": ("terminal", "show the state of the running hand in one line"),
         "send": ("terminal", "send one command to the running daemon"),
-        "monitor": ("terminal", "live page of the running daemon in the terminal"),
-        "view": ("viewing", "show and command the running hand, or show a recording, in a page"),
+        "monitor": ("terminal", "show and command the running hand in the terminal"),
+        "view": ("viewing", "show and command the running hand on a web page, or show a recording"),
     },
     "data": {
         "record": ("recordings", "record the running daemon's stream into an MCAP file"),
-        "replay": ("recordings", "publish a recording again, or compare it with today's code"),
+        "replay": ("recordings", "publish a recording again, or recompute it with this version"),
         "analyse": ("analysis", "compute contact, force and energy over time from frames"),
-        "plot": ("analysis", "draw a recording beside the model: forces, energy landscape, errors"),
+        "plot": ("analysis", "draw a recording with the model: forces, energy landscape, errors"),
         "export": ("recordings", "export a recording's topics as CSV or Parquet"),
     },
     "machine": {
-        "doctor": ("setup", "check ports, servos, boards and this machine; say what mends them"),
-        "scan": ("setup", "find the servos on a port, at any rate"),
+        "doctor": ("setup", "check ports, servos, boards and this machine, and name fixes"),
+        "scan": ("setup", "find the servos on a port, at any baud rate"),
         "calibrate": ("calibration", "calibrate joints, sensors and tips, step by step"),
-        "envelope": ("setup", "find out what a hand holds: shape, size, friction, mass"),
+        "envelope": ("setup", "simulate which shapes, sizes, frictions and masses a hand holds"),
         "limits": ("setup", "list every limit: condition, consequence, setting"),
         "config": ("setup", "list and show the profiles, and every setting with its default"),
-        "compile": ("processes", "compile a hand's kernels ahead of its first start"),
-        "keys": ("setup", "make the keys that addresses outside this machine need"),
+        "compile": ("processes", "compile a hand's kernels before its first start"),
+        "keys": ("setup", "make the keys required for access from other machines"),
         "install-service": ("setup", "print a systemd unit and udev rules"),
-        "completion": ("setup", "print what completes these words in bash, zsh or fish"),
+        "completion": ("setup", "print a completion script for bash, zsh or fish"),
     },
     "develop": {
         "figures": ("paper", "draw the paper's figures from this model, as CSV and PNG"),
         "validate": ("paper", "compare this model with published figures"),
-        "bench": ("benchmarks", "measure run time, and what the hand does in simulation"),
+        "bench": ("benchmarks", "measure run time and the simulated hand's behaviour"),
     },
 }
 SUBCOMMANDS = {name: row for rows in GROUPS.values() for name, row in rows.items()}
 
 _LINUX = (*GROUPS["run"], "doctor", "scan", "calibrate", "compile", "install-service", "bench")
 _FIRST_STEPS = """\
-softfinger {version}: two rotational fingers with soft tips. To begin:
-  softfinger run --monitor          a simulated hand and its live page; q ends both
+softfinger {version}: two rotational fingers with soft tips. To start:
+  softfinger run --monitor          run a simulated hand with its live page; q ends both
   softfinger send arm               in another terminal: torque on; then grasp force=10
-  softfinger run --config PROFILE   another hand; softfinger config list names some
-  softfinger doctor --config FILE   what a hand of metal still lacks
-  softfinger help                   all subcommands; help SUBCOMMAND: its arguments"""
+  softfinger run --config PROFILE   run another hand; softfinger config list names profiles
+  softfinger doctor --config FILE   check a physical hand and name the missing steps
+  softfinger help                   list all subcommands; help SUBCOMMAND: its arguments"""
 _EPILOG = """\
-softfinger help SUBCOMMAND: its arguments. To begin: softfinger run --monitor
-Exit status: 0 done; 1 it could not be done, with the reason; 2 wrong arguments or settings;
-130 ended by Ctrl-C. What a subcommand has beside these is in its help."""
+softfinger help SUBCOMMAND: its arguments. To start: softfinger run --monitor
+Exit status: 0 done; 1 failed, with the reason; 2 wrong arguments or settings; 130 ended by Ctrl-C.
+The help of a subcommand lists its additional exit statuses."""
 
 
 def _open_standard_streams() -> None:

@@ -40,13 +40,13 @@ if TYPE_CHECKING:
     from softfinger.daemon.perception.finger_model import FingerModel
 
 _EPILOG = """\
-FILE is a recording (.mcap), .npz with frames [n, rows, cols] and t, .npy frames or a folder of
-them, or a Tekscan-style ASCII export. A recording has its settings in it. For the others, name a
-profile by --config, or what the file doesn't have, for instance
+FILE is a recording (.mcap), .npz with frames [n, rows, cols] and t, .npy frames, a folder of these,
+or a Tekscan-style ASCII export. A recording contains its settings. For the other files, select a
+profile with --config, or set the missing values, for example
   --set tip.radius=0.02 --set tactile.pitch=0.0013 --set tactile.pascal_per_count=4
   --set tactile.noise=500 --set material.law=constant --set material.modulus=3e5
-Writes FILE.contacts.csv beside it, which PlotJuggler draws. Several files are analysed side by
-side, one on each processor."""
+The results are written to FILE.contacts.csv in the same folder, which PlotJuggler can draw. Several
+files are analysed in parallel, one on each processor."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

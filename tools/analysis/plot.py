@@ -38,10 +38,10 @@ if TYPE_CHECKING:
 
 _EPILOG = """\
 pages:
-  angle      force and energy against θ beside the model's curves
-  landscape  the path over U(d, θ) with its local minimum
+  angle      force and energy against θ, with the model's curves
+  landscape  the path over U(d, θ), with its local minimum
 
-Needs the extra 'plot'. Foxglove and PlotJuggler open the file too, and draw any field over time."""
+Needs the extra 'plot'. To draw any field over time, open the file in Foxglove or PlotJuggler."""
 
 
 FloatArray = NDArray[np.float64]
@@ -67,7 +67,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         choices=("png", "svg", "pdf"),
         default=["png"],
-        help="of the files (default: png)",
+        help="format of the files (default: png)",
     )
     add_range(parser)
 

@@ -24,10 +24,10 @@ if TYPE_CHECKING:
 MEASUREMENTS = {
     "estimator": "lookup of force and energy, pressure grid to d and tilt: run time and error",
     "tick": "the tick back to back, in place and over ptys",
-    "control": "what each grip law leaves of an object's angle",
-    "reflex": "greater loads on a grip that bears one: held or lost, slid, answered",
-    "witnesses": "false measurements, and the true force of a grip on them, a quarter of an hour",
-    "robustness": "hands that are not as their settings say, and the true force of their grips",
+    "control": "error of an object's angle that remains with each grip law",
+    "reflex": "sudden larger loads on a grip: held or lost, slide, reaction time",
+    "witnesses": "true force of grips with faulty measurements, a quarter of an hour",
+    "robustness": "true force of grips by hands that differ from their settings",
 }
 # These run on virtual time, so other load on the machine does not affect them.
 SWEPT = ("reflex", "witnesses", "robustness")
@@ -45,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "names",
         metavar="NAME",
         nargs="*",
-        help=f"what to measure: {known}; without a name one page of the figures that matter, in "
+        help=f"what to measure: {known}; without a name, one page of the main results in "
         "about a minute",
     )
     parser.add_argument(
@@ -54,9 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--only", default="", metavar="TEXT", help="only cases with this text in their name"
     )
-    parser.add_argument(
-        "--brief", action="store_true", help="fewer cases of each NAME, as for the page"
-    )
+    parser.add_argument("--brief", action="store_true", help="fewer cases for each NAME")
     parser.add_argument("--full", action="store_true", help="all loads of 'reflex', not a few")
     parser.add_argument(
         "--json",

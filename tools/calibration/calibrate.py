@@ -39,37 +39,37 @@ _LEARNT = 0.8
 # Lower limit of each factor's relative standard deviation: rubber and joints change day by day.
 _LEAST = 0.02
 _EPILOG = """\
-the profile; FILE is one, made of --config's if absent:
-  joints       with torque off each finger is closed, opened and put upright by hand: its servo,
-               direction, zero and range, of both
-  heat         from the recording of a grip of some minutes, begun cold: by how much the servo of
-               --finger warms, and how fast
-  friction     what each joint loses to friction, in air: the running daemon sweeps it there and
-               back; or from a recording of such motion
-  latency      by how much frames are late: the running daemon grasps an object with several
-               forces (--force: the first); or from a recording of such a grip
+steps of a hand; FILE is a profile, copied from --config's if absent:
+  joints       with torque off, close, open and straighten each finger by hand; determines servo,
+               direction, zero and range of both fingers
+  heat         from the recording of a grip of some minutes that starts cold: temperature rise and
+               time constants of the servo of --finger
+  friction     friction of each joint in air: the running daemon sweeps the joint back and forth; or
+               from a recording of such motion
+  latency      latency of frames: the running daemon grasps an object with several forces (--force:
+               the first); or from a recording of such a grip
 
 steps of a tip, in this order; each is written into FILE, which keeps the others:
-  tare         unloaded: the zero of each cell; its noise, how that correlates, and drift
-  equilibrate  several uniform pressures: the gain of each cell, and dead cells
+  tare         without load: zero of each cell, noise with its correlation, drift
+  equilibrate  several uniform pressures: gain of each cell, dead cells
   curve        known weights upright on the tip (--force), or a run of known displacement (--d)
-  centre       presses upright or of known tilt (--theta): the tip's place and rotation
-  modulus      a run of known displacement (--d): E; its zero of d is fitted
-  law          presses at known depths and tilts (--d, --theta): springs or solid rubber, its E and
-               ν, how well each explains the frames, and what error it leaves
-  relaxation   a press and a hold of some seconds at a known d (--d, --frames 500): how much firmer
-               the rubber is at once than in the end, for the profile
-  scales       what a running daemon's grips, or a recording's, told of the tip's modulus, the
-               sensor's gain and the joint's torque: the daemon begins with it next time
+  centre       presses upright or at known tilt (--theta): position and rotation of the tip
+  modulus      a run of known displacement (--d): E; the zero of d is fitted
+  law          presses at known depths and tilts (--d, --theta): compares springs and solid rubber
+               by E, ν, fit to the frames and remaining error
+  relaxation   a press held for some seconds at a known d (--d, --frames 500): initial stiffness of
+               the rubber relative to its final stiffness, for the profile
+  scales       factors of the tip's modulus, the sensor's gain and the joint's torque, as estimated
+               in grips of a running daemon or a recording; the daemon starts with them
 
-Frames come live from the sensor of the profile, load by load, or from recordings: one for each
-load, or one .npz of the whole run with its own d [m], theta [rad], force [N] for each frame.
+Frames come live from the profile's sensor, one load after the other, or from recordings: one file
+for each load, or one .npz of the whole run with d [m], theta [rad] and force [N] of each frame.
 Without a stage, try the steps on `softfinger emulate`:
   --move "softfinger emulate --send 'press depth={d}mm tilt={theta}deg'"
   --move "softfinger emulate --send 'turn {finger}={pose}'"     for joints
-Each step but law draws its result and residuals as FILE.STEP.png, where matplotlib is installed.
+Each step except law draws its result and residuals to FILE.STEP.png if matplotlib is installed.
 A new equilibrate removes curve and modulus, a new curve removes modulus, and each of these removes
-scales: they depend on it.
+scales, because these steps depend on it.
 """
 
 

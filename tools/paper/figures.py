@@ -25,8 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "names",
         metavar="NAME",
         nargs="*",
-        help=f"which: {', '.join(NAMES)} (all these if none is named); "
-        f"{', '.join(BY_NAME)}: a minute",
+        help=f"figures: {', '.join(NAMES)} (default: all of these); {', '.join(BY_NAME)}: a minute",
     )
     parser.add_argument(
         "--out",

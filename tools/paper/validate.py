@@ -49,7 +49,7 @@ class Beside(NamedTuple):
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.epilog = "Takes some seconds: grips and frames are simulated."
+    parser.epilog = "This takes some seconds, because grips and frames are simulated."
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_profile(parser)
     add_duration(parser)
     parser.add_argument(
-        "--monitor", action="store_true", help="show the live page here; q ends both"
+        "--monitor", action="store_true", help="show the live page in this terminal; q ends both"
     )
     parser.add_argument(
         "--log", choices=("plain", "json"), default="plain", help="lines for people, or JSON"

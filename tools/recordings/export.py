@@ -22,9 +22,10 @@ from softfinger.tools.extras import require
 from softfinger.tools.recordings.reader import Recording
 
 _EPILOG = """\
-Writes one table a topic, hand-state.csv and so on, with a column for each field (left.force). A
-sensor's frames also go into tactile-left.npz or -right.npz: frames [n, rows, cols] and t [n],
-which `softfinger analyse` and numpy.load read. Parquet keeps the frames' bytes in the table too."""
+Writes one table for each topic, e.g. hand-state.csv, with a column for each field (left.force). The
+frames of a sensor are also written to tactile-left.npz or tactile-right.npz, as frames
+[n, rows, cols] and t [n], for `softfinger analyse` and numpy.load. Parquet tables also contain the
+bytes of the frames."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -44,10 +44,10 @@ from softfinger.tools.recordings.channels import (
 from softfinger.tools.recordings.reader import Recording
 
 _EPILOG = """\
-Ends with Ctrl-C or after --duration; prints what it wrote and what was lost on the way.
-With --split-size or --split-time it goes on in FILE-2.mcap, FILE-3.mcap and so on.
-`replay --recompute` needs --topics all; `run --record` records that from the first tick on.
-Exit status: 0 written, 1 not or not all, with the reason."""
+Recording ends with Ctrl-C or after --duration. The messages written and lost are then printed.
+With --split-size or --split-time, recording continues in FILE-2.mcap, FILE-3.mcap and so on.
+`replay --recompute` needs --topics all; `run --record` records all topics from the first tick on.
+Exit status: 0 everything was written, 1 not everything was written, with the reason."""
 
 _SILENCE = 2.0  # s without a message before a notice is printed
 # s between two reads of the socket; waking up for each message would cost more than processing it.
@@ -200,7 +200,9 @@ class RecordingWriter:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
-    parser.add_argument("file", type=Path, metavar="FILE.mcap", help="must not exist yet")
+    parser.add_argument(
+        "file", type=Path, metavar="FILE.mcap", help="output file; must not exist yet"
+    )
     add_stream(parser)
     parser.add_argument(
         "--topics",

@@ -21,14 +21,14 @@ if TYPE_CHECKING:
     from softfinger.tools.recordings.reader import Recording
 
 _EPILOG = """\
-Without --recompute the messages are published on the stream's socket as they were, at their own
-pace or --speed times that: to subscribers it looks like a daemon.
+Without --recompute, the messages are published unchanged on the stream's socket, at their original
+pace or --speed times as fast. To subscribers this looks like a daemon.
 
---recompute runs readings, frames and commands through today's estimator, tables, control and
-limits, and compares every state with the recorded one. It needs a recording with every topic:
-`record --topics all`, or `run --record`, which begins with the first tick. From there the same code
-and settings give the same bits.
-Exit status: 0 the same, 1 can't be read, 3 states differ."""
+With --recompute, the recorded readings, frames and commands are processed by this version's
+estimator, tables, control and limits, and every state is compared with the recorded one. This needs
+a recording of all topics: `record --topics all`, or `run --record`, which starts at the first tick.
+From the first tick on, the same code and settings give identical bits.
+Exit status: 0 identical or published, 1 the file can't be read, 3 states differ."""
 
 _SUBSCRIBER_WAIT = 10.0  # s to wait for a subscriber
 _DIFFERENT = 3

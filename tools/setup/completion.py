@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 _EPILOG = """\
-Where the script belongs:
+To install the script:
   softfinger completion bash > ~/.local/share/bash-completion/completions/softfinger
   softfinger completion zsh > ~/.zfunc/_softfinger     # with fpath+=~/.zfunc before compinit
   softfinger completion fish > ~/.config/fish/completions/softfinger.fish"""

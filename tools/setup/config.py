@@ -11,9 +11,9 @@ from softfinger.daemon.profile import reference
 from softfinger.daemon.profile.load import find, names, profile_text
 
 _EPILOG = """\
-  softfinger config show hil > my.toml      the beginning of a profile of your own
-  softfinger config schema > schema.json    beside it: editors then complete and check keys
-  softfinger config reference tactile       that section alone; or a key's name, as pitch"""
+  softfinger config show hil > my.toml      start your own profile from a packaged one
+  softfinger config schema > schema.json    in the same folder, for completion and checks in editors
+  softfinger config reference tactile       print one section; or a key's name, e.g. pitch"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -37,15 +37,15 @@ from softfinger.tools.arguments import add_profile, profile
 from softfinger.tools.processes.compile import build_kernels, print_event
 
 _EPILOG = """\
-exit status: 0 when nothing failed (warnings may remain), 1 when something did, 2 for settings that
-can't be used. Without --fix nothing is changed. With it: adapters' latency timers go to 1 ms,
-servos get their ID and rate where there is no doubt which one is meant, and the values of all
-registers that matter to the hand, and are rebooted after a hardware error or where their position
-is a turn off (the hand lets go meanwhile), and kernels are compiled. Nothing is ever stiffened or
-moved.
+exit status: 0 no check failed (there may be warnings), 1 a check failed, 2 the settings can't be
+used. Without --fix nothing is changed. With --fix, the latency timers of adapters are set to 1 ms,
+servos get their ID and baud rate if it is certain which servo is meant, all registers that the hand
+needs are set, and kernels are compiled. Servos are rebooted after a hardware error or if their
+position is off by a turn; the hand releases its object meanwhile. --fix never switches torque on or
+moves the hand.
 
-factory-new servos all have ID 1, at 57600 baud: connect one alone, then doctor --fix; then the next
-one beside it, and doctor --fix again."""
+factory-new servos all have ID 1 at 57600 baud: connect one servo alone and run doctor --fix; then
+also connect the next one and run doctor --fix again."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -12,7 +12,7 @@ from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.profile.load import find
 
 _EPILOG = """\
-To install what it prints:
+To install the printed files:
   softfinger install-service --config /etc/softfinger/hand.toml --user $USER |
       sudo tee /etc/systemd/system/softfinger.service
   softfinger install-service --udev | sudo tee /etc/udev/rules.d/70-softfinger.rules

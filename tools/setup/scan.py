@@ -13,7 +13,7 @@ from softfinger.daemon.servos.provisioning import ALONE, SEARCH_TIME, FoundServo
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.epilog = "Exit status: 0 when a servo answered, 1 when none did or no port can be used."
+    parser.epilog = "Exit status: 0 a servo answered, 1 no servo answered or no port can be used."
     parser.add_argument(
         "ports", metavar="PORT", nargs="*", help="ports to scan (default: every serial port)"
     )

@@ -131,8 +131,8 @@ PLAIN_LINE = 1.0  # s between plain lines
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = (
-        "Show the hand on a live terminal page; keys arm, grasp, rotate, release and stop it, and\n"
-        "choose the force. Prints a plain line a second when the output is not a terminal."
+        "Show the hand on a live terminal page with keys to arm, grasp, rotate, release, stop and\n"
+        "change the force. If the output is not a terminal, print a plain line every second."
     )
     add_stream(parser, addresses, client=True)
     parser.add_argument("--plain", action="store_true", help="print plain lines, not the page")

@@ -23,11 +23,11 @@ _UNITS = {  # units allowed for each key; a number without a unit is in SI units
     **dict.fromkeys(("angle", "left", "right"), _ANGLES),
 }
 _EPILOG = """\
-commands: arm, disarm, tare, grasp force=N, rotate angle=RAD, hold force=N angle=RAD (setpoints of a
-stream), move left=RAD right=RAD, release, set compliance=RAD/NM, demo (the profile's task again),
-stop, clear, status. Numbers are SI, or carry their unit: force=10N, angle=8deg or 8°.
-Exit status: 0 done, 1 refused, 2 no answer or not understood here, 3 stop or disarm was received,
-but the servos have not confirmed torque off yet."""
+commands: arm, disarm, tare, grasp force=N, rotate angle=RAD, hold force=N angle=RAD (a streamed
+setpoint), move left=RAD right=RAD, release, set compliance=RAD/NM, demo (restart the profile's
+task), stop, clear, status. Numbers are in SI units or carry a unit: force=10N, angle=8deg or 8°.
+Exit status: 0 done, 1 refused, 2 no answer or invalid words, 3 stop or disarm was received, but the
+servos have not confirmed yet that torque is off."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

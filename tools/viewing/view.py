@@ -11,14 +11,14 @@ from softfinger.tools.ending import Ending
 from softfinger.tools.extras import require
 
 _EPILOG = """\
-Serves a page for browsers on this machine. The address with the token, which is printed, gives
-buttons and sliders, and stop on the space key; the one without it only watches.
-With --foxglove the page's port speaks Foxglove's protocol, too, by default at ws://127.0.0.1:8765;
-the line it prints says where the layout file is. A recording is opened in Foxglove itself.
+Serves a page for browsers on this machine. The printed address with the token opens a page with
+buttons and sliders, on which the space key stops the hand; without the token the page only shows.
+With --foxglove, the page also serves Foxglove's protocol, by default at ws://127.0.0.1:8765. The
+printed line names the layout file. Open recordings in Foxglove directly.
 Ends with Ctrl-C, or after --duration.
-From another machine: ssh -L 9090:127.0.0.1:9090, with the port printed; or, in a network that you
-trust, --host ADDRESS. Each address that it then prints opens the page in one browser.
-Exit status: 0, or 1 with the reason when nothing could be shown."""
+From another machine, use ssh -L 9090:127.0.0.1:9090 with the printed port, or --host ADDRESS in a
+trusted network. Each address that is then printed opens the page in one browser.
+Exit status: 0, or 1 with the reason if nothing could be shown."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -33,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="?",
         const=8765,
         metavar="PORT",
-        help="serve the stream to Foxglove (default: 8765; 0: a free port)",
+        help="serve the stream to Foxglove (default port: 8765; 0: a free port)",
     )
     parser.add_argument(
         "--host",
