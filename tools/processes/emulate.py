@@ -84,7 +84,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--dir",
         type=Path,
         metavar="DIR",
-        help="folder, owned by you, for the links servos, tactile-left and tactile-right; made if absent "
+        help="your own folder for the links servos, tactile-left, tactile-right; made if absent "
         "(default: a folder in your runtime folder)",
     )
     add_settings(parser)
