@@ -30,7 +30,7 @@ _FROM_ENDS = 0.05  # rad at each end of the joint's range that the sweeps avoid
 _ARRIVED = 0.05
 _REST = 0.3  # s of rest between two strokes, in addition to the smoothing time of the setpoints
 _TOUCHED = 0.2  # s discarded before and after a contact, which may not be detected immediately
-_SEEN = 2.0  # standard deviations by which breakaway friction must exceed sliding friction
+_SEEN = 2.0  # standard deviations above sliding friction from which breakaway friction is reported
 
 
 def calibrate_friction(arguments: argparse.Namespace, settings: Settings) -> str:

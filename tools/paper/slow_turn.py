@@ -5,11 +5,11 @@ shear ζ of a tip
 
     U = πE [d³/(3 cos² θ) + d² ζ tan θ + d ζ²]      ζ̇ = −ṡ + (a − d) θ̇ − ḋ tan θ
 
-The shear rate is the tip's rolling minus the motion of the face along itself, minus the component
-along a tilted face as d increases (s, d, θ of `kinematics.hand.geometry`, with θ of the right tip
-mirrored). The object is in balance if Σ δU = 0 for each of its motions. With M = ∂U/∂θ, T = ∂U/∂ζ
-and N = ∂U/∂d − T tan θ, this is Σ N δd + M δθ + T (−δs + (a − d) δθ) = 0. Every pose of a slow turn
-fulfils this condition. `turned` solves it step by step, without time, mass or damping.
+The shear rate is the difference between the tip's rolling and its motion along the face, minus the
+component along a tilted face as d increases (s, d, θ of `kinematics.hand.geometry`, with θ of the
+right tip mirrored). The object is in balance if Σ δU = 0 for each of its motions. With M = ∂U/∂θ,
+T = ∂U/∂ζ and N = ∂U/∂d − T tan θ, this is Σ N δd + M δθ + T (−δs + (a − d) δθ) = 0. Every pose of a
+slow turn fulfils this condition. `turned` solves it step by step, without time, mass or damping.
 """
 
 from __future__ import annotations

@@ -30,15 +30,15 @@ from softfinger.daemon.wire.local_stop import stop_locally
 LATELY = 3.0  # s, window over which waits for a busy machine are summed and shown
 EVENTS = 200  # number of events kept
 MEANINGS = (  # meanings of the words on the pages
-    ("d", "how deep the object presses the tip in"),
+    ("d", "displacement of the object's face into the tip"),
     ("θ", "tilt of the object's face against the tip"),
-    ("force", "F(d, θ), what presses the tip, normal to the face"),
+    ("force", "F(d, θ), contact force on the tip, normal to the face"),
     ("energy", "U(d, θ), elastic energy in the tip"),
     ("±", "one standard deviation"),
     ("map age", "time since the newest pressure map was measured"),
-    ("joint, goal", "angles now and asked for; positive closes"),
-    ("current, bound", "of the motor, and the most that its goal allows"),
-    ("object", "its angle and width between the tips"),
+    ("joint, goal", "present and requested angle; positive closes"),
+    ("current, bound", "motor current, and the limit that its goal allows"),
+    ("object", "angle and width of the object between the tips"),
 )
 _RAISED = 1.01  # fraction of the requested force above which the grip is reported as raised
 _DRAIN_LIMIT = 4000  # messages read per call, so that a flood of messages cannot block drawing
@@ -308,8 +308,8 @@ class Commander:
     """Send commands without waiting for their replies; ``reply`` holds the newest reply.
 
     Each command uses its own request socket, so a missing answer does not delay other commands. If
-    the daemon runs on this machine under the same user, a stop bypasses the queue of commands; its
-    answer comes at the next tick.
+    the daemon runs on this machine under the same user, a stop bypasses the requests of all
+    clients. It is answered at the next tick, and the wait for a stalled daemon is short.
     """
 
     OPEN_LIMIT = 8  # number of open commands; further commands except stop are dropped

@@ -63,8 +63,8 @@ _KEYS = {
     "q": "quit",
 }
 _KEYS_EXPLAINED = (
-    ("w", "begins the profile's task again, while disarmed"),
-    ("+ -", "more or less force; a grip follows at once"),
+    ("w", "restarts the profile's task, while disarmed"),
+    ("+ -", "increase or reduce the force, also of a current grip"),
 )
 
 # (label, field, factor, decimals, unit, field of the standard deviation)
