@@ -19,7 +19,7 @@ from typing import Any
 
 from softfinger.daemon.errors import SoftfingerError
 
-# restores the terminal if the monitor was killed
+# Restores the terminal if the monitor was killed.
 LEAVE = "\x18\x1b[0m\x1b[?2004l\x1b[?25h\x1b[?1049l"
 _PATIENCE = 20.0  # s for a recorder to subscribe, or to close its file
 
@@ -94,7 +94,7 @@ class MonitorBeside:
                 break
             except subprocess.TimeoutExpired:
                 end()
-        # killed: the page is still on the screen
+        # Killed: the page is still on the screen.
         if self.process.wait() < 0 and self._attributes is not None:
             with contextlib.suppress(OSError, termios.error):
                 termios.tcsetattr(self._terminal, termios.TCSANOW, self._attributes)

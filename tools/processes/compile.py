@@ -155,7 +155,7 @@ class _Build:
             for process in self._processes:
                 with process:
                     pass
-        # reported once each: wrong settings make every part fail for the same reason
+        # Reported once each: wrong settings make every part fail for the same reason.
         reasons: set[str] = set()
         for name, future in built.items():
             if (reason := future.result()) and reason not in reasons:
@@ -221,7 +221,7 @@ def main() -> None:
     has lines of three forms: ``kernel NAME`` when a kernel is started, ``done`` when a part is
     built, and ``failed REASON`` when a part could not be built.
     """
-    # the compiler allocates many long-lived objects; frequent collections cost 10 %
+    # The compiler allocates many long-lived objects; frequent collections cost 10 %.
     gc.set_threshold(100_000)
     out = sys.stdout
     sys.stdout = sys.stderr  # other prints must not disturb the protocol

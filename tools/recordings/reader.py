@@ -37,7 +37,7 @@ _FIELDS_MOST = 500  # fields in one message
 _HEADER, _FOOTER, _CHANNEL, _MESSAGE, _CHUNK, _STATISTICS, _DATA_END = 1, 2, 4, 5, 6, 11, 15
 _RECORD = struct.Struct("<BQ")  # head of each record: kind, size of the content
 _BEFORE_DATA = struct.Struct("<HIQQ")  # head of a message: channel, number, log time, publish time
-# head of a chunk: first and last time, size, CRC, length of the compression's name
+# Head of a chunk: first and last time, size, CRC, length of the compression's name.
 _BEFORE_CHUNK = struct.Struct("<QQQII")
 _LENGTH = struct.Struct("<Q")
 _MAGIC = b"\x89MCAP0\r\n"

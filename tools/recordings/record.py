@@ -80,12 +80,12 @@ class RecordingWriter:
         self._dumps = orjson.dumps
         self._added = 0  # number of messages, including the incomplete chunk
         self._filled = 0  # bytes of messages in the incomplete chunk
-        # by topic, for frames by channel name
+        # By topic, for frames by channel name.
         self._channels: dict[bytes | str, tuple[int, Converter]] = {}
         self._schemas: dict[bytes, int] = {}
         self._ended = False
         self._newest = math.nan  # time of the newest message [s]
-        # repeated messages that came before any other message
+        # Repeated messages that came before any other message.
         self._early: list[tuple[bytes, dict[str, Any]]] = []
         try:
             self._file = path.open("xb", buffering=4 * CHUNK)  # a chunk is written at once
@@ -96,7 +96,7 @@ class RecordingWriter:
         except OSError as error:
             raise RecordingError(f"{path}: {error.strerror}") from None
         try:
-            # larger than the limit at which `add` ends a chunk
+            # Larger than the limit at which `add` ends a chunk.
             self._mcap = Writer(self._file, 2 * CHUNK)
             self._mcap.start(PROFILE, LIBRARY)
             self._wrote()
@@ -187,7 +187,7 @@ class RecordingWriter:
 
     def _failed(self, error: OSError) -> RecordingError:
         self._ended = True
-        # the remaining buffer does not fit either and is dropped
+        # The remaining buffer does not fit either and is dropped.
         with contextlib.suppress(OSError):
             self._file.close()
         with contextlib.suppress(OSError):
@@ -308,7 +308,7 @@ class _Recorder:
                     return
                 began = time.monotonic()
                 socket.poll(int(_STEP * 1e3))
-                # a stall of the process counts as one step
+                # A stall of the process counts as one step.
                 quiet -= min(time.monotonic() - began, _STEP)
 
     def _take(self, frames: list[bytes]) -> None:
@@ -354,7 +354,7 @@ class _Recorder:
             if written:
                 print(f"{path}: {path.stat().st_size / 1e6:.2f} MB")
             else:
-                # an empty file would block the next call with this name
+                # An empty file would block the next call with this name.
                 path.unlink(missing_ok=True)
         lost = ", ".join(
             f"{gaps.lost} of {topic.decode()}" for topic, gaps in self._gaps.items() if gaps.lost
