@@ -55,7 +55,7 @@ _NO_COMMAND = (ValueError, TypeError, LookupError, AttributeError, OverflowError
 _BUFFER = 256 << 10  # bytes queued for a page or a Foxglove client
 _LARGEST = 65536  # bytes, largest message accepted from a page or a Foxglove client
 _HEADERS = {
-    "Cache-Control": "no-store",  # the page may contain a token, which changes with each daemon
+    "Cache-Control": "no-store",  # the page may contain a token, which changes with each start
     "Content-Security-Policy": "frame-ancestors 'none'; base-uri 'none'; form-action 'none'",
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
