@@ -1,7 +1,7 @@
-"""The pages of the site that are made at its build: from the code, and from the project's folder.
+"""Make those pages and tables of the site that are generated from the code at build time.
 
-MkDocs calls the functions named ``on_…`` (``hooks`` in mkdocs.yml). `PAGES` are whole pages, and
-`TABLES` tables within pages: no figure that the code can compute is typed.
+MkDocs calls the functions named ``on_…`` (``hooks`` in mkdocs.yml). `PAGES` contains whole pages,
+and `TABLES` contains tables within pages, so that computed figures are never typed by hand.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def _from(name: str) -> Callable[[], str]:
-    """The page is a file of the project's folder."""
+    """Return a function that reads a page from a file of the repository."""
     return lambda: (ROOT / name).read_text(encoding="utf-8")
 
 
 def _program(name: str) -> Callable[[], str]:
-    """The page shows a program of the project's folder."""
+    """Return a function that makes a page from a program of the repository."""
     return lambda: f"# {Path(name).stem}\n\n```python\n{_from(name)()}```\n"
 
 
@@ -45,7 +45,7 @@ def _table(heads: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
 
 
 def _signed(value: float, form: str) -> str:
-    """The number with a real minus sign, and 0 without one."""
+    """Format the number with a minus sign (U+2212), and without a sign if it rounds to 0."""
     return f"{value:{form}}".replace("-", "−") if float(f"{value:{form}}") else f"{0.0:{form}}"
 
 
@@ -83,7 +83,7 @@ profile of your own.
 
 
 def configuration() -> str:
-    """Every section and key, from their declarations."""
+    """Make the page of all sections and keys from their declarations."""
     from softfinger.daemon.profile import reference
 
     parts = [_SETTINGS, _head("profile", "what it is"), *_profiles()]
@@ -100,7 +100,7 @@ def configuration() -> str:
 
 
 def _profiles() -> list[str]:
-    """A row of the table for each profile that comes with the package."""
+    """Make a table row for each profile of the package."""
     from softfinger.daemon.profile.load import names
     from softfinger.tools.setup.config import subject
 
@@ -111,7 +111,7 @@ def _profiles() -> list[str]:
 
 
 def stream() -> str:
-    """Every topic and field, from the schema."""
+    """Make the page of all topics and fields from the schema."""
     from softfinger.daemon.wire.schema_docs import page
 
     return page()
@@ -121,14 +121,15 @@ def stream() -> str:
 
 
 def commands() -> str:
-    """The hand's commands from the table of modes, the command line's words from its parser."""
+    """Make the page of the hand's commands from the table of modes."""
     from softfinger.daemon.control.modes import COMMANDS, Mode
     from softfinger.daemon.types import UNLEASED
     from softfinger.tools.terminal.send import _EPILOG
 
     parts = [
-        "# Commands to the hand\n\nMsgpack maps on a REQ socket, `softfinger send`, or methods of "
-        f"[`Hand`](api.md): the same words.\n\n```text\n{_EPILOG}\n```\n\n",
+        "# Commands to the hand\n\nSend commands as msgpack maps on a REQ socket, with "
+        "`softfinger send`, or with the methods of [`Hand`](api.md). The names are the same.\n\n"
+        f"```text\n{_EPILOG}\n```\n\n",
         _head("command", "numbers", "accepted in the modes", "needs the lease"),
     ]
     for name, (modes, numbers) in COMMANDS.items():
@@ -140,10 +141,10 @@ def commands() -> str:
 
 
 def command_line() -> str:
-    """The help of every subcommand."""
+    """Make the page with the help of every subcommand."""
     from softfinger.tools.cli import SUBCOMMANDS, make_parser
 
-    os.environ["COLUMNS"] = "100"  # the width that argparse wraps to
+    os.environ["COLUMNS"] = "100"  # width at which argparse wraps lines
     parser, _ = make_parser(SUBCOMMANDS)
     parts = [f"# The command line\n\n```text\n{parser.format_help()}```\n"]
     for name, subparser in _children(parser).items():
@@ -154,7 +155,7 @@ def command_line() -> str:
 
 
 def _children(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
-    """The parsers of a parser's subcommands."""
+    """Return the parsers of a parser's subcommands, by name."""
     found: dict[str, argparse.ArgumentParser] = {}
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
@@ -168,16 +169,16 @@ def _children(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentPar
 _LIMITS = """\
 # Limits
 
-What is judged of a running hand, with the built-in one's numbers; `softfinger limits --config FILE`
-has a profile's. `warn` is reported, `limit` changes the goal, `fault` turns torque off until
-`clear`. *Noticed* counts from the first reading or frame that is past the bound; an age among the
-settings comes before it.
+The daemon checks these limits while a hand runs. The numbers are those of the built-in hand;
+`softfinger limits --config FILE` prints those of a profile. A `warn` is reported, a `limit` changes
+the goal, and a `fault` turns torque off until `clear`. The column *noticed* is the delay from the
+first reading or frame that exceeds the limit. If a setting is an age, add that age to the delay.
 
 """
 
 
 def limits() -> str:
-    """Every limit: what is judged, how soon, by which settings, and what follows."""
+    """Make the page of all limits: condition, delay, consequence and settings."""
     from softfinger.daemon.profile.settings import Settings
     from softfinger.daemon.safety.limits import LIMITS
     from softfinger.tools.setup.limits import _values
@@ -193,7 +194,7 @@ def limits() -> str:
         lasts = getattr(settings.safety, row.lasts) if isinstance(row.lasts, str) else row.lasts
         after = f"{lasts:g} s + " if lasts else ""
         if row.in_turn:
-            turns = 2 if lasts else 1  # to see it, and to see that it has lasted
+            turns = 2 if lasts else 1  # detection, then the end of the required duration
             when = f"{after}up to {turns * taking_turns * tick:g} ms"
         elif row.check:
             when = f"{after}a tick ({tick:g} ms)"
@@ -221,7 +222,7 @@ send `clear`.
 
 
 def events() -> str:
-    """Every kind of event, from the table that explains them."""
+    """Make the page of all kinds of events from the table that explains them."""
     from softfinger.daemon.wire.event_kinds import KINDS
 
     parts = [_EVENTS, _head("kind", "level", "cause", "what to do")]
@@ -234,7 +235,7 @@ def events() -> str:
 
 
 def api() -> str:
-    """The public names of the package, from their docstrings."""
+    """Make the page of the package's public names from their docstrings."""
     import softfinger
 
     parts = ["# For programs\n\nThe names below are imported from `softfinger` itself.\n"]
@@ -250,7 +251,7 @@ def api() -> str:
 
 
 def checkpoints() -> str:
-    """Closed forms at a few places."""
+    """Tabulate closed forms at a few points."""
     from softfinger.kinematics.contact.closed_form import closed_forms
 
     rows = []
@@ -262,7 +263,7 @@ def checkpoints() -> str:
 
 
 def rates() -> str:
-    """How fast force and energy change with the tilt at 25°, by the paper's integrals."""
+    """Tabulate the slopes of force and energy over the tilt at 25°, from the paper's integrals."""
     from softfinger.tools.paper.model_pages import DEPTHS, ENERGY, FORCE
 
     heads = ("d [mm]", *(f"d = {d}" for d in DEPTHS))
@@ -275,7 +276,7 @@ def rates() -> str:
 
 
 def exponents() -> str:
-    """The exponent of the displacement by both laws, from 1 to 8 mm."""
+    """Tabulate the exponent of the displacement for both laws, from 1 to 8 mm."""
     from softfinger.tools.paper.model_pages import ENERGY, FORCE, over_depth
 
     force, energy = (over_depth("", each)[1] for each in (FORCE, ENERGY))
@@ -289,7 +290,7 @@ def exponents() -> str:
 
 
 def early_minimum() -> str:
-    """Where force and energy are least if a share of a rolling shears the tip."""
+    """Tabulate the minima of force and energy if a share of the rolling shears the tip."""
     from softfinger.tools.paper.model_pages import DEPTHS
     from softfinger.tools.paper.sheared_rolling import sheared_rolling
 
@@ -307,7 +308,7 @@ def early_minimum() -> str:
 
 
 def upright_forces() -> str:
-    """Forces of upright tips of several laws."""
+    """Tabulate the forces of upright tips for several laws."""
     from softfinger.kinematics.contact.closed_form import Fingertip
     from softfinger.kinematics.contact.material import Material
     from softfinger.kinematics.contact.table import ContactTable
@@ -331,7 +332,7 @@ def upright_forces() -> str:
 
 
 def minimum_strength() -> str:
-    """c of each kind of tip, near upright: how much its energy rises with the tilt."""
+    """Tabulate c for each kind of tip near upright: the increase of its energy with the tilt."""
     from softfinger.kinematics.contact.closed_form import Fingertip
     from softfinger.kinematics.contact.material import Material
     from softfinger.kinematics.contact.table import ContactTable
@@ -354,7 +355,7 @@ def minimum_strength() -> str:
 
 
 def _grips() -> list[tuple[str, float, float, float, float]]:
-    """Name, d [m], q [rad], c and upright spring [N·m/rad] of grips of 10 N on 40 mm."""
+    """Return name, d [m], q [rad], c and upright spring [N·m/rad] of 10 N grips on 40 mm."""
     from softfinger.daemon.profile.factory import make_material, make_table
     from softfinger.daemon.profile.settings import Settings
     from softfinger.kinematics.hand.upright import upright_spring
@@ -382,11 +383,11 @@ def _grips() -> list[tuple[str, float, float, float, float]]:
     return found
 
 
-_FORCE, _WIDTH = 10.0, 0.040  # N, m of the grips that the pages speak of
+_FORCE, _WIDTH = 10.0, 0.040  # N, m; the grip used on the pages
 
 
 def upright_grips() -> str:
-    """Displacement, joint angle and spring of a grip, and what stuck tips leave of an angle."""
+    """Tabulate displacement, joint angle and spring of a grip, and the remaining object angle."""
     rows = []
     for name, d, q, c, spring in _grips():
         angles = (_signed(_left_of(k, d, q, c), ".3f") for k in (0.0, spring, 1e9))
@@ -396,7 +397,7 @@ def upright_grips() -> str:
 
 
 def _left_of(spring: float, d: float, q: float, c: float) -> float:
-    """φ/φ0 by the closed form of `kinematics.hand.upright`, of the built-in hand's lengths [m]."""
+    """Return φ/φ0 by the closed form of `kinematics.hand.upright`, for the built-in hand."""
     inward, radius = 0.080 * math.sin(q), 0.020
     b = spring / (_FORCE * 0.050)
     line = _WIDTH * (2.0 * inward + (1.0 - 2.0 * c) * d - b * (_WIDTH - d))
@@ -405,7 +406,7 @@ def _left_of(spring: float, d: float, q: float, c: float) -> float:
 
 
 def symmetric_grips() -> str:
-    """Joint angle, normal force and torque of symmetric grips whose tips bear no shear."""
+    """Tabulate joint angle, normal force and torque of symmetric grips without tip shear."""
     rows = []
     for d in (2, 4, 6, 8):
         q = math.asin((50.0 - 20.0 + d - 20.0) / 80.0)
@@ -416,7 +417,7 @@ def symmetric_grips() -> str:
 
 
 def relaxations() -> str:
-    """Force after a sudden press that stays, over what lasts, of three kinds of memory."""
+    """Tabulate force after a sudden constant press, relative to its final value, for three laws."""
     times = (0.001, 0.01, 0.1, 1.0, 10.0)
     prony = list(zip((0.1, 0.2, 0.2), (0.004, 0.07, 1.4), strict=True))
     laws: dict[str, Callable[[float], float]] = {
@@ -431,7 +432,7 @@ def relaxations() -> str:
 
 
 def errata() -> str:
-    """Each erratum that `softfinger figures` marks, once."""
+    """Tabulate each erratum that `softfinger figures` marks, once."""
     from softfinger.tools.paper.figures import pages
 
     found = dict.fromkeys(each for page in pages().values() for each in page.errata)
@@ -441,7 +442,7 @@ def errata() -> str:
 
 
 def servos() -> str:
-    """The known models, what they press at the tip, and the bounds to set for them."""
+    """Tabulate the known servo models, their tip forces, and the limits to set for them."""
     from softfinger.daemon.servos.control_table import MODELS
 
     columns = ("V", "stall [N·m at A]", "N·m/A", "force [N]", "current_max [A]", "force_max [N]")
@@ -461,7 +462,7 @@ def servos() -> str:
 
 
 def _stored(name: str) -> tuple[str, list[dict[str, Any]]]:
-    """The machine and the rows of a file of docs/ that `softfinger bench --json` wrote."""
+    """Return the machine and the rows of a file in docs/ written by `softfinger bench --json`."""
     content = json.loads((ROOT / "docs" / name).read_text(encoding="utf-8"))
     load = " to ".join(f"{each:.1f}" for each in content["load"])
     about = f"{content['machine']}, {content['cores']} cores, load {load}.\n"
@@ -476,7 +477,7 @@ def _shown(rows: Iterable[dict[str, Any]], keys: Sequence[str]) -> Iterable[list
 
 
 def measured() -> str:
-    """The figures that docs/benchmarks.json keeps, of a `softfinger bench` without names."""
+    """Tabulate docs/benchmarks.json, the results of `softfinger bench` without names."""
     about, rows = _stored("benchmarks.json")
     keys = ("median", "p99", "unit", "aim ≤", "relative error", "RMS of d [µm]")
     parts = [about]
@@ -488,7 +489,7 @@ def measured() -> str:
 
 
 def _control(table: int) -> str:
-    """One of the tables of docs/control.json, of a `softfinger bench control`."""
+    """Make one table of docs/control.json, the results of `softfinger bench control`."""
     _, rows = _stored("control.json")
     titles = list(dict.fromkeys(row["table"] for row in rows))
     shown = (row for row in rows if row["table"] == titles[table])
@@ -497,7 +498,7 @@ def _control(table: int) -> str:
 
 
 def control_late() -> str:
-    """What each law leaves of an angle that it gets late, from the third table of that file."""
+    """Tabulate the remaining angle of each law with a delayed angle, from docs/control.json."""
     _, rows = _stored("control.json")
     found: dict[str, dict[str, str]] = {}
     for row in rows:
@@ -513,7 +514,7 @@ def control_late() -> str:
 
 
 def held_loads() -> str:
-    """How many sudden loads each simulated hand held, of docs/reflex.json."""
+    """Tabulate the number of sudden loads that each simulated hand held, from docs/reflex.json."""
     _, rows = _stored("reflex.json")
     found: dict[str, dict[str, list[int]]] = {}
     for row in rows:
@@ -532,7 +533,7 @@ def held_loads() -> str:
 
 
 def envelope_map() -> str:
-    """The heaviest mass of each object that the built-in hand's map holds, and all lighter ones."""
+    """Tabulate the heaviest mass up to which the built-in hand's map holds each object."""
     from softfinger.daemon.control.envelope import HELD
 
     found = tomllib.loads((ROOT / "daemon/control/envelope.toml").read_text(encoding="utf-8"))
@@ -552,7 +553,7 @@ _SHAPES = {"rectangle": "block", "disc": "disc"}
 
 
 def published() -> str:
-    """The rows of `softfinger validate`, computed anew."""
+    """Tabulate the rows of `softfinger validate`, computed at build time."""
     from softfinger.tools.paper.validate import FIGURES, comparisons
 
     heads = ("", "quantity", "published", "here", "source", "what stands between")
@@ -597,7 +598,7 @@ PAGES: dict[str, Callable[[], str]] = {
     "events.md": events,
     "api.md": api,
 }
-# Where a link to a file of the project's folder leads to on the site.
+# Pages of the site that correspond to files of the repository.
 _LINKS = {
     "README.md": "index.md",
     "CONTRIBUTING.md": "contributing.md",
@@ -614,7 +615,7 @@ _LINKS = {
 
 
 def on_config(config: Any) -> Any:
-    """State the version and the licence at the foot of every page."""
+    """State version and licence in the footer of every page."""
     from softfinger import __version__
 
     config.copyright = f"softfinger {__version__}, MIT licence"
@@ -622,7 +623,7 @@ def on_config(config: Any) -> Any:
 
 
 def on_files(files: Any, config: Any) -> Any:
-    """Add the pages that no file in docs/ holds."""
+    """Add the generated pages."""
     from mkdocs.structure.files import File
 
     for name, make in PAGES.items():
@@ -631,7 +632,7 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Tables made from the code; links as a reader of the repository follows them."""
+    """Insert the generated tables, and redirect links to repository files to pages of the site."""
     markdown = re.sub(
         r"\s*<!-- table: (\w+) -->", lambda found: f"\n\n{TABLES[found[1]]()}", markdown
     )
@@ -644,10 +645,10 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
 
 
 def on_page_content(content: str, **_: Any) -> str:
-    """Formulas and drawings as part of the page, in the colours of its theme.
+    """Convert formulas to MathML and insert drawings inline.
 
-    Formulas, which the extension arithmatex has marked, become MathML: browsers draw it without any
-    script or font of the site's. Drawings use `currentColor`, which an image would not inherit.
+    The extension arithmatex marks the formulas. Browsers render MathML without scripts or fonts
+    from the site. Drawings use `currentColor`, which would have no effect in an image element.
     """
     content = re.sub(
         r'<(div|span) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', _formula, content, flags=re.S
@@ -659,7 +660,7 @@ def _formula(found: re.Match[str]) -> str:
     from latex2mathml.converter import convert
 
     tex, display = html.unescape(found[2]).strip(), "block" if found[1] == "div" else "inline"
-    # A function is set apart from what it multiplies and from its argument, as TeX does it.
+    # As in TeX, separate a function from its factor and from its argument.
     function = r"\\(?:arcsin|cos|ln|sin|tan)(?:\^\d)?(?![a-z])"
     tex = re.sub(rf"(?<=[\w)}}])\s*(?={function})", r" \, ", tex)
     tex = re.sub(rf"({function})\s*(?=[\\\w])", r"\1 \, ", tex)
@@ -667,7 +668,7 @@ def _formula(found: re.Match[str]) -> str:
 
 
 def _drawing(found: re.Match[str]) -> str:
-    """The drawing itself, its styles bound to it alone."""
+    """Return the drawing as inline SVG, with its styles limited to it."""
     name = found[1]
     text = (ROOT / "docs" / "pictures" / f"{name}.svg").read_text(encoding="utf-8")
 

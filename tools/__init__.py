@@ -1,1 +1,1 @@
-"""Tools for people: the command line `cli` and its subcommands, each in the room of its subject."""
+"""User tools: the command line `cli` and its subcommands, grouped into packages by subject."""

@@ -1,6 +1,6 @@
-"""Command-line arguments that several subcommands share.
+"""Define command-line arguments that several subcommands share.
 
-The settings are imported where a profile is taken: the clients of a running hand need none.
+The settings are imported only when a profile is loaded; clients of a running hand do not need them.
 """
 
 from __future__ import annotations
@@ -19,39 +19,45 @@ if TYPE_CHECKING:
     from softfinger.daemon.profile.settings import Settings
     from softfinger.daemon.wire.keys import ClientKeys
 
-PATIENCE = 5.0  # s that `--no-wait` gives a stream to arrive
+PATIENCE = 5.0  # s, how long `--no-wait` waits for the first message
 
 
 def add_profile(parser: argparse.ArgumentParser) -> None:
-    """``--config``, ``--set`` and ``--dir``: which hand. `profile` loads it."""
+    """Add ``--config``, ``--set`` and ``--dir``, which select the hand; `profile` loads it."""
     add_settings(parser)
     parser.add_argument(
         "--dir",
         type=Path,
         metavar="DIR",
-        help="replaces {dir} in the ports' paths (default: the folder of `softfinger emulate`)",
+        help="replaces {dir} in port paths (default: the folder of `softfinger emulate`)",
     )
 
 
 def add_settings(parser: argparse.ArgumentParser) -> None:
-    """``--config`` and ``--set``, for a subcommand whose ``--dir`` is its own."""
+    """Add ``--config`` and ``--set``, for a subcommand that defines its own ``--dir``."""
     parser.add_argument(
         "--config",
         type=Path,
         metavar="PROFILE",
-        help="settings: a TOML file, or a name that `softfinger config list` has",
+        help="the settings: a TOML file, or a profile name from `softfinger config list`",
     )
     parser.add_argument(
         "--set",
         action="append",
         default=[],
         metavar="KEY=VALUE",
-        help="override a setting, as loop.rate=1000; may be repeated",
+        help="override a setting, e.g. loop.rate=1000; may be repeated",
     )
 
 
 def profile(arguments: argparse.Namespace) -> Settings:
-    """The settings that `add_profile`'s arguments name. Raises SettingsError with the report."""
+    """Load the settings selected by the arguments of `add_profile`.
+
+    Raises
+    ------
+    SettingsError
+        With the report of all errors.
+    """
     from softfinger.daemon.profile.load import load
 
     folder = arguments.dir or own_runtime_folder()
@@ -64,14 +70,16 @@ def profile(arguments: argparse.Namespace) -> Settings:
 
 
 def own_runtime_folder() -> Path | None:
-    """Return where an emulated hand links its ports without ``--dir``; None: nowhere of our own."""
+    """Return the default port folder of an emulated hand; None without a runtime folder."""
     return None if runtime_fault() else runtime_folder()
 
 
 def client_keys(folder: Path | None) -> ClientKeys | None:
-    """The keys that `add_daemon` names, to guard a socket or a context with before it connects.
+    """Load the client keys given by ``--keys``, to be applied to a socket before it connects.
 
-    Raises KeyFileError.
+    Raises
+    ------
+    KeyFileError
     """
     if folder is None:
         return None
@@ -81,20 +89,24 @@ def client_keys(folder: Path | None) -> ClientKeys | None:
 
 
 def stream_address(text: str) -> str:
-    """The stream's address: its own, or of ``tcp://HOST`` or ``STREAM,COMMANDS``.
+    """Return the stream's address from a socket address, ``tcp://HOST`` or ``STREAM,COMMANDS``.
 
-    When empty that of SOFTFINGER_ADDRESS, or else this machine's. Raises ArgumentTypeError.
+    An empty text selects SOFTFINGER_ADDRESS, or the default address on this machine.
+
+    Raises
+    ------
+    ArgumentTypeError
     """
     return addresses(text)[0]
 
 
 def command_address(text: str) -> str:
-    """The commands' address, as `stream_address`."""
+    """Return the command socket's address; see `stream_address`."""
     return addresses(text)[1]
 
 
 def addresses(text: str) -> tuple[str, str]:
-    """Return the stream's and the commands' address; one that stands alone is both."""
+    """Return the addresses of stream and commands; a single socket address is used for both."""
     from softfinger.daemon.client.connection import both_addresses, default_addresses, is_host
 
     try:
@@ -106,12 +118,15 @@ def addresses(text: str) -> tuple[str, str]:
 
 
 def waiting(address: str, folder: Path | None) -> str:
-    """The line while no stream arrives; a daemon that requires keys looks the same without them."""
+    """Return the message shown while no stream arrives, with a hint if no keys were given.
+
+    A daemon that requires keys looks unreachable to a client without keys.
+    """
     return f"waiting for a stream from {address}{_hint(folder)}"
 
 
 def no_stream(address: str, folder: Path | None) -> str:
-    """The line when no stream arrived in time."""
+    """Return the message for a stream that did not arrive in time."""
     return f"no stream from {address} within {PATIENCE:g} s; is softfinger running?{_hint(folder)}"
 
 
@@ -120,14 +135,20 @@ def _hint(folder: Path | None) -> str:
 
 
 def to_stderr(subcommand: str) -> Callable[[str], None]:
-    """A function that prints a line for people on standard error."""
+    """Return a function that prints a line on standard error, prefixed by the subcommand."""
     return lambda line: print(f"{subcommand}: {line}", file=sys.stderr, flush=True)
 
 
 def number(
     text: str, what: str, low: float, high: float = 1e9, *, includes_low: bool = False
 ) -> float:
-    """A number between bounds. Raises ArgumentTypeError with ``what`` was expected and found."""
+    """Parse a number between two bounds.
+
+    Raises
+    ------
+    ArgumentTypeError
+        With ``what``, the description of the expected number, and the text found.
+    """
     try:
         value = float(text)
     except ValueError:
@@ -138,17 +159,17 @@ def number(
 
 
 def seconds(text: str) -> float:
-    """A time above 0 s. Raises ArgumentTypeError."""
+    """Parse a time above 0 s; raise ArgumentTypeError otherwise."""
     return number(text, "a time above 0 s", 0.0)
 
 
 def megabytes(text: str) -> float:
-    """A size above 0 MB. Raises ArgumentTypeError."""
+    """Parse a size above 0 MB; raise ArgumentTypeError otherwise."""
     return number(text, "a size above 0 MB", 0.0)
 
 
 def add_range(parser: argparse.ArgumentParser) -> None:
-    """``--from`` and ``--to``, in seconds from the first message on: ``start`` and ``end``."""
+    """Add ``--from`` and ``--to``, stored as ``start`` and ``end`` [s after the first message]."""
 
     def moment(text: str) -> float:
         return number(text, "a time of 0 s or more", 0.0, includes_low=True)
@@ -170,14 +191,14 @@ def add_range(parser: argparse.ArgumentParser) -> None:
 def add_daemon(
     parser: argparse.ArgumentParser, kind: Callable[[str], Any], client: bool = False
 ) -> None:
-    """``--address`` and ``--keys``, and ``--client`` of one that commands."""
-    where = "where the daemon is: tcp://HOST, STREAM,COMMANDS, or one socket"
+    """Add ``--address`` and ``--keys``, and ``--client`` for a program that sends commands."""
+    where = "the daemon's address: tcp://HOST, STREAM,COMMANDS, or one socket"
     parser.add_argument("--address", type=kind, default="", help=where)
     parser.add_argument(
         "--keys", type=Path, metavar="FOLDER", help="this client's keys, from `softfinger keys`"
     )
     if client:
-        name = "a name: the commander's lease is bound to it"
+        name = "client name, to which the commander's lease is bound"
         parser.add_argument("--client", default="", help=name)
 
 
@@ -186,28 +207,28 @@ def add_stream(
     kind: Callable[[str], Any] = stream_address,
     client: bool = False,
 ) -> None:
-    """`add_daemon`, ``--no-wait`` and ``--duration``, of a subscriber."""
+    """Add a subscriber's arguments: `add_daemon`'s, ``--no-wait`` and ``--duration``."""
     add_daemon(parser, kind, client)
     parser.add_argument(
         "--no-wait",
         action="store_true",
-        help=f"end with an error when nothing arrives within {PATIENCE:g} s (monitor: or it ends)",
+        help=f"exit with an error if nothing arrives for {PATIENCE:g} s (monitor: or at its end)",
     )
     add_duration(parser)
 
 
 def add_duration(parser: argparse.ArgumentParser) -> None:
-    """``--duration``."""
-    parser.add_argument("--duration", type=seconds, metavar="S", help="end after S seconds")
+    """Add ``--duration``."""
+    parser.add_argument("--duration", type=seconds, metavar="S", help="stop after S seconds")
 
 
 def add_split(parser: argparse.ArgumentParser) -> None:
-    """``--split-size`` and ``--split-time``: a recorder's memory grows with its file."""
+    """Add ``--split-size`` and ``--split-time``: a recorder's memory use grows with its file."""
     parser.add_argument(
-        "--split-size", type=megabytes, metavar="MB", help="begin a new file after this size"
+        "--split-size", type=megabytes, metavar="MB", help="start a new file after this size"
     )
     parser.add_argument(
-        "--split-time", type=seconds, metavar="S", help="begin a new file after S seconds"
+        "--split-time", type=seconds, metavar="S", help="start a new file after S seconds"
     )
 
 
@@ -215,9 +236,12 @@ ALL = b"all"
 
 
 def topic(text: str) -> bytes:
-    """A topic of the stream by its name, with or without ``hand/``; or ``all``.
+    """Parse a topic name of the stream, with or without ``hand/``, or ``all``.
 
-    Raises ArgumentTypeError with what was found.
+    Raises
+    ------
+    ArgumentTypeError
+        With the text found.
     """
     from softfinger.daemon.wire import schema
 

@@ -1,8 +1,9 @@
-"""The command line: parses which subcommand is meant and hands over to its module.
+"""Parse the command line and run the selected subcommand.
 
-A subcommand's module, in a room of ``tools/``, is imported only when it is called. Its functions:
-``add_arguments(parser)`` and ``run(arguments) -> exit status``. What a person can put right, it
-raises: a SettingsError (exit status 2), any other SoftfingerError or an OSError about a file (1).
+Each subcommand is a module in a package of ``tools/`` and is imported only when it is called. It
+defines ``add_arguments(parser)`` and ``run(arguments) -> exit status``. For errors that the user
+can correct it raises a SettingsError (exit status 2), or another SoftfingerError or an OSError
+about a file (exit status 1).
 """
 
 from __future__ import annotations
@@ -24,67 +25,67 @@ from softfinger.daemon.errors import SettingsError, SoftfingerError
 _OPTIONS = ("-h", "--help", "--version")
 _UNKNOWN = re.compile(r"invalid choice: '([^']*)'|unrecognized arguments: (\S+)")
 
-GROUPS = {  # subcommands: the room of tools/ that its module is in, and what it does
+GROUPS = {  # for each subcommand: its package in tools/, and its description
     "run": {
         "run": ("processes", "run the daemon; without --config, on the built-in simulated hand"),
         "emulate": ("processes", "emulate a hand: servos and tactile boards on ptys"),
     },
     "hand": {
-        "status": ("terminal", "say in one line what the running hand does"),
+        "status": ("terminal", "show the state of the running hand in one line"),
         "send": ("terminal", "send one command to the running daemon"),
-        "monitor": ("terminal", "live page of the running daemon in the terminal"),
-        "view": ("viewing", "show and command the running hand, or show a recording, in a page"),
+        "monitor": ("terminal", "show and command the running hand in the terminal"),
+        "view": ("viewing", "show and command the running hand on a web page, or show a recording"),
     },
     "data": {
         "record": ("recordings", "record the running daemon's stream into an MCAP file"),
-        "replay": ("recordings", "publish a recording again, or compare it with today's code"),
+        "replay": ("recordings", "publish a recording again, or recompute it with this version"),
         "analyse": ("analysis", "compute contact, force and energy over time from frames"),
-        "plot": ("analysis", "draw a recording beside the model: forces, energy landscape, errors"),
+        "plot": ("analysis", "draw a recording with the model: forces, energy landscape, errors"),
         "export": ("recordings", "export a recording's topics as CSV or Parquet"),
     },
     "machine": {
-        "doctor": ("setup", "check ports, servos, boards and this machine; say what mends them"),
-        "scan": ("setup", "find the servos on a port, at any rate"),
+        "doctor": ("setup", "check ports, servos, boards and this machine, and name fixes"),
+        "scan": ("setup", "find the servos on a port, at any baud rate"),
         "calibrate": ("calibration", "calibrate joints, sensors and tips, step by step"),
-        "envelope": ("setup", "find out what a hand holds: shape, size, friction, mass"),
+        "envelope": ("setup", "simulate which shapes, sizes, frictions and masses a hand holds"),
         "limits": ("setup", "list every limit: condition, consequence, setting"),
         "config": ("setup", "list and show the profiles, and every setting with its default"),
-        "compile": ("processes", "compile a hand's kernels ahead of its first start"),
-        "keys": ("setup", "make the keys that addresses outside this machine need"),
+        "compile": ("processes", "compile a hand's kernels before its first start"),
+        "keys": ("setup", "make the keys required for access from other machines"),
         "install-service": ("setup", "print a systemd unit and udev rules"),
-        "completion": ("setup", "print what completes these words in bash, zsh or fish"),
+        "completion": ("setup", "print a completion script for bash, zsh or fish"),
     },
     "develop": {
         "figures": ("paper", "draw the paper's figures from this model, as CSV and PNG"),
         "validate": ("paper", "compare this model with published figures"),
-        "bench": ("benchmarks", "measure run time, and what the hand does in simulation"),
+        "bench": ("benchmarks", "measure run time and the simulated hand's behaviour"),
     },
 }
 SUBCOMMANDS = {name: row for rows in GROUPS.values() for name, row in rows.items()}
 
 _LINUX = (*GROUPS["run"], "doctor", "scan", "calibrate", "compile", "install-service", "bench")
 _FIRST_STEPS = """\
-softfinger {version}: two rotational fingers with soft tips. To begin:
-  softfinger run --monitor          a simulated hand and its live page; q ends both
+softfinger {version}: two rotational fingers with soft tips. To start:
+  softfinger run --monitor          run a simulated hand with its live page; q ends both
   softfinger send arm               in another terminal: torque on; then grasp force=10
-  softfinger run --config PROFILE   another hand; softfinger config list names some
-  softfinger doctor --config FILE   what a hand of metal still lacks
-  softfinger help                   all subcommands; help SUBCOMMAND: its arguments"""
+  softfinger run --config PROFILE   run another hand; softfinger config list names profiles
+  softfinger doctor --config FILE   check a physical hand and name the missing steps
+  softfinger help                   list all subcommands; help SUBCOMMAND: its arguments"""
 _EPILOG = """\
-softfinger help SUBCOMMAND: its arguments. To begin: softfinger run --monitor
-Exit status: 0 done; 1 it could not be done, with the reason; 2 wrong arguments or settings;
-130 ended by Ctrl-C. What a subcommand has beside these is in its help."""
+softfinger help SUBCOMMAND: its arguments. To start: softfinger run --monitor
+Exit status: 0 done; 1 failed, with the reason; 2 wrong arguments or settings; 130 ended by Ctrl-C.
+The help of a subcommand lists its additional exit statuses."""
 
 
 def _open_standard_streams() -> None:
-    """Open /dev/null for closed standard streams, so that no other file takes their place.
+    """Open /dev/null for closed standard streams, so that no other file takes their descriptors.
 
-    Characters that a terminal or pipe can't encode, such as θ, are replaced.
+    Characters that a terminal or pipe cannot encode, such as θ, are replaced.
     """
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:
             descriptor = os.open(os.devnull, os.O_RDWR)
-            os.set_inheritable(descriptor, True)  # so that a child has them, too
+            os.set_inheritable(descriptor, True)  # child processes inherit it too
             setattr(sys, name, os.fdopen(descriptor, mode))
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
@@ -92,7 +93,7 @@ def _open_standard_streams() -> None:
 
 
 class Parser(argparse.ArgumentParser):
-    """Names the nearest of what is known for a word that is not."""
+    """Argument parser that suggests the nearest known word for an unknown one."""
 
     def error(self, message: str) -> NoReturn:
         unknown = _UNKNOWN.search(message)
@@ -107,7 +108,7 @@ class Parser(argparse.ArgumentParser):
 
 
 class TopParser(Parser):
-    """Lists the subcommands in their groups."""
+    """Parser whose help lists the subcommands in groups."""
 
     def format_help(self) -> str:
         lines = [f"usage: {self.prog} SUBCOMMAND …\n\n{self.description}"]
@@ -118,9 +119,12 @@ class TopParser(Parser):
 
 
 def make_parser(imported: Collection[str]) -> tuple[Parser, dict[str, tuple[Any, Parser]]]:
-    """Make the parser with all subcommands; return it with module and parser of each ``imported``.
+    """Make the parser with all subcommands.
 
-    Without its module a subcommand has no arguments.
+    Returns
+    -------
+    The parser, and the module and parser of each subcommand in ``imported``. The other subcommands
+    have no arguments.
     """
     parser = TopParser(
         prog="softfinger",
@@ -146,7 +150,7 @@ def make_parser(imported: Collection[str]) -> tuple[Parser, dict[str, tuple[Any,
     return parser, made
 
 
-# What the loader of shared libraries says where the process may have no more memory.
+# Parts of the messages that the shared-library loader gives when memory is exhausted.
 _NO_MEMORY = ("failed to map segment", "Cannot allocate memory", "libllvmlite")
 
 
@@ -159,7 +163,7 @@ def _lacks_memory(error: BaseException | None) -> bool:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point of ``softfinger``; returns the exit status."""
+    """Run ``softfinger``; return the exit status."""
     try:
         return _main(argv)
     except (MemoryError, ImportError, OSError) as error:
@@ -174,7 +178,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _main(argv: Sequence[str] | None) -> int:
-    # While modules are imported Ctrl-C ends the process as it ends any other: no traceback.
+    # Until the subcommand installs its own handler, Ctrl-C ends the process without a traceback.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     _open_standard_streams()
     words = list(sys.argv[1:] if argv is None else argv)
@@ -183,7 +187,7 @@ def _main(argv: Sequence[str] | None) -> int:
         return 0
     if words[:1] == ["help"]:
         words = [*words[1:2], "--help"]
-    # Only the subcommand that is called is imported, for its arguments and for its work.
+    # Import only the subcommand that is called, both for its arguments and for its work.
     called = next((word for word in words if word in SUBCOMMANDS), "")
     if called in _LINUX and sys.platform != "linux":
         print(
@@ -210,12 +214,12 @@ def _main(argv: Sequence[str] | None) -> int:
         status: int = module.run(arguments)
         sys.stdout.flush()
     except KeyboardInterrupt:
-        return 130  # as a shell says of a program that Ctrl-C ended
+        return 130  # exit status that shells use for Ctrl-C
     except BrokenPipeError:
-        # Whoever read the output has seen enough, as in `| head`; nothing more can be said to it.
+        # The reader has closed the pipe, as in `| head`; discard the remaining output.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
-    except SettingsError as error:  # a report with a line for each key
+    except SettingsError as error:  # contains one line for each key
         print(error, file=sys.stderr)
         return 2
     except SoftfingerError as error:

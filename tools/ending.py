@@ -1,4 +1,4 @@
-"""End of a subcommand: by a signal, after a duration, or with the process that started it."""
+"""End a subcommand by a signal, after a duration, or with its parent process."""
 
 from __future__ import annotations
 
@@ -13,14 +13,19 @@ from typing import Any, Self
 
 
 def known(*names: str) -> tuple[signal.Signals, ...]:
-    """Return those signals that this system has."""
+    """Return those of the named signals that exist on this system."""
     return tuple(each for each in signal.Signals if each.name in names)
 
 
 class Ending:
-    """A context in which signals ask for the end, as does the end of ``duration`` s.
+    """Context in which a signal, a time limit or a closed pipe requests the end of a subcommand.
 
-    So does the end of ``lifeline``, a pipe whose other end is the process that started this one.
+    Parameters
+    ----------
+    duration
+        Time limit [s], counted from `begin`.
+    lifeline
+        Read end of a pipe that the parent process holds; its closing requests the end.
     """
 
     signals: tuple[signal.Signals, ...] = (signal.SIGINT, signal.SIGTERM)
@@ -32,28 +37,29 @@ class Ending:
         self._lifeline = [] if lifeline is None else [lifeline]
 
     def begin(self) -> None:
-        """The duration counts from now on."""
+        """Start counting the duration."""
         self._deadline = time.monotonic() + self._duration
 
     @property
     def asked(self) -> bool:
-        """A signal has come, or the lifeline has ended."""
+        """True if a signal has come or the lifeline was closed."""
         return self._asked
 
     @property
     def over(self) -> bool:
-        """It is time to end."""
+        """True if the subcommand should end."""
         return self.asked or time.monotonic() >= self._deadline
 
     def wait(self, seconds: float) -> bool:
-        """Wait for the end, ``seconds`` at most; True when it has come."""
+        """Wait at most ``seconds`` for the end; return True if it has come."""
         self.ready(seconds)
         return self.over
 
     def ready(self, seconds: float, *others: int) -> list[int]:
-        """Wait for the end, a signal or ``others``, ``seconds`` at most; which of these are ready.
+        """Wait at most ``seconds`` for the end, a signal or readable descriptors among ``others``.
 
-        A signal that asks for no end ends the wait once.
+        Returns the readable descriptors. A signal that does not request the end also interrupts the
+        wait.
         """
         left = min(seconds, self._deadline - time.monotonic())
         watched = [self._wakes.fileno(), *self._lifeline, *others]
@@ -64,18 +70,18 @@ class Ending:
         return [each for each in ready if each in others]
 
     def end(self, *_: object) -> None:
-        """Ask for the end; from a signal handler, too."""
+        """Request the end; may be called from a signal handler."""
         self._asked = True
         self.wake()
 
     def wake(self, *_: object) -> None:
-        """End a wait."""
-        # No lock, as an Event has: the signal may come while this very thread holds it.
-        with contextlib.suppress(BlockingIOError):  # it is full: that wakes, too
+        """Interrupt a wait."""
+        # Do not use an Event: its lock may be held by the thread that the signal interrupts.
+        with contextlib.suppress(BlockingIOError):  # a full buffer also wakes the waiting thread
             self._wake.send(b"!")
 
     def __enter__(self) -> Self:
-        self._wakes, self._wake = socket.socketpair()  # Windows can't wait for a pipe
+        self._wakes, self._wake = socket.socketpair()  # on Windows, select does not accept pipes
         self._wake.setblocking(False)
         self._before = {number: signal.signal(number, self.end) for number in self.signals}
         return self
@@ -88,16 +94,16 @@ class Ending:
 
 
 class Interrupted(BaseException):
-    """A signal asked for the end before anything ran. No ``except Exception`` may hold it up."""
+    """A signal requested the end before the daemon ran; ``except Exception`` does not catch it."""
 
 
-# A signal whose default ends the process without a word would leave torque to the watchdog.
-# SIGHUP: the terminal is gone.
+# Signals whose default action would end the process at once, leaving the torque to the servo
+# watchdog. SIGHUP means that the terminal was closed.
 _ENDING = known("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGUSR2", "SIGALRM")
 
 
 class Signals:
-    """Every signal that would end the process ends it quietly, at any stage."""
+    """Handle every signal that would end the process, for a clean shutdown at any stage."""
 
     def __init__(self) -> None:
         self._end_running: Callable[[], None] | None = None
@@ -106,14 +112,14 @@ class Signals:
             signal.signal(number, self._end)
 
     def hand_over(self, end: Callable[[], None]) -> None:
-        """Let signals call ``end`` from now on. Raises Interrupted when one came before."""
+        """Let signals call ``end`` from now on; raise Interrupted if one has already come."""
         self._end_running = end
         if self._ended:
             raise Interrupted
 
     @contextlib.contextmanager
     def held(self) -> Iterator[None]:
-        """Keep signals waiting meanwhile."""
+        """Defer signals within this context; raise Interrupted at its end if one came."""
         self._held = True
         try:
             yield
@@ -126,5 +132,5 @@ class Signals:
         first, self._ended = not self._ended, True
         if self._end_running is not None:
             self._end_running()
-        elif first and not self._held:  # a second one would cut the clean end short
+        elif first and not self._held:  # a second signal must not interrupt the shutdown
             raise Interrupted

@@ -1,4 +1,4 @@
-"""Optional packages, by the extra that installs them."""
+"""Import optional packages, by the extra that installs them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 from softfinger.daemon.errors import SoftfingerError
 
-_EXTRAS = {  # what the message says, and the modules
+_EXTRAS = {  # extra: (reason in the error message, modules)
     "plot": ("pictures need matplotlib", ("matplotlib",)),
     "record": ("recordings need mcap, orjson and zstandard", ("mcap", "orjson", "zstandard")),
     "view": ("the page needs websockets and orjson", ("websockets", "orjson")),
@@ -20,11 +20,11 @@ _EXTRAS = {  # what the message says, and the modules
 
 
 class MissingExtra(SoftfingerError, ImportError):
-    """A package that an extra installs is missing. The message says what to install."""
+    """A package of an optional extra is missing; the message gives the command that installs it."""
 
 
 def require(extra: str) -> None:
-    """Import an extra's packages. Raises MissingExtra without one of them."""
+    """Import the packages of an extra; raise MissingExtra if one is missing."""
     needs, modules = _EXTRAS[extra]
     try:
         for module in modules:
@@ -34,9 +34,9 @@ def require(extra: str) -> None:
 
 
 def _install() -> str:
-    """The command that installs packages beside this one, however it was installed."""
+    """Return the command that installs packages in this environment."""
     if (Path(sys.prefix) / "pipx_metadata.json").exists():
         return "pipx runpip softfinger install"
-    if importlib.util.find_spec("pip") is None:  # an environment of uv's
+    if importlib.util.find_spec("pip") is None:  # an environment made by uv
         return f"uv pip install --python {sys.executable}"
     return f"{sys.executable} -m pip install"

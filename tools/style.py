@@ -1,8 +1,8 @@
-"""Style of all pictures: sizes for print, and lines that differ without their colour.
+"""Plot style: sizes for print, and lines that can be told apart without colour.
 
-Families that are ordered (by displacement, by angle) take colours of falling lightness, which stay
-in order in grey and for colour-blind readers, each with a dash of its own. Things of different
-kinds take the colours of Okabe and Ito.
+Ordered families of lines (by displacement or angle) use colours of decreasing lightness, which keep
+their order in greyscale and for colour-blind readers; each line also has its own dash pattern.
+Unordered categories use the colours of Okabe and Ito.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ _SETTINGS: dict[Any, Any] = {
 
 
 def settings() -> AbstractContextManager[None]:
-    """A context in which figures are made in this style. Raises MissingExtra without matplotlib."""
+    """Return a context that applies this style; raise MissingExtra without matplotlib."""
     require("plot")
     import matplotlib
 
@@ -62,14 +62,14 @@ def settings() -> AbstractContextManager[None]:
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """An empty figure of this size [inch], free of any window system."""
+    """Return an empty figure of this size [inch], independent of any window system."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height), layout="constrained")
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write the picture as its suffix says."""
+    """Write the figure in the format given by the path's suffix."""
     picture = io.BytesIO()
     figure.savefig(picture, dpi=DPI, format=path.suffix.removeprefix(".") or None)
     with write_bytes(path) as file:
@@ -77,7 +77,7 @@ def save(figure: Figure, path: Path) -> None:
 
 
 def ordered(count: int) -> list[dict[str, Any]]:
-    """Colour and dash of each line of an ordered family, light to dark; the first continuous."""
+    """Return colour and dash of each line in an ordered family, light to dark, solid first."""
     import matplotlib
 
     shades = matplotlib.colormaps["viridis"](np.linspace(0.72, 0.0, count))
@@ -85,7 +85,7 @@ def ordered(count: int) -> list[dict[str, Any]]:
 
 
 def caption(figure: Figure, lines: Sequence[str]) -> None:
-    """Notes below the panels, wrapped to the figure's width."""
+    """Write notes below the panels, wrapped to the figure's width."""
     import textwrap
 
     columns = int(figure.get_figwidth() * 17.5)

@@ -1,8 +1,8 @@
-"""Long work: its progress bar, and sweeps of seeded cases over processors or a Dask cluster.
+"""Run sweeps of independent cases on several processors or a Dask cluster, with a progress bar.
 
-The results are the same to the bit however many workers there are, since a case knows nothing of
-the others. A worker that dies costs the cases it had a second try. What is done is in a journal,
-where one is wanted, from which the next call goes on.
+The results are identical to the bit for any number of workers, because the cases are independent.
+If a worker dies, its cases are run again. With a journal, an interrupted sweep continues from the
+cases already done.
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ from softfinger.tools.extras import require
 Case = TypeVar("Case")
 Result = TypeVar("Result")
 
-_CONNECT = 10.0  # s that a scheduler may take to answer
-_REDRAW = 0.1  # s between two pictures of a bar
+_CONNECT = 10.0  # s to wait for the scheduler to answer
+_REDRAW = 0.1  # s between redraws of a bar
 _BAR = 20  # columns
 
 
 class SweepError(SoftfingerError):
-    """A sweep can't go on. The message says why."""
+    """A sweep cannot continue; the message gives the reason."""
 
 
 class Progress:
-    """``with Progress("analyse", total) as progress: progress(done)``; written to stderr."""
+    """Progress bar on stderr: ``with Progress("analyse", total) as progress: progress(done)``."""
 
     def __init__(self, what: str, total: int, on: bool = True) -> None:
         self._what = what
@@ -51,7 +51,7 @@ class Progress:
         self.on = on and sys.stderr.isatty()
 
     def __call__(self, done: int, note: str = "") -> None:
-        """Show that ``done`` of the total is done, with ``note`` instead of the percentage."""
+        """Show ``done`` of the total, with ``note`` in place of the percentage."""
         if not self.on or time.monotonic() - self._shown < _REDRAW:
             return
         self._shown = time.monotonic()
@@ -71,7 +71,7 @@ class Progress:
 
 
 def processors() -> int:
-    """Return how many processors this process may use; all, where it can't be kept to some."""
+    """Return the number of processors available to this process."""
     mine = getattr(os, "sched_getaffinity", lambda _: range(os.cpu_count() or 1))
     return len(mine(0))
 
@@ -82,20 +82,21 @@ def add_sweep(parser: argparse.ArgumentParser) -> None:
         "--processes",
         type=lambda text: int(number(text, "1 to 1024 processes", 0, 1024)),
         metavar="N",
-        help="run the cases in N processes (default: one a processor)",
+        help="run the cases in N processes (default: one per processor)",
     )
     parser.add_argument(
         "--scheduler",
         metavar="ADDRESS",
-        help="run them on a Dask cluster, as tcp://HOST:8786 (extra 'cluster')",
+        help="run the cases on a Dask cluster, e.g. tcp://HOST:8786 (extra 'cluster')",
     )
 
 
 class Sweep(Generic[Case, Result]):
-    """``work`` done once for each of ``cases``; iterate over it for the results, in their order.
+    """Run ``work`` once for each of ``cases``; iterating yields the results in their order.
 
-    ``work``, cases and results are pickled; with a ``journal`` the results are JSON's. ``name`` is
-    what the progress bar says. The caller removes the journal when the results are kept.
+    ``work``, cases and results must be picklable; with a ``journal``, results must be
+    JSON-serialisable. ``name`` is the label of the progress bar. The caller removes the journal
+    once the results are stored.
     """
 
     def __init__(
@@ -110,10 +111,15 @@ class Sweep(Generic[Case, Result]):
         self._digest = hashlib.sha256(pickle.dumps((work, list(cases)))).hexdigest()
 
     def run(self, processes: int | None = None, scheduler: str | None = None) -> Iterator[Result]:
-        """Yield the results as they come, in the cases' order.
+        """Yield the results as they arrive, in the order of the cases.
 
-        Raises SweepError for a scheduler that doesn't answer, workers that die again and again, and
-        another sweep's journal; MissingExtra without Dask.
+        Raises
+        ------
+        SweepError
+            If the scheduler does not answer, workers die repeatedly, or the journal belongs to
+            another sweep.
+        MissingExtra
+            Without Dask.
         """
         self._take_up()
         processes = processes or processors()
@@ -129,7 +135,7 @@ class Sweep(Generic[Case, Result]):
             yield from (self._results[k] for k in range(yielded, len(self._cases)))
 
     def _done(self, processes: int, scheduler: str | None) -> Iterator[int]:
-        """Do what isn't done yet; yields how many are done."""
+        """Run the remaining cases; yield the number of finished ones."""
         yield len(self._results)
         if scheduler is None and processes == 1:
             for k in self._left():
@@ -144,7 +150,7 @@ class Sweep(Generic[Case, Result]):
                 if len(self._results) > before:
                     before, workers = len(self._results), processes
                 elif workers > 1:
-                    workers = 1  # in order, so that the first one left is to blame
+                    workers = 1  # one case at a time, to identify the one that crashes the worker
                 else:
                     case = self._cases[self._left()[0]]
                     raise SweepError(f"{self._name}: each worker dies at {case}") from None
@@ -176,7 +182,7 @@ class Sweep(Generic[Case, Result]):
                 file.write(json.dumps([k, result]) + "\n")
 
     def _take_up(self) -> None:
-        """Read the journal of a sweep that was interrupted, or begin one."""
+        """Read the journal of an interrupted sweep, or start a new one."""
         if self._journal is None:
             return
         if not self._journal.exists():
@@ -190,7 +196,7 @@ class Sweep(Generic[Case, Result]):
             try:
                 k, result = json.loads(line)
             except ValueError:
-                break  # cut short while it was written
+                break  # the last line is incomplete
             self._results[int(k)] = result
 
 
@@ -200,7 +206,7 @@ def _pool(processes: int) -> Iterator[Executor]:
         processes,
         mp_context=multiprocessing.get_context("spawn"),
         initializer=signal.signal,
-        initargs=(signal.SIGINT, signal.SIG_IGN),  # Ctrl-C is the parent's
+        initargs=(signal.SIGINT, signal.SIG_IGN),  # the parent process handles Ctrl-C
     )
     try:
         yield executor

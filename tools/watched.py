@@ -1,4 +1,7 @@
-"""A daemon on virtual time whose hand's truth is recorded: for envelope, bench and tests."""
+"""Run a daemon on virtual time and record the simulated hand's true state.
+
+Used by ``envelope``, ``bench`` and the tests.
+"""
 
 from __future__ import annotations
 
@@ -16,32 +19,32 @@ from softfinger.daemon.types import Event
 
 @dataclass(frozen=True)
 class Seen:
-    """The truth, tick by tick."""
+    """True state of the simulated hand at each tick."""
 
     t: NDArray[np.float64]  # s
     force: NDArray[np.float64]  # N [n, 2]
     angle: NDArray[np.float64]  # rad
-    slip: NDArray[np.float64]  # |T|/μN, the greater of both tips
+    slip: NDArray[np.float64]  # |T|/μN, the larger of both tips
 
     def since(self, index: int) -> Seen:
-        """Return the record from this tick on."""
+        """Return the part of the record from this tick on."""
         return Seen(self.t[index:], self.force[index:], self.angle[index:], self.slip[index:])
 
     def settled(self, off: NDArray[np.bool_]) -> float:
-        """Time until nothing is ``off`` any more [s]."""
+        """Return the time of the last tick at which ``off`` is True [s]."""
         where = np.flatnonzero(off)
         return float(self.t[where[-1]] - self.t[0]) if len(where) else 0.0
 
 
 class Watched:
-    """A daemon on virtual time, its hand's truth recorded. Raises SettingsError."""
+    """Daemon on virtual time whose simulated hand can be observed; raises SettingsError."""
 
     def __init__(
         self,
         sections: dict[str, dict[str, Any]],
         hand: dict[str, dict[str, Any]] | None = None,
     ) -> None:
-        """``hand``: sections of the hand, where it is not what the daemon assumes."""
+        """Build the daemon; ``hand`` gives the hand's settings if they differ from the daemon's."""
         settings = checked(sections | {"loop": {"clock": "virtual"}})
         self.events: list[Event] = []
         real = None if hand is None else checked(hand | {"loop": {"clock": "virtual"}})
@@ -66,7 +69,7 @@ class Watched:
 
     @property
     def now(self) -> float:
-        """The clock's time [s]."""
+        """Current time of the virtual clock [s]."""
         return self._daemon.clock.now()
 
     @property
@@ -77,18 +80,18 @@ class Watched:
         return self.loop.command({"command": name, **numbers})
 
     def grasp(self, force: float) -> None:
-        """Arm and start to grasp."""
+        """Arm the hand and start a grasp."""
         self.loop.advance(0.3)
         self.command("arm")
         self.loop.advance(0.2)
         self.command("grasp", force=force)
 
     def run(self, seconds: float) -> None:
-        """Go on for ``seconds`` without looking."""
+        """Advance by ``seconds`` without recording."""
         self.loop.advance(seconds)
 
     def watch(self, seconds: float) -> Seen:
-        """Go on for ``seconds``; the truth at each tick."""
+        """Advance by ``seconds``; return the true state at each tick."""
         return Seen(*(np.array(column) for column in zip(*self._ticks(seconds), strict=True)))
 
     def _ticks(self, seconds: float) -> Iterator[tuple[float, tuple[float, ...], float, float]]:

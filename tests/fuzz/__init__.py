@@ -1,11 +1,11 @@
-"""Fuzzing: random and mutated input. The tests run a little of it, `python -m tests.fuzz` hours."""
+"""Fuzz with random and mutated input: the tests briefly, `python -m tests.fuzz` for hours."""
 
 import random
 from typing import NamedTuple
 
 
 class Report(NamedTuple):
-    """What became of the inputs: how many came through, which were never sent, what was wrong."""
+    """Result of a run: number of inputs processed, and the errors found."""
 
     through: int
     wrong: list[str]
@@ -13,7 +13,7 @@ class Report(NamedTuple):
 
 
 def mutated(rng: random.Random, data: bytes) -> bytes:
-    """Some bytes changed, cut, doubled, put in or grown far too large; mostly few."""
+    """Return ``data`` with bytes changed, removed, repeated, inserted or greatly extended."""
     made = bytearray(data)
     for _ in range(rng.choice((0, 1, 1, 2, 5, 20))):
         kind = rng.randrange(8)
@@ -30,7 +30,7 @@ def mutated(rng: random.Random, data: bytes) -> bytes:
             made[at:at] = made[at : at + rng.randrange(1, 40)]
         elif kind == 5:
             del made[at:]
-        elif kind == 6:  # what framings set apart
+        elif kind == 6:  # separators of the framings
             made.insert(at, rng.choice((0, 1, 10, 11, 42, 43, 0x55, 0xAA, 0xFD, 254, 255)))
         elif rng.random() < 0.02:
             made[at:at] = rng.randbytes(1) * rng.choice((100, 5000, 20_000))

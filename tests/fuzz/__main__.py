@@ -1,6 +1,6 @@
-"""``python -m tests.fuzz TARGET … --count N --seed S``: all targets by default, N inputs each.
+"""Run ``python -m tests.fuzz TARGET … --count N --seed S``: N inputs each, by default all targets.
 
-It ends at the first input that raises what it must not, and prints what else is wrong.
+The run stops at the first input that raises an unexpected exception, and prints all other errors.
 """
 
 import argparse

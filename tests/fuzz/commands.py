@@ -1,4 +1,4 @@
-"""Random, mutated and oversized commands, profiles and calibration files: a refusal or nothing.
+"""Fuzz commands, profiles and calibration files: invalid input must only cause a refusal.
 
 Commands go to a running hand, every hundredth through a real socket.
 """
@@ -41,7 +41,7 @@ _ODD = (
 
 
 def some_request(rng: random.Random) -> Any:
-    """A command of the right form, or nearly."""
+    """Return a command in the correct form, or nearly."""
     name = rng.choice([*COMMANDS, "arm", "grasp", "nothing"])
     request: dict[Any, Any] = {"command": name}
     for key in COMMANDS.get(name, (None, {}))[1]:
@@ -57,13 +57,13 @@ def some_request(rng: random.Random) -> Any:
 
 
 def some_message(rng: random.Random) -> bytes:
-    """Bytes for the command socket."""
+    """Return bytes for the command socket."""
     kind = rng.random()
     if kind < 0.1:
         return rng.randbytes(rng.randrange(0, 200))
     if kind < 0.12:
         return rng.randbytes(rng.choice((_MAX_BYTES - 1, _MAX_BYTES + 1, 4 * _MAX_BYTES + 1)))
-    if kind < 0.15:  # nested, or lengths that promise more than there is
+    if kind < 0.15:  # nested, or with lengths that exceed the data
         deep = rng.choice((b"\x91" * 3000, b"\x81\xa1a" * 1000, b"\xdf\xff\xff\xff\xff"))
         return deep + rng.randbytes(rng.randrange(8))
     try:
@@ -74,10 +74,10 @@ def some_message(rng: random.Random) -> bytes:
 
 
 class CommandTarget:
-    """A hand on the virtual clock behind a real command server, asked directly and by its socket.
+    """Hand on the virtual clock with a real command server, called directly and through its socket.
 
-    After every message the hand lives on: it ticks, its goals are inside the limits, torque is off
-    where its mode says so.
+    After every message the hand must keep working: it ticks, its goals are within the limits, and
+    torque is off in modes without torque.
     """
 
     def __init__(self) -> None:
@@ -94,7 +94,7 @@ class CommandTarget:
         self.asked = 0
 
     def give(self, rng: random.Random) -> tuple[str, bytes]:
-        """One message; what became of it."""
+        """Send one message; return the kind of result and the message."""
         self.asked += 1
         message = some_message(rng)
         by_socket = self.asked % 100 == 0 and len(message) <= 4 * _MAX_BYTES
@@ -152,7 +152,7 @@ class CommandTarget:
 
 
 class FileTarget:
-    """A reader of files that gives what it read or raises its one error."""
+    """Reader of files that returns the content or raises its one documented error."""
 
     def __init__(
         self, read: Callable[[Path], Any], error: type[Exception], seeds: list[bytes], end: str
@@ -164,7 +164,7 @@ class FileTarget:
         self._path = Path(self._folder.name) / f"fuzz{end}"
 
     def give(self, rng: random.Random) -> tuple[str, bytes]:
-        """One file; what became of it."""
+        """Read one file; return the kind of result and the file."""
         kind = rng.random()
         text = rng.choice(self._seeds)
         if kind < 0.05:
@@ -194,7 +194,7 @@ _VALUES = (
 
 
 def _tokens_mixed(rng: random.Random, text: bytes) -> bytes:
-    """Values of a text file replaced by odd ones, lines dropped, doubled or moved."""
+    """Replace values in a text file, and drop, repeat or move lines."""
     lines = text.split(b"\n")
     for _ in range(rng.choice((1, 1, 2, 4))):
         at = rng.randrange(len(lines))
@@ -216,14 +216,14 @@ def _tokens_mixed(rng: random.Random, text: bytes) -> bytes:
 
 
 def settings_target() -> FileTarget:
-    """Profiles."""
+    """Return the target for profiles."""
     seeds = [path.read_bytes() for path in sorted((ROOT / "config").glob("*.toml"))]
     short = [b"[safety]\ncurrent_max = 1.0\n[tip]\nradius = 0.01\n", b'task.name = "demo"\n', b""]
     return FileTarget(load, SettingsError, short * 3 + seeds, ".toml")
 
 
 def calibration_target() -> FileTarget:
-    """Calibration files, of a small sensor: the larger ones are only longer."""
+    """Return the target for calibration files of a small sensor; larger files are only longer."""
     rows, cols = 4, 5
     sensor = {"finger": "left", "label": "x", "rows": rows, "cols": cols, "full_count": 255}
     table = [[1.0 + 0.1 * column for column in range(cols)] for _ in range(rows)]
@@ -256,7 +256,7 @@ TARGETS: dict[str, Callable[[], Any]] = {
 
 
 def fuzz(name: str, count: int, seed: int) -> Counter[str]:
-    """What became of ``count`` inputs to a target. Raises what should not have been raised."""
+    """Send ``count`` inputs to a target and count the results; unexpected exceptions are raised."""
     target, rng, counts = TARGETS[name](), random.Random(seed), Counter[str]()
     try:
         for _ in range(count):

@@ -1,6 +1,6 @@
-"""Random commands, pushes and parameters against the simulated hand, in every scene it has.
+"""Fuzz the simulated hand with random commands, pushes and parameters, in every kind of scene.
 
-A hand's commands are drawn in one go and carried out inside one compiled loop.
+The commands for a hand are drawn at once and executed in one compiled loop.
 """
 
 import math
@@ -12,10 +12,11 @@ from softfinger.kinematics.compiled.kernel import kernel
 from tests.fuzz import Report
 from tests.harness.plant import BOUNDED, CURRENT, PAPER, POSITION, TABLE_I, make
 
-LONGER = 10  # times the step that the plant chooses, in one hand of three
-EACH = 400  # commands to a hand
+LONGER = 10  # in one of three hands, factor on the step chosen by the plant
+EACH = 400  # commands for each hand
 SHAPES = ("rectangle", "rectangle", "disc", "wedge", "none")
-# joint, mode, torque on, goal, current, three of a push, whether to, reset, seconds, quiet
+# Columns: joint, mode, torque on, goal, current, three load components, load set, reset, seconds,
+# quiet.
 _COLUMNS = 12
 
 FINE, NOT_FINITE, UNTOLD, RUNAWAY, CREATED = range(5)
@@ -30,7 +31,7 @@ WRONG = (
 
 @kernel
 def past_limit(radius, d, theta, curvature):
-    """How far the rim must be pressed in by the tip's d and θ alone [m]."""
+    """Return the rim's minimum indentation that follows from the tip's d and θ alone [m]."""
     if curvature == 0.0:
         return d - radius * (1.0 - abs(math.sin(theta)))
     away = radius - d + 1.0 / curvature
@@ -40,7 +41,7 @@ def past_limit(radius, d, theta, curvature):
 
 @kernel
 def is_sound(plant):
-    """Whether what a hand shows is finite."""
+    """Return True if all values of the hand are finite."""
     state, felt = plant.state, plant.felt
     total = plant.energy
     for j in range(5):
@@ -56,7 +57,7 @@ def is_sound(plant):
 
 @kernel
 def carry_out(plants, data, ring, commands):
-    """Carry the commands out one by one; what went wrong, and at which."""
+    """Execute the commands one by one; return the error found and the index of its command."""
     plant = plants[0]
     goals, state, felt = plant.goals, plant.state, plant.felt
     for k in range(commands.shape[0]):
@@ -67,11 +68,11 @@ def carry_out(plants, data, ring, commands):
         goals.current[joint] = commands[k, 4]
         if commands[k, 8] > 0.0:
             goals.load[:] = commands[k, 5:8]
-        if commands[k, 9] > 0.0:  # open, the object back between the fingers
+        if commands[k, 9] > 0.0:  # open the hand and put the object back between the fingers
             state.position[:] = 0.0
             state.velocity[:] = 0.0
             state.position[3] = 0.08
-        if commands[k, 11] > 0.0:  # no input for a while: from then on the energy may only fall
+        if commands[k, 11] > 0.0:  # no input for a while: from now on the energy may only decrease
             goals.torque_on[:] = 0
             state.current[:] = 0.0
             goals.load[:] = 0.0
@@ -95,10 +96,10 @@ def carry_out(plants, data, ring, commands):
 
 
 def random_hand(generator: np.random.Generator, long: bool = False):
-    """A hand of random scene and parameters.
+    """Return a hand with a random scene and random parameters.
 
-    Masses from 1 g to 10 kg, moduli from 10 kPa to 10 MPa, friction from 0 to 2, joints from 1e-4
-    to 0.1 kg·m², gravity in any direction.
+    Masses are from 1 g to 10 kg, moduli from 10 kPa to 10 MPa, friction from 0 to 2, and joint
+    inertias from 1e-4 to 0.1 kg·m², with gravity in any direction.
     """
     table = (PAPER, TABLE_I)[generator.integers(2)]
     modulus = float(10 ** generator.uniform(4, 7))
@@ -145,7 +146,7 @@ def random_commands(generator: np.random.Generator, count: int) -> np.ndarray:
 
 
 def abuse(seed: int, count: int = EACH) -> str:
-    """Send ``count`` random commands to a hand of random parameters; what went wrong, or \"\"."""
+    """Send ``count`` random commands to a random hand; return the error found, or \"\"."""
     generator = np.random.default_rng(seed)
     hand = random_hand(generator, seed % 3 == 0)
     commands = random_commands(generator, count)
@@ -154,7 +155,7 @@ def abuse(seed: int, count: int = EACH) -> str:
 
 
 def fuzz(count: int, seed: int) -> Report:
-    """Send ``count`` commands in all, each EACH of them to a hand of its own."""
+    """Send ``count`` commands in total, EACH of them to a hand of its own."""
     hands = max(count // EACH, 1)
     found = [abuse(each) for each in range(1000 * seed, 1000 * seed + hands)]
     return Report(hands, [each for each in found if each])

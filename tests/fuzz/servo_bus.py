@@ -1,4 +1,4 @@
-"""Random and mutated packets against the emulated servo bus."""
+"""Fuzz the emulated servo bus with random and mutated packets."""
 
 import random
 import struct
@@ -32,13 +32,13 @@ SEEDS = (
 
 
 def fuzz(count: int, seed: int) -> Report:
-    """Feed ``count`` packets to two servos; raises whatever the bus raises."""
+    """Feed ``count`` packets to two servos; exceptions of the bus are raised."""
     source = random.Random(seed)
     bus = make_bus()
     t = 0.0
     for _ in range(count):
         packet = mutated(source, source.choice(SEEDS))
-        if source.random() < 0.7:  # most get a right CRC, so that they come through
+        if source.random() < 0.7:  # most packets get a valid CRC, so that the bus processes them
             packet = packet[:-2] + crc16(packet[:-2]).to_bytes(2, "little")
         t += source.choice((0.0, 0.0002, 0.002, 0.02))
         bus.feed(packet, t)
@@ -49,7 +49,7 @@ def fuzz(count: int, seed: int) -> Report:
 
 
 def _answers_alone(bus: ServoBus, servo: EmulatedServo, t: float) -> bool:
-    """To a ping, with the others unplugged: by now they may all have one ID."""
+    """Return True if the servo answers a ping with the others silent, as all may share one ID."""
     for each in bus.servos:
         each.silent = each is not servo
     servo.table.set(reg.PROTOCOL_TYPE, 2)  # a write may have set it to 1

@@ -1,1 +1,1 @@
-"""What several tests share: hands, buses, daemons and terminals to test with."""
+"""Helpers shared by tests: hands, servo buses, daemons and terminals."""

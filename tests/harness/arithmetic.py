@@ -1,9 +1,9 @@
-"""The arithmetic of a test run, on which the last bits of its numbers depend, and another one.
+"""Describe the arithmetic of a test run, which affects the last bits of results, or change it.
 
-``python -m tests.harness.arithmetic MODULE …`` runs ``python -m MODULE …`` under another one:
-OpenBLAS with the kernels of an older processor, NumPy without the SIMD loops that it chooses by the
-processor, and Numba's kernels for any processor of this kind. Those are kept in a folder of their
-own, since the folder's name covers the processor that they were compiled for
+``python -m tests.harness.arithmetic MODULE …`` runs ``python -m MODULE …`` with a different
+arithmetic: OpenBLAS uses the kernels of an older processor, NumPy does not use the SIMD loops that
+it selects by processor, and Numba compiles for a generic processor. The generic kernels have their
+own folder, because the folder's name depends on the target processor
 (`kinematics.compiled.kernel_folder`).
 """
 
@@ -16,23 +16,23 @@ import llvmlite.binding
 import numpy as np
 from numpy._core import _multiarray_umath
 
-# What chooses another arithmetic than the processor's own.
+# Environment variables that select an arithmetic other than the processor's own.
 VARIABLES = (
     "OPENBLAS_CORETYPE",
     "NPY_DISABLE_CPU_FEATURES",
     "NUMBA_CPU_NAME",
     "NUMBA_CPU_FEATURES",
 )
-_AVX512 = ("skylakex", "cooperlake", "sapphirerapids")  # OpenBLAS's cores that use it
+_AVX512 = ("skylakex", "cooperlake", "sapphirerapids")  # OpenBLAS cores that use it
 
 
 def chosen() -> dict[str, str]:
-    """The variables that are set, which choose another arithmetic; empty in a usual run."""
+    """Return the variables that are set; empty in a usual run."""
     return {name: os.environ[name] for name in VARIABLES if os.environ.get(name)}
 
 
 def blas_core() -> str:
-    """The processor whose kernels OpenBLAS uses; empty where NumPy has another BLAS."""
+    """Return the processor whose kernels OpenBLAS uses; empty if NumPy uses another BLAS."""
     library = ctypes.CDLL(np.linalg._umath_linalg.__file__)
     for name in ("scipy_openblas_get_corename64_", "openblas_get_corename64_"):
         if hasattr(library, name):
@@ -43,34 +43,34 @@ def blas_core() -> str:
 
 
 def simd() -> list[str]:
-    """The SIMD extensions that NumPy uses beyond those that it was built for."""
+    """Return the SIMD extensions that NumPy uses in addition to its build baseline."""
     has = _multiarray_umath.__cpu_features__
     return [name for name in _multiarray_umath.__cpu_dispatch__ if has[name]]
 
 
 def described() -> str:
-    """One line that names the arithmetic."""
+    """Describe the arithmetic in one line."""
     processor = os.environ.get("NUMBA_CPU_NAME") or llvmlite.binding.get_host_cpu_name()
     extensions = " ".join(simd()) or "the baseline"
     return f"OpenBLAS {blas_core() or 'none'}, NumPy {extensions}, kernels for {processor}"
 
 
 def other() -> dict[str, str]:
-    """Variables that choose an arithmetic which this processor has, too."""
+    """Return variables that select a different arithmetic supported by this processor."""
     core = blas_core().lower()
     if platform.machine() == "aarch64":
         older = "CORTEXA57" if core == "armv8" else "ARMV8"
     elif core in _AVX512:
         older = "Haswell"
     else:
-        older = "Prescott" if core == "nehalem" else "Nehalem"  # NumPy itself asks for Nehalem
+        older = "Prescott" if core == "nehalem" else "Nehalem"  # NumPy itself requires Nehalem
     variables = {"OPENBLAS_CORETYPE": older, "NUMBA_CPU_NAME": "generic"}
     extensions = simd()
     return variables | ({"NPY_DISABLE_CPU_FEATURES": " ".join(extensions)} if extensions else {})
 
 
 def main() -> None:
-    """Become the command under the other arithmetic."""
+    """Replace this process by the command with the other arithmetic."""
     variables = other()
     named = " ".join(f"{name}='{value}'" for name, value in variables.items())
     print(f"usual arithmetic: {described()}", f"now with {named}", sep="\n", flush=True)

@@ -1,4 +1,4 @@
-"""Inner kernels as tests call them: from Python, which needs a wrapper that they don't have."""
+"""Call inner kernels from Python: they have no wrapper for this, so tests compile one."""
 
 from typing import Any
 
@@ -6,5 +6,5 @@ from softfinger.kinematics.compiled.kernel import kernel
 
 
 def called(inner: Any) -> Any:
-    """The same source compiled as a kernel that Python may call."""
+    """Compile the same source as a kernel that can be called from Python."""
     return kernel(inner.py_func)

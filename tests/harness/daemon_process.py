@@ -1,4 +1,4 @@
-"""``softfinger`` as real processes: one that ends by itself, and a daemon that runs."""
+"""Run ``softfinger`` in real processes: subcommands that end by themselves, and daemons."""
 
 import shutil
 import signal
@@ -11,7 +11,7 @@ from typing import Any
 from softfinger.daemon.client.command_client import send
 
 SOFTFINGER = [sys.executable, "-m", "softfinger"]
-# A hand that sits out a busy machine's stalls, for tests that are not about its time-outs.
+# Settings of a hand that tolerates the stalls of a busy machine, for tests not about time-outs.
 PATIENCE = {
     "servos.open_timeout": 60.0,
     "servos.reply_timeout": 0.1,
@@ -26,19 +26,19 @@ PATIENT = [word for key, value in PATIENCE.items() for word in ("--set", f"{key}
 
 
 def python(*words: object, **options: Any) -> subprocess.CompletedProcess[str]:
-    """A program of this Python that ends by itself: its status and what it said."""
+    """Run a program in this Python until it ends; return status and output."""
     call = [sys.executable, *map(str, words)]
     return subprocess.run(call, capture_output=True, text=True, check=False, **options)
 
 
 def softfinger(*words: object, **options: Any) -> subprocess.CompletedProcess[str]:
-    """A subcommand that ends by itself."""
+    """Run a subcommand until it ends; return status and output."""
     return python("-m", "softfinger", *words, **options)
 
 
 def pip_installed(package: Path, folder: Path) -> Path:
-    """Where a package of this tree is, as pip installs it, for itself alone."""
-    shutil.copytree(package, folder / "source")  # builds leave files
+    """Install one package of this tree with pip and return its location."""
+    shutil.copytree(package, folder / "source")  # builds leave files in the source folder
     options = ("--no-deps", "--no-build-isolation", "--no-index", "--quiet")
     words = ("install", *options, "--target", folder / "site", folder / "source")
     done = python("-m", "pip", *words)
@@ -47,18 +47,18 @@ def pip_installed(package: Path, folder: Path) -> Path:
 
 
 def started(*words: object, **options: Any) -> subprocess.Popen[str]:
-    """A subcommand that runs, with pipes for what it says."""
+    """Start a subcommand with pipes for its output."""
     pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     return subprocess.Popen([*SOFTFINGER, *map(str, words)], **pipes | options)
 
 
 def ask(address: str, name: str, **numbers: float) -> dict[str, Any]:
-    """The reply to a command."""
+    """Send a command and return the reply."""
     return send(address, {"command": name, **numbers}, timeout=120.0)
 
 
 def until_it_says(words: Sequence[str | Path], text: str) -> None:
-    """Run a tool until it prints a line with ``text``; it is ended then, and must end well."""
+    """Run a tool until it prints a line with ``text``, then end it; it must end without error."""
     process = started(*words, stderr=None)
     assert any(text in line for line in process.stdout), f"{text!r} never came"
     process.terminate()
@@ -67,7 +67,7 @@ def until_it_says(words: Sequence[str | Path], text: str) -> None:
 
 
 class Running:
-    """A ``softfinger run`` in a process of its own, ready when constructed."""
+    """Process of ``softfinger run``, ready when constructed."""
 
     def __init__(self, *words: str) -> None:
         self.lines: list[str] = []
@@ -79,13 +79,13 @@ class Running:
         raise AssertionError("".join(self.lines))
 
     def end(self, number: int = signal.SIGTERM) -> int:
-        """Send a signal, read the rest of what it says, and return the exit status."""
+        """Send a signal, read the remaining output and return the exit status."""
         self.process.send_signal(number)
         self.lines += self.process.stderr.readlines()
         return self.process.wait(timeout=300)
 
     def kill(self) -> None:
-        """End it however it stands, if it has not ended yet."""
+        """Kill the process if it is still running."""
         self.process.kill()
         self.process.wait()
         self.process.stderr.close()

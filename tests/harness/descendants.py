@@ -1,7 +1,7 @@
-"""The processes that tests started, whoever started them: to end what a test left running.
+"""Find and end processes that tests started, directly or indirectly.
 
-As a program, with a word, it waits for the end of its standard input, and then kills every process
-that has this word in its environment.
+As a program with one argument, it waits for the end of its standard input and then kills every
+process with this word in its environment.
 """
 
 import contextlib
@@ -19,7 +19,7 @@ _PR_SET_CHILD_SUBREAPER = 36  # from <linux/prctl.h>
 
 @contextlib.contextmanager
 def ending(process: subprocess.Popen[Any]) -> Iterator[subprocess.Popen[Any]]:
-    """A process that is killed at the end, where ``with`` alone would wait for it for ever."""
+    """Context that kills a process at its end, where ``with`` alone would wait forever."""
     with process:
         try:
             yield process
@@ -28,53 +28,53 @@ def ending(process: subprocess.Popen[Any]) -> Iterator[subprocess.Popen[Any]]:
 
 
 def adopt_orphans() -> None:
-    """Whatever runs below this process stays below it when the process between them ends."""
+    """Make this process the parent of descendants whose own parent ends."""
     ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
 
 
 def end_with_this_process() -> None:
-    """Have what this process starts from now on killed when it dies, be it by SIGKILL."""
+    """Kill all processes started from now on when this process ends, even by SIGKILL."""
     word = f"TESTS_OF_PROCESS={os.getpid()}"
     _watching.append(
         subprocess.Popen(
             [sys.executable, "-S", __file__, word],
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
-            start_new_session=True,  # Ctrl-C is not for it
+            start_new_session=True,  # ignore Ctrl-C
         )
     )
     os.environ["TESTS_OF_PROCESS"] = str(os.getpid())
 
 
-_watching: list[subprocess.Popen[bytes]] = []  # whose standard input ends with this process
+_watching: list[subprocess.Popen[bytes]] = []  # their standard input closes when this process ends
 
 
 def running(process: int | None = None) -> set[int]:
-    """The children of a process, of this one by default, by their numbers."""
+    """Return the IDs of a process's children, by default of this process."""
     tasks = Path(f"/proc/{process or os.getpid()}/task").glob("*/children")
     found: set[int] = set()
     for task in tasks:
-        with contextlib.suppress(OSError):  # it ended meanwhile
+        with contextlib.suppress(OSError):  # the task has ended
             found |= set(map(int, task.read_text().split()))
     return found
 
 
 def end(processes: set[int]) -> None:
-    """Kill children of this process with all that runs below them."""
+    """Kill children of this process and all their descendants."""
     for process in processes:
         below = running(process)
         with contextlib.suppress(OSError):
             os.kill(process, signal.SIGKILL)
         with contextlib.suppress(ChildProcessError):
             os.waitpid(process, 0)
-        end(below)  # by now they are children of this process
+        end(below)  # they are now children of this process
 
 
 def _sweep(word: bytes) -> bool:
-    """Kill every process with ``word`` in its environment; whether there was one."""
+    """Kill every process with ``word`` in its environment; return True if there was one."""
     found = False
     for folder in Path("/proc").glob("[0-9]*"):
-        with contextlib.suppress(OSError):  # it ended meanwhile, or is another user's
+        with contextlib.suppress(OSError):  # the process has ended or belongs to another user
             if word in (folder / "environ").read_bytes().split(b"\0"):
                 os.kill(int(folder.name), signal.SIGKILL)
                 found = True

@@ -1,7 +1,7 @@
-"""The `softfinger` of a documentation's shell blocks, carried out in the test's own process.
+"""Execute `softfinger` commands of the documentation's shell blocks in the test process.
 
-What goes on until somebody ends it is parsed, with its profile, and not run; an emulated hand is
-started as a process of its own, in the place of the one before it.
+Commands that run until they are interrupted are only parsed, together with their profile. An
+emulated hand is started as a separate process and replaces the previous one.
 """
 
 import contextlib
@@ -24,9 +24,10 @@ from softfinger.tools.cli import main, make_parser
 from softfinger.tools.terminal.status import told
 from tests.harness.daemon_process import SOFTFINGER, Running
 
-_BUSY = "DOCUMENTED_BUSY"  # set for what a command starts: that runs on its own
+_BUSY = "DOCUMENTED_BUSY"  # set for processes started by a command, which run separately
 _ENDLESS = {"run", "monitor", "view", "replay", "envelope", "bench"}
-_ENDS = {"--record", "--recompute"}  # with these they are run
+# Options with which such commands end by themselves and are run.
+_ENDS = {"--record", "--recompute"}
 _SHOWN = re.compile(r"# (?P<mode>\w+)(?: (?P<force>[\d.]+) N)?(?:.*?(?P<angle>-?[\d.]+)°)?")
 _CLIENT = """\
 import json, socket, sys
@@ -42,14 +43,14 @@ sys.exit(status)
 
 
 def parse(words: list[str]) -> None:
-    """Ends the process, or raises SettingsError, for words that the command doesn't take."""
+    """Parse arguments and load their profile; exit or raise SettingsError if they are invalid."""
     arguments = make_parser({words[0]})[0].parse_args(words)
     if hasattr(arguments, "set"):
         profile(arguments)
 
 
 class Softfinger:
-    """The command as a program in ``folder``; `serve` carries out one call of it."""
+    """The command as a program in ``folder``; `serve` executes one call of it."""
 
     def __init__(self, folder: Path) -> None:
         client, command = folder / "client.py", folder / "softfinger"
@@ -78,7 +79,7 @@ class Softfinger:
         with contextlib.redirect_stdout(told), contextlib.redirect_stderr(error):
             try:
                 status = self._carry_out(words)
-            except SystemExit as ended:  # argparse's
+            except SystemExit as ended:  # raised by argparse
                 status = int(ended.code or 0)
             except SettingsError as wrong:
                 status = 2
@@ -96,7 +97,7 @@ class Softfinger:
             return _await(words[1])
         if name == "emulate" and "--send" not in words:
             return self._emulate(words)
-        if name == "run":  # for a recording; the usual addresses are taken
+        if name == "run":  # for a recording; the default addresses are in use
             for each in ("stream", "commands"):
                 words += ["--set", f"{each}.address=ipc://{Path.cwd()}/{each}"]
             return subprocess.run([*SOFTFINGER, *words, "--duration", "1"], check=False).returncode
@@ -107,7 +108,7 @@ class Softfinger:
                 return main(words)
 
     def _run(self, words: list[str]) -> int:
-        """Run the daemon of an emulated hand; later commands go there."""
+        """Run the daemon of an emulated hand; later commands are sent to it."""
         self._end_daemon()
         stream, commands = (f"ipc://{Path.cwd()}/{each}" for each in ("stream", "commands"))
         own = ("--set", f"stream.address={stream}", "--set", f"commands.address={commands}")
@@ -137,7 +138,7 @@ class Softfinger:
 
 
 def _await(shown: str) -> int:
-    """Wait until `status` says what a page shows: its mode, force and angle."""
+    """Wait until `status` reports the mode, force and angle shown on the page."""
     wanted = _SHOWN.match(shown)
     assert wanted is not None, shown
     force, angle = (float(wanted[each] or "nan") for each in ("force", "angle"))
@@ -161,7 +162,7 @@ def _await(shown: str) -> int:
 
 
 def _patient_doctor() -> contextlib.ExitStack:
-    """On a busy machine, on which others have the sockets."""
+    """Patch the doctor for a busy machine on which other processes use the sockets."""
     from softfinger.daemon.diagnosis import machine
     from softfinger.tools.setup import doctor
 

@@ -1,4 +1,4 @@
-"""Emulated hands for the tests: one in a thread of this process, and the SDK on its servos."""
+"""Run emulated hands in a thread or in a process, and access their servos with the SDK."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from tests.harness.daemon_process import SOFTFINGER
 
 HIL = Path(__file__).parents[2] / "config" / "hil.toml"
 _COMPILED = re.compile(r"^(compil(ing|ed) .*|.*: \d+ of about \d+, .*)\n", re.MULTILINE)
-READY_WITHIN = 200.0  # s; kernels may have to be compiled
+READY_WITHIN = 200.0  # s, includes the compilation of kernels
 
 
 @contextlib.contextmanager
 def emulated(
     folder: Path, *faults: str, settings: Settings | None = None, **options: Any
 ) -> Iterator[Emulator]:
-    """An emulator in a thread of this process, ready."""
+    """Run an emulator in a thread of this process; it is ready when the context starts."""
     made = Emulator(settings or Settings(), folder, faults=faults, **options)
     ready = threading.Event()
     runner = threading.Thread(target=made.run, args=(ready.set,), daemon=True)
@@ -46,7 +46,7 @@ def emulated(
 
 
 class EmulatorProcess:
-    """``softfinger emulate`` with these arguments, in a process of its own."""
+    """Process of ``softfinger emulate`` with these arguments."""
 
     def __init__(self, *arguments: str | Path) -> None:
         pipes: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
@@ -64,7 +64,7 @@ class EmulatorProcess:
         return self
 
     def end(self, number: int = signal.SIGTERM) -> tuple[int, str, str]:
-        """Send a signal; exit status and what else was printed, but for kernels it compiled."""
+        """Send a signal; return exit status and remaining output without lines about kernels."""
         self.popen.send_signal(number)
         out, err = self.popen.communicate(timeout=300)
         return self.popen.returncode, out, _COMPILED.sub("", err)
@@ -79,7 +79,7 @@ class EmulatorProcess:
 
 
 class PatientPort(PortHandler):
-    """Waits for a reply longer than the SDK's 34 ms, which a busy machine may exceed."""
+    """Port that waits longer for a reply than the SDK's 34 ms, which a busy machine may exceed."""
 
     patience = 60_000.0  # ms
 
@@ -88,7 +88,7 @@ class PatientPort(PortHandler):
 
 
 class SdkServos:
-    """The maker's own SDK on the servos' port."""
+    """Client that uses the manufacturer's SDK on the servos' port."""
 
     def __init__(self, folder: Path, baud: int = 2_000_000) -> None:
         self.port = PatientPort(str(folder / "servos"))
@@ -97,13 +97,13 @@ class SdkServos:
         self.packets = PacketHandler(2.0)
 
     def ping(self, servo: int) -> int:
-        """The model."""
+        """Return the servo's model number."""
         model, result, _ = self.packets.ping(self.port, servo)
         assert result == COMM_SUCCESS
         return int(model)
 
     def silent(self, servo: int) -> bool:
-        """No reply comes soon."""
+        """Return True if the servo does not reply."""
         self.port.patience = 100.0
         _, result, _ = self.packets.ping(self.port, servo)
         self.port.patience = PatientPort.patience
@@ -132,12 +132,12 @@ class SdkServos:
 
 
 def board(folder: Path, finger: int, timeout: float = 60.0, **changes: object) -> FlexiTac:
-    """The daemon's own backend on one of the stand-in hand's boards."""
+    """Open the daemon's backend on one board of the emulated hand."""
     tactile = load(HIL, folder).tactile
     tactile = tactile.model_copy(update={"open_timeout": timeout, **changes})
     return FlexiTac(tactile, RealClock(), finger)
 
 
 def send(folder: Path, words: str) -> int:
-    """The exit status of ``softfinger emulate --send``."""
+    """Return the exit status of ``softfinger emulate --send``."""
     return main(["emulate", "--dir", str(folder), "--send", words])

@@ -1,6 +1,6 @@
-"""A publisher and command server on real sockets, with a hand that is nothing but formulas.
+"""Publisher and command server on real sockets, with a hand computed from formulas.
 
-For tests of those who look at the stream from outside: everything here is chosen by the test.
+It is used to test clients of the stream; the test controls all messages.
 """
 
 from __future__ import annotations
@@ -79,11 +79,12 @@ def event(seq: int, kind: str, text: str, level: str = "info") -> dict[str, Any]
 
 
 class FakeDaemon:
-    """Publishes at 100 Hz (frames at 25 Hz) until closed. ``changes`` go into every state.
+    """Publish states at 100 Hz and frames at 25 Hz until closed.
 
-    ``requests`` holds what the command socket was sent, ``keys`` the key of each; ``replies`` maps
-    a command to its reply, or to a list of replies to one after the other. Without states while it
-    is ``silent``, without answers while it is ``deaf``, without frames of fingers in ``dead``.
+    ``changes`` are merged into every state. ``requests`` contains the received commands and
+    ``keys`` the client key of each. ``replies`` maps a command to its reply, or to a list of
+    replies given one after the other. No states are sent while ``silent`` is set, no answers while
+    ``deaf`` is set, and no frames for the fingers in ``dead``.
     """
 
     def __init__(self) -> None:
@@ -94,7 +95,7 @@ class FakeDaemon:
         self.silent = threading.Event()
         self.deaf = threading.Event()
         self.dead: set[str] = set()
-        self.published = 0  # states so far
+        self.published = 0  # number of states so far
         self._extra: list[list[bytes]] = []
         self._context: zmq.Context[Any] = zmq.Context()
         self._publisher = self._context.socket(zmq.PUB)
@@ -111,7 +112,7 @@ class FakeDaemon:
         return f"tcp://127.0.0.1:{socket.bind_to_random_port('tcp://127.0.0.1')}"
 
     def send(self, topic: bytes, payload: bytes) -> None:
-        """Publish one message as it is."""
+        """Publish one message unchanged."""
         self._extra.append([topic, payload])
 
     def send_event(self, kind: str, text: str, level: str = "info") -> None:

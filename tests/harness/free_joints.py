@@ -1,8 +1,8 @@
-"""A plant of independent joints that touch nothing, for servo buses without a hand.
+"""Simulate independent joints without contact, for servo buses without a hand.
 
-Each joint is a motor with first-order current, inertia, viscous and Coulomb friction, and the
-servo's inner position loop in current; it is stepped with a fixed step, so a run is deterministic.
-The constants are about an XM430-W350 with nothing on its horn.
+Each joint is a motor with first-order current dynamics, inertia, viscous and Coulomb friction, and
+the servo's inner position loop acting on the current. A fixed step makes runs deterministic. The
+constants approximate an XM430-W350 with a bare horn.
 """
 
 import numpy as np
@@ -11,34 +11,35 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 
 STEP = 0.0005  # s
-INERTIA = 0.002  # kg·m², rotor through the gear
+INERTIA = 0.002  # kg·m², rotor inertia at the output of the gear
 VISCOUS = 0.05  # N·m·s/rad
 COULOMB = 0.02  # N·m
 TORQUE_CONSTANT = 1.78  # N·m/A
 CURRENT_LAG = 0.001  # s
 STIFFNESS = 8.0  # A/rad
 DAMPING = 0.10  # A·s/rad
-STALL = 3.21  # A with all of the supply
+STALL = 3.21  # A at full supply voltage
 
 
 class FreeJoints:
-    """``count`` joints at rest at angle 0, as a servo bus wants them."""
+    """``count`` joints at rest at angle 0, with the interface required by a servo bus."""
 
     def __init__(self, count: int = 2, start: float = 0.0) -> None:
         self._start = start
-        self._done = 0  # steps since start
-        self.q: FloatArray = np.zeros(count)  # rad; may be written to place the joints
+        self._done = 0  # steps since the start
+        self.q: FloatArray = np.zeros(count)  # rad; may be written to position the joints
         self.dq: FloatArray = np.zeros(count)  # rad/s
         self.current: FloatArray = np.zeros(count)  # A
-        self._goals = [(False, 0.0, 0.0, 0.0)] * count  # torque on, signed current, angle, bound
-        self._tuned = [(1.0, 0.0, 1.0)] * count  # stiffness, damping, duty, as of `tune`
+        # Torque on, signed current, angle, current limit.
+        self._goals = [(False, 0.0, 0.0, 0.0)] * count
+        self._tuned = [(1.0, 0.0, 1.0)] * count  # stiffness, damping, duty; see `tune`
 
     def measured_current(self, joint: int) -> float:
-        """As :meth:`JointPlant.measured_current`."""
+        """Return the measured current; see :meth:`JointPlant.measured_current`."""
         return self.current.item(joint)
 
     def advance(self, t: float) -> None:
-        """Step up to time t [s]."""
+        """Advance to time t [s]."""
         count = int((t - self._start) / STEP + 1e-9) - self._done
         if count > 0:
             self._done += count
@@ -48,14 +49,14 @@ class FreeJoints:
     def drive(
         self, joint: int, mode: int, torque_on: bool, goal_q: float, goal_current: float
     ) -> None:
-        """Set what a joint's servo does, as :meth:`JointPlant.drive`."""
+        """Set a servo's mode and goals; see :meth:`JointPlant.drive`."""
         if mode == 0:
             self._goals[joint] = torque_on, goal_current, 0.0, 0.0
         else:
             self._goals[joint] = torque_on, 0.0, goal_q, abs(goal_current)
 
     def tune(self, joint: int, stiffness: float, damping: float, duty: float) -> None:
-        """Set a servo's gains and PWM, as :meth:`JointPlant.tune`."""
+        """Set a servo's gains and PWM limit; see :meth:`JointPlant.tune`."""
         self._tuned[joint] = stiffness, damping, duty
 
     def _advance(self, joint: int, count: int) -> None:

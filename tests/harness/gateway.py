@@ -1,4 +1,4 @@
-"""A gateway in the test's own process, which does something only when it is asked to."""
+"""Run a gateway in the test's own process, step by step."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.conftest import until
 
 
 class Served:
-    """Both ends of a link: clients come in at the gateway's, the loop's are used by the test."""
+    """Both ends of a link: clients connect to the gateway's end, the test uses the loop's end."""
 
     def __init__(
         self,
@@ -55,22 +55,22 @@ class Served:
         until(lambda: not commands or self._is_open())
 
     def _is_open(self) -> bool:
-        """Whether what comes now is carried out."""
+        """Return True if incoming commands are executed."""
         if self._clock is not None:
             self._clock.sleep_until(self._clock.now() + bounds.PURGE)
         self.settle()
         return self.link.stops == self.server._stops
 
     def settle(self, times: int = 3) -> None:
-        """Let the link carry what is on the way."""
+        """Transfer the messages in transit on the link."""
         for _ in range(times):
             self.service.step(0.0)
             self.link.look()
-        while select.select([self.service.channel], [], [], 0)[0]:  # long messages take more
+        while select.select([self.service.channel], [], [], 0)[0]:  # long messages need more steps
             self.service.step(0.0)
 
     def serve(self, handler: Handler) -> None:
-        """One look of the gateway, one tick of the loop's, one look for its answers."""
+        """Run one step of the gateway, one tick of the loop, and one step for the answers."""
         self.service.step(0.0)
         self.server.serve(handler)
         self.service.step(0.0)

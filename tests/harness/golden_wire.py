@@ -1,6 +1,6 @@
-"""Samples of every topic's message, and their golden bytes in ``tests/golden/``.
+"""Make samples of every topic's message, and their golden bytes in ``tests/golden/``.
 
-``python -m tests.harness.golden_wire`` writes the bytes anew, after a field was added.
+``python -m tests.harness.golden_wire`` writes the bytes again, after a field was added.
 """
 
 from collections.abc import Callable
@@ -24,7 +24,7 @@ def message_maker(topic: bytes) -> Callable[..., dict[str, Any]]:
 
 
 def golden_file(topic: bytes) -> Path:
-    """Where a topic's golden bytes are kept."""
+    """Return the file with a topic's golden bytes."""
     name = f"{topic.decode().replace('/', '-')}.msgpack"
     return Path(__file__).parents[1] / "golden" / name
 
@@ -37,7 +37,7 @@ class SampleTruth:
 
 
 def sample_state() -> State:
-    """A state in which no two fields have the same value."""
+    """Return a state in which all fields have different values."""
     state = State(seq=1234, t=12.5, wall=1.7e9 + 0.25, mode="holding", fault="", torque=True)
     state.reading.seq, state.reading.t, state.reading.valid = 1234, 12.4995, True
     state.timing.tick_s, state.timing.compute_s = 0.002, 15.5e-6
@@ -73,7 +73,7 @@ def sample_state() -> State:
 
 
 def arguments(topic: bytes) -> tuple[Any, ...]:
-    """What a sample of the topic's message is made from."""
+    """Return the arguments from which a sample of the topic's message is made."""
     state, wall, t = sample_state(), 1.7e9 + 0.25, 12.5
     if topic == schema.STATE:
         return state, Parts(fingers=(True, True), servos=True, sensors=True), 5
@@ -115,12 +115,12 @@ def arguments(topic: bytes) -> tuple[Any, ...]:
 
 
 def sample(topic: bytes) -> dict[str, Any]:
-    """A topic's message."""
+    """Return a sample message of the topic."""
     return message_maker(topic)(*arguments(topic))
 
 
 def flat(message: dict[str, Any], outer: str = "") -> dict[str, Any]:
-    """A message without maps in it: ``left.q`` for q in ``left``."""
+    """Flatten nested maps: ``left.q`` for q in ``left``."""
     found: dict[str, Any] = {}
     for key, value in message.items():
         name = f"{outer}{key}"

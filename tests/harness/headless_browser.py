@@ -1,6 +1,6 @@
-"""A headless Chromium that a test drives by its DevTools: open a page, ask what is in it.
+"""Control a headless Chromium through DevTools: open pages and evaluate scripts in them.
 
-Everything it keeps is in a folder of the test's; it has no network beyond what the page asks for.
+The browser stores all data in a folder of the test and makes only the requests of the page.
 """
 
 import json
@@ -29,18 +29,18 @@ _FLAGS = (
     "--disable-extensions",
     "--disable-dev-shm-usage",
     "--hide-scrollbars",
-    "--disable-gpu",  # a test machine has no graphics card
+    "--disable-gpu",  # test machines have no graphics card
     "--remote-debugging-port=0",
 )
 
 
 def browser_path() -> str | None:
-    """The browser on this machine, None when there is none."""
+    """Return the browser on this machine; None if there is none."""
     return next((path for name in _NAMES if (path := shutil.which(name))), None)
 
 
 class Browser:
-    """One page of one browser. ``requests`` are the addresses that the page asked for."""
+    """One page in one browser; ``requests`` contains the addresses requested by the page."""
 
     def __init__(self, path: str, folder: Path) -> None:
         words = [*_FLAGS, f"--user-data-dir={folder}"]
@@ -48,7 +48,7 @@ class Browser:
         self.process = subprocess.Popen(
             [path, *words, "about:blank"], start_new_session=True, **quiet
         )
-        told = folder / "DevToolsActivePort"  # written once somebody listens there
+        told = folder / "DevToolsActivePort"  # the browser writes this file once it listens
         until(lambda: told.exists() and "/" in told.read_text())
         pages: list[dict[str, Any]] = []
 
@@ -57,7 +57,7 @@ class Browser:
                 pages[:] = [each for each in json.load(answer) if each["type"] == "page"]
             return bool(pages)
 
-        until(listed)  # the browser opens its first page after it listens
+        until(listed)  # the browser opens its first page after it starts listening
         waits: Any = {"open_timeout": WAIT, "ping_interval": None}
         url = pages[0]["webSocketDebuggerUrl"]
         self._socket = connect(url, proxy=None, max_size=None, **waits).__enter__()
@@ -68,28 +68,28 @@ class Browser:
         self.resize(1400, 900)
 
     def open(self, url: str) -> None:
-        """Go to a page."""
+        """Open a page."""
         self.ask("Page.navigate", url=url)
 
     def resize(self, width: int, height: int, ratio: int = 1) -> None:
-        """Set the page's size; with more pixels for each of these a phone's."""
+        """Set the page's size; ``ratio`` is the number of device pixels per pixel."""
         size = {"width": width, "height": height, "deviceScaleFactor": ratio, "mobile": ratio > 1}
         self.ask("Emulation.setDeviceMetricsOverride", **size)
 
     def evaluate(self, script: str) -> Any:
-        """The value of a JavaScript expression in the page."""
+        """Return the value of a JavaScript expression in the page."""
         answer = self.ask("Runtime.evaluate", expression=script, returnByValue=True)
         if "exceptionDetails" in answer:
             raise RuntimeError(f"{script}: {answer['result'].get('description')}")
         return answer["result"].get("value")
 
     def prefer(self, colours: str) -> None:
-        """Prefer ``dark`` or ``light`` colours, as a system's setting does."""
+        """Emulate a system preference for ``dark`` or ``light`` colours."""
         feature = {"name": "prefers-color-scheme", "value": colours}
         self.ask("Emulation.setEmulatedMedia", features=[feature])
 
     def ask(self, method: str, **parameters: Any) -> Any:
-        """Send one command and wait for its answer. Raises RuntimeError when it is an error."""
+        """Send one command and wait for its answer; raise RuntimeError if it is an error."""
         self._number += 1
         message = {"id": self._number, "method": method, "params": parameters}
         self._socket.send(json.dumps(message))

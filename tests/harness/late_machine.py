@@ -1,10 +1,10 @@
-"""A machine whose time moves by its own work and sleeps alone, and that wakes up late when told."""
+"""Clock of a machine that advances only by work and sleep, and wakes up late on request."""
 
 from softfinger.daemon.clock import VirtualClock
 
 
 class LateMachine(VirtualClock):
-    """In the place of the real clock. ``late_by`` [s]: of the next wake-ups, one after another."""
+    """Replacement for the real clock; ``late_by`` holds the delays of the next wake-ups [s]."""
 
     waits = False
 
@@ -13,7 +13,7 @@ class LateMachine(VirtualClock):
         self.late_by: list[float] = []
 
     def work(self, seconds: float) -> None:
-        """Something keeps the machine at work."""
+        """Advance the time by work of this duration."""
         self._now += seconds
 
     def sleep_until(self, t: float) -> float:

@@ -1,4 +1,4 @@
-"""A whole daemon on the virtual clock, without sockets, and what tests do with it."""
+"""Run a complete daemon on the virtual clock without sockets."""
 
 from collections.abc import Callable
 from typing import Any
@@ -17,12 +17,12 @@ def command(daemon: Daemon, name: str, **numbers: float) -> dict[str, Any]:
 
 
 def torque_of(daemon: Daemon) -> Any:
-    """Whether the plant's servos have torque, each."""
+    """Return the torque state of each servo of the plant."""
     return daemon.hand.torque_on
 
 
 def advance_to(daemon: Daemon, mode: str, seconds: float) -> None:
-    """Advance until the hand is in ``mode``; fail when it is not within ``seconds``."""
+    """Advance until the hand is in ``mode``; fail if it is not within ``seconds``."""
     finish = daemon.clock.now() + seconds
     while daemon.loop.state.mode != mode:
         assert daemon.clock.now() < finish, f"{daemon.loop.state.mode}, not {mode}"
@@ -44,14 +44,14 @@ def refusal(daemon: Daemon, name: str, **numbers: float) -> str:
 
 
 def heard(daemon: Daemon) -> list[Event]:
-    """The daemon's events from now on."""
+    """Return a list that collects the daemon's events from now on."""
     events: list[Event] = []
     daemon.loop._on_event = lambda *event: events.append(event)
     return events
 
 
 def change_frames(daemon: Daemon, finger: int, change: Callable[[Frame], Frame | None]) -> None:
-    """From now on each new frame of one sensor goes through ``change``."""
+    """Pass each new frame of one sensor through ``change`` from now on."""
     sensor = daemon.loop.perception.fingers[finger].sensor
     really, last = sensor.latest, [None, None]
 
@@ -65,6 +65,6 @@ def change_frames(daemon: Daemon, finger: int, change: Callable[[Frame], Frame |
 
 
 def silence(daemon: Daemon) -> None:
-    """From now on no frame comes."""
+    """Suppress all frames from now on."""
     for perception in daemon.loop.perception.fingers:
         perception.sensor.latest = lambda kept=perception.frame: kept

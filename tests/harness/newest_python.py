@@ -1,4 +1,4 @@
-"""Print the newest release of Python that this machine has, on the path or among pyenv's."""
+"""Print the newest Python release on this machine, from the path or from pyenv."""
 
 import os
 import re
@@ -9,7 +9,7 @@ _TELL = "import sys; print(*sys.version_info[:3], sys.version_info.releaselevel,
 
 
 def candidates() -> list[Path]:
-    """Whatever is called python3 or python3.N."""
+    """Return all programs named python3 or python3.N."""
     folders = [Path(each) for each in os.environ.get("PATH", "").split(os.pathsep)]
     folders += Path.home().glob(".pyenv/versions/*/bin")
     named = [path for folder in folders for path in folder.glob("python3*")]
@@ -17,7 +17,7 @@ def candidates() -> list[Path]:
 
 
 def main() -> None:
-    """Ask each for its version, and pass over what does not answer, as a shim of pyenv's."""
+    """Ask each program for its version; skip those that do not answer, such as pyenv's shims."""
     found = []
     for path in candidates():
         done = subprocess.run([path, "-c", _TELL], capture_output=True, text=True, check=False)

@@ -1,4 +1,4 @@
-"""The tip and sensor of most tests, the paper's: 20 mm, 0.304 MPa, 44 × 44 cells on 58 mm."""
+"""Tip and sensor of the paper, used by most tests: 20 mm, 0.304 MPa, 44 × 44 cells on 58 mm."""
 
 import math
 from typing import Any
@@ -47,8 +47,8 @@ def tilts(theta: float, azimuth: float) -> tuple[float, float]:
 def dense(
     grid: SensorGrid, material: Material, contact: Any, pieces: int = 16, margin: int = 6
 ) -> np.ndarray[Any, Any]:
-    """Pressure sampled ``pieces`` times a cell's side, blurred by SciPy, averaged over cells."""
-    from scipy.ndimage import gaussian_filter  # not at each start of the tests
+    """Return pressure with ``pieces`` samples per cell side, blurred, averaged over cells."""
+    from scipy.ndimage import gaussian_filter  # slow import, needed by few tests
 
     d, tilt_x, tilt_y = contact
     axes = []
@@ -72,7 +72,7 @@ def dense(
 def fisher(
     grid: SensorGrid, material: Material, truth: Any, noise: float, free_gain: bool
 ) -> np.ndarray[Any, Any]:
-    """Inverse Fisher information of (d, tilt_x, tilt_y[, gain]) by finite differences."""
+    """Return the inverse Fisher information of (d, tilt_x, tilt_y[, gain]), numerically."""
     columns = []
     for k, step in enumerate((1e-7, 1e-5, 1e-5, 1e-4)[: 4 if free_gain else 3]):
         ends = []
@@ -86,16 +86,16 @@ def fisher(
 
 
 def errors(estimate: Any, truth: Any) -> np.ndarray[Any, Any]:
-    """Of d, both tilts and the gain."""
+    """Return the errors of d, both tilts and the gain."""
     return np.array([estimate.d, estimate.tilt_x, estimate.tilt_y, estimate.gain]) - np.array(truth)
 
 
 def board(pascal_per_count: float = 1.0, **range_: int) -> TactileSettings:
-    """A board of the sensor's, of 16 bits by default."""
+    """Return the settings of a board for this sensor, with 16 bits by default."""
     return TactileSettings(pascal_per_count=pascal_per_count, **range_)
 
 
 def flawed(**flaws: float) -> SimulationSettings:
-    """A simulated sensor without any flaw but these."""
+    """Return the settings of a simulated sensor with only these defects."""
     named = {"noise": 0.0, **flaws}
     return SimulationSettings(**{f"tactile_{name}": value for name, value in named.items()})

@@ -1,21 +1,22 @@
-"""Results that are off by a unit in the last place, to find tests that depend on rounding.
+"""Change results by a unit in the last place, to find tests that depend on rounding.
 
-``pytest --perturb SEED`` moves by -1, 0 or 1 unit in the last place
+``pytest --perturb SEED`` changes by -1, 0 or 1 unit in the last place
 
-- what elementary functions, sums and products of NumPy and `math` return to the tests' modules and
-  to the product's modules that define no kernel;
-- what `numpy.linalg` returns, to whomever;
-- what the functions return that `solve_ivp` and `curve_fit` are given;
-- what contact tables, the closed forms, the quadrature, material laws and pressure grids return;
-- the parameters of each simulated plant, by which stick and slip go another way.
+- the results of NumPy's and `math`'s elementary functions, sums and products in the tests' modules
+  and in the product's modules that define no kernel;
+- the results of `numpy.linalg` in all modules;
+- the results of functions passed to `solve_ivp` and `curve_fit`;
+- the results of contact tables, closed forms, quadrature, material laws and pressure grids;
+- the parameters of each simulated plant, which affects transitions between stick and slip.
 
-It depends on the number, its place in its array and SEED alone. So the same computation gives the
-same bits again, but an array other ones than a number, and neither are alike that are by symmetry.
-Whole numbers stay: every library has sin 0 and cos 0 exactly.
+The change depends only on the number, its position in its array and SEED. Thus the same computation
+gives the same bits again, but the result for an array differs from that for a single number, and
+values that are equal by symmetry become different. Whole numbers are not changed, because every
+library computes sin 0 and cos 0 exactly.
 
-It does not reach operators (``+``, ``@``), methods of arrays, what kernels compute on the way,
-modules that are imported within a function, and other processes. `tests.harness.arithmetic` has
-another BLAS and other machine code for those.
+Operators (``+``, ``@``), array methods, intermediate results of kernels, modules imported within a
+function, and other processes are not affected. `tests.harness.arithmetic` covers them with another
+BLAS and other machine code.
 """
 
 import importlib
@@ -47,7 +48,7 @@ _PRODUCT = {
 }
 _TABLE = "softfinger.kinematics.contact.table"
 _PLANT = "softfinger.daemon.simulation.physics.simulated_hand"
-_TIMES = ("step", "sample_period")  # parameters that divide a millisecond, and so are exact
+_TIMES = ("step", "sample_period")  # parameters that must divide a millisecond exactly
 _KERNELS = (Dispatcher, InnerKernel)
 _SIGN = np.uint64(1 << 63)
 _STEPS = np.array([-1, 0, 0, 1]).astype(np.uint64)
@@ -56,13 +57,13 @@ Function = Callable[..., Any]
 
 
 class Perturbation:
-    """What is moved, by one seed."""
+    """Changes determined by one seed."""
 
     def __init__(self, seed: int) -> None:
         self._seed = seed
 
     def start(self) -> None:
-        """Change NumPy's linear algebra, SciPy's solvers and the product; before tests import."""
+        """Patch `numpy.linalg`, SciPy's solvers and the product, before tests are imported."""
         self._wrap(np.linalg, _LINALG, self._moving)
         for module, names in _SOLVERS.items():
             self._wrap(importlib.import_module(module), names, self._moving_first)
@@ -74,7 +75,7 @@ class Perturbation:
         self._wrap(importlib.import_module(_PLANT), "SimulatedHand.__init__", self._moving_plant)
 
     def enter_modules(self) -> None:
-        """Give the modules without kernels their own `np` and `math`; once all are imported."""
+        """Replace `np` and `math` in modules without kernels, once all are imported."""
         own = {"np": self._own(np, _NUMPY), "math": self._own(math, _MATH)}
         for name, module in list(sys.modules.items()):
             names = vars(module)
@@ -84,7 +85,7 @@ class Perturbation:
                 names.update({key: own[key] for key in own if names.get(key) in (np, math)})
 
     def moved(self, value: Any) -> Any:
-        """``value`` with its floats moved; arrays stay the same objects."""
+        """Return ``value`` with its floats changed; arrays are changed in place."""
         if isinstance(value, tuple):
             parts = [self.moved(each) for each in value]
             return value._make(parts) if hasattr(value, "_make") else tuple(parts)

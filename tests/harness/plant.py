@@ -1,4 +1,4 @@
-"""What the tests of the simulated hand share: making one, putting it somewhere, letting it run."""
+"""Make simulated hands for tests, position them and let them run."""
 
 import math
 
@@ -36,7 +36,7 @@ def place(hand: SimulatedHand, q, pose, dq=(0, 0), velocity=(0, 0, 0)) -> None:
 
 
 def hold_with(hand: SimulatedHand, currents) -> None:
-    """Constant currents from the start on, whatever the joints' speed."""
+    """Apply constant currents from the start, independent of the joints' speed."""
     hand.plant.parameters.no_load_speed = 1e9
     hand.current[:] = currents
     for joint in range(2):
@@ -54,9 +54,10 @@ def settled(hand: SimulatedHand, goals, current: float, seconds: float = 2.0) ->
 
 
 def push_along(hand: Watched, force: float, rate: float, start: float = 0.0) -> float:
-    """Push the object along its faces from ``start`` to ``force`` [N], ``rate`` [N/s].
+    """Push the object along its faces from ``start`` to ``force`` [N] at ``rate`` [N/s].
 
-    Positive is away from the palm; the push stays. Returns the largest share of friction used.
+    A positive force is directed away from the palm; the push is kept. Returns the largest fraction
+    of friction used.
     """
     dt, used = 0.02, 0.0
     count = max(round(abs(force - start) / (rate * dt)), 1)

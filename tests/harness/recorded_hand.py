@@ -1,4 +1,4 @@
-"""The simulated hand at work on the virtual clock: what it publishes, and recordings of that."""
+"""Run the simulated hand on the virtual clock; return or record its published messages."""
 
 from collections import deque
 from pathlib import Path
@@ -19,7 +19,7 @@ Messages = list[tuple[bytes, dict[str, Any]]]
 
 
 class Script:
-    """Commands at their ticks, in the place of the command server."""
+    """Replacement for the command server that gives commands at their ticks."""
 
     refused_by_pace = 0
 
@@ -43,7 +43,7 @@ class Script:
 
 
 class Keeping(Link):
-    """Keeps what is published, in the place of the link to the gateway."""
+    """Replacement for the link to the gateway that stores the published messages."""
 
     def __init__(self, taken: Messages) -> None:
         super().__init__()
@@ -62,9 +62,9 @@ def published(
     profile: str | None = None,
     hand: tuple[str, ...] = (),
 ) -> Messages:
-    """All that the hand publishes under ``script``; ``folder`` is for its sockets.
+    """Return all messages that the hand publishes under ``script``; ``folder`` is for its sockets.
 
-    ``hand``: settings of the simulated hand that the daemon does not have.
+    ``hand`` contains settings that apply only to the simulated hand, not to the daemon.
     """
     common = (
         "loop.clock=virtual",
@@ -94,7 +94,10 @@ def record_hand(
     profile: str | None = None,
     hand: tuple[str, ...] = (),
 ) -> None:
-    """The commands in ``due`` at their ticks (500 a second); topics ``without`` are left out."""
+    """Record a run with the commands in ``due`` at their ticks (500 per second).
+
+    Topics in ``without`` are omitted.
+    """
     writer = RecordingWriter(path)
     with TemporaryDirectory() as folder:
         for topic, message in published(Path(folder), Script(due), seconds, changes, profile, hand):

@@ -1,6 +1,6 @@
-"""The hand's contact Jacobian, rolling constraint and inverse kinematics: what tests compare with.
+"""Reference for tests: the hand's contact Jacobian, rolling constraint and inverse kinematics.
 
-A tip that rolls without slip shears by
+A tip that rolls without slip is sheared by
 
     ḋ_t1 = (a − d1) θ̇1 − ṡ1 − tan θ1 ḋ1        ḋ_t2 = (a − d2) θ̇2 + ṡ2 − tan θ2 ḋ2
 
@@ -19,10 +19,10 @@ FloatArray = NDArray[np.float64]
 
 
 class ReferenceHand(HandGeometry):
-    """The hand with its derivatives and its inverse kinematics."""
+    """Hand with derivatives and inverse kinematics."""
 
     def variables(self, x: Any, width: float) -> Any:
-        """(d, θ, s) of each tip (2, 3, …) at coordinates (5, …), which may be complex."""
+        """Return (d, θ, s) of each tip (2, 3, …) at coordinates (5, …), which may be complex."""
         found = []
         for side, q in ((1.0, x[0]), (-1.0, x[1])):
             inwards = self.finger_length * np.sin(q) + self.finger_offset * np.cos(q)
@@ -34,27 +34,28 @@ class ReferenceHand(HandGeometry):
         return np.array(found)
 
     def tip_jacobian(self, q: ArrayLike) -> FloatArray:
-        """Derivatives [[∂x1/∂q1, ∂y1/∂q1], [∂x2/∂q2, ∂y2/∂q2]] [m/rad]."""
+        """Return the derivatives [[∂x1/∂q1, ∂y1/∂q1], [∂x2/∂q2, ∂y2/∂q2]] [m/rad]."""
         q1, q2 = vector(q, 2, "q")
         lengths = (self.finger_length, self.finger_offset)
         return np.array([tip_velocity(q1, 1.0, *lengths), tip_velocity(q2, -1.0, *lengths)])
 
     def jacobian(self, x: FloatArray) -> FloatArray:
-        """Derivatives (2, 3, 5) of each tip's (d, θ, s) by the coordinates, by complex steps."""
+        """Return the derivatives (2, 3, 5) of each tip's (d, θ, s), by complex steps."""
         return np.asarray(self.variables(x[:, None] + 1e-30j * np.eye(5), 0.0).imag / 1e-30)
 
     def rolling_rows(self, x: FloatArray, width: float) -> FloatArray:
-        """Rows (2, 5) of ḋ_t1 and ḋ_t2 over the coordinates' velocities."""
+        """Return the rows (2, 5) that map the coordinates' velocities to ḋ_t1 and ḋ_t2."""
         d, theta, _ = self.variables(x, width).T[..., None]
         by_d, by_theta, by_s = self.jacobian(x).swapaxes(0, 1)
         along = np.array([[-1.0], [1.0]])
         return np.asarray((self.tip_radius - d) * by_theta + along * by_s - np.tan(theta) * by_d)
 
     def inverse(self, pose: ArrayLike, d: ArrayLike, width: float) -> FloatArray:
-        """Joint angles (2,) that press ``d`` (2,) [m] into an object of ``width`` at ``pose``.
+        """Return joint angles (2,) that press by ``d`` (2,) [m] on an object at ``pose``.
 
-        Closed form: O1·n = −B cos φ + L sin θ1 + e cos θ1 and its mirror image. A negative ``d`` is
-        a gap. Raises ValueError when a finger can't reach that far.
+        The solution is closed-form: O1·n = −B cos φ + L sin θ1 + e cos θ1, and the mirror image for
+        the other finger. A negative ``d`` is a gap. Raises ValueError if a finger cannot reach that
+        far.
         """
         x, y, angle = vector(pose, 3, "pose")
         d1, d2 = vector(d, 2, "d")
@@ -68,5 +69,5 @@ class ReferenceHand(HandGeometry):
         )
 
     def _angle_for(self, inward: float) -> float:
-        """ψ with L sin ψ + e cos ψ = ``inward``, on the branch around 0."""
+        """Return ψ with L sin ψ + e cos ψ = ``inward``, on the branch around 0."""
         return math.asin(inward / self.reach) - math.atan2(self.finger_offset, self.finger_length)

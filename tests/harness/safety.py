@@ -1,4 +1,4 @@
-"""States for the limits to judge, and a `Safety` that does."""
+"""States for tests of the limits, and a `Safety` object that judges them."""
 
 from typing import Any, cast
 
@@ -21,7 +21,7 @@ BOUNDS = SETTINGS.safety
 
 
 class Sensor:
-    """What the rows see of a sensor."""
+    """The properties of a sensor that the limits use."""
 
     def __init__(self, finger: int) -> None:
         self.finger = finger
@@ -44,7 +44,7 @@ def safety(has_servos: bool = True, has_sensors: bool = True, **parts: Any) -> S
 
 
 def sound(mode: Mode = Mode.HOLDING) -> State:
-    """A state with nothing wrong, at 5 s."""
+    """Return a state without faults at 5 s."""
     state = State(t=5.0, mode=mode, torque=True, seq=10)
     state.reading.t = 5.0
     state.reading.valid = True
@@ -72,14 +72,14 @@ def sound(mode: Mode = Mode.HOLDING) -> State:
 
 
 class Deaf:
-    """Servos that take any goal, and do nothing."""
+    """Servos that accept any goal and ignore it."""
 
     def write(self, _: Goal) -> None:
         pass
 
 
 def bounded(judge: Safety, state: State) -> None:
-    """Bound the state's goal as on its way to the servos."""
+    """Limit the state's goal as before sending it to the servos."""
     judge.write(cast(Servos, Deaf()), state)
 
 
@@ -88,7 +88,7 @@ def goal(q: tuple[float, float], current: tuple[float, float]) -> Goal:
 
 
 def later(state: State, dt: float) -> None:
-    """Time goes on, and everything is as fresh as it was."""
+    """Advance the time, with all data as fresh as before."""
     state.t += dt
     state.reading.t += dt
     state.seq += 1
@@ -104,7 +104,7 @@ def levers(lever: float) -> GraspState:
 
 
 def judged(judge: Safety, state: State, seconds: float = 0.0) -> tuple[str, str]:
-    """The fault after so many seconds of this state; every row has had its turn."""
+    """Return the fault after ``seconds`` of this state, with every limit checked at least once."""
     found = None
     for _ in range(max(round(seconds / 0.002), len(LIMITS)) + len(LIMITS)):
         found = judge.judge(state)

@@ -1,6 +1,6 @@
-"""Emulated servo buses for the tests: one to feed by hand, and one on a pty in a thread.
+"""Emulated servo buses for tests: called directly, or on a pty served by a thread.
 
-The thread serves tests of behaviour; what is timed runs the bus in a process of its own.
+The thread is for tests of behaviour; timing tests run the bus in a separate process.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from softfinger.daemon.simulation.servo_model.servo import EmulatedServo
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 from tests.harness.free_joints import FreeJoints
 
-_LOOK = 0.005  # s until a bus looks for what was done to it
+_LOOK = 0.005  # s between checks for changes made by the test
 RADIAN = 2.0 * math.pi / COUNTS_PER_TURN
 
 
@@ -41,7 +41,7 @@ def make_bus(
     t: float = 0.0,
     **options: Any,
 ) -> ServoBus:
-    """Factory-new servos on free joints that stand at ``counts``, with the time at ``t``."""
+    """Return factory-new servos on free joints at positions ``counts``, at time ``t``."""
     plant, chosen = FreeJoints(len(ids), t), by_name(model)
     eeprom = servo.prepared(chosen, reg.CURRENT_BASED_POSITION_MODE) if prepared else {}
     for joint, count in enumerate(counts):
@@ -62,33 +62,33 @@ def make_bus(
 
 
 def hand_bus(t: float = 0.0, servos: dict[str, Any] | None = None, **options: Any) -> ServoBus:
-    """The servos of settings with these ``servos``, set up for the hand, on free joints."""
+    """Return servos prepared for the hand by settings with these ``servos``, on free joints."""
     settings = Settings.model_validate({"servos": servos or {}})
     return ServoBus.from_settings(settings, FreeJoints(2, t), t=t, **options)
 
 
 def put_fault(bus: ServoBus, text: str, t: float) -> None:
-    """A fault in words, as ``silent=2``."""
+    """Apply a fault given in words, e.g. ``silent=2``."""
     kind, _, value = text.partition("=")
     bus.fault(kind, float(value), t)
 
 
 def backend_settings(path: str, **servos: Any) -> Settings:
-    """The Dynamixel backend on this port, with time for a test that waits for a processor."""
+    """Return settings of the Dynamixel backend on this port, with time-outs for a busy machine."""
     waits = {"reply_timeout": 1.0, "watchdog": 2.0}
     values = {"backend": "dynamixel", "port": path} | waits | servos
     return Settings.model_validate({"servos": values})
 
 
 def connected(bus: RunningBus, **servos: Any) -> DynamixelServos:
-    """The Dynamixel backend, connected to a running bus."""
+    """Return the Dynamixel backend, connected to a running bus."""
     backend = DynamixelServos(backend_settings(bus.path, **servos), RealClock())
     backend.connect()
     return backend
 
 
 class BusClient:
-    """Talks to a bus at its own time; parses the replies with the independent parser."""
+    """Client of a bus with its own time; it parses replies with the independent parser."""
 
     def __init__(self, bus: ServoBus) -> None:
         self.bus = bus
@@ -100,7 +100,7 @@ class BusClient:
     def ask(
         self, instruction: int, parameters: bytes = b"", packet_id: int = 1
     ) -> tuple[int, bytes]:
-        """(error byte, data) of the one reply."""
+        """Return (error byte, data) of the single reply."""
         (packet,) = PacketParser().feed(self.send(packet_id, instruction, parameters), 0.0)
         assert packet.valid
         assert packet.instruction == framing.STATUS
@@ -112,7 +112,7 @@ class BusClient:
         return int.from_bytes(data, "little", signed=True)
 
     def write(self, address: int, value: int, size: int, packet_id: int = 1) -> int:
-        """The error byte."""
+        """Write a register and return the error byte."""
         data = address.to_bytes(2, "little") + value.to_bytes(size, "little", signed=value < 0)
         return self.ask(framing.WRITE, data, packet_id)[0]
 
@@ -122,10 +122,11 @@ class BusClient:
 
 
 class DirectPort(SerialPort):
-    """A port whose other end is a bus in this thread: a reply is there at once or never comes.
+    """Port connected to a bus in this thread: a reply is available at once or never.
 
-    The bus's time is ``clock``'s; without one it is ``t``, set by hand, and waiting for a reply
-    that does not come takes its deadline. ``baud`` 0 is heard at every rate.
+    The bus uses the time of ``clock``. Without a clock, it uses ``t``, which the test sets; waiting
+    for a missing reply then advances ``t`` to the deadline. With ``baud`` 0, the port receives at
+    every rate.
     """
 
     def __init__(
@@ -159,7 +160,7 @@ class DirectPort(SerialPort):
 
 
 class RunningBus:
-    """A bus on a pty, served by a thread until :meth:`close`, in monotonic time."""
+    """Bus on a pty in monotonic time, served by a thread until :meth:`close`."""
 
     def __init__(
         self,
@@ -185,11 +186,11 @@ class RunningBus:
         return self.bus.servos[index]
 
     def memory(self, index: int) -> bytes:
-        """A copy of a servo's control table."""
+        """Return a copy of a servo's control table."""
         return self.call(lambda: bytes(self.servo(index).table.memory))
 
     def call(self, job: Callable[[], Any]) -> Any:
-        """Run ``job`` between two packets, and return what it gave."""
+        """Run ``job`` between two packets and return its result."""
         with self._between_packets:
             return job()
 
@@ -209,7 +210,7 @@ class RunningBus:
                 self.port.service(self._now())
 
     def _now(self) -> float:
-        """Monotonic time less this process's standstills, of which the servos must not know."""
+        """Return monotonic time less stalls of this process, which must not affect servos."""
         looked, self._looked = self._looked, time.monotonic()
         self._stood += max(self._looked - looked - 0.5, 0.0)
         return self._looked - self._stood

@@ -1,4 +1,4 @@
-"""Every tactile backend at work, each with known images: what the conformance suite runs on."""
+"""Run every tactile backend with known images, for the conformance tests."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ RATE = 200.0  # Hz
 
 
 def image(number: int) -> NDArray[np.uint16]:
-    """A different image for each number; no cell is like its transposed one."""
+    """Return a different image for each number, in which no cell equals its transpose."""
     cells = np.arange(ROWS * COLS, dtype=np.uint16).reshape(ROWS, COLS)
     return (cells * 7 + 3 * (cells // COLS) + number) % 160
 
 
 class _Images:
-    """A board's source: a new image at each call."""
+    """Source of a board's frames that returns a new image at each call."""
 
     def __init__(self) -> None:
         self.number = 0
@@ -48,7 +48,7 @@ class _Images:
 
 
 def why_not_open(sensor: TactileSensor) -> str:
-    """What it says when it can't be opened; empty when it can."""
+    """Return the error message if the sensor cannot be opened, otherwise an empty text."""
     try:
         sensor.open()
     except TactileError as error:
@@ -58,12 +58,12 @@ def why_not_open(sensor: TactileSensor) -> str:
 
 
 class Rig:
-    """One backend with what it needs around it. Use as a context."""
+    """Context with one backend and its environment."""
 
     def __init__(
         self, backend: str, folder: Path, fault: str = "", rows: int = ROWS, source: Any = None
     ) -> None:
-        """``source`` makes a serial board's frames, by default a new image each."""
+        """``source`` makes the frames of a serial board; by default each frame is a new image."""
         self.backend = backend
         self._stack = ExitStack()
         self._stop = threading.Event()
@@ -105,7 +105,7 @@ class Rig:
         self._stack.close()
 
     def wait(self, condition: Callable[[Frame], object]) -> Frame:
-        """Let time pass until a frame fulfils ``condition``."""
+        """Advance the time until a frame fulfils ``condition``."""
 
         def holds() -> bool:
             if not isinstance(self.clock, RealClock):
@@ -117,7 +117,7 @@ class Rig:
         return self.sensor.latest()
 
     def unplug(self) -> None:
-        """Take the board's port away, in the thread that serves it."""
+        """Remove the board's port, in the thread that serves it."""
         self._unplug.set()
 
     def _serve(self) -> None:

@@ -1,4 +1,4 @@
-"""A process on a pseudo-terminal of its own, and what a person would see there."""
+"""Run a process on its own pseudo-terminal and reproduce the screen that a user would see."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from typing import Any
 
 import pyte
 
-_CAPACITY = 1 << 16  # bytes that wait on a terminal at most
+_CAPACITY = 1 << 16  # capacity of a terminal's buffer, bytes
 ENVIRONMENT = {"TERM": "xterm-256color", "COLORTERM": "truecolor", "LANG": "C.UTF-8"}
 
 
 class TerminalProcess:
-    """``command`` with a pty as controlling terminal; ``screen`` follows what it writes."""
+    """Run ``command`` with a pty as controlling terminal; ``screen`` shows its output."""
 
     def __init__(self, command: list[str], columns: int = 80, lines: int = 24) -> None:
         self.master, self.slave = pty.openpty()
@@ -48,9 +48,10 @@ class TerminalProcess:
             self.screen.reset()
 
     def pump(self, seconds: float = 0.02) -> None:
-        """Take what it has written, and what it writes within ``seconds`` where that is nothing.
+        """Read the available output; if there is none, wait up to ``seconds`` for it.
 
-        No more than a terminal holds: a page may be written faster than it is followed here.
+        At most one terminal buffer is read, because a page may be written faster than it is
+        processed.
         """
         end = len(self.written) + _CAPACITY
         while len(self.written) < end and select.select([self.master], [], [], seconds)[0]:
@@ -63,7 +64,7 @@ class TerminalProcess:
         return "\n".join(self.screen.display)
 
     def wait(self, condition: Callable[[], Any], seconds: float = 150.0) -> None:
-        """Follow the page until ``condition`` holds; fail with the page when it doesn't."""
+        """Read output until ``condition`` holds; fail with the page if it does not."""
         deadline = time.monotonic() + seconds
         while not condition():
             self.pump()
@@ -81,24 +82,24 @@ class TerminalProcess:
         os.write(self.master, keys)
 
     def press(self, key: bytes, text: str) -> None:
-        """Until ``text`` is shown: a busy machine's daemon or page may not have heard the first."""
+        """Press a key until ``text`` is shown; on a busy machine the first press may be lost."""
         while text not in self.text():
             self.type(key)
             later = time.monotonic() + 1.0
             self.wait(lambda later=later: text in self.text() or time.monotonic() > later)
 
     def ended(self) -> int:
-        """Wait for its end; the exit code."""
+        """Wait for the end of the process; return its exit status."""
         self.wait(lambda: self.process.poll() is not None)
         self.pump()
         return self.process.returncode
 
     def is_restored(self) -> bool:
-        """The terminal is as it was: modes, main screen, cursor, colours, pastes."""
+        """Return True if the terminal's modes, main screen, cursor and pasting are restored."""
         self.pump()
         pairs = ((b"\x1b[?1049h", b"\x1b[?1049l"), (b"\x1b[?25l", b"\x1b[?25h"))
         pairs += ((b"\x1b[?2004h", b"\x1b[?2004l"),)
-        # The one that gives back is the last of each pair, and the page had taken the terminal.
+        # Of each pair, the page must have sent both sequences, and the restoring one last.
         given = all(0 <= self.written.rfind(a) < self.written.rfind(b) for a, b in pairs)
         return given and termios.tcgetattr(self.slave) == self.attributes
 

@@ -1,4 +1,4 @@
-"""``softfinger view`` in a process of its own, and its pictures as a page gets them."""
+"""Run ``softfinger view`` as a process and receive its pictures like a page."""
 
 import json
 import subprocess
@@ -14,9 +14,10 @@ WAIT = 60.0  # s for one picture
 
 
 class Viewed:
-    """Serving when constructed. ``address`` is the page's, ``commanding`` that with the token.
+    """Process that serves when constructed.
 
-    ``folder``: where it runs, and records.
+    ``address`` is the address of the page, ``commanding`` the one with the token. ``folder`` is the
+    working directory, which also receives recordings.
     """
 
     def __init__(self, *words: str, folder: Path | None = None) -> None:
@@ -36,7 +37,7 @@ class Viewed:
         self.host = urlsplit(self.address).netloc
 
     def end(self) -> str:
-        """End it as a signal does, and return what it said."""
+        """End the process with a signal and return its output."""
         self.process.terminate()
         said = self.process.communicate(timeout=300)[1]
         assert self.process.returncode == 0, said
@@ -52,7 +53,7 @@ class Viewed:
 
 
 class Watcher:
-    """A page's connection: asks for pictures."""
+    """Connection of a page that requests pictures."""
 
     def __init__(self, host: str, query: str = "", **more: Any) -> None:
         waits: Any = {"open_timeout": WAIT, "ping_timeout": None}
@@ -60,7 +61,7 @@ class Watcher:
         self._connection = connect(url, proxy=None, max_size=None, **waits, **more)
 
     def next(self) -> dict[str, Any]:
-        """The next picture."""
+        """Return the next picture."""
         self.socket.send("")
         while True:
             message: dict[str, Any] = json.loads(self.socket.recv(timeout=WAIT))

@@ -1,9 +1,9 @@
-"""A process that runs many kinds of scene and tells which kernels were compiled or loaded in them.
+"""Run many kinds of scene in a process and report the kernels that were compiled or loaded.
 
-``python -m tests.harness.warm_scenes FOLDER SCENE…`` prints one JSON line a scene. FOLDER takes a
-calibration file; a stand-in hand's ports must be in it for the scene that runs on them. Each
-scene runs in a fork of a process that has called no kernel yet, so that none is warm through
-another scene.
+``python -m tests.harness.warm_scenes FOLDER SCENE…`` prints one line of JSON per scene. A
+calibration file is written to FOLDER. For the scene with an emulated hand, FOLDER must contain the
+hand's ports. Each scene runs in a fork of a process that has not called any kernel yet, so that
+scenes do not warm up kernels for each other.
 """
 
 import contextlib
@@ -61,13 +61,13 @@ SCRIPT: list[tuple[float, dict[str, Any]]] = [
 
 
 class Watch(event.Listener):
-    """Hears whenever a kernel is compiled or loaded from the cache: both hold up a tick."""
+    """Record each time a kernel is compiled or loaded from the cache, which delays a tick."""
 
     def __init__(self) -> None:
         self.heard: list[str] = []
 
     def on_start(self, event: Any) -> None:
-        """The compiler is at work; who called it stands in the stack."""
+        """Record the callers of the compiler from the stack."""
         frame, names = sys._getframe(), []
         while frame is not None and len(names) < 40:
             if "/numba/" not in frame.f_code.co_filename:
@@ -76,11 +76,11 @@ class Watch(event.Listener):
         self.heard.append(" < ".join(names[1:5]))
 
     def on_end(self, event: Any) -> None:
-        """And is done."""
+        """Ignore the end of a compilation."""
 
 
 def run(settings: Settings) -> dict[str, Any]:
-    """Run the script; what was compiled or loaded before the first tick, in no part, and after."""
+    """Run the script; report compilations before the first tick, in no part, and after."""
     watch = Watch()
     modes, faults = [], []
     with event.install_listener("numba:compiler_lock", watch):
@@ -91,12 +91,12 @@ def run(settings: Settings) -> dict[str, Any]:
     with event.install_listener("numba:compiler_lock", watch), hand:
         for wait, request in SCRIPT:
             hand.loop.advance(wait)
-            for _ in range(300):  # in real time a busy machine may be long about it
+            for _ in range(300):  # in real time a busy machine may take long
                 if hand.loop.state.mode not in ("grasping", "rotating"):
                     break
                 hand.loop.advance(0.1)
             fault = hand.loop.state.fault_name
-            with contextlib.suppress(Refused):  # not every scene has what each command needs
+            with contextlib.suppress(Refused):  # not every scene supports every command
                 hand.loop.command(request)
             hand.loop.advance(hand.loop.period)
             modes.append(hand.loop.state.mode)
@@ -107,7 +107,7 @@ def run(settings: Settings) -> dict[str, Any]:
 
 
 def calibrated(folder: Path) -> dict[str, Any]:
-    """A left sensor with a calibration, so that its frames are pressures."""
+    """Return settings of a left sensor with a calibration, so that its frames are pressures."""
     settings = Settings()
     cells = [[0.0] * settings.tactile.cols for _ in range(settings.tactile.rows)]
     tare = TareStep(date=now(), zero=cells, noise=1520.0, frames=16)
@@ -133,7 +133,7 @@ def main(folder: Path, names: list[str]) -> None:
             print(json.dumps({"scene": name, **run(scenes[name])}), flush=True)
             os._exit(0)
         if os.waitpid(child, 0)[1]:
-            sys.exit(f"{name}: failed")  # what of is printed already
+            sys.exit(f"{name}: failed")  # the reason is already printed
 
 
 if __name__ == "__main__":

@@ -1,1 +1,1 @@
-"""Soaks: each module a program, of which the tests run a little."""
+"""Soak programs, one per module; the tests run short versions."""

@@ -1,10 +1,10 @@
-"""Heat foreseen on servos whose constants nobody knows: ``python -m tests.soak.heat --runs 40``.
+"""Predict servo temperatures with unknown constants: ``python -m tests.soak.heat --runs 40``.
 
-Each run draws a model of servo, factors of its heating, cooling and heat capacity (0.75 to 1.33),
-the room (15 to 35 °C), a current of 1.15 to 1.8 times what it would bear for ever, and when the
-room gets warmer or colder by 5 or 8 °C. The daemon's filter sees the thermometer's whole degrees
-and a current with 3 % of noise; the plant is `servo_model.servo_joint`. ``--grips N`` adds whole
-hands on virtual time that grip too hard for too long.
+Each run draws a servo model; factors of heating, cooling and heat capacity (0.75 to 1.33); the room
+temperature (15 to 35 °C); a current of 1.15 to 1.8 times the one that could be held forever; and a
+time at which the room becomes warmer or colder by 5 or 8 °C. The daemon's filter receives
+temperatures in whole degrees and a current with 3 % noise. The plant is `servo_model.servo_joint`.
+``--grips N`` adds complete hands on virtual time that grip too hard for too long.
 """
 
 import argparse
@@ -23,19 +23,19 @@ from softfinger.tools.watched import Watched
 LIMIT = 70.0  # °C
 _DT = 0.5  # s
 _MODELS = ("XM430-W350", "XL330-M288")
-_LONG = 8000.0  # s: everything has settled
+_LONG = 8000.0  # s, long enough to reach a steady state
 
 
 class Foreseen(NamedTuple):
-    """How one hold was foreseen."""
+    """Result of the prediction for one hold."""
 
-    warned: float  # s before the reading came to the limit
-    told: float  # s that were told when 60 were left
-    lasted: float  # s in all
+    warned: float  # s from the warning until the reading reached the limit
+    told: float  # s predicted when 60 s were left
+    lasted: float  # s in total
 
 
 class Bench:
-    """One hidden servo, and the daemon's watch on its readings."""
+    """Servo with hidden constants, and the daemon's watch on its readings."""
 
     def __init__(self, seed: int) -> None:
         self.chance = chance = random.Random(seed)
@@ -49,7 +49,7 @@ class Bench:
         self._watch = HeatWatch(settings, self.state)
 
     def lasting_current(self) -> float:
-        """Find the current [A] with which the case settles at the limit, in the plant itself."""
+        """Find the current [A] at which the plant's case settles at the limit."""
         low, high = 0.0, 3.0
         while high - low > 3e-3:
             current = 0.5 * (low + high)
@@ -62,7 +62,7 @@ class Bench:
         return low
 
     def step(self, current: float) -> float:
-        """Go on by _DT with this current [A]; the time that is told until the limit [s]."""
+        """Advance by _DT with this current [A]; return the predicted time until the limit [s]."""
         self.t += _DT
         noisy = current * (1.0 + 0.03 * self.chance.gauss(0.0, 1.0))
         self.plant.step(current, _DT)
@@ -75,7 +75,7 @@ class Bench:
 
 
 def foreseen(seed: int) -> Foreseen:
-    """Hold too hard from a moment on, until the reading comes to the limit."""
+    """Hold with too high a current until the reading reaches the limit."""
     bench = Bench(seed)
     chance = bench.chance
     current = bench.lasting_current() * chance.uniform(1.15, 1.8)
@@ -91,7 +91,10 @@ def foreseen(seed: int) -> Foreseen:
 
 
 def least_at_half_load(seed: int, seconds: float = 3600.0) -> float:
-    """Hold half the lasting current, the room 8 °C warmer half-way; the least time told [s]."""
+    """Hold half the lasting current, with the room 8 °C warmer from half-time.
+
+    Returns the shortest predicted time until the limit [s].
+    """
     bench = Bench(seed)
     current, least = 0.5 * bench.lasting_current(), _LONG
     while bench.t < seconds:
@@ -102,15 +105,15 @@ def least_at_half_load(seed: int, seconds: float = 3600.0) -> float:
 
 
 class Held(NamedTuple):
-    """What came of a grip that was too hard to last."""
+    """Result of a grip that was too hard to last."""
 
-    dropped: bool  # the fault of a hot servo, or any other end of the grip
-    force: float  # N asked for in the end
+    dropped: bool  # by the fault of a hot servo, or in any other way
+    force: float  # N requested at the end
     events: list[str]
 
 
 def held(seed: int, seconds: float = 400.0) -> Held:
-    """Grip with 20 to 26 N on servos of a fifth of their heat capacity, by a hand as a whole."""
+    """Grip with 20 to 26 N with a complete hand whose servos have a fifth of the heat capacity."""
     chance = random.Random(seed)
     factors = (
         chance.uniform(0.9, 1.33),
@@ -126,7 +129,7 @@ def held(seed: int, seconds: float = 400.0) -> Held:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Print what share of the runs met each aim; 1 where one was missed."""
+    """Print the share of runs that met each aim; return 1 if an aim was missed."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seed", type=int, default=0, help="of the first run")
     parser.add_argument("--runs", type=int, default=40)

@@ -1,11 +1,11 @@
-"""A soak in real time, hardware in the loop: ``python -m tests.soak.hil``, one hour.
+"""Soak in real time with hardware in the loop: ``python -m tests.soak.hil``, one hour.
 
-The daemon's process on the emulated hand's, with a recorder, three subscribers and a client that
-grasps, turns, moves, releases and streams setpoints at 50 Hz, while faults come to servos, boards
-and the daemon itself. What was on the servos' wire is judged every few seconds by the emulated
-hand's record; each process's memory must be flat, nothing may be lost that is not counted, and the
-ticks of the end must be as punctual as those of the beginning, and three grasps of ten must come to
-hold. Faults that a busy machine brings about are counted, told and cleared.
+The daemon's process runs on an emulated hand, with a recorder, three subscribers and a client that
+grasps, turns, moves, releases and streams setpoints at 50 Hz. Meanwhile, servos, boards and the
+daemon itself are disturbed by faults. The emulated hand's record of the servo bus is judged every
+few seconds. The memory of each process must stay constant, all lost messages must be counted, the
+ticks at the end must be as punctual as at the beginning, and three of ten grasps must reach a hold.
+Faults caused by a busy machine are counted, reported and cleared.
 """
 
 from __future__ import annotations
@@ -36,43 +36,49 @@ from tests.soak.rig import CASES, End, Rig, judge_wire
 
 SECONDS = 3600.0
 SUBSCRIBERS = 3
-_LOOK = 5.0  # s between two looks at wire and memory
-_WINDOW = 600.0  # s at both ends between which lateness and memory are compared, at most a third
-_FLAT = 2.0  # MB that a process may grow by
-_FAULT_EVERY = 40.0  # s, in the mean
+_LOOK = 5.0  # s between two checks of bus and memory
+# s at both ends in which lateness and memory are compared, at most a third of the run
+_WINDOW = 600.0
+_FLAT = 2.0  # MB by which a process may grow
+_FAULT_EVERY = 40.0  # s on average
 _FAULT_FOR = 0.3
-_SETPOINT = 0.02  # s between two of a stream
-_STREAM = 3.0  # s that a stream takes
-_SPLIT = 300  # s a file of the recorder, which keeps an index of each until it is closed
-_ASKEW = ("hand.angle", "tip.tilt")  # the object lies askew, as stops leave it: it is put upright
-_DROPPED = 20.0  # s without a grip: the object has slipped away, and is put back
-_HELD = 0.3  # of the grasps, at least, must come to hold, where there are …
-_MANY = 50  # … or more
-_BEGUN = 1500  # states between the first listener and the last, at most
+_SETPOINT = 0.02  # s between two setpoints
+_STREAM = 3.0  # s for which setpoints are streamed
+_SPLIT = 300  # s per file of the recorder, which keeps an index until the file is closed
+# Faults after stops that leave the object tilted; it is then put upright.
+_ASKEW = ("hand.angle", "tip.tilt")
+_DROPPED = 20.0  # s without a grip after which the object, which has slipped away, is put back
+_HELD = 0.3  # fraction of grasps that must reach a hold
+_MANY = 50  # number of grasps from which that is required
+_BEGUN = 1500  # largest difference between the states received by the first and the last listener
 
 
 @dataclass
 class Account:
-    """What a soak went through."""
+    """Results of a soak."""
 
     seconds: float = 0.0
     ticks: int = 0
     overruns: int = 0
-    modes: Counter[str] = field(default_factory=Counter)  # looks in each
-    done: Counter[str] = field(default_factory=Counter)  # commands carried out
+    modes: Counter[str] = field(default_factory=Counter)  # number of checks in each mode
+    done: Counter[str] = field(default_factory=Counter)  # accepted commands
     injected: Counter[str] = field(default_factory=Counter)
     faults: Counter[str] = field(default_factory=Counter)
-    held: int = 0  # grips that came to hold
-    placed: int = 0  # times that the object was put upright
-    received: list[tuple[int, int]] = field(default_factory=list)  # by subscribers, and lost
-    recorded: tuple[int, int] = 0, 0  # states that came to the recorder, by its files; lost
+    held: int = 0  # grips that reached a hold
+    placed: int = 0  # number of times the object was put upright
+    # (received, lost) of each subscriber
+    received: list[tuple[int, int]] = field(default_factory=list)
+    recorded: tuple[int, int] = 0, 0  # states in the recorder's files, lost states
     wrong: list[str] = field(default_factory=list)
-    memory: dict[str, list[float]] = field(default_factory=dict)  # MB of each process's own
-    late: array[float] = field(default_factory=lambda: array("f"))  # s, of each state's tick
-    looked: list[tuple[float, int]] = field(default_factory=list)  # time [s], how many late then
+    # MB of private memory of each process.
+    memory: dict[str, list[float]] = field(default_factory=dict)
+    # s, lateness of each state's tick.
+    late: array[float] = field(default_factory=lambda: array("f"))
+    # (time [s], number of `late` values at that time)
+    looked: list[tuple[float, int]] = field(default_factory=list)
 
     def growth(self) -> dict[str, float]:
-        """Return the MB by which each process's memory rose after the first window."""
+        """Return the growth of each process's memory after the first window [MB]."""
         looks = [t for t, _ in self.looked]
         warm = int(np.searchsorted(looks, self.window))
         return {
@@ -82,7 +88,7 @@ class Account:
 
     @property
     def window(self) -> float:
-        """How long the beginning and the end are [s]."""
+        """Length of the beginning and the end [s]."""
         return min(_WINDOW, self.seconds / 3.0)
 
     def lateness(self) -> tuple[float, float]:
@@ -118,7 +124,7 @@ class Account:
 
 
 def soak(seconds: float, seed: int = 1) -> Account:
-    """Run it. Raises RigError when the set-up does not work."""
+    """Run the soak; raise RigError if the set-up does not work."""
     chance = random.Random(seed)
     account = Account()
     with Rig() as rig, ExitStack() as others:
@@ -155,7 +161,7 @@ def soak(seconds: float, seed: int = 1) -> Account:
                     request = _next(chance, mode)
                     if request is not None and rig.ask(request, 5.0)["ok"]:
                         account.done[str(request["command"])] += 1
-                    elif request is not None and mode == "armed":  # a lost board: arm opens it
+                    elif request is not None and mode == "armed":  # arm reopens a lost board
                         rig.ask({"command": "disarm"}, 5.0)
                 if end_fault is not None and now > ends_at:
                     end_fault()
@@ -202,7 +208,7 @@ def _next(chance: random.Random, mode: str) -> dict[str, object] | None:
 
 
 def _teleoperate(rig: Rig, account: Account, chance: random.Random) -> None:
-    """Stream force and angle for a while, as a person's hand moves."""
+    """Stream force and angle for a while, in the way of a teleoperator's hand."""
     force, swing, pace = chance.uniform(4, 10), chance.uniform(0.02, 0.15), chance.uniform(2, 8)
     begin = time.monotonic()
     while (t := time.monotonic() - begin) < _STREAM:
@@ -220,7 +226,7 @@ def _inject(rig: Rig, account: Account, chance: random.Random) -> End:
 
 
 def _listen(rig: Rig, account: Account, seconds: float) -> None:
-    """Take states for so long, and how late their ticks were."""
+    """Receive states for ``seconds`` and record the lateness of their ticks."""
     end = time.monotonic() + seconds
     while (left := end - time.monotonic()) > 0:
         account.late.extend(state["wake_late_s"] for state in rig.states(left))
@@ -228,7 +234,7 @@ def _listen(rig: Rig, account: Account, seconds: float) -> None:
 
 @contextmanager
 def _listeners(rig: Rig, account: Account) -> Iterator[dict[str, int]]:
-    """Run recorder and subscribers; yield each process's name and number."""
+    """Run recorder and subscribers; yield the name and ID of each process."""
     assert rig.daemon is not None
     assert rig.hand is not None
     file = rig.folder / "soak.mcap"
@@ -249,7 +255,7 @@ def _listeners(rig: Rig, account: Account) -> Iterator[dict[str, int]]:
         ]
         for each in subscribers:
             assert each.stdout is not None
-            each.stdout.readline()  # it has a state
+            each.stdout.readline()  # it has received a state
         while not file.exists() or not file.stat().st_size:
             rig.states()
         try:
@@ -301,12 +307,12 @@ def _conclude(account: Account) -> None:
 
 
 def subscribe(address: str) -> None:
-    """Print "ready" with the first state; at the end how many came, and how many were lost."""
+    """Print "ready" at the first state, and at the end the number of received and lost states."""
     received = 0
     with Ending() as ending, Hand(address, timeout=60.0) as hand, hand.stream(1.0) as states:
         ending.begin()
         while not ending.over:
-            with suppress(NoStream):  # a daemon that is gone keeps nobody from ending
+            with suppress(NoStream):  # the daemon may be gone
                 next(states)
                 received += 1
                 if received == 1:

@@ -1,4 +1,4 @@
-"""An emulated hand and its daemon, as users run them, and the faults that a soak gives them."""
+"""Run an emulated hand and its daemon as processes, and inject faults during a soak."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ from softfinger.daemon.simulation.emulator.folder import NoEmulator, send_words
 from softfinger.daemon.wire.schema import STATE
 from softfinger.tools.benchmarks.rigs import HIL, SOFTFINGER, RigError, emulator
 
-_PATIENCE = 300.0  # s for a process to be ready: kernels may be new
+_PATIENCE = 300.0  # s for a process to become ready, including the compilation of kernels
 _STATE_RATE = 250.0  # Hz
-# At the start alone: a busy machine may hold up the emulated hand's first bytes.
+# Only for the start: a busy machine may delay the emulated hand's first bytes.
 _PATIENT = [word for key in ("servos", "tactile") for word in ("--set", f"{key}.open_timeout=60")]
 _POLL = 0.003  # s between two polls of the stream
 _SLACK = 0.05  # s by which a process may be late
-_RESOLUTION = 0.0016  # rad, a count of the servo's
+_RESOLUTION = 0.0016  # rad, one count of the servo's encoder
 _CURRENT_UNIT = 0.0027  # A
-_ROOM = 1 << 18  # bytes that a daemon without memory may still take
+_ROOM = 1 << 18  # bytes that a daemon without memory may still allocate
 
 
 class Rig:
-    """An emulated hand and a daemon on it, two processes, each of which can be started again.
+    """Emulated hand and daemon as two processes that can be restarted.
 
-    What reached the servos is read from the emulated hand's record, never from the daemon.
+    The data sent to the servos are read from the emulated hand's record, never from the daemon.
     """
 
     def __init__(self) -> None:
@@ -57,14 +57,14 @@ class Rig:
         self.config.write_text(head + HIL.read_text(encoding="utf-8"), encoding="utf-8")
         self.settings = load(self.config, self.ports)
         self.context: zmq.Context[Any] = zmq.Context()
-        self._running = contextlib.ExitStack()  # the emulated hand
+        self._running = contextlib.ExitStack()  # context of the emulated hand
         self.hand: subprocess.Popen[str] | None = None
-        self.hand_words: tuple[str, ...] = ()  # of `softfinger emulate`, beside the config
+        self.hand_words: tuple[str, ...] = ()  # additional arguments of `softfinger emulate`
         self.daemon: subprocess.Popen[bytes] | None = None
         self._states: zmq.Socket[bytes] | None = None
 
     def start(self, *words: str) -> None:
-        """Start whatever does not run, the daemon with these ``words`` too. Raises RigError."""
+        """Start stopped processes, the daemon with ``words``; may raise RigError."""
         if self.hand is None or self.hand.poll() is not None:
             self.hand = self._running.enter_context(
                 emulator(self.ports, self.config, *self.hand_words)
@@ -73,7 +73,7 @@ class Rig:
             self.start_daemon(*words)
 
     def start_daemon(self, *more: str) -> None:
-        """Start the daemon, and wait for its first answer. Raises RigError."""
+        """Start the daemon and wait for its first answer; may raise RigError."""
         end = time.monotonic() + _PATIENCE
         words = ["run", "--config", str(self.config), "--dir", str(self.ports), *_PATIENT, *more]
         log = str(self.folder / "daemon.log")
@@ -89,7 +89,7 @@ class Rig:
                 raise RigError(f"the daemon did not start: {self.log()[-1:]}")
 
     def end_daemon(self, number: int = signal.SIGTERM) -> int | None:
-        """Signal the daemon and wait for it; None when it hangs, and had to be killed."""
+        """Signal the daemon and wait for it; return None if it had to be killed."""
         daemon, self.daemon = self.daemon, None
         if daemon is None:
             return 0
@@ -127,7 +127,7 @@ class Rig:
         return self.daemon is not None and self.daemon.poll() is None
 
     def send(self, words: str) -> str:
-        """Send words to the emulated hand's control socket; return its reply. Raises RigError."""
+        """Send words to the emulated hand's control socket; may raise RigError."""
         try:
             reply = send_words(self.ports, words)
         except NoEmulator as error:
@@ -137,16 +137,16 @@ class Rig:
         return reply
 
     def report(self, more: str = "") -> dict[str, Any]:
-        """Return what was on the servos' wire; ``more``: ``forget`` begins again."""
+        """Return the record of the servo bus; ``more``: ``forget`` starts a new record."""
         report: dict[str, Any] = json.loads(self.send(f"report {more}"))
         return report
 
     def ask(self, request: dict[str, Any], timeout: float = 2.0) -> dict[str, Any]:
-        """One command and its reply. Raises NoAnswer."""
+        """Send one command and return its reply; may raise NoAnswer."""
         return send(self.commands, request, timeout)
 
     def status(self, timeout: float = 0.5) -> dict[str, Any] | None:
-        """Return the daemon's status, None when it does not answer."""
+        """Return the daemon's status; None if it does not answer."""
         try:
             status = self.ask({"command": "status"}, timeout)
         except NoAnswer:
@@ -154,7 +154,7 @@ class Rig:
         return status if status["ok"] else None
 
     def states(self, wait: float = _POLL) -> list[dict[str, Any]]:
-        """Return states that came since the last call, none after ``wait`` s without one."""
+        """Return the states received since the last call; wait at most ``wait`` s for one."""
         found: list[dict[str, Any]] = []
         assert self._states is not None
         while self._states.poll(0 if found else int(wait * 1000)):
@@ -162,13 +162,13 @@ class Rig:
         return found
 
 
-# Begins a fault; what it returns ends the fault.
+# Starts a fault and returns a function that ends it.
 End = Callable[[], object]
 Inject = Callable[[Rig, random.Random], End]
 
 
 def _sent(begin: str, end: str = "well", *, places: tuple[Any, ...] = ("",)) -> Inject:
-    """Words for the emulated hand that begin the fault and end it; ``{}`` is one of ``places``."""
+    """Return a fault that sends words to the emulated hand; ``{}`` stands for one of ``places``."""
 
     def inject(rig: Rig, chance: random.Random) -> End:
         place = chance.choice(places)
@@ -186,7 +186,7 @@ def _board(begin: str, end: str = "{}:well") -> Inject:
 
 
 def _stood_still(rig: Rig, chance: random.Random) -> End:
-    """The daemon's process is stopped for 2 s, then goes on."""
+    """Suspend the daemon's process for 2 s."""
     assert rig.daemon is not None
     rig.daemon.send_signal(signal.SIGSTOP)
     timer = threading.Timer(2.0, rig.daemon.send_signal, (signal.SIGCONT,))
@@ -195,7 +195,7 @@ def _stood_still(rig: Rig, chance: random.Random) -> End:
 
 
 def _without_memory(rig: Rig, chance: random.Random) -> End:
-    """The daemon may take next to no address space any more, and is asked meanwhile."""
+    """Limit the daemon's address space to almost its present size, and send requests meanwhile."""
     assert rig.daemon is not None
     process = rig.daemon.pid
     _, hard = resource.prlimit(process, resource.RLIMIT_AS)
@@ -229,10 +229,10 @@ CASES: dict[str, Inject] = {
 
 
 def judge_wire(rig: Rig) -> str:
-    """Return what was wrong on the servos' wire, by the emulated hand's record; or an empty text.
+    """Return an error found in the emulated hand's record of the servo bus, or an empty text.
 
-    No goal may be outside its limits, no torque be without packets or switched on far from its
-    goal.
+    Goals must be within their limits. While torque is on, packets must keep arriving, and torque
+    must not be switched on far from the goal.
     """
     settings = rig.settings
     wrong = ""

@@ -1,13 +1,13 @@
-"""A soak on the virtual clock: random sequences of commands, loads and faults, each from a seed.
+"""Soak on the virtual clock: random sequences of commands, loads and faults, each from a seed.
 
-``python -m tests.soak.virtual`` runs a thousand sequences of 10 s; most of them grip, and are
-loaded, turned, lied to and stopped from there. The daemon is whole but for its sockets. What must
-hold is judged by the plant and by what reaches the servos, never by what the daemon says of itself,
-and it is counted how often each of it was judged: a soak that never came to one of them has failed.
-Tests run a few sequences.
+``python -m tests.soak.virtual`` runs a thousand sequences of 10 s. Most of them grip; from there
+they are loaded, turned, disturbed by faulty measurements and stopped. The daemon is complete except
+for its sockets. Requirements are judged from the plant and from the data sent to the servos, never
+from the daemon's own reports. The number of judgements of each requirement is counted, and a soak
+that never judges one of them fails. The tests run a few sequences.
 
-``--ticks 14400000`` runs one hand for eight hours of its time, with its stream recorded and read:
-it counts what breaks, goes on, and fails when memory grows or a state contradicts itself.
+``--ticks 14400000`` runs one hand for eight hours of its time, with its stream recorded and read.
+It counts violations, continues, and fails if memory grows or a state is inconsistent.
 """
 
 import argparse
@@ -43,30 +43,30 @@ from softfinger.daemon.wire.schema import INPUT, TOPICS
 from softfinger.tools.recordings.record import RecordingWriter
 
 SEQUENCES, TICKS = 1000, 5000
-LONG = 1_000_000  # ticks from which on one sequence is a long one
-HELD = 0.3  # of the sequences, at least, must come to hold
+LONG = 1_000_000  # ticks from which a sequence counts as long
+HELD = 0.3  # fraction of the sequences that must reach a hold
 _GRIPPING = ("grasping", "holding", "rotating")
-_COMMAND_EVERY = 150  # ticks between two commands, in the mean
-_DISTURBED_EVERY = 800  # ticks between two loads or faults, likewise
+_COMMAND_EVERY = 150  # ticks between two commands on average
+_DISTURBED_EVERY = 800  # ticks between two loads or faults on average
 _DISTURBED_FOR = 500
-_WILD = 0.1  # of the commands are of any kind, whatever the hand does
-_LOOKS = 96  # at the memory, in a long sequence
-_WARM = 2  # of them pass before it counts: ten minutes of eight hours
-_FLAT = 2.0  # MB by which it may grow from there
-_STREAM = {"state_rate": 20.0, "tactile_rate": 10.0}  # Hz, of a long sequence
-_SPLIT = 16e6  # bytes of its recording's files
-# deaf: all that is written gets lost, and readings come.
-# jumped: the angle is 0.2 rad off. numb: angle, velocity and current stand still.
+_WILD = 0.1  # fraction of the commands that are drawn regardless of the mode
+_LOOKS = 96  # memory checks in a long sequence
+_WARM = 2  # memory checks during the warm-up: ten minutes of eight hours
+_FLAT = 2.0  # MB by which memory may grow after the warm-up
+_STREAM = {"state_rate": 20.0, "tactile_rate": 10.0}  # Hz, in a long sequence
+_SPLIT = 16e6  # bytes per file of its recording
+# In "deaf", written data are lost but readings arrive. In "jumped", the angle is off by 0.2 rad.
+# In "numb", angle, velocity and current stay constant.
 SERVO_FAULTS = (
     *("silent", "gone", "deaf", "alert", "hot", "low", "fast", "stuck", "strayed"),
     *("jumped", "numb"),
 )
-_ENCODER = ("fast", "strayed", "jumped", "numb")  # the frames disagree with the joint, too
-_UNHEARD = ("silent", "gone", "deaf")  # no servo hears that torque shall be off
-_WATCHDOG = 100  # ticks, 0.2 s, within which the servos' watchdogs then stop them
-_LOST = 20  # goals in a row that get lost and are noticed
+_ENCODER = ("fast", "strayed", "jumped", "numb")  # the frames also disagree with the joint
+_UNHEARD = ("silent", "gone", "deaf")  # the servo does not receive torque off
+_WATCHDOG = 100  # ticks (0.2 s) within which the servo watchdogs then stop the motors
+_LOST = 20  # consecutive lost goals that are noticed
 SENSOR_FAULTS = ("no frames", "frozen", "full", "zero", "noise", "invalid")
-# What a sensor or a servo's current reads wrongly: between which values, and what may be named.
+# Faulty measurements of a sensor or a servo's current: range of values, channel that may be named.
 LIES = {
     "gain": ((0.5, 1.6), "sensor"),
     "shift-x": ((-4.0, 4.0), "sensor"),
@@ -77,14 +77,14 @@ LIES = {
     "current": ((0.4, 2.5), "current"),
 }
 LOADS = ("push", "twist")
-_TOO_LONG = 0.05  # s that a tip's force may be above its bound
-_TOO_MUCH = 1.3  # of the force asked for, where nothing called for more
-_UNSURE = 1.2  # of what a grip may be raised to, and tips that bear a load differ
-_REMEMBERED = 5.0  # s after a load in which a grip may still be raised, or has been by a lie
-_RETARGETED = 0.5  # s in which a force that was asked for before may still be there
-_UNCOVERED = 1.0  # s after which a tip that came to the object's edge no longer counts
+_TOO_LONG = 0.05  # s for which a tip's force may exceed its bound
+_TOO_MUCH = 1.3  # ratio to the requested force without a reason for more
+_UNSURE = 1.2  # ratio to the highest raised force, because tips that carry a load differ
+_REMEMBERED = 5.0  # s after a load or a faulty measurement in which a grip may still be raised
+_RETARGETED = 0.5  # s in which the force of the previous request may persist
+_UNCOVERED = 1.0  # s after which a tip near the object's edge no longer counts
 
-# What must hold, and is counted.
+# Requirements, each of which is counted.
 STOPPED = {mode: f"no torque after a stop while {mode}" for mode in ("holding", "rotating")}
 OFF = "no torque after disarm or fault"
 WATCHDOG = "no torque 0.2 s after a stop that no servo hears"
@@ -106,9 +106,9 @@ ASSERTIONS = (
 
 
 class Judge:
-    """What must hold, and how often each of it was judged.
+    """Check requirements and count how often each was checked.
 
-    Where ``broken`` is given, what does not hold is counted there.
+    If ``broken`` is given, violations are counted there instead of raised.
     """
 
     def __init__(self, judged: Counter[str], broken: Counter[str] | None = None) -> None:
@@ -116,7 +116,7 @@ class Judge:
         self._broken = broken
 
     def __call__(self, name: str, holds: bool, *found: object) -> None:
-        """Count ``name``. Raises AssertionError with what was found where it does not hold."""
+        """Count ``name``; if it does not hold, raise AssertionError with ``found``."""
         self._judged[name] += 1
         if not holds and self._broken is not None:
             self._broken[name] += 1
@@ -125,7 +125,7 @@ class Judge:
 
 
 class Listener(Link):
-    """In the gateway's place: reads and records all that is published."""
+    """Replacement for the gateway that reads and records all published messages."""
 
     def __init__(self, folder: Path) -> None:
         super().__init__()
@@ -156,7 +156,7 @@ class Listener(Link):
 
 
 class FaultyServos:
-    """Servos that fail on demand, and a judge of all that is sent to them."""
+    """Servos that fail on demand and check all data sent to them."""
 
     def __init__(self, servos: Any, settings: Settings, clock: Any, must: Judge) -> None:
         self._servos = servos
@@ -169,8 +169,8 @@ class FaultyServos:
         self.finger = 0
         self.last_good = -math.inf
         self.torque = False
-        self.armed = False  # it was, and nothing has ended that
-        self._last = 0.0  # angle at which a numb joint stands [rad]
+        self.armed = False  # armed, and no event has ended this state
+        self._last = 0.0  # angle of a joint that is numb [rad]
         self._unheard = 0
 
     def connect(self) -> None:
@@ -260,7 +260,7 @@ class FaultyServos:
 
 
 class FaultySensor:
-    """A sensor whose frames stop, freeze or go wrong on demand."""
+    """Sensor whose frames stop, freeze or become faulty on demand."""
 
     def __init__(self, sensor: Any, settings: Settings, source: np.random.Generator) -> None:
         self._sensor = sensor
@@ -269,7 +269,7 @@ class FaultySensor:
         self._given: Frame | None = None
         self._seen: Frame | None = None
         self.fault = ""
-        self.last_sent = 0.0  # arrival of the last frame that a sound sensor gave [s]
+        self.last_sent = 0.0  # arrival of the last valid frame of a sensor without fault [s]
 
     def open(self) -> None:
         self._sensor.open()
@@ -308,36 +308,36 @@ class FaultySensor:
 
 @dataclass
 class Account:
-    """What sequences went through."""
+    """Results of the sequences."""
 
     sequences: int = 0
-    held: int = 0  # of them
+    held: int = 0  # sequences that reached a hold
     ticks: int = 0
-    seconds: float = 0.0  # that it took
+    seconds: float = 0.0  # run time
     judged: Counter[str] = field(default_factory=Counter)
-    modes: Counter[str] = field(default_factory=Counter)  # ticks in each
-    faults: Counter[str] = field(default_factory=Counter)  # latched, by name
+    modes: Counter[str] = field(default_factory=Counter)  # ticks in each mode
+    faults: Counter[str] = field(default_factory=Counter)  # latched faults by name
     injected: Counter[str] = field(default_factory=Counter)
-    named: Counter[str] = field(default_factory=Counter)  # what was wrong, and what was named then
-    commands: Counter[str] = field(default_factory=Counter)  # carried out
+    named: Counter[str] = field(default_factory=Counter)  # named channel, with the actual fault
+    commands: Counter[str] = field(default_factory=Counter)  # accepted commands
     refused: int = 0
     failures: list[str] = field(default_factory=list)
-    broken: Counter[str] = field(default_factory=Counter)  # in a long sequence, in ticks
-    published: tuple[int, int] = 0, 0  # messages of a long sequence, and lost
-    memory: list[float] = field(default_factory=list)  # MB, resident, since warm
+    broken: Counter[str] = field(default_factory=Counter)  # violations in a long sequence, in ticks
+    published: tuple[int, int] = 0, 0  # messages of a long sequence: published, lost
+    memory: list[float] = field(default_factory=list)  # resident memory after the warm-up, MB
 
     @property
     def growth(self) -> float:
-        """How much memory rose at most after the warm-up [MB]."""
+        """Largest growth of memory after the warm-up [MB]."""
         return max(self.memory) - self.memory[0] if self.memory else 0.0
 
     @property
     def never(self) -> list[str]:
-        """What was never judged."""
+        """Requirements that were never checked."""
         return [name for name in ASSERTIONS if not self.judged[name]]
 
     def lines(self) -> list[str]:
-        """For people."""
+        """Return a report for people."""
         return [
             *(f"{self.judged[name]:>10}  {name}" for name in ASSERTIONS),
             f"{self.held} of {self.sequences} sequences came to hold; {self.ticks} ticks in "
@@ -362,7 +362,7 @@ class Account:
 
 
 class Soak:
-    """One sequence: a daemon on the virtual clock, what is done to it, and what must hold."""
+    """One sequence: a daemon on the virtual clock, random actions and requirements."""
 
     def __init__(
         self, seed: int = 1, account: Account | None = None, listener: Listener | None = None
@@ -396,7 +396,7 @@ class Soak:
             )
             loop.publish_truth(self.hand)
         self.hand.plant.parameters.torque_constant *= chance.uniform(0.9, 1.1)
-        self.count = 0  # ticks
+        self.count = 0  # ticks so far
         self.held = False
         self.off_by = math.inf  # tick by which torque must be off
         self._off_name = OFF
@@ -405,18 +405,20 @@ class Soak:
         self._next_command = 1
         self._next_disturbance = self._after(_DISTURBED_EVERY)
         self._well_at = math.inf  # tick at which a disturbance ends
-        self._lie = ""  # kind of the measurement that is wrong now
-        self._false: set[str] = set()  # what was wrong, and may be named
+        self._lie = ""  # kind of the current faulty measurement
+        self._false: set[str] = set()  # channels that have been faulty and may be named
         self._loaded = 0.0  # N along the faces
-        self._loaded_t = self._lied_t = self._uncovered_t = -math.inf  # s, when last so
-        self._asked: list[tuple[float, float]] = []  # when [s], force [N]; none without a grip
-        self._above = {MOST: math.inf, CALM: math.inf}  # since when [s]
+        # s, last times of these states
+        self._loaded_t = self._lied_t = self._uncovered_t = -math.inf
+        self._asked: list[tuple[float, float]] = []  # (time [s], force [N]); empty without a grip
+        # Start of the current period above the bound [s].
+        self._above = {MOST: math.inf, CALM: math.inf}
 
     def close(self) -> None:
         self.daemon.close()
 
     def run(self, ticks: int) -> Account:
-        """Go on for so many ticks."""
+        """Advance by ``ticks``."""
         loop, clock = self.daemon.loop, self.daemon.clock
         for _ in range(ticks):
             self.count += 1
@@ -439,10 +441,10 @@ class Soak:
         return 1 + int(self._random.expovariate(1.0 / mean))
 
     def _may_be_disturbed(self) -> bool:
-        """While it holds; also at other times, but seldom."""
+        """Return True while holding, and occasionally in other modes."""
         return self.daemon.loop.state.mode == "holding" or self._random.random() < 1e-3
 
-    # What is done to it
+    # Actions
 
     def _command(self) -> None:
         chance, state = self._random, self.daemon.loop.state
@@ -477,7 +479,7 @@ class Soak:
             self._carried_out(request, str(mode))
 
     def _carried_out(self, request: dict[str, Any], mode: str) -> None:
-        """Keep what follows of a command that was accepted."""
+        """Record the consequences of an accepted command."""
         name = request["command"]
         if name == "arm":
             self.servos.armed, self.off_by = True, math.inf
@@ -486,14 +488,14 @@ class Soak:
         if name == "grasp" or (name == "hold" and ("force" in request or mode not in _GRIPPING)):
             force = request.get("force", self.settings.control.force_default)
             t = self.daemon.clock.now()
-            if not self._asked:  # a motion may have pressed more
+            if not self._asked:  # a motion may have pressed harder
                 self._asked.append((t, max(self.hand.force.tolist())))
             self._asked.append((t, force))
         elif name in ("arm", "move", "release", "stop", "disarm"):
             self._asked.clear()
 
     def _must_end(self, name: str) -> None:
-        """From now on no motor may be driven, and no goal sent."""
+        """Require that motors are off from now on and that goals are no longer sent."""
         if not self.servos.armed:
             return
         self.servos.armed = False
@@ -515,7 +517,7 @@ class Soak:
         return chance.uniform(low, high)
 
     def _disturb(self) -> None:
-        """A load, a false measurement, a servo's or a sensor's fault."""
+        """Start a load, a faulty measurement, or a fault of a servo or a sensor."""
         self._mend()
         chance, t = self._random, self.daemon.clock.now()
         self._well_at = self.count + self._after(_DISTURBED_FOR)
@@ -543,7 +545,7 @@ class Soak:
         self.account.injected[kind] += 1
 
     def _load(self, kind: str) -> None:
-        """Up to what the grip bears, and in some cases more."""
+        """Apply a load up to the limit of the grip, and in some cases above it."""
         chance, friction = self._random, self.settings.simulation.tip_friction
         force = self._asked[-1][1] if self._asked else 5.0
         share = chance.uniform(-0.7, 0.7) if chance.random() < 0.8 else chance.uniform(-1.6, 1.6)
@@ -562,7 +564,7 @@ class Soak:
         self.hand.load()
 
     def _put_object_back(self) -> None:
-        """Where loads have carried it off, and the fingers leave room for it at its place."""
+        """Put the object back if loads have moved it and the fingers leave room at its place."""
         hand, (x, y) = self.hand, self.settings.simulation.object_position
         pose = hand.object_pose.copy()
         if hand.force.any() or (math.dist(pose[:2], (x, y)) < 0.003 and abs(pose[2]) < 0.03):
@@ -572,7 +574,7 @@ class Soak:
             hand.object_pose[:] = pose
             hand.refresh()
 
-    # What must hold
+    # Requirements
 
     def _hear(self, level: str, kind: str, _: str) -> None:
         if kind.startswith("witness.") and level != "info":
@@ -627,14 +629,14 @@ class Soak:
             self.must(FRAME, age <= most + 1e-9, f"{mode} on one {age:.3f} s old")
 
     def _judge_forces(self, t: float) -> None:
-        """By the plant's own forces: none above its bound for long."""
+        """Check that no force of the plant exceeds its bound for long."""
         control, most = self.settings.control, self.settings.safety.force_max
         if self._loaded:
             self._loaded_t = t
         if self._lie or any(sensor.fault for sensor in self.sensors):
             self._lied_t = t
         force = max(self.hand.force.tolist())
-        # What is felt may be as far off as the torque constant, by which it is known.
+        # The measured force has the relative error of the torque constant.
         self._must_end_soon(MOST, MOST, force, (1.0 + control.torque_error) * most, t)
         while len(self._asked) > 1 and self._asked[1][0] < t - _RETARGETED:
             del self._asked[0]
@@ -648,7 +650,7 @@ class Soak:
         bound = _TOO_MUCH * asked
         if loaded:
             bound = max(bound, _UNSURE * min(raised, GRIP_FRACTION * most))
-        bound += 2.0 * friction  # that is given, and that holds
+        bound += 2.0 * friction  # once for its compensation, once for holding
         lied = t < self._lied_t + _REMEMBERED
         name = RAISED if loaded else LIED if lied else CALM
         self._must_end_soon(CALM, name, force, bound, t)
@@ -671,7 +673,7 @@ class Soak:
             self.must(LOADED if self._loaded else HONEST[mode], True)
 
     def _doubts(self, held: bool) -> Iterator[str]:
-        """What the perception's own state holds for false."""
+        """Yield the channels that the estimator currently treats as faulty."""
         perception = self.daemon.loop.perception
         found = perception.filter.grasp
         for sensor in perception.fingers:
@@ -686,7 +688,7 @@ class Soak:
                 yield f"{side}_current"
 
     def _names(self, name: str) -> None:
-        """A witness is held for false: it must be one that is, or the object has slipped away."""
+        """Check that a channel named as faulty is faulty, unless the object has slipped away."""
         t = self.daemon.loop.state.t
         wrong = self._lie or self.servos.fault or "".join(each.fault for each in self.sensors)
         self.account.named[f"{name} ({wrong or ('load' if self._loaded else 'nothing')})"] += 1
@@ -697,7 +699,7 @@ class Soak:
             )
 
     def _covered(self) -> bool:
-        """Whether the object's faces lie under both tips' whole footprints, by the plant."""
+        """Return True if, in the plant, the object's faces cover the footprints of both tips."""
         hand, simulation = self.hand, self.settings.simulation
         x, y, angle = hand.object_pose.tolist()
         sine, cosine, radius = math.sin(angle), math.cos(angle), self.settings.tip.radius
@@ -711,14 +713,14 @@ class Soak:
 
 
 def resident() -> float:
-    """This process's resident memory without what the collector could free at once [MB]."""
+    """Return this process's resident memory after garbage collection [MB]."""
     gc.collect()
     pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
 def sequence(seed: int, ticks: int, account: Account) -> None:
-    """Run the sequence of ``seed``; what must not be is kept in the account."""
+    """Run the sequence of ``seed`` and add violations to the account."""
     soak = Soak(seed, account)
     try:
         soak.run(ticks)
@@ -731,7 +733,7 @@ def sequence(seed: int, ticks: int, account: Account) -> None:
 
 
 def long_sequence(seed: int, ticks: int, account: Account) -> None:
-    """Run one hand for long, its stream listened to; look at the memory meanwhile."""
+    """Run one hand for a long time with a listener, and check the memory meanwhile."""
     with tempfile.TemporaryDirectory() as folder:
         listener = Listener(Path(folder))
         soak = Soak(seed, account, listener)
@@ -759,11 +761,12 @@ def main() -> int:
     else:
         for seed in range(arguments.seed, arguments.seed + arguments.sequences):
             sequence(seed, arguments.ticks, account)
-            gc.collect()  # each daemon refers to itself, with megabytes of frames
+            gc.collect()  # a daemon has reference cycles that hold megabytes of frames
     account.seconds = time.monotonic() - begin
     print("\n".join(account.lines()))
     few = account.held < HELD * account.sequences
-    broken = account.failures or account.broken[STATE]  # in a long one, of forces a few may
+    # A long sequence may contain a few violations of forces.
+    broken = account.failures or account.broken[STATE]
     return 1 if broken or account.never or few or account.growth > _FLAT else 0
 
 

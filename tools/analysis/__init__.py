@@ -1,4 +1,4 @@
-"""`analyse` and `plot`: recorded frames to contacts, and recordings beside the contact model.
+"""Analysis of recordings: `analyse` computes contacts from frames, `plot` compares with the model.
 
-The estimate is the daemon's own.
+Both use the daemon's estimator.
 """

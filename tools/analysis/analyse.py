@@ -1,8 +1,9 @@
-"""``softfinger analyse FILE``: d, θ, force and energy over time from recorded pressure frames.
+"""Run ``softfinger analyse FILE``: compute d, θ, force and energy over time from frames.
 
-By the daemon's own perception. A recording of the stream (.mcap) has its own settings and
-calibrations. A file of frames alone (.npz, .npy or a folder of these, a Tekscan-style export) is
-the profile's left sensor, with its own number of cells, and its own pitch where the file has it.
+The frames are processed by the daemon's perception code. A recording of the stream (.mcap) contains
+its own settings and calibrations. A file with frames only (.npz, .npy, a folder of these, or a
+Tekscan-style export) is treated as the profile's left sensor; it determines the number of cells,
+and the pitch if the file contains it.
 """
 
 from __future__ import annotations
@@ -39,25 +40,25 @@ if TYPE_CHECKING:
     from softfinger.daemon.perception.finger_model import FingerModel
 
 _EPILOG = """\
-FILE is a recording (.mcap), .npz with frames [n, rows, cols] and t, .npy frames or a folder of
-them, or a Tekscan-style ASCII export. A recording has its settings in it. For the others, name a
-profile by --config, or what the file doesn't have, for instance
+FILE is a recording (.mcap), .npz with frames [n, rows, cols] and t, .npy frames, a folder of these,
+or a Tekscan-style ASCII export. A recording contains its settings. For the other files, select a
+profile with --config, or set the missing values, for example
   --set tip.radius=0.02 --set tactile.pitch=0.0013 --set tactile.pascal_per_count=4
   --set tactile.noise=500 --set material.law=constant --set material.modulus=3e5
-Writes FILE.contacts.csv beside it, which PlotJuggler draws. Several files are analysed side by
-side, one on each processor."""
+The results are written to FILE.contacts.csv in the same folder, which PlotJuggler can draw. Several
+files are analysed in parallel, one on each processor."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
     parser.add_argument("files", type=Path, nargs="+", metavar="FILE")
     add_profile(parser)
-    parser.add_argument("--csv", type=Path, metavar="OUT", help="where to write the numbers")
+    parser.add_argument("--csv", type=Path, metavar="OUT", help="write the results to this file")
     add_sweep(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Analyse and write. Raises SoftfingerError or OSError where there is one file."""
+    """Analyse and write the results; for a single file, may raise SoftfingerError or OSError."""
     settings, files = profile(arguments), arguments.files
     if len(files) == 1:
         print(_analysed(arguments, settings, files[0]), end="")
@@ -76,7 +77,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _one_of_many(arguments: argparse.Namespace, settings: Settings, path: Path) -> tuple[str, str]:
-    """Analyse one, and return what is printed and what is wrong with it, which ends no other."""
+    """Analyse one of several files; return the text to print and the error, if any."""
     try:
         return _analysed(arguments, settings, path), ""
     except (SoftfingerError, OSError) as error:
@@ -111,7 +112,7 @@ _EIGHT_BITS = 255
 
 
 def _silence(recording: FrameRecording, tactile: TactileSettings) -> str:
-    """Return a line on frames without any contact: largest reading, threshold, likely cause."""
+    """Explain frames without any contact: largest reading, threshold and likely cause."""
     from softfinger.kinematics.estimation.estimator import PEAK_LEVEL
 
     scale = tactile.pascal_per_count if recording.whole else 1.0
@@ -154,9 +155,9 @@ OnProgress = Callable[[int], None]
 class Source:
     """Frames of the sensors in one file: ``frames(progress)`` yields (finger, t [s], counts).
 
-    Kernels are loaded where ``models`` is called, not for a file that can't be read.
-    ``t`` counts from the first frame; ``total`` is the end of ``progress``. A file of frames alone
-    is ``recording``.
+    ``t`` counts from the first frame; ``total`` is the final value of ``progress``. ``recording``
+    is set for a file with frames only. Kernels are loaded when ``models`` is called, so that an
+    unreadable file fails quickly.
     """
 
     settings: Settings
@@ -168,16 +169,24 @@ class Source:
 
     @property
     def truths(self) -> dict[str, NDArray[np.float64]]:
-        """The true contact at each frame, by name, where a file of one sensor has it."""
+        """True contact at each frame, by name, if a file of one sensor contains it."""
         return {} if self.recording is None else self.recording.truths
 
 
 def open_source(path: Path, settings: Settings, own: bool) -> Source:
     """Open a file of frames.
 
-    With ``own`` a recording of the stream uses the settings it was made with, else ``settings``;
-    frames alone need ``settings``, and have their shape unless the file tells its pitch itself.
-    Raises RecordingError with the file's name, and SettingsError or TactileError.
+    Parameters
+    ----------
+    own
+        For a recording of the stream, use its own settings instead of ``settings``. A file with
+        frames only always needs ``settings``, and has their pitch unless it contains one.
+
+    Raises
+    ------
+    RecordingError
+        With the file's name.
+    SettingsError, TactileError
     """
     if path.suffix == ".mcap":
         return _stream(path, settings, own)
@@ -248,7 +257,7 @@ def _models_of(settings: Settings) -> tuple[FingerModel, FingerModel]:
     return make_models(settings)
 
 
-# The contact's fields and their units; the CSV's header says name_unit.
+# Fields of a contact and their units; the CSV header has the form name_unit.
 COLUMNS = (
     ("d", "m"),
     ("d_std", "m"),
@@ -263,27 +272,27 @@ COLUMNS = (
 
 @dataclass(frozen=True)
 class Contacts:
-    """One sensor's contacts, a row a frame. ``values`` by the names in COLUMNS, SI units."""
+    """Contacts of one sensor, a row per frame; ``values`` by the names in COLUMNS, in SI units."""
 
     finger: str
     t: FloatArray
-    invalid: NDArray[np.int64]  # an `Invalid` each
+    invalid: NDArray[np.int64]  # an `Invalid` per frame
     contact: NDArray[np.bool_]
     values: dict[str, FloatArray]
     truths: dict[str, FloatArray]
 
     @property
     def valid(self) -> NDArray[np.bool_]:
-        """Frames whose estimate can be used."""
+        """Frames with a valid estimate."""
         return np.equal(self.invalid, Invalid.NONE)
 
     def reasons(self) -> Counter[str]:
-        """Count the reasons for which frames can't be used."""
+        """Count the reasons for invalid frames."""
         return Counter(REASONS[k].text for k in self.invalid[~self.valid])
 
 
 class _Pass:
-    """One sensor's perception and its rows."""
+    """Perception of one sensor and the rows computed so far."""
 
     def __init__(
         self, source: Source, models: tuple[FingerModel, FingerModel], finger: int
@@ -314,7 +323,7 @@ class _Pass:
 
 
 def analyse(source: Source, progress: OnProgress) -> list[Contacts]:
-    """Return the contacts of each sensor. Raises what the source's frames raise."""
+    """Return the contacts of each sensor; may raise the errors of the source's frames."""
     models = source.models()
     passes = {finger: _Pass(source, models, finger) for finger in source.fingers}
     for finger, t, counts in source.frames(progress):
@@ -323,7 +332,12 @@ def analyse(source: Source, progress: OnProgress) -> list[Contacts]:
 
 
 def write_csv(path: Path, contacts: list[Contacts]) -> None:
-    """Write one line a frame, sensors one after the other; names with units. Raises OSError."""
+    """Write one line per frame, one sensor after the other, with units in the header.
+
+    Raises
+    ------
+    OSError
+    """
     names = [f"{name}_{unit}" if unit else name for name, unit in COLUMNS]
     truths = sorted({name for each in contacts for name in each.truths})
     units = dict(COLUMNS)

@@ -1,8 +1,8 @@
-"""``softfinger plot FILE.mcap``: a recording beside the contact model, over θ and on its landscape.
+"""Run ``softfinger plot FILE.mcap``: compare a recording with the model over θ and in U(d, θ).
 
-The model is that of the recording's own settings and calibrations; force and energy are those of
-the state: the model times the scale of the tip's modulus that grips have found. What is drawn over
-time is left to programs that open the file, Foxglove and PlotJuggler.
+The model uses the recording's own settings and calibrations. Force and energy are those of the
+recorded states, which include the modulus factor estimated from grips. For plots over time, open
+the file in Foxglove or PlotJuggler.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ if TYPE_CHECKING:
 
 _EPILOG = """\
 pages:
-  angle      force and energy against θ beside the model's curves
-  landscape  the path over U(d, θ) with its local minimum
+  angle      force and energy against θ, with the model's curves
+  landscape  the path over U(d, θ), with its local minimum
 
-Needs the extra 'plot'. Foxglove and PlotJuggler open the file too, and draw any field over time."""
+Needs the extra 'plot'. To draw any field over time, open the file in Foxglove or PlotJuggler."""
 
 
 FloatArray = NDArray[np.float64]
@@ -51,9 +51,9 @@ LINES: dict[str, dict[str, Any]] = {
     "left": {"color": style.KINDS[0], "linestyle": "-"},
     "right": {"color": style.KINDS[1], "linestyle": (0, (5, 1.5))},
 }
-_POINTS = 700  # of each finger in one panel; more hide each other
+_POINTS = 700  # points per finger and panel; more points would hide each other
 _CURVES = 5
-_GRID = 241  # of the landscape along each axis
+_GRID = 241  # nodes of the landscape along each axis
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -67,17 +67,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         choices=("png", "svg", "pdf"),
         default=["png"],
-        help="of the files (default: png)",
+        help="format of the files (default: png)",
     )
     add_range(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Draw. Raises RecordingError, Missing, MissingExtra or OSError."""
+    """Draw the figures; may raise RecordingError, Missing, MissingExtra or OSError."""
     require("plot")  # before a long recording is read
     path: Path = arguments.file
     folder = arguments.out or path.with_name(path.name + ".plots")
-    recording = Recording(path, to_stderr("plot"))  # what is none is refused before kernels load
+    # This fails for other files before kernels are loaded.
+    recording = Recording(path, to_stderr("plot"))
     from softfinger.daemon.loop.warm_up import FRAMES
     from softfinger.tools.processes.compile import build_kernels, print_event
 
@@ -95,14 +96,14 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 class Missing(SoftfingerError):
-    """The recording lacks what a picture needs. The message says what."""
+    """The recording lacks data for a figure; the message names them."""
 
 
 @dataclass(frozen=True)
 class RecordedRun:
-    """A recording, or a part of it. SI units; ``t`` counts from the recording's first message.
+    """A recording or a part of it, in SI units; ``t`` counts from the recording's first message.
 
-    ``states`` is one array a field, by the names of the stream, nested ones with a dot.
+    ``states`` has one array per field, with the names of the stream; nested names contain a dot.
     """
 
     name: str
@@ -113,7 +114,7 @@ class RecordedRun:
 
     @cached_property
     def t(self) -> FloatArray:
-        """Time of each state [s], by the daemon's monotonic clock."""
+        """Time of each state [s], from the daemon's monotonic clock."""
         mono, wall = self.states["mono_ns"], self.states["timestamp"]
         if not mono.size:
             return mono
@@ -122,16 +123,16 @@ class RecordedRun:
 
     @cached_property
     def fingers(self) -> tuple[str, ...]:
-        """The fingers that took part."""
+        """The fingers in the recording."""
         return tuple(name for name in FINGERS if self.states[f"{name}.valid"].any())
 
     def touching(self, finger: str) -> NDArray[np.bool_]:
-        """Return where the finger's state is valid and in contact."""
+        """Return a mask of the states in which the finger is valid and in contact."""
         of = {name: self.states[f"{finger}.{name}"] for name in ("valid", "contact", "d")}
         return np.asarray(of["valid"] & of["contact"] & np.isfinite(of["d"]))
 
     def contacts(self) -> dict[str, ContactTable]:
-        """Return the table of each finger that ever touched. Raises Missing without any."""
+        """Return the contact table of each finger that touched; raise Missing if no finger did."""
         if not self.t.size:
             raise Missing("no hand/state in it")
         touched = [name for name in self.fingers if self.touching(name).any()]
@@ -148,7 +149,7 @@ def load_run(
     end: float,
     progress: Callable[[int], None] | None = None,
 ) -> RecordedRun:
-    """Read what pictures need from ``start`` to ``end`` s. Raises RecordingError."""
+    """Read the data for the figures from ``start`` to ``end`` [s]; may raise RecordingError."""
     messages = recording.messages([schema.STATE], start, end, progress)
     record = schema.TOPICS[schema.STATE].record
     states = to_columns([read(record, message) for _, message in messages])
@@ -170,7 +171,7 @@ def _titled(figure: Figure, run: RecordedRun, text: str) -> None:
 
 
 def draw_angle(run: RecordedRun) -> Figure:
-    """Draw F and U against θ on curves at fixed d, and measured over modelled pressure."""
+    """Draw F and U against θ with curves of constant d, and measured over modelled pressure."""
     tables = run.contacts()
     rows = len(tables)
     figure = style.new_figure(7.2, 1.9 + 3.0 * rows)
@@ -206,12 +207,13 @@ def draw_angle(run: RecordedRun) -> Figure:
 def _against_angle(
     panel: Axes, seen: dict[str, FloatArray], table: ContactTable, field: str, factor: float
 ) -> Any:
-    """Points coloured by d over the model's curves; returns the colour bar's mappable."""
+    """Draw points coloured by d over the model's curves; return the mappable for the colour bar."""
     from matplotlib.colors import Normalize
 
     depths = _depths(seen["d"])
     widest = max(1.1 * float(np.abs(seen["theta"]).max()), 5.0 / DEGREES)
-    scale = Normalize(0.0, depths[-1] * 1e3 / 0.85)  # the yellow end is too faint in print
+    # The yellow end of the colour map is too faint in print.
+    scale = Normalize(0.0, depths[-1] * 1e3 / 0.85)
     for depth in depths:
         limit = float(table.tip.theta_limit(depth))
         tilt = np.linspace(-min(widest, limit), min(widest, limit), 181)
@@ -231,7 +233,7 @@ def _against_angle(
 
 
 def _depths(d: FloatArray) -> FloatArray:
-    """A few round displacements [m] that span the measured ones, at least one."""
+    """Return round displacements [m] that span the measured ones, at least one."""
     from matplotlib.ticker import MaxNLocator
 
     largest = max(float(np.quantile(d, 0.995)), 2e-4) * 1e3
@@ -239,7 +241,7 @@ def _depths(d: FloatArray) -> FloatArray:
 
 
 def draw_landscape(run: RecordedRun) -> Figure:
-    """Return paths over U(d, θ) with its minimum over θ, and their height above θ = 0 over time."""
+    """Draw paths on U(d, θ) with its minimum over θ, and their height above θ = 0 over time."""
     tables = run.contacts()
     figure = style.new_figure(7.0, 2.2 + 4.0 * len(tables))
     panels = figure.subplots(len(tables) + 1, 1, height_ratios=[*[1.0] * len(tables), 0.4])
@@ -269,7 +271,7 @@ def draw_landscape(run: RecordedRun) -> Figure:
 
 
 def draw_map(panel: Axes, table: ContactTable, deepest: float, widest: float) -> None:
-    """Draw U(d, θ) [mJ] to ``deepest`` [m] and ±``widest`` [rad], its minimum over θ."""
+    """Draw U(d, θ) [mJ] up to ``deepest`` [m] and ±``widest`` [rad], with its minimum over θ."""
     from matplotlib.colors import PowerNorm
 
     d = np.linspace(0.0, deepest, _GRID)[1:]
@@ -290,10 +292,12 @@ def draw_map(panel: Axes, table: ContactTable, deepest: float, widest: float) ->
     lines = panel.contour(
         theta * DEGREES, d * 1e3, energy, levels[1:-1], colors=style.GREY, linewidths=0.5
     )
-    low = [level for level in levels[1:-1] if level < 0.65 * largest]  # others run out of the frame
+    # Labels of higher levels would leave the frame.
+    low = [level for level in levels[1:-1] if level < 0.65 * largest]
     panel.clabel(lines, low, fmt=lambda level: f"{level:.3g} mJ", fontsize=6.5)
     minima = theta[np.argmin(energy, axis=1)]
-    local = np.abs(minima) < 0.99 * widest  # a bonded solid tip's energy falls to the sides
+    # The energy of a bonded solid tip falls towards the sides.
+    local = np.abs(minima) < 0.99 * widest
     if local.any():
         panel.plot(
             np.where(local, minima, np.nan) * DEGREES,

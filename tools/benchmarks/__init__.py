@@ -1,4 +1,4 @@
-"""``softfinger bench``: one module for each thing it measures, and what they share.
+"""The command ``softfinger bench``: one module for each measurement, and shared modules.
 
-`measuring`, `rigs` and `virtual_grip` know no single measurement.
+The shared modules are `measuring`, `rigs` and `virtual_grip`.
 """

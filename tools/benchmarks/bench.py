@@ -1,4 +1,4 @@
-"""``softfinger bench``: run time of this very machine, printed as tables and kept as JSON."""
+"""Run ``softfinger bench``: measure this machine, print tables and write JSON."""
 
 from __future__ import annotations
 
@@ -24,18 +24,19 @@ if TYPE_CHECKING:
 MEASUREMENTS = {
     "estimator": "lookup of force and energy, pressure grid to d and tilt: run time and error",
     "tick": "the tick back to back, in place and over ptys",
-    "control": "what each grip law leaves of an object's angle",
-    "reflex": "greater loads on a grip that bears one: held or lost, slid, answered",
-    "witnesses": "false measurements, and the true force of a grip on them, a quarter of an hour",
-    "robustness": "hands that are not as their settings say, and the true force of their grips",
+    "control": "error of an object's angle that remains with each grip law",
+    "reflex": "sudden larger loads on a grip: held or lost, slide, reaction time",
+    "witnesses": "true force of grips with faulty measurements, a quarter of an hour",
+    "robustness": "true force of grips by hands that differ from their settings",
 }
-# On virtual time, which others on the machine don't disturb.
+# These run on virtual time, so other load on the machine does not affect them.
 SWEPT = ("reflex", "witnesses", "robustness")
 PAGE = ("estimator", "tick")
 _PAGE_COLUMNS = ("median", "p99", "unit", "aim ≤", "relative error", "RMS of d [µm]")
 _CASES = ("witnesses", "robustness")
-_OWN = {"full": ("reflex",), "trials": _CASES, "only": _CASES}  # options of some of them
-FAILED = 1  # exit status; 2 is for words that are refused
+# Options that apply to some measurements only.
+_OWN = {"full": ("reflex",), "trials": _CASES, "only": _CASES}
+FAILED = 1  # exit status; 2 is for invalid arguments
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -44,30 +45,28 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "names",
         metavar="NAME",
         nargs="*",
-        help=f"what to measure: {known}; without a name one page of the figures that matter, in "
+        help=f"what to measure: {known}; without a name, one page of the main results in "
         "about a minute",
     )
     parser.add_argument(
         "--trials", type=_trials, metavar="N", help=f"trials of each case of {' and '.join(_CASES)}"
     )
     parser.add_argument(
-        "--only", default="", metavar="TEXT", help="its cases with this in their name"
+        "--only", default="", metavar="TEXT", help="only cases with this text in their name"
     )
-    parser.add_argument(
-        "--brief", action="store_true", help="fewer cases of each NAME, as for the page"
-    )
+    parser.add_argument("--brief", action="store_true", help="fewer cases for each NAME")
     parser.add_argument("--full", action="store_true", help="all loads of 'reflex', not a few")
     parser.add_argument(
         "--json",
         type=Path,
         metavar="FILE",
-        help=f"write the figures here too; after Ctrl-C the same call goes on ({', '.join(SWEPT)})",
+        help=f"write results as JSON; after Ctrl-C, the same call continues ({', '.join(SWEPT)})",
     )
     add_sweep(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Measure, print, and write the files that were asked for."""
+    """Measure, print and write the requested files; return the exit status."""
     from softfinger.tools.benchmarks.measuring import Report
 
     names = arguments.names or list(PAGE)
@@ -109,7 +108,7 @@ def _journal(file: Path, name: str) -> Path:
 
 
 def _measured(name: str, arguments: argparse.Namespace) -> list[Report]:
-    """A measurement's tables, none where it failed."""
+    """Return the tables of a measurement; an empty list if it failed."""
     tables: list[Report] = []
     more = {key: getattr(arguments, key) for key, of in _OWN.items() if name in of}
     if name in SWEPT:
@@ -121,7 +120,7 @@ def _measured(name: str, arguments: argparse.Namespace) -> list[Report]:
         more["sweep"] = sweep
     try:
         tables = _module(name).measure(brief=arguments.brief or not arguments.names, **more)
-    except (RuntimeError, SoftfingerError) as error:  # on a busy machine a hand may let go
+    except (RuntimeError, SoftfingerError) as error:  # on a busy machine a hand may lose its grip
         print(f"bench: {name}: {error}", file=sys.stderr)
     for table in tables:
         for note in table.notes if table.failed else ():
@@ -130,7 +129,7 @@ def _measured(name: str, arguments: argparse.Namespace) -> list[Report]:
 
 
 def _kept(name: str, tables: list[Report]) -> list[Row]:
-    """Rows as JSON has them, which knows no NaN."""
+    """Convert rows for JSON, which has no NaN."""
     return [
         {"measurement": name, "table": table.title}
         | {key: None if value != value else value for key, value in row.items()}
@@ -148,7 +147,7 @@ def _page(tables: list[Report]) -> list[Row]:
 
 
 def _processor() -> str:
-    """The processor's name where Linux says it."""
+    """Return the processor's name if Linux reports it."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
         return next(line.split(":")[1].strip() for line in lines if line.startswith("model name"))
@@ -165,7 +164,7 @@ def _module(name: str) -> ModuleType:
 
 
 def _check(names: list[str], arguments: argparse.Namespace) -> None:
-    """Refuse what can be refused before anything is measured. Raises ValueError."""
+    """Check the arguments before measuring; raise ValueError if they are invalid."""
     for key, of in _OWN.items():
         if getattr(arguments, key) and (len(names) != 1 or names[0] not in of):
             raise ValueError(f"--{key}: for {' or '.join(of)} alone")

@@ -1,13 +1,14 @@
-"""The error that each grip law leaves of the angle at which an object was put between the fingers.
+"""Measure the error of the object's angle that remains with each grip law.
 
-Judged by the plant's truth, not by the daemon's estimates, over plants that differ from the
-settings. The sensor is the ideal one, or one of those with flaws. On virtual time: nothing here
-depends on the machine's speed.
+An object is placed askew between the fingers and grasped. The error is that of the simulated hand,
+not of the daemon's estimates, for plants that differ from the settings. The sensor is either ideal
+or has defects. Everything runs on virtual time, so the results do not depend on the machine's
+speed.
 
-Beside the daemon's laws stand two of the literature. *Equal torques* is the law upright without its
-spring and dither. *Two-phased* is the serial two-phased controller of soft-fingered manipulation,
-:class:`TwoPhased`. It was published with a camera that shows the object's angle late, so both it
-and the daemon's law are also given an angle that is up to 0.3 s old.
+Two laws of the literature are compared with the daemon's laws. *Equal torques* is the law upright
+without its spring and dither. *Two-phased* is the serial two-phased controller of soft-fingered
+manipulation, :class:`TwoPhased`. It was published with a camera that delivers the object's angle
+late, so both this law and the daemon's law are also tested with an angle that is up to 0.3 s old.
 """
 
 from __future__ import annotations
@@ -30,16 +31,17 @@ from softfinger.tools.watched import Watched
 _FORCE = 10.0  # N
 _ASKEW = math.radians(5.0)
 _DRAWS = 12
-_FOUND = 5.0  # s from the command to grasp on, when the object's angle is read
-_STEERED = 2.0  # s before that, in which it is steered to 0
+_FOUND = 5.0  # s from the grasp command until the object's angle is read
+_STEERED = 2.0  # s before that, during which the angle is steered to 0
 DELAYS = (0.0, 0.05, 0.1, 0.2, 0.3)  # s
-_SLOW = 0.5  # Hz of an angle integral that bears all of these: ω times the delay is below π/2
+# Hz, angle integral that is stable for all these delays: ω times the delay is below π/2
+_SLOW = 0.5
 
 
 class Altered(Grip):
-    """The daemon's law, with an object's angle that is ``delay`` [s] old.
+    """The daemon's law with an object's angle that is ``delay`` [s] old.
 
-    Its joints' torque constants are a share ``apart`` of their mean apart.
+    The torque constants of the two joints differ by the fraction ``apart`` of their mean.
     """
 
     def __init__(self, hand: Watched, delay: float = 0.0, apart: float = 0.0) -> None:
@@ -60,11 +62,11 @@ class Altered(Grip):
 
 
 class TwoPhased(Altered):
-    """The published serial two-phased controller.
+    """Published serial two-phased controller.
 
-    Phase one integrates the error of the object's angle into an antisymmetric goal of the joints.
-    Phase two is a PD law of the joints for that goal, on top of equal bias torques for the grip.
-    It feels no force: the bias is what the wanted force asks for.
+    Phase one integrates the error of the object's angle into an antisymmetric goal for the joints.
+    Phase two is a PD law of the joints for that goal, in addition to equal bias torques for the
+    grip. It does not use the measured force: the bias follows from the requested force.
     """
 
     def _law(self, reading: Reading, pose: ObjectPose, _: bool) -> tuple[float, float]:
@@ -84,15 +86,15 @@ _AS_SET: Sections = {}
 
 
 class Way(NamedTuple):
-    """A law: settings of `control`, the plant's tips and sensors, and the aim [°]."""
+    """Law to test: settings of `control`, the plant's tips and sensors, and the aim [°]."""
 
     control: Mapping[str, Any] = _AS_SET
     tips: Sections = _AS_SET
     aim: float | None = None
-    is_steered: bool = False  # to 0, by the measured angle
-    law: Callable[[Watched], Grip] | None = None  # in place of the daemon's
+    is_steered: bool = False  # to 0, with the measured angle
+    law: Callable[[Watched], Grip] | None = None  # replaces the daemon's law
     force: float = _FORCE
-    weight: tuple[float, float] = (0.0, 0.0)  # N along x and y, once the grip is firm
+    weight: tuple[float, float] = (0.0, 0.0)  # N along x and y, applied once the grip is firm
 
 
 EQUAL_TORQUES = {"law": "upright", "dither_time": 0.0, "joint_stiffness": 1e-9}
@@ -121,7 +123,7 @@ def _upright(
     weight: tuple[float, float] = (0.0, 0.0),
     **simulation: Any,
 ) -> Way:
-    """Return the blind law on a plant that it does not assume."""
+    """Return the law without angle feedback on a plant that differs from the law's assumptions."""
     tips: Sections = {"simulation": simulation}
     if width:
         tips = {"object": {"width": width}, "simulation": {"object_width": width}}
@@ -152,7 +154,7 @@ LATE = {
 
 
 def measure(brief: bool = False) -> list[Report]:
-    """Return the angles that are left [°]; p99 of a few draws is about the worst of them."""
+    """Return tables of the remaining angles [°]; with few draws, p99 is close to the maximum."""
     plants = drawn(2 if brief else _DRAWS)
     title = f"left of {math.degrees(_ASKEW):g}° after {_FOUND:g} s at {_FORCE:g} N"
     return [
@@ -162,7 +164,7 @@ def measure(brief: bool = False) -> list[Report]:
 
 
 def drawn(count: int = _DRAWS) -> list[dict[str, Any]]:
-    """Return how each plant differs from the settings; the same for all laws."""
+    """Return the differences between each plant and the settings, the same for all laws."""
     rng = np.random.default_rng(16)
     return [
         {
@@ -178,7 +180,7 @@ def drawn(count: int = _DRAWS) -> list[dict[str, Any]]:
 
 
 def row(name: str, way: Way, plants: list[dict[str, Any]]) -> Row:
-    """Return a law's row: what is left on these plants, and how many were not held."""
+    """Return the row of a law: remaining angles on these plants, and the number not held."""
     found = [left(way, plant) for plant in plants]
     held = [each for each in found if not math.isnan(each)]
     more = {"not held": len(found) - len(held)}
@@ -186,7 +188,7 @@ def row(name: str, way: Way, plants: list[dict[str, Any]]) -> Row:
 
 
 def left(way: Way, simulation: Mapping[str, Any]) -> float:
-    """Return what is left of the object's angle [°] on this plant; NaN where it is not held."""
+    """Return the remaining angle of the object [°] on this plant; NaN if it is not held."""
     sections = merged({"simulation": simulation, "control": way.control}, way.tips)
     with Watched(sections) as hand:
         if way.law is not None:
@@ -197,7 +199,7 @@ def left(way: Way, simulation: Mapping[str, Any]) -> float:
             hand.run(hand.loop.period)
         hand.plant.apply_load(*way.weight)
         hand.run(begun + _FOUND - _STEERED - hand.now)
-        if way.is_steered:  # without waiting for a force that not every law feels
+        if way.is_steered:  # do not wait for a force, because not every law measures it
             hand.control.grip.steer(hand.state.object.angle, 0.0)
         hand.run(_STEERED)
         is_held = min(hand.plant.force) > 0.0

@@ -1,13 +1,13 @@
-"""Run time against error: the contact table's lookup, and the estimator's frame.
+"""Measure run time and error of contact table lookups and of frame estimates.
 
-All of one run, in turns. Lookups are of the same points, d up to 8 mm, half of them spread evenly
-and half by orders of magnitude down to 1 µm, |θ| up to 30°; errors are the largest relative ones,
-against the integrals with many nodes.
+All subjects take turns in one run. Lookups use the same points: d up to 8 mm, half of them evenly
+spaced and half logarithmically down to 1 µm, |θ| up to 30°. Errors are the largest relative errors
+compared with integrals with many nodes.
 
-Frames are 44 × 44 cells on 58 mm, d = 4 mm, a tilt of 15°, 0.2 % of the modulus as noise, estimated
-by the control loop's Python call; a solid tip's beside springs' in the same turns. Errors are RMS
-over these frames, beside the Cramér-Rao bound; "sensor" rows have those of a profile's own cells,
-pressed so for a second.
+Frames have 44 × 44 cells on 58 mm, d = 4 mm, a tilt of 15° and noise of 0.2 % of the modulus. They
+are estimated by the control loop's Python call, for a spring tip and a solid tip in turns. Errors
+are RMS over these frames and are listed with the Cramér-Rao bound. The "sensor" rows show the
+errors for the cells of a profile, pressed in the same way for one second.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ TIP = Fingertip(radius=0.020)
 SOLID = Fingertip(0.020, "solid")
 MODULUS = 0.304e6  # Pa
 LINEAR = Material.constant(MODULUS)
-SIZE, WIDTH = 44, 0.058  # cells a side, m
+SIZE, WIDTH = 44, 0.058  # cells per side, m
 NOISE = 0.002 * MODULUS
 _PASCAL_PER_COUNT = 4.0
 _FRAMES = 32
@@ -54,12 +54,12 @@ _STEPS = (1e-7, 1e-5, 1e-5, 1e-4)
 LOOKUP_ERROR = "relative error"
 _LAW = Material.table_i()
 _DEEPEST, _STEEPEST = 0.008, math.radians(30.0)  # m, rad
-_SINGLE = 16  # points that calls with floats go round
-_CALL_NS = 800.0  # aim of a call
+_SINGLE = 16  # number of points used in turn by calls with floats
+_CALL_NS = 800.0  # aim for one call, ns
 
 
 def rms_errors(found: FloatArray, truth: Truth) -> dict[str, float]:
-    """Return RMS of d and of the tilts."""
+    """Return the RMS errors of d and of the tilts."""
     rms = np.sqrt(np.mean((found - np.array(truth)) ** 2, axis=0))
     return {ERROR: 1e6 * float(rms[0]), "of tilts [°]": math.degrees(math.hypot(*rms[1:]))}
 
@@ -77,13 +77,13 @@ _LIGHT: Truth = (0.001, 0.0, 0.0)
 
 
 def measure(brief: bool = False, rounds: int = 25) -> list[Report]:
-    """Return times with errors of lookups and of frames."""
+    """Return times and errors of lookups and of frames."""
     rounds = 10 if brief else rounds
     return [lookups(rounds), frames_to_contacts(rounds)]
 
 
 def lookups(rounds: int, count: int = 512) -> Report:
-    """Return times of a point [ns], of ``count`` points at once and called one by one."""
+    """Return the times per point [ns] for ``count`` points at once and one by one."""
     rng = np.random.default_rng(3)
     even = rng.uniform(0.0, _DEEPEST, count)
     spread = 10.0 ** rng.uniform(-6.0, np.log10(_DEEPEST), count)
@@ -114,7 +114,7 @@ def lookups(rounds: int, count: int = 512) -> Report:
 
 
 def _spline(d: FloatArray, theta: FloatArray, force: FloatArray, rounds: int) -> dict[str, Any]:
-    """Return the time of a point, and the error, of SciPy's bicubic spline of F alone."""
+    """Return time per point and error of SciPy's bicubic spline of F alone."""
     interpolate: Any = import_module("scipy.interpolate")
     at = np.linspace(0.0, _DEEPEST, 129), np.linspace(-_STEEPEST, _STEEPEST, 65)
     spline = interpolate.RectBivariateSpline(*at, integrate(TIP, _LAW, *np.meshgrid(*at)).force.T)
@@ -125,7 +125,7 @@ def _spline(d: FloatArray, theta: FloatArray, force: FloatArray, rounds: int) ->
 
 
 def frames_to_contacts(rounds: int) -> Report:
-    """Return times with errors, and the bound."""
+    """Return times and errors for frames, and the bound."""
     noise = np.random.default_rng(4).standard_normal((_FRAMES, SIZE, SIZE))
     frames = GRID.pressure(TIP, LINEAR, *TRUTH) + NOISE * noise
     empty, deep = NOISE * noise, GRID.pressure(TIP, LINEAR, *_CORNER) + NOISE * noise
@@ -147,7 +147,8 @@ def frames_to_contacts(rounds: int) -> Report:
     subjects: dict[str, Callable[[], object]] = {name: run for name, (run, _, _) in cases.items()}
     subjects["decode: cobs"] = decode(frames)
     times = {name: taken / _FRAMES for name, taken in interleave(subjects, rounds).items()}
-    quickest = {name: float(np.min(taken)) for name, taken in times.items()}  # beside any load
+    # The minimum is least affected by other load.
+    quickest = {name: float(np.min(taken)) for name, taken in times.items()}
     rows = []
     for name, (run, truth, aim) in cases.items():
         more = rms_errors(run(), truth) if truth else {}
@@ -163,11 +164,11 @@ def frames_to_contacts(rounds: int) -> Report:
 
 
 def centroid_and_extent(frames: FloatArray) -> FloatArray:
-    """Return d, tilts [n, 3] from each frame's centroid and extent over its footprint, by NumPy.
+    """Return d and tilts [n, 3] from centroid and extent of each frame's footprint, with NumPy.
 
-    For a constant modulus the centroid is (a − d/3)(n_x, n_y), and the trace of the covariance
-    d (4a − d)/6 − sin² θ d (12a − 5d)/36. The footprint is where a cell and its neighbours stand
-    above the noise, at first, and then the one of the last d and tilts.
+    For a constant modulus the centroid is (a − d/3)(n_x, n_y), and the trace of the covariance d
+    (4a − d)/6 − sin² θ d (12a − 5d)/36. The footprint first consists of the cells that exceed the
+    noise together with their neighbours, and then follows from the last d and tilts.
     """
     cells, a = GRID.on(TIP), TIP.radius
     x = cells.x + cells.pitch_x * (np.arange(SIZE) + 0.5)
@@ -184,7 +185,7 @@ def centroid_and_extent(frames: FloatArray) -> FloatArray:
             trace -= (cells.pitch_x**2 + cells.pitch_y**2) / 12.0
             for _ in range(4):
                 square = (m_x * m_x + m_y * m_y) / (a - d / 3.0) ** 2
-                # In powers of d: (24a − 12a s²) d/36 − (6 − 5 s²) d²/36.
+                # Coefficients of d: (24a − 12a s²) d/36 − (6 − 5 s²) d²/36.
                 b, c = a * (24.0 - 12.0 * square), 6.0 - 5.0 * square
                 d = float((b - math.sqrt(max(b * b - 144.0 * c * trace, 0.0))) / (2.0 * c))
             s_x, s_y = m_x / (a - d / 3.0), m_y / (a - d / 3.0)
@@ -197,7 +198,7 @@ def centroid_and_extent(frames: FloatArray) -> FloatArray:
 
 
 def settled(settings: Settings, truth: Truth, count: int = _FRAMES) -> FloatArray:
-    """Return d, tilts [count, 3] from frames of a profile's sensor that was pressed so for 1 s."""
+    """Return d and tilts [count, 3] from frames of a profile's sensor that was pressed for 1 s."""
     model = make_sensor_model(settings, 0)
     estimator = make_estimator(settings, make_material(settings.material))
     counts = np.zeros(model.grid.shape, np.uint16)
@@ -210,9 +211,9 @@ def settled(settings: Settings, truth: Truth, count: int = _FRAMES) -> FloatArra
 
 
 def bound() -> float:
-    """Return the Cramér-Rao bound of d [m] from all cells, with both tilts and the gain unknown.
+    """Return the Cramér-Rao bound of d [m] from all cells, with unknown tilts and gain.
 
-    The slopes of pressure by (d, tilt_x, tilt_y, gain) are central differences.
+    The derivatives of pressure with respect to (d, tilt_x, tilt_y, gain) are central differences.
     """
     at, slopes = np.array([*TRUTH, 1.0]), []
     for step in np.diag(_STEPS):
@@ -225,7 +226,7 @@ def bound() -> float:
 def estimates(
     frames: FloatArray, cold: bool = False, tip: Fingertip = TIP
 ) -> Callable[[], FloatArray]:
-    """Return the control loop's calls on these frames, each alone if ``cold``: d, tilts [n, 3]."""
+    """Return a function that estimates d, tilts [n, 3] of these frames, each alone if ``cold``."""
     estimator = ContactEstimator(tip, LINEAR, GRID, NOISE)
 
     def run() -> FloatArray:
@@ -241,13 +242,13 @@ def estimates(
 
 
 def call_with_each(call: Callable[..., object], arguments: Sequence[tuple[Any, ...]]) -> None:
-    """Call with each of these arguments."""
+    """Call the function once with each tuple of arguments."""
     for one in arguments:
         call(*one)
 
 
 def decode(frames: FloatArray) -> Callable[[], object]:
-    """Return a cobs board's bytes to counts, of all frames."""
+    """Return a function that decodes all frames from the bytes of a COBS board."""
     counts = np.maximum(frames / _PASCAL_PER_COUNT, 0.0).astype(np.uint16)
     packets = [ENCODERS["cobs"].encode(frame, k, 0.01 * k) for k, frame in enumerate(counts)]
     feed = CobsDecoder(*frames.shape[1:]).feed

@@ -1,4 +1,4 @@
-"""Shared by all measurements: times in turns, tables of rows."""
+"""Shared by all measurements: timing in turns, and tables of rows."""
 
 from __future__ import annotations
 
@@ -15,15 +15,16 @@ from numpy.typing import ArrayLike, NDArray
 from softfinger.daemon.errors import SoftfingerError
 from softfinger.tools.terminal.typeset import plain_table, table_text
 
-# One measured thing; each key is the heading of its column, "name" the first of them.
+# Result of one measurement; each key is a column heading, with "name" first.
 Row = dict[str, Any]
 
-_SLICE = 4e-4  # s of one repetition: short against the machine's hiccups, long against the clock
+# s of one repetition: short compared with interruptions, long compared with the clock's resolution.
+_SLICE = 4e-4
 
 
 @dataclass(frozen=True)
 class Report:
-    """Rows under a title, and notes below them."""
+    """Table with a title, rows and notes."""
 
     title: str
     rows: list[Row]
@@ -31,7 +32,7 @@ class Report:
     failed: bool = False
 
     def __str__(self) -> str:
-        """Aligned text; numbers with four digits, nothing for None and NaN."""
+        """Format aligned text, with four digits for numbers and blanks for None and NaN."""
         keys = list(dict.fromkeys(key for row in self.rows for key in row)) or ["name"]
         table = plain_table()
         for key in keys:
@@ -46,7 +47,7 @@ class Report:
 def attempt(title: str, part: Callable[[], Report]) -> Report:
     """Return the table of one part of a measurement, or a failed one with the reason.
 
-    On a busy machine a hand may let go; the other parts go on.
+    If a hand loses its grip on a busy machine, the other parts continue.
     """
     try:
         return part()
@@ -71,10 +72,11 @@ def figure(name: str, unit: str, samples: ArrayLike, aim: float | None = None, *
 def interleave(
     subjects: Mapping[str, Callable[[], object]], rounds: int
 ) -> dict[str, NDArray[np.float64]]:
-    """Return nanoseconds a call of each subject in each round, float64 [rounds].
+    """Return the time per call [ns] of each subject in each round, float64 [rounds].
 
-    They take turns, so that a slow minute slows all of them. Each is called once before, which
-    compiles it, and then repeated often enough to fill a slice; nothing is collected meanwhile.
+    The subjects take turns, so that a slow period of the machine affects all of them. Each subject
+    is called once beforehand, which compiles it, and then repeated to fill a time slice. Garbage
+    collection is off during the measurement.
     """
     timers, repeats = {name: Timer(run) for name, run in subjects.items()}, {}
     for name, timer in timers.items():
@@ -88,7 +90,7 @@ def interleave(
 
 
 def timed(call: Callable[[], object], count: int = 1) -> list[float]:
-    """Wall time of each of ``count`` calls [µs]."""
+    """Return the wall time of each of ``count`` calls [µs]."""
     samples = []
     for _ in range(count):
         before = time.perf_counter_ns()

@@ -1,11 +1,11 @@
-"""A grip whose load becomes greater at once: held or lost, slid how far, how soon.
+"""Measure the reaction of a grip to a sudden increase of the load.
 
-A grip of 10 N bears a standing load along the object's faces, away from the palm, and then a
-greater one that stays, or a twist of as many newtons at the faces. On virtual time, and judged by
-the plant. *Lost*: the object is no longer between the tips. *Slid*: along the tips' faces, from the
-midpoint of both tips; that the fingers lean is no slide. *Answer*: from a slip's onset to goal
-currents a quarter higher. *Said*: from when the object has gone until the mode is no longer one of
-a grip.
+A grip of 10 N carries a standing load along the object's faces, away from the palm. Then a larger
+load is applied and stays, either a push or a twist with the same force at the faces. Trials run on
+virtual time and are judged by the simulated hand. *Lost*: the object is no longer between the tips.
+*Slid*: displacement along the tips' faces from the midpoint of both tips, so that leaning fingers
+do not count. *Answer*: time from the onset of slip until the goal currents are a quarter higher.
+*Said*: time from the loss of the object until the mode is no longer a grip mode.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from softfinger.tools.benchmarks.measuring import Report, Row, figure
 from softfinger.tools.benchmarks.rigs import SENSORS, SOLID, RigError, Sections, merged
 from softfinger.tools.benchmarks.virtual_grip import VirtualGrip
 
-# Plants, each with the ideal sensor, and sensors on springs.
+# Plants with an ideal sensor, and sensors on spring tips.
 TIPS: dict[str, Sections] = {
     "springs": {},
     "bristles": {"simulation": {"tip_law": "bristles"}},
@@ -31,21 +31,21 @@ TIPS: dict[str, Sections] = {
 }
 MASSES = (0.1, 0.5, 2.0)  # kg
 STANDING = (0.0, 3.0, 6.0, 8.0, 9.0)  # N
-OVERLOADS = (12.5, 13.0, 14.0, 15.0, 16.0, 18.0)  # N; the tips' friction bears 12 N of 10 N
-THIN = (0.0, 6.0, 9.0), (13.0, 15.0, 18.0)  # of these, unless all are wanted
+OVERLOADS = (12.5, 13.0, 14.0, 15.0, 16.0, 18.0)  # N; friction at a grip of 10 N holds 12 N
+THIN = (0.0, 6.0, 9.0), (13.0, 15.0, 18.0)  # the loads used unless all are requested
 _FORCE = 10.0  # N
-_TRIALS = 3  # of each
+_TRIALS = 3  # number of trials for each case
 _ANSWER, _SAID = 22.0, 200.0  # ms, aims
-_GRIP = 5.0  # s until it holds, at most
-_RISES, _STANDS = 1.0, 1.5  # s in which the standing load comes, and stays
-_STEPS = 50  # in which it comes
-_LOOK = 1.0  # s of the greater one, and for a lost object's mode
+_GRIP = 5.0  # s within which the grip must hold
+_RISES, _STANDS = 1.0, 1.5  # s in which the standing load is applied, s for which it then stays
+_STEPS = 50  # steps in which it is applied
+_LOOK = 1.0  # s of the larger load, and s to wait for the mode after a loss
 
 
 class Overload(NamedTuple):
-    """The outcome of one."""
+    """Outcome of one trial."""
 
-    answer: float  # s; NaN: nothing slipped, infinity: no answer
+    answer: float  # s; NaN: no slip, infinity: no answer
     slid: float  # m, while it was between the tips
     lost: bool
     said: float = math.nan  # s
@@ -54,9 +54,9 @@ class Overload(NamedTuple):
 def measure(
     brief: bool = False, full: bool = False, sweep: Callable[..., Iterable[Any]] = map
 ) -> list[Report]:
-    """Return a table for each kind of tips, or sensor, and mass; ``brief``: a few of them.
+    """Return a table for each kind of tip or sensor and each mass; ``brief`` runs few of them.
 
-    ``sweep`` is what maps trials to their outcomes, in one process or in many.
+    ``sweep`` maps cases to outcomes, in one process or in many.
     """
     standing, overloads = (STANDING, OVERLOADS) if full else THIN
     loads = [
@@ -77,7 +77,7 @@ def measure(
 
 
 def _outcome(case: tuple[Sections, tuple[float, float, str], int]) -> Overload | None:
-    """Return the outcome of a case; None where no grip came about."""
+    """Return the outcome of a case; None if the grip was not established."""
     settings, (standing, overload, kind), seed = case
     try:
         return overloaded(settings, standing, overload, seed, kind)
@@ -100,7 +100,7 @@ def _table(
 
 
 def row(name: str, found: Sequence[Overload]) -> Row:
-    """Held share and greatest slide of those held, beside the times."""
+    """Return the percentage held and the largest slide of those held, with the times."""
     answers = [1e3 * each.answer for each in found if math.isfinite(each.answer)]
     times: Row = figure(name, "ms", answers, _ANSWER) if answers else {"name": name}
     held = [each for each in found if not each.lost]
@@ -116,9 +116,9 @@ def row(name: str, found: Sequence[Overload]) -> Row:
 def overloaded(
     settings: Sections, standing: float, overload: float, seed: int, kind: str = "push"
 ) -> Overload:
-    """Grip, bear ``standing`` [N], then ``overload`` [N], a push or a twist.
+    """Grip, carry ``standing`` [N], then ``overload`` [N], a push or a twist.
 
-    Raises RigError without a grip.
+    Raises RigError if the grip is not established.
     """
     chance = random.Random(seed)
     with VirtualGrip.drawn(seed, chance, settings) as grip:

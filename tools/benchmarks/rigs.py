@@ -1,4 +1,4 @@
-"""Shared by several benchmarks: daemons that hold, canned backends, an emulated hand."""
+"""Shared by several benchmarks: daemons that hold an object, canned backends, an emulated hand."""
 
 from __future__ import annotations
 
@@ -31,20 +31,20 @@ SOLID: Sections = {  # tips of solid rubber
     "material": {"law": "constant", "modulus": 0.15e6},
     "safety": {"d_max": 0.008},
 }
-SENSORS: dict[str, Sections] = {  # with flaws; the ideal one has noise alone
+SENSORS: dict[str, Sections] = {  # sensors with defects; the ideal sensor has noise only
     name: load(Path(name)).model_dump(exclude_unset=True) for name in ("velostat", "capacitive")
 }
 SOFTFINGER = (sys.executable, "-m", "softfinger")
-_KEPT = 16  # frames that take turns
+_KEPT = 16  # number of frames that take turns
 
 
 class RigError(SoftfingerError):
-    """The set-up itself does not work: nothing was measured."""
+    """The set-up does not work, so nothing was measured."""
 
 
 @contextlib.contextmanager
 def emulator(folder: Path, config: Path, *words: str) -> Iterator[subprocess.Popen[str]]:
-    """Yield the simulated hand behind ptys in ``folder``, in its own process, once it answers."""
+    """Yield the process of an emulated hand on ptys in ``folder`` once it answers."""
     command = [*SOFTFINGER, "emulate", "--dir", str(folder), "--config", str(config), *words]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         try:
@@ -57,14 +57,14 @@ def emulator(folder: Path, config: Path, *words: str) -> Iterator[subprocess.Pop
 
 
 def merged(sections: Sections, base: Sections) -> dict[str, dict[str, Any]]:
-    """Return ``base`` with what ``sections`` have instead or besides."""
+    """Return ``base`` updated by ``sections``."""
     names = dict.fromkeys((*base, *sections))
     return {name: {**base.get(name, {}), **sections.get(name, {})} for name in names}
 
 
 @contextlib.contextmanager
 def virtual_daemon(*topics: bytes) -> Iterator[Daemon]:
-    """Yield a daemon on virtual time at its own addresses, with ``topics`` subscribed to."""
+    """Yield a daemon on virtual time at its own addresses, with ``topics`` subscribed."""
     with tempfile.TemporaryDirectory() as folder, zmq.Context() as context:
         sections = {
             "loop": {"clock": "virtual"},
@@ -82,7 +82,10 @@ def virtual_daemon(*topics: bytes) -> Iterator[Daemon]:
 
 
 def hold(daemon: Daemon, force: float = 8.0) -> None:
-    """Grasp the simulated object. Raises RigError when it is not held within 10 s, or Refused."""
+    """Grasp the simulated object.
+
+    Raises RigError if it is not held within 10 s, or Refused.
+    """
     loop = daemon.loop
     loop.advance(0.2)
     loop.command({"command": "arm"})
@@ -103,10 +106,10 @@ def must_hold(daemon: Daemon) -> None:
 
 
 class _Canned:
-    """The part of a backend in which there is nothing to do."""
+    """Base of the backends: operations that do nothing."""
 
     def close(self) -> None:
-        """Nothing to do."""
+        """Do nothing."""
 
     connect = open = torque_on = close
 
@@ -116,7 +119,7 @@ class _Canned:
 
 
 class CannedServos(_Canned):
-    """Always the same good reading; goals go nowhere."""
+    """Servos that always return the same reading and ignore goals."""
 
     def __init__(self, reading: Reading, clock: Clock) -> None:
         self._clock = clock
@@ -124,7 +127,7 @@ class CannedServos(_Canned):
         self._current = reading.current.copy()
 
     def read(self, reading: Reading) -> None:
-        """Return the same again, taken now."""
+        """Return the same reading with a new time."""
         reading.seq += 1
         reading.valid = True
         reading.t = self._clock.now()
@@ -132,16 +135,16 @@ class CannedServos(_Canned):
         reading.current[:] = self._current
 
     def torque_off(self, reading: Reading) -> bool:
-        """Confirmed at once."""
+        """Confirm immediately."""
         self.read(reading)
         return True
 
     def write(self, goal: Goal) -> None:
-        """Nothing to do."""
+        """Ignore the goal."""
 
 
 class CannedSensor(_Canned):
-    """The same few grids of counts in a random order, each a new frame, every ``period`` s."""
+    """Sensor that returns a few grids of counts in random order, one every ``period`` s."""
 
     def __init__(self, counts: list[NDArray[np.uint16]], period: float, clock: Clock) -> None:
         self._counts = counts
@@ -160,9 +163,10 @@ class CannedSensor(_Canned):
 
 
 def can(daemon: Daemon) -> None:
-    """Put canned backends in place of a daemon's, so that a tick costs what it does by itself.
+    """Replace a daemon's backends by canned ones, so that only the tick itself is timed.
 
-    They repeat the next frames and the last reading: one frame alone would be a frozen sensor.
+    The canned backends repeat the next frames and the last reading. Several frames are used,
+    because the daemon would detect a single repeated frame as a frozen sensor.
     """
     loop, period = daemon.loop, 1.0 / daemon.settings.tactile.rate
     fingers = loop.perception.fingers

@@ -1,8 +1,8 @@
-"""Hands that are not as their settings say: the true force of a grip, by the plant.
+"""Measure the true force of grips by hands that differ from their settings.
 
-Plant and daemon have settings of their own. *Rows* differ in one thing each, by as much as an
-ordinary healthy hand does; the *ensemble* is drawn at random and differs in all of them at once.
-Grips run on virtual time, so nothing depends on the machine.
+The simulated hand and the daemon have separate settings. Each of the *rows* differs in one
+parameter by the variation of an ordinary healthy hand. The *ensemble* is drawn at random and
+differs in all parameters. Grips run on virtual time, so the results do not depend on the machine.
 """
 
 from __future__ import annotations
@@ -24,33 +24,33 @@ from softfinger.tools.benchmarks.rigs import Sections, merged
 from softfinger.tools.benchmarks.virtual_grip import VirtualGrip, Watch
 
 _TRIALS, _HANDS = 20, 400
-_GRIP, _REST, _LOOK = 8.0, 1.2, 6.0  # s: until it holds at most, held in peace, looked at
-_NEAR, _FAR, _LOST = 0.2, 0.3, 0.01  # shares of the force; m
-_SAID = 2.0  # s within which a force further off than `_NEAR` is to be explained
-_STRONG, _BRIEFLY = 1.4, 0.1  # of the force asked for, s: no load, no more
+_GRIP, _REST, _LOOK = 8.0, 1.2, 6.0  # s: limit for the grip to hold, undisturbed hold, observation
+_NEAR, _FAR, _LOST = 0.2, 0.3, 0.01  # relative force errors; m
+_SAID = 2.0  # s within which a force error above `_NEAR` must be reported
+_STRONG, _BRIEFLY = 1.4, 0.1  # unloaded: ratio to the requested force, longest time above it [s]
 _WITNESS = "witness."
-_GAIN_OFF = math.log(1.3)  # of a sensor that may be named
-_BORNE = 0.8  # of what friction bears: a load that no hand need lose
+_GAIN_OFF = math.log(1.3)  # log of the gain error above which naming a sensor is correct
+_BORNE = 0.8  # fraction of the friction limit up to which no load should be lost
 
-# A scale of 127.5 kPa, as boards have it, and not the simulated sensor's of 262 kPa.
+# Full scale of 127.5 kPa, as tactile boards have; the simulated sensor has 262 kPa.
 _EIGHT_BITS: Sections = {"tactile": {**DEFAULT_BOARD, "backend": "simulated"}}
 _LATENCY = Settings().tactile.latency
 
 
 @dataclass(frozen=True)
 class HandCase:
-    """A grip of ``force`` [N] by a daemon on a hand of other settings."""
+    """Grip of ``force`` [N] by a daemon on a hand with different settings."""
 
     name: str
     force: float
-    hand: Sections = field(default_factory=dict)  # where it is not as the daemon's settings say
+    hand: Sections = field(default_factory=dict)  # differences from the daemon's settings
     daemon: Sections = field(default_factory=dict)
-    torque: float = 1.0  # true torque constant over the settings'
-    words: str = ""  # faults as `softfinger emulate --fault` takes them, once it holds
-    load: float = 0.0  # N along the faces, and …
-    within: float = 0.0  # … s in which it comes
+    torque: float = 1.0  # true torque constant divided by the one in the settings
+    words: str = ""  # faults in the form of `softfinger emulate --fault`, started during the hold
+    load: float = 0.0  # N along the faces
+    within: float = 0.0  # s in which the load is applied
     turn: float = 0.0  # rad
-    false: tuple[str, ...] = ()  # channels that may be named
+    false: tuple[str, ...] = ()  # channels that may be named as faulty
 
 
 def _hand(**simulation: Any) -> Sections:
@@ -96,7 +96,7 @@ NAMES = (*(case.name for case in ROWS), *(f"{_ENSEMBLE}{seed}" for seed in range
 
 
 def drawn(seed: int) -> HandCase:
-    """Return a hand of the ensemble: it differs from its settings in everything at once."""
+    """Return a hand of the ensemble, which differs from its settings in all parameters."""
     chance = random.Random(f"{_ENSEMBLE}{seed}")
 
     def span(low: float, high: float) -> float:
@@ -144,7 +144,7 @@ def drawn(seed: int) -> HandCase:
         load=chance.choice((-1.0, 1.0)) * span(0.0, _BORNE) * 2.0 * friction * force * pushed,
         within=chance.choice((0.0, 0.3, 2.0)),
         turn=span(-0.14, 0.14) * turned,
-        # A drifting zero is a fault of its sensor, too.
+        # A drifting zero is also a fault of the sensor.
         false=tuple(
             f"{side}_sensor"
             for side, wrong in zip(FINGERS, off, strict=True)
@@ -155,28 +155,28 @@ def drawn(seed: int) -> HandCase:
 
 @dataclass
 class Outcome:
-    """A grip's outcome; forces over what was asked for, times [s]."""
+    """Outcome of a grip; forces are relative to the requested force, times in s."""
 
-    held: bool = False  # it came to hold
-    settled: float = math.nan  # mean of both tips in the end; NaN where they were let go
-    peak: float = 0.0  # of either tip, while nothing loads the object
-    above: float = 0.0  # longest time above `_STRONG`, likewise
-    first_off: float = math.inf  # when the mean was off by more than `_NEAR` first
-    named: float = math.inf  # when a false channel was named first
-    accused: tuple[str, ...] = ()  # channels that are not false
-    raised: bool = False  # more force was asked for than commanded, while nothing loads
-    lost: bool = False  # the object has gone
+    held: bool = False  # the grip reached the hold
+    settled: float = math.nan  # mean of both tips at the end; NaN if the object was released
+    peak: float = 0.0  # of either tip, without a load
+    above: float = 0.0  # longest time above `_STRONG`, without a load
+    first_off: float = math.inf  # first time at which the mean error exceeded `_NEAR`
+    named: float = math.inf  # first time at which a channel was named
+    accused: tuple[str, ...] = ()  # named channels without a fault
+    raised: bool = False  # without a load, more force was requested than commanded
+    lost: bool = False  # the object was lost
     end: str = ""  # fault or mode
 
     def well(self) -> bool:
-        """Within `_NEAR`, or named in time and not raised."""
+        """Return True if the force is within `_NEAR`, or the error was reported in time."""
         near = self.held and abs(self.settled - 1.0) <= _NEAR and self.above == 0.0
         told = self.named - self.first_off <= _SAID and not self.raised
         return near or (self.first_off < math.inf and told)
 
 
 def grip(case: HandCase, seed: int = 1) -> Outcome:
-    """Run one grip of a case; ``seed`` of its noise and its finger."""
+    """Run one grip of a case; ``seed`` determines its noise and its finger."""
     chance, found = random.Random(f"{case.name} {seed}"), Outcome()
     daemon = merged({"simulation": {"seed": seed}}, case.daemon)
     with VirtualGrip(daemon, merged(case.hand, daemon), case.torque) as hand:
@@ -219,7 +219,7 @@ def grip(case: HandCase, seed: int = 1) -> Outcome:
         names = [(t - begin, k.removeprefix(_WITNESS)) for t, k in hand.alarms if _WITNESS in k]
     found.accused = tuple(dict.fromkeys(name for _, name in names if name not in case.false))
     found.first_off -= begin
-    # What is said of a force that is off explains it, whichever channel is at fault.
+    # A report about any channel counts as an explanation of a force error.
     found.named = min((t for t, _ in names), default=math.inf)
     return found
 
@@ -234,7 +234,7 @@ def measure(
     only: str = "",
     sweep: Callable[..., Iterable[Any]] = map,
 ) -> list[Report]:
-    """Return a table of the rows and one of the ensemble; ``brief``: a few of each."""
+    """Return a table of the rows and one of the ensemble; ``brief`` runs a few of each."""
     trials = trials or (1 if brief else _TRIALS)
     hands = [drawn(seed) for seed in range(1, (4 if brief else trials * _HANDS // _TRIALS) + 1)]
     rows = [case for case in ROWS if only in case.name]

@@ -1,9 +1,9 @@
-"""The tick: back to back, in place, and with emulated servos over a pty; a second on virtual time.
+"""Measure the tick: back to back, in place, and with emulated servos over a pty.
 
-Back to back the pipeline's ticks follow each other; in place each wakes from the sleep before it,
-as in a running daemon. Both take turns, on canned readings and the same hand. With hardware in the
-loop the servos are emulated by another process: unpaced, and at a baud rate, where their bytes take
-a line's own time.
+Back to back, the ticks of the pipeline follow each other without a pause; in place, each tick wakes
+from a sleep as in a running daemon. Both take turns with the same hand and canned readings. With
+hardware in the loop, another process emulates the servos, either unpaced or with the transmission
+time of a baud rate. A second of virtual time of the whole simulated hand is also timed.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from softfinger.daemon.wire import schema
 from softfinger.tools.benchmarks.measuring import Report, attempt, figure, timed
 from softfinger.tools.benchmarks.rigs import HIL, can, emulator, hold, must_hold, virtual_daemon
 
-_PRIORITY = 40  # of SCHED_FIFO
-# Fast sync read of 2 × 10 bytes, its reply, and a sync write of 2 × 6.
+_PRIORITY = 40  # SCHED_FIFO priority
+# Bits on the line: fast sync read of 2 × 10 bytes, its reply, and a sync write of 2 × 6 bytes.
 _BITS = 10 * (16 + 36 + 28)
-_IN_TURN = 20  # cycles
+_IN_TURN = 20  # cycles in each turn
 
 
 def measure(brief: bool = False) -> list[Report]:
-    """Return ticks of a hand that holds an object [µs], a second on virtual time [ms]."""
+    """Return times of ticks while holding an object [µs], and of a second on virtual time [ms]."""
     rounds, turns = (10, 10) if brief else (40, 60)
     parts: dict[str, Callable[[str], Report]] = {
         "tick": partial(_in_turns, rounds=rounds),
@@ -45,7 +45,7 @@ def measure(brief: bool = False) -> list[Report]:
 
 
 def _simulated(title: str, seconds: int) -> Report:
-    """Return the whole daemon's time with the simulated hand: for a second, and for a tick."""
+    """Return the whole daemon's time with the simulated hand, per second and per tick."""
     with virtual_daemon() as daemon:
         hold(daemon)
         second = timed(partial(daemon.loop.advance, 1.0), seconds)
@@ -58,12 +58,12 @@ def _simulated(title: str, seconds: int) -> Report:
 
 
 def _in_turns(title: str, rounds: int) -> Report:
-    """The pipeline alone: back to back with and without subscribers, in place at three rates.
+    """Time the pipeline alone: back to back with and without subscribers, in place at three rates.
 
-    SCHED_FIFO where it is allowed.
+    SCHED_FIFO is used if it is permitted.
     """
     samples: dict[str, list[float]] = {}
-    used: dict[str, float] = {}  # s of the processor, of all seconds
+    used: dict[str, float] = {}  # s of processor time over all measured seconds
     with virtual_daemon() as quiet, virtual_daemon(schema.STATE, schema.TACTILE) as heard:
         for daemon in (quiet, heard):
             hold(daemon)
@@ -96,7 +96,7 @@ def _in_turns(title: str, rounds: int) -> Report:
 
 
 def ticks(daemon: Daemon, count: int) -> list[float]:
-    """Return times of ``count`` ticks on virtual time, one after the other [µs]."""
+    """Return the times of ``count`` consecutive ticks on virtual time [µs]."""
     loop, clock = daemon.loop, daemon.clock
     samples = []
     for _ in range(count):
@@ -106,7 +106,7 @@ def ticks(daemon: Daemon, count: int) -> list[float]:
 
 
 def in_place(daemon: Daemon, rate: float) -> list[float]:
-    """Return times of ticks [µs] that each wake at a deadline of the machine's time; of 0.15 s."""
+    """Return the times of ticks [µs] that each wake at a deadline in real time, over 0.15 s."""
     machine = RealClock(daemon.settings.realtime.spin)
     deadline, samples = machine.now(), []
     for _ in range(round(0.15 * rate)):
@@ -117,10 +117,10 @@ def in_place(daemon: Daemon, rate: float) -> list[float]:
 
 
 def in_the_loop(title: str, turns: int, baud: int, changes: Sequence[str] = ()) -> Report:
-    """Return ticks over ptys of a hand that holds, and its servos' exchanges alone, in turns.
+    """Time ticks over ptys while holding, and the servo exchanges alone, in turns.
 
-    ``baud`` 0 is unpaced; ``changes`` go over the profile. Raises RigError where the hand lets go,
-    as on a machine that is busy.
+    ``baud`` 0 is unpaced; ``changes`` override the profile. Raises RigError if the hand loses its
+    grip, e.g. on a busy machine.
     """
     in_place: list[float] = []
     back_to_back: list[float] = []

@@ -1,7 +1,6 @@
-"""A simulated hand on virtual time that grips, and the plant's word for what its tips do.
+"""Grip with a simulated hand on virtual time and observe the plant at every tick.
 
-The true force, the object's place and slips are judged by the plant at every tick, with nothing of
-the code that is measured.
+True force, object position and slips come from the plant, independently of the code under test.
 """
 
 from __future__ import annotations
@@ -20,29 +19,30 @@ from softfinger.daemon.types import FINGERS
 from softfinger.tools.benchmarks.rigs import Sections, merged
 from softfinger.tools.watched import Watched
 
-TOO_MUCH = 1.3  # of the force asked for
-GONE = 0.1  # m that an object has slid: beyond, it no longer matters how far
-_TORQUE_ERROR = 0.1  # share by which the joints' torque constant may be off
-_RAISED = 1.25  # of the goal currents before: a firmer grip
-_LAST = 0.5  # s over which the force has settled
-_SLIPS = 0.999  # of what friction bears
+TOO_MUCH = 1.3  # ratio to the requested force
+GONE = 0.1  # m of slide, above which the object counts as lost
+_TORQUE_ERROR = 0.1  # largest relative error of the joints' torque constant
+_RAISED = 1.25  # ratio of goal currents that counts as a firmer grip
+_LAST = 0.5  # s at the end over which the settled force is averaged
+_SLIPS = 0.999  # fraction of the friction limit that counts as slip
 
 
 class Watch:
-    """The true forces and the object's place, tick by tick."""
+    """Record true forces and the object's position, tick by tick."""
 
     def __init__(self, asked: float, too_much: float = TOO_MUCH) -> None:
         self.asked = asked  # N
-        self.too_much = too_much  # of that
-        self.peak = 0.0  # force over what is asked for, of either tip
+        self.too_much = too_much  # ratio to it
+        self.peak = 0.0  # largest force of either tip relative to the requested force
         self.above = 0.0  # longest time above `too_much` [s]
-        self.slid = 0.0  # by how much the object was displaced with torque on [m]
-        self._mean: list[tuple[float, float]] = []  # when [s], force over what is asked for
-        self._below = math.inf  # since then above
+        self.slid = 0.0  # displacement of the object while the torque is on [m]
+        # (time [s], force relative to the requested force)
+        self._mean: list[tuple[float, float]] = []
+        self._below = math.inf  # start of the current period above the limit
         self._place: Sequence[float] = ()
 
     def see(self, t: float, forces: Sequence[float], place: Sequence[float], torque: bool) -> None:
-        """Take in time [s], both tips' forces [N], the object's place [m], whether torque is on."""
+        """Record time [s], forces of both tips [N], object position [m] and torque state."""
         ratios = [force / self.asked for force in forces]
         self._mean.append((t, fmean(ratios)))
         self.peak = max(self.peak, *ratios)
@@ -53,12 +53,12 @@ class Watch:
             self.slid = min(max(self.slid, math.dist(place, self._place)), GONE)
 
     def settled(self) -> float:
-        """Return the mean force over what is asked for, in the end."""
+        """Return the mean relative force at the end."""
         end = self._mean[-1][0] - _LAST
         return fmean(ratio for t, ratio in self._mean if t > end)
 
     def first_off(self, share: float) -> float:
-        """Return when the mean force, once it was near, was off by more than ``share`` [s]."""
+        """Return when the mean force was first off by more than ``share`` after being near [s]."""
         came = False
         for t, ratio in self._mean:
             near = abs(ratio - 1.0) <= share
@@ -69,11 +69,15 @@ class Watch:
 
 
 class VirtualGrip(Watched):
-    """A grip; ``look`` is called after each tick."""
+    """Grip on virtual time; ``look`` is called after each tick."""
 
     def __init__(self, daemon: Sections, hand: Sections | None = None, torque: float = 1.0) -> None:
-        """``hand``: of other settings; ``torque``: its torque constant over the settings'."""
-        self.alarms: list[tuple[float, str]] = []  # warnings and errors: when [s], kind
+        """Build daemon and hand.
+
+        ``hand`` has the hand's settings if they differ, and ``torque`` is its torque constant
+        divided by the one in the settings.
+        """
+        self.alarms: list[tuple[float, str]] = []  # (time [s], kind) of warnings and errors
         super().__init__(merged(daemon, {}), None if hand is None else merged(hand, {}))
         self.plant.plant.parameters.torque_constant *= torque
         self.look: Callable[[], None] = lambda: None
@@ -82,7 +86,7 @@ class VirtualGrip(Watched):
 
     @classmethod
     def drawn(cls, seed: int, chance: random.Random, sections: Sections) -> Self:
-        """Return a grip whose mass and torque constant are drawn."""
+        """Return a grip with random object mass and torque constant."""
         drawn = {"seed": seed, "object_mass": 0.1 * 2.0 ** chance.uniform(-1.0, 1.0)}
         error = chance.uniform(-_TORQUE_ERROR, _TORQUE_ERROR)
         return cls(merged(sections, {"simulation": drawn}), torque=1.0 + error)
@@ -95,23 +99,23 @@ class VirtualGrip(Watched):
 
     def __exit__(self, *ended: object) -> None:
         super().__exit__(*ended)
-        gc.collect()  # a daemon refers to itself, with megabytes of frames
+        gc.collect()  # a daemon has reference cycles that hold megabytes of frames
 
     def command(self, name: str, **numbers: float) -> dict[str, Any]:
-        """Give a command, which the hand may refuse."""
+        """Send a command; a refusal is ignored."""
         with contextlib.suppress(Refused):
             return super().command(name, **numbers)
         return {}
 
     def until(self, mode: str, seconds: float) -> bool:
-        """Go on until the hand is in that mode; False when it is not within ``seconds``."""
+        """Advance until the hand is in ``mode``; return False if it is not within ``seconds``."""
         end = self.state.t + seconds
         while self.state.mode != mode and self.state.t < end:
             self.loop.advance(self.loop.period)
         return self.state.mode == mode
 
     def begin(self, words: str) -> None:
-        """Let begin now what these words of `softfinger emulate --fault` say."""
+        """Start faults given in the form of `softfinger emulate --fault`."""
         for after, part, kind, value, over in parse_faults(words.split(), ()):
             if part == OBJECT:
                 self.plant.load(**{kind: value})
@@ -120,7 +124,7 @@ class VirtualGrip(Watched):
                 faults.begin(kind, value, self.state.t + after, over)
 
     def watched(self, asked: float) -> Watch:
-        """Return a watch that sees each tick from now on."""
+        """Return a `Watch` that records each tick from now on."""
         watch, hand, state = Watch(asked), self.plant, self.state
         self.look = lambda: watch.see(
             state.t, hand.force.tolist(), hand.object_pose[:2].tolist(), state.torque
@@ -128,9 +132,9 @@ class VirtualGrip(Watched):
         return watch
 
     def answer(self, words: str, seconds: float) -> float:
-        """Return the time from the slip that ``words`` cause to raised goal currents [s].
+        """Return the time from the slip caused by ``words`` to increased goal currents [s].
 
-        NaN where nothing slips in ``seconds``, infinity without an answer.
+        The result is NaN if nothing slips within ``seconds``, and infinity without an answer.
         """
         state, loop = self.state, self.loop
         calm = sum(state.goal.current)
@@ -147,14 +151,14 @@ class VirtualGrip(Watched):
         return answered - onset if onset < math.inf else math.nan
 
     def along(self) -> list[float]:
-        """Return each tip's place along the object's faces, from their middle [m]."""
+        """Return each tip's position along the object's faces, relative to their middle [m]."""
         x, y, angle = self.plant.object_pose.tolist()
         sine, cosine = math.sin(angle), math.cos(angle)
         tips = (self.plant.plant.fingers[k] for k in range(2))
         return [(tip.y - y) * cosine - (tip.x - x) * sine for tip in tips]
 
     def between(self) -> bool:
-        """Return whether the object is between the tips: both press on it."""
+        """Return True if the object is between the tips, i.e. both press on it."""
         return min(self.plant.force.tolist()) > 0.0 and not self.plant.on_other_tip.any()
 
     def _slips(self) -> bool:

@@ -1,8 +1,8 @@
-"""False measurements of a grip: what it does then, by the plant.
+"""Measure the behaviour of grips with faulty measurements, judged by the plant.
 
-Each case is a grip with a false measurement or an odd tip; each trial of it draws from a seed of
-its own noise, instants, the finger, the object's mass and an error of the joints' torque constant.
-They run on virtual time, so nothing depends on the machine.
+Each case is a grip with a faulty measurement or an unusual tip. Each trial draws, from its seed,
+noise, times, the finger, the object's mass and an error of the joints' torque constant. Trials run
+on virtual time, so the results do not depend on the machine.
 """
 
 from __future__ import annotations
@@ -26,25 +26,25 @@ from softfinger.tools.benchmarks.rigs import SOLID, Sections
 from softfinger.tools.benchmarks.virtual_grip import VirtualGrip, Watch
 
 _TRIALS = 20
-_FORCES = (6.0, 12.0)  # N asked for
-_WITNESS = "witness."  # how the kinds of events begin that name a false measurement
+_FORCES = (6.0, 12.0)  # N, requested forces
+_WITNESS = "witness."  # prefix of the kinds of events that name a faulty measurement
 
-# Aims: forces over what was asked for; times [s].
+# Aims: forces relative to the requested force; times in s.
 SETTLES = "settled at 0.8 … 1.2, not raised"
 BOUNDED = "≤ 50 ms above 1.3, named ≤ 0.3 s"
 _SETTLED = (0.8, 1.2)
-_TOO_LONG = 0.05  # above 1.3
-_NAMED = 0.3  # since it is wrong by half of what it comes to
+_TOO_LONG = 0.05  # s above 1.3
+_NAMED = 0.3  # s since the error reached half of its final value
 _LOST = 0.010  # m
 
-# A trial's course [s].
-_GRIP = 2.5  # until the hand holds, at most
-_REST = 1.2  # held in peace
-_LOOK = 5.0  # looked at after what comes has come
-_REPEATED = 1.0  # of repeated frames, before another force is asked for
+# Phases of a trial [s].
+_GRIP = 2.5  # limit until the hand holds
+_REST = 1.2  # undisturbed hold
+_LOOK = 5.0  # observation after the fault
+_REPEATED = 1.0  # repeated frames before another force is requested
 
 _SENSORS = ("left_sensor", "right_sensor")
-# A scale of 127.5 kPa, as boards have it, and not the simulated sensor's of 262 kPa.
+# Full scale of 127.5 kPa, as tactile boards have; the simulated sensor has 262 kPa.
 _EIGHT_BITS: Sections = {"tactile": {**DEFAULT_BOARD, "backend": "simulated"}}
 
 
@@ -52,18 +52,18 @@ _EIGHT_BITS: Sections = {"tactile": {**DEFAULT_BOARD, "backend": "simulated"}}
 class WitnessCase:
     """One kind of grip.
 
-    ``words`` are faults as `softfinger emulate --fault` takes them, with ``{side}`` for a finger;
-    they begin when the hand holds, or before the grasp.
+    ``words`` are faults in the form of `softfinger emulate --fault`, with ``{side}`` for a finger.
+    They start when the hand holds, or before the grasp.
     """
 
     name: str
     aim: str
-    force: float  # asked for [N]
+    force: float  # requested [N]
     words: str = ""
-    false: tuple[str, ...] = ()  # what may be named
-    comes: float = 0.0  # s in which it comes
+    false: tuple[str, ...] = ()  # channels that may be named
+    comes: float = 0.0  # s in which the fault develops
     before: bool = False
-    then: float = 0.0  # N asked for after a while
+    then: float = 0.0  # N, requested later
     settings: Sections = field(default_factory=dict)
 
 
@@ -114,11 +114,11 @@ NAMES = tuple(case.name for case in CASES)
 
 @dataclass
 class GripTrial:
-    """The outcome of a trial: forces over what was asked for, times since it began [s]."""
+    """Outcome of a trial: forces relative to the requested force, times since its start [s]."""
 
-    false: tuple[str, ...]  # what may be named
-    held: bool = True  # before anything went wrong
-    settled: float = math.nan  # mean of both tips at the end; NaN when they were let go
+    false: tuple[str, ...]  # channels that may be named
+    held: bool = True  # before the fault
+    settled: float = math.nan  # mean of both tips at the end; NaN if the object was released
     peak: float = 0.0  # of either tip
     above: float = 0.0
     slid: float = 0.0  # m
@@ -126,13 +126,13 @@ class GripTrial:
     events: list[tuple[float, str]] = field(default_factory=list)
 
     def see(self, watch: Watch, mode: str, fault: str, events: list[tuple[float, str]]) -> None:
-        """Take over what was watched, and how it ended."""
+        """Record the results of the observation and the final state."""
         self.settled = watch.settled() if mode in GRIPPING else math.nan
         self.peak, self.above, self.slid = watch.peak, watch.above, watch.slid
         self.end, self.events = fault or mode, events
 
     def named(self, rightly: bool) -> list[tuple[float, str]]:
-        """Return what was named and when: what is false, or what is not."""
+        """Return (time, channel) of the channels that were named, either correctly or wrongly."""
         names = [(t, k.removeprefix(_WITNESS)) for t, k in self.events if k.startswith(_WITNESS)]
         return [(t, name) for t, name in names if (name in self.false) == rightly]
 
@@ -157,10 +157,9 @@ def measure(
     only: str = "",
     sweep: Callable[..., Iterable[Any]] = map,
 ) -> list[Report]:
-    """Return a table for each aim, of the cases whose name ``only`` is found in.
+    """Return a table for each aim with the cases whose name contains ``only``.
 
-    ``brief``: one trial of each. ``sweep`` is what maps trials to their outcomes, in one process or
-    in many.
+    ``brief`` runs one trial of each. ``sweep`` maps trials to outcomes, in one process or in many.
     """
     trials, reports = trials or (1 if brief else _TRIALS), []
     cases = [each for aim in (SETTLES, BOUNDED) for each in CASES if each.aim == aim]
@@ -187,7 +186,7 @@ def _outcome(drawn: tuple[WitnessCase, int]) -> dict[str, Any]:
 
 
 def trial(case: WitnessCase, seed: int) -> GripTrial:
-    """One grip of a case."""
+    """Run one trial of a case."""
     chance = random.Random(f"{case.name} {seed}")
     side = chance.choice(FINGERS)
     found = GripTrial(tuple(name.format(side=side) for name in case.false))
@@ -216,7 +215,7 @@ def trial(case: WitnessCase, seed: int) -> GripTrial:
 
 
 def summary(case: WitnessCase, found: Sequence[GripTrial]) -> Row:
-    """Return a case's row: median and extremes of its trials, what was missed, when events came."""
+    """Return a case's row: median and extremes, missed aims, and times of events."""
     settled = [each.settled for each in found if not math.isnan(each.settled)]
     missed = [each.missed(case) for each in found]
     return {
@@ -243,7 +242,7 @@ def _counts(words: Iterator[str]) -> str:
 
 
 def _firsts(trials: Sequence[Sequence[tuple[float, str]]]) -> str:
-    """Return for each kind in how many trials it came, and the median first time [s]."""
+    """Return for each kind the number of trials with it, and its median first time [s]."""
     first: dict[str, list[float]] = {}
     for events in trials:
         for kind in dict.fromkeys(kind for _, kind in events):

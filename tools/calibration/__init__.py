@@ -1,1 +1,1 @@
-"""`calibrate`: its frames, steps and pictures."""
+"""The calibration command `calibrate`: how it gets frames, its steps and its pictures."""

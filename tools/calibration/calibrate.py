@@ -1,4 +1,4 @@
-"""``softfinger calibrate``: one step of calibrating the hand, or the sensor under one tip."""
+"""Run ``softfinger calibrate``: one calibration step of the hand or of one tip's sensor."""
 
 from __future__ import annotations
 
@@ -32,48 +32,51 @@ STEPS = (
     "relaxation",
     "scales",
 )
-_OF_PROFILE = STEPS[: STEPS.index("tare")]  # the others are of a tip
-_LEARNT = 0.8  # of the settings' doubt about a sensor's gain: with more, no grip has told of it
-_LEAST = 0.02  # relative, of each scale: rubber and joints are not the same from day to day
+_OF_PROFILE = STEPS[: STEPS.index("tare")]  # the other steps calibrate a tip
+# Fraction of the prior standard deviation of a sensor's gain. Above it, no grip has measured the
+# gain.
+_LEARNT = 0.8
+# Lower limit of each factor's relative standard deviation: rubber and joints change day by day.
+_LEAST = 0.02
 _EPILOG = """\
-the profile; FILE is one, made of --config's if absent:
-  joints       with torque off each finger is closed, opened and put upright by hand: its servo,
-               direction, zero and range, of both
-  heat         from the recording of a grip of some minutes, begun cold: by how much the servo of
-               --finger warms, and how fast
-  friction     what each joint loses to friction, in air: the running daemon sweeps it there and
-               back; or from a recording of such motion
-  latency      by how much frames are late: the running daemon grasps an object with several
-               forces (--force: the first); or from a recording of such a grip
+steps of a hand; FILE is a profile, copied from --config's if absent:
+  joints       with torque off, close, open and straighten each finger by hand; determines servo,
+               direction, zero and range of both fingers
+  heat         from the recording of a grip of some minutes that starts cold: temperature rise and
+               time constants of the servo of --finger
+  friction     friction of each joint in air: the running daemon sweeps the joint back and forth; or
+               from a recording of such motion
+  latency      latency of frames: the running daemon grasps an object with several forces (--force:
+               the first); or from a recording of such a grip
 
 steps of a tip, in this order; each is written into FILE, which keeps the others:
-  tare         unloaded: the zero of each cell; its noise, how that correlates, and drift
-  equilibrate  several uniform pressures: the gain of each cell, and dead cells
+  tare         without load: zero of each cell, noise with its correlation, drift
+  equilibrate  several uniform pressures: gain of each cell, dead cells
   curve        known weights upright on the tip (--force), or a run of known displacement (--d)
-  centre       presses upright or of known tilt (--theta): the tip's place and rotation
-  modulus      a run of known displacement (--d): E; its zero of d is fitted
-  law          presses at known depths and tilts (--d, --theta): springs or solid rubber, its E and
-               ν, how well each explains the frames, and what error it leaves
-  relaxation   a press and a hold of some seconds at a known d (--d, --frames 500): how much firmer
-               the rubber is at once than in the end, for the profile
-  scales       what a running daemon's grips, or a recording's, told of the tip's modulus, the
-               sensor's gain and the joint's torque: the daemon begins with it next time
+  centre       presses upright or at known tilt (--theta): position and rotation of the tip
+  modulus      a run of known displacement (--d): E; the zero of d is fitted
+  law          presses at known depths and tilts (--d, --theta): compares springs and solid rubber
+               by E, ν, fit to the frames and remaining error
+  relaxation   a press held for some seconds at a known d (--d, --frames 500): initial stiffness of
+               the rubber relative to its final stiffness, for the profile
+  scales       factors of the tip's modulus, the sensor's gain and the joint's torque, as estimated
+               in grips of a running daemon or a recording; the daemon starts with them
 
-Frames come live from the sensor of the profile, load by load, or from recordings: one for each
-load, or one .npz of the whole run with its own d [m], theta [rad], force [N] for each frame.
+Frames come live from the profile's sensor, one load after the other, or from recordings: one file
+for each load, or one .npz of the whole run with d [m], theta [rad] and force [N] of each frame.
 Without a stage, try the steps on `softfinger emulate`:
   --move "softfinger emulate --send 'press depth={d}mm tilt={theta}deg'"
   --move "softfinger emulate --send 'turn {finger}={pose}'"     for joints
-Each step but law draws its result and residuals as FILE.STEP.png, where matplotlib is installed.
+Each step except law draws its result and residuals to FILE.STEP.png if matplotlib is installed.
 A new equilibrate removes curve and modulus, a new curve removes modulus, and each of these removes
-scales: they depend on it.
+scales, because these steps depend on it.
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
     parser.add_argument("step", choices=STEPS)
-    parser.add_argument("file", type=Path, metavar="FILE", help="what is written; made if absent")
+    parser.add_argument("file", type=Path, metavar="FILE", help="output file, made if absent")
     parser.add_argument("--finger", choices=("left", "right"), default="left")
     add_profile(parser)
     parser.add_argument(
@@ -82,13 +85,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         default=[],
         metavar="R",
-        help="recordings, instead of the live sensor",
+        help="recordings to use instead of the live sensor",
     )
     parser.add_argument(
-        "--frames", type=_frames, default=64, help="live frames of each load (default 64)"
+        "--frames", type=_frames, default=64, help="live frames for each load (default 64)"
     )
     parser.add_argument(
-        "--loads", type=int, default=0, help="equilibrate, live: number of pressures"
+        "--loads", type=int, default=0, help="equilibrate, live: the number of pressures"
     )
     for name, unit in (("force", "N"), ("d", "mm"), ("theta", "degrees")):
         parser.add_argument(
@@ -108,16 +111,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--move",
         metavar="COMMAND",
-        help="live: a program that brings each load on and ends when it is there, as of a stage, "
-        "instead of Enter; {force}, {d} and {theta} stand for the load's, {finger} and {pose} "
-        "(closed, open, zero) for a joint's",
+        help="live: instead of Enter, run a program that applies each load and exits when done; "
+        "{force}, {d} and {theta} are replaced by the load's values, {finger} and {pose} "
+        "(closed, open, zero) by those of a joint",
     )
     parser.add_argument("--no-plot", action="store_true", help="draw no picture")
-    add_daemon(parser, addresses)  # of friction, latency and scales
+    add_daemon(parser, addresses)  # for friction, latency and scales
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Do one step. Raises SoftfingerError or OSError; then the file is unchanged."""
+    """Run one step.
+
+    Raises
+    ------
+    SoftfingerError, OSError
+        The file is then unchanged.
+    """
     step = arguments.step
     if step in _OF_PROFILE and arguments.config is None:
         arguments.config = arguments.file
@@ -170,12 +179,19 @@ def _frames(text: str) -> int:
 
 
 def calibrate_scales(arguments: argparse.Namespace, settings: Settings) -> str:
-    """Write a finger's scales into its file and return the line to print.
+    """Write a finger's calibration factors to its file and return the line to print.
 
-    A sensor's gain changes when the sensor is mounted again, and a tip's modulus may be known only
-    by the name of its rubber. A grip shows both (`daemon.perception.hand_channels`), and a daemon
-    that starts with them reaches the right force in its first grip. Raises CalibrationError if no
-    grip has shown them, NoStream without a daemon, and CalibrationFileError.
+    A sensor's gain changes when the sensor is mounted again, and the modulus of a tip may be known
+    only roughly. A grip measures both (`daemon.perception.hand_channels`), and a daemon that starts
+    with these factors reaches the right force in its first grip.
+
+    Raises
+    ------
+    CalibrationError
+        If no grip has measured the factors.
+    NoStream
+        Without a daemon.
+    CalibrationFileError
     """
     from softfinger.daemon.perception.calibration_file import ScalesStep, now, save_calibration
     from softfinger.kinematics.calibration.calibration import CalibrationError

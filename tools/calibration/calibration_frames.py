@@ -1,4 +1,4 @@
-"""Frames for a calibration step: live, load by load, or recorded."""
+"""Get the frames of a calibration step: live for each load, or from recordings."""
 
 from __future__ import annotations
 
@@ -30,21 +30,34 @@ from softfinger.kinematics.calibration.calibration import CalibrationError
 from softfinger.tools.arguments import to_stderr
 
 _UNITS = {"force": 1.0, "d": 1e-3, "theta": math.pi / 180.0}
-_PATIENCE = 10.0  # s without a new frame
-_WAIT = 60.0  # s for --move to end
-_BEFORE = 4000  # frames at most that are kept of the time before a hold
+_PATIENCE = 10.0  # s without a new frame before the sensor counts as stopped
+_WAIT = 60.0  # s for --move to finish
+_BEFORE = 4000  # largest number of frames kept from before a hold
 
 
 @dataclass(frozen=True)
 class Loads:
-    """``frames``: for each load counts uint16 [k, rows, cols]; ``truths``: float64 [loads] each."""
+    """Loads of a step.
+
+    Attributes
+    ----------
+    frames
+        For each load, counts uint16 [k, rows, cols].
+    truths
+        For each quantity, float64 [loads].
+    """
 
     frames: list[NDArray[np.uint16]]
     truths: dict[str, NDArray[np.float64]]
 
 
 def gather(arguments: argparse.Namespace, settings: Settings, calibration: Calibration) -> Loads:
-    """Return the step's loads. Raises TactileError, RecordingError or CalibrationError."""
+    """Return the loads of a step.
+
+    Raises
+    ------
+    TactileError, RecordingError, CalibrationError
+    """
     sensor = calibration.sensor
     given = {
         name: np.array(getattr(arguments, name)) * unit
@@ -64,7 +77,7 @@ def gather(arguments: argparse.Namespace, settings: Settings, calibration: Calib
                 raise RecordingError(f"{path}: {wrong}")
         whole = runs[0]
         if len(runs) == 1 and whole.truths:
-            # A run: each pressed frame is a load.
+            # In a recording of one run, each frame with contact is a load.
             used = whole.truths["d"] > 0.0 if "d" in whole.truths else np.ones(len(whole.t), bool)
             frames = [whole.counts[k : k + 1] for k in np.flatnonzero(used)]
             return Loads(frames, {name: whole.truths[name][used] for name in whole.truths})
@@ -75,7 +88,7 @@ def gather(arguments: argparse.Namespace, settings: Settings, calibration: Calib
 
 
 def _read(path: Path, tactile: TactileSettings, full: int) -> FrameRecording:
-    """Read a recording in which saturated cells read ``full``; say what looks wrong with it."""
+    """Read a recording, set saturated cells to ``full`` and print notes on its defects."""
     found = load_recording(
         path, tactile.pascal_per_count, tactile.rate, tactile.noise, tactile.full_count
     )
@@ -88,7 +101,7 @@ def _read(path: Path, tactile: TactileSettings, full: int) -> FrameRecording:
 
 
 def _spread(given: dict[str, Any], count: int) -> dict[str, Any]:
-    """Each list of values with one for each load; a single value holds for all."""
+    """Expand each list of values to one value per load; a single value applies to all loads."""
     for name, values in given.items():
         if len(values) not in (1, count):
             raise CalibrationError(f"--{name}: found {len(values)} values for {count} loads")
@@ -114,7 +127,7 @@ def _live(
                     loads.append(_while_pressed(arguments, backend, clock, told, load))
                     continue
                 bring(arguments, told, {"load": k + 1, **load})
-            # A frame scanned before this moment may still show the last load.
+            # A frame scanned before this moment may still show the previous load.
             frames = _fresh(backend, clock, clock.now())
             loads.append(np.stack([next(frames).data for _ in range(arguments.frames)]))
     return loads
@@ -127,7 +140,7 @@ def _while_pressed(
     told: str,
     load: Mapping[str, float],
 ) -> NDArray[np.uint16]:
-    """Frames from before a load is brought on until ``--frames`` after it."""
+    """Return the frames from before a load is applied until ``--frames`` after it."""
     before: deque[NDArray[np.uint16]] = deque(maxlen=_BEFORE)
     frames = _fresh(backend, clock, clock.now())
     with ThreadPoolExecutor(1) as pool:
@@ -139,7 +152,7 @@ def _while_pressed(
 
 
 def bring(arguments: argparse.Namespace, told: str, load: Mapping[str, float | str]) -> None:
-    """Say what is wanted, and wait for Enter or for ``--move``. Raises CalibrationError."""
+    """Print an instruction, then wait for Enter or run ``--move``; may raise CalibrationError."""
     _say(told if arguments.move else f"{told}; then press Enter")
     if arguments.move:
         _move(arguments.move, load)
@@ -148,7 +161,7 @@ def bring(arguments: argparse.Namespace, told: str, load: Mapping[str, float | s
 
 
 def _move(command: str, load: Mapping[str, float | str]) -> None:
-    """Run the stage's program for one load, until it ends. Raises CalibrationError."""
+    """Run the stage's program for one load until it ends; may raise CalibrationError."""
     try:
         words = [
             word.format(**{"force": 0.0, "d": 0.0, "theta": 0.0, **load})
@@ -163,7 +176,7 @@ def _move(command: str, load: Mapping[str, float | str]) -> None:
 
 @contextlib.contextmanager
 def _opened(settings: Settings, clock: RealClock, finger: str) -> Iterator[TactileSensor]:
-    """The finger's sensor, open. Raises TactileError."""
+    """Open the finger's sensor for a context; may raise TactileError."""
     hand = None
     if settings.tactile.backend == "simulated":
         from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
@@ -180,7 +193,7 @@ def _opened(settings: Settings, clock: RealClock, finger: str) -> Iterator[Tacti
 
 
 def _fresh(backend: TactileSensor, clock: RealClock, since: float) -> Iterator[Frame]:
-    """Each new frame scanned after ``since``. Raises TactileError when the sensor stops."""
+    """Yield each new frame scanned after ``since``; raise TactileError when the sensor stops."""
     last = backend.latest()
     waited = clock.now()
     while True:

@@ -1,4 +1,4 @@
-"""The picture of one calibration step: its result and residuals."""
+"""Draw the result and the residuals of one calibration step."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from softfinger.tools import style
 
 
 class Map(NamedTuple):
-    """Values of all cells [rows, cols]."""
+    """Panel with the values of all cells [rows, cols]."""
 
     title: str
     values: ArrayLike
@@ -24,7 +24,7 @@ class Map(NamedTuple):
 
 
 class Points(NamedTuple):
-    """Measured ``y`` over ``x``, beside the fit where there is one."""
+    """Panel with measured ``y`` over ``x``, and the fit if there is one."""
 
     title: str
     xlabel: str
@@ -45,7 +45,7 @@ Panel = Map | Points
 
 
 def draw(step: str, panels: tuple[Panel, ...], path: Path) -> None:
-    """Write the picture of ``step``, its panels side by side."""
+    """Write the figure of ``step`` with its panels side by side."""
     with style.settings():
         figure = style.new_figure(7.5, 3.4)
         figure.suptitle(f"Calibration: {step}", fontsize=10)

@@ -1,4 +1,4 @@
-"""`calibrate friction`: the joints' friction from slow sweeps there and back, in air."""
+"""Measure the joints' friction from slow sweeps in air: `calibrate friction`."""
 
 from __future__ import annotations
 
@@ -22,21 +22,26 @@ from softfinger.tools.calibration.joints import write_keys
 from softfinger.tools.calibration.live_hand import LiveHand
 from softfinger.tools.recordings.reader import read_recording
 
-# rad/s and rad of each sweep, and how often: slow ones for break-away, two speeds for the rest.
+# (rad/s, rad, number) of the sweeps: slow ones for breakaway friction, two speeds for the rest.
 _SWEEPS = ((0.05, 0.06, 2), (0.3, 0.4, 2), (0.6, 0.4, 2))
 _WIDEST = max(wide for _, wide, _ in _SWEEPS)
-_FROM_ENDS = 0.05  # rad of the joint's range that no sweep uses
-_ARRIVED = 0.05  # rad off where the sweeps begin: friction may hold a joint short of it
-_REST = 0.3  # s between two strokes, beside what smooths the setpoints
-_TOUCHED = 0.2  # s before and after a contact that may be one already
-_SEEN = 2.0  # standard deviations by which friction at break-away is above the rest
+_FROM_ENDS = 0.05  # rad at each end of the joint's range that the sweeps avoid
+# rad, accepted error at the start of a sweep: friction may stop a joint before its goal.
+_ARRIVED = 0.05
+_REST = 0.3  # s of rest between two strokes, in addition to the smoothing time of the setpoints
+_TOUCHED = 0.2  # s discarded before and after a contact, which may not be detected immediately
+_SEEN = 2.0  # standard deviations above sliding friction from which breakaway friction is reported
 
 
 def calibrate_friction(arguments: argparse.Namespace, settings: Settings) -> str:
-    """Write the joints' friction into the profile and return what was found.
+    """Write the joints' friction into the profile and return a summary.
 
-    Raises CalibrationError for too little motion or a contact, RecordingError, SettingsError; and
-    what a `LiveHand` raises.
+    Raises
+    ------
+    CalibrationError
+        If there is too little motion, or a contact.
+    RecordingError, SettingsError
+        And the errors of `LiveHand`.
     """
     unit = by_name(settings.servos.model).current_unit * settings.control.torque_constant
     if not unit:
@@ -61,7 +66,7 @@ def calibrate_friction(arguments: argparse.Namespace, settings: Settings) -> str
 def _fit(
     columns: dict[str, NDArray[Any]], name: str, settings: Settings, unit: float
 ) -> FrictionFit:
-    """Fit a joint's motion without a contact. Raises CalibrationError."""
+    """Fit a joint's contact-free motion; may raise CalibrationError."""
     t, touched = columns["t"], columns[f"{name}.contact"]
     used = columns["torque"].copy()
     for begin, end in _stretches(touched):
@@ -77,7 +82,7 @@ def _fit(
 
 
 def _stretches(holds: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
-    """Yield the first and the last index of each stretch in which something holds."""
+    """Yield the first and last index of each run of True values."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], holds, [False]])))
     return zip(edges[::2].tolist(), (edges[1::2] - 1).tolist(), strict=True)
 
@@ -94,7 +99,7 @@ def _told(fit: FrictionFit) -> str:
 
 
 def _swept(arguments: argparse.Namespace, settings: Settings) -> dict[str, NDArray[Any]]:
-    """Sweep one joint after the other, and return all states."""
+    """Sweep one joint after the other and return all states."""
     names = sorted(settings.scene.fingers)
     ways = {name: _way(settings, name) for name in names}
     told = ", ".join(
@@ -122,9 +127,10 @@ def _swept(arguments: argparse.Namespace, settings: Settings) -> dict[str, NDArr
 
 
 def _way(settings: Settings, name: str) -> tuple[float, float]:
-    """Begin and length [rad] of a joint's sweeps: opening if there is room, else closing.
+    """Return start and signed length [rad] of a joint's sweeps.
 
-    Raises CalibrationError.
+    The sweeps open the joint if there is room, otherwise they close it. Raises CalibrationError if
+    there is too little room.
     """
     hand, finger = settings.hand, FINGERS.index(name)
     start = hand.open_angle[finger]
@@ -142,7 +148,7 @@ def _way(settings: Settings, name: str) -> tuple[float, float]:
 def _stroke(
     hand: LiveHand, settings: Settings, name: str, ends: tuple[float, float], speed: float
 ) -> None:
-    """Lead a joint from one end to the other at ``speed`` [rad/s]. Raises CalibrationError."""
+    """Move a joint from one end to the other at ``speed`` [rad/s]; may raise CalibrationError."""
     first, last = ends
     touch, rest = settings.control.contact_force, _REST + settings.control.smooth_time
     seconds = abs(last - first) / speed

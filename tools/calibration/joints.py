@@ -1,7 +1,8 @@
-"""`calibrate joints` and `calibrate heat`: what is written of the servos into a profile.
+"""Write servo data into a profile: `calibrate joints` and `calibrate heat`.
 
-With torque off each finger is moved by hand, and its servo's counts are read where it is closed,
-open and at its zero. The heat's constants are from the recording of a hold of minutes.
+For `calibrate joints`, torque is off and each finger is moved by hand; the servo's counts are read
+in the closed, open and zero poses. `calibrate heat` fits the thermal constants to a recording of a
+hold of several minutes.
 """
 
 from __future__ import annotations
@@ -35,16 +36,19 @@ _POSES = {
     "open": "open it fully",
     "zero": "put it upright, straight away from the palm",
 }
-_LEAST = 0.2  # rad between closed and open
-_ALONE = 0.25  # of that, which another finger may move meanwhile
+_LEAST = 0.2  # rad, smallest accepted rotation between closed and open
+_ALONE = 0.25  # fraction of that rotation by which the other finger may move meanwhile
 _MARGIN = 0.03  # rad between the stops and the commanded range
-_Counts = dict[int, int]  # by the servo's ID
+_Counts = dict[int, int]  # by servo ID
 
 
 def calibrate_joints(arguments: argparse.Namespace, settings: Settings) -> str:
-    """Have each finger moved, write the profile, and tell what was found.
+    """Guide the user through the poses of each finger, write the profile and return a summary.
 
-    Raises ServoError, CalibrationError or SettingsError; then nothing is written.
+    Raises
+    ------
+    ServoError, CalibrationError, SettingsError
+        The profile is then unchanged.
     """
     servos = settings.servos
     if servos.backend != "dynamixel":
@@ -87,7 +91,7 @@ def calibrate_joints(arguments: argparse.Namespace, settings: Settings) -> str:
 
 
 def _read(line: ServoLine, ids: list[int]) -> _Counts:
-    """Each servo's position. Raises ServoError unless all answer, limp and within one turn."""
+    """Return each servo's position; raise ServoError unless all are limp and within one turn."""
     counts = {}
     for servo in ids:
         table = Registers(line.read(servo, 0, CHECKED) or b"")
@@ -96,7 +100,7 @@ def _read(line: ServoLine, ids: list[int]) -> _Counts:
         if table[reg.TORQUE_ENABLE]:
             raise ServoError(f"servo {servo}: torque is on: end `softfinger run`, or disarm")
         counts[servo] = table.long(reg.PRESENT_POSITION)
-        # What it is after a power-up: the encoder's count, below one turn.
+        # After a power-up the position equals the encoder's count, which is below one turn.
         encoder = counts[servo] - table.long(reg.HOMING_OFFSET)
         if table[reg.DRIVE_MODE] & DRIVE_REVERSE:
             encoder = -encoder
@@ -110,7 +114,7 @@ def _read(line: ServoLine, ids: list[int]) -> _Counts:
 
 
 def _turned(name: str, at: dict[str, _Counts], radian: float) -> int:
-    """The servo that turned between closed and open. Raises CalibrationError."""
+    """Return the servo that turned between closed and open; may raise CalibrationError."""
     moved = {k: abs(at["closed"][k] - at["open"][k]) * radian for k in at["open"]}
     servo, *others = sorted(moved, key=lambda k: -moved[k])
     if moved[servo] < _LEAST:
@@ -127,10 +131,13 @@ def _turned(name: str, at: dict[str, _Counts], radian: float) -> int:
 
 
 def calibrate_heat(arguments: argparse.Namespace, settings: Settings) -> str:
-    """Write the constants into the profile and return what was found.
+    """Write the thermal constants into the profile and return a summary.
 
-    Raises CalibrationError without a recording or for too short a hold, RecordingError,
-    SettingsError.
+    Raises
+    ------
+    CalibrationError
+        Without a recording, or if the hold is too short.
+    RecordingError, SettingsError
     """
     if len(arguments.recording) != 1:
         raise CalibrationError(
@@ -155,7 +162,7 @@ def calibrate_heat(arguments: argparse.Namespace, settings: Settings) -> str:
 
 
 def write_keys(arguments: argparse.Namespace, new: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Put ``new`` into the file, or into a copy of the profile; nothing else in it changes."""
+    """Write ``new`` into the file, or into a copy of the profile, and keep all other text."""
     changes = [f"{s}.{key} = {value}" for s, values in new.items() for key, value in values.items()]
     source = arguments.file if arguments.file.exists() else arguments.config
     load(source, arguments.dir or own_runtime_folder(), [*arguments.set, *changes])
@@ -175,9 +182,9 @@ def write_keys(arguments: argparse.Namespace, new: Mapping[str, Mapping[str, Any
 
 
 def put(text: str, section: str, values: Mapping[str, Any]) -> str:
-    """Return a profile's text with these arrays or numbers in its ``[section]``, or as new lines.
+    """Return a profile's text with these arrays or numbers set in ``[section]``.
 
-    Without that header they are ``section.key`` where the text has such keys.
+    If the profile has no such header but keys of the form ``section.key``, that form is used.
     """
     head = re.search(rf"(?m)^\[{section}\].*\n?", text)
     if head is None and not re.search(rf"(?m)^{section}\.", text):

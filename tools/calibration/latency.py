@@ -1,4 +1,4 @@
-"""`calibrate latency`: the latency of tactile frames, from a grip whose force rises and falls."""
+"""Measure the latency of tactile frames from a grip of varying force: `calibrate latency`."""
 
 from __future__ import annotations
 
@@ -26,20 +26,25 @@ from softfinger.tools.recordings.recomputed import counts_of, recorded_models, r
 
 FloatArray = NDArray[np.float64]
 
-_STEPS = (1.0, 0.5, 1.25, 0.5)  # of the force, one after the other
-_HELD = 0.5  # s for which each is held
-_STD_MAX = 5e-3  # s
-_SCALE = 0.5, 2.0  # of d by frames over d by joints: beyond, frames don't show what joints do
-_MISFIT_MAX = 0.3e-3  # m, r.m.s.: an object that slides or tilts, a second contact
-# Relative errors of d by frames that show it by their shape, and of those that do by their height.
+_STEPS = (1.0, 0.5, 1.25, 0.5)  # successive forces, as multiples of the first force
+_HELD = 0.5  # s for which each force is held
+_STD_MAX = 5e-3  # s, largest accepted standard deviation of the latency
+# Accepted ratio of d from frames to d from joints; outside, frames do not follow the joints.
+_SCALE = 0.5, 2.0
+_MISFIT_MAX = 0.3e-3  # m RMS; more indicates that the object slides or tilts, or a second contact
+# Relative errors of d from frames, if d is estimated from the frame's shape or from its amplitude.
 _SHAPE_ERROR, _HEIGHT_ERROR = 0.05, 0.2
 
 
 def calibrate_latency(arguments: argparse.Namespace, settings: Settings) -> str:
-    """Write the frames' latency into the profile and return what was found.
+    """Write the frames' latency into the profile and return a summary.
 
-    Raises CalibrationError for data that do not show it, RecordingError, SettingsError; and what a
-    `LiveHand` raises.
+    Raises
+    ------
+    CalibrationError
+        If the data do not determine the latency.
+    RecordingError, SettingsError
+        And the errors of `LiveHand`.
     """
     if len(arguments.recording) > 1:
         raise CalibrationError("latency: expected one --recording, or none")
@@ -84,7 +89,7 @@ def calibrate_latency(arguments: argparse.Namespace, settings: Settings) -> str:
 
 
 def _gripped(arguments: argparse.Namespace, settings: Settings) -> LiveHand:
-    """Grasp with several forces, open, and return what the hand said meanwhile."""
+    """Grasp with several forces, then open; return the hand with the stored stream."""
     first = arguments.force[0] if arguments.force else settings.control.force_default
     forces = [min(step * first, settings.safety.force_max) for step in _STEPS]
     bring(arguments, f"latency: put an object between the fingers, for {first:g} N", {})
@@ -99,9 +104,10 @@ def _gripped(arguments: argparse.Namespace, settings: Settings) -> LiveHand:
 
 
 def _frames(source: MessageSource, own: Settings) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Times, d of all fingers together, and the deviation of its noise, where all touch.
+    """Return times, the sum of d over all fingers, and its noise (standard deviation).
 
-    By each frame alone, at the times of the first finger's.
+    Each frame is estimated independently. Times are those of the first finger's frames, restricted
+    to the period in which all fingers touch.
     """
     names = sorted(own.scene.fingers)
     models = recorded_models(source)
@@ -136,9 +142,9 @@ def _frames(source: MessageSource, own: Settings) -> tuple[FloatArray, FloatArra
 
 
 def _closing(source: MessageSource, own: Settings) -> tuple[FloatArray, FloatArray]:
-    """Times, and the depth to which the joints close, from any origin [m].
+    """Return times and the depth by which the joints close [m], relative to an arbitrary origin.
 
-    d1 + d2 = W + 2a − (O2 − O1)·n: it does not change when the object shifts between the tips.
+    d1 + d2 = W + 2a − (O2 − O1)·n, which is unaffected by a shift of the object between the tips.
     """
     states = to_columns(read(HandState, message) for _, message in source.messages([STATE]))
     hand, angle = own.hand, states["object.angle"]

@@ -1,4 +1,4 @@
-"""A running daemon's hand, moved for a calibration while its stream is stored."""
+"""Move a running daemon's hand for a calibration and store its stream."""
 
 from __future__ import annotations
 
@@ -18,14 +18,15 @@ from softfinger.daemon.wire.schema import SETTINGS, STATE, TACTILE, HandState
 from softfinger.kinematics.calibration.calibration import CalibrationError
 from softfinger.tools.arguments import client_keys
 
-_MOST = 1000  # messages taken at once
-_WITHIN = 20.0  # s of the hand's time for a command to be carried out
+_MOST = 1000  # messages read at a time
+_WITHIN = 20.0  # s of the hand's time within which a command must be completed
 
 
 class LiveHand:
-    """A context in which the hand is armed, and its stream stored as in a `Recording`.
+    """Context in which the hand is armed and its stream is stored as in a `Recording`.
 
-    On leaving, a hand that was disarmed is disarmed. After an error torque goes off.
+    On exit, a hand that was disarmed before is disarmed again. After an error the torque is
+    switched off.
     """
 
     path = Path("the stream")
@@ -34,7 +35,7 @@ class LiveHand:
         self._address, self._keys = arguments.address, arguments.keys
         self._taken: list[tuple[bytes, dict[str, Any]]] = []
         self._disarm = False
-        self._commanded = False  # a command of ours was accepted
+        self._commanded = False  # a command of this context was accepted
 
     def __enter__(self) -> Self:
         with contextlib.ExitStack() as stack:
@@ -65,18 +66,18 @@ class LiveHand:
             self._hand.disarm()
 
     def command(self, name: str, **numbers: float) -> None:
-        """Send a command. Raises Refused and NoAnswer."""
+        """Send a command; may raise Refused and NoAnswer."""
         self._hand.command(name, **numbers)
         self._commanded = True
 
     def states(self) -> Iterator[HandState]:
-        """Yield the newest state, again and again; all that comes is stored. Raises NoStream."""
+        """Yield the newest state repeatedly and store all messages; may raise NoStream."""
         while True:
             if not self._socket.poll(int(1e3 * PATIENCE)):
                 raise no_stream(self._address[0], STATE, PATIENCE)
             newest = None
             for frames in drain(self._socket, _MOST):
-                with contextlib.suppress(ValueError):  # not a message
+                with contextlib.suppress(ValueError):  # skip invalid messages
                     topic, message = unpack(frames)
                     self._taken.append((topic, message))
                     newest = message if topic == STATE else newest
@@ -87,7 +88,7 @@ class LiveHand:
                 yield state
 
     def until(self, holds: Callable[[HandState], object]) -> None:
-        """Wait for a state for which ``holds`` is true. Raises CalibrationError after 20 s."""
+        """Wait for a state for which ``holds`` is true; raise CalibrationError after 20 s."""
         begin = None
         for state in self.states():
             if holds(state):
@@ -97,14 +98,14 @@ class LiveHand:
                 raise CalibrationError(f"the hand is still {state.mode} after {_WITHIN:g} s")
 
     def wait(self, seconds: float) -> None:
-        """Wait by the hand's time."""
+        """Wait for ``seconds`` of the hand's time."""
         end = next(self.states()).mono_ns + int(1e9 * seconds)
         self.until(lambda state: state.mono_ns >= end)
 
     def messages(
         self, topics: Collection[bytes] | None = None
     ) -> Iterator[tuple[bytes, dict[str, Any]]]:
-        """Yield the stored messages of ``topics`` in the order in which they came."""
+        """Yield the stored messages of ``topics`` in order of arrival."""
         for topic, message in self._taken:
             if topics is None or topic in topics:
                 yield topic, message

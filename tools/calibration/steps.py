@@ -1,6 +1,6 @@
-"""The steps of a calibration: from loads to what is written into the file.
+"""Calibration steps: compute the contents of the calibration file from loads.
 
-The mathematics is in `kinematics.calibration.calibration`, the file in
+The mathematics is in `kinematics.calibration.calibration`, the file format in
 `daemon.perception.calibration_file`.
 """
 
@@ -64,12 +64,14 @@ from softfinger.tools.calibration.calibration_plot import Map, Panel, Points
 
 FloatArray = NDArray[np.float64]
 _UNDONE: dict[str, Any] = {"modulus": None, "law": None, "scales": None, "wants": {}}
-_SOFTENS = 0.03  # by which a first press may be firmer: plates and noise are no better
-Done = tuple[Calibration, str, tuple[Panel, ...]]  # with the line to print and the picture
+# Relative softening after first presses above which it is reported; plates and noise cause less.
+_SOFTENS = 0.03
+# New calibration, line to print, panels of the picture.
+Done = tuple[Calibration, str, tuple[Panel, ...]]
 
 
 def begin(arguments: argparse.Namespace, settings: Settings) -> Calibration:
-    """Return the file's calibration, or a new one. Raises CalibrationFileError."""
+    """Return the calibration in the file, or a new one; may raise CalibrationFileError."""
     sensor = sensor_of(settings, FINGERS.index(arguments.finger))
     if not arguments.file.exists():
         return Calibration(sensor=sensor, date=now())
@@ -84,7 +86,7 @@ def begin(arguments: argparse.Namespace, settings: Settings) -> Calibration:
 
 @dataclass(frozen=True)
 class Step:
-    """One step's inputs, and what several steps compute from them."""
+    """Inputs of one step, and quantities that several steps use."""
 
     arguments: argparse.Namespace
     settings: Settings
@@ -93,17 +95,17 @@ class Step:
 
     @cached_property
     def converter(self) -> Converter:
-        """The conversion of counts to pressure, by the steps done so far."""
+        """Conversion of counts to pressure with the steps done so far."""
         return Converter(self.calibration, self.settings.tactile.pascal_per_count)
 
     @property
     def theta(self) -> FloatArray:
-        """Each load's tilt [rad]."""
+        """Tilt of each load [rad]."""
         return self.loads.truths.get("theta", np.zeros(len(self.loads.frames)))
 
     @cached_property
     def over(self) -> list[FloatArray]:
-        """Each load's mean counts over the zero times the gains, as if no noise ended at 0."""
+        """Each load's mean counts above zero, times the gains, corrected for noise cut at 0."""
         tare, zero, gain = self.calibration.tare, self.converter.zero, self.converter.gain
         means = [frames.mean(axis=0) for frames in self.loads.frames]
         if tare is None or self.settings.tactile.threshold:
@@ -112,7 +114,7 @@ class Step:
 
     @cached_property
     def readings(self) -> list[FloatArray]:
-        """Each load's mean reading, cleared of noise far from the contact."""
+        """Mean reading of each load, without noise far from the contact."""
         noise = self.calibration.tare.noise if self.calibration.tare else 0.0
         spread = np.full(self.converter.zero.shape, noise)
         return [
@@ -122,7 +124,7 @@ class Step:
 
     @cached_property
     def pressures(self) -> FloatArray:
-        """Each load's mean pressure [Pa], [loads, rows, cols]."""
+        """Mean pressure of each load [Pa], [loads, rows, cols]."""
         return np.stack(
             [
                 np.mean([self.converter(frame) for frame in frames], axis=0)
@@ -132,23 +134,23 @@ class Step:
 
     @property
     def cell_area(self) -> float:
-        """[m²]"""
+        """Area of a cell [m²]."""
         x, y = self.calibration.sensor.pitch
         return x * y
 
     @property
     def plain_grid(self) -> SensorGrid:
-        """The sensor's grid, centred and not rotated."""
+        """Grid of the sensor, centred and not rotated."""
         sensor = self.calibration.sensor
         return SensorGrid(sensor.rows, sensor.cols, sensor.pitch)
 
     def result(self, **steps: Any) -> Calibration:
-        """Return the calibration with these steps."""
+        """Return the calibration updated by these steps."""
         return self.calibration.model_copy(update={"date": now(), **steps})
 
 
 def done(step: Step) -> Done:
-    """Do the step. Raises CalibrationError."""
+    """Run the step; may raise CalibrationError."""
     truths = step.loads.truths
     if not step.loads.frames:
         raise CalibrationError("no frame with d above 0 in this run")
@@ -166,7 +168,7 @@ def done(step: Step) -> Done:
 
 
 def _kept(kind: type[Any], found: object, **more: Any) -> Any:
-    """Return the file's step of this ``kind``: its fields by name from ``found``, or ``more``."""
+    """Return a ``kind`` step for the file, with fields taken by name from ``found`` or ``more``."""
     values = {name: getattr(found, name) for name in kind.model_fields if hasattr(found, name)}
     lists = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in values.items()}
     return kind(date=now(), **(lists | more))
@@ -207,7 +209,7 @@ def _curve(step: Step) -> Done:
         d = truths.get("d")
         if d is None:
             raise CalibrationError("curve: expected --force or --d, or a run that has them")
-        # The force by the profile's material, over the whole footprint.
+        # Compute the force from the profile's material over the whole footprint.
         tip, material = make_tip(step.settings), make_material(step.settings.material)
         pressures = [
             step.plain_grid.pressure(tip, material, float(x), float(theta))
@@ -257,7 +259,7 @@ def _modulus(step: Step) -> Done:
     pressed = zip(step.pressures, step.readings, strict=True)
     force = np.array([each[reading > 0.0].sum() for each, reading in pressed]) * step.cell_area
     full = np.stack([(each >= sensor.full_count).any(axis=0) for each in step.loads.frames])
-    whole = ~full.any(axis=(1, 2))  # a saturated cell hides a part of the force
+    whole = ~full.any(axis=(1, 2))  # a saturated cell hides part of the force
     tip = make_tip(step.settings)
     found = fit_modulus(d[whole], theta[whole], force[whole], tip=tip)
     line = (
@@ -329,9 +331,16 @@ def _law(step: Step) -> Done:
 
 
 def _measured(step: Step, live: NDArray[np.bool_]) -> tuple[TipCurves, FloatArray]:
-    """Curves through the presses; rms of what they leave in d [m], θ [rad] and F over its rms.
+    """Fit curves through the presses.
 
-    Of each press the mean over its frames. Raises CurvesError.
+    Returns
+    -------
+    The curves, and the RMS residuals of d [m], θ [rad] and F (relative to its RMS), for the mean
+    over the frames of each press.
+
+    Raises
+    ------
+    CurvesError
     """
     d, theta, frames = step.loads.truths["d"], step.theta, step.loads.frames
     sensor, converter, tare = step.calibration.sensor, step.converter, step.calibration.tare
@@ -368,7 +377,7 @@ def _measured_told(law: TipCurves, left: FloatArray) -> str:
 
 
 def _over_d(trend: Trend) -> str:
-    """E at the least, middle and largest d, and a warning where it drifts."""
+    """Describe E at the smallest, middle and largest d, with a warning if E drifts."""
     order = np.argsort(trend.d, kind="stable")[[0, len(trend.d) // 2, -1]]
     values = ", ".join(f"{each / 1e6:.3f}" for each in trend.modulus[order])
     depths = ", ".join(f"{each * 1e3:g}" for each in trend.d[order])

@@ -1,1 +1,1 @@
-"""Example programs: each stands alone, on the public client and the mathematics, to be copied."""
+"""Example programs to copy; each is self-contained and uses the public client and kinematics."""

@@ -1,5 +1,5 @@
-"""`figures`: the pages of the paper's figures, their numbers and their drawing.
+"""The paper's figures and comparisons: the commands `figures` and `validate`.
 
-A page is drawn from the very sheets that are written as CSV. Nothing here imports matplotlib
-before something is drawn.
+Each figure is drawn from the same sheets that are written as CSV. matplotlib is imported only when
+a figure is drawn.
 """

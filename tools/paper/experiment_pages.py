@@ -1,8 +1,9 @@
-"""Figs. 7 and 10: the model's curves for the paper's two experiments; Fig. 11: its appendix.
+"""Figs. 7, 10 and 11: the model's curves for the paper's two experiments, and its appendix.
 
-The measured points are printed in the paper as pictures only and are not reproduced. The appendix
-has U(d, 0), eq. 12, in three terms, each by its integral and as printed: `terms` and `limits` are
-SI and dimensionally the paper's, eq. 16 is a length, eq. 18 a number, eq. 19 one over a length.
+The paper shows the measured points only as plots, so they are not reproduced. The appendix splits
+U(d, 0), eq. 12, into three terms, which are computed both as integrals and as printed. `terms` and
+`limits` use SI units and the paper's dimensions: eq. 16 is a length, eq. 18 is dimensionless, and
+eq. 19 is an inverse length.
 """
 
 from __future__ import annotations
@@ -48,21 +49,21 @@ PITCH = 0.058 / 44  # [m]
 GRID = SensorGrid(rows=44, cols=44, pitch=PITCH)
 
 TILTED = -11.5  # relative angle [deg] at the end of the finger's rotation
-ROLLED = 9.2  # and at the end of the object's rolling, 20.7° on
+ROLLED = 9.2  # relative angle [deg] after the object has rolled by 20.7°
 
 
 def _force(d: Numbers, theta: Numbers) -> FloatArray:
-    """F [N] for the paper's constant modulus; d in mm, θ in degrees."""
+    """Return F [N] for the paper's constant modulus; d in mm, θ in degrees."""
     return closed_forms(MODULUS, d * MILLI, np.radians(theta)).force
 
 
 def _force_table_i(d: Numbers, theta: Numbers) -> FloatArray:
-    """F [N] for the law through Table I; d in mm, θ in degrees."""
+    """Return F [N] for the law through Table I; d in mm, θ in degrees."""
     return integrate(TIP, Material.table_i(), d * MILLI, np.radians(theta)).force
 
 
 def compression() -> tuple[Sheet, ...]:
-    """Tabulate force over displacement at each angle: the model and the sum of the cells."""
+    """Tabulate force over displacement at each angle, of the model and summed over the cells."""
     material = Material.constant(MODULUS)
     d = np.arange(81) / 10.0
     columns = {"d [mm]": d}
@@ -95,7 +96,7 @@ def _all_tilts(axes: Axes, numbers: Sheet) -> None:
 
 
 def _compression_panels() -> Iterator[Panel]:
-    """Panels (a) to (g), one an angle, and (h) with all of them."""
+    """Yield panels (a) to (g), one per angle, and (h) with all angles."""
     for k, (letter, tilt) in enumerate(zip("abcdefg", TILTS, strict=True)):
         labels = DEPTH if k >= 4 else "", "" if k % 4 else FORCE
         place = "" if k else "upper left"
@@ -105,10 +106,11 @@ def _compression_panels() -> Iterator[Panel]:
 
 
 def tilt_and_roll() -> tuple[Sheet, ...]:
-    """Return path of the relative angle: the finger tilts about its root, then the object rolls.
+    """Return the path of the relative angle: the finger tilts at its root, then the object rolls.
 
-    Rotation, at each final displacement D: a root at the distance D/sin 11.5° from the tip's centre
-    makes d rise from first touch as D sin |θ|/sin 11.5°. Rolling: d stays D.
+    During the rotation to each final displacement D, the root is at the distance D/sin 11.5° from
+    the tip's centre, so that d rises from first touch as D sin |θ|/sin 11.5°. During rolling, d
+    remains D.
     """
     tilting = -np.arange(0, 116) / 10.0
     rolling = np.arange(-115, 93) / 10.0
@@ -122,7 +124,7 @@ def tilt_and_roll() -> tuple[Sheet, ...]:
             f"F at d = {deepest} mm [N]": _force(d, tilting),
         }
         force, law = _force(d, rolling), _force_table_i(d, rolling)
-        # Springs that point at the tip's centre (Nguyen and Arimoto): N = πE d² at any tilt.
+        # Springs directed at the tip's centre (Nguyen and Arimoto): N = πE d² at any tilt.
         radial = np.full(rolling.shape, math.pi * MODULUS * (d * MILLI) ** 2)
         second |= {
             f"F at d = {deepest} mm [N]": force,
@@ -165,7 +167,7 @@ _TERMS = ("first", "second", "third")
 
 
 class Terms(NamedTuple):
-    """The integrals of the root, of 1 and of the root's inverse over eq. 14's area element."""
+    """Integrals of the root, of 1 and of the inverse root over the area element of eq. 14."""
 
     first: FloatArray  # eq. 16 [m]
     second: FloatArray  # eq. 18
@@ -184,14 +186,14 @@ class Terms(NamedTuple):
 
 
 def limits(radius: float, d: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return (θ_max, p) [rad], eqs. 15 and 17: θ at the contact's rim, and t there."""
+    """Return (θ_max, p) [rad] of eqs. 15 and 17: θ at the contact's rim, and t there."""
     h = radius - d
     theta_max = np.arctan(np.sqrt(radius**2 - h**2) / h)
     return theta_max, np.arccos(h / radius * np.tan(theta_max))
 
 
 def printed_terms(radius: float, d: FloatArray) -> Terms:
-    """Return eqs. 16, 18 and 19 as they are printed, at d [m]."""
+    """Return eqs. 16, 18 and 19 as printed, at d [m]."""
     h2 = (radius - d) ** 2
     return Terms(
         2.0 * np.pi * d / (3.0 * h2) * (3.0 * radius**2 - 3.0 * radius * d + d**2),
@@ -201,19 +203,20 @@ def printed_terms(radius: float, d: FloatArray) -> Terms:
 
 
 def integrated_terms(radius: float, d: FloatArray) -> Terms:
-    """Return them by Gauss quadrature of eq. 12 over θ; relative error ≤ 1e-12 to d = 0.7 a."""
+    """Return the terms by Gauss quadrature of eq. 12; relative error ≤ 1e-12 up to d = 0.7 a."""
     d = np.asarray(d, dtype=np.float64)[..., None]
     h = radius - d
     points, weights = leggauss(_NODES)
     theta_max, _ = limits(radius, d)
     theta = 0.5 * theta_max * (points + 1.0)
-    area = np.pi * theta_max * weights * np.sin(theta) / np.cos(theta) ** 3  # and 2π for φ
+    # This includes the factor 2π from φ.
+    area = np.pi * theta_max * weights * np.sin(theta) / np.cos(theta) ** 3
     root = np.sqrt(radius**2 - (h * np.tan(theta)) ** 2)
     return Terms(*(np.sum(area * each, axis=-1) for each in (root, 1.0, 1.0 / root)))
 
 
 def _appendix() -> tuple[Sheet, ...]:
-    d = np.arange(1, 81) / 10.0  # the terms cancel to nothing at d = 0
+    d = np.arange(1, 81) / 10.0  # at d = 0 the terms cancel
     metres = d * MILLI
     columns = {"d [mm]": d}
     for how, terms in (

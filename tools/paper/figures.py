@@ -1,4 +1,7 @@
-"""``softfinger figures``: the paper's figures from this model, as CSV and PNG, errata marked."""
+"""Run ``softfinger figures``: draw the paper's figures from this model, as CSV and PNG.
+
+Errata of the paper are marked.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,7 @@ NAMES = (
     *("fig3", "fig4a", "fig4b", "fig5a", "fig5b"),
     *("fig7", "fig7_run", "fig10", "fig10_run", "fig10_shear", "fig11"),
 )
-BY_NAME = ("slow_turn",)  # long: drawn only when it is named
+BY_NAME = ("slow_turn",)  # slow figures, drawn only if named
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -22,15 +25,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "names",
         metavar="NAME",
         nargs="*",
-        help=f"which: {', '.join(NAMES)} (all these if none is named); "
-        f"{', '.join(BY_NAME)}: a minute",
+        help=f"figures: {', '.join(NAMES)} (default: all of these); {', '.join(BY_NAME)}: a minute",
     )
     parser.add_argument(
         "--out",
         type=Path,
         default=Path("figures"),
         metavar="DIR",
-        help="where to write them, made if missing (default: figures)",
+        help="output folder, made if missing (default: figures)",
     )
 
 
@@ -50,7 +52,7 @@ def pages() -> dict[str, FigurePage]:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Write the numbers, then the pictures where matplotlib is installed. Raises OSError."""
+    """Write the data, and the figures if matplotlib is installed; may raise OSError."""
     known = (*NAMES, *BY_NAME)
     unknown = [name for name in arguments.names if name not in known]
     if unknown:
@@ -62,7 +64,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def write(chosen: dict[str, FigurePage], folder: Path) -> None:
-    """Write these pages into ``folder`` and print each file's path. Raises OSError."""
+    """Write these figures into ``folder`` and print the path of each file; may raise OSError."""
     from softfinger.tools import style
     from softfinger.tools.extras import MissingExtra
     from softfinger.tools.paper.sheets import errata_sheet

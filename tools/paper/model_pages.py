@@ -1,7 +1,7 @@
-"""Figs. 3 to 5 and Table I: the material's law; force and energy over tilt and displacement.
+"""Figs. 3 to 5 and Table I: material law, and force and energy over tilt and displacement.
 
-In Figs. 4 and 5 lines are the closed forms; markers are the paper's double integrals, evaluated
-numerically.
+In Figs. 4 and 5 the lines are closed forms and the markers are the paper's double integrals,
+evaluated numerically.
 """
 
 from __future__ import annotations
@@ -42,10 +42,10 @@ TIP = Fingertip(radius=0.020)
 MODULUS = TABLE_I_MAXIMUM  # the paper's choice [Pa]
 MILLI = 1e-3
 MPA = 1e-6
-_NODES = 64  # of the double integrals
-_STEEP = 25  # degrees, where the rate of change by the tilt is told
-_FITTED = slice(10, None)  # of the displacements: exponents are fitted from 1 to 8 mm
-_NEAR = 1e-4  # relative, and rad: steps of differences
+_NODES = 64  # Gauss nodes of the double integrals
+_STEEP = 25  # degrees at which the slope over the tilt is reported
+_FITTED = slice(10, None)  # displacements from 1 to 8 mm, to which exponents are fitted
+_NEAR = 1e-4  # step of finite differences, relative or in rad
 DEPTHS = (2, 4, 6, 8)  # mm
 TILTS = (0, 5, 10, 15, 20, 25, 30)  # degrees
 
@@ -56,13 +56,13 @@ Numbers = FloatArray | np.float64
 
 
 def _tangent(material: Material, strain: FloatArray) -> FloatArray:
-    """Tangent modulus dσ/dε [Pa]."""
+    """Return the tangent modulus dσ/dε [Pa]."""
     slope = [j * float(value) for j, value in enumerate(material.coefficients, 1)]
     return np.asarray(np.polynomial.polynomial.polyval(strain, slope), dtype=np.float64)
 
 
 def law() -> tuple[Sheet, ...]:
-    """Return the law over strain, and Table I with the law at its strains."""
+    """Tabulate the law over strain, and Table I with the law at its strains."""
     material = Material.table_i()
     strain, nodes = np.arange(101) / 100.0, np.array(TABLE_I_STRAIN)
     curve = {
@@ -87,7 +87,7 @@ def _stress(axes: Axes, curve: Sheet, _: Sheet) -> None:
 
 
 def _slope(axes: Axes, curve: Sheet, table: Sheet) -> None:
-    """Draw the law's slope and Table I, its numbers beside its points."""
+    """Draw the slope of the law and Table I, with its numbers next to the points."""
     axes.plot(curve["strain"], curve["modulus"], color=KINDS[0], label="slope of the law")
     measured = table["modulus in the paper"]
     axes.plot(table["strain"], measured, "o", color="white", mec=KINDS[0], mew=1.4, label="Table I")
@@ -107,12 +107,12 @@ def double_integrals(
 ) -> tuple[FloatArray, FloatArray]:
     """Return (F, U) [N], [J] of eqs. 3 and 10 as printed, at d [m] and θ [rad], which broadcast.
 
-    By product Gauss quadrature: with the closed forms each is a check of the other.
-
-    Relative error ≤ 1e-10 within 6° of θ's limit and further in; zeros at d = 0.
+    The integrals use product Gauss quadrature, so they and the closed forms verify each other. The
+    relative error is ≤ 1e-10 for tilts at least 6° below θ's limit; the result is 0 at d = 0.
     """
     points, weights = leggauss(_NODES)
-    angle = 0.5 * np.pi * points  # x and y over the ellipse as sines: its rim costs no accuracy
+    # With x and y as sines over the ellipse, its rim does not reduce the accuracy.
+    angle = 0.5 * np.pi * points
     weight = 0.5 * np.pi * weights * np.cos(angle)
     depth, tilt = np.broadcast_arrays(np.asarray(d, float), np.asarray(theta, float))
     force = np.empty(depth.shape)
@@ -125,7 +125,7 @@ def double_integrals(
         y = b * np.sin(angle)
         area = (rho * c * weight)[:, None] * b * weight
         z = np.sqrt(radius**2 - x**2 - y**2)
-        q = (h - x * s) / c  # height of the object's face over the base
+        q = (h - x * s) / c  # height of the object's face above the base
         force[i] = modulus * np.sum((1.0 - q / z) * area)
         energy[i] = 0.5 * modulus * np.sum((z - 2.0 * q + q**2 / z) * area)  # eq. 9
     return force, energy
@@ -133,22 +133,22 @@ def double_integrals(
 
 @dataclass(frozen=True)
 class Plotted:
-    """Force or energy, as the figures name it."""
+    """Force or energy, with its notation in the figures."""
 
     symbol: str
     label: str
     unit: str
     scale: float  # from SI to the unit
-    row: int  # in closed_forms and double_integrals
-    slope: int  # of its derivative by d, in closed_forms
+    row: int  # row in closed_forms and double_integrals
+    slope: int  # row of its derivative with respect to d in closed_forms
     exponent: int
     equation: int
-    power: str  # of the displacement at θ = 0
+    power: str  # power law of the displacement at θ = 0
     prefactor: str
-    straight: float  # the power's factor over E
+    straight: float  # factor of the power law, divided by E
 
     def closed(self, d: Numbers, theta: Numbers) -> FloatArray:
-        """Return closed form in the figure's unit; d in mm, θ in degrees."""
+        """Return the closed form in the figure's unit; d in mm, θ in degrees."""
         return closed_forms(MODULUS, d * MILLI, np.radians(theta))[self.row] * self.scale
 
     def integral(self, d: Numbers, theta: Numbers) -> FloatArray:
@@ -157,7 +157,7 @@ class Plotted:
         return pair[self.row] * self.scale
 
     def local_exponent(self, d: Numbers, theta: Numbers) -> FloatArray:
-        """Return the slope of the integral's logarithm over that of d; d in mm, θ in degrees."""
+        """Return d ln(integral) / d ln(d); d in mm, θ in degrees."""
         above, below = (self.integral(d * (1.0 + step), theta) for step in (_NEAR, -_NEAR))
         return np.log(above / below) / math.log((1.0 + _NEAR) / (1.0 - _NEAR))
 
@@ -207,10 +207,10 @@ def over_tilt(name: str, quantity: Plotted) -> tuple[Sheet, ...]:
 
 
 def over_depth(name: str, quantity: Plotted) -> tuple[Sheet, ...]:
-    """Tabulate over d to 8 mm at each tilt: factor over the power at θ = 0, exponents by both laws.
+    """Tabulate over d to 8 mm at each tilt: the ratio to θ = 0, and exponents for both laws.
 
-    Factor and exponent come from the double integral, so that they owe the closed form nothing; for
-    Table I's law from its own integral.
+    Ratio and exponents come from the double integral, so that they are independent of the closed
+    form; those of Table I's law come from its own integral.
     """
     d = np.arange(81) / 10.0
     power = quantity.at_zero_tilt(d)
@@ -243,7 +243,7 @@ def over_depth(name: str, quantity: Plotted) -> tuple[Sheet, ...]:
 
 
 def _power(d: FloatArray, values: FloatArray) -> float:
-    """Return the exponent of the power law of d that fits ``values`` best, from 1 to 8 mm."""
+    """Return the exponent of the power law of d that fits ``values`` best from 1 to 8 mm."""
     return float(np.polyfit(np.log(d[_FITTED]), np.log(values[_FITTED]), 1)[0])
 
 

@@ -1,8 +1,8 @@
-"""Figs. 7, 8 and 10 run in simulation: plant, sensor, estimator and table as the daemon has them.
+"""Figs. 7, 8 and 10 in simulation, with the daemon's plant, sensor, estimator and table.
 
-Each run gives what is true and what was estimated from the frames, one row a frame; a figure shows
-the model, the estimates and their errors. The sensor is the paper's: 44 × 44 cells on 58 mm, 40 ms
-a scan, with noise of 0.5 % of the modulus in each cell.
+Each run returns true and estimated values, one row per frame. A figure shows the model, the
+estimates and their errors. The sensor is that of the paper: 44 × 44 cells on 58 mm, 40 ms per scan,
+with noise of 0.5 % of the modulus in each cell.
 """
 
 from __future__ import annotations
@@ -36,25 +36,25 @@ from softfinger.tools.style import GREY, KINDS, ordered
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Row = tuple[tuple[float, float], tuple[float, ...]]  # true d and θ; `_estimates`
+Row = tuple[tuple[float, float], tuple[float, ...]]  # true (d, θ), and the result of `_estimates`
 
 RADIUS = 0.020  # m
 SCAN = 0.040  # s
-TILTED = math.radians(11.5)  # by the finger's rotation about its root
-ROLLED = math.radians(20.7)  # by the object's rolling, back
-_SPEED = 0.002  # m/s, of compression
-_GAP = 0.5e-3  # m before compression
+TILTED = math.radians(11.5)  # rotation of the finger about its root
+ROLLED = math.radians(20.7)  # rolling of the object back
+_SPEED = 0.002  # m/s, compression
+_GAP = 0.5e-3  # m, gap before compression
 _DEEPEST = 0.4 * RADIUS
-_ROOT_DEPTH = 0.004  # m, that the finger's rotation ends at
+_ROOT_DEPTH = 0.004  # m, displacement at the end of the finger's rotation
 _GIVES = math.radians(3.0)
 _WIDTH = 0.040
 _HALF_SEPARATION = 0.050
-_ROLL_STEPS = 104  # frames in which the object rolls
-_LATE = 2  # frames that are on their way
-_SURE = 1.0  # mm of displacement from which on relative errors are shown
-_ROLLED_AT = 4  # mm, where rotation ends and the path goes on
+_ROLL_STEPS = 104  # frames during the rolling
+_LATE = 2  # frames in transit
+_SURE = 1.0  # mm of displacement above which relative errors are shown
+_ROLLED_AT = 4  # mm, displacement of the path that is shown through rotation and rolling
 _PATH = -12.5, 10.5
-_SCALES = {"d": 1e3, "theta": 1.0}  # of the errors shown
+_SCALES = {"d": 1e3, "theta": 1.0}  # scale of the errors shown
 
 
 def run_compression(tilt: float) -> dict[str, FloatArray]:
@@ -74,10 +74,10 @@ def run_compression(tilt: float) -> dict[str, FloatArray]:
 
 
 def run_rotation() -> dict[str, FloatArray]:
-    """Turn the finger by 11.5° about its root against a fixed object, from first touch on.
+    """Turn the finger by 11.5° about its root against a fixed object, starting at first touch.
 
-    The root is so far that d is 4 mm at the end. The servo moves the joint; d and θ are
-    predicted from it between frames.
+    The distance of the root is chosen so that d is 4 mm at the end. The servo moves the joint, and
+    d and θ are predicted from the joint angle between frames.
     """
     length = _ROOT_DEPTH / math.sin(TILTED)
     sections: Sections = {
@@ -92,7 +92,7 @@ def run_rotation() -> dict[str, FloatArray]:
         loop = daemon.loop
         loop.advance(0.3)
         loop.command({"command": "arm"})
-        # The servo gives way under the force: its goal lies beyond.
+        # Command a larger angle, because the servo yields under the force.
         loop.command({"command": "move", "left": TILTED + _GIVES})
         assert daemon.hand is not None
         rows: list[Row] = []
@@ -106,7 +106,7 @@ def run_rotation() -> dict[str, FloatArray]:
 
 
 def run_rolling(depth: int) -> dict[str, FloatArray]:
-    """Roll the object on the fixed finger from 11.5° by 20.7° to −9.2°, ``depth`` [mm] held."""
+    """Roll the object on the fixed finger from 11.5° to −9.2° at constant ``depth`` [mm]."""
     sections: Sections = {
         "servos": {"backend": "none"},
         "hand": {"open_angle": (TILTED, 0.0)},
@@ -126,7 +126,7 @@ def _daemon(sections: Sections) -> Daemon:
         "scene": {"fingers": ("left",)},
         "tip": {"radius": RADIUS},
         "material": {"law": "constant", "modulus": MODULUS},
-        # A calibrated sensor: what its frames are higher is the tip, which is stiffer.
+        # The sensor is calibrated, so excess pressure is attributed to a stiffer tip.
         "tactile": {
             "rate": 1.0 / SCAN,
             "latency": SCAN,
@@ -146,12 +146,12 @@ def _daemon(sections: Sections) -> Daemon:
 def _frames(
     daemon: Daemon, count: int, place: Callable[[SimulatedHand, float], None] | None = None
 ) -> Iterator[Row]:
-    """Truth at each frame's instant, and the estimate from that frame alone."""
+    """Yield the truth at each frame's sample time and the estimate from that frame alone."""
     hand, loop = daemon.hand, daemon.loop
     assert hand is not None
     if place is not None:
         place(hand, 0.0)
-        loop.advance(3.0 * SCAN)  # frames of before have come
+        loop.advance(3.0 * SCAN)  # wait until older frames have arrived
     last = loop.state.contacts[0].seq
     for k in range(count + _LATE):
         if place is not None:
@@ -175,7 +175,7 @@ def _estimates(contact: Contact) -> tuple[float, ...]:
 def _columns(
     rows: Iterable[Row], daemon: Daemon, suffix: str = "", sign: float = 1.0
 ) -> dict[str, FloatArray]:
-    """Return truth and estimates, a row a frame; ``sign`` is that of the paper's angle."""
+    """Return truth and estimates, one row per frame; ``sign`` gives the paper's sign of θ."""
     truth, estimates = (np.array(each) for each in zip(*rows, strict=True))
     d, theta = np.maximum(truth[:, 0], 0.0), truth[:, 1]
     contact = daemon.tables[0](d, theta)
@@ -190,16 +190,16 @@ def _columns(
 
 
 def roll(hand: SimulatedHand, d: float, angle: float, rolling: float = 1.0) -> None:
-    """Put the held object where it has rolled to ``angle`` [rad] with ``d`` [m] held.
+    """Place the held object as if it had rolled to ``angle`` [rad] at constant ``d`` [m].
 
-    ``rolling``: share of its face's motion that the tip rolls off.
+    ``rolling`` is the fraction of the face's motion that the tip follows by rolling.
     """
     q = float(hand.q[0])
     parameters = hand.plant.parameters
     length = parameters.length
     tip = -_HALF_SEPARATION + length * math.sin(q), length * math.cos(q)
     out = RADIUS + 0.5 * _WIDTH - d
-    along = rolling * (RADIUS - d) * angle  # the tip's place on the face
+    along = rolling * (RADIUS - d) * angle  # position of the tip on the face
     parameters.script_x = tip[0] + out * math.cos(angle) + along * math.sin(angle)
     hand.object_pose[:] = (
         parameters.script_x,
@@ -215,7 +215,7 @@ def _rms(off: FloatArray) -> float:
 
 @cache
 def compression() -> tuple[Sheet, ...]:
-    """Return one sheet an angle, and one with the errors beyond 1 mm."""
+    """Return one sheet per angle, and one with the errors beyond 1 mm."""
     sheets, rows = [], []
     for tilt in TILTS:
         run = Sheet(f"fig7_run_{tilt}deg", run_compression(float(np.radians(tilt))))
@@ -235,7 +235,7 @@ def compression() -> tuple[Sheet, ...]:
 
 
 def _deep_errors(run: Sheet, symbol: str) -> FloatArray:
-    """Return the errors beyond 1 mm: of d [µm], θ [degrees], force or energy [%]."""
+    """Return the errors beyond 1 mm: d [µm], θ [degrees], force or energy [%]."""
     deep = run["d"] > _SURE
     truth, found = run[symbol][deep], run[f"{symbol} estimated"][deep]
     relative = symbol in ("F", "U")
@@ -266,7 +266,7 @@ def _error_panel(symbol: str, title: str, label: str, limit: float) -> Panel:
 
 @cache
 def tilt_and_roll() -> tuple[Sheet, ...]:
-    """Return rotation, the rolling at each displacement, and where force and energy are least."""
+    """Return the rotation, the rolling at each displacement, and the minima of force and energy."""
     columns: dict[str, FloatArray] = {}
     for depth in DEPTHS:
         columns |= run_rolling(depth)
@@ -290,10 +290,10 @@ def tilt_and_roll() -> tuple[Sheet, ...]:
 
 
 def _minimum(theta: FloatArray, values: FloatArray) -> tuple[float, float]:
-    """Return where a parabola in θ through all values is least, and the standard error of that.
+    """Return the minimum of a parabola in θ through all values, and its standard error.
 
-    Without noise both curves are parabolas within 0.1 %. The error is that of the fit, from its
-    residuals: runs with ten seeds scattered by as much.
+    Without noise both curves are parabolas within 0.1 %. The standard error follows from the
+    residuals of the fit; the scatter of runs with ten seeds was the same.
     """
     (a, b, _), covariance = np.polyfit(theta, values, 2, cov=True)
     slope = np.array([0.5 * b / a**2, -0.5 / a, 0.0])
@@ -301,7 +301,7 @@ def _minimum(theta: FloatArray, values: FloatArray) -> tuple[float, float]:
 
 
 def _along(symbol: str, axes: Axes, rotation: Sheet, rolling: Sheet, _: Sheet) -> None:
-    """Draw along the path: the rotation, then the rolling at 4 mm."""
+    """Draw the path: the rotation, then the rolling at 4 mm."""
     for piece, at, color, name in (
         (rotation, "", KINDS[1], "the finger rotates"),
         (rolling, f" at {_ROLLED_AT} mm", KINDS[0], "then the object rolls"),

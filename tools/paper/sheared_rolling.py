@@ -1,21 +1,21 @@
-"""Sec. IV-B's minimum slightly before 0°: rolling of which a small share shears the tip.
+"""Minimum slightly before 0° (Sec. IV-B): rolling during which a small share shears the tip.
 
-The finger has been tilted to −11.5°, then the object rolls to 9.2° at a fixed displacement d. If a
-share s of the motion of the face is not rolled off, the tip is sheared by
+The finger has been tilted to −11.5°, then the object rolls to 9.2° at a constant displacement d. If
+a share s of the face's motion is not followed by rolling, it shears the tip by
 
     ζ = s (a − d) (θ − θ₀),    θ₀ = −11.5°
 
-With the springs of the parallel distributed model, each as stiff sideways as along its axis,
+For the springs of the parallel distributed model, with equal lateral and axial stiffness,
 
     U = πE [d³/(3 cos² θ) + d² ζ tan θ + d ζ²]      F = πE [d²/cos θ + 2 d ζ sin θ]
 
-F is the sum of the springs' forces on the base, which is what a sensor under the tip measures. The
-term with ζ has the sign of θ, so both are least before the object is upright. ∂U/∂d, the force on
-the face at a fixed tilt and shear, is least in between.
+F is the sum of the spring forces on the base, which a sensor under the tip measures. The term with
+ζ has the sign of θ, so the minima of F and U lie before the upright position. ∂U/∂d, the force on
+the face at fixed tilt and shear, has its minimum in between.
 
-*Plant* is the simulated tip: its rows integrate the shear, its forces and energy are read. What
-presses on its base is N cos θ + T sin θ. This is F and πE ζ² cos θ more, for the springs at the
-contact's rim, which the plant's energy shears as soon as they touch.
+*Plant* is the simulated tip, which integrates the shear. The force on its base is N cos θ + T sin
+θ. It exceeds F by πE ζ² cos θ, because the plant's energy shears the springs at the contact's rim
+as soon as they touch.
 """
 
 from __future__ import annotations
@@ -45,15 +45,15 @@ from softfinger.tools.style import GREY, ordered
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-SHARES = (0.0, 0.02, 0.05, 0.1)  # that are drawn
+SHARES = (0.0, 0.02, 0.05, 0.1)  # shares that are drawn
 _EACH = tuple(k / 100.0 for k in range(11))
-DEPTH, SHARE = 6, 0.05  # mm; that are drawn, and run on the plant
+DEPTH, SHARE = 6, 0.05  # mm, 1; drawn and simulated with the plant
 _STEPS = 208
 _FORCE, _SLOPE, _ENERGY = "F on the base", "dU/dd", "U"
 
 
 def rolled(d: float, share: float, theta: FloatArray) -> dict[str, FloatArray]:
-    """Return F, ∂U/∂d [N] and U [mJ] at tilts ``theta`` [rad], ``d`` [m] held."""
+    """Return F, ∂U/∂d [N] and U [mJ] at tilts ``theta`` [rad] and constant ``d`` [m]."""
     shear = share * (TIP.radius - d) * (theta + TILTED)
     sine, cosine, tangent = np.sin(theta), np.cos(theta), np.tan(theta)
     stiff = math.pi * MODULUS
@@ -65,7 +65,7 @@ def rolled(d: float, share: float, theta: FloatArray) -> dict[str, FloatArray]:
 
 
 def plant(d: float, share: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return θ [rad], N cos θ + T sin θ [N] and U [mJ] of the simulated tip, ``d`` [m] held."""
+    """Return θ [rad], N cos θ + T sin θ [N] and U [mJ] of the simulated tip at ``d`` [m]."""
     settings = Settings.model_validate(
         {
             "scene": {"fingers": ("left",)},
@@ -94,7 +94,7 @@ def plant(d: float, share: float) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def least(theta: FloatArray, values: FloatArray) -> float:
-    """Return the angle [degrees] at which ``values`` are least, between the given ones."""
+    """Return the angle of the minimum [degrees], from a parabola through three points."""
     k = int(np.clip(np.argmin(values), 1, len(values) - 2))
     near = slice(k - 1, k + 2)
     a, b, _ = np.polyfit(theta[near] - theta[k], values[near], 2)
@@ -103,7 +103,7 @@ def least(theta: FloatArray, values: FloatArray) -> float:
 
 @cache
 def sheared_rolling() -> tuple[Sheet, ...]:
-    """Return the curves at one depth, the plant's, and where each is least at all depths."""
+    """Return the curves at one depth, those of the plant, and the minima at all depths."""
     theta = np.linspace(-TILTED, ROLLED - TILTED, _STEPS + 1)
     columns = {"theta [deg]": np.degrees(theta)}
     rows = []

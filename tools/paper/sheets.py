@@ -1,4 +1,4 @@
-"""Figures as data: sheets of numbers, each a CSV file, and the panels drawn from them."""
+"""Represent figures as data: sheets of numbers, each a CSV file, and the panels drawn from them."""
 
 from __future__ import annotations
 
@@ -31,22 +31,22 @@ DOT = CIRCLE | {"ms": 3, "mec": INK, "mew": 0.6}
 
 @dataclass(frozen=True)
 class Sheet:
-    """Columns of equal length by their heads, ``name [unit]``, under the name of their file.
+    """Columns of equal length with keys ``name [unit]``; ``name`` is the name of the file.
 
-    Values are texts, or numbers of which NaN is written as an empty cell. The unit 1 is that of a
-    number without one; texts have none.
+    Values are texts or numbers; NaN is written as an empty cell. Dimensionless numbers have the
+    unit 1, and texts have no unit.
     """
 
     name: str
     columns: Columns
 
     def __getitem__(self, name: str) -> NDArray[Any]:
-        """The values of the column called ``name``. Raises KeyError when there is none."""
+        """Return the values of the column ``name``; raise KeyError if it does not exist."""
         heads = {head.partition(" [")[0]: head for head in self.columns}
         return np.asarray(self.columns[heads[name]])
 
     def write(self, folder: Path) -> Path:
-        """Write ``folder``/name.csv; returns its path."""
+        """Write ``folder``/name.csv and return its path."""
         path = folder / f"{self.name}.csv"
         with write_text(path, newline="") as file:
             writer = csv.writer(file, lineterminator="\n")
@@ -57,7 +57,7 @@ class Sheet:
 
 
 def summary(name: str, rows: Sequence[Mapping[str, Any]]) -> Sheet:
-    """Return a sheet of rows with the same heads."""
+    """Return a sheet from rows with the same keys."""
     return Sheet(name, {head: [row[head] for row in rows] for head in rows[0]})
 
 
@@ -69,7 +69,7 @@ def _cell(value: Any) -> str:
 
 @dataclass(frozen=True)
 class Erratum:
-    """Error of the paper: the place, the printed statement, and the correct one."""
+    """Erratum of the paper: its place, the printed statement and the correct one."""
 
     place: str
     printed: str
@@ -78,15 +78,15 @@ class Erratum:
 
 @dataclass(frozen=True)
 class Panel:
-    """Axes of a figure: what draws into them from the page's sheets, and the words around it."""
+    """Axes of a figure: the function that draws the sheets, labels, limits and legend."""
 
-    content: Callable[..., None]  # of axes and sheets
+    content: Callable[..., None]  # called with axes and sheets
     xlabel: str
     ylabel: str
     title: str = ""
     x: Ends | None = None
     y: Ends | None = None
-    legend: str | dict[str, Any] = ""  # its place, or more of matplotlib's words
+    legend: str | dict[str, Any] = ""  # location, or keyword arguments for matplotlib
 
     def draw(self, axes: Axes, sheets: Sequence[Sheet]) -> None:
         self.content(axes, *sheets)
@@ -98,14 +98,15 @@ class Panel:
 
 @dataclass(frozen=True)
 class FigurePage:
-    """One figure: its numbers, its panels, and what in the paper's version is mistaken."""
+    """Figure of the paper: its data, its panels, and the errata of the paper's version."""
 
     title: str
     size: tuple[float, float]  # [inch]
     sheets: Callable[[], tuple[Sheet, ...]]
     panels: tuple[Panel, ...]
     rows: int = 1
-    layout: dict[str, Any] = field(default_factory=dict)  # of matplotlib's subplots
+    # Keyword arguments for matplotlib's subplots.
+    layout: dict[str, Any] = field(default_factory=dict)
     errata: tuple[Erratum, ...] = ()
     notes: tuple[str, ...] = ()
 
@@ -121,7 +122,7 @@ class FigurePage:
 
 
 def errata_sheet(pages: dict[str, FigurePage]) -> Sheet:
-    """Return the errata of these pages, one a row."""
+    """Return the errata of these figures, one per row."""
     rows = [
         {"figure": name, "place in the paper": e.place, "printed": e.printed, "holds": e.holds}
         for name, page in pages.items()

@@ -1,14 +1,15 @@
-"""Sec. V's quasi-static manipulation: a slow turn, by the equations and on the simulated hand.
+"""Quasi-static manipulation (Sec. V): a slow turn, from the equations and on the simulated hand.
 
-Both tips are the paper's springs and stick; nothing else rubs. With the shear ζ of a tip
+Both tips are the paper's springs and stick to the object; there is no other friction. With the
+shear ζ of a tip
 
     U = πE [d³/(3 cos² θ) + d² ζ tan θ + d ζ²]      ζ̇ = −ṡ + (a − d) θ̇ − ḋ tan θ
 
-its rate the face's motion along itself less the tip's rolling, and less what lies along a tilted
-face as it goes deeper (s, d, θ of `kinematics.hand.geometry`, θ of the right tip mirrored). The
-object is in balance where Σ δU = 0 for each motion of it, that is, with M = ∂U/∂θ, T = ∂U/∂ζ and
-N = ∂U/∂d − T tan θ, Σ N δd + M δθ + T (−δs + (a − d) δθ) = 0. So is every pose of a turn that is
-slow: `turned` solves that step by step, and no time, mass or damping is in it.
+The shear rate is the difference between the tip's rolling and its motion along the face, minus the
+component along a tilted face as d increases (s, d, θ of `kinematics.hand.geometry`, with θ of the
+right tip mirrored). The object is in balance if Σ δU = 0 for each of its motions. With M = ∂U/∂θ,
+T = ∂U/∂ζ and N = ∂U/∂d − T tan θ, this is Σ N δd + M δθ + T (−δs + (a − d) δθ) = 0. Every pose of a
+slow turn fulfils this condition. `turned` solves it step by step, without time, mass or damping.
 """
 
 from __future__ import annotations
@@ -29,8 +30,8 @@ from softfinger.tools.watched import Watched
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-FORCE, WIDTH = 10.0, 0.040  # N on each tip's base; m
-REACH = math.radians(8.0)  # the object's angle, there, back, and to the other side
+FORCE, WIDTH = 10.0, 0.040  # N on each tip's base, m
+REACH = math.radians(8.0)  # object angle reached to both sides
 LEANS = (-4, -2, 0, 2, 4)  # degrees
 _SWING = 4.0  # s from 0 to REACH
 _ASIDE = np.radians(np.linspace(-2.5, 2.5, 41))
@@ -43,7 +44,7 @@ _FREE = {"table_friction": 0.0, "joint_friction": 0.0}
 
 
 class Held(NamedTuple):
-    """A pose of hand and object, and each tip's contact."""
+    """Pose of hand and object, and the contact of each tip."""
 
     q: FloatArray
     pose: FloatArray
@@ -72,7 +73,7 @@ class Held(NamedTuple):
         return float(math.pi * MODULUS * parts.sum())
 
     def torques(self) -> FloatArray:
-        """Return what each joint must bear [N·m], positive closing."""
+        """Return the torque of each joint [N·m], positive closing."""
         lengths = _HAND.finger_length, _HAND.finger_offset
         moves = np.array(
             [tip_velocity(q, k, *lengths) for q, k in zip(self.q, _SIDES, strict=True)]
@@ -85,7 +86,7 @@ class Held(NamedTuple):
         return np.asarray(normal * deeper - tangential * along + rolls)
 
     def unbalanced(self) -> FloatArray:
-        """Return the forces along x and y [N], the moment over W [N], and the grip's error [N]."""
+        """Return the residual forces along x and y [N], moment over W [N] and grip force [N]."""
         normal, moment, tangential = self.gradient()
         angle = self.pose[2]
         across, along = [math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]
@@ -103,7 +104,7 @@ class Held(NamedTuple):
 
 
 def held(q: FloatArray, pose: FloatArray, last: Held | None) -> Held:
-    """Return a pose whose tips have rolled there from ``last``; without it they are unsheared."""
+    """Return a pose to which the tips have rolled from ``last``; None means unsheared tips."""
     contacts = _HAND.contacts(q, pose, WIDTH)
     theta = _SIDES * contacts.theta
     shear = np.zeros(2)
@@ -115,7 +116,7 @@ def held(q: FloatArray, pose: FloatArray, last: Held | None) -> Held:
 
 
 def solve(residual: Callable[[FloatArray], FloatArray], start: FloatArray) -> FloatArray:
-    """Return the root near ``start`` by Newton's method. Raises RuntimeError without one."""
+    """Return the root near ``start`` by Newton's method; raise RuntimeError if it is not found."""
     x = start.copy()
     for _ in range(30):
         value = residual(x)
@@ -129,7 +130,7 @@ def solve(residual: Callable[[FloatArray], FloatArray], start: FloatArray) -> Fl
 
 @cache
 def gripped() -> Held:
-    """Return the upright grip in balance, from unsheared tips."""
+    """Return the balanced upright grip with unsheared tips."""
 
     def met(x: FloatArray) -> Held:
         q = np.full(2, x[0])
@@ -140,7 +141,7 @@ def gripped() -> Held:
 
 
 def turned(angles: FloatArray, start: Held) -> list[Held]:
-    """Return the quasi-static path from ``start`` on which the object takes ``angles`` [rad]."""
+    """Return the quasi-static path from ``start`` along which the object takes ``angles`` [rad]."""
     path = [start]
     for angle in angles:
 
@@ -155,15 +156,16 @@ def turned(angles: FloatArray, start: Held) -> list[Held]:
 
 
 def potential(there: Held, start: Held) -> float:
-    """Return V = ΣU − τ (q1 + q2) [J], 0 at ``start``, whose equal joint torque is τ."""
+    """Return V = ΣU − τ (q1 + q2) [J], 0 at ``start``, where both joint torques are τ."""
     torque = float(start.torques().mean())
     return there.energy() - start.energy() - torque * float((there.q - start.q).sum())
 
 
 def valley(floor: Held, aside: FloatArray, start: Held) -> FloatArray:
-    """Return V over the object's angles ``aside`` [rad] of the path's ``floor``, at the same lean.
+    """Return V at the object angle of ``floor`` plus each of ``aside`` [rad], at the same lean.
 
-    Least over all else; rolled there from ``start`` in one step; NaN where a tip would slip.
+    V is minimised over all other coordinates. The tips have rolled there from ``start`` in one
+    step. The value is NaN where a tip would slip.
     """
     lean = 0.5 * float(floor.q[0] - floor.q[1])
     torque = float(start.torques().mean())
@@ -189,9 +191,9 @@ def valley(floor: Held, aside: FloatArray, start: Held) -> FloatArray:
 
 
 def swing() -> list[dict[str, float]]:
-    """Turn the simulated hand's object there and back; a row every 20 ms.
+    """Turn the simulated hand's object there and back; return one row every 20 ms.
 
-    ΣU and T are scaled to `FORCE`, with F^(3/2) and F, as the held force is off by some percent.
+    The held force deviates by some percent, so ΣU and T are scaled to `FORCE`, with F^(3/2) and F.
     """
     sections: dict[str, dict[str, Any]] = {
         "material": {"law": "constant", "modulus": MODULUS},
@@ -227,13 +229,13 @@ def swing() -> list[dict[str, float]]:
 
 
 def _triangle(turns: float) -> float:
-    """0, 1, 0, −1, 0 at 0, 1, 2, 3, 4, straight in between."""
+    """Return a triangle wave: 0, 1, 0, −1, 0 at 0, 1, 2, 3, 4."""
     return 1.0 - abs((turns + 1.0) % 4.0 - 2.0)
 
 
 @cache
 def slow_turn() -> tuple[Sheet, ...]:
-    """Return the path by the equations, the plant's, and V at some leans of the fingers."""
+    """Return the path by the equations, that of the plant, and V at some leans of the fingers."""
     there = np.linspace(0.0, REACH, _STEPS + 1)[1:]
     back = np.r_[there[-2::-1], -np.linspace(0.0, REACH, _STEPS + 1)]
     start = gripped()

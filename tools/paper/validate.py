@@ -1,7 +1,8 @@
-"""``softfinger validate``: this model beside published figures: agree, disagree or unknown.
+"""Run ``softfinger validate``: compare this model with published figures.
 
-Each row computes its own figure when it is called, and names where the other one was published. A
-figure that nothing here models, or that no metal has shown, is unknown, with the reason.
+Each row computes a quantity and names the source of the published value; the verdict is agree,
+disagree or unknown. A quantity that is not modelled here, or that needs measurements on hardware,
+is unknown, with the reason.
 """
 
 from __future__ import annotations
@@ -27,28 +28,28 @@ if TYPE_CHECKING:
 
     FloatArray = NDArray[np.float64]
 
-RADIUS, MODULUS, POISSON = 0.020, 0.304e6, 0.49  # m, Pa: the paper's tip
+RADIUS, MODULUS, POISSON = 0.020, 0.304e6, 0.49  # m, Pa, 1: the paper's tip
 DEPTHS = np.linspace(0.001, 0.007, 25)  # m
 TILTS = np.radians(np.linspace(0.0, 20.0, 41))
 FIGURES = {"agree": "✓", "disagree": "✗", "unknown": "?"}
 _TRIALS = 5
 _FRAMES = 64
-_PRESSED = 0.005, 0.2  # m, rad: of the sensors' frames
+_PRESSED = 0.005, 0.2  # m, rad: contact in the sensors' frames
 
 
 class Beside(NamedTuple):
-    """One row: a published figure beside this project's."""
+    """Row with a published value and the value of this project."""
 
     quantity: str
     published: str
     source: str
     ours: str
-    verdict: str  # of FIGURES
+    verdict: str  # key of FIGURES
     why: str = ""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.epilog = "Takes some seconds: grips and frames are simulated."
+    parser.epilog = "This takes some seconds, because grips and frames are simulated."
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -66,14 +67,14 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def comparisons() -> Iterator[Beside]:
-    """Yield all rows, each computed as it comes."""
+    """Yield all rows; each is computed when it is requested."""
     for rows in (_tips, _energy, _memory, _sensors, _hands):
         yield from rows()
 
 
 def between(quantity: str, low: float, high: float, source: str, ours: float, form: str = ".2f",
             unit: str = "", why: str = "") -> Beside:  # fmt: skip
-    """Return a row that agrees where ``ours`` is within [low, high], to the digits of ``form``."""
+    """Return a row that agrees if ``ours`` is within [low, high], to the digits of ``form``."""
     shown = [f"{each:{form}}" for each in (low, high, ours)]
     inside = float(shown[0]) <= float(shown[2]) <= float(shown[1])
     verdict = "agree" if inside else "disagree"
@@ -82,7 +83,7 @@ def between(quantity: str, low: float, high: float, source: str, ours: float, fo
 
 
 def exponent(d: FloatArray, force: FloatArray) -> float:
-    """Return ζ of the least squares line of ln F = ln C + ζ ln d."""
+    """Return ζ from a least-squares fit of ln F = ln C + ζ ln d."""
     return float(np.polyfit(np.log(d), np.log(force), 1)[0])
 
 
@@ -179,7 +180,7 @@ def _sensors() -> Iterator[Beside]:
 
 
 def _errors(settings: Settings) -> tuple[float, float, float]:
-    """Return r.m.s. errors of d [m], tilt [rad] and force [N] of settled frames of a sensor."""
+    """Return RMS errors of d [m], tilt [rad] and force [N] for settled frames of a sensor."""
     from softfinger.daemon.profile.factory import make_material
     from softfinger.tools.benchmarks.estimator import settled
 

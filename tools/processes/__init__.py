@@ -1,1 +1,1 @@
-"""`run`, `emulate` and `compile`: the processes of a hand, what runs beside them, and their log."""
+"""Processes of a hand: `run`, `emulate` and `compile`, their child processes and their log."""

@@ -1,7 +1,7 @@
-"""Subcommands that run beside the daemon as its child processes: the monitor and the recorder.
+"""Run the monitor and the recorder as child processes of the daemon.
 
-Each holds one end of a pipe whose other end is the daemon's alone: however the daemon ends, the
-child sees the pipe close and ends too.
+Each child holds one end of a pipe, and only the daemon holds the other end. However the daemon
+ends, the pipe closes; the child notices this and ends too.
 """
 
 from __future__ import annotations
@@ -19,21 +19,22 @@ from typing import Any
 
 from softfinger.daemon.errors import SoftfingerError
 
-LEAVE = "\x18\x1b[0m\x1b[?2004l\x1b[?25h\x1b[?1049l"  # what a killed page could not write
+# Restores the terminal if the monitor was killed.
+LEAVE = "\x18\x1b[0m\x1b[?2004l\x1b[?25h\x1b[?1049l"
 _PATIENCE = 20.0  # s for a recorder to subscribe, or to close its file
 
 
 class NoRecorder(SoftfingerError):
-    """The recorder did not start. The message is the recorder's."""
+    """The recorder did not start; the message is the recorder's."""
 
 
 class _Lifeline:
-    """The pipe between this process and a child of it."""
+    """Pipe whose closing ends a child process."""
 
     def start(self, words: list[str], keys: str, **options: Any) -> subprocess.Popen[Any]:
-        """Start ``softfinger`` with ``words``, as a client with ``keys`` if there are any."""
+        """Start ``softfinger`` with the arguments ``words``, and ``--keys`` if there are any."""
         reads, self._ours = os.pipe()
-        # -P: a folder named tools where the daemon was started is not ours.
+        # -P: do not import from a folder named tools in the working directory.
         command = [sys.executable, "-P", "-m", "softfinger", *words, "--lifeline", str(reads)]
         try:
             return subprocess.Popen(
@@ -46,24 +47,24 @@ class _Lifeline:
             os.close(reads)
 
     def close(self) -> None:
-        """Let the child end."""
+        """Close the pipe, so that the child ends."""
         if self._ours >= 0:
             os.close(self._ours)
             self._ours = -1
 
 
 class MonitorBeside:
-    """The monitor on this process's terminal, which is the page's until `close`; a context.
+    """Run the monitor on this process's terminal until `close`.
 
-    ``on_end`` is called once, from a signal handler in the main thread, when the monitor has ended:
-    with ``on_end=loop.end`` the person's q ends the daemon.
+    ``on_end`` is called once, from a signal handler in the main thread, when the monitor has ended.
+    With ``on_end=loop.end`` the monitor's q key ends the daemon.
     """
 
     def __init__(
         self, stream: str, commands: str, on_end: Callable[[], None], keys: str = ""
     ) -> None:
         self._attributes: list[Any] | None = None
-        # A standard output that was closed, or is no file, is no terminal either.
+        # Standard output may be closed, or may be an object without a file descriptor.
         with contextlib.suppress(termios.error, AttributeError, OSError, ValueError):
             self._terminal = sys.stdout.fileno()
             self._attributes = termios.tcgetattr(self._terminal)
@@ -72,17 +73,20 @@ class MonitorBeside:
         self.process = self._lifeline.start(words, keys)
         called = False
 
-        def child_changed(*_: Any) -> None:  # also when the child was stopped or continued
+        def child_changed(*_: Any) -> None:  # called for stopped and continued children too
             nonlocal called
             if not called and self.process.poll() is not None:
                 called = True
                 on_end()
 
         signal.signal(signal.SIGCHLD, child_changed)
-        child_changed()  # it may have ended before there was a handler
+        child_changed()  # the monitor may have ended before the handler was set
 
     def close(self, patience: float = 2.0) -> None:
-        """End the monitor if it still runs, and wait until the terminal is back. Never raises."""
+        """End the monitor if it still runs, and wait until it has restored the terminal.
+
+        Never raises.
+        """
         self._lifeline.close()
         for end in (self.process.terminate, self.process.kill):
             try:
@@ -90,7 +94,8 @@ class MonitorBeside:
                 break
             except subprocess.TimeoutExpired:
                 end()
-        if self.process.wait() < 0 and self._attributes is not None:  # killed: it left the page on
+        # Killed: the page is still on the screen.
+        if self.process.wait() < 0 and self._attributes is not None:
             with contextlib.suppress(OSError, termios.error):
                 termios.tcsetattr(self._terminal, termios.TCSANOW, self._attributes)
                 os.write(self._terminal, LEAVE.encode())
@@ -103,9 +108,9 @@ class MonitorBeside:
 
 
 class RecorderBeside:
-    """A recording by ``record`` with these ``words``, the first of which is its file.
+    """Run ``record`` with the arguments ``words``; the first one is the file.
 
-    ``failed`` once it is known to be incomplete.
+    ``failed`` is set once the recording is known to be incomplete.
     """
 
     def __init__(
@@ -115,9 +120,9 @@ class RecorderBeside:
         on_end: Callable[[str], None],
         keys: str = "",
     ) -> None:
-        """Start it and wait until ``subscribed()``. Raises NoRecorder.
+        """Start the recorder and wait until ``subscribed()``; raise NoRecorder if that fails.
 
-        ``on_end`` is called from a thread, with the reason, when the recorder ends before `close`.
+        ``on_end`` is called from a thread, with the reason, if the recorder ends before `close`.
         """
         self.failed = False
         self._path = words[0]
@@ -125,7 +130,8 @@ class RecorderBeside:
         self._closing = False
         self._said = ""
         self._lifeline = _Lifeline()
-        # Its own session: Ctrl-C is for the daemon, whose last messages are recorded too.
+        # In a session of its own, the recorder does not receive Ctrl-C and records the daemon's
+        # last messages.
         self._process = self._lifeline.start(
             ["record", *words],
             keys,
@@ -145,7 +151,7 @@ class RecorderBeside:
         self._watch.start()
 
     def _wait(self) -> None:
-        """Sleep until the recorder has ended, and report it when that was not by `close`."""
+        """Wait until the recorder has ended, and report an end that `close` did not request."""
         self._said = "".join(self._process.communicate()).strip()
         self.failed = not self._closing or self._process.returncode != 0
         if self._closing:
@@ -157,7 +163,7 @@ class RecorderBeside:
         self._on_end(f"the recorder has ended, nothing is recorded any more: {why[0]}")
 
     def close(self) -> str:
-        """Have the file closed; the recorder's own summary."""
+        """Let the recorder close its file; return the recorder's summary."""
         self._closing = True
         if self._watch.is_alive():
             self._process.send_signal(signal.SIGTERM)

@@ -1,7 +1,7 @@
-"""``softfinger compile``, and what a first start does: a scene's kernels, on all cores.
+"""Compile the kernels of a scene on all cores, for ``softfinger compile`` and first starts.
 
-The daemon then only loads them and stays small. Each process takes one part of the pipeline after
-another (`loop.warm_up`); parts that need the contact table wait for it.
+The daemon then only loads the kernels, which keeps its memory use small. Each process takes one
+part of the pipeline after another (`loop.warm_up`); parts that need the contact table wait for it.
 """
 
 from __future__ import annotations
@@ -38,19 +38,24 @@ from softfinger.tools.sweep import Progress, processors
 Tell = Callable[[str, str, str], None]
 
 _ROOT = Path(__file__).parents[3]
-_MEMORY = 400e6  # bytes that a process needs at most
-_LOOK = 0.2  # s between two looks at the time
+_MEMORY = 400e6  # bytes, upper bound for one process
+_LOOK = 0.2  # s between two checks
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_profile(parser)
     parser.add_argument(
-        "--all", action="store_true", help="also what the other tools and the tests use"
+        "--all", action="store_true", help="also compile the kernels of other tools and tests"
     )
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Compile what is missing; 1 when something could not be. Raises SettingsError."""
+    """Compile the missing kernels; return 1 if one could not be compiled.
+
+    Raises
+    ------
+    SettingsError
+    """
     built = build_kernels(profile(arguments), print_event, ALL if arguments.all else None)
     if built.failed:
         return 1
@@ -60,14 +65,14 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 class Built(NamedTuple):
-    """The result: how many parts were missing, and whether one could not be built."""
+    """Result of a build: the number of missing parts, and whether one of them failed."""
 
     parts: int
     failed: bool
 
 
 def print_event(_level: str, _kind: str, text: str) -> None:
-    """Print an event on standard error, for tools without a log."""
+    """Print an event on standard error, for tools that have no log."""
     print(text, file=sys.stderr, flush=True)
 
 
@@ -76,9 +81,9 @@ def build_kernels(
 ) -> Built:
     """Build the missing parts of ``wanted``, by default of the whole scene.
 
-    Silent and quick when none is missing. Progress is a bar on standard error if that is a
-    terminal and ``bar`` allows it, else a call of ``tell`` for each part, as (level, kind, text);
-    failures go to ``tell``, too. When interrupted it ends every process.
+    Returns quickly and prints no message if all parts exist. Progress is shown as a bar if standard
+    error is a terminal and ``bar`` is set, otherwise by a call of ``tell(level, kind, text)`` for
+    each part. Failures are also passed to ``tell``. An interruption ends all processes.
     """
     folder = kernel_folder()
     if folder is not None and (count := remove_damaged(folder)):
@@ -107,7 +112,7 @@ def _kernels(missing: list[Part]) -> int:
 
 
 def _available() -> float:
-    """Memory that may be taken without swapping [bytes]; infinite where Linux doesn't tell."""
+    """Return the memory available without swapping [bytes]; infinite if it is unknown."""
     try:
         _, _, rest = Path("/proc/meminfo").read_text().partition("MemAvailable:")
     except OSError:
@@ -116,21 +121,21 @@ def _available() -> float:
 
 
 class _Build:
-    """Builds parts in a few processes, each with a thread that hands it one part after another."""
+    """Build parts in several processes, each fed by its own thread."""
 
     def __init__(self, settings: Settings, missing: list[Part], tell: Tell, bar: Progress) -> None:
         self._head = f"{settings.model_dump_json()}\n"
         self._missing = missing
-        self._at: dict[str, str] = {}  # the kernel under way of each part under way
+        self._at: dict[str, str] = {}  # for each part being built, the kernel being compiled
         self._total, self._begun = _kernels(missing), 0
         self._started = time.monotonic()
         self._bar, self._tell = bar, tell
         self._processes: list[subprocess.Popen[str]] = []
-        self._own = threading.local()  # each thread's process
+        self._own = threading.local()  # one process per thread
         self.failed = self._over = False
 
     def run(self) -> None:
-        """Build all parts; when interrupted, end every process."""
+        """Build all parts; end all processes if interrupted."""
         built: dict[str, Future[str]] = {}
         jobs = max(1, min(processors(), len(self._missing), int(_available() / _MEMORY)))
         pool = ThreadPoolExecutor(jobs)
@@ -150,7 +155,8 @@ class _Build:
             for process in self._processes:
                 with process:
                     pass
-        reasons: set[str] = set()  # wrong settings fail every part alike
+        # Reported once each: wrong settings make every part fail for the same reason.
+        reasons: set[str] = set()
         for name, future in built.items():
             if (reason := future.result()) and reason not in reasons:
                 self._tell("warning", "compile", f"{name} was not compiled ahead: {reason}")
@@ -164,7 +170,7 @@ class _Build:
         )
 
     def _build(self, part: Part, after: Future[str] | None) -> str:
-        """Have this thread's process build a part once ``after`` is done; why that failed."""
+        """Build a part in this thread's process after ``after``; return the reason of a failure."""
         if after is not None:
             wait([after])
         head, process = "", getattr(self._own, "process", None)
@@ -194,8 +200,8 @@ class _Build:
 
 
 def _start() -> subprocess.Popen[str]:
-    """A process that runs `main`."""
-    # -P: a folder named tools where this was started is not ours.
+    """Start a process that runs `main`."""
+    # -P: do not import from a folder named tools in the working directory.
     command = [sys.executable, "-P", "-m", "softfinger.tools.processes.compile"]
     path = os.pathsep.join(filter(None, (str(_ROOT), os.environ.get("PYTHONPATH"))))
     return subprocess.Popen(
@@ -204,20 +210,21 @@ def _start() -> subprocess.Popen[str]:
         stdout=subprocess.PIPE,
         env=os.environ | {"PYTHONPATH": path},
         text=True,
-        process_group=0,  # Ctrl-C is for this process, which ends it
+        process_group=0,  # this process handles Ctrl-C and ends the children
     )
 
 
 def main() -> None:
-    """Compile kernels, a part of a scene at a time, until standard input ends.
+    """Compile kernels, one part of a scene at a time, until standard input ends.
 
-    Standard input: the settings in JSON, then the name of a part a line. Standard output, a line
-    each: ``kernel NAME`` as one is begun, ``done`` when a part is built, ``failed REASON`` when it
-    can't be.
+    Standard input holds the settings in JSON, then the name of one part per line. Standard output
+    has lines of three forms: ``kernel NAME`` when a kernel is started, ``done`` when a part is
+    built, and ``failed REASON`` when a part could not be built.
     """
-    gc.set_threshold(100_000)  # the compiler makes much that lives: looking through it costs 10 %
+    # The compiler allocates many long-lived objects; frequent collections cost 10 %.
+    gc.set_threshold(100_000)
     out = sys.stdout
-    sys.stdout = sys.stderr  # for all other prints
+    sys.stdout = sys.stderr  # other prints must not disturb the protocol
 
     def tell(line: str) -> None:
         print(line, file=out, flush=True)

@@ -1,4 +1,4 @@
-"""``softfinger emulate``: the emulated hand's process. Arguments, signals and exit status."""
+"""Run ``softfinger emulate``, the process of an emulated hand: arguments, signals, exit status."""
 
 from __future__ import annotations
 
@@ -19,62 +19,62 @@ from softfinger.tools.ending import Interrupted, Signals
 if TYPE_CHECKING:
     from softfinger.daemon.profile.settings import Settings
 
-_LOOK = 0.1  # s between two looks at a plate's way
+_LOOK = 0.1  # s between two queries about the motion of a plate or joint
 _FAULTS = """\
-faults, each KIND[=VALUE][@START], given as often as needed:
+faults, each KIND[=VALUE][@START], any number of them:
   tactile boards   torn, noisy (=PROBABILITY a frame), silent, frozen, wrong-size, saturated, zero;
-                   both boards, or one: left:silent, right:torn=0.2
-  to the servos    lose, lose-writes =PROBABILITY that an instruction reaches none of them
+                   on both boards, or on one: left:silent, right:torn=0.2
+  to the servos    lose, lose-writes =PROBABILITY that an instruction does not reach any servo
   servo replies    drop, late, truncate, corrupt, duplicate =PROBABILITY; delay=S for every reply
-  servos           silent, answer, reboot, overheat, overload, undervoltage =ID; their readings:
-                   stuck (angle stands, velocity and current read 0), jump (by 0.2 rad), frozen
-                   (all registers stand, their time too), refuse (an error for each); recover =ID
-  ports            unplug, plug for the servos'; left:unplug, right:plug … for a board's
-  measurements     which are wrong while the hand is as it was; of both fingers, or left:gain=0.5:
-                   gain=FACTOR of all pressures, shift-x, shift-y=CELLS of the image, mirror=1 (its
-                   columns in reverse), drift=SHARE of the largest count (below 0, too), replay=S
-                   (the last S seconds of frames, 3 at most, again and again with new numbers),
-                   current=FACTOR of what a servo reports; back with 1, 1 for factors and 0 else
+  servos           silent, answer, reboot, overheat, overload, undervoltage =ID; readings: stuck
+                   (constant angle, velocity and current 0), jump (by 0.2 rad), frozen (all
+                   registers constant, including time), refuse (errors only); recover =ID
+  ports            unplug, plug for the port of the servos; left:unplug, right:plug … for a board
+  measurements     wrong values while the hand itself is unchanged; on both fingers, or on one:
+                   left:gain=0.5. gain=FACTOR of all pressures, shift-x, shift-y=CELLS of the image,
+                   mirror=1 (columns reversed), drift=FRACTION of the largest count (may be
+                   negative), replay=S (repeats the last S seconds of frames, at most 3, with new
+                   numbers), current=FACTOR of the reported current; to end: factors 1, others 0
   the object       push=N along its faces, away from the palm, twist=N·m; 0 ends it
-  all well again   well for the servos' line, boards and measurements, left:well for one finger's
-  @START           when it starts [s]; at once without. gain=0.5@3..5: a measurement goes wrong
-                   evenly from 3 to 5 s
+  recovery         well for the servos' line, boards and measurements, left:well for one finger
+  @START           start time [s], by default at once. gain=0.5@3..5: a measurement changes linearly
+                   from 3 to 5 s
 
-softfinger emulate --send "drop=0.01 left:frozen@2" changes a running one, by DIR/control.
+softfinger emulate --send "drop=0.01 left:frozen@2" changes a running emulator, through DIR/control.
 
-a plate on a stage, which presses a tip instead of the object, so that `calibrate` can be tried:
-  --send "press PRESSES", which returns when the plate is there
-  PRESSES are separated by commas, each some of these words:
-    depth=4mm      or force=5N; or pressure=10kPa on all cells, as by a bladder; depth=0mm lifts off
-    tilt=10deg     of the plate (0)
-    speed=2mm/s    of the way there (5)
-    hold=1s        then it lifts off; a last press without it stays, others rest for 1 s
+a plate on a stage, which presses a tip instead of the object, for trying `calibrate`:
+  --send "press PRESSES", which returns when the plate has arrived
+  PRESSES are separated by commas; each consists of some of these words:
+    depth=4mm      or force=5N; or pressure=10kPa on all cells, as from a bladder; depth=0mm lifts
+    tilt=10deg     tilt of the plate (0)
+    speed=2mm/s    approach speed (5)
+    hold=1s        hold, then lift; without it the last press stays, and others are held for 1 s
     tip=left       or right (both)
-  The log says what a tip feels where a plate has come to rest. The joints don't feel it.
+  The log shows the force on a tip when a plate has come to rest. Plates do not act on the joints.
 
-a person's hand, which turns joints without torque, so that `calibrate joints` can be tried:
-  --send "turn left=closed right=open"   each to its stop, or upright with zero; ends when there
+a person's hand, which turns joints without torque, for trying `calibrate joints`:
+  --send "turn left=closed right=open"   each to its stop, or upright with zero; returns on arrival
 
-the object, where it slipped away: --send place puts it back, at rest and without a load.
+the object, after it slipped away: --send place puts it back, at rest and without a load.
 
-what was on the servos' wire, for tests of a daemon: --send report prints it as JSON, --send forget
-begins the record again, --send "report forget" does both without a gap:
-  t, monotonic     the hand's time now [s], and time.monotonic() then
-  servos           left first, of each:
-    id, torque, mode, q, hardware_error, watchdog (time armed for [s], 0 when it is not, null after
-                   it stopped the motor), stopped_by_watchdog: the state now
+the record of the servo bus, for tests of a daemon: --send report prints it as JSON, --send forget
+starts a new record, and --send "report forget" does both without a gap:
+  t, monotonic     current time of the hand [s], and time.monotonic() at that time
+  servos           left first, for each:
+    id, torque, mode, q, hardware_error, watchdog (time-out [s], 0 if it is not armed, null after it
+                   stopped the motor), stopped_by_watchdog: current state
     goal_q, goal_current
-                   least and greatest goal that came [rad, A; positive closes], refused ones too;
-                   null when none came; goals near where a limp joint is are left out
-    goals_refused  how many writes with a goal the servo refused
-    torque_on      count, t of the last; far: how often the goal was more than 0.05 rad away,
+                   smallest and largest goal received [rad, A; positive closes], including refused
+                   ones; null without goals; goals near the position of a limp joint are omitted
+    goals_refused  number of writes with a goal that the servo refused
+    torque_on      count, t of the last; far: number of times the goal was more than 0.05 rad away,
                    farthest [rad]
     quiet, longest_quiet
-                   time since the last instruction with torque on, null while it is off, and the
-                   longest such [s]
+                   time since the last instruction with torque on (null while it is off), and the
+                   longest such time [s]
     watchdog_fired count, t of the last
-  object           pose (x, y [m], angle [rad]) now
-  force            what presses each tip now [N], left first
+  object           current pose (x, y [m], angle [rad])
+  force            current force on each tip [N], left first
 """
 
 
@@ -84,39 +84,38 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--dir",
         type=Path,
         metavar="DIR",
-        help="where servos, tactile-left and tactile-right are linked, a folder of your own, made "
-        "if absent; without it one in your runtime folder",
+        help="your own folder for the links servos, tactile-left, tactile-right; made if absent "
+        "(default: a folder in your runtime folder)",
     )
     add_settings(parser)
-    parser.add_argument("--model", metavar="NAME", help="the servos' model")
+    parser.add_argument("--model", metavar="NAME", help="model of the servos")
     parser.add_argument(
         "--ids",
         type=_ids,
         metavar="L,R",
-        help="the servos' IDs, left first; 1,1 lets both answer at once, as factory-new ones do",
+        help="IDs of the servos, left first; with 1,1 both answer at once, like factory-new servos",
     )
     parser.add_argument(
         "--baud",
         type=int,
         default=0,
         metavar="N",
-        help="servos take the wire's time at this rate and hear no other; "
-        "0 answers at once and at any rate (default)",
+        help="servos answer only at this baud rate, with its transmission time; "
+        "0: at any rate and without delay (default)",
     )
     parser.add_argument(
         "--factory",
         action="store_true",
-        help="servos as they leave the factory: position mode, 500 µs return delay; in all with "
+        help="factory-new servos: position mode, 500 µs return delay; complete with "
         "--baud 57600 --ids 1,1",
     )
     parser.add_argument(
         "--send",
         metavar="WORDS",
-        help="send words to the emulator that runs in DIR: faults that begin, or a request for a "
-        "report; then end",
+        help="send faults or requests (see below) to the emulator that runs in DIR, then exit",
     )
     parser.add_argument(
-        "--fault", action="append", default=[], metavar="FAULT", help="what goes wrong; see below"
+        "--fault", action="append", default=[], metavar="FAULT", help="a fault; see below"
     )
 
 
@@ -131,7 +130,7 @@ def _ids(text: str) -> tuple[int, ...]:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Emulate until SIGINT, SIGTERM or SIGHUP; 1 with one line when it can't be set up."""
+    """Emulate until SIGINT, SIGTERM or SIGHUP; return 1 with a message if the set-up fails."""
     arguments.dir = arguments.dir or own_runtime_folder()
     if arguments.dir is None:
         raise SettingsError(f"{runtime_fault()}; or name another folder by --dir")
@@ -148,10 +147,10 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _serve(settings: Settings, arguments: argparse.Namespace, signals: Signals) -> int:
-    # What follows imports numpy and numba: wrong settings are reported without waiting for them.
+    # The following imports load numpy and numba; report wrong settings before this delay.
     from softfinger.daemon.loop.realtime import RealTime
 
-    gc.disable()  # collections over half-imported modules are a tenth of the start-up
+    gc.disable()  # garbage collections during imports take a tenth of the start-up time
     from softfinger.daemon.loop.warm_up import EMULATED
     from softfinger.daemon.simulation.emulator.emulator import (
         EmulatedServos,
@@ -184,10 +183,11 @@ def _serve(settings: Settings, arguments: argparse.Namespace, signals: Signals) 
 
 
 def _unhurried(settings: Settings, paced: bool) -> Settings:
-    """``settings`` with the real-time measures that suit a pseudo-terminal.
+    """Return the settings with the real-time measures that suit a pseudo-terminal.
 
-    Not SCHED_FIFO, which holds up the kernel's worker that carries the bytes across. Idle states
-    are held off where servos have a wire's time, since they sleep as little as a wire does.
+    SCHED_FIFO is not used, because it delays the kernel worker that transfers the bytes. Idle
+    states are disabled only if the servos reproduce wire timing, because they then sleep for times
+    as short as on a wire.
     """
     changes = {"priority": 0, "cpus": (), "spin": 0.0, "lock_memory": False}
     held = paced and settings.realtime.hold_latency
@@ -201,7 +201,8 @@ def _send(folder: Path, words: str) -> int:
 
     try:
         reply = send_words(folder, words)
-        # The way takes the emulated hand's time, which stands still while that is held up.
+        # The motion is timed by the emulated hand's clock, which stops while the emulator is
+        # suspended, so ask again for the remaining time.
         kind = words.partition(" ")[0]
         while kind in ("press", "turn") and reply.startswith("{"):
             left = json.loads(reply)["wait"]

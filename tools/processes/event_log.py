@@ -1,11 +1,12 @@
-"""The daemon's log: events as lines on standard error or in a file, written by its own thread.
+"""Log the daemon's events as lines on standard error or in a file, from a separate thread.
 
-A stopped terminal (Ctrl-S), a full pipe or a full disk blocks a writer: the tick never writes, and
-lines that can't be written are dropped.
+A stopped terminal (Ctrl-S), a full pipe or a full disk blocks the writer. Therefore the tick never
+writes, and lines that cannot be written are dropped.
 
-Plain lines are for people. With ``form="json"`` each line is an object: ``timestamp`` (Unix s, when
-it was handed over), ``level`` (``info``, ``warning``, ``error``), ``kind`` and ``text``, as in
-``hand/event``, and numbers as fields of their own. In systemd's journal each line has its priority.
+Plain lines are for people. With ``form="json"`` each line is an object with the fields
+``timestamp`` (Unix time [s] at which the line was queued), ``level`` (``info``, ``warning``,
+``error``), ``kind`` and ``text``, as in ``hand/event``, and numbers in separate fields. In
+systemd's journal each line has its priority.
 """
 
 from __future__ import annotations
@@ -22,19 +23,19 @@ from typing import Any, TextIO
 
 from softfinger.daemon.own_files import write_text
 
-_KEPT = 1000  # lines that wait for a slow reader; older ones are dropped
+_KEPT = 1000  # lines kept for a slow reader; older lines are dropped
 _PRIORITIES = {"error": "<3>", "warning": "<4>", "": "<6>", "info": "<6>"}  # see sd-daemon(3)
 _LEVELS = {logging.DEBUG: "info", logging.INFO: "info", logging.WARNING: "warning"}
 
 
 class EventLog:
-    """Lines for people or programs. ``line`` never waits and never fails.
+    """Log for people or programs; ``line`` never blocks and never fails.
 
-    Raises OSError when ``file`` can't be opened; it is written on at its end.
+    An existing ``file`` is appended to. Raises OSError if it cannot be opened.
     """
 
     def __init__(self, form: str = "plain", file: Path | None = None) -> None:
-        self.quiet = False  # while a page owns the terminal
+        self.quiet = False  # set while a full-screen page uses the terminal
         self._json = form == "json"
         self._file: TextIO | None = None
         if file is not None:
@@ -47,24 +48,27 @@ class EventLog:
         self._thread.start()
 
     def line(self, level: str, kind: str, text: str, **fields: Any) -> None:
-        """Hand over one line; ``fields`` are shown in JSON alone."""
+        """Queue one line; ``fields`` appear only in JSON."""
         if not self.quiet or self._file is not None:
             self._lines.append((time.time(), level, kind, text, fields))
             self._news.set()
 
     def plain(self, text: str, level: str = "") -> None:
-        """Hand over one line as it is; in JSON it is of ``level``, or ``info``, and no kind."""
+        """Queue one line without a kind; plain logs show it unchanged.
+
+        In JSON its level is ``level``, or ``info`` if that is empty.
+        """
         self._lines.append((time.time(), level, "", text, {}))
         self._news.set()
 
     def take_over_logging(self) -> None:
-        """Take all modules' warnings and errors from Python's logging."""
+        """Receive the warnings and errors of all modules from Python's logging."""
         handler = _LogHandler(self)
         handler.setLevel(logging.WARNING)
         logging.getLogger().addHandler(handler)
 
     def close(self, patience: float = 1.0) -> None:
-        """Write what waits, for ``patience`` s at most."""
+        """Write the queued lines, for at most ``patience`` s."""
         self._closing = True
         self._news.set()
         self._thread.join(patience)
@@ -78,7 +82,7 @@ class EventLog:
                 try:
                     print(self._shown(*self._lines.popleft()), file=out, flush=True)
                 except (OSError, ValueError):
-                    pass  # nobody can read it
+                    pass  # the output was closed
             if self._closing:
                 return
 
@@ -92,7 +96,7 @@ class EventLog:
             shown = text
         else:
             shown = f"{level:7} {kind:8} {text}"
-            if not self._journal:  # which has the time of each line by itself
+            if not self._journal:  # the journal adds the time itself
                 date = "%H:%M:%S" if self._file is None else "%Y-%m-%d %H:%M:%S"
                 shown = f"{_clock(date, timestamp)} {shown}"
         if self._journal:
@@ -102,7 +106,7 @@ class EventLog:
 
 
 def _clock(date: str, timestamp: float) -> str:
-    """The time of day, or the seconds of a nonsensical clock."""
+    """Format the time of day; return the seconds if the system clock is invalid."""
     try:
         clock = time.strftime(date, time.localtime(timestamp))
     except (OverflowError, OSError, ValueError):
@@ -111,7 +115,7 @@ def _clock(date: str, timestamp: float) -> str:
 
 
 def _is_journal() -> bool:
-    """Return whether standard error goes to systemd's journal."""
+    """Return True if standard error goes to systemd's journal."""
     try:
         status = os.fstat(sys.stderr.fileno())
     except (OSError, ValueError, AttributeError):
@@ -120,7 +124,7 @@ def _is_journal() -> bool:
 
 
 class _LogHandler(logging.Handler):
-    """Python's logging into an event log."""
+    """Forward Python's logging to an event log."""
 
     def __init__(self, log: EventLog) -> None:
         super().__init__()
@@ -130,5 +134,5 @@ class _LogHandler(logging.Handler):
         level = _LEVELS.get(record.levelno, "error")
         try:
             self._log.line(level, record.name.rpartition(".")[2], record.getMessage())
-        except Exception:  # a log call must not end its caller
+        except Exception:  # an error in logging must not end the caller
             self.handleError(record)

@@ -1,4 +1,4 @@
-"""``softfinger run``: the daemon's process. Settings, signals and exit status, and no more."""
+"""Run ``softfinger run``, the daemon's process: settings, signals and exit status."""
 
 from __future__ import annotations
 
@@ -23,44 +23,51 @@ from softfinger.tools.processes.beside import MonitorBeside, NoRecorder, Recorde
 from softfinger.tools.processes.event_log import EventLog
 
 _STARTED = time.monotonic()
-_DETAIL = "realtime"  # kind of news that only --verbose logs
+_DETAIL = "realtime"  # kind of event that is logged only with --verbose
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_profile(parser)
     add_duration(parser)
     parser.add_argument(
-        "--monitor", action="store_true", help="show the live page here; q ends both"
+        "--monitor", action="store_true", help="show the live page in this terminal; q ends both"
     )
     parser.add_argument(
-        "--log", choices=("plain", "json"), default="plain", help="lines for people or programs"
+        "--log", choices=("plain", "json"), default="plain", help="lines for people, or JSON"
     )
     parser.add_argument(
-        "--log-file", type=Path, metavar="FILE", help="log to FILE's end, not to standard error"
+        "--log-file", type=Path, metavar="FILE", help="append the log to FILE, not to stderr"
     )
     parser.add_argument("--verbose", action="store_true", help="also log the real-time measures")
     parser.add_argument(
-        "--no-task", action="store_true", help="stay disarmed although the profile names a task"
+        "--no-task", action="store_true", help="stay disarmed even if the profile names a task"
     )
     parser.add_argument(
         "--record",
         type=Path,
         metavar="FILE.mcap",
-        help="record everything from the first tick on (extra 'record')",
+        help="record all topics from the first tick on (extra 'record')",
     )
     add_split(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run until a signal or ``--duration``; 0, or 1 with a line that says what was wrong.
+    """Run until a signal or the end of ``--duration``.
 
-    Raises SettingsError with the whole report.
+    Returns
+    -------
+    0, or 1 after a message with the reason of the failure.
+
+    Raises
+    ------
+    SettingsError
+        With the report of all errors.
     """
     settings = profile(arguments)
     if arguments.no_task:
         settings = settings.model_copy(update={"task": TaskSettings()})
     signals = Signals()
-    signal.signal(signal.SIGUSR1, signal.SIG_IGN)  # until there is something to stop
+    signal.signal(signal.SIGUSR1, signal.SIG_IGN)  # ignored until the loop runs
     try:
         log = EventLog(arguments.log, arguments.log_file)
     except OSError as error:
@@ -79,10 +86,10 @@ def run(arguments: argparse.Namespace) -> int:
 def _serve(
     settings: Settings, arguments: argparse.Namespace, signals: Signals, log: EventLog
 ) -> int:
-    # What follows imports numpy, numba and zmq: wrong settings are reported before.
+    # The following imports load numpy, numba and zmq; report wrong settings before this delay.
     from softfinger.daemon.loop.realtime import RealTime
 
-    gc.disable()  # collections over half-imported modules are a tenth of the start-up
+    gc.disable()  # garbage collections during imports take a tenth of the start-up time
     from softfinger.daemon.loop.build import Daemon
     from softfinger.tools.processes.compile import build_kernels
 
@@ -98,7 +105,8 @@ def _serve(
         daemon = Daemon(settings, on_event=on_event)
     except (SoftfingerError, ValueError) as error:
         log.plain(f"softfinger: {error}", "error")
-        return 2 if isinstance(error, SettingsError) else 1  # 2: a service is not started again
+        # The service is not restarted after status 2.
+        return 2 if isinstance(error, SettingsError) else 1
     with daemon, _service(daemon.loop), RealTime(settings) as measures:
         loop = daemon.loop
         signals.hand_over(loop.end)
@@ -120,7 +128,7 @@ def _serve(
                 log.plain(f"softfinger: {error}")
                 return 1
         page: AbstractContextManager[Any] = nullcontext()
-        log.quiet = arguments.monitor  # from here on the page owns the terminal
+        log.quiet = arguments.monitor  # the page now uses the terminal
         if arguments.monitor:
             addresses = settings.stream.address, settings.commands.address
             page = MonitorBeside(*addresses, loop.end, settings.access.keys)
@@ -150,7 +158,7 @@ def _serve(
 
 @contextmanager
 def _service(loop: Any) -> Iterator[None]:
-    """Notify systemd where it asks: ready with the first tick, alive with each, stopping."""
+    """Notify systemd, if it asks for that: ready at the first tick, alive at each, stopping."""
     service = Service.of_environment()
     if service is None:
         yield
@@ -164,7 +172,7 @@ def _service(loop: Any) -> Iterator[None]:
 
 
 def _record(arguments: argparse.Namespace, settings: Settings, daemon: Any) -> Any:
-    """A recorder that has subscribed to everything. Raises NoRecorder."""
+    """Start a recorder and wait until it has subscribed; raise NoRecorder on failure."""
     from softfinger.daemon.wire import schema
     from softfinger.daemon.wire.publisher import bit
 
@@ -191,7 +199,7 @@ def _scene(settings: Settings) -> str:
 
 
 def _numbers(state: State) -> dict[str, Any]:
-    """Return the hand's numbers that the log has at an event; ``seq`` finds it in a recording."""
+    """Return the numbers logged with an event; ``seq`` locates the event in a recording."""
     numbers = {"force": [each.force for each in state.contacts], "q": state.reading.q}
     real = {
         name: [float(each) if math.isfinite(each) else None for each in pair]  # JSON has no NaN

@@ -1,4 +1,4 @@
-"""Conversion of a topic's map to a channel's JSON and back, for the writer and the reader."""
+"""Convert the map of a topic to the JSON of a channel and back, for the writer and the reader."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ SCHEMA_ENCODING = "jsonschema"
 PROFILE = "softfinger"
 LIBRARY = "softfinger"
 
-# Frames and events are Foxglove's messages, too: its schema, and the fields that it wants. Where
-# one of ours has the same name, ours has another name in the recording.
+# Frames and events also follow Foxglove's schemas and contain the fields that these require. A
+# field of the stream whose name is used by Foxglove gets another name in the recording.
 _STAMP = {
     "type": "object",
     "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}},
@@ -37,26 +37,26 @@ _FOXGLOVE: dict[bytes, tuple[str, dict[str, Any]]] = {
     ),
 }
 _STORED_AS = {"timestamp": "unix", "level": "severity"}
-_LEVELS = {"info": 2, "warning": 3, "error": 4}  # Foxglove's; 0 is one that it doesn't know
+_LEVELS = {"info": 2, "warning": 3, "error": 4}  # Foxglove's levels; its level 0 means unknown
 
 Converter = Callable[[dict[str, Any]], dict[str, Any]]
 
 
 def channel_name(topic: bytes, message: dict[str, Any]) -> str:
-    """Return the channel of a message: its topic, and a frame's finger."""
+    """Return the channel of a message: its topic, for a frame followed by the finger."""
     if topic == schema.TACTILE:
         return f"{topic.decode()}/{message.get('finger')}"
     return topic.decode()
 
 
 def topic_of(channel: str) -> bytes:
-    """Return the topic whose messages a channel holds."""
+    """Return the topic of the messages in a channel."""
     topic = schema.TACTILE.decode()
     return schema.TACTILE if channel.startswith(f"{topic}/") else channel.encode()
 
 
 def schema_of(topic: bytes) -> tuple[str, dict[str, Any]]:
-    """Return name and JSON schema of a topic's channels; an unknown topic's is any object."""
+    """Return name and JSON schema of a topic's channels; an unknown topic may hold any object."""
     if topic not in schema.TOPICS:
         return topic.decode(), {"type": "object"}
     described = schema_docs.json_schema(topic)
@@ -71,12 +71,12 @@ def schema_of(topic: bytes) -> tuple[str, dict[str, Any]]:
 
 
 def to_json(topic: bytes) -> Converter:
-    """Return the converter of maps to JSON. It may change the map."""
+    """Return the converter from maps to JSON; the converter may modify the map."""
     return {schema.TACTILE: _image, schema.EVENT: _log}.get(topic, lambda message: message)
 
 
 def from_json(topic: bytes) -> Converter:
-    """Return the converter of a channel's JSON to the map of the wire."""
+    """Return the converter from a channel's JSON to the map on the wire."""
     fields = schema.TOPICS[topic].fields if topic in schema.TOPICS else ()
     floats = [field.name.split(".") for field in fields if field.kind == "float"]
     return partial(_restored, topic, floats, [field.name for field in fields])
@@ -124,9 +124,9 @@ def _log(message: dict[str, Any]) -> dict[str, Any]:
 def _restored(
     topic: bytes, floats: list[list[str]], names: list[str], message: dict[str, Any]
 ) -> dict[str, Any]:
-    """Return the topic's own map: nulls are NaN again, bytes are bytes, and no image or log line.
+    """Return the topic's own map: nulls become NaN, base64 becomes bytes, Foxglove's fields go.
 
-    Raises ValueError, TypeError or AttributeError for what is no message of the topic.
+    Raises ValueError, TypeError or AttributeError if the map is not a message of the topic.
     """
     if topic in _FOXGLOVE and _STORED_AS["timestamp"] in message:
         for name in _FOXGLOVE[topic][1]:

@@ -1,4 +1,4 @@
-"""``softfinger export FILE.mcap``: topics as CSV or Parquet, frames as arrays."""
+"""Run ``softfinger export FILE.mcap``: export topics as CSV or Parquet, and frames as arrays."""
 
 from __future__ import annotations
 
@@ -22,9 +22,10 @@ from softfinger.tools.extras import require
 from softfinger.tools.recordings.reader import Recording
 
 _EPILOG = """\
-Writes one table a topic, hand-state.csv and so on, with a column for each field (left.force). A
-sensor's frames also go into tactile-left.npz or -right.npz: frames [n, rows, cols] and t [n],
-which `softfinger analyse` and numpy.load read. Parquet keeps the frames' bytes in the table too."""
+Writes one table for each topic, e.g. hand-state.csv, with a column for each field (left.force). The
+frames of a sensor are also written to tactile-left.npz or tactile-right.npz, as frames
+[n, rows, cols] and t [n], for `softfinger analyse` and numpy.load. Parquet tables also contain the
+bytes of the frames."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -35,13 +36,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--format", choices=("csv", "parquet"), default="csv")
     parser.add_argument(
-        "--topics", nargs="+", metavar="TOPIC", help="as state or hand/state (default: all)"
+        "--topics", nargs="+", metavar="TOPIC", help="e.g. state or hand/state (default: all)"
     )
     add_range(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Export; 1 when there is nothing to export. Raises RecordingError, MissingExtra, OSError."""
+    """Export the topics; return 1 if there is nothing to export.
+
+    Raises
+    ------
+    RecordingError, MissingExtra, OSError
+    """
     from softfinger.tools.sweep import Progress
 
     path: Path = arguments.file
@@ -71,11 +77,11 @@ def _topics(words: list[str] | None, recorded: list[bytes]) -> list[bytes]:
 
 
 Row = dict[str, Any]
-_BLOCK = 2000  # rows
+_BLOCK = 2000  # rows written at a time
 
 
 class CsvTable:
-    """A CSV file; floats with all their digits, NaN as an empty cell, no bytes."""
+    """CSV file; floats keep all digits, NaN is an empty cell, byte fields are left out."""
 
     suffix = ".csv"
 
@@ -93,12 +99,12 @@ class CsvTable:
 
 
 class ParquetTable:
-    """A Parquet file with the schema's types."""
+    """Parquet file with the types of the schema."""
 
     suffix = ".parquet"
 
     def __init__(self, path: Path, columns: dict[str, str]) -> None:
-        """Raises MissingExtra."""
+        """Open the file; raise MissingExtra without pyarrow."""
         require("parquet")
         import pyarrow
         import pyarrow.parquet
@@ -144,13 +150,21 @@ def export(
     end: float = math.inf,
     progress: Any = None,
 ) -> list[Path]:
-    """Write each topic's table into ``folder``, and frames into one ``.npz`` file a sensor.
+    """Write a table for each topic into ``folder``, and one ``.npz`` file of frames per sensor.
 
-    Columns are the schema's and what the first message has besides; ``t`` counts in s from the
-    recording's first message. Returns the files. Raises OSError, and MissingExtra.
+    The columns are those of the schema and any additional fields of the first message; ``t`` is the
+    time since the recording's first message [s].
+
+    Returns
+    -------
+    The files written.
+
+    Raises
+    ------
+    OSError, MissingExtra
     """
     tables: dict[bytes, Table] = {}
-    grids: dict[str, tuple[list[float], list[Any]]] = {}  # times and counts by finger
+    grids: dict[str, tuple[list[float], list[Any]]] = {}  # (times, counts) by finger
     files: list[Path] = []
     with contextlib.ExitStack() as opened:
         for topic, message in recording.messages(topics, start, end, progress):
@@ -179,12 +193,12 @@ def export(
 
 
 def _file_name(topic: bytes) -> str:
-    """A topic's name as a file's, from any recording: neither hidden nor in another folder."""
+    """Return a safe file name for a topic of any recording: not hidden, and without a folder."""
     return re.sub(r"[^A-Za-z0-9._-]", "-", topic.decode()).lstrip(".")[:100] or "topic"
 
 
 def _flat(message: Row, outer: str = "") -> Row:
-    """A map without maps in it: ``left.force`` for the force in ``left``."""
+    """Flatten nested maps: ``left.force`` for the force in ``left``."""
     row: Row = {}
     for key, value in message.items():
         if isinstance(value, dict):

@@ -1,8 +1,8 @@
-"""`Recording`: an MCAP file's summary, and its messages in the order in which they came.
+"""Read MCAP files: `Recording` gives a summary of a file and its messages in order of arrival.
 
-A recording may come from any writer of the format: with or without chunks, indexes, statistics and
-other channels. Its claims are not trusted: memory and time are bounded by its size on the disk.
-`read_recording` gives its states as NumPy columns.
+A recording may come from any writer of the format, with or without chunks, indexes, statistics and
+channels of other programs. Sizes and counts in the file are not trusted: memory and time are
+bounded by the file's size on disk. `read_recording` returns the states as NumPy columns.
 """
 
 from __future__ import annotations
@@ -26,28 +26,34 @@ if TYPE_CHECKING:
     from mcap.records import Statistics
     from numpy.typing import NDArray
 
-_MESSAGE_MOST = 1 << 20  # bytes; the largest grid's frame has 0.2 MB
-_SETTINGS_MOST = 4 << 20  # with the calibrations of each cell
-_CHUNK_MOST = 64 << 20  # unpacked; writers' usual chunks have 1 to 8 MB
-_RECORD_LEAST = 512  # bytes that a channel or a message counts for: each takes time
+_MESSAGE_MOST = 1 << 20  # bytes; a frame of the largest grid has 0.2 MB
+_SETTINGS_MOST = 4 << 20  # bytes; includes calibrations of each cell
+_CHUNK_MOST = 64 << 20  # bytes unpacked; chunks usually have 1 to 8 MB
+# bytes counted at least for each channel or message, because each takes time to read
+_RECORD_LEAST = 512
 _CHANNELS_MOST = 64
-_OTHERS_SHOWN = 3  # channels of other writers
-_FIELDS_MOST = 500  # of a message
+_OTHERS_SHOWN = 3  # channels of other programs named in a message
+_FIELDS_MOST = 500  # fields in one message
 _HEADER, _FOOTER, _CHANNEL, _MESSAGE, _CHUNK, _STATISTICS, _DATA_END = 1, 2, 4, 5, 6, 11, 15
-_RECORD = struct.Struct("<BQ")  # what each begins with: its kind, the bytes of its content
-_BEFORE_DATA = struct.Struct("<HIQQ")  # channel, number, log time and publish time of a message
-_BEFORE_CHUNK = struct.Struct("<QQQII")  # first and last time, size, CRC, length of a name
+_RECORD = struct.Struct("<BQ")  # head of each record: kind, size of the content
+_BEFORE_DATA = struct.Struct("<HIQQ")  # head of a message: channel, number, log time, publish time
+# Head of a chunk: first and last time, size, CRC, length of the compression's name.
+_BEFORE_CHUNK = struct.Struct("<QQQII")
 _LENGTH = struct.Struct("<Q")
 _MAGIC = b"\x89MCAP0\r\n"
 _END = struct.Struct("<BQQQI8s")  # footer and magic
 
 
 def read_recording(path: str | Path) -> dict[str, NDArray[Any]]:
-    """Return a recording's states as one array a field, in the order in which they came.
+    """Read a recording's states as one array per field, in the order in which they arrived.
 
-    The names are those of `hand/state`, nested ones with a dot (``left.force``); ``t`` is the time
-    from the first state on [s]. ``pandas.DataFrame(read_recording("run.mcap"))`` takes it as it is.
-    Raises RecordingError for a file that is no recording or holds no state.
+    Names are those of `hand/state`, nested ones with a dot (``left.force``); ``t`` is the time
+    since the first state [s]. ``pandas.DataFrame(read_recording("run.mcap"))`` accepts the result.
+
+    Raises
+    ------
+    RecordingError
+        If the file is not a recording or contains no state.
     """
     from softfinger.daemon.client.stream import read, to_columns
     from softfinger.daemon.wire.schema import STATE, HandState
@@ -61,7 +67,7 @@ def read_recording(path: str | Path) -> dict[str, NDArray[Any]]:
 
 
 class MessageSource(Protocol):
-    """A stream's messages, stored in a file or in memory; ``path`` names it in messages."""
+    """Source of messages, in a file or in memory; ``path`` names it in messages to the user."""
 
     path: Path
 
@@ -72,29 +78,29 @@ class MessageSource(Protocol):
 
 
 class Recording:
-    """A recording that exists. Raises RecordingError for another file.
+    """Existing recording; raises RecordingError if the file is not a recording.
 
-    ``counts`` messages by channel, and ``start`` and ``end`` [Unix s] (NaN when empty) come from
-    the summary at the file's end. A file without a full summary, or with channels of other writers,
-    is read through once instead. A killed recorder leaves a file without an end: it is
-    ``truncated``. Damaged chunks are left out. ``others`` counts the messages of other writers'
-    channels, which are ignored. ``say`` is called once with each of these findings.
+    ``counts`` (messages by channel), ``start`` and ``end`` (Unix time [s], NaN when empty) come
+    from the summary at the end of the file. A file without a full summary, or with channels of
+    other programs, is read once as a whole instead. The file of a killed recorder has no end and is
+    marked ``truncated``. Damaged chunks are skipped. ``others`` counts the messages in channels of
+    other programs, which are ignored. ``say`` is called once for each of these findings.
     """
 
     def __init__(self, path: Path, say: Callable[[str], None] | None = None) -> None:
         require("record")
         self.path = path
         self.truncated = False
-        self.damage = ""  # what is wrong with it, as far as it was read
+        self.damage = ""  # description of the first damage found so far
         self._say = say
         self.counts: dict[str, int] = {}
-        self.others: dict[str, int] = {}  # messages of channels that are not the stream's
+        self.others: dict[str, int] = {}  # number of messages in channels of other programs
         self.start = math.nan
         self.end = math.nan
         self.chunks = 0
         self._first = 0  # log time of the earliest message [ns]
-        self._left = 0  # bytes that may yet be unpacked
-        self._names: dict[int, str] = {}  # of the channels, by number
+        self._left = 0  # bytes that may still be unpacked
+        self._names: dict[int, str] = {}  # channel names by channel number
         self._other_names: dict[int, str] = {}
         try:
             with open_regular(path) as file:
@@ -128,21 +134,21 @@ class Recording:
 
     @property
     def duration(self) -> float:
-        """Time from the first message to the last [s]; 0 when empty."""
+        """Time from the first to the last message [s]; 0 when empty."""
         return 0.0 if math.isnan(self.start) else self.end - self.start
 
     @property
     def total(self) -> int:
-        """Messages of all channels."""
+        """Number of messages in all channels."""
         return sum(self.counts.values())
 
     @property
     def topics(self) -> list[bytes]:
-        """The topics that it has messages of."""
+        """Topics with at least one message."""
         return sorted({topic_of(name) for name, count in self.counts.items() if count})
 
     def count(self, topic: bytes) -> int:
-        """Return the messages of one topic."""
+        """Return the number of messages of one topic."""
         return sum(n for name, n in self.counts.items() if topic_of(name) == topic)
 
     def messages(
@@ -152,12 +158,11 @@ class Recording:
         end: float = math.inf,
         progress: Callable[[int], None] | None = None,
     ) -> Iterator[tuple[bytes, dict[str, Any]]]:
-        """Yield topic and map of each message, as it came off the wire, from ``start`` to ``end``
-        [s].
+        """Yield topic and map of each message from ``start`` to ``end`` [s], as on the wire.
 
-        Times count from the recording's first message. ``progress`` is called with the bytes read
-        so far. A truncated file ends where its sound part ends; damaged chunks and messages that
-        don't fit their topic are left out.
+        Times count from the recording's first message. ``progress`` is called with the number of
+        bytes read so far. A truncated file is read up to its first incomplete record. Damaged
+        chunks and messages that do not fit their topic are skipped.
         """
         import orjson
 
@@ -188,9 +193,9 @@ class Recording:
     def _messages(
         self, times: tuple[int, int] = (0, 2**64), progress: Callable[[int], None] | None = None
     ) -> Iterator[tuple[int, int, bytes]]:
-        """Yield number of the channel, log time [ns] and data of each message; learn channels.
+        """Yield channel number, log time [ns] and data of each message, and record new channels.
 
-        Chunks outside ``times`` are passed over.
+        Chunks outside ``times`` are skipped.
         """
         self.chunks = 0
         with open_regular(self.path) as file:
@@ -215,7 +220,7 @@ class Recording:
     def _messages_in(
         self, chunk: bytes, times: tuple[int, int]
     ) -> Iterator[tuple[int, int, bytes]]:
-        """Yield a chunk's messages up to where it is damaged."""
+        """Yield the messages of a chunk, up to a damaged record."""
         first, last, size, crc, length = _BEFORE_CHUNK.unpack_from(chunk)
         self._count(size)
         if last < times[0] or first > times[1]:
@@ -229,11 +234,11 @@ class Recording:
             for kind, content in _records(io.BytesIO(data), (_CHANNEL, _MESSAGE)):
                 if (message := self._take_record(kind, content)) is not None:
                     yield message
-        except Exception as error:  # the format's, the compression's and more kinds
+        except Exception as error:  # errors of the format, of the compression and others
             self._damaged(error)
 
     def _take_record(self, kind: int, content: bytes) -> tuple[int, int, bytes] | None:
-        """Take in a channel, None, or a message."""
+        """Process a channel record (returns None) or a message."""
         if kind == _CHANNEL:
             self._count(max(0, _RECORD_LEAST - len(content)))
             self._learn(content)
@@ -255,7 +260,7 @@ class Recording:
         channel = Channel.read(ReadDataStream(io.BytesIO(content)))
         name = channel.topic.removeprefix("/")
         known = topic_of(name) in schema.TOPICS
-        # In the stream's own profile unknown topics are those of a newer version.
+        # In a recording by softfinger, an unknown topic comes from a newer version.
         if channel.message_encoding != ENCODING or not (known or self._profile == PROFILE):
             self._other_names[channel.id] = channel.topic
             return
@@ -264,7 +269,7 @@ class Recording:
             raise ValueError(f"more than {_CHANNELS_MOST} channels")
 
     def check(self) -> bool:
-        """Read every message; whether the file is whole and sound."""
+        """Read every message; return True if the file is complete and undamaged."""
         for _ in self._messages():
             pass
         return not self.truncated and not self.damage
@@ -272,14 +277,14 @@ class Recording:
     def _damaged(self, error: Exception | None) -> None:
         first = not self.damage
         usual = "its end is missing" if self.truncated else "a chunk can't be read"
-        # What the format's reader says of a wrong length or checksum helps nobody.
+        # The MCAP library's messages about a wrong length or checksum do not help the user.
         self.damage = self.damage or (str(error) if type(error) is ValueError else "") or usual
         if first and self._say is not None:
             what = "cut short" if self.truncated else "damaged"
             self._say(f"{self.path}: {what} ({self.damage}); what is sound in it is read")
 
     def _begin(self, file: BinaryIO) -> str:
-        """Return the profile in the header, empty where that is damaged; and see the file's end."""
+        """Check the file's end; return the profile in the header, PROFILE if it is damaged."""
         from mcap.data_stream import ReadDataStream
         from mcap.records import Header
 
@@ -297,7 +302,7 @@ class Recording:
             return PROFILE
 
     def _summary(self, file: BinaryIO) -> Statistics | None:
-        """Return the summary's statistics, None where they or their channels are missing."""
+        """Return the summary's statistics; None if they or their channels are missing."""
         from mcap.data_stream import ReadDataStream
         from mcap.records import Statistics
 
@@ -335,7 +340,7 @@ class Recording:
             self.end = statistics.message_end_time * 1e-9
 
     def _scan(self) -> None:
-        """Count the messages and find their times by reading all of them."""
+        """Read all messages to count them and to find their times."""
         start, end = 2**64, -1
         for channel, log_time, _ in self._messages():
             if channel in self._names:
@@ -351,10 +356,10 @@ class Recording:
 
 
 def _records(file: IO[bytes], wanted: Collection[int]) -> Iterator[tuple[int, bytes]]:
-    """Yield kind and content of the records that are ``wanted``, until the end.
+    """Yield kind and content of each record of the ``wanted`` kinds.
 
-    Of a message that is too long only the part before its data. Raises EOFError for a record that
-    is cut short, ValueError for an invalid or too long one.
+    For a message that is too long, only the part before its data is returned. Raises EOFError for
+    an incomplete record, ValueError for an invalid or too long one.
     """
     while head := file.read(_RECORD.size):
         if len(head) < _RECORD.size:
@@ -378,9 +383,9 @@ def _records(file: IO[bytes], wanted: Collection[int]) -> Iterator[tuple[int, by
 
 
 def _plain(message: dict[str, Any]) -> dict[str, Any]:
-    """Return a map whose values are plain, or maps of at most two levels, with few fields in all.
+    """Check that a map has plain values, at most two levels of nested maps and few fields.
 
-    Raises ValueError for another, AttributeError for what is no map.
+    Raises ValueError if it does not, AttributeError if it is not a map.
     """
     count, maps = 0, [message]
     for _ in range(3):
@@ -396,7 +401,7 @@ def _plain(message: dict[str, Any]) -> dict[str, Any]:
 
 
 def _unpacked(method: str, data: memoryview, size: int, crc: int) -> bytes:
-    """A chunk's records. Raises ValueError where it claims too much, or isn't what it claims."""
+    """Unpack a chunk's records; raise ValueError for a wrong checksum or an excessive size."""
     if size > _CHUNK_MOST:
         raise ValueError(f"a chunk of {size >> 20} MB")
     if method == "zstd":

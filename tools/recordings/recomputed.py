@@ -1,4 +1,4 @@
-"""Runs a recording's inputs through today's code and compares the states with the recorded ones."""
+"""Recompute the states of a recording from its inputs and compare them with the recorded states."""
 
 from __future__ import annotations
 
@@ -28,19 +28,19 @@ from softfinger.tools.recordings.reader import MessageSource, Recording
 if TYPE_CHECKING:
     from softfinger.daemon.perception.finger_model import FingerModel
 
-# Fields that depend on the machine and the moment, not on the loop's inputs.
+# Fields that depend on the machine's timing and not on the loop's inputs.
 _TIMING = frozenset({"tick_s", "compute_s", "wake_late_s", "overruns", "behind_s", "seq_step"})
 
-_SETTINGS = ("settings", "calibration_left", "calibration_right")  # of hand/settings
+_SETTINGS = ("settings", "calibration_left", "calibration_right")  # fields of hand/settings
 
 
 @dataclass(slots=True)
 class Difference:
-    """Difference of one field of ``hand/state``: how often, first where, worst where."""
+    """Differences in one field of ``hand/state``: how often, where first and where largest."""
 
     count: int = 0
     first_tick: int = 0
-    recorded: Any = None  # at the first
+    recorded: Any = None  # at the first difference
     recomputed: Any = None
     worst: float = 0.0  # largest difference of numbers
     worst_tick: int = 0
@@ -48,21 +48,25 @@ class Difference:
 
 @dataclass(slots=True)
 class Comparison:
-    """The result: ticks run, states compared, fields that differ."""
+    """Result of a comparison: ticks run, states compared and fields that differ."""
 
     ticks: int = 0
     states: int = 0
     fields: int = 0
-    from_start: bool = False  # the recording has the first tick
+    from_start: bool = False  # the recording contains the first tick
     missing_ticks: int = 0
     missing_frames: int = 0
     differences: dict[str, Difference] = field(default_factory=dict)
 
 
 def recorded_settings(recording: MessageSource) -> tuple[Settings, list[str]]:
-    """Return the recording's settings and calibrations (JSON). Raises RecordingError.
+    """Return the recording's settings and its calibrations (JSON).
 
-    The settings name no files: a recording may come from anywhere.
+    References to files are removed from the settings, because recordings are not trusted.
+
+    Raises
+    ------
+    RecordingError
     """
     message = next((each for _, each in recording.messages([schema.SETTINGS])), None)
     if message is None:
@@ -82,9 +86,11 @@ def recorded_settings(recording: MessageSource) -> tuple[Settings, list[str]]:
 
 
 def recorded_models(recording: MessageSource) -> tuple[FingerModel, FingerModel]:
-    """Return the models of a recording's fingers by its own settings and calibrations.
+    """Return the finger models that follow from the recording's settings and calibrations.
 
-    Raises RecordingError, SettingsError, TactileError.
+    Raises
+    ------
+    RecordingError, SettingsError, TactileError
     """
     settings, calibrations = recorded_settings(recording)
     from softfinger.daemon.loop.process_replay import with_calibrations
@@ -97,7 +103,13 @@ def recorded_models(recording: MessageSource) -> tuple[FingerModel, FingerModel]
 def counts_of(
     recording: MessageSource, message: dict[str, Any], settings: Settings
 ) -> NDArray[np.uint16]:
-    """Return a frame's counts. Raises RecordingError for pressures, or a grid of another shape."""
+    """Return the counts of a frame.
+
+    Raises
+    ------
+    RecordingError
+        If the frame holds pressures, or a grid of another shape.
+    """
     if message.get("unit") != "count":
         raise RecordingError(
             f"{recording.path}: frames in {message.get('unit')!r}, expected counts: "
@@ -120,8 +132,8 @@ def recompute(
 ) -> Comparison:
     """Run the recorded inputs through the loop and compare every state.
 
-    ``settings`` replace the recorded ones. Raises RecordingError when the recording lacks a topic
-    or frames.
+    ``settings`` replace the recorded ones. Raises RecordingError if the recording lacks a topic or
+    frames.
     """
     own, calibrations = recorded_settings(recording)
     if not recording.count(schema.INPUT):
@@ -146,7 +158,7 @@ def _run(
     calibrations: list[str],
     progress: Callable[[int], None] | None,
 ) -> None:
-    # What has no settings and no inputs is refused before the loop is loaded.
+    # Refuse a recording without settings and inputs before the loop is imported.
     from softfinger.daemon.loop.process_replay import ProcessReplay
     from softfinger.daemon.loop.publishing import parts
 
@@ -182,7 +194,7 @@ def _run(
         result.ticks += 1
         if state is not None:
             step = state.get("seq_step", 1)
-            # Through the packer, as the recorded one: the same types and roundings.
+            # Pack and unpack as for the recorded state, to get the same types and rounding.
             again = msgpack.unpackb(pack_state(now, scene, step))
             _compare(result, state, again)
 
@@ -196,7 +208,7 @@ _Tick = tuple[
 def _ticks(
     recording: Recording, used: Settings, progress: Callable[[int], None] | None
 ) -> Iterator[_Tick]:
-    """Yield each tick: its frames and commands come before its input, its state after it."""
+    """Yield each tick: frames and commands are stored before its input, its state after it."""
     wanted = (schema.INPUT, schema.TACTILE, schema.COMMAND, schema.STATE)
     frames: dict[tuple[int, int], Any] = {}
     commands: dict[int, list[dict[str, Any]]] = {}
@@ -228,7 +240,7 @@ def _ticks(
 
 
 def _request(text: str) -> dict[str, Any] | None:
-    """A command's map, None where there is none."""
+    """Return a command's map; None if there is none."""
     try:
         found = json.loads(text)
     except (ValueError, RecursionError):

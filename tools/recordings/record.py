@@ -1,4 +1,4 @@
-"""``softfinger record FILE.mcap``: the running daemon's stream into an MCAP file by chunks."""
+"""Run ``softfinger record FILE.mcap``: record the running daemon's stream into an MCAP file."""
 
 from __future__ import annotations
 
@@ -44,30 +44,29 @@ from softfinger.tools.recordings.channels import (
 from softfinger.tools.recordings.reader import Recording
 
 _EPILOG = """\
-Ends with Ctrl-C or after --duration; prints what it wrote and what was lost on the way.
-With --split-size or --split-time it goes on in FILE-2.mcap, FILE-3.mcap and so on.
-`replay --recompute` needs --topics all; `run --record` records that from the first tick on.
-Exit status: 0 written, 1 not or not all, with the reason."""
+Recording ends with Ctrl-C or after --duration. The messages written and lost are then printed.
+With --split-size or --split-time, recording continues in FILE-2.mcap, FILE-3.mcap and so on.
+`replay --recompute` needs --topics all; `run --record` records all topics from the first tick on.
+Exit status: 0 everything was written, 1 not everything was written, with the reason."""
 
-_SILENCE = 2.0  # s without a message after which a line says so
-# s between two looks at the socket, where messages wait meanwhile: waking for each one would cost
-# more than all that is done with it.
+_SILENCE = 2.0  # s without a message before a notice is printed
+# s between two reads of the socket; waking up for each message would cost more than processing it.
 _STEP = 0.1
-_BACKLOG = 10.0  # s for messages that wait when the end is asked for
-_QUIET = 0.5  # s in which what was sent before it arrives, on a busy machine, too
-_SHOW = 0.5  # s between two progress lines, and two flushes
-_BATCH = 1000  # messages between two looks at the clock
+_BACKLOG = 10.0  # s for processing queued messages after the end is requested
+_QUIET = 0.5  # s to wait at the end for messages still in transit on a busy machine
+_SHOW = 0.5  # s between progress lines, and between flushes
+_BATCH = 1000  # messages between two checks of the time
 
 
-# A killed recorder loses at most the chunk that wasn't full yet, since the last flush.
+# A killed recorder loses at most the incomplete chunk, i.e. the messages since the last flush.
 CHUNK = 256 * 1024  # bytes before compression: a fifth of a second of state at 1 kHz
 
 
 class RecordingWriter:
-    """Writes one file. ``messages`` and ``size`` [bytes] count what is in it: whole chunks.
+    """Write one file; ``messages`` and ``size`` [bytes] count the complete chunks in it.
 
-    Raises RecordingError when the file can't be opened, or exists already. After a failed write the
-    file is closed: what was written until then can be read.
+    Raises RecordingError if the file cannot be opened or already exists. After a failed write the
+    file is closed; the data written before remain readable.
     """
 
     def __init__(self, path: Path) -> None:
@@ -79,15 +78,17 @@ class RecordingWriter:
         self.messages = 0
         self.size = 0
         self._dumps = orjson.dumps
-        self._added = 0  # messages, with those of the chunk that is being filled
-        self._filled = 0  # bytes of messages in that chunk
-        self._channels: dict[bytes | str, tuple[int, Converter]] = {}  # by topic, frames' by name
+        self._added = 0  # number of messages, including the incomplete chunk
+        self._filled = 0  # bytes of messages in the incomplete chunk
+        # By topic, for frames by channel name.
+        self._channels: dict[bytes | str, tuple[int, Converter]] = {}
         self._schemas: dict[bytes, int] = {}
         self._ended = False
         self._newest = math.nan  # time of the newest message [s]
-        self._early: list[tuple[bytes, dict[str, Any]]] = []  # repeated before any other came
+        # Repeated messages that came before any other message.
+        self._early: list[tuple[bytes, dict[str, Any]]] = []
         try:
-            self._file = path.open("xb", buffering=4 * CHUNK)  # a chunk goes out in one write
+            self._file = path.open("xb", buffering=4 * CHUNK)  # a chunk is written at once
         except FileExistsError:
             raise RecordingError(f"{path}: exists already; nothing is written over it") from None
         except FileNotFoundError:
@@ -95,17 +96,19 @@ class RecordingWriter:
         except OSError as error:
             raise RecordingError(f"{path}: {error.strerror}") from None
         try:
-            self._mcap = Writer(self._file, 2 * CHUNK)  # `add` ends a chunk before that
+            # Larger than the limit at which `add` ends a chunk.
+            self._mcap = Writer(self._file, 2 * CHUNK)
             self._mcap.start(PROFILE, LIBRARY)
             self._wrote()
         except OSError as error:
             raise self._failed(error) from None
 
     def add(self, topic: bytes, message: dict[str, Any]) -> None:
-        """Write one message; the map may be changed. Raises RecordingError.
+        """Write one message; the map may be modified. Raises RecordingError.
 
-        A repeated message (``again``) has its first time in it, from before the recording. In the
-        file its log time is that of the message before it, so that the file's times are its own.
+        A repeated message (``again``) contains its original time, from before the recording. Its
+        log time in the file is that of the preceding message, so that log times stay within the
+        recording.
         """
         assert not self._ended
         stamp = message.get("timestamp")
@@ -122,7 +125,7 @@ class RecordingWriter:
         self._write(topic, message, when)
 
     def flush(self) -> None:
-        """End the chunk and hand it to the system: a killed process doesn't lose it."""
+        """End the chunk and pass it to the system, so that it survives a killed process."""
         try:
             self._mcap.flush()  # type: ignore[no-untyped-call]
             self._wrote()
@@ -130,7 +133,7 @@ class RecordingWriter:
             raise self._failed(error) from None
 
     def close(self) -> None:
-        """Write the last chunk and the summary. Raises RecordingError."""
+        """Write the last chunk and the summary; raise RecordingError if that fails."""
         if self._ended:
             return
         if self._early:
@@ -140,7 +143,7 @@ class RecordingWriter:
             self._mcap.finish()  # type: ignore[no-untyped-call]
             self._wrote()
             self._file.close()
-            del self._mcap  # with the index of all its chunks, by far the most of its memory
+            del self._mcap  # frees the index of all chunks, which takes most of the writer's memory
         except OSError as error:
             raise self._failed(error) from None
 
@@ -157,7 +160,7 @@ class RecordingWriter:
             channel, convert = self._channels[key]
             try:
                 data = self._dumps(convert(message))
-            except TypeError:  # orjson's error, too: JSON can't hold it
+            except TypeError:  # also orjson's error for values that JSON cannot represent
                 return
             sequence = message.get("seq")
             sequence = sequence & 0xFFFFFFFF if isinstance(sequence, int) else 0
@@ -184,10 +187,11 @@ class RecordingWriter:
 
     def _failed(self, error: OSError) -> RecordingError:
         self._ended = True
-        with contextlib.suppress(OSError):  # the buffer's rest doesn't fit either, and is dropped
+        # The remaining buffer does not fit either and is dropped.
+        with contextlib.suppress(OSError):
             self._file.close()
         with contextlib.suppress(OSError):
-            os.truncate(self.path, self.size)  # to the last record that is whole
+            os.truncate(self.path, self.size)  # keep only complete records
         return RecordingError(
             f"{self.path}: {error.strerror}; what was written until then can be read, "
             f"`softfinger record --recover {self.path}` closes it"
@@ -196,24 +200,26 @@ class RecordingWriter:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
-    parser.add_argument("file", type=Path, metavar="FILE.mcap", help="must not exist yet")
+    parser.add_argument(
+        "file", type=Path, metavar="FILE.mcap", help="output file; must not exist yet"
+    )
     add_stream(parser)
     parser.add_argument(
         "--topics",
         nargs="+",
         type=topic,
         metavar="TOPIC",
-        help="as state or hand/state, or all (default: all but input, each tick's inputs)",
+        help="e.g. state or hand/state, or all (default: all but input, each tick's inputs)",
     )
     add_split(parser)
-    parser.add_argument("--lifeline", type=int, help=argparse.SUPPRESS)  # ends when it closes
+    parser.add_argument("--lifeline", type=int, help=argparse.SUPPRESS)  # end when this pipe closes
     parser.add_argument(
         "--recover", action="store_true", help="repair a FILE that was cut short; record nothing"
     )
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Record until the end; 1 when not everything was written. Raises SoftfingerError."""
+    """Record until the end; return 1 if not everything was written. Raises SoftfingerError."""
     if arguments.recover:
         messages, damage = recover(arguments.file)
         state = f"was damaged ({damage}), its sound part is kept" if damage else "sound"
@@ -224,21 +230,21 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 class _Recorder:
-    """One call of ``record``: socket, files and counters."""
+    """State of one call of ``record``: socket, files and counters."""
 
     def __init__(self, arguments: argparse.Namespace, ending: Ending) -> None:
         self._arguments = arguments
         self._ending = ending
-        self._keys = client_keys(arguments.keys)  # before there is a file
+        self._keys = client_keys(arguments.keys)  # fail before a file is created
         self._gaps: dict[bytes, Gaps] = {}
-        self._writers = [RecordingWriter(arguments.file)]  # the last is being written
+        self._writers = [RecordingWriter(arguments.file)]  # messages go to the last one
         self._opened = time.monotonic()
-        self._messages = 0  # received, to be written
+        self._messages = 0  # number of messages received for writing
         self._unreadable = 0
-        self._waiting = False  # and said so
+        self._waiting = False  # the notice about the missing stream was printed
 
     def record(self) -> int:
-        """Take messages until the end."""
+        """Record messages until the end; return the exit status."""
         arguments, failure = self._arguments, ""
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         try:
@@ -258,7 +264,7 @@ class _Recorder:
         return self._summary(failure)
 
     def _take_all(self, socket: zmq.Socket[bytes]) -> str:
-        """Take messages until the end; why it failed, or an empty text."""
+        """Read messages until the end; return the reason of a failure, or an empty text."""
         arguments, ending = self._arguments, self._ending
         began = shown = last = time.monotonic()
         ending.begin()
@@ -281,12 +287,12 @@ class _Recorder:
                 self._writers[-1].flush()
                 self._show(now - began, now - last)
                 shown = now
-        # What was sent before a signal may still be on its way: a daemon's last words among it.
+        # Messages sent before a signal may still be in transit, e.g. the daemon's last ones.
         self._read_remaining(socket, _QUIET if ending.asked or not ending.over else 0.0)
         return failure
 
     def _take_batch(self, socket: zmq.Socket[bytes]) -> int:
-        """Take the messages that wait; their number, ``_BATCH`` at most."""
+        """Process at most ``_BATCH`` waiting messages; return their number."""
         count = 0
         for message in drain(socket, _BATCH):
             self._take(message)
@@ -294,7 +300,7 @@ class _Recorder:
         return count
 
     def _read_remaining(self, socket: zmq.Socket[bytes], quiet: float) -> None:
-        """Take the messages that wait, and those for which ``quiet`` s of waiting are enough."""
+        """Process the waiting messages, and those that arrive within ``quiet`` s of waiting."""
         end = time.monotonic() + _BACKLOG
         while time.monotonic() < end:
             if self._take_batch(socket) < _BATCH:
@@ -302,7 +308,8 @@ class _Recorder:
                     return
                 began = time.monotonic()
                 socket.poll(int(_STEP * 1e3))
-                quiet -= min(time.monotonic() - began, _STEP)  # a standstill is one step of it
+                # A stall of the process counts as one step.
+                quiet -= min(time.monotonic() - began, _STEP)
 
     def _take(self, frames: list[bytes]) -> None:
         try:
@@ -323,7 +330,7 @@ class _Recorder:
             return
         path = arguments.file
         path = path.with_name(f"{path.stem}-{len(self._writers) + 1}{path.suffix}")
-        # Before the old one is closed: should this fail, that is still there.
+        # Open the new file before closing the old one, which stays usable if opening fails.
         self._writers.append(RecordingWriter(path))
         self._opened = time.monotonic()
         writer.close()
@@ -347,7 +354,8 @@ class _Recorder:
             if written:
                 print(f"{path}: {path.stat().st_size / 1e6:.2f} MB")
             else:
-                path.unlink(missing_ok=True)  # an empty file would be in the next call's way
+                # An empty file would block the next call with this name.
+                path.unlink(missing_ok=True)
         lost = ", ".join(
             f"{gaps.lost} of {topic.decode()}" for topic, gaps in self._gaps.items() if gaps.lost
         )
@@ -367,9 +375,9 @@ def _topics(named: list[bytes] | None) -> list[bytes]:
 
 
 def recover(path: Path) -> tuple[int, str]:
-    """Close the recording in place; how many messages it has, and what ended its reading.
+    """Close a recording in place; return its number of messages and the reason it was incomplete.
 
-    A sound file is left as it is. The new file takes the old one's place only once it is whole.
+    A complete file is not changed. The new file replaces the old one only once it is complete.
     Raises RecordingError.
     """
     recording = Recording(path)

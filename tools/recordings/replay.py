@@ -1,4 +1,4 @@
-"""``softfinger replay FILE.mcap``: a recording on the wire again, or through today's code."""
+"""Run ``softfinger replay FILE.mcap``: publish a recording again, or recompute its states."""
 
 from __future__ import annotations
 
@@ -21,29 +21,29 @@ if TYPE_CHECKING:
     from softfinger.tools.recordings.reader import Recording
 
 _EPILOG = """\
-Without --recompute the messages are published on the stream's socket as they were, at their own
-pace or --speed times that: to subscribers it looks like a daemon.
+Without --recompute, the messages are published unchanged on the stream's socket, at their original
+pace or --speed times as fast. To subscribers this looks like a daemon.
 
---recompute runs readings, frames and commands through today's estimator, tables, control and
-limits, and compares every state with the recorded one. It needs a recording with every topic:
-`record --topics all`, or `run --record`, which begins with the first tick. From there the same code
-and settings give the same bits.
-Exit status: 0 the same, 1 can't be read, 3 states differ."""
+With --recompute, the recorded readings, frames and commands are processed by this version's
+estimator, tables, control and limits, and every state is compared with the recorded one. This needs
+a recording of all topics: `record --topics all`, or `run --record`, which starts at the first tick.
+From the first tick on, the same code and settings give identical bits.
+Exit status: 0 identical or published, 1 the file can't be read, 3 states differ."""
 
-_SUBSCRIBER_WAIT = 10.0  # s
+_SUBSCRIBER_WAIT = 10.0  # s to wait for a subscriber
 _DIFFERENT = 3
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
     parser.add_argument("file", type=Path, metavar="FILE.mcap")
-    parser.add_argument("--address", default=StreamSettings().address, help="where to publish")
+    parser.add_argument("--address", default=StreamSettings().address, help="address to publish on")
     parser.add_argument(
         "--keys",
         type=Path,
         metavar="FOLDER",
-        help="publish to the clients of these keys only, as a daemon with access.keys does; from "
-        "`softfinger keys`",
+        help="publish only to the clients of these keys from `softfinger keys`, as a daemon with "
+        "access.keys does",
     )
     parser.add_argument(
         "--speed",
@@ -54,21 +54,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_range(parser)
     parser.add_argument(
-        "--no-wait", action="store_true", help="begin at once, without waiting for a subscriber"
+        "--no-wait", action="store_true", help="start at once, without waiting for a subscriber"
     )
     parser.add_argument(
-        "--recompute", action="store_true", help="run it through today's code and compare"
+        "--recompute", action="store_true", help="recompute the states with this version"
     )
     parser.add_argument(
         "--config",
         type=Path,
         metavar="FILE",
-        help="with --recompute: other settings than the recorded",
+        help="with --recompute: use these settings instead of the recorded ones",
     )
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Publish or compare. Raises RecordingError, SettingsError, TactileError or OSError."""
+    """Publish or compare.
+
+    Raises
+    ------
+    RecordingError, SettingsError, TactileError, OSError
+    """
     from softfinger.tools.recordings.reader import Recording
 
     recording = Recording(arguments.file, to_stderr("replay"))
@@ -90,10 +95,10 @@ def _publish(arguments: argparse.Namespace, recording: Recording) -> None:
                 pass
         began, first = time.monotonic(), None
         for topic, message in recording.messages(start=arguments.start, end=arguments.end):
-            if message.get("again") is not True:  # a repeated one is older than the recording
+            if message.get("again") is not True:  # a repeated message is older than the recording
                 stamp = message.get("timestamp", 0.0)
                 if not isinstance(stamp, int | float):
-                    continue  # no message of this stream
+                    continue  # not a message of this stream
                 if first is None:
                     began, first = time.monotonic(), stamp
                 due = began + (stamp - first) / arguments.speed
@@ -111,7 +116,8 @@ def _recompute(arguments: argparse.Namespace, recording: Recording) -> int:
     from softfinger.tools.recordings.recomputed import recompute, recorded_settings
     from softfinger.tools.sweep import Progress
 
-    recorded, _ = recorded_settings(recording)  # refuses what has none before kernels are loaded
+    # This fails for a recording without settings before kernels are loaded.
+    recorded, _ = recorded_settings(recording)
     from softfinger.tools.processes.compile import build_kernels, print_event
 
     settings = None if arguments.config is None else load(arguments.config)
@@ -140,14 +146,15 @@ def _recompute(arguments: argparse.Namespace, recording: Recording) -> int:
     return _DIFFERENT
 
 
-_QUEUE = 10_000  # messages that wait for a subscriber; it misses further ones
-_PATIENCE = 1.0  # s for the gateway to take a message
+_QUEUE = 10_000  # messages queued for a subscriber; further messages are lost
+_PATIENCE = 1.0  # s for the gateway to accept a message
 
 
 class Wire:
-    """A context that publishes on ``address``, with ``keys`` only to their holders.
+    """Context that publishes on ``address``; with ``keys``, only to clients with these keys.
 
-    Raises RecordingError when the address can't be bound, or reaches other machines without keys.
+    Raises RecordingError if the address cannot be bound, or is reachable from other machines
+    without keys.
     """
 
     def __init__(self, address: str, keys: Path | None = None) -> None:
@@ -165,13 +172,13 @@ class Wire:
         self._link = self._gateway.link
 
     def subscribed(self, seconds: float) -> bool:
-        """Wait ``seconds``, or until the subscribers change; whether there are any."""
+        """Wait ``seconds`` for a change of the subscribers; return True if there are any."""
         self._link.wait(seconds)
         return bool(self._link.wanted)
 
     def send(self, topic: bytes, message: dict[str, Any]) -> None:
-        """Publish one message, as soon as the gateway has room for it."""
-        if topic not in schema.TOPICS:  # of another version
+        """Publish one message as soon as the gateway has room for it."""
+        if topic not in schema.TOPICS:  # topic of another version
             return
         self._link.wait_for_room(_PATIENCE)
         index = GATEWAY_TOPICS.index(topic.decode())

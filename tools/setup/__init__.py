@@ -1,1 +1,1 @@
-"""Before a hand runs: `doctor`, `scan`, `keys`, `limits`, `envelope`, `install-service`."""
+"""Setup commands: `doctor`, `scan`, `keys`, `limits`, `config`, `envelope`, `install-service`."""

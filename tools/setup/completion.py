@@ -1,6 +1,6 @@
-"""``softfinger completion SHELL``: a script by which a shell completes softfinger's arguments.
+"""Run ``softfinger completion SHELL``: print a script that completes softfinger's arguments.
 
-The script knows them all by itself: no process is started while somebody types.
+The script contains all arguments, so completing a word starts no process.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 _EPILOG = """\
-Where the script belongs:
+To install the script:
   softfinger completion bash > ~/.local/share/bash-completion/completions/softfinger
   softfinger completion zsh > ~/.zfunc/_softfinger     # with fpath+=~/.zfunc before compinit
   softfinger completion fish > ~/.config/fish/completions/softfinger.fish"""

@@ -1,4 +1,4 @@
-"""``softfinger config``: the profiles that come with the package, and every setting there is."""
+"""Run ``softfinger config``: show the profiles of the package, and every setting."""
 
 from __future__ import annotations
 
@@ -11,24 +11,27 @@ from softfinger.daemon.profile import reference
 from softfinger.daemon.profile.load import find, names, profile_text
 
 _EPILOG = """\
-  softfinger config show hil > my.toml      the beginning of a profile of your own
-  softfinger config schema > schema.json    beside it: editors then complete and check keys
-  softfinger config reference tactile       that section alone; or a key's name, as pitch"""
+  softfinger config show hil > my.toml      start your own profile from a packaged one
+  softfinger config schema > schema.json    in the same folder, for completion and checks in editors
+  softfinger config reference tactile       print one section; or a key's name, e.g. pitch"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
     actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
-    actions.add_parser("list", help="the profiles' names")
+    actions.add_parser("list", help="list the names of the profiles")
     show = actions.add_parser("show", help="print a profile")
     show.add_argument("profile", type=Path, metavar="PROFILE", help=f"one of {', '.join(names())}")
-    every = actions.add_parser("reference", help="every key, with default, bounds and meaning")
+    every = actions.add_parser("reference", help="every key with default, bounds and meaning")
     every.add_argument("what", nargs="?", default="", metavar="SECTION|KEY")
     actions.add_parser("schema", help="the JSON schema of a profile, for editors")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print. Raises SettingsError for a profile, section or key that is not there, or OSError."""
+    """Print the requested list, profile or reference.
+
+    Raises SettingsError for an unknown profile, section or key, or OSError.
+    """
     if arguments.action == "list":
         width = max(map(len, names()))
         for name in names():
@@ -47,14 +50,14 @@ def _text(profile: Path) -> str:
 
 
 def subject(profile: Path) -> str:
-    """Return the first sentence of the comment that a profile begins with."""
+    """Return the first sentence of the comment at the start of a profile."""
     comment = itertools.takewhile(lambda line: line.startswith("#"), _text(profile).splitlines())
     words = " ".join(line[1:].strip() for line in comment if not line.startswith("#:"))
     return min((words.partition(mark)[0] for mark in (": ", ". ")), key=len)
 
 
 def _explained(what: str) -> str:
-    """Return the text of a section, or of the keys called ``section.key`` or ``key``."""
+    """Return the reference of a section, or of the keys named ``section.key`` or ``key``."""
     if not what:
         return reference.profile()
     if what in reference.sections():

@@ -1,6 +1,7 @@
-"""``softfinger doctor``: checks ports, servos, boards, machine; one line each, with its fix.
+"""Run ``softfinger doctor``: check ports, servos, boards and machine, and name fixes.
 
-Arguments, order, printing and exit status; the checks are :mod:`softfinger.daemon.diagnosis`'s.
+Each check prints one line. This module handles arguments, order, printing and exit status; the
+checks are in :mod:`softfinger.daemon.diagnosis`.
 """
 
 from __future__ import annotations
@@ -36,35 +37,35 @@ from softfinger.tools.arguments import add_profile, profile
 from softfinger.tools.processes.compile import build_kernels, print_event
 
 _EPILOG = """\
-exit status: 0 when nothing failed (warnings may remain), 1 when something did, 2 for settings that
-can't be used. Without --fix nothing is changed. With it: adapters' latency timers go to 1 ms,
-servos get their ID and rate where there is no doubt which one is meant, and the values of all
-registers that matter to the hand, and are rebooted after a hardware error or where their position
-is a turn off (the hand lets go meanwhile), and kernels are compiled. Nothing is ever stiffened or
-moved.
+exit status: 0 no check failed (there may be warnings), 1 a check failed, 2 the settings can't be
+used. Without --fix nothing is changed. With --fix, the latency timers of adapters are set to 1 ms,
+servos get their ID and baud rate if it is certain which servo is meant, all registers that the hand
+needs are set, and kernels are compiled. Servos are rebooted after a hardware error or if their
+position is off by a turn; the hand releases its object meanwhile. --fix never switches torque on or
+moves the hand.
 
-factory-new servos all have ID 1, at 57600 baud: connect one alone, then doctor --fix; then the next
-one beside it, and doctor --fix again."""
+factory-new servos all have ID 1 at 57600 baud: connect one servo alone and run doctor --fix; then
+also connect the next one and run doctor --fix again."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
     add_profile(parser)
     change = parser.add_mutually_exclusive_group()
-    change.add_argument("--fix", action="store_true", help="repair what can be repaired from here")
+    change.add_argument("--fix", action="store_true", help="repair what softfinger can repair")
     change.add_argument(
         "--restore",
         type=Path,
         metavar="FILE",
-        help="write the servos' registers back as --save stored them",
+        help="write the servo registers back that --save stored in FILE",
     )
     parser.add_argument(
-        "--save", type=Path, metavar="FILE", help="first store the servos' registers in FILE"
+        "--save", type=Path, metavar="FILE", help="first store the servo registers in FILE"
     )
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Check, print, and tell by the exit status. Raises SettingsError."""
+    """Run the checks, print their results and return the exit status. Raises SettingsError."""
     settings = profile(arguments)
     print(f"settings: {arguments.config or 'the built-in simulated hand'}")
     counts = {"FAIL": 0, "warn": 0, "pass": 0}
@@ -80,7 +81,7 @@ def run(arguments: argparse.Namespace) -> int:
 def results(
     settings: Settings, fix: bool, save: Path | None = None, restore: Path | None = None
 ) -> Iterator[Finding]:
-    """Run all checks, each after those that it needs, with the repairs before them."""
+    """Run all checks in the order of their dependencies, after the requested repairs."""
     ports = _ports(settings)
     for kind in BUILT_IN:
         yield from (Finding("note", f"softfinger.{kind}", source(each)) for each in plugins(kind))
@@ -128,7 +129,7 @@ def _register_files(
 
 
 def _ports(settings: Settings) -> list[tuple[str, str]]:
-    """(key, path) of every port that the scene needs; what a plugin opens is not known."""
+    """Return (key, path) of every port that the scene needs; ports of plugins are unknown."""
     ports = []
     servos = backend("servos", settings.servos.backend)
     tactile = backend("tactile", settings.tactile.backend)
@@ -146,7 +147,7 @@ def _latency(settings: Settings, path: str, fix: bool) -> Iterator[Finding]:
         if repaired is not None:
             yield repaired
     servos = path == settings.servos.port
-    # A board sends by itself: the timer makes its frames late and none of them fail.
+    # A board sends on its own: the latency timer delays its frames but does not cause failures.
     found = check_latency_timer(path, settings.servos.reply_timeout if servos else 1.0)
     if found is not None:
         yield found

@@ -1,4 +1,4 @@
-"""``softfinger envelope``: what a hand holds: shapes, sizes, frictions, masses on virtual time."""
+"""Run ``softfinger envelope``: simulate which shapes, sizes, frictions and masses a hand holds."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ SHAPES = ("rectangle", "disc")
 SIZES = (2, 3, 4, 5, 6, 8, 10, 15, 20, 30, 40, 60, 90)  # mm: width or diameter
 FRICTIONS = (0.2, 0.4, 0.6, 0.8)
 MASSES = (0.05, 0.2, 0.5, 1.0, 2.0)  # kg
-_SETTLE = 3.0  # s for the grip to come about
-_LIFT = 1.0  # s in which the weight comes on
-_AFTER = 1.0  # s that it then is watched
-_STEPS = 20  # of the weight
+_SETTLE = 3.0  # s for the grip to settle
+_LIFT = 1.0  # s in which the weight is applied
+_AFTER = 1.0  # s of observation afterwards
+_STEPS = 20  # steps in which the weight is applied
 _TURNED = math.radians(5.0)
-_AWAY = 0.010  # m along the faces: lost
+_AWAY = 0.010  # m, displacement along the faces at which the object counts as lost
 _GRAVITY = 9.81  # m/s²
 _COLOURS = {HELD: "#009E73", TURNED: "#E69F00", LOST: "#D55E00", REFUSED: "#777777"}
 
@@ -45,40 +45,46 @@ class Cell(NamedTuple):
     """Result of one grasp."""
 
     outcome: str  # a key of MEANING
-    turned: float  # by the object, at most [rad]
+    turned: float  # largest rotation of the object [rad]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of ``envelope``."""
     add_profile(parser)
     force = _between("a force above 0 N", 0.0, 1e9)
-    parser.add_argument("--force", type=force, default=10.0, metavar="N", help="grip (default: 10)")
-    parser.add_argument("--shape", choices=SHAPES, action="append", help="of these only")
+    parser.add_argument(
+        "--force", type=force, default=10.0, metavar="N", help="grip force (default: 10)"
+    )
+    parser.add_argument("--shape", choices=SHAPES, action="append", help="only these shapes")
     for name, metavar, kind in (
         ("--size", "MM", _between("a size of 0.2 to 10000 mm", 0.2, 1e4)),
         ("--friction", "F", _between("a friction of 1e-5 to 1e5", 1e-5, 1e5)),
         ("--mass", "KG", _between("a mass of 1e-5 to 1e5 kg", 1e-5, 1e5)),
     ):
-        parser.add_argument(name, type=kind, nargs="+", metavar=metavar, help="of these only")
+        parser.add_argument(name, type=kind, nargs="+", metavar=metavar, help="only these values")
     parser.add_argument(
         "--keep",
         type=Path,
         metavar="FILE",
-        help="write the map, as grasp reads it; after Ctrl-C the same call goes on",
+        help="write the map for use by grasp; after Ctrl-C, the same call continues",
     )
-    parser.add_argument("--plot", type=Path, metavar="FILE", help="draw it (extra 'plot')")
+    parser.add_argument("--plot", type=Path, metavar="FILE", help="draw the map (extra 'plot')")
     add_sweep(parser)
 
 
 def _between(what: str, low: float, high: float) -> Callable[[str], float]:
-    """Return the reader of an argument within the settings' bounds, at least ``low`` if not 0."""
+    """Return a parser for numbers within bounds; ``low`` itself is allowed if it is not 0."""
     return lambda text: number(text, what, low, high, includes_low=low > 0.0)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Try each, print the map, and write what was asked for.
+    """Simulate every grasp, print the map and write the requested files.
 
-    Raises SettingsError, SweepError, OSError, and MissingExtra without matplotlib or Dask.
+    Raises
+    ------
+    SettingsError, SweepError, OSError
+    MissingExtra
+        Without matplotlib or Dask.
     """
     settings = profile(arguments)
     if arguments.plot:
@@ -86,7 +92,7 @@ def run(arguments: argparse.Namespace) -> int:
     shapes = tuple(arguments.shape or SHAPES)
     axes = (
         tuple(sorted(arguments.friction or FRICTIONS)),
-        tuple(sorted(arguments.mass or MASSES)),  # as the map's reader takes them
+        tuple(sorted(arguments.mass or MASSES)),  # sorted, as the reader of the map requires
         tuple(sorted(arguments.size or SIZES)),
     )
     print(f"{arguments.force:g} N; " + "; ".join(f"{k}: {text}" for k, text in MEANING.items()))
@@ -114,7 +120,7 @@ def sweep(
     axes: tuple[tuple[float, ...], ...],
     arguments: argparse.Namespace,
 ) -> Iterator[Cell]:
-    """Yield each grasp, sizes first, then masses, frictions and shapes."""
+    """Yield the result of each grasp; size varies fastest, then mass, friction and shape."""
     build_kernels(settings, print_event)
     journal = _journal(arguments.keep) if arguments.keep else None
     cases = list(itertools.product(shapes, *axes))
@@ -134,10 +140,10 @@ def _one(sections: dict[str, Any], force: float, case: tuple[str, float, float, 
 def grasped(
     settings: Settings, shape: str, size: float, friction: float, mass: float, force: float
 ) -> Cell:
-    """Grasp an object on the table, then let its weight [kg] pull it out of the fingers.
+    """Grasp an object on the table, then apply its weight so that it pulls out of the fingers.
 
-    The settings say what it is: its width or diameter ``size`` [m], friction and weight. Not its
-    shape: to the daemon all are blocks.
+    The daemon's settings contain the object's width or diameter ``size`` [m], friction and weight
+    (``mass`` in kg). They do not contain its shape: the daemon assumes a block.
     """
     from softfinger.tools.watched import Watched
 
@@ -163,7 +169,8 @@ def grasped(
         if hand.mode != "holding":
             return Cell(REFUSED, math.nan)
         before = hand.plant.object_pose.copy()
-        pull = weight * (1.0 + settings.simulation.table_friction)  # which the table would hold
+        # Friction of the table opposes the load, so add it.
+        pull = weight * (1.0 + settings.simulation.table_friction)
         for k in range(_STEPS):
             load, phi = pull * (k + 1) / _STEPS, float(hand.plant.object_pose[2])
             hand.plant.apply_load(-load * math.sin(phi), load * math.cos(phi))

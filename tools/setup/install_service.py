@@ -1,4 +1,4 @@
-"""``softfinger install-service``: prints a systemd unit, or udev rules; nothing is enabled."""
+"""Run ``softfinger install-service``: print a systemd unit or udev rules without enabling them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.profile.load import find
 
 _EPILOG = """\
-To install what it prints:
+To install the printed files:
   softfinger install-service --config /etc/softfinger/hand.toml --user $USER |
       sudo tee /etc/systemd/system/softfinger.service
   softfinger install-service --udev | sudo tee /etc/udev/rules.d/70-softfinger.rules
@@ -23,19 +23,19 @@ To install what it prints:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
     parser.add_argument("--config", type=Path, metavar="PROFILE", help="the hand's profile")
-    parser.add_argument("--user", default="", help="the user it runs as (default: root)")
-    parser.add_argument("--udev", action="store_true", help="the udev rules instead of the unit")
+    parser.add_argument("--user", default="", help="user that runs the service (default: root)")
+    parser.add_argument("--udev", action="store_true", help="print udev rules instead of the unit")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print. Raises SettingsError for a user or profile that is not there."""
+    """Print the unit or the rules; raise SettingsError if the user or profile does not exist."""
     rules = _file("70-softfinger.rules") if arguments.udev else ""
     print(rules or unit(arguments.config, arguments.user), end="")
     return 0
 
 
 def unit(config: Path | None, user: str) -> str:
-    """Return the unit's text. Raises SettingsError for a user or profile that is not there."""
+    """Return the unit's text; raise SettingsError if the user or profile does not exist."""
     words = [sys.executable, "-P", "-m", "softfinger", "run", "--no-task", "--log", "json"]
     if config is not None:
         if not find(config).is_file():
@@ -57,7 +57,7 @@ def _file(name: str) -> str:
 
 
 def _quoted(word: str) -> str:
-    """A word of ExecStart: nothing in it is a specifier, a variable or a separator."""
+    """Quote a word of ExecStart: escape specifiers, variables and separators."""
     if any(ord(character) < 32 for character in word):
         raise SettingsError(f"{word!r}: control characters can't stand in a unit")
     word = word.replace("\\", "\\\\").replace('"', '\\"').replace("%", "%%").replace("$", "$$")

@@ -1,4 +1,4 @@
-"""``softfinger keys FOLDER [CLIENT …]``: keys for sockets that other machines may reach."""
+"""Run ``softfinger keys FOLDER [CLIENT …]``: make keys for access from other machines."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from pathlib import Path
 from softfinger.daemon.wire.keys import make_keys
 
 _EPILOG = """\
-The first call makes the daemon's keys and those of the client `local`, for the tools on the
-daemon's own machine; each CLIENT is one more. Set access.keys in the profile to FOLDER, bring
-FOLDER/CLIENT to that client's machine, and give it to the tools with --keys. Nothing is ever
-overwritten. Removing FOLDER/server/clients/CLIENT.key shuts a client out within a second. With keys
-the commander's lease belongs to the key's name.
+The first call makes the daemon's keys and those of the client `local`, for tools on the daemon's
+machine; each CLIENT adds the keys of one client. Set access.keys in the profile to FOLDER, copy
+FOLDER/CLIENT to the client's machine, and pass it to the tools with --keys. Files are never
+overwritten. Removing FOLDER/server/clients/CLIENT.key disconnects a client within a second. With
+keys, the commander's lease belongs to the name of the key.
 Exit status: 0 made, 1 refused."""
 
 
@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Make keys. Raises KeyFileError."""
+    """Make the keys; raise KeyFileError if that fails."""
     for folder in make_keys(arguments.folder, arguments.clients):
         print(folder)
     return 0

@@ -1,4 +1,4 @@
-"""``softfinger scan [PORT …]``: which servos answer, at which rate. It changes nothing in them."""
+"""Run ``softfinger scan [PORT …]``: find the servos and their baud rates, changing nothing."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ from softfinger.daemon.servos.provisioning import ALONE, SEARCH_TIME, FoundServo
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.epilog = "Exit status: 0 when a servo answered, 1 when none did or no port can be used."
+    parser.epilog = "Exit status: 0 a servo answered, 1 no servo answered or no port can be used."
     parser.add_argument(
-        "ports", metavar="PORT", nargs="*", help="where to look (default: every serial port)"
+        "ports", metavar="PORT", nargs="*", help="ports to scan (default: every serial port)"
     )
     parser.add_argument(
         "--baud",
         type=int,
         action="append",
         metavar="N",
-        help="a baud rate to try, may be repeated (default: all that servos have)",
+        help="a baud rate to try; may be repeated (default: all rates that servos support)",
     )
     parser.add_argument(
         "--wait",
         type=float,
         default=SEARCH_TIME,
         metavar="S",
-        help="seconds to listen at each rate (0.8 are enough for 253 servos at 1 Mbaud)",
+        help="seconds to listen at each rate (0.8 s is enough for 253 servos at 1 Mbaud)",
     )
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Scan and print a line for each servo; the exit status is 0 when there was one."""
+    """Scan the ports and print a line for each servo; return 0 if at least one was found."""
     paths = arguments.ports or [path for path, _ in serial_ports()]
     if not paths:
         print("scan: this machine has no serial port; name one", file=sys.stderr)
@@ -50,7 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
         for servo in found.servos:
             rates.setdefault(replace(servo, baud=0), []).append(str(servo.baud))
         for servo, at in rates.items():
-            # An emulated servo may answer at any rate; two of one ID at two rates are two.
+            # An emulated servo may answer at several rates; they are joined in one line.
             print(f"{path}: {servo.told(', '.join(at))}", flush=True)
         for garbled in found.garbled:
             print(f"{path}: {garbled}\n  → {ALONE}", flush=True)

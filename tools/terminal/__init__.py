@@ -1,1 +1,1 @@
-"""`monitor` and `send`: the running daemon from a terminal, and the parts of the live page."""
+"""Terminal clients of the running daemon: `monitor`, `send` and `status`."""

@@ -1,7 +1,7 @@
-"""Data of the live page, and the sockets they come from; nothing that draws.
+"""Collect the live page's data from the daemon's sockets; drawing is done elsewhere.
 
-Every message is data of unknown origin: a missing or wrong-typed field is NaN or empty, a message
-that can't be read is counted and skipped.
+Message contents are not trusted: a missing or wrong-typed field becomes NaN or empty, and a message
+that cannot be decoded is counted and skipped.
 """
 
 from __future__ import annotations
@@ -27,26 +27,26 @@ from softfinger.daemon.types import FINGERS, GRIP_FRACTION, UNLEASED
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.local_stop import stop_locally
 
-LATELY = 3.0  # s in which waiting for a busy machine is shown
-EVENTS = 200  # kept
-MEANINGS = (  # of the words on the pages
-    ("d", "how deep the object presses the tip in"),
+LATELY = 3.0  # s, window over which waits for a busy machine are summed and shown
+EVENTS = 200  # number of events kept
+MEANINGS = (  # meanings of the words on the pages
+    ("d", "displacement of the object's face into the tip"),
     ("θ", "tilt of the object's face against the tip"),
-    ("force", "F(d, θ), what presses the tip, normal to the face"),
+    ("force", "F(d, θ), contact force on the tip, normal to the face"),
     ("energy", "U(d, θ), elastic energy in the tip"),
     ("±", "one standard deviation"),
     ("map age", "time since the newest pressure map was measured"),
-    ("joint, goal", "angles now and asked for; positive closes"),
-    ("current, bound", "of the motor, and the most that its goal allows"),
-    ("object", "its angle and width between the tips"),
+    ("joint, goal", "present and requested angle; positive closes"),
+    ("current, bound", "motor current, and the limit that its goal allows"),
+    ("object", "angle and width of the object between the tips"),
 )
-_RAISED = 1.01  # share of the requested force above which the grip is reported as raised
-_DRAIN_LIMIT = 4000  # messages taken at once, so that a flood can't keep the page from drawing
+_RAISED = 1.01  # fraction of the requested force above which the grip is reported as raised
+_DRAIN_LIMIT = 4000  # messages read per call, so that a flood of messages cannot block drawing
 _MESSAGE_LIMIT = 4_000_000  # bytes; the largest grid is 131 kB
 
 
 def field(record: object, *path: str) -> Any:
-    """Return the value at ``path`` in nested maps, None where there is none."""
+    """Return the value at ``path`` in nested maps; None if it is missing."""
     for key in path:
         if not isinstance(record, dict):
             return None
@@ -55,7 +55,7 @@ def field(record: object, *path: str) -> Any:
 
 
 def number(record: object, *path: str) -> float:
-    """Return the number at ``path``, NaN where there is none."""
+    """Return the number at ``path``; NaN if it is missing."""
     value = field(record, *path)
     if isinstance(value, (int, float)) and not isinstance(value, bool):
         return float(value)
@@ -63,36 +63,36 @@ def number(record: object, *path: str) -> float:
 
 
 def text(record: object, *path: str) -> str:
-    """Return the text at ``path`` without control characters (they would reach the terminal)."""
+    """Return the text at ``path`` without control characters, which would reach the terminal."""
     value = field(record, *path)
     return printable(value) if isinstance(value, str) else ""
 
 
 def printable(value: str) -> str:
-    """Return ``value`` on one line, with nothing in it that a terminal would obey."""
+    """Return ``value`` as one line without terminal control sequences."""
     return "".join(c if c.isprintable() else " " for c in value)
 
 
 class ShownFrame(NamedTuple):
-    """A tactile frame as the page draws it."""
+    """Tactile frame in the form in which the page draws it."""
 
     arrived: float  # monotonic s
     scale: float  # Pa per count, NaN when unknown
-    grid: NDArray[np.float64]  # [rows, cols] pressures, Pa; counts where the scale isn't known
-    aspect: float  # a cell's height over its width
+    grid: NDArray[np.float64]  # [rows, cols] pressures [Pa], or counts if the scale is unknown
+    aspect: float  # height of a cell divided by its width
     source: schema.TactileFrame
 
 
 class ShownEvent(NamedTuple):
-    """One line of hand/event."""
+    """One event of ``hand/event``."""
 
-    timestamp: float  # Unix s, NaN when unknown
+    timestamp: float  # Unix time [s], NaN if unknown
     level: str
     kind: str
     text: str
 
     def clock(self) -> str:
-        """Return local time of day."""
+        """Return the local time of day."""
         try:
             return time.strftime("%H:%M:%S", time.localtime(self.timestamp))
         except (ValueError, OverflowError, OSError):
@@ -100,27 +100,28 @@ class ShownEvent(NamedTuple):
 
 
 class Feed:
-    """Takes messages, remembers what a page shows. ``now`` is monotonic seconds throughout.
+    """Process the stream's messages and keep the data that a page shows.
 
-    ``events`` are in the order in which they happened, which after a late subscription is not the
-    order in which they came; ``news`` hands them over as they came.
+    ``now`` is monotonic time [s] in all methods. ``events`` are sorted by the time at which they
+    happened; this differs from the order of arrival after a late subscription. `news` returns
+    events in the order of arrival.
     """
 
     def __init__(self) -> None:
         self.state = read(schema.HandState, None)
         self.state_at = -math.inf
-        self.mode = self.fault = ""  # of the state
+        self.mode = self.fault = ""  # of the last state
         self.frames: dict[str, ShownFrame] = {}
         self.events: list[ShownEvent] = []
         self._news: deque[ShownEvent] = deque(maxlen=EVENTS)
         self._heard: deque[tuple[float, float]] = deque(maxlen=2 * EVENTS)
-        self.times: schema.LoopStatistics | None = None  # of all ticks so far
-        self.warm = 0.0  # s before a servo's limit of temperature from which it is warned about
-        self._commanding = "", -math.inf  # who has the commander's lease, until when
+        self.times: schema.LoopStatistics | None = None  # statistics of all ticks so far
+        self.warm = 0.0  # s to a servo's temperature limit below which a warning is shown
+        self._commanding = "", -math.inf  # holder of the commander's lease, end of the lease
         self._lease = math.nan  # s
-        self.commanded = math.nan  # N of the last grasp command, of any client
-        self.force_default = math.nan  # N of a grasp without a force
-        self.force_limit = math.inf  # N that a grip may be asked for
+        self.commanded = math.nan  # N, force of the last grasp command of any client
+        self.force_default = math.nan  # N, force of a grasp command without a force
+        self.force_limit = math.inf  # N, highest grip force that a command may request
         self.skipped = 0
         self._waits: deque[tuple[float, float]] = deque(maxlen=10_000)
         self._period = 0.0  # s between states, smoothed
@@ -134,14 +135,14 @@ class Feed:
         }
 
     def read(self, message: list[bytes], now: float) -> None:
-        """Read one message off the wire, of any content."""
+        """Process one raw message."""
         try:
             self.sort_in(*unpack(message), now)
         except ValueError:
             self.skipped += 1
 
     def sort_in(self, topic: bytes, record: dict[str, Any], now: float) -> None:
-        """Take a message that is unpacked already, as `take` does."""
+        """Process one message that is already unpacked."""
         try:
             if topic in self.topics:
                 self.topics[topic](read(schema.TOPICS[topic].record, record), now)
@@ -150,7 +151,7 @@ class Feed:
 
     def _read_state(self, state: schema.HandState, now: float) -> None:
         before = self.state
-        if state.seq < before.seq:  # another daemon: a new story
+        if state.seq < before.seq:  # the daemon was restarted
             self._waits.clear()
             self.frames.clear()
             self._period = 0.0
@@ -178,8 +179,8 @@ class Feed:
         )
 
     def _read_event(self, event: schema.Event, _: float) -> None:
-        # Told again for somebody who came later, it has its first seq and times; another daemon's
-        # has other times.
+        # A repeated event, sent for a late subscriber, keeps its original seq and time. An event of
+        # another daemon has a different time.
         name = event.seq, event.timestamp
         if event.again and name in self._heard:
             return
@@ -199,7 +200,7 @@ class Feed:
         self.times = times
 
     def _read_command(self, answered: schema.AnsweredCommand, now: float) -> None:
-        """Note who commands; show a refusal as an event, unless this page sent the command."""
+        """Record the commanding client, and show a refused command as an event."""
         client = printable(answered.client)
         if answered.again:
             return
@@ -226,18 +227,18 @@ class Feed:
         self.warm = 0.0 if math.isnan(warm) else warm
 
     def news(self) -> list[ShownEvent]:
-        """Return the events that have come since the last call."""
+        """Return the events received since the last call."""
         fresh = list(self._news)
         self._news.clear()
         return fresh
 
     def commander(self, now: float) -> str:
-        """Return client that has the commander's lease; empty: nobody, or one without a name."""
+        """Return the holder of the commander's lease; empty if there is none or it is unnamed."""
         client, until = self._commanding
         return client if now < until else ""
 
     def grip(self) -> str:
-        """Return the grip's goal in words; empty without a grip."""
+        """Return a description of the grip's goal; empty if there is no grip."""
         force, angle = self.state.goal_force, math.degrees(self.state.goal_angle)
         if not math.isfinite(force):
             return ""
@@ -246,11 +247,11 @@ class Feed:
         return f"grip: goal {force:.1f} N{raised}{turned}"
 
     def age(self, now: float) -> float:
-        """Return seconds since the last state, infinite before the first."""
+        """Return the time since the last state [s]; infinite before the first."""
         return now - self.state_at
 
     def status(self, now: float) -> str:
-        """Return ``waiting`` before the first state, then ``live``, ``stale``, ``lost`` by age."""
+        """Return ``waiting`` before the first state, then ``live``, ``stale`` or ``lost``."""
         age = self.age(now)
         if age == math.inf:
             return "waiting"
@@ -259,19 +260,19 @@ class Feed:
         return "stale" if age > max(0.5, 3.0 * self._period) else "live"
 
     def waited(self, now: float) -> float:
-        """Return seconds that a simulated hand has lately waited for a busy machine."""
+        """Return the time that a simulated hand recently waited for a busy machine [s]."""
         while self._waits and self._waits[0][0] < now - LATELY:
             self._waits.popleft()
         return sum(waited for _, waited in self._waits)
 
     @property
     def rate(self) -> float:
-        """States a second, NaN when unknown."""
+        """Number of states per second; NaN if unknown."""
         return 1.0 / self._period if self._period else math.nan
 
 
 class FeedSubscriber:
-    """The stream's socket: everything that waits is taken into a feed."""
+    """Subscriber socket that passes all waiting messages to a feed."""
 
     def __init__(self, context: zmq.Context[Any], address: str, feed: Feed) -> None:
         self.feed = feed
@@ -283,7 +284,7 @@ class FeedSubscriber:
 
 
 class ShownReply(NamedTuple):
-    """Reply to a command, for the page."""
+    """Reply to a command, as the page shows it."""
 
     at: float
     ok: bool
@@ -292,26 +293,26 @@ class ShownReply(NamedTuple):
 
 @dataclass(slots=True)
 class _Pending:
-    """A command that is not answered yet."""
+    """Command that has not been answered yet."""
 
     label: str
     socket: zmq.Socket[bytes]
     attempts: Attempts
     sent: float
-    late: dict[str, Any] | None = None  # the daemon's refusal, until the command is sent again …
-    again_at: float = 0.0  # … then
-    warned: bool = False  # that it takes long
+    late: dict[str, Any] | None = None  # "too late" reply, kept until the command is sent again
+    again_at: float = 0.0  # time at which it is sent again
+    warned: bool = False  # a message about the missing answer was shown
 
 
 class Commander:
-    """Sends commands without waiting for their replies. The newest one is kept in ``reply``.
+    """Send commands without waiting for their replies; ``reply`` holds the newest reply.
 
-    Each command has its own request socket: an answer that never comes holds nothing up,
-    a stop least of all. To a daemon of this user on this machine, a stop goes past all clients; its
-    answer comes at the next tick, and a daemon that stands still is given a moment for it.
+    Each command uses its own request socket, so a missing answer does not delay other commands. If
+    the daemon runs on this machine under the same user, a stop bypasses the requests of all
+    clients. It is answered at the next tick, and the wait for a stalled daemon is short.
     """
 
-    OPEN_LIMIT = 8  # commands under way; further ones are dropped, except stop
+    OPEN_LIMIT = 8  # number of open commands; further commands except stop are dropped
 
     def __init__(self, context: zmq.Context[Any], address: str, client: str = "") -> None:
         self._context = context
@@ -321,7 +322,7 @@ class Commander:
         self.reply: ShownReply | None = None
 
     def send(self, now: float, label: str, command: str, **fields: float) -> None:
-        """Send ``command`` with ``fields``; the reply is shown under ``label``."""
+        """Send ``command`` with ``fields``; show its reply under ``label``."""
         if len(self._pending) >= self.OPEN_LIMIT and command != "stop":
             self.refuse(now, f"{label}: dropped, the daemon doesn't answer")
             return
@@ -337,11 +338,11 @@ class Commander:
         self._pending.append(_Pending(label, request, attempts, now))
 
     def refuse(self, now: float, why: str) -> None:
-        """Say why something was not done."""
+        """Show the reason why a command was not sent or failed."""
         self.reply = ShownReply(now, False, why)
 
     def collect(self, now: float) -> None:
-        """Take the replies that came, give up on those that are overdue."""
+        """Process the replies received, and close commands whose reply is overdue."""
         for each in list(self._pending):
             if each.late is not None:
                 if now < each.again_at:
@@ -349,7 +350,7 @@ class Commander:
                 if each.attempts.remaining():
                     each.late = None
                     each.socket.send(msgpack.packb(each.attempts.request), zmq.NOBLOCK)
-                else:  # suspended meanwhile
+                else:  # the process was suspended in between
                     self._end(each, now, each.late)
                 continue
             try:
@@ -382,11 +383,11 @@ class Commander:
 
 
 def judge(now: float, label: str, record: Any) -> ShownReply:
-    """Return what a daemon's answer says of the command that is shown as ``label``."""
+    """Convert the daemon's answer to the command shown as ``label`` into a reply for the page."""
     if field(record, "ok") is True:
         if text(record, "torque_off") == "unconfirmed":
             return ShownReply(now, False, f"{label}: {UNCONFIRMED}")
         return ShownReply(now, True, f"{label}: ok")
     why = text(record, "error") or "an answer that can't be read"
-    named = why.split(":")[0] == label.split()[0]  # the daemon names the command itself
+    named = why.split(":")[0] == label.split()[0]  # the daemon's message already names the command
     return ShownReply(now, False, why if named else f"{label}: {why}")

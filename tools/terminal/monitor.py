@@ -1,7 +1,8 @@
-"""``softfinger monitor``: a live page of the hand in the terminal.
+"""Run ``softfinger monitor``, a live page of the hand in the terminal.
 
-The command's arguments and its loop: keys and signals in, redraws out, or plain lines when the
-output is no terminal. The page itself is `monitor_page`, its data `feed`.
+This module parses the arguments and runs the loop: it reads keys and signals and redraws the page,
+or prints plain lines if the output is not a terminal. `monitor_page` draws the page, `feed`
+collects its data.
 """
 
 from __future__ import annotations
@@ -32,27 +33,27 @@ from softfinger.tools.terminal.monitor_page import MonitorPage
 from softfinger.tools.terminal.status import told
 from softfinger.tools.terminal.terminal import KeyDecoder, Terminal, TerminalGone
 
-STEP_ANGLE = math.radians(5.0)  # of the arrow keys
-_STEPS = ((1.0, 0.1), (5.0, 0.5), (math.inf, 1.0))  # N: up to this force, in steps of that
-_BETWEEN = 1.0  # s between two presses that add up
-_SURE = 3.0  # s in which a second d means it
+STEP_ANGLE = math.radians(5.0)  # rad, object rotation per press of an arrow key
+_STEPS = ((1.0, 0.1), (5.0, 0.5), (math.inf, 1.0))  # (upper force limit [N], step below it [N])
+_BETWEEN = 1.0  # s, presses within this time accumulate
+_SURE = 3.0  # s within which a second d confirms disarming
 _SIMPLE = {"a": "arm", "r": "release", " ": "stop", "c": "clear", "d": "disarm", "w": "demo"}
 _GRIPPING = ("grasping", "holding", "rotating")
 
 
 class HandKeys:
-    """Turns keys into commands."""
+    """Convert key presses to commands."""
 
     def __init__(self, feed: Feed, commander: Commander) -> None:
         self._feed = feed
         self._commander = commander
         self._target: float | None = None  # object angle [rad]
         self._chosen = math.nan  # grasp force [N]
-        self._pressed = -math.inf  # time of its last change here
-        self._asked = -math.inf  # when disarm was asked for in a grip
+        self._pressed = -math.inf  # time of the last force change made here
+        self._asked = -math.inf  # time of the first d during a grip
 
     def press(self, key: str, now: float) -> None:
-        """Send the key's command; other keys do nothing."""
+        """Send the command of a key; ignore other keys."""
         if key in ("left", "right"):
             self._rotate(STEP_ANGLE if key == "right" else -STEP_ANGLE, now)
         elif key in "+=-_":
@@ -67,11 +68,14 @@ class HandKeys:
             self._commander.send(now, _SIMPLE[key], _SIMPLE[key])
 
     def force(self, now: float) -> float:
-        """Return force of the next grasp [N]; in a grip, its requested force; NaN: not known."""
+        """Return the force of the next grasp, or the requested force of the current grip [N].
+
+        Returns NaN if the force is unknown.
+        """
         feed = self._feed
         if not self._gripping or self._adding(now):
             return feed.force_default if math.isnan(self._chosen) else self._chosen
-        # A grip's goal may be older than this page.
+        # The grip may have been commanded before this page was started.
         known = (feed.commanded, feed.state.goal_force, self._chosen)
         return next((force for force in known if not math.isnan(force)), math.nan)
 
@@ -80,20 +84,19 @@ class HandKeys:
         return self._feed.mode in _GRIPPING
 
     def _adding(self, now: float) -> bool:
-        """A key was pressed just now: its force counts before the daemon publishes it."""
+        """Return True shortly after a force key, while the chosen force is not yet published."""
         reply = self._commander.reply
         refused = reply is not None and not reply.ok and reply.at >= self._pressed
         return now - self._pressed < _BETWEEN and not refused
 
     def _change_force(self, sign: float, now: float) -> None:
-        """Raise or lower the force to the next step; a grip follows at once."""
+        """Change the force by one step; a current grip is changed immediately."""
         present = self.force(now)
         if not math.isfinite(present):
             self._commander.refuse(now, "grasp: the hand's settings are not known yet")
             return
         step = next(step for limit, step in _STEPS if present + 0.01 * sign <= limit)
         target = round(step * (round(present / step) + sign), 3)
-        # The daemon checks it.
         self._chosen = min(max(target, step), self._feed.force_limit)
         self._pressed = now
         if self._gripping:
@@ -108,7 +111,7 @@ class HandKeys:
             self._commander.send(now, label, "grasp", force=self._chosen)
 
     def _rotate(self, step: float, now: float) -> None:
-        """Rotate by one step from the last target, not the present angle: key presses add up."""
+        """Rotate by one step from the last target, not the current angle: presses add up."""
         reply, pose = self._commander.reply, self._feed.state.object
         refused = reply is not None and not reply.ok
         if self._target is None or refused or self._feed.mode not in ("rotating", "holding"):
@@ -121,25 +124,27 @@ class HandKeys:
         self._commander.send(now, label, "rotate", angle=self._target)
 
 
-REDRAW = 0.1  # s between redraws at most
-PLAIN_STEP = 0.1  # s between looks at the stream in plain mode
+REDRAW = 0.1  # s, shortest time between redraws
+PLAIN_STEP = 0.1  # s between reads of the stream in plain mode
 PLAIN_LINE = 1.0  # s between plain lines
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = (
-        "Show the hand on a live terminal page; keys arm, grasp, rotate, release and stop it, and\n"
-        "choose the force. Prints a plain line a second when the output is not a terminal."
+        "Show the hand on a live terminal page with keys to arm, grasp, rotate, release, stop and\n"
+        "change the force. If the output is not a terminal, print a plain line every second."
     )
     add_stream(parser, addresses, client=True)
-    parser.add_argument("--plain", action="store_true", help="plain lines, no page")
-    parser.add_argument("--lifeline", type=int, help=argparse.SUPPRESS)  # end when it closes
+    parser.add_argument("--plain", action="store_true", help="print plain lines, not the page")
+    parser.add_argument("--lifeline", type=int, help=argparse.SUPPRESS)  # end when this pipe closes
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run until q, a signal, the duration or the daemon's end; 1 without a stream.
+    """Run until q, a signal, the end of the duration or of the daemon; return 1 without a stream.
 
-    Raises KeyFileError.
+    Raises
+    ------
+    KeyFileError
     """
     state, commands = args.address
     if args.lifeline is not None:
@@ -169,7 +174,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _lower_priority() -> None:
-    """Drop the daemon's priority, which a child inherits."""
+    """Reset the real-time priority inherited from the daemon."""
     with contextlib.suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     with contextlib.suppress(OSError):
@@ -184,19 +189,19 @@ def _is_page(args: argparse.Namespace) -> bool:
 
 
 class _Ending(Ending):
-    """Also suspends, and ends without a stream if that is asked for."""
+    """Ending that also handles suspension, and ends without a stream if ``--no-wait`` is given."""
 
     signals = known("SIGINT", "SIGTERM", "SIGHUP")
 
     def __init__(self, args: argparse.Namespace) -> None:
         super().__init__(args.duration, args.lifeline)
         self.begin()
-        self.why = ""  # to be printed once the terminal is back
+        self.why = ""  # printed after the terminal is restored
         self.suspend = False
         self.terminal: Terminal | None = None
         self._no_wait: bool = args.no_wait
         self._keys: Path | None = args.keys
-        self.beside = args.lifeline is not None  # the daemon is in this process group
+        self.beside = args.lifeline is not None  # started by the daemon, in the same process group
         self._patience = time.monotonic() + PATIENCE
 
     def __enter__(self) -> Self:
@@ -215,7 +220,7 @@ class _Ending(Ending):
         self.wake()
 
     def watch(self, feed: Feed, address: str, now: float) -> None:
-        """Watch the stream; with ``--no-wait`` end without one."""
+        """Request the end if ``--no-wait`` is given and there is no stream."""
         if not self._no_wait or self.over:
             return
         status = feed.status(now)
@@ -239,11 +244,11 @@ def _run_page(
         while not ending.over:
             with terminal:
                 _page_loop(page, terminal, keyboard, subscriber, commander, ending)
-            if ending.suspend and not ending.over:  # Ctrl-Z: the shell has its terminal meanwhile
+            if ending.suspend and not ending.over:  # Ctrl-Z: return the terminal to the shell
                 ending.suspend = False
                 os.kill(os.getpid(), signal.SIGSTOP)
     except TerminalGone:
-        pass  # nobody sees the page any more
+        pass  # the terminal was closed
 
 
 def _page_loop(
@@ -262,7 +267,7 @@ def _page_loop(
         for each in ending.ready(due - time.monotonic(), *keyboards):
             typed = _read(each)
             if not typed:
-                keyboard = None  # the keyboard is gone, the page stays
+                keyboard = None  # the keyboard was closed; keep showing the page
             for key in keys.decode(typed):
                 if key == "q":
                     return ending.end()
@@ -308,7 +313,8 @@ def _run_plain(address: str, subscriber: FeedSubscriber, ending: _Ending) -> Non
                 due = now + PLAIN_LINE
                 _say(f"{_clock()} {printable(told(feed.state))}")
         return
-    # The reader has gone. Python flushes its output once more at exit: into nothing then.
+    # The reader has closed the pipe. Python flushes its output again at exit; send that to
+    # /dev/null.
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 

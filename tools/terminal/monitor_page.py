@@ -1,8 +1,8 @@
-"""The page of ``softfinger monitor`` as lines of styled text: layout, wording and colours.
+"""Lay out the page of ``softfinger monitor`` as lines of styled text.
 
 Lengths are in mm, angles in degrees, energies in mJ, pressures in kPa. The left finger's map is on
-the left, the right one's on the right, the numbers of both between them, with the object's.
-Widths are terminal columns: a wide character takes two.
+the left, the right finger's map on the right, and the numbers of both fingers and of the object are
+in between. Widths are terminal columns: a wide character takes two.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ from softfinger.tools.terminal.typeset import (
     wrapped,
 )
 
-WIDTH, HEIGHT = 80, 24  # the least that everything fits into
-CENTRE = 34  # columns of the numbers
-MAP_LINES = 11  # of each map at the least size
-OLD = 1.0  # s after which a frame is marked as old
-REPLY_TIME = 12.0  # s a reply stays
-LATE = 0.05  # s behind from which a line says so
+WIDTH, HEIGHT = 80, 24  # smallest size into which everything fits
+CENTRE = 34  # width of the numbers, columns
+MAP_LINES = 11  # height of each map at the smallest page size
+OLD = 1.0  # s, age above which a frame is marked as old
+REPLY_TIME = 12.0  # s for which a reply is shown
+LATE = 0.05  # s, delay above which a message is shown
 
 GOOD, WARN, BAD = "#1fa883", "#e69f00", "bold #ff6a3d"
 KEY = "bold #56b4e9"
@@ -53,7 +53,7 @@ _LEVELS = {"info": DIM, "warning": WARN, "error": BAD}
 _KEYS = {
     "a": "arm",
     "g": "grasp",
-    "+-": "",  # the force
+    "+-": "",  # changes the force
     "←→": "turn 5°",
     "r": "release",
     "space": "stop",
@@ -63,8 +63,8 @@ _KEYS = {
     "q": "quit",
 }
 _KEYS_EXPLAINED = (
-    ("w", "begins the profile's task again, while disarmed"),
-    ("+ -", "more or less force; a grip follows at once"),
+    ("w", "restarts the profile's task, while disarmed"),
+    ("+ -", "increase or reduce the force, also of a current grip"),
 )
 
 # (label, field, factor, decimals, unit, field of the standard deviation)
@@ -85,15 +85,15 @@ _ROWS = (
 
 @dataclass
 class MonitorPage:
-    """The page of a feed. ``now`` is monotonic seconds."""
+    """Page that shows a feed; ``now`` is monotonic time [s]."""
 
     feed: Feed
     address: str
-    coloured: bool = True  # in more than 16 colours
-    keys: bool = True  # a keyboard is there
+    coloured: bool = True  # the terminal has more than 16 colours
+    keys: bool = True  # a keyboard is available
     guarded: bool = False  # subscribed with keys
-    force: float = math.nan  # N of the grasp key
-    explains: bool = False  # the numbers' meanings stand in their place
+    force: float = math.nan  # N, force that the grasp key requests
+    explains: bool = False  # show the meanings of the numbers in place of the numbers
     _pressure: heatmap.FullScale = field(default_factory=lambda: heatmap.FullScale(5e3, 3.0))
 
     def lines(self, width: int, height: int, now: float, reply: ShownReply | None) -> list[Text]:
@@ -164,7 +164,7 @@ class MonitorPage:
         return cut(Text(f" {why_invalid(feed.state)}", WARN), width)
 
     def _body(self, width: int, lines: int, now: float) -> list[Text]:
-        """Titles, maps with the numbers between them, and the maps' scale with the object."""
+        """Draw titles, both maps with the numbers between them, their scale and the object."""
         box = min(2 * lines, (width - CENTRE - 2) // 2)
         frames = self.feed.frames
         peak = max((float(frame.grid.max()) for frame in frames.values()), default=0.0)
@@ -183,7 +183,7 @@ class MonitorPage:
     def _map(
         self, name: str, lines: int, box: int, full: float, now: float, counts: bool
     ) -> list[Text]:
-        """Title, ``lines`` of picture and the scale, each at most ``box`` columns."""
+        """Draw title, ``lines`` of map and scale, each at most ``box`` columns wide."""
         frame = self.feed.frames.get(name)
         title = Text(name.upper(), SIDE[name])
         picture = [Text() for _ in range(lines)]
@@ -207,7 +207,7 @@ class MonitorPage:
         return [title, *picture, Text.assemble(("0 ", DIM), bar, (end, DIM))]
 
     def _numbers(self, lines: int) -> list[Text]:
-        """Heads, one row a quantity, and the object, in the middle of ``lines``."""
+        """Draw heads, one row per quantity and the object, vertically centred in ``lines``."""
         rows = [self._row(*row) for row in _ROWS]
         between = [Text()] if lines > len(rows) + 3 else []
         block = [self._heads(), *between, *rows, *(each.copy() for each in between), self._object()]
@@ -229,7 +229,7 @@ class MonitorPage:
             value, style = getattr(finger, key), "default" if finger.valid else DIM
             if key == "temperature":
                 style = BAD if finger.time_to_limit < self.feed.warm else style
-                value = value or math.nan  # 0 is not known yet
+                value = value or math.nan  # 0 means unknown
             spread = factor * getattr(finger, std) if std else math.nan
             shown = aligned(factor * value, decimals)
             beside = "" if math.isnan(spread) else "±" + narrow(spread)
@@ -250,7 +250,7 @@ class MonitorPage:
         )
 
     def _ticks(self) -> Text:
-        """Rate and overruns, then median, tail and largest times of all ticks."""
+        """Return rate and overruns, then median, tail and maximum of the times of all ticks."""
         times, overruns = self.feed.times, self.feed.state.overruns
         rate = math.nan if times is None else times.rates.tick
         line = Text(f" tick {short(rate, 0)} Hz").append("  overruns ", DIM)
@@ -263,7 +263,7 @@ class MonitorPage:
         return line.append(" µs", DIM)
 
     def _messages(self, width: int, count: int, now: float, reply: ShownReply | None) -> list[Text]:
-        """A rule with the commander and the last reply, texts cut above in full, then events."""
+        """Draw commander and last reply, then texts too long for their line, then events."""
         who = cut(Text(self.feed.commander(now)), 16)
         title = Text(f"events ─ {who} commands the hand" if who else "events")
         full: list[Text] = []
@@ -280,7 +280,7 @@ class MonitorPage:
 
     @property
     def _way_out(self) -> str:
-        """Command that clears a fault."""
+        """Return the command that clears a fault."""
         return "c clears it " if self.keys else "softfinger send clear "
 
     def _events(self, width: int, count: int) -> list[Text]:
@@ -294,7 +294,7 @@ class MonitorPage:
         return lines + [Text() for _ in range(count - len(lines))]
 
     def _footer(self, width: int) -> Text:
-        """The keys by name; in a narrow terminal without those that are useless at present."""
+        """Name the keys; a narrow terminal shows only those that are useful in the current mode."""
         if not self.keys:
             return Text(" no keyboard here: commands go through softfinger send", DIM)
         force = f"{self.force:.3g} N" if math.isfinite(self.force) else "N"
@@ -321,9 +321,9 @@ def _named(keys: dict[str, str]) -> Text:
 
 
 def _heights(width: int, height: int) -> tuple[int, int]:
-    """Lines of (each map, the events) on a page of this size."""
+    """Return the number of lines of each map and of the events for a page of this size."""
     spare = height - HEIGHT
-    widest = (width - CENTRE - 2) // 4  # the maps' width is twice their height
+    widest = (width - CENTRE - 2) // 4  # a map is twice as many columns wide as lines high
     maps = max(MAP_LINES, min(widest, MAP_LINES + (2 * spare + 2) // 3))
     return maps, 5 + spare - (maps - MAP_LINES)
 

@@ -1,4 +1,4 @@
-"""``softfinger send COMMAND [key=value …]``: one command to the daemon, its reply as JSON."""
+"""Run ``softfinger send COMMAND [key=value …]``: send one command and print the reply as JSON."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from softfinger.tools.arguments import add_daemon, client_keys, command_address,
 
 _NUMBER = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*")
 _ANGLES = {"rad": 1.0, "deg": math.radians(1.0), "°": math.radians(1.0)}
-_UNITS = {  # that a number may carry, by its key; without one it is SI
+_UNITS = {  # units allowed for each key; a number without a unit is in SI units
     "force": {"N": 1.0, "mN": 1e-3},
     **dict.fromkeys(("angle", "left", "right"), _ANGLES),
 }
 _EPILOG = """\
-commands: arm, disarm, tare, grasp force=N, rotate angle=RAD, hold force=N angle=RAD (setpoints of a
-stream), move left=RAD right=RAD, release, set compliance=RAD/NM, demo (the profile's task again),
-stop, clear, status. Numbers are SI, or carry their unit: force=10N, angle=8deg or 8°.
-Exit status: 0 done, 1 refused, 2 no answer or not understood here, 3 stop or disarm was received,
-but the servos have not confirmed torque off yet."""
+commands: arm, disarm, tare, grasp force=N, rotate angle=RAD, hold force=N angle=RAD (a streamed
+setpoint), move left=RAD right=RAD, release, set compliance=RAD/NM, demo (restart the profile's
+task), stop, clear, status. Numbers are in SI units or carry a unit: force=10N, angle=8deg or 8°.
+Exit status: 0 done, 1 refused, 2 no answer or invalid words, 3 stop or disarm was received, but the
+servos have not confirmed yet that torque is off."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -45,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Send, print the reply, and return 1 when the command was refused."""
+    """Send the command and print the reply; return 1 if the command was refused."""
     request: dict[str, Any] = {"command": arguments.command}
     if arguments.client:
         request["client"] = arguments.client
@@ -67,7 +67,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def si_numbers(words: list[str]) -> dict[str, float]:
-    """Parse ``key=value`` words to SI numbers. Raises ValueError with the word and the reason."""
+    """Parse ``key=value`` words to SI numbers; raise ValueError with the word and the reason."""
     numbers = {}
     for key, text in _pairs(words):
         found = _NUMBER.fullmatch(text)
@@ -82,7 +82,7 @@ def si_numbers(words: list[str]) -> dict[str, float]:
 
 
 def _pairs(words: list[str]) -> Iterator[tuple[str, str]]:
-    """``key=`` and the text after it; ``angle=8 deg`` may come as two words."""
+    """Yield keys and their values; ``angle=8 deg`` may be given as two words."""
     text = " ".join(words)
     for pair in re.split(r"\s+(?=\S+=)", text) if words else ():
         key, equals, value = pair.partition("=")

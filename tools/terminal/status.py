@@ -1,4 +1,4 @@
-"""``softfinger status``: what the running hand does, in one line for people."""
+"""Run ``softfinger status``: describe the state of the running hand in one line."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from softfinger.tools.arguments import add_daemon, no_stream, stream_address
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_daemon(parser, stream_address)
-    parser.add_argument("--json", action="store_true", help="the whole state, for programs")
+    parser.add_argument("--json", action="store_true", help="print the whole state as JSON")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print the next state; 1 when the hand has a fault, 2 when no state comes."""
+    """Print the next state; return 1 if the hand has a fault, 2 if no state arrives."""
     try:
         with Hand(arguments.address, keys=arguments.keys) as hand:
             state = hand.state()
@@ -34,7 +34,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def told(state: HandState) -> str:
-    """Return the line: mode, mean force, the object's angle and width; or the fault."""
+    """Return a line with mode, mean force and the object's angle and width, or the fault."""
     if state.fault:
         return f"{state.mode}: {state.fault}"
     parts = [state.mode]
@@ -51,7 +51,7 @@ def told(state: HandState) -> str:
 
 
 def why_invalid(state: HandState) -> str:
-    """Return why the scene's fingers are not valid, empty where they are."""
+    """Return the reason why the fingers' estimates are invalid; empty if they are valid."""
     reasons = {name: state.finger(name).invalid for name in FINGERS}
     return "; ".join(
         f"{name} not valid: {reason}"

@@ -1,6 +1,6 @@
-"""The terminal of a full-screen page: screen modes, key decoding, output, and their restoring.
+"""Control the terminal of a full-screen page: screen modes, key decoding, output, and restoring.
 
-Only lines that changed are written, in one write a redraw: that is light over ssh and doesn't
+A redraw writes only the lines that changed, in one write. This is fast over ssh and does not
 flicker.
 """
 
@@ -20,13 +20,13 @@ from rich.text import Text
 
 from softfinger.daemon.errors import SoftfingerError
 
-with contextlib.suppress(ModuleNotFoundError):  # Windows has no page, but `monitor --plain`
+with contextlib.suppress(ModuleNotFoundError):  # Windows supports only `monitor --plain`
     import termios
     import tty
 
-_ENTER = "\x1b[?1049h\x1b[?25l\x1b[?2004h\x1b[2J"  # alternate screen, no cursor, pastes marked
-_LEAVE = "\x18\x1b[0m\x1b[?2004l\x1b[?25h\x1b[?1049l"  # CAN ends a sequence that was cut off
-_HOLD, _SHOW = "\x1b[?2026h", "\x1b[?2026l"  # terminals that know it show a redraw as one
+_ENTER = "\x1b[?1049h\x1b[?25l\x1b[?2004h\x1b[2J"  # alternate screen, no cursor, bracketed paste
+_LEAVE = "\x18\x1b[0m\x1b[?2004l\x1b[?25h\x1b[?1049l"  # CAN ends an incomplete sequence
+_HOLD, _SHOW = "\x1b[?2026h", "\x1b[?2026l"  # synchronised update, where the terminal supports it
 
 _COLOUR_SYSTEMS = {
     "truecolor": ColorSystem.TRUECOLOR,
@@ -37,20 +37,20 @@ _COLOUR_SYSTEMS = {
 _ARROWS = {b"D": "left", b"C": "right"}
 _KEY = re.compile(
     rb"\x1b\[200~(?s:.)*?\x1b\[201~"  # a paste
-    rb"|(?P<part>\x1b(\[(200~(?s:.)*|[0-?]*[ -/]*)|O)?\Z)"  # cut off: the rest is to come
+    rb"|(?P<part>\x1b(\[(200~(?s:.)*|[0-?]*[ -/]*)|O)?\Z)"  # incomplete; the rest is still to come
     rb"|\x1b[\[O](?P<arrow>[CD])"
-    rb"|\x1b(\[[0-?]*[ -/]*[@-~]|O(?s:.)|(?s:.))"  # a sequence that means nothing here
+    rb"|\x1b(\[[0-?]*[ -/]*[@-~]|O(?s:.)|(?s:.))"  # a sequence that is not used here
     rb"|(?P<character>[ -~])"
     rb"|(?s:.)"
 )
 
 
 class TerminalGone(SoftfingerError):
-    """The terminal can't be written to any more, or a signal ended a blocked write."""
+    """The terminal cannot be written to, or a signal interrupted a blocked write."""
 
 
 class KeyDecoder:
-    """Decodes a terminal's bytes to names of keys. Pasted text is ignored."""
+    """Decode a terminal's bytes to names of keys, ignoring pasted text."""
 
     def __init__(self) -> None:
         self._rest = b""
@@ -63,13 +63,13 @@ class KeyDecoder:
         return [key for key in known if key]
 
     def settle(self) -> None:
-        """Drop an incomplete key: no more bytes come for now, and a lone Escape begins nothing."""
+        """Drop an incomplete key when no more bytes are waiting, e.g. after a single Escape."""
         if not self._rest.startswith(b"\x1b[200~"):
             self._rest = b""
 
 
 class Terminal:
-    """A context in which the page owns the terminal; it is restored afterwards."""
+    """Context in which the page controls the terminal; the terminal is restored afterwards."""
 
     def __init__(self, output: int, keyboard: int | None, suspendable: bool = True) -> None:
         self._output = output
@@ -83,13 +83,13 @@ class Terminal:
         self._console = Console()
         name = None if self._console.no_color else self._console.color_system
         self._colours = _COLOUR_SYSTEMS.get(name) if name else None
-        self.coloured = name in ("truecolor", "256")  # 16 are too few for a map
+        self.coloured = name in ("truecolor", "256")  # 16 colours are too few for a map
 
     def __enter__(self) -> Terminal:
         if self._keyboard is not None:
             self._attributes = termios.tcgetattr(self._keyboard)
-            tty.setcbreak(self._keyboard)  # also drops keys typed ahead
-            if not self._suspendable:  # Ctrl-Z would stop the daemon too, torque on
+            tty.setcbreak(self._keyboard)  # also discards keys typed before
+            if not self._suspendable:  # Ctrl-Z would also stop the daemon, with the torque on
                 ours = termios.tcgetattr(self._keyboard)
                 ours[6][termios.VSUSP] = b"\0"
                 termios.tcsetattr(self._keyboard, termios.TCSANOW, ours)
@@ -104,21 +104,22 @@ class Terminal:
     def __exit__(self, *_: object) -> None:
         with contextlib.suppress(OSError, termios.error, TerminalGone):
             if self._attributes is not None and self._keyboard is not None:
-                # At once, not after the output has drained: a stopped terminal would block here.
+                # Do not wait for the output to drain: this would block on a stopped terminal.
                 termios.tcsetattr(self._keyboard, termios.TCSANOW, self._attributes)
         with contextlib.suppress(OSError, termios.error, TerminalGone):
-            if self._stuck:  # drop the page's rest
+            if self._stuck:  # discard the rest of the page
                 termios.tcflush(self._output, termios.TCOFLUSH)
-            termios.tcflow(self._output, termios.TCOON)  # as Ctrl-Q, or the next write hangs
+            # Resume a terminal stopped by Ctrl-S; otherwise the next write blocks.
+            termios.tcflow(self._output, termios.TCOON)
             self._write(_LEAVE)
 
     def size(self) -> tuple[int, int]:
-        """Return (columns, lines)"""
+        """Return the size as (columns, lines)."""
         try:
             size = os.get_terminal_size(self._output)
         except OSError:
             size = shutil.get_terminal_size()
-        # A serial console may say 0 × 0.
+        # A serial console may report a size of 0 × 0.
         return size.columns or 80, size.lines or 24
 
     def draw(self, lines: Sequence[Text]) -> None:

@@ -1,4 +1,4 @@
-"""Typesetting of numbers and lines for a page of fixed width.
+"""Format numbers and lines for a page of fixed width.
 
 Widths are terminal columns: a wide character takes two.
 """
@@ -16,12 +16,12 @@ DIM = "#8b929c"
 
 
 def plain_table(*, heads: bool = True) -> Table:
-    """Return a table without lines, two columns between its own."""
+    """Return a table without rules, with two blank columns between its columns."""
     return Table(box=None, padding=(0, 2, 0, 0), show_header=heads)
 
 
 def table_text(table: Table, width: int) -> str:
-    """Return a table as text without colours, in at most ``width`` columns."""
+    """Return a table as text without colours, at most ``width`` columns wide."""
     console = Console(width=width, highlight=False, markup=False, color_system=None)
     with console.capture() as printed:
         console.print(table)
@@ -29,13 +29,13 @@ def table_text(table: Table, width: int) -> str:
 
 
 def cut(line: Text, columns: int) -> Text:
-    """Return ``line`` in at most ``columns`` columns, with an ellipsis where it was cut."""
+    """Shorten ``line`` to at most ``columns`` columns, with an ellipsis at the cut."""
     line.truncate(max(columns, 0), overflow="ellipsis")
     return line
 
 
 def wrapped(line: Text, columns: int) -> list[Text]:
-    """Return the first two lines of ``columns`` columns, one in from the left."""
+    """Wrap ``line`` to ``columns`` columns, indented by one; return the first two lines."""
     lines = line.wrap(Console(), columns)[:2]
     for each in lines:
         each.pad_left(1)
@@ -43,18 +43,18 @@ def wrapped(line: Text, columns: int) -> list[Text]:
 
 
 def apart(left: Text, right: Text, width: int) -> Text:
-    """Return ``left`` and ``right`` at the two ends of ``width`` columns."""
+    """Place ``left`` and ``right`` at the two ends of ``width`` columns."""
     return Text.assemble(left, " " * max(1, width - left.cell_len - right.cell_len), right)
 
 
 def centred(line: Text, width: int) -> Text:
-    """Return ``line`` in the middle of ``width`` columns, not padded at its end."""
+    """Centre ``line`` in ``width`` columns, without padding at its end."""
     line.pad_left((width - line.cell_len) // 2)
     return line
 
 
 def rule(width: int, title: Text, note: Text | None = None) -> Text:
-    """Return a line across the page with a title at its left end and a note at its right end."""
+    """Return a horizontal rule with a title at its left end and a note at its right end."""
     head = f"─ {cut(title, width - 4)} " if title else ""
     if not note:
         return Text(head + "─" * (width - len(head)), DIM)
@@ -70,7 +70,7 @@ def faded(line: Text) -> Text:
 
 
 def aligned(value: float, decimals: int) -> str:
-    """Return the number with its decimal point in the fourth column, at most 7 wide."""
+    """Format a number at most 7 columns wide, with the decimal point in the fourth column."""
     if not math.isfinite(value):
         return "  —"
     shown = f"{value:{4 + decimals}.{decimals}f}"
@@ -78,17 +78,17 @@ def aligned(value: float, decimals: int) -> str:
 
 
 def narrow(value: float) -> str:
-    """Return a standard deviation in 4 columns."""
+    """Format a standard deviation in 4 columns."""
     return f"{value:.2f}" if value < 9.995 else f"{value:.0f}" if value < 9999.5 else "many"
 
 
 def short(value: float, decimals: int) -> str:
-    """Return the number, or a dash where there is none."""
+    """Format a number; a missing number becomes a dash."""
     return f"{value:.{decimals}f}" if math.isfinite(value) else "—"
 
 
 def micro(seconds: float) -> str:
-    """Return a time in µs, in at most 4 columns; from 10 ms on in ms, with its unit."""
+    """Format a time in at most 4 columns: in µs, or from 10 ms on in ms with its unit."""
     if not math.isfinite(seconds):
         return "—"
     return f"{1e6 * seconds:.0f}" if seconds < 9.9995e-3 else f"{1e3 * seconds:.0f}ms"

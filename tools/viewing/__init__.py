@@ -1,1 +1,1 @@
-"""`view`: the stream, or a recording, on a web page; the stream for Foxglove."""
+"""The command `view`: show the stream or a recording on a web page, and serve it to Foxglove."""

@@ -1,8 +1,8 @@
-"""The stream for Foxglove, by its WebSocket protocol (foxglove/ws-protocol, version 1).
+"""Serve the stream to Foxglove with its WebSocket protocol (foxglove/ws-protocol, version 1).
 
 Channels have the names, schemas and messages of recordings (`tools.recordings.channels`), so that
-one layout shows both; ``hand/scene``, the moving hand, is made here. What nobody subscribes to
-isn't packed.
+one layout works for both. The additional channel ``hand/scene`` contains the moving hand. Messages
+without subscribers are not packed.
 """
 
 from __future__ import annotations
@@ -29,34 +29,34 @@ from softfinger.tools.terminal.feed import number
 from softfinger.tools.viewing.planar import COLOURS, Drawn, hand_parts
 
 LAYOUT = Path(__file__).with_name("foxglove_layout.json")
-ORIGINS = ("https://app.foxglove.dev", "file://")  # of Foxglove in the browser and on the desktop
+ORIGINS = ("https://app.foxglove.dev", "file://")  # Foxglove in the browser and on the desktop
 PROTOCOLS = (Subprotocol("foxglove.sdk.v1"), Subprotocol("foxglove.websocket.v1"))
 CLIENTS = 8
 SCENE = "hand/scene"
-_FRAME = "hand"  # x from the left pivot to the right one, y away from the palm [m]
+_FRAME = "hand"  # coordinate frame: x from the left to the right pivot, y away from the palm [m]
 _LIST = {"type": "array", "items": {"type": "object", "properties": {}}}
 _ENTITIES = {"type": "object", "properties": {"deletions": _LIST, "entities": _LIST}}
-_HEAD = struct.Struct("<BIQ")  # before a message: its kind, the subscription, the time [ns]
-_EVENTS = 50  # kept for who begins to look at them, as many as the daemon repeats
-_QUEUE = 500  # messages that wait for a client; more are lost
-_PATIENCE = 2.0  # s for a client to take one
+_HEAD = struct.Struct("<BIQ")  # head of a message: kind, subscription, time [ns]
+_EVENTS = 50  # events kept for new subscribers, as many as the daemon repeats
+_QUEUE = 500  # messages queued for a client; further messages are dropped
+_PATIENCE = 2.0  # s for a client to accept a message
 
 
 class _Client:
-    """Its subscriptions by channel, and the messages on their way to it."""
+    """Subscriptions of a client by channel, and the messages queued for it."""
 
     def __init__(self) -> None:
         self.subscribed: dict[str, int] = {}
         self.queue: asyncio.Queue[bytes] = asyncio.Queue(_QUEUE)
 
     def give(self, channel: str, stamp: float, data: bytes) -> None:
-        """Put a message on its way, if it is subscribed to and there is room."""
+        """Queue a message if the client subscribes to its channel and the queue has room."""
         if channel in self.subscribed and not self.queue.full():
             head = _HEAD.pack(1, self.subscribed[channel], int(stamp * 1e9))
             self.queue.put_nowait(head + data)
 
     async def send(self, socket: ServerConnection) -> None:
-        """Send all that comes; end the connection where it isn't taken."""
+        """Send queued messages; end the connection if the client does not read them."""
         try:
             while True:
                 message = await self.queue.get()
@@ -67,19 +67,19 @@ class _Client:
 
 
 class Foxglove:
-    """Serves in ``loop``; messages and scenes come from another thread."""
+    """Server running in ``loop``; messages and scenes come from another thread."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
         self._clients: list[_Client] = []
         self._events: deque[tuple[float, bytes]] = deque(maxlen=_EVENTS)
-        self._frames: dict[str, dict[str, Any]] = {}  # the newest, by channel
+        self._frames: dict[str, dict[str, Any]] = {}  # newest frame by channel
         tactile = schema.TACTILE.decode()
         described = {SCENE: ("foxglove.SceneUpdate", _ENTITIES)}
         described |= {f"{tactile}/{name}": channels.schema_of(schema.TACTILE) for name in FINGERS}
         for topic in (schema.STATE, schema.TRUTH, schema.STATS, schema.EVENT):
             described[topic.decode()] = channels.schema_of(topic)
-        self._channels = list(described)  # by their number
+        self._channels = list(described)  # channel names by channel number
         coded = {"encoding": channels.ENCODING, "schemaEncoding": channels.SCHEMA_ENCODING}
         advertised = [
             {"id": number, "topic": topic, "schemaName": name, "schema": json.dumps(form)} | coded
@@ -91,7 +91,7 @@ class Foxglove:
         ]
 
     async def serve(self, socket: ServerConnection) -> None:
-        """Serve one client until it goes, takes nothing for a while, or asks for what isn't."""
+        """Serve one client until it leaves, stops reading or sends an invalid request."""
         if len(self._clients) == CLIENTS:
             return
         client = _Client()
@@ -120,7 +120,7 @@ class Foxglove:
         client.subscribed = kept
 
     def take(self, topic: bytes, message: dict[str, Any]) -> None:
-        """Take one message of the stream; frames wait for `draw`."""
+        """Process one message of the stream; frames are kept until `draw`."""
         channel = channels.channel_name(topic, message)
         if topic == schema.TACTILE:
             self._frames[channel] = message
@@ -128,7 +128,7 @@ class Foxglove:
             self._send(channel, number(message, "timestamp"), message, topic)
 
     def draw(self, settings: Settings, state: HandState, truth: dict[str, Any] | None) -> None:
-        """Send the newest frames, and the hand as it is now."""
+        """Send the newest frames and the current scene of the hand."""
         for channel, frame in self._frames.items():
             self._send(channel, number(frame, "timestamp"), frame, schema.TACTILE)
         self._frames.clear()
@@ -147,8 +147,8 @@ class Foxglove:
         if not keeps and not self._wanted(channel):
             return
         try:
-            data = orjson.dumps(channels.to_json(topic)(dict(message)))  # null for NaN
-        except TypeError:  # orjson's error, too: JSON can't hold it
+            data = orjson.dumps(channels.to_json(topic)(dict(message)))  # NaN becomes null
+        except TypeError:  # also orjson's error for values that JSON cannot represent
             return
         self._loop.call_soon_threadsafe(partial(self._give, channel, stamp, data, keeps))
 

@@ -1,6 +1,7 @@
-"""The hand by its settings, from ``hand/settings``, and its energy landscape U(d, θ) as a picture.
+"""Read the hand's settings from ``hand/settings``, and draw its energy landscape U(d, θ).
 
-Keys of another version that can't be read keep their defaults, so that the rest is shown.
+Keys of another version that cannot be read keep their default values, so that the rest can be
+shown.
 """
 
 from __future__ import annotations
@@ -22,24 +23,25 @@ from softfinger.kinematics.contact.table_record import TableError
 from softfinger.tools.terminal import heatmap
 
 WIDTH, HEIGHT = 240, 200  # pixels of the landscape
-THETA_END = 45.0  # degrees to both sides
-_TOLERANCE = 1e-6  # relative error of a table for a picture
+THETA_END = 45.0  # degrees to each side
+_TOLERANCE = 1e-6  # relative error of a table used for a picture
 
 
 class Landscape(NamedTuple):
-    """A tip's energy: θ to the right, d upwards.
+    """Energy of a tip, with θ to the right and d upwards.
 
-    Colour goes in steps with the cube root of U, which grows in proportion to d, so that the valley
-    along θ = 0 shows at every depth; the edge of a step is a line of equal energy.
+    The colour changes in steps with the cube root of U, which is proportional to d, so that the
+    valley along θ = 0 is visible at every depth. The edge of a step is a line of equal energy.
     """
 
-    levels: NDArray[np.uint8]  # [HEIGHT, WIDTH]: `heatmap`'s; one more: no such contact can be
+    # [HEIGHT, WIDTH] of `heatmap`; the next higher value marks impossible contacts
+    levels: NDArray[np.uint8]
     d_end: float  # m, at the upper edge
     highest: float  # J, of the last colour
 
 
 def landscape(settings: Settings) -> Landscape | None:
-    """The energy landscape of the settings' material; None where no table can be made of it."""
+    """Return the energy landscape of the settings' material; None if no table can be built."""
     try:
         material, tip = make_material(settings.material), make_tip(settings)
         table = ContactTable.build(tip, material, tolerance=_TOLERANCE)
@@ -56,12 +58,12 @@ def landscape(settings: Settings) -> Landscape | None:
 
 
 def fingers_of(settings: Settings) -> list[str]:
-    """Return the fingers that the hand has, left first."""
+    """Return the fingers of the hand, left first."""
     return [name for name in FINGERS if name in settings.scene.fingers]
 
 
 def read_settings(message: dict[str, Any]) -> tuple[Settings, list[str]]:
-    """Return a ``hand/settings``, and the keys in it that could not be read."""
+    """Read a ``hand/settings`` message; return the settings and the keys that could not be read."""
     try:
         sections = json.loads(message.get("settings") or "{}")
         return Settings.model_validate_json(json.dumps(sections)), []

@@ -1,8 +1,9 @@
-"""The web page of ``softfinger view``: its server on the loopback, with pictures and commands.
+"""Serve the web page of ``softfinger view``, with its pictures and commands, on the loopback.
 
-One thread serves. The main thread reads the stream, or plays a recording, and makes a picture for
-all pages. A page asks for the next one when it has drawn the last, so that a slow one skips and
-costs nothing. Whoever has the token that the terminal prints may command, each page as a client.
+One thread serves. The main thread reads the stream or plays a recording, and makes one picture for
+all pages. A page requests the next picture after drawing the last one, so a slow page skips
+pictures without delaying the others. Pages with the token that the terminal prints may send
+commands, each page as a separate client.
 """
 
 from __future__ import annotations
@@ -45,16 +46,16 @@ from softfinger.tools.viewing.sources import Playback, ViewError, follow
 _HELP = "".join(f"<dt><b>{words}</b><dd>{meaning}" for words, meaning in MEANINGS)
 _WEB = Path(__file__).with_name("web")
 _LOOPBACK = "127.0.0.1"
-_PORT = 9090  # where nobody says another
-_NICE = 5  # everything real-time goes first
-_AT_ONCE = 40  # commands that wait for their answers, of all pages
-_PATIENCE = 5.0  # s for a request's head, of a busy browser, too
+_PORT = 9090  # default port
+_NICE = 5  # lower priority than all real-time threads
+_AT_ONCE = 40  # commands of all pages waiting for an answer
+_PATIENCE = 5.0  # s for the head of a request, sufficient for a busy browser
 _NAME = 40  # characters of a command's name that are shown
 _NO_COMMAND = (ValueError, TypeError, LookupError, AttributeError, OverflowError, RecursionError)
-_BUFFER = 256 << 10  # bytes that wait for a page or a client of Foxglove
-_LARGEST = 65536  # bytes of what a page or a client of Foxglove sends
+_BUFFER = 256 << 10  # bytes queued for a page or a Foxglove client
+_LARGEST = 65536  # bytes, largest message accepted from a page or a Foxglove client
 _HEADERS = {
-    "Cache-Control": "no-store",  # the page may hold a token, and a new daemon's is another
+    "Cache-Control": "no-store",  # the page may contain a token, which changes with each start
     "Content-Security-Policy": "frame-ancestors 'none'; base-uri 'none'; form-action 'none'",
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
@@ -63,7 +64,7 @@ _say = to_stderr("view")
 
 
 def _page() -> str:
-    """Return the whole page: what a browser loads is one document, with style and scripts."""
+    """Return the page as one document that includes style and scripts."""
     html, style, *scripts = (
         (_WEB / name).read_text("utf-8")
         for name in ("page.html", "page.css", "charts.js", "controls.js", "page.js")
@@ -76,7 +77,7 @@ _PAGE = _page()
 
 
 class _Published(NamedTuple):
-    """A picture, with what a page needs beside it."""
+    """A picture, and the other data that a page needs with it."""
 
     scene: str
     picture: str
@@ -84,13 +85,13 @@ class _Published(NamedTuple):
 
 
 class Site:
-    """The page, the pictures and commands of all pages, and what Foxglove connects to.
+    """Serve the page, the pictures and commands of all pages, and Foxglove clients.
 
-    Lets in what names this server as its host, and pages of this very server: a name that an
-    attacker's DNS leads here is another host; a foreign page's requests carry its own origin.
-    Pages with the ``token`` may command, by ``send``; without it they play a recording, by
-    ``wish``. Where other machines can reach it, even looking needs the token, and a browser gets
-    it for a code that is good for one.
+    Requests must name this server as their host and, from a browser, come from its own pages. This
+    blocks DNS rebinding, where the host has another name, and requests of foreign pages, which
+    carry another origin. Pages with the ``token`` may send commands through ``send``; pages without
+    it may control the playback of a recording through ``wish``. If other machines can reach the
+    server, watching also requires the token. A browser then obtains the token with a one-time code.
     """
 
     def __init__(
@@ -102,22 +103,23 @@ class Site:
         stale: float,
         announce: Callable[[str], None] | None = None,
     ) -> None:
-        """``stale`` [s] after its picture a command is dropped.
+        """``stale`` [s]: age of its picture above which a command is dropped.
 
-        ``announce``, of a page that other machines can reach, is told each one-time code.
+        ``announce`` is called with each one-time code if other machines can reach the page.
         """
         self._loop = loop
         self._token = token
-        self._code = ""  # for one browser
+        self._code = ""  # one-time code for one browser
         self._announce = announce
         self._send = send
         self._stale = stale
         self._ended = asyncio.Event()
-        self._hosts: set[str] = set()  # names of this server
+        self._hosts: set[str] = set()  # valid host names of this server
         self._at_once = asyncio.Semaphore(_AT_ONCE)
-        self.waiting: list[asyncio.Future[_Published]] = []  # pages, for the next picture
-        self.record: Callable[[], str] = lambda: ""  # begins a recording, or ends it
-        self.wish: Callable[[str], None] = lambda _: None  # what pages ask with each picture
+        self.waiting: list[asyncio.Future[_Published]] = []  # pages waiting for the next picture
+        self.record: Callable[[], str] = lambda: ""  # starts or ends a recording
+        # Receives the text by which a page requests each picture.
+        self.wish: Callable[[str], None] = lambda _: None
         self._routes: dict[str, Callable[[ServerConnection], Awaitable[None]]] = {
             "/pictures": self._show,
             "/command": self._command,
@@ -126,23 +128,23 @@ class Site:
             self._routes["/"] = foxglove.serve
 
     def publish(self, scene: str, picture: str, rows: list[Row]) -> None:
-        """Give them to the pages that wait, from another thread."""
+        """Send a picture to the waiting pages; called from another thread."""
         self._loop.call_soon_threadsafe(self._give, _Published(scene, picture, rows))
 
     def announce(self) -> None:
-        """Make a new one-time code, and tell it, if one is needed."""
+        """Make a new one-time code and announce it, if codes are used."""
         if self._announce is not None:
             self._code = secrets.token_urlsafe(8)
             self._announce(self._code)
 
     def end(self) -> None:
-        """End `run`, from another thread."""
+        """End `run`; called from another thread."""
         self._loop.call_soon_threadsafe(self._ended.set)
 
     async def run(self, listener: socket.socket) -> None:
         """Serve on ``listener`` until the end."""
         quiet = logging.getLogger("softfinger.view")
-        quiet.disabled = True  # what strangers do wrong is nobody's business here
+        quiet.disabled = True  # invalid requests of other programs are not logged
         self._hosts = {f"{name}:{listener.getsockname()[1]}" for name in (_LOOPBACK, "localhost")}
         server = await serve(
             self._serve,
@@ -153,13 +155,14 @@ class Site:
             select_subprotocol=lambda _, offered: next(
                 (each for each in offered if each in PROTOCOLS), None
             ),
-            compression=None,  # nothing is gained on this machine
+            compression=None,  # no benefit on a local connection
             open_timeout=_PATIENCE,
             max_size=_LARGEST,
             logger=quiet,
         )
         await self._ended.wait()
-        for connection in server.connections:  # one that takes nothing would never be closed
+        # Connections that do not read would never close by themselves.
+        for connection in server.connections:
             connection.transport.abort()
         others = asyncio.all_tasks() - {asyncio.current_task()}
         for each in others:
@@ -167,14 +170,15 @@ class Site:
         await asyncio.gather(*others, return_exceptions=True)
 
     def _admit(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Return the page, or why not; None lets a WebSocket in."""
+        """Return the page or a refusal; None accepts a WebSocket."""
         hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
         path, upgrade = urlsplit(request.path).path, "Upgrade" in request.headers
         known = [[], *([f"http://{host}"] for host in hosts)]
         if upgrade and path == "/":
             known += [[origin] for origin in ORIGINS]
         here = len(hosts) == 1 and hosts[0] in self._hosts
-        if self._announce is not None:  # each request has a secret; its host may have any name
+        # Each request contains a secret, so the host may have any name.
+        if self._announce is not None:
             here = True
             if not self._allows(request):
                 return self._exchange(connection, request)
@@ -193,7 +197,7 @@ class Site:
         return response
 
     def _exchange(self, connection: ServerConnection, request: Request) -> Response:
-        """Send a browser with the one-time code to the page with the token; refuse others."""
+        """Redirect a browser with the one-time code to the page with the token; refuse others."""
         if not self._code or not _has(request, "code", self._code):
             said = "This page needs the newest address that softfinger view prints; each works once"
             return connection.respond(403, said)
@@ -203,7 +207,7 @@ class Site:
         return response
 
     def _allows(self, request: Request) -> bool:
-        """Return whether it has the token."""
+        """Return True if the request contains the token."""
         return _has(request, "token", self._token)
 
     async def _serve(self, connection: ServerConnection) -> None:
@@ -217,9 +221,9 @@ class Site:
         self.waiting = []
 
     async def _show(self, page: ServerConnection) -> None:
-        """Send a page the next picture each time it asks, with the rows that it does not have.
+        """Send a page the next picture whenever it asks, with the rows that it does not have yet.
 
-        Before it the scene, where it is another.
+        A new scene is sent before the picture.
         """
         known, next_row = "", 0
         async for wish in page:
@@ -234,7 +238,7 @@ class Site:
             await page.send(f'{picture[:-1]},"rows":[{",".join(fresh)}]}}')
 
     async def _command(self, page: ServerConnection) -> None:
-        """Carry out what a page with the token asks of the daemon, once, and tell it the answer."""
+        """Execute the commands of a page that has the token and return the answers."""
         assert page.request is not None
         allowed = self._send is not None and self._allows(page.request)
         async for text in page:
@@ -245,11 +249,11 @@ class Site:
             await page.send(answer)
 
     def _in_thread(self, text: str | bytes) -> asyncio.Future[str]:
-        """Return the coming `_answer`, from a thread that does not outlive the process."""
+        """Run `_answer` in a thread that does not outlive the process; return its future."""
         future: asyncio.Future[str] = self._loop.create_future()
 
         def give(answer: str) -> None:
-            if not future.done():  # the page has gone
+            if not future.done():  # the page may have left meanwhile
                 future.set_result(answer)
 
         def work() -> None:
@@ -259,15 +263,16 @@ class Site:
         return future
 
     def _answer(self, text: str | bytes) -> str:
-        """Carry out the daemon's request ``text``, which it checks; what is said of it.
+        """Send the request ``text`` to the daemon, which checks it; return a line about the result.
 
-        All but a stop is dropped when its picture (``seen``, monotonic s) is long past.
+        Commands except stop are dropped if their picture (``seen``, monotonic s) is too old.
         """
         try:
             asked = json.loads(text)
             name = str(asked["command"])[:_NAME]
             age = time.monotonic() - float(asked.pop("seen", "nan"))
-            msgpack.packb(asked)  # which holds less than JSON: no deep nesting, no long integers
+            # This fails for values that msgpack cannot represent: deep nesting, long integers.
+            msgpack.packb(asked)
         except _NO_COMMAND as error:
             return f"✗ no command: {error!r}"
         if name == "record":
@@ -294,7 +299,7 @@ def _has(request: Request, name: str, secret: str) -> bool:
 
 
 def listen(host: str, port: int | None) -> socket.socket:
-    """A socket on ``port`` of ``host``; None: 9090 or, where that is taken, any.
+    """Open a socket on ``port`` of ``host``; None selects 9090, or a free port if 9090 is taken.
 
     Raises ViewError.
     """
@@ -306,13 +311,13 @@ def listen(host: str, port: int | None) -> socket.socket:
             at = f"--host {host}" if port is None else f"port {port} of {host}"
             raise ViewError(f"{at} can't be used: {error.strerror}") from None
         return listen(host, 0)
-    # What waits in the system's buffer is what a client takes without reading.
+    # A small buffer, because data in the system's buffer count as accepted although not yet read.
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER)
     return listener
 
 
 def show(arguments: argparse.Namespace, ending: Ending) -> None:
-    """Serve the page until the end. Raises SoftfingerError when nothing can be shown."""
+    """Serve the page until the end; raise SoftfingerError if nothing can be shown."""
     os.nice(_NICE)
     recording = None if arguments.file is None else Recording(arguments.file, _say)
     build_kernels(Settings(), lambda _level, _kind, text: _say(text), LANDSCAPE)
@@ -367,7 +372,7 @@ def show(arguments: argparse.Namespace, ending: Ending) -> None:
             else:
                 print(f"view: http://{address}/ to see it", flush=True)
             if foxglove is None and not away and not arguments.no_browser:
-                # Without the token: other users of this machine may read a browser's command line.
+                # Omit the token: other users of this machine may read a browser's command line.
                 webbrowser.open(f"http://{address}/")
             ending.begin()
             source()
@@ -381,7 +386,7 @@ def show(arguments: argparse.Namespace, ending: Ending) -> None:
 
 
 def _address(listener: socket.socket) -> str:
-    """Host and port for a browser; of all addresses of this machine its name."""
+    """Return host and port for a browser; the machine's name if all its addresses are served."""
     host, port = listener.getsockname()[:2]
     if host in ("0.0.0.0", "::"):
         host = socket.gethostname()

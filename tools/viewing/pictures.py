@@ -1,8 +1,9 @@
-"""The stream's messages as data that a page draws: the scene, pictures, and rows of the plots.
+"""Convert the stream's messages to data for the web page: scene, pictures and rows of the plots.
 
-A picture is JSON: lines, dots, texts and images of each panel, of one moment. The scene is what
-stands still: the layout, the energy landscape. A row has the values of all plots at one moment; a
-page gets each row once, also when it misses pictures. Colours are names, which the page has RGB of.
+A picture is JSON with lines, dots, texts and images for each panel at one moment. The scene
+contains the constant parts: the layout and the energy landscape. A row holds the values of all
+plots at one moment; a page gets each row once, even if it skips pictures. Colours are sent by name,
+and the page defines their RGB values.
 """
 
 from __future__ import annotations
@@ -39,22 +40,22 @@ if TYPE_CHECKING:
     from softfinger.tools.viewing.foxglove_server import Foxglove
 
 TOPICS = (*Feed().topics, schema.TRUTH)
-SECONDS = 60.0  # of the past that a page gets when it opens
-STEP = 0.1  # s from one row of the plots to the next
-_TRAIL = 60  # of these rows on the landscape
-_EVENTS = 50  # shown
-_LATELY = 5.0  # s for which a warning counts as present
-_NEAR = 0.8  # of a limit from which it is shown
+SECONDS = 60.0  # s of history that a page gets when it opens
+STEP = 0.1  # s between two rows of the plots
+_TRAIL = 60  # rows shown as a trail on the landscape
+_EVENTS = 50  # events shown
+_LATELY = 5.0  # s for which a warning is shown
+_NEAR = 0.8  # fraction of a limit from which the value is reported
 _DARK = 2.0  # standard deviations of a cell's noise that a pressure map draws as zero
-_SMALLEST = 10.0  # likewise, the least end of its scale
-_PATIENCE = 0.35  # s without a message from which the last one is shown as old …
-_PERIODS = 4.0  # … or so many of the stream's periods, where that is longer
-_MOST = 1e6  # of what is drawn; a stranger's numbers are of any size
+_SMALLEST = 10.0  # smallest full scale, also in standard deviations
+_PATIENCE = 0.35  # s without a message after which the last one is shown as old
+_PERIODS = 4.0  # the same in periods of the stream; the longer time applies
+_MOST = 1e6  # limit of drawn numbers, since messages may contain any value
 _DEGREE = math.degrees(1.0)
 
 
 class _Plot(NamedTuple):
-    """Lines over time, in ``unit``; ``span`` is the least height of its scale."""
+    """Plot of lines over time, in ``unit``; ``span`` is the smallest height of its scale."""
 
     title: str
     unit: str
@@ -88,15 +89,16 @@ _HEADLINE = (  # title, decimals, fields of the plots
     ("Object width", 1, "object.width"),
     ("Displacement d", 2, "left.d right.d"),
 )
-_SERVOS = ("q", "current")  # what a hand without servos lacks
-_DEVIATED = ("force", "d", "theta")  # fields of a finger whose {}_std is drawn, too
-_OTHERS = {  # names and colours of lines that are no finger's
+_SERVOS = ("q", "current")  # fields that a hand without servos lacks
+_DEVIATED = ("force", "d", "theta")  # fields of a finger for which {}_std is also drawn
+_OTHERS = {  # names and colours of lines that do not belong to a finger
     "object.angle": ("object", OBJECT),
     "object.width": ("object", OBJECT),
     "compute_s": ("work", OBJECT),
     "wake_late_s": ("late", "late"),
 }
-_BOUNDED = ("force", "d", "current", "temperature")  # of a finger, each by `safety.…_max`
+# Fields of a finger with a limit `safety.…_max`.
+_BOUNDED = ("force", "d", "current", "temperature")
 _FACTORS = {path: plot.factor for plot in _PLOTS for path in plot.paths.split()}
 _FACTORS |= {
     f"{path}_std": factor
@@ -108,7 +110,7 @@ _values = attrgetter(*_FACTORS)
 
 
 def _row(number: int, state: HandState) -> list[Any]:
-    """A row of the plots; NaN where the hand has no value."""
+    """Make a row of the plots, with NaN for values that the hand lacks."""
     row = [number, state.timestamp, printable(state.mode)]
     for value, factor in zip(_values(state), _FACTORS.values(), strict=True):
         row.append(round(min(max(factor * value, -_MOST), _MOST), 4))
@@ -118,17 +120,18 @@ def _row(number: int, state: HandState) -> list[Any]:
 
 
 class Row(NamedTuple):
-    """A row of the plots, as a page gets it. ``number`` counts up."""
+    """Row of the plots in the form sent to a page; ``number`` counts up."""
 
     number: int
     text: str
 
 
 class Pictures:
-    """Takes messages of any content, and gives ``publish`` the scene and each picture.
+    """Process messages of any content, and pass the scene and each picture to ``publish``.
 
-    ``watched``: whether anybody looks. ``say`` is told what can't be read. Times are the machine's
-    of a ``live`` stream, the messages' of a recording. ``foxglove`` is given what is taken, too.
+    ``watched`` returns True if a page is open. ``say`` is called for messages that cannot be read.
+    Times are those of the machine for a ``live`` stream, and those of the messages for a recording.
+    ``foxglove`` receives the messages too.
     """
 
     def __init__(
@@ -141,32 +144,32 @@ class Pictures:
         period: float = STEP,
         foxglove: Foxglove | None = None,
     ) -> None:
-        """``period`` [s] from one picture to the next."""
+        """``period`` [s]: time between two pictures."""
         self._publish = publish
         self._watched = watched
         self._say = say
         self._live = live
         self._foxglove = foxglove
         self._period = period
-        self._number = 0  # of rows so far
+        self._number = 0  # number of rows so far
         self._marks: list[Any] = []
-        self.recording: dict[str, Any] = {}  # by the page's recorder
-        self._settings_text = ""  # as they came
-        self.seen = self.unreadable = 0  # states; messages
+        self.recording: dict[str, Any] = {}  # set by the page's recorder
+        self._settings_text = ""  # as received
+        self.seen = self.unreadable = 0  # number of states; number of messages
         self.clear()
         self._know(Settings())
 
     def clear(self) -> None:
-        """Forget all but the hand: what comes next is of another time."""
+        """Discard everything except the hand's settings, before data of another time are read."""
         self.feed = Feed()
-        self.states = 0  # since then
-        self.time = math.nan  # of the newest state [Unix s]
+        self.states = 0  # number of states since then
+        self.time = math.nan  # time of the newest state [Unix s]
         self._truth: dict[str, Any] | None = None
         self._gaps = {topic: Gaps() for topic in TOPICS}
         self._begin_rows()
 
     def _begin_rows(self) -> None:
-        """Forget the rows: pages drop those before the one that comes next."""
+        """Discard the rows; pages drop the rows before the next one."""
         self._first = self._number
         self._past: deque[tuple[HandState, Row]] = deque(maxlen=round(SECONDS / STEP))
 
@@ -174,7 +177,7 @@ class Pictures:
         return time.monotonic() if self._live else self.time
 
     def take(self, topic: bytes, message: Any) -> None:
-        """Take one message of any content."""
+        """Process one message of any content."""
         stamp = number(message, "timestamp")
         if topic not in self._gaps or not 0.0 <= stamp < 2.0**32:
             self.unreadable += 1
@@ -183,9 +186,9 @@ class Pictures:
             return
         if topic == schema.STATE:
             if number(message, "seq") < self.feed.state.seq:
-                self._begin_rows()  # another daemon's
+                self._begin_rows()  # the daemon was restarted
             elif self.states and self.time // STEP != stamp // STEP:
-                last = self.feed.state  # of the step
+                last = self.feed.state  # last state of the step
                 self._past.append((last, Row(self._number, _packed(_row(self._number, last)))))
                 self._number += 1
             self.time = stamp
@@ -204,7 +207,7 @@ class Pictures:
             self._foxglove.take(topic, message)
 
     def _know(self, settings: Settings) -> None:
-        """Lay out the scene of a hand: panels and plots of what it has, and no others."""
+        """Lay out the scene for a hand, with panels and plots only for the parts that it has."""
         self._settings, self._fingers = settings, fingers_of(settings)
         self._pressure = heatmap.FullScale(heatmap.round_up(_SMALLEST * settings.tactile.noise))
         hand, rows, cols = geometry_of(settings), settings.tactile.rows, settings.tactile.cols
@@ -250,12 +253,12 @@ class Pictures:
         self._scene_text = _packed(self._scene)
 
     def mark(self, marks: list[Any]) -> None:
-        """Show a recording's ``marks``, from `sources.marks_of`."""
+        """Show the ``marks`` of a recording, from `sources.marks_of`."""
         self._marks = self._scene["marks"] = marks
         self._scene_text = _packed(self._scene)
 
     def _has(self, path: str) -> bool:
-        """Return whether the hand has what is at this path of the state."""
+        """Return True if the hand has the state field at this path."""
         finger, _, key = path.rpartition(".")
         no_servos = self._settings.servos.backend == "none"
         return not (
@@ -265,9 +268,9 @@ class Pictures:
         )
 
     def draw(self, place: dict[str, Any] | None = None) -> None:
-        """Publish a picture of what has come so far, if a page waits for one.
+        """Publish a picture of the current data if a page waits for one.
 
-        ``place``: of a recording, see `sources.Playback`.
+        ``place`` is the position in a recording, see `sources.Playback`.
         """
         now, feed, state = self._moment(), self.feed, self.feed.state
         if self._foxglove is not None and self.states:
@@ -302,7 +305,7 @@ class Pictures:
         self._publish(self._scene_text, _packed(picture), [row for _, row in self._past])
 
     def _set(self) -> dict[str, float]:
-        """The grip's requested force [N] and angle [°], NaN without a grip."""
+        """Return the grip's requested force [N] and angle [°]; NaN without a grip."""
         feed, state = self.feed, self.feed.state
         angle = state.goal_angle if math.isfinite(state.goal_angle) else state.object.angle
         force = feed.commanded if math.isfinite(feed.commanded) else state.goal_force
@@ -319,7 +322,7 @@ class Pictures:
         return {"lines": lines, "texts": texts}
 
     def _maps(self, now: float) -> dict[str, Any]:
-        """Each tip's frame with its rim, and footprint and centroid of the contact."""
+        """Return each tip's frame with its rim, and the contact's footprint and centroid."""
         frames, tip = self.feed.frames, self._settings.tip.radius
         peak = max((float(frame.grid.max()) for frame in frames.values()), default=0.0)
         full = self._pressure.follow(peak, now)
@@ -349,7 +352,7 @@ class Pictures:
         return maps
 
     def _contacts(self) -> dict[str, Any]:
-        """Each contact on the landscape, in mm and degrees, with its trail."""
+        """Return each contact on the landscape, in mm and degrees, with its trail."""
         lines, dots = [], []
         states = [self.feed.state, *(state for state, _ in reversed(self._past))][: 1 + _TRAIL]
         for name in self._fingers:
@@ -360,7 +363,7 @@ class Pictures:
         return {"lines": lines, "dots": dots}
 
     def _notes(self) -> list[str]:
-        """Return recent warnings, reasons why a finger is not valid, and near limits."""
+        """Return recent warnings, reasons for invalid fingers, and values near their limits."""
         state, safety, feed = self.feed.state, self._settings.safety, self.feed
         last = [each for each in feed.events[-1:] if each.level == "warning"]
         notes = [each.text for each in last if self.time - each.timestamp < _LATELY]
@@ -381,12 +384,12 @@ class Pictures:
         return notes
 
     def _raised(self) -> str:
-        """Return the grip's goal in words when the daemon has raised the force."""
+        """Return a description of the grip's goal if the daemon has raised the force."""
         grip = self.feed.grip()
         return grip if "raised" in grip else ""
 
     def _facts(self, now: float) -> list[tuple[str, str]]:
-        """Names and values of the details: the loop and its times, frames, servos, losses."""
+        """Return names and values of the details: loop times, frames, servos and losses."""
         feed, state, times = self.feed, self.feed.state, self.feed.times
         fingers = [state.finger(name) for name in self._fingers]
 
@@ -412,7 +415,7 @@ class Pictures:
 
 
 def _described(plot: _Plot, paths: list[str]) -> dict[str, Any]:
-    """A plot of the lines at ``paths``, as a page lays it out."""
+    """Describe a plot of the lines at ``paths`` for the page's layout."""
     lines = []
     for path in paths:
         finger, _, key = path.rpartition(".")
@@ -427,12 +430,12 @@ def _described(plot: _Plot, paths: list[str]) -> dict[str, Any]:
 
 
 def _panel(name: str, title: str, *box: float, **more: Any) -> dict[str, Any]:
-    """``box``: left, right, top, bottom; ``scaled``: lines' widths have its unit."""
+    """Describe a panel; ``box``: left, right, top, bottom; ``scaled``: widths in its unit."""
     return {"name": name, "title": title, "box": box, **more}
 
 
 def _flat(points: FloatArray) -> FloatArray:
-    """x and y in turn; four decimals are a tenth of a pixel or less, in metres, too."""
+    """Return x and y alternately, rounded to four decimals (at most a tenth of a pixel)."""
     return np.clip(points, -_MOST, _MOST).round(4).ravel()
 
 

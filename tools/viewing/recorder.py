@@ -1,4 +1,4 @@
-"""Recordings that the page begins and ends."""
+"""Start and end recordings from the web page."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ if TYPE_CHECKING:
 
 
 class PageRecorder:
-    """One recording at a time, by `softfinger record` in the current folder.
+    """Run one `softfinger record` at a time, in the current folder.
 
-    ``show`` is given the recording that goes on: its ``file`` and ``since`` [Unix s], or why it
-    ``failed``; an empty map without one.
+    ``show`` is called with the ``file`` and start time ``since`` [Unix s] of the running recording,
+    with the reason if it ``failed``, or with an empty map if there is no recording.
     """
 
     def __init__(self, address: str, keys: str, show: Callable[[dict[str, Any]], None]) -> None:
@@ -27,10 +27,10 @@ class PageRecorder:
         self._process: RecorderBeside | None = None
 
     def toggle(self) -> str:
-        """Begin a recording, or end the one that goes on; a line about it."""
+        """Start a recording or end the running one; return a line about the result."""
         try:
             from softfinger.tools.processes.beside import NoRecorder, RecorderBeside
-        except ImportError:  # no termios
+        except ImportError:  # termios is missing
             return "✗ record: only on Linux and macOS; use softfinger record"
         with self._lock:
             if self._process is not None:
@@ -45,7 +45,7 @@ class PageRecorder:
             return f"✓ recording to {path}"
 
     def close(self) -> None:
-        """End a recording that goes on."""
+        """End the running recording, if any."""
         with self._lock:
             if self._process is not None:
                 self._end()

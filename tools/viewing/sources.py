@@ -1,4 +1,4 @@
-"""The sources of messages, live or recorded: taken in time, with pictures of them at a rate."""
+"""Read messages from the stream or a recording, and draw pictures at a given rate."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.terminal.feed import number, printable
 from softfinger.tools.viewing.pictures import SECONDS, TOPICS, Pictures
 
-_SILENCE = 2.0  # s without a message after which a line says so
-_REST = 1.0  # s between two pictures at most, where drawing is slow
-_MARKS = 2_000  # of a recording, at most
+_SILENCE = 2.0  # s without a message before a notice is printed
+_REST = 1.0  # s, longest pause between two pictures if drawing is slow
+_MARKS = 2_000  # largest number of marks in a recording
 _SPEEDS = 0.1, 10.0
-_QUEUE = 5_000  # messages that wait meanwhile: 2 s of state and truth at 1 kHz with their frames
+_QUEUE = 5_000  # messages queued between reads: 2 s of state and truth at 1 kHz with their frames
 
 
 class ViewError(SoftfingerError):
-    """Nothing can be shown. The message says why, and what to do."""
+    """Nothing can be shown; the message gives the reason and a remedy."""
 
 
 def follow(
@@ -42,7 +42,7 @@ def follow(
     ending: Ending,
     say: Callable[[str], None],
 ) -> None:
-    """Show the stream that ``arguments`` name until the end. Raises ViewError."""
+    """Show the stream selected by ``arguments`` until the end; may raise ViewError."""
     context: zmq.Context[Any] = zmq.Context()
     try:
         if keys is not None:
@@ -65,7 +65,7 @@ def follow(
                 where = waiting(arguments.address, arguments.keys)
                 say(where if silent else "the stream has begun")
             pictures.draw()
-            # Never works for more than half of its time, however slow the machine is.
+            # Limit the load to half of the time, even on a slow machine.
             worked = time.thread_time() - worked
             rest = max(1.0 / arguments.rate - (time.monotonic() - began), min(worked, _REST))
     except zmq.ZMQError as error:
@@ -75,7 +75,7 @@ def follow(
 
 
 def marks_of(recording: Recording) -> list[tuple[float, str, str, str]]:
-    """Return time [s], level, kind and text of the changes of mode, the warnings and the errors."""
+    """Return time [s], level, kind and text of mode changes, warnings and errors."""
     marks = []
     for _, message in recording.messages([schema.EVENT]):
         event = read(schema.Event, message)
@@ -91,19 +91,19 @@ def marks_of(recording: Recording) -> list[tuple[float, str, str, str]]:
 
 
 class Playback:
-    """A recording's place, and that it is ``playing``. ``run`` is for its own thread."""
+    """Position and playback state of a recording; ``run`` is executed in a separate thread."""
 
     def __init__(self, recording: Recording, pictures: Pictures, period: float) -> None:
         self._recording = recording
         self._pictures = pictures
         self._period = period  # s between two pictures
-        self._target: float | None = 0.0  # where to go, from another thread
+        self._target: float | None = 0.0  # requested position, set from another thread
         self.playing = True
         self.speed = 1.0
-        self.position = 0.0  # s from the first message on
+        self.position = 0.0  # s from the first message
 
     def ask(self, wish: str) -> None:
-        """Carry out a page's wish: ``play``, ``pause``, ``speed N`` or a position [s]."""
+        """Execute a page's request: ``play``, ``pause``, ``speed N`` or a position [s]."""
         name, _, value = wish.partition(" ")
         with contextlib.suppress(ValueError):
             if name == "speed":
@@ -117,20 +117,22 @@ class Playback:
                 self._target = min(max(place, 0.0), self._recording.duration)
 
     def run(self, ending: Ending) -> None:
-        """Play until the end is asked for."""
+        """Play until the end is requested."""
         recording, pictures = self._recording, self._pictures
-        # A reader of its own: a long recording takes seconds, and the first picture comes before.
+        # Search the marks with a separate reader: this takes seconds for a long recording, and the
+        # first picture should not wait.
         finder = ThreadPoolExecutor(1)
         marks: Future[list[Any]] | None = finder.submit(lambda: marks_of(Recording(recording.path)))
         finder.shutdown(wait=False)
-        for message in islice(recording.messages([schema.SETTINGS]), 1):  # they may come only once
+        # Settings may occur only once.
+        for message in islice(recording.messages([schema.SETTINGS]), 1):
             pictures.take(*message)
         while not ending.over:
             begun = time.monotonic()
             if (target := self._target) is not None:
                 self._target, self.position = None, target
                 pictures.clear()
-                messages = recording.messages(TOPICS, target - SECONDS)  # the plots' past
+                messages = recording.messages(TOPICS, target - SECONDS)  # history of the plots
                 ahead = next(messages, None)
             while ahead is not None and (self._is_past(ahead[1]) or not pictures.states):
                 pictures.take(*ahead)

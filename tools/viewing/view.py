@@ -1,4 +1,4 @@
-"""``softfinger view``: the hand on a web page, live or recorded; the stream for Foxglove."""
+"""Run ``softfinger view``: show the hand or a recording on a web page, and serve Foxglove."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from softfinger.tools.ending import Ending
 from softfinger.tools.extras import require
 
 _EPILOG = """\
-Serves a page for browsers on this machine. The address with the token, which is printed, gives
-buttons and sliders, and stop on the space key; the one without it only watches.
-With --foxglove the page's port speaks Foxglove's protocol, too, by default at ws://127.0.0.1:8765;
-the line it prints says where the layout file is. A recording is opened in Foxglove itself.
+Serves a page for browsers on this machine. The printed address with the token opens a page with
+buttons and sliders, on which the space key stops the hand; without the token the page only shows.
+With --foxglove, the page also serves Foxglove's protocol, by default at ws://127.0.0.1:8765. The
+printed line names the layout file. Open recordings in Foxglove directly.
 Ends with Ctrl-C, or after --duration.
-From another machine: ssh -L 9090:127.0.0.1:9090, with the port printed; or, in a network that you
-trust, --host ADDRESS. Each address that it then prints opens the page in one browser.
-Exit status: 0, or 1 with the reason when nothing could be shown."""
+From another machine, use ssh -L 9090:127.0.0.1:9090 with the printed port, or --host ADDRESS in a
+trusted network. Each address that is then printed opens the page in one browser.
+Exit status: 0, or 1 with the reason if nothing could be shown."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
     parser.add_argument(
-        "file", type=Path, nargs="?", metavar="FILE.mcap", help="a recording, instead of the stream"
+        "file", type=Path, nargs="?", metavar="FILE.mcap", help="show a recording, not the stream"
     )
     add_stream(parser, addresses)
     parser.add_argument(
@@ -33,25 +33,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="?",
         const=8765,
         metavar="PORT",
-        help="serve the stream to Foxglove (default: 8765; 0: a free port)",
+        help="serve the stream to Foxglove (default port: 8765; 0: a free port)",
     )
     parser.add_argument(
         "--host",
         default="127.0.0.1",
         metavar="ADDRESS",
-        help="serve on this address of the machine; 0.0.0.0: on all (default: 127.0.0.1, for "
-        "browsers on this machine alone)",
+        help="serve on this address of the machine, 0.0.0.0 for all of them (default: 127.0.0.1, "
+        "for browsers on this machine only)",
     )
     parser.add_argument("--no-browser", action="store_true", help="only print the page's address")
     parser.add_argument(
-        "--port", type=_any_port, metavar="N", help="the page's port (default: 9090 or a free one)"
+        "--port", type=_any_port, metavar="N", help="the page's port (default: 9090 or a free port)"
     )
     parser.add_argument(
         "--timeout",
         type=seconds,
         default=3.0,
         metavar="S",
-        help="drop a command this long after its picture, wait this long for the daemon's reply "
+        help="drop a command this long after its picture; wait this long for the daemon's reply "
         "(default 3)",
     )
     parser.add_argument(
@@ -59,7 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=_rate,
         default=10.0,
         metavar="HZ",
-        help="pictures a second at most (default 10)",
+        help="largest number of pictures per second (default 10)",
     )
 
 
@@ -72,7 +72,7 @@ def _rate(text: str) -> float:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Show until the end. Raises SoftfingerError when nothing can be shown."""
+    """Show the page until the end; raise SoftfingerError if nothing can be shown."""
     if arguments.foxglove is not None and arguments.file is not None:
         print("view: --foxglove serves the stream alone, found FILE.mcap, too", file=sys.stderr)
         return 2

@@ -1,5 +1,5 @@
 
-// Commands: one of each kind is on its way; of those that wait for it the newest goes next.
+// Commands: one of each kind is in transit; of those waiting for it, only the newest is sent next.
 const client = "page " + Math.random().toString(16).slice(2, 6);
 const one = selector => document.querySelector(selector);
 const lanes = {}, settings = {};
@@ -12,7 +12,7 @@ function say(text, bad = false) {
   reply.classList.toggle("bad", bad);
 }
 
-// `answered` is told whether it was carried out, and what was said.
+// `answered` is called with the success and the text of the answer.
 function send(command, numbers = {}, answered = () => {}) {
   const lane = lanes[command] ??= { busy: 0, next: null };
   const asked = { message: { command, client, seen: picture?.now, ...numbers }, answered };
@@ -32,7 +32,7 @@ function transmit(lane, { message, answered }) {
   lane.busy++;
   say(`${message.command} …`);
   let answer = `✗ ${message.command}: the page's server doesn't answer`;
-  // By a connection of its own: that of the pictures may be gone.
+  // Use a separate connection, because the one for pictures may be closed.
   const line = new WebSocket(`ws://${location.host}/command${location.search}`);
   line.onopen = () => line.send(JSON.stringify(message));
   line.onmessage = ({ data }) => { answer = data; line.close(); };
@@ -47,8 +47,8 @@ function transmit(lane, { message, answered }) {
   };
 }
 
-// A number of the hand, with a slider and a field. It follows the hand, except while it is changed here:
-// then it shows what was wanted until the hand has it, or has refused it.
+// A setting of the hand with a slider and a field. It follows the hand, except after a change here:
+// it then shows the new value until the hand has reached or refused it.
 class Setting {
   wanted = null;
   value = NaN;
@@ -85,13 +85,13 @@ class Setting {
     this.tell(`${text} is being sent …`);
     send(command, numbers, (done, answer) => {
       this.tell(done ? `✓ ${text} accepted` : answer.startsWith("✗") ? answer : `✗ ${text} was not sent: ${answer}`, !done);
-      if (this.wanted !== wanted) return;  // changed since: that one is on its way
+      if (this.wanted !== wanted) return;  // changed since then; the newer value is in transit
       if (done) this.until = Date.now() + 2000; else this.wanted = null;
       this.show();
     });
   }
 
-  // The hand's value, NaN where it has none.
+  // Show the hand's value; NaN if it has none.
   follow(value) {
     if (!Number.isNaN(value)) this.value = value;
     const reached = Math.abs(value - this.wanted) < 0.05;
@@ -172,7 +172,7 @@ function showControls() {
   put(button, on ? `End recording, ${Math.floor(seconds)} s` : "Record");
 }
 
-// Keys, as in the terminal's page. Space stops, whatever has the focus: it would press a button, too.
+// Keys as in the terminal's page. Space stops with any focus, although it would also press a button.
 const KEYS = {
   a: ["arm", "Arm"], g: ["grasp", "Grasp"], r: ["release", "Release"], d: ["disarm", "Disarm"], c: ["clear", "Clear the fault"],
   "+": ["", "More force"], "-": ["", "Less force"], ArrowLeft: ["", "Turn by −5°"], ArrowRight: ["", "Turn by +5°"],
@@ -210,7 +210,7 @@ function beginKeys() {
   });
 }
 
-// The recording's player. What is wished goes with the next requests for pictures.
+// Player of a recording. Wishes are sent with the next requests for pictures.
 class Player {
   wishes = [];
 
@@ -233,7 +233,7 @@ class Player {
   }
 
   jump(step) {
-    // It goes on while one looks at a mark: the one just passed is not the previous one yet.
+    // While playing, a mark that was just passed does not count as the previous one yet.
     const { position, playing } = picture.place, least = step < 0 && playing ? 0.5 : 0.03;
     const beyond = scene.marks.filter(([at]) => step * (at - position) > least);
     const mark = beyond.at(step > 0 ? 0 : -1);
@@ -265,10 +265,10 @@ class Player {
     if (this.drawn !== `${duration} ${scene.marks.length}`) this.draw();
   }
 
-  // The modes along the recording, and above them its warnings and errors.
+  // Draw the modes along the recording, with its warnings and errors above them.
   draw() {
     if (!picture || !scene.marks || !this.track.clear()) return;
-    const { pen, width } = this.track, { duration } = picture.place, inset = 8;  // half of the thumb
+    const { pen, width } = this.track, { duration } = picture.place, inset = 8;  // px, half of the thumb
     this.drawn = `${duration} ${scene.marks.length}`;
     const x = at => inset + (width - 2 * inset) * at / duration;
     const modes = scene.marks.filter(([, , kind]) => kind === "mode");
