@@ -1,7 +1,7 @@
-"""The pages of the site that are made at its build: from the code, and from the project's folder.
+"""Generate pages and tables of the documentation site from the code and from project files.
 
-MkDocs calls the functions named ``on_…`` (``hooks`` in mkdocs.yml). `PAGES` are whole pages, and
-`TABLES` tables within pages: no figure that the code can compute is typed.
+MkDocs calls the functions named ``on_…`` (``hooks`` in mkdocs.yml). `PAGES` has whole pages, and
+`TABLES` has tables within pages. Every figure that the code can compute is generated here.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def _from(name: str) -> Callable[[], str]:
-    """The page is a file of the project's folder."""
+    """Return a function that reads a page from a file of the project."""
     return lambda: (ROOT / name).read_text(encoding="utf-8")
 
 
 def _program(name: str) -> Callable[[], str]:
-    """The page shows a program of the project's folder."""
+    """Return a function that makes a page of a program's source."""
     return lambda: f"# {Path(name).stem}\n\n```python\n{_from(name)()}```\n"
 
 
@@ -45,7 +45,7 @@ def _table(heads: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
 
 
 def _signed(value: float, form: str) -> str:
-    """The number with a real minus sign, and 0 without one."""
+    """Format a number with a typographic minus sign, and zero without a sign."""
     return f"{value:{form}}".replace("-", "−") if float(f"{value:{form}}") else f"{0.0:{form}}"
 
 
@@ -83,10 +83,10 @@ profile of your own.
 
 
 def configuration() -> str:
-    """Every section and key, from their declarations."""
+    """List every section and key of a profile, from their declarations."""
     from softfinger.daemon.profile import reference
 
-    parts = [_SETTINGS, _head("profile", "what it is"), *_profiles()]
+    parts = [_SETTINGS, _head("profile", "description"), *_profiles()]
     keys = reference.every_key()
     for name, section in reference.sections().items():
         parts.append(f"\n## `[{name}]`\n\n{reference.about(section)}\n\n")
@@ -100,7 +100,7 @@ def configuration() -> str:
 
 
 def _profiles() -> list[str]:
-    """A row of the table for each profile that comes with the package."""
+    """Return a row of the table for each profile of the package."""
     from softfinger.daemon.profile.load import names
     from softfinger.tools.setup.config import subject
 
@@ -111,7 +111,7 @@ def _profiles() -> list[str]:
 
 
 def stream() -> str:
-    """Every topic and field, from the schema."""
+    """List every topic and field, from the schema."""
     from softfinger.daemon.wire.schema_docs import page
 
     return page()
@@ -121,18 +121,21 @@ def stream() -> str:
 
 
 def commands() -> str:
-    """The hand's commands from the table of modes, the command line's words from its parser."""
+    """List the commands of the hand, from the table of modes."""
     from softfinger.daemon.control.modes import COMMANDS, Mode
     from softfinger.daemon.types import UNLEASED
     from softfinger.tools.terminal.send import _EPILOG
 
     parts = [
-        "# Commands to the hand\n\nMsgpack maps on a REQ socket, `softfinger send`, or methods of "
-        f"[`Hand`](api.md): the same words.\n\n```text\n{_EPILOG}\n```\n\n",
-        _head("command", "numbers", "accepted in the modes", "needs the lease"),
+        "# Commands to the hand\n\nSend a command with `softfinger send`, with a method of "
+        "[`Hand`](api.md), or as a msgpack map on a REQ socket ([the stream](stream.md#commands)). "
+        "All three use the same names:\n\n"
+        f"```text\n{_EPILOG}\n```\n\nEach command is accepted only in some modes. Most commands "
+        "need the lease: while a client has it, other clients cannot command the hand.\n\n",
+        _head("command", "parameters", "accepted in the modes", "needs the lease"),
     ]
     for name, (modes, numbers) in COMMANDS.items():
-        given = ", ".join(f"`{key}`" + " (may be left out)" * (not numbers[key]) for key in numbers)
+        given = ", ".join(f"`{key}`" + " (optional)" * (not numbers[key]) for key in numbers)
         where = "any" if modes == set(Mode) else ", ".join(m for m in Mode if m in modes)
         leased = "no" if name in UNLEASED | {"stop"} else "yes"
         parts.append(_row(f"`{name}`", given, where, leased))
@@ -140,7 +143,7 @@ def commands() -> str:
 
 
 def command_line() -> str:
-    """The help of every subcommand."""
+    """Show the help of every subcommand."""
     from softfinger.tools.cli import SUBCOMMANDS, make_parser
 
     os.environ["COLUMNS"] = "100"  # the width that argparse wraps to
@@ -154,7 +157,7 @@ def command_line() -> str:
 
 
 def _children(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
-    """The parsers of a parser's subcommands."""
+    """Return the parsers of a parser's subcommands by name."""
     found: dict[str, argparse.ArgumentParser] = {}
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
@@ -168,16 +171,23 @@ def _children(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentPar
 _LIMITS = """\
 # Limits
 
-What is judged of a running hand, with the built-in one's numbers; `softfinger limits --config FILE`
-has a profile's. `warn` is reported, `limit` changes the goal, `fault` turns torque off until
-`clear`. *Noticed* counts from the first reading or frame that is past the bound; an age among the
-settings comes before it.
+The daemon checks these limits while a hand runs. The numbers are those of the built-in hand. For
+your profile, use `softfinger limits --config FILE`.
+
+A limit has one of three levels:
+
+- `warn`: the daemon reports it.
+- `limit`: the daemon changes the goal.
+- `fault`: the daemon turns torque off until `clear`.
+
+The reaction time counts from the first reading or frame that exceeds the bound. If a setting is an
+age, add it to the reaction time.
 
 """
 
 
 def limits() -> str:
-    """Every limit: what is judged, how soon, by which settings, and what follows."""
+    """List every limit with its quantity, level, reaction time and settings."""
     from softfinger.daemon.profile.settings import Settings
     from softfinger.daemon.safety.limits import LIMITS
     from softfinger.tools.setup.limits import _values
@@ -186,19 +196,21 @@ def limits() -> str:
     taking_turns = sum(row.in_turn for row in LIMITS)
     rows = [
         _LIMITS,
-        _head("limit", "what is judged", "follows", "noticed", "settings, with their defaults"),
+        _head("limit", "quantity", "level", "reaction time", "settings and defaults"),
     ]
     for row in LIMITS:
         tick = 1e3 / settings.loop.rate
         lasts = getattr(settings.safety, row.lasts) if isinstance(row.lasts, str) else row.lasts
         after = f"{lasts:g} s + " if lasts else ""
         if row.in_turn:
-            turns = 2 if lasts else 1  # to see it, and to see that it has lasted
+            turns = (
+                2 if lasts else 1
+            )  # one to detect it, one to see that it lasts
             when = f"{after}up to {turns * taking_turns * tick:g} ms"
         elif row.check:
             when = f"{after}a tick ({tick:g} ms)"
         else:
-            when = "where it is met"
+            when = "at once"
         keys = ", ".join(_values(settings, row))
         rows.append(_row(f"`{row.name}`", row.quantity, row.level, when, keys and f"`{keys}`"))
     return "".join(rows)
@@ -221,7 +233,7 @@ send `clear`.
 
 
 def events() -> str:
-    """Every kind of event, from the table that explains them."""
+    """List every kind of event, from the table that explains them."""
     from softfinger.daemon.wire.event_kinds import KINDS
 
     parts = [_EVENTS, _head("kind", "level", "cause", "what to do")]
@@ -234,15 +246,18 @@ def events() -> str:
 
 
 def api() -> str:
-    """The public names of the package, from their docstrings."""
+    """Describe the public names of the package by their docstrings."""
     import softfinger
 
-    parts = ["# For programs\n\nThe names below are imported from `softfinger` itself.\n"]
+    parts = [
+        "# Python interface\n\nImport these names from `softfinger`. "
+        "[Programs](programs.md) shows how to use them.\n"
+    ]
     for name in softfinger.__all__:
         if not name.startswith("_"):
             module = softfinger._MODULES.get(name, "softfinger")
             parts.append(f"\n::: {module}.{name}\n")
-    parts.append("\n## Checks for authors of plugins\n\n::: softfinger.testing\n")
+    parts.append("\n## Checks for plugin authors\n\n::: softfinger.testing\n")
     return "".join(parts)
 
 
@@ -250,7 +265,7 @@ def api() -> str:
 
 
 def checkpoints() -> str:
-    """Closed forms at a few places."""
+    """Evaluate the closed forms at a few displacements and tilts."""
     from softfinger.kinematics.contact.closed_form import closed_forms
 
     rows = []
@@ -262,7 +277,7 @@ def checkpoints() -> str:
 
 
 def rates() -> str:
-    """How fast force and energy change with the tilt at 25°, by the paper's integrals."""
+    """Tabulate the slope of force and energy over the tilt at 25°, by the paper's integrals."""
     from softfinger.tools.paper.model_pages import DEPTHS, ENERGY, FORCE
 
     heads = ("d [mm]", *(f"d = {d}" for d in DEPTHS))
@@ -275,7 +290,7 @@ def rates() -> str:
 
 
 def exponents() -> str:
-    """The exponent of the displacement by both laws, from 1 to 8 mm."""
+    """Tabulate the exponent of the displacement for both laws, from 1 to 8 mm."""
     from softfinger.tools.paper.model_pages import ENERGY, FORCE, over_depth
 
     force, energy = (over_depth("", each)[1] for each in (FORCE, ENERGY))
@@ -289,7 +304,7 @@ def exponents() -> str:
 
 
 def early_minimum() -> str:
-    """Where force and energy are least if a share of a rolling shears the tip."""
+    """Tabulate the angles of least force and energy if a share of the rolling shears the tip."""
     from softfinger.tools.paper.model_pages import DEPTHS
     from softfinger.tools.paper.sheared_rolling import sheared_rolling
 
@@ -307,7 +322,7 @@ def early_minimum() -> str:
 
 
 def upright_forces() -> str:
-    """Forces of upright tips of several laws."""
+    """Tabulate the forces of upright tips for several contact laws."""
     from softfinger.kinematics.contact.closed_form import Fingertip
     from softfinger.kinematics.contact.material import Material
     from softfinger.kinematics.contact.table import ContactTable
@@ -331,7 +346,7 @@ def upright_forces() -> str:
 
 
 def minimum_strength() -> str:
-    """c of each kind of tip, near upright: how much its energy rises with the tilt."""
+    """Tabulate c, the rise of the energy with the tilt near upright, for each kind of tip."""
     from softfinger.kinematics.contact.closed_form import Fingertip
     from softfinger.kinematics.contact.material import Material
     from softfinger.kinematics.contact.table import ContactTable
@@ -354,7 +369,7 @@ def minimum_strength() -> str:
 
 
 def _grips() -> list[tuple[str, float, float, float, float]]:
-    """Name, d [m], q [rad], c and upright spring [N·m/rad] of grips of 10 N on 40 mm."""
+    """Compute name, d [m], q [rad], c and upright spring [N·m/rad] of grips of 10 N on 40 mm."""
     from softfinger.daemon.profile.factory import make_material, make_table
     from softfinger.daemon.profile.settings import Settings
     from softfinger.kinematics.hand.upright import upright_spring
@@ -382,11 +397,11 @@ def _grips() -> list[tuple[str, float, float, float, float]]:
     return found
 
 
-_FORCE, _WIDTH = 10.0, 0.040  # N, m of the grips that the pages speak of
+_FORCE, _WIDTH = 10.0, 0.040  # force [N] and object width [m] of the grips in the pages
 
 
 def upright_grips() -> str:
-    """Displacement, joint angle and spring of a grip, and what stuck tips leave of an angle."""
+    """Tabulate displacement, joint angle and spring of a grip, and the remaining angle φ/φ0."""
     rows = []
     for name, d, q, c, spring in _grips():
         angles = (_signed(_left_of(k, d, q, c), ".3f") for k in (0.0, spring, 1e9))
@@ -396,7 +411,7 @@ def upright_grips() -> str:
 
 
 def _left_of(spring: float, d: float, q: float, c: float) -> float:
-    """φ/φ0 by the closed form of `kinematics.hand.upright`, of the built-in hand's lengths [m]."""
+    """Return φ/φ0 by the closed form of `kinematics.hand.upright`, for the built-in hand [m]."""
     inward, radius = 0.080 * math.sin(q), 0.020
     b = spring / (_FORCE * 0.050)
     line = _WIDTH * (2.0 * inward + (1.0 - 2.0 * c) * d - b * (_WIDTH - d))
@@ -405,7 +420,7 @@ def _left_of(spring: float, d: float, q: float, c: float) -> float:
 
 
 def symmetric_grips() -> str:
-    """Joint angle, normal force and torque of symmetric grips whose tips bear no shear."""
+    """Tabulate joint angle, normal force and torque of symmetric grips without shear."""
     rows = []
     for d in (2, 4, 6, 8):
         q = math.asin((50.0 - 20.0 + d - 20.0) / 80.0)
@@ -416,7 +431,7 @@ def symmetric_grips() -> str:
 
 
 def relaxations() -> str:
-    """Force after a sudden press that stays, over what lasts, of three kinds of memory."""
+    """Tabulate the relative force after a sudden press for three relaxation models."""
     times = (0.001, 0.01, 0.1, 1.0, 10.0)
     prony = list(zip((0.1, 0.2, 0.2), (0.004, 0.07, 1.4), strict=True))
     laws: dict[str, Callable[[float], float]] = {
@@ -431,17 +446,17 @@ def relaxations() -> str:
 
 
 def errata() -> str:
-    """Each erratum that `softfinger figures` marks, once."""
+    """List the errata that `softfinger figures` marks, without duplicates."""
     from softfinger.tools.paper.figures import pages
 
     found = dict.fromkeys(each for page in pages().values() for each in page.errata)
     return _table(
-        ("place", "printed", "holds"), ((each.place, each.printed, each.holds) for each in found)
+        ("place", "printed", "correct"), ((each.place, each.printed, each.holds) for each in found)
     )
 
 
 def servos() -> str:
-    """The known models, what they press at the tip, and the bounds to set for them."""
+    """List the known servo models, their forces at the tip, and the bounds to set for them."""
     from softfinger.daemon.servos.control_table import MODELS
 
     columns = ("V", "stall [N·m at A]", "N·m/A", "force [N]", "current_max [A]", "force_max [N]")
@@ -461,7 +476,7 @@ def servos() -> str:
 
 
 def _stored(name: str) -> tuple[str, list[dict[str, Any]]]:
-    """The machine and the rows of a file of docs/ that `softfinger bench --json` wrote."""
+    """Read the machine and the rows from a file in docs/ that `softfinger bench --json` wrote."""
     content = json.loads((ROOT / "docs" / name).read_text(encoding="utf-8"))
     load = " to ".join(f"{each:.1f}" for each in content["load"])
     about = f"{content['machine']}, {content['cores']} cores, load {load}.\n"
@@ -476,7 +491,7 @@ def _shown(rows: Iterable[dict[str, Any]], keys: Sequence[str]) -> Iterable[list
 
 
 def measured() -> str:
-    """The figures that docs/benchmarks.json keeps, of a `softfinger bench` without names."""
+    """Tabulate the figures in docs/benchmarks.json, of a `softfinger bench` without names."""
     about, rows = _stored("benchmarks.json")
     keys = ("median", "p99", "unit", "aim ≤", "relative error", "RMS of d [µm]")
     parts = [about]
@@ -488,7 +503,7 @@ def measured() -> str:
 
 
 def _control(table: int) -> str:
-    """One of the tables of docs/control.json, of a `softfinger bench control`."""
+    """Return one of the tables in docs/control.json, of a `softfinger bench control`."""
     _, rows = _stored("control.json")
     titles = list(dict.fromkeys(row["table"] for row in rows))
     shown = (row for row in rows if row["table"] == titles[table])
@@ -497,7 +512,7 @@ def _control(table: int) -> str:
 
 
 def control_late() -> str:
-    """What each law leaves of an angle that it gets late, from the third table of that file."""
+    """Tabulate the remaining angle with delayed angles, from the third table of that file."""
     _, rows = _stored("control.json")
     found: dict[str, dict[str, str]] = {}
     for row in rows:
@@ -513,7 +528,7 @@ def control_late() -> str:
 
 
 def held_loads() -> str:
-    """How many sudden loads each simulated hand held, of docs/reflex.json."""
+    """Count the sudden loads that each simulated hand held, from docs/reflex.json."""
     _, rows = _stored("reflex.json")
     found: dict[str, dict[str, list[int]]] = {}
     for row in rows:
@@ -532,7 +547,7 @@ def held_loads() -> str:
 
 
 def envelope_map() -> str:
-    """The heaviest mass of each object that the built-in hand's map holds, and all lighter ones."""
+    """Tabulate the heaviest mass that the built-in hand holds, with all lighter masses."""
     from softfinger.daemon.control.envelope import HELD
 
     found = tomllib.loads((ROOT / "daemon/control/envelope.toml").read_text(encoding="utf-8"))
@@ -552,10 +567,10 @@ _SHAPES = {"rectangle": "block", "disc": "disc"}
 
 
 def published() -> str:
-    """The rows of `softfinger validate`, computed anew."""
+    """Compute the rows of `softfinger validate`."""
     from softfinger.tools.paper.validate import FIGURES, comparisons
 
-    heads = ("", "quantity", "published", "here", "source", "what stands between")
+    heads = ("", "quantity", "published", "here", "source", "remarks")
     rows = (
         (FIGURES[each.verdict], each.quantity, each.published, each.ours, each.source, each.why)
         for each in comparisons()
@@ -597,7 +612,7 @@ PAGES: dict[str, Callable[[], str]] = {
     "events.md": events,
     "api.md": api,
 }
-# Where a link to a file of the project's folder leads to on the site.
+# Pages of the site for links to files of the project.
 _LINKS = {
     "README.md": "index.md",
     "CONTRIBUTING.md": "contributing.md",
@@ -614,7 +629,7 @@ _LINKS = {
 
 
 def on_config(config: Any) -> Any:
-    """State the version and the licence at the foot of every page."""
+    """Show the version and the licence at the foot of every page."""
     from softfinger import __version__
 
     config.copyright = f"softfinger {__version__}, MIT licence"
@@ -622,7 +637,7 @@ def on_config(config: Any) -> Any:
 
 
 def on_files(files: Any, config: Any) -> Any:
-    """Add the pages that no file in docs/ holds."""
+    """Add the generated pages."""
     from mkdocs.structure.files import File
 
     for name, make in PAGES.items():
@@ -631,7 +646,7 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Tables made from the code; links as a reader of the repository follows them."""
+    """Insert generated tables, and point links to files of the repository to pages of the site."""
     markdown = re.sub(
         r"\s*<!-- table: (\w+) -->", lambda found: f"\n\n{TABLES[found[1]]()}", markdown
     )
@@ -644,10 +659,10 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
 
 
 def on_page_content(content: str, **_: Any) -> str:
-    """Formulas and drawings as part of the page, in the colours of its theme.
+    """Insert formulas and drawings into the page, so that they use the colours of its theme.
 
-    Formulas, which the extension arithmatex has marked, become MathML: browsers draw it without any
-    script or font of the site's. Drawings use `currentColor`, which an image would not inherit.
+    The extension arithmatex marks formulas. They become MathML, which browsers draw without scripts
+    or fonts. Drawings use `currentColor`, which an image would not inherit.
     """
     content = re.sub(
         r'<(div|span) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', _formula, content, flags=re.S
@@ -659,7 +674,7 @@ def _formula(found: re.Match[str]) -> str:
     from latex2mathml.converter import convert
 
     tex, display = html.unescape(found[2]).strip(), "block" if found[1] == "div" else "inline"
-    # A function is set apart from what it multiplies and from its argument, as TeX does it.
+    # TeX sets a function apart from its factors and its argument; MathML needs explicit spaces.
     function = r"\\(?:arcsin|cos|ln|sin|tan)(?:\^\d)?(?![a-z])"
     tex = re.sub(rf"(?<=[\w)}}])\s*(?={function})", r" \, ", tex)
     tex = re.sub(rf"({function})\s*(?=[\\\w])", r"\1 \, ", tex)
@@ -667,7 +682,7 @@ def _formula(found: re.Match[str]) -> str:
 
 
 def _drawing(found: re.Match[str]) -> str:
-    """The drawing itself, its styles bound to it alone."""
+    """Return the drawing as SVG, with its styles restricted to itself."""
     name = found[1]
     text = (ROOT / "docs" / "pictures" / f"{name}.svg").read_text(encoding="utf-8")
 
