@@ -203,9 +203,7 @@ def limits() -> str:
         lasts = getattr(settings.safety, row.lasts) if isinstance(row.lasts, str) else row.lasts
         after = f"{lasts:g} s + " if lasts else ""
         if row.in_turn:
-            turns = (
-                2 if lasts else 1
-            )  # one to detect it, one to see that it lasts
+            turns = 2 if lasts else 1  # one to detect it, one to see that it lasts
             when = f"{after}up to {turns * taking_turns * tick:g} ms"
         elif row.check:
             when = f"{after}a tick ({tick:g} ms)"
