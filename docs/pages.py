@@ -1,7 +1,7 @@
-"""Make those pages and tables of the site that are generated from the code at build time.
+"""Generate pages and tables of the documentation site from the code and from project files.
 
-MkDocs calls the functions named ``on_…`` (``hooks`` in mkdocs.yml). `PAGES` contains whole pages,
-and `TABLES` contains tables within pages, so that computed figures are never typed by hand.
+MkDocs calls the functions named ``on_…`` (``hooks`` in mkdocs.yml). `PAGES` has whole pages, and
+`TABLES` has tables within pages. Every figure that the code can compute is generated here.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def _from(name: str) -> Callable[[], str]:
-    """Return a function that reads a page from a file of the repository."""
+    """Return a function that reads a page from a file of the project."""
     return lambda: (ROOT / name).read_text(encoding="utf-8")
 
 
 def _program(name: str) -> Callable[[], str]:
-    """Return a function that makes a page from a program of the repository."""
+    """Return a function that makes a page of a program's source."""
     return lambda: f"# {Path(name).stem}\n\n```python\n{_from(name)()}```\n"
 
 
@@ -45,7 +45,7 @@ def _table(heads: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
 
 
 def _signed(value: float, form: str) -> str:
-    """Format the number with a minus sign (U+2212), and without a sign if it rounds to 0."""
+    """Format a number with a typographic minus sign, and zero without a sign."""
     return f"{value:{form}}".replace("-", "−") if float(f"{value:{form}}") else f"{0.0:{form}}"
 
 
@@ -83,10 +83,10 @@ profile of your own.
 
 
 def configuration() -> str:
-    """Make the page of all sections and keys from their declarations."""
+    """List every section and key of a profile, from their declarations."""
     from softfinger.daemon.profile import reference
 
-    parts = [_SETTINGS, _head("profile", "what it is"), *_profiles()]
+    parts = [_SETTINGS, _head("profile", "description"), *_profiles()]
     keys = reference.every_key()
     for name, section in reference.sections().items():
         parts.append(f"\n## `[{name}]`\n\n{reference.about(section)}\n\n")
@@ -100,7 +100,7 @@ def configuration() -> str:
 
 
 def _profiles() -> list[str]:
-    """Make a table row for each profile of the package."""
+    """Return a row of the table for each profile of the package."""
     from softfinger.daemon.profile.load import names
     from softfinger.tools.setup.config import subject
 
@@ -111,7 +111,7 @@ def _profiles() -> list[str]:
 
 
 def stream() -> str:
-    """Make the page of all topics and fields from the schema."""
+    """List every topic and field, from the schema."""
     from softfinger.daemon.wire.schema_docs import page
 
     return page()
@@ -121,19 +121,21 @@ def stream() -> str:
 
 
 def commands() -> str:
-    """Make the page of the hand's commands from the table of modes."""
+    """List the commands of the hand, from the table of modes."""
     from softfinger.daemon.control.modes import COMMANDS, Mode
     from softfinger.daemon.types import UNLEASED
     from softfinger.tools.terminal.send import _EPILOG
 
     parts = [
-        "# Commands to the hand\n\nSend commands as msgpack maps on a REQ socket, with "
-        "`softfinger send`, or with the methods of [`Hand`](api.md). The names are the same.\n\n"
-        f"```text\n{_EPILOG}\n```\n\n",
-        _head("command", "numbers", "accepted in the modes", "needs the lease"),
+        "# Commands to the hand\n\nSend a command with `softfinger send`, with a method of "
+        "[`Hand`](api.md), or as a msgpack map on a REQ socket ([the stream](stream.md#commands)). "
+        "All three use the same names:\n\n"
+        f"```text\n{_EPILOG}\n```\n\nEach command is accepted only in some modes. Most commands "
+        "need the lease: while a client has it, other clients cannot command the hand.\n\n",
+        _head("command", "parameters", "accepted in the modes", "needs the lease"),
     ]
     for name, (modes, numbers) in COMMANDS.items():
-        given = ", ".join(f"`{key}`" + " (may be left out)" * (not numbers[key]) for key in numbers)
+        given = ", ".join(f"`{key}`" + " (optional)" * (not numbers[key]) for key in numbers)
         where = "any" if modes == set(Mode) else ", ".join(m for m in Mode if m in modes)
         leased = "no" if name in UNLEASED | {"stop"} else "yes"
         parts.append(_row(f"`{name}`", given, where, leased))
@@ -141,10 +143,10 @@ def commands() -> str:
 
 
 def command_line() -> str:
-    """Make the page with the help of every subcommand."""
+    """Show the help of every subcommand."""
     from softfinger.tools.cli import SUBCOMMANDS, make_parser
 
-    os.environ["COLUMNS"] = "100"  # width at which argparse wraps lines
+    os.environ["COLUMNS"] = "100"  # the width that argparse wraps to
     parser, _ = make_parser(SUBCOMMANDS)
     parts = [f"# The command line\n\n```text\n{parser.format_help()}```\n"]
     for name, subparser in _children(parser).items():
@@ -155,7 +157,7 @@ def command_line() -> str:
 
 
 def _children(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
-    """Return the parsers of a parser's subcommands, by name."""
+    """Return the parsers of a parser's subcommands by name."""
     found: dict[str, argparse.ArgumentParser] = {}
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
@@ -169,16 +171,23 @@ def _children(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentPar
 _LIMITS = """\
 # Limits
 
-The daemon checks these limits while a hand runs. The numbers are those of the built-in hand;
-`softfinger limits --config FILE` prints those of a profile. A `warn` is reported, a `limit` changes
-the goal, and a `fault` turns torque off until `clear`. The column *noticed* is the delay from the
-first reading or frame that exceeds the limit. If a setting is an age, add that age to the delay.
+The daemon checks these limits while a hand runs. The numbers are those of the built-in hand. For
+your profile, use `softfinger limits --config FILE`.
+
+A limit has one of three levels:
+
+- `warn`: the daemon reports it.
+- `limit`: the daemon changes the goal.
+- `fault`: the daemon turns torque off until `clear`.
+
+The reaction time counts from the first reading or frame that exceeds the bound. If a setting is an
+age, add it to the reaction time.
 
 """
 
 
 def limits() -> str:
-    """Make the page of all limits: condition, delay, consequence and settings."""
+    """List every limit with its quantity, level, reaction time and settings."""
     from softfinger.daemon.profile.settings import Settings
     from softfinger.daemon.safety.limits import LIMITS
     from softfinger.tools.setup.limits import _values
@@ -187,19 +196,19 @@ def limits() -> str:
     taking_turns = sum(row.in_turn for row in LIMITS)
     rows = [
         _LIMITS,
-        _head("limit", "what is judged", "follows", "noticed", "settings, with their defaults"),
+        _head("limit", "quantity", "level", "reaction time", "settings and defaults"),
     ]
     for row in LIMITS:
         tick = 1e3 / settings.loop.rate
         lasts = getattr(settings.safety, row.lasts) if isinstance(row.lasts, str) else row.lasts
         after = f"{lasts:g} s + " if lasts else ""
         if row.in_turn:
-            turns = 2 if lasts else 1  # detection, then the end of the required duration
+            turns = 2 if lasts else 1  # one to detect it, one to see that it lasts
             when = f"{after}up to {turns * taking_turns * tick:g} ms"
         elif row.check:
             when = f"{after}a tick ({tick:g} ms)"
         else:
-            when = "where it is met"
+            when = "at once"
         keys = ", ".join(_values(settings, row))
         rows.append(_row(f"`{row.name}`", row.quantity, row.level, when, keys and f"`{keys}`"))
     return "".join(rows)
@@ -222,7 +231,7 @@ send `clear`.
 
 
 def events() -> str:
-    """Make the page of all kinds of events from the table that explains them."""
+    """List every kind of event, from the table that explains them."""
     from softfinger.daemon.wire.event_kinds import KINDS
 
     parts = [_EVENTS, _head("kind", "level", "cause", "what to do")]
@@ -235,15 +244,18 @@ def events() -> str:
 
 
 def api() -> str:
-    """Make the page of the package's public names from their docstrings."""
+    """Describe the public names of the package by their docstrings."""
     import softfinger
 
-    parts = ["# For programs\n\nThe names below are imported from `softfinger` itself.\n"]
+    parts = [
+        "# Python interface\n\nImport these names from `softfinger`. "
+        "[Programs](programs.md) shows how to use them.\n"
+    ]
     for name in softfinger.__all__:
         if not name.startswith("_"):
             module = softfinger._MODULES.get(name, "softfinger")
             parts.append(f"\n::: {module}.{name}\n")
-    parts.append("\n## Checks for authors of plugins\n\n::: softfinger.testing\n")
+    parts.append("\n## Checks for plugin authors\n\n::: softfinger.testing\n")
     return "".join(parts)
 
 
@@ -251,7 +263,7 @@ def api() -> str:
 
 
 def checkpoints() -> str:
-    """Tabulate closed forms at a few points."""
+    """Evaluate the closed forms at a few displacements and tilts."""
     from softfinger.kinematics.contact.closed_form import closed_forms
 
     rows = []
@@ -263,7 +275,7 @@ def checkpoints() -> str:
 
 
 def rates() -> str:
-    """Tabulate the slopes of force and energy over the tilt at 25°, from the paper's integrals."""
+    """Tabulate the slope of force and energy over the tilt at 25°, by the paper's integrals."""
     from softfinger.tools.paper.model_pages import DEPTHS, ENERGY, FORCE
 
     heads = ("d [mm]", *(f"d = {d}" for d in DEPTHS))
@@ -290,7 +302,7 @@ def exponents() -> str:
 
 
 def early_minimum() -> str:
-    """Tabulate the minima of force and energy if a share of the rolling shears the tip."""
+    """Tabulate the angles of least force and energy if a share of the rolling shears the tip."""
     from softfinger.tools.paper.model_pages import DEPTHS
     from softfinger.tools.paper.sheared_rolling import sheared_rolling
 
@@ -308,7 +320,7 @@ def early_minimum() -> str:
 
 
 def upright_forces() -> str:
-    """Tabulate the forces of upright tips for several laws."""
+    """Tabulate the forces of upright tips for several contact laws."""
     from softfinger.kinematics.contact.closed_form import Fingertip
     from softfinger.kinematics.contact.material import Material
     from softfinger.kinematics.contact.table import ContactTable
@@ -332,7 +344,7 @@ def upright_forces() -> str:
 
 
 def minimum_strength() -> str:
-    """Tabulate c for each kind of tip near upright: the increase of its energy with the tilt."""
+    """Tabulate c, the rise of the energy with the tilt near upright, for each kind of tip."""
     from softfinger.kinematics.contact.closed_form import Fingertip
     from softfinger.kinematics.contact.material import Material
     from softfinger.kinematics.contact.table import ContactTable
@@ -355,7 +367,7 @@ def minimum_strength() -> str:
 
 
 def _grips() -> list[tuple[str, float, float, float, float]]:
-    """Return name, d [m], q [rad], c and upright spring [N·m/rad] of 10 N grips on 40 mm."""
+    """Compute name, d [m], q [rad], c and upright spring [N·m/rad] of grips of 10 N on 40 mm."""
     from softfinger.daemon.profile.factory import make_material, make_table
     from softfinger.daemon.profile.settings import Settings
     from softfinger.kinematics.hand.upright import upright_spring
@@ -383,11 +395,11 @@ def _grips() -> list[tuple[str, float, float, float, float]]:
     return found
 
 
-_FORCE, _WIDTH = 10.0, 0.040  # N, m; the grip used on the pages
+_FORCE, _WIDTH = 10.0, 0.040  # force [N] and object width [m] of the grips in the pages
 
 
 def upright_grips() -> str:
-    """Tabulate displacement, joint angle and spring of a grip, and the remaining object angle."""
+    """Tabulate displacement, joint angle and spring of a grip, and the remaining angle φ/φ0."""
     rows = []
     for name, d, q, c, spring in _grips():
         angles = (_signed(_left_of(k, d, q, c), ".3f") for k in (0.0, spring, 1e9))
@@ -397,7 +409,7 @@ def upright_grips() -> str:
 
 
 def _left_of(spring: float, d: float, q: float, c: float) -> float:
-    """Return φ/φ0 by the closed form of `kinematics.hand.upright`, for the built-in hand."""
+    """Return φ/φ0 by the closed form of `kinematics.hand.upright`, for the built-in hand [m]."""
     inward, radius = 0.080 * math.sin(q), 0.020
     b = spring / (_FORCE * 0.050)
     line = _WIDTH * (2.0 * inward + (1.0 - 2.0 * c) * d - b * (_WIDTH - d))
@@ -406,7 +418,7 @@ def _left_of(spring: float, d: float, q: float, c: float) -> float:
 
 
 def symmetric_grips() -> str:
-    """Tabulate joint angle, normal force and torque of symmetric grips without tip shear."""
+    """Tabulate joint angle, normal force and torque of symmetric grips without shear."""
     rows = []
     for d in (2, 4, 6, 8):
         q = math.asin((50.0 - 20.0 + d - 20.0) / 80.0)
@@ -417,7 +429,7 @@ def symmetric_grips() -> str:
 
 
 def relaxations() -> str:
-    """Tabulate force after a sudden constant press, relative to its final value, for three laws."""
+    """Tabulate the relative force after a sudden press for three relaxation models."""
     times = (0.001, 0.01, 0.1, 1.0, 10.0)
     prony = list(zip((0.1, 0.2, 0.2), (0.004, 0.07, 1.4), strict=True))
     laws: dict[str, Callable[[float], float]] = {
@@ -432,17 +444,17 @@ def relaxations() -> str:
 
 
 def errata() -> str:
-    """Tabulate each erratum that `softfinger figures` marks, once."""
+    """List the errata that `softfinger figures` marks, without duplicates."""
     from softfinger.tools.paper.figures import pages
 
     found = dict.fromkeys(each for page in pages().values() for each in page.errata)
     return _table(
-        ("place", "printed", "holds"), ((each.place, each.printed, each.holds) for each in found)
+        ("place", "printed", "correct"), ((each.place, each.printed, each.holds) for each in found)
     )
 
 
 def servos() -> str:
-    """Tabulate the known servo models, their tip forces, and the limits to set for them."""
+    """List the known servo models, their forces at the tip, and the bounds to set for them."""
     from softfinger.daemon.servos.control_table import MODELS
 
     columns = ("V", "stall [N·m at A]", "N·m/A", "force [N]", "current_max [A]", "force_max [N]")
@@ -462,7 +474,7 @@ def servos() -> str:
 
 
 def _stored(name: str) -> tuple[str, list[dict[str, Any]]]:
-    """Return the machine and the rows of a file in docs/ written by `softfinger bench --json`."""
+    """Read the machine and the rows from a file in docs/ that `softfinger bench --json` wrote."""
     content = json.loads((ROOT / "docs" / name).read_text(encoding="utf-8"))
     load = " to ".join(f"{each:.1f}" for each in content["load"])
     about = f"{content['machine']}, {content['cores']} cores, load {load}.\n"
@@ -477,7 +489,7 @@ def _shown(rows: Iterable[dict[str, Any]], keys: Sequence[str]) -> Iterable[list
 
 
 def measured() -> str:
-    """Tabulate docs/benchmarks.json, the results of `softfinger bench` without names."""
+    """Tabulate the figures in docs/benchmarks.json, of a `softfinger bench` without names."""
     about, rows = _stored("benchmarks.json")
     keys = ("median", "p99", "unit", "aim ≤", "relative error", "RMS of d [µm]")
     parts = [about]
@@ -489,7 +501,7 @@ def measured() -> str:
 
 
 def _control(table: int) -> str:
-    """Make one table of docs/control.json, the results of `softfinger bench control`."""
+    """Return one of the tables in docs/control.json, of a `softfinger bench control`."""
     _, rows = _stored("control.json")
     titles = list(dict.fromkeys(row["table"] for row in rows))
     shown = (row for row in rows if row["table"] == titles[table])
@@ -498,7 +510,7 @@ def _control(table: int) -> str:
 
 
 def control_late() -> str:
-    """Tabulate the remaining angle of each law with a delayed angle, from docs/control.json."""
+    """Tabulate the remaining angle with delayed angles, from the third table of that file."""
     _, rows = _stored("control.json")
     found: dict[str, dict[str, str]] = {}
     for row in rows:
@@ -514,7 +526,7 @@ def control_late() -> str:
 
 
 def held_loads() -> str:
-    """Tabulate the number of sudden loads that each simulated hand held, from docs/reflex.json."""
+    """Count the sudden loads that each simulated hand held, from docs/reflex.json."""
     _, rows = _stored("reflex.json")
     found: dict[str, dict[str, list[int]]] = {}
     for row in rows:
@@ -533,7 +545,7 @@ def held_loads() -> str:
 
 
 def envelope_map() -> str:
-    """Tabulate the heaviest mass up to which the built-in hand's map holds each object."""
+    """Tabulate the heaviest mass that the built-in hand holds, with all lighter masses."""
     from softfinger.daemon.control.envelope import HELD
 
     found = tomllib.loads((ROOT / "daemon/control/envelope.toml").read_text(encoding="utf-8"))
@@ -553,10 +565,10 @@ _SHAPES = {"rectangle": "block", "disc": "disc"}
 
 
 def published() -> str:
-    """Tabulate the rows of `softfinger validate`, computed at build time."""
+    """Compute the rows of `softfinger validate`."""
     from softfinger.tools.paper.validate import FIGURES, comparisons
 
-    heads = ("", "quantity", "published", "here", "source", "what stands between")
+    heads = ("", "quantity", "published", "here", "source", "remarks")
     rows = (
         (FIGURES[each.verdict], each.quantity, each.published, each.ours, each.source, each.why)
         for each in comparisons()
@@ -598,7 +610,7 @@ PAGES: dict[str, Callable[[], str]] = {
     "events.md": events,
     "api.md": api,
 }
-# Pages of the site that correspond to files of the repository.
+# Pages of the site for links to files of the project.
 _LINKS = {
     "README.md": "index.md",
     "CONTRIBUTING.md": "contributing.md",
@@ -615,7 +627,7 @@ _LINKS = {
 
 
 def on_config(config: Any) -> Any:
-    """State version and licence in the footer of every page."""
+    """Show the version and the licence at the foot of every page."""
     from softfinger import __version__
 
     config.copyright = f"softfinger {__version__}, MIT licence"
@@ -632,7 +644,7 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Insert the generated tables, and redirect links to repository files to pages of the site."""
+    """Insert generated tables, and point links to files of the repository to pages of the site."""
     markdown = re.sub(
         r"\s*<!-- table: (\w+) -->", lambda found: f"\n\n{TABLES[found[1]]()}", markdown
     )
@@ -645,10 +657,10 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
 
 
 def on_page_content(content: str, **_: Any) -> str:
-    """Convert formulas to MathML and insert drawings inline.
+    """Insert formulas and drawings into the page, so that they use the colours of its theme.
 
-    The extension arithmatex marks the formulas. Browsers render MathML without scripts or fonts
-    from the site. Drawings use `currentColor`, which would have no effect in an image element.
+    The extension arithmatex marks formulas. They become MathML, which browsers draw without scripts
+    or fonts. Drawings use `currentColor`, which an image would not inherit.
     """
     content = re.sub(
         r'<(div|span) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', _formula, content, flags=re.S
@@ -660,7 +672,7 @@ def _formula(found: re.Match[str]) -> str:
     from latex2mathml.converter import convert
 
     tex, display = html.unescape(found[2]).strip(), "block" if found[1] == "div" else "inline"
-    # As in TeX, separate a function from its factor and from its argument.
+    # TeX sets a function apart from its factors and its argument; MathML needs explicit spaces.
     function = r"\\(?:arcsin|cos|ln|sin|tan)(?:\^\d)?(?![a-z])"
     tex = re.sub(rf"(?<=[\w)}}])\s*(?={function})", r" \, ", tex)
     tex = re.sub(rf"({function})\s*(?=[\\\w])", r"\1 \, ", tex)
@@ -668,7 +680,7 @@ def _formula(found: re.Match[str]) -> str:
 
 
 def _drawing(found: re.Match[str]) -> str:
-    """Return the drawing as inline SVG, with its styles limited to it."""
+    """Return the drawing as SVG, with its styles restricted to itself."""
     name = found[1]
     text = (ROOT / "docs" / "pictures" / f"{name}.svg").read_text(encoding="utf-8")
 
