@@ -1,11 +1,11 @@
-"""The stream's schema: every field of every topic, declared once.
+"""Schema of the stream: the only declaration of all topics and fields.
 
-A topic is a record. Each of its fields has a unit and a meaning, and is taken from a source: by a
-function, or as the source's attribute of the same name. From it follow the packers
-(`wire.publisher`), the records that clients read (`client.stream`), the page ``STREAM.md`` and the
-JSON schemas of recordings (`wire.schema_docs`).
+A topic is a record. Each of its fields has a unit, a meaning and a source. Its value is computed by
+a function of the source, or is the attribute of the same name. The packers (`wire.publisher`), the
+records that clients read (`client.stream`), the page ``STREAM.md`` and the JSON schemas of
+recordings (`wire.schema_docs`) are derived from these declarations.
 
-Fields are only ever added, none is left out, and a float is always sent as a float. SI units.
+New versions may add fields, but never remove any. A float is always sent as a float. SI units.
 """
 
 import json
@@ -44,7 +44,7 @@ TRUTH = b"hand/truth"
 
 NO_FRAME = Frame(0, t_sample=0.0, t_arrival=0.0, valid=False, data=np.zeros((0, 0), np.uint16))
 
-# What several topics begin with.
+# Common first fields of several topics.
 _SCHEMA = "", "number of this schema; changes only when a field's meaning does"
 _SEQ = "", "counts up: ticks, frames, events"
 _STEP = "", "one of so many is sent"
@@ -58,7 +58,7 @@ def _ns(t: float) -> int:
     return int(t * 1e9)
 
 
-# What several topics' sources have alike is taken as from one of them.
+# Fields that several sources have in common are declared for one of them.
 _tick = FieldSource["StateSource"]()
 _state = _tick.of(lambda m: m.state)
 _timing = _state.of(lambda s: s.timing)
@@ -67,7 +67,7 @@ _news = FieldSource["EventSource"]()
 
 @record
 class _TickMessage:
-    """A message of every so many ticks."""
+    """Message that is sent every n-th tick."""
 
     schema: int = _state(*_SCHEMA, lambda _: SCHEMA)
     seq: int = _state(*_SEQ)
@@ -78,7 +78,7 @@ class _TickMessage:
 
 @record
 class _Announcement:
-    """A message that is sent when it happens."""
+    """Message that is sent when an event occurs."""
 
     schema: int = _news(*_SCHEMA, lambda _: SCHEMA)
     seq: int = _news(*_SEQ)
@@ -237,7 +237,7 @@ class HandState(_TickMessage):
     object: ObjectState = _state.part("", lambda s: s.object)
 
     def finger(self, name: str) -> FingerState:
-        """Return ``left`` or ``right`` by its name. Raises ValueError for another."""
+        """Return ``left`` or ``right`` by its name. Raises ValueError for other names."""
         if name not in FINGERS:
             raise ValueError(f"found finger {name!r}, expected one of {', '.join(FINGERS)}")
         return self.left if name == FINGERS[0] else self.right
@@ -267,7 +267,7 @@ _facts = _tactile.of(lambda m: m.facts)
 )
 @record
 class TactileFrame:
-    """One ``hand/tactile``. Raises ValueError when its data isn't a grid of rows × cols."""
+    """One ``hand/tactile``. Raises ValueError if its data is not a grid of rows × cols."""
 
     schema: int = _tactile(*_SCHEMA, lambda _: SCHEMA)
     seq: int = _frame(*_SEQ)
@@ -311,7 +311,7 @@ class TactileFrame:
         return np.frombuffer(self.data, dtype="<u2").reshape(self.rows, self.cols)
 
     def pressure(self) -> NDArray[np.float64]:
-        """Return counts times the scale [Pa], [rows, cols]."""
+        """Return counts times scale [Pa], shape [rows, cols]."""
         return self.counts.astype(np.float64) * self.scale
 
 

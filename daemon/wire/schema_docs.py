@@ -1,6 +1,6 @@
-"""The schema for readers of the stream: the page ``STREAM.md``, and JSON Schema for recordings.
+"""Documentation of the schema: the page ``STREAM.md``, and JSON Schema for recordings.
 
-``python -m softfinger.daemon.wire.schema_docs`` writes the page anew.
+``python -m softfinger.daemon.wire.schema_docs`` regenerates the page.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ another command since. `disarm` needs no key; it is carried out each time. `Hand
 
 
 def json_schema(topic: bytes) -> dict[str, Any]:
-    """Return a topic's map as JSON Schema. Bytes are base64, a float that is no number null."""
+    """Return the JSON Schema of a topic's map; bytes are base64, and NaN and infinity are null."""
     schema: dict[str, Any] = {
         "title": topic.decode(),
         "description": TOPICS[topic].summary,
@@ -100,7 +100,7 @@ def json_schema(topic: bytes) -> dict[str, Any]:
 
 
 def page() -> str:
-    """Return the page for people, in Markdown."""
+    """Return the page ``STREAM.md`` in Markdown."""
     reasons = "".join(f"| `{reason}` | {reason.meaning} |\n" for reason in Reason)
     parts = [_INTRODUCTION, _COMMANDS + reasons + _KEYS]
     for name, topic in TOPICS.items():
