@@ -371,8 +371,8 @@ class Control:
         # A tip that reaches the object before the sensor detects contact must not exceed the
         # commanded force.
         pressed = 0.5 * state.order.force * self._settings.hand.finger_length * law.driving
-        # A joint that does not move under this torque, without contact, has more friction than the
-        # settings say; `free_torque` is the torque that was measured.
+        # A joint that does not move under this torque, without contact, has more friction than in
+        # the settings; `free_torque` is the measured torque.
         pressed += max(law.joint_friction, float(self.fingers.grasp.free_torque.max()))
         return min(law.approach_current, pressed / law.torque_constant)
 

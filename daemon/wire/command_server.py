@@ -2,7 +2,7 @@
 
 It runs in the loop's thread, once per tick, without a lock. A ``stop`` takes precedence. Requests
 that arrived before a stop, whose stamp counts fewer stops, are refused, except ``status``. A
-``hold`` replaces a waiting ``hold`` of the same connection.
+``hold`` replaces the ``hold`` that waits just before it on the same connection.
 
 A client may give a request a unique ``key`` and send the same map again if it was refused as late.
 The daemon then carries out the command at most once, and only if it has carried out no other

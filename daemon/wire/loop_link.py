@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import msgpack
 
 # From the loop
-PUBLISH = "publish"  # index of the topic, number of messages to keep, message
+PUBLISH = "publish"  # index of the topic, number of messages to repeat later, message
 REPLY = "reply"  # `Ask.urgent` and `Ask.route` of the request, reply
 FENCE = "fence"  # number of stops so far
 

@@ -228,7 +228,7 @@ class ControlTable:
         return next(filter(None, refusals), framing.OK), plan
 
     def _refusal(self, item: Item, value: int) -> int:
-        """The error of writing ``value`` because of what other registers hold; OK if allowed."""
+        """Return the error of writing ``value`` due to other registers; OK if it is allowed."""
         memory, address = self.memory, item.address
         if address in _GOALS:
             if memory[reg.BUS_WATCHDOG] == reg.WATCHDOG_ERROR:
