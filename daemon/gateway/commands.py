@@ -77,7 +77,7 @@ class CommandEndpoint(Endpoint):
         self._send_to_loop = send_to_loop
         self._clock = clock
         self.refused = 0  # requests refused because of their number
-        self.stops = 0  # stops that surely preceded the requests that are read now
+        self.stops = 0  # stops known to have preceded the requests that are read now
         self._fence = 0  # stops so far
         self._looked = clock()  # time of the last poll
         self._dated: float | None = None  # last poll before a gap, while its requests may remain

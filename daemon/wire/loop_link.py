@@ -41,9 +41,9 @@ _FIRST, _AGAIN = (msgpack.packb("again") + msgpack.packb(again) for again in (Fa
 class Ask(NamedTuple):
     """A client's request that is within all limits but not unpacked yet.
 
-    ``came`` is the arrival time by `machine_time`, and ``stops`` the number of stops that surely
-    preceded it. An ``urgent`` request looks like a stop. ``name`` is the name of the client by its
-    key. ``route`` is the route of the reply; its first part identifies the connection.
+    ``came`` is the arrival time by `machine_time`, and ``stops`` the number of stops that are known
+    to have preceded it. An ``urgent`` request looks like a stop. ``name`` is the name of the client
+    by its key. ``route`` is the route of the reply; its first part identifies the connection.
     """
 
     came: float
@@ -126,7 +126,7 @@ class Link:
     def __init__(self) -> None:
         self.wanted = 0  # topics with subscribers, as bits
         self.refused = 0  # requests that the gateway refused because of their number
-        self.stops = 0  # stops that surely preceded the requests that arrive now
+        self.stops = 0  # stops known to have preceded the requests that arrive now
         self.asked: deque[Ask] = deque()  # urgent requests first
         self.unpacked: deque[tuple[Ask, dict[str, Any]]] = deque()  # requests that wait for a tick
         self.notices: deque[str] = deque(maxlen=_NOTICES)  # warnings of the gateway

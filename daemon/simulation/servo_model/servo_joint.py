@@ -211,7 +211,7 @@ class ServoJoint:
 
 ROOM = 25.0  # °C
 _LAG = 4.0  # s, lag of the thermometer
-_CONVECTION = 0.006  # 1/K, relative increase of the cooling
+_CONVECTION = 0.006  # 1/K, relative increase of the cooling with the temperature difference
 _LONGEST = 1.0  # s, longest step
 _NEAR = 1e-6  # counts; without this tolerance, rounding of the square root prevents arrival
 
