@@ -234,7 +234,7 @@ class HandState(_TickMessage):
         lambda g: g.force,
     )
     goal_angle: float = _goal(
-        "rad", "target of the object's angle; NaN without one", lambda g: g.angle
+        "rad", "target of the object's angle; NaN unless the object is steered", lambda g: g.angle
     )
     left: FingerState = _tick.part("left finger: ", lambda m: _Finger(m.state, m.scene, 0))
     right: FingerState = _tick.part("right finger: ", lambda m: _Finger(m.state, m.scene, 1))
