@@ -1,4 +1,4 @@
-"""The hand from a notebook or a program of one's own: its stream as typed records, its commands.
+"""Client library: control the hand and read its stream from a notebook or program.
 
 ::
 
@@ -12,5 +12,5 @@
         for state in hand.stream():
             ...
 
-`AsyncHand` is the same for asyncio. Nothing here needs more of a daemon than its two addresses.
+`AsyncHand` is the same for asyncio. A client needs only the two addresses of the daemon.
 """

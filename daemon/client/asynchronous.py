@@ -1,4 +1,4 @@
-"""`AsyncHand`: what `client.hand.Hand` is, for asyncio."""
+"""`AsyncHand`: the asyncio version of `client.hand.Hand`."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class AsyncSubscription(Subscriber[_Record]):
         return await self.next(self._timeout)
 
     async def next(self, timeout: float | None) -> _Record:
-        """Return the next record. Raises NoStream when none comes within ``timeout`` s."""
+        """Return the next record. Raises NoStream if none arrives within ``timeout`` s."""
         for milliseconds in self._waits(timeout):
             if await self._socket.poll(milliseconds):
                 record = self._take(await self._socket.recv_multipart())
@@ -43,7 +43,7 @@ class AsyncSubscription(Subscriber[_Record]):
         raise no_stream(self._address, self._topic, timeout or 0.0)
 
     async def skip(self) -> None:
-        """Drop what waits: the next record is one that is still to come."""
+        """Drop queued messages, so that the next record is a new one."""
         self._require_open()
         while await self._socket.poll(0):
             self._take(await self._socket.recv_multipart())
@@ -56,7 +56,10 @@ class AsyncSubscription(Subscriber[_Record]):
 
 
 class AsyncHand(HandClient[Coroutine[Any, Any, None]]):
-    """`client.hand.Hand` in one event loop: ``async with AsyncHand() as hand: …``."""
+    """Hand for use in one event loop: ``async with AsyncHand() as hand: …``.
+
+    See `client.hand.Hand`.
+    """
 
     _CONTEXT = zmq.asyncio.Context
     _states: AsyncSubscription[HandState] | None = None
@@ -68,7 +71,7 @@ class AsyncHand(HandClient[Coroutine[Any, Any, None]]):
         self.close()
 
     async def state(self, timeout: float | None = None) -> HandState:
-        """Return the next state to come, never one that has been waiting. Raises NoStream."""
+        """Wait for a new state and return it; queued states are dropped. Raises NoStream."""
         if self._states is None:
             self._states = self.stream()
         else:
@@ -76,15 +79,15 @@ class AsyncHand(HandClient[Coroutine[Any, Any, None]]):
         return await self._states.next(self.timeout if timeout is None else timeout)
 
     def stream(self, timeout: float | None = None) -> AsyncSubscription[HandState]:
-        """Return states one after the other, every one that is published."""
+        """Subscribe to all published states, in order."""
         return self._subscription(STATE, timeout)
 
     def frames(self, timeout: float | None = None) -> AsyncSubscription[TactileFrame]:
-        """Tactile frames of both fingers; see `TactileFrame.finger`."""
+        """Subscribe to the tactile frames of both fingers; see `TactileFrame.finger`."""
         return self._subscription(TACTILE, timeout)
 
     def events(self, timeout: float | None = None) -> AsyncSubscription[Event]:
-        """Return the daemon's events: modes, faults, warnings."""
+        """Subscribe to the daemon's events: modes, faults, warnings."""
         return self._subscription(EVENT, timeout)
 
     def _subscription(self, topic: bytes, timeout: float | None) -> AsyncSubscription[Any]:
@@ -92,7 +95,7 @@ class AsyncHand(HandClient[Coroutine[Any, Any, None]]):
         return AsyncSubscription(self._context, self.stream_address, topic, timeout)
 
     async def collect(self, seconds: float) -> list[HandState]:
-        """Return all states of the next ``seconds`` s, by the daemon's clock. Raises NoStream."""
+        """Return all states of the next ``seconds`` s of the daemon's clock. Raises NoStream."""
         async with self.stream(self.timeout) as states:
             collected = [await anext(states)]
             end = collected[0].mono_ns + round(seconds * 1e9)
@@ -105,9 +108,9 @@ class AsyncHand(HandClient[Coroutine[Any, Any, None]]):
     async def wait_for(
         self, condition: Callable[[HandState], object], timeout: float = 10.0
     ) -> HandState:
-        """Return the first state from now on for which ``condition`` holds.
+        """Return the first new state for which ``condition`` holds.
 
-        Raises as `client.hand.Hand.wait_for` does.
+        Raises the same exceptions as `client.hand.Hand.wait_for`.
         """
         wait = Wait(condition, timeout)
         async with self.stream() as states:
@@ -120,16 +123,21 @@ class AsyncHand(HandClient[Coroutine[Any, Any, None]]):
                     return state
 
     async def command(self, name: str, **numbers: float | None) -> dict[str, Any]:
-        """Send one command, without numbers that are None, and return the reply.
+        """Send one command, without arguments that are None, and return the reply.
 
-        Raises Refused with the reason, and NoAnswer.
+        Raises
+        ------
+        Refused
+            If the daemon refuses the command; the message gives the reason.
+        NoAnswer
+            If no reply arrives in time.
         """
         attempts = Attempts(self._request(name, numbers), self.timeout)
         where, keys = self.command_address, self._keys
         reply = await asyncio.to_thread(send_once, where, attempts, keys)
         while attempts.again(reply):
             await asyncio.sleep(AGAIN_AFTER)
-            if not attempts.remaining():  # the machine slept
+            if not attempts.remaining():  # the computer was suspended
                 break
             reply = await asyncio.to_thread(send_once, where, attempts, keys)
         return accepted(reply)

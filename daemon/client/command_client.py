@@ -1,4 +1,4 @@
-"""Commands to a daemon from outside: one request and its answer, and the commands by name."""
+"""Sending commands to a daemon: single requests with their replies, and a method per command."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ _Done = TypeVar("_Done")
 
 _log = logging.getLogger(__name__)
 
-AGAIN_AFTER = 0.05  # s until a command that was late is sent again
-_CLOCK = getattr(time, "CLOCK_BOOTTIME", None)  # Linux's
-LOCALLY = 0.5  # s for a daemon to answer past all other clients
-UNCONFIRMED = "the servos have not confirmed torque off yet"  # to ``torque_off``: ``unconfirmed``
+AGAIN_AFTER = 0.05  # s until a late command is sent again
+_CLOCK = getattr(time, "CLOCK_BOOTTIME", None)  # Linux only
+LOCALLY = 0.5  # s, timeout of a stop over the local socket
+UNCONFIRMED = "the servos have not confirmed torque off yet"  # if ``torque_off`` is ``unconfirmed``
 
 
 class NoAnswer(SoftfingerError):
@@ -42,31 +42,31 @@ class NoAnswer(SoftfingerError):
 
 
 class Attempts:
-    """Decides whether a command is sent again, within the time that its caller waits for a reply.
+    """Retry policy for a command, within the timeout of its caller.
 
-    After a stall the daemon refuses commands that became too old, with the reason ``late``; they
+    After a stall the daemon refuses commands that became too old with the reason ``late``. They
     have no effect. All attempts carry the same key, so the daemon carries out the command at most
-    once, and not after a stop or another command that came in between.
+    once, and not after a stop or another command in between.
     """
 
     def __init__(self, request: dict[str, Any], timeout: float) -> None:
-        """``timeout`` [s] bounds all attempts together."""
+        """Create a policy; ``timeout`` [s] applies to all attempts together."""
         harmless = request.get("command") in UNLEASED
         self.request = request if harmless else {**request, "key": secrets.token_hex(8)}
         self.timeout = timeout
         self._end = _now() + timeout
 
     def remaining(self) -> float:
-        """Return the time [s] that is left."""
+        """Return the remaining time [s]."""
         return max(self._end - _now(), 0.0)
 
     def again(self, reply: dict[str, Any]) -> bool:
-        """Return True if the command is to be sent again, after `AGAIN_AFTER` s."""
+        """Return True if the command must be sent again after `AGAIN_AFTER` s."""
         return reply.get("reason") == Reason.LATE and self.remaining() > 2.0 * AGAIN_AFTER
 
 
 def _now() -> float:
-    """Return monotonic time [s] that goes on while the machine sleeps, where the system has it."""
+    """Return monotonic time [s], including suspension where the system supports it."""
     return time.clock_gettime(_CLOCK) if _CLOCK is not None else time.monotonic()
 
 
@@ -75,22 +75,23 @@ def send(
 ) -> dict[str, Any]:
     """Send one command and return the reply. Raises NoAnswer after ``timeout`` s.
 
-    A command that the daemon refuses as late is sent again, within ``timeout``. A warning is logged
-    if the reply takes longer than 1 s; without logging handlers it goes to standard error.
-    A ``stop`` to a daemon of this user on this machine goes past all other clients.
+    A command that the daemon refuses as late is sent again within ``timeout``. A warning is logged
+    if the reply takes longer than 1 s; without logging handlers it goes to standard error. If the
+    daemon runs on this machine as the same user, a ``stop`` uses a local socket and does not queue
+    behind other clients.
     """
     attempts = Attempts(request, timeout)
     reply = send_once(address, attempts, keys)
     while attempts.again(reply):
         time.sleep(AGAIN_AFTER)
-        if not attempts.remaining():  # the machine slept
+        if not attempts.remaining():  # the computer was suspended
             break
         reply = send_once(address, attempts, keys)
     return reply
 
 
 def send_once(address: str, attempts: Attempts, keys: ClientKeys | None = None) -> dict[str, Any]:
-    """Make one attempt, and return the reply; see `send`."""
+    """Make one attempt and return the reply; see `send`."""
     request, timeout, remaining = attempts.request, attempts.timeout, attempts.remaining()
     if request.get("command") == "stop":
         stopped = stop_locally(address, min(remaining, LOCALLY))
@@ -128,9 +129,9 @@ def send_once(address: str, attempts: Attempts, keys: ClientKeys | None = None) 
 
 
 def _number(what: str, value: Any) -> float:
-    """Return a number as msgpack takes it, NumPy's scalars and 0-d arrays included.
+    """Return a number, also a NumPy scalar or 0-d array, as a float for msgpack.
 
-    Raises Refused for all else.
+    Raises Refused for other types.
     """
     if getattr(value, "shape", None) == ():
         value = value.item()
@@ -138,15 +139,15 @@ def _number(what: str, value: Any) -> float:
         if isinstance(value, Real) and not isinstance(value, bool):
             return float(value)
     except OverflowError:
-        pass  # an integer beyond the largest float
+        pass  # the integer exceeds the largest float
     text = f"{what}: expected a number, found {type(value).__name__} {str(value)[:40]!r}"
     raise Refused(text, Reason.REQUEST)
 
 
 def accepted(reply: dict[str, Any]) -> dict[str, Any]:
-    """Return the reply without ``ok``. Raises Refused with the reason when it is not ok.
+    """Return the reply without ``ok``. Raises Refused with the reason if it is not ok.
 
-    A warning is logged when the servos have not confirmed that torque is off.
+    A warning is logged if the servos have not confirmed that torque is off.
     """
     if reply.get("ok") is not True:
         text = str(reply.get("error", "refused without a reason"))
@@ -157,7 +158,7 @@ def accepted(reply: dict[str, Any]) -> dict[str, Any]:
 
 
 def is_done(command: str, status: dict[str, Any]) -> bool:
-    """Return whether a refused command asks for what is so already, by the daemon's status."""
+    """Return True if the daemon's status already matches the goal of a refused command."""
     mode = status.get("mode", "fault")
     if command == "arm":
         return mode not in ("disarmed", "fault")
@@ -167,11 +168,11 @@ def is_done(command: str, status: dict[str, Any]) -> bool:
 
 
 class HandClient(Generic[_Done]):
-    """Shared by `Hand` and `AsyncHand`: the addresses, and the commands by name.
+    """Base of `Hand` and `AsyncHand`, with the addresses and a method for each command.
 
-    Commands raise Refused with the daemon's reason, and NoAnswer. A command that the daemon
-    refuses as late is sent again, within ``timeout``. ``arm``, ``disarm``, ``clear`` and
-    ``release`` may be repeated: a hand that is armed stays armed.
+    Commands raise Refused with the daemon's reason, and NoAnswer without a reply. A command that
+    the daemon refuses as late is sent again within ``timeout``. ``arm``, ``disarm``, ``clear`` and
+    ``release`` may be repeated: arming an armed hand is not an error.
     """
 
     _CONTEXT: type[zmq.Context[Any]] = zmq.Context
@@ -198,7 +199,7 @@ class HandClient(Generic[_Done]):
             self._keys.guard(self._context)
 
     def close(self) -> None:
-        """Close all sockets, those of open subscriptions included. The hand stays as it is."""
+        """Close all sockets, including those of open subscriptions. The hand keeps its state."""
         self._context.destroy(linger=0)
 
     def _require_open(self) -> None:
@@ -219,23 +220,23 @@ class HandClient(Generic[_Done]):
         raise NotImplementedError
 
     def arm(self) -> _Done:
-        """Torque on; the joints hold where they are."""
+        """Switch torque on; the joints hold their positions."""
         return self._carry_out("arm")
 
     def disarm(self) -> _Done:
-        """Torque off."""
+        """Switch torque off."""
         return self._carry_out("disarm")
 
     def tare(self) -> _Done:
-        """Take what the sensors read now as unloaded."""
+        """Set the zero of the unloaded sensors to their present readings."""
         return self._carry_out("tare")
 
     def move(self, left: float | None = None, right: float | None = None) -> _Done:
-        """Move joints to angles [rad]."""
+        """Move one or both joints to angles [rad]."""
         return self._carry_out("move", left=left, right=right)
 
     def grasp(self, force: float | None = None) -> _Done:
-        """Close, and press with ``force`` [N] on each tip; the settings' force when None."""
+        """Close and grip with ``force`` [N] on each tip, by default the force of the settings."""
         return self._carry_out("grasp", force=force)
 
     def rotate(self, angle: float) -> _Done:
@@ -243,24 +244,24 @@ class HandClient(Generic[_Done]):
         return self._carry_out("rotate", angle=angle)
 
     def hold(self, force: float | None = None, angle: float | None = None) -> _Done:
-        """Send setpoints of a stream, at 50-100 Hz or as seldom as you like.
+        """Send streamed setpoints, for example at 50 to 100 Hz.
 
-        ``force`` [N] of each tip, ``angle`` [rad] of the object, or both. A hand that doesn't grip
-        yet grasps first. A turn is bounded by what the grip reaches, and goes at most at
-        ``control.rotate_speed``.
+        Give the ``force`` [N] of each tip, the ``angle`` [rad] of the object, or both. A hand that
+        does not grip yet grasps first. The angle is limited to the range of the grip, and its rate
+        to ``control.rotate_speed``.
         """
         return self._carry_out("hold", force=force, angle=angle)
 
     def release(self) -> _Done:
-        """Open."""
+        """Open the fingers."""
         return self._carry_out("release")
 
     def set(self, **numbers: float) -> _Done:
-        """Change a property of the grip, as ``compliance`` [rad/(N·m)]."""
+        """Set a property of the grip: ``compliance`` [rad/(N·m)]."""
         return self._carry_out("set", **numbers)
 
     def stop(self) -> _Done:
-        """Torque off at once, in every state."""
+        """Switch torque off immediately, in any mode."""
         return self._carry_out("stop")
 
     def clear(self) -> _Done:

@@ -1,4 +1,4 @@
-"""Shared by all clients: the daemon's addresses, the subscriber's socket, time-outs."""
+"""Addresses of the daemon, subscriber sockets and timeouts, shared by all clients."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ import zmq
 from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.types import COMMAND_ADDRESS, STREAM_ADDRESS
 
-PATIENCE = 5.0  # s that an answer or a first message is waited for by default
-SILENCE = 1.0  # s without one after which a warning says what is waited for
+PATIENCE = 5.0  # s, default timeout of a reply or a first message
+SILENCE = 1.0  # s of waiting, after which a warning is logged
 
-_QUEUE = 100_000  # messages kept for a program that is slow for a while
+_QUEUE = 100_000  # messages queued for a slow program
 _MESSAGE_LIMIT = 4_000_000  # bytes; the largest grid is 131 kB
 
 
 def default_addresses() -> tuple[str, str]:
-    """Return where stream and commands are, by SOFTFINGER_ADDRESS or on this machine.
+    """Return the stream and command address from SOFTFINGER_ADDRESS, or those of this machine.
 
-    Raises SettingsError as :func:`both_addresses`.
+    Raises SettingsError like :func:`both_addresses`.
     """
     named = os.environ.get("SOFTFINGER_ADDRESS", "").strip()
     if not named:
@@ -31,10 +31,10 @@ def default_addresses() -> tuple[str, str]:
 
 
 def both_addresses(named: str, where: str) -> tuple[str, str]:
-    """Return the stream's and the commands' address that one text names.
+    """Return the stream and command address that a text specifies.
 
-    It is ``tcp://HOST``, with the usual ports, or both addresses with a comma between them.
-    Raises SettingsError, with ``where`` it stands, when it is neither.
+    The text is ``tcp://HOST``, which implies the default ports, or both addresses separated by a
+    comma. Otherwise the function raises SettingsError, whose message begins with ``where``.
     """
     addresses = [part.strip() for part in named.split(",")]
     if is_host(named):
@@ -51,7 +51,7 @@ def both_addresses(named: str, where: str) -> tuple[str, str]:
 
 
 def is_host(named: str) -> bool:
-    """Return whether an address is ``tcp://HOST``, without a port."""
+    """Return True if an address is ``tcp://HOST`` without a port."""
     alone = named.startswith("tcp://") and "," not in named
     return alone and ":" not in named[6:].split("]")[-1]
 
@@ -59,9 +59,9 @@ def is_host(named: str) -> bool:
 def subscribe(
     context: zmq.Context[Any], address: str, *topics: bytes, queue: int = _QUEUE
 ) -> zmq.Socket[Any]:
-    """Return a socket subscribed to topics; ``queue`` messages wait in it for a slow program.
+    """Return a socket that is subscribed to topics and queues up to ``queue`` messages.
 
-    Raises zmq.ZMQError when the address can't be read.
+    Raises zmq.ZMQError if the address is malformed.
     """
     socket: zmq.Socket[Any] = context.socket(zmq.SUB)
     try:
@@ -79,7 +79,7 @@ def subscribe(
 
 
 def drain(socket: zmq.Socket[Any], limit: int) -> Iterator[list[bytes]]:
-    """Yield the messages that wait in a socket, at most ``limit``; never wait for one."""
+    """Yield the queued messages of a socket, at most ``limit``, without waiting."""
     for _ in range(limit):
         try:
             yield socket.recv_multipart(zmq.NOBLOCK)
@@ -88,7 +88,7 @@ def drain(socket: zmq.Socket[Any], limit: int) -> Iterator[list[bytes]]:
 
 
 def unpack(frames: list[bytes]) -> tuple[bytes, dict[str, Any]]:
-    """Topic and map of a message. Raises ValueError when it is none."""
+    """Return topic and map of a message. Raises ValueError if it is not a stream message."""
     try:
         topic, packed = frames
         message = msgpack.unpackb(packed)
@@ -100,5 +100,5 @@ def unpack(frames: list[bytes]) -> tuple[bytes, dict[str, Any]]:
 
 
 def still_waiting(what: str, timeout: float) -> str:
-    """Return the warning about something that has not come yet."""
+    """Return the warning that something has not arrived yet."""
     return f"no {what} yet, waiting up to {round(timeout, 2):g} s"

@@ -1,4 +1,4 @@
-"""`Hand`: the hand for a program or a notebook, one thread, plain calls that wait."""
+"""`Hand`: blocking client for a program or notebook."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ _Record = TypeVar("_Record")
 
 
 class Subscription(Subscriber[_Record]):
-    """The records of one topic, in order, as they come. Subscribed from its making on.
+    """Iterator over the records of one topic, in order of arrival.
 
-    ``timeout`` [s] is how long it waits for the next one before it raises NoStream; None: for ever.
+    The subscription begins when the object is created. The iterator raises NoStream if no record
+    arrives within ``timeout`` [s]; with None it waits without limit.
     """
 
     def __iter__(self) -> Iterator[_Record]:
@@ -26,9 +27,9 @@ class Subscription(Subscriber[_Record]):
         return self.next(self._timeout)
 
     def next(self, timeout: float | None) -> _Record:
-        """Return the next record. Raises NoStream when none comes within ``timeout`` s.
+        """Return the next record. Raises NoStream if none arrives within ``timeout`` s.
 
-        A warning is logged when that takes long; without a timeout, silence may be as it should.
+        With a timeout, a warning is logged after a wait of 1 s.
         """
         for milliseconds in self._waits(timeout):
             if self._socket.poll(milliseconds):
@@ -38,7 +39,7 @@ class Subscription(Subscriber[_Record]):
         raise no_stream(self._address, self._topic, timeout or 0.0)
 
     def skip(self) -> None:
-        """Drop what waits: the next record is one that is still to come."""
+        """Drop queued messages, so that the next record is a new one."""
         self._require_open()
         while self._socket.poll(0):
             self._take(self._socket.recv_multipart())
@@ -51,15 +52,27 @@ class Subscription(Subscriber[_Record]):
 
 
 class Hand(HandClient[None]):
-    """A hand by its two addresses, or by one text as ``tcp://HOST`` or ``STREAM,COMMANDS``.
+    """Client of one hand. Not thread-safe: create one object in each thread.
 
-    Not for use from several threads at once; make one in each.
+    All methods raise HandClosed after `close`.
 
-    The addresses are, unless given, those in the environment variable SOFTFINGER_ADDRESS
-    (`client.connection.default_addresses`), or else this machine's. ``client`` is the name that
-    owns the commander's lease; ``timeout`` [s] is how long a reply, or a first state, is waited
-    for. ``keys`` is the folder of this client's keys, where the daemon wants some; KeyFileError
-    when they can't be read. Once closed, everything raises HandClosed.
+    Parameters
+    ----------
+    stream, commands
+        Addresses of the daemon. ``stream`` may also contain both, as ``tcp://HOST`` or
+        ``STREAM,COMMANDS``. The default is the environment variable SOFTFINGER_ADDRESS, or else
+        this machine (`client.connection.default_addresses`).
+    client
+        Name that owns the command lease.
+    timeout
+        Time limit for a reply or a first state [s].
+    keys
+        Folder with the keys of this client, if the daemon requires keys.
+
+    Raises
+    ------
+    KeyFileError
+        If the keys can't be read.
     """
 
     _states: Subscription[HandState] | None = None
@@ -71,7 +84,7 @@ class Hand(HandClient[None]):
         self.close()
 
     def state(self, timeout: float | None = None) -> HandState:
-        """Return the next state to come, never one that has been waiting. Raises NoStream."""
+        """Wait for a new state and return it; queued states are dropped. Raises NoStream."""
         if self._states is None:
             self._states = self.stream()
         else:
@@ -79,15 +92,15 @@ class Hand(HandClient[None]):
         return self._states.next(self.timeout if timeout is None else timeout)
 
     def stream(self, timeout: float | None = None) -> Subscription[HandState]:
-        """Return states one after the other, every one that is published."""
+        """Subscribe to all published states, in order."""
         return self._subscription(STATE, timeout)
 
     def frames(self, timeout: float | None = None) -> Subscription[TactileFrame]:
-        """Tactile frames of both fingers; see `TactileFrame.finger`."""
+        """Subscribe to the tactile frames of both fingers; see `TactileFrame.finger`."""
         return self._subscription(TACTILE, timeout)
 
     def events(self, timeout: float | None = None) -> Subscription[Event]:
-        """Return the daemon's events: modes, faults, warnings."""
+        """Subscribe to the daemon's events: modes, faults, warnings."""
         return self._subscription(EVENT, timeout)
 
     def _subscription(self, topic: bytes, timeout: float | None) -> Subscription[Any]:
@@ -95,7 +108,7 @@ class Hand(HandClient[None]):
         return Subscription(self._context, self.stream_address, topic, timeout)
 
     def collect(self, seconds: float) -> list[HandState]:
-        """Return all states of the next ``seconds`` s, by the daemon's clock. Raises NoStream."""
+        """Return all states of the next ``seconds`` s of the daemon's clock. Raises NoStream."""
         with self.stream(self.timeout) as states:
             collected = [next(states)]
             end = collected[0].mono_ns + round(seconds * 1e9)
@@ -108,10 +121,16 @@ class Hand(HandClient[None]):
     def wait_for(
         self, condition: Callable[[HandState], object], timeout: float = 10.0
     ) -> HandState:
-        """Return the first state from now on for which ``condition`` holds.
+        """Return the first new state for which ``condition`` holds.
 
-        Raises NotInTime after ``timeout`` s, HandFault as soon as the hand has a fault (unless the
-        condition holds then), and NoStream when nothing comes at all.
+        Raises
+        ------
+        NotInTime
+            If the condition does not hold within ``timeout`` [s].
+        HandFault
+            If the hand has a fault in a state for which the condition does not hold.
+        NoStream
+            If no state arrives at all.
         """
         wait = Wait(condition, timeout)
         with self.stream() as states:
@@ -124,9 +143,14 @@ class Hand(HandClient[None]):
                     return state
 
     def command(self, name: str, **numbers: float | None) -> dict[str, Any]:
-        """Send one command, without numbers that are None, and return the reply.
+        """Send one command, without arguments that are None, and return the reply.
 
-        Raises Refused with the reason, and NoAnswer.
+        Raises
+        ------
+        Refused
+            If the daemon refuses the command; the message gives the reason.
+        NoAnswer
+            If no reply arrives in time.
         """
         request = self._request(name, numbers)
         return accepted(send(self.command_address, request, self.timeout, self._keys))

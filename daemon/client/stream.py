@@ -1,8 +1,7 @@
-"""A topic's messages as records: decoding, lost messages, and waiting for a state.
+"""Reading the stream: decode messages to records, count lost messages, and wait for a state.
 
-A message is data of unknown origin: a field that is missing or of another type is NaN, 0, False or
-empty here, and unknown fields are ignored, so that a program goes on with the fields it knows when
-the daemon's schema is newer.
+Messages are untrusted input. A field that is missing or has another type becomes NaN, 0, False or
+empty. Unknown fields are ignored, so that a program also works with a daemon whose schema is newer.
 """
 
 from __future__ import annotations
@@ -28,15 +27,15 @@ from softfinger.daemon.wire.schema import SCHEMA, STATE, TOPICS, HandState, fiel
 
 _Record = TypeVar("_Record")
 
-_REPEATED = 1000  # messages that are known when they are repeated
+_REPEATED = 1000  # messages that are remembered to recognise repetitions
 
 _log = logging.getLogger(__name__)
 
 
 def read(record: type[_Record], message: object) -> _Record:
-    """Return a topic's map as its record of `wire.schema`.
+    """Return the record of `wire.schema` for a topic's map.
 
-    Raises ValueError for a tactile frame that is no grid.
+    Raises ValueError for a tactile frame whose data does not fit its grid.
     """
     given = message if isinstance(message, dict) else {}
     plan = _converters(record)  # type: ignore[arg-type]  # a class is hashable
@@ -64,9 +63,9 @@ _CONVERTERS: dict[Any, Callable[[object], Any]] = {
 
 
 def to_columns(states: Iterable[Any]) -> dict[str, NDArray[Any]]:
-    """Return states as one array a field, nested ones with a dot (``left.force``), in their order.
+    """Return states as one array per field; names of nested fields contain a dot (``left.force``).
 
-    ``pandas.DataFrame(to_columns(states))`` takes it as it is. Records of another topic, too.
+    The result can be passed to ``pandas.DataFrame``. Records of other topics work too.
     """
     rows = list(states)
     names = [field.name for field in fields_of(type(rows[0]) if rows else HandState)]
@@ -74,11 +73,11 @@ def to_columns(states: Iterable[Any]) -> dict[str, NDArray[Any]]:
 
 
 class Gaps:
-    """Counts the messages of one topic that were lost.
+    """Counter of the lost messages of one topic.
 
-    By their ``number`` where they have one, else by ``seq``, of which one in ``seq_step`` is sent.
-    One that goes back is another daemon's, or the same one's started again: no loss. A repeated
-    message (``again``) is new where it was not received before, and may fill a gap.
+    Messages are identified by ``number`` if they have one, otherwise by ``seq``, of which one in
+    ``seq_step`` is sent. A number that decreases is not a loss: the daemon was restarted, or there
+    is a second one. A repeated message (``again``) that was not received before fills a gap.
     """
 
     def __init__(self) -> None:
@@ -87,7 +86,7 @@ class Gaps:
         self._received: deque[int] = deque(maxlen=_REPEATED)
 
     def take(self, message: dict[str, Any]) -> bool:
-        """Count one more message. False: it was received before."""
+        """Count one more message; return False if it was received before."""
         place = message.get("number")
         if not isinstance(place, int):
             seq, step = message.get("seq"), message.get("seq_step", 1)
@@ -105,7 +104,7 @@ class Gaps:
             return True
         if again is not None:
             if last is not None and place <= last:
-                self._received.clear()  # another daemon's
+                self._received.clear()  # these were from another daemon
             self._received.append(place)
         if last is not None and place > last:
             self.lost += place - last - 1
@@ -114,16 +113,16 @@ class Gaps:
 
 
 def no_stream(address: str, topic: bytes, timeout: float) -> NoStream:
-    """Return the exception when nothing has come at all."""
+    """Return the exception for a topic without any message."""
     return NoStream(
         f"no {topic.decode()} from {address} within {timeout:g} s; is softfinger running?"
     )
 
 
 class Subscriber(Generic[_Record]):
-    """A topic's socket and records: what `Subscription` and `AsyncSubscription` have in common.
+    """Base of `Subscription` and `AsyncSubscription`, with the socket and records of a topic.
 
-    ``unreadable`` counts the messages that could not be read, and were left out.
+    ``unreadable`` counts the messages that were skipped because they could not be read.
     """
 
     def __init__(
@@ -140,7 +139,7 @@ class Subscriber(Generic[_Record]):
 
     @property
     def lost(self) -> int:
-        """Messages that never arrived, by the gaps in their ``seq``."""
+        """Number of lost messages, from the gaps in their sequence numbers."""
         return self._gaps.lost
 
     def close(self) -> None:
@@ -151,7 +150,7 @@ class Subscriber(Generic[_Record]):
             raise HandClosed("this subscription is closed: make another")
 
     def _take(self, frames: list[bytes]) -> _Record | None:
-        """Return the record of one message, None when it can't be read or was received before."""
+        """Return the record of one message, or None if it is unreadable or a repetition."""
         try:
             _, message = unpack(frames)
             record = read(self._record, message)
@@ -171,9 +170,9 @@ class Subscriber(Generic[_Record]):
         return record
 
     def _waits(self, timeout: float | None) -> Iterator[int | None]:
-        """Yield how long to wait for the next message [ms], until ``timeout`` s are over.
+        """Yield durations [ms] to wait for the next message, until ``timeout`` s have passed.
 
-        Log what is waited for when that takes long; without a timeout silence may be as it should.
+        With a timeout, log a warning after a wait of 1 s.
         """
         if timeout is None:
             while True:
@@ -193,7 +192,7 @@ class Subscriber(Generic[_Record]):
 
 
 class Wait:
-    """A wait of ``timeout`` s for a state for which ``condition`` holds."""
+    """Wait of at most ``timeout`` s for a state for which ``condition`` holds."""
 
     def __init__(self, condition: Callable[[HandState], object], timeout: float) -> None:
         self._condition = condition
@@ -202,14 +201,14 @@ class Wait:
         self._last: HandState | None = None
 
     def left(self) -> float:
-        """Return how long the next state may take [s]. Raises NotInTime after the end."""
+        """Return the remaining time [s]. Raises NotInTime if it is over and states arrived."""
         left = self._end - time.monotonic()
         if left <= 0.0 and self._last is not None:
             raise self.over("")
         return max(left, 0.0)
 
     def ends_with(self, state: HandState) -> bool:
-        """Return whether the condition holds. Raises HandFault for a hand in fault."""
+        """Return True if the condition holds. Raises HandFault for a hand in fault."""
         self._last = state
         if self._condition(state):
             return True
@@ -218,7 +217,7 @@ class Wait:
         return False
 
     def over(self, address: str) -> NotInTime | NoStream:
-        """Return the exception when no further state came."""
+        """Return the exception for a wait that has timed out."""
         if self._last is None:
             return no_stream(address, STATE, self._timeout)
         return NotInTime(

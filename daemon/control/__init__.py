@@ -1,4 +1,4 @@
-"""Control: the hand's mode and the joints' goals, by grip, setpoints, slip and tasks.
+"""Control: mode of the hand, grip laws, setpoints, slip monitor and tasks.
 
-No socket, no servo protocol.
+This package uses neither sockets nor the servo protocol.
 """

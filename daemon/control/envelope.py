@@ -1,7 +1,7 @@
-"""Map of the objects that the hand can hold, over shape, size, friction and mass, by simulation.
+"""Simulated map of the objects that the hand can hold, by shape, size, friction and mass.
 
-`softfinger envelope --keep` makes it, `grasp` asks it for a warning. It holds for the hand it was
-made for; the packaged one is the built-in hand's, and tells of others nothing.
+`softfinger envelope --keep` creates it, and `grasp` uses it to warn. A map is valid only for the
+hand that it was simulated for; the packaged map is valid for the built-in hand.
 """
 
 from __future__ import annotations
@@ -29,21 +29,21 @@ _SECTIONS = ("hand", "tip", "material")
 
 
 def identity(settings: Settings) -> dict[str, Any]:
-    """Return the settings that a map belongs to."""
+    """Return the settings that identify the hand of a map."""
     told = {name: getattr(settings, name).model_dump(mode="json") for name in _SECTIONS}
     return told | {"control": {"law": settings.control.law}}
 
 
 def raised(settings: Settings, force: float) -> float:
-    """Return the force [N] to which a grip of ``force`` [N] may be raised."""
+    """Return the force [N] up to which the slip monitor may raise a grip of ``force`` [N]."""
     most = GRIP_FRACTION * settings.safety.force_max
     return max(min(force + settings.control.grip_raise_max, most), force)
 
 
 def _difference(found: dict[str, Any], expected: dict[str, Any]) -> str:
-    """The first key of both sections that is not the same, with both values.
+    """Return the first setting that differs, with both values, or an empty text.
 
-    A setting that came after the map was made had its default.
+    A setting that an older map does not contain counts as its default.
     """
     defaults = identity(Settings())
     for name, section in expected.items():
@@ -54,12 +54,15 @@ def _difference(found: dict[str, Any], expected: dict[str, Any]) -> str:
 
 
 class Envelope:
-    """A map of one hand, asked for the object that the settings name."""
+    """Map of one hand, evaluated for the object of the settings."""
 
     def __init__(self, settings: Settings) -> None:
-        """Read the settings' own map, or the packaged one if it is this hand's.
+        """Read the map that the settings name, or the packaged one if it fits this hand.
 
-        Raises SettingsError for a map that can't be read, or is another hand's.
+        Raises
+        ------
+        SettingsError
+            If the map can't be read or belongs to another hand.
         """
         own, control = settings.control.envelope, settings.control
         try:
@@ -69,7 +72,7 @@ class Envelope:
             width, count = settings.object.width, len(self._masses)
             column = min(range(len(sizes)), key=lambda k: abs(sizes[k] - width))
             row = max(sum(each <= control.tip_friction + 1e-9 for each in frictions) - 1, 0) * count
-            # Over the masses: what became of a block, of a disc.
+            # For each mass, the outcomes of a block and of a disc.
             rows = zip(*(found[shape][row : row + count] for shape in found["shapes"]), strict=True)
             self._outcomes = ["".join(cells[column] for cells in shapes) for shapes in rows]
             self._raised = found["raised"]
@@ -83,10 +86,11 @@ class Envelope:
         self._settings = settings
 
     def warning(self, force: float) -> str:
-        """Return why a grasp of so many N may fail with the settings' object; empty if not.
+        """Return a warning if a grasp of ``force`` [N] may fail, or an empty text.
 
-        Taken are the nearest size, friction that is no more than `control.tip_friction`, and the
-        mass whose weight is `control.object_load`, scaled by what the grip may be raised to.
+        The lookup uses the nearest object size, the largest friction up to `control.tip_friction`,
+        and the mass whose weight is `control.object_load`. The mass is scaled by the ratio of the
+        force limit of the map to the force limit of this grip.
         """
         if not self._known:
             return ""

@@ -1,4 +1,4 @@
-"""The fingers as the control's states use them: contacts in, goals of the joints out."""
+"""Fingers of the control state machine: their contacts, and the goals of their joints."""
 
 from __future__ import annotations
 
@@ -9,25 +9,25 @@ from softfinger.daemon.perception.grasp import GraspState
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS, Goal, State
 
-# rad from the present angle to the goal of a joint that is to give a torque: far enough that the
-# servo's current bound decides (`hand_estimator` expects 0.25 rad), and less than
+# rad from the present angle to the goal angle of a torque-controlled joint. It is large enough that
+# the current limit determines the torque (`hand_estimator` expects 0.25 rad). It is smaller than
 # `safety.goal_reach`, so that the goal may change sides at once.
 _GOAL_OFFSET = 0.35
-# rad between the tilt that a turn may lead to and the tilt that is a fault.
+# rad between the largest tilt that a turn may cause and the tilt that is a fault.
 _TILT_RESERVE = 0.1
 
 
 def off_range(angle: float, low: float, high: float) -> str:
-    """Return what was found and expected of an angle [rad], in degrees and radians."""
+    """Return the found and expected part of a message for an angle [rad] outside its range."""
     found, least, most = (f"{math.degrees(each):.1f}°" for each in (angle, low, high))
     return f"found {found} ({angle:.4g} rad), expected {least} to {most} ({low:.2f} to {high:.2f})"
 
 
 class Fingers:
-    """The scene's fingers: their contacts, and setpoints that their joints follow."""
+    """The fingers of the scene, with their contacts and the setpoints of their joints."""
 
     def __init__(self, settings: Settings, state: State, grasp: GraspState) -> None:
-        """``state`` and ``grasp`` are read at each tick, and never written."""
+        """Create the fingers; ``state`` and ``grasp`` are read in each tick and never written."""
         self.indices = [FINGERS.index(finger) for finger in sorted(settings.scene.fingers)]
         self.reading, self.pose, self.grasp = state.reading, state.object, grasp
         self._settings, self._contacts = settings, state.contacts
@@ -38,7 +38,7 @@ class Fingers:
 
     @property
     def in_contact(self) -> bool:
-        """True if all fingers touch something."""
+        """True if all fingers are in contact."""
         return all(self._contacts[index].contact for index in self.indices)
 
     @property
@@ -49,8 +49,9 @@ class Fingers:
     def turning_range(self) -> tuple[float, float]:
         """Return the lowest and the highest angle [rad] to which this grip can turn the object.
 
-        While the object turns by φ, each joint leans by φ over the sum of its turns, and each tip's
-        tilt changes by both. The range ends at limits of joint angles and tilts.
+        While the object turns by φ, each joint moves by φ divided by the sum of both rotation
+        Jacobians, and the tilt of each tip changes by the sum of both angles. The joint and tilt
+        limits bound the range.
         """
         settings, present = self._settings, self.pose.angle
         lean = 1.0 / max(self.grasp.jacobian_rotation[0] + self.grasp.jacobian_rotation[1], 0.1)
@@ -67,7 +68,7 @@ class Fingers:
         return present + min(low, 0.0), present + max(high, 0.0)
 
     def why_not_turn(self, angle: float) -> str:
-        """Return why the held object can't be turned to ``angle`` [rad] now; empty where it can."""
+        """Return the reason why the object can't turn to ``angle`` [rad], or an empty text."""
         if not self.pose.valid:
             return "the object's angle is not known"
         low, high = self.turning_range()
@@ -76,7 +77,7 @@ class Fingers:
     # Setpoints
 
     def hold_here(self) -> None:
-        """Set all setpoints to the joints' present angles, at rest."""
+        """Set all setpoints to the present joint angles, at rest."""
         for index, q in enumerate(self.reading.q):
             self._joints[index].reset(q)
 
@@ -85,9 +86,10 @@ class Fingers:
         self._joints[index].target = q
 
     def close(self, touching: set[int]) -> set[int]:
-        """Close the fingers that don't touch, and return those that do.
+        """Close the fingers without contact, and return the fingers in contact.
 
-        A finger stops when it is not among ``touching``, the result of the last tick.
+        A finger whose contact is new, so that it is not in ``touching``, stops at its present
+        angle. ``touching`` is the result of the last tick.
         """
         law, now = self._settings.control, set[int]()
         for index in self.indices:
@@ -101,25 +103,25 @@ class Fingers:
         return now
 
     def ramp(self, rate: float) -> bool:
-        """Move the setpoints on, at most at ``rate`` [rad/s]; True if all are at their targets."""
+        """Advance the setpoints at ``rate`` [rad/s] or less; return True if all have arrived."""
         arrived = [joint.step(rate) for joint in self._joints]
         return all(arrived)
 
     @property
     def distance(self) -> float:
-        """Largest distance of a joint from its setpoint's target [rad]."""
+        """Largest distance of a joint from the target of its setpoint [rad]."""
         return max(abs(self.reading.q[i] - self._joints[i].target) for i in self.indices)
 
     # Goals
 
     def rest(self, goal: Goal, current: float) -> None:
-        """Let the joints follow their setpoints with at most ``current`` [A]."""
+        """Set goals that make the joints follow their setpoints with at most ``current`` [A]."""
         for index in self.indices:
             goal.q[index] = self._joints[index].value
             goal.current[index] = current
 
     def pull(self, goal: Goal, torques: tuple[float, float]) -> None:
-        """Let the joints give ``torques`` [N·m], positive closing."""
+        """Set goals that make the joints apply ``torques`` [N·m], positive closing."""
         for index in self.indices:
             current = torques[index] / self._settings.control.torque_constant
             goal.q[index] = self.reading.q[index] + math.copysign(_GOAL_OFFSET, current)

@@ -1,23 +1,23 @@
-"""The grip laws: forces and the object's angle to joint torques, once both tips touch.
+"""Grip laws: joint torques from the tip forces and the object's angle, once both tips touch.
 
 `control.grip_kernels` computes them. Two fingers have one motion that changes the grip (both close)
 and one that moves the object (q1 + δ, q2 − δ), so every law has two parts:
 
-1. *grip*: a bias torque, lever times force wanted, with what the joints' friction takes on the way;
-   a proportional and an integral part on the force felt; damping to the stiffness of the tips;
-2. *steering*, the 'serial two-phased' law of the soft-fingertip literature: the object's angle
-   error is integrated and fed antisymmetrically to the joints' goal, joint PD follows that goal.
-   The object turns by φ̇ = turn1 q̇1 − turn2 q̇2, against the fingers' own sense.
+1. *grip*: a feed-forward torque (moment arm times target force, plus joint friction), a
+   proportional and an integral term on the force error, and damping matched to the tip stiffness;
+2. *steering*, the 'serial two-phased' law of the soft-fingertip literature: the error of the
+   object's angle is integrated and added with opposite signs to the joint goals, which a PD
+   controller follows. The object turns by φ̇ = turn1 q̇1 − turn2 q̇2, opposite to the fingers.
 
-With ``control.law = "energy"`` the levers are the gradient of the tables' energy along the rolling
-increments, in which the tips' moments and shear forces are counted, too.
+With ``control.law = "energy"`` the moment arms are the gradient of the contact tables' energy along
+the rolling increments. They include the moments and shear forces of the tips.
 
-``upright`` doesn't use the object's angle until it is steered by a command. It gives both joints
-one torque, with damping, as in the literature on blind grasping, and makes use of the tips' elastic
-energy: it adds a spring between the fingers that puts the energy's minimum where the object stands
-upright, whatever shear is stuck in the tips (`hand.upright`), and shakes the fingers against each
-other until nothing but the minimum holds the object. Then it keeps the fingers' lean. Steered, it
-takes the force's arm about the pivot as its lever.
+With ``"upright"`` the law ignores the object's angle until a command steers it. Both joints get the
+same torque, with damping, as in the literature on blind grasping. A virtual spring between the
+fingers places the minimum of the tips' elastic energy where the object stands upright, for any
+shear that is stuck in the tips (`hand.upright`). A dither of the fingers against each other
+overcomes joint friction until the object rests in that minimum. Then the law holds the
+antisymmetric joint angle. Once steered, it uses the arm of the force about the pivot as moment arm.
 """
 
 from __future__ import annotations
@@ -34,24 +34,24 @@ from softfinger.daemon.types import ObjectPose, Reading
 
 
 class Grip:
-    """Force control from the tactile estimate, and steering by the antisymmetric joint motion."""
+    """Control the force from the tactile estimate; steer by antisymmetric joint motion."""
 
     def __init__(self, settings: Settings, fingers: list[int], grasp: GraspState) -> None:
-        """``fingers`` take part, left first; ``grasp`` is read at each tick."""
+        """Create the law for the given ``fingers``, left first; ``grasp`` is read in each tick."""
         control = settings.control
         dt = 1.0 / settings.loop.rate
         self._control = control
         self._alone = None if len(fingers) == 2 else fingers[0]
         self._grasp = grasp
         self._state = state = GripState()
-        self.force = Setpoint(dt, control.smooth_time, state.force)  # mean of the tips [N]
+        self.force = Setpoint(dt, control.smooth_time, state.force)  # mean of both tips [N]
         self.angle = Setpoint(dt, control.smooth_time, state.angle)  # of the object [rad]
         self.slip = state.slip
-        self.commanded = 0.0  # force of the command [N]
-        self.most = math.inf  # that it is eased to, whatever is commanded [N]
-        self.target = 0.0  # target force, more where the tips would slip [N]
-        self.slipped = False  # the object has turned in the grip, at this tick
-        self.target_angle = math.nan  # target of the object's angle [rad]; NaN: it is not steered
+        self.commanded = 0.0  # commanded force [N]
+        self.most = math.inf  # upper bound of the commanded force, set by `ease` [N]
+        self.target = 0.0  # commanded force, or more to prevent slip [N]
+        self.slipped = False  # the object has turned in the grip in this tick
+        self.target_angle = math.nan  # of the object [rad], NaN unless it is steered
         set_law(state.slip.law, settings)
         law = state.law
         law.dt = dt
@@ -76,19 +76,19 @@ class Grip:
 
     @property
     def upright(self) -> bool:
-        """True if a grip takes no account of the object's angle."""
+        """True if the law grips without the object's angle."""
         return self._state.law.upright
 
     @property
     def shaking(self) -> bool:
-        """True while the fingers are still to bring the object upright."""
+        """True while the dither that brings the object upright is running or due."""
         state = self._state
         awaited = state.law.upright and self._alone is None and not state.steering
         return awaited and state.dither_elapsed < state.law.dither_time
 
     @property
     def turning_on(self) -> float:
-        """The angle at which turning could stop, over the present one; 0 while it goes upright."""
+        """Ratio of the earliest stopping angle to the present angle; 0 unless |angle| grows."""
         angle, speed = self.angle.value, self.angle.speed
         if speed * angle <= 0.0:
             return 0.0
@@ -96,17 +96,17 @@ class Grip:
 
     @property
     def turning(self) -> bool:
-        """True while the setpoint of the object's angle is on its way."""
+        """True while the setpoint of the object's angle is moving to its target."""
         return self._state.steering and self.angle.value != self.target_angle
 
     def start(self, felt: float, force: float) -> None:
-        """Take over from the approach with ``felt`` N on the tips, and go to ``force`` [N]."""
+        """Take over from the approach at a measured force ``felt`` and go to ``force`` [N]."""
         kernels.start(self._state.array, self._grasp.array, self.force.windows, felt)
         self.target_angle = math.nan
         self.retarget(force)
 
     def retarget(self, force: float) -> None:
-        """Go to another grip force [N]; what a firmer one needed more is less of a weaker one."""
+        """Go to another grip force [N]; a lower one scales the force increase down with it."""
         force = min(force, self.most)
         if force < self.commanded:
             self.slip.needed *= force / self.commanded
@@ -118,42 +118,42 @@ class Grip:
         self._state.force_rate = change / self._control.force_time
 
     def ease(self, most: float, seconds: float) -> None:
-        """Press with ``most`` [N] at most from now on, come to within ``seconds``."""
+        """Limit the force to ``most`` [N] from now on, and reach it within ``seconds``."""
         self.most = most
         self.retarget(most)
         self._state.force_rate = abs(self.force.value - most) / seconds
 
     def load_needs(self) -> float:
-        """Return the force [N] that the load needs with its margin, what may be hidden included."""
+        """Return the force [N] for the load, with the slip margin and the hidden load."""
         law, grasp = self.slip.law, self._grasp
         load = self.slip.guarded
-        if not law.has_shear and law.object_load == 0.0:  # nothing says that there is none
+        if not law.has_shear and law.object_load == 0.0:  # friction may hide a load of this size
             load = max(load, law.joint_friction / max(grasp.load_arm, 0.5 * law.width))
         spare = law.friction * (1.0 - law.margin) - grasp.shear
         return max(load / max(spare, 0.3 * law.friction), self.slip.needed)
 
     def steer(self, present: float, angle: float) -> None:
-        """Turn the object from its ``present`` angle to ``angle`` [rad], and keep it there."""
+        """Turn the object from its ``present`` angle to ``angle`` [rad] and hold it there."""
         if math.isnan(self.target_angle):
             self.angle.reset(present)
         self.target_angle = self.angle.target = angle
         self._state.steering = True
 
     def set_joint_stiffness(self, joint_stiffness: float) -> None:
-        """Keep the joints to their lean with so many N·m/rad; torques go on as they are."""
+        """Set the antisymmetric joint stiffness [N·m/rad] without a step in the torques."""
         state, (q1, q2) = self._state, self._grasp.q
         lean = 0.5 * (q1 - q2)
         state.offset = lean + (state.offset - lean) * state.joint_stiffness / joint_stiffness
         state.joint_stiffness = joint_stiffness
 
     def begin_holding(self) -> None:
-        """Mark the grip as settled: from now on loads from outside show."""
+        """Mark the grip as settled: from now on, external loads can be detected."""
         kernels.begin_holding(self._state.array, self._grasp.array)
 
     def torques(self, reading: Reading, pose: ObjectPose, holding: bool) -> tuple[float, float]:
-        """Return joint torques [N·m], positive closing; a finger that takes no part gets 0.
+        """Return joint torques [N·m], positive closing, 0 for a finger that does not take part.
 
-        ``holding``: nothing but loads moves the joints.
+        Set ``holding`` if the grip is settled, so that only loads move the joints.
         """
         if self._alone is not None:
             return self._torque_alone(reading, False)
@@ -170,10 +170,10 @@ class Grip:
         return torque1, torque2
 
     def hold_goal(self, reading: Reading) -> tuple[float, float]:
-        """Return joint torques [N·m] while frames are late: the force stays, turning ends.
+        """Return joint torques [N·m] while frames are late: hold the force, end a turn.
 
-        Joints are read all the same. Torques that stayed as they are would turn the object on, to
-        the end of what damps and steers it.
+        The joints are still read. Constant torques would keep the object turning, without damping
+        or steering.
         """
         if self._alone is not None:
             return self._torque_alone(reading, True)

@@ -1,7 +1,7 @@
-"""The grip laws' state and kernels; `control.grip` explains the laws.
+"""State and kernels of the grip laws; `control.grip` explains the laws.
 
-Kernels that Python calls take the laws' state, the grasp of this tick, and the windows of both
-setpoints. Pairs are (left, right). SI units.
+The kernels called from Python take the state of the laws, the grasp of this tick, and the windows
+of both setpoints. Pairs are (left, right). SI units.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from softfinger.kinematics.hand.upright import upright_spring
 
 FloatArray = NDArray[np.float64]
 
-_SURE = 2.0  # standard deviations of the torque constants that a grip may need
+_SURE = 2.0  # standard deviations of the torque constant, allowed in the force limit
 _ARM_MIN = 0.1  # of the finger's length
-_INTEGRAL_RATIO = 0.3  # the integral's bound, as a share of the force wanted
-_DISTRIBUTE_BANDWIDTH = 2.0  # Hz of the integral of the tips' difference
-_DISTRIBUTE_ANGLE = 3e-3  # rad that the object may turn by that
-_QUIET = 3.0  # standard deviations of the angle that the joints at rest don't follow
-_LONGEST_PAUSE = 0.05  # s of the dither's time that passes at once after ticks without
-_STIFFNESS_MIN = 100.0  # N/m, below which a contact is too light to scale by
-_ROTATION_MIN = 0.1  # of the object over the antisymmetric angle, likewise
+_INTEGRAL_RATIO = 0.3  # limit of the integral term, as a fraction of the force target
+_DISTRIBUTE_BANDWIDTH = 2.0  # Hz, integral control of the force difference of the tips
+_DISTRIBUTE_ANGLE = 3e-3  # rad that this may turn the object
+_QUIET = 3.0  # standard deviations of the angle, dead band of the joints at rest
+_LONGEST_PAUSE = 0.05  # s, largest time step of the dither, after a pause between ticks
+_STIFFNESS_MIN = 100.0  # N/m, lower bound, since the gains are divided by it
+_ROTATION_MIN = 0.1  # lower bound of the object's rotation per antisymmetric angle
 
 
 class GripLaw(Record):
@@ -40,28 +40,28 @@ class GripLaw(Record):
     force_bandwidth: float  # [rad/s]
     rotate_bandwidth: float  # [rad/s]
     rotate_speed: float  # [rad/s]
-    damping: float  # 2 ζ √J, times √stiffness the damping [N·m·s/rad]
+    damping: float  # 2 ζ √J; times √stiffness it is the damping [N·m·s/rad]
     friction: float  # of a joint [N·m]
-    driving: float  # motor's torque over the tip's of a joint that closes
-    friction_speed: float  # from which on all of it is given [rad/s]
+    driving: float  # ratio of motor torque to tip torque of a closing joint
+    friction_speed: float  # from which friction is fully compensated [rad/s]
     torque_max: float  # [N·m]
-    torque_error: float  # relative, of the joints' torque constants
-    decay: float  # what is left of a turning a tick later without frames
-    upright: bool  # the fingers' shaking brings the object upright, its angle is not looked at
-    half_separation: float  # of the hand, in m as its other lengths
-    length: float
-    offset: float
-    radius: float
+    torque_error: float  # relative error of the torque constants
+    decay: float  # factor per tick of the turning rate without frames
+    upright: bool  # the object is brought upright by dither, without its measured angle
+    half_separation: float  # half the distance of the pivots [m]
+    length: float  # of a finger [m]
+    offset: float  # of a finger [m]
+    radius: float  # of a tip [m]
     dither_torque: float  # [N·m]
     dither_rate: float  # [rad/s]
-    dither_time: float  # in which it fades [s]
+    dither_time: float  # until the dither has faded [s]
 
 
 class GripState(Record):
-    """Commanded values and memory of the grip laws."""
+    """Commanded values and internal state of the grip laws."""
 
     law: GripLaw
-    force: SetpointState  # mean of the tips [N]
+    force: SetpointState  # mean of both tips [N]
     angle: SetpointState  # of the object [rad]
     slip: SlipState
     commanded: float  # force [N]
@@ -69,14 +69,14 @@ class GripState(Record):
     joint_stiffness: float  # [N·m/rad]
     steering: bool  # the object's angle has a target
     integral: float  # [N]
-    grip_force: float  # that the joints give, both laws' parts together [N]
-    offset_rate: float  # speed of the offset that turns the object [rad/s]
+    grip_force: float  # feed-forward and feedback together [N]
+    offset_rate: float  # rate of the offset that turns the object [rad/s]
     offset: float  # goal of (q1 − q2)/2 [rad]
-    dither_elapsed: float  # since the dither began [s]
-    seen: float  # when the joints were last read while both pushed alike [s]
-    shift: float  # of the offset, to share the force out between the tips [rad]
-    closing_friction: float  # share of the joints' friction that is given for closing
-    torque: Pair  # last of both joints [N·m]
+    dither_elapsed: float  # time since the dither began [s]
+    seen: float  # time of the last tick with equal torques or start [s]
+    shift: float  # part of the offset that balances the tip forces [rad]
+    closing_friction: float  # fraction of the joint friction compensated for closing
+    torque: Pair  # last torques of both joints [N·m]
 
 
 @kernel
@@ -86,7 +86,7 @@ def start(
     force_windows: FloatArray,
     felt: float,
 ) -> None:
-    """Take over from the approach with ``felt`` N on the tips."""
+    """Take over from the approach at a measured force ``felt`` [N]."""
     g = grips[0]
     q = grasps[0].q
     slip_monitor.reset(g.slip)
@@ -99,7 +99,7 @@ def start(
 
 @kernel
 def begin_holding(grips: Records[GripState], grasps: Records[GraspState]) -> None:
-    """Mark the grip as settled: from now on loads show."""
+    """Mark the grip as settled: from now on, loads can be detected."""
     slip_monitor.begin(grips[0].slip, grasps[0])
 
 
@@ -113,10 +113,10 @@ def grip_torques(
     dq: tuple[float, float],
     holding: bool,
 ) -> tuple[float, float, float, bool]:
-    """Return torques of both joints [N·m], the target force [N], and whether the object slipped.
+    """Return the torques of both joints [N·m], the target force [N], and True if it slipped.
 
-    ``angle`` is the object's angle [rad], NaN where it is not known. ``dq``: joint velocities
-    [rad/s]. ``holding``: nothing but loads moves the joints.
+    ``angle`` is the object's angle [rad], NaN if unknown, and ``dq`` are the joint velocities
+    [rad/s]. ``holding`` is True in a settled grip, in which only loads move the joints.
     """
     g = grips[0]
     grasp = grasps[0]
@@ -155,7 +155,10 @@ def grip_torques(
 def hold_goal(
     grips: Records[GripState], grasps: Records[GraspState], dq: tuple[float, float]
 ) -> tuple[float, float]:
-    """Replace :func:`grip_torques` while frames are late: the force stays, turning ends."""
+    """Return joint torques while frames are late: hold the force, end a turn.
+
+    It is called instead of :func:`grip_torques`.
+    """
     g = grips[0]
     g.offset_rate *= g.law.decay
     g.offset += g.offset_rate * g.law.dt
@@ -171,9 +174,9 @@ def single_torque(
     dq: float,
     frames_late: bool,
 ) -> float:
-    """Return torque [N·m] of one ``finger`` on an object that stands by itself.
+    """Return the torque [N·m] of one ``finger`` on an object with its own support.
 
-    ``frames_late``: the force stays.
+    With ``frames_late`` the force stays constant.
     """
     g = grips[0]
     grasp = grasps[0]
@@ -182,7 +185,7 @@ def single_torque(
     close = 0.0
     if not frames_late:
         target = setpoint.advance(g.force, force_windows, g.force_rate)
-        # The object stands by itself, so that the tip's friction on it may take some of the torque.
+        # The object can't yield, so friction of the tip on it may take some of the torque.
         q, law = grasp.q[finger], g.law
         reach = law.length * math.sin(q) + law.offset * math.cos(q) + law.radius
         limit = _force_limit(g, g.slip.law.friction * g.force.target * max(reach, 0.0), arm)
@@ -203,17 +206,17 @@ def _mean_stiffness(grasp: GraspState) -> float:
 
 @inner_kernel
 def _turning(grasp: GraspState) -> float:
-    """Return ∂φ of the object by the antisymmetric joint angle."""
+    """Return the derivative of the object's angle by the antisymmetric joint angle."""
     both: float = grasp.jacobian_rotation[0] + grasp.jacobian_rotation[1]
     return max(both, _ROTATION_MIN)
 
 
 @inner_kernel
 def _correction(g: GripState, target: float, felt: float, bound: float) -> float:
-    """Return the force [N] that feedback adds to the feed-forward; ``bound``: of its integral."""
+    """Return the feedback part of the force [N]; ``bound`` limits its integral term."""
     law = g.law
     error = target - felt
-    # Beyond what the servos may give, more error must not be stored.
+    # Anti-windup: do not integrate while a torque is at its limit.
     full = abs(g.torque[0]) >= law.torque_max or abs(g.torque[1]) >= law.torque_max
     if not full or error < 0.0:
         integral = g.integral + law.force_bandwidth * error * law.dt
@@ -223,10 +226,10 @@ def _correction(g: GripState, target: float, felt: float, bound: float) -> float
 
 @inner_kernel
 def _force_limit(g: GripState, load: float, arm: float) -> float:
-    """Upper limit [N] of the grip force for the target force, independent of the sensors.
+    """Return an upper limit of the grip force [N] that does not depend on the sensors.
 
-    Beside what the torque constants may be off, friction and the torque [N·m] of the ``load`` that
-    is believed may take some; ``arm`` [m]: the force's lever.
+    It is the target force, increased for the error of the torque constants, for joint friction and
+    for the torque [N·m] of the detected ``load``. ``arm`` is the moment arm of the force [m].
     """
     law = g.law
     force: float = g.force.target * (1.0 + _SURE * law.torque_error)
@@ -235,13 +238,13 @@ def _force_limit(g: GripState, load: float, arm: float) -> float:
 
 @inner_kernel
 def _steer(g: GripState, windows: FloatArray, grasp: GraspState, angle: float) -> float:
-    """Move the antisymmetric goal; returns its rate [rad/s]."""
+    """Move the antisymmetric goal, and return its rate [rad/s]."""
     target = setpoint.advance(g.angle, windows, g.law.rotate_speed)
     rotation = _turning(grasp)
     offset_rate = g.angle.speed / rotation
     if not math.isnan(angle):
         error = target - angle
-        if setpoint.arrived(g.angle):  # what is no more than noise, joints at rest shall not follow
+        if setpoint.arrived(g.angle):  # dead band, so that joints at rest do not follow noise
             noise = _QUIET * grasp.angle_std
             error -= min(max(error, -noise), noise)
         g.offset += g.law.rotate_bandwidth * error / rotation * g.law.dt
@@ -251,10 +254,10 @@ def _steer(g: GripState, windows: FloatArray, grasp: GraspState, angle: float) -
 
 @inner_kernel
 def _distribute(g: GripState, grasp: GraspState) -> None:
-    """Balance the tips' forces, which the object's friction on the table keeps apart.
+    """Balance the tip forces, which friction of the object on its support may keep unequal.
 
-    The force law holds their mean; friction may keep the object where one tip is pressed more.
-    Both fingers then shift sideways by a little, less than the object's angle is held to.
+    The force law controls only their mean. To balance them, both fingers shift sideways by a small
+    angle, which turns the object by _DISTRIBUTE_ANGLE at most.
     """
     off = (
         0.5
@@ -270,7 +273,7 @@ def _distribute(g: GripState, grasp: GraspState) -> None:
 
 @inner_kernel
 def _closing(grasp: GraspState, rate: float, offset_rate: float) -> float:
-    """Closing [rad/s] for a ``rate`` [N/s] of the force, what turning takes counted in."""
+    """Return the closing rate [rad/s] for a force ``rate`` [N/s] during a turn."""
     arm = grasp.moment_arm
     rotation = grasp.jacobian_rotation
     d_rate = 2.0 * rate / _mean_stiffness(grasp)
@@ -283,7 +286,7 @@ def _closing(grasp: GraspState, rate: float, offset_rate: float) -> float:
 def _torques(
     g: GripState, grasp: GraspState, close: float, offset_rate: float, dq: tuple[float, float]
 ) -> tuple[float, float]:
-    """Torques of two fingers at commanded rates [rad/s] of closing and of the offset."""
+    """Return the torques of two fingers at commanded rates of closing and offset [rad/s]."""
     law = g.law
     arm = mean(grasp.moment_arm)
     damping = law.damping * math.sqrt(_mean_stiffness(grasp) * arm * arm)
@@ -304,10 +307,10 @@ def _torques(
 def _equal_torques(
     g: GripState, grasp: GraspState, target: float, dq: tuple[float, float]
 ) -> tuple[float, float]:
-    """Torques of two fingers of the same force, whatever the object's angle.
+    """Return the torques of two fingers that push with equal force at any angle of the object.
 
-    With the spring of `hand.upright` between the fingers, and a dither that fades and so leaves the
-    joints' friction without a bias. Then the joints keep their antisymmetric angle.
+    While the dither lasts, the spring of `hand.upright` acts between the fingers. The dither fades,
+    so that joint friction leaves no bias. After that, the joints hold their antisymmetric angle.
     """
     law, q = g.law, grasp.q
     close = _closing(grasp, g.force.speed, 0.0)
@@ -326,15 +329,15 @@ def _equal_torques(
         spring = min(
             upright_spring(closed, depth, target, grasp.tip_turning, lengths), g.joint_stiffness
         )
-        # What then holds the fingers begins with the torque that the spring has come to.
+        # The hold that follows must start with the present torque of the spring.
         g.offset = antisymmetric * (1.0 - spring / g.joint_stiffness)
-        # Within its first period it grows, from then on it fades.
+        # The amplitude grows during the first period and fades throughout.
         phase = law.dither_rate * g.dither_elapsed
         size = min(phase / (2.0 * math.pi), 1.0) * (1.0 - g.dither_elapsed / law.dither_time)
         steering = size * law.dither_torque * math.sin(phase) - spring * antisymmetric
         if g.dither_elapsed > 0.0 or setpoint.arrived(g.force):
-            # By the clock and not by ticks: where these come late the dither must not become slow,
-            # for the fingers on the tips swing by themselves at one to two hertz.
+            # Use the clock instead of counting ticks: late ticks must not slow the dither down to
+            # the resonance of the fingers on the tips, at 1 to 2 Hz.
             g.dither_elapsed += min(max(grasp.t - g.seen, 0.0), _LONGEST_PAUSE)
     else:
         steering += g.joint_stiffness * (g.offset - antisymmetric)
@@ -346,9 +349,9 @@ def _equal_torques(
 
 @inner_kernel
 def _geared(law: GripLaw, torque: float, rate: float) -> float:
-    """Return the motor's torque for a tip's [N·m] at the commanded ``rate`` [rad/s] of a joint.
+    """Return the motor torque for a tip torque [N·m] at the commanded joint ``rate`` [rad/s].
 
-    One that rests is given what it needs to close.
+    A joint at rest gets the torque that it needs to close.
     """
     opening = min(max(-rate / law.friction_speed, 0.0), 1.0)
     return torque * (law.driving - opening * (law.driving - 1.0 / law.driving))
@@ -356,5 +359,5 @@ def _geared(law: GripLaw, torque: float, rate: float) -> float:
 
 @inner_kernel
 def _friction(law: GripLaw, rate: float) -> float:
-    """Return a joint's friction [N·m] at the commanded ``rate`` [rad/s]."""
+    """Return the friction of a joint [N·m] at the commanded ``rate`` [rad/s]."""
     return law.friction * min(max(rate / law.friction_speed, -1.0), 1.0)

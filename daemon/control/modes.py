@@ -24,7 +24,7 @@ HELD = frozenset({Mode.HOLDING, Mode.ROTATING})
 _ON = frozenset(Mode) - {Mode.DISARMED, Mode.FAULT}
 _ANY = frozenset(Mode)
 
-# command → (modes in which it is accepted, its numbers: name → required)
+# command → (modes in which it is accepted, its numeric arguments: name → required)
 COMMANDS: dict[str, tuple[frozenset[Mode], dict[str, bool]]] = {
     "arm": (frozenset({Mode.DISARMED}), {}),
     "disarm": (_ANY - {Mode.FAULT}, {}),
@@ -35,17 +35,17 @@ COMMANDS: dict[str, tuple[frozenset[Mode], dict[str, bool]]] = {
         {"force": False},
     ),
     "rotate": (GRIPPING, {"angle": True}),  # waits for the grip to hold
-    "hold": (  # setpoints of a stream; leaves a grip in its mode
+    "hold": (  # streamed setpoints; does not change the mode of a grip
         frozenset({Mode.ARMED, Mode.MOVING}) | GRIPPING,
         {"force": False, "angle": False},
     ),
     "release": (_ON, {}),
     "set": (_ON, {"compliance": True}),
-    "demo": (frozenset({Mode.DISARMED}), {}),  # begins the profile's task again
+    "demo": (frozenset({Mode.DISARMED}), {}),  # restarts the task of the profile
     "stop": (_ANY, {}),
     "clear": (frozenset({Mode.FAULT}), {}),
     "status": (_ANY, {}),
 }
 
-# These never stiffen or move the hand, so they may be carried out although they are some time old.
+# These commands never stiffen or move the hand, so they are accepted even if they arrived late.
 HARMLESS = frozenset({"disarm", "tare", "clear"})

@@ -1,6 +1,6 @@
-"""Smooth setpoints: a target that may jump at any tick in, a jerk-limited way to it out.
+"""Smooth setpoints: a jerk-limited path to a target that may jump in any tick.
 
-Knows nothing of what the value means.
+The values may have any unit.
 """
 
 from __future__ import annotations
@@ -15,21 +15,21 @@ FloatArray = NDArray[np.float64]
 
 
 class RunningMean(Record):
-    """The mean of the last ``length`` values, which are kept beside it."""
+    """Mean of the last ``length`` values, which are stored in a separate window."""
 
     length: int
-    index: int  # of the oldest value
+    index: int  # position of the oldest value
     sum: float
 
 
 class SetpointState(Record):
-    """A setpoint and how it came there. The values under both means are kept beside it."""
+    """State of a setpoint. The values of both running means are stored in separate windows."""
 
     target: float
     value: float
     speed: float  # [1/s]
-    ramp: float  # what goes to the target at the given rate
-    idle: int  # ticks since it arrived there
+    ramp: float  # value before smoothing; moves to the target at the given rate
+    idle: int  # ticks since the ramp reached the target
     dt: float  # [s]
     first: RunningMean
     second: RunningMean
@@ -37,7 +37,7 @@ class SetpointState(Record):
 
 @inner_kernel
 def reset(s: SetpointState, windows: FloatArray, value: float) -> None:
-    """Be at ``value``, at rest."""
+    """Set the setpoint to ``value``, at rest."""
     s.target = s.ramp = s.value = value
     s.speed = 0.0
     s.idle = s.first.length + s.second.length
@@ -50,14 +50,14 @@ def reset(s: SetpointState, windows: FloatArray, value: float) -> None:
 
 @inner_kernel
 def arrived(s: SetpointState) -> bool:
-    """Return whether the setpoint is at rest at its target."""
+    """Return True if the setpoint is at rest at its target."""
     there: bool = s.idle >= s.first.length + s.second.length and s.ramp == s.target
     return there
 
 
 @inner_kernel
 def _add(mean: RunningMean, windows: FloatArray, start: int, value: float) -> float:
-    """Take ``value`` into a mean whose window begins at ``start``."""
+    """Add ``value`` to a running mean whose window begins at ``start``, and return the mean."""
     index = mean.index
     mean.sum += value - windows[start + index]
     windows[start + index] = value
@@ -68,7 +68,7 @@ def _add(mean: RunningMean, windows: FloatArray, start: int, value: float) -> fl
 
 @inner_kernel
 def advance(s: SetpointState, windows: FloatArray, rate: float) -> float:
-    """Go on by one tick towards the target, at most ``rate`` a second; the new value."""
+    """Advance by one tick towards the target at ``rate`` [1/s] or less; return the new value."""
     left = s.target - s.ramp
     last = s.value
     if left == 0.0:
@@ -77,7 +77,7 @@ def advance(s: SetpointState, windows: FloatArray, rate: float) -> float:
             return last
         s.idle += 1
         if s.idle >= length:
-            reset(s, windows, s.target)  # the running sums' rounding ends here
+            reset(s, windows, s.target)  # clears the rounding errors of the running sums
             return s.target
     else:
         step_max = rate * s.dt
@@ -104,34 +104,34 @@ def _reset(setpoints: Records[SetpointState], windows: FloatArray, value: float)
 
 
 class Setpoint:
-    """A ramp of bounded rate, averaged over two windows in turn.
+    """Ramp of limited rate, smoothed by two running means in series.
 
-    The first mean bounds the acceleration to rate/window, the second the jerk to
-    rate/(window · window/2). The way never overshoots, whatever the stream of targets, and is at
-    its target 1.5 windows after the ramp is.
+    The first mean limits the acceleration to rate/window, the second the jerk to
+    rate/(window · window/2). The value never overshoots, for any sequence of targets. It reaches
+    the target 1.5 windows after the ramp does.
     """
 
     def __init__(self, dt: float, window: float, state: SetpointState) -> None:
-        """``dt`` is the tick and ``window`` the first mean's length [s]; kept in ``state``."""
+        """Create a setpoint in ``state`` for a tick of ``dt`` and a first ``window`` [s]."""
         self.state = state
         self.state.dt = dt
         self.state.first.length = max(round(window / dt), 1)
         self.state.second.length = max(round(0.5 * window / dt), 1)
         self.windows = np.zeros(self.state.first.length + self.state.second.length)
         self.reset(0.0)
-        self.step(0.0)  # nothing to do yet, but compiled now and by no tick
+        self.step(0.0)  # compiles the kernel before the first tick
 
     def reset(self, value: float) -> None:
-        """Be at ``value``, at rest."""
+        """Set the setpoint to ``value``, at rest."""
         _reset(self.state.array, self.windows, value)
 
     def step(self, rate: float) -> bool:
-        """Go on by one tick, at most ``rate`` a second; whether it is at its target."""
+        """Advance by one tick at ``rate`` [1/s] or less; return True at rest at the target."""
         return _step(self.state.array, self.windows, rate)
 
     @property
     def target(self) -> float:
-        """Target; it may be set at any tick."""
+        """Target; it may be set in any tick."""
         return self.state.target
 
     @target.setter

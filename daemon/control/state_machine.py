@@ -1,6 +1,6 @@
-"""The control's state machine: commands in, one goal for the servos a tick out.
+"""State machine of the hand: it takes commands and sets one goal for the servos in each tick.
 
-State        Mode       What happens                     Cause → next state
+State        Mode       Action                           Event → next state
 -----------  ---------  -------------------------------  ------------------------------------------
 Off          DISARMED   torque is off                    `arm` → Armed
              FAULT      torque is off                    `clear` → Off (DISARMED)
@@ -9,13 +9,13 @@ Armed        ARMED      joints hold where they are       `move` → Travelling (
 Travelling   MOVING     joints go to commanded angles    arrived, or _GRACE over → Armed;
                                                          `grasp`, `hold` → Approaching
              RELEASING  joints go to the open angles     arrived, or _GRACE over → Armed
-Approaching  GRASPING   fingers close; one that touches  all touch → Pressing; at the joints' ends
-                        waits for the other              for _GRACE → Armed
-Pressing     GRASPING   the force is built up            force reached → Settled, and from there
-                                                         Turning, if an angle was asked for
-Settled      HOLDING    force and angle are held: only   `grasp`, `hold` or `ease` with another
-                        loads move the joints            value, contact lost and back → Changing
-Changing     HOLDING    force or angle is on its way     force and angle reached → Settled
+Approaching  GRASPING   fingers close; the first one to  all touch → Pressing; at the joint limits
+                        touch waits for the other        for _GRACE → Armed
+Pressing     GRASPING   the force increases              force reached → Settled, then Turning if
+                                                         an angle was commanded
+Settled      HOLDING    force and angle are constant:    `grasp`, `hold` or `ease` with another
+                        only loads move the joints       value, contact lost and back → Changing
+Changing     HOLDING    force or angle changes           force and angle reached → Settled
 Turning      ROTATING   the object turns                 angle reached → Settled
 
 Transitions that several states have in common:
@@ -26,12 +26,12 @@ Transitions that several states have in common:
 - Approaching, Pressing, Settled, Changing, Turning: tips touch each other for _EMPTY → Travelling
   (RELEASING)
 - Pressing, Settled, Changing, Turning: a contact is missing for _LOST → Armed. Until then the
-  joints hold where they are (`ContactLoss`).
+  joints hold their positions (`ContactLoss`).
 
-Each transition makes a new object of a class below. Timers and flags are attributes of the state
-that uses them, so they end with it. `control.modes` has the commands of each mode, `loop.requests`
-checks them, `control.fingers` drives the joints, `control.grip` has the grip law, and
-`safety.safety` bounds the goals.
+Each transition creates a new object of one of the classes below. Timers and flags are attributes of
+the state that uses them, so they end with it. `control.modes` lists the commands of each mode,
+`loop.requests` checks them, `control.fingers` drives the joints, `control.grip` computes the grip
+law, and `safety.safety` limits the goals.
 """
 
 from __future__ import annotations
@@ -46,33 +46,35 @@ from softfinger.daemon.perception.grasp import GraspState
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS, Event, Goal, State
 
-# rad off its goal, within which a joint has arrived: five times what the default joint friction
-# leaves at the default servos.stiffness.
+# rad between a joint and its goal, below which it has arrived: five times the position error due to
+# the default joint friction at the default servos.stiffness.
 _ARRIVED = 0.03
-# s after its setpoint's arrival that a joint has to follow; then friction holds it for good.
+# s that a joint may take to arrive after its setpoint has; after that, friction holds it.
 _GRACE = 1.0
-# Share of the force target: the force scatters by 0.3 to 0.6 % (1 σ) with simulated sensors.
+# Fraction of the force target: the force scatters by 0.3 to 0.6 % (1 σ) with simulated sensors.
 _FORCE_REACHED = 0.03
-# Share of the force target that gears may hold above it, besides: 6 % in the small hand.
+# Fraction of the force target: additional force above it that gear friction may hold, at most.
+# It is 6 % in the small hand.
 _HELD_OVER = 0.12
-# Share of the force target that friction may hold: 0.05 N·m at the default finger are a tenth of
-# 6 N. The force law brings it in the end, which takes s, since it grows with the error.
+# Fraction of the force target: the error that joint friction may cause. 0.05 N·m at the default
+# finger are a tenth of 6 N. The integral term removes this error within seconds.
 _NEAR = 0.1
-# s after which such a force is reached, too: ten times what the law takes without friction.
+# s after which such a force counts as reached: ten times the settling time without friction.
 _STUCK = 2.0
 # rad off the angle's target: the angle scatters by 0.5 to 2 mrad (1 σ) with simulated sensors.
 _ANGLE_REACHED = math.radians(0.5)
-# s for which force and angle have to stay reached: five frames at 25 Hz, two default smooth_time.
+# s for which force and angle must stay at their targets: five frames at 25 Hz, and twice the
+# default smooth_time.
 _SETTLED = 0.2
-# Share of the force target: a streamed target may never rest, so a grip also counts as built up
-# when it follows its setpoint so near to the target.
+# Fraction of the force target. A streamed target may never rest, so a grip also settles when it
+# follows its setpoint within this distance of the target.
 _FOLLOWED = 0.25
-# Share of the force, and rad (1 σ of the angle): a stream's setpoints and a raise of the grip
-# that change less are flicker.
+# Smaller changes of a streamed setpoint or of the force increase are ignored as noise: a fraction
+# of the force, and rad (1 σ of the angle).
 _FORCE_FLICKER, _ANGLE_FLICKER = 0.02, 2e-3
-# s without a contact: two frames at 25 Hz that could show it again.
+# s without a contact before it counts as lost: two frames at 25 Hz could show it again.
 _LOST = 0.1
-# s in which the tips seem to touch each other: more than one frame at 25 Hz.
+# s for which the tips must seem to touch each other: more than one frame at 25 Hz.
 _EMPTY = 0.05
 
 
@@ -91,28 +93,28 @@ class Off(ControlState):
 
 @dataclass
 class Armed(ControlState):
-    """The joints hold where they are."""
+    """The joints hold their positions."""
 
     mode = Mode.ARMED
-    current: float  # at most [A]
-    following: int = 0  # ticks in which setpoints still follow the joints
+    current: float  # limit [A]
+    following: int = 0  # remaining ticks in which the setpoints follow the joints
 
 
 @dataclass
 class Travelling(ControlState):
-    """The joints go to their setpoints' targets: MOVING or RELEASING."""
+    """The joints go to the targets of their setpoints: MOVING or RELEASING."""
 
     mode: Mode
-    arrived_for: float = 0.0  # since the setpoints are there [s]
+    arrived_for: float = 0.0  # time since the setpoints arrived [s]
 
 
 @dataclass
 class Order:
-    """Commands to a grasp, kept until it has settled."""
+    """Commanded values of a grasp, stored until it has settled."""
 
     force: float  # [N]
-    is_streamed: bool  # the force is a stream's setpoint
-    angle: float | None = None  # to turn to after that [rad]
+    is_streamed: bool  # the force is a streamed setpoint
+    angle: float | None = None  # target after the grasp has settled [rad]
 
 
 @dataclass
@@ -122,55 +124,55 @@ class Approaching(ControlState):
     mode = Mode.GRASPING
     order: Order
     touching: set[int] = field(default_factory=set)  # fingers
-    arrived_for: float = 0.0  # since the setpoints are at the joints' ends [s]
-    empty_for: float = 0.0  # since the tips seem to touch each other [s]
+    arrived_for: float = 0.0  # time since the setpoints reached the joint limits [s]
+    empty_for: float = 0.0  # time for which the tips have seemed to touch each other [s]
 
 
 @dataclass
 class ContactLoss:
-    """A contact is missing: the joints hold where they are."""
+    """A contact is missing: the joints hold their positions."""
 
-    current: float  # at most [A]
+    current: float  # limit [A]
     lost_for: float = 0.0  # [s]
 
 
 @dataclass
 class GripHistory:
-    """Data that the states of one grip share, from the touch of all fingers to its end."""
+    """Data that the states of one grip share, from the first contact of all fingers to its end."""
 
     loss: ContactLoss | None = None
-    empty_for: float = 0.0  # since the tips seem to touch each other [s]
-    settled_force: float = math.nan  # asked for when it settled last [N]
-    settled_angle: float = math.nan  # likewise [rad]
+    empty_for: float = 0.0  # time for which the tips have seemed to touch each other [s]
+    settled_force: float = math.nan  # commanded force when the grip last settled [N]
+    settled_angle: float = math.nan  # commanded angle when the grip last settled [rad]
     raise_reported: bool = False
     turn_end_reported: bool = False
 
 
 @dataclass
 class Gripping(ControlState):
-    """Base of the states in which the grip law gives the joints' torques."""
+    """Base of the states in which the grip law computes the joint torques."""
 
     history: GripHistory
-    reached_for: float = 0.0  # since force and angle are at their targets [s]
-    near_for: float = 0.0  # since the force is so near that friction may hold the rest [s]
+    reached_for: float = 0.0  # time for which force and angle have been at their targets [s]
+    near_for: float = 0.0  # time for which the force error has been within _NEAR [s]
 
 
 @dataclass(kw_only=True)
 class Pressing(Gripping):
-    """The force is built up."""
+    """The force increases to its target."""
 
     mode = Mode.GRASPING
     order: Order
 
 
 class Settled(Gripping):
-    """Force and angle are held: only loads move the joints."""
+    """Force and angle are constant: only loads move the joints."""
 
     mode = Mode.HOLDING
 
 
 class Changing(Gripping):
-    """Force or angle is on its way to another target."""
+    """Force or angle changes to another target."""
 
     mode = Mode.HOLDING
 
@@ -182,10 +184,10 @@ class Turning(Gripping):
 
 
 class Control:
-    """The state machine and its commands. Only the loop's thread calls it."""
+    """State machine of the hand and its commands. Only the loop's thread calls it."""
 
     def __init__(self, settings: Settings, state: State, grasp: GraspState) -> None:
-        """``state`` and ``grasp`` are read at each tick, and never written."""
+        """Create the machine; ``state`` and ``grasp`` are read in each tick and never written."""
         self._settings = settings
         self.fingers = Fingers(settings, state, grasp)
         self.grip = Grip(settings, self.fingers.indices, grasp)
@@ -199,7 +201,7 @@ class Control:
 
     @property
     def torque(self) -> bool:
-        """True if the servos' torque shall be on."""
+        """True if the torque of the servos is to be on."""
         return not isinstance(self.state, Off)
 
     def _enter(self, state: ControlState) -> None:
@@ -224,12 +226,12 @@ class Control:
         self.events.append(("error", name, reason))
 
     def arm(self) -> None:
-        """Switch torque on, with the joints held where they are."""
-        # Torque goes on at the end of the first tick: until the second one the joints may move.
+        """Switch torque on and hold the joints at their positions."""
+        # Torque is switched on at the end of the first tick. Until the second, the joints may move.
         self._enter(Armed(self._settings.safety.current_move, following=2))
 
     def disarm(self) -> None:
-        """Switch torque off; also the way out of a fault."""
+        """Switch torque off. This also clears a fault."""
         self._enter(Off())
 
     def stop(self) -> None:
@@ -238,7 +240,7 @@ class Control:
             self._enter(Off())
 
     def move(self, **angles: float) -> None:
-        """Move the joints to these angles [rad], ``left`` and ``right`` or one of them."""
+        """Move the joint ``left``, ``right`` or both to these angles [rad]."""
         if self.mode is not Mode.MOVING:
             self.fingers.hold_here()
         for name, q in angles.items():
@@ -246,17 +248,17 @@ class Control:
         self._enter(Travelling(Mode.MOVING))
 
     def release(self) -> None:
-        """Open to the hand's open angles."""
+        """Open the fingers to the hand's open angles."""
         self.fingers.hold_here()
         for index in self.fingers.indices:
             self.fingers.go_to(index, self._settings.hand.open_angle[index])
         self._enter(Travelling(Mode.RELEASING))
 
     def grasp(self, force: float, is_streamed: bool = False) -> None:
-        """Close until all fingers touch, then a mean tip force of ``force`` [N].
+        """Close until all fingers touch, then build up a mean tip force of ``force`` [N].
 
-        A hand that grips already goes to that force and stays in its mode. ``is_streamed``: the
-        force may change again before it is reached.
+        A hand that already grips goes to that force and stays in its mode. Set ``is_streamed`` if
+        the force may change again before it is reached.
         """
         state = self.state
         if isinstance(state, Gripping):
@@ -271,7 +273,7 @@ class Control:
             self._enter(Approaching(Order(force, is_streamed)))
 
     def rotate(self, angle: float) -> None:
-        """Turn the object to ``angle`` [rad]; while grasping, once the grip has settled."""
+        """Turn the object to ``angle`` [rad]; during a grasp, wait until the grip has settled."""
         state = self.state
         if isinstance(state, Approaching | Pressing):
             state.order.angle = angle
@@ -281,11 +283,15 @@ class Control:
             self._enter(Turning(state.history))
 
     def hold(self, force: float | None = None, angle: float | None = None) -> float | None:
-        """Take setpoints of a stream: a grip's ``force`` [N], the object's ``angle`` [rad].
+        """Follow streamed setpoints of the grip ``force`` [N] and the object's ``angle`` [rad].
 
-        A hand that doesn't grip yet grasps first, with ``force``. The setpoints go there at
-        `control.rotate_speed` and in `control.force_time`, smoothly whatever the stream. Return the
-        angle that is turned to, bounded by what this grip reaches; None where none is known yet.
+        A hand that does not grip yet grasps first, with ``force``. The setpoints move smoothly, the
+        angle at `control.rotate_speed` and the force within `control.force_time`.
+
+        Returns
+        -------
+        float | None
+            Target angle, limited to the range of this grip; None until the grip has one.
         """
         repeated = isinstance(self.state, Gripping) and force == self.grip.commanded
         if force is not None and not repeated:
@@ -304,17 +310,17 @@ class Control:
         return None
 
     def ease(self, most: float, seconds: float) -> None:
-        """Let this grip come down to ``most`` [N] within ``seconds``, and press no more after."""
+        """Reduce the grip force to ``most`` [N] within ``seconds``, and limit it from then on."""
         if isinstance(self.state, Gripping):
             self.grip.ease(most, seconds)
             self._change(self.state)
 
     def set(self, compliance: float) -> None:
-        """Set the angle by which the grip gives way to a torque [rad/(N·m)]."""
+        """Set the rotational compliance of the grip [rad/(N·m)]."""
         self.grip.set_joint_stiffness(1.0 / compliance)
 
     def _change(self, state: Gripping) -> None:
-        """Leave Settled if the force or the angle asked for differs from what it settled with."""
+        """Leave Settled if the commanded force or angle differs from its settled value."""
         grip, force, angle = self.grip, state.history.settled_force, state.history.settled_angle
         if isinstance(state, Settled) and not (
             abs(grip.commanded - force) < _FORCE_FLICKER * force
@@ -325,12 +331,12 @@ class Control:
     # One tick
 
     def step(self, dt: float, goal: Goal) -> None:
-        """Fill ``goal`` for this tick; ``goal.valid`` is False while torque is to be off."""
+        """Set ``goal`` for this tick; ``goal.valid`` is False while torque is to be off."""
         goal.valid = self.torque
         goal.force = goal.angle = math.nan
         if not goal.valid:
             return
-        current = self._current()  # of the state in which the tick begins
+        current = self._current()  # of the state before any transition in this tick
         if isinstance(self.state, Armed) and self.state.following:
             self.state.following -= 1
             self.fingers.hold_here()
@@ -338,7 +344,7 @@ class Control:
             self._travel(self.state, dt)
         elif isinstance(self.state, Approaching):
             self._approach(self.state, dt)
-        if isinstance(self.state, Gripping):  # also if it has begun at this tick
+        if isinstance(self.state, Gripping):  # also if it began in this tick
             self._hold(self.state, dt, goal)
         else:
             self.fingers.rest(goal, current)
@@ -348,23 +354,25 @@ class Control:
             goal.force = self.state.order.force
 
     def hold_goal(self, goal: Goal) -> None:
-        """Replace :meth:`step` while frames are late: goals stay as they are.
+        """Hold the goals while frames are late; called instead of :meth:`step`.
 
-        A grip's goals are torques: its joints are damped, and a turn comes to rest.
+        The goals of a grip are torques: the joints stay damped, and a turn comes to rest.
         """
         if goal.valid and isinstance(self.state, Gripping) and self.state.history.loss is None:
             self.fingers.pull(goal, self.grip.hold_goal(self.fingers.reading))
 
     def _current(self) -> float:
-        """Current [A] with which the joints follow their setpoints."""
+        """Return the current limit [A] for joints that follow their setpoints."""
         state, law = self.state, self._settings.control
         if isinstance(state, Armed):
             return state.current
         if not isinstance(state, Approaching):
             return self._settings.safety.current_move
-        # A tip that meets the object before it is felt shall not press beyond the force wanted.
+        # A tip that reaches the object before the sensor detects contact must not exceed the
+        # commanded force.
         pressed = 0.5 * state.order.force * self._settings.hand.finger_length * law.driving
-        # A joint that stands under it, and whose tip feels nothing, has more friction than is set.
+        # A joint that does not move under this torque, without contact, has more friction than in
+        # the settings; `free_torque` is the measured torque.
         pressed += max(law.joint_friction, float(self.fingers.grasp.free_torque.max()))
         return min(law.approach_current, pressed / law.torque_constant)
 
@@ -396,10 +404,10 @@ class Control:
                 self._stay()
 
     def _empty_for(self, before: float, dt: float) -> float:
-        """Return for how long [s] the tips seem to touch each other, and release when that lasts.
+        """Return how long [s] the tips have seemed to touch each other; release after _EMPTY.
 
-        Tips that press each other would roll off to one side. Their contacts are one, so that the
-        object's width by joints and sensors is 0 up to their errors.
+        Tips that press against each other would roll off to one side. Both sensors then measure the
+        same contact, so the estimated object width is 0 within its error.
         """
         pose, width_min = self.fingers.pose, self._settings.object.width_min
         if not pose.valid or pose.width >= width_min:
@@ -418,7 +426,7 @@ class Control:
         if not fingers.in_contact:
             self._lose(history, dt, goal)
             return
-        if history.loss is not None:  # the force is built up again: what moves joints is no load
+        if history.loss is not None:  # while the force builds up again, joint motion is not a load
             history.loss, state.reached_for = None, 0.0
             if isinstance(state, Settled):
                 self._enter(state := Changing(history))
@@ -430,10 +438,10 @@ class Control:
         history.empty_for = self._empty_for(history.empty_for, dt)
 
     def _lose(self, history: GripHistory, dt: float, goal: Goal) -> None:
-        """Hold the joints where they are without a contact; end the grip when it stays away."""
+        """Hold the joints while a contact is missing; end the grip after _LOST."""
         if history.loss is None:
             self.fingers.hold_here()
-            # A board that went blind must not make the joints press harder than they did.
+            # A sensor that fails must not make the joints press harder than before.
             pressed = max(goal.current[index] for index in self.fingers.indices)
             history.loss = ContactLoss(min(pressed, self._settings.safety.current_move))
         loss = history.loss
@@ -444,12 +452,12 @@ class Control:
             self._enter(Armed(loss.current))
 
     def _watch_settling(self, state: Gripping, dt: float) -> None:
-        """Pass into Settled once force and angle have stayed reached."""
+        """Enter Settled once force and angle have stayed at their targets for _SETTLED."""
         grip, pose, history = self.grip, self.fingers.pose, state.history
         is_reached = True
         if not isinstance(state, Pressing):
             self._end_turn_before_slip(history)
-            is_reached = not abs(pose.angle - grip.target_angle) >= _ANGLE_REACHED  # also for NaN
+            is_reached = not abs(pose.angle - grip.target_angle) >= _ANGLE_REACHED  # True for NaN
         if not isinstance(state, Turning):
             streamed = isinstance(state, Pressing) and state.order.is_streamed
             near = abs(self.fingers.force - grip.target) < _NEAR * grip.target
@@ -471,9 +479,9 @@ class Control:
                 self.rotate(angle)
 
     def _is_force_reached(self, is_streamed: bool) -> bool:
-        """Return True if the tips' mean force is at its target, or at a stream's setpoint near it.
+        """Return True if the mean tip force is at its target, or at a streamed setpoint near it.
 
-        The mean, since what the object rubs on may take some force between the tips.
+        The mean is used because friction of the object on its support may unbalance the tip forces.
         """
         grip = self.grip
         wanted = grip.force.value if is_streamed else grip.target
@@ -484,7 +492,7 @@ class Control:
         return is_near and is_there and not grip.shaking
 
     def _end_turn_before_slip(self, history: GripHistory) -> None:
-        """End a turn at the present angle where the tips would slip."""
+        """End a turn at the present angle if the tips would slip beyond it."""
         law, angle = self._settings.control, self.fingers.pose.angle
         shear_max = law.tip_friction * (1.0 - law.slip_margin)
         if self.fingers.grasp.shear * self.grip.turning_on > shear_max:
@@ -495,7 +503,7 @@ class Control:
             self.grip.steer(angle, angle)
 
     def _report_raise(self, history: GripHistory) -> None:
-        """Report when the grip is raised against slip."""
+        """Report slip, and the begin of each force increase against it."""
         grip = self.grip
         if grip.slipped:
             self._warn("slip", "the object turns in the grip")

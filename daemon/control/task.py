@@ -1,6 +1,6 @@
-"""Tasks: scripts of commands that the daemon gives itself after start.
+"""Tasks: scripts of commands that the daemon runs after start.
 
-They are a client's commands; a task can do nothing that a client can't.
+They use the same commands as clients, with the same checks.
 """
 
 from __future__ import annotations
@@ -15,42 +15,44 @@ from softfinger.daemon.errors import SoftfingerError
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import State
 
-Step = tuple[dict[str, Any], Mode, float]  # command, mode that ends the step, rest after it [s]
+Step = tuple[dict[str, Any], Mode, float]  # command, mode that ends the step, pause after it [s]
 
-_PATIENCE = 10.0  # s for a step
-_PAUSE = 2.0  # s in which a person can read what went wrong
+_PATIENCE = 10.0  # s, timeout of a step
+_PAUSE = 2.0  # s before a restart, so that a user can read the message
 
 
 class TaskOver(SoftfingerError):
-    """The task can't go on. The message says why."""
+    """The task can't continue. The message gives the reason."""
 
 
 class Task:
-    """Gives one command after another, each when the hand is in the mode that the last one led to.
+    """Issue the commands of a script, each once the hand has reached the mode of the last one.
 
-    ``lasting``: it begins again after a fault. That is for simulated hands alone: metal must not
-    start by itself when something was wrong.
+    With ``lasting`` the script restarts after a fault. Only simulated hands do so, because real
+    hardware must not start moving by itself after a fault.
     """
 
     def __init__(self, settings: Settings) -> None:
         self._script = partial(demo, settings.task.force, settings.task.angle)
         self.lasting = settings.simulated
         self._steps = self._script()
-        self._mode: str = Mode.DISARMED  # what the present step waits for
+        self._mode: str = Mode.DISARMED  # mode that ends the present step
         self._rest = 0.5
         self._left = self._rest
         self._waited = 0.0
 
     @staticmethod
     def named(settings: Settings) -> Task | None:
-        """Return the settings' task, or None."""
+        """Return the task that the settings select, or None."""
         return None if settings.task.name == "none" else Task(settings)
 
     def next(self, state: State, dt: float) -> dict[str, Any] | None:
-        """Return the command that is due at this tick, if any.
+        """Return the command that is due in this tick, or None.
 
-        Raises TaskOver after a fault, when the hand was disarmed, or when a step did not come to
-        its end.
+        Raises
+        ------
+        TaskOver
+            After a fault, after the hand was disarmed, or when a step times out.
         """
         if state.mode != self._mode:
             if state.mode in (Mode.FAULT, Mode.DISARMED):
@@ -68,7 +70,7 @@ class Task:
         return request
 
     def begin_again(self, state: State, reason: str) -> str:
-        """Pause, leave the present mode, and begin the script again; the text of the event."""
+        """Pause, leave the present mode and restart the script; return the event's text."""
         way_out, says = ("clear", "clears it") if state.mode == Mode.FAULT else ("stop", "stops it")
         self._steps = chain([({"command": way_out}, Mode.DISARMED, 0.5)], self._script())
         self._mode = state.mode
@@ -77,7 +79,7 @@ class Task:
 
 
 def demo(force: float, angle: float) -> Iterator[Step]:
-    """Grasp, turn to both sides, and release, for ever. ``force`` [N], ``angle`` [rad]."""
+    """Grasp with ``force`` [N], turn by ``angle`` [rad] to both sides, release, and repeat."""
     yield {"command": "arm"}, Mode.ARMED, 0.5
     yield from cycle(
         [

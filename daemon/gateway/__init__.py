@@ -1,4 +1,4 @@
-"""The process that holds the clients' sockets and alone reads what they send, within `bounds`.
+"""Gateway process: it holds the sockets of all clients and enforces the limits of `bounds`.
 
-The loop gives it the stream and takes a few checked requests at a time, over `wire.loop_link`.
+Over `wire.loop_link` the loop sends it the stream and receives a few requests at a time.
 """

@@ -1,7 +1,7 @@
-"""All bounds of the gateway: what clients may send, hold and cost; see `docs/security.md`.
+"""Limits of the gateway for messages, queues, rates and memory; see `docs/security.md`.
 
-Those that a profile sets (`commands.max_bytes`, `commands.per_second`, `stream.queue`) are in
-`Config`, which a gateway is given when it is started.
+The limits that a profile sets (`commands.max_bytes`, `commands.per_second`, `stream.queue`) are in
+`Config`, which the gateway receives at its start.
 """
 
 from __future__ import annotations
@@ -9,54 +9,54 @@ from __future__ import annotations
 from typing import NamedTuple
 
 # The process
-MEMORY = 128 << 20  # bytes of data, of which Python and libzmq take a third
-DESCRIPTORS = 64  # that are not clients'
-CLIENTS = 256  # connections, of commands and stream together
-STALLED = 3.0  # s of processor time within one step after which the process is ended, …
-BLOCKED = 30.0  # … and of any time; a machine that is busy or stops it takes only such time
-GAP = 0.05  # s; after a longer gap between polls, requests are dated by the earlier poll
+MEMORY = 128 << 20  # bytes of data; Python and libzmq use a third of it
+DESCRIPTORS = 64  # file descriptors besides those of clients
+CLIENTS = 256  # connections for commands and stream together
+STALLED = 3.0  # s of CPU time within one step, after which the kernel ends the process
+BLOCKED = 30.0  # s of elapsed time likewise; longer, since a busy machine delays the process
+GAP = 0.05  # s; after a longer gap between polls, requests are dated to the earlier poll
 
 # A connection
-HANDSHAKE = 2.0  # s in which a client has to have finished its handshake
-QUEUE = 64  # requests, answers or subscriptions of one client that wait in its socket
-FRAMES = 4  # times commands.max_bytes, in one part of a message
-PARTS = 16  # of a request, with its connection's and those of its envelope, …
-ENVELOPE = 1024  # … which have so many bytes
-SUBSCRIPTION = 1024  # bytes; the handshake's own messages are longer than any topic
-SUBSCRIPTIONS = 64  # read at a time
-TELL_AGAIN = 0.1  # s between two times at which late subscribers are told what they missed
-KEYS_CHECKED = 0.5  # s between looks at the folder of keys
+HANDSHAKE = 2.0  # s, timeout of the handshake
+QUEUE = 64  # requests, answers or subscriptions of one client, queued in its socket
+FRAMES = 4  # size limit of one message part, in units of commands.max_bytes
+PARTS = 16  # parts of a request, including the routing frame and the envelope
+ENVELOPE = 1024  # bytes of the routing frame and the envelope
+SUBSCRIPTION = 1024  # bytes; messages of the handshake are longer than any topic
+SUBSCRIPTIONS = 64  # read in one turn
+TELL_AGAIN = 0.1  # s between two repetitions of messages for late subscribers
+KEYS_CHECKED = 0.5  # s between two checks of the key folder
 
 # A stop
-PURGE = 0.02  # s after it in which all requests but a status are refused, and on while they flood
-LONGEST_HELD = 0.25  # s that answers wait for that
+PURGE = 0.02  # s after a stop for which requests are refused, except status; repeated in a flood
+LONGEST_HELD = 0.25  # s for which answers wait for the end of that time
 
 # Requests
-UNDER_WAY = 16  # that the loop has and hasn't answered; …
-URGENT = 32  # … and of those that look like a stop, which go beside them …
-URGENT_BYTES = 256  # … if they are so short
-WAITING_EACH = 64  # of one client that wait here …
-WAITING = 2048  # … and of all
-ALL_RATE = 2000.0  # a second of all clients together …
-LEAST_RATE = 2.0  # … but each may send so many
-REST = 0.05  # s without a request after which a client that sent too many is heard again
+UNDER_WAY = 16  # requests that the loop has not answered yet
+URGENT = 32  # likewise of requests that look like a stop, which are counted separately
+URGENT_BYTES = 256  # size limit of a request that counts as urgent
+WAITING_EACH = 64  # queued requests of one client
+WAITING = 2048  # queued requests of all clients
+ALL_RATE = 2000.0  # requests per second of all clients together
+LEAST_RATE = 2.0  # requests per second that every client may send
+REST = 0.05  # s without a request, after which a client above its rate is accepted again
 
 # Turns
-TEND = 0.01  # s between looks at what is due by the time
-TURN = 0.004  # s of reading requests, before others
-LAST_WORDS = 0.2  # s for subscribers to take what waits when the loop has ended
+TEND = 0.01  # s, longest wait of a step
+TURN = 0.004  # s of reading requests in one step
+LAST_WORDS = 0.2  # s for which queued messages are still sent after the loop has ended
 
 
 class Config(NamedTuple):
-    """Addresses (an empty one is not bound), bounds, and the stream's topics."""
+    """Addresses (an empty one is not bound), limits, and the topics of the stream."""
 
     stream: str
     commands: str
     topics: list[str]
-    queue: int  # messages that wait for a subscriber
+    queue: int  # messages queued for one subscriber
     max_bytes: int = 4096  # of a request
-    per_second: float = 200.0  # requests of a client
-    ipc_mode: int = 0o600  # rights of an ipc address's file
+    per_second: float = 200.0  # requests of one client
+    ipc_mode: int = 0o600  # permissions of the file of an ipc address
     keys: str = ""  # folder of `softfinger keys`
-    stream_key: str = "stream.address"  # what errors call the stream's address
-    latest: str = ""  # where the first topic goes out in one frame
+    stream_key: str = "stream.address"  # name of the stream's address in error messages
+    latest: str = ""  # address that publishes the first topic in one frame

@@ -1,14 +1,15 @@
-"""The address of commands: requests within bounds on their way to the loop, and replies back.
+"""Command endpoint: passes requests to the loop within the limits, and replies back to clients.
 
-A request is not unpacked here. One that looks like a stop is urgent: it goes to the loop at once,
-one of each client at a time. Of all others few are on their way to the loop; the rest waits here,
-where clients take turns. A client that sends more than it may a second is refused until it pauses.
+Requests are not unpacked here. A request that looks like a stop is urgent: it goes to the loop at
+once, one per client at a time. Of all other requests, only a few are with the loop at any time. The
+remaining ones wait in queues, and the clients take turns. A client that exceeds its rate is refused
+until it pauses.
 
-Each request is stamped with the time at which it came and the number of stops that are known to
-have been carried out before. libzmq's own thread reads ahead of us, so only time can tell: after a
-stop, or a gap between polls, requests are stamped as if they had come before, until for a moment
-none were waiting and few came. Until then answers are held back, within a bound, so that a client
-that acts upon one is heard.
+Each request is stamped with its arrival time and the number of stops that preceded it. The thread
+of libzmq reads ahead, so the arrival order of a request and a stop can only be inferred from time.
+After a stop or a gap between polls, requests are therefore stamped as if they had arrived before
+it, until the socket was empty for a moment and few requests arrived. Until then answers are held
+back for a limited time, so that requests which clients send in response are not refused.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from softfinger.daemon.gateway.endpoints import NOW, Admission, Endpoint
 from softfinger.daemon.wire.command_server import refusal
 from softfinger.daemon.wire.loop_link import ASK, Ask
 
-_STOP = msgpack.packb("command") + msgpack.packb("stop")  # no text can hold this
+_STOP = msgpack.packb("command") + msgpack.packb("stop")  # can't occur within a text
 _FORM = refusal(
     "envelope: expected the command in one frame, alone or behind an empty frame that ends an "
     f"envelope of at most {bounds.PARTS - 2} frames and {bounds.ENVELOPE} bytes",
@@ -37,19 +38,19 @@ _FULL = refusal("too many commands wait already", Reason.BUSY)
 
 
 class Client:
-    """A connection: its requests that wait, and a token bucket that holds those of one second."""
+    """Connection with its queued requests and a token bucket for one second of requests."""
 
     __slots__ = ("_behind", "_left", "_then", "urgent", "waiting")
 
     def __init__(self, per_second: float, now: float) -> None:
         self.waiting: deque[Ask] = deque()
-        self.urgent = False  # an urgent request of its has not been answered
-        self._behind = False  # it sent too much, and has not paused since
+        self.urgent = False  # an urgent request has not been answered yet
+        self._behind = False  # above its rate, without a pause since
         self._left = per_second
         self._then = now
 
     def floods(self, per_second: float, now: float) -> bool:
-        """Count one more request; True when it is too many, or it has not paused since."""
+        """Count one more request; return True if the client is above its rate, until it pauses."""
         passed = now - self._then
         left = min(self._left + passed * per_second, per_second) - 1.0
         self._left = max(left, 0.0)
@@ -59,7 +60,7 @@ class Client:
 
 
 class CommandEndpoint(Endpoint):
-    """The socket by which requests come in and answers go out."""
+    """Socket that receives requests and sends answers."""
 
     def __init__(
         self,
@@ -75,33 +76,33 @@ class CommandEndpoint(Endpoint):
         self._too_many = refusal(text, Reason.BUSY)
         self._send_to_loop = send_to_loop
         self._clock = clock
-        self.refused = 0  # because too many came
-        self.stops = 0  # stops before which what is read now cannot have come
+        self.refused = 0  # requests refused because of their number
+        self.stops = 0  # stops known to have preceded the requests that are read now
         self._fence = 0  # stops so far
-        self._looked = clock()  # time of the last poll; nothing came before the socket was bound
-        self._dated: float | None = None  # time of the poll before a gap whose requests may be left
-        self._left = 0  # requests that may be
-        self._since = 0.0  # a stop, a gap or the last look at what came since; since then …
-        self._came = 0  # … so many requests came that change something
+        self._looked = clock()  # time of the last poll
+        self._dated: float | None = None  # last poll before a gap, while its requests may remain
+        self._left = 0  # requests that may remain from before the gap
+        self._since = 0.0  # time of a stop, of a gap, or of the last check of `_came`
+        self._came = 0  # requests since then, except status
         self._held: list[list[bytes]] = []  # answers
-        self._held_for = 0.0  # s, of which each step counts PURGE at most: a stall is none
+        self._held_for = 0.0  # s; each step counts for at most PURGE, so that stalls don't count
         self._clients: OrderedDict[bytes, Client] = OrderedDict()
-        self._active: set[bytes] = set()  # who has sent something in this second
+        self._active: set[bytes] = set()  # clients that sent a request in this second
         self._active_until = 0.0
-        self._turns: deque[Client] = deque()  # those with requests that wait
+        self._turns: deque[Client] = deque()  # clients with queued requests
         self._urgent: deque[Ask] = deque()
-        self.count = 0  # requests that wait, but for urgent ones
-        self._under_way = [0, 0]  # with the loop; urgent ones
+        self.count = 0  # queued requests, without urgent ones
+        self._under_way = [0, 0]  # requests with the loop: normal, urgent
         limit = bounds.FRAMES * config.max_bytes
         super().__init__(admission, zmq.ROUTER, config.commands, "commands.address", config, limit)
 
     def fence(self, stops: int) -> None:
-        """Stamp requests as older than the last stop until what came before it has been read."""
+        """Stamp requests as older than the last stop until all earlier requests have been read."""
         self._fence = stops
         self._since, self._came = self._clock(), 0
 
     def read(self) -> None:
-        """Take in requests, for as long as others may wait, and give the loop what it may have."""
+        """Read requests for up to `bounds.TURN`, and pass on as many as the loop may have."""
         began = self._clock()
         if began - self._looked > bounds.GAP:
             if self._dated is None:
@@ -130,9 +131,10 @@ class CommandEndpoint(Endpoint):
                 self._turns.append(client)
 
     def _note_empty(self, now: float) -> None:
-        """Note that nothing waits: perhaps all has been read that came before a stop or a gap.
+        """Handle an empty socket: all requests from before a stop or a gap may have been read.
 
-        libzmq's thread may still hand on a message. So it takes `PURGE` in which few came.
+        The thread of libzmq may still deliver one. They count as read only after `PURGE` seconds in
+        which few requests arrived.
         """
         if now - self._since > bounds.PURGE:
             if self._came <= bounds.ALL_RATE * bounds.PURGE:
@@ -140,8 +142,8 @@ class CommandEndpoint(Endpoint):
             self._since, self._came = now, 0
 
     def _take(self, parts: list[bytes], name: str, now: float) -> None:
-        """One message of a client: it waits for its turn, or is refused."""
-        # As with a REP socket, all up to the first empty frame goes back with the reply.
+        """Queue one message of a client, or refuse it."""
+        # As with a REP socket, the frames up to the first empty one are returned with the reply.
         ends = parts.index(b"", 1) + 1 if b"" in parts[1:-1] else 1
         route, payload = parts[:ends], parts[-1]
         if sum(map(len, route)) > bounds.ENVELOPE or len(parts) > bounds.PARTS:
@@ -149,7 +151,7 @@ class CommandEndpoint(Endpoint):
         client = self._client(parts[0], now)
         self._came += b"status" not in payload
         self._left -= 1
-        if self._left < 0:  # more than can have waited
+        if self._left < 0:  # more requests than the queues can have held
             self._dated = None
         is_urgent = _STOP in payload and len(payload) <= bounds.URGENT_BYTES and not client.urgent
         if client.floods(self._share(parts[0], now), now) and not is_urgent:
@@ -186,7 +188,7 @@ class CommandEndpoint(Endpoint):
         return client
 
     def _share(self, identity: bytes, now: float) -> float:
-        """Return what each client may send in a second: less when many send."""
+        """Return the request rate [1/s] allowed for each client; it is lower if many send."""
         if now > self._active_until:
             self._active_until = now + 1.0
             self._active.clear()
@@ -199,14 +201,14 @@ class CommandEndpoint(Endpoint):
         self._send_to_loop(ASK, *ask)
 
     def reply(self, urgent: bool, route: list[bytes], reply: bytes) -> None:
-        """Take the loop's answer to a request."""
+        """Forward the loop's answer to a request."""
         self._under_way[urgent] -= 1
         if urgent and route[0] in self._clients:
             self._clients[route[0]].urgent = False
         self._answer(route, reply)
 
     def _answer(self, route: list[bytes], reply: bytes) -> None:
-        """Send a reply, once what came before a stop has been read."""
+        """Send a reply, or hold it back until all requests from before a stop have been read."""
         if self.stops == self._fence:
             self._send([*route, reply])
             return
@@ -215,5 +217,5 @@ class CommandEndpoint(Endpoint):
         self._held.append([*route, reply])
 
     def _send(self, message: list[bytes]) -> None:
-        with contextlib.suppress(zmq.ZMQError):  # the client has gone
+        with contextlib.suppress(zmq.ZMQError):  # the client has disconnected
             self.socket.send_multipart(message, NOW)

@@ -1,7 +1,7 @@
-"""The addresses where clients come in, and who is let in.
+"""Sockets for clients, and their authentication.
 
-Without keys everybody is, but libzmq hangs up on all who don't greet it as ZMTP 3 does: web pages
-among them, whose POST older versions take for messages.
+Without keys all clients are accepted, but libzmq disconnects peers without a ZMTP 3 greeting. That
+includes web pages, whose POST requests older versions of the protocol accept as messages.
 """
 
 from __future__ import annotations
@@ -30,14 +30,20 @@ _DOMAIN = "softfinger"
 
 
 class StartAnew(SoftfingerError):
-    """All connections are to end, and clients to come in again. The message says why."""
+    """All connections must end, and clients must reconnect. The message gives the reason."""
 
 
 class Admission(ThreadAuthenticator):
-    """Asked by libzmq about each client. Knows the keys as the folder has them now."""
+    """Authenticate clients for libzmq with the keys that the folder contains at present."""
 
     def __init__(self, context: zmq.Context[Any], folder: Path | None) -> None:
-        """``folder`` is of `softfinger keys`, None to let everybody in. Raises KeyFileError."""
+        """Load the keys of ``folder`` (see `softfinger keys`); None accepts all clients.
+
+        Raises
+        ------
+        KeyFileError
+            If the keys can't be read.
+        """
         super().__init__(context)
         self._folder = folder
         self._keys: ServerKeys | None = None if folder is None else load_server(folder)
@@ -47,29 +53,35 @@ class Admission(ThreadAuthenticator):
             self.configure_curve_callback(_DOMAIN, self)
 
     def guard(self, socket: zmq.Socket[Any]) -> None:
-        """Before bind: only whom this lets in."""
+        """Restrict a socket to authenticated clients. Call this before bind."""
         if self._keys is not None:
             self._keys.guard(socket)
-        # Without an authenticator nobody is let in, rather than everybody.
+        # If the authenticator fails, libzmq then rejects all clients instead of accepting them.
         socket.setsockopt(zmq.ZAP_DOMAIN, _DOMAIN.encode())
         socket.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)
         socket.setsockopt(zmq.HANDSHAKE_IVL, int(1e3 * bounds.HANDSHAKE))
 
     def callback(self, domain: str, key: bytes) -> bool:
-        """Return whether a client with this key is let in; asked by the authenticator."""
+        """Return True if the client with this key is accepted. The authenticator calls this."""
         return self._keys is not None and domain == _DOMAIN and key in self._keys.clients
 
     def curve_user_id(self, client_public_key: bytes) -> str:
-        """Return the key's name."""
+        """Return the name of the client with this key."""
         assert self._keys is not None
         return self._keys.clients.get(zmq.utils.z85.encode(client_public_key), "")
 
     def name(self, part: zmq.Frame) -> str:
-        """Return who sent this, by the key; empty without keys."""
+        """Return the name of the sender by its key; empty without keys."""
         return "" if self._keys is None else str(part.get("User-Id"))
 
     def look(self, now: float) -> None:
-        """Let in who was added to the folder. Raises StartAnew when somebody was taken away."""
+        """Check the key folder, and accept new clients.
+
+        Raises
+        ------
+        StartAnew
+            If a key was removed or the authenticator has ended.
+        """
         if now < self._look_at:
             return
         self._look_at = now + bounds.KEYS_CHECKED
@@ -80,7 +92,7 @@ class Admission(ThreadAuthenticator):
         try:
             try:
                 found = load_server(self._folder)
-            except NoDescriptor:  # strangers hold them all: nobody is let in who was not before
+            except NoDescriptor:  # connections use them all, so new keys can't be read
                 found = self._keys.left(self._folder)
         except KeyFileError as error:
             raise StartAnew(str(error)) from None
@@ -91,14 +103,14 @@ class Admission(ThreadAuthenticator):
 
 
 def bind(bound: zmq.Socket[Any], address: str, ipc_mode: int) -> str:
-    """Bind a socket; return its file, empty where there is none. Raises AddressError."""
+    """Bind a socket; return the path of its file, empty for TCP. Raises AddressError."""
     path = address.removeprefix("ipc://") if address.startswith("ipc://") else ""
     if path and (trouble := _taken(path)):
         raise AddressError(f"{address} {trouble}")
     bound.setsockopt(zmq.IPV6, int("[" in address))
-    before = os.umask(0o777 & ~ipc_mode)  # its rights from the first: nobody slips in before
+    before = os.umask(0o777 & ~ipc_mode)  # the file must never have wider permissions
     try:
-        # libzmq binds numbers alone.
+        # libzmq binds only to numeric addresses.
         bound.bind(address.replace("tcp://localhost:", "tcp://127.0.0.1:"))
         if path:
             Path(path).chmod(ipc_mode)
@@ -112,7 +124,7 @@ def bind(bound: zmq.Socket[Any], address: str, ipc_mode: int) -> str:
 
 
 def _taken(path: str) -> str:
-    """Return why a socket may not take the place of ``path``; empty if it may."""
+    """Return the reason why a socket can't replace ``path``; empty if it can."""
     if not Path(path).exists():
         return ""
     if not Path(path).is_socket():
@@ -121,9 +133,9 @@ def _taken(path: str) -> str:
         trial.setblocking(False)
         try:
             trial.connect(path)
-        except (FileNotFoundError, ConnectionRefusedError):  # of a process that was killed
+        except (FileNotFoundError, ConnectionRefusedError):  # left over from a killed process
             return ""
-        except OSError:  # it takes nobody more, or not us
+        except OSError:  # its queue is full, or we lack permission
             pass
     return IN_USE
 
@@ -134,12 +146,15 @@ class Endpoint:
     def __init__(
         self, admission: Admission, kind: int, address: str, key: str, config: Config, limit: int
     ) -> None:
-        """``key`` is the setting that names the address, ``limit`` bounds a message's part.
+        """Bind a socket; ``key`` is the setting of its address, ``limit`` is per message part.
 
-        Raises AddressError.
+        Raises
+        ------
+        AddressError
+            If the address can't be bound.
         """
         self.socket: zmq.Socket[Any] = admission.context.socket(kind)
-        # These hold only for connections made after they were set, so before bind.
+        # The options affect only connections made after they were set, so set them before bind.
         self.socket.setsockopt(zmq.LINGER, int(1e3 * bounds.LAST_WORDS))
         self.socket.setsockopt(zmq.MAXMSGSIZE, limit)
         self.socket.setsockopt(zmq.SNDHWM, bounds.QUEUE if kind == zmq.ROUTER else config.queue)
@@ -152,7 +167,7 @@ class Endpoint:
             raise AddressError(f"{key}: {error}") from None
 
     def _parts(self) -> list[zmq.Frame]:
-        """The next message's first parts, one more than are allowed; empty when there is none."""
+        """Return the parts of the next message, at most one more than allowed; empty if none."""
         found: list[zmq.Frame] = []
         with contextlib.suppress(zmq.Again):
             while not found or found[-1].more:
@@ -167,23 +182,23 @@ class Endpoint:
 
 
 class StreamEndpoint(Endpoint):
-    """The socket of the subscribers."""
+    """Socket that publishes the stream to subscribers."""
 
     def __init__(self, admission: Admission, config: Config) -> None:
-        """Raises AddressError."""
+        """Bind the socket. Raises AddressError."""
         self._topics = [name.encode() for name in config.topics]
         self._prefixes: set[bytes] = set()
-        self._kept: dict[int, deque[bytes]] = {}  # for late subscribers, by topic
-        self._came_late = 0  # topics that are to be told again, as bits …
-        self._tell_at = 0.0  # … then
-        self.wanted = 0  # topics that somebody subscribes to, as bits
+        self._kept: dict[int, deque[bytes]] = {}  # last messages for late subscribers, by topic
+        self._came_late = 0  # topics to repeat for late subscribers, as bits
+        self._tell_at = 0.0  # earliest time of the next repetition
+        self.wanted = 0  # topics with subscribers, as bits
         super().__init__(
             *(admission, zmq.XPUB, config.stream, config.stream_key, config, bounds.SUBSCRIPTION)
         )
         self.socket.setsockopt(zmq.XPUB_VERBOSE, 1)  # reports each subscriber of a topic
 
     def read(self, now: float) -> None:
-        """Learn who came and went; tell all again what those who came have missed."""
+        """Read subscriptions, and repeat stored messages for new subscribers."""
         for _ in range(bounds.SUBSCRIPTIONS):
             parts = self._parts()
             if not parts:
@@ -204,15 +219,15 @@ class StreamEndpoint(Endpoint):
             self._tell_at = now + bounds.TELL_AGAIN
 
     def _matching(self, *prefixes: bytes) -> int:
-        """Return the topics that begin with any of these, as bits."""
+        """Return the topics that begin with any of the prefixes, as bits."""
         return sum(1 << k for k, name in enumerate(self._topics) if name.startswith(prefixes))
 
     def publish(self, topic: int, keep: int, message: bytes) -> None:
-        """Send a message, and keep the last few for late subscribers."""
+        """Send a message, and store the last ``keep`` messages for late subscribers."""
         if keep:
             self._kept.setdefault(topic, deque(maxlen=keep)).append(repeated(message))
         self._send(topic, message)
 
     def _send(self, topic: int, message: bytes) -> None:
-        """One message to all who want its topic; a slow one's is dropped."""
+        """Send one message to all subscribers of its topic; slow subscribers lose it."""
         self.socket.send_multipart((self._topics[topic], message), NOW)

@@ -1,7 +1,7 @@
-"""The gateway's process: one thread that waits for the loop and for clients, and serves both.
+"""Main module of the gateway process: one thread serves the loop and the clients.
 
-``python -m softfinger.daemon.gateway.server FD CONFIG``: the link's descriptor, and a `Config` as
-JSON. Its sockets are bound first; it ends when the loop hangs up.
+Run as ``python -m softfinger.daemon.gateway.server FD CONFIG`` with the file descriptor of the link
+and a `Config` as JSON. The process first binds its sockets. It ends when the loop disconnects.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from softfinger.daemon.gateway.endpoints import NOW, Admission, Endpoint, StartA
 from softfinger.daemon.wire import loop_link
 from softfinger.daemon.wire.loop_link import Channel
 
-_STEPS = 0.5  # s between two words that it lives
-_LATEST = 0  # index of the topic that goes out in one frame, too
-_TURN = 5e-4  # s that the authenticator waits for the interpreter while requests flood
+_STEPS = 0.5  # s between two restarts of the timers that end a stalled process
+_LATEST = 0  # index of the topic that is also published in one frame
+_TURN = 5e-4  # s that the authenticator thread waits for the interpreter during a flood
 
 
 class Server:
-    """Serves clients until the loop hangs up: call `step` again and again."""
+    """Serve clients until the loop disconnects; call `step` repeatedly."""
 
     def __init__(
         self,
@@ -41,13 +41,18 @@ class Server:
         config: Config,
         clock: Callable[[], float] = loop_link.machine_time,
     ) -> None:
-        """Bind what ``config`` names; ``channel`` is this end of the link.
+        """Bind the addresses of ``config``; ``channel`` is this end of the link.
 
-        Raises AddressError, and KeyFileError where there are keys.
+        Raises
+        ------
+        AddressError
+            If an address can't be bound.
+        KeyFileError
+            If the keys can't be read.
         """
         self.channel = channel
         self._clock = clock
-        self._reported: tuple[int, int, int] | None = None  # as the loop knows it
+        self._reported: tuple[int, int, int] | None = None  # last report to the loop
         self._context: zmq.Context[Any] = zmq.Context()
         self._admission = Admission(self._context, Path(config.keys) if config.keys else None)
         self.stream: StreamEndpoint | None = None
@@ -72,7 +77,7 @@ class Server:
             raise
 
     def step(self, seconds: float = bounds.TEND) -> None:
-        """Wait for the loop or a client for so long at most, and serve them."""
+        """Wait up to ``seconds`` for messages of the loop or of clients, and handle them."""
         self._poller.poll(int(1e3 * seconds))
         now = self._clock()
         self._admission.look(now)
@@ -98,7 +103,7 @@ class Server:
         self.channel.flush()
 
     def close(self) -> None:
-        """Let subscribers take what waits, for a moment, and disconnect all."""
+        """Send queued messages for up to `bounds.LAST_WORDS`, and disconnect all clients."""
         for endpoint in (self.stream, self._latest, self.commands):
             if endpoint is not None:
                 endpoint.close()
@@ -107,12 +112,16 @@ class Server:
 
 
 def main(words: list[str]) -> int:
-    """Serve; 0 when the loop has ended, 1 when the sockets could not be bound.
+    """Serve clients until the loop ends, and return the exit status.
 
-    `loop_link.ANEW` when all clients are to come in again.
+    Returns
+    -------
+    int
+        0 when the loop has ended, 1 if the sockets could not be bound, `loop_link.ANEW` if all
+        clients must reconnect.
     """
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.SIG_IGN)  # it ends with the loop, whose last words it sends
+        signal.signal(number, signal.SIG_IGN)  # it must still send the last messages of the loop
     channel = Channel(socket.socket(fileno=int(words[0])))
     try:
         _be_bounded()
@@ -129,7 +138,7 @@ def main(words: list[str]) -> int:
             now = time.monotonic()
             if now - lived > _STEPS:
                 lived = now
-                # Neither SIGPROF nor SIGALRM is handled: each ends it.
+                # SIGPROF and SIGALRM have no handlers, so each of them ends the process.
                 signal.setitimer(signal.ITIMER_PROF, bounds.STALLED)
                 signal.setitimer(signal.ITIMER_REAL, bounds.BLOCKED)
     except StartAnew as reason:
@@ -140,7 +149,7 @@ def main(words: list[str]) -> int:
 
 
 def _be_bounded() -> None:
-    """Bound memory, be the first to go when the system has none, and be no real-time process."""
+    """Limit memory, prefer this process when memory runs out, and drop real-time scheduling."""
     resource.setrlimit(resource.RLIMIT_DATA, (bounds.MEMORY, bounds.MEMORY))
     _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = bounds.CLIENTS + bounds.DESCRIPTORS
@@ -151,7 +160,7 @@ def _be_bounded() -> None:
         Path("/proc/self/oom_score_adj").write_text("500", encoding="ascii")
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     except OSError:
-        pass  # not worth doing without the hand
+        pass  # these two are optional
 
 
 if __name__ == "__main__":

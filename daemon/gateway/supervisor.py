@@ -1,4 +1,4 @@
-"""Starts the gateway's process, and starts it again when it has died."""
+"""Supervisor that starts the gateway process and restarts it when it has died."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from softfinger.daemon.gateway.bounds import Config
 from softfinger.daemon.wire import loop_link
 from softfinger.daemon.wire.loop_link import Channel, Link
 
-_ROOT = Path(__file__).parents[3]  # where the package is found
-_PATIENCE = 60.0  # s for a gateway to bind its sockets; one that ended is not waited for
-_LASTED = 10.0  # s after which a death counts as the first
-_LOOK, _LOOKS = 1.0, 2  # s between looks at a process, and how many see it stopped
-_AGAIN = 0.1, 2.0  # s between a death and the next start, at first and after many
+_ROOT = Path(__file__).parents[3]  # folder that contains the package
+_PATIENCE = 60.0  # s, timeout for binding the sockets, unless the process ends before
+_LASTED = 10.0  # s of running after which the restart delay is reset
+_LOOK, _LOOKS = 1.0, 2  # s between checks; a process found stopped this many times is killed
+_AGAIN = 0.1, 2.0  # s from an exit to the next start: first delay, longest delay
 
 
 class Gateway:
-    """A gateway that runs until it is closed. `link` is the loop's way to it."""
+    """Gateway process that runs until it is closed. The loop uses `link` to reach it."""
 
     def __init__(self, config: Config) -> None:
-        """It starts beside whatever is done until `wait`."""
+        """Start the process in the background; call `wait` before use."""
         self.link = Link()
         self._config = config
         self._closing = threading.Event()
@@ -35,7 +35,7 @@ class Gateway:
         self._process, self._channel = self._start()
 
     def wait(self) -> Gateway:
-        """Be ready. Raises AddressError when the sockets can't be bound."""
+        """Wait until the gateway is ready. Raises AddressError if the sockets can't be bound."""
         self._meet()
         self._thread = threading.Thread(target=self._watch, name="gateway", daemon=True)
         self._thread.start()
@@ -49,21 +49,21 @@ class Gateway:
         ours, theirs = loop_link.pair()
         paths = [str(_ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
         with theirs:
-            # -P: a folder named daemon where this was started is not ours.
+            # -P keeps a folder named daemon in the working directory from being imported.
             words = [sys.executable, "-P", "-m", f"{__package__}.server", str(theirs.fileno())]
             process = subprocess.Popen(
                 [*words, json.dumps(self._config)],
                 pass_fds=(theirs.fileno(),),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
-                # A session of its own: Ctrl-C is the daemon's, whose last words are to be sent.
+                # In its own session, Ctrl-C does not end it before the daemon's last messages.
                 start_new_session=True,
                 env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
             )
         return process, Channel(ours)
 
     def _meet(self) -> None:
-        """Wait until its sockets are bound. Raises AddressError."""
+        """Wait until the process has bound its sockets. Raises AddressError."""
         select.select([self._channel], [], [], _PATIENCE)
         for kind, *fields in self._channel.receive():
             if kind == loop_link.READY:
@@ -97,11 +97,11 @@ class Gateway:
                         self.link.notices.append(f"clients can't be served: {error}")
                 else:
                     break
-            if self._closing.is_set():  # while it was started
+            if self._closing.is_set():  # closed during the start
                 self._channel.close()
 
     def _wait(self) -> int:
-        """Wait for its end; one that is stopped is ended: its own timers don't run then."""
+        """Wait for the process to end, and kill it if it is stopped, since its timers don't run."""
         process, stopped = self._process, 0
         while True:
             try:
@@ -118,7 +118,7 @@ class Gateway:
         self._process.wait()
 
     def close(self) -> None:
-        """Disconnect, and wait until all has been sent."""
+        """Disconnect, and wait until the gateway has sent all messages and ended."""
         self._closing.set()
         self.link.close()
         self._channel.close()
@@ -133,6 +133,6 @@ class Gateway:
 def _is_stopped(process: int) -> bool:
     try:
         state = Path(f"/proc/{process}/stat").read_text(encoding="latin-1").rpartition(")")[2]
-    except OSError:  # it has ended
+    except OSError:  # the process has ended
         return False
     return state.split()[0] in "Tt"

@@ -1,1 +1,1 @@
-"""Perception, from tactile frames to contacts: calibration, estimate, and filter between frames."""
+"""Perception: from tactile frames to contacts, with calibration, estimation and filtering."""

@@ -1,7 +1,7 @@
-"""The calibration file of one sensor: read, checked against the sensor, written, applied.
+"""Calibration file of one sensor: read it, check it against the sensor, write and apply it.
 
-One JSON file a sensor. A step that was not done yet is null, and the settings' value is taken
-instead. What the numbers mean is in `kinematics.calibration`.
+Each sensor has one JSON file. A calibration step that was not done yet is null, and the value of
+the settings is used instead. `kinematics.calibration` explains the numbers.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from softfinger.kinematics.contact.tip_curves import TipCurves
 FloatArray = NDArray[np.float64]
 _NAMES: tuple[Literal["left"], Literal["right"]] = ("left", "right")
 _STEPS = ("tare", "equilibrate", "curve", "centre", "modulus", "law", "scales")
-_PITCH = 1e-9  # m within which pitches are equal
+_PITCH = 1e-9  # m, tolerance of equal pitches
 _MONOTONE_POINTS = 257
-_FAULTY = 0.2  # of the median range: a cell with less is nearly full without load
+_FAULTY = 0.2  # of the median range; a cell with less is nearly saturated without load
 
 
 class CalibrationFileError(TactileError):
-    """The file can't be used, or belongs to another sensor. The message says why."""
+    """The file can't be used or belongs to another sensor. The message gives the reason."""
 
 
 class _StepModel(BaseModel):
@@ -53,11 +53,11 @@ class Sensor(_StepModel):
 
 
 class TareStep(_StepModel):
-    """Mean count of each unloaded cell, and their typical standard deviation [counts].
+    """Mean count of each unloaded cell, and typical standard deviation of a cell [counts].
 
-    ``correlation`` of two cells' noise by their distance in rows and columns, empty for none;
-    ``drift``: standard deviation of what all cells do together; ``excess``: mean reading over the
-    zero, as none is below [counts].
+    ``correlation`` is the noise correlation of two cells by their distance in rows and columns; it
+    is empty for independent noise. ``drift`` is the standard deviation of the common change of all
+    cells. ``excess`` is the mean reading above zero, since readings are clipped at 0 [counts].
     """
 
     date: str
@@ -70,7 +70,7 @@ class TareStep(_StepModel):
 
 
 class EquilibrateStep(_StepModel):
-    """Gain of each cell, 0 for a dead one; relative spread before and after."""
+    """Gain of each cell, 0 for a dead cell; relative spread before and after correction."""
 
     date: str
     gain: list[list[Finite]]
@@ -80,7 +80,7 @@ class EquilibrateStep(_StepModel):
 
 
 class CurveStep(_StepModel):
-    """(exponent b, c_1, c_2, c_3) of p = c_1 x^b + c_2 x² + c_3 x³ [Pa]; relative residual."""
+    """Coefficients (b, c_1, c_2, c_3) of p = c_1 x^b + c_2 x² + c_3 x³ [Pa], relative residual."""
 
     date: str
     kind: Literal["power", "cubic"]
@@ -89,7 +89,7 @@ class CurveStep(_StepModel):
 
 
 class CentreStep(_StepModel):
-    """Tip's centre on the sensor, ``std`` its error [m]; rotation [rad], null: not measured."""
+    """Centre of the tip on the sensor and its ``std`` [m]; rotation [rad], null if not measured."""
 
     date: str
     centre: tuple[Finite, Finite]
@@ -100,7 +100,7 @@ class CentreStep(_StepModel):
 
 
 class ModulusStep(_StepModel):
-    """Modulus [Pa], or the points of a law: strain and stress [Pa]; relative residual for E."""
+    """Modulus E [Pa], or points of a stress-strain law [Pa]; relative residual of E."""
 
     date: str
     modulus: Positive
@@ -110,16 +110,17 @@ class ModulusStep(_StepModel):
     residual: Finite
 
     def material(self) -> Material:
-        """Return the tip's law. Raises ValueError for points that make none."""
+        """Return the stress-strain law of the tip. Raises ValueError for unsuitable points."""
         if self.strain:
             return Material.from_points(self.strain, self.stress)
         return Material.constant(self.modulus)
 
 
 class ScalesStep(_StepModel):
-    """Scales of the finger by its grips: (mean, relative standard deviation) of each.
+    """Calibration factors of the finger from grips: mean and relative standard deviation of each.
 
-    Of the modulus over this file's or the settings', the sensor's gain, the joint's torque.
+    The factors are the modulus relative to this file or the settings, the gain of the sensor, and
+    the torque constant of the joint.
     """
 
     date: str
@@ -129,9 +130,9 @@ class ScalesStep(_StepModel):
 
 
 class Calibration(_StepModel):
-    """All steps of one sensor. Frozen: a step is put in by ``model_copy(update=…)``.
+    """All calibration steps of one sensor. Add a step with ``model_copy(update=…)``.
 
-    ``wants`` are the settings of ``[tip]`` that the presses of `calibrate law` want, by name.
+    ``wants`` has the settings of ``[tip]`` that the presses of `calibrate law` require, by name.
     """
 
     format: Literal[1] = 1
@@ -148,22 +149,22 @@ class Calibration(_StepModel):
 
     @property
     def identity(self) -> str:
-        """The sensor's name, or its finger, and the file's date."""
+        """Label of the sensor, or its finger, and the date of the file."""
         return f"{self.sensor.label or self.sensor.finger} {self.date}"
 
     def summary(self) -> str:
-        """Return the same and the steps that were done, in one line."""
+        """Return the identity and the completed steps in one line."""
         steps = [name for name in _STEPS if getattr(self, name) is not None]
         return f"{self.identity}: {', '.join(steps) or 'no step'}"
 
 
 def now() -> str:
-    """Return the present date and time as the file has it."""
+    """Return the present date and time in the format of the file."""
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
 def sensor_of(settings: Settings, finger: int) -> Sensor:
-    """Return the settings' sensor under ``finger``; its USB port's serial number if none is set."""
+    """Return the sensor of ``finger``; without a label, the USB serial number is its label."""
     tactile = settings.tactile
     return Sensor(
         finger=_NAMES[finger],
@@ -195,9 +196,9 @@ def load_calibration(path: Path) -> Calibration:
 
 
 def calibration_for(settings: Settings, finger: int) -> Calibration | None:
-    """Return the settings' calibration of one finger's sensor, None where they name none.
+    """Return the calibration of a finger's sensor, or None if the settings name no file.
 
-    Raises CalibrationFileError when it can't be read or is another sensor's.
+    Raises CalibrationFileError if the file can't be read or belongs to another sensor.
     """
     name = settings.tactile.calibration[finger]
     if not name:
@@ -210,7 +211,7 @@ def calibration_for(settings: Settings, finger: int) -> Calibration | None:
 
 
 def difference(file: Sensor, there: Sensor) -> str:
-    """Return how the file's sensor differs from the one that is ``there``; empty: not at all."""
+    """Return the differences between the sensor of a file and the sensor ``there``, or ""."""
     pairs = [
         ("finger", file.finger, there.finger),
         ("sensor", file.label or "no name", there.label or "no name"),
@@ -225,7 +226,7 @@ def difference(file: Sensor, there: Sensor) -> str:
 
 
 def save_calibration(path: Path, calibration: Calibration) -> None:
-    """Write the file whole, or leave the one that is there. Raises CalibrationFileError."""
+    """Write the file atomically. Raises CalibrationFileError and then keeps the old file."""
     text = json.dumps(calibration.model_dump(mode="json"), ensure_ascii=False) + "\n"
     try:
         write_whole(path, text.encode())
@@ -234,14 +235,21 @@ def save_calibration(path: Path, calibration: Calibration) -> None:
 
 
 class Converter:
-    """Counts → Pa of one sensor."""
+    """Conversion of one sensor's counts to pressures [Pa]."""
 
     def __init__(
         self, calibration: Calibration, pascal_per_count: float, full_count: int | None = None
     ) -> None:
-        """``pascal_per_count`` is taken where no curve was measured.
+        """Create a converter.
 
-        ``full_count``: the reading of saturated cells; None: the sensor's.
+        Parameters
+        ----------
+        calibration
+            Calibration of the sensor.
+        pascal_per_count
+            Scale that is used without a measured curve.
+        full_count
+            Reading of saturated cells; None for that of the calibrated sensor.
         """
         sensor = calibration.sensor
         shape = (sensor.rows, sensor.cols)
@@ -260,50 +268,51 @@ class Converter:
             )
 
     def __call__(self, counts: NDArray[np.uint16]) -> FloatArray:
-        """Pressure [Pa] of counts [rows, cols]."""
+        """Return the pressure [Pa] of counts [rows, cols]."""
         return self.pressure(self.readings(counts))
 
     def readings(self, counts: NDArray[Any]) -> FloatArray:
-        """Return x = max(counts − zero, 0)·gain of (mean) counts: what the curve is fitted to."""
+        """Return x = max(counts − zero, 0)·gain of (mean) counts, the argument of the curve."""
         return np.asarray(np.maximum(counts - self.zero, 0.0) * self.gain)
 
     def pressure(self, readings: FloatArray) -> FloatArray:
-        """Return pressure [Pa] of readings that noise may take below 0, where the curve goes on."""
+        """Return the pressure [Pa] of readings. Noise may make them negative; the curve is odd."""
         exponent, c1, c2, c3 = self._curve.tolist()
         x = np.abs(readings)
         return np.asarray(np.sign(readings) * (c1 * x**exponent + c2 * x**2 + c3 * x**3))
 
     def at(self, count: int) -> FloatArray:
-        """Return pressure [Pa] of each cell when it reads ``count``, a new array."""
+        """Return a new array with the pressure [Pa] of each cell that reads ``count``."""
         return self(np.full(self.zero.shape, count, np.uint16))
 
     @property
     def saturation(self) -> float:
-        """The least pressure [Pa] at which a live cell is full, see :func:`least_end`."""
+        """Lowest pressure [Pa] at which a live cell saturates; see :func:`least_end`."""
         pressure = self.at(self._full)[self.live]
         return least_end(pressure) if pressure.size else np.inf
 
     @property
     def largest(self) -> float:
-        """The greatest pressure [Pa] that any cell can read."""
+        """Highest pressure [Pa] that any cell can read."""
         return float(self.at(self._full).max())
 
     @property
     def quantum(self) -> float:
-        """A count's typical width [Pa]: the mean slope of the curve."""
+        """Typical pressure of one count [Pa]: the mean slope of the curve."""
         return self.saturation / self._full
 
 
 def least_end(ends: FloatArray) -> float:
-    """Return the least of the readings at which cells are full, each over its own zero.
+    """Return the smallest reading, above the cell's own zero, at which a cell saturates.
 
-    Cells that are nearly full without load are left out: they would make all others count as full.
+    Cells that are nearly saturated without load are ignored. Otherwise all other cells would count
+    as saturated.
     """
     return float(ends[ends >= _FAULTY * np.median(ends)].min())
 
 
 def _contradiction(calibration: Calibration) -> str:
-    """Return the contradiction in a file whose single values are valid; empty if there is none."""
+    """Return a message if values contradict each other, or an empty text."""
     sensor = calibration.sensor
     tables = {}
     if calibration.tare:
@@ -335,7 +344,7 @@ def _contradiction(calibration: Calibration) -> str:
 
 
 def _usb_serial(settings: Settings, finger: int) -> str:
-    """The serial number of the USB adapter at the finger's port; empty where there is none."""
+    """Return the serial number of the USB adapter at the finger's port, or an empty text."""
     tactile = settings.tactile
     if tactile.backend in ("simulated", "replay", "none"):
         return ""

@@ -1,4 +1,4 @@
-"""One finger's tip and sensor as they are modelled, from settings and calibration file."""
+"""Model of a finger's tip and sensor, from the settings and the calibration file."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
 @dataclass(frozen=True)
 class FingerModel:
-    """Material, contact table and grid of one finger; ``calibration`` is None without a file."""
+    """Material, contact table and grid of one finger, and its calibration if there is one."""
 
     finger: int
     material: Material
@@ -44,17 +44,19 @@ class FingerModel:
 
     @property
     def own_material(self) -> bool:
-        """The tip's law was measured, and is not the settings'."""
+        """True if the stress-strain law of the tip comes from its calibration."""
         return self.calibration is not None and self.calibration.modulus is not None
 
 
 def make_models(
     settings: Settings, on_event: Callable[[str, str, str], None] | None = None
 ) -> tuple[FingerModel, FingerModel]:
-    """Make both fingers' models, by the settings' law where a tip's modulus is not calibrated.
+    """Create the models of both fingers.
 
-    A finger that takes no part, or has no sensor, goes by the settings alone. Raises as
-    `profile.factory.make_table` and `calibration_file.calibration_for`.
+    Without a calibrated modulus, a tip has the stress-strain law of the settings. A finger that is
+    not in the scene or has no sensor uses the settings alone.
+
+    Raises the exceptions of `profile.factory.make_table` and `calibration_file.calibration_for`.
     """
     if on_event is not None:
         for doubt in sensor_doubts(settings):
@@ -68,7 +70,7 @@ def make_models(
             calibration = calibration_for(settings, finger)
         if measured:
             if name not in settings.scene.fingers:
-                continue  # it has the other's
+                continue  # it gets the model of the other finger
             material, tip = Material.constant(1.0), _measured_tip(settings, finger, calibration)
             table = make_table(settings, material, tip)
         elif calibration is not None and calibration.modulus is not None:
@@ -114,7 +116,10 @@ def _prior(settings: Settings, calibration: Calibration | None) -> Prior:
 
 
 def _measured_tip(settings: Settings, finger: int, calibration: Calibration | None) -> Fingertip:
-    """The tip by the curves of its file. Raises SettingsError where they don't serve."""
+    """Return the tip with the curves of its calibration file.
+
+    Raises SettingsError if there are none or they do not fit the settings.
+    """
     law = None if calibration is None else calibration.law
     file = settings.tactile.calibration[finger]
     if law is None:
@@ -136,7 +141,7 @@ def _measured_tip(settings: Settings, finger: int, calibration: Calibration | No
 
 
 def calibrated_grid(settings: Settings, finger: int, calibration: Calibration | None) -> SensorGrid:
-    """Return the sensor's cells, at the calibrated centre if there is one."""
+    """Return the grid of a sensor, with the calibrated centre and rotation if there are any."""
     if settings.tip.physics == "measured" and calibration is not None and calibration.law:
         return make_grid(settings, finger, calibration.law.centre, calibration.law.rotation)
     if calibration is None or calibration.centre is None:
@@ -151,10 +156,16 @@ def make_estimator(
     active: NDArray[np.bool_] | None = None,
     calibration: Calibration | None = None,
 ) -> ContactEstimator | MeasuredEstimator:
-    """Return an estimator of its own for each finger, since it starts from its last estimate.
+    """Create the estimator of a finger. Fingers can't share one, since it keeps its last estimate.
 
-    ``active``: cells that exist, less the settings' dead ones. With a ``calibration``
-    its frames are the pressures [Pa] of a `Converter`, without one they are counts.
+    Parameters
+    ----------
+    settings, material, finger
+        Settings of the hand, material of the tip, and index of the finger.
+    active
+        Cells that exist [rows, cols]; dead cells of the settings are excluded in addition.
+    calibration
+        With a calibration, frames are the pressures [Pa] of a `Converter`; without, counts.
     """
     tactile = settings.tactile
     alive = np.ones((tactile.rows, tactile.cols), np.bool_) if active is None else active.copy()
@@ -165,7 +176,7 @@ def make_estimator(
         converter = Converter(calibration, tactile.pascal_per_count, tactile.full_count)
         alive &= converter.live
         saturation, quantum = converter.saturation, converter.quantum
-        # The estimator takes half a count off a threshold, in the frame's unit.
+        # The estimator subtracts 0.5 from a threshold, in the unit of the frame.
         threshold = quantum * max(threshold - 0.5, 0.0) + 0.5 if threshold else 0.0
     if settings.tip.physics == "measured":
         return MeasuredEstimator(
@@ -188,7 +199,7 @@ def make_estimator(
 
 
 def uncertainty(settings: Settings, calibration: Calibration | None) -> Uncertainty:
-    """Return the uncertainties that frames don't show, by settings or calibration."""
+    """Return the systematic uncertainties, from the settings or the calibration."""
     tactile = settings.tactile
     baseline, centre, pitch = tactile.baseline_error, tactile.centre_error, tactile.pitch_error
     modulus, correlation = settings.material.modulus_error, None

@@ -1,7 +1,7 @@
-"""Perception of each finger: its newest frame calibrated and estimated, then filtered.
+"""Perception of the fingers: calibrate each new frame, estimate its contact, and filter.
 
-`FingerPerception` estimates each frame once; `hand_estimator` carries the estimates on
-to the contacts of every tick.
+`FingerPerception` estimates each frame once. `hand_estimator` filters the estimates and predicts
+the contacts of every tick.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from softfinger.daemon.types import FINGERS, Event, Frame, SensorFacts, State
 from softfinger.kinematics.estimation.estimator import ContactEstimate
 
 _TARE_FRAMES = 16
-_ZERO_EVERY = 8  # frames: what warmth moves takes seconds
-_STEPS = 65535  # of a published pressure
-_REMEMBERED = 2.0  # s of frames that are known again
-_REPEATED = 0.1  # s of frames that come again, from which on that is no chance …
-_DISTINCT = 5  # … and how many they are at least
-_CELLS = 4  # that change from each to the next: one or two that flicker come again by chance
+_ZERO_EVERY = 8  # frames between updates of the zero; thermal drift takes seconds
+_STEPS = 65535  # quantisation steps of a published pressure
+_REMEMBERED = 2.0  # s of frames that are remembered
+_REPEATED = 0.1  # s of repeated frames that are no coincidence
+_DISTINCT = 5  # lower bound of the number of these frames
+_CELLS = 4  # cells that must change between frames; one or two noisy cells repeat by chance
 
 
 class Perception:
-    """A hand's tactile sensors and the filter of its contacts. Only the loop's thread calls it."""
+    """Tactile sensors of a hand and the filter of its contacts. Only the loop's thread calls it."""
 
     def __init__(
         self,
@@ -41,8 +41,8 @@ class Perception:
         sensors: Mapping[int, TactileSensor],
         models: tuple[FingerModel, FingerModel],
     ) -> None:
-        """``sensors`` by finger, none in a scene without."""
-        self.events: list[Event] = []  # the loop takes them out
+        """Create the perception of ``sensors``, a mapping by finger, which may be empty."""
+        self.events: list[Event] = []  # the loop publishes and removes them
         self.fingers = [
             FingerPerception(sensor, models[finger], settings, self.events)
             for finger, sensor in sorted(sensors.items())
@@ -55,12 +55,12 @@ class Perception:
         )
 
     def tare(self) -> None:
-        """Take the mean of the next frames as zero, cell by cell."""
+        """Set the zero of each cell to its mean over the next frames."""
         for each in self.fingers:
             each.tare()
 
     def update(self, state: State) -> None:
-        """Take in new frames; write the contacts and the object's pose of this tick."""
+        """Process new frames, and write the contacts and the object pose of this tick."""
         if not self.fingers:
             return
         for each in self.fingers:
@@ -74,33 +74,34 @@ class Perception:
 
 
 class Repeats:
-    """Notices frames that come again in the order in which they came before.
+    """Detector of sequences of frames that are repeated in the same order.
 
-    A sensor with noise never repeats one. One without, at rest, sends the same frame for long, or
-    one of two: that is no repetition; what stays the same is judged as a frozen sensor.
+    A noisy sensor never repeats a frame. A sensor without noise may send the same frame for a long
+    time at rest, or alternate between two. That does not count as a repetition; constant frames are
+    handled by the check for a frozen sensor.
     """
 
     def __init__(self, rate: float, enabled: bool = True) -> None:
-        """``rate``: of the frames [Hz]; ``enabled``: to repeat them is wrong."""
+        """Create a detector for a frame ``rate`` [Hz]; ``enabled`` if repetitions are faults."""
         self._enabled = enabled
-        self.lag = 0  # frames after which they come again, 0: they don't
-        self._run = 0  # frames in a row that did so
+        self.lag = 0  # period of the repetition in frames, 0 for none
+        self._run = 0  # consecutive frames with this period
         self._enough = max(round(_REPEATED * rate), _DISTINCT)
         self._digests: deque[int] = deque(maxlen=round(_REMEMBERED * rate))  # newest first
         self._last: NDArray[np.uint16] | None = None  # frame
 
     @property
     def again(self) -> bool:
-        """True if the last two frames came in this order before."""
+        """True if the last two frames arrived before in this order."""
         return self._enabled and self._run > 1
 
     @property
     def long(self) -> bool:
-        """True if the frames have repeated for long enough to be sure."""
+        """True if the frames have repeated for too long to be a coincidence."""
         return self.again and self._run >= self._enough
 
     def differs(self, data: NDArray[np.uint16]) -> bool:
-        """Take in a frame; return whether it differs from the last."""
+        """Process a frame; return True if it differs from the last one."""
         last, self._last = self._last, data.copy()
         changed = np.count_nonzero(data != last)
         if not changed:
@@ -114,13 +115,13 @@ class Repeats:
 
 
 class FingerPerception:
-    """One finger's sensor: its newest frame, and what is estimated from that frame alone."""
+    """Sensor of one finger, its newest frame, and the contact estimate from that frame alone."""
 
     def __init__(
         self, sensor: TactileSensor, model: FingerModel, settings: Settings, events: list[Event]
     ) -> None:
-        """``events`` takes a tare that failed."""
-        full = getattr(sensor, "full_count", None)  # of a recording that has its own
+        """Create the perception of one finger; a failed tare appends to ``events``."""
+        full = getattr(sensor, "full_count", None)  # some recordings have their own
         if full is not None and full < settings.tactile.full_count:
             own = settings.tactile.model_copy(update={"full_count": full})
             settings = settings.model_copy(update={"tactile": own})
@@ -130,58 +131,58 @@ class FingerPerception:
         self.finger = model.finger
         self.sensor = sensor
         self.frame: Frame | None = None
-        self.frames = 0  # that came
-        self.changes = True  # the newest tells anything new
-        self.changed = 0.0  # when one that differs from its last arrived [s]
-        # A recording that plays from its start again repeats itself.
+        self.frames = 0  # frames received
+        self.changes = True  # the newest frame is neither equal to the last nor a repetition
+        self.changed = 0.0  # arrival time of the last frame that differed from the one before [s]
+        # A recording that plays in a loop repeats itself.
         self.repeats = Repeats(settings.tactile.rate, tactile.backend != "replay")
         self.estimate = ContactEstimate()  # of the last valid frame
-        active = getattr(sensor, "live", None)  # of a recording that lacks cells
+        active = getattr(sensor, "live", None)  # some recordings lack cells
         self._estimator = make_estimator(
             settings, model.material, model.finger, active, calibration
         )
         self._full = float(tactile.full_count)
-        self._scale = tactile.pascal_per_count  # of the readings
-        self._quantum = tactile.pascal_per_count  # of a count where nothing presses
+        self._scale = tactile.pascal_per_count  # Pa per unit of the readings
+        self._quantum = tactile.pascal_per_count  # Pa per count
         self._converter: Converter | None = None
         if calibration is not None:
             self._converter = Converter(calibration, tactile.pascal_per_count, tactile.full_count)
             self._scale = 1.0
             self._quantum = self._converter.quantum
-        self._readings: NDArray[Any] | None = None  # of the newest frame: counts over zero, or Pa
+        self._readings: NDArray[Any] | None = None  # newest frame: counts above zero, or Pa
         self._as_pressure = settings.stream.tactile_unit == "Pa"
         self.facts = self._facts(settings, model)
         self._events = events
-        self._zero: NDArray[np.uint16] | None = None  # where there is no converter
+        self._zero: NDArray[np.uint16] | None = None  # used without a converter
         live = np.ones(model.grid.shape, np.bool_) if active is None else active
         self._unpressed = UnpressedCells(model.grid, settings.tip.radius, live)
-        self._noise = tactile.noise  # of a cell, as set [Pa]
+        self._noise = tactile.noise  # of a cell, from the settings [Pa]
         self._tare_sum: NDArray[np.uint32] | int = 0
         self._tare_left = 0
 
     @property
     def noise(self) -> float:
-        """Standard deviation that the cells show [Pa]; 0 where that is not known."""
+        """Measured standard deviation of a cell [Pa]; 0 if it is unknown."""
         return self._unpressed.scatter * self._quantum
 
     @property
     def full_count(self) -> float:
-        """The reading of a saturated cell [counts]."""
+        """Reading of a saturated cell [counts]."""
         return self._full
 
     @property
     def taring(self) -> bool:
-        """The zero is being learnt."""
+        """True while the zero is being measured."""
         return self._tare_left > 0
 
     def tare(self) -> None:
-        """Take the mean of the next frames as zero, cell by cell."""
+        """Set the zero of each cell to its mean over the next frames."""
         self._tare_sum = 0
         self._tare_left = _TARE_FRAMES
         self._unpressed.forget_zero()
 
     def update(self) -> Frame | None:
-        """Return the newest frame, estimated, where it is a new one; None where it is not."""
+        """Estimate and return the newest frame, or return None if there is no new one."""
         frame, last = self.sensor.latest(), self.frame
         if frame is None or frame is last:
             return None
@@ -211,16 +212,14 @@ class FingerPerception:
         return frame
 
     def published(self) -> NDArray[np.uint16]:
-        """Return the newest frame's data [rows, cols] for subscribers; unit and scale are in
-        ``facts``.
-        """
+        """Return the newest frame's data [rows, cols] for subscribers, in the unit of ``facts``."""
         assert self.frame is not None
         assert self._readings is not None
         if not self._as_pressure:
             return self.frame.data
         if self._converter is None:
             return self._readings
-        # A zero below the calibration's lets a cell read more than the scale was made for.
+        # With a zero below that of the calibration, a cell may exceed the range of the scale.
         steps = np.minimum(self._readings * (1.0 / self.facts.scale), _STEPS)
         return np.rint(steps).astype(np.uint16)
 
@@ -248,7 +247,7 @@ class FingerPerception:
             return
         mean = self._tare_sum / _TARE_FRAMES
         ends = self._full - np.round(mean)
-        if not np.median(ends) > 0.0:  # over such a zero no contact could be felt
+        if not np.median(ends) > 0.0:  # above such a zero no contact could be measured
             side = FINGERS[self.finger]
             text = f"{side} sensor's zero stays: most cells are full where nothing presses"
             self._events.append(("warning", "tare", text))

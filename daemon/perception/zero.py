@@ -1,9 +1,9 @@
-"""Zero and noise of a sensor, by the cells that no tip can press.
+"""Zero and noise of a sensor, measured with the cells beyond the tip.
 
-A cell that nothing presses reads its zero, and about it its noise. Under a tip of 20 mm some 60 %
-of a 58 mm grid lies beyond the tip, so these cells show both whatever the tip does, and a second
-contact on a few of them changes no median. Readings end at 0: a zero that falls below it is not
-seen here, but by the joints' closing (`perception.hand_channels`).
+An unloaded cell reads its zero plus noise. With a tip of 20 mm, some 60 % of a 58 mm grid lies
+beyond the tip, so these cells show zero and noise during any contact of the tip. A second contact
+on a few of them does not change their median. Readings are clipped at 0, so a zero that falls below
+0 is not detected here, but by the closing of the joints (`perception.frame_channels`).
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ from numpy.typing import NDArray
 
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
-_BESIDE = 2.0  # pitches from the tip's rim, from which on a cell feels nothing of it
-_FEWEST = 50  # cells: below, nothing is said
-_AVERAGED = 8  # frames of which the noise is averaged
-_CLIPPED = 0.25  # share of cells that read 0, from which on noise round 0 is cut in half …
-_CLIPPED_VARIANCE = 0.5 - 0.5 / math.pi  # … which leaves so much of its variance
+_BESIDE = 2.0  # pitches from the rim of the tip, beyond which a cell is unloaded
+_FEWEST = 50  # cells; with fewer, zero and noise are not estimated
+_AVERAGED = 8  # frames, time constant of the noise average
+_CLIPPED = 0.25  # fraction of cells that read 0, above which noise counts as clipped at 0
+_CLIPPED_VARIANCE = 0.5 - 0.5 / math.pi  # part of the variance that clipping leaves
 
 
 class UnpressedCells:
-    """Follows one sensor's zero, and its noise."""
+    """Estimator of one sensor's zero shift and noise."""
 
     def __init__(self, grid: SensorGrid, radius: float, live: NDArray[np.bool_]) -> None:
-        """``radius`` [m] of the tip; ``live`` [rows, cols]: cells that work."""
+        """Create an estimator for a tip ``radius`` [m] and the working cells ``live``."""
         (pitch_x, pitch_y), (centre_x, centre_y) = grid.pitches, grid.centre
         x = (np.arange(grid.cols) - 0.5 * (grid.cols - 1)) * pitch_x - centre_x
         y = (np.arange(grid.rows) - 0.5 * (grid.rows - 1)) * pitch_y - centre_y
@@ -35,23 +35,23 @@ class UnpressedCells:
         cells = np.flatnonzero(live & (distance > reach))
         self._cells = cells if cells.size >= _FEWEST else cells[:0]
         self._live = np.flatnonzero(live)
-        self._before: NDArray[np.float64] | None = None  # what these read
-        self._squares: NDArray[np.float64] | None = None  # of their changes, averaged
-        self._zeros = 0.0  # share of them that read 0
-        self._reference: float | None = None  # median of these cells at the tare
+        self._before: NDArray[np.float64] | None = None  # last readings of the live cells
+        self._squares: NDArray[np.float64] | None = None  # their squared changes, averaged
+        self._zeros = 0.0  # fraction of the live cells that read 0
+        self._reference: float | None = None  # median of the unloaded cells at the tare
         self._variance: float | None = None
-        self.shift = 0  # counts that the zero has risen since the tare
+        self.shift = 0  # increase of the zero since the tare [counts]
 
     @property
     def noise(self) -> float:
-        """Standard deviation of a cell [counts]; 0 where nothing shows it."""
+        """Standard deviation of a cell [counts]; 0 if it is unknown."""
         return 0.0 if self._variance is None else math.sqrt(self._variance)
 
     @property
     def scatter(self) -> float:
-        """Noise by what all cells do from frame to frame [counts], where none is out of reach.
+        """Noise [counts], from changes between frames if no cells lie beyond the tip.
 
-        Most of them rest, except while a tip moves. 0 where nothing shows it.
+        Most cells are constant, except while a tip moves. The value is 0 if the noise is unknown.
         """
         if self._squares is None:
             return self.noise
@@ -59,12 +59,12 @@ class UnpressedCells:
         return math.sqrt(variance / (_CLIPPED_VARIANCE if self._zeros > _CLIPPED else 1.0))
 
     def forget_zero(self) -> None:
-        """The zero is learnt anew."""
+        """Reset the zero shift; the next frame sets a new reference."""
         self.shift = 0
         self._reference = None
 
     def follow(self, counts: NDArray[np.uint16]) -> None:
-        """Take in a frame of raw ``counts``."""
+        """Update the estimates with a frame of raw ``counts``."""
         if not self._cells.size:
             self._compare(counts.ravel()[self._live].astype(np.float64))
             return
@@ -73,8 +73,9 @@ class UnpressedCells:
         if self._reference is None:
             self._reference = level
         self.shift = round(level - self._reference)
-        # What is above the median alone: readings may end below it. A cell that something presses
-        # counts as if it were three deviations off; the counts' own rounding is known to others.
+        # Use only readings above the median, since readings below it may be clipped. Limit the
+        # deviation to three standard deviations, since some cells may be loaded. Subtract the
+        # quantisation error (1/12), which the error budget adds separately.
         above = np.maximum(read - level, 0.0)
         most = 3.0 * max(self.noise, 1.0) if self._variance is not None else math.inf
         square = 2.0 * float(np.square(np.minimum(above, most)).mean()) - 1.0 / 12.0
@@ -92,7 +93,7 @@ class UnpressedCells:
         self._zeros = 1.0 - np.count_nonzero(read) / read.size
 
     def corrected(self, counts: NDArray[np.uint16], full: int) -> NDArray[np.uint16]:
-        """Return the counts less what the zero has moved by; ``full`` ones stay."""
+        """Return the counts minus the zero shift; counts at ``full`` are not changed."""
         if self.shift == 0:
             return counts
         moved = np.clip(counts.astype(np.int32) - self.shift, 0, full)

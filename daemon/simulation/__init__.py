@@ -1,1 +1,1 @@
-"""The simulated hand: its physics, and its servos and tactile boards as bytes on ptys."""
+"""Simulated hand: its physics, and emulated servos and tactile boards on ptys."""

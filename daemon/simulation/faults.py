@@ -1,5 +1,7 @@
-"""Faults of the emulated hand: ``[PART:]KIND[=VALUE][@START[..END]]`` in words, on the line, and in
-what is measured, at once or more and more; the hand itself is as it was.
+"""Faults of the emulated hand: text form, faults of the servo line, and measurement faults.
+
+A fault is written as ``[PART:]KIND[=VALUE][@START[..END]]``. It begins suddenly or grows from START
+to END. Faults do not change the physics of the hand.
 """
 
 from __future__ import annotations
@@ -21,21 +23,21 @@ FloatArray = NDArray[np.float64]
 
 SERVOS = "servos"
 OBJECT = "object"
-LATE = 0.010  # s that a late reply is late by
+LATE = 0.010  # s, delay of a late reply
 
 
 @dataclass(slots=True)
 class LineFaults:
-    """Probabilities, 0 … 1, for each instruction and each reply, and the delay of every reply."""
+    """Fault probabilities (0 to 1) of each instruction and reply, and the delay of every reply."""
 
-    lose: float = 0.0  # an instruction reaches no servo
-    lose_writes: float = 0.0  # one that asks for no reading reaches none, besides
-    drop: float = 0.0  # a reply never comes
-    late: float = 0.0  # it comes LATE seconds later
-    truncate: float = 0.0  # its end is missing
-    corrupt: float = 0.0  # one bit is flipped
-    duplicate: float = 0.0  # it comes twice
-    delay: float = 0.0  # s that every reply comes later, as behind a slow adapter
+    lose: float = 0.0  # an instruction is lost
+    lose_writes: float = 0.0  # an instruction other than a read is lost, in addition
+    drop: float = 0.0  # a reply is lost
+    late: float = 0.0  # a reply arrives LATE seconds later
+    truncate: float = 0.0  # the end of a reply is missing
+    corrupt: float = 0.0  # one bit of a reply is flipped
+    duplicate: float = 0.0  # a reply is sent twice
+    delay: float = 0.0  # s by which all replies are delayed, like a slow adapter
 
 
 LINE_FAULTS = tuple(field.name.replace("_", "-") for field in fields(LineFaults))
@@ -54,7 +56,7 @@ _UNVALUED = ("unplug", "plug", "well")
 
 
 class FaultSource:
-    """Applies :class:`LineFaults`, the same way for the same seed."""
+    """Apply :class:`LineFaults` at random, reproducibly for a given seed."""
 
     def __init__(self, seed: int = 1) -> None:
         self.rates = LineFaults()
@@ -68,14 +70,14 @@ class FaultSource:
         return bool(damage or rates.delay)
 
     def loses(self, reads: bool) -> bool:
-        """Draw whether the next instruction reaches no servo; ``reads``: it asks for a reading."""
+        """Return True if the next instruction is lost; ``reads`` if it is a read instruction."""
         rates = self.rates
         if rates.lose and self._random.random() < rates.lose:
             return True
         return bool(not reads and rates.lose_writes and self._random.random() < rates.lose_writes)
 
     def spoil(self, reply: bytes) -> list[tuple[float, bytes]]:
-        """Return (extra delay [s], bytes) of a spoilt reply, none when it was dropped."""
+        """Return the copies of a damaged reply as (extra delay [s], bytes); empty if dropped."""
         rates, chance = self.rates, self._random.random
         if chance() < rates.drop:
             return []
@@ -95,7 +97,7 @@ LONGEST_REPLAY = 3.0  # s
 
 
 class MeasurementFault(NamedTuple):
-    """A kind: its value where nothing is wrong, and the bounds of its value."""
+    """A kind of measurement fault: its value without a fault, and the limits of its value."""
 
     honest: float
     low: float
@@ -103,29 +105,29 @@ class MeasurementFault(NamedTuple):
 
 
 MEASUREMENT_FAULTS = {
-    "gain": MeasurementFault(1.0, 0.0, 100.0),  # each cell reads so many times its pressure
-    "shift-x": MeasurementFault(0.0, -255.0, 255.0),  # cells, towards higher columns; zeros follow
-    "shift-y": MeasurementFault(0.0, -255.0, 255.0),  # and towards higher rows
-    "mirror": MeasurementFault(0.0, 0.0, 1.0),  # 1: the columns are in reverse order
-    "drift": MeasurementFault(0.0, -1.0, 1.0),  # share of the largest count that each cell gains
-    "replay": MeasurementFault(0.0, 0.0, LONGEST_REPLAY),  # s of frames that come again and again
-    "current": MeasurementFault(1.0, -100.0, 100.0),  # the servo reads so many times its current
+    "gain": MeasurementFault(1.0, 0.0, 100.0),  # factor of the pressure of all cells
+    "shift-x": MeasurementFault(0.0, -255.0, 255.0),  # cells, to higher columns, filled with zeros
+    "shift-y": MeasurementFault(0.0, -255.0, 255.0),  # cells, to higher rows
+    "mirror": MeasurementFault(0.0, 0.0, 1.0),  # 1: the order of the columns is reversed
+    "drift": MeasurementFault(0.0, -1.0, 1.0),  # offset of all cells, fraction of the largest count
+    "replay": MeasurementFault(0.0, 0.0, LONGEST_REPLAY),  # s of frames that are repeated
+    "current": MeasurementFault(1.0, -100.0, 100.0),  # factor of the measured current
 }
-SUDDEN = ("mirror", "replay")  # have nothing between off and on
+SUDDEN = ("mirror", "replay")  # these are either on or off
 
 
 class FaultError(SoftfingerError, ValueError):
-    """A fault that can't be understood. The message says what is known."""
+    """The text of a fault is invalid. The message lists the expected forms."""
 
 
 class FaultEvent(NamedTuple):
-    """Fault or load of one device or object at an instant."""
+    """Begin of a fault or load of one device or of the object."""
 
     after: float  # s
-    part: str  # ``servos``, ``object``, or a finger: its board, or what it measures
+    part: str  # ``servos``, ``object``, or a finger, for its board or measurements
     kind: str
-    value: float = 1.0  # a probability, a servo's ID, a load, or a measurement's error
-    over: float = 0.0  # s in which it comes
+    value: float = 1.0  # probability, ID of a servo, load, or value of a measurement fault
+    over: float = 0.0  # s in which the fault grows
 
     def __str__(self) -> str:
         value = "" if self.kind in _UNVALUED else f"={self.value:g}"
@@ -133,15 +135,15 @@ class FaultEvent(NamedTuple):
 
 
 class _Form(NamedTuple):
-    """Kinds of faults that are written alike."""
+    """Kinds of faults with the same syntax."""
 
     kinds: Collection[str]
-    value: str  # how a value is written: in brackets where there may be none, empty for no value
-    parts: tuple[str, ...]  # what it happens to where the word names no finger
-    sided: bool = False  # a finger may be named
+    value: str  # syntax of the value: in brackets if optional, empty for no value
+    parts: tuple[str, ...]  # affected parts if the word names no finger
+    sided: bool = False  # the word may name a finger
 
     def fits(self, side: str | None, kind: str, valued: bool) -> bool:
-        """Return whether a word may be of this form."""
+        """Return True if a word may have this form."""
         optional = self.value.startswith("[")
         return (
             kind in self.kinds
@@ -150,13 +152,14 @@ class _Form(NamedTuple):
         )
 
     def bounds(self, kind: str) -> tuple[float, float]:
-        """Return the least and the greatest value."""
+        """Return the lowest and the highest value."""
         if kind in MEASUREMENT_FAULTS:
             return MEASUREMENT_FAULTS[kind][1:]
         return (0.0, 1.0) if "PROBABILITY" in self.value else (-math.inf, math.inf)
 
 
-# The first that fits: `silent=2` and `frozen=2` are a servo's, `left:silent` and `silent` boards'.
+# The first matching form counts: `silent=2` and `frozen=2` are faults of a servo, `left:silent` and
+# `silent` are faults of boards.
 _ID = "=ID"
 _FORMS = (
     _Form(SERVO_FAULTS, _ID, (SERVOS,)),
@@ -171,21 +174,32 @@ _WORD = re.compile(r"(?:([^:]*):)?([a-z-]+)(?:=([^@]*))?(?:@(.*?)(?:\.\.(.*))?)?
 
 
 def parse_faults(words: Iterable[str], ids: tuple[int, ...]) -> list[FaultEvent]:
-    """Parse faults from words of text, in time's order, then in the given one.
+    """Parse fault words, and return the faults in order of time, then in the given order.
 
-    - ``torn``, ``noisy``, ``silent``, ``frozen``, ``wrong-size``, ``saturated``, ``zero`` for both
-      boards, with ``left:`` or ``right:`` before it for one; see :class:`TactileBoard`.
-    - ``drop=0.01``, ``silent=2`` … for the servos; see :meth:`ServoBus.fault`.
-    - ``gain=0.5``, ``left:current=2`` … for what both fingers or one measure; see
-      MEASUREMENT_FAULTS.
-    - ``unplug`` and ``plug`` for the servos' port, ``left:unplug`` … for a board's.
-    - ``push=15``, ``twist=0.3`` for the object, from then on; 0 ends it.
-    - ``well`` ends what is wrong with the servos' line, boards and measurements, ``left:well`` with
-      one finger's.
+    - ``torn``, ``noisy``, ``silent``, ``frozen``, ``wrong-size``, ``saturated``, ``zero`` affect
+      both boards, or one with the prefix ``left:`` or ``right:``; see :class:`TactileBoard`.
+    - ``drop=0.01``, ``silent=2`` and others affect the servos; see :meth:`ServoBus.fault`.
+    - ``gain=0.5``, ``left:current=2`` and others affect the measurements of both fingers or one;
+      see MEASUREMENT_FAULTS.
+    - ``unplug`` and ``plug`` affect the port of the servos, ``left:unplug`` that of a board.
+    - ``push=15``, ``twist=0.3`` load the object from then on; 0 ends the load.
+    - ``well`` ends the faults of the servo line, boards and measurements, ``left:well`` those of
+      one finger.
 
-    ``@START`` behind it says when it starts [s]; ``@START..END`` that a measurement goes wrong
-    evenly from then to then. ``ids`` are the servos'. Raises FaultError for a word that can't be
-    understood.
+    The suffix ``@START`` gives the time of the begin [s]. With ``@START..END`` a measurement fault
+    grows linearly from START to END.
+
+    Parameters
+    ----------
+    words
+        The faults.
+    ids
+        IDs of the servos.
+
+    Raises
+    ------
+    FaultError
+        For an invalid word.
     """
     return sorted((event for word in words for event in _parse(word.strip(), ids)), key=_after)
 
@@ -239,7 +253,7 @@ def _number(text: str) -> float:
 
 @dataclass(slots=True)
 class _Ramp:
-    """A value that changes evenly from one to another."""
+    """Value that changes linearly in time."""
 
     before: float
     after: float
@@ -255,32 +269,32 @@ class _Ramp:
 
 
 class MeasurementFaults:
-    """Faults of one finger's tactile sensor and of its servo's present current."""
+    """Measurement faults of one finger: of its tactile sensor and of its servo's current."""
 
     def __init__(self) -> None:
         self._ramps: dict[str, _Ramp] = {}
 
     def begin(self, kind: str, value: float, t: float, over: float = 0.0) -> None:
-        """Let a kind of MEASUREMENT_FAULTS go to ``value`` from ``t`` on, evenly in ``over`` [s].
+        """Change a kind of MEASUREMENT_FAULTS linearly to ``value`` within ``over`` [s] from ``t``.
 
-        It starts from what it is at ``t``, and takes the place of a change that has not ended then.
-        Raises KeyError for another kind.
+        The change starts from the value at ``t`` and replaces an unfinished one. Raises KeyError
+        for an unknown kind.
         """
         self._ramps[kind] = _Ramp(self(kind, t), value, t, over)
 
     def clear(self) -> None:
-        """End all of them at once."""
+        """End all faults at once."""
         self._ramps.clear()
 
     def __call__(self, kind: str, t: float) -> float:
-        """The value of a kind at time ``t`` [s]."""
+        """Return the value of a kind at time ``t`` [s]."""
         ramp = self._ramps.get(kind)
         return MEASUREMENT_FAULTS[kind].honest if ramp is None else ramp(t)
 
     def apply(self, signal: FloatArray, full_count: int, t: float) -> None:
-        """Change a sensor's counts ``signal`` [rows, cols] in place, as it reads them at ``t`` [s].
+        """Apply the faults at ``t`` [s] to a sensor's counts ``signal`` [rows, cols] in place.
 
-        Between whole cells a shifted image is interpolated.
+        Shifts by fractions of a cell are interpolated.
         """
         if not self._ramps:
             return
@@ -294,7 +308,7 @@ class MeasurementFaults:
 
 
 def _shift(count: int, cells: float) -> FloatArray:
-    """Return the matrix [count, count] that shifts ``count`` values by so many cells, linearly."""
+    """Return the matrix [count, count] of a shift by ``cells``, with linear interpolation."""
     places = np.arange(count)
     weights: FloatArray = np.maximum(1.0 - np.abs(places[:, None] - places - cells), 0.0)
     return weights

@@ -1,4 +1,4 @@
-"""The stream and the commands as bytes: schema, packing, sockets, keys.
+"""Wire format and transport of the stream and the commands: schema, packing, sockets, keys.
 
-The process that holds the clients' connections is `gateway`.
+The process that holds the clients' connections is in `gateway`.
 """

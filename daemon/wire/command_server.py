@@ -1,13 +1,13 @@
-"""The loop's side of commands: unpacks requests that the gateway passes on, and answers them.
+"""Command server of the loop: unpacks the requests from the gateway and answers them.
 
-It runs in the loop's thread, once a tick, without a lock. A ``stop`` goes first. What came before
-one is refused, wherever it waited, but for a ``status``: its stamp counts fewer stops. A ``hold``
-takes the place of the one that waits just before it.
+It runs in the loop's thread, once per tick, without a lock. A ``stop`` takes precedence. Requests
+that arrived before a stop, whose stamp counts fewer stops, are refused, except ``status``. A
+``hold`` replaces the ``hold`` that waits just before it on the same connection.
 
-A client may give a request a ``key`` that no other request has, and send the same map again when it
-was refused as late. The command is then carried out once at most, and only if no other command was
-carried out since that refusal: the newest command prevails. What can only make the hand safer
-(`UNLEASED`) is carried out each time.
+A client may give a request a unique ``key`` and send the same map again if it was refused as late.
+The daemon then carries out the command at most once, and only if it has carried out no other
+command since that refusal: the newest command prevails. Commands that can only make the hand safer
+(`UNLEASED`) are carried out every time.
 """
 
 from __future__ import annotations
@@ -23,29 +23,29 @@ from softfinger.daemon.errors import Reason, Refused
 from softfinger.daemon.types import UNLEASED
 from softfinger.daemon.wire.loop_link import Ask, Link, machine_time
 
-if TYPE_CHECKING:  # the gateway has no use for it
+if TYPE_CHECKING:  # the gateway process does not need this module
     from softfinger.daemon.wire.local_stop import LocalStop
 
 Handler = Callable[[dict[str, Any], float], dict[str, Any]]  # request, its age [s]
 
-_PAST_WITHIN = 0.4  # s that a local stop's answer waits for a gateway that may have died
-_A_TICK = 2  # commands carried out at one, a stop not counted
-_UNPACKED = 4096  # bytes after which no more requests are unpacked at a tick
-_KEYS = 256  # requests whose outcome is kept
+_PAST_WITHIN = 0.4  # s that the answer to a local stop waits for the gateway
+_A_TICK = 2  # commands carried out per tick, without stops
+_UNPACKED = 4096  # bytes after which no more requests are unpacked in a tick
+_KEYS = 256  # requests whose outcome is stored
 _KEY_LENGTH = 64
-_VALUES = (str, int, float)  # and bool, which is an int
+_VALUES = (str, int, float)  # bool is a subclass of int
 
 
 class _Outcome(NamedTuple):
     """Reply to a request that has a key."""
 
     stops: int  # number of stops when the request was first refused or carried out
-    changes: int  # and of other commands carried out
-    reply: bytes  # empty when the request was late, and may be sent again
+    changes: int  # number of other commands carried out by then
+    reply: bytes  # empty if the request was late and may be sent again
 
 
 class CommandServer:
-    """Answers requests that come over a link, and a stop that comes past it."""
+    """Answer requests from the link to the gateway, and stops from the local socket."""
 
     def __init__(
         self,
@@ -53,29 +53,29 @@ class CommandServer:
         local: LocalStop | None = None,
         clock: Callable[[], float] = machine_time,
     ) -> None:
-        """``clock`` is the gateway's, by which it notes when a request came."""
+        """Create a server; ``clock`` is the clock with which the gateway stamps requests."""
         self._link = link
-        self.notices = link.notices  # the gateway's warnings, to be published as events
+        self.notices = link.notices  # warnings of the gateway, to be published as events
         self._local = local
         self._clock = clock
         self._stops = 0
-        self._changes = 0  # commands carried out that may change the hand, but for stops
-        # By the key's client and the request, oldest first.
+        self._changes = 0  # commands carried out that may change the hand, without stops
+        # Key: name of the client by its access key, and the request. Oldest first.
         self._outcomes: OrderedDict[tuple[str, bytes], _Outcome] = OrderedDict()
-        self._stopped: bytes | None = None  # answer to a local stop, until the gateway knows it
+        self._stopped: bytes | None = None  # answer to a local stop, until the gateway confirms it
         self._answer_by = 0.0
         if local is not None:
             link.watch(local.fileno())
 
     @property
     def refused_by_pace(self) -> int:
-        """Requests refused because too many came."""
+        """Number of requests refused because of their rate."""
         return self._link.refused
 
     def serve(self, handler: Handler) -> None:
-        """Have ``handler`` carry out what is due at this tick.
+        """Pass the requests of this tick to ``handler`` and answer them.
 
-        It raises Refused with the reason.
+        The handler raises Refused, with the reason, for a command that it does not carry out.
         """
         self._link.look()
         if self._local is not None and (self._link.called or self._stopped is not None):
@@ -88,12 +88,12 @@ class CommandServer:
             self._link.reply(ask, self._answer(ask, request, handler))
 
     def raise_fence(self) -> None:
-        """Refuse all commands that arrived before now, except stop and status: the hand stopped."""
+        """Refuse all commands that arrived before now, except stop and status, after a stop."""
         self._stops += 1
         self._link.fence(self._stops)
 
     def _unpack(self, handler: Handler) -> None:
-        """Take in what has come; carry out a stop, several at once as one."""
+        """Unpack the requests that arrived; carry out a stop at once, several as one."""
         stopped, waiting = b"", self._link.unpacked
         size = 0  # bytes
         while self._link.asked and size < _UNPACKED:
@@ -101,7 +101,7 @@ class CommandServer:
             size += len(ask.payload)
             try:
                 request = decode(ask.payload)
-                if ask.urgent and request["command"] != "stop":  # the map names two commands
+                if ask.urgent and request["command"] != "stop":  # the map has two commands
                     raise _malformed('expected one text under "command"')
             except Refused as refused:
                 self._link.reply(ask, refusal(str(refused), refused.reason))
@@ -111,7 +111,7 @@ class CommandServer:
             if request["command"] == "stop":
                 if not stopped:
                     stopped = accepted(handler({"command": "stop", "client": ask.name}, 0.0))
-                    self.raise_fence()  # before the answer, after which its client may go on
+                    self.raise_fence()  # before the answer, since its client may then continue
                 self._link.reply(ask, stopped)
                 continue
             mine = [other for other in waiting if other[0].route[0] == ask.route[0]]
@@ -122,7 +122,7 @@ class CommandServer:
             waiting.append((ask, request))
 
     def _answer(self, ask: Ask, request: dict[str, Any], handler: Handler) -> bytes:
-        """Return the reply to a request; one that has a key is carried out once at most."""
+        """Return the reply to a request; a request with a key is carried out at most once."""
         name, place = request["command"], (ask.name, ask.payload)
         keyed = request.pop("key", None) is not None and name not in UNLEASED
         present = _Outcome(self._stops, self._changes, b"")
@@ -160,7 +160,7 @@ class CommandServer:
 
 
 def _replaces(request: dict[str, Any], other: dict[str, Any]) -> bool:
-    """Return True if a hold sets all that another one before it does."""
+    """Return True if a hold sets all values that the earlier hold sets."""
     is_hold = request["command"] == other["command"] == "hold"
     return is_hold and other.keys() - {"key"} <= request.keys()
 
@@ -178,19 +178,19 @@ def refusal(error: str, reason: str) -> bytes:
 
 
 def decode(payload: bytes) -> dict[str, Any]:
-    """Unpack a command, a map of plain numbers and texts with a text under ``command``.
+    """Unpack a command: a map of plain numbers and texts, with a text under ``command``.
 
-    Raises Refused for all else, but a stop is one whatever its map holds besides.
+    Raises Refused for other data, but accepts a stop with any additional content.
     """
     try:
         request = msgpack.unpackb(payload, raw=False, max_map_len=64, max_array_len=64)
-    except Exception as error:  # msgpack raises many kinds, ValueError and its own among them
+    except Exception as error:  # msgpack raises its own exceptions, ValueError and others
         raise _malformed(f"not msgpack: {error}") from None
     if not isinstance(request, dict):
         raise _malformed(f"expected a map, found {type(request).__name__}")
     if not isinstance(request.get("command"), str):
         raise _malformed('expected a text under "command"')
-    # Nothing nested: requests are published as they came.
+    # Nested values are rejected, since requests are published unchanged.
     plain = {
         key: value
         for key, value in request.items()

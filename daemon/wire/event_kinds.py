@@ -1,7 +1,7 @@
-"""The kinds of events: for each its levels, its cause, and what to do about it.
+"""Table of all kinds of events with their levels, causes and remedies.
 
-The documentation's page of events is generated from this table. The kinds with a dot are rows of
-`safety.limits`, which states what is checked.
+The documentation page of events is generated from this table. Kinds with a dot are rows of
+`safety.limits`, which defines the checks.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ class EventKind(NamedTuple):
 
     levels: str  # info, warning, error; a fault is an error that turns torque off
     cause: str
-    remedy: str = ""  # empty if there is nothing to do
+    remedy: str = ""  # empty if no action is needed
 
 
 _CALIBRATE_JOINTS = "Calibrate the joints: `softfinger calibrate joints my.toml`."

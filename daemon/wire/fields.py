@@ -1,4 +1,4 @@
-"""Declarations of records of fields and of the stream's topics: the mechanism of `wire.schema`."""
+"""Declaration of the stream's topics, records and fields; `wire.schema` uses it."""
 
 import dataclasses
 from collections.abc import Callable, Iterator
@@ -15,9 +15,9 @@ Getter = Callable[[Any], Any]
 
 
 class Field(NamedTuple):
-    """One number or text of a topic's map. A field of a map within the map has a dot in its name.
+    """One number or text of a topic's map. Names of fields of a nested map contain a dot.
 
-    ``kind`` is int, float, bool, str or bin; ``unit`` is empty where there is none.
+    ``kind`` is int, float, bool, str or bin; ``unit`` is empty for a field without a unit.
     """
 
     name: str
@@ -27,7 +27,7 @@ class Field(NamedTuple):
 
 
 class Topic(NamedTuple):
-    """One topic: the record of its messages, and the class of what a message is made from."""
+    """One topic: the record of its messages, and the class of the source of a message."""
 
     record: type[Any]
     summary: str
@@ -39,7 +39,7 @@ TOPICS: dict[bytes, Topic] = {}
 
 
 class FieldSource(Generic[_From]):
-    """Declares fields that are taken from a ``_From``, which ``get`` finds in ``outer``."""
+    """Source of declared fields: a ``_From`` object, which ``get`` returns from ``outer``."""
 
     def __init__(
         self, outer: "FieldSource[Any] | None" = None, get: Getter = lambda it: it
@@ -48,38 +48,38 @@ class FieldSource(Generic[_From]):
         self.get = get
 
     def of(self, get: Callable[[_From], _Within]) -> "FieldSource[_Within]":
-        """Declare a source within this one."""
+        """Declare a source that ``get`` returns from this one."""
         return FieldSource(self, get)
 
     def __call__(
         self, unit: str, meaning: str, get: Callable[[_From], _Value] | None = None
     ) -> _Value:
-        """Declare a field; without ``get`` it is the attribute of its own name."""
+        """Declare a field; without ``get`` it is the attribute of the same name."""
         about = {"unit": unit, "meaning": meaning, "source": self, "get": get}
         return cast(_Value, dataclasses.field(metadata=about))
 
     def part(self, prefix: str, get: Callable[[_From], object]) -> Any:
-        """Declare a map within the map, whose own fields are taken from what ``get`` returns.
+        """Declare a nested map, whose fields come from the object that ``get`` returns.
 
-        ``prefix`` comes before all their meanings.
+        ``prefix`` is put before the meanings of its fields.
         """
         about = {"unit": "", "meaning": prefix, "source": self, "get": get}
         return dataclasses.field(metadata=about)
 
 
 class Member(NamedTuple):
-    """A record's field or part as it is declared."""
+    """Declared field or part of a record."""
 
     name: str
     type: Any
     unit: str
-    meaning: str  # a part's: what comes before those of its fields
+    meaning: str  # of a part: prefix of the meanings of its fields
     source: FieldSource[Any]
     get: Getter
 
 
 def members(cls: type[Any]) -> Iterator[Member]:
-    """Yield a record's fields and parts in their order."""
+    """Yield the fields and parts of a record in order."""
     for each in dataclasses.fields(cls):
         get = each.metadata["get"] or attrgetter(each.name)
         yield Member(each.name, each.type, **{**each.metadata, "get": get})
@@ -87,14 +87,14 @@ def members(cls: type[Any]) -> Iterator[Member]:
 
 @dataclass_transform(frozen_default=True)
 def record(cls: type[_Record]) -> type[_Record]:
-    """Make a record of a class of declared fields."""
+    """Turn a class of declared fields into a record."""
     return dataclasses.dataclass(frozen=True, slots=True)(cls)
 
 
 def topic(
     name: bytes, summary: str, source: Callable[..., Any]
 ) -> Callable[[type[_Record]], type[_Record]]:
-    """Declare that a record is a topic's, whose messages are each made from a ``source``."""
+    """Declare the record of a topic, whose messages are each made from a ``source``."""
 
     def declare(cls: type[_Record]) -> type[_Record]:
         TOPICS[name] = Topic(cls, summary, source, tuple(fields_of(cls)))
@@ -104,7 +104,7 @@ def topic(
 
 
 def fields_of(cls: type[Any], outer: str = "", prefix: str = "") -> Iterator[Field]:
-    """Yield all fields of a record in their order, those of records within it with a dot."""
+    """Yield all fields of a record in order; names of nested fields contain a dot."""
     for each in members(cls):
         if each.type in KINDS:
             yield Field(outer + each.name, KINDS[each.type], each.unit, prefix + each.meaning)

@@ -1,18 +1,18 @@
-"""Keys of the daemon's sockets and of those who may use them: files, and what they do to a socket.
+"""CurveZMQ keys of the daemon and its clients: key files and socket options.
 
-CurveZMQ: each side has a key pair; a client knows the server's public key, and the server the
-public keys of its clients. Whoever has no key among them gets nothing. A folder of `make_keys`:
+Each side has a key pair. A client has the public key of the server, and the server has the public
+keys of its clients. It rejects all others. `make_keys` creates a folder with these files:
 
 ``server/server.key_secret``, ``server/server.key``
-    the daemon's own pair, and its public key
+    the key pair of the daemon, and its public key
 ``server/clients/NAME.key``
-    whom it lets in; a file taken away is a client shut out at once
+    public key of an accepted client; removing the file disconnects the client at once
 ``NAME/server.key``, ``NAME/client.key_secret``
-    what that client needs: the folder to bring to its machine. ``local`` is this machine's.
+    the folder to copy to the machine of that client; ``local`` is for this machine
 
-The files are ZeroMQ certificates, which other ZeroMQ programs can read, too. Files and folders that
-somebody else owns or may write are refused, with all folders above them: whoever may write there
-may add a key of his own.
+The files are ZeroMQ certificates, which other ZeroMQ programs can read too. Files and folders that
+another user owns or may write are refused, and so are files below such a folder, since that user
+could add a key.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ import zmq.utils.z85
 from softfinger.daemon.errors import KeyFileError, NoDescriptor
 from softfinger.kinematics.compiled.own_folder import check_above, fault
 
-LOCAL = "local"  # the client that every folder of keys has
+LOCAL = "local"  # client that every key folder contains
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 _LENGTH = 32  # bytes of a key
@@ -42,14 +42,17 @@ _LENGTH = 32  # bytes of a key
 
 @dataclass(frozen=True, slots=True)
 class ServerKeys:
-    """The daemon's pair and its clients' public keys, in Z85."""
+    """Key pair of the daemon and public keys of its clients, in Z85."""
 
     public: bytes
     secret: bytes
     clients: dict[bytes, str]  # public key → name
 
     def left(self, folder: Path) -> ServerKeys:
-        """Return them without clients whose files are gone. Opens nothing. Raises KeyFileError."""
+        """Return the keys without clients whose files were removed. Raises KeyFileError.
+
+        This opens no file, so it works without a free file descriptor.
+        """
         clients = _place(folder) / "clients"
         _check_above(clients / "any")
         kept = {
@@ -58,7 +61,7 @@ class ServerKeys:
         return ServerKeys(self.public, self.secret, kept)
 
     def guard(self, socket: zmq.Socket[Any]) -> None:
-        """Before bind: take clients with keys alone."""
+        """Make a socket accept only clients with keys. Call this before bind."""
         socket.setsockopt(zmq.CURVE_SERVER, 1)
         socket.setsockopt(zmq.CURVE_SECRETKEY, self.secret)
         socket.setsockopt(zmq.CURVE_PUBLICKEY, self.public)
@@ -66,21 +69,21 @@ class ServerKeys:
 
 @dataclass(frozen=True, slots=True)
 class ClientKeys:
-    """A client's pair and the server's public key, in Z85."""
+    """Key pair of a client and public key of the server, in Z85."""
 
     server: bytes
     public: bytes
     secret: bytes
 
     def guard(self, socket: zmq.Socket[Any] | zmq.Context[Any]) -> None:
-        """Speak with this server alone, by this name: a socket before connect, or all to come."""
+        """Make a socket (before connect), or all future sockets of a context, use these keys."""
         socket.setsockopt(zmq.CURVE_SERVERKEY, self.server)
         socket.setsockopt(zmq.CURVE_PUBLICKEY, self.public)
         socket.setsockopt(zmq.CURVE_SECRETKEY, self.secret)
 
 
 def check_curve() -> None:
-    """Raise KeyFileError when this machine's libzmq can't do it."""
+    """Raise KeyFileError if the installed libzmq does not support CURVE."""
     if not zmq.has("curve"):
         raise KeyFileError(
             f"libzmq {zmq.zmq_version()} of this Python was built without CURVE: install a pyzmq "
@@ -89,9 +92,17 @@ def check_curve() -> None:
 
 
 def make_keys(folder: Path, names: list[str]) -> list[Path]:
-    """Make the server's pair, unless it is there, and a pair for each client; the new folders.
+    """Create the server's key pair, unless it exists, and a pair for each client.
 
-    Raises KeyFileError before anything is written when a client is there already.
+    Returns
+    -------
+    list[Path]
+        The new folders.
+
+    Raises
+    ------
+    KeyFileError
+        If a client exists already (then nothing is written), or a file can't be written.
     """
     check_curve()
     server = folder / "server"
@@ -125,7 +136,7 @@ def _write_keys(folder: Path, server: Path, names: list[str], new: bool) -> list
             client.mkdir()
             zmq.auth.create_certificates(client, "client")
             shutil.copyfile(server / "server.key", client / "server.key")
-            # Last, so that nobody is let in whose own keys could not be written.
+            # This comes last, so that a client without written keys is not accepted.
             (client / "client.key").rename(server / "clients" / f"{name}.key")
     finally:
         os.umask(before)
@@ -133,7 +144,10 @@ def _write_keys(folder: Path, server: Path, names: list[str], new: bool) -> list
 
 
 def load_server(folder: Path) -> ServerKeys:
-    """Return the daemon's keys: `make_keys`'s folder or its ``server``. Raises KeyFileError."""
+    """Return the daemon's keys from a folder of `make_keys` or its ``server``.
+
+    Raises KeyFileError.
+    """
     check_curve()
     place = _place(folder)
     public, secret = _pair(place / "server.key_secret")
@@ -149,7 +163,10 @@ def load_server(folder: Path) -> ServerKeys:
 
 
 def load_client(folder: Path) -> ClientKeys:
-    """Return a client's keys, from its own folder or `make_keys`'s. Raises KeyFileError."""
+    """Return a client's keys from its own folder or a folder of `make_keys`.
+
+    Raises KeyFileError.
+    """
     check_curve()
     place = folder if (folder / "client.key_secret").exists() else folder / LOCAL
     public, secret = _pair(place / "client.key_secret")
@@ -157,7 +174,7 @@ def load_client(folder: Path) -> ClientKeys:
 
 
 def _place(folder: Path) -> Path:
-    """The server's folder, which ``folder`` is or holds."""
+    """Return the server's folder, which is ``folder`` itself or a subfolder."""
     return folder if (folder / "server.key_secret").exists() else folder / "server"
 
 
@@ -183,13 +200,13 @@ def _keys(path: Path, secret: bool = False) -> tuple[bytes, bytes | None]:
                 raise ValueError("a key of another length")
     except OSError as error:
         raise _unreadable(path, error) from None
-    except (ValueError, LookupError, struct.error):  # the last of a key beyond Z85's range
+    except (ValueError, LookupError, struct.error):  # struct.error: key outside the range of Z85
         raise KeyFileError(f"{path}: no key file") from None
     return keys
 
 
 def _check(path: Path, status: os.stat_result, secret: bool = False) -> None:
-    """Raises KeyFileError when somebody else owns or may write it, or may read a secret."""
+    """Raise KeyFileError if another user owns or may write the file, or may read a secret."""
     mode = stat.S_IMODE(status.st_mode)
     if secret and mode & 0o077:
         raise KeyFileError(f"{path}: may be read by others ({mode:04o}): chmod 600 {path}")
@@ -198,7 +215,7 @@ def _check(path: Path, status: os.stat_result, secret: bool = False) -> None:
 
 
 def _check_above(path: Path) -> None:
-    """All folders above a file. Raises KeyFileError."""
+    """Check all folders above a file. Raises KeyFileError."""
     try:
         check_above(path)
     except PermissionError as error:

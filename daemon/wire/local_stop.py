@@ -1,7 +1,7 @@
-"""A way for ``stop`` that no client's connections can take: a socket for this user alone.
+"""Local socket for ``stop``, which other clients can't block.
 
-Datagrams to a Unix socket, so there is nothing to connect, to wait for or to use up. It lies in a
-folder that only the daemon's user may enter; `client.command_client` takes it where it is there.
+It is a Unix datagram socket, so there are no connections that could be exhausted. It lies in a
+folder that only the daemon's user may enter; `client.command_client` uses it if it exists.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ from softfinger.daemon.errors import AddressError
 from softfinger.daemon.own_files import home_folder, shared_folder
 from softfinger.kinematics.compiled.own_folder import require_own
 
-_ANY = ("localhost", "*", "0.0.0.0", "[::]")  # and addresses that mean this machine, too
+_ANY = ("localhost", "*", "0.0.0.0", "[::]")  # also addresses of this machine
 _LONGEST = 4096  # bytes
-_ASKERS = 16  # who wait for the answer
-_A_TICK = 4  # taken at one; the system keeps few more
+_ASKERS = 16  # senders that wait for the answer
+_A_TICK = 4  # datagrams read per tick; the system queues only a few more
 
 
 class LocalStop:
-    """The daemon's end. The socket is named after ``address``, where it takes commands.
+    """Daemon's end of the socket, named after ``address``, the address for commands.
 
-    ``notice`` says where it is, if not where it should be.
+    ``notice`` gives the location of the socket if it is not the preferred one.
     """
 
     def __init__(self, address: str) -> None:
-        """Raises AddressError."""
+        """Bind the socket. Raises AddressError."""
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
         try:
@@ -56,12 +56,12 @@ class LocalStop:
         self._askers: deque[Any] = deque(maxlen=_ASKERS)
 
     def take(self) -> bool:
-        """Return whether a stop has come."""
+        """Read queued datagrams; return True if a stop arrived."""
         came = False
         for _ in range(_A_TICK):
             try:
                 _, asker = self._socket.recvfrom(_LONGEST)
-            except OSError:  # nothing more
+            except OSError:  # the queue is empty
                 break
             came = True
             if asker:
@@ -69,26 +69,26 @@ class LocalStop:
         return came
 
     def fileno(self) -> int:
-        """Return the descriptor at which it comes."""
+        """Return the file descriptor of the socket."""
         return self._socket.fileno()
 
     def answer(self, reply: bytes) -> None:
-        """Answer all who asked."""
+        """Send the reply to all senders of a stop."""
         while self._askers:
-            with contextlib.suppress(OSError):  # it has gone
+            with contextlib.suppress(OSError):  # the sender has ended
                 self._socket.sendto(reply, self._askers.popleft())
 
     def close(self) -> None:
-        """Take it away."""
+        """Close the socket and remove its file."""
         self._socket.close()
         with contextlib.suppress(OSError):
             self._path.unlink()
 
 
 def stop_locally(address: str, seconds: float) -> dict[str, Any] | None:
-    """Stop the daemon of this user that takes commands at ``address``; its reply.
+    """Stop this user's daemon with the command address ``address``, and return its reply.
 
-    None when there is none on this machine, or it doesn't answer so.
+    Returns None if there is no such daemon on this machine or it does not answer.
     """
     try:
         name = _name(address)
@@ -102,7 +102,7 @@ def stop_locally(address: str, seconds: float) -> dict[str, Any] | None:
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as asking:
             asking.settimeout(seconds)
             try:
-                asking.bind("")  # a name of the system's choice, for the answer
+                asking.bind("")  # the system chooses a name, for the answer
                 asking.connect(str(folder / name))
                 asking.send(b"stop")
                 reply = msgpack.unpackb(asking.recv(_LONGEST))
@@ -114,7 +114,7 @@ def stop_locally(address: str, seconds: float) -> dict[str, Any] | None:
 
 
 def _name(address: str) -> str:
-    """Return what the socket is called. Raises ValueError for an address of another machine."""
+    """Return the name of the socket. Raises ValueError for an address of another machine."""
     kind, _, place = address.partition("://")
     if kind == "ipc":
         return f"stop-{hashlib.sha256(os.path.realpath(place).encode()).hexdigest()[:16]}"
@@ -126,14 +126,14 @@ def _name(address: str) -> str:
 
 
 def _folders() -> Iterator[Path]:
-    """Return where it may be: of a system service, of this session, of no session at all."""
+    """Yield possible folders: of a system service, of the login session, of neither."""
     for name in ("RUNTIME_DIRECTORY", "XDG_RUNTIME_DIR"):
         if place := os.environ.get(name):
             yield Path(place.split(":")[0]) / "softfinger"
     yield Path("/run/softfinger/softfinger")
     yield Path(f"/run/user/{os.geteuid()}/softfinger")
     yield shared_folder()
-    with contextlib.suppress(RuntimeError):  # no home
+    with contextlib.suppress(RuntimeError):  # no home folder
         folder = home_folder()
         with contextlib.suppress(OSError):
             folder.parent.mkdir(parents=True, exist_ok=True)
@@ -141,7 +141,10 @@ def _folders() -> Iterator[Path]:
 
 
 def _own_folder() -> tuple[Path, str]:
-    """The first that can be had, made if need be, and why none before it. Raises OSError."""
+    """Return the first usable folder, created if necessary, and a notice about unusable ones.
+
+    Raises OSError if there is none.
+    """
     refused: OSError | None = None
     notice = ""
     for folder in _folders():
@@ -160,7 +163,7 @@ def _own_folder() -> tuple[Path, str]:
 
 
 def _is_ours(folder: Path) -> bool:
-    """Return whether it is this user's, no link, and nobody else may even look into it."""
+    """Return True if this user owns the folder, it is no link, and others have no access."""
     try:
         require_own(folder)
     except OSError:
@@ -170,7 +173,7 @@ def _is_ours(folder: Path) -> bool:
 
 
 def _remove_dead(path: Path, address: str) -> None:
-    """Take away the socket of a daemon that was killed. Raises AddressError when one lives."""
+    """Remove the socket of a daemon that was killed. Raises AddressError if it still runs."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as trial:
         try:
             trial.connect(str(path))

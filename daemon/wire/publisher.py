@@ -1,11 +1,11 @@
-"""The publisher: messages of the stream, packed as the schema says and given to the gateway.
+"""Publisher: packs stream messages according to the schema and sends them to the gateway.
 
-Integers take msgpack's smallest form, so that JavaScript clients get numbers wherever one can hold
-the value. Floats always take 64 bits.
+Integers are packed in msgpack's smallest form, so that JavaScript clients get numbers wherever
+possible. Floats always take 64 bits.
 
-A subscriber that comes late, stops reading or dies changes nothing here: the gateway sends to all
-of them, and repeats the settings and the last events, with ``again`` true, for late ones. Topics
-that nobody subscribes to are not packed.
+The gateway serves the subscribers, so slow or dead subscribers do not affect the loop. For late
+subscribers it repeats the settings and the last events, with ``again`` set. Topics without
+subscribers are not packed.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ _PACK: dict[type, Pack] = {int: pack, float: _float, bool: _bool, str: pack, byt
 
 
 def packer(topic: bytes) -> Callable[..., bytes]:
-    """Return the function that packs a topic's messages from its source's arguments."""
+    """Return a function that packs a topic's messages from the arguments of its source."""
     source = TOPICS[topic].source
     pack_map = _packer(TOPICS[topic].record)
     return lambda *arguments: pack_map(source(*arguments))
 
 
 def _packer(record: type[Any]) -> Pack:
-    """Return the function that packs a record's map from what it is taken from."""
-    # Sources behind the first are each had from an earlier one, values each from one of them.
+    """Return a function that packs the map of a record from its source."""
+    # Each source after the first comes from an earlier one, and each value from one source.
     sources: list[tuple[int, Getter]] = []
     found: dict[FieldSource[Any], int] = {}
 
@@ -76,11 +76,11 @@ def _packer(record: type[Any]) -> Pack:
 
 _INDEX = {topic: index for index, topic in enumerate(TOPICS)}
 GATEWAY_TOPICS = [topic.decode() for topic in TOPICS]
-KEPT = {SETTINGS: 1, EVENT: 50}  # messages that late subscribers get again
+KEPT = {SETTINGS: 1, EVENT: 50}  # messages that are repeated for late subscribers
 
 
 def bit(topic: bytes) -> int:
-    """Return a topic's bit in `Publisher.wanted`."""
+    """Return the bit of a topic in `Publisher.wanted`."""
     return 1 << _INDEX[topic]
 
 
@@ -88,7 +88,7 @@ _COMMANDS = bit(COMMAND)
 
 
 class Publisher:
-    """Publishes state, tactile frames and events. One thread, the loop's, may call it."""
+    """Publish state, tactile frames and events. Only the loop's thread may call it."""
 
     def __init__(self, link: Link) -> None:
         self._link = link
@@ -97,11 +97,11 @@ class Publisher:
 
     @property
     def wanted(self) -> int:
-        """The topics that somebody subscribes to, as bits: see `bit`."""
+        """Topics with subscribers, as bits; see `bit`."""
         return self._link.wanted
 
     def look(self) -> None:
-        """Learn who came and went. The loop does by taking in commands."""
+        """Read the gateway's messages; the loop does this when it reads commands."""
         self._link.look()
 
     def send(self, topic: bytes, *arguments: object) -> None:
@@ -116,7 +116,7 @@ class Publisher:
     def command(
         self, wall: float, t: float, tick: int, request: dict[str, Any], error: str
     ) -> None:
-        """Publish ``hand/command``; ``error`` is why it was refused, or empty."""
+        """Publish ``hand/command``; ``error`` is the reason for a refusal, or empty."""
         if self._link.wanted & _COMMANDS:
             self.send(COMMAND, self._count(COMMAND), wall, t, tick, request, error)
 

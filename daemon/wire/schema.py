@@ -1,11 +1,11 @@
-"""The stream's schema: every field of every topic, declared once.
+"""Schema of the stream: the only declaration of all topics and fields.
 
-A topic is a record. Each of its fields has a unit and a meaning, and is taken from a source: by a
-function, or as the source's attribute of the same name. From it follow the packers
-(`wire.publisher`), the records that clients read (`client.stream`), the page ``STREAM.md`` and the
-JSON schemas of recordings (`wire.schema_docs`).
+A topic is a record. Each of its fields has a unit, a meaning and a source. Its value is computed by
+a function of the source, or is the attribute of the same name. The packers (`wire.publisher`), the
+records that clients read (`client.stream`), the page ``STREAM.md`` and the JSON schemas of
+recordings (`wire.schema_docs`) are derived from these declarations.
 
-Fields are only ever added, none is left out, and a float is always sent as a float. SI units.
+New versions may add fields, but never remove any. A float is always sent as a float. SI units.
 """
 
 import json
@@ -44,21 +44,21 @@ TRUTH = b"hand/truth"
 
 NO_FRAME = Frame(0, t_sample=0.0, t_arrival=0.0, valid=False, data=np.zeros((0, 0), np.uint16))
 
-# What several topics begin with.
-_SCHEMA = "", "number of this schema; changes only when a field's meaning does"
-_SEQ = "", "counts up: ticks, frames, events"
-_STEP = "", "one of so many is sent"
+# Common first fields of several topics.
+_SCHEMA = "", "number of this schema; it changes only if the meaning of a field changes"
+_SEQ = "", "sequence number of ticks, frames or events"
+_STEP = "", "decimation: every n-th message is sent"
 _UNIX = "s", "Unix time"
-_MONO = "ns", "the daemon's monotonic clock at the tick"
-_TEMPERATURE = "°C", "of the servo, 0 while not known"
-_VOLTAGE = "V", "of the servo's supply, 0 while not known"
+_MONO = "ns", "time of the tick by the daemon's monotonic clock"
+_TEMPERATURE = "°C", "temperature of the servo, 0 if unknown"
+_VOLTAGE = "V", "supply voltage of the servo, 0 if unknown"
 
 
 def _ns(t: float) -> int:
     return int(t * 1e9)
 
 
-# What several topics' sources have alike is taken as from one of them.
+# Fields that several sources have in common are declared for one of them.
 _tick = FieldSource["StateSource"]()
 _state = _tick.of(lambda m: m.state)
 _timing = _state.of(lambda s: s.timing)
@@ -67,7 +67,7 @@ _news = FieldSource["EventSource"]()
 
 @record
 class _TickMessage:
-    """A message of every so many ticks."""
+    """Message that is sent every n-th tick."""
 
     schema: int = _state(*_SCHEMA, lambda _: SCHEMA)
     seq: int = _state(*_SEQ)
@@ -78,12 +78,12 @@ class _TickMessage:
 
 @record
 class _Announcement:
-    """A message that is sent when it happens."""
+    """Message that is sent when an event occurs."""
 
     schema: int = _news(*_SCHEMA, lambda _: SCHEMA)
     seq: int = _news(*_SEQ)
     again: bool = _news(
-        "", "repeated for a late subscriber, with its first seq and times", lambda _: False
+        "", "repeated for a late subscriber, with the original seq and times", lambda _: False
     )
     timestamp: float = _news(*_UNIX, lambda m: m.wall)
     mono_ns: int = _news("ns", "the daemon's monotonic clock", lambda m: _ns(m.t))
@@ -130,7 +130,7 @@ class FingerState:
 
     valid: bool = _finger(
         "",
-        "in the scene, with fresh and sound data from its servo and sensor",
+        "in the scene, with current and valid data from its servo and sensor",
         lambda f: not _invalid(f),
     )
     q: float = _finger("rad", "joint angle, positive closes", lambda f: f.state.reading.q[f.i])
@@ -142,50 +142,52 @@ class FingerState:
     voltage: float = _finger(*_VOLTAGE, lambda f: f.state.reading.voltage[f.i])
     goal_q: float = _finger("rad", "goal angle", lambda f: f.state.goal.q[f.i])
     goal_current: float = _finger(
-        "A", "bound on the current's magnitude", lambda f: f.state.goal.current[f.i]
+        "A", "limit of the current's magnitude", lambda f: f.state.goal.current[f.i]
     )
     d: float = _contact("m", "maximum displacement of the tip")
     theta: float = _contact("rad", "the object's angle in the tip's frame, in the hand's plane")
-    tilt_y: float = _contact("rad", "and across the plane")
+    tilt_y: float = _contact("rad", "likewise, normal to the hand's plane")
     force: float = _contact(
-        "N", "elastic force, modulus_scale · F(d, total tilt of theta and tilt_y) by the table"
+        "N", "elastic force: modulus_scale · F(d, total tilt of theta and tilt_y) from the table"
     )
     energy: float = _contact("J", "elastic potential energy, modulus_scale · U(d, total tilt)")
     d_std: float = _contact(
-        "m", "standard deviation of d; without contact the d that could hide from the sensor"
+        "m", "standard deviation of d; without contact, the largest undetectable d"
     )
     theta_std: float = _contact("rad", "standard deviation of theta")
-    force_std: float = _contact("N", "standard deviation of force, with that of the tip's law")
+    force_std: float = _contact("N", "standard deviation of force, including the contact law")
     shear_x: float = _contact(
         "N",
-        "force along a solid tip's face, in the hand's plane, by the newest frame; 0 with springs",
+        "shear force of a solid tip in the hand's plane, from the newest frame; 0 with springs",
     )
-    shear_y: float = _contact("N", "and across the plane")
-    gain: float = _contact("", "measured over modelled pressure")
-    modulus_scale: float = _contact("", "of the tip's modulus over the settings', as grips tell it")
-    modulus_scale_std: float = _contact("", "its standard deviation")
-    sensor_gain: float = _contact("", "of the sensor: gain over modulus_scale")
-    sensor_gain_std: float = _contact("", "its standard deviation")
-    torque_scale: float = _contact("", "of the joint's torque constant over the settings'")
-    torque_scale_std: float = _contact("", "its standard deviation")
+    shear_y: float = _contact("N", "likewise, normal to the hand's plane")
+    gain: float = _contact("", "ratio of measured to modelled pressure")
+    modulus_scale: float = _contact("", "ratio of the tip's modulus to the settings, from grips")
+    modulus_scale_std: float = _contact("", "standard deviation of modulus_scale")
+    sensor_gain: float = _contact("", "gain of the sensor: gain over modulus_scale")
+    sensor_gain_std: float = _contact("", "standard deviation of sensor_gain")
+    torque_scale: float = _contact("", "ratio of the joint's torque constant to the settings")
+    torque_scale_std: float = _contact("", "standard deviation of torque_scale")
     nis_angle: float = _contact(
         "", "consistency of the sensor's angle: normalised innovation squared, averaged; about 1"
     )
-    nis_footprint: float = _contact("", "likewise of d by the footprint")
-    nis_amplitude: float = _contact("", "likewise of the pressure's amplitude")
-    misfit: bool = _contact("", "the frame fits no contact of the model: d, theta may be biased")
-    contact: bool = _contact("", "something touches the tip")
+    nis_footprint: float = _contact("", "likewise for d from the footprint")
+    nis_amplitude: float = _contact("", "likewise for the amplitude of the pressure")
+    misfit: bool = _contact("", "the frame fits no contact of the model; d, theta may be biased")
+    contact: bool = _contact("", "the tip is in contact")
     frame_seq: int = _contact(
-        "", "the estimate's tactile frame, 0 before the first", lambda c: c.seq
+        "", "number of the estimated tactile frame, 0 before the first", lambda c: c.seq
     )
-    frame_age_s: float = _finger("s", "age of that frame's sample", _frame_age)
-    invalid: str = _finger("", "why it is not valid, empty when it is", lambda f: _invalid(f).text)
-    winding: float = _heat("°C", "temperature of the motor's winding, by the thermal model")
-    winding_std: float = _heat("°C", "its standard deviation")
-    case: float = _heat("°C", "temperature without the reading's steps, by the thermal model")
-    case_std: float = _heat("°C", "its standard deviation")
+    frame_age_s: float = _finger("s", "time since this frame was sampled", _frame_age)
+    invalid: str = _finger(
+        "", "reason why the finger is not valid, or empty", lambda f: _invalid(f).text
+    )
+    winding: float = _heat("°C", "temperature of the motor winding by the thermal model")
+    winding_std: float = _heat("°C", "standard deviation of winding")
+    case: float = _heat("°C", "temperature of the case by the thermal model, not quantised")
+    case_std: float = _heat("°C", "standard deviation of case")
     time_to_limit: float = _heat(
-        "s", "until the servo is at safety.temperature_max with this current; 3600: an hour or more"
+        "s", "time to safety.temperature_max at this current; 3600 means an hour or more"
     )
 
 
@@ -193,22 +195,22 @@ class FingerState:
 class ObjectState:
     """The object in ``hand/state``, from the two contacts."""
 
-    valid: bool = _pose("", "both contacts give the object's pose")
+    valid: bool = _pose("", "both contacts are valid and determine the pose")
     angle: float = _pose(
         "rad",
-        "the object's angle in the hand's frame: of its faces' bisector, or of the line between "
-        "the contacts of a disc",
+        "the object's angle in the hand's frame: of the bisector of its faces, or of the line "
+        "between the contacts of a disc",
     )
     width: float = _pose("m", "the object's width between the tips")
     nis_torque: float = _pose(
         "", "consistency of joint torques and forces: normalised innovation squared, averaged"
     )
-    nis_balance: float = _pose("", "likewise of the balance between both tips")
+    nis_balance: float = _pose("", "likewise for the balance between both tips")
 
 
 @topic(
     STATE,
-    "What the hand is, does and feels, every n-th tick (`stream.state_rate`).",
+    "The state of the hand, every n-th tick (`stream.state_rate`).",
     StateSource,
 )
 @record
@@ -216,28 +218,30 @@ class HandState(_TickMessage):
     """One ``hand/state``."""
 
     mode: str = _state("", "disarmed, armed, moving, grasping, holding, rotating, releasing, fault")
-    fault: str = _state("", "reason of the latched fault, empty when none")
-    fault_name: str = _state("", "its name in `softfinger.daemon.safety.limits`, empty when none")
-    torque: bool = _state("", "torque is on, or not known to be off")
-    tick_s: float = _timing("s", "from the last tick's start to this one's")
-    compute_s: float = _timing("s", "work of the last tick")
-    wake_late_s: float = _timing("s", "this tick's start after its deadline")
-    overruns: int = _timing("", "ticks whose work outlasted the period")
+    fault: str = _state("", "reason of the latched fault, or empty")
+    fault_name: str = _state("", "name of the fault in `softfinger.daemon.safety.limits`, or empty")
+    torque: bool = _state("", "torque is on, or not confirmed to be off")
+    tick_s: float = _timing("s", "time between the starts of the last tick and this one")
+    compute_s: float = _timing("s", "computing time of the last tick")
+    wake_late_s: float = _timing("s", "delay of this tick's start after its deadline")
+    overruns: int = _timing("", "number of ticks that took longer than the period")
     behind_s: float = _timing(
-        "s", "how long a hand simulated in the daemon has waited for a busy machine since the start"
+        "s", "total time that a hand simulated in the daemon has waited for a busy machine"
     )
     goal_force: float = _goal(
         "N",
-        "mean tip force of the grip: as commanded, or raised against slip; NaN without a grip",
+        "target of the mean tip force, as commanded or increased against slip; NaN without a grip",
         lambda g: g.force,
     )
-    goal_angle: float = _goal("rad", "object angle of the grip; NaN without one", lambda g: g.angle)
+    goal_angle: float = _goal(
+        "rad", "target of the object's angle; NaN unless the object is steered", lambda g: g.angle
+    )
     left: FingerState = _tick.part("left finger: ", lambda m: _Finger(m.state, m.scene, 0))
     right: FingerState = _tick.part("right finger: ", lambda m: _Finger(m.state, m.scene, 1))
     object: ObjectState = _state.part("", lambda s: s.object)
 
     def finger(self, name: str) -> FingerState:
-        """Return ``left`` or ``right`` by its name. Raises ValueError for another."""
+        """Return ``left`` or ``right`` by its name. Raises ValueError for other names."""
         if name not in FINGERS:
             raise ValueError(f"found finger {name!r}, expected one of {', '.join(FINGERS)}")
         return self.left if name == FINGERS[0] else self.right
@@ -262,40 +266,40 @@ _facts = _tactile.of(lambda m: m.facts)
 
 @topic(
     TACTILE,
-    "The grids' raw frames (`stream.tactile_rate`), one finger a message.",
+    "Tactile frames (`stream.tactile_rate`), one message per finger.",
     TactileSource,
 )
 @record
 class TactileFrame:
-    """One ``hand/tactile``. Raises ValueError when its data isn't a grid of rows × cols."""
+    """One ``hand/tactile``. Raises ValueError if its data is not a grid of rows × cols."""
 
     schema: int = _tactile(*_SCHEMA, lambda _: SCHEMA)
     seq: int = _frame(*_SEQ)
     seq_step: int = _tactile(*_STEP, lambda m: m.step)
-    number: int = _tactile("", "counts this sensor's messages: a gap is a loss on the way")
+    number: int = _tactile("", "number of this sensor's message; a gap means lost messages")
     timestamp: float = _tactile(*_UNIX, lambda m: m.wall)
     mono_ns: int = _frame(
-        "ns", "the daemon's monotonic clock at the board's scan", lambda f: _ns(f.t_sample)
+        "ns", "time of the board's scan by the daemon's clock", lambda f: _ns(f.t_sample)
     )
     delay_s: float = _frame(
-        "s", "from the scan until the frame had come", lambda f: f.t_arrival - f.t_sample
+        "s", "time from the scan to the arrival", lambda f: f.t_arrival - f.t_sample
     )
-    valid: bool = _frame("", "false: the board is gone, this is its last frame again")
+    valid: bool = _frame("", "false if the board is lost; this is then its last frame")
     finger: str = _tactile("", "left or right", lambda m: FINGERS[m.finger])
-    rows: int = _tactile("", "cells along y", lambda m: m.data.shape[0])
-    cols: int = _tactile("", "cells along x", lambda m: m.data.shape[1])
-    pitch: float = _facts("m", "from column to column")
-    pitch_y: float = _facts("m", "from row to row")
-    centre_x: float = _facts("m", "the tip's centre off the grid's, along x")
-    centre_y: float = _facts("m", "and along y")
-    rotation: float = _facts("rad", "of the sensor's axes against the finger's")
-    unit: str = _facts("", "`count`: as the board sent it; `Pa`: as it was estimated")
-    scale: float = _facts("Pa", "one step of the data, exact for linear sensors")
-    calibrated: bool = _facts("", "data × scale is the pressure by the calibration")
-    calibration: str = _facts("", "name and date of the estimator's calibration, or empty")
+    rows: int = _tactile("", "number of cells along y", lambda m: m.data.shape[0])
+    cols: int = _tactile("", "number of cells along x", lambda m: m.data.shape[1])
+    pitch: float = _facts("m", "distance between columns")
+    pitch_y: float = _facts("m", "distance between rows")
+    centre_x: float = _facts("m", "offset of the tip's centre from the grid's centre, along x")
+    centre_y: float = _facts("m", "likewise, along y")
+    rotation: float = _facts("rad", "rotation of the sensor's axes relative to the finger's")
+    unit: str = _facts("", "`count`: as sent by the board; `Pa`: as used by the estimator")
+    scale: float = _facts("Pa", "pressure of one step of the data, exact for linear sensors")
+    calibrated: bool = _facts("", "data × scale is the calibrated pressure")
+    calibration: str = _facts("", "name and date of the calibration, or empty")
     data: bytes = _tactile(
         "",
-        "rows × cols little-endian uint16, row by row",
+        "rows × cols little-endian uint16, row-major",
         lambda m: m.data.astype("<u2", copy=False).tobytes(),
     )
 
@@ -311,7 +315,7 @@ class TactileFrame:
         return np.frombuffer(self.data, dtype="<u2").reshape(self.rows, self.cols)
 
     def pressure(self) -> NDArray[np.float64]:
-        """Return counts times the scale [Pa], [rows, cols]."""
+        """Return counts times scale [Pa], shape [rows, cols]."""
         return self.counts.astype(np.float64) * self.scale
 
 
@@ -331,7 +335,7 @@ _event = FieldSource[EventSource]()
 
 @topic(
     EVENT,
-    "What happened: modes, faults, warnings; late subscribers get the last 50 again.",
+    "Events: modes, faults, warnings. The last 50 are repeated for late subscribers.",
     EventSource,
 )
 @record
@@ -339,8 +343,8 @@ class Event(_Announcement):
     """One ``hand/event``."""
 
     level: str = _event("", "info, warning or error")
-    kind: str = _event("", "what it is about: mode, fault, servos, …")
-    text: str = _event("", "one line for a person")
+    kind: str = _event("", "kind of the event: mode, fault, servos, …")
+    text: str = _event("", "message of one line")
 
 
 _times = FieldSource[TimeSpread]()
@@ -352,20 +356,20 @@ class Spread:
     """One of the loop's times in ``hand/stats``."""
 
     p50: float = _times("s", "median")
-    p99: float = _times("s", "99 % are below")
-    p999: float = _times("s", "99.9 % are below")
-    max: float = _times("s", "longest")
+    p99: float = _times("s", "99 % quantile")
+    p999: float = _times("s", "99.9 % quantile")
+    max: float = _times("s", "maximum")
 
 
 @record
 class Rates:
-    """Rates of what happened over the last second, in ``hand/stats``."""
+    """Rates over the last second, in ``hand/stats``."""
 
     tick: float = _rates("Hz", "ticks")
-    left: float = _rates("Hz", "tactile frames that came from the left sensor")
-    right: float = _rates("Hz", "tactile frames that came from the right sensor")
-    state: float = _rates("Hz", "states that went out")
-    tactile: float = _rates("Hz", "tactile frames that went out")
+    left: float = _rates("Hz", "tactile frames received from the left sensor")
+    right: float = _rates("Hz", "tactile frames received from the right sensor")
+    state: float = _rates("Hz", "states published")
+    tactile: float = _rates("Hz", "tactile frames published")
 
 
 class StatsSource(NamedTuple):
@@ -382,16 +386,16 @@ class StatsSource(NamedTuple):
 _stats = FieldSource[StatsSource]()
 
 
-@topic(STATS, "Once a second, how the loop keeps its time.", StatsSource)
+@topic(STATS, "Timing of the loop, once a second.", StatsSource)
 @record
 class LoopStatistics(_TickMessage):
     """One ``hand/stats``."""
 
-    ticks: int = _stats("", "since the start, as all of this but the rates")
-    overruns: int = _timing("", "ticks whose work outlasted the period")
-    period_s: float = _stats("s", "the tick's period", lambda m: m.period)
-    wake: Spread = _stats.part("a tick's start after its deadline: ", lambda m: m.spreads["wake"])
-    compute: Spread = _stats.part("all of a tick's work: ", lambda m: m.spreads["compute"])
+    ticks: int = _stats("", "ticks since the start, the time span of all fields except rates")
+    overruns: int = _timing("", "number of ticks that took longer than the period")
+    period_s: float = _stats("s", "period of the ticks", lambda m: m.period)
+    wake: Spread = _stats.part("delay of a tick's start: ", lambda m: m.spreads["wake"])
+    compute: Spread = _stats.part("total time of a tick: ", lambda m: m.spreads["compute"])
     bus: Spread = _stats.part("reading and writing the servos: ", lambda m: m.spreads["bus"])
     publish: Spread = _stats.part("publishing: ", lambda m: m.spreads["publish"])
     rates: Rates = _stats.part("over the last second: ", lambda m: m.rates)
@@ -409,19 +413,19 @@ class SettingsSource(NamedTuple):
 _hand_facts = FieldSource[SettingsSource]().of(lambda m: m.facts)
 
 
-@topic(SETTINGS, "Once, and again for late subscribers: what this hand is.", SettingsSource)
+@topic(SETTINGS, "Description of this hand, once, and again for late subscribers.", SettingsSource)
 @record
 class HandSettings(_Announcement):
     """One ``hand/settings``."""
 
-    version: str = _hand_facts("", "of softfinger")
-    settings: str = _hand_facts("", "all settings, as JSON")
-    calibration_left: str = _hand_facts("", "the left sensor's calibration as JSON, or empty")
-    calibration_right: str = _hand_facts("", "the right sensor's")
+    version: str = _hand_facts("", "version of softfinger")
+    settings: str = _hand_facts("", "all settings as JSON")
+    calibration_left: str = _hand_facts("", "calibration of the left sensor as JSON, or empty")
+    calibration_right: str = _hand_facts("", "likewise of the right sensor")
     table_left: str = _hand_facts(
-        "", "the left tip's contact table: form, tolerance, certificate (bound of its error)"
+        "", "contact table of the left tip: form, tolerance, certificate (bound of its error)"
     )
-    table_right: str = _hand_facts("", "the right tip's")
+    table_right: str = _hand_facts("", "likewise of the right tip")
 
 
 class CommandSource(NamedTuple):
@@ -438,21 +442,21 @@ class CommandSource(NamedTuple):
 _command = FieldSource[CommandSource]()
 
 
-@topic(COMMAND, "Each command that was answered, by whomever; `status` is left out.", CommandSource)
+@topic(COMMAND, "Each answered command of any client, except `status`.", CommandSource)
 @record
 class AnsweredCommand(_Announcement):
     """One ``hand/command``."""
 
-    tick: int = _command("", "seq of the tick at which it was answered")
-    command: str = _command("", "its name", lambda m: str(m.request.get("command", "")))
+    tick: int = _command("", "seq of the tick in which the command was answered")
+    command: str = _command("", "name of the command", lambda m: str(m.request.get("command", "")))
     client: str = _command(
-        "",
-        "who sent it, empty for all who give no name",
-        lambda m: str(m.request.get("client", "")),
+        "", "name of the client, or empty", lambda m: str(m.request.get("client", ""))
     )
-    request: str = _command("", "all of it, as JSON", lambda m: json.dumps(m.request, default=str))
-    ok: bool = _command("", "carried out", lambda m: not m.error)
-    error: str = _command("", "why it was refused, empty when it was carried out")
+    request: str = _command(
+        "", "complete request as JSON", lambda m: json.dumps(m.request, default=str)
+    )
+    ok: bool = _command("", "the command was carried out", lambda m: not m.error)
+    error: str = _command("", "reason for the refusal, or empty")
 
 
 class InputSource(NamedTuple):
@@ -483,13 +487,13 @@ def _input_finger(m: InputSource, i: int) -> _InputFinger:
 class InputReading:
     """The servos' reading in ``hand/input``."""
 
-    seq: int = _reading("", "readings of the servos")
-    t: float = _reading("s", "when the last good one was taken; −∞ before it")
-    valid: bool = _reading("", "this tick's is good")
+    seq: int = _reading("", "number of the reading of the servos")
+    t: float = _reading("s", "time of the last valid reading, −∞ before the first")
+    valid: bool = _reading("", "the reading of this tick is valid")
     alert: int = _reading("", "bit i: servo of finger i reports a hardware error")
-    error: str = _read("", "what the bus failed with, or empty", lambda s: s.read_error)
-    lost: int = _reading("", "bit i: servo of finger i holds none of the last goals")
-    frozen: int = _reading("", "bit i: servo of finger i measures nothing new")
+    error: str = _read("", "error of the bus, or empty", lambda s: s.read_error)
+    lost: int = _reading("", "bit i: servo of finger i has received none of the last goals")
+    frozen: int = _reading("", "bit i: servo of finger i repeats old readings")
 
 
 @record
@@ -500,21 +504,21 @@ class InputFinger:
     dq: float = _taken("rad/s", "joint velocity", lambda f: f.reading.dq[f.i])
     current: float = _taken("A", "motor current", lambda f: f.reading.current[f.i])
     hardware: int = _taken(
-        "", "the servo's hardware error bits, 0 if not known", lambda f: f.reading.hardware[f.i]
+        "", "hardware error bits of the servo, 0 if unknown", lambda f: f.reading.hardware[f.i]
     )
     temperature: float = _taken(*_TEMPERATURE, lambda f: f.reading.temperature[f.i])
     voltage: float = _taken(*_VOLTAGE, lambda f: f.reading.voltage[f.i])
-    frame_seq: int = _newest("", "newest tactile frame, 0 before the first", lambda f: f.seq)
-    frame_t: float = _newest(
-        "s", "when it was scanned, by the daemon's clock", lambda f: f.t_sample
+    frame_seq: int = _newest(
+        "", "number of the newest tactile frame, 0 before the first", lambda f: f.seq
     )
-    frame_arrival: float = _newest("s", "when it was complete here", lambda f: f.t_arrival)
-    frame_valid: bool = _newest("", "false: the board is gone", lambda f: f.valid)
+    frame_t: float = _newest("s", "time of its scan by the daemon's clock", lambda f: f.t_sample)
+    frame_arrival: float = _newest("s", "time of its complete arrival", lambda f: f.t_arrival)
+    frame_valid: bool = _newest("", "false if the board is lost", lambda f: f.valid)
 
 
 @topic(
     INPUT,
-    "All that a tick took in, every tick: what `replay --recompute` starts from.",
+    "All inputs of each tick, from which `replay --recompute` computes the tick again.",
     InputSource,
 )
 @record
@@ -525,14 +529,14 @@ class TickInput:
     seq: int = _state(*_SEQ)
     timestamp: float = _state(*_UNIX, lambda s: s.wall)
     mono_ns: int = _state(*_MONO, lambda s: _ns(s.t))
-    t: float = _state("s", "the same, with all its digits")
-    late_in_row: int = _timing("", "consecutive overruns")
-    busy_s: float = _timing("s", "how long a busy machine has just held up the loop")
+    t: float = _state("s", "the same time in full precision")
+    late_in_row: int = _timing("", "number of consecutive overruns")
+    busy_s: float = _timing("s", "duration of a recent delay of the loop by a busy machine")
     reading: InputReading = _input.part("", lambda m: m.state)
     left: InputFinger = _input.part("left finger: ", lambda m: _input_finger(m, 0))
     right: InputFinger = _input.part("right finger: ", lambda m: _input_finger(m, 1))
-    write_error: str = _state("", "what the bus failed with when written to, or empty")
-    torque_off: bool = _state("", "the servos confirmed at this tick that torque is off")
+    write_error: str = _state("", "error of the bus during the write, or empty")
+    torque_off: bool = _state("", "the servos confirmed in this tick that torque is off")
 
 
 class TruthSource(NamedTuple):
@@ -558,31 +562,33 @@ class TrueFinger:
     """One finger in ``hand/truth``."""
 
     d: float = _true_finger(
-        "m", "maximum displacement, negative: a gap", lambda f: float(f.truth.d[f.i])
+        "m", "maximum displacement, negative for a gap", lambda f: float(f.truth.d[f.i])
     )
     theta: float = _true_finger(
         "rad", "the object's angle in the tip's frame", lambda f: float(f.truth.theta[f.i])
     )
-    force: float = _true_finger("N", "on the tip's base", lambda f: float(f.truth.force[f.i]))
+    force: float = _true_finger("N", "force on the tip's base", lambda f: float(f.truth.force[f.i]))
 
 
 @record
 class TrueObject:
     """The object in ``hand/truth``."""
 
-    x: float = _true_pose("m", "the object's centre in the hand's frame", lambda p: float(p[0]))
-    y: float = _true_pose("m", "and along y", lambda p: float(p[1]))
+    x: float = _true_pose(
+        "m", "x of the object's centre in the hand's frame", lambda p: float(p[0])
+    )
+    y: float = _true_pose(
+        "m", "y of the object's centre in the hand's frame", lambda p: float(p[1])
+    )
     angle: float = _true_pose(
         "rad", "the object's angle in the hand's frame", lambda p: float(p[2])
     )
 
 
-@topic(
-    TRUTH, "A simulated hand's own knowledge, with each state. No real hand has it.", TruthSource
-)
+@topic(TRUTH, "True state of a simulated hand, with each `hand/state`.", TruthSource)
 @record
 class TrueState(_TickMessage):
-    """One ``hand/truth``, by names of its own: a plot of all topics keeps them apart."""
+    """One ``hand/truth``; its names differ from ``hand/state``, for plots of all topics."""
 
     true_left: TrueFinger = _truth.part("left finger: ", lambda m: _TruthOf(m.truth, 0))
     true_right: TrueFinger = _truth.part("right finger: ", lambda m: _TruthOf(m.truth, 1))

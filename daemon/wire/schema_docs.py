@@ -1,6 +1,6 @@
-"""The schema for readers of the stream: the page ``STREAM.md``, and JSON Schema for recordings.
+"""Documentation of the schema: the page ``STREAM.md``, and JSON Schema for recordings.
 
-``python -m softfinger.daemon.wire.schema_docs`` writes the page anew.
+``python -m softfinger.daemon.wire.schema_docs`` regenerates the page.
 """
 
 from __future__ import annotations
@@ -22,17 +22,19 @@ _JSON: dict[str, dict[str, Any]] = {
 _INTRODUCTION = f"""\
 # The stream
 
-Written from `daemon/wire/schema.py` by `python -m softfinger.daemon.wire.schema_docs`;
-a test keeps it true.
+This page is generated from `daemon/wire/schema.py` by
+`python -m softfinger.daemon.wire.schema_docs`.
 
-Schema {SCHEMA}. Two frames a message, topic and msgpack map with text keys, in SI units. Fields are
-only ever added, none is left out, and none changes its type: a float is always sent as a float. A
-field named `left.q` is `q` in the map `left`. Integers are sent in msgpack's
-smallest form: JavaScript reads those below 2³² as numbers, and `mono_ns` perhaps as BigInt.
+This is schema {SCHEMA}. A message has two frames: the topic, and a msgpack map with text keys.
+Values are in SI units. A field named `left.q` is `q` in the map `left`. Messages always contain all
+fields. New versions may add fields, but never remove a field or change its type: a float is always
+sent as a float. Integers are sent in msgpack's smallest form, so JavaScript reads integers below
+2³² as numbers. It may read `mono_ns` as BigInt.
 
-A subscriber that wants the newest state alone can set `ZMQ_CONFLATE`, which drops messages of two
-frames. Set `stream.latest = "tcp://127.0.0.1:9874"` in the profile: each `hand/state` then also
-goes out on that address, as one frame that holds the map alone. Subscribe there to everything:
+A subscriber that only needs the newest state can use `ZMQ_CONFLATE`. That option does not support
+messages of two frames, so set `stream.latest = "tcp://127.0.0.1:9874"` in the profile. The daemon
+then also publishes each `hand/state` on that address, as a single frame with the map. Subscribe to
+all messages there:
 
 ```python
 newest = zmq.Context.instance().socket(zmq.SUB)
@@ -42,19 +44,19 @@ newest.connect("tcp://127.0.0.1:9874")
 state = msgpack.unpackb(newest.recv())
 ```
 
-`timestamp` is the machine's Unix time. `mono_ns` is the daemon's clock, for differences: the
-machine's monotonic clock or, of a hand simulated in the daemon, one that waits while the machine is
-too busy to keep up (`loop.clock`, `behind_s`). Durations (`tick_s`, `compute_s`, `hand/stats`) are
-in the machine's time.
+`timestamp` is Unix time. Use `mono_ns`, the daemon's clock, for time differences. It is the
+machine's monotonic clock. With a hand simulated in the daemon, this clock waits while the machine
+is too busy to keep up (`loop.clock`, `behind_s`). Durations (`tick_s`, `compute_s`, `hand/stats`)
+are always in the machine's time.
 """
 
 
 _COMMANDS = """\
 ## Commands
 
-A command is one msgpack map, `{"command": "grasp", "force": 5.0}`, and so is its reply:
-`{"ok": true, …}` or `{"ok": false, "error": …, "reason": …}`. `error` is for people. `reason` is
-one of these texts:
+A command is one msgpack map, for example `{"command": "grasp", "force": 5.0}`. The reply is also a
+map: `{"ok": true, …}` or `{"ok": false, "error": …, "reason": …}`. `error` is a message for the
+user, and `reason` is one of these texts:
 
 | reason | meaning |
 |---|---|
@@ -62,27 +64,27 @@ one of these texts:
 
 _KEYS = """\
 
-Any socket may send a command that may talk to a REP socket: REQ, also with `REQ_CORRELATE`, and
-DEALER. The reply begins with all frames up to the first empty one. A DEALER may leave out the empty
-frame; its reply has none either. A command in several frames, or in an envelope of more than 14
-frames or 1,024 bytes, is refused as `request`.
+Send commands from a REQ socket, with or without `REQ_CORRELATE`, or from a DEALER socket. As with a
+REP socket, the reply begins with all frames of the request up to the first empty one. A DEALER
+socket may omit the empty frame; the reply then has none either. A command in several frames, or in
+an envelope of more than 14 frames or 1,024 bytes, is refused with the reason `request`.
 
-After a stall of the daemon, the commands that waited are older than their clients expected. `arm`
-and all commands that move the hand or change its grip are then refused as `late` if they are older
-than 0.2 s (or `servos.watchdog`, where that is shorter). `disarm`, `tare`, `clear`, and a `hold`
-while the hand grips, are carried out up to an age of 1 s, `status` and `stop` always.
+After a stall of the daemon, waiting commands are older than their clients expected. `arm` and all
+commands that move the hand or change its grip are refused as `late` if they are older than 0.2 s
+(or `servos.watchdog`, if that is shorter). `disarm`, `tare`, `clear`, and a `hold` while the hand
+grips, are accepted up to an age of 1 s. `status` and `stop` are always accepted.
 
-To send a late command again safely, give it a `key`: a text of 1 to 64 characters that no other
-command has, for example a random number. Send the same map again. The daemon carries it out at most
-once, and answers a repetition with the first reply. It refuses the repetition as `stopped` if the
-hand was stopped since it refused the first one as late, and as `superseded` if it has carried out
-another command since. `disarm` needs no key; it is carried out each time. `Hand`, `AsyncHand`,
-`softfinger send`, `monitor` and `view` repeat late commands by themselves.
+To repeat a late command safely, give it a `key`: a unique text of 1 to 64 characters, for example a
+random number. Then send the same map again. The daemon carries out the command at most once, and
+answers a repetition with the first reply. It refuses the repetition as `stopped` if the hand was
+stopped after the first refusal, and as `superseded` if it has carried out another command since
+then. `disarm` needs no key; it is carried out every time. `Hand`, `AsyncHand`, `softfinger send`,
+`monitor` and `view` repeat late commands automatically.
 """
 
 
 def json_schema(topic: bytes) -> dict[str, Any]:
-    """Return a topic's map as JSON Schema. Bytes are base64, a float that is no number null."""
+    """Return the JSON Schema of a topic's map; bytes are base64, and NaN and infinity are null."""
     schema: dict[str, Any] = {
         "title": topic.decode(),
         "description": TOPICS[topic].summary,
@@ -100,7 +102,7 @@ def json_schema(topic: bytes) -> dict[str, Any]:
 
 
 def page() -> str:
-    """Return the page for people, in Markdown."""
+    """Return the page ``STREAM.md`` in Markdown."""
     reasons = "".join(f"| `{reason}` | {reason.meaning} |\n" for reason in Reason)
     parts = [_INTRODUCTION, _COMMANDS + reasons + _KEYS]
     for name, topic in TOPICS.items():

@@ -1,4 +1,5 @@
-"""`softfinger emulate`: the simulated hand behind ptys, as servos and tactile boards.
+"""`softfinger emulate`: the simulated hand as servos and tactile boards on ptys.
 
-Ports, the wire's time, framings, and faults on request; what servos do is in `servo_model`.
+The package handles ports, transmission times, framings and injected faults. The servos themselves
+are in `servo_model`.
 """

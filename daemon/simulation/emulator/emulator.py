@@ -1,12 +1,11 @@
-"""The emulated hand: physics behind servos and tactile boards on ptys, in real time.
+"""Emulated hand: simulated physics behind servos and tactile boards on ptys, in real time.
 
-On a busy machine its time stands still for its daemon as the daemon's does for it, unless that
-one's ``loop.clock`` is ``real``: see `EmulatorClock`.
+On a busy machine the emulator and the daemon wait for each other, unless the daemon's
+``loop.clock`` is ``real``; see `EmulatorClock`.
 
-One thread, one event loop: it waits for bytes on the servos' pty or for the next thing that is
-due, answers the servos first, and does at most one slower thing (a step of the physics, a frame)
-before it looks for bytes again. Where requests come at even intervals, slower things wait until the
-next one is answered.
+There is one thread with one event loop. It waits for bytes on the servo pty or for the next event.
+It answers the servos first, then does at most one slower task (a step of the physics, a frame)
+before it checks for bytes again.
 """
 
 from __future__ import annotations
@@ -45,15 +44,15 @@ from softfinger.daemon.simulation.sensor.simulated_tactile import SimulatedTacti
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 from softfinger.daemon.types import FINGERS
 
-_STEP = 0.002  # s, longest that the physics lags behind
-_REQUESTS = ("report", "forget", "place")  # words to the control socket that are no fault
-_TURNS = {"closed": 6.0, "open": -6.0, "zero": 0.0}  # rad; a joint's stops come before 6
-_TURNING = 0.3  # A of the servo's motor, as strong as the hand that turns a joint is
+_STEP = 0.002  # s, largest delay of the physics
+_REQUESTS = ("report", "forget", "place")  # words to the control socket that are not faults
+_TURNS = {"closed": 6.0, "open": -6.0, "zero": 0.0}  # rad; the joint stops are closer than 6 rad
+_TURNING = 0.3  # A of motor current that corresponds to the force of a person's hand
 _TURN_TIME = 1.0  # s
-_STALL = 0.05  # s; a longer interruption is left out of the hand's time
-_AHEAD = 0.002  # s that the hand's time may be ahead of its daemon's, which waits for the replies
-_HELD = 0.0005  # s from one look for a new deadline to the next
-# The board where a profile names none: that of config/hil.toml.
+_STALL = 0.05  # s; the part of a pause beyond this does not count as the hand's time
+_AHEAD = 0.002  # s by which the hand's time may be ahead of the daemon, which waits for replies
+_HELD = 0.0005  # s between two checks for a new deadline
+# Board for profiles without one: the same as in config/hil.toml.
 DEFAULT_BOARD = {
     "backend": "flexitac",
     "rows": 32,
@@ -65,30 +64,30 @@ DEFAULT_BOARD = {
 
 
 class EmulatorError(SoftfingerError):
-    """The emulated hand can't be set up. The message says why, and how to fix it."""
+    """The emulated hand can't be set up. The message gives the reason and the remedy."""
 
 
 class EmulatorClock:
-    """Time of the emulated hand: real time from 0, less the interruptions of its process.
+    """Time of the emulated hand: real time from 0, without interruptions of its process.
 
-    Without that a process that was stopped for a minute would have to compute that minute, and
-    would answer no client meanwhile. A daemon whose own time waits for a late machine sets
-    deadlines: from one to the next this time goes on by as much as the daemon's, give or take
-    `_AHEAD`, while ``servos`` have their torque on and are the daemon's.
+    Otherwise a process that was stopped for a minute would have to simulate that minute, and could
+    not answer meanwhile. A daemon whose own time waits for a busy machine sets deadlines. While
+    that daemon uses the ``servos`` and their torque is on, the emulator's time advances from one
+    deadline to the next by the same amount as the daemon's, within `_AHEAD`.
     """
 
     waits = False
 
     def __init__(self, deadline: Deadline) -> None:
         self.servos: PtyServoBus | None = None
-        self.held = False  # the last time was kept back
+        self.held = False  # the last returned time was limited
         self._deadline = deadline
         self._seen = 0.0
-        self._bound = math.inf  # where time waits for the next deadline
+        self._bound = math.inf  # time at which to wait for the next deadline
         self._origin = self._last = time.monotonic()
 
     def now(self) -> float:
-        """Return the hand's time [s]. What passed since the last call counts up to a limit."""
+        """Return the hand's time [s]; the time since the last call counts up to `_STALL`."""
         now = time.monotonic()
         self._origin += max(now - self._last - _STALL, 0.0)
         self._last = now
@@ -100,7 +99,7 @@ class EmulatorClock:
         self.held = False
         if t > self._bound and self.servos is not None:
             if not self.servos.driven():
-                self._bound = math.inf  # nothing moves, or that daemon is gone
+                self._bound = math.inf  # torque is off, or the daemon has ended
             elif t > (bound := max(self._bound, self.servos.answering_until)):
                 self.held = True
                 self._origin += t - bound
@@ -112,7 +111,7 @@ class EmulatorClock:
         return time.time()
 
     def sleep_until(self, t: float) -> float:
-        """Return at the hand's time ``t``: how late it woke up [s]."""
+        """Sleep until the hand's time ``t``, and return the delay of the wake-up [s]."""
         while (delay := t - self.now()) > 0.0:
             time.sleep(min(delay, 0.5 * _STALL))
         return -delay
@@ -120,18 +119,18 @@ class EmulatorClock:
 
 @dataclass(frozen=True, slots=True)
 class EmulatedServos:
-    """Emulation options of the servos, beside the settings."""
+    """Options of the emulated servos in addition to the settings."""
 
     baud: int = 0  # 0: they answer at once and at any rate
-    factory: bool = False  # as they leave the factory but for their IDs and rate
-    ids: tuple[int, ...] | None = None  # others than the settings', even one for both
+    factory: bool = False  # factory settings, except IDs and baud rate
+    ids: tuple[int, ...] | None = None  # instead of those of the settings; may be equal
 
 
 class Emulator:
-    """An emulated hand on ptys, linked in ``folder``; :meth:`run` keeps it alive.
+    """Emulated hand on ptys, with links in ``folder``; :meth:`run` serves it.
 
-    The scene of ``settings`` says what there is: a finger that is absent has no board, and servos
-    or tactile backends of ``none`` have no port.
+    A finger that is absent in the scene of ``settings`` has no board. Servos or tactile sensors
+    with the backend ``none`` have no port.
     """
 
     def __init__(
@@ -143,25 +142,38 @@ class Emulator:
         faults: Iterable[str] = (),
         tell: Callable[[str], None] = lambda _: None,
     ) -> None:
-        """Build it; nothing answers before :meth:`run`.
+        """Create the hand; it does not answer before :meth:`run`.
 
-        ``faults``: see :func:`parse_faults`. ``tell`` takes the log's lines: faults that begin, and
-        where a plate has come to rest. No signal handler may raise meanwhile: what has been made
-        would stay behind.
-        Raises EmulatorError, and SettingsError when the settings' material is no stress-strain law.
+        Signal handlers must not raise during this call, since files would be left behind.
+
+        Parameters
+        ----------
+        settings, folder, servos
+            Settings of the hand, folder for the links, and options of the servos.
+        faults
+            Faults; see :func:`parse_faults`.
+        tell
+            Function for log lines about faults that begin and plates that come to rest.
+
+        Raises
+        ------
+        EmulatorError
+            If the folder can't be used or a fault is invalid.
+        SettingsError
+            If the material is not a valid stress-strain law.
         """
         self._closers: list[Callable[[], None]] = []
         self._wake = os.pipe()
         self._closers.append(self._close_wake)
         self._stopping = False
-        # poll and epoll would wait for whole milliseconds.
+        # poll and epoll only have a resolution of milliseconds.
         self._selector = selectors.SelectSelector()
         self._selector.register(self._wake[0], selectors.EVENT_READ)
         self._servos: PtyServoBus | None = None
         self._boards: dict[str, TactileBoard] = {}
         self._sources: dict[str, SimulatedTactile] = {}
         self._plates: dict[str, Plate] = {}
-        self._turned = 0.0  # when a person's hand has turned a joint
+        self._turned = 0.0  # end time of the last turn of a joint by hand
         self._tell = tell
         self._advance_due = 0.0
         try:
@@ -222,7 +234,7 @@ class Emulator:
         self._links.link(f"tactile-{FINGERS[finger]}", board.path)
 
     def run(self, on_ready: Callable[[], None] = lambda: None) -> None:
-        """Answer until :meth:`end`. ``on_ready`` is called once everything answers."""
+        """Serve the ports until :meth:`end`. ``on_ready`` is called once all parts answer."""
         ready = False
         while not self._stopping:
             self._turn()
@@ -231,13 +243,13 @@ class Emulator:
                 on_ready()
 
     def end(self) -> None:
-        """End :meth:`run`; may be called from a signal handler or another thread."""
+        """End :meth:`run`. Signal handlers and other threads may call this."""
         self._stopping = True
         with contextlib.suppress(OSError):
             os.write(self._wake[1], b"x")
 
     def close(self) -> None:
-        """Take the ports and their links away. Never raises."""
+        """Remove the ports and their links. Never raises."""
         while self._closers:
             with contextlib.suppress(OSError):
                 self._closers.pop()()
@@ -249,13 +261,13 @@ class Emulator:
     # --- the event loop --------------------------------------------------------------------------
 
     def _turn(self) -> None:
-        """Wait for bytes or for what is due, and do it: servos first, one slow thing at most."""
+        """Wait for bytes or the next event; serve the servos, then at most one slower task."""
         servos, boards = self._servos, self._boards.values()
         due = min([self._advance_due, *[board.next_event() for board in boards]])
         start = self.clock.now()
         if servos is not None:
             due = min(due, servos.next_event())
-        # A time that stands still comes to nothing that is due: no haste then.
+        # While the hand's time is held, no event becomes due, so avoid a busy loop.
         wait = max(due - start, _HELD if self.clock.held else 0.0)
         ready = [key for key, _ in self._selector.select(wait)]
         t = self.clock.now()
@@ -289,12 +301,17 @@ class Emulator:
     # --- requests and faults ---------------------------------------------------------------------
 
     def request(self, text: str) -> str:
-        """Take words of the control socket: ``ok``, or ``error: `` and why none of them counts.
+        """Handle words from the control socket; return ``ok``, or ``error: `` with the reason.
 
-        A time behind a word counts from now. With ``report`` among them the answer is
-        :meth:`report` as JSON; ``forget`` begins the record again; ``place`` puts the object back
-        where it was at the start, at rest and with no load on it, and takes plates away.
-        ``press …`` is for :meth:`press`, ``turn …`` for :meth:`turn`.
+        Words are faults, with times relative to now, and these requests:
+
+        - ``report``: the reply is :meth:`report` as JSON.
+        - ``forget``: the record of the bus begins again.
+        - ``place``: put the object back to its start, at rest and without load; remove plates.
+        - ``press …``, as the first word: see :meth:`press`.
+        - ``turn …``, as the first word: see :meth:`turn`.
+
+        After an error, none of the words takes effect.
         """
         words = text.split()
         if words[:1] == ["turn"]:
@@ -316,14 +333,14 @@ class Emulator:
                 self._take_away(finger)
         self._events += [event._replace(after=now + event.after) for event in fresh]
         self._events.sort(key=lambda event: event.after)
-        self._advance_due = now  # so that what starts now does
+        self._advance_due = now  # so that faults without a time begin at once
         return reply
 
     def press(self, text: str) -> str:
-        """Let plates do the presses of ``text``; without any, tell how far the last ones are.
+        """Start the presses of ``text``; return their state as JSON, or ``error: `` with a reason.
 
-        ``error: `` and why not, or JSON: ``wait``, the time until the last press is reached [s], 0
-        then.
+        The JSON object has ``wait``, the remaining time until the last press is reached [s]. With
+        an empty text no press is started.
         """
         now = self.clock.now()
         if text.strip():
@@ -341,15 +358,15 @@ class Emulator:
         return json.dumps({"wait": max(0.0, *ends) if ends else 0.0})
 
     def _take_away(self, finger: str) -> None:
-        """Take a tip's plate away: its sensor feels the object again."""
+        """Remove the plate of a tip, so that its sensor measures the object again."""
         del self._plates[finger]
         self._sources[finger].stage = None
 
     def turn(self, words: Sequence[str]) -> str:
-        """Let a person's hand turn joints: ``left=closed``, to its stop; ``open``; ``zero``.
+        """Turn joints as if by hand: ``left=closed`` to its stop, ``open``, or ``zero``.
 
-        It holds them until the servos are written to. ``error: `` and why not, or JSON as of
-        :meth:`press`; without words how long the last way takes yet.
+        The joints are held until the servos are written to. The reply is ``error: `` with a reason,
+        or JSON with the remaining time, as from :meth:`press`. Without words no turn is started.
         """
         now = self.clock.now()
         turns = [word.partition("=") for word in words]
@@ -365,16 +382,16 @@ class Emulator:
         return json.dumps({"wait": max(0.0, self._turned - now)})
 
     def _answer(self, text: str) -> str:
-        """:meth:`request`, with what starts now in force before the reply goes out."""
+        """Handle a :meth:`request`, and apply faults that begin now before the reply is sent."""
         reply = self.request(text)
         self._advance(self.clock.now())
         return reply
 
     def report(self, t: float) -> dict[str, Any]:
-        """Report the traffic on the servos' wire and the hand's true state; times are the hand's
-        [s].
+        """Return the traffic on the servo bus and the true state of the hand.
 
-        ``monotonic`` is time.monotonic() at ``t``, to compare with times of other processes.
+        Times are in the hand's time [s]. ``monotonic`` is time.monotonic() at ``t``, for comparison
+        with other processes.
         """
         servos = self._servos.bus.report(t) if self._servos is not None else []
         held = {"pose": self.hand.object_pose.tolist()}
@@ -419,7 +436,7 @@ class Emulator:
 
 
 def with_board(settings: Settings) -> Settings:
-    """Return ``settings`` with the default board where its tactile backend has no framing."""
+    """Return ``settings``, with the default board if the tactile backend has no framing."""
     if settings.tactile.backend in (*ENCODERS, "none"):
         return settings
     tactile = TactileSettings.model_validate({**settings.tactile.model_dump(), **DEFAULT_BOARD})

@@ -1,7 +1,7 @@
-"""The emulator's folder, held by one emulator at a time: links to its ports, and a control socket.
+"""Folder of an emulator, with links to its ports and a control socket.
 
-The socket takes words of text and answers each message with one line; the emulator's own event loop
-serves it, and `send_words` is its client.
+Only one emulator may use a folder at a time. The socket answers each text message with one line.
+The emulator's event loop serves it, and `send_words` is its client.
 """
 
 from __future__ import annotations
@@ -25,22 +25,22 @@ _CONTROL = "control"
 _LONGEST = 4096  # bytes of a message
 _LONGEST_REPLY = 1 << 17
 _CLIENTS = 8  # at a time
-_PATIENCE = 10.0  # s that a client waits for its reply, of a busy machine, too
+_PATIENCE = 10.0  # s, timeout of a client, also on a busy machine
 
 
 class FolderError(SoftfingerError):
-    """The folder can't be used. The message says why, and how to fix it."""
+    """The folder can't be used. The message gives the reason and the remedy."""
 
 
 class LinkFolder:
-    """The folder with the links to the ptys, held by one emulator at a time.
+    """Folder with the links to the ptys, locked by one emulator.
 
-    It must be this user's, and no other may write in it.
-    Links that a killed emulator left behind are replaced; anything else in their place is not.
+    The user must own the folder, and other users must not be able to write to it. Links left behind
+    by a killed emulator are replaced, but other files are not.
     """
 
     def __init__(self, path: Path) -> None:
-        """Raises FolderError when the folder is in use or can't be used."""
+        """Create and lock the folder. Raises FolderError if it is in use or unusable."""
         self.path = path
         self._links: dict[Path, str] = {}
         try:
@@ -68,7 +68,7 @@ class LinkFolder:
                     f"{self.path}: in use by another emulator (process {holder or 'unknown'}); "
                     "end that one or choose another --dir"
                 ) from None
-            # The holder before us may have removed the file between our open and our lock.
+            # The previous holder may have removed the file between our open and our lock.
             with contextlib.suppress(FileNotFoundError):
                 if path.stat().st_ino == os.fstat(lock).st_ino:
                     os.ftruncate(lock, 0)
@@ -77,7 +77,7 @@ class LinkFolder:
             os.close(lock)
 
     def link(self, name: str, target: str) -> None:
-        """Put the link ``name`` to ``target`` in place, whole at any instant."""
+        """Create or replace the link ``name`` to ``target`` atomically."""
         link = self.path / name
         fresh = self.path / f".{name}.{os.getpid()}"
         fresh.unlink(missing_ok=True)
@@ -86,14 +86,14 @@ class LinkFolder:
         self._links[link] = target
 
     def unlink(self, name: str) -> None:
-        """Remove the link ``name``, unless it leads elsewhere by now."""
+        """Remove the link ``name``, unless its target has changed."""
         target = self._links.pop(self.path / name, "")
         with contextlib.suppress(OSError):
             if str((self.path / name).readlink()) == target:
                 (self.path / name).unlink()
 
     def close(self) -> None:
-        """Remove what is ours: the links, unless they lead elsewhere by now, and the lock."""
+        """Remove the links, unless their targets have changed, and the lock."""
         for link in list(self._links):
             self.unlink(link.name)
         with contextlib.suppress(OSError):
@@ -107,15 +107,15 @@ class NoEmulator(SoftfingerError):
 
 
 class ControlPort:
-    """Listens at ``folder``/control; each message is handed to ``handle``, whose text goes back.
+    """Control socket ``folder``/control; ``handle`` returns the reply to each message.
 
-    Who waits at ``selector`` calls the data of what is readable.
+    The owner of ``selector`` must call the data of each readable key.
     """
 
     def __init__(
         self, folder: Path, handle: Callable[[str], str], selector: selectors.BaseSelector
     ) -> None:
-        """Raises FolderError when the name is taken by something that is no socket."""
+        """Bind the socket. Raises FolderError if another kind of file has its name."""
         self._handle = handle
         self._selector = selector
         self._folder = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
@@ -123,7 +123,7 @@ class ControlPort:
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         try:
             with contextlib.suppress(FileNotFoundError):
-                # A killed emulator's; the folder's lock says that it is gone.
+                # It was left by a killed emulator, since we hold the lock of the folder.
                 if not stat.S_ISSOCK(os.stat(_CONTROL, dir_fd=self._folder).st_mode):
                     raise FolderError(f"{folder / _CONTROL}: is in the way; move it elsewhere")
                 os.unlink(_CONTROL, dir_fd=self._folder)
@@ -137,7 +137,7 @@ class ControlPort:
             raise
 
     def close(self) -> None:
-        """Hang up and take the socket away."""
+        """Disconnect all clients and remove the socket."""
         for each in (self._listener, *self._clients):
             each.close()
         with contextlib.suppress(OSError):
@@ -172,10 +172,12 @@ class ControlPort:
 
 
 def send_words(folder: Path, text: str) -> str:
-    """Send ``text`` to the emulator in ``folder``; its reply.
+    """Send ``text`` to the emulator in ``folder`` and return its reply.
 
-    Raises:
-        NoEmulator: none runs there, or it does not answer.
+    Raises
+    ------
+    NoEmulator
+        If no emulator runs there, or it does not answer.
     """
     try:
         with _directory(folder) as descriptor:
@@ -202,5 +204,5 @@ def _directory(folder: Path) -> Iterator[int]:
 
 
 def _address(folder: int) -> str:
-    """The socket's address by the folder's descriptor: a whole path may not pass 107 bytes."""
+    """Return the address via the folder's descriptor, since a path is limited to 107 bytes."""
     return f"/proc/self/fd/{folder}/{_CONTROL}"

@@ -1,7 +1,8 @@
-"""A plate on a stage that presses a tip of the emulated hand: so deep, so tilted, so fast.
+"""Plate on a stage that presses a tip of the emulated hand with given depth, tilt and speed.
 
-For trying calibration without metal: the sensor feels the plate instead of the object, and what it
-feels is known. The plate has no friction; the finger's joint doesn't feel it, as in a clamp.
+With it, calibration can be tried without hardware: the sensor measures the plate instead of the
+object, and the true contact is known. The plate has no friction, and it does not load the joint of
+the finger, as if the finger were clamped.
 """
 
 from __future__ import annotations
@@ -19,10 +20,10 @@ from softfinger.daemon.types import FINGERS
 from softfinger.kinematics.contact.lookup import lookup
 from softfinger.kinematics.contact.table import ContactTable
 
-_CLEAR = 1e-3  # m over the tip, where the plate tilts and waits
+_CLEAR = 1e-3  # m above the tip, where the plate tilts and waits
 _LIFT = 0.02  # m/s
-_FILL = 0.1  # s that a bladder takes
-_BETWEEN = 1.0  # s clear of the tip between two presses
+_FILL = 0.1  # s to inflate a bladder
+_BETWEEN = 1.0  # s without contact between two presses
 
 _UNITS = {
     "depth": {"mm": 1e-3, "m": 1.0},
@@ -37,14 +38,15 @@ _NUMBER = re.compile(r"([-+]?[0-9.]+(?:e[-+]?[0-9]+)?)(.*)")
 
 
 class PlateError(SoftfingerError, ValueError):
-    """Presses that can't be understood or done. The message says what is expected."""
+    """The presses are invalid or impossible. The message states the expected form or range."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlatePress:
-    """Press to ``d`` [m] at ``theta`` [rad], or a uniform ``pressure`` [Pa] on all cells instead.
+    """Press to ``d`` [m] at ``theta`` [rad], or a uniform ``pressure`` [Pa] on all cells.
 
-    ``force`` [N] is what the tip's base then feels; ``hold`` [s], inf: until told otherwise.
+    ``force`` [N] is the resulting force on the base of the tip. The press is held for ``hold`` [s];
+    inf means until the next command.
     """
 
     d: float
@@ -56,7 +58,7 @@ class PlatePress:
 
     @property
     def is_clear(self) -> bool:
-        """True for a plate that is lifted off, and stays so."""
+        """True if the plate is lifted off and stays there."""
         return self.d <= 0.0 and self.pressure == 0.0 and self.hold == math.inf
 
     def __str__(self) -> str:
@@ -68,11 +70,12 @@ class PlatePress:
 
 
 def parse_presses(text: str, table: ContactTable, scale: float) -> dict[str, list[PlatePress]]:
-    """Return the presses of each finger's tip: ``[tip=left] depth=4mm [tilt=10deg] …, …``.
+    """Parse presses, ``[tip=left] depth=4mm [tilt=10deg] …, …``, and return them by finger.
 
-    Each has one of depth (0 lifts off), force and pressure (uniform, as by a bladder), and may have
-    tilt, speed, hold, tip (left, right or both, the default). Without ``hold`` the last one stays,
-    others rest for a second. Forces are ``scale`` times the ``table``'s. Raises PlateError.
+    Each press has either depth (0 lifts off), force or pressure (uniform, like a bladder), and may
+    have tilt, speed, hold, and tip (left, right or both, the default). Without ``hold`` the last
+    press stays, and the others last one second. Forces are ``scale`` times those of ``table``.
+    Raises PlateError.
     """
     made: dict[str, list[PlatePress]] = {}
     each = [part.split() for part in text.split(",")]
@@ -113,7 +116,7 @@ def _value(name: str, text: str) -> float:
 
 def _press(values: dict[str, float], table: ContactTable, scale: float) -> PlatePress:
     d, theta, pressure = values.get("depth", 0.0), values["tilt"], values.get("pressure", 0.0)
-    # As far as the tip's law goes at that tilt.
+    # Limit the depth to the valid range of the contact law at that tilt.
     d_max = 0.75 * table.tip.radius * (1.0 - abs(math.sin(theta)))
     known = [(float(x), lookup(table.data, x, theta)) for x in np.linspace(0.0, d_max, 1001)]
     depths = [x for x, (*_, inside) in known if inside]
@@ -130,19 +133,19 @@ def _press(values: dict[str, float], table: ContactTable, scale: float) -> Plate
 
 
 class Plate:
-    """The plate over one tip. Its way is a line through knots; times are the hand's [s]."""
+    """Plate over one tip. Its path is piecewise linear in the hand's time [s]."""
 
     def __init__(self) -> None:
         self._t = [0.0]
         self._d = [-_CLEAR]
         self._doing: list[tuple[PlatePress | None, bool]] = [
             (None, False)
-        ]  # from a knot on; if at rest
+        ]  # from each knot on: the press, and True if the plate is at rest
         self._reported = -1
-        self.arrives = 0.0  # when a sequence's last press is reached
+        self.arrives = 0.0  # time at which the last press of the sequence is reached
 
     def go(self, presses: Sequence[PlatePress], t: float) -> None:
-        """Lift off and do ``presses`` from ``t`` on."""
+        """Lift off and perform ``presses`` from ``t`` on."""
         d, (press, _) = max(self(t).d, -_CLEAR), self._doing[self._leg(t)]
         self._t, self._d, self._doing, self._reported = [t], [d], [], -1
         self._add((d + _CLEAR) / _LIFT, -_CLEAR, press)
@@ -166,7 +169,7 @@ class Plate:
         self._doing.append((press, rests))
 
     def __call__(self, t: float) -> StageTouch:
-        """Return the tip's touch at ``t``."""
+        """Return the contact of the tip at ``t``."""
         press, rests = self._doing[self._leg(t)]
         d = float(np.interp(t, self._t, self._d))
         if press is None:
@@ -174,7 +177,7 @@ class Plate:
         return StageTouch(d, press.theta, press.pressure if rests else 0.0)
 
     def reached(self, t: float) -> PlatePress | None:
-        """Return the press that has come to rest since the last call; None: none has."""
+        """Return the press that has come to rest since the last call, or None."""
         leg = self._leg(t)
         press, rests = self._doing[leg]
         fresh = rests and leg != self._reported

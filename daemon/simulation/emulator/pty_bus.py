@@ -1,8 +1,8 @@
-"""A servo bus behind a pseudo-terminal, served by somebody else's event loop.
+"""Servo bus on a pseudo-terminal, served by an event loop of the caller.
 
-It owns the terminal and the time on the wire: replies leave when their last byte would have
-arrived at the client's baud rate, return delays included; or at once, unpaced. Times on the wire
-are absolute: time in which this process did not run, which no servo ever loses, does not count.
+It manages the terminal and the transmission times. A paced reply is sent at the time at which its
+last byte would arrive at the client's baud rate, including the return delay. Unpaced replies are
+sent at once. Transmission times are absolute, so interruptions of this process do not add to them.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ _TCGETS2 = 0x802C542A  # struct termios2: four flag words, line, 19 control char
 _TERMIOS2 = struct.Struct("=4IB19s2I")
 _BITS_PER_BYTE = 10  # start bit, eight data bits, stop bit
 _READ_SIZE = 4096
-_AT_A_TIME = 4  # reads, so that a client that never pauses leaves time for the rest of the hand
-_GAP = 0.02  # s of silence within a packet that drop it: the reader may be held up beyond 1.5 ms
-# s: about what a pseudo-terminal takes from one process's write to the other's read, woken by it.
-# A paced bus takes it off both ways, since it stands for a wire that has its own time already.
+_AT_A_TIME = 4  # reads in one turn, so that a busy client leaves time for other tasks
+_GAP = 0.02  # s of silence that end a packet; more than 1.5 ms, since this process may be delayed
+# s: typical latency of a pseudo-terminal from a write to the wake-up of the reader. A paced bus
+# subtracts it in both directions, since the simulated wire has its own transmission time.
 PASSAGE = 15e-6
-# s by which what a reading shows may be older than its reply, as in a servo, which measures at
-# intervals of its own: so that the physics is computed beside the exchange, not within it.
+# s by which a reading may be older than its reply. Servos also measure at intervals of their own.
+# This allows the physics to be computed outside the exchange.
 _LAG = 0.0005
 
 
 def open_pty() -> tuple[int, int, str]:
-    """Return a new pty: its non-blocking end, the clients' one, which is raw, and that one's path.
+    """Open a pty; return its non-blocking master, its raw slave for clients, and the slave's path.
 
-    The clients' end stays open here, so that they may come and go without an error.
+    The slave stays open here, so that clients may come and go without an error.
     """
     master, slave = pty.openpty()
     tty.setraw(slave)
@@ -45,16 +45,22 @@ def open_pty() -> tuple[int, int, str]:
 
 
 class PtyServoBus:
-    """``bus`` on a new pseudo-terminal at ``path``.
+    """Servo bus on a new pseudo-terminal at ``path``.
 
-    The loop that owns it waits until :meth:`fileno` is readable or :meth:`next_event` has come,
-    then calls :meth:`service`; ``clock`` must be the clock that those times are of.
+    The caller's event loop waits until :meth:`fileno` is readable or the time of :meth:`next_event`
+    is reached, and then calls :meth:`service`.
 
-    Args:
-        baud: 0 answers at any rate and at once. Above 0 a servo ignores a client whose port is
-            set to another rate than its own, and replies take their time on the wire.
-        spin: s before a paced reply is due in which :meth:`service` waits for it awake, since a
-            sleep ends late by a timer's slack.
+    Parameters
+    ----------
+    bus
+        Emulated servos.
+    baud
+        With 0, servos answer at any rate and at once. Otherwise a servo ignores a client whose port
+        is set to a different rate than its own, and replies take transmission time.
+    spin
+        Duration [s] of busy waiting before a paced reply is due, since sleeps end late.
+    clock
+        Clock of all times.
     """
 
     def __init__(
@@ -74,11 +80,11 @@ class PtyServoBus:
         self._free_at = -math.inf  # the wire is busy until then
         self._due: list[tuple[float, int, bytes]] = []
         self._order = 0
-        self._arrives = -math.inf  # when the last reply has arrived
+        self._arrives = -math.inf  # arrival time of the last reply
         self.plug()
 
     def fileno(self) -> int:
-        """Return the descriptor to wait for; -1 while unplugged."""
+        """Return the file descriptor to wait for; -1 while unplugged."""
         return self._master
 
     @property
@@ -87,11 +93,11 @@ class PtyServoBus:
         return self._master >= 0
 
     def plug(self) -> None:
-        """Make the terminal (again), at a new ``path``."""
+        """Create the terminal (again), at a new ``path``."""
         self._master, self._slave, self.path = open_pty()
 
     def unplug(self) -> None:
-        """Take the terminal away, as when an adapter is pulled; the servos go on."""
+        """Remove the terminal, like an unplugged adapter; the servos continue."""
         self._due.clear()
         self.bus.parser.reset()
         if self.plugged:
@@ -100,23 +106,23 @@ class PtyServoBus:
         self._master = self._slave = -1
 
     def client_baud(self) -> int:
-        """Return the rate that the terminal is set to."""
+        """Return the baud rate of the terminal."""
         raw = bytearray(_TERMIOS2.size)
         fcntl.ioctl(self._master, _TCGETS2, raw, True)
         return int(_TERMIOS2.unpack(raw)[-1])
 
     def next_event(self) -> float:
-        """Return when :meth:`service` is needed next [s] though no byte came."""
+        """Return the time [s] at which :meth:`service` is needed next without new bytes."""
         servos = self.bus.next_event()
         return min(servos, self._due[0][0] - self._spin) if self._due else servos
 
     @property
     def answering_until(self) -> float:
-        """Time [s] at which the last reply, but one that a fault holds back, has arrived."""
+        """Arrival time [s] of the last reply, except replies delayed by a fault."""
         return self._arrives
 
     def driven(self) -> bool:
-        """Return whether torque is on and a process has the port for itself, as the daemon does."""
+        """Return True if torque is on and a process, like the daemon, has locked the port."""
         if not (self.plugged and any(servo.torque_on for servo in self.bus.servos)):
             return False
         try:
@@ -127,22 +133,22 @@ class PtyServoBus:
         return False
 
     def service(self, t: float) -> None:
-        """Take what has arrived by time t [s], let the servos act, send what is due."""
+        """Read bytes at time t [s], advance the servos, and send the replies that are due."""
         if self.plugged:
             for _ in range(_AT_A_TIME):
                 try:
                     data = os.read(self._master, _READ_SIZE)
-                except OSError:  # nothing there
+                except OSError:  # no data
                     break
                 if self._receive(data, t):
-                    break  # the client takes some time for the reply
-                # Its next request often comes while its last write is being done.
+                    break  # the client needs some time to read the reply
+                # The next request often arrives while a write is being processed.
                 t = max(t, self._clock())
         self.bus.advance(t)
         self._send()
 
     def _receive(self, data: bytes, t: float) -> bool:
-        """Let the servos act on ``data``; whether there is a reply."""
+        """Pass ``data`` to the servos; return True if there is a reply."""
         if not self._baud:
             replies = self.bus.exchange(data, t)
             for reply in replies:
@@ -178,12 +184,12 @@ class PtyServoBus:
                 return
             while now < due:
                 before, now = now, self._clock()
-                if now == before:  # the hand's time stands still
+                if now == before:  # the hand's time is held
                     return
             self._write(heapq.heappop(self._due)[2])
 
     def _write(self, data: bytes) -> None:
-        # A client that never reads fills the terminal; a wire would lose those bytes too.
+        # A client that never reads fills the terminal. A real wire would lose these bytes too.
         try:
             os.write(self._master, data)
         except BlockingIOError:

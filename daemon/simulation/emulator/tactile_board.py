@@ -1,7 +1,7 @@
-"""An emulated tactile board: the simulated sensor's frames, in a board's framing, on a pty.
+"""Emulated tactile board: sends the frames of the simulated sensor on a pty.
 
-Framings plug in as encoders (`ENCODERS`), pure functions from counts to bytes. The faults that a
-board may have are applied here too.
+The encoders (`ENCODERS`) are pure functions from counts to the bytes of a board's framing. Faults
+of the board are applied here too.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from softfinger.daemon.simulation.emulator.pty_bus import open_pty
 from softfinger.daemon.tactile import cobs
 from softfinger.daemon.types import Frame
 
-_TTY_ROOM = 2048  # bytes; a tty reports at most 4095 unread ones, so more is never asked for
+_TTY_ROOM = 2048  # unread bytes; a tty reports at most 4095, so the limit must be below
 _DRAIN = 4096
-_RETRY = 5e-4  # s until a frame that is late is asked for again
+_RETRY = 5e-4  # s until the source is asked again for a late frame
 _NOISE_LENGTH = 64  # bytes, longest burst of noise between frames
 
 
@@ -38,24 +38,24 @@ class FrameSource(Protocol):
 
 
 class FrameWriter:
-    """The board's end of a pty. Frames go out whole or not at all.
+    """Board's end of a pty. Frames are sent completely or not at all.
 
-    A pty holds some tens of kilobytes. While nobody reads, frames are dropped early, so that the
-    next client isn't fed old ones, as with a board whose port nobody has opened.
+    A pty buffers tens of kilobytes. Without a reader, frames are dropped early, so that the next
+    client does not receive old ones. A board with a closed port behaves the same way.
     """
 
     def __init__(self) -> None:
         self._master, self._slave, self.path = open_pty()
         self.dropped = 0  # frames
-        self._remaining = b""  # of a frame that the pty took only a part of
+        self._remaining = b""  # unsent part of a frame
         self._unread = array.array("i", [0])
 
     def fileno(self) -> int:
-        """Return a descriptor, readable when the client has written; see :meth:`drain`."""
+        """Return a file descriptor that is readable when the client has written; see `drain`."""
         return self._master
 
     def send(self, frame: bytes) -> bool:
-        """Write one frame, or drop it when the client has not read those before it."""
+        """Write one frame, or drop it if the client has not read the earlier ones."""
         if not self.flush() or self._unread_bytes() > min(len(frame), _TTY_ROOM):
             self.dropped += 1
             return False
@@ -64,7 +64,7 @@ class FrameWriter:
         return True
 
     def flush(self) -> bool:
-        """Write on with what is left of a frame; True when nothing is left."""
+        """Write the unsent part of a frame; return True if nothing remains."""
         if self._remaining:
             with contextlib.suppress(BlockingIOError):
                 self._remaining = self._remaining[os.write(self._master, self._remaining) :]
@@ -89,19 +89,19 @@ class FrameWriter:
 
 
 class TactileBoard:
-    """Sends each new frame of ``source`` on a pty, in one framing, with the faults asked for.
+    """Emulated board that sends each new frame of ``source`` on a pty, with optional faults.
 
-    A board that is asked for its frames sends the next one that comes after it was asked.
-    ``faults`` are in force, by their kind, with their probability:
+    A board that waits for requests sends the first frame after a request. ``faults`` has the
+    probabilities of active faults by kind:
 
-    - ``torn``: a frame lacks some of its bytes, anywhere.
-    - ``noisy``: random bytes stand before a frame, and one byte of it is wrong.
-    - ``silent``: it sends nothing more.
-    - ``frozen``: it repeats its last frame.
-    - ``wrong-size``: it sends a grid of half the rows and half the columns.
-    - ``saturated``, ``zero``: all its cells read the greatest count, or none.
+    - ``torn``: a sequence of bytes is missing in a frame.
+    - ``noisy``: random bytes precede a frame, and one byte of it is wrong.
+    - ``silent``: the board sends no frames.
+    - ``frozen``: the board repeats its last frame.
+    - ``wrong-size``: the grid has half the rows and half the columns.
+    - ``saturated``, ``zero``: all cells read the largest count, or 0.
 
-    The latter five are certain whatever their probability.
+    The probabilities of the last five are ignored: they are always active.
     """
 
     def __init__(
@@ -112,7 +112,7 @@ class TactileBoard:
         delay: float,
         seed: int = 1,
     ) -> None:
-        """Frames are due at k/rate + delay [Hz, s]; ``seed`` drives the faults' chance."""
+        """Create a board; frame k is due at k/rate + delay [Hz, s], ``seed`` is for faults."""
         self._source = source
         self._encoder = encoder
         self._requested = not encoder.request
@@ -122,46 +122,46 @@ class TactileBoard:
         self._random = np.random.default_rng(seed)
         self.plug()
         self._seq = -1
-        self._frozen: NDArray[np.uint16] | None = None  # the image that a frozen board repeats
+        self._frozen: NDArray[np.uint16] | None = None  # image that a frozen board repeats
         self._due = -math.inf
         self.sent = 0  # frames
 
     def plug(self) -> None:
-        """Make the port (again), at a new ``path``."""
+        """Create the port (again), at a new ``path``."""
         self._writer = FrameWriter()
         self.path = self._writer.path
         self.plugged = True
 
     def unplug(self) -> None:
-        """Take the port away; a client reads an error. The board goes on."""
+        """Remove the port, so that a client reads an error; the board continues."""
         if self.plugged:
             self._writer.close()
         self.plugged = False
 
     @property
     def dropped(self) -> int:
-        """Frames that nobody read in time."""
+        """Number of frames that were not read in time."""
         return self._writer.dropped
 
     def fileno(self) -> int:
-        """Return a descriptor, readable when :meth:`hear` has something to do."""
+        """Return a file descriptor that is readable when :meth:`hear` must be called."""
         return self._writer.fileno()
 
     def hear(self) -> None:
-        """Take what the client wrote: requests, where the board waits for them."""
+        """Read the bytes of the client, which may be a request for a frame."""
         written = self._writer.drain() if self.plugged else b""
         if self._encoder.request and self._encoder.request in written:
             self._requested = True
 
     def next_event(self) -> float:
-        """Return when :meth:`service` next has something to do [s]."""
+        """Return the time [s] at which :meth:`service` must be called next."""
         return self._due
 
     def service(self, t: float) -> None:
         """Send the newest frame if a new one is due at time t [s]."""
         if self.plugged:
             self._writer.flush()
-        # The instant of a due frame itself may be rounded either way.
+        # The time of a due frame may be rounded up or down.
         self._due = (math.floor((t - self._delay) * self._rate + 1e-6) + 1) / self._rate
         self._due += self._delay
         frame = self._source.latest()
@@ -187,7 +187,7 @@ class TactileBoard:
             counts = counts if self._frozen is None else self._frozen
         self._frozen = counts
         if "saturated" in faults:
-            counts = np.full_like(counts, np.iinfo(counts.dtype).max)  # framings clip it
+            counts = np.full_like(counts, np.iinfo(counts.dtype).max)  # clipped by the encoder
         elif "zero" in faults:
             counts = np.zeros_like(counts)
         if "wrong-size" in faults:
@@ -205,29 +205,29 @@ class TactileBoard:
         return data
 
 
-# counts [rows, cols], the scan's number, the board's time [s] → bytes
+# counts [rows, cols], number of the scan, time of the board [s] → bytes
 Encode = Callable[[NDArray[np.uint16], int, float], bytes]
 
 
 @dataclass(frozen=True, slots=True)
 class Encoder:
-    """A framing, and the byte that a board waits for before each frame; empty when it runs free."""
+    """Framing of a board, and the byte that requests a frame; empty if it sends continuously."""
 
     encode: Encode
     request: bytes = b""
 
 
 def encode_flexitac(counts: NDArray[np.uint16], _number: int = 0, _t: float = 0.0) -> bytes:
-    """Encode ``AA 55``, then one byte a cell, row-major; counts above 255 saturate."""
+    """Encode ``AA 55``, then one byte per cell, row-major; counts above 255 saturate."""
     return b"\xaa\x55" + np.minimum(counts, 255).astype(np.uint8).tobytes()
 
 
 def encode_glove(
     counts: NDArray[np.uint16], number: int = 0, _t: float = 0.0, values: int = 32
 ) -> bytes:
-    """Encode number + 11, each count's high and low half + 11, newline; larger counts saturate.
+    """Encode number + 11, the high and low half of each count + 11, newline; counts saturate.
 
-    ``values`` of a half: 32 or, with a 12-bit converter, 64.
+    A half has ``values`` values: 32, or 64 with a 12-bit converter.
     """
     counts = np.minimum(counts, values * values - 1)
     halves = np.stack([counts // values + 11, counts % values + 11], axis=-1)
@@ -235,7 +235,7 @@ def encode_glove(
 
 
 def encoder_for(backend: str, full_count: int) -> Encoder:
-    """Return the framing of a backend's board whose largest count is ``full_count``."""
+    """Return the framing of a backend's board with the largest count ``full_count``."""
     if backend == "glove" and 1023 < full_count <= 4095:
         return Encoder(partial(encode_glove, values=64), b"a")
     return ENCODERS[backend]

@@ -1,4 +1,5 @@
-"""The simulated hand's mechanics: `simulated_hand` is its face, `plant` its integrator.
+"""Mechanics of the simulated hand: `simulated_hand` is the interface, `plant` the integrator.
 
-The rest are kernels on the records of `plant_state`: contacts, forces, equations, energy guard.
+The other modules are kernels on the records of `plant_state`: contacts, forces, equations of motion
+and energy guard.
 """

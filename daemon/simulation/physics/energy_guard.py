@@ -1,10 +1,11 @@
-"""The plant's energy, and the guard by which a step doesn't create any.
+"""Energy of the plant, and a guard that prevents integration steps from creating energy.
 
-Where forces are smooth the method's error is small and falls with the step. Where they aren't, as
-when the backing plate's stiff rim is hit by a light object, or where a step is far too long, a step
-could leave more energy than there was and than the motors and pushes put in. The excess is then
-taken out of the motion; when there isn't enough, the motion ends, at rest, where there is. Without
-any losses, where the energy should stay, the method's own small drift is allowed in smooth steps.
+With smooth forces the integration error is small and decreases with the step. With non-smooth
+forces, for example when a light object hits the stiff rim of the backing plate, or with a far too
+long step, the energy could increase by more than the work of the motors and loads. The guard then
+removes the excess from the kinetic energy. If the kinetic energy is too small for that, the motion
+ends at rest at an earlier point of the step. Without losses the energy should be constant; there,
+the small drift of the method is allowed in smooth steps.
 """
 
 from __future__ import annotations
@@ -14,14 +15,14 @@ import math
 from softfinger.daemon.simulation.physics.plant_state import LAYERS, SHEARS, Plant
 from softfinger.kinematics.compiled.kernel import inner_kernel
 
-LOSSLESS_TOLERANCE = 1e-3  # of the energy, what smooth steps may gain in all without losses
-_ROUNDING = 3e-13  # of the energy, for d comes from lengths that are much greater
-HALVINGS = 12  # of a step that has to be shortened
+LOSSLESS_TOLERANCE = 1e-3  # relative energy gain allowed in smooth steps without losses
+_ROUNDING = 3e-13  # relative rounding error of the energy; d is a difference of larger lengths
+HALVINGS = 12  # limit for a step that must be shortened
 
 
 @inner_kernel
 def kinetic_energy(plant: Plant) -> float:
-    """Return kinetic energy of joints and object [J]."""
+    """Return the kinetic energy of joints and object [J]."""
     p, v = plant.parameters, plant.state.velocity
     joints = v[0] ** 2 + v[1] ** 2
     moving = v[2] ** 2 + v[3] ** 2
@@ -31,7 +32,7 @@ def kinetic_energy(plant: Plant) -> float:
 
 @inner_kernel
 def weight_energy(plant: Plant) -> float:
-    """Return potential energy of the object's weight [J]."""
+    """Return the potential energy of the object's weight [J]."""
     p, at = plant.parameters, plant.state.position
     energy: float = -p.mass * (p.gravity[0] * at[2] + p.gravity[1] * at[3])
     return energy
@@ -39,7 +40,7 @@ def weight_energy(plant: Plant) -> float:
 
 @inner_kernel
 def elastic_energy(plant: Plant) -> float:
-    """Return the energy [J] of end stops, bristles and all contacts in the first stage."""
+    """Return the elastic energy [J] of end stops, bristles and the contacts of the first stage."""
     p, stage = plant.parameters, plant.stages[0]
     energy: float = plant.palm_energy
     for finger in range(2):
@@ -56,7 +57,7 @@ def elastic_energy(plant: Plant) -> float:
 
 @inner_kernel
 def on_rim(plant: Plant) -> bool:
-    """Return whether a backing plate's rim is pressed into something."""
+    """Return True if the rim of a backing plate is in contact."""
     stage = plant.stages[0]
     depth = 0.0
     for finger in range(2):
@@ -66,7 +67,7 @@ def on_rim(plant: Plant) -> bool:
 
 @inner_kernel
 def open_guard(plant: Plant) -> None:
-    """Allow the energy there is, unless it is the one that the last step left."""
+    """Allow the present energy, if it was changed since the last step."""
     energy = kinetic_energy(plant) + elastic_energy(plant) + weight_energy(plant)
     if energy != plant.energy:
         plant.energy = energy
@@ -75,7 +76,7 @@ def open_guard(plant: Plant) -> None:
 
 @inner_kernel
 def work_done(plant: Plant) -> float:
-    """Return the largest work of motors and loads since the earlier state [J]."""
+    """Return an upper bound of the work of motors and loads since the earlier state [J]."""
     before, now = plant.earlier, plant.state
     work = 0.0
     for j in range(5):
@@ -90,11 +91,16 @@ def work_done(plant: Plant) -> float:
 
 @inner_kernel
 def guard_step(plant: Plant, was_on_rim: bool) -> int:
-    """Take a step's excess energy out of its velocities; what was changed.
+    """Remove the excess energy of a step from its velocities.
 
-    0: nothing. 1: the motion was slowed. 2: it had too little energy to be slowed, and was ended;
-    the step has to be shortened by :func:`shorten` until :func:`is_allowed`. A changed state is to
-    be evaluated again and entered by :func:`enter_changed`.
+    After a change the caller must evaluate the state again and call :func:`enter_changed`.
+
+    Returns
+    -------
+    int
+        0 if nothing was changed, and 1 if the motion was slowed. 2 if the kinetic energy was too
+        small and the motion was stopped; the step must then be shortened with :func:`shorten` until
+        :func:`is_allowed`.
     """
     moving = kinetic_energy(plant)
     weight = weight_energy(plant)
@@ -119,7 +125,7 @@ def guard_step(plant: Plant, was_on_rim: bool) -> int:
 
 @inner_kernel
 def shorten(plant: Plant, scale: float) -> None:
-    """Leave only ``scale`` of what a step brought to positions, shears and bristles."""
+    """Scale the changes of positions, shears and bristles in this step by ``scale``."""
     before, now = plant.earlier, plant.state
     for j in range(5):
         now.position[j] = before.position[j] + scale * (now.position[j] - before.position[j])
@@ -129,7 +135,7 @@ def shorten(plant: Plant, scale: float) -> None:
         now.bristles[j] = before.bristles[j] + scale * bent
         layers, earlier = plant.layers[j], plant.earlier_layers[j]
         mean = square = 0.0
-        for k in range(LAYERS):  # whole arrays at once would load Numba's ufuncs at each start
+        for k in range(LAYERS):  # array expressions would load Numba's ufuncs at each start
             layers[k] = earlier[k] + scale * (layers[k] - earlier[k])
             mean += layers[k] / LAYERS
         for k in range(LAYERS):
@@ -142,14 +148,14 @@ def shorten(plant: Plant, scale: float) -> None:
 
 @inner_kernel
 def is_allowed(plant: Plant) -> bool:
-    """Return whether a state at rest has no more energy than it may have."""
+    """Return True if the energy of a state at rest is within the allowed energy."""
     energy = elastic_energy(plant) + weight_energy(plant)
     return bool(energy <= plant.allowed + work_done(plant))
 
 
 @inner_kernel
 def enter_changed(plant: Plant) -> None:
-    """Enter the energy of a state that :func:`guard_step` changed."""
+    """Update the energies after :func:`guard_step` has changed the state."""
     energy = kinetic_energy(plant) + elastic_energy(plant) + weight_energy(plant)
     plant.energy = energy
     plant.allowed = min(energy, plant.allowed + work_done(plant))
@@ -157,7 +163,7 @@ def enter_changed(plant: Plant) -> None:
 
 @inner_kernel
 def enter_relaxed(plant: Plant) -> None:
-    """Enter the energy of a state whose tips have relaxed, and allow as much more or less."""
+    """Update the energies after relaxation of the tips, which changes the allowed energy too."""
     energy = kinetic_energy(plant) + elastic_energy(plant) + weight_energy(plant)
     plant.allowed += energy - plant.energy
     plant.energy = energy

@@ -1,18 +1,18 @@
-"""Contacts that only some scenes have: the object on the palm, and both tips on each other.
+"""Contacts that occur only in some scenes: the object on the palm, and both tips on each other.
 
-Their rows join the step's matrix (`solver`).
+Their rows are added to the matrix of the step (`solver`).
 
-The palm is a plane along x. Each corner of the object, or a disc's lowest point, is on springs: one
-that is below the palm is pushed up with a viscous loss, which doesn't pull. Along the palm a second
-spring follows the corner's slide, sticks, and gives way where its force would exceed friction times
-the push, so that a resting object doesn't creep.
+The palm is a plane along x. Each corner of the object, or the lowest point of a disc, has two
+springs. A corner below the palm is pushed up, with a viscous loss that never pulls. A second spring
+along the palm models Coulomb friction: it sticks, and slips when its force would exceed the
+friction coefficient times the normal force. So a resting object does not creep.
 
-Two equal hemispheres meet on the plane midway between their centres, and each is pressed as by a
-rigid plane: d = a − D/2 with the centres' distance D. The energy is that of both, U(d, θ1, d_t1) +
-U(d, θ2, d_t2), which is 2 U(d, θ) for fingers that mirror each other. With unlike tilts the plane
-would bulge towards the softer tip, and this energy is a little too high (of second order in the
-difference of cos² θ). The plane sticks to both tips alike: each shears by half of what their
-surfaces slide along each other, less its tan θ ḋ.
+Two equal hemispheres meet on the plane midway between their centres. Each is pressed as by a rigid
+plane, d = a − D/2 with the distance D of the centres. The energy is the sum for both tips,
+U(d, θ1, d_t1) + U(d, θ2, d_t2), which is 2 U(d, θ) for symmetric fingers. With different tilts the
+real interface would bulge towards the softer tip, so this energy is slightly too high (of second
+order in the difference of cos² θ). The plane sticks equally to both tips: each shears by half of
+the relative sliding of their surfaces, minus its tan θ ḋ.
 """
 
 from __future__ import annotations
@@ -43,14 +43,14 @@ from softfinger.daemon.simulation.physics.tip import (
 from softfinger.kinematics.compiled.kernel import inner_kernel
 from softfinger.kinematics.contact.table_record import Table
 
-STIFFNESS = 1e5  # N/m, of each corner up and along the palm
+STIFFNESS = 1e5  # N/m, of each corner, normal to the palm and along it
 LOSS = 1e-3  # s, damping over stiffness
-_FAR = 1.5  # radii: half the tips' distance from which on nothing is evaluated
+_FAR = 1.5  # radii, half the distance of the tips beyond which their contact is not evaluated
 
 
 @inner_kernel
 def palm_is_far(plant: Plant, now: Motion) -> bool:
-    """Return whether no point of the object can meet the palm within a step."""
+    """Return True if no point of the object can reach the palm within a step."""
     p = plant.parameters
     height = now.position[3] - p.palm - p.extent
     rate = now.velocity[3]
@@ -62,9 +62,9 @@ def palm_is_far(plant: Plant, now: Motion) -> bool:
 def touch_palm(
     plant: Plant, now: Motion, stage: Stage, nx: float, ny: float, is_first: bool
 ) -> None:
-    """Add the palm's forces on the object, where it may meet it; (nx, ny) is the object's n.
+    """Add the forces of the palm on the object; (nx, ny) is the object's n.
 
-    The first stage also brings the shears within friction and hands the rows to the full matrix.
+    The first stage also limits the shears by friction and sets the rows of the full matrix.
     """
     if palm_is_far(plant, now):
         for corner in range(CORNERS):
@@ -130,7 +130,7 @@ def touch_palm(
 
 @inner_kernel
 def tips_are_far(plant: Plant) -> bool:
-    """Return whether both tips are too far from each other to be evaluated."""
+    """Return True if the tips are so far apart that their contact is not evaluated."""
     left, right = plant.fingers[0], plant.fingers[1]
     apart_x = right.x - left.x
     apart_y = right.y - left.y
@@ -140,7 +140,7 @@ def tips_are_far(plant: Plant) -> bool:
 
 @inner_kernel
 def tip_on_tip(plant: Plant, table: Table, now: Motion, stage: Stage) -> bool:
-    """Evaluate both tips on each other and add their torques to the forces; may they touch?"""
+    """Evaluate the contact of both tips and add its torques; return True if they may touch."""
     p = plant.parameters
     left, right = plant.fingers[0], plant.fingers[1]
     apart_x = right.x - left.x
@@ -165,7 +165,7 @@ def tip_on_tip(plant: Plant, table: Table, now: Motion, stage: Stage) -> bool:
     for finger in range(2):
         tip = stage.on_tip[finger]
         side = 1.0 - 2.0 * finger
-        ux = plant.fingers[finger].cosine  # the axis and e turned over for the right tip
+        ux = plant.fingers[finger].cosine  # axis and e are mirrored for the right tip
         uy = -side * plant.fingers[finger].sine
         tip.sine = ux * ey - uy * ex
         tip.cosine = ux * ex + uy * ey
@@ -210,9 +210,9 @@ def tip_on_tip(plant: Plant, table: Table, now: Motion, stage: Stage) -> bool:
 
 @inner_kernel
 def touch_each_other(plant: Plant, table: Table, now: Motion, stage: Stage, is_first: bool) -> None:
-    """Add the tips' torques on each other where they may meet; without an object always.
+    """Add the torques of the tips on each other, if they are near or there is no object.
 
-    The first stage also hands their rows to the full matrix.
+    The first stage also sets their rows of the full matrix.
     """
     near = not tips_are_far(plant) or plant.parameters.shape == NO_OBJECT
     touching = near and tip_on_tip(plant, table, now, stage)
@@ -240,7 +240,7 @@ def touch_each_other(plant: Plant, table: Table, now: Motion, stage: Stage, is_f
 
 @inner_kernel
 def clear_extra(plant: Plant) -> None:
-    """Take the extra rows out of the matrix."""
+    """Remove the extra rows from the matrix."""
     for number in range(EXTRA_ROWS):
         plant.extra[number].stiffness = 0.0
         plant.extra[number].damping = 0.0

@@ -1,6 +1,6 @@
-"""All forces of a state: motors, weight, pushes, friction, end stops; contacts are evaluated here.
+"""Forces of a state: motors, weight, loads, friction and end stops.
 
-The contacts' own forces are in `tip` and `extra_contacts`.
+The contacts are evaluated from here, but their forces are computed in `tip` and `extra_contacts`.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from softfinger.kinematics.contact.table_record import Table
 
 @inner_kernel
 def current_reference(plant: Plant, joint: int, q: float, rate: float) -> float:
-    """Return current [A] that a servo asks of its motor: its mode's law within all limits.
+    """Return the current [A] that a servo commands to its motor, within all limits.
 
-    The limit of the supply, or of the share of it that the servo's PWM lets through, falls linearly
-    from the stall current at rest to none at no-load speed.
+    The limit due to the supply voltage, scaled by the PWM limit, decreases linearly from the stall
+    current at rest to 0 at no-load speed.
     """
     p, goals = plant.parameters, plant.goals
     if goals.torque_on[joint] == 0:
@@ -52,10 +52,10 @@ def current_reference(plant: Plant, joint: int, q: float, rate: float) -> float:
 
 @inner_kernel
 def set_motor_slopes(plant: Plant, g: float) -> None:
-    """Set the slopes of the motors' torques by angle and by velocity, over (τ + g).
+    """Set the slopes of the motor torques by angle and by velocity, divided by (τ + g).
 
-    Only where a step of ``g`` makes them stiff, else 0. They are upper bounds, since whether the
-    reference is limited may change within the step.
+    They are 0 unless a step of ``g`` makes the motors stiff. They are upper bounds, since the
+    current may enter or leave its limits within the step.
     """
     p, goals = plant.parameters, plant.goals
     constant = p.torque_constant
@@ -76,7 +76,7 @@ def set_motor_slopes(plant: Plant, g: float) -> None:
 
 @inner_kernel
 def joint_stiffness(plant: Plant, joint: int) -> float:
-    """Return the stiffness [N·m/rad] of a joint's bristles and of an end stop within a step."""
+    """Return the stiffness of a joint's bristles and of an end stop within reach [N·m/rad]."""
     p = plant.parameters
     stiffness: float = plant.gears[joint].stiffness
     q = plant.state.position[joint]
@@ -88,7 +88,7 @@ def joint_stiffness(plant: Plant, joint: int) -> float:
 
 @inner_kernel
 def free_object(plant: Plant, now: Motion) -> None:
-    """Add weight, loads and the table's friction to the object."""
+    """Set the object's forces to weight, loads and table friction."""
     p, load = plant.parameters, plant.goals.load
     vx = now.velocity[2]
     vy = now.velocity[3]
@@ -105,10 +105,10 @@ def free_object(plant: Plant, now: Motion) -> None:
 
 @inner_kernel
 def friction_level(plant: Plant, finger: int, rate: float, current: float) -> float:
-    """Return the torque [N·m] at which a joint's gears slip, by motor ``current`` and load.
+    """Return the friction torque [N·m] at which a joint slips, for motor ``current`` and load.
 
-    Base, Stribeck and load terms are those identified for such servos (model M4 of Rhoban's,
-    arXiv 2410.08650), the gears' torque being |external − motor|.
+    Base, Stribeck and load terms follow the model M4 of Rhoban, identified for such servos
+    (arXiv 2410.08650). The gear torque is |external − motor|.
     """
     p = plant.parameters
     still = math.exp(-abs(rate) / p.stribeck_speed)
@@ -120,18 +120,19 @@ def friction_level(plant: Plant, finger: int, rate: float, current: float) -> fl
 
 @inner_kernel
 def bend_bristles(plant: Plant, finger: int, now: Motion, is_first: bool) -> float:
-    """Return the torque [N·m] of a joint's bristles; sets their damping as the joint's drag.
+    """Return the torque [N·m] of a joint's bristles, and set their damping as the joint's drag.
 
-    Elastic bristles with the deflection z join the gears and slip at the friction level f. This is
-    the elasto-plastic model of Dupont, Hayward, Armstrong and Altpeter (IEEE Trans. Automatic
+    Elastic bristles with the deflection z connect the gears and slip at the friction level f. This
+    is the elasto-plastic model of Dupont, Hayward, Armstrong and Altpeter (IEEE Trans. Automatic
     Control 47(5), 2002) with one deflection z_p = ``presliding`` for break-away and steady slip:
 
         torque = f z/z_p    ż = q̇ while |z| ≤ z_p
 
-    Below f the bristles are elastic, so a load below f, steady or oscillating, causes no drift.
-    Their number follows f. Bristles that join are not bent, on average at half of the step, and
-    bristles that leave take their energy with them, so a change of f adds no energy. Damping of the
-    stuck joint is half of the critical one, and bristles and damping together stay within f.
+    Below f the bristles are elastic, so a load below f, constant or oscillating, causes no drift.
+    The number of bristles is proportional to f. New bristles are not deflected; on average they are
+    added at half of the step. Removed bristles take their energy with them. So a change of f adds
+    no energy. The damping of a stuck joint is half of the critical one, and the sum of bristle
+    torque and damping is limited to f.
     """
     p, gears = plant.parameters, plant.gears[finger]
     rate = now.velocity[finger]
@@ -157,7 +158,7 @@ def bend_bristles(plant: Plant, finger: int, now: Motion, is_first: bool) -> flo
 
 @inner_kernel
 def free_joint(plant: Plant, finger: int, now: Motion, is_first: bool) -> float:
-    """Return torque [N·m] of a joint's friction and end stops; sets its drag."""
+    """Return the torque [N·m] of a joint's friction and end stops, and set its drag."""
     p = plant.parameters
     q = now.position[finger]
     torque = -bend_bristles(plant, finger, now, is_first)
@@ -171,11 +172,11 @@ def free_joint(plant: Plant, finger: int, now: Motion, is_first: bool) -> float:
 
 @inner_kernel
 def place_finger(plant: Plant, finger: int, q: float) -> None:
-    """Set where a finger is at the joint angle ``q``."""
+    """Set the position of a finger for the joint angle ``q``."""
     p, its = plant.parameters, plant.fingers[finger]
     cosine = math.cos(q)
     sine = math.sin(q)
-    # The tip's centre from its pivot, inwards and away from the palm (hand.geometry).
+    # Centre of the tip relative to its pivot: inwards and away from the palm (hand.geometry).
     inward = p.length * sine + p.offset * cosine
     ahead = p.length * cosine - p.offset * sine
     side = 1.0 - 2.0 * finger
@@ -189,9 +190,9 @@ def place_finger(plant: Plant, finger: int, q: float) -> None:
 
 @inner_kernel
 def evaluate_hand(plant: Plant, table: Table, now: Motion, stage: Stage, is_first: bool) -> None:
-    """Evaluate all contacts of ``now`` into the ``stage``, and all forces but the motors'.
+    """Evaluate the contacts of ``now`` into ``stage``, and all forces except those of the motors.
 
-    The drag is viscous friction over velocity, in the forces already.
+    The drag is viscous friction divided by velocity; the forces already include this friction.
     """
     p, forces = plant.parameters, plant.forces
     nx = math.cos(now.position[4])
@@ -224,13 +225,13 @@ def evaluate_hand(plant: Plant, table: Table, now: Motion, stage: Stage, is_firs
 
 @inner_kernel
 def evaluate_state(plant: Plant, table: Table) -> None:
-    """Evaluate all contacts and forces of the state as it is."""
+    """Evaluate all contacts and forces of the present state."""
     evaluate_hand(plant, table, plant.state, plant.stages[0], True)
 
 
 @inner_kernel
 def script_x(plant: Plant, t: float) -> float:
-    """Return x [m] of a scripted object at ``t``: from its start to the left tip, back, right."""
+    """Return x [m] of a scripted object at ``t``: to the left, back, and to the right."""
     p = plant.parameters
     x: float = p.script_x
     left = p.script_travel[0]

@@ -1,4 +1,4 @@
-"""The object's outline as a tip sees it: the nearest point, and the rim of the tip's backing plate.
+"""Contact geometry of the object's outline: nearest point, and rim of a tip's backing plate.
 
 The object is rigid and convex: a polygon or a disc.
 """
@@ -10,18 +10,18 @@ import math
 from softfinger.daemon.simulation.physics.plant_state import DISC, Parameters, TipContact
 from softfinger.kinematics.compiled.kernel import inner_kernel
 
-FACE = -1.0  # radius of curvature that means a plane face
+FACE = -1.0  # code of a plane face, in place of a radius of curvature
 _SMALLEST = 1e-12  # m
 
 
 @inner_kernel
 def nearest(p: Parameters, u: float, v: float) -> tuple[float, float, float, float]:
-    """Return inward direction and distance of the boundary from a point (u, v) in its frame.
+    """Return direction, distance and curvature of the outline nearest to a point (u, v).
 
-    The direction leads from an outer point to the nearest one of the outline. For a point inside
-    the distance is negative, to the nearest face, and the direction that face's inward normal. The
-    last result is the boundary's radius of curvature there: 0 on a corner, ``FACE`` on a face, a
-    disc's radius.
+    (u, v) is in the object's frame. From a point outside, the direction leads to the nearest point
+    of the outline. For a point inside, the distance to the nearest face is negative, and the
+    direction is the inward normal of that face. The last result is the radius of curvature there: 0
+    at a corner, ``FACE`` on a face, or the radius of a disc.
     """
     if p.shape == DISC:
         away = max(math.sqrt(u * u + v * v), _SMALLEST)
@@ -36,7 +36,7 @@ def nearest(p: Parameters, u: float, v: float) -> tuple[float, float, float, flo
             best = out
             face = k
         if out > 0.0:
-            # Edges run counter-clockwise: along an edge is its normal turned by a right angle.
+            # Edges run counter-clockwise, so their direction is the normal turned by 90°.
             along = (v - edge.y) * edge.normal_x
             along -= (u - edge.x) * edge.normal_y
             if 0.0 <= along <= edge.length:
@@ -62,11 +62,11 @@ def nearest(p: Parameters, u: float, v: float) -> tuple[float, float, float, flo
 
 @inner_kernel
 def rim_on_plane(p: Parameters, tip: TipContact) -> float:
-    """Press both ends of the rim into a plane; how deep the deeper one is [m], negative: a gap.
+    """Evaluate both ends of the rim on a plane; return the larger depth [m], negative for a gap.
 
-    They are d − a(1 ∓ sin θ) deep, each on a spring of its own, so that energy and forces are
-    smooth also where the plate lies flat on the face. Writes the rim's energy and derivatives when
-    it is met.
+    The depths are d − a(1 ∓ sin θ). Each end has its own spring, so that energy and forces are
+    smooth even if the plate lies flat on the face. With contact, the rim's energy and its
+    derivatives are set.
     """
     d = tip.d
     sine = tip.sine
@@ -84,10 +84,10 @@ def rim_on_plane(p: Parameters, tip: TipContact) -> float:
 
 @inner_kernel
 def rim_on_disc(p: Parameters, tip: TipContact, away: float) -> float:
-    """Evaluate :func:`rim_on_plane` for a disc, the plate's chord pressed into it by one spring.
+    """Evaluate the rim on a disc like :func:`rim_on_plane`, with one spring for the plate's chord.
 
-    ``away`` is the distance of the disc's centre from the tip's. The chord is as deep in the disc
-    as the disc's radius exceeds the distance of its centre from the chord, and that is smooth.
+    ``away`` is the distance between the centres of disc and tip. The depth is the disc's radius
+    minus the distance of its centre from the chord, which is smooth.
     """
     across = away * tip.sine
     up = away * tip.cosine

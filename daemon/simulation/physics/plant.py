@@ -1,16 +1,16 @@
-"""The kernel that moves the simulated hand: two joints, two soft tips, one rigid object.
+"""Integration kernel of the simulated hand: two joints, two soft tips, one rigid object.
 
 Coordinates (q1, q2, x, y, φ) with their velocities, the shear of each contact and the current of
 each motor are advanced by fixed sub-steps of a two-stage Rosenbrock method (ROS2, γ = 1 − 1/√2):
 
     (1 − γhA) k1 = f(y)    (1 − γhA) k2 = f(y + h k1) − 2 k1    y ← y + h (3 k1 + k2)/2
 
-It is of second order whatever matrix A is, and L-stable where A is the Jacobian; A here holds what
-is stiff: the contacts' normal, turning and shear stiffness with their losses, end stops, the
-gears' bristles, the table's friction at its secant, the motors' lag and the servos' loops. Of the
-unknowns only the five accelerations are coupled, so that a step costs two evaluations of the tips
-and one 5 × 5 factorisation. Coulomb slip is a return of shears and bristles into their limits at
-the start of a step. The energy guard has the last word.
+The method is of second order for any matrix A, and L-stable if A is the Jacobian. Here A contains
+the stiff parts: normal, rotational and shear stiffness of the contacts with their losses, end
+stops, bristles of the gears, table friction by its secant, motor lag and servo loops. Only the five
+accelerations are coupled, so a step costs two evaluations of the tips and one 5 × 5 factorisation.
+Coulomb slip is implemented by limiting shears and bristles at the start of each step. Finally the
+energy guard checks the step.
 """
 
 from __future__ import annotations
@@ -63,16 +63,16 @@ _GAMMA = 1.0 - math.sqrt(0.5)
 
 @inner_kernel
 def bounded(value: float, limit: float) -> float:
-    """Return ``value`` within ± ``limit``."""
+    """Return ``value`` clipped to ± ``limit``."""
     return min(max(value, -limit), limit)
 
 
 @inner_kernel
 def load_motors(plant: Plant, now: Motion, k: Motion, g: float) -> None:
-    """Add the motors' part to the load; the currents of ``k`` but for what the solution brings.
+    """Add the motors to the load, and set the currents of ``k`` except the effect of the solution.
 
-    A current follows its reference with a lag: i' = (r(q, ω) − i)/τ. Its k falls by
-    (r_q g + r_ω) g/(τ + g) for each unit of acceleration, which stands in the matrix.
+    A current follows its reference with a lag: i' = (r(q, ω) − i)/τ. Its k decreases by
+    (r_q g + r_ω) g/(τ + g) per unit of acceleration; the matrix contains this term.
     """
     p = plant.parameters
     lag = p.electric_time
@@ -89,7 +89,7 @@ def load_motors(plant: Plant, now: Motion, k: Motion, g: float) -> None:
 
 @inner_kernel
 def finish_stage(plant: Plant, k: Motion, g: float) -> None:
-    """Solve for the velocities of ``k`` and add what they bring to its other rates."""
+    """Solve for the velocities of ``k`` and add their effect to its other rates."""
     solve(plant, k)
     if plant.coupled:
         add_extra_shears(plant, k, g)
@@ -140,7 +140,7 @@ def go_to_second_stage(plant: Plant, h: float) -> None:
 
 @inner_kernel
 def second_stage(plant: Plant, g: float) -> None:
-    """Compute k2 of the step, from the second stage's forces."""
+    """Compute k2 of the step from the forces of the second stage."""
     p, stage, first, k = plant.parameters, plant.stages[1], plant.first, plant.second
     for j in range(5):
         inertia = p.joint_inertia if j < 2 else p.mass if j < 4 else p.inertia
@@ -161,7 +161,7 @@ def second_stage(plant: Plant, g: float) -> None:
 
 @inner_kernel
 def go_on(plant: Plant, h: float) -> None:
-    """Take the step: y + h (3 k1 + k2)/2, of what isn't held."""
+    """Advance the state by y + h (3 k1 + k2)/2, except held parts."""
     p, state, first, second = plant.parameters, plant.state, plant.first, plant.second
     for j in range(2):
         state.shear[j] += h * (1.5 * first.shear[j] + 0.5 * second.shear[j])
@@ -174,8 +174,8 @@ def go_on(plant: Plant, h: float) -> None:
             continue
         displacement = h * (1.5 * first.position[j] + 0.5 * second.position[j])
         change = h * (1.5 * first.velocity[j] + 0.5 * second.velocity[j])
-        # A step that would carry a tip past a quarter of its radius is far too long for what it
-        # is asked: it goes that far, and what it loses by that is energy.
+        # A step that would move a tip by more than a quarter of its radius is far too long. Limit
+        # the displacement, which only loses energy.
         limit = 0.25 * p.radius
         if j < 2:
             limit /= p.length + abs(p.offset)
@@ -190,7 +190,7 @@ def go_on(plant: Plant, h: float) -> None:
 
 @inner_kernel
 def go_back(plant: Plant, table: Table) -> None:
-    """Shorten a step that leads uphill, until it doesn't, or all of it."""
+    """Shorten a step until its energy is allowed, or undo it after HALVINGS attempts."""
     for _ in range(HALVINGS):
         shorten(plant, 0.5)
         evaluate_state(plant, table)
@@ -202,7 +202,7 @@ def go_back(plant: Plant, table: Table) -> None:
 
 @inner_kernel
 def enter_bristles(plant: Plant) -> None:
-    """Bring the bristles within their limits; keep their level for the next step."""
+    """Limit the bristle deflections, and store the friction level for the next step."""
     for joint in range(2):
         gears = plant.gears[joint]
         gears.level = gears.friction
@@ -210,12 +210,12 @@ def enter_bristles(plant: Plant) -> None:
         plant.state.bristles[joint] = gears.bent
 
 
-# --- what the tips feel, at the instants of the sensors' frames ----------------------------------
+# --- contacts of the tips at the times of the sensor frames --------------------------------------
 
 
 @inner_kernel
 def feels_tip(plant: Plant, finger: int) -> bool:
-    """Return whether a tip feels the other one, which presses more than the object."""
+    """Return True if a tip's sensed contact is the other tip, since it presses more."""
     if not plant.tips_near:
         return False
     stage = plant.stages[0]
@@ -225,7 +225,7 @@ def feels_tip(plant: Plant, finger: int) -> bool:
 
 @inner_kernel
 def felt_contact(plant: Plant, finger: int) -> TipContact:
-    """Return the contact that a tip feels."""
+    """Return the sensed contact of a tip."""
     if feels_tip(plant, finger):
         return plant.stages[0].on_tip[finger]
     return plant.stages[0].on_object[finger]
@@ -233,7 +233,7 @@ def felt_contact(plant: Plant, finger: int) -> TipContact:
 
 @inner_kernel
 def take_sample(plant: Plant, ring: Records[Sample]) -> None:
-    """Write the sample that is due into ``ring``, between what was felt before and is felt now."""
+    """Write the due sample into ``ring``, interpolated between the last contact and the present."""
     p = plant.parameters
     due = plant.samples * p.sample_period
     back = min((plant.steps * p.step - due) / p.step, 1.0)
@@ -242,7 +242,7 @@ def take_sample(plant: Plant, ring: Records[Sample]) -> None:
     row.t = due
     for finger in range(2):
         now, before = felt_contact(plant, finger), plant.felt[finger]
-        # Between what is touched before and after there is nothing to interpolate.
+        # Do not interpolate between contacts with different bodies.
         same = feels_tip(plant, finger) == (plant.on_other_tip[finger] != 0)
         fraction = back if same else 0.0
         row.d[finger] = now.d - fraction * (now.d - before.d)
@@ -256,7 +256,7 @@ def take_sample(plant: Plant, ring: Records[Sample]) -> None:
 
 @inner_kernel
 def settle(plant: Plant, ring: Records[Sample]) -> None:
-    """Take the samples that are due at the state's instant, then record what the tips feel."""
+    """Take the samples that are due, then store the present contacts of the tips."""
     p, stage = plant.parameters, plant.stages[0]
     while plant.samples * p.sample_period <= plant.steps * p.step:
         take_sample(plant, ring)
@@ -273,13 +273,13 @@ def settle(plant: Plant, ring: Records[Sample]) -> None:
 
 @kernel
 def step(plants: Records[Plant], tables: Records[Table], ring: Records[Sample], count: int) -> None:
-    """Advance the plant by ``count`` sub-steps; what the tips feel is then current.
+    """Advance the plant by ``count`` sub-steps and update the contacts of the tips.
 
-    ``tables`` is the contact table's data; ``ring`` takes the samples that fall due.
+    ``tables`` is the data of the contact table. Due samples are written to ``ring``.
     """
     plant = plants[0]
     p, state = plant.parameters, plant.state
-    # A bare address from here on: an array argument costs a reference count at each call.
+    # Pass a record from here on, since array arguments cost a reference count at each call.
     data = tables[0]
     h = p.step
     g = _GAMMA * h
@@ -307,7 +307,7 @@ def step(plants: Records[Plant], tables: Records[Table], ring: Records[Sample], 
             state.position[2] = script_x(plant, plant.steps * h)
         if relaxing:
             relax_shears(plant)
-        # Slip: the shears come back within their limits, and settle keeps them there.
+        # Slip: this limits the shears, and `settle` stores them.
         evaluate_state(plant, data)
         if scripted:
             open_guard(plant)
@@ -316,7 +316,7 @@ def step(plants: Records[Plant], tables: Records[Table], ring: Records[Sample], 
             if changed == 2:
                 go_back(plant, data)
             elif changed == 1:
-                # Bristles that join the slowed gears are not bent either.
+                # New bristles of the slowed gears are not deflected either.
                 enter_bristles(plant)
                 evaluate_state(plant, data)
             if changed != 0:
@@ -324,7 +324,8 @@ def step(plants: Records[Plant], tables: Records[Table], ring: Records[Sample], 
         enter_bristles(plant)
         settle(plant, ring)
         if p.remembers:
-            # Firmness is constant within a step; what its change brings is the tip's own.
+            # The relaxation factor is constant within a step; the energy change between steps
+            # comes from the tip itself, so the guard allows it.
             relax_tips(plant)
             evaluate_state(plant, data)
             enter_relaxed(plant)

@@ -1,4 +1,4 @@
-"""The plant's record: its state, parameters, goals and scratch, one block that all kernels share.
+"""Record of the plant: state, parameters, goals and work data, shared by all kernels.
 
 Pairs are (left, right). Coordinates are the joint angles q1, q2 and the object's x, y, φ.
 """
@@ -28,31 +28,31 @@ ALONG_D = 0
 ALONG_THETA = 1
 ALONG_SHEAR = 2
 
-LAYERS = 8  # of a footprint, from its edge inwards, that slip one after the other
-CORNERS = 8  # that an object may have
-SHEARS = CORNERS + 2  # of the palm under each corner, then of each tip on the other
-PALM_ROWS = 2 * CORNERS  # of the extra ones: height and slide of each corner
-EXTRA_ROWS = PALM_ROWS + 6  # and d, θ and d_t of each tip on the other
+LAYERS = 8  # layers of a footprint, from its edge inwards, that slip one after the other
+CORNERS = 8  # largest number of corners of an object
+SHEARS = CORNERS + 2  # shear of the palm at each corner, then of each tip on the other
+PALM_ROWS = 2 * CORNERS  # height and slide of each corner
+EXTRA_ROWS = PALM_ROWS + 6  # additionally d, θ and d_t of each tip on the other
 
 Shears = Annotated[FloatArray, SHEARS]
 
 
 class Motion(Record):
-    """Coordinates, velocities, shears and currents: of a state, or their rates of change.
+    """Coordinates, velocities, shears and currents of a state, or their rates of change.
 
-    The bristles' rates are those of their joints.
+    The rates of the bristles are those of the joints.
     """
 
     position: Five  # [rad], [rad], [m], [m], [rad]
     velocity: Five
     shear: Pair  # d_t of the tips on the object [m]
     extra_shear: Shears  # [m]
-    bristles: Pair  # deflection of those of the joints' gears [rad]
+    bristles: Pair  # deflection of the gear bristles [rad]
     current: Pair  # [A]
 
 
 class Sample(Record):
-    """Contact of the tips at a frame's instant; fields as in :class:`TipContact`."""
+    """Contacts of the tips at the time of a frame; fields as in :class:`TipContact`."""
 
     number: int  # -1: none
     t: float  # since the start [s]
@@ -65,9 +65,9 @@ class Sample(Record):
 
 
 class Edge(Record):
-    """An edge of the object's outline, in the object's frame."""
+    """Edge of the object's outline, in the object's frame."""
 
-    x: float  # where it starts [m]
+    x: float  # start point [m]
     y: float
     normal_x: float  # outward
     normal_y: float
@@ -81,19 +81,19 @@ class Parameters(Record):
     sample_period: float  # [s]
     modulus: float  # of the real tip at zero strain [Pa]
     radius: float  # of the tips [m]
-    deepest: float  # d up to which their law holds [m]
-    scale: float  # real modulus over the table's
+    deepest: float  # largest d for which their law is valid [m]
+    scale: float  # ratio of the real modulus to that of the table
     friction: float
     loss: float  # damping over stiffness [s]
-    shear_stiffness: float  # over that of the springs
-    shear_coupling: float  # of d_t with d and θ: 1 by springs, 0 by bristles
-    creep: float  # share of a stuck shear that relaxes in a sub-step
-    micro_slip: bool  # the footprint's edge slips before all of it does
+    shear_stiffness: float  # relative to the springs
+    shear_coupling: float  # of d_t with d and θ: 1 for springs, 0 for bristles
+    creep: float  # fraction of a stuck shear that relaxes in a sub-step
+    micro_slip: bool  # the edge of the footprint slips before the rest
     remembers: bool  # the tips relax
-    relaxation: Three  # stiffness of each Prony term over the lasting one
-    relaxed: Three  # share of it that relaxes in a sub-step
+    relaxation: Three  # stiffness of each Prony term relative to the long-term stiffness
+    relaxed: Three  # fraction of each term that relaxes in a sub-step
     rim_stiffness: float  # [N/m]
-    tolerance: float  # share of the energy that smooth steps may gain
+    tolerance: float  # relative energy gain allowed in smooth steps
     half_separation: float  # of the pivots [m]
     length: float  # of a finger [m]
     offset: float  # of the tip from the finger's axis [m]
@@ -102,26 +102,26 @@ class Parameters(Record):
     half_width: float  # [m]
     half_height: float  # [m]
     roundness: float  # radius of a disc [m]
-    factor: float  # stiffness of a tip on the object over that on a plane
-    extent: float  # farthest point from the object's centre [m]
-    corners: int  # that it has
+    factor: float  # stiffness of a tip on the object relative to a plane
+    extent: float  # distance of the farthest point from the object's centre [m]
+    corners: int  # number of corners
     outline: Annotated[Records[Edge], CORNERS]  # counter-clockwise
     mass: float  # of the object [kg]
     inertia: float  # of the object [kg·m²]
     gravity: Pair  # x, y [m/s²]
     table_force: float  # Coulomb friction of the table on the object [N]
-    table_torque: float  # likewise when it spins [N·m]
-    table_speed: float  # below it table friction is viscous [m/s]
-    table_spin: float  # [rad/s]
+    table_torque: float  # Coulomb friction torque of the table on the object [N·m]
+    table_speed: float  # below which table friction is viscous [m/s]
+    table_spin: float  # likewise for rotation [rad/s]
     palm: float  # y of the palm [m]
     palm_friction: float
     joint_inertia: float  # [kg·m²]
     joint_damping: float  # [N·m·s/rad]
     joint_friction: float  # [N·m]
-    stribeck: float  # more at rest [N·m]
-    load_friction: Pair  # share of the gears' torque, and more of it at rest
-    stribeck_speed: float  # over which what is more at rest falls to 1/e [rad/s]
-    presliding: float  # deflection at which the bristles' friction is fully built up [rad]
+    stribeck: float  # additional friction at rest [N·m]
+    load_friction: Pair  # friction per gear torque, and additional part at rest
+    stribeck_speed: float  # at which the additional friction has decreased to 1/e [rad/s]
+    presliding: float  # deflection at which the bristles slip [rad]
     torque_constant: float  # [N·m/A]
     electric_time: float  # lag of the current [s]
     current_limit: float  # [A]
@@ -134,9 +134,9 @@ class Parameters(Record):
     stop_stiffness: float  # [N·m/rad]
     joints_held: bool
     object_held: bool
-    script_speed: float  # of a held object's to and fro; 0 leaves it still [m/s]
-    script_travel: Pair  # how far it goes to the left and to the right [m]
-    script_x: float  # where it starts [m]
+    script_speed: float  # of a held object that moves back and forth; 0: at rest [m/s]
+    script_travel: Pair  # distance to the left and to the right [m]
+    script_x: float  # start position [m]
 
 
 class Goals(Record):
@@ -146,14 +146,14 @@ class Goals(Record):
     torque_on: Flags
     q: Pair  # [rad]
     current: Pair  # [A]
-    stiffness: Pair  # of the servos' position loops, over the factory's
-    damping: Pair  # that they have more than the factory's [s of its stiffness]
-    duty: Pair  # share of the supply that their motors may get
+    stiffness: Pair  # of the servos' position loops, relative to the factory setting
+    damping: Pair  # in excess of the factory setting, relative to its stiffness [s]
+    duty: Pair  # limit of the motor voltage as a fraction of the supply
     load: Three  # external force x, y [N] and torque [N·m] on the object
 
 
 class Finger(Record):
-    """Position of a finger: its tip's centre from the hand's origin."""
+    """Position of a finger: centre of its tip in the hand's frame."""
 
     cosine: float  # of the joint angle
     sine: float
@@ -164,107 +164,107 @@ class Finger(Record):
 
 
 class Gears(Record):
-    """Friction of a joint's gears, carried by elastic bristles between the teeth."""
+    """Friction of a joint's gears, modelled by elastic bristles between the teeth."""
 
-    deflection: float  # of the bristles when the step began [rad]
-    level: float  # friction level then [N·m]
-    bent: float  # deflection as last evaluated, within its limits [rad]
-    friction: float  # friction level, likewise [N·m]
-    stiffness: float  # of the bristles in the step's matrix [N·m/rad]
+    deflection: float  # of the bristles at the begin of the step [rad]
+    level: float  # friction level at the begin of the step [N·m]
+    bent: float  # last evaluated deflection, within its limits [rad]
+    friction: float  # last evaluated friction level [N·m]
+    stiffness: float  # of the bristles, in the matrix of the step [N·m/rad]
 
 
 class TipContact(Record):
-    """One tip on the object or on the other tip.
+    """Contact of one tip with the object or with the other tip.
 
-    Rows are d, θ, d_t; columns q, x, y, φ, or q1, q2 for tip on tip.
+    Rows are d, θ, d_t; columns are q, x, y, φ, or q1, q2 for tip on tip.
     """
 
-    d: float  # normal displacement [m], negative: a gap
-    theta: float  # tilt of the object against the tip [rad]
+    d: float  # normal displacement, negative for a gap [m]
+    theta: float  # tilt of the object relative to the tip [rad]
     sine: float  # of θ
     cosine: float
-    tangent: float  # tan θ, 0 where nothing soft is left and for bristles
-    gain: float  # of the force against a plane: w(θ) and the face's curvature
-    curvature: float  # curvature of what is touched [1/m]
-    travel: float  # how much deeper the step may lead [m]
+    tangent: float  # tan θ; 0 for bristles and beyond the soft hemisphere
+    gain: float  # force relative to a plane: w(θ) and the curvature of the face
+    curvature: float  # of the touched surface [1/m]
+    travel: float  # possible increase of d in this step [m]
     rate_d: float  # [m/s]
     rate_theta: float  # [rad/s]
-    slip_rate: float  # velocity of what is touched less the tip's, along t [m/s]
+    slip_rate: float  # velocity of the touched surface minus that of the tip, along t [m/s]
     shear: float  # d_t within its limits [m]
-    shear_variance: float  # variance of its layers' shears [m²]
-    shear_rate: float  # stick rate of d_t [m/s]
-    force: float  # total force on the tip's base, what a pressure grid sums to [N]
+    shear_variance: float  # variance of the shears of its layers [m²]
+    shear_rate: float  # rate of d_t without slip [m/s]
+    force: float  # total force on the base of the tip, the sum of a pressure grid [N]
     energy: float  # elastic [J]
     normal: float  # N [N]
     tangential: float  # T [N]
-    rim: float  # how far the rim is pressed into the object [m], 0 when free
-    rim_energy: float  # of the rim alone, set where ``rim`` is above 0 [J]
+    rim: float  # depth of the rim in the object, 0 without contact [m]
+    rim_energy: float  # of the rim alone, set if ``rim`` is above 0 [J]
     rim_d: float  # its derivatives by d [N] and by θ [N·m]
     rim_theta: float
     rows: Annotated[FloatArray, 3, 4]  # ∂d, ∂θ and the increments of d_t by the coordinates
     stiffness: Three  # along each row
     damping: Three
     along: Three  # forces along the rows, with losses
-    forces: Annotated[FloatArray, 4]  # generalised, on the coordinates
+    forces: Annotated[FloatArray, 4]  # generalised forces on the coordinates
 
 
 class Stage(Record):
-    """All contacts as one of a step's two evaluations finds them."""
+    """All contacts in one of the two evaluations of a step."""
 
     on_object: Annotated[Records[TipContact], 2]
     on_tip: Annotated[Records[TipContact], 2]
-    extra_rate: Shears  # stick rates of the extra shears [m/s]
+    extra_rate: Shears  # rates of the extra shears without slip [m/s]
 
 
 class ExtraRow(Record):
-    """A row over the coordinates, of a contact that only some scenes have."""
+    """Row over the coordinates for a contact that occurs only in some scenes."""
 
     row: Five
     stiffness: float
     damping: float
-    shear: int  # 1 + the place of its shear among the extra ones, 0: none
+    shear: int  # 1 + index of its extra shear, 0 for none
 
 
 class Factors(Record):
-    """The step's matrix over all coordinates, factorised as L D Lᵀ."""
+    """Matrix of the step over all coordinates, factorised as L D Lᵀ."""
 
-    inverse: Five  # pivots
+    inverse: Five  # inverse pivots
     lower: Annotated[FloatArray, 5, 5]
 
 
 class Plant(Record):
-    """The simulated hand."""
+    """All data of the simulated hand."""
 
     parameters: Parameters
     goals: Goals
     state: Motion
-    felt: Annotated[Records[TipContact], 2]  # by each tip now, of two contacts the firmer one
-    on_other_tip: Flags  # that is on the other tip
+    felt: Annotated[Records[TipContact], 2]  # present contact of each tip, the stronger of two
+    on_other_tip: Flags  # this contact is with the other tip
     steps: int  # sub-steps done
-    samples: int  # taken
+    samples: int  # number of samples taken
     energy: float  # kinetic, elastic and gravitational [J]
-    allowed: float  # the most that it may be by the work done on the hand [J]
-    guarded: int  # sub-steps whose energy had to be brought down to that
-    earlier: Motion  # the state before the step
-    later: Motion  # where the second stage is evaluated
+    allowed: float  # upper limit of the energy, from the work done on the hand [J]
+    guarded: int  # sub-steps whose energy was reduced to this limit
+    earlier: Motion  # state before the step
+    later: Motion  # state of the second stage
     first: Motion  # k1 of the step
-    second: Motion  # k2
+    second: Motion  # k2 of the step
     stages: Annotated[Records[Stage], 2]
     fingers: Annotated[Records[Finger], 2]
     gears: Annotated[Records[Gears], 2]
-    forces: Five  # on the coordinates, but for the motors'
+    forces: Five  # on the coordinates, except those of the motors
     drag: Five  # friction over velocity
-    external: Pair  # contacts' torque on each joint, as last evaluated [N·m]
-    load: Five  # right-hand side of the step's equations
-    motor_by_q: Pair  # slopes of the motors' torques for the matrix
+    external: Pair  # last evaluated torque of the contacts on each joint [N·m]
+    load: Five  # right-hand side of the equations of the step
+    motor_by_q: Pair  # slopes of the motor torques, for the matrix
     motor_by_rate: Pair
     layers: Annotated[FloatArray, 2, LAYERS]  # shear of each tip's layers [m]
     earlier_layers: Annotated[FloatArray, 2, LAYERS]  # before the step
     shear_variance: Pair  # their variance [m²]
-    memory: Annotated[FloatArray, 2, 3]  # each tip's lasting force, followed by each term [N]
-    firmness: Pair  # of each tip on the object, over the lasting one
+    memory: Annotated[FloatArray, 2, 3]  # relaxation state of each tip and Prony term [N]
+    firmness: Pair  # relaxation factor of each tip: force relative to the long-term force
     palm_energy: float  # [J]
-    tips_near: bool  # the tips on each other were evaluated
-    coupled: bool  # an extra row may act in this step
+    tips_near: bool  # the contact of both tips was evaluated
+    coupled: bool  # an extra row may be active in this step
     extra: Annotated[Records[ExtraRow], EXTRA_ROWS]
     factors: Factors

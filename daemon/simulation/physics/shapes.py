@@ -1,4 +1,4 @@
-"""The shapes of the simulated object: outline, inertia, and what friction under it needs."""
+"""Shapes of the simulated object: outline, inertia, and radius of the table friction."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Shape:
-    """One object's outline, round its centre of mass. Lengths are m."""
+    """Outline of an object, with its centre of mass at the origin. Lengths are in m."""
 
-    kind: int  # by plant_state's numbers
-    corners: FloatArray  # [n, 2], counter-clockwise; of a disc: those of the square round it
+    kind: int  # constant of plant_state
+    corners: FloatArray  # [n, 2], counter-clockwise; of a disc: its circumscribed square
     roundness: float  # radius of a disc, else 0
     gyration: float  # radius of gyration
-    mean_radius: float  # of its points from the centre: what spinning friction acts on
+    mean_radius: float  # mean distance of its points from the centre, for spinning friction
 
     @property
     def extent(self) -> float:
-        """The farthest point's distance from the centre."""
+        """Largest distance of a point from the centre."""
         return self.roundness or float(np.hypot(*self.corners.T).max())
 
     @property
@@ -56,7 +56,7 @@ class Shape:
 
 
 def shape_of(settings: Settings) -> Shape:
-    """Make the settings' object by the function that `daemon.backends` names for it."""
+    """Create the object of the settings with the function registered in `daemon.backends`."""
     simulation = settings.simulation
     found = backend("shapes", simulation.object_shape)
     shape: Shape = found.load()(simulation, *found.options(settings.plugins.tables))
@@ -64,11 +64,11 @@ def shape_of(settings: Settings) -> Shape:
 
 
 def polygon(corners: ArrayLike, kind: int = POLYGON) -> Shape:
-    """Return the shape of 3 to 8 convex ``corners`` [n, 2] m, counter-clockwise.
+    """Return the shape of a convex polygon with 3 to 8 ``corners`` [n, 2] m, counter-clockwise.
 
-    It turns about its centre of mass, wherever the corners' origin lies. The integrals over it are
-    closed forms of the triangles between the centre and each edge. Raises ValueError for an
-    outline that is none of this kind.
+    The corners may have any origin, since the shape is centred at its centre of mass. The integrals
+    over the shape are closed forms of the triangles between the centre and each edge. Raises
+    ValueError for other outlines.
     """
     points = np.array(corners, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 2 or not 3 <= len(points) <= CORNERS:
@@ -95,14 +95,14 @@ def polygon(corners: ArrayLike, kind: int = POLYGON) -> Shape:
 
 
 def rectangle(simulation: SimulationSettings) -> Shape:
-    """Return a box of the settings' width and height."""
+    """Return a box with the width and height of the settings."""
     return polygon(_trapezoid(simulation, 0.0))
 
 
 def wedge(simulation: SimulationSettings) -> Shape:
-    """Return faces that lean by half the taper each, with the settings' width at half the height.
+    """Return a wedge whose faces are tilted by half the taper, with the given width at mid-height.
 
-    Raises ValueError where they meet; `profile.validation` finds that in profiles.
+    Raises ValueError if the faces meet; `profile.validation` checks profiles for this.
     """
     leaning = 0.5 * simulation.object_height * math.tan(0.5 * simulation.object_taper)
     width = simulation.object_width
@@ -115,14 +115,14 @@ def wedge(simulation: SimulationSettings) -> Shape:
 
 
 def disc(simulation: SimulationSettings) -> Shape:
-    """Return a disc of the settings' radius."""
+    """Return a disc with the radius of the settings."""
     radius = simulation.object_radius
     square = radius * np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])
     return Shape(DISC, square, radius, radius * math.sqrt(0.5), radius * 2.0 / 3.0)
 
 
 def nothing(simulation: SimulationSettings) -> Shape:
-    """Return the shape of no object; its outline is the rectangle's."""
+    """Return the shape for a scene without an object; its outline is that of the rectangle."""
     return polygon(_trapezoid(simulation, 0.0), NO_OBJECT)
 
 

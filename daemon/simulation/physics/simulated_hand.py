@@ -1,8 +1,8 @@
-"""The simulated hand: what its servos are commanded, where it is, what its tips feel.
+"""Simulated hand: commands to its servos, its state, and the contacts of its tips.
 
-Time moves only by :meth:`SimulatedHand.advance`; the state depends on nothing but the settings and
-on when which command came, so that two runs are the same to the bit. Physical constants that no
-setting names are this project's own choice of a plausible hand; they come from no publication.
+Only :meth:`SimulatedHand.advance` advances time. The state depends only on the settings and on the
+commands with their times, so runs are reproducible to the bit. Physical constants without a setting
+are plausible values chosen for this project; they are not taken from a publication.
 """
 
 from __future__ import annotations
@@ -43,18 +43,18 @@ _MODES = (CURRENT_MODE, POSITION_MODE, CURRENT_BASED_POSITION_MODE)
 STANDARD_GRAVITY = 9.80665  # m/s²
 LONGEST_STEP = 0.25e-3  # s
 SHORTEST_STEP = 0.05e-3  # s
-PHASE_A_STEP = 0.25  # rad of the fastest oscillation that a sub-step may cover
+PHASE_A_STEP = 0.25  # rad, largest phase of the fastest oscillation per sub-step
 ELECTRIC_TIME = 1e-3  # s, lag of the servo's current behind its reference
-FULL_EFFORT_ERROR = 0.27  # rad of position error at which the loop asks for the stall current
-TABLE_SPEED = 0.0005  # m/s, below it the table's friction on the object is viscous
+FULL_EFFORT_ERROR = 0.27  # rad of position error at which the loop commands the stall current
+TABLE_SPEED = 0.0005  # m/s, below which the friction of the table on the object is viscous
 STOP_CLEARANCE = 0.05  # rad between the commanded range and the mechanical end stops
 STOP_STIFFNESS = 500.0  # N·m/rad
 RIM_STIFFNESS = 1e6  # N/m, backing plate on the object
-COMPRESSION_DEPTH = 0.4  # of the tip's radius, how far the scripted compression presses
+COMPRESSION_DEPTH = 0.4  # of the tip's radius, depth of the scripted compression
 
 
 def geometry_of(settings: Settings) -> HandGeometry:
-    """Return the hand's lengths as the settings have them."""
+    """Return the lengths of the hand from the settings."""
     hand = settings.hand
     return HandGeometry(
         hand.pivot_separation, hand.finger_length, hand.finger_offset, settings.tip.radius
@@ -66,7 +66,7 @@ def stiff_step(settings: Settings, table: ContactTable) -> float:
     simulation = settings.simulation
     d = min(settings.safety.d_max, 0.6 * settings.tip.radius, table.header.deepest)
     c = table(d, 0.0)
-    # Normal stiffness ∂F/∂d and shear stiffness 2F/d are of one size; both tips push.
+    # Normal stiffness ∂F/∂d and shear stiffness 2F/d are similar. The factor 2 is for two tips.
     stiffness = 2.0 * simulation.modulus_scale * max(float(c.force_d), 2.0 * float(c.force) / d)
     stiffness *= 1.0 + sum(simulation.tip_relaxation)
     shape = shape_of(settings)
@@ -76,7 +76,7 @@ def stiff_step(settings: Settings, table: ContactTable) -> float:
         turning = (shape.half_width / shape.gyration) ** 2
         fastest = math.sqrt(stiffness / simulation.object_mass * max(1.0, turning))
     step = min(max(PHASE_A_STEP / fastest, SHORTEST_STEP), LONGEST_STEP)
-    # A whole number of sub-steps to the millisecond keeps ticks and frames on the grid.
+    # An integer number of sub-steps per millisecond keeps ticks and frames on the grid.
     return 1e-3 / math.ceil(1e-3 / step - 1e-9)
 
 
@@ -124,7 +124,7 @@ def _object(p: Parameters, settings: Settings) -> None:
     for k, values in enumerate(shape.edges().tolist()):
         edge = p.outline[k]
         edge.x, edge.y, edge.normal_x, edge.normal_y, edge.length = values
-    # κ of a face with that radius, see tip.py.
+    # κ of a face with this radius; see tip.py.
     curved = shape.roundness
     p.factor = math.sqrt(curved / (curved + settings.tip.radius)) if curved else 1.0
     if settings.tip.physics == "solid":
@@ -132,13 +132,13 @@ def _object(p: Parameters, settings: Settings) -> None:
     p.mass = mass
     p.inertia = mass * shape.gyration**2
     p.gravity[:] = simulation.gravity
-    # What gravity doesn't pull along the plane presses the object on the table.
+    # The component of gravity that is not along the plane presses the object on the table.
     pressing = math.sqrt(max(STANDARD_GRAVITY**2 - math.hypot(*simulation.gravity) ** 2, 0.0))
     p.table_force = simulation.table_friction * mass * pressing
     p.table_torque = p.table_force * shape.mean_radius
     p.table_speed = TABLE_SPEED
     p.table_spin = TABLE_SPEED / shape.mean_radius
-    # One finger alone can't hold anything: the object is then fixed to the bench.
+    # A single finger can't hold an object, so the object is then fixed to the bench.
     p.object_held = (
         shape.kind == NO_OBJECT
         or len(settings.scene.fingers) == 1
@@ -163,7 +163,7 @@ def _joints(p: Parameters, settings: Settings) -> None:
     p.stall_current = model.stall_current
     p.no_load_speed = model.no_load_speed / servos.gear_ratio
     p.position_gain = model.stall_current / FULL_EFFORT_ERROR
-    # Critical damping of the joint on its position loop.
+    # Critical damping of the joint with its position loop.
     p.rate_gain = 2.0 * math.sqrt(p.position_gain * constant * inertia) / constant
     p.stop_low[:] = np.subtract(settings.hand.q_min, STOP_CLEARANCE)
     p.stop_high[:] = np.add(settings.hand.q_max, STOP_CLEARANCE)
@@ -186,17 +186,17 @@ def _script(p: Parameters, settings: Settings) -> None:
 
 
 class SimulatedHand:
-    """Two jointed fingers with soft tips and the object between them, in one plane.
+    """Two fingers with joints and soft tips, and an object between them, in one plane.
 
-    Tips touch the object, or each other where it isn't between them; of two contacts a tip
-    feels the one that presses more. The object may lie on the palm.
+    The tips touch the object, or each other if it is not between them. If a tip has two contacts,
+    its sensor measures the stronger one. The object may lie on the palm.
 
-    Which tips take part is ``settings.scene.fingers``. With one finger the object is fixed to the
-    bench, as in a compression test. Without servos (``settings.servos.backend`` is ``none``) the
-    joints stay at ``settings.hand.open_angle``, and with ``simulation.compression_speed`` above 0
-    the object is moved to and fro, onto the left tip and onto the right one, 0.4 radii deep.
+    ``settings.scene.fingers`` selects the tips. With one finger the object is fixed to the bench,
+    as in a compression test. Without servos (``settings.servos.backend`` is ``none``) the joints
+    stay at ``settings.hand.open_angle``. If then ``simulation.compression_speed`` is above 0, the
+    object moves back and forth between both tips and presses each 0.4 radii deep.
 
-    The arrays given out are views of the state, (2,) left first: valid until the next ``advance``.
+    The array attributes are views of the state, (2,) left first, valid until the next ``advance``.
     """
 
     def __init__(
@@ -206,11 +206,23 @@ class SimulatedHand:
         table: ContactTable | None = None,
         step: float | None = None,
     ) -> None:
-        """Build the plant at rest, torque off, at time ``start`` [s].
+        """Create the hand at rest, with torque off.
 
-        ``table`` is the contact table of the settings' tip and material, built when not given;
-        ``step`` [s] the sub-step, chosen from the stiffness when not given. Raises SettingsError
-        for settings that no plant can be built from.
+        Parameters
+        ----------
+        settings
+            Settings of the hand and the simulation.
+        start
+            Start time [s].
+        table
+            Contact table of the tip and material; None to compute it.
+        step
+            Sub-step [s]; None to choose it from the stiffness.
+
+        Raises
+        ------
+        SettingsError
+            If the settings can't be simulated.
         """
         if table is None:
             table = make_table(settings, make_material(settings.material))
@@ -229,7 +241,7 @@ class SimulatedHand:
         goals = self.plant.goals
         goals.mode[:] = CURRENT_BASED_POSITION_MODE
         goals.stiffness[:] = goals.duty[:] = 1.0
-        # As many as may be on their way to a sensor's reader.
+        # Store as many samples as may be in transit to the reader of a sensor.
         latest = simulation.tactile_delay + simulation.tactile_jitter
         stored = math.ceil(latest * settings.tactile.rate) + SPARE_SAMPLES
         self._ring = np.zeros(stored, Sample.dtype)
@@ -250,23 +262,23 @@ class SimulatedHand:
         self.normal = felt.array["normal"]  # N [N]
         self.tangential = felt.array["tangential"]  # T [N]
         self.shear = state.shear  # d_t [m]
-        # How far the backing plate's rim is pressed into the object: > 0 is past the tip's limit.
+        # Depth of the backing plate's rim in the object; above 0 the tip is beyond its limit.
         self.rim = felt.array["rim"]  # m
-        self.on_other_tip = self.plant.on_other_tip  # 1: the other tip is felt, not the object
-        self.torque_on = goals.torque_on  # 1 where a servo has torque
+        self.on_other_tip = self.plant.on_other_tip  # 1 if the contact is with the other tip
+        self.torque_on = goals.torque_on  # 1 if the servo has torque
         self._mode, self._goal_q, self._goal_current = goals.mode, goals.q, goals.current
-        # Of each finger's tactile sensor and servo, left first; the hand itself is as it was.
+        # Of each finger's tactile sensor and servo, left first. They do not change the physics.
         self.measurement_faults = MeasurementFaults(), MeasurementFaults()
         self.servo_heat = ServoHeat.of(settings), ServoHeat.of(settings)
         self._run(0)
 
     @property
     def t(self) -> float:
-        """Time the state belongs to [s]."""
+        """Time of the state [s]."""
         return self.start + self._done * self.step
 
     def advance(self, t: float) -> None:
-        """Step to the last sub-step at or before ``t`` [s]; nothing when that has passed."""
+        """Advance to the last sub-step at or before ``t`` [s], unless it has passed already."""
         if t > self._torque_until:
             self._advance(self._torque_until)
             self.torque_on[:] = 0
@@ -274,7 +286,7 @@ class SimulatedHand:
         self._advance(t)
 
     def _advance(self, t: float) -> None:
-        # The small addend keeps ticks that are multiples of the sub-step on their sub-step.
+        # The addend 1e-6 prevents rounding down when t is a multiple of the sub-step.
         remaining = int((t - self.start) * self._per_step + 1e-6) - self._done
         steps_max = int(LONGEST_ADVANCE * self._per_step)
         while remaining > 0:
@@ -283,11 +295,11 @@ class SimulatedHand:
             remaining -= count
 
     def refresh(self) -> None:
-        """Evaluate the contacts of a state that was written from outside; time stays."""
+        """Evaluate the contacts after the state was changed from outside; time does not advance."""
         self._run(0)
 
     def place_object(self) -> None:
-        """Put the object back where it was at the start, at rest and without a load."""
+        """Move the object back to its start position, at rest and without load."""
         self.object_pose[:], self.object_velocity[:] = self._first_pose, 0.0
         self.load()
         self.refresh()
@@ -297,7 +309,7 @@ class SimulatedHand:
     ) -> None:
         """Set a servo's mode, torque, goal angle [rad] and goal current [A].
 
-        Modes have Dynamixel's numbers: 0 current, 3 position, 5 current-based position. Raises
+        Modes have the Dynamixel numbers: 0 current, 3 position, 5 current-based position. Raises
         ValueError for another mode or a goal that is not finite.
         """
         if mode not in _MODES:
@@ -310,41 +322,42 @@ class SimulatedHand:
         self._goal_current[joint] = goal_current
 
     def tune(self, joint: int, stiffness: float, damping: float, duty: float) -> None:
-        """Set a servo's position gains and the share of the supply that its motor may get."""
+        """Set a servo's position gains and its limit of the motor voltage (fraction of supply)."""
         goals = self.plant.goals
         goals.stiffness[joint], goals.damping[joint] = stiffness, damping
         goals.duty[joint] = duty
 
     def measured_current(self, joint: int) -> float:
-        """Return the motor current [A] that a servo's own sensor shows."""
+        """Return the motor current [A] measured by the servo's sensor."""
         scale = self.measurement_faults[joint]("current", self.t)
         return scale * self.current.item(joint)
 
     def hold_torque_until(self, t: float) -> None:
-        """End both servos' torque at ``t`` [s]; infinity: don't."""
+        """Switch off the torque of both servos at ``t`` [s]; infinity cancels this."""
         self._torque_until = t
 
     def apply_load(self, force_x: float, force_y: float, torque: float = 0.0) -> None:
-        """Push the object with this force [N] and torque [N·m] from now on; zeros end it."""
+        """Apply this force [N] and torque [N·m] to the object from now on; zeros end it."""
         self.plant.goals.load[:] = force_x, force_y, torque
 
     def load(self, push: float = 0.0, twist: float = 0.0) -> None:
-        """Load the object from now on: along its faces, away from the palm [N], and round [N·m].
+        """Load the object from now on with a ``push`` [N] and a ``twist`` [N·m]; zeros end it.
 
-        The force keeps its direction when the object turns; zeros end it.
+        The push acts along the faces, away from the palm. It keeps its direction when the object
+        turns.
         """
         angle = self.object_pose.item(2)
         self.apply_load(-push * math.sin(angle), push * math.cos(angle), twist)
 
     @property
     def samples(self) -> int:
-        """Contact samples taken so far; number k was taken at ``start`` + k / tactile.rate."""
+        """Number of contact samples; sample k was taken at ``start`` + k / tactile.rate."""
         return self.plant.samples
 
     def sample(self, number: int) -> Sample:
-        """Return sample ``number``, valid until a newer one replaces it.
+        """Return sample ``number``, which is valid until a newer one replaces it.
 
-        Raises LookupError for one that is not taken yet or is overwritten.
+        Raises LookupError if it was not taken yet or was overwritten.
         """
         row = self._rows[number % len(self._rows)]
         if row.number != number:
@@ -352,7 +365,7 @@ class SimulatedHand:
         return row
 
     def energy(self) -> float:
-        """Return kinetic, elastic and gravitational energy of joints, tips and object [J]."""
+        """Return the kinetic, elastic and gravitational energy of joints, tips and object [J]."""
         return self.plant.energy
 
     def _run(self, count: int) -> None:

@@ -1,7 +1,7 @@
-"""The linear equations of a step: factorised as L D Lᵀ, and solved. ``g`` is γh of `plant`.
+"""Linear equations of a step: factorisation as L D Lᵀ, and solution. ``g`` is γh of `plant`.
 
-The tips on the object are always in it; where the object is on the palm or the tips are on each
-other, extra rows join in.
+The matrix always includes the tips on the object. Extra rows are added for the object on the palm
+and for the tips on each other.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from softfinger.kinematics.compiled.kernel import inner_kernel
 
 @inner_kernel
 def joint_pivot(plant: Plant, joint: int, g: float) -> float:
-    """Return the matrix's entry of a joint by itself: inertia, friction, stop and motor."""
+    """Return the diagonal entry of a joint: inertia, friction, end stop and motor."""
     motor = plant.motor_by_rate[joint] + g * plant.motor_by_q[joint]
     pivot: float = plant.parameters.joint_inertia + g * (
         plant.drag[joint] + g * (joint_stiffness(plant, joint) + motor)
@@ -33,7 +33,7 @@ def joint_pivot(plant: Plant, joint: int, g: float) -> float:
 
 @inner_kernel
 def along_row(tip: TipContact, r: int, finger: int, rates: FloatArray) -> float:
-    """Return a tip's row ``r`` times the coordinates' ``rates``."""
+    """Return the product of a tip's row ``r`` and the ``rates`` of the coordinates."""
     rate: float = (
         tip.rows[r, 0] * rates[finger]
         + tip.rows[r, 1] * rates[2]
@@ -45,7 +45,7 @@ def along_row(tip: TipContact, r: int, finger: int, rates: FloatArray) -> float:
 
 @inner_kernel
 def take_stiffness(plant: Plant, k: Motion, g: float) -> None:
-    """Take g K r from the load, with K of the first stage; r are positions and shears of ``k``."""
+    """Subtract g K r from the load: K from the first stage, r positions and shears of ``k``."""
     for finger in range(2):
         tip = plant.stages[0].on_object[finger]
         rows, stiffness = tip.rows, tip.stiffness
@@ -110,7 +110,7 @@ def factorise(plant: Plant, g: float) -> None:
 
 @inner_kernel
 def solve(plant: Plant, k: Motion) -> None:
-    """Solve for the load: the velocities of ``k``, those of held parts 0."""
+    """Solve for the load and set the velocities of ``k``; those of held parts are 0."""
     full, out = plant.factors.lower, k.velocity
     for i in range(5):
         value = plant.load[i]
@@ -126,7 +126,7 @@ def solve(plant: Plant, k: Motion) -> None:
 
 @inner_kernel
 def along_extra(extra: ExtraRow, rates: FloatArray) -> float:
-    """Return an extra row times the coordinates' ``rates``."""
+    """Return the product of an extra row and the ``rates`` of the coordinates."""
     rate: float = 0.0
     for j in range(5):
         rate += extra.row[j] * rates[j]
@@ -135,7 +135,7 @@ def along_extra(extra: ExtraRow, rates: FloatArray) -> float:
 
 @inner_kernel
 def take_extra_stiffness(plant: Plant, k: Motion, g: float) -> None:
-    """Take g K r of the extra rows from the load; r are positions and extra shears of ``k``."""
+    """Subtract g K r of the extra rows from the load; r are positions and extra shears of ``k``."""
     for number in range(EXTRA_ROWS):
         extra = plant.extra[number]
         if extra.stiffness == 0.0:
@@ -149,7 +149,7 @@ def take_extra_stiffness(plant: Plant, k: Motion, g: float) -> None:
 
 @inner_kernel
 def add_extra_shears(plant: Plant, k: Motion, g: float) -> None:
-    """Add what the solved velocities of ``k`` bring to its extra shears: g row·k."""
+    """Add the effect of the solved velocities of ``k`` to its extra shears: g row·k."""
     for number in range(EXTRA_ROWS):
         extra = plant.extra[number]
         if extra.shear > 0 and extra.stiffness != 0.0:

@@ -1,51 +1,53 @@
-"""One soft tip of the simulated hand: the law of its contact, and its contact with the object.
+"""Soft tip of the simulated hand: its contact law, and its contact with the object.
 
-All elastic forces are the gradient of one energy, so that the contact can't create any:
+All elastic forces are the gradient of one energy, so the contact can't create energy:
 
     U = w(θ) κ [ U₀(d, θ) + F(d, θ) (sin θ d_t + s cos θ d_t²/d) ] + U_rim(d, θ)
 
-U₀ and F are energy and force of the contact table, for a plane face. With a constant modulus E,
-F = πEd²/cos θ and the second term is πE(d² d_t tan θ + d d_t²), the parallel-distributed model's
-tangential energy, with s = ``tip_shear_stiffness`` = 1; for other materials F carries their
-effective modulus into it. w(θ) is 1 where the soft hemisphere is and fades to 0 towards the
-finger's side. U_rim is a stiff spring between the backing plate's rim and the object, met on a
-plane at d = a(1 − |sin θ|), the end of the soft tip's range; just before it, at
-a(1 − √(sin² θ + 0.03²)), U₀ goes on linearly in d and F stays.
+U₀ and F are energy and force from the contact table, for a plane face. With a constant modulus E,
+F = πEd²/cos θ. With s = ``tip_shear_stiffness`` = 1 the second term is then
+πE(d² d_t tan θ + d d_t²), the tangential energy of the parallel-distributed model. For other
+materials F introduces their effective modulus. w(θ) is 1 on the soft hemisphere and fades to 0
+towards the side of the finger. U_rim is a stiff spring between the rim of the backing plate and the
+object. A plane reaches the rim at d = a(1 − |sin θ|), the end of the soft range. From slightly
+before, a(1 − √(sin² θ + 0.03²)), U₀ is continued linearly in d and F is constant.
 
-That is the law ``simulation.tip_law = "springs"``. With ``"bristles"`` the term sin θ d_t is left
-out: the tangential force T = 2 s F cos θ d_t/d, 2πE s d d_t for a constant E, comes from a bristle
-at the contact's centre that neither a tilt nor a press bends, and d_t follows the slide there
-alone. Force upright, at d_t = 0 and on the sensor are the same. A controller that subtracts the
-springs' own tangential terms then meets a tip that does not have them.
+This is the law ``simulation.tip_law = "springs"``. With ``"bristles"`` the term sin θ d_t is
+omitted. The tangential force T = 2 s F cos θ d_t/d, 2πE s d d_t for a constant E, then comes from a
+bristle at the centre of the contact. Tilt and compression do not bend it, and d_t only follows the
+slide at that point. The force upright, the force at d_t = 0 and the sensor are the same for both
+laws. So the bristles test a controller that compensates the tangential terms of the springs against
+a tip without these terms.
 
-The tip touches the object's nearest point: on a face, along the face's normal; on a corner, along
-the line to it, as if on the plane normal to that line; on a disc, along the line to its centre. A
-disc stands upright on the hand's plane, so that its face is curved about one axis, with radius R.
-Against the springs of the tip it takes the place of its tangent plane with two changes to leading
-order in d: the footprint is narrower along the tilt by κ² = R/(R + a), the curvatures adding to
-1/a + 1/R, and force and energy are κ times those of the plane, whatever θ. Integrals over the very
-springs, for a constant modulus, a = 20 mm and d up to 8 mm, are within 1.6 % of that upright and
-within 4.5 % at 30° for R = 20 and 40 mm, within 3 % and 9 % for R = 10 mm. The sensor's frame is
-rendered from those springs (`sensor.sensor_model`), so its sum differs by as much. A solid tip's
-force goes with d^(3/2) and by √κ, as Hertz's does between a sphere and a cylinder in the limit of
-small d; its frame is the plane's times that.
+The tip touches the nearest point of the object. On a face, the contact is along the normal of the
+face. On a corner it is along the line to the corner, as on the plane normal to that line. On a disc
+it is along the line to the centre. The axis of a disc is normal to the plane of the hand, so its
+face is curved about one axis, with radius R. To leading order in d, the contact with the springs of
+the tip differs from that of the tangent plane in two ways. The footprint is narrower along the tilt
+by κ² = R/(R + a), since the curvatures add to 1/a + 1/R, and force and energy are κ times those of
+the plane for any θ. For a constant modulus, a = 20 mm and d up to 8 mm, integrals over the springs
+agree with this within 1.6 % upright and 4.5 % at 30° for R = 20 and 40 mm, and within 3 % and 9 %
+for R = 10 mm. The frame of the sensor is computed from these springs (`sensor.sensor_model`), so
+its sum differs by the same amount. The force of a solid tip is proportional to d^(3/2) and √κ, as
+in Hertz's theory for a sphere on a cylinder in the limit of small d. Its frame is that of the plane
+times this factor.
 
-Friction is Coulomb's: d_t stays within the two shears at which |T| = μN. Where the model's own
-ratio |T|/N can't reach μ (with a constant E and s = 1 it can't exceed 1 at θ = 0), the tip slips at
-its largest ratio. Losses are viscous, each proportional to the soft part's stiffness, so they grow
-with the contact.
+Friction is Coulomb's: d_t stays between the two shears at which |T| = μN. If the ratio |T|/N of the
+model can't reach μ (with a constant E and s = 1 it is at most 1 at θ = 0), the tip slips at its
+largest ratio. Losses are viscous and proportional to the stiffness of the soft part, so they
+increase with the contact.
 
-A stuck tip's shear may relax, by creep and by micro-slip; both are off by default: a tip then
-sticks or slips as a whole, and forgets nothing. Micro-slip is what the tip's own springs do when
-each has Coulomb friction of its own. A spring of length ℓ(r) = √(a² − r²) is pressed in by
-w = ℓ − h with the pressure Ew/ℓ, and bears a shear traction Eu/ℓ when the face has moved by u: it
-slips where u > μw. All layers w = 0 … d are equally stiff, since r dr = −ℓ dℓ, so that from rest
+The shear of a stuck tip may relax by creep and by micro-slip. Both are off by default; a tip then
+sticks or slips as a whole and has no memory. Micro-slip is the behaviour of springs with individual
+Coulomb friction. A spring of length ℓ(r) = √(a² − r²), compressed by w = ℓ − h, has the pressure
+Ew/ℓ. When the face has moved by u, it has the shear traction Eu/ℓ and slips if u > μw. All layers
+w = 0 … d are equally stiff, since r dr = −ℓ dℓ. So from rest
 
     T = 2πE ∫₀^d min(u, μw) dw = μN (1 − (1 − u/μd)²),   N = πEd²
 
-and the whole tip slips at u = μd: an Iwan model with evenly spread limits. Its layers are scaled
-with the footprint as that grows; their mean is the tip's d_t, and their variance adds to d_t² in
-the tip's energy.
+and the whole tip slips at u = μd. This is an Iwan model with uniformly distributed limits. Its
+layers are scaled with the footprint. Their mean is d_t of the tip, and their variance adds to d_t²
+in the energy of the tip.
 """
 
 from __future__ import annotations
@@ -67,13 +69,13 @@ from softfinger.kinematics.compiled.kernel import inner_kernel
 from softfinger.kinematics.contact.lookup import lookup_at, normal_at, stiffness_ahead
 from softfinger.kinematics.contact.table_record import Table
 
-D_MIN = 1e-9  # m, less is no contact
+D_MIN = 1e-9  # m, lower limit of d for a contact
 _FADE_FROM = 1.15  # rad, where w(θ) begins to fade
-_FADE_TO = 1.35  # rad, where nothing soft is left
-_CLOSEST = 1e-3  # of the radius: how near a corner the tip's centre counts
-_WITHIN = 5e-13  # of friction's limit
-_LIMP = 0.02  # of a tip's lasting firmness: what is left of it where it comes back late
-_BEFORE_RIM = 0.03  # of the radius, when the plate is parallel to the face: end of the soft range
+_FADE_TO = 1.35  # rad, where w(θ) reaches 0
+_CLOSEST = 1e-3  # of the radius, lower bound of the distance from the tip's centre to a corner
+_WITHIN = 5e-13  # relative tolerance of the friction limit
+_LIMP = 0.02  # lower bound of the relaxation factor of a tip that recovers late
+_BEFORE_RIM = 0.03  # of the radius, from the end of the soft range to the rim at θ = 0
 
 
 @inner_kernel
@@ -90,9 +92,9 @@ def fade(theta: float) -> tuple[float, float]:
 
 @inner_kernel
 def shear_limit(t1: float, n0: float, n1: float, n2: float, friction: float) -> float:
-    """Return largest ζ ≥ 0 with t1 ζ ≤ μ (n0 + n1 ζ + n2 ζ²), or the ζ of the largest ratio.
+    """Return the largest ζ ≥ 0 with t1 ζ ≤ μ (n0 + n1 ζ + n2 ζ²), or the ζ of the largest ratio.
 
-    ζ is the shear measured from where T = 0.
+    ζ is the shear relative to the shear at which T = 0.
     """
     if friction <= 0.0 or n0 <= 0.0:
         return 0.0
@@ -105,7 +107,7 @@ def shear_limit(t1: float, n0: float, n1: float, n2: float, friction: float) -> 
 
 @inner_kernel
 def clear_contact(tip: TipContact) -> None:
-    """Clear a tip's contact; d, θ and the gain stay."""
+    """Clear the contact of a tip, except d, θ and the gain."""
     tip.force = 0.0
     tip.energy = 0.0
     tip.rim = 0.0
@@ -125,7 +127,7 @@ def clear_contact(tip: TipContact) -> None:
 
 @inner_kernel
 def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) -> None:
-    """Compute forces, stiffness and losses of a ``tip`` along d, θ and d_t.
+    """Compute the forces, stiffness and losses of a ``tip`` along d, θ and d_t.
 
     With ζ the shear d_t, v its variance, γ = ``gain`` = w(θ) κ, ρ = ``ratio`` = s cos θ/d and
     χ = ``shear_coupling``, 1 for springs and 0 for bristles, within the soft range:
@@ -134,11 +136,11 @@ def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) 
         N = n0 + n1 ζ + n2 ζ²     n0 = γ ∂U₀/∂d − χ t0 tan θ + ∂U_rim/∂d
                                   n1 = χ (γ ∂F/∂d sin θ − t1 tan θ),  n2 = γ ρ (∂F/∂d − F/d)
         U = γ (U₀ + F sheared) + U_rim     sheared = χ ζ sin θ + ρ (ζ² + v)
-        |T| ≤ μ N bounds ζ on both sides of ``neutral`` = −χ d tan θ/2s, where T = 0
+        |T| ≤ μ N limits ζ on both sides of ``neutral`` = −χ d tan θ/2s, where T = 0
         losses: loss · stiffness · rate    stiffness = γ/cos θ (∂F/∂d, 2d/3 ∂U₀/∂d) and t1
 
-    ``factor`` is κ. Takes from the tip d, θ, travel, rates, slip rate, shear, its variance and the
-    rim; writes the rest but what is over the coordinates.
+    ``factor`` is κ. The inputs in the tip are d, θ, travel, rates, slip rate, shear, its variance
+    and the rim. The other fields are set, except the rows and forces over the coordinates.
     """
     d = tip.d
     sine = tip.sine
@@ -163,7 +165,7 @@ def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) 
     stiffness_d = 0.0
     stiffness_theta = 0.0
     stiffness_t = 0.0
-    ahead = 0.0  # stiffness of the soft part that the step may add
+    ahead = 0.0  # possible increase of the soft part's stiffness in this step
     if gain > 0.0:
         inverse_cosine = 1.0 / cosine
         leaning = sine * inverse_cosine
@@ -171,7 +173,7 @@ def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) 
         ahead = stiffness_ahead(table, 2.0 * math.pi * p.modulus * gain, tip.travel)
         ahead *= inverse_cosine
     if gain > 0.0 and d > D_MIN:
-        # The soft part within its range; d_soft_d, d_soft_theta are d_soft's derivatives.
+        # d limited to the soft range; d_soft_d and d_soft_theta are the derivatives of d_soft.
         radius = p.radius
         d_soft = d
         d_soft_d = 1.0
@@ -198,7 +200,7 @@ def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) 
         slope *= scale
         slope_d *= scale
         slope_theta *= scale
-        # Beyond the range U₀ goes on along its slope ∂U₀/∂d.
+        # Beyond the range, continue U₀ with its slope ∂U₀/∂d.
         inverse_d = 1.0 / d_soft
         over = d - d_soft
         soft = scale * soft + slope * over
@@ -216,11 +218,11 @@ def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) 
         curvature = max(n2, 0.25 * gain * force * ratio * inverse_d)
         neutral = -0.5 * tangent * d_soft / firm  # where T = 0
         at_neutral = n0 + neutral * (n1 + neutral * n2)
-        # Most steps are far from slip, which two comparisons tell.
+        # Most steps are far from slip; two comparisons detect these.
         normal = n0 + shear * (n1 + shear * n2)
         tangential = t0 + t1 * shear
         friction = p.friction
-        # What was brought within the limits just now is within them.
+        # The tolerance keeps a shear that was just limited from being limited again.
         stuck = friction * normal * (1.0 + _WITHIN)
         if abs(tangential) > stuck or curvature * (shear - neutral) ** 2 > at_neutral:
             slope_there = n1 + 2.0 * n2 * neutral
@@ -249,8 +251,9 @@ def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) 
     else:
         shear = 0.0
 
-    # Losses: a tip that leaves doesn't pull, and shear's loss stays within friction. Stick is
-    # without slide, but for the springs' tan θ ḋ that keeps the virtual work consistent.
+    # Losses: a separating tip must not pull, and the loss of the shear stays within friction. A
+    # stuck tip does not slide, except for the term tan θ ḋ of the springs, which keeps the virtual
+    # work consistent.
     rate_d = tip.rate_d
     rate_t = tip.slip_rate - tangent * rate_d
     loss = p.loss
@@ -284,7 +287,7 @@ def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) 
 
 @inner_kernel
 def set_row(tip: TipContact, r: int, q: float, x: float, y: float, rotation: float) -> None:
-    """Set a row over (q, x, y, φ)."""
+    """Set row ``r`` over (q, x, y, φ)."""
     tip.rows[r, 0] = q
     tip.rows[r, 1] = x
     tip.rows[r, 2] = y
@@ -293,9 +296,9 @@ def set_row(tip: TipContact, r: int, q: float, x: float, y: float, rotation: flo
 
 @inner_kernel
 def stiffen_by_rim(p: Parameters, tip: TipContact) -> None:
-    """Add the rim's stiffness to a tip whose step may meet it.
+    """Add the stiffness of the rim to a tip that may reach it in this step.
 
-    Its own row is at most that of d and a times that of θ; twice each bounds it.
+    The row of the rim is at most the row of d plus a times that of θ. Twice each is an upper bound.
     """
     hard = 2.0 * p.rim_stiffness
     tip.stiffness[ALONG_D] += hard
@@ -306,7 +309,7 @@ def stiffen_by_rim(p: Parameters, tip: TipContact) -> None:
 def touch_object(
     plant: Plant, table: Table, tip: TipContact, finger: int, now: Motion, nx: float, ny: float
 ) -> None:
-    """Evaluate a finger's ``tip`` on the object where ``now`` is; (nx, ny) is the object's n."""
+    """Evaluate a finger's ``tip`` on the object in ``now``; (nx, ny) is the object's n."""
     p = plant.parameters
     its = plant.fingers[finger]
     rx = its.x - now.position[2]
@@ -314,7 +317,7 @@ def touch_object(
     side = 1.0 - 2.0 * finger
     radius = p.radius
     mu, mv, distance, curved = nearest(p, rx * nx + ry * ny, ry * nx - rx * ny)
-    # m leads from the tip's centre into the object, t is m turned by a right angle.
+    # m points from the tip's centre into the object; t is m turned by 90°.
     mx = mu * nx - mv * ny
     my = mu * ny + mv * nx
     d = radius - distance
@@ -341,8 +344,8 @@ def touch_object(
     y_rate = now.velocity[3]
     rotation_rate = now.velocity[4]
     rate_d = v_m * q_rate - mx * x_rate - my * y_rate - rotation_m * rotation_rate
-    # The integrator's matrix takes the stiffness of where the step leads, so that an impact meets
-    # it at once; losses take that of here.
+    # The matrix of the integrator uses the stiffness at the end of the step, so that it is correct
+    # during an impact. Losses use the present stiffness.
     travel = max(p.step * rate_d, 0.0)
     if d + travel <= D_MIN:
         tip.gain = fade(theta)[0] * p.factor * plant.firmness[finger]
@@ -353,8 +356,8 @@ def touch_object(
     theta_y = 0.0
     theta_rotation = 1.0
     if curved >= 0.0:
-        # m turns with the way from the tip's centre to the centre of curvature, which is fixed in
-        # the object: the corner itself, or the disc's centre.
+        # m points to the centre of curvature, which is fixed in the object: the corner, or the
+        # centre of the disc.
         inverse = 1.0 / max(distance + curved, _CLOSEST * radius)
         theta_q -= v_t * inverse
         theta_x = -my * inverse
@@ -372,7 +375,7 @@ def touch_object(
     tip.rate_theta = (
         theta_q * q_rate + theta_x * x_rate + theta_y * y_rate + theta_rotation * rotation_rate
     )
-    # The object's velocity at the contact less the tip's, along t.
+    # Velocity of the object minus that of the tip at the contact, along t.
     t_q = side * distance - v_t
     tip.slip_rate = t_q * q_rate - my * x_rate + mx * y_rate + rotation_t * rotation_rate
     tip.shear = now.shear[finger]
@@ -399,7 +402,7 @@ def touch_object(
 
 @inner_kernel
 def relax_shears(plant: Plant) -> None:
-    """Relax the shears that a sub-step has led to; the contacts are those of where it began."""
+    """Relax the shears after a sub-step, with the contacts from its begin."""
     p, state = plant.parameters, plant.state
     for finger in range(2):
         tip, layers = plant.stages[0].on_object[finger], plant.layers[finger]
@@ -434,10 +437,11 @@ def relax_shears(plant: Plant) -> None:
 
 @inner_kernel
 def relax_tips(plant: Plant) -> None:
-    """Let each tip on the object follow its lasting force F∞ for a sub-step; set its firmness ρ.
+    """Advance the relaxation of each tip on the object by a sub-step; set its factor ρ.
 
-    ρ = 1 + Σ r_i (1 − h_i/F∞) with ḣ_i = (F∞ − h_i)/τ_i scales all of the tip's forces: pressed at
-    once it is firmer by Σ r_i than in the end, let go at once it comes back late.
+    ρ = 1 + Σ r_i (1 − h_i/F∞) with ḣ_i = (F∞ − h_i)/τ_i scales all forces of the tip, and F∞ is the
+    long-term force. A suddenly pressed tip is stiffer by Σ r_i at first. A suddenly released tip
+    recovers with a delay.
     """
     p = plant.parameters
     for finger in range(2):

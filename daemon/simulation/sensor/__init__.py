@@ -1,1 +1,1 @@
-"""The simulated pressure sensor: what it reads, its flaws, when its frames arrive."""
+"""Simulated pressure sensor: readings, imperfections, and arrival times of frames."""

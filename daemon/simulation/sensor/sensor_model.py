@@ -1,14 +1,14 @@
-"""The simulated pressure sensor: from a contact to the counts that a board would send.
+"""Model of the simulated pressure sensor: from a contact to the counts that a board would send.
 
-Delay and lost frames are in `simulated_tactile`. The flaws have the usual forms; ``velostat`` and
-``capacitive`` are profiles that have them.
+Delayed and lost frames are in `simulated_tactile`. The imperfections have the usual forms; the
+profiles ``velostat`` and ``capacitive`` use them.
 
-The pressure from a plane face is `sensing.pressure_grid`'s; a curved one, a cylinder as a disc has
-it, is here. The springs are the same: over each point of the base a vertical one as long as the
-hemisphere is high there, pressed down to the face. A tip that takes the face for a plane, as the
-estimator does, finds a narrower footprint and takes it for a smaller d: 0.72 of the true one for
-R = a, 0.83 for R = 2a, θ 1 % to 12 % too small, the more the deeper, and a gain above 1 that makes
-up for it in the force.
+The pressure of a plane face is computed by `sensing.pressure_grid`, that of a cylindrical face, as
+on a disc, here. Both use the same springs: over each point of the base there is a vertical spring
+as long as the hemisphere is high, and the face compresses it. An estimator that assumes a plane
+face sees a narrower footprint and estimates a smaller d: 0.72 of the true value for R = a, 0.83 for
+R = 2a. Its θ is 1 % to 12 % too small, more so for larger d, and its gain is above 1, which
+compensates the force.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ from softfinger.kinematics.sensing.springs_pressure import SpringsPressure, coun
 FloatArray = NDArray[np.float64]
 
 PLAYS = 4
-_FINENESS = 60.0  # points of the model to the tip's radius, or more
+_FINENESS = 60.0  # points of the model per radius of the tip, at least
 
 
 class SensorModel:
-    """A pressure sensor under one simulated tip: the board's range, and what is imperfect.
+    """Pressure sensor under one simulated tip, with the range of the board and imperfections.
 
-    ``gain`` is what it reads over the material's pressure, and ``dead`` has the cells (row, col)
-    that always read 0. Two models of equal arguments and calls give equal frames.
+    ``gain`` is the ratio of the reading to the pressure of the material. ``dead`` has the cells
+    (row, col) that always read 0. Models with equal arguments and calls give equal frames.
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class SensorModel:
         self._plays = np.zeros((PLAYS if flaws.tactile_hysteresis > 0.0 else 0, *shape))
         self._creep_lag, self._response_lag = np.zeros((2, 2, *shape))
         self._offset = np.zeros(shape)  # counts
-        self._warmer = np.zeros(1)  # the gain's excess
+        self._warmer = np.zeros(1)  # relative drift of the gain
         self._full_scale = board.full_count * board.pascal_per_count
         self._signal = np.zeros(shape)  # counts
         self._normals = np.zeros(shape)
@@ -94,12 +94,12 @@ class SensorModel:
 
     @property
     def active(self) -> NDArray[np.bool_]:
-        """Cells that read anything, bool [rows, cols]."""
+        """Cells that are not dead, bool [rows, cols]."""
         return self._sensitivity > 0.0
 
     @property
     def remembers(self) -> bool:
-        """True if readings depend on earlier contacts, not on the present one alone."""
+        """True if readings also depend on earlier contacts."""
         flaws = self._flaws
         return (
             flaws.tactile_hysteresis > 0.0
@@ -116,10 +116,11 @@ class SensorModel:
         t: float = 0.0,
         curvature: float = 0.0,
     ) -> None:
-        """Write the next frame's counts into ``out``, uint16 [rows, cols] contiguous.
+        """Write the counts of the next frame into ``out``, uint16 [rows, cols] contiguous.
 
-        ``d`` [m] ≤ 0 is no contact; tilts [rad] as for :meth:`SensorGrid.pressure`; ``t`` [s], for
-        creep, response and drift, is the frame's time; ``curvature`` as for :meth:`press`.
+        ``d`` [m] ≤ 0 means no contact. Tilts [rad] are as for :meth:`SensorGrid.pressure`. ``t``
+        [s] is the time of the frame, for creep, response and drift. ``curvature`` is as for
+        :meth:`press`.
         """
         self.press(d, tilt_x, tilt_y, t, curvature)
         self.read(out)
@@ -134,12 +135,12 @@ class SensorModel:
         fraction: float = 1.0,
         shear: float = 0.0,
     ) -> None:
-        """Let the cells feel the contact of time ``t`` without reading them.
+        """Apply the contact of time ``t`` to the cells without reading them.
 
-        ``curvature`` [1/m] is the face's curvature in the plane of ``tilt_x``, 0 for a plane face:
-        that of a cylinder whose axis is along the finger's y. All pressure is multiplied by
-        ``fraction``, by which alone a solid tip shows the curvature; and it shows the ``shear`` [N]
-        along x, as at the height a.
+        ``curvature`` [1/m] is the curvature of the face in the plane of ``tilt_x``, 0 for a plane:
+        the face is a cylinder with its axis along the finger's y. All pressure is multiplied by
+        ``fraction``. A solid tip shows the curvature only by this factor. It also shows the
+        ``shear`` [N] along x, applied at the height a.
         """
         n_x, n_y = self.grid.to_sensor(math.sin(tilt_x), math.sin(tilt_y))
         flaws, pressure = self._flaws, self._pressure
@@ -169,10 +170,10 @@ class SensorModel:
 
     @cached_property
     def _points(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Points in the cells: their place across the cylinder's axis, and the hemisphere's height.
+        """Sample points: position across the cylinder's axis, and height of the hemisphere [m].
 
-        [lines, points of a line], in m, the height 0 beyond the rim. Then the matrices that take a
-        cell's mean, blurred, along y and x.
+        Both have the shape [lines, points of a line]; the height is 0 beyond the rim. The other two
+        are the matrices that average over cells, with blur, along y and x.
         """
         cells, blur = self._cells, self._flaws.tactile_blur
         x, along_x = axis_points(cells.x, cells.pitch_x, cells.cols, self._count[0], blur)
@@ -186,12 +187,12 @@ class SensorModel:
     def _curved(self, d: float, n_x: float, n_y: float, roundness: float) -> FloatArray:
         """Return the pressure [Pa] of a cylinder of radius R = ``roundness`` [m] on each cell.
 
-        The normal (n_x, n_y, …) leads from the tip's centre to the axis, a − d + R away. With p the
-        way across the axis
+        The normal (n_x, n_y, …) points from the tip's centre to the axis, at the distance
+        a − d + R. With the coordinate p across the axis,
 
             z = c_z − √(R² − (p − c_p)²),    ε = 1 − z/√(a² − x² − y²)
 
-        The mean over a cell is that of its points.
+        The pressure of a cell is the mean over its sample points.
         """
         tilted = n_x * n_x + n_y * n_y
         if not (d > 0.0 and tilted < 1.0):
@@ -210,13 +211,13 @@ class SensorModel:
         return np.asarray(along_y @ pressure @ along_x)
 
     def press_evenly(self, pressure: float) -> None:
-        """Let all cells feel this pressure [Pa], as under a bladder, in the last press' place."""
+        """Apply a uniform pressure [Pa], like a bladder, instead of the last press."""
         self._pressure[:] = pressure
 
     def read(
         self, out: NDArray[np.uint16], faults: MeasurementFaults | None = None, t: float = 0.0
     ) -> None:
-        """Write the counts of what the cells feel into ``out``, with ``faults`` as at ``t`` [s]."""
+        """Write the counts of the cells into ``out``, with the ``faults`` at time ``t`` [s]."""
         flaws = self._flaws
         felt = self._pressure
         if flaws.tactile_exponent != 1.0 or flaws.tactile_fold > 0.0:
@@ -242,17 +243,18 @@ class SensorModel:
         count(signal, self._sensitivity > 0.0, self._ends, out)
 
 
-# --- what a soft, resistive sensor does to the pressure: in place, on arrays [rows, cols] --------
+# --- effects of a soft, resistive sensor: in place, on arrays [rows, cols] -----------------------
 
 
 def hysteresis(pressure: FloatArray, excess: float, memory: FloatArray) -> None:
-    """Let each cell read more while it is unloaded than while it was loaded.
+    """Apply hysteresis: each cell reads more during unloading than during loading.
 
-    A Prandtl-Ishlinskii sum of PLAYS generalised play operators: a cell's output is the mean of
-    their states ``memory`` [PLAYS, rows, cols]. Each follows the pressure p upwards at once and
-    downwards only once it is above (1 + h_k) p, with h_k spread evenly over 0 … 2·excess. So the
-    loading curve is the pressure itself, the unloading one ends at (1 + excess) p, loops close,
-    inner loops lie within, and no pressure reads 0 whatever came before.
+    This is a Prandtl-Ishlinskii model: the output of a cell is the mean of PLAYS generalised play
+    operators with the states ``memory`` [PLAYS, rows, cols]. Each state follows an increasing
+    pressure p at once. It follows a decreasing one only when it is above (1 + h_k) p, with h_k
+    evenly distributed over 0 … 2·excess. So the loading curve is the pressure itself, the unloading
+    curve ends at (1 + excess) p, loops are closed, inner loops lie inside, and zero pressure always
+    reads 0.
     """
     widths = 2.0 * excess * (np.arange(PLAYS) + 0.5) / PLAYS
     np.minimum(memory, (1.0 + widths)[:, None, None] * pressure, out=memory)
@@ -261,17 +263,17 @@ def hysteresis(pressure: FloatArray, excess: float, memory: FloatArray) -> None:
 
 
 def lag(pressure: FloatArray, time: float, elapsed: float, memory: FloatArray) -> FloatArray:
-    """Return z of dz/dt = (p − z)/time: each cell's pressure with a first-order lag.
+    """Return each cell's pressure with a first-order lag, z of dz/dt = (p − z)/time.
 
-    With p + share · z it is the creep of a standard linear solid. Solved exactly for a pressure
-    that went straight to now in ``elapsed`` [s]; ``memory`` [2, rows, cols] has what p and z were,
-    and takes what they are.
+    p + share · z is the creep of a standard linear solid. The solution is exact for a pressure that
+    changed linearly during ``elapsed`` [s]. ``memory`` [2, rows, cols] has the last p and z, and is
+    updated.
     """
     before = memory[0]
     lagged: FloatArray = memory[1]
     ratio = elapsed / time
     decay = math.exp(-ratio)
-    # Mean of the decay over the interval, 1 − r/2 + … where the interval is short.
+    # Mean of the decay over the interval; for short intervals it is 1 − r/2 + …
     mean = -math.expm1(-ratio) / ratio if ratio > 0.0 else 1.0
     lagged *= decay
     lagged += (mean - decay) * before + (1.0 - mean) * pressure
@@ -280,10 +282,10 @@ def lag(pressure: FloatArray, time: float, elapsed: float, memory: FloatArray) -
 
 
 def curve(pressure: FloatArray, exponent: float, full_scale: float, fold: float) -> FloatArray:
-    """Return what cells read of the pressure p: (p/full_scale)^exponent · full_scale.
+    """Return the readings for the pressure p: (p/full_scale)^exponent · full_scale.
 
-    Above ``fold`` [Pa], where that isn't 0, they read it of fold²/p: a cell that is pressed harder
-    than its contact resistance goes by reads less again.
+    Above ``fold`` [Pa], unless that is 0, p is replaced by fold²/p: beyond the range of its contact
+    resistance, a cell reads less with more pressure.
     """
     if fold > 0.0:
         pressure = np.minimum(pressure, fold * fold / np.maximum(pressure, fold))
@@ -295,10 +297,10 @@ def curve(pressure: FloatArray, exponent: float, full_scale: float, fold: float)
 def drift(
     value: FloatArray, deviation: float, time: float, elapsed: float, normals: FloatArray
 ) -> None:
-    """Let each cell's zero drift, or the gain: an Ornstein-Uhlenbeck process.
+    """Advance the drift of each cell's zero, or of the gain: an Ornstein-Uhlenbeck process.
 
-    ``value`` starts at 0 with a fresh tare and ends up with the standard ``deviation``, forgetting
-    over ``time`` [s]; ``normals`` are standard normal numbers.
+    ``value`` starts at 0 after a tare and approaches the standard ``deviation`` with the
+    correlation time ``time`` [s]. ``normals`` are standard normal numbers.
     """
     decay = math.exp(-elapsed / time)
     value *= decay
@@ -306,10 +308,10 @@ def drift(
 
 
 def crosstalk(signal: FloatArray, fraction: float, rows: FloatArray, cols: FloatArray) -> None:
-    """Add crosstalk to every cell of each line: ``fraction`` of its line's mean signal.
+    """Compute the crosstalk of each line: ``fraction`` of the mean signal of the line.
 
-    Cells of a resistive matrix share their drive and sense lines, and current leaks along them.
-    ``rows`` [rows] and ``cols`` [cols] take the lines' parts.
+    Cells of a resistive matrix share their drive and sense lines, and current leaks along them. The
+    results are written to ``rows`` [rows] and ``cols`` [cols].
     """
     np.multiply(fraction, signal.mean(axis=1), out=rows)
     np.multiply(fraction, signal.mean(axis=0), out=cols)
@@ -318,11 +320,11 @@ def crosstalk(signal: FloatArray, fraction: float, rows: FloatArray, cols: Float
 def count(
     signal: FloatArray, active: NDArray[np.bool_], ends: tuple[int, int], out: NDArray[np.uint16]
 ) -> None:
-    """Round a signal in counts, into ``out``; cells that aren't ``active`` read 0.
+    """Round a signal to counts in ``out``; cells that are not ``active`` read 0.
 
-    ``ends`` are the smallest count that is sent, below which goes 0, and the largest there is.
+    ``ends`` are the threshold, below which counts are set to 0, and the largest count.
     """
     lowest, full = ends
     value = np.clip(signal + 0.5, 0.0, full + 0.5)
     value[~active | (value < lowest)] = 0.0
-    out[:] = value  # cut to whole numbers
+    out[:] = value  # truncates to integers

@@ -1,4 +1,4 @@
-"""The tactile sensor under one tip of the simulated hand, in this process and without a thread."""
+"""Tactile sensor under one tip of the simulated hand, in this process and without a thread."""
 
 from __future__ import annotations
 
@@ -36,24 +36,25 @@ def make_sensor_model(settings: Settings, finger: int) -> SensorModel:
 
 
 class StageTouch(NamedTuple):
-    """Touch of a tip by something else than the hand's object, at an instant."""
+    """Contact of a tip with something other than the hand's object, at one instant."""
 
     d: float  # m
     theta: float  # rad
-    pressure: float  # on all cells instead [Pa]
+    pressure: float  # uniform pressure on all cells instead, if above 0 [Pa]
 
 
 class SimulatedTactile:
     """Frames of one fingertip of a :class:`SimulatedHand`.
 
-    The sensor is that of the hand's own settings. A frame is due at every k / ``tactile.rate``
-    since the hand's start, shows the contact of that instant and arrives
-    ``simulation.tactile_delay`` later, or later still, or never (see :class:`Arrivals`). As on
-    hardware nobody tells when it was sampled: ``settings.tactile.latency`` before it was due.
-    Only the newest that has arrived is read, and only when it is asked for; ``seq`` counts the
-    others too. What is wrong with it is in the hand's ``measurement_faults``.
-    ``stage``, where there is one, presses the tip instead of the hand's object: it takes the time
-    since the hand's start [s].
+    The sensor is defined by the settings of the hand. Frame k samples the contact at
+    k / ``tactile.rate`` after the hand's start. It arrives ``simulation.tactile_delay`` later, or
+    later still, or never (see :class:`Arrivals`). As on hardware, the sample time is not known: it
+    is taken as ``settings.tactile.latency`` before the nominal arrival. Only the newest frame is
+    computed, when it is requested; ``seq`` counts the others too. The hand's ``measurement_faults``
+    are applied.
+
+    If ``stage`` is set, it presses the tip instead of the hand's object. It is a function of the
+    time since the hand's start [s].
     """
 
     def __init__(self, settings: Settings, hand: SimulatedHand, clock: Clock, finger: int) -> None:
@@ -79,8 +80,8 @@ class SimulatedTactile:
         self._relaxation = list(
             zip(simulation.tip_relaxation, simulation.tip_relaxation_times, strict=True)
         )
-        self._memory = [0.0] * len(self._relaxation)  # the plate's force, followed by each [N]
-        self._pressed = -1  # number of the newest sample that the cells have felt
+        self._memory = [0.0] * len(self._relaxation)  # lagged plate force of each term [N]
+        self._pressed = -1  # number of the newest sample applied to the cells
         self._frame: Frame | None = None
         self._faults = hand.measurement_faults[finger]
         self._given: deque[NDArray[np.uint16]] = deque(
@@ -97,7 +98,7 @@ class SimulatedTactile:
         self.latest()
 
     def latest(self) -> Frame | None:
-        """Return the newest frame that has arrived, None before the first or when not open."""
+        """Return the newest frame, or None before the first one or if not open."""
         now = self._clock.now()
         if self._open and self._arrivals.take(now):
             self._hand.advance(now)
@@ -105,7 +106,7 @@ class SimulatedTactile:
         return self._frame
 
     def counters(self) -> dict[str, int]:
-        """Return ``frames`` that arrived since open, ``missed`` those that never came.
+        """Return the numbers of ``frames`` that arrived since open and of ``missed`` ones.
 
         ``resyncs`` and ``skipped_bytes`` stay 0.
         """
@@ -118,12 +119,12 @@ class SimulatedTactile:
         }
 
     def close(self) -> None:
-        """Deliver nothing more."""
+        """Stop delivering frames."""
         self._open = False
 
     def _read(self, number: int, arrival: float) -> None:
-        """Make the frame of that sample the newest, if the plant still has it."""
-        # Cells with a memory have felt those that nobody asked for as well.
+        """Compute the frame of a sample, if the plant still has it, and make it the newest."""
+        # Cells with memory also depend on the samples without a computed frame.
         first = self._pressed + 1 if self._model.remembers else number
         for each in range(first, number):
             self._press(each)
@@ -137,7 +138,7 @@ class SimulatedTactile:
         self._frame = Frame(number + 1, t + self._early, arrival, valid=True, data=data)
 
     def _counts(self, t: float) -> NDArray[np.uint16]:
-        """Return the cells' readings at ``t`` [s], or the next of the frames that are repeated."""
+        """Return the readings at ``t`` [s], or the next frame during a replay fault."""
         last = round(self._faults("replay", t) / self._period)
         if last == 0 or not self._given:
             self._replayed = None
@@ -149,7 +150,7 @@ class SimulatedTactile:
         return next(self._replayed)
 
     def _relaxed(self, d: float, theta: float) -> float:
-        """Return a tip's firmness under the plate, a frame later; as the plant's on the object."""
+        """Return a tip's relaxation factor under the plate, one frame later, as in the plant."""
         lasting = float(self._hand.table(d, theta).force)
         firmness = 1.0
         for k, (strength, time) in enumerate(self._relaxation):
@@ -158,7 +159,7 @@ class SimulatedTactile:
         return max(firmness, 0.0)
 
     def _press(self, number: int) -> bool:
-        """Let the cells feel sample ``number``; False when the plant no longer has it."""
+        """Apply sample ``number`` to the cells; return False if the plant no longer has it."""
         if self.stage is not None:
             touch = self.stage(number * self._period)
             firmness = self._relaxed(max(touch.d, 0.0), touch.theta)
@@ -179,9 +180,9 @@ class SimulatedTactile:
             shear = float(sample.tangential[finger]) * (1.0 - d / self._radius)
             self._model.press(d, theta, 0.0, number * self._period, curvature, factor, shear)
             return True
-        # What is left without the curvature's own share, which the cells are to show themselves.
+        # Remove the part of the factor due to curvature, which the sensor model computes itself.
         factor *= math.sqrt(1.0 + curvature * self._radius)
-        # Force goes with d²: half a tip on the face's edge presses with half the force.
+        # Force is proportional to d²: half a tip on the edge of the face has half the force.
         firmness = float(sample.firmness[finger])
         d *= math.sqrt(factor / firmness)
         self._model.press(d, theta, 0.0, number * self._period, curvature, firmness)
@@ -189,14 +190,14 @@ class SimulatedTactile:
 
 
 class Arrivals:
-    """The frames 0, 1, … of a sensor that samples one every ``period`` [s] from ``start`` [s] on.
+    """Arrival times of the frames 0, 1, … of a sensor.
 
-    Frame k is due at start + k · period + ``delay``. With the probability ``dropped`` it never
-    comes, and it comes later by an even chance of up to ``jitter`` [s], and not before one that was
-    sampled earlier: it waits for that.
+    Frame k is sampled at start + k · period and due ``delay`` later [s]. It is lost with the
+    probability ``dropped``. Otherwise it is late by a uniformly distributed time of up to
+    ``jitter`` [s]; frames never overtake each other.
     """
 
-    # A few roundings of the clock's value, so that a frame due now counts as come.
+    # Covers rounding errors of the clock, so that a frame due now counts as arrived.
     _SLACK = 1e-9
 
     def __init__(
@@ -214,16 +215,16 @@ class Arrivals:
         self._dropped = dropped
         self._jitter = jitter
         self._random = np.random.default_rng(seed)
-        self.number = -1  # of the newest frame that arrived
-        self.arrival = start  # and when it did [s]
+        self.number = -1  # of the newest frame
+        self.arrival = start  # time at which it arrived [s]
         self.arrived = 0  # frames
-        self.missed = 0  # frames before the newest that never came
+        self.missed = 0  # lost frames before the newest
         self._next = -1
         self.next_arrival = start + delay  # of the frame after the newest [s]
         self._plan()
 
     def take(self, now: float) -> bool:
-        """Let time pass until ``now`` [s]; True when a newer frame has arrived."""
+        """Advance to ``now`` [s]; return True if a newer frame has arrived."""
         newest = self.number
         while self.next_arrival <= now + self._SLACK:
             self.missed += self._next - self.number - 1
@@ -234,7 +235,7 @@ class Arrivals:
         return self.number > newest
 
     def _plan(self) -> None:
-        """Find the next frame that comes."""
+        """Determine the next frame that is not lost, and its arrival time."""
         self._next += 1
         while self._dropped > 0.0 and self._random.random() < self._dropped:
             self._next += 1

@@ -1,4 +1,5 @@
-"""Emulated Dynamixel servos: their registers, what these do, and the packets on their bus.
+"""Emulated Dynamixel servos: registers, their effects, and the packets on the bus.
 
-Bytes and times in, bytes out: no port, and no code of the client but the control table and CRC.
+The input are bytes with times, the output are bytes; there is no port. The package shares only the
+control table and the CRC with the client.
 """

@@ -1,7 +1,6 @@
-"""Dynamixel Protocol 2.0 framing as a servo does it: byte stuffing, packets and their parser.
+"""Dynamixel Protocol 2.0 framing on the servo side: byte stuffing, packets and their parser.
 
-Bytes in, bytes out. It shares only the CRC with the client, so that a test of one against the other
-means something.
+It shares only the CRC with the client, so that tests of one against the other are meaningful.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ BULK_READ: Final = 0x92
 BULK_WRITE: Final = 0x93
 FAST_BULK_READ: Final = 0x9A
 
-# Error numbers of a status packet; bit 7 (ALERT) beside them means a hardware error.
+# Error numbers of a status packet; the additional bit 7 (ALERT) means a hardware error.
 OK: Final = 0x00
 RESULT_FAIL: Final = 0x01
 INSTRUCTION_ERROR: Final = 0x02
@@ -40,14 +39,14 @@ DATA_LIMIT: Final = 0x06
 ACCESS: Final = 0x07
 ALERT: Final = 0x80
 
-MAX_LENGTH: Final = 1024  # longest packet a servo takes; a longer length field is noise
+MAX_LENGTH: Final = 1024  # longest packet that a servo accepts
 _PREFIX: Final = HEADER + b"\x00"
 _STUFFED: Final = HEADER + b"\xfd"
 _UNSTUFFED: Final = re.compile(rb"\xff\xff\xfd[^\xfd]")
 
 
 def frame(packet_id: int, instruction: int, parameters: bytes = b"") -> bytes:
-    """Return a whole packet on the wire: header, stuffed body, its stuffed length, CRC."""
+    """Return a complete packet: header, stuffed length, stuffed body, CRC."""
     body = (bytes((instruction,)) + parameters).replace(HEADER, _STUFFED)
     length = len(body) + 2
     packet = _PREFIX + bytes((packet_id, length & 0xFF, length >> 8)) + body
@@ -60,55 +59,55 @@ def status(packet_id: int, error: int, data: bytes = b"") -> bytes:
 
 
 def fast_head(length: int) -> bytes:
-    """Return how the one reply to a fast group read begins."""
+    """Return the beginning of the single reply to a fast group read."""
     return _PREFIX + bytes((BROADCAST, length & 0xFF, length >> 8 & 0xFF, STATUS))
 
 
 def old_status(packet_id: int) -> bytes:
-    """Return a status packet of Protocol 1.0 without an error and data."""
+    """Return a status packet of Protocol 1.0 without error or data."""
     body = bytes((packet_id, 2, 0))
     return b"\xff\xff" + body + bytes((~sum(body) & 0xFF,))
 
 
 def old_pings(data: bytes) -> list[int]:
-    """Return the IDs of the pings of Protocol 1.0 in ``data``."""
+    """Return the IDs in the Protocol 1.0 pings in ``data``."""
     found = re.finditer(rb"\xff\xff([\x00-\xfe]\x02\x01)(.)", data, re.DOTALL)
     return [m[1][0] for m in found if ~sum(m[1]) & 0xFF == m[2][0]]
 
 
 class Packet(NamedTuple):
-    """One packet taken off the wire. ``valid`` is False when only its CRC was wrong."""
+    """One received packet. ``valid`` is False if only its CRC was wrong."""
 
     id: int
     instruction: int
     parameters: bytes
     valid: bool
-    size: int  # bytes it took on the wire
+    size: int  # bytes on the wire
 
 
 def _packet(raw: bytes) -> Packet:
-    """The whole packet that ``raw`` is."""
+    """Decode the complete packet ``raw``."""
     valid = crc16(raw[:-2]) == raw[-2] | raw[-1] << 8
     body = raw[7:-2].replace(_STUFFED, HEADER)
     return Packet(raw[4], body[0], body[1:], valid, len(raw))
 
 
 class PacketParser:
-    """Packets out of a byte stream, as a servo finds them.
+    """Parser that finds packets in a byte stream like a servo.
 
-    A header inside a packet (FF FF FD not followed by FD, where stuffing is due) throws away the
-    packet begun before it, as does silence of more than ``gap`` seconds within a packet; so a
-    frame that was sent unstuffed is never obeyed.
+    A header inside a packet (FF FF FD not followed by FD, which stuffing prevents) discards the
+    packet before it, and so does silence of more than ``gap`` seconds within a packet. A packet
+    that was sent without stuffing is therefore never executed.
     """
 
     def __init__(self, gap: float = 0.0015) -> None:
         self.gap = gap
-        self.dropped = 0  # bytes that belonged to no packet
+        self.dropped = 0  # bytes outside of packets
         self._buffer = bytearray()
         self._last = 0.0
 
     def feed(self, data: bytes, t: float) -> list[Packet]:
-        """Return the packets that ``data``, arriving at time t [s], completes."""
+        """Return the packets that are complete with ``data``, which arrived at time t [s]."""
         if t - self._last > self.gap:
             self._drop(len(self._buffer))
         self._last = t
@@ -116,7 +115,7 @@ class PacketParser:
         return list(iter(self._next, None))
 
     def reset(self) -> None:
-        """Forget a packet begun."""
+        """Discard an incomplete packet."""
         self._buffer.clear()
 
     def _drop(self, count: int) -> None:
@@ -128,7 +127,7 @@ class PacketParser:
         while True:
             start = buffer.find(_PREFIX)
             if start < 0:
-                # Keep what may be the beginning of a header.
+                # Keep bytes that may be the beginning of a header.
                 keep = next((n for n in (3, 2, 1) if buffer.endswith(_PREFIX[:n])), 0)
                 self._drop(len(buffer) - keep)
                 return None
@@ -143,7 +142,7 @@ class PacketParser:
             end = 7 + length
             body = bytes(buffer[7 : end - 2])
             if len(buffer) > end - 2:
-                body += b"\0"  # no stuffing follows a header that ends the body
+                body += b"\0"  # a header at the end of the body is not followed by stuffing
             if intruder := _UNSTUFFED.search(body):
                 self._drop(7 + intruder.start())
                 continue

@@ -1,6 +1,6 @@
-"""The registers of an emulated servo: access, defaults and ranges, their bytes, forbidden writes.
+"""Registers of an emulated servo: access rights, defaults, ranges, bytes and invalid writes.
 
-What a write does besides changing registers belongs to :mod:`simulation.servo_model.servo`.
+The further effects of a write are in :mod:`simulation.servo_model.servo`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _LIMITS = {
     reg.GOAL_CURRENT: reg.CURRENT_LIMIT,
     reg.GOAL_VELOCITY: reg.VELOCITY_LIMIT,
 }
-_PAIRS = {  # lower and upper limits of the same thing
+_PAIRS = {  # lower limit → upper limit
     reg.MIN_POSITION_LIMIT: reg.MAX_POSITION_LIMIT,
     reg.MIN_VOLTAGE_LIMIT: reg.MAX_VOLTAGE_LIMIT,
 }
@@ -33,7 +33,7 @@ _UPPER = {upper: lower for lower, upper in _PAIRS.items()}
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """One register. ``low`` and ``high`` bound what may be written, by the table alone."""
+    """One register. ``low`` and ``high`` are the limits of its value by the table alone."""
 
     address: int
     size: int
@@ -62,7 +62,7 @@ def _gain(address: int, default: int) -> Item:
 
 
 def _items_of(model: ServoModel, firmware: int) -> list[Item]:
-    """Return all registers of that model and firmware, by address."""
+    """Return all registers of a model and firmware, sorted by address."""
     low, high = model.voltage_min, model.voltage_max
     items = [
         _read_only(reg.MODEL_NUMBER, 2, model.number),
@@ -133,9 +133,9 @@ def _items_of(model: ServoModel, firmware: int) -> list[Item]:
 
 
 class ControlTable:
-    """The registers' bytes, with access by value and by the span of a packet.
+    """Memory of the registers, with access by value and by the address range of a packet.
 
-    Addresses between the registers read as 0. ``memory`` may be written directly by the servo.
+    Addresses between the registers read as 0. The servo may write to ``memory`` directly.
     """
 
     def __init__(self, model: ServoModel, firmware: int) -> None:
@@ -159,20 +159,20 @@ class ControlTable:
     # --- values ----------------------------------------------------------------------------------
 
     def get(self, address: int) -> int:
-        """Return value of the item at that address."""
+        """Return the value of the item at an address."""
         value: int = self._unpack[address](self.memory, address)[0]
         return value
 
     def set(self, address: int, value: int) -> None:
-        """Store a value, access rights aside; too great a value keeps its low bytes."""
+        """Store a value regardless of access rights; too large a value is truncated."""
         item = self.at[address]
         mask = (1 << 8 * item.size) - 1
         self.memory[address : address + item.size] = (value & mask).to_bytes(item.size, "little")
 
     def reset(self, keep: tuple[int, ...] = (), first: int = 0) -> None:
-        """Restore factory defaults from address ``first`` on but in the items at ``keep``.
+        """Restore the factory defaults from address ``first`` on, except in the items at ``keep``.
 
-        From `control_table.RAM` on it is what a power-up does.
+        With ``first`` at `control_table.RAM` this has the effect of a power-up.
         """
         for item in self.items:
             if item.address >= first and item.address not in keep:
@@ -181,32 +181,31 @@ class ControlTable:
     # --- reading ---------------------------------------------------------------------------------
 
     def holds(self, address: int, length: int) -> bool:
-        """Return whether the span lies inside the table."""
+        """Return True if the address range lies inside the table."""
         return length > 0 and address + length <= self.size
 
     def resolve(self, address: int) -> int:
-        """Return a byte's real address: indirect data stands for the register its address names."""
+        """Return the real address of a byte; an indirect data byte refers to another address."""
         pointer = self._indirect.get(address)
         if pointer is None:
             return address
         return self.memory[pointer] | self.memory[pointer + 1] << 8
 
     def read(self, address: int, length: int) -> bytes:
-        """Return the bytes of a span inside the table, indirect data resolved."""
+        """Return the bytes of a range inside the table, with indirect data resolved."""
         return bytes(self.memory[self.resolve(i)] for i in range(address, address + length))
 
     def reads(self, address: int, length: int, first: int, last: int) -> bool:
-        """Return whether reading the span shows any byte of ``first`` … ``last``."""
+        """Return True if reading the range includes any byte of ``first`` … ``last``."""
         return any(first <= self.resolve(i) <= last for i in range(address, address + length))
 
     # --- writing ---------------------------------------------------------------------------------
 
     def plan(self, address: int, data: bytes) -> tuple[int, list[tuple[Item, int]]]:
-        """Return the effect of a write: (error, the items with their new values).
+        """Return the effect of a write: the error number, and the items with their new values.
 
-        Every item must be written whole; one that is cut gives DATA_LENGTH, a read-only or
-        undefined byte ACCESS, a value out of the item's own range DATA_RANGE. With an error
-        nothing is to be written, the items before the bad one neither.
+        A partly written item gives DATA_LENGTH, a read-only or undefined byte ACCESS, and a value
+        outside the item's range DATA_RANGE. After an error the write must not change any item.
         """
         if not data:
             return framing.DATA_LENGTH, []
@@ -229,7 +228,7 @@ class ControlTable:
         return next(filter(None, refusals), framing.OK), plan
 
     def _refusal(self, item: Item, value: int) -> int:
-        """The error of writing ``value`` because of what other registers hold; OK if allowed."""
+        """Return the error of writing ``value`` due to other registers; OK if it is allowed."""
         memory, address = self.memory, item.address
         if address in _GOALS:
             if memory[reg.BUS_WATCHDOG] == reg.WATCHDOG_ERROR:

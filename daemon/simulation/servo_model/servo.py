@@ -1,10 +1,12 @@
-"""One emulated Dynamixel X servo: what its registers do, over a joint of a plant.
+"""Emulated Dynamixel X servo: the effects of its registers on a joint of a plant.
 
-Torque, operating modes, limits, profiles, bus watchdog, hardware errors and shutdown, reboot;
-packets belong to :mod:`simulation.servo_model.servo_bus`. PWM mode, which no client is known to
-set, is out of range here; a startup with the RAM's backup and the integral gain have no effect.
-Choices of our own, where the manuals say nothing: a write that breaks any rule changes nothing at
-all; torque on after a shutdown is refused with RESULT_FAIL.
+It models torque, operating modes, limits, profiles, bus watchdog, hardware errors, shutdown and
+reboot. Packets are in :mod:`simulation.servo_model.servo_bus`. PWM mode, which no known client
+uses, is refused as out of range. The integral gain and a startup from the RAM backup have no
+effect.
+
+The manuals leave two points open. Here, a write that breaks any rule changes no register, and
+torque on after a shutdown is refused with RESULT_FAIL.
 """
 
 from __future__ import annotations
@@ -29,8 +31,8 @@ from softfinger.daemon.simulation.servo_model.servo_joint import (
 )
 
 REBOOT_TIME = 0.34  # s without an answer
-JUMP = 130  # counts, 0.2 rad at the shaft, by which an encoder's zero jumps
-FAR = 0.05  # rad between goal and present angle at torque on that count as far
+JUMP = 130  # counts (0.2 rad at the shaft) by which the zero of the encoder jumps
+FAR = 0.05  # rad between goal and present angle at torque on, above which a goal counts as far
 _WATCHED = frozenset((reg.GOAL_CURRENT, reg.GOAL_POSITION))
 _TUNED = (reg.PWM_LIMIT, reg.POSITION_D_GAIN, reg.POSITION_P_GAIN, reg.GOAL_PWM)
 _CLEAR_FIRMWARE = 42
@@ -38,17 +40,17 @@ _CLEAR_KEY = b"\x01DXL\x22"
 
 
 def prepared(model: ServoModel, mode: int) -> dict[int, int]:
-    """Return an EEPROM as the daemon needs it: no return delay, and the model's mode."""
+    """Return the EEPROM values that the daemon needs: no return delay, and the mode."""
     needed = {reg.RETURN_DELAY_TIME: 0}
     return needed | {reg.OPERATING_MODE: mode} if mode in model.modes else needed
 
 
 class EmulatedServo:
-    """A servo on joint ``joint`` of ``plant``, factory-new but for the registers in ``eeprom``.
+    """Servo on joint ``joint`` of ``plant``, with factory settings except the values in ``eeprom``.
 
-    ``health`` may be set from outside; a ``silent`` servo neither hears nor answers, with
-    ``frozen`` what it measures stands still, its time included, and with ``refuses`` it answers
-    every reading with an error.
+    ``health`` may be set from outside. A ``silent`` servo neither receives nor answers. With
+    ``frozen`` its measured values and its time stay constant. With ``refuses`` it answers every
+    read with an error.
     """
 
     def __init__(
@@ -72,17 +74,17 @@ class EmulatedServo:
         self.health = ServoHealth(model, heat)
         self._joint = ServoJoint(model, self.table, plant, joint, scale)
         self.recorder = BusRecorder(t)
-        self._watched = 0.0  # time of the last packet the watchdog knows of
+        self._watched = 0.0  # time at which the watchdog was last restarted
         self._booted = t
-        self._boot_at = -math.inf  # a reboot ends then
+        self._boot_at = -math.inf  # end of a reboot
         self._next_step = math.inf
         self._next_sense = t
-        self._registered: tuple[int, bytes] | None = None  # a write that waits for an action
+        self._registered: tuple[int, bytes] | None = None  # write that waits for an action
         for address, value in eeprom.items():
             self.table.set(address, value)
         self._start(t)
 
-    # --- state that the bus asks for -------------------------------------------------------
+    # --- state for the bus -----------------------------------------------------------------
 
     @property
     def id(self) -> int:
@@ -90,12 +92,12 @@ class EmulatedServo:
 
     @property
     def shadow(self) -> int:
-        """A second ID whose instructions it obeys without an answer; 253 and more are none."""
+        """Second ID, whose instructions are executed without an answer; 253 and up disable it."""
         return self._memory[reg.SHADOW_ID]
 
     @property
     def old_protocol(self) -> bool:
-        """True if it speaks Protocol 1.0, of which this emulator answers the ping."""
+        """True if it is set to Protocol 1.0, of which this emulator only answers the ping."""
         return self._memory[reg.PROTOCOL_TYPE] == 1
 
     @property
@@ -104,11 +106,11 @@ class EmulatedServo:
 
     @property
     def return_delay(self) -> float:
-        """Seconds between an instruction and its reply."""
+        """Time between an instruction and its reply [s]."""
         return self._memory[reg.RETURN_DELAY_TIME] * reg.RETURN_DELAY_UNIT
 
     def answers_reads(self, servo_id: int, fast: bool) -> bool:
-        """Return whether it answers group reads from ``servo_id``."""
+        """Return True if it answers a group read of ``servo_id``."""
         memory = self._memory
         if memory[reg.ID] != servo_id or not memory[reg.STATUS_RETURN_LEVEL]:
             return False
@@ -116,7 +118,7 @@ class EmulatedServo:
 
     @property
     def alert(self) -> int:
-        """The alert bit of its status packets."""
+        """Alert bit of its status packets."""
         return framing.ALERT if self._memory[reg.HARDWARE_ERROR_STATUS] else 0
 
     @property
@@ -139,25 +141,25 @@ class EmulatedServo:
         return self._memory[reg.OPERATING_MODE]
 
     def awake(self, t: float) -> bool:
-        """Return whether it hears and answers at time t: neither silent nor rebooting."""
+        """Return True if it is neither silent nor rebooting at time t."""
         return not self.silent and t >= self._boot_at
 
     # --- time ------------------------------------------------------------------------------
 
     def heard(self, t: float) -> None:
-        """Restart the bus watchdog: an instruction packet went by."""
+        """Restart the bus watchdog after an instruction packet on the bus."""
         self._watched = t
         self.recorder.heard(t, self._memory[reg.TORQUE_ENABLE] != 0)
 
     def next_event(self) -> float:
-        """Return when :meth:`act` next has something to do [s]."""
+        """Return the time [s] at which :meth:`act` must be called next."""
         due = min(self._next_step, self._next_sense)
         if self._boot_at > -math.inf:
             return min(due, self._boot_at)
         return min(due, self._watched + self.watchdog) if self._armed else due
 
     def act(self, t: float) -> None:
-        """Do what is due at time t; the plant must have been advanced to it."""
+        """Handle the events due at time t; the plant must have been advanced to t."""
         if self._boot_at > -math.inf:
             if t < self._boot_at:
                 self._next_sense = max(self._next_sense, self._boot_at)
@@ -181,7 +183,7 @@ class EmulatedServo:
     # --- instructions ----------------------------------------------------------------------
 
     def read(self, address: int, length: int, t: float) -> bytes | None:
-        """Return the bytes of a span, or None when it does not lie inside the table."""
+        """Return the bytes of an address range, or None if the servo refuses the read."""
         table = self.table
         if self.refuses or not table.holds(address, length):
             return None
@@ -192,7 +194,7 @@ class EmulatedServo:
         return table.read(address, length)
 
     def write(self, address: int, data: bytes, t: float) -> int:
-        """Write a span; the error number, 0 when all of it was done."""
+        """Write an address range; return the error number, 0 for success."""
         error, plan = self.table.plan(address, data)
         values = {item.address: value for item, value in plan}
         self.recorder.goals(values, self._joint, self.torque_on, error != framing.OK)
@@ -213,7 +215,7 @@ class EmulatedServo:
         return framing.OK
 
     def register(self, address: int, data: bytes) -> int:
-        """Keep a write until :meth:`action`; the error number."""
+        """Store a write until :meth:`action`; return the error number."""
         error, _ = self.table.plan(address, data)
         if not error:
             self._registered = address, data
@@ -221,7 +223,7 @@ class EmulatedServo:
         return error
 
     def action(self, t: float) -> int:
-        """Do the write that was registered last; the error number."""
+        """Execute the write that was registered last; return the error number."""
         if self._registered is None:
             return framing.INSTRUCTION_ERROR
         (address, data), self._registered = self._registered, None
@@ -229,7 +231,7 @@ class EmulatedServo:
         return self.write(address, data, t)
 
     def reboot(self, t: float) -> None:
-        """Switch torque off, be silent for REBOOT_TIME, then restore the RAM as after power-up."""
+        """Switch torque off, and restore the RAM as after a power-up after REBOOT_TIME."""
         self.table.set(reg.TORQUE_ENABLE, 0)
         self._joint.drive()
         self._next_step = math.inf
@@ -237,7 +239,7 @@ class EmulatedServo:
         self._next_sense = self._boot_at
 
     def factory_reset(self, option: bytes, t: float) -> int:
-        """Restore factory defaults (FF all, 01 keeps ID, 02 ID and baud rate), then reboot."""
+        """Restore factory defaults (FF: all, 01: not ID, 02: not ID and baud rate), then reboot."""
         if len(option) != 1:
             return framing.DATA_LENGTH
         keep = {0xFF: (), 1: (reg.ID,), 2: (reg.ID, reg.BAUD_RATE)}.get(option[0])
@@ -249,7 +251,7 @@ class EmulatedServo:
         return framing.OK
 
     def clear(self, parameters: bytes, t: float) -> int:
-        """Bring the position back into one turn; fails while the shaft moves."""
+        """Reset the position to a single turn; this fails while the shaft moves."""
         if self.firmware < _CLEAR_FIRMWARE:
             return framing.INSTRUCTION_ERROR
         if parameters != _CLEAR_KEY:
@@ -264,7 +266,7 @@ class EmulatedServo:
         return framing.OK
 
     def report(self, t: float) -> dict[str, Any]:
-        """Return the servo's state and the record of what it was sent."""
+        """Return the state of the servo and the record of received goals."""
         stopped = self._memory[reg.BUS_WATCHDOG] == reg.WATCHDOG_ERROR
         return {
             "id": self.id,
@@ -303,7 +305,7 @@ class EmulatedServo:
                 self.frozen = self.refuses = False
                 self._joint.stuck, self._joint.shift = None, 0
 
-    # --- what a write does ------------------------------------------------------------------
+    # --- effects of a write -----------------------------------------------------------------
 
     def _effect(self, address: int, value: int, t: float) -> None:
         if address == reg.TORQUE_ENABLE:
@@ -343,7 +345,7 @@ class EmulatedServo:
         self._joint.tune()
 
     def _start(self, t: float) -> None:
-        """Power-up, or the end of a reboot."""
+        """Start after power-up or at the end of a reboot."""
         table = self.table
         table.reset(first=reg.RAM)
         self.health.restart()
@@ -351,17 +353,17 @@ class EmulatedServo:
         self._joint.forget_turns()
         self._registered = None
         self._reset_goals()
-        if self._memory[reg.STARTUP_CONFIGURATION] & 1:  # unused where the firmware has it not
+        if self._memory[reg.STARTUP_CONFIGURATION] & 1:  # 0 if the firmware lacks this register
             table.set(reg.TORQUE_ENABLE, 1)
         self._joint.hold()
         self._next_step = math.inf
         self._next_sense = t + SENSE
         self._joint.drive()
 
-    # --- what happens by itself ------------------------------------------------------------
+    # --- internal events -------------------------------------------------------------------
 
     def _stop(self) -> None:
-        """The bus watchdog's stop: stand where the shaft is, with torque still on."""
+        """Stop by the bus watchdog: hold the present position, with torque still on."""
         table = self.table
         if self.mode == reg.CURRENT_MODE:
             table.set(reg.GOAL_CURRENT, 0)
@@ -379,7 +381,7 @@ class EmulatedServo:
             self._fail(bit)
 
     def _fail(self, bit: int) -> None:
-        """A hardware error: the alert bit, and a shutdown if the mask has its bit."""
+        """Set a hardware error and its alert bit, and shut down if the mask has its bit."""
         status = self.table.get(reg.HARDWARE_ERROR_STATUS) | 1 << bit
         self.table.set(reg.HARDWARE_ERROR_STATUS, status)
         if self.table.shut_down and self.torque_on:
@@ -388,25 +390,25 @@ class EmulatedServo:
 
 
 class BusRecorder:
-    """Record of what a servo was sent, for tests of a daemon against its limits.
+    """Record of the goals sent to a servo, for tests of a daemon against its limits.
 
-    In counts as they came over the wire; a goal counts whether the servo took or refused it.
+    Goals are in counts as received. They are recorded even if the servo refused them.
     """
 
     def __init__(self, t: float) -> None:
-        self._goals: dict[int, tuple[int, int]] = {}  # register → least and greatest, counts
+        self._goals: dict[int, tuple[int, int]] = {}  # register → lowest and highest value, counts
         self._refused = 0
-        self._torque_on = 0  # how often
+        self._torque_on = 0  # number of times
         self._torque_t: float | None = None
         self._far = 0
         self._farthest = 0.0  # rad
-        self._last = t  # when a packet was heard
-        self._quiet = 0.0  # s, longest with torque on
+        self._last = t  # time of the last packet
+        self._quiet = 0.0  # s, longest silence with torque on
         self._fired = 0
         self._fired_t: float | None = None
 
     def goals(self, values: dict[int, int], joint: ServoJoint, torque: bool, refused: bool) -> None:
-        """Record a write: values by register, but no angle near where a limp joint is."""
+        """Record a write, except goals near the present angle while torque is off."""
         goals = _WATCHED & values.keys()
         self._refused += refused and bool(goals)
         for address in goals:
@@ -417,7 +419,7 @@ class BusRecorder:
             self._goals[address] = min(least, value), max(greatest, value)
 
     def torque_on(self, t: float, joint: ServoJoint, mode: int, position: int) -> None:
-        """Record torque on at time t with this goal in force, in counts."""
+        """Record torque on at time t with this goal [counts]."""
         self._torque_on += 1
         self._torque_t = self._last = t
         if mode in POSITION_MODES:
@@ -426,7 +428,7 @@ class BusRecorder:
             self._farthest = max(self._farthest, away)
 
     def heard(self, t: float, torque: bool) -> None:
-        """Record a packet at time t that the servo understood."""
+        """Record a valid packet at time t."""
         if torque and t - self._last > self._quiet:
             self._quiet = t - self._last
         self._last = t
@@ -437,7 +439,7 @@ class BusRecorder:
         self._fired_t = t
 
     def report(self, t: float, joint: ServoJoint, torque: bool) -> dict[str, Any]:
-        """Return the record at time t, in SI and in the joint's sense, as JSON takes it."""
+        """Return the record at time t for JSON, in SI units and joint coordinates."""
         angles = [joint.goal_angle(each) for each in self._goals.get(reg.GOAL_POSITION, ())]
         currents = [joint.goal_current(each) for each in self._goals.get(reg.GOAL_CURRENT, ())]
         quiet = t - self._last
@@ -458,5 +460,5 @@ class BusRecorder:
 
 
 def _away(joint: ServoJoint, position: int) -> float:
-    """Return how far a goal is from where the joint is [rad]."""
+    """Return the distance between a goal and the present angle of the joint [rad]."""
     return abs(joint.goal_angle(position) - joint.goal_angle(joint.position()))

@@ -1,10 +1,10 @@
-"""A bus of emulated Dynamixel servos: instruction packets in, status packets out, byte for byte.
+"""Bus of emulated Dynamixel servos: instruction packets in, status packets out, byte by byte.
 
-It takes bytes and the time and gives bytes, so that tests and fuzzers need no port; the
-pseudo-terminal around it is :mod:`simulation.emulator.pty_bus`. In group reads a servo answers
-after it has heard the one named before it; so where one is missing, those after it stay silent.
-Control table backups, which no client is known to send, are answered with an instruction error. Of
-Protocol 1.0 the ping is answered, by a servo that is set to it.
+Input and output are bytes with times, so that tests and fuzzers need no port;
+:mod:`simulation.emulator.pty_bus` adds the pseudo-terminal. In group reads a servo answers after
+the previous one in the list, so servos after a missing one stay silent. Control table backups,
+which no known client uses, are answered with an instruction error. Servos that are set to Protocol
+1.0 answer only its ping.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _ITEM = struct.Struct("<BHH")  # ID, address, length
 
 
 class TimedReply(NamedTuple):
-    """Bytes to send ``delay`` seconds after the wire fell silent; ``late`` adds to that alone."""
+    """Bytes to send ``delay`` s after the wire is free; ``late`` delays only this reply."""
 
     delay: float
     data: bytes
@@ -50,7 +50,7 @@ class TimedReply(NamedTuple):
 
 
 class ServoBus:
-    """Servos sharing one wire and one plant. A damaged packet stays unanswered."""
+    """Servos that share one wire and one plant. Damaged packets are not answered."""
 
     def __init__(
         self,
@@ -63,10 +63,10 @@ class ServoBus:
         self.plant = plant
         self.faults = FaultSource(seed)
         self.parser = PacketParser()
-        self.lag = 0.0  # s by which what a reading shows may be older than its reply
-        self.packets = 0  # that came through
+        self.lag = 0.0  # s by which a reading may be older than its reply
+        self.packets = 0  # packets received
         self._now = -math.inf
-        self._due = -math.inf  # no servo does anything by itself before then
+        self._due = -math.inf  # no servo has an event before this time
 
     @classmethod
     def from_settings(
@@ -79,11 +79,11 @@ class ServoBus:
         factory: bool = False,
         t: float = 0.0,
     ) -> ServoBus:
-        """Return the settings' servos, one a joint, left first.
+        """Create the servos of the settings, one per joint, left first.
 
-        ``baud`` > 0 sets the servos to that rate, ``ids`` to others than the settings'; with
-        ``factory`` all else is as the maker delivers it. Raises ValueError for a rate the model
-        has not.
+        ``baud`` > 0 and ``ids`` replace the rate and the IDs of the settings. With ``factory`` all
+        other registers have their factory defaults. Raises ValueError for a rate that the model
+        does not support.
         """
         servos = settings.servos
         model = by_name(servos.model)
@@ -107,11 +107,11 @@ class ServoBus:
 
     @property
     def now(self) -> float:
-        """The time last advanced to [s]."""
+        """Time up to which the bus was advanced [s]."""
         return self._now
 
     def advance(self, t: float) -> None:
-        """Bring plant and servos to time t [s]; each servo's own events happen at their time."""
+        """Advance plant and servos to time t [s], with the events of each servo at their times."""
         if t <= self._now:
             return
         if t >= self._due:
@@ -125,17 +125,17 @@ class ServoBus:
         self._now = t
 
     def next_event(self) -> float:
-        """Return when a servo next acts by itself [s]; possibly too early, never too late."""
+        """Return the time of the next servo event [s]; it may be too early, but never too late."""
         return self._due
 
     # --- bytes -----------------------------------------------------------------------------
 
     def feed(self, data: bytes, t: float, baud: int = 0) -> bytes:
-        """Return the bus' answer to ``data`` that arrives at time t, all at once."""
+        """Return the answers to ``data``, which arrives at time t, without their delays."""
         return b"".join(reply.data for reply in self.exchange(data, t, baud))
 
     def exchange(self, data: bytes, t: float, baud: int = 0) -> list[TimedReply]:
-        """Return :meth:`feed`'s answers with their delays. ``baud`` 0 reaches all servos."""
+        """Return the answers to ``data`` with their delays. ``baud`` 0 reaches all servos."""
         if t >= self._due or t > self._now + self.lag:
             self.advance(t)
         replies: list[TimedReply] = []
@@ -171,8 +171,7 @@ class ServoBus:
         ]
 
     def fault(self, kind: str, value: float, t: float) -> None:
-        """Let a fault begin: one of LINE_FAULTS with its probability, or of SERVO_FAULTS with the
-        servo's ID."""
+        """Begin a fault; ``value`` is a probability for LINE_FAULTS, an ID for SERVO_FAULTS."""
         self._due = -math.inf
         if kind in LINE_FAULTS:
             setattr(self.faults.rates, kind.replace("-", "_"), value)
@@ -181,12 +180,12 @@ class ServoBus:
                 servo.fault(kind, t)
 
     def report(self, t: float) -> list[dict[str, Any]]:
-        """Report each servo's state, and the record of what it was sent."""
+        """Return the state and the record of each servo."""
         self.advance(t)
         return [servo.report(t) for servo in self.servos]
 
     def forget(self, t: float) -> None:
-        """Begin the record again."""
+        """Clear the records of all servos."""
         for servo in self.servos:
             servo.recorder = BusRecorder(t)
 
@@ -197,18 +196,18 @@ class ServoBus:
         if packet.id == BROADCAST:
             return self._broadcast(packet, servos, t)
         if instruction == framing.STATUS:
-            return []  # another servo's answer, or our own echo
-        # A status return level of 0 answers pings only, 1 reads too, 2 everything.
+            return []  # the answer of another servo, or an echo
+        # Status return level: 0 answers only pings, 1 also reads, 2 everything.
         needed = {framing.PING: 0, framing.READ: 1}.get(instruction, 2)
         replies = []
         for servo in servos:
             if servo.id == packet.id:
-                # Level, delay and ID as they were when the instruction came.
+                # The reply uses level, delay and ID from before the instruction.
                 level = servo.table.get(reg.STATUS_RETURN_LEVEL)
                 delay, name = servo.return_delay, servo.id
                 error, data = _execute(servo, instruction, packet.parameters, t)
                 if level >= needed:
-                    # The alert bit is taken after the instruction was done.
+                    # The alert bit is that from after the instruction.
                     status = framing.status(name, error | servo.alert, data)
                     replies.append(TimedReply(delay, status))
             elif servo.shadow == packet.id:
@@ -230,7 +229,7 @@ class ServoBus:
             _write_each(_sync_items(data), servos, t)
         elif instruction == framing.BULK_WRITE:
             _write_each(_bulk_items(data), servos, t)
-        else:  # what else a broadcast may ask is done without an answer
+        else:  # other broadcast instructions are executed without an answer
             for servo in servos:
                 guarded = servo.firmware >= _FACTORY_RESET_GUARD and data == b"\xff"
                 if instruction != framing.FACTORY_RESET or not guarded:
@@ -255,7 +254,7 @@ class ServoBus:
                     [_status(servo, *_execute(servo, framing.READ, span, t)) for servo in same]
                 )
                 continue
-            # Each CRC goes over all bytes before it, the earlier CRCs too.
+            # Each CRC covers all bytes before it, including the earlier CRCs.
             (servo,) = same
             values = servo.read(address, length, t)
             error = framing.ACCESS if values is None else framing.OK
@@ -266,15 +265,15 @@ class ServoBus:
             delay += servo.return_delay
         if not block:
             return replies
-        # The blocks follow each other as one packet; the delays before them add up.
+        # The blocks form one packet, and their delays add up.
         return [TimedReply(delay, block + piece)]
 
 
 @lru_cache(maxsize=32)
 def _requested(instruction: int, data: bytes) -> tuple[list[tuple[int, int, int]], bytes]:
-    """ID, address and length of each span that a group read asks for, and how a fast reply begins.
+    """Return (ID, address, length) of each part of a group read, and the head of a fast reply.
 
-    There are none where it is cut, or an ID stands in it twice.
+    The result is empty if the packet is incomplete or contains an ID twice.
     """
     requested: list[tuple[int, int, int]] = []
     if instruction not in _SYNC_READS:
@@ -322,7 +321,7 @@ def _status(servo: EmulatedServo, error: int, data: bytes = b"") -> TimedReply:
 
 
 def _execute(servo: EmulatedServo, instruction: int, data: bytes, t: float) -> tuple[int, bytes]:
-    """Let a servo do an instruction; error number and data of its reply."""
+    """Execute an instruction on a servo; return error number and data of the reply."""
     match instruction:
         case framing.PING:
             return framing.OK, struct.pack("<HB", servo.model.number, servo.firmware)
@@ -353,10 +352,10 @@ def _execute(servo: EmulatedServo, instruction: int, data: bytes, t: float) -> t
 
 
 def _at_once(replies: list[TimedReply]) -> list[TimedReply]:
-    """Replies of servos that share an ID come as one, garbled: a low bit wins.
+    """Return the replies of servos with the same ID as one garbled reply, in which 0 bits win.
 
-    Servos never begin at the same instant, so that even replies that are alike garble each other:
-    each begins a byte after the one before it.
+    Servos never start at exactly the same time, so even equal replies collide: each begins one byte
+    after the previous one.
     """
     if len(replies) < 2:
         return replies

@@ -1,9 +1,9 @@
-"""The physical side of an emulated servo: between its registers and a joint of the plant.
+"""Physical side of an emulated servo: the connection of its registers to a joint of the plant.
 
-`ServoJoint` maps counts to angles (turns, homing offset, drive direction), follows the profile,
-drives the plant as each operating mode asks, and writes the present values into the control table.
-`ServoHealth` is what the servo suffers: heat (`ServoHeat`), its supply, overload. A choice of our
-own, where the manuals say nothing: overload after OVERLOAD_TIME of current at the configured limit.
+`ServoJoint` converts counts to angles (turns, homing offset, drive direction), follows the profile,
+drives the plant according to the operating mode, and writes the present values to the control
+table. `ServoHealth` models heat (`ServoHeat`), supply voltage and overload. The manuals do not
+specify the time until overload; here it is OVERLOAD_TIME of current at the configured limit.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ from softfinger.daemon.servos.control_table import ServoModel, by_name
 from softfinger.daemon.servos.joint import JointScale
 from softfinger.daemon.simulation.servo_model.registers import ControlTable
 
-STEP = 0.001  # s: trajectories, velocity mode
+STEP = 0.001  # s, step of trajectories and velocity mode
 OVERLOAD_TIME = 2.0  # s at the current limit
-SENSE = 0.010  # s between two looks
+SENSE = 0.010  # s between checks of heat, voltage and overload
 _VOLTAGE = 0  # bit of the hardware error status
 POSITION_MODES = (
     reg.POSITION_MODE,
     reg.EXTENDED_POSITION_MODE,
     reg.CURRENT_BASED_POSITION_MODE,
 )
-_PER_VELOCITY = reg.VELOCITY_UNIT * reg.COUNTS_PER_TURN / (2.0 * math.pi)  # counts/s a count
+_PER_VELOCITY = reg.VELOCITY_UNIT * reg.COUNTS_PER_TURN / (2.0 * math.pi)  # counts/s per unit
 _PER_ACCELERATION = reg.ACCELERATION_UNIT * reg.COUNTS_PER_TURN / (2.0 * math.pi)
-_ARRIVED = 20  # counts from the goal that count as there
+_ARRIVED = 20  # counts, tolerance of arrival at the goal
 _PRESENT = struct.Struct("<HBBhhiiiiHB")  # registers 120 … 146
 
 
 class ServoJoint:
-    """Joint ``joint`` of ``plant`` as the servo with this control table sees it."""
+    """Joint ``joint`` of ``plant``, driven by a servo with the control table ``table``."""
 
     def __init__(
         self,
@@ -52,10 +52,10 @@ class ServoJoint:
         self._plant = plant
         self._joint = joint
         self._scale = scale
-        self.stuck: int | None = None  # where the encoder stands still [counts]
-        self.shift = 0  # counts that are added to the encoder
-        self._turns = 0  # whole turns that the position has forgotten
-        self._load = scale.direction / model.stall_current  # share of stall current, counts' sign
+        self.stuck: int | None = None  # reading of a stuck encoder [counts]
+        self.shift = 0  # error of the encoder's zero [counts]
+        self._turns = 0  # whole turns that were subtracted from the position
+        self._load = scale.direction / model.stall_current  # load per ampere, with the servo's sign
         self._speed = scale.direction * reg.VELOCITY_UNIT / scale.velocity / model.no_load_speed
 
     @property
@@ -70,7 +70,7 @@ class ServoJoint:
 
     @property
     def current_limit(self) -> float:
-        """The greatest current that the registers allow [A]."""
+        """Current limit of the registers [A]."""
         if not self._model.senses_current:
             return self._model.stall_current
         return self._table.get(reg.CURRENT_LIMIT) * self._model.current_unit
@@ -78,46 +78,46 @@ class ServoJoint:
     # --- position ----------------------------------------------------------------------------
 
     def encoder(self) -> int:
-        """Return the encoder's count, over all turns."""
+        """Return the count of the encoder over all turns."""
         if self.stuck is not None:
             return self.stuck
         return self._scale.position_counts(self._plant.q.item(self._joint)) + self.shift
 
     def forget_turns(self) -> int:
-        """Bring the position into one turn; by how many counts it fell."""
+        """Reset the position to a single turn; return its decrease [counts]."""
         before = self._turns
         self._turns = self.encoder() // reg.COUNTS_PER_TURN
         return self.sign * (self._turns - before) * reg.COUNTS_PER_TURN
 
     def position(self) -> int:
-        """Return present position in counts, as register 132 has it."""
+        """Return the present position in counts, as in register 132."""
         within = self.encoder() - self._turns * reg.COUNTS_PER_TURN
         return self.sign * within + self._table.get(reg.HOMING_OFFSET)
 
     def goal_angle(self, counts: float) -> float:
-        """Return joint angle [rad] that a goal position means."""
+        """Return the joint angle [rad] of a goal position."""
         within = self.sign * (counts - self._table.get(reg.HOMING_OFFSET))
         return self._scale.angle(within + self._turns * reg.COUNTS_PER_TURN)
 
     def goal_current(self, counts: int) -> float:
-        """Return the current [A] of a goal current, positive closing; a bound's sign is void."""
+        """Return a goal current [A], positive closing; for a limit the sign has no meaning."""
         return self._scale.amperes(self.sign * counts)
 
     # --- trajectory --------------------------------------------------------------------------
 
     def hold(self) -> None:
-        """End the trajectory where the shaft is."""
+        """End the trajectory at the present position."""
         self.profile.hold(self.position())
 
     def aim(self) -> None:
-        """Start the trajectory to the goal position as the profile registers ask."""
+        """Start a trajectory to the goal position according to the profile registers."""
         memory, table, profile = self._memory, self._table, self.profile
         if memory[reg.OPERATING_MODE] not in POSITION_MODES:
             return
         target = float(table.get(reg.GOAL_POSITION))
         acceleration, speed = table.get(reg.PROFILE_ACCELERATION), table.get(reg.PROFILE_VELOCITY)
         if not speed:
-            profile.hold(target)  # a profile velocity of 0 stands for no profile
+            profile.hold(target)  # a profile velocity of 0 disables the profile
         elif memory[reg.DRIVE_MODE] & 4:
             profile.aim_in(target, speed / 1000.0, acceleration / 1000.0)
         else:
@@ -125,14 +125,14 @@ class ServoJoint:
             profile.aim(target, speed * _PER_VELOCITY, acceleration * _PER_ACCELERATION)
 
     def moves_by_itself(self) -> bool:
-        """Return whether :meth:`follow` has work while torque is on."""
+        """Return True if :meth:`follow` must be called while torque is on."""
         mode = self._memory[reg.OPERATING_MODE]
         if mode in POSITION_MODES:
             return self.profile.busy
         return mode == reg.VELOCITY_MODE
 
     def follow(self) -> None:
-        """Advance whatever moves by itself by one STEP."""
+        """Advance the trajectory, or the position of velocity mode, by one STEP."""
         mode = self._memory[reg.OPERATING_MODE]
         if mode in POSITION_MODES:
             self.profile.step(STEP)
@@ -146,9 +146,9 @@ class ServoJoint:
     # --- plant -------------------------------------------------------------------------------
 
     def tune(self) -> None:
-        """Give the plant what gains and PWM registers ask for; the integral gain has no effect.
+        """Pass gains and PWM registers to the plant; the integral gain has no effect.
 
-        The servo's torque is K_P·error − K_D·Δposition a millisecond, with K_P = P / 128 and
+        The torque of the servo is K_P·error − K_D·Δposition per millisecond, with K_P = P / 128 and
         K_D = D / 16 (e-Manual, position PID gain).
         """
         get, (d, _, p) = self._table.get, self._model.position_gains
@@ -158,7 +158,7 @@ class ServoJoint:
         self._plant.tune(self._joint, stiffness, damping, duty)
 
     def drive(self) -> None:
-        """Command the plant by the registers."""
+        """Command the plant according to the registers."""
         memory, table, joint = self._memory, self._table, self._joint
         mode = memory[reg.OPERATING_MODE]
         if not memory[reg.TORQUE_ENABLE]:
@@ -175,7 +175,7 @@ class ServoJoint:
             self._plant.drive(joint, reg.POSITION_MODE, True, goal, self.current_limit)
 
     def refresh(self, seconds: float, voltage: float, temperature: float) -> None:
-        """Bring registers 120 … 146 up to date, ``seconds`` after power-up."""
+        """Update registers 120 … 146, ``seconds`` after power-up."""
         profile, memory, position = self.profile, self._memory, self.position()
         plant, joint, scale = self._plant, self._joint, self._scale
         current = velocity = pwm = 0
@@ -210,43 +210,43 @@ class ServoJoint:
 
 
 ROOM = 25.0  # °C
-_LAG = 4.0  # s, of the thermometer
-_CONVECTION = 0.006  # 1/K that the cooling grows by
-_LONGEST = 1.0  # s of a step
-_NEAR = 1e-6  # counts: below it the square root's rounding would never let the trajectory arrive
+_LAG = 4.0  # s, lag of the thermometer
+_CONVECTION = 0.006  # 1/K, relative increase of the cooling with the temperature difference
+_LONGEST = 1.0  # s, longest step
+_NEAR = 1e-6  # counts; without this tolerance, rounding of the square root prevents arrival
 
 
 class Profile:
-    """The trajectory to a goal, velocity- or time-based: where it is and how fast it goes.
+    """Trajectory to a goal, velocity- or time-based, with its position and velocity.
 
-    A limit of 0 means none.
+    A limit of 0 means no limit.
     """
 
     def __init__(self) -> None:
         self.position = 0.0  # counts
         self.velocity = 0.0  # counts/s
         self.target = 0.0
-        self.speed = 0.0  # greatest velocity, 0 = at once
-        self.acceleration = 0.0  # counts/s², 0 = at once
+        self.speed = 0.0  # velocity limit, 0: none [counts/s]
+        self.acceleration = 0.0  # acceleration limit, 0: none [counts/s²]
 
     @property
     def busy(self) -> bool:
-        """True while the trajectory still moves towards its target."""
+        """True while the trajectory has not reached its target."""
         return self.position != self.target or self.velocity != 0.0
 
     def hold(self, position: float) -> None:
-        """Stand still at a position."""
+        """Rest at a position."""
         self.position = self.target = position
         self.velocity = 0.0
 
     def aim(self, target: float, speed: float, acceleration: float) -> None:
-        """Go to a target with these limits (velocity-based profile)."""
+        """Set a target with velocity and acceleration limits (velocity-based profile)."""
         self.target, self.speed, self.acceleration = target, speed, acceleration
         if speed == 0.0 and acceleration == 0.0:
             self.hold(target)
 
     def aim_in(self, target: float, duration: float, ramp: float) -> None:
-        """Go to a target in ``duration`` seconds with ramps of ``ramp`` (time-based profile)."""
+        """Set a target to be reached in ``duration`` s, with ramps of ``ramp`` s (time-based)."""
         if duration <= 0.0:
             self.hold(target)
             return
@@ -255,7 +255,7 @@ class Profile:
         self.aim(target, speed, speed / ramp if ramp > 0.0 else 0.0)
 
     def step(self, dt: float) -> None:
-        """Go on by dt [s]: a trapezoid, which never passes its target."""
+        """Advance by dt [s] on a trapezoidal profile without overshoot."""
         distance = self.target - self.position
         if distance == 0.0 and self.velocity == 0.0:
             return
@@ -264,7 +264,7 @@ class Profile:
             return
         limit = self.speed if self.speed > 0.0 else math.inf
         if self.acceleration > 0.0:
-            # The speed from which it can still stop at the target, over the coming step too.
+            # Highest speed from which it can stop at the target, including the coming step.
             a = self.acceleration
             stop = math.sqrt(2.0 * a * abs(distance) + (a * dt / 2.0) ** 2) - a * dt / 2.0
             speed = math.copysign(min(limit, stop), distance)
@@ -281,12 +281,12 @@ class Profile:
 
 
 class ServoHeat:
-    """Heat of one servo. ``ambient`` [°C] may be changed at any time.
+    """Thermal model of one servo. ``ambient`` [°C] may be changed at any time.
 
-    Written apart from the daemon's own model (`kinematics.hand.servo_heat`), with other constants:
-    copper's resistance rises, the case cools by convection, which grows with what it is warmer, and
-    the thermometer on the board lags behind the case. ``heating``, ``cooling`` and ``capacity`` are
-    factors of the model's own.
+    It is independent of the daemon's model (`kinematics.hand.servo_heat`) and has other constants.
+    The resistance of copper increases with temperature, convection at the case increases with the
+    temperature difference, and the thermometer lags behind the case. ``heating``, ``cooling`` and
+    ``capacity`` are factors of the values of the servo model.
     """
 
     def __init__(
@@ -301,7 +301,7 @@ class ServoHeat:
 
     @classmethod
     def of(cls, settings: Settings) -> Self:
-        """Return a servo of the settings' model, as warm as the room."""
+        """Return a servo of the settings' model at ambient temperature."""
         simulation = settings.simulation
         heat = cls(by_name(settings.servos.model), *simulation.servo_heat)
         heat.ambient = simulation.ambient
@@ -309,15 +309,15 @@ class ServoHeat:
         return heat
 
     def cool(self) -> None:
-        """Bring all of it to the ambient temperature."""
+        """Set all temperatures to the ambient temperature."""
         self.winding = self.case = self.sensed = self.ambient
 
     def warm(self, temperature: float) -> None:
-        """Bring all of it to this temperature [°C]."""
+        """Set all temperatures to ``temperature`` [°C]."""
         self.winding = self.case = self.sensed = temperature
 
     def step(self, current: float, seconds: float) -> None:
-        """Go on by ``seconds`` with this ``current`` [A]."""
+        """Advance by ``seconds`` with a constant ``current`` [A]."""
         while seconds > 0.0:
             dt = min(seconds, _LONGEST)
             seconds -= dt
@@ -332,7 +332,10 @@ class ServoHeat:
 
 
 class ServoHealth:
-    """``supply`` [V], without a load, and ``heat`` may be changed from outside."""
+    """Supply voltage, heat and overload of a servo.
+
+    ``supply``, the voltage without load [V], and ``heat`` may be changed from outside.
+    """
 
     def __init__(self, model: ServoModel, heat: ServoHeat | None = None) -> None:
         self._model = model
@@ -348,17 +351,17 @@ class ServoHealth:
 
     @property
     def voltage(self) -> float:
-        """V, by so much less as its current takes on the way."""
+        """Supply voltage less the voltage drop due to the servo's current [V]."""
         return self.supply - reg.SAG * self._current
 
     def restart(self) -> None:
-        """Restart as after a power-up: what was warm stays warm."""
+        """Restart as after a power-up; temperatures stay."""
         self._overload = 0.0
 
     def sense(self, table: ControlTable, current: float, pressed: bool) -> list[int]:
-        """Return, SENSE later, the bits of the hardware errors that there are now.
+        """Advance by SENSE seconds and return the bits of the present hardware errors.
 
-        ``current`` [A] flows; ``pressed``: it is at the configured limit.
+        ``current`` is in A; ``pressed`` is True if it is at the configured limit.
         """
         self._current = abs(current)
         self.heat.step(current, SENSE)
