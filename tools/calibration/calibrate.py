@@ -182,7 +182,7 @@ def calibrate_scales(arguments: argparse.Namespace, settings: Settings) -> str:
     """Write a finger's calibration factors to its file and return the line to print.
 
     A sensor's gain changes when the sensor is mounted again, and the modulus of a tip may be known
-    only roughly. A grip measures both (`daemon.perception.hand_channels`), and a daemon that starts
+    only roughly. A grip measures both (`daemon.perception.hand_state`), and a daemon that starts
     with these factors reaches the right force in its first grip.
 
     Raises
