@@ -48,7 +48,6 @@ class GraspState(Record):
 
     # Load along the faces: it causes the mean residual load_arm L + load_curvature L².
     torque_residual: Pair  # joint torque that only a load along the faces explains [N·m]
-    torque_std: float  # uncertainty of the mean residual by the tips' forces [N·m]
     load_arm: float  # [m]; 0: the torques show no load
     load_curvature: float  # [m/N]
     pull_shear: float  # shear of a pull in the newest frames of solid tips [N]

@@ -235,9 +235,6 @@ def write_grasp(hands: Records[HandFilter], table1: FloatArray, table2: FloatArr
     grasp.torque_residual[1] = modulus2 * residual2
     grasp.load_curvature = 2.0 * curvature / (modulus1 + modulus2)
     _write_shear(h)
-    _set_torque_slopes(h)
-    grasp.torque_std = math.sqrt(expected_variance(h))
-    h.slopes[:] = 0.0
     if (left.has_new_frame or right.has_new_frame) and left.in_contact and right.in_contact:
         left.has_new_frame = right.has_new_frame = False
         if grasp.load_arm > 0.0 and dt > 0.0:

@@ -29,7 +29,6 @@ RETURN_DELAY_MAX: Final = 25
 DRIVE_UNFIT: Final = 0b1010
 PWM_FULL: Final = 885
 _STARTUP_FIRMWARE = 45
-_NO_ID = 253  # shadow IDs from here on are disabled
 _POSITION_MAX = reg.COUNTS_PER_TURN - 1
 
 
