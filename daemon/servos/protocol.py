@@ -53,7 +53,7 @@ _STATUS_SIZE = 11  # bytes of a status packet without data
 _FAST_SYNC_READ = 0x8A  # not defined by dynamixel-sdk 3
 _OLD_HEADER = b"\xff\xff"  # Protocol 1.0: header, ID, length, instruction or error, checksum
 _OLD_STATUS = 6  # bytes of a reply to a ping in Protocol 1.0
-_OLD_WAIT = 0.1  # s
+_OLD_WAIT = 0.5  # s; an emulated servo on a busy machine takes longer than 0.1 s
 _ERROR = 0x7F  # error code in a servo's error byte; the highest bit is the alert
 
 
