@@ -96,7 +96,7 @@ def test_the_page_grasps_and_turns_as_our_plant_does(monkeypatch, timestep):
     backends._plugin.cache_clear()
     code = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.S)[-1]
     names: dict[str, Any] = {}
-    exec(code.partition("# Beside")[0].replace("0.001", str(timestep)), names)
+    exec(code.partition("# Compare")[0].replace("0.001", str(timestep)), names)
     ours, mujocos = (names["turned"](backend) for backend in ("simulated", "mujoco"))
     backends._plugin.cache_clear()
     assert math.degrees(mujocos.angle[-1]) == pytest.approx(math.degrees(ours.angle[-1]), abs=0.5)
