@@ -1,7 +1,8 @@
-"""Generate pages and tables of the documentation site from the code and from project files.
+"""Generate documentation pages and tables from the code and from project files.
 
-MkDocs calls the functions named ``on_…`` (``hooks`` in mkdocs.yml). `PAGES` has whole pages, and
-`TABLES` has tables within pages. Every figure that the code can compute is generated here.
+MkDocs calls the functions named ``on_…`` (``hooks`` in mkdocs.yml). `PAGES` contains complete
+pages, and `TABLES` contains tables within pages. All numbers that the code can compute are
+generated here.
 """
 
 from __future__ import annotations
@@ -23,12 +24,12 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def _from(name: str) -> Callable[[], str]:
-    """Return a function that reads a page from a file of the project."""
+    """Return a function that reads a page from a project file."""
     return lambda: (ROOT / name).read_text(encoding="utf-8")
 
 
 def _program(name: str) -> Callable[[], str]:
-    """Return a function that makes a page of a program's source."""
+    """Return a function that shows a program's source as a page."""
     return lambda: f"# {Path(name).stem}\n\n```python\n{_from(name)()}```\n"
 
 
@@ -55,19 +56,21 @@ def _signed(value: float, form: str) -> str:
 _SETTINGS = """\
 # Settings
 
-A profile is a TOML file with the settings that differ from the defaults below, which are those of
-the built-in simulated hand. To change a setting for one run, write `--set loop.rate=1000`. Units
-are SI unless stated otherwise, and pairs are [left, right]. A hand may have one finger or two, and
-may lack servos or sensors.
+A profile is a TOML file with the settings that differ from the defaults below, which describe the
+built-in simulated hand. To change a setting for one run, add an option such as
+`--set loop.rate=1000`. Units are SI unless stated otherwise, and pairs are [left, right]. A hand
+can have one or two fingers, and servos or sensors can be omitted.
 
-Unknown keys, wrong types and numbers out of range are reported together at the start. Errors that
-only show while the models are built follow: a contact table that cannot reach `table.tolerance`, a
-law that misses its measured points, a calibration file that does not fit.
+At startup, all unknown keys, wrong types and numbers out of range are reported together. Some
+errors can only be detected when the models are built: a contact table that cannot reach
+`table.tolerance`, a material law that does not fit its measured points, or a calibration file that
+does not match the profile. These errors are reported afterwards.
 
-`softfinger config reference SECTION` prints a section in the terminal.
+To print a section in the terminal, run `softfinger config reference SECTION`.
 
-Editors complete and check keys with the JSON schema that the first line of the packaged profiles
-names (Even Better TOML in VS Code, Taplo in others). Begin a profile of your own with both:
+Editors can complete and check keys with a JSON schema (Even Better TOML in VS Code, Taplo in other
+editors). The first line of each packaged profile names the schema file. To start your own profile,
+create both files:
 
 ```sh
 softfinger config show hil > my.toml
@@ -76,14 +79,14 @@ softfinger config schema > schema.json
 
 ## Profiles
 
-`--config hil` finds one of these by its name, wherever softfinger is installed; a path names a
-profile of your own.
+These profiles are installed with softfinger. Select one by its name, for example `--config hil`, or
+select your own profile by its path.
 
 """
 
 
 def configuration() -> str:
-    """List every section and key of a profile, from their declarations."""
+    """List all sections and keys of a profile from their declarations."""
     from softfinger.daemon.profile import reference
 
     parts = [_SETTINGS, _head("profile", "description"), *_profiles()]
@@ -100,7 +103,7 @@ def configuration() -> str:
 
 
 def _profiles() -> list[str]:
-    """Return a row of the table for each profile of the package."""
+    """Return a table row for each packaged profile."""
     from softfinger.daemon.profile.load import names
     from softfinger.tools.setup.config import subject
 
@@ -111,7 +114,7 @@ def _profiles() -> list[str]:
 
 
 def stream() -> str:
-    """List every topic and field, from the schema."""
+    """List all topics and fields from the schema."""
     from softfinger.daemon.wire.schema_docs import page
 
     return page()
@@ -121,17 +124,18 @@ def stream() -> str:
 
 
 def commands() -> str:
-    """List the commands of the hand, from the table of modes."""
+    """List the hand's commands from the table of modes."""
     from softfinger.daemon.control.modes import COMMANDS, Mode
     from softfinger.daemon.types import UNLEASED
     from softfinger.tools.terminal.send import _EPILOG
 
     parts = [
-        "# Commands to the hand\n\nSend a command with `softfinger send`, with a method of "
+        "# Commands to the hand\n\nYou can send a command with `softfinger send`, with a method of "
         "[`Hand`](api.md), or as a msgpack map on a REQ socket ([the stream](stream.md#commands)). "
         "All three use the same names:\n\n"
-        f"```text\n{_EPILOG}\n```\n\nEach command is accepted only in some modes. Most commands "
-        "need the lease: while a client has it, other clients cannot command the hand.\n\n",
+        f"```text\n{_EPILOG}\n```\n\nEach command is only accepted in certain modes. Most commands "
+        "need the lease. While one client has the lease, other clients cannot command the "
+        "hand.\n\n",
         _head("command", "parameters", "accepted in the modes", "needs the lease"),
     ]
     for name, (modes, numbers) in COMMANDS.items():
@@ -146,7 +150,7 @@ def command_line() -> str:
     """Show the help of every subcommand."""
     from softfinger.tools.cli import SUBCOMMANDS, make_parser
 
-    os.environ["COLUMNS"] = "100"  # the width that argparse wraps to
+    os.environ["COLUMNS"] = "100"  # width at which argparse wraps
     parser, _ = make_parser(SUBCOMMANDS)
     parts = [f"# The command line\n\n```text\n{parser.format_help()}```\n"]
     for name, subparser in _children(parser).items():
@@ -157,7 +161,7 @@ def command_line() -> str:
 
 
 def _children(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
-    """Return the parsers of a parser's subcommands by name."""
+    """Return the subcommand parsers of ``parser`` by name."""
     found: dict[str, argparse.ArgumentParser] = {}
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
@@ -171,23 +175,23 @@ def _children(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentPar
 _LIMITS = """\
 # Limits
 
-The daemon checks these limits while a hand runs. The numbers are those of the built-in hand. For
-your profile, use `softfinger limits --config FILE`.
+The daemon checks these limits while a hand is running. The values are those of the built-in hand.
+To list the limits of your profile, run `softfinger limits --config FILE`.
 
-A limit has one of three levels:
+Each limit has one of three levels:
 
-- `warn`: the daemon reports it.
-- `limit`: the daemon changes the goal.
+- `warn`: the daemon reports the violation.
+- `limit`: the daemon restricts the goal.
 - `fault`: the daemon turns torque off until `clear`.
 
-The reaction time counts from the first reading or frame that exceeds the bound. If a setting is an
-age, add it to the reaction time.
+The reaction time starts with the first reading or frame that exceeds the limit. If the setting is
+an age, add it to the reaction time.
 
 """
 
 
 def limits() -> str:
-    """List every limit with its quantity, level, reaction time and settings."""
+    """List all limits with their quantities, levels, reaction times and settings."""
     from softfinger.daemon.profile.settings import Settings
     from softfinger.daemon.safety.limits import LIMITS
     from softfinger.tools.setup.limits import _values
@@ -203,7 +207,7 @@ def limits() -> str:
         lasts = getattr(settings.safety, row.lasts) if isinstance(row.lasts, str) else row.lasts
         after = f"{lasts:g} s + " if lasts else ""
         if row.in_turn:
-            turns = 2 if lasts else 1  # one to detect it, one to see that it lasts
+            turns = 2 if lasts else 1  # one to detect the violation, one to confirm it
             when = f"{after}up to {turns * taking_turns * tick:g} ms"
         elif row.check:
             when = f"{after}a tick ({tick:g} ms)"
@@ -220,18 +224,18 @@ def limits() -> str:
 _EVENTS = """\
 # Events
 
-The daemon reports what happens as events: on the topic [`hand/event`](stream.md), in its log, and
-in `softfinger monitor` and `view`. An event has a level, a kind and a text. The text has the
-details of the case; this table explains the kinds.
+The daemon publishes events on the topic [`hand/event`](stream.md). They also appear in its log and
+in `softfinger monitor` and `view`. Each event has a level, a kind and a text. The text gives the
+details, and this table explains the kinds.
 
-An error whose kind [Limits](limits.md) lists as a `fault` turns torque off. Remove its cause, then
-send `clear`.
+If [Limits](limits.md) lists the kind of an error as a `fault`, the error turns torque off. Remove
+its cause, then send `clear`.
 
 """
 
 
 def events() -> str:
-    """List every kind of event, from the table that explains them."""
+    """List all kinds of events from the table that explains them."""
     from softfinger.daemon.wire.event_kinds import KINDS
 
     parts = [_EVENTS, _head("kind", "level", "cause", "what to do")]
@@ -244,7 +248,7 @@ def events() -> str:
 
 
 def api() -> str:
-    """Describe the public names of the package by their docstrings."""
+    """List the public names of the package with their docstrings."""
     import softfinger
 
     parts = [
@@ -263,7 +267,7 @@ def api() -> str:
 
 
 def checkpoints() -> str:
-    """Evaluate the closed forms at a few displacements and tilts."""
+    """Tabulate the closed forms for several displacements and tilts."""
     from softfinger.kinematics.contact.closed_form import closed_forms
 
     rows = []
@@ -275,7 +279,7 @@ def checkpoints() -> str:
 
 
 def rates() -> str:
-    """Tabulate the slope of force and energy over the tilt at 25°, by the paper's integrals."""
+    """Tabulate the slopes of force and energy versus tilt at 25° from the paper's integrals."""
     from softfinger.tools.paper.model_pages import DEPTHS, ENERGY, FORCE
 
     heads = ("d [mm]", *(f"d = {d}" for d in DEPTHS))
@@ -288,7 +292,7 @@ def rates() -> str:
 
 
 def exponents() -> str:
-    """Tabulate the exponent of the displacement for both laws, from 1 to 8 mm."""
+    """Tabulate the exponent of d for both material laws, fitted from 1 to 8 mm."""
     from softfinger.tools.paper.model_pages import ENERGY, FORCE, over_depth
 
     force, energy = (over_depth("", each)[1] for each in (FORCE, ENERGY))
@@ -302,7 +306,7 @@ def exponents() -> str:
 
 
 def early_minimum() -> str:
-    """Tabulate the angles of least force and energy if a share of the rolling shears the tip."""
+    """Tabulate the angles of minimum force and energy if part of the rolling shears the tip."""
     from softfinger.tools.paper.model_pages import DEPTHS
     from softfinger.tools.paper.sheared_rolling import sheared_rolling
 
@@ -344,7 +348,7 @@ def upright_forces() -> str:
 
 
 def minimum_strength() -> str:
-    """Tabulate c, the rise of the energy with the tilt near upright, for each kind of tip."""
+    """Tabulate c, the increase of the energy with tilt near upright, for each kind of tip."""
     from softfinger.kinematics.contact.closed_form import Fingertip
     from softfinger.kinematics.contact.material import Material
     from softfinger.kinematics.contact.table import ContactTable
@@ -367,7 +371,7 @@ def minimum_strength() -> str:
 
 
 def _grips() -> list[tuple[str, float, float, float, float]]:
-    """Compute name, d [m], q [rad], c and upright spring [N·m/rad] of grips of 10 N on 40 mm."""
+    """Compute name, d [m], q [rad], c and upright spring [N·m/rad] for 10 N grips on 40 mm."""
     from softfinger.daemon.profile.factory import make_material, make_table
     from softfinger.daemon.profile.settings import Settings
     from softfinger.kinematics.hand.upright import upright_spring
@@ -409,7 +413,10 @@ def upright_grips() -> str:
 
 
 def _left_of(spring: float, d: float, q: float, c: float) -> float:
-    """Return φ/φ0 by the closed form of `kinematics.hand.upright`, for the built-in hand [m]."""
+    """Return φ/φ0 of the built-in hand from the closed form in `kinematics.hand.upright`.
+
+    ``spring`` is in N·m/rad and ``d`` in m.
+    """
     inward, radius = 0.080 * math.sin(q), 0.020
     b = spring / (_FORCE * 0.050)
     line = _WIDTH * (2.0 * inward + (1.0 - 2.0 * c) * d - b * (_WIDTH - d))
@@ -444,7 +451,7 @@ def relaxations() -> str:
 
 
 def errata() -> str:
-    """List the errata that `softfinger figures` marks, without duplicates."""
+    """List the errata that `softfinger figures` marks, each one once."""
     from softfinger.tools.paper.figures import pages
 
     found = dict.fromkeys(each for page in pages().values() for each in page.errata)
@@ -454,7 +461,7 @@ def errata() -> str:
 
 
 def servos() -> str:
-    """List the known servo models, their forces at the tip, and the bounds to set for them."""
+    """List the supported servo models, their tip forces, and the limits to set for them."""
     from softfinger.daemon.servos.control_table import MODELS
 
     columns = ("V", "stall [N·m at A]", "N·m/A", "force [N]", "current_max [A]", "force_max [N]")
@@ -474,7 +481,7 @@ def servos() -> str:
 
 
 def _stored(name: str) -> tuple[str, list[dict[str, Any]]]:
-    """Read the machine and the rows from a file in docs/ that `softfinger bench --json` wrote."""
+    """Read the machine and the rows from the output of `softfinger bench --json` in docs/."""
     content = json.loads((ROOT / "docs" / name).read_text(encoding="utf-8"))
     load = " to ".join(f"{each:.1f}" for each in content["load"])
     about = f"{content['machine']}, {content['cores']} cores, load {load}.\n"
@@ -489,7 +496,7 @@ def _shown(rows: Iterable[dict[str, Any]], keys: Sequence[str]) -> Iterable[list
 
 
 def measured() -> str:
-    """Tabulate the figures in docs/benchmarks.json, of a `softfinger bench` without names."""
+    """Tabulate docs/benchmarks.json, the results of all default benchmarks."""
     about, rows = _stored("benchmarks.json")
     keys = ("median", "p99", "unit", "aim ≤", "relative error", "RMS of d [µm]")
     parts = [about]
@@ -501,7 +508,7 @@ def measured() -> str:
 
 
 def _control(table: int) -> str:
-    """Return one of the tables in docs/control.json, of a `softfinger bench control`."""
+    """Return one of the tables in docs/control.json, the results of `softfinger bench control`."""
     _, rows = _stored("control.json")
     titles = list(dict.fromkeys(row["table"] for row in rows))
     shown = (row for row in rows if row["table"] == titles[table])
@@ -510,7 +517,7 @@ def _control(table: int) -> str:
 
 
 def control_late() -> str:
-    """Tabulate the remaining angle with delayed angles, from the third table of that file."""
+    """Tabulate the remaining angle for delayed measurements, from the third table of that file."""
     _, rows = _stored("control.json")
     found: dict[str, dict[str, str]] = {}
     for row in rows:
@@ -526,7 +533,7 @@ def control_late() -> str:
 
 
 def held_loads() -> str:
-    """Count the sudden loads that each simulated hand held, from docs/reflex.json."""
+    """Tabulate the fraction of sudden loads that each simulated hand held (docs/reflex.json)."""
     _, rows = _stored("reflex.json")
     found: dict[str, dict[str, list[int]]] = {}
     for row in rows:
@@ -545,7 +552,7 @@ def held_loads() -> str:
 
 
 def envelope_map() -> str:
-    """Tabulate the heaviest mass that the built-in hand holds, with all lighter masses."""
+    """Tabulate the mass up to which the built-in hand holds all tested objects."""
     from softfinger.daemon.control.envelope import HELD
 
     found = tomllib.loads((ROOT / "daemon/control/envelope.toml").read_text(encoding="utf-8"))
@@ -610,7 +617,7 @@ PAGES: dict[str, Callable[[], str]] = {
     "events.md": events,
     "api.md": api,
 }
-# Pages of the site for links to files of the project.
+# Pages that replace links to project files.
 _LINKS = {
     "README.md": "index.md",
     "CONTRIBUTING.md": "contributing.md",
@@ -627,7 +634,7 @@ _LINKS = {
 
 
 def on_config(config: Any) -> Any:
-    """Show the version and the licence at the foot of every page."""
+    """Show the version and the licence in the footer of each page."""
     from softfinger import __version__
 
     config.copyright = f"softfinger {__version__}, MIT licence"
@@ -644,7 +651,7 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Insert generated tables, and point links to files of the repository to pages of the site."""
+    """Insert generated tables, and convert links to repository files to links to pages."""
     markdown = re.sub(
         r"\s*<!-- table: (\w+) -->", lambda found: f"\n\n{TABLES[found[1]]()}", markdown
     )

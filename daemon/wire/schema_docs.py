@@ -28,13 +28,13 @@ This page is generated from `daemon/wire/schema.py` by
 This is schema {SCHEMA}. A message has two frames: the topic, and a msgpack map with text keys.
 Values are in SI units. A field named `left.q` is `q` in the map `left`. Messages always contain all
 fields. New versions may add fields, but never remove a field or change its type: a float is always
-sent as a float. Integers are sent in msgpack's smallest form, so JavaScript reads integers below
-2³² as numbers. It may read `mono_ns` as BigInt.
+sent as a float. Integers use the shortest msgpack format, so JavaScript reads integers below 2³² as
+numbers. It may read `mono_ns` as BigInt.
 
-A subscriber that only needs the newest state can use `ZMQ_CONFLATE`. That option does not support
-messages of two frames, so set `stream.latest = "tcp://127.0.0.1:9874"` in the profile. The daemon
-then also publishes each `hand/state` on that address, as a single frame with the map. Subscribe to
-all messages there:
+A subscriber that only needs the newest state can use `ZMQ_CONFLATE`. This option does not support
+two-frame messages, so set `stream.latest = "tcp://127.0.0.1:9874"` in the profile. The daemon then
+also publishes each `hand/state` at this address, as a single frame that contains the map. Subscribe
+to all messages there:
 
 ```python
 newest = zmq.Context.instance().socket(zmq.SUB)
@@ -44,10 +44,10 @@ newest.connect("tcp://127.0.0.1:9874")
 state = msgpack.unpackb(newest.recv())
 ```
 
-`timestamp` is Unix time. Use `mono_ns`, the daemon's clock, for time differences. It is the
-machine's monotonic clock. With a hand simulated in the daemon, this clock waits while the machine
-is too busy to keep up (`loop.clock`, `behind_s`). Durations (`tick_s`, `compute_s`, `hand/stats`)
-are always in the machine's time.
+`timestamp` is Unix time. For time differences, use `mono_ns`, the daemon's clock, which is the
+machine's monotonic clock. If the daemon simulates the hand, this clock waits while the machine is
+too busy to keep up (`loop.clock`, `behind_s`). Durations (`tick_s`, `compute_s`, `hand/stats`) are
+always measured in the machine's time.
 """
 
 
@@ -56,7 +56,7 @@ _COMMANDS = """\
 
 A command is one msgpack map, for example `{"command": "grasp", "force": 5.0}`. The reply is also a
 map: `{"ok": true, …}` or `{"ok": false, "error": …, "reason": …}`. `error` is a message for the
-user, and `reason` is one of these texts:
+user, and `reason` is one of these words:
 
 | reason | meaning |
 |---|---|
@@ -66,20 +66,20 @@ _KEYS = """\
 
 Send commands from a REQ socket, with or without `REQ_CORRELATE`, or from a DEALER socket. As with a
 REP socket, the reply begins with all frames of the request up to the first empty one. A DEALER
-socket may omit the empty frame; the reply then has none either. A command in several frames, or in
-an envelope of more than 14 frames or 1,024 bytes, is refused with the reason `request`.
+socket may omit the empty frame; the reply then omits it as well. A command with several frames, or
+with an envelope of more than 14 frames or 1,024 bytes, is rejected with the reason `request`.
 
-After a stall of the daemon, waiting commands are older than their clients expected. `arm` and all
-commands that move the hand or change its grip are refused as `late` if they are older than 0.2 s
-(or `servos.watchdog`, if that is shorter). `disarm`, `tare`, `clear`, and a `hold` while the hand
-grips, are accepted up to an age of 1 s. `status` and `stop` are always accepted.
+After a stall of the daemon, the waiting commands are older than their clients expected. `arm` and
+all commands that move the hand or change its grip are rejected as `late` if they are older than
+0.2 s or `servos.watchdog`, whichever is shorter. `disarm`, `tare`, `clear`, and a `hold` while the
+hand grips are accepted up to an age of 1 s. `status` and `stop` are always accepted.
 
-To repeat a late command safely, give it a `key`: a unique text of 1 to 64 characters, for example a
-random number. Then send the same map again. The daemon carries out the command at most once, and
-answers a repetition with the first reply. It refuses the repetition as `stopped` if the hand was
-stopped after the first refusal, and as `superseded` if it has carried out another command since
-then. `disarm` needs no key; it is carried out every time. `Hand`, `AsyncHand`, `softfinger send`,
-`monitor` and `view` repeat late commands automatically.
+To make a late command safe to repeat, give it a `key`: a unique text of 1 to 64 characters, for
+example a random number. Then send the same map again. The daemon executes the command at most once
+and responds to a repetition with the first reply. A repetition is rejected as `stopped` if the hand
+was stopped after the first rejection, and as `superseded` if another command has been executed
+since then. `disarm` does not need a key, because it is executed every time. `Hand`, `AsyncHand`,
+`softfinger send`, `monitor` and `view` repeat late commands automatically.
 """
 
 
