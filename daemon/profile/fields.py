@@ -10,8 +10,8 @@ from pydantic_core import PydanticCustomError
 from softfinger.daemon.backends import Kind, backend, known, known_servo_models
 from softfinger.daemon.errors import PluginError
 
-# Every number is bounded on both sides, because implausible values are typing errors and must not
-# reach an integral. Bounds are open or closed as the quantity requires.
+# Every number has two bounds, because implausible values are typing errors and must not reach an
+# integral. Whether a bound itself is allowed depends on the quantity.
 Positive = Annotated[float, Field(ge=1e-9, le=1e9, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False)]
 Finite = Annotated[float, Field(ge=-1e9, le=1e9, allow_inf_nan=False)]
@@ -41,11 +41,11 @@ def setting(default: Any, unit: str, description: str, **options: Any) -> Any:
     Parameters
     ----------
     default
-        The value of the built-in simulated hand.
+        Value of the built-in simulated hand.
     unit
         SI unit of the value or of each of its elements; empty if it has none.
     description
-        The meaning in plain English, one or two sentences.
+        Meaning of the value, in one or two sentences.
     **options
         Bounds and examples, as in :func:`pydantic.Field`.
     """
@@ -55,16 +55,16 @@ def setting(default: Any, unit: str, description: str, **options: Any) -> Any:
 
 
 class Section(BaseModel):
-    """Base of all sections: immutable, without type conversion, and unknown keys are errors.
+    """Base class of all sections: immutable and strict.
 
-    An integer is accepted for a float; a string is never converted.
+    Unknown keys are errors. An integer is accepted for a float, but strings are never converted.
     """
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
 
 def names_backend(kind: Kind) -> AfterValidator:
-    """Validate the name of a backend, with errors worded like pydantic's for a Literal."""
+    """Return a validator of backend names whose errors are worded like those of a Literal."""
 
     def check(name: str) -> str:
         try:

@@ -1,7 +1,7 @@
 """Generate the reference of all settings from their declarations.
 
-``python -m softfinger.daemon.profile.reference`` writes ``config/sim.toml``, the built-in simulated
-hand with every key explained, and ``config/schema.json``, the JSON schema for editors.
+``python -m softfinger.daemon.profile.reference`` writes ``config/sim.toml``, which describes every
+key of the built-in simulated hand, and ``config/schema.json``, the JSON schema for editors.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ import softfinger
 from softfinger.daemon.profile.fields import Section
 from softfinger.daemon.profile.settings import Settings
 
-_WIDTH = 100  # columns of sim.toml
-_NO_BOUND = 1e9  # larger bounds only catch typing errors
+_WIDTH = 100  # maximum line length of sim.toml
+_NO_BOUND = 1e9  # bounds of this size only catch typing errors and are not shown
 _HEAD = """\
 #:schema ./schema.json
-# The built-in simulated hand, with every setting: `softfinger run` without a profile is the same as
-# with this file. A profile of your own needs only the settings that differ. Units are SI unless
-# stated otherwise; pairs are [left, right].
+# The built-in simulated hand, with every setting at its default. `softfinger run` without a profile
+# starts this hand. Your own profile needs only the settings that differ. Units are SI unless stated
+# otherwise; pairs are [left, right].
 """
 
 

@@ -23,17 +23,20 @@ from softfinger.daemon.profile.fields import (
 
 
 class SimulationSettings(Section):
-    """The plant behind simulated backends and the emulated hand; its defaults are our choice."""
+    """The simulated hand of the simulated backends and of `softfinger emulate`.
 
-    seed: int = setting(1, "", "Seed of noise and faults.", ge=0)
+    The default values are plausible, but not measured.
+    """
+
+    seed: int = setting(1, "", "Random seed of noise and faults.", ge=0)
     object_mass: Factor = setting(0.10, "kg", "Mass of the object.")
     object_shape: Annotated[str, names_backend("shapes")] = setting(
         "rectangle", "", "Shape of the object in the hand's plane.", examples=[*BUILT_IN["shapes"]]
     )
     object_width: Length = setting(
-        0.040, "m", "Width of the object; of a wedge, at half its height."
+        0.040, "m", "Width of the object; for a wedge, the width at half its height."
     )
-    object_height: Length = setting(0.060, "m", "Height of the object, away from the palm.")
+    object_height: Length = setting(0.060, "m", "Size of the object, away from the palm.")
     object_radius: Length = setting(0.020, "m", "Radius of a disc.")
     object_taper: float = setting(
         0.17, "rad", "Angle between the faces of a wedge.", ge=-1.5, le=1.5
@@ -45,102 +48,103 @@ class SimulationSettings(Section):
     gravity: tuple[Acceleration, Acceleration] = setting(
         (0.0, 0.0),
         "m/s²",
-        "Gravity (x, y) in the hand's plane; by default the hand lies on a table.",
+        "Gravity (x, y) in the hand's plane; the default hand lies on a table.",
     )
-    table_friction: NonNegative = setting(
-        0.3, "", "Coulomb coefficient of the object on the table on which the hand lies."
-    )
-    tip_friction: NonNegative = setting(0.6, "", "Coulomb coefficient of tip on object.")
+    table_friction: NonNegative = setting(0.3, "", "Friction coefficient between object and table.")
+    tip_friction: NonNegative = setting(0.6, "", "Friction coefficient between tip and object.")
     modulus_scale: Factor = setting(
-        1.0, "", "Modulus of the simulated tips over that of the profile's material."
+        1.0, "", "Modulus of the simulated tips divided by the modulus of the profile's material."
     )
-    tactile_noise: NonNegative = setting(1520.0, "Pa", "Standard deviation of a cell's noise.")
+    tactile_noise: NonNegative = setting(1520.0, "Pa", "Standard deviation of the noise of a cell.")
     tactile_gain: tuple[Factor, Factor] = setting(
-        (1.0, 1.0), "", "Gain of each sensor: reading over pressure."
+        (1.0, 1.0), "", "Gain of each sensor: reading divided by pressure."
     )
     tactile_gain_spread: Fraction = setting(
-        0.0, "", "Relative standard deviation of the cells' gains."
+        0.0, "", "Relative standard deviation of the cell gains."
     )
     tactile_dead: Fraction = setting(
-        0.0, "", "Share of cells that read 0, in addition to `tactile.dead`."
+        0.0, "", "Fraction of cells that read 0, in addition to `tactile.dead`."
     )
     tactile_blur: float = setting(
-        0.0, "m", "Standard deviation of the blur by the layer above the cells.", ge=0, le=0.1
+        0.0, "m", "Standard deviation of the blur due to the layer above the cells.", ge=0, le=0.1
     )
     tactile_hysteresis: Fraction = setting(
-        0.0, "", "Relative excess of the reading while a cell is unloaded."
+        0.0, "", "Relative excess of the reading while the load on a cell decreases."
     )
     tactile_creep: Fraction = setting(
-        0.0, "", "Relative rise of the reading under constant pressure."
+        0.0, "", "Relative increase of the reading under constant pressure."
     )
-    tactile_creep_time: Positive = setting(10.0, "s", "Time constant of that rise.")
+    tactile_creep_time: Positive = setting(10.0, "s", "Time constant of this increase.")
     tactile_response: Delay = setting(0.0, "s", "Time constant of the cells' first-order lag.")
     tactile_exponent: Factor = setting(
-        1.0, "", "Exponent of the pressure in the cells' characteristic."
+        1.0, "", "Exponent of the cells' characteristic curve, reading versus pressure."
     )
     tactile_fold: NonNegative = setting(
-        0.0, "Pa", "Pressure above which the reading of a cell falls again; 0: never."
+        0.0, "Pa", "Pressure above which the reading of a cell decreases again; 0: never."
     )
     tactile_crosstalk: Fraction = setting(
-        0.0, "", "Share of the mean of its row and column that a cell reads in addition."
+        0.0, "", "Fraction of the mean of its row and column that is added to each cell."
     )
     tactile_row_noise: NonNegative = setting(
         0.0, "Pa", "Standard deviation of the noise that all cells of a row share."
     )
     tactile_drift: NonNegative = setting(
-        0.0, "Pa", "Standard deviation of the drift of each cell's zero."
+        0.0, "Pa", "Standard deviation of the zero drift of each cell."
     )
     tactile_gain_drift: Fraction = setting(
-        0.0, "", "Relative standard deviation of the drift of the sensor's gain."
+        0.0, "", "Relative standard deviation of the sensor's gain drift."
     )
     tactile_drift_time: Positive = setting(60.0, "s", "Time constant of both drifts.")
     tactile_delay: Delay = setting(
         0.020, "s", "Time from the middle of a scan to the arrival of the frame."
     )
-    tactile_jitter: Delay = setting(0.0, "s", "Largest additional delay of a frame.")
-    tactile_dropped: float = setting(0.0, "", "Share of frames that are lost.", ge=0, le=0.99)
-    palm: Place = setting(0.0, "m", "Position of the palm along y; the pivots are at 0.")
-    palm_friction: NonNegative = setting(0.3, "", "Coulomb coefficient of the object on the palm.")
-    tip_loss: Delay = setting(0.002, "s", "Damping of the tip over its stiffness.")
+    tactile_jitter: Delay = setting(0.0, "s", "Maximum additional delay of a frame.")
+    tactile_dropped: float = setting(0.0, "", "Fraction of frames that are lost.", ge=0, le=0.99)
+    palm: Place = setting(0.0, "m", "Position of the palm along y; the pivots are at y = 0.")
+    palm_friction: NonNegative = setting(0.3, "", "Friction coefficient between object and palm.")
+    tip_loss: Delay = setting(0.002, "s", "Damping of the tip divided by its stiffness.")
     tip_law: Literal["springs", "bristles"] = setting(
-        "springs", "", "Tangential law of the tips; springs lean with θ, bristles do not."
+        "springs", "", "Tangential force law of the tips; with `springs`, shear is coupled to θ."
     )
     tip_shear_stiffness: Ratio = setting(
-        1.0, "", "Tangential over normal stiffness of the tip's springs."
+        1.0, "", "Ratio of tangential to normal stiffness of the tip's springs."
     )
     tip_creep_time: NonNegative = setting(
-        0.0, "s", "Time constant with which a sticking tip's shear relaxes; 0: it does not."
+        0.0, "s", "Time constant with which the shear of a sticking tip relaxes; 0: no relaxation."
     )
     tip_micro_slip: bool = setting(
-        False, "", "Let the edge of the footprint slip before the rest does."
+        False, "", "Let the edge of the footprint slip before its centre."
     )
     tip_relaxation: tuple[Fraction, Fraction, Fraction] = setting(
-        (0.0, 0.0, 0.0), "", "Amplitudes of three Prony terms: shares of its final stiffness by "
-        "which the tip is firmer at first; 0: elastic."
+        (0.0, 0.0, 0.0), "", "Amplitudes of three Prony terms: initial excess of the tip stiffness "
+        "as fractions of its final value; 0: elastic."
     )  # fmt: skip
     tip_relaxation_times: tuple[Positive, Positive, Positive] = setting(
         (0.004, 0.07, 1.4), "s", "Time constants of the Prony terms; the defaults are those of a "
         "human fingerpad (Pawluk & Howe, 1999)."
     )  # fmt: skip
     joint_inertia: Factor = setting(
-        0.010, "kg·m²", "Inertia of the finger and the reflected rotor at the joint."
+        0.010, "kg·m²", "Inertia of finger and rotor, referred to the joint."
     )
     joint_damping: NonNegative = setting(0.02, "N·m·s/rad", "Viscous friction of the joint.")
     joint_friction: NonNegative = setting(0.05, "N·m", "Coulomb friction of the joint.")
-    joint_stribeck: NonNegative = setting(0.0, "N·m", "Additional friction of a joint at rest.")
-    joint_load_friction: tuple[Fraction, Fraction] = setting(
-        (0.0, 0.0), "", "Gear friction as a share of the gears' torque, and its addition at rest."
+    joint_stribeck: NonNegative = setting(
+        0.0, "N·m", "Additional friction of a joint at standstill."
     )
+    joint_load_friction: tuple[Fraction, Fraction] = setting(
+        (0.0, 0.0), "", "Gear friction as a fraction of the transmitted torque, and its increase "
+        "at standstill."
+    )  # fmt: skip
     joint_stribeck_speed: Positive = setting(
-        0.12, "rad/s", "Joint speed at which the friction added at rest has fallen to 1/e."
+        0.12, "rad/s", "Joint speed at which the additional friction has fallen to 1/e."
     )
     joint_presliding: Positive = setting(
-        0.0005, "rad", "Elastic deflection of the gears before they slip."
+        0.0005, "rad", "Elastic deflection of the gears before they start to move."
     )
     servo_heat: tuple[Factor, Factor, Factor] = setting(
         (1.0, 1.0, 1.0), "", "Factors of the servos' heating, cooling and heat capacity."
     )
-    ambient: float = setting(25.0, "°C", "Temperature around the servos.", ge=-40, le=80)
+    ambient: float = setting(25.0, "°C", "Ambient temperature of the servos.", ge=-40, le=80)
     compression_speed: NonNegative = setting(
-        0.004, "m/s", "Speed at which the object is pressed on the tips if there are no servos."
+        0.004, "m/s", "Speed at which the object is pressed onto the tips if there are no servos."
     )

@@ -46,10 +46,10 @@ NO_FRAME = Frame(0, t_sample=0.0, t_arrival=0.0, valid=False, data=np.zeros((0, 
 
 # Common first fields of several topics.
 _SCHEMA = "", "number of this schema; it changes only if the meaning of a field changes"
-_SEQ = "", "sequence number of ticks, frames or events"
+_SEQ = "", "sequence number of the tick, frame or event"
 _STEP = "", "decimation: every n-th message is sent"
 _UNIX = "s", "Unix time"
-_MONO = "ns", "time of the tick by the daemon's monotonic clock"
+_MONO = "ns", "time of the tick in the daemon's monotonic clock"
 _TEMPERATURE = "°C", "temperature of the servo, 0 if unknown"
 _VOLTAGE = "V", "supply voltage of the servo, 0 if unknown"
 
@@ -83,7 +83,9 @@ class _Announcement:
     schema: int = _news(*_SCHEMA, lambda _: SCHEMA)
     seq: int = _news(*_SEQ)
     again: bool = _news(
-        "", "repeated for a late subscriber, with the original seq and times", lambda _: False
+        "",
+        "true if repeated for a new subscriber, with the original seq and times",
+        lambda _: False,
     )
     timestamp: float = _news(*_UNIX, lambda m: m.wall)
     mono_ns: int = _news("ns", "the daemon's monotonic clock", lambda m: _ns(m.t))
@@ -130,64 +132,72 @@ class FingerState:
 
     valid: bool = _finger(
         "",
-        "in the scene, with current and valid data from its servo and sensor",
+        "the finger is in the scene, and its servo and sensor deliver valid, recent data",
         lambda f: not _invalid(f),
     )
-    q: float = _finger("rad", "joint angle, positive closes", lambda f: f.state.reading.q[f.i])
+    q: float = _finger(
+        "rad", "joint angle, positive when closing", lambda f: f.state.reading.q[f.i]
+    )
     dq: float = _finger("rad/s", "joint velocity", lambda f: f.state.reading.dq[f.i])
     current: float = _finger(
-        "A", "motor current, positive closes", lambda f: f.state.reading.current[f.i]
+        "A", "motor current, positive when closing", lambda f: f.state.reading.current[f.i]
     )
     temperature: float = _finger(*_TEMPERATURE, lambda f: f.state.reading.temperature[f.i])
     voltage: float = _finger(*_VOLTAGE, lambda f: f.state.reading.voltage[f.i])
     goal_q: float = _finger("rad", "goal angle", lambda f: f.state.goal.q[f.i])
     goal_current: float = _finger(
-        "A", "limit of the current's magnitude", lambda f: f.state.goal.current[f.i]
+        "A", "maximum magnitude of the motor current", lambda f: f.state.goal.current[f.i]
     )
     d: float = _contact("m", "maximum displacement of the tip")
-    theta: float = _contact("rad", "the object's angle in the tip's frame, in the hand's plane")
-    tilt_y: float = _contact("rad", "likewise, normal to the hand's plane")
+    theta: float = _contact("rad", "tilt: object angle relative to the tip, in the hand's plane")
+    tilt_y: float = _contact("rad", "tilt out of the hand's plane")
     force: float = _contact(
         "N", "elastic force: modulus_scale · F(d, total tilt of theta and tilt_y) from the table"
     )
     energy: float = _contact("J", "elastic potential energy, modulus_scale · U(d, total tilt)")
     d_std: float = _contact(
-        "m", "standard deviation of d; without contact, the largest undetectable d"
+        "m", "standard deviation of d; without contact, the smallest detectable d"
     )
     theta_std: float = _contact("rad", "standard deviation of theta")
-    force_std: float = _contact("N", "standard deviation of force, including the contact law")
+    force_std: float = _contact(
+        "N", "standard deviation of force, including the error of the contact law"
+    )
     shear_x: float = _contact(
         "N",
         "shear force of a solid tip in the hand's plane, from the newest frame; 0 with springs",
     )
-    shear_y: float = _contact("N", "likewise, normal to the hand's plane")
+    shear_y: float = _contact(
+        "N", "shear force of a solid tip normal to the hand's plane; 0 with springs"
+    )
     gain: float = _contact("", "ratio of measured to modelled pressure")
-    modulus_scale: float = _contact("", "ratio of the tip's modulus to the settings, from grips")
+    modulus_scale: float = _contact("", "tip modulus divided by its setting, estimated in grips")
     modulus_scale_std: float = _contact("", "standard deviation of modulus_scale")
-    sensor_gain: float = _contact("", "gain of the sensor: gain over modulus_scale")
+    sensor_gain: float = _contact("", "sensor gain: gain divided by modulus_scale")
     sensor_gain_std: float = _contact("", "standard deviation of sensor_gain")
-    torque_scale: float = _contact("", "ratio of the joint's torque constant to the settings")
+    torque_scale: float = _contact("", "torque constant of the joint divided by its setting")
     torque_scale_std: float = _contact("", "standard deviation of torque_scale")
     nis_angle: float = _contact(
-        "", "consistency of the sensor's angle: normalised innovation squared, averaged; about 1"
+        "", "consistency of the angle channel: mean normalised innovation squared, expected 1"
     )
-    nis_footprint: float = _contact("", "likewise for d from the footprint")
-    nis_amplitude: float = _contact("", "likewise for the amplitude of the pressure")
-    misfit: bool = _contact("", "the frame fits no contact of the model; d, theta may be biased")
+    nis_footprint: float = _contact("", "consistency of the footprint channel (d)")
+    nis_amplitude: float = _contact("", "consistency of the amplitude channel (pressure)")
+    misfit: bool = _contact(
+        "", "the frame does not fit the contact model; d and theta may be biased"
+    )
     contact: bool = _contact("", "the tip is in contact")
     frame_seq: int = _contact(
-        "", "number of the estimated tactile frame, 0 before the first", lambda c: c.seq
+        "", "sequence number of the estimated tactile frame, 0 before the first", lambda c: c.seq
     )
     frame_age_s: float = _finger("s", "time since this frame was sampled", _frame_age)
     invalid: str = _finger(
         "", "reason why the finger is not valid, or empty", lambda f: _invalid(f).text
     )
-    winding: float = _heat("°C", "temperature of the motor winding by the thermal model")
+    winding: float = _heat("°C", "temperature of the motor winding, from the thermal model")
     winding_std: float = _heat("°C", "standard deviation of winding")
-    case: float = _heat("°C", "temperature of the case by the thermal model, not quantised")
+    case: float = _heat("°C", "temperature of the case, from the thermal model, not quantised")
     case_std: float = _heat("°C", "standard deviation of case")
     time_to_limit: float = _heat(
-        "s", "time to safety.temperature_max at this current; 3600 means an hour or more"
+        "s", "time until safety.temperature_max at the present current; 3600 means one hour or more"
     )
 
 
@@ -198,14 +208,14 @@ class ObjectState:
     valid: bool = _pose("", "both contacts are valid and determine the pose")
     angle: float = _pose(
         "rad",
-        "the object's angle in the hand's frame: of the bisector of its faces, or of the line "
+        "object angle in the hand's frame: angle of the bisector of the faces, or of the line "
         "between the contacts of a disc",
     )
-    width: float = _pose("m", "the object's width between the tips")
+    width: float = _pose("m", "width of the object between the tips")
     nis_torque: float = _pose(
-        "", "consistency of joint torques and forces: normalised innovation squared, averaged"
+        "", "consistency of the torque channel: mean normalised innovation squared, expected 1"
     )
-    nis_balance: float = _pose("", "likewise for the balance between both tips")
+    nis_balance: float = _pose("", "consistency of the balance channel (forces of both tips)")
 
 
 @topic(
@@ -218,23 +228,23 @@ class HandState(_TickMessage):
     """One ``hand/state``."""
 
     mode: str = _state("", "disarmed, armed, moving, grasping, holding, rotating, releasing, fault")
-    fault: str = _state("", "reason of the latched fault, or empty")
+    fault: str = _state("", "text of the latched fault, or empty")
     fault_name: str = _state("", "name of the fault in `softfinger.daemon.safety.limits`, or empty")
-    torque: bool = _state("", "torque is on, or not confirmed to be off")
+    torque: bool = _state("", "torque is on, or torque off is not confirmed")
     tick_s: float = _timing("s", "time between the starts of the last tick and this one")
     compute_s: float = _timing("s", "computing time of the last tick")
-    wake_late_s: float = _timing("s", "delay of this tick's start after its deadline")
+    wake_late_s: float = _timing("s", "delay of the start of this tick after its deadline")
     overruns: int = _timing("", "number of ticks that took longer than the period")
     behind_s: float = _timing(
-        "s", "total time that a hand simulated in the daemon has waited for a busy machine"
+        "s", "total time for which a hand simulated in the daemon has paused on a busy machine"
     )
     goal_force: float = _goal(
         "N",
-        "target of the mean tip force, as commanded or increased against slip; NaN without a grip",
+        "target of the mean tip force, including an increase against slip; NaN without a grip",
         lambda g: g.force,
     )
     goal_angle: float = _goal(
-        "rad", "target of the object's angle; NaN unless the object is steered", lambda g: g.angle
+        "rad", "target of the object angle; NaN unless the object is steered", lambda g: g.angle
     )
     left: FingerState = _tick.part("left finger: ", lambda m: _Finger(m.state, m.scene, 0))
     right: FingerState = _tick.part("right finger: ", lambda m: _Finger(m.state, m.scene, 1))
@@ -276,25 +286,25 @@ class TactileFrame:
     schema: int = _tactile(*_SCHEMA, lambda _: SCHEMA)
     seq: int = _frame(*_SEQ)
     seq_step: int = _tactile(*_STEP, lambda m: m.step)
-    number: int = _tactile("", "number of this sensor's message; a gap means lost messages")
+    number: int = _tactile("", "number of this message of the sensor; a gap means lost messages")
     timestamp: float = _tactile(*_UNIX, lambda m: m.wall)
     mono_ns: int = _frame(
-        "ns", "time of the board's scan by the daemon's clock", lambda f: _ns(f.t_sample)
+        "ns", "time of the board's scan in the daemon's clock", lambda f: _ns(f.t_sample)
     )
     delay_s: float = _frame(
-        "s", "time from the scan to the arrival", lambda f: f.t_arrival - f.t_sample
+        "s", "time from the scan to the arrival of the frame", lambda f: f.t_arrival - f.t_sample
     )
-    valid: bool = _frame("", "false if the board is lost; this is then its last frame")
+    valid: bool = _frame("", "false if the board is lost and this is its last frame")
     finger: str = _tactile("", "left or right", lambda m: FINGERS[m.finger])
     rows: int = _tactile("", "number of cells along y", lambda m: m.data.shape[0])
     cols: int = _tactile("", "number of cells along x", lambda m: m.data.shape[1])
-    pitch: float = _facts("m", "distance between columns")
-    pitch_y: float = _facts("m", "distance between rows")
-    centre_x: float = _facts("m", "offset of the tip's centre from the grid's centre, along x")
-    centre_y: float = _facts("m", "likewise, along y")
+    pitch: float = _facts("m", "distance between the columns")
+    pitch_y: float = _facts("m", "distance between the rows")
+    centre_x: float = _facts("m", "x offset of the tip's centre from the grid's centre")
+    centre_y: float = _facts("m", "y offset of the tip's centre from the grid's centre")
     rotation: float = _facts("rad", "rotation of the sensor's axes relative to the finger's")
     unit: str = _facts("", "`count`: as sent by the board; `Pa`: as used by the estimator")
-    scale: float = _facts("Pa", "pressure of one step of the data, exact for linear sensors")
+    scale: float = _facts("Pa", "pressure per step of the data, exact for linear sensors")
     calibrated: bool = _facts("", "data × scale is the calibrated pressure")
     calibration: str = _facts("", "name and date of the calibration, or empty")
     data: bytes = _tactile(
@@ -335,7 +345,7 @@ _event = FieldSource[EventSource]()
 
 @topic(
     EVENT,
-    "Events: modes, faults, warnings. The last 50 are repeated for late subscribers.",
+    "Events: mode changes, faults, warnings. New subscribers receive the last 50 again.",
     EventSource,
 )
 @record
@@ -344,7 +354,7 @@ class Event(_Announcement):
 
     level: str = _event("", "info, warning or error")
     kind: str = _event("", "kind of the event: mode, fault, servos, …")
-    text: str = _event("", "message of one line")
+    text: str = _event("", "one-line message")
 
 
 _times = FieldSource[TimeSpread]()
@@ -391,10 +401,12 @@ _stats = FieldSource[StatsSource]()
 class LoopStatistics(_TickMessage):
     """One ``hand/stats``."""
 
-    ticks: int = _stats("", "ticks since the start, the time span of all fields except rates")
+    ticks: int = _stats(
+        "", "number of ticks since startup; all fields except the rates refer to these ticks"
+    )
     overruns: int = _timing("", "number of ticks that took longer than the period")
     period_s: float = _stats("s", "period of the ticks", lambda m: m.period)
-    wake: Spread = _stats.part("delay of a tick's start: ", lambda m: m.spreads["wake"])
+    wake: Spread = _stats.part("delay of the start of a tick: ", lambda m: m.spreads["wake"])
     compute: Spread = _stats.part("total time of a tick: ", lambda m: m.spreads["compute"])
     bus: Spread = _stats.part("reading and writing the servos: ", lambda m: m.spreads["bus"])
     publish: Spread = _stats.part("publishing: ", lambda m: m.spreads["publish"])
@@ -413,7 +425,11 @@ class SettingsSource(NamedTuple):
 _hand_facts = FieldSource[SettingsSource]().of(lambda m: m.facts)
 
 
-@topic(SETTINGS, "Description of this hand, once, and again for late subscribers.", SettingsSource)
+@topic(
+    SETTINGS,
+    "Description of this hand, sent once, and again to each new subscriber.",
+    SettingsSource,
+)
 @record
 class HandSettings(_Announcement):
     """One ``hand/settings``."""
@@ -421,11 +437,11 @@ class HandSettings(_Announcement):
     version: str = _hand_facts("", "version of softfinger")
     settings: str = _hand_facts("", "all settings as JSON")
     calibration_left: str = _hand_facts("", "calibration of the left sensor as JSON, or empty")
-    calibration_right: str = _hand_facts("", "likewise of the right sensor")
+    calibration_right: str = _hand_facts("", "calibration of the right sensor as JSON, or empty")
     table_left: str = _hand_facts(
-        "", "contact table of the left tip: form, tolerance, certificate (bound of its error)"
+        "", "contact table of the left tip: form, tolerance, certificate (bound on the error)"
     )
-    table_right: str = _hand_facts("", "likewise of the right tip")
+    table_right: str = _hand_facts("", "contact table of the right tip")
 
 
 class CommandSource(NamedTuple):
@@ -442,12 +458,12 @@ class CommandSource(NamedTuple):
 _command = FieldSource[CommandSource]()
 
 
-@topic(COMMAND, "Each answered command of any client, except `status`.", CommandSource)
+@topic(COMMAND, "Each command that was answered, from any client, except `status`.", CommandSource)
 @record
 class AnsweredCommand(_Announcement):
     """One ``hand/command``."""
 
-    tick: int = _command("", "seq of the tick in which the command was answered")
+    tick: int = _command("", "seq of the tick that answered the command")
     command: str = _command("", "name of the command", lambda m: str(m.request.get("command", "")))
     client: str = _command(
         "", "name of the client, or empty", lambda m: str(m.request.get("client", ""))
@@ -456,7 +472,7 @@ class AnsweredCommand(_Announcement):
         "", "complete request as JSON", lambda m: json.dumps(m.request, default=str)
     )
     ok: bool = _command("", "the command was carried out", lambda m: not m.error)
-    error: str = _command("", "reason for the refusal, or empty")
+    error: str = _command("", "reason for the rejection, or empty")
 
 
 class InputSource(NamedTuple):
@@ -487,13 +503,13 @@ def _input_finger(m: InputSource, i: int) -> _InputFinger:
 class InputReading:
     """The servos' reading in ``hand/input``."""
 
-    seq: int = _reading("", "number of the reading of the servos")
+    seq: int = _reading("", "sequence number of the servo reading")
     t: float = _reading("s", "time of the last valid reading, −∞ before the first")
     valid: bool = _reading("", "the reading of this tick is valid")
-    alert: int = _reading("", "bit i: servo of finger i reports a hardware error")
+    alert: int = _reading("", "bit i: the servo of finger i reports a hardware error")
     error: str = _read("", "error of the bus, or empty", lambda s: s.read_error)
-    lost: int = _reading("", "bit i: servo of finger i has received none of the last goals")
-    frozen: int = _reading("", "bit i: servo of finger i repeats old readings")
+    lost: int = _reading("", "bit i: the servo of finger i has not received the last goals")
+    frozen: int = _reading("", "bit i: the servo of finger i repeats old readings")
 
 
 @record
@@ -509,16 +525,18 @@ class InputFinger:
     temperature: float = _taken(*_TEMPERATURE, lambda f: f.reading.temperature[f.i])
     voltage: float = _taken(*_VOLTAGE, lambda f: f.reading.voltage[f.i])
     frame_seq: int = _newest(
-        "", "number of the newest tactile frame, 0 before the first", lambda f: f.seq
+        "", "sequence number of the newest tactile frame, 0 before the first", lambda f: f.seq
     )
-    frame_t: float = _newest("s", "time of its scan by the daemon's clock", lambda f: f.t_sample)
-    frame_arrival: float = _newest("s", "time of its complete arrival", lambda f: f.t_arrival)
+    frame_t: float = _newest("s", "time of its scan in the daemon's clock", lambda f: f.t_sample)
+    frame_arrival: float = _newest(
+        "s", "time of the arrival of its last byte", lambda f: f.t_arrival
+    )
     frame_valid: bool = _newest("", "false if the board is lost", lambda f: f.valid)
 
 
 @topic(
     INPUT,
-    "All inputs of each tick, from which `replay --recompute` computes the tick again.",
+    "All inputs of each tick; `replay --recompute` computes the tick from them again.",
     InputSource,
 )
 @record
@@ -529,14 +547,14 @@ class TickInput:
     seq: int = _state(*_SEQ)
     timestamp: float = _state(*_UNIX, lambda s: s.wall)
     mono_ns: int = _state(*_MONO, lambda s: _ns(s.t))
-    t: float = _state("s", "the same time in full precision")
+    t: float = _state("s", "time of the tick in full precision")
     late_in_row: int = _timing("", "number of consecutive overruns")
-    busy_s: float = _timing("s", "duration of a recent delay of the loop by a busy machine")
+    busy_s: float = _timing("s", "duration of a recent delay of the loop on a busy machine")
     reading: InputReading = _input.part("", lambda m: m.state)
     left: InputFinger = _input.part("left finger: ", lambda m: _input_finger(m, 0))
     right: InputFinger = _input.part("right finger: ", lambda m: _input_finger(m, 1))
     write_error: str = _state("", "error of the bus during the write, or empty")
-    torque_off: bool = _state("", "the servos confirmed in this tick that torque is off")
+    torque_off: bool = _state("", "the servos confirmed torque off in this tick")
 
 
 class TruthSource(NamedTuple):
@@ -565,7 +583,7 @@ class TrueFinger:
         "m", "maximum displacement, negative for a gap", lambda f: float(f.truth.d[f.i])
     )
     theta: float = _true_finger(
-        "rad", "the object's angle in the tip's frame", lambda f: float(f.truth.theta[f.i])
+        "rad", "tilt: object angle relative to the tip", lambda f: float(f.truth.theta[f.i])
     )
     force: float = _true_finger("N", "force on the tip's base", lambda f: float(f.truth.force[f.i]))
 
@@ -580,12 +598,10 @@ class TrueObject:
     y: float = _true_pose(
         "m", "y of the object's centre in the hand's frame", lambda p: float(p[1])
     )
-    angle: float = _true_pose(
-        "rad", "the object's angle in the hand's frame", lambda p: float(p[2])
-    )
+    angle: float = _true_pose("rad", "object angle in the hand's frame", lambda p: float(p[2]))
 
 
-@topic(TRUTH, "True state of a simulated hand, with each `hand/state`.", TruthSource)
+@topic(TRUTH, "True state of a simulated hand, sent with each `hand/state`.", TruthSource)
 @record
 class TrueState(_TickMessage):
     """One ``hand/truth``; its names differ from ``hand/state``, for plots of all topics."""

@@ -1,6 +1,6 @@
-"""Documentation of the schema: the page ``STREAM.md``, and JSON Schema for recordings.
+"""Generate documentation of the stream: the page ``STREAM.md``, and JSON Schemas for recordings.
 
-``python -m softfinger.daemon.wire.schema_docs`` regenerates the page.
+``python -m softfinger.daemon.wire.schema_docs`` writes the page.
 """
 
 from __future__ import annotations
@@ -22,19 +22,21 @@ _JSON: dict[str, dict[str, Any]] = {
 _INTRODUCTION = f"""\
 # The stream
 
-This page is generated from `daemon/wire/schema.py` by
+To read the hand's state in any language, subscribe to the daemon's ZeroMQ socket
+(`stream.address`) and unpack each message with msgpack. In Python, `softfinger.Hand` does this for
+you. This page lists all messages and their fields. It is generated from `daemon/wire/schema.py` by
 `python -m softfinger.daemon.wire.schema_docs`.
 
-This is schema {SCHEMA}. A message has two frames: the topic, and a msgpack map with text keys.
-Values are in SI units. A field named `left.q` is `q` in the map `left`. Messages always contain all
-fields. New versions may add fields, but never remove a field or change its type: a float is always
-sent as a float. Integers use the shortest msgpack format, so JavaScript reads integers below 2³² as
-numbers. It may read `mono_ns` as BigInt.
+Each message has two frames: the topic, and a msgpack map whose keys are strings. Values are in SI
+units. The field `left.q` is the entry `q` of the map `left`. A message always contains all fields.
+This is schema {SCHEMA}. New versions may add fields, but never remove a field or change its type.
+A float is always sent as a float. An integer is sent in the smallest msgpack form, so JavaScript
+reads integers below 2³² as numbers and may read `mono_ns` as a BigInt.
 
-A subscriber that only needs the newest state can use `ZMQ_CONFLATE`. This option does not support
-two-frame messages, so set `stream.latest = "tcp://127.0.0.1:9874"` in the profile. The daemon then
-also publishes each `hand/state` at this address, as a single frame that contains the map. Subscribe
-to all messages there:
+A subscriber that needs only the newest state can use `ZMQ_CONFLATE`. This option does not support
+messages with two frames. Therefore set `stream.latest = "tcp://127.0.0.1:9874"` in the profile. The
+daemon then also publishes each `hand/state` at that address, as a single frame that contains the
+map. Subscribe to all messages there:
 
 ```python
 newest = zmq.Context.instance().socket(zmq.SUB)
@@ -44,19 +46,19 @@ newest.connect("tcp://127.0.0.1:9874")
 state = msgpack.unpackb(newest.recv())
 ```
 
-`timestamp` is Unix time. For time differences, use `mono_ns`, the daemon's clock, which is the
-machine's monotonic clock. If the daemon simulates the hand, this clock waits while the machine is
-too busy to keep up (`loop.clock`, `behind_s`). Durations (`tick_s`, `compute_s`, `hand/stats`) are
-always measured in the machine's time.
+`timestamp` is Unix time. For time differences use `mono_ns`, the daemon's clock, which is normally
+the machine's monotonic clock. If the hand is simulated in the daemon, this clock pauses while the
+machine is too busy to keep up (`loop.clock`, `behind_s`). Durations (`tick_s`, `compute_s`,
+`hand/stats`) are always measured in the machine's time.
 """
 
 
 _COMMANDS = """\
 ## Commands
 
-A command is one msgpack map, for example `{"command": "grasp", "force": 5.0}`. The reply is also a
+A command is a msgpack map, for example `{"command": "grasp", "force": 5.0}`. The reply is also a
 map: `{"ok": true, …}` or `{"ok": false, "error": …, "reason": …}`. `error` is a message for the
-user, and `reason` is one of these words:
+user, and `reason` is one of these strings for programs:
 
 | reason | meaning |
 |---|---|
@@ -65,21 +67,23 @@ user, and `reason` is one of these words:
 _KEYS = """\
 
 Send commands from a REQ socket, with or without `REQ_CORRELATE`, or from a DEALER socket. As with a
-REP socket, the reply begins with all frames of the request up to the first empty one. A DEALER
-socket may omit the empty frame; the reply then omits it as well. A command with several frames, or
-with an envelope of more than 14 frames or 1,024 bytes, is rejected with the reason `request`.
+REP socket, the reply begins with all frames of the request up to and including the first empty
+frame. A DEALER socket may omit the empty frame; the reply then omits it too. A command that spans
+several frames is rejected with the reason `request`. So is an envelope of more than 14 frames or
+1,024 bytes.
 
-After a stall of the daemon, the waiting commands are older than their clients expected. `arm` and
-all commands that move the hand or change its grip are rejected as `late` if they are older than
-0.2 s or `servos.watchdog`, whichever is shorter. `disarm`, `tare`, `clear`, and a `hold` while the
-hand grips are accepted up to an age of 1 s. `status` and `stop` are always accepted.
+**Late commands.** If the daemon stalls, commands wait longer than their clients expect. The daemon
+therefore rejects `arm`, and all commands that move the hand or change its grip, as `late` if they
+are older than 0.2 s (or than `servos.watchdog`, if that is shorter). `disarm`, `tare`, `clear`, and
+`hold` during a grip are accepted up to an age of 1 s. `status` and `stop` are always accepted.
 
-To make a late command safe to repeat, give it a `key`: a unique text of 1 to 64 characters, for
-example a random number. Then send the same map again. The daemon executes the command at most once
-and responds to a repetition with the first reply. A repetition is rejected as `stopped` if the hand
-was stopped after the first rejection, and as `superseded` if another command has been executed
-since then. `disarm` does not need a key, because it is executed every time. `Hand`, `AsyncHand`,
-`softfinger send`, `monitor` and `view` repeat late commands automatically.
+**Repeated commands.** To repeat a late command safely, add a `key`: a unique string of 1 to 64
+characters, for example a random number. Then send the same map again. The daemon carries out the
+command at most once, and answers each repetition with the first reply. If the hand was stopped
+after the first rejection, the repetition is rejected as `stopped`. If another command has been
+carried out since then, it is rejected as `superseded`. `disarm` needs no key, because it may be
+carried out repeatedly. `Hand`, `AsyncHand`, `softfinger send`, `monitor` and `view` repeat late
+commands automatically.
 """
 
 
