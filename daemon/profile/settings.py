@@ -92,8 +92,8 @@ class TipSettings(Section):
         "frictionless", "", "Contact between a solid tip and the object."
     )
     relaxation: tuple[Fraction, Fraction, Fraction] = setting(
-        (0.0, 0.0, 0.0), "", "Amplitudes of three Prony terms: initial excess of the tip stiffness "
-        "as fractions of its final value."
+        (0.0, 0.0, 0.0), "", "Amplitudes of three Prony terms: initial excess stiffness of the tip "
+        "as fractions of its final stiffness."
     )  # fmt: skip
     relaxation_times: tuple[Positive, Positive, Positive] = setting(
         (0.004, 0.07, 1.4), "s", "Time constants of the Prony terms; the defaults are those of a "
@@ -166,10 +166,10 @@ class ServoSettings(Section):
         "watchdog.", ge=0, le=2.54
     )  # fmt: skip
     heat_rise: NonNegative = setting(
-        0.0, "K/A²", "Final temperature rise of the servo's case; 0 selects the model's value."
+        0.0, "K/A²", "Final case temperature rise per squared current; 0 selects the model's value."
     )
     heat_time: NonNegative = setting(
-        0.0, "s", "Time constant of this rise; 0 selects the model's value."
+        0.0, "s", "Time constant of the case temperature; 0 selects the model's value."
     )
 
 
@@ -422,7 +422,7 @@ class ControlSettings(Section):
         0.02, "rad/s", "Commanded speed above which friction is fully compensated."
     )
     tip_friction: Positive = setting(0.6, "", "Assumed Coulomb friction coefficient of the tip.")
-    slip_margin: Fraction = setting(0.2, "", "Fraction of this friction that is kept in reserve.")
+    slip_margin: Fraction = setting(0.2, "", "Fraction of `tip_friction` that is kept in reserve.")
     object_load: NonNegative = setting(
         0.0, "N", "Known load along the object's faces, usually its weight."
     )
@@ -474,12 +474,12 @@ class SafetySettings(Section):
         10.0, "frame periods", "Age of the last frame above which a fault is latched."
     )
     frame_age_action: Literal["torque off", "open"] = setting(
-        "torque off", "", "Reaction to this fault; `open` opens the hand before torque off."
+        "torque off", "", "Reaction to the fault of old frames; `open` opens the hand first."
     )
     goal_reach: Positive = setting(
         0.5, "rad", "Distance from the present joint angle within which a goal may step."
     )
-    goal_speed: Positive = setting(3.0, "rad/s", "Maximum speed of a goal outside this distance.")
+    goal_speed: Positive = setting(3.0, "rad/s", "Maximum speed of a goal outside `goal_reach`.")
     current_rate: Positive = setting(60.0, "A/s", "Maximum rate of increase of a goal current.")
     current_fault: Positive = setting(
         1.8, "A", "Measured current that latches a fault if it is exceeded for 0.1 s."
@@ -492,11 +492,11 @@ class SafetySettings(Section):
         70.0, "°C", "Servo temperature above which a fault is latched."
     )
     heat_warn: Positive = setting(
-        60.0, "s", "Predicted time until this fault at which the daemon warns and reduces the grip "
-        "force."
+        60.0, "s", "Predicted time until `temperature_max` below which the daemon warns and "
+        "reduces the grip force."
     )  # fmt: skip
     heat_action: Literal["hold", "release", "stop"] = setting(
-        "hold", "", "Action if the load does not allow a smaller grip force."
+        "hold", "", "Action against overheating if the load does not allow a smaller grip force."
     )
     voltage_min: NonNegative = setting(
         0.0, "V", "Minimum supply voltage of a servo; 0 selects the model's limit."
@@ -529,9 +529,9 @@ class SafetySettings(Section):
 class ObjectSettings(Section):
     """Assumptions about the object."""
 
-    width: Length = setting(0.040, "m", "Distance between its faces.")
+    width: Length = setting(0.040, "m", "Distance between the object's faces.")
     taper: float = setting(
-        0.0, "rad", "Angle between its faces; positive if the object is wider at the palm.",
+        0.0, "rad", "Angle between the object's faces; positive if it is wider at the palm.",
         ge=-1.5, le=1.5
     )  # fmt: skip
     width_min: NonNegative = setting(

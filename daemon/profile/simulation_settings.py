@@ -72,9 +72,9 @@ class SimulationSettings(Section):
         0.0, "", "Relative excess of the reading while the load on a cell decreases."
     )
     tactile_creep: Fraction = setting(
-        0.0, "", "Relative increase of the reading under constant pressure."
+        0.0, "", "Relative creep of the reading under constant pressure."
     )
-    tactile_creep_time: Positive = setting(10.0, "s", "Time constant of this increase.")
+    tactile_creep_time: Positive = setting(10.0, "s", "Time constant of the creep.")
     tactile_response: Delay = setting(0.0, "s", "Time constant of the cells' first-order lag.")
     tactile_exponent: Factor = setting(
         1.0, "", "Exponent of the cells' characteristic curve, reading versus pressure."
@@ -94,7 +94,9 @@ class SimulationSettings(Section):
     tactile_gain_drift: Fraction = setting(
         0.0, "", "Relative standard deviation of the sensor's gain drift."
     )
-    tactile_drift_time: Positive = setting(60.0, "s", "Time constant of both drifts.")
+    tactile_drift_time: Positive = setting(
+        60.0, "s", "Time constant of the zero drift and of the gain drift."
+    )
     tactile_delay: Delay = setting(
         0.020, "s", "Time from the middle of a scan to the arrival of the frame."
     )
@@ -116,8 +118,8 @@ class SimulationSettings(Section):
         False, "", "Let the edge of the footprint slip before its centre."
     )
     tip_relaxation: tuple[Fraction, Fraction, Fraction] = setting(
-        (0.0, 0.0, 0.0), "", "Amplitudes of three Prony terms: initial excess of the tip stiffness "
-        "as fractions of its final value; 0: elastic."
+        (0.0, 0.0, 0.0), "", "Amplitudes of three Prony terms: initial excess stiffness of the tip "
+        "as fractions of its final stiffness; 0: elastic."
     )  # fmt: skip
     tip_relaxation_times: tuple[Positive, Positive, Positive] = setting(
         (0.004, 0.07, 1.4), "s", "Time constants of the Prony terms; the defaults are those of a "
