@@ -245,7 +245,7 @@ def _sums(axes: Axes, numbers: Sheet) -> None:
 
 PAGES = {
     "fig7": FigurePage(
-        "Fig. 7: translational contact, force over the displacement at each angle",
+        "Fig. 7: translational contact, force versus displacement at each angle",
         (7.6, 5.2),
         compression,
         tuple(_compression_panels()),
@@ -256,19 +256,20 @@ PAGES = {
                 "IV-A",
                 "the elastic force is proportional to the over-square of the displacement, also in "
                 "experiments",
-                "the model's exponent is exactly 2 at every angle, its prefactor 1/cos θ; only a "
-                "modulus that rises with strain gives more.",
+                "The model's exponent is exactly 2 at every angle, with the prefactor 1/cos θ. "
+                "The exponent is larger only if the modulus increases with strain.",
             ),
             Erratum(
                 "IV-A",
                 "an approximately constant error over d, which a higher modulus brings close",
-                "springs of any one E press with πE d²/cos θ: another E changes F by a share, "
-                "never by a constant over d.",
+                "The force of springs is πE d²/cos θ. Another E multiplies F by a factor; it "
+                "does not add a constant that is independent of d.",
             ),
         ),
         notes=(
-            "Sensor: 44 × 44 cells on 58 mm × 58 mm, each averaging the pressure over its area. "
-            "The paper's measured points, off by a near-constant amount, are not reproduced.",
+            "Sensor: 44 × 44 cells on 58 mm × 58 mm; each cell averages the pressure over its "
+            "area. The paper's measured points, which have a nearly constant offset, are not "
+            "reproduced.",
         ),
     ),
     "fig10": FigurePage(
@@ -284,10 +285,11 @@ PAGES = {
         ),
         layout={"width_ratios": (1.0, 1.25)},
         notes=(
-            "Negative angles are those that the finger's rotation makes. The paper gives neither d "
-            "nor the distance of the finger's root: four depths are shown, and in (a) d grows from "
-            "first touch at 0° as sin |θ|. The measured forces, off by about 17 % in (b), are not "
-            "reproduced; that they are least slightly before 0° is, in fig10_shear.",
+            "The rotation of the finger produces negative angles. The paper gives neither d nor "
+            "the distance of the finger's root. Therefore four depths are shown, and in (a) d "
+            "increases from the first touch at 0° in proportion to sin |θ|. The measured forces, "
+            "which differ by about 17 % in (b), are not reproduced. Their minimum slightly before "
+            "0° is reproduced in fig10_shear.",
         ),
     ),
     "fig11": FigurePage(
@@ -302,14 +304,14 @@ PAGES = {
             Erratum(
                 "eq. 18",
                 "the last integral, of t⁻³ from cos θ_max to 1, has no dt",
-                "it is 2π ∫ t⁻³ dt; its value is right.",
+                "The integral is 2π ∫ t⁻³ dt. Its value is correct.",
             ),
             Erratum(
                 "Appendix I",
                 "eq. 10 is converted to spherical coordinates",
-                "x² + y² = (a − d)² tan² θ and eq. 14 are polar coordinates in the contact's "
-                "plane, r = (a − d) tan θ: θ is the angle at the tip's centre to a point of that "
-                "plane, not to one of the sphere.",
+                "x² + y² = (a − d)² tan² θ and eq. 14 are polar coordinates in the contact plane, "
+                "r = (a − d) tan θ. The angle θ at the tip's centre points to a point of that "
+                "plane, not to a point of the sphere.",
             ),
         ),
         notes=("Tip of radius 20 mm, E = 0.304 MPa, as in the paper.",),

@@ -319,7 +319,7 @@ def _depth_page(name: str, title: str, quantity: Plotted, **more: Any) -> Figure
 _CLOSED = Erratum(
     "III-B",
     "it is difficult to calculate the double integrals, eqs. 3 and 10, analytically",
-    "both integrals are elementary: F = πEd²/cos θ and U = πEd³/(3 cos² θ), for "
+    "Both integrals are elementary: F = πEd²/cos θ and U = πEd³/(3 cos² θ) for "
     "|θ| ≤ asin((a − d)/a).",
 )
 _TIP = "Tip of radius 20 mm, E = 0.304 MPa, as in the paper."
@@ -340,24 +340,26 @@ PAGES = {
                 "III-A",
                 "Young's modulus is comparatively large when the fingertip deforms a little, and "
                 "comparatively small unless it deforms largely",
-                "Table I's modulus rises with strain, from 0.135 to 0.304 MPa, so the text has it "
-                "both ways; E is a number to calibrate in compression, 0.304 MPa by default.",
+                "The modulus in Table I increases with strain, from 0.135 to 0.304 MPa, so the "
+                "text contradicts itself. E should be calibrated in compression; the default is "
+                "0.304 MPa.",
             ),
             Erratum(
                 "III-A",
                 "the true stress of a tension test over its strain is the springs' law",
-                "springs are compressed: of one rubber (neo-Hookean, modulus E for small strains) "
-                "the true stress at 40 % is 0.42 E stretched and 0.44 E compressed, but the force "
-                "over the first section is 0.30 E and 0.73 E.",
+                "The springs are compressed. For a neo-Hookean rubber with the modulus E at small "
+                "strains, the true stress at 40 % is 0.42 E in tension and 0.44 E in compression, "
+                "but the force per initial cross-section is 0.30 E and 0.73 E.",
             ),
         ),
         notes=(
-            "The paper prints Table I's numbers alone; its plotted specimens are not reproduced.",
+            "The paper prints only the numbers of Table I. The plotted specimens are not "
+            "reproduced.",
         ),
     ),
     "fig4a": _tilt_page(
         "fig4a",
-        "Fig. 4a: total elastic force over the object's angle",
+        "Fig. 4a: total elastic force versus object angle",
         4.2,
         FORCE,
         errata=(_CLOSED,),
@@ -365,23 +367,23 @@ PAGES = {
     ),
     "fig4b": _depth_page(
         "fig4b",
-        "Fig. 4b: total elastic force over the displacement",
+        "Fig. 4b: total elastic force versus displacement",
         FORCE,
         errata=(
             Erratum(
                 "III-B",
                 "the continuous line is πEd², and all the other curves follow a power law whose "
                 "exponent is more than the square",
-                "with the constant E that is plotted the exponent is exactly 2 at every angle; the "
-                "angle changes the prefactor alone, F = πEd² · 1/cos θ. With Table I's law it is "
-                "above 2, more so tilted.",
+                "With the constant E of the plot, the exponent is exactly 2 at every angle. The "
+                "angle changes only the prefactor, F = πEd² · 1/cos θ. With Table I's law, the "
+                "exponent is above 2 and increases with the angle.",
             ),
         ),
         notes=(_TIP,),
     ),
     "fig5a": _tilt_page(
         "fig5a",
-        "Fig. 5a: elastic potential energy over the object's angle",
+        "Fig. 5a: elastic potential energy versus object angle",
         4.4,
         ENERGY,
         errata=(
@@ -389,26 +391,26 @@ PAGES = {
             Erratum(
                 "eqs. 10, 11",
                 "the inner limits are ±f(x); eq. 11's outer limits run from B to A",
-                "f(x) is b(x) of eq. 6, and eq. 11 runs from A to B: as printed its sign is wrong.",
+                "f(x) is b(x) of eq. 6. Eq. 11 runs from A to B; its printed sign is wrong.",
             ),
         ),
         notes=(
-            f"{_TIP} The minimum at θ = 0 holds at a fixed d; at a fixed normal force N it is "
-            "U − N d that has it.",
+            f"{_TIP} The minimum at θ = 0 is that at a fixed d. At a fixed normal force N, U − N d "
+            "has the minimum.",
         ),
     ),
     "fig5b": _depth_page(
         "fig5b",
-        "Fig. 5b: elastic potential energy over the displacement",
+        "Fig. 5b: elastic potential energy versus displacement",
         ENERGY,
         errata=(
             Erratum(
                 "III-B",
                 "the continuous line is proportional to the cube of d, and the power law exceeds "
                 "the cube as the angle increases to 30°",
-                "with the constant E that is plotted the exponent is exactly 3 at every angle; the "
-                "angle changes the prefactor alone, U = (πEd³/3) · 1/cos² θ. With Table I's law it "
-                "is above 3, more so tilted.",
+                "With the constant E of the plot, the exponent is exactly 3 at every angle. The "
+                "angle changes only the prefactor, U = (πEd³/3) · 1/cos² θ. With Table I's law, "
+                "the exponent is above 3 and increases with the angle.",
             ),
         ),
         notes=(_TIP,),

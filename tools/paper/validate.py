@@ -104,43 +104,43 @@ def _tips() -> Iterator[Beside]:
     source = "Human Inspired Dexterity in Robotic Manipulation, table 7.1"
     for law in _LAWS:
         zeta = exponent(DEPTHS, _table(law)(DEPTHS, 0.0 * DEPTHS, "force"))
-        stiff = "of a constant modulus F = π E d², whatever E is" if law == "springs" else ""
+        stiff = "with a constant modulus, F = π E d² for every E" if law == "springs" else ""
         yield between(f"ζ of F = C d^ζ, 1 to 7 mm: {law}", 1.46, 1.88, f"silicone cores: {source}",
                       zeta, why=stiff)  # fmt: skip
     radius = np.sqrt(2.0 * RADIUS * DEPTHS - DEPTHS**2)
-    yield between("γ of the contact's radius, c N^γ: springs", 0.0, 1.0 / 3.0,
+    yield between("γ of the contact radius, c N^γ: springs", 0.0, 1.0 / 3.0,
                   "Xydas & Kao, IJRR 18(9), 1999",
                   exponent(math.pi * MODULUS * DEPTHS**2, radius))  # fmt: skip
-    yield Beside("γ of the contact's radius: solid", "0.00 to 0.33", "the same", "—", "unknown",
-                     "the data have the pressure under the base, not on the face")  # fmt: skip
+    yield Beside("γ of the contact radius: solid", "0.00 to 0.33", "the same", "—", "unknown",
+                     "the data contain the pressure under the base, not on the face")  # fmt: skip
     springs = _table("springs")
     hertz = 4.0 / 3.0 * MODULUS / 0.75 * math.sqrt(RADIUS)
     d = np.linspace(0.004, 0.0079, 3901)
     crossing = d[np.argmin(np.abs(springs(d, 0.0 * d, "force") - hertz * d**1.5))]
-    yield between("depth at which springs press as Hertz's half-space of ν ½ does", 6.4, 6.4,
+    yield between("depth at which springs and Hertz (ν ½) have the same force", 6.4, 6.4,
                   "π E d² = 4/3 E* √a d^(3/2)", 1e3 * float(crossing), ".1f", " mm")  # fmt: skip
 
 
 def _energy() -> Iterator[Beside]:
     from softfinger.tools.paper import sheared_rolling
 
-    source = "Inoue & Hirai, the paper that this model is from"
+    source = "Inoue & Hirai, the source of this model"
     for law in _LAWS:
         energy = _table(law)(np.full(TILTS.shape, 0.004), TILTS, "energy")
         least = math.degrees(TILTS[int(np.argmin(energy))])
         why = (
             ""
             if least == 0.0
-            else f"at a fixed d the energy falls with the tilt, to {least:.0f}° of 20° looked at"
+            else f"at a fixed d, the energy decreases up to {least:.0f}° (tested: 0 to 20°)"
         )
-        yield between(f"tilt of the least U at d = 4 mm: {law}", 0.0, 0.0, source, least, ".1f",
+        yield between(f"tilt of minimum U at d = 4 mm: {law}", 0.0, 0.0, source, least, ".1f",
                       "°", why)  # fmt: skip
     theta = np.radians(np.linspace(-11.5, 9.2, 208))
     rolled = sheared_rolling.rolled(0.006, 0.05, theta)
     before = sheared_rolling.least(theta, rolled["F on the base"])
-    yield Beside("tilt of the least force in rolling, d = 6 mm: springs", "slightly before 0°",
+    yield Beside("tilt of minimum force while rolling, d = 6 mm: springs", "slightly before 0°",
                  source, f"{before:.1f}°", "agree" if -3.0 < before < 0.0 else "disagree",
-                 "where 5 % of the motion is not rolled off, but shears the tip")  # fmt: skip
+                 "if 5 % of the rolling motion shears the tip instead")  # fmt: skip
     d, chosen = 1e-3 * np.arange(8, 33) / 4.0, Material.constant(1.0)
     for face in ("frictionless", "sticking"):
         solid = ContactTable.build(replace(_LAWS["solid, bonded"], face=face), chosen)(d, 0.0).force
@@ -148,34 +148,34 @@ def _energy() -> Iterator[Beside]:
         modulus = float(np.polyfit(solid, springs, 1)[0])
         over = modulus * solid - springs
         yield Beside(f"Fig. 7's offset from springs, 2 to 8 mm: solid, bonded, {face}",
-                     "one constant", source, f"{over.min():.1f} to {over.max():.1f} N", "disagree",
-                     f"by the E that comes nearest to it, {1e-6 * modulus:.3f} MPa")  # fmt: skip
+                     "constant", source, f"{over.min():.1f} to {over.max():.1f} N", "disagree",
+                     f"with the best-fitting E, {1e-6 * modulus:.3f} MPa")  # fmt: skip
 
 
 def _memory() -> Iterator[Beside]:
     times = Settings().tip.relaxation_times
     yield Beside("relaxation of a fingerpad", "4 ms, 70 ms, 1.4 s", "Pawluk & Howe, 1999",
                  ", ".join(f"{t:g} s" for t in times), "unknown",
-                 "the times are theirs; how much, `calibrate relaxation` tells")  # fmt: skip
-    yield Beside("a grasp with time", "more stable", "Tiezzi & Kao, T-RO 23(2), 2007", "—",
-                 "unknown", "nobody has looked at it here")  # fmt: skip
-    yield Beside("softening over the first cycles", "all elastomers tried",
+                 "the published times; `calibrate relaxation` measures the amplitudes")  # fmt: skip
+    yield Beside("stability of a grasp over time", "increases", "Tiezzi & Kao, T-RO 23(2), 2007",
+                 "—", "unknown", "not investigated here")  # fmt: skip
+    yield Beside("softening in the first load cycles", "all tested elastomers",
                  "Case et al., Soft Robotics 2015", "none", "disagree",
-                 "tips here are as they were before")  # fmt: skip
-    yield Beside("shear on a face that sticks", "depends on the path",
+                 "the simulated tips do not change")  # fmt: skip
+    yield Beside("shear on a sticking face", "depends on the path",
                  "HydroShear, arXiv 2603.00446", "one path", "disagree",
-                 "the table holds a press straight along the normal")  # fmt: skip
+                 "the data contain only straight presses along the normal")  # fmt: skip
 
 
 def _sensors() -> Iterator[Beside]:
     for name in ("ideal", "velostat", "capacitive"):
         d, angle, force = _errors(Settings() if name == "ideal" else load(Path(name)))
         for quantity, ours, published, unit, source in (
-            ("depth", 1e3 * d, 0.4, " mm", "Insight's localisation, arXiv 2111.05934"),
-            ("angle", math.degrees(angle), 5.0, "°", "the same, of the force"),
+            ("depth", 1e3 * d, 0.4, " mm", "localisation error of Insight, arXiv 2111.05934"),
+            ("angle", math.degrees(angle), 5.0, "°", "force direction, the same source"),
             ("force", force, 0.44, " N", "uSkin 0.12, FingerTac 0.16 to 0.44, arXiv 2411.13335"),
         ):  # fmt: skip
-            yield between(f"r.m.s. error of {quantity} at 5 mm: simulated sensor, {name}", 0.0,
+            yield between(f"rms error of {quantity} at 5 mm: simulated sensor, {name}", 0.0,
                           published, source, ours, ".2f", unit)  # fmt: skip
 
 
@@ -197,12 +197,12 @@ def _hands() -> Iterator[Beside]:
     from softfinger.tools.benchmarks.reflex import overloaded
 
     answers = [overloaded({}, 0.0, 13.0, seed).answer for seed in range(1, _TRIALS + 1)]
-    simulated = "on virtual time: neither a bus nor a motor's own delay beyond the plant's"
-    yield between("from a slip's onset to a firmer grip, at most", 0, 40,
-                  "answers of 35 to 40 ms, arXiv 2602.16127; people 100 ms, Delhaye 2024",
+    simulated = "in virtual time, without delays of the bus and the motor except those simulated"
+    yield between("maximum time from the onset of slip to a force increase", 0, 40,
+                  "reaction in 35 to 40 ms, arXiv 2602.16127; humans 100 ms, Delhaye 2024",
                   1e3 * max(answers), ".0f", " ms", simulated)  # fmt: skip
-    yield Beside("friction in the servos' gears", "depends on the load",
+    yield Beside("friction in the servo gears", "depends on the load",
                      "Rhoban, arXiv 2410.08650", f"{Settings().simulation.joint_friction:g} N·m",
-                     "disagree", "by default Coulomb's, the same under any load")  # fmt: skip
-    yield Beside("all of it, on a hand of metal", "—", "nobody yet", "—", "unknown",
-                     "no hand of metal has been run with this daemon")  # fmt: skip
+                     "disagree", "Coulomb friction that is independent of the load")  # fmt: skip
+    yield Beside("all results on physical hardware", "—", "none yet", "—", "unknown",
+                     "softfinger has not been tested on physical hardware")  # fmt: skip
