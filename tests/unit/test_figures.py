@@ -294,7 +294,7 @@ def test_springs_are_no_rubber_and_say_so(rows: dict[str, Beside]) -> None:
     springs = rows["ζ of F = C d^ζ, 1 to 7 mm: springs"]
     assert (springs.ours, springs.verdict) == ("2.00", "disagree")
     crossing = (4.0 / (3.0 * 0.75 * np.pi)) ** 2 * 20.0
-    hertz = rows["depth at which springs press as Hertz's half-space of ν ½ does"]
+    hertz = rows["depth at which springs and Hertz (ν ½) have the same force"]
     assert hertz.ours == f"{crossing:.1f} mm"
     assert hertz.verdict == "agree"
 
