@@ -78,7 +78,7 @@ class Contact:
     modulus_scale_std: float = 0.0
     sensor_gain: float = 1.0  # sensor gain; `gain` is modulus_scale · sensor_gain
     sensor_gain_std: float = 0.0
-    torque_scale: float = 1.0  # torque constant over the settings' value
+    torque_scale: float = 1.0  # torque constant in the settings over the true one
     torque_scale_std: float = 0.0
     # Averaged normalised innovation squared of each sensor channel, about 1 if consistent.
     nis_angle: float = 1.0

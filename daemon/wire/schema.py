@@ -174,7 +174,9 @@ class FingerState:
     modulus_scale_std: float = _contact("", "standard deviation of modulus_scale")
     sensor_gain: float = _contact("", "sensor gain: gain divided by modulus_scale")
     sensor_gain_std: float = _contact("", "standard deviation of sensor_gain")
-    torque_scale: float = _contact("", "torque constant of the joint divided by its setting")
+    torque_scale: float = _contact(
+        "", "setting of the joint's torque constant divided by the estimated constant"
+    )
     torque_scale_std: float = _contact("", "standard deviation of torque_scale")
     nis_angle: float = _contact(
         "", "consistency of the angle channel: mean normalised innovation squared, expected 1"
