@@ -434,7 +434,7 @@ class ControlSettings(Section):
     )
     envelope: str = setting(
         "", "", "File of `softfinger envelope --keep` that `grasp` is checked against; empty: "
-        "the map of the built-in hand."
+        "the packaged map."
     )  # fmt: skip
 
     @property
