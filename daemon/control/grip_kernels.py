@@ -327,7 +327,8 @@ def _equal_torques(
         lengths = (law.half_separation, law.length, law.offset, law.radius)
         depth = mean(grasp.d)
         spring = min(
-            upright_spring(closed, depth, target, grasp.tip_turning, lengths), g.joint_stiffness
+            upright_spring(closed, depth, target, grasp.tilt_moment_ratio, lengths),
+            g.joint_stiffness,
         )
         # The hold that follows must start with the present torque of the spring.
         g.offset = antisymmetric * (1.0 - spring / g.joint_stiffness)

@@ -109,7 +109,7 @@ class Publishing:
         """Return the rates [Hz] since the previous call, by machine time."""
         frames = [0, 0]
         for perception in self._perceptions:
-            frames[perception.finger] = perception.frames
+            frames[perception.finger] = perception.frame_count
         t = state.t + state.timing.behind_s
         last, self._counted = self._counted, (t, state.seq, *frames, self._states, self._maps)
         dt, *counts = (now - before for now, before in zip(self._counted, last, strict=True))

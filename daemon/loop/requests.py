@@ -269,7 +269,7 @@ class Requests:
         elif name == "hold":
             refuse_if(not numbers, Reason.REQUEST, "force or angle is missing")
         if begins:
-            taring = any(perception.taring for perception in fingers)
+            taring = any(perception.is_taring for perception in fingers)
             refuse_if(taring, Reason.STATE, "tare is still at work")
             text = "each finger needs a tactile sensor in this scene"
             refuse_if(not fingers, Reason.SCENE, text)

@@ -23,7 +23,7 @@ from softfinger.daemon.control.modes import GRIPPING, HELD, Mode
 from softfinger.daemon.perception.frame_channels import ANGLE_JUMP, REJECTED_MAX
 from softfinger.daemon.perception.grasp import GraspState
 from softfinger.daemon.perception.grasp_kernels import ANGLE_BIAS_MIN
-from softfinger.daemon.perception.hand_state import CURRENT_TIME
+from softfinger.daemon.perception.hand_state import CURRENT_OFF_TIME_MAX
 from softfinger.daemon.perception.perception import FingerPerception
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.safety.wiring import WiringWatch
@@ -546,8 +546,8 @@ def _doubt(view: View, state: State, finger: int) -> str:
             "displacement than its joint's closing and torque say: tare it"
         )
     for sensor in view.sensors:
-        if sensor.finger == finger and sensor.repeats.long:
-            return f"{side} sensor sends the same {sensor.repeats.lag} frames again"
+        if sensor.finger == finger and sensor.repeats.is_fault:
+            return f"{side} sensor sends the same {sensor.repeats.period} frames again"
     return ""
 
 
@@ -581,7 +581,7 @@ def _enter_witnesses(finger: int, side: str) -> None:
     @Limit(f"witness.{side}_current", "a joint's current in a grip, by its goal", "warn",
         (), "servos", in_turn=True)  # fmt: skip
     def _current(view: View, state: State, _: float) -> str:
-        if not view.grasp.current_off_time[finger] > CURRENT_TIME:
+        if not view.grasp.current_off_time[finger] > CURRENT_OFF_TIME_MAX:
             return ""
         return (
             f"{side} joint's current reads {state.reading.current[finger]:.2f} A where its goal is "
@@ -608,7 +608,7 @@ def _witness_force(view: View, state: State, _: float) -> str:
     "fault", ("safety.frozen_after",), "sensors", in_turn=True)  # fmt: skip
 def _tactile_frozen(view: View, state: State, _: float) -> str:
     for sensor in view.sensors:
-        same = 0.0 if sensor.frame is None else sensor.frame.t_arrival - sensor.changed
+        same = 0.0 if sensor.frame is None else sensor.frame.t_arrival - sensor.changed_time
         if same > view.limits.frozen_after > 0.0 and state.contacts[sensor.finger].contact:
             side = FINGERS[sensor.finger]
             return f"tactile: {side} sensor frozen, the same frame for {same:.2f} s"

@@ -106,7 +106,7 @@ def sheared_gradient(
 
 
 @inner_kernel
-def holding_levers(
+def holding_moment_arms(
     data1: NDArray[float64],
     data2: NDArray[float64],
     d: Two,
@@ -223,8 +223,8 @@ def load_torques(
         τ2 = −N2 v2·n2 − ∂U2/∂θ2 − T2 lever2     T2 = rolled2 − L
 
     with n_i and t_i of the face at each tip. ``rolled`` [N] are the shears that rolling, the
-    turning moments and the ``taper`` [rad] cause without a load (:func:`holding_levers`). N and
-    ∂U/∂θ include the effect of the shears. ``motion`` is the result of :func:`held_motion`; for
+    turning moments and the ``taper`` [rad] cause without a load (:func:`holding_moment_arms`). N
+    and ∂U/∂θ include the effect of the shears. ``motion`` is the result of :func:`held_motion`; for
     parallel faces ±v_i·n is arm_i and lever_i is W turn_i.
 
     δ_i is the residual of τ_i at L = 0. A load gives exactly (δ1 + δ2)/2 = lever L + bow L². All

@@ -14,7 +14,7 @@ from softfinger import Fingertip, Material, SensorGrid
 from softfinger.daemon.clock import VirtualClock
 from softfinger.daemon.errors import RecordingError, TactileError
 from softfinger.daemon.perception.finger_model import make_models
-from softfinger.daemon.perception.zero import UnpressedCells
+from softfinger.daemon.perception.unloaded_cells import UnloadedCells
 from softfinger.daemon.profile.settings import Settings, TactileSettings
 from softfinger.daemon.profile.validation import sensor_doubts
 from softfinger.daemon.tactile.frame_files import load_recording
@@ -465,11 +465,11 @@ def test_a_solid_tips_sensor_covers_its_base():
 def test_the_noise_of_a_sensor_no_larger_than_its_tip_is_seen_from_frame_to_frame(zero, noise):
     rng = np.random.default_rng(5)
     grid = SensorGrid(24, 24, PITCH)
-    cells = UnpressedCells(grid, 0.020, np.ones(grid.shape, bool))
+    cells = UnloadedCells(grid, 0.020, np.ones(grid.shape, bool))
     press = 2000.0 * (np.hypot(*(np.indices(grid.shape) - 11.5)) < 5.0)
     for _ in range(60):
         frame = zero + press + noise * rng.standard_normal(grid.shape)
-        cells.follow(np.clip(np.round(frame), 0, 65535).astype(np.uint16))
+        cells.update(np.clip(np.round(frame), 0, 65535).astype(np.uint16))
     assert cells.noise == 0.0
     assert cells.scatter == pytest.approx(noise, rel=0.2, abs=0.4)
 

@@ -98,7 +98,7 @@ def test_solid_tips_come_upright_too() -> None:
     sections = load(Path("solid")).model_dump(include={"tip", "material", "estimator", "safety"})
     simulation = {"object_angle": START}
     with Watched({**sections, "control": {"law": "upright"}, "simulation": simulation}) as hand:
-        assert hand.estimator.grasp.tip_turning < 0.0
+        assert hand.estimator.grasp.tilt_moment_ratio < 0.0
         hand.grasp(FORCE)
         hand.run(4.5)
         assert hand.mode == "holding"
