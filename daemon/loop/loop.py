@@ -12,9 +12,9 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 from softfinger.daemon.clock import LoopClock
-from softfinger.daemon.control.modes import GRIPPING, Mode
+from softfinger.daemon.control.modes import GRIPPING_MODES, Mode
 from softfinger.daemon.control.state_machine import Control
-from softfinger.daemon.control.task import Task, TaskOver
+from softfinger.daemon.control.task import Task, TaskEnded
 from softfinger.daemon.errors import Refused, ServoError
 from softfinger.daemon.loop.publishing import Publishing
 from softfinger.daemon.loop.requests import Requests
@@ -229,7 +229,7 @@ class Loop:
             self._fail(str(error))
         self._heat.follow()
         if reading.valid and self.perception.fingers:
-            gripping = state.mode in GRIPPING and state.goal.valid
+            gripping = state.mode in GRIPPING_MODES and state.goal.valid
             self.perception.filter.predict(reading, state.goal if gripping else None)
 
     def _decide(self) -> None:
@@ -253,7 +253,7 @@ class Loop:
             self._react(breach)
         if self._heat.due and (action := self._heat.act(control, control.events)):
             self._requests.end_grip(action)
-        if self._safety.must_hold and state.mode in GRIPPING:
+        if self._safety.must_hold and state.mode in GRIPPING_MODES:
             control.hold_goal(state.goal)
         else:
             control.step(self.period, state.goal)
@@ -340,9 +340,9 @@ class Loop:
             request = task.next(self.state, self.period)
             if request is not None:
                 self.command(request, by_task=True)
-        except (TaskOver, Refused) as reason:
-            if task.lasting:
-                self.emit("warning", "task", task.begin_again(self.state, str(reason)))
+        except (TaskEnded, Refused) as reason:
+            if task.restarts:
+                self.emit("warning", "task", task.restart(self.state, str(reason)))
             else:
                 self._end_task(str(reason))
 

@@ -12,8 +12,14 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from softfinger.daemon.control.envelope import Envelope
-from softfinger.daemon.control.fingers import off_range
-from softfinger.daemon.control.modes import COMMANDS, GRIPPING, HARMLESS, HELD, Mode
+from softfinger.daemon.control.fingers import range_text
+from softfinger.daemon.control.modes import (
+    COMMANDS,
+    GRIPPING_MODES,
+    HOLDING_MODES,
+    SAFE_COMMANDS,
+    Mode,
+)
 from softfinger.daemon.control.state_machine import Control
 from softfinger.daemon.errors import Reason, Refused, ServoError, TactileError
 from softfinger.daemon.perception.perception import Perception
@@ -182,7 +188,7 @@ class Requests:
         if name in ("clear", "arm"):
             self._reopen(name)
         self._check(name, numbers)
-        begins = control.mode not in GRIPPING
+        begins = control.mode not in GRIPPING_MODES
         angle = self._handlers[name](**numbers)
         self._lease.renew(command, state.t)
         reply: dict[str, Any] = {"mode": control.mode.value}
@@ -215,7 +221,7 @@ class Requests:
         if action == "stop" and control.torque:
             control.stop()
             self._torque.off()
-        elif action == "release" and control.mode in GRIPPING | {Mode.MOVING}:
+        elif action == "release" and control.mode in GRIPPING_MODES | {Mode.MOVING}:
             control.release()
         else:
             return False
@@ -229,8 +235,8 @@ class Requests:
         """
         if name == "status":
             return
-        streamed = name == "hold" and self._control.mode in GRIPPING
-        longest = LONGEST_AGE if streamed or name in HARMLESS else self._start_age
+        streamed = name == "hold" and self._control.mode in GRIPPING_MODES
+        longest = LONGEST_AGE if streamed or name in SAFE_COMMANDS else self._start_age
         if age > longest:
             text = f"{name}: {age:.2f} s old when its turn came, at most {longest:g} s is allowed"
             raise Refused(f"{text}; send it again", Reason.LATE)
@@ -249,7 +255,7 @@ class Requests:
                 Reason.STATE,
                 "the servos have not confirmed torque off yet: check their cable and their power",
             )
-        begins = name == "grasp" or (name == "hold" and self._control.mode not in GRIPPING)
+        begins = name == "grasp" or (name == "hold" and self._control.mode not in GRIPPING_MODES)
         if begins or name in ("arm", "clear"):
             cause = self._safety.cause(state, gripping=name != "arm")
             refuse_if(cause, Reason.STATE, cause)
@@ -285,8 +291,8 @@ class Requests:
             turns = len(settings.scene.fingers) == 2 and settings.scene.object_model
             text = "needs both fingers and the object model in the scene"
             refuse_if(not turns, Reason.SCENE, text)
-            if self._control.mode in HELD and (name == "rotate" or not state.object.valid):
-                text = self._control.fingers.why_not_turn(numbers["angle"])
+            if self._control.mode in HOLDING_MODES and (name == "rotate" or not state.object.valid):
+                text = self._control.fingers.turn_refusal(numbers["angle"])
                 refuse_if(text, Reason.BOUNDS if state.object.valid else Reason.STATE, text)
         if name == "set":
             compliance, (low, high) = numbers["compliance"], _COMPLIANCE
@@ -302,7 +308,7 @@ class Requests:
                 raise Refused(f"move: this scene has no {name} finger", Reason.SCENE)
             low, high = hand.q_min[index], hand.q_max[index]
             if not low <= q <= high:
-                raise Refused(f"move: {name}: {off_range(q, low, high)}", Reason.BOUNDS)
+                raise Refused(f"move: {name}: {range_text(q, low, high)}", Reason.BOUNDS)
 
     def _reconnect(self) -> None:
         """Reconnect servos that have stopped answering. Only a ``clear`` command does this.

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 
-from softfinger.daemon.control.modes import GRIPPING
+from softfinger.daemon.control.modes import GRIPPING_MODES
 from softfinger.daemon.control.state_machine import Control
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.control_table import by_name
@@ -114,7 +114,7 @@ class HeatWatch:
     def act(self, control: Control, events: list[Event]) -> str:
         """Reduce the force of a grip that gets too hot; return a ``heat_action`` due now, or ''."""
         state = self._state
-        if state.mode not in GRIPPING:
+        if state.mode not in GRIPPING_MODES:
             self._told = False
             return ""
         i = min(self._fingers, key=lambda k: state.heat[k].time_to_limit)
@@ -128,10 +128,10 @@ class HeatWatch:
         now = state.goal.force
         square = lasting_square(self._states[i].array, self._limits.temperature_max - _BELOW)
         lasts = now * math.sqrt(square / max(self._square[i], 1e-6))
-        eased = max(min(lasts, now), _AT_ONCE * now, control.grip.load_needs())
+        eased = max(min(lasts, now), _AT_ONCE * now, control.grip.force_for_load())
         if eased < _EASED * now:
             self._eased = state.t
-            control.ease(eased, _LAST)
+            control.limit_force(eased, _LAST)
             text = f"{who}: grip eased from {now:.1f} to {eased:.1f} N"
             events.append(("warning", "servos.heat", text))
             return ""

@@ -19,7 +19,7 @@ from typing import Literal
 
 import numpy as np
 
-from softfinger.daemon.control.modes import GRIPPING, HELD, Mode
+from softfinger.daemon.control.modes import GRIPPING_MODES, HOLDING_MODES, Mode
 from softfinger.daemon.perception.frame_channels import ANGLE_JUMP, REJECTED_MAX
 from softfinger.daemon.perception.grasp import GraspState
 from softfinger.daemon.perception.grasp_kernels import ANGLE_BIAS_MIN
@@ -138,7 +138,7 @@ class View:
         target, last = state.goal.force, self._target
         self._target = target
         felt = 0.5 * (state.contacts[0].force + state.contacts[1].force)
-        if not (state.mode in GRIPPING and self.touched(state) and target > felt):
+        if not (state.mode in GRIPPING_MODES and self.touched(state) and target > felt):
             self.rise_t = math.inf
         elif target > (1.0 + _RISE) * last and self.rise_t == math.inf:
             self.rise_t, self.rise_felt = state.t, felt
@@ -152,7 +152,7 @@ class View:
 
     def holds(self, state: State) -> bool:
         """Return True if `touched` is true in a grip that has settled."""
-        return state.mode in HELD and self.touched(state)
+        return state.mode in HOLDING_MODES and self.touched(state)
 
 
 def _touches(contact: Contact) -> bool:
@@ -363,7 +363,7 @@ _FULL_CURRENT = 0.9  # fraction of a goal's current limit at which no reserve is
     ("safety.stall_error", "safety.stall_time"), "servos", in_turn=True,
     lasts="stall_time").each  # fmt: skip
 def _joint_stall(view: View, state: State, _: float, i: int) -> str:
-    if not state.torque or not state.goal.valid or state.mode in GRIPPING:
+    if not state.torque or not state.goal.valid or state.mode in GRIPPING_MODES:
         return ""
     reading, goal = state.reading, state.goal
     by_current = view.settings.servos.mode != "position"
@@ -407,7 +407,7 @@ _ALL = 0.95  # fraction of the maximum current at which the grip force cannot ri
 def _joint_strained(view: View, state: State, fraction: float, i: int) -> str:
     limit = view.limits.current_max
     well = abs(state.reading.current[i]) < _ALL * fraction * limit
-    if not state.torque or state.mode not in GRIPPING or well:
+    if not state.torque or state.mode not in GRIPPING_MODES or well:
         return ""
     return f"{FINGERS[i]} joint grips with all of its {limit:g} A"
 

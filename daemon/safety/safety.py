@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from softfinger.daemon.control.modes import GRIPPING, Mode
+from softfinger.daemon.control.modes import GRIPPING_MODES, Mode
 from softfinger.daemon.perception.grasp import GraspState
 from softfinger.daemon.perception.perception import FingerPerception
 from softfinger.daemon.profile.settings import Settings
@@ -127,7 +127,7 @@ class Safety:
         if self._in_turn:
             self._turn = (self._turn + 1) % len(self._in_turn)
             self._in_turn[self._turn].check_limit(view, state, found, self.warnings)
-        gripping = state.mode in GRIPPING
+        gripping = state.mode in GRIPPING_MODES
         oldest, contacts = state.t - self._hold_age, state.contacts
         late = any(contacts[i].t_valid < oldest for i in view.fingers)
         self.must_hold = gripping and self._has_sensors and late
@@ -144,7 +144,7 @@ class Safety:
 
         With ``gripping``, the limits of a grip are checked in every mode. Nothing is changed.
         """
-        gripping = gripping or state.mode in GRIPPING
+        gripping = gripping or state.mode in GRIPPING_MODES
         view = self._view
         for watch in self._faults:
             if watch.limit.gripping and not gripping:
@@ -157,7 +157,7 @@ class Safety:
     def opens_first(self, breach: Breach, mode: Mode | str) -> bool:
         """Return True if the hand opens before this fault turns its torque off."""
         commanded = self._limits.frame_age_action == "open"
-        return commanded and breach.name == "tactile.silent" and mode in GRIPPING
+        return commanded and breach.name == "tactile.silent" and mode in GRIPPING_MODES
 
     # Goals
 

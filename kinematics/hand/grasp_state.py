@@ -124,7 +124,7 @@ def holding_moment_arms(
     Equilibrium of the object gives T W = N slide + ∂U1/∂θ1 + ∂U2/∂θ2 for the mean shear force T.
     The shear forces of the tips are T − N tan(α/2) at the left and T + N tan(α/2) at the right,
     since tapered faces push the object out; α is the ``taper`` [rad]. F is the mean force of both
-    tips, so the levers τ/F [m] do not depend on a common modulus. N is the mean of the normal
+    tips, so the moment arms τ/F [m] do not depend on a common modulus. N is the mean of the normal
     forces N1 and N2 [N], which differ if friction with the surroundings acts on the object.
     ``data1`` and ``data2`` are the data of the contact tables. All results are zero unless both
     tips are in contact.
@@ -214,7 +214,7 @@ def load_torques(
     rolled: Two,
     torques: Two,
 ) -> tuple[float, float, float, float]:
-    """Return the residual torques and the load model (δ1, δ2, lever, bow) of a held object.
+    """Return the residual torques and the load model of a held object.
 
     δ1 and δ2 [N·m] are the parts of the joint torques that only a load along the object's t can
     explain. If each tip carries L [N] of a load 2 L, the torques are
@@ -227,8 +227,9 @@ def load_torques(
     and ∂U/∂θ include the effect of the shears. ``motion`` is the result of :func:`held_motion`; for
     parallel faces ±v_i·n is arm_i and lever_i is W turn_i.
 
-    δ_i is the residual of τ_i at L = 0. A load gives exactly (δ1 + δ2)/2 = lever L + bow L². All
-    results are zero unless both tips are in contact, and if a load would not change the torques.
+    δ_i is the residual of τ_i at L = 0. A load gives exactly
+    (δ1 + δ2)/2 = moment_arm L + curvature L². The results are (δ1, δ2, moment_arm, curvature), all
+    zero unless both tips are in contact, and if a load would not change the torques.
     """
     d1, d2 = d
     theta1, theta2 = theta
@@ -256,7 +257,7 @@ def load_torques(
 
 @inner_kernel
 def load_of(torque: float, moment_arm: float, curvature: float) -> tuple[float, float]:
-    """Solve torque = lever L + bow L² [N·m]; return the load L [N] and the slope ∂torque/∂L [m].
+    """Solve torque = moment_arm L + curvature L² [N·m]; return L [N] and the slope ∂torque/∂L [m].
 
     Torques beyond the vertex of the parabola, which no load can cause, use the smallest slope.
     """

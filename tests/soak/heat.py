@@ -13,7 +13,7 @@ import sys
 from copy import copy
 from typing import NamedTuple
 
-from softfinger.daemon.control.modes import GRIPPING
+from softfinger.daemon.control.modes import GRIPPING_MODES
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.safety.heat import HeatWatch
 from softfinger.daemon.simulation.servo_model.servo_joint import ServoHeat
@@ -125,7 +125,7 @@ def held(seed: int, seconds: float = 400.0) -> Held:
         hand.grasp(chance.uniform(20.0, 26.0))
         hand.run(seconds)
         told = [text for _, kind, text in hand.events if kind == "servos.heat"]
-        return Held(hand.mode not in GRIPPING, hand.state.goal.force, told)
+        return Held(hand.mode not in GRIPPING_MODES, hand.state.goal.force, told)
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -73,7 +73,7 @@ def test_a_demo_whose_step_never_ends_begins_again(make):
 def test_metals_demo_ends_with_the_first_fault(make):
     metal = Settings.model_validate({"task": {"name": "demo"}, "servos": {"backend": "dynamixel"}})
     task = Task.named(metal)
-    assert not task.lasting
+    assert not task.restarts
     daemon = make()
     daemon.loop._task = task
     events = holding_demo(daemon)

@@ -202,7 +202,7 @@ def test_what_one_joint_alone_shows_is_no_sudden_load():
         watched.held.torque_residual = [0.0, torque]
         for _ in range(5):
             watched.grip.torques(Reading(), ObjectPose(), True)
-            assert not watched.grip.slip.reflex
+            assert not watched.grip.slip.reflex_triggered
 
 
 @pytest.mark.parametrize(
@@ -228,7 +228,7 @@ def test_noise_of_the_currents_is_no_load_and_a_load_in_it_is(force):
         assert watched.grip.target == force
     watched.held.torque_residual = [0.35, 0.35]
     watched.grip.torques(Reading(dq=[GIVES_WAY, GIVES_WAY]), ObjectPose(), True)
-    assert watched.grip.slip.reflex
+    assert watched.grip.slip.reflex_triggered
 
 
 def standing(load: float, asked: float = 4.0) -> Watched:
@@ -265,7 +265,7 @@ def test_a_channel_that_is_named_ends_what_it_raised():
     assert watched.run(2.0 * FRICTION, 1, speed=GIVES_WAY) == FORCE + 10.0
     watched.held.sensor_fault = True
     assert watched.run(2.0 * FRICTION, 1, speed=GIVES_WAY) == FORCE
-    assert not watched.grip.slip.reflex
+    assert not watched.grip.slip.reflex_triggered
 
 
 def test_the_raise_is_bounded_by_its_setting_and_by_the_force_that_is_a_fault():

@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from statistics import fmean
 from typing import Any, NamedTuple
 
-from softfinger.daemon.control.modes import GRIPPING
+from softfinger.daemon.control.modes import GRIPPING_MODES
 from softfinger.tools.benchmarks.measuring import Report, Row, figure
 from softfinger.tools.benchmarks.rigs import SENSORS, SOLID, RigError, Sections, merged
 from softfinger.tools.benchmarks.virtual_grip import VirtualGrip
@@ -141,7 +141,7 @@ def overloaded(
                 slid = max(slid, abs(fmean(grip.along()) - begin))
             else:
                 gone = min(gone, state.t)
-            if gone < math.inf and state.mode not in GRIPPING:
+            if gone < math.inf and state.mode not in GRIPPING_MODES:
                 said = min(said, state.t)
 
         grip.look = look

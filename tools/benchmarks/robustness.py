@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from softfinger.daemon.control.modes import GRIPPING
+from softfinger.daemon.control.modes import GRIPPING_MODES
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.emulator.emulator import DEFAULT_BOARD
 from softfinger.daemon.simulation.faults import parse_faults
@@ -205,7 +205,7 @@ def grip(case: HandCase, seed: int = 1) -> Outcome:
         if case.turn:
             hand.command("rotate", angle=case.turn)
             loop.advance(2.0)
-        gripped = state.mode in GRIPPING
+        gripped = state.mode in GRIPPING_MODES
         found.settled = watch.settled() if gripped else math.nan
         found.peak, found.above, found.first_off = watch.peak, watch.above, watch.first_off(_NEAR)
         if case.load and gripped and hand.between():

@@ -18,7 +18,7 @@ from functools import partial
 from statistics import median
 from typing import Any
 
-from softfinger.daemon.control.modes import GRIPPING
+from softfinger.daemon.control.modes import GRIPPING_MODES
 from softfinger.daemon.simulation.emulator.emulator import DEFAULT_BOARD
 from softfinger.daemon.types import FINGERS
 from softfinger.tools.benchmarks.measuring import Report, Row
@@ -127,7 +127,7 @@ class GripTrial:
 
     def see(self, watch: Watch, mode: str, fault: str, events: list[tuple[float, str]]) -> None:
         """Record the results of the observation and the final state."""
-        self.settled = watch.settled() if mode in GRIPPING else math.nan
+        self.settled = watch.settled() if mode in GRIPPING_MODES else math.nan
         self.peak, self.above, self.slid = watch.peak, watch.above, watch.slid
         self.end, self.events = fault or mode, events
 

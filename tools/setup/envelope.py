@@ -14,11 +14,11 @@ from typing import Any, NamedTuple
 from softfinger.daemon.control.envelope import (
     HELD,
     LOST,
-    MEANING,
+    OUTCOME_TEXTS,
     REFUSED,
     TURNED,
     identity,
-    raised,
+    increased_force_limit,
 )
 from softfinger.daemon.own_files import write_text
 from softfinger.daemon.profile.settings import Settings
@@ -95,7 +95,9 @@ def run(arguments: argparse.Namespace) -> int:
         tuple(sorted(arguments.mass or MASSES)),  # sorted, as the reader of the map requires
         tuple(sorted(arguments.size or SIZES)),
     )
-    print(f"{arguments.force:g} N; " + "; ".join(f"{k}: {text}" for k, text in MEANING.items()))
+    print(
+        f"{arguments.force:g} N; " + "; ".join(f"{k}: {text}" for k, text in OUTCOME_TEXTS.items())
+    )
     found: dict[str, list[list[Cell]]] = {shape: [] for shape in shapes}
     frictions, masses, sizes = axes
     results = sweep(settings, shapes, axes, arguments)
@@ -193,9 +195,10 @@ def _keep(
     frictions, masses, sizes = axes
     lines = [
         "# What the hand holds, by `softfinger envelope --keep`; a row for each friction and mass,",
-        "# a letter for each size: " + ", ".join(f"{k} {text}" for k, text in MEANING.items()),
+        "# a letter for each size: "
+        + ", ".join(f"{k} {text}" for k, text in OUTCOME_TEXTS.items()),
         f"force = {force!r}",
-        f"raised = {raised(settings, force)!r}",
+        f"raised = {increased_force_limit(settings, force)!r}",
         f"friction = {json.dumps([float(each) for each in frictions])}",
         f"mass = {json.dumps([float(each) for each in masses])}",
         f"size = {json.dumps([round(1e-3 * each, 6) for each in sizes])}",
@@ -241,6 +244,6 @@ def _draw(
             if k == len(frictions) - 1:
                 axes_.set_xlabel("width or diameter [mm]")
         for outcome, colour in _COLOURS.items():
-            grid[0, 0].barh([0], [0], color=colour, label=MEANING[outcome])
+            grid[0, 0].barh([0], [0], color=colour, label=OUTCOME_TEXTS[outcome])
         figure.legend(loc="outside lower center", ncols=2)
         style.save(figure, path)

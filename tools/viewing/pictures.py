@@ -22,7 +22,7 @@ import orjson
 from numpy.typing import NDArray
 
 from softfinger.daemon.client.stream import Gaps
-from softfinger.daemon.control.modes import COMMANDS, GRIPPING, Mode
+from softfinger.daemon.control.modes import COMMANDS, GRIPPING_MODES, Mode
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.physics.simulated_hand import geometry_of
 from softfinger.daemon.types import FINGERS
@@ -309,7 +309,7 @@ class Pictures:
         feed, state = self.feed, self.feed.state
         angle = state.goal_angle if math.isfinite(state.goal_angle) else state.object.angle
         force = feed.commanded if math.isfinite(feed.commanded) else state.goal_force
-        gripping = feed.mode in GRIPPING
+        gripping = feed.mode in GRIPPING_MODES
         return {
             "force": force if gripping else math.nan,
             "angle": math.degrees(angle) if gripping else math.nan,
