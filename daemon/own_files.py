@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import BinaryIO, Literal, TextIO
 
 from softfinger.kinematics.compiled.own_folder import (
-    JUDGED,
+    HAS_OWNERS,
     NO_FOLLOW,
     require_own,
     user_cache,
@@ -50,7 +50,7 @@ def unpacked_most(file: BinaryIO) -> int:
     Recordings compress to between a third and a tenth. Holes in a sparse file do not count as size.
     """
     found = os.fstat(file.fileno())
-    room = 512 * found.st_blocks if JUDGED else found.st_size
+    room = 512 * found.st_blocks if HAS_OWNERS else found.st_size
     return max(MOST // 2, 32 * min(found.st_size, room))
 
 
@@ -133,7 +133,7 @@ def _open(path: str, flags: int) -> int:
 
 
 def _refuse_strange(path: str, found: os.stat_result) -> None:
-    strange = JUDGED and found.st_uid not in (os.geteuid(), 0)
+    strange = HAS_OWNERS and found.st_uid not in (os.geteuid(), 0)
     link = stat.S_ISLNK(found.st_mode)
     if strange and (link or Path(path).parent.stat().st_mode & _SHARED):
         what = "a link" if link else "a file in a folder that all may write in"

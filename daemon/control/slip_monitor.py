@@ -47,7 +47,7 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import GRIP_FRACTION
 from softfinger.kinematics.compiled.kernel import inner_kernel
 from softfinger.kinematics.compiled.layout import Pair, Record
-from softfinger.kinematics.hand.grasp_state import Two, load_of
+from softfinger.kinematics.hand.grasp_state import FloatPair, load_of
 
 _AVERAGE_TIME = 0.1  # s; a velocity flickers by one unit of 0.024 rad/s
 _SETTLING_TIME = 1.0  # s in which the residual of a new hold settles
@@ -172,7 +172,7 @@ def update(
     commanded: float,
     holding: bool,
     closing: float,
-    dq: Two,
+    dq: FloatPair,
     torques: Pair,
 ) -> float:
     """Return the grip force [N]: ``commanded``, or more if the load needs it.
@@ -249,7 +249,7 @@ def _force_limit(s: SlipState, commanded: float, declared: float) -> float:
 
 @inner_kernel
 def _detect_torque_jump(
-    s: SlipState, grasp: GraspState, closing: float, dq: Two, is_held: bool, sudden_min: float
+    s: SlipState, grasp: GraspState, closing: float, dq: FloatPair, is_held: bool, sudden_min: float
 ) -> bool:
     """Average the residuals; return True if both jumped while both joints yielded.
 

@@ -15,7 +15,7 @@ from softfinger.daemon.loop.realtime import GRANT_LATENCY, GRANT_MEMORY_LOCK, GR
 from softfinger.daemon.loop.warm_up import is_built, parts
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.base import Finding
-from softfinger.kinematics.compiled.kernel_folder import damaged, find_folder
+from softfinger.kinematics.compiled.kernel_folder import damaged, find_kernel_folder
 
 _MEMORY = 1 << 30  # bytes, more than the daemon maps
 _WAKE_UPS = 100
@@ -105,7 +105,7 @@ def check_wake_ups(late: list[float]) -> Finding:
 def check_kernels(settings: Settings) -> list[Finding]:
     """Check that compiled kernels can be stored and that those of this scene are present."""
     try:
-        with find_folder() as folder:
+        with find_kernel_folder() as folder:
             place, spoilt = folder.path, len(damaged(folder))
     except (OSError, RuntimeError) as error:
         problem = f"can't be used, so every start compiles: {error}"

@@ -164,7 +164,7 @@ class HandEstimator:
         board that is frozen or sends old data, so it is not used.
         """
         contact.seq, contact.t, contact.t_arrival = frame.seq, frame.t_sample, frame.t_arrival
-        self._invalid[finger] = estimate.invalid if frame.valid else Invalid.FRAME
+        self._invalid[finger] = estimate.invalid if frame.valid else Invalid.BAD_FRAME
         if self._invalid[finger]:
             return  # the joints carry the contact on, and its age grows
         # Without a reading of the joints, the frame is used alone.
@@ -184,7 +184,7 @@ class HandEstimator:
             estimate.systematic,
             self._tables[finger],
         ):
-            self._invalid[finger] = Invalid.JOINTS
+            self._invalid[finger] = Invalid.CONTRADICTS_JOINTS
             return
         self._in_contact[finger] = in_contact
         self._factors_outdated = True

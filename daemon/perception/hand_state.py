@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from softfinger.daemon.perception.grasp import GraspState
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 from softfinger.kinematics.compiled.layout import Pair, Record, Records
-from softfinger.kinematics.hand.grasp_state import Motion, Two, held_motion
+from softfinger.kinematics.hand.grasp_state import FloatPair, Motion, held_motion
 
 FloatArray = NDArray[np.float64]
 
@@ -238,10 +238,10 @@ def predict(
     hands: Records[HandFilter],
     history: Records[HistoryRow],
     t: float,
-    q: Two,
-    dq: Two,
-    current: Two,
-    goal: Two,
+    q: FloatPair,
+    dq: FloatPair,
+    current: FloatPair,
+    goal: FloatPair,
 ) -> None:
     """Predict the state at time ``t`` by a reading of the joints [rad, rad/s, A].
 
@@ -300,7 +300,7 @@ def interpolate(first: float, last: float, fraction: float) -> float:
 
 
 @inner_kernel
-def _move(h: HandFilter, dq: Two, dt: float) -> None:
+def _move(h: HandFilter, dq: FloatPair, dt: float) -> None:
     """Move joints, tips and object with the measured velocities ``dq`` [rad/s]."""
     left = h.tip[0]
     right = h.tip[1]

@@ -179,10 +179,10 @@ def _cells_under(settings: Settings) -> Iterator[str]:
     """Check the number of cells under a solid tip, whose whole base shows the contact."""
     from softfinger.daemon.profile.factory import make_grid, make_tip
     from softfinger.kinematics.estimation.error_budget import Uncertainty
-    from softfinger.kinematics.estimation.estimator import CELLS_MIN, within_rim
+    from softfinger.kinematics.estimation.estimator import CELLS_MIN, cells_within_rim
 
     known = Uncertainty(centre=settings.tactile.centre_error, pitch=settings.tactile.pitch_error)
-    cells = within_rim(make_grid(settings), make_tip(settings), known).sum()
+    cells = cells_within_rim(make_grid(settings), make_tip(settings), known).sum()
     if cells < CELLS_MIN:
         yield (
             f"tactile.pitch, tactile.centre: found {cells} cells well within a solid tip's rim, "

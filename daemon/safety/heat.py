@@ -23,7 +23,7 @@ from softfinger.kinematics.hand.servo_heat import (
     HeatLaw,
     HeatState,
     follow,
-    lasting_square,
+    sustained_square,
     time_to_limit,
     winding_std,
 )
@@ -126,7 +126,7 @@ class HeatWatch:
         if state.t - self._eased < _SETTLES and left > _LAST:
             return ""  # the last reduction has not taken effect yet
         now = state.goal.force
-        square = lasting_square(self._states[i].array, self._limits.temperature_max - _BELOW)
+        square = sustained_square(self._states[i].array, self._limits.temperature_max - _BELOW)
         lasts = now * math.sqrt(square / max(self._square[i], 1e-6))
         eased = max(min(lasts, now), _AT_ONCE * now, control.grip.force_for_load())
         if eased < _EASED * now:

@@ -113,9 +113,9 @@ _goal = _state.of(lambda s: s.goal)
 def _invalid(f: _Finger) -> Invalid:
     scene, state = f.scene, f.state
     if not scene.fingers[f.i]:
-        return Invalid.ABSENT
+        return Invalid.NOT_IN_SCENE
     if scene.servos and not state.reading.valid:
-        return Invalid.SERVO
+        return Invalid.SERVO_NOT_READ
     return state.contacts[f.i].invalid if scene.sensors else Invalid.NONE
 
 

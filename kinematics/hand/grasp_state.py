@@ -21,7 +21,7 @@ from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 from softfinger.kinematics.contact.lookup import lookup
 from softfinger.kinematics.hand.geometry import tip_position, tip_velocity
 
-Two = tuple[float, float]  # (left, right)
+FloatPair = tuple[float, float]  # (left, right)
 Motion = tuple[float, float, float, float, float, float, float]  # result of `held_motion`
 
 _SHEAR_STEPS = 3  # fixed-point iterations for the shears; each adds two digits
@@ -35,7 +35,11 @@ def total_tilt(tilt_x: float, tilt_y: float) -> float:
 
 @inner_kernel
 def held_motion(
-    q: Two, d: Two, angle: float, taper: float, lengths: tuple[float, float, float, float]
+    q: FloatPair,
+    d: FloatPair,
+    angle: float,
+    taper: float,
+    lengths: tuple[float, float, float, float],
 ) -> Motion:
     """Return (arm1, arm2, turn1, turn2, slide, width, across) of a held object.
 
@@ -109,8 +113,8 @@ def sheared_gradient(
 def holding_moment_arms(
     data1: NDArray[float64],
     data2: NDArray[float64],
-    d: Two,
-    theta: Two,
+    d: FloatPair,
+    theta: FloatPair,
     taper: float,
     motion: Motion,
 ) -> tuple[float, float, float, float, float]:
@@ -207,12 +211,12 @@ def _unexplained(
 def load_torques(
     data1: NDArray[float64],
     data2: NDArray[float64],
-    d: Two,
-    theta: Two,
+    d: FloatPair,
+    theta: FloatPair,
     taper: float,
     motion: Motion,
-    rolled: Two,
-    torques: Two,
+    rolled: FloatPair,
+    torques: FloatPair,
 ) -> tuple[float, float, float, float]:
     """Return the residual torques and the load model of a held object.
 

@@ -27,7 +27,7 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import checks
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.simulation.emulator.emulator import EmulatedServos
-from softfinger.kinematics.compiled.kernel_folder import find_folder
+from softfinger.kinematics.compiled.kernel_folder import find_kernel_folder
 from softfinger.tools.cli import main
 from softfinger.tools.setup import doctor
 from tests.conftest import Addresses
@@ -350,7 +350,7 @@ def test_memory_idle_states_and_clocks(tmp_path, monkeypatch):
 def test_kernels_are_told_where_they_are_or_are_not(tmp_path, monkeypatch):
     scene = Settings.model_validate({"servos": {"backend": "none"}, "tactile": {"backend": "none"}})
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    monkeypatch.setattr(warm_up, "kernel_folder", find_folder)
+    monkeypatch.setattr(warm_up, "kernel_folder", find_kernel_folder)
     (found,) = kernels.check_kernels(scene)
     assert found.status == "warn"
     assert "contact table, joints and timing not compiled yet" in found.text

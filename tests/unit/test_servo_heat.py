@@ -14,10 +14,10 @@ from softfinger.daemon.safety.heat import set_law
 from softfinger.daemon.servos.control_table import by_name
 from softfinger.daemon.simulation.servo_model.servo_joint import ServoHeat
 from softfinger.kinematics.hand.servo_heat import (
-    LONGEST,
+    TIME_MAX,
     HeatState,
     follow,
-    lasting_square,
+    sustained_square,
     time_to_limit,
 )
 from softfinger.tools.calibration import joints as calibrating
@@ -64,7 +64,7 @@ def test_the_time_to_the_limit_is_that_of_the_equations(square):
     reached.terminal = True
     solved = solve_ivp(
         lambda _, x: derivative(state, x, square),
-        (0.0, LONGEST),
+        (0.0, TIME_MAX),
         state.x,
         events=reached,
         rtol=1e-8,
@@ -75,14 +75,14 @@ def test_the_time_to_the_limit_is_that_of_the_equations(square):
 def test_the_lasting_current_settles_at_the_limit():
     state = law(HeatState())
     follow(state.array, 0.0, 0.5, 30.0)
-    square = lasting_square(state.array, LIMIT)
+    square = sustained_square(state.array, LIMIT)
     solved = solve_ivp(
         lambda _, x: derivative(state, x, square), (0.0, 4e4), state.x, method="LSODA"
     )
     assert solved.y[1, -1] == pytest.approx(LIMIT, abs=0.1)
-    assert time_to_limit(state.array, square, LIMIT + 1.0) == LONGEST
+    assert time_to_limit(state.array, square, LIMIT + 1.0) == TIME_MAX
     state.x[2] = LIMIT + 5.0
-    assert lasting_square(state.array, LIMIT) == 0.0
+    assert sustained_square(state.array, LIMIT) == 0.0
 
 
 @pytest.mark.parametrize("seed", range(4))
