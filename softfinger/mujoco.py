@@ -37,10 +37,10 @@ from softfinger.daemon.simulation.physics.outline import rim_on_plane
 from softfinger.daemon.simulation.physics.plant import settle
 from softfinger.daemon.simulation.physics.plant_state import (
     FloatArray,
+    FloatTriple,
     Parameters,
     Plant,
     Sample,
-    Three,
     TipContact,
 )
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand, set_parameters
@@ -70,10 +70,10 @@ class Touch(Record):
     """One tip on a face in 3D; vectors are in world coordinates."""
 
     contact: TipContact
-    normal: Three  # m, unit vector from the tip's centre into the face
-    along: Three  # t, unit vector in the face, opposite to the lean of the tip's axis
-    across: Three  # m × t, the rotation axis of θ
-    shear: Three  # displacement of the face relative to the tip [m]
+    normal: FloatTriple  # m, unit vector from the tip's centre into the face
+    along: FloatTriple  # t, unit vector in the face, opposite to the lean of the tip's axis
+    across: FloatTriple  # m × t, the rotation axis of θ
+    shear: FloatTriple  # displacement of the face relative to the tip [m]
     shear_across: float  # [m]
 
 
@@ -419,7 +419,7 @@ class MujocoHand(SimulatedHand):
                 mujoco.mj_step1(self.model, data)  # updates the contacts for feel
                 state.position[:], state.velocity[:] = data.qpos, data.qvel
                 state.current[:] = data.act
-                self._done = plant.steps = self._done + 1
+                self._done = plant.step_count = self._done + 1
                 feel(plant.array, self.tips._all, self._ring)
 
 

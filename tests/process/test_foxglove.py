@@ -22,7 +22,7 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.wire import schema
 from softfinger.tools import cli
 from softfinger.tools.viewing.foxglove_server import CLIENTS, PROTOCOLS
-from softfinger.tools.viewing.planar import hand_parts
+from softfinger.tools.viewing.hand_drawing import hand_parts
 from tests.conftest import until
 from tests.harness.daemon_process import started
 from tests.harness.fake_daemon import FakeDaemon, event, frame, state

@@ -69,7 +69,7 @@ def test_bristles_far_stiffer_than_the_step_stick_too():
     assert hand.q[0] == pytest.approx(0.6 * presliding, abs=presliding)
     assert abs(hand.dq[0]) < 1e-9
     assert hand.plant.state.bristles[0] == pytest.approx(0.6 * presliding, rel=1e-6)
-    assert hand.plant.guarded == 0
+    assert hand.plant.limited_step_count == 0
 
 
 # Slip.
@@ -183,7 +183,7 @@ def errors(torque: float, rate: float, stribeck: float, counts: Iterable[int]) -
         run(hand, SECONDS)
         state = (hand.q[0], hand.dq[0], hand.plant.state.bristles[0])
         found.append(np.abs((np.array(state) - exact) / SCALE).max())
-        assert hand.plant.guarded == 0
+        assert hand.plant.limited_step_count == 0
     return found
 
 

@@ -9,7 +9,7 @@ import pytest
 from softfinger.daemon.perception.hand_state import ANGLE, TAPER
 from softfinger.daemon.perception.perception import RepeatDetector
 from softfinger.tools.benchmarks.rigs import SOLID
-from softfinger.tools.watched import Watched as Hand
+from softfinger.tools.simulated_daemon import SimulatedDaemon as Hand
 from tests.unit.test_control import grasped
 
 FORCE = 6.0

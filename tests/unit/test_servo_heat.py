@@ -22,7 +22,7 @@ from softfinger.kinematics.hand.servo_heat import (
 )
 from softfinger.tools.calibration import joints as calibrating
 from softfinger.tools.cli import main
-from softfinger.tools.watched import Watched
+from softfinger.tools.simulated_daemon import SimulatedDaemon
 from tests.harness.golden_recording import RECORDING
 from tests.soak.heat import Bench, foreseen, least_at_half_load
 
@@ -151,10 +151,10 @@ def test_a_hold_that_hardly_warms_tells_nothing(tmp_path, capsys):
     assert "found 0 °C of warming, expected 8 at least" in capsys.readouterr().err
 
 
-def hot(force: float, seconds: float, **sections: dict[str, Any]) -> Watched:
+def hot(force: float, seconds: float, **sections: dict[str, Any]) -> SimulatedDaemon:
     """A grip on servos that soon get too hot: half the frames a hand has."""
     sections |= {"simulation": {"servo_heat": FAST, "ambient": 35.0}, "tactile": {"rate": 50.0}}
-    hand = Watched(sections)
+    hand = SimulatedDaemon(sections)
     hand.grasp(force)
     hand.run(2.0)
     assert hand.mode == Mode.HOLDING
@@ -164,7 +164,7 @@ def hot(force: float, seconds: float, **sections: dict[str, Any]) -> Watched:
     return hand
 
 
-def heat_events(hand: Watched) -> list[tuple[str, str]]:
+def heat_events(hand: SimulatedDaemon) -> list[tuple[str, str]]:
     return [(level, text) for level, kind, text in hand.events if kind == "servos.heat"]
 
 

@@ -26,7 +26,7 @@ from softfinger.daemon.control.grip import Grip
 from softfinger.daemon.types import ObjectPose, Reading
 from softfinger.tools.benchmarks.measuring import Report, Row, figure
 from softfinger.tools.benchmarks.rigs import SENSORS, SOLID, Sections, merged
-from softfinger.tools.watched import Watched
+from softfinger.tools.simulated_daemon import SimulatedDaemon
 
 _FORCE = 10.0  # N
 _ASKEW = math.radians(5.0)
@@ -44,7 +44,7 @@ class Altered(Grip):
     The torque constants of the two joints differ by the fraction ``apart`` of their mean.
     """
 
-    def __init__(self, hand: Watched, delay: float = 0.0, apart: float = 0.0) -> None:
+    def __init__(self, hand: SimulatedDaemon, delay: float = 0.0, apart: float = 0.0) -> None:
         fingers = hand.control.fingers
         super().__init__(hand.settings, fingers.indices, fingers.grasp)
         ticks = round(delay * hand.settings.loop.rate)
@@ -92,7 +92,7 @@ class Way(NamedTuple):
     tips: Sections = _AS_SET
     aim: float | None = None
     is_steered: bool = False  # to 0, with the measured angle
-    law: Callable[[Watched], Grip] | None = None  # replaces the daemon's law
+    law: Callable[[SimulatedDaemon], Grip] | None = None  # replaces the daemon's law
     force: float = _FORCE
     weight: tuple[float, float] = (0.0, 0.0)  # N along x and y, applied once the grip is firm
 
@@ -117,7 +117,7 @@ WAYS = {
 
 
 def _upright(
-    law: Callable[[Watched], Grip] | None = None,
+    law: Callable[[SimulatedDaemon], Grip] | None = None,
     force: float = _FORCE,
     width: float = 0.0,
     weight: tuple[float, float] = (0.0, 0.0),
@@ -190,7 +190,7 @@ def row(name: str, way: Way, plants: list[dict[str, Any]]) -> Row:
 def left(way: Way, simulation: Mapping[str, Any]) -> float:
     """Return the remaining angle of the object [°] on this plant; NaN if it is not held."""
     sections = merged({"simulation": simulation, "control": way.control}, way.tips)
-    with Watched(sections) as hand:
+    with SimulatedDaemon(sections) as hand:
         if way.law is not None:
             hand.control.grip = way.law(hand)
         hand.grasp(way.force)

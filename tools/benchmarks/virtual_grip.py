@@ -17,7 +17,7 @@ from softfinger.daemon.errors import Refused
 from softfinger.daemon.simulation.faults import OBJECT, parse_faults
 from softfinger.daemon.types import FINGERS
 from softfinger.tools.benchmarks.rigs import Sections, merged
-from softfinger.tools.watched import Watched
+from softfinger.tools.simulated_daemon import SimulatedDaemon
 
 TOO_MUCH = 1.3  # ratio to the requested force
 GONE = 0.1  # m of slide, above which the object counts as lost
@@ -68,7 +68,7 @@ class Watch:
         return math.inf
 
 
-class VirtualGrip(Watched):
+class VirtualGrip(SimulatedDaemon):
     """Grip on virtual time; ``look`` is called after each tick."""
 
     def __init__(self, daemon: Sections, hand: Sections | None = None, torque: float = 1.0) -> None:

@@ -24,8 +24,8 @@ import numpy as np
 from softfinger.kinematics.hand.geometry import HandGeometry, tip_velocity
 from softfinger.tools.paper.model_pages import MODULUS
 from softfinger.tools.paper.sheets import FigurePage, FloatArray, Panel, Sheet, summary
+from softfinger.tools.simulated_daemon import SimulatedDaemon
 from softfinger.tools.style import INK, KINDS, ordered
-from softfinger.tools.watched import Watched
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -200,7 +200,7 @@ def swing() -> list[dict[str, float]]:
         "simulation": _FREE,
     }
     rows = []
-    with Watched(sections) as hand:
+    with SimulatedDaemon(sections) as hand:
         hand.grasp(FORCE)
         hand.run(_GRIP)
         start, t = hand.state.t, 0.0

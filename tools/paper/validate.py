@@ -21,7 +21,7 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.table import ContactTable
-from softfinger.tools.terminal.typeset import plain_table, table_text
+from softfinger.tools.terminal.text_layout import plain_table, table_text
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

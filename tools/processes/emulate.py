@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.own_files import runtime_fault
 from softfinger.tools.arguments import add_settings, own_runtime_folder, profile
-from softfinger.tools.ending import Interrupted, Signals
+from softfinger.tools.stop_condition import Interrupted, Signals
 
 if TYPE_CHECKING:
     from softfinger.daemon.profile.settings import Settings
@@ -163,7 +163,7 @@ def _serve(settings: Settings, arguments: argparse.Namespace, signals: Signals) 
     build_kernels(with_board(settings), print_event, EMULATED)
     servos = EmulatedServos(arguments.baud, arguments.factory, arguments.ids)
     with contextlib.ExitStack() as made:
-        with signals.held():
+        with signals.deferred():
             try:
                 emulator = Emulator(
                     settings,

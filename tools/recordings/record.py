@@ -29,7 +29,6 @@ from softfinger.tools.arguments import (
     topic,
     waiting,
 )
-from softfinger.tools.ending import Ending
 from softfinger.tools.extras import require
 from softfinger.tools.recordings.channels import (
     ENCODING,
@@ -42,6 +41,7 @@ from softfinger.tools.recordings.channels import (
     to_json,
 )
 from softfinger.tools.recordings.reader import Recording
+from softfinger.tools.stop_condition import StopCondition
 
 _EPILOG = """\
 Recording ends with Ctrl-C or after --duration. The messages written and lost are then printed.
@@ -225,14 +225,14 @@ def run(arguments: argparse.Namespace) -> int:
         state = f"was damaged ({damage}), its sound part is kept" if damage else "sound"
         print(f"{arguments.file}: {messages} messages; {state}")
         return 0
-    with Ending(arguments.duration, arguments.lifeline) as ending:
+    with StopCondition(arguments.duration, arguments.lifeline) as ending:
         return _Recorder(arguments, ending).record()
 
 
 class _Recorder:
     """State of one call of ``record``: socket, files and counters."""
 
-    def __init__(self, arguments: argparse.Namespace, ending: Ending) -> None:
+    def __init__(self, arguments: argparse.Namespace, ending: StopCondition) -> None:
         self._arguments = arguments
         self._ending = ending
         self._keys = client_keys(arguments.keys)  # fail before a file is created
@@ -269,7 +269,7 @@ class _Recorder:
         began = shown = last = time.monotonic()
         ending.begin()
         failure = ""
-        while not ending.over:
+        while not ending.is_met:
             taken = self._take_batch(socket)
             if taken < _BATCH:
                 ending.wait(_STEP)
@@ -288,7 +288,7 @@ class _Recorder:
                 self._show(now - began, now - last)
                 shown = now
         # Messages sent before a signal may still be in transit, e.g. the daemon's last ones.
-        self._read_remaining(socket, _QUIET if ending.asked or not ending.over else 0.0)
+        self._read_remaining(socket, _QUIET if ending.is_requested or not ending.is_met else 0.0)
         return failure
 
     def _take_batch(self, socket: zmq.Socket[bytes]) -> int:

@@ -15,7 +15,7 @@ from softfinger.daemon.profile.validation import address_problem
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.publisher import GATEWAY_TOPICS, KEPT, pack
 from softfinger.tools.arguments import add_range, number, to_stderr
-from softfinger.tools.ending import Ending
+from softfinger.tools.stop_condition import StopCondition
 
 if TYPE_CHECKING:
     from softfinger.tools.recordings.reader import Recording
@@ -85,13 +85,15 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _publish(arguments: argparse.Namespace, recording: Recording) -> None:
     sent = 0
-    with Ending() as ending, Wire(arguments.address, arguments.keys) as wire:
+    with StopCondition() as ending, Wire(arguments.address, arguments.keys) as wire:
         if not arguments.no_wait:
             to_stderr("replay")(
                 f"waiting up to {_SUBSCRIBER_WAIT:g} s for a subscriber at {arguments.address}"
             )
             waited = time.monotonic() + _SUBSCRIBER_WAIT
-            while not ending.asked and time.monotonic() < waited and not wire.subscribed(0.1):
+            while (
+                not ending.is_requested and time.monotonic() < waited and not wire.subscribed(0.1)
+            ):
                 pass
         began, first = time.monotonic(), None
         for topic, message in recording.messages(start=arguments.start, end=arguments.end):
@@ -102,9 +104,9 @@ def _publish(arguments: argparse.Namespace, recording: Recording) -> None:
                 if first is None:
                     began, first = time.monotonic(), stamp
                 due = began + (stamp - first) / arguments.speed
-                while not ending.asked and (left := due - time.monotonic()) > 0.0:
+                while not ending.is_requested and (left := due - time.monotonic()) > 0.0:
                     wire.subscribed(min(left, 0.1))
-            if ending.asked:
+            if ending.is_requested:
                 break
             wire.send(topic, message)
             sent += 1

@@ -147,7 +147,7 @@ def grasped(
     The daemon's settings contain the object's width or diameter ``size`` [m], friction and weight
     (``mass`` in kg). They do not contain its shape: the daemon assumes a block.
     """
-    from softfinger.tools.watched import Watched
+    from softfinger.tools.simulated_daemon import SimulatedDaemon
 
     weight = mass * _GRAVITY
     changed: dict[str, dict[str, Any]] = settings.model_dump(exclude_unset=True)
@@ -164,7 +164,7 @@ def grasped(
     }
     for name, values in changes.items():
         changed[name] = changed.get(name, {}) | values
-    with Watched(changed) as hand:
+    with SimulatedDaemon(changed) as hand:
         hand.grasp(force)
         angle = float(hand.plant.object_pose[2])
         hand.run(_SETTLE)

@@ -27,10 +27,10 @@ from softfinger.tools.arguments import (
     no_stream,
     to_stderr,
 )
-from softfinger.tools.ending import Ending, known
-from softfinger.tools.terminal.feed import Commander, Feed, FeedSubscriber, printable
+from softfinger.tools.stop_condition import StopCondition, available_signals
 from softfinger.tools.terminal.monitor_page import MonitorPage
 from softfinger.tools.terminal.status import told
+from softfinger.tools.terminal.stream_state import Commander, StreamReader, StreamState, printable
 from softfinger.tools.terminal.terminal import KeyDecoder, Terminal, TerminalGone
 
 STEP_ANGLE = math.radians(5.0)  # rad, object rotation per press of an arrow key
@@ -44,7 +44,7 @@ _GRIPPING = ("grasping", "holding", "rotating")
 class HandKeys:
     """Convert key presses to commands."""
 
-    def __init__(self, feed: Feed, commander: Commander) -> None:
+    def __init__(self, feed: StreamState, commander: Commander) -> None:
         self._feed = feed
         self._commander = commander
         self._target: float | None = None  # object angle [rad]
@@ -76,8 +76,8 @@ class HandKeys:
         if not self._gripping or self._adding(now):
             return feed.force_default if math.isnan(self._chosen) else self._chosen
         # The grip may have been commanded before this page was started.
-        known = (feed.commanded, feed.state.goal_force, self._chosen)
-        return next((force for force in known if not math.isnan(force)), math.nan)
+        candidates = (feed.commanded, feed.state.goal_force, self._chosen)
+        return next((force for force in candidates if not math.isnan(force)), math.nan)
 
     @property
     def _gripping(self) -> bool:
@@ -151,13 +151,13 @@ def run(args: argparse.Namespace) -> int:
         _lower_priority()
     keys = client_keys(args.keys)
     context: zmq.Context[Any] = zmq.Context(io_threads=1)
-    feed = Feed()
+    feed = StreamState()
     try:
         if keys is not None:
             keys.guard(context)
-        subscriber = FeedSubscriber(context, state, feed)
+        subscriber = StreamReader(context, state, feed)
         commander = Commander(context, commands, args.client)
-        with _Ending(args) as ending:
+        with _MonitorStop(args) as ending:
             if _is_page(args):
                 page = MonitorPage(feed, state, guarded=keys is not None)
                 _run_page(page, subscriber, commander, ending)
@@ -188,10 +188,10 @@ def _is_page(args: argparse.Namespace) -> bool:
     return (sys.stdout.encoding or "").lower().replace("-", "") == "utf8"
 
 
-class _Ending(Ending):
-    """Ending that also handles suspension, and ends without a stream if ``--no-wait`` is given."""
+class _MonitorStop(StopCondition):
+    """Stop condition of the monitor: also suspension, and no stream with ``--no-wait``."""
 
-    signals = known("SIGINT", "SIGTERM", "SIGHUP")
+    signals = available_signals("SIGINT", "SIGTERM", "SIGHUP")
 
     def __init__(self, args: argparse.Namespace) -> None:
         super().__init__(args.duration, args.lifeline)
@@ -219,9 +219,9 @@ class _Ending(Ending):
         self.suspend = True
         self.wake()
 
-    def watch(self, feed: Feed, address: str, now: float) -> None:
+    def watch(self, feed: StreamState, address: str, now: float) -> None:
         """Request the end if ``--no-wait`` is given and there is no stream."""
-        if not self._no_wait or self.over:
+        if not self._no_wait or self.is_met:
             return
         status = feed.status(now)
         if status == "lost":
@@ -233,7 +233,7 @@ class _Ending(Ending):
 
 
 def _run_page(
-    page: MonitorPage, subscriber: FeedSubscriber, commander: Commander, ending: _Ending
+    page: MonitorPage, subscriber: StreamReader, commander: Commander, ending: _MonitorStop
 ) -> None:
     keyboard = sys.stdin.fileno() if sys.stdin is not None and sys.stdin.isatty() else None
     page.keys = keyboard is not None
@@ -241,10 +241,10 @@ def _run_page(
     page.coloured = terminal.coloured
     ending.terminal = terminal
     try:
-        while not ending.over:
+        while not ending.is_met:
             with terminal:
                 _page_loop(page, terminal, keyboard, subscriber, commander, ending)
-            if ending.suspend and not ending.over:  # Ctrl-Z: return the terminal to the shell
+            if ending.suspend and not ending.is_met:  # Ctrl-Z: return the terminal to the shell
                 ending.suspend = False
                 os.kill(os.getpid(), signal.SIGSTOP)
     except TerminalGone:
@@ -255,16 +255,16 @@ def _page_loop(
     page: MonitorPage,
     terminal: Terminal,
     keyboard: int | None,
-    subscriber: FeedSubscriber,
+    subscriber: StreamReader,
     commander: Commander,
-    ending: _Ending,
+    ending: _MonitorStop,
 ) -> None:
     keys = KeyDecoder()
     hand = HandKeys(page.feed, commander)
     due = time.monotonic()
-    while not (ending.over or ending.suspend):
+    while not (ending.is_met or ending.suspend):
         keyboards = [] if keyboard is None else [keyboard]
-        for each in ending.ready(due - time.monotonic(), *keyboards):
+        for each in ending.wait_readable(due - time.monotonic(), *keyboards):
             typed = _read(each)
             if not typed:
                 keyboard = None  # the keyboard was closed; keep showing the page
@@ -294,11 +294,11 @@ def _read(keyboard: int) -> bytes:
         return b""
 
 
-def _run_plain(address: str, subscriber: FeedSubscriber, ending: _Ending) -> None:
+def _run_plain(address: str, subscriber: StreamReader, ending: _MonitorStop) -> None:
     feed = subscriber.feed
     with contextlib.suppress(BrokenPipeError):
         said_status, due = "live", 0.0
-        while not ending.over:
+        while not ending.is_met:
             ending.wait(PLAIN_STEP)
             now = time.monotonic()
             subscriber.drain(now)

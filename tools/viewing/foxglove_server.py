@@ -25,8 +25,8 @@ from softfinger.daemon.types import FINGERS
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.schema import HandState
 from softfinger.tools.recordings import channels
-from softfinger.tools.terminal.feed import number
-from softfinger.tools.viewing.planar import COLOURS, Drawn, hand_parts
+from softfinger.tools.terminal.stream_state import number
+from softfinger.tools.viewing.hand_drawing import COLOURS, DrawnPart, hand_parts
 
 LAYOUT = Path(__file__).with_name("foxglove_layout.json")
 ORIGINS = ("https://app.foxglove.dev", "file://")  # Foxglove in the browser and on the desktop
@@ -159,7 +159,7 @@ class Foxglove:
             self._events.append((stamp, data))
 
 
-def _entity(name: str, part: Drawn, stamp: float) -> dict[str, Any]:
+def _entity(name: str, part: DrawnPart, stamp: float) -> dict[str, Any]:
     lines = [
         {"type": 0, "pose": _pose(0.0, 0.0), "thickness": width, "scale_invariant": False}
         | {"points": [_point(x, y) for x, y in points.tolist()], "color": _colour(colour)}

@@ -34,16 +34,16 @@ from softfinger.daemon.client.command_client import NoAnswer, send
 from softfinger.daemon.loop.warm_up import LANDSCAPE
 from softfinger.daemon.profile.settings import Settings
 from softfinger.tools.arguments import client_keys, to_stderr
-from softfinger.tools.ending import Ending
 from softfinger.tools.processes.compile import build_kernels
 from softfinger.tools.recordings.reader import Recording
-from softfinger.tools.terminal.feed import MEANINGS, judge
+from softfinger.tools.stop_condition import StopCondition
+from softfinger.tools.terminal.stream_state import GLOSSARY, judge
 from softfinger.tools.viewing.foxglove_server import LAYOUT, ORIGINS, PROTOCOLS, Foxglove
 from softfinger.tools.viewing.pictures import Pictures, Row
 from softfinger.tools.viewing.recorder import PageRecorder
 from softfinger.tools.viewing.sources import Playback, ViewError, follow
 
-_HELP = "".join(f"<dt><b>{words}</b><dd>{meaning}" for words, meaning in MEANINGS)
+_HELP = "".join(f"<dt><b>{words}</b><dd>{meaning}" for words, meaning in GLOSSARY)
 _WEB = Path(__file__).with_name("web")
 _LOOPBACK = "127.0.0.1"
 _PORT = 9090  # default port
@@ -69,8 +69,8 @@ def _page() -> str:
         (_WEB / name).read_text("utf-8")
         for name in ("page.html", "page.css", "charts.js", "controls.js", "page.js")
     )
-    parts = {"MEANINGS": _HELP, "STYLE": style, "SCRIPTS": "".join(scripts)}
-    return re.sub("MEANINGS|STYLE|SCRIPTS", lambda word: parts[word[0]], html)
+    parts = {"GLOSSARY": _HELP, "STYLE": style, "SCRIPTS": "".join(scripts)}
+    return re.sub("GLOSSARY|STYLE|SCRIPTS", lambda word: parts[word[0]], html)
 
 
 _PAGE = _page()
@@ -316,7 +316,7 @@ def listen(host: str, port: int | None) -> socket.socket:
     return listener
 
 
-def show(arguments: argparse.Namespace, ending: Ending) -> None:
+def show(arguments: argparse.Namespace, ending: StopCondition) -> None:
     """Serve the page until the end; raise SoftfingerError if nothing can be shown."""
     os.nice(_NICE)
     recording = None if arguments.file is None else Recording(arguments.file, _say)

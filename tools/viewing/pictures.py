@@ -29,17 +29,17 @@ from softfinger.daemon.types import FINGERS
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.schema import HandState
 from softfinger.tools.terminal import heatmap
-from softfinger.tools.terminal.feed import Feed, number, printable, text
 from softfinger.tools.terminal.status import why_invalid
-from softfinger.tools.terminal.typeset import micro, short
-from softfinger.tools.viewing import planar
-from softfinger.tools.viewing.known import THETA_END, fingers_of, landscape, read_settings
-from softfinger.tools.viewing.planar import GOAL, OBJECT, FloatArray, touches
+from softfinger.tools.terminal.stream_state import StreamState, number, printable, text
+from softfinger.tools.terminal.text_layout import format_microseconds, format_value
+from softfinger.tools.viewing import hand_drawing
+from softfinger.tools.viewing.hand_drawing import GOAL, OBJECT, FloatArray, touches
+from softfinger.tools.viewing.landscape import THETA_END, fingers_of, landscape, read_settings
 
 if TYPE_CHECKING:
     from softfinger.tools.viewing.foxglove_server import Foxglove
 
-TOPICS = (*Feed().topics, schema.TRUTH)
+TOPICS = (*StreamState().topics, schema.TRUTH)
 SECONDS = 60.0  # s of history that a page gets when it opens
 STEP = 0.1  # s between two rows of the plots
 _TRAIL = 60  # rows shown as a trail on the landscape
@@ -161,7 +161,7 @@ class Pictures:
 
     def clear(self) -> None:
         """Discard everything except the hand's settings, before data of another time are read."""
-        self.feed = Feed()
+        self.feed = StreamState()
         self.states = 0  # number of states since then
         self.time = math.nan  # time of the newest state [Unix s]
         self._truth: dict[str, Any] | None = None
@@ -202,7 +202,7 @@ class Pictures:
             if unknown:
                 self._say(f"settings not known here: {printable(', '.join(unknown))}")
             self._know(settings)
-        self.feed.sort_in(topic, message, self._moment())
+        self.feed.process(topic, message, self._moment())
         if self._foxglove is not None:
             self._foxglove.take(topic, message)
 
@@ -316,7 +316,7 @@ class Pictures:
         }
 
     def _planar(self) -> dict[str, Any]:
-        parts = planar.hand_parts(self._settings, self.feed.state, self._truth).values()
+        parts = hand_drawing.hand_parts(self._settings, self.feed.state, self._truth).values()
         lines = [(colour, wide, _flat(each)) for part in parts for colour, wide, each in part.lines]
         texts = [(colour, *_flat(at), words) for part in parts for colour, at, words in part.texts]
         return {"lines": lines, "texts": texts}
@@ -332,12 +332,12 @@ class Pictures:
             if math.isnan(frame.scale):
                 unit, factor, dark = "counts", 1.0, 0.0
             lines, dots, (rows, cols) = [], [], frame.grid.shape
-            grid, contact = planar.grid_of(frame.source), self.feed.state.finger(name)
+            grid, contact = hand_drawing.grid_of(frame.source), self.feed.state.finger(name)
             if grid is not None:
-                lines.append((name, 1.0, _flat(planar.tip_circle(grid, tip))))
+                lines.append((name, 1.0, _flat(hand_drawing.tip_circle(grid, tip))))
             if grid is not None and touches(contact):
                 tilts = contact.theta, contact.tilt_y if math.isfinite(contact.tilt_y) else 0.0
-                if place := planar.footprint(grid, tip, contact.d, *tilts):
+                if place := hand_drawing.footprint(grid, tip, contact.d, *tilts):
                     lines.append(("white", 1.5, _flat(place[0])))
                     dots.append((name, *_flat(place[1])))
             levels = heatmap.levels_of(frame.grid - dark, full - dark)
@@ -394,20 +394,22 @@ class Pictures:
         fingers = [state.finger(name) for name in self._fingers]
 
         def each(key: str, factor: float, decimals: int) -> str:
-            return " / ".join(short(factor * getattr(finger, key), decimals) for finger in fingers)
+            return " / ".join(
+                format_value(factor * getattr(finger, key), decimals) for finger in fingers
+            )
 
         facts = [
             ("Age of the pressure maps", f"{each('frame_age_s', 1e3, 0)} ms"),
             ("Servos", f"{each('temperature', 1.0, 0)} °C, {each('voltage', 1.0, 1)} V"),
             ("Messages lost", f"{sum(gaps.lost for gaps in self._gaps.values())}"),
-            ("Messages unreadable", f"{feed.skipped}"),
+            ("Messages unreadable", f"{feed.skipped_count}"),
             ("Loop overruns", f"{state.overruns}"),
         ]
         if times is not None:
-            facts.append(("Loop rate", f"{short(times.rates.tick, 0)} Hz"))
+            facts.append(("Loop rate", f"{format_value(times.rates.tick, 0)} Hz"))
             named = {"Loop work": times.compute, "Loop late": times.wake, "Servo bus": times.bus}
             for name, of in named.items():
-                median, tail, most = map(micro, (of.p50, of.p99, of.max))
+                median, tail, most = map(format_microseconds, (of.p50, of.p99, of.max))
                 facts.append((name, f"median {median}, p99 {tail}, max {most} µs"))
         if who := feed.commander(now):
             facts.append(("Commanded by", who))

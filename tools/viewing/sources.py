@@ -19,9 +19,9 @@ from softfinger.daemon.errors import SoftfingerError
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.keys import ClientKeys
 from softfinger.tools.arguments import PATIENCE, no_stream, waiting
-from softfinger.tools.ending import Ending
 from softfinger.tools.recordings.reader import Recording
-from softfinger.tools.terminal.feed import number, printable
+from softfinger.tools.stop_condition import StopCondition
+from softfinger.tools.terminal.stream_state import number, printable
 from softfinger.tools.viewing.pictures import SECONDS, TOPICS, Pictures
 
 _SILENCE = 2.0  # s without a message before a notice is printed
@@ -39,7 +39,7 @@ def follow(
     arguments: argparse.Namespace,
     keys: ClientKeys | None,
     pictures: Pictures,
-    ending: Ending,
+    ending: StopCondition,
     say: Callable[[str], None],
 ) -> None:
     """Show the stream selected by ``arguments`` until the end; may raise ViewError."""
@@ -116,7 +116,7 @@ class Playback:
             elif math.isfinite(place := float(wish)):
                 self._target = min(max(place, 0.0), self._recording.duration)
 
-    def run(self, ending: Ending) -> None:
+    def run(self, ending: StopCondition) -> None:
         """Play until the end is requested."""
         recording, pictures = self._recording, self._pictures
         # Search the marks with a separate reader: this takes seconds for a long recording, and the
@@ -127,7 +127,7 @@ class Playback:
         # Settings may occur only once.
         for message in islice(recording.messages([schema.SETTINGS]), 1):
             pictures.take(*message)
-        while not ending.over:
+        while not ending.is_met:
             begun = time.monotonic()
             if (target := self._target) is not None:
                 self._target, self.position = None, target

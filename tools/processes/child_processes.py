@@ -24,7 +24,7 @@ LEAVE = "\x18\x1b[0m\x1b[?2004l\x1b[?25h\x1b[?1049l"
 _PATIENCE = 20.0  # s for a recorder to subscribe, or to close its file
 
 
-class NoRecorder(SoftfingerError):
+class RecorderError(SoftfingerError):
     """The recorder did not start; the message is the recorder's."""
 
 
@@ -53,7 +53,7 @@ class _Lifeline:
             self._ours = -1
 
 
-class MonitorBeside:
+class MonitorProcess:
     """Run the monitor on this process's terminal until `close`.
 
     ``on_end`` is called once, from a signal handler in the main thread, when the monitor has ended.
@@ -100,14 +100,14 @@ class MonitorBeside:
                 termios.tcsetattr(self._terminal, termios.TCSANOW, self._attributes)
                 os.write(self._terminal, LEAVE.encode())
 
-    def __enter__(self) -> MonitorBeside:
+    def __enter__(self) -> MonitorProcess:
         return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
 
 
-class RecorderBeside:
+class RecorderProcess:
     """Run ``record`` with the arguments ``words``; the first one is the file.
 
     ``failed`` is set once the recording is known to be incomplete.
@@ -120,7 +120,7 @@ class RecorderBeside:
         on_end: Callable[[str], None],
         keys: str = "",
     ) -> None:
-        """Start the recorder and wait until ``subscribed()``; raise NoRecorder if that fails.
+        """Start the recorder and wait until ``subscribed()``; raise RecorderError if that fails.
 
         ``on_end`` is called from a thread, with the reason, if the recorder ends before `close`.
         """
@@ -145,7 +145,7 @@ class RecorderBeside:
             if self._process.poll() is not None or time.monotonic() > deadline:
                 self._process.kill()
                 output = " ".join(text.strip() for text in self._process.communicate())
-                raise NoRecorder(output.strip() or "the recorder did not start")
+                raise RecorderError(output.strip() or "the recorder did not start")
             time.sleep(0.01)
         self._watch = threading.Thread(target=self._wait, name="recorder", daemon=True)
         self._watch.start()
