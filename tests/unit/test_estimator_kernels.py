@@ -142,7 +142,7 @@ def test_a_threshold_of_three_counts_of_eight_bits_leaves_d_unbiased(d, percent,
         )
         clean = grid.pressure(TIP, LINEAR, d, 0.1 * k, 0.05 * k)
         for _ in range(frames):
-            counts = np.clip_noise(
+            counts = np.clip(
                 np.round((clean + rng.normal(0.0, noise, grid.shape)) / scale), 0, 255
             )
             counts[counts < 3] = 0
@@ -220,6 +220,6 @@ def test_a_misfit_is_flagged_and_good_frames_are_not():
     assert e.misfit
     assert e.valid
     assert abs(e.d / 0.003 - 1.0) < 0.05
-    counts = np.clip_noise(np.round((good + rng.normal(0.0, noise, grid.shape)) / 800.0), 0, 255)
+    counts = np.clip(np.round((good + rng.normal(0.0, noise, grid.shape)) / 800.0), 0, 255)
     assert not estimator(counts.astype(np.uint8), 800.0).misfit
     assert not estimator(np.zeros(grid.shape)).misfit

@@ -135,7 +135,7 @@ def test_a_level_that_changes_at_rest_adds_no_torque_to_the_bristles():
         load(hand, [motor], 0.02)  # longer than the motor's lag
         gears = hand.plant.gears[0]
         assert gears.friction == pytest.approx(FRICTION + share * motor, rel=1e-6)
-        return gears.friction * gears.bent / PRESLIDING
+        return gears.friction * gears.limited_deflection / PRESLIDING
 
     bent = 0.6 * FRICTION
     assert torque(0.0) == pytest.approx(bent, rel=1e-6)
