@@ -18,9 +18,9 @@ from softfinger.daemon.servos.base import Finding
 from softfinger.kinematics.compiled.kernel_folder import damaged, find_kernel_folder
 
 _MEMORY = 1 << 30  # bytes, more than the daemon maps
-_WAKE_UPS = 100
+_WAKE_UP_COUNT = 100
 _PERIOD = 0.002  # s
-_OLDEST = 1_700_000_000.0  # Unix time [s], an earlier clock was never set
+_CLOCK_MIN = 1_700_000_000.0  # Unix time [s], an earlier clock was never set
 
 
 def check_machine() -> list[Finding]:
@@ -73,7 +73,7 @@ def check_idle_states(path: Path) -> Finding:
 
 def check_wall_clock(now: float) -> Finding:
     """Check that Unix time ``now`` [s], which is in every published message, is plausible."""
-    if now >= _OLDEST:
+    if now >= _CLOCK_MIN:
         return Finding("pass", "wall clock", time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(now)))
     date = time.strftime("%Y-%m-%d", time.gmtime(now))
     problem = f"says {date}: published timestamps will be wrong"
@@ -84,7 +84,7 @@ def wake_ups() -> list[float]:
     """Measure the lateness [s] of sleeps until a deadline, like those of the daemon's ticks."""
     late = []
     deadline = time.monotonic()
-    for _ in range(_WAKE_UPS):
+    for _ in range(_WAKE_UP_COUNT):
         deadline += _PERIOD
         time.sleep(max(deadline - time.monotonic(), 0.0))
         late.append(time.monotonic() - deadline)

@@ -32,7 +32,7 @@ from softfinger.daemon.wire.local_stop import LocalStop
 from softfinger.daemon.wire.publisher import GATEWAY_TOPICS, Publisher
 from softfinger.kinematics.contact.table import ContactTable
 
-_LOOK_AGAIN = 0.2  # s between two connection attempts
+_RETRY_INTERVAL = 0.2  # s between two connection attempts
 
 if TYPE_CHECKING:
     from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
@@ -113,7 +113,7 @@ class Daemon:
                     text = f"{silent}; waiting up to servos.open_timeout = {patience:g} s"
                     on_event("warning", "servos", text)
                     told = True
-            time.sleep(_LOOK_AGAIN)
+            time.sleep(_RETRY_INTERVAL)
 
     def _bind(self) -> tuple[Publisher, CommandServer]:
         stream, commands = self.settings.stream, self.settings.commands

@@ -31,7 +31,8 @@ from softfinger.daemon.wire.publisher import Publisher
 
 EventSink = Callable[[str, str, str], None]
 
-_START_AGE = 0.2  # s, age limit of commands that stiffen or move the hand, except holds in a grip
+# s, age limit of commands that stiffen or move the hand, except holds in a grip.
+_START_AGE_MAX = 0.2
 
 
 def start_age(settings: Settings, waits: bool) -> float:
@@ -41,7 +42,7 @@ def start_age(settings: Settings, waits: bool) -> float:
     state. With ``waits``, the servos' time and their watchdog pause while this machine is late.
     """
     watchdog = 0.0 if settings.simulated or waits else settings.servos.watchdog
-    return min(_START_AGE, watchdog or _START_AGE)
+    return min(_START_AGE_MAX, watchdog or _START_AGE_MAX)
 
 
 class Commands(Protocol):
@@ -227,7 +228,7 @@ class Loop:
             reading.valid = False
             state.read_error = str(error)
             self._fail(str(error))
-        self._heat.follow()
+        self._heat.update()
         if reading.valid and self.perception.fingers:
             gripping = state.mode in GRIPPING_MODES and state.goal.valid
             self.perception.filter.predict(reading, state.goal if gripping else None)

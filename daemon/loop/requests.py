@@ -28,10 +28,10 @@ from softfinger.daemon.safety.safety import Safety
 from softfinger.daemon.safety.torque_state import TorqueState
 from softfinger.daemon.types import FINGERS, GRIP_FRACTION, UNLEASED, State
 
-LONGEST_AGE = 1.0  # s, age limit of every command except status and stop
-_COMPLIANCE = (0.01, 1.0)  # rad/(N·m)
-_ENVELOPE = frozenset({"command", "client"})
-_FIRST = {Mode.DISARMED: "arm first", Mode.FAULT: "clear the fault first"}
+AGE_MAX = 1.0  # s, age limit of every command except status and stop
+_COMPLIANCE_RANGE = (0.01, 1.0)  # rad/(N·m)
+_ENVELOPE_KEYS = frozenset({"command", "client"})
+_MODE_REMEDIES = {Mode.DISARMED: "arm first", Mode.FAULT: "clear the fault first"}
 
 
 class Command(NamedTuple):
@@ -51,7 +51,7 @@ def parse(request: dict[str, Any], mode: Mode) -> Command:
     if not isinstance(client, str) or len(client) > 64:
         raise _malformed("client: expected a text of at most 64 characters")
     heard, parameters = COMMANDS[name]
-    unknown = sorted(set(request) - _ENVELOPE - set(parameters))
+    unknown = sorted(set(request) - _ENVELOPE_KEYS - set(parameters))
     if unknown:
         known = ", ".join(parameters) or "no parameters"
         raise _malformed(f"{name}: unknown parameter {unknown[0][:40]!r}; expected {known}")
@@ -68,7 +68,7 @@ def parse(request: dict[str, Any], mode: Mode) -> Command:
             raise _malformed(f"{name}: {key}: expected a finite number, found {value}")
         numbers[key] = float(value)
     if mode not in heard:
-        hint = _FIRST.get(mode) or f"possible while {', '.join(sorted(heard))}"
+        hint = _MODE_REMEDIES.get(mode) or f"possible while {', '.join(sorted(heard))}"
         if name == "clear":
             hint = "there is no fault"
         raise Refused(f"{name}: not while {mode.value}; {hint}", Reason.MODE)
@@ -236,7 +236,7 @@ class Requests:
         if name == "status":
             return
         streamed = name == "hold" and self._control.mode in GRIPPING_MODES
-        longest = LONGEST_AGE if streamed or name in SAFE_COMMANDS else self._start_age
+        longest = AGE_MAX if streamed or name in SAFE_COMMANDS else self._start_age
         if age > longest:
             text = f"{name}: {age:.2f} s old when its turn came, at most {longest:g} s is allowed"
             raise Refused(f"{text}; send it again", Reason.LATE)
@@ -295,7 +295,7 @@ class Requests:
                 text = self._control.fingers.turn_refusal(numbers["angle"])
                 refuse_if(text, Reason.BOUNDS if state.object.valid else Reason.STATE, text)
         if name == "set":
-            compliance, (low, high) = numbers["compliance"], _COMPLIANCE
+            compliance, (low, high) = numbers["compliance"], _COMPLIANCE_RANGE
             text = f"compliance: found {compliance:g} rad/(N·m), expected {low:g} to {high:g}"
             refuse_if(not low <= compliance <= high, Reason.BOUNDS, text)
 

@@ -77,7 +77,7 @@ def hands(tmp_path: Path) -> Iterator[Callable[..., Hand]]:
 def short(monkeypatch: pytest.MonkeyPatch) -> None:
     """Measure this machine for less long than on metal, and leave its sockets alone."""
     monkeypatch.setattr(doctor, "check_addresses", lambda _: [])
-    monkeypatch.setattr(machine, "_WAKE_UPS", 5)
+    monkeypatch.setattr(machine, "_WAKE_UP_COUNT", 5)
 
 
 def scanned(capsys: pytest.CaptureFixture[str], folder: Path, *words: str) -> list[str]:
@@ -382,7 +382,7 @@ def profile(addresses: Addresses) -> Settings:
 def test_free_and_taken_sockets(addresses, monkeypatch):
     settings = profile(addresses)
     assert [each.status for each in ports.check_addresses(settings)] == ["pass", "pass"]
-    monkeypatch.setattr("softfinger.daemon.diagnosis.ports._PATIENCE", 0.05)
+    monkeypatch.setattr("softfinger.daemon.diagnosis.ports._TIMEOUT", 0.05)
     host, port = addresses[0].removeprefix("tcp://").split(":")
     with socket.create_server((host, int(port))):
         taken, free = ports.check_addresses(settings)

@@ -70,7 +70,7 @@ class Bench:
         reading.t = self.t
         reading.current[0] = noisy
         reading.temperature[0] = float(round(self.plant.sensed))
-        self._watch.follow()
+        self._watch.update()
         return self.state.heat[0].time_to_limit
 
 

@@ -16,7 +16,7 @@ from softfinger.daemon.errors import RecordingError, TactileError
 from softfinger.daemon.perception.finger_model import make_models
 from softfinger.daemon.perception.unloaded_cells import UnloadedCells
 from softfinger.daemon.profile.settings import Settings, TactileSettings
-from softfinger.daemon.profile.validation import sensor_doubts
+from softfinger.daemon.profile.validation import sensor_warnings
 from softfinger.daemon.tactile.frame_files import load_recording
 from softfinger.daemon.tactile.replay import ReplayTactile
 from softfinger.tools.analysis.analyse import analyse, open_source
@@ -444,7 +444,7 @@ def test_a_sensor_of_another_size_than_the_tip_wants_is_told(changes, told):
         section, name = key.split(".")
         tables.setdefault(section, {})[name] = value
     settings = Settings.model_validate(tables)
-    doubts = sensor_doubts(settings)
+    doubts = sensor_warnings(settings)
     events: list[tuple[str, str, str]] = []
     make_models(settings, lambda *event: events.append(event))
     warned = [text for level, _, text in events if level == "warning"]
@@ -456,7 +456,7 @@ def test_a_sensor_of_another_size_than_the_tip_wants_is_told(changes, told):
 def test_a_solid_tips_sensor_covers_its_base():
     solid = {"tip": {"physics": "solid"}, "material": {"law": "constant"}}
     settings = Settings.model_validate({**solid, "tactile": {"rows": 28}})
-    (doubt,) = sensor_doubts(settings)
+    (doubt,) = sensor_warnings(settings)
     assert "smaller than the tip's base, 40 mm wide" in doubt
 
 

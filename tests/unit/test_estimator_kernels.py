@@ -142,9 +142,7 @@ def test_a_threshold_of_three_counts_of_eight_bits_leaves_d_unbiased(d, percent,
         )
         clean = grid.pressure(TIP, LINEAR, d, 0.1 * k, 0.05 * k)
         for _ in range(frames):
-            counts = np.clip(
-                np.round((clean + rng.normal(0.0, noise, grid.shape)) / scale), 0, 255
-            )
+            counts = np.clip(np.round((clean + rng.normal(0.0, noise, grid.shape)) / scale), 0, 255)
             counts[counts < 3] = 0
             e = estimator.update(counts.astype(np.uint8), scale)
             assert e.valid

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, BinaryIO, Protocol
 
 from softfinger.daemon.errors import RecordingError
-from softfinger.daemon.own_files import MOST, open_regular, unpacked_most
+from softfinger.daemon.own_files import SIZE_MAX, open_regular, unpacked_size_max
 from softfinger.daemon.wire import schema
 from softfinger.tools.extras import require
 from softfinger.tools.recordings.channels import ENCODING, PROFILE, Converter, from_json, topic_of
@@ -200,7 +200,7 @@ class Recording:
         self.chunks = 0
         with open_regular(self.path) as file:
             file.seek(len(_MAGIC))
-            self._left = unpacked_most(file)
+            self._left = unpacked_size_max(file)
             try:
                 for kind, content in _records(file, (_CHANNEL, _MESSAGE, _CHUNK, _DATA_END)):
                     if kind == _DATA_END:
@@ -371,9 +371,9 @@ def _records(file: IO[bytes], wanted: Collection[int]) -> Iterator[tuple[int, by
             file.seek(length, os.SEEK_CUR)
             continue
         skipped = 0
-        if length > MOST and kind == _MESSAGE:
+        if length > SIZE_MAX and kind == _MESSAGE:
             length, skipped = _BEFORE_DATA.size, length - _BEFORE_DATA.size
-        elif length > (_CHUNK_MOST if kind == _CHUNK else MOST):
+        elif length > (_CHUNK_MOST if kind == _CHUNK else SIZE_MAX):
             raise ValueError(f"a record of {length >> 20} MB")
         content = file.read(length)
         if len(content) < length:

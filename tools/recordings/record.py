@@ -20,7 +20,7 @@ from softfinger.daemon.errors import RecordingError
 from softfinger.daemon.wire import schema
 from softfinger.tools.arguments import (
     ALL,
-    PATIENCE,
+    WAIT_MAX,
     add_split,
     add_stream,
     client_keys,
@@ -277,7 +277,7 @@ class _Recorder:
             if taken:
                 last = now
             elif not self._messages and now - began > _SILENCE:
-                if arguments.no_wait and now - began > PATIENCE:
+                if arguments.no_wait and now - began > WAIT_MAX:
                     failure = no_stream(arguments.address, arguments.keys)
                     break
                 if not self._waiting:

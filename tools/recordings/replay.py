@@ -13,7 +13,7 @@ from softfinger.daemon.gateway.supervisor import Gateway
 from softfinger.daemon.profile.settings import StreamSettings
 from softfinger.daemon.profile.validation import address_problem
 from softfinger.daemon.wire import schema
-from softfinger.daemon.wire.publisher import GATEWAY_TOPICS, KEPT, pack
+from softfinger.daemon.wire.publisher import GATEWAY_TOPICS, REPEATED_COUNTS, pack
 from softfinger.tools.arguments import add_range, number, to_stderr
 from softfinger.tools.stop_condition import StopCondition
 
@@ -184,7 +184,7 @@ class Wire:
             return
         self._link.wait_for_room(_PATIENCE)
         index = GATEWAY_TOPICS.index(topic.decode())
-        self._link.publish(index, pack(message), KEPT.get(topic, 0))
+        self._link.publish(index, pack(message), REPEATED_COUNTS.get(topic, 0))
 
     def __enter__(self) -> Wire:
         return self

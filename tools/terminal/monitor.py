@@ -20,7 +20,7 @@ from typing import Any, Self
 import zmq
 
 from softfinger.tools.arguments import (
-    PATIENCE,
+    WAIT_MAX,
     add_stream,
     addresses,
     client_keys,
@@ -202,7 +202,7 @@ class _MonitorStop(StopCondition):
         self._no_wait: bool = args.no_wait
         self._keys: Path | None = args.keys
         self.beside = args.lifeline is not None  # started by the daemon, in the same process group
-        self._patience = time.monotonic() + PATIENCE
+        self._patience = time.monotonic() + WAIT_MAX
 
     def __enter__(self) -> Self:
         super().__enter__()

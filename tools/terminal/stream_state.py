@@ -20,8 +20,19 @@ import numpy as np
 import zmq
 from numpy.typing import NDArray
 
-from softfinger.daemon.client.command_client import AGAIN_AFTER, LOCALLY, UNCONFIRMED, Attempts
-from softfinger.daemon.client.connection import PATIENCE, SILENCE, drain, subscribe, unpack
+from softfinger.daemon.client.command_client import (
+    LOCAL_STOP_TIMEOUT,
+    RETRY_DELAY,
+    UNCONFIRMED_TEXT,
+    Attempts,
+)
+from softfinger.daemon.client.connection import (
+    REPLY_TIMEOUT,
+    SILENCE_TIME,
+    drain,
+    subscribe,
+    unpack,
+)
 from softfinger.daemon.client.stream import read
 from softfinger.daemon.types import FINGERS, GRIP_FRACTION, UNLEASED
 from softfinger.daemon.wire import schema
@@ -329,10 +340,13 @@ class Commander:
         if len(self._pending) >= self.OPEN_LIMIT and command != "stop":
             self.refuse(now, f"{label}: dropped, the daemon doesn't answer")
             return
-        if command == "stop" and (stopped := stop_locally(self._address, LOCALLY)) is not None:
+        if (
+            command == "stop"
+            and (stopped := stop_locally(self._address, LOCAL_STOP_TIMEOUT)) is not None
+        ):
             self.reply = judge(now, label, stopped)
             return
-        attempts = Attempts({"command": command, **self._envelope, **fields}, PATIENCE)
+        attempts = Attempts({"command": command, **self._envelope, **fields}, REPLY_TIMEOUT)
         request = self._context.socket(zmq.REQ)
         request.setsockopt(zmq.LINGER, 0)
         request.setsockopt(zmq.MAXMSGSIZE, _MESSAGE_LIMIT)
@@ -359,10 +373,11 @@ class Commander:
             try:
                 payload = each.socket.recv(zmq.NOBLOCK)
             except zmq.Again:
-                overdue = now - each.sent >= PATIENCE
-                if overdue or (not each.warned and now - each.sent >= SILENCE):
+                overdue = now - each.sent >= REPLY_TIMEOUT
+                if overdue or (not each.warned and now - each.sent >= SILENCE_TIME):
                     each.warned = True
-                    so_far = f"within {PATIENCE:g} s" if overdue else f"yet, {PATIENCE:g} s at most"
+                    timeout = f"{REPLY_TIMEOUT:g} s"
+                    so_far = f"within {timeout}" if overdue else f"yet, {timeout} at most"
                     self.refuse(now, f"{each.label}: no answer from {self._address} {so_far}")
                 if overdue:
                     self._close(each)
@@ -372,7 +387,7 @@ class Commander:
             except (ValueError, RecursionError, msgpack.UnpackException):
                 record = None
             if isinstance(record, dict) and each.attempts.again(record):
-                each.late, each.again_at = record, now + AGAIN_AFTER
+                each.late, each.again_at = record, now + RETRY_DELAY
             else:
                 self._end(each, now, record)
 
@@ -389,7 +404,7 @@ def judge(now: float, label: str, record: Any) -> ShownReply:
     """Convert the daemon's answer to the command shown as ``label`` into a reply for the page."""
     if field(record, "ok") is True:
         if text(record, "torque_off") == "unconfirmed":
-            return ShownReply(now, False, f"{label}: {UNCONFIRMED}")
+            return ShownReply(now, False, f"{label}: {UNCONFIRMED_TEXT}")
         return ShownReply(now, True, f"{label}: ok")
     why = text(record, "error") or "an answer that can't be read"
     named = why.split(":")[0] == label.split()[0]  # the daemon's message already names the command

@@ -18,7 +18,7 @@ from softfinger.daemon.client.stream import read
 from softfinger.daemon.errors import SoftfingerError
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.keys import ClientKeys
-from softfinger.tools.arguments import PATIENCE, no_stream, waiting
+from softfinger.tools.arguments import WAIT_MAX, no_stream, waiting
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.stop_condition import StopCondition
 from softfinger.tools.terminal.stream_state import number, printable
@@ -58,7 +58,7 @@ def follow(
                     pictures.take(*unpack(message))
                 except ValueError:
                     pictures.unreadable += 1
-            if arguments.no_wait and last == begun and began - begun > PATIENCE:
+            if arguments.no_wait and last == begun and began - begun > WAIT_MAX:
                 raise ViewError(no_stream(arguments.address, arguments.keys))
             if silent != (began - last > _SILENCE):
                 silent = not silent

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from softfinger.daemon.clock import Clock
 from softfinger.daemon.profile.factory import make_grid, make_material, make_tip
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.simulation.faults import LONGEST_REPLAY
+from softfinger.daemon.simulation.faults import REPLAY_TIME_MAX
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.daemon.simulation.sensor.sensor_model import SensorModel
 from softfinger.daemon.types import Frame
@@ -86,7 +86,7 @@ class SimulatedTactile:
         self._frame: Frame | None = None
         self._faults = hand.measurement_faults[finger]
         self._given: deque[NDArray[np.uint16]] = deque(
-            maxlen=math.ceil(LONGEST_REPLAY * tactile.rate)
+            maxlen=math.ceil(REPLAY_TIME_MAX * tactile.rate)
         )
         self._replayed: Iterator[NDArray[np.uint16]] | None = None
         self._lost = 0
