@@ -607,7 +607,7 @@ class Soak:
         if mode not in ("disarmed", "fault"):
             self._judge_ages(mode)
         self._judge_forces(state.t)
-        self._judge_witnesses(mode)
+        self._judge_sensor_faults(mode)
 
     def _judge_torque(self) -> None:
         if self.servos.armed:
@@ -660,7 +660,7 @@ class Soak:
         found = f"{force:.2f} N for {t - self._above[key]:.3f} s, bound {bound:.2f} N"
         self.must(name, t - self._above[key] <= _TOO_LONG, found)
 
-    def _judge_witnesses(self, mode: str) -> None:
+    def _judge_sensor_faults(self, mode: str) -> None:
         if not self._covered():
             self._uncovered_t = self.daemon.loop.state.t
         for name in self._doubts(mode in _GRIPPING):

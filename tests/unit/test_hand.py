@@ -260,7 +260,7 @@ def test_advance_is_idempotent_and_split_ways_are_bit_identical():
     hands[2].advance(1.0)
 
     def state(hand):
-        parts = ("state", "gears", "felt", "energy", "samples")
+        parts = ("state", "gears", "sensed_contact", "energy", "sample_count")
         return [hand.plant.array[part].tobytes() for part in parts]
 
     before = state(hands[0])

@@ -20,8 +20,8 @@ from typing import Any
 from softfinger.daemon.errors import SoftfingerError
 
 # Restores the terminal if the monitor was killed.
-LEAVE = "\x18\x1b[0m\x1b[?2004l\x1b[?25h\x1b[?1049l"
-_PATIENCE = 20.0  # s for a recorder to subscribe, or to close its file
+RESTORE_TERMINAL = "\x18\x1b[0m\x1b[?2004l\x1b[?25h\x1b[?1049l"
+_RECORDER_TIMEOUT = 20.0  # s for a recorder to subscribe, or to close its file
 
 
 class RecorderError(SoftfingerError):
@@ -98,7 +98,7 @@ class MonitorProcess:
         if self.process.wait() < 0 and self._attributes is not None:
             with contextlib.suppress(OSError, termios.error):
                 termios.tcsetattr(self._terminal, termios.TCSANOW, self._attributes)
-                os.write(self._terminal, LEAVE.encode())
+                os.write(self._terminal, RESTORE_TERMINAL.encode())
 
     def __enter__(self) -> MonitorProcess:
         return self
@@ -140,7 +140,7 @@ class RecorderProcess:
             text=True,
             start_new_session=True,
         )
-        deadline = time.monotonic() + _PATIENCE
+        deadline = time.monotonic() + _RECORDER_TIMEOUT
         while not subscribed():
             if self._process.poll() is not None or time.monotonic() > deadline:
                 self._process.kill()
@@ -168,7 +168,7 @@ class RecorderProcess:
         if self._watch.is_alive():
             self._process.send_signal(signal.SIGTERM)
         self._lifeline.close()
-        self._watch.join(_PATIENCE)
+        self._watch.join(_RECORDER_TIMEOUT)
         if self._watch.is_alive():
             self._process.kill()
             self._watch.join()

@@ -19,7 +19,7 @@ from softfinger.tools.stop_condition import Interrupted, Signals
 if TYPE_CHECKING:
     from softfinger.daemon.profile.settings import Settings
 
-_LOOK = 0.1  # s between two queries about the motion of a plate or joint
+_QUERY_INTERVAL = 0.1  # s between two queries about the motion of a plate or joint
 _FAULTS = """\
 faults, each KIND[=VALUE][@START], any number of them:
   tactile boards   torn, noisy (=PROBABILITY a frame), silent, frozen, wrong-size, saturated, zero;
@@ -208,7 +208,7 @@ def _send(folder: Path, words: str) -> int:
             left = json.loads(reply)["wait"]
             if left == 0.0:
                 return 0
-            time.sleep(min(left, _LOOK))
+            time.sleep(min(left, _QUERY_INTERVAL))
             reply = send_words(folder, kind)
     except NoEmulator as error:
         reply = f"error: {error}"

@@ -31,7 +31,7 @@ From the first tick on, the same code and settings give identical bits.
 Exit status: 0 identical or published, 1 the file can't be read, 3 states differ."""
 
 _SUBSCRIBER_WAIT = 10.0  # s to wait for a subscriber
-_DIFFERENT = 3
+_EXIT_DIFFERENT = 3
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -145,11 +145,11 @@ def _recompute(arguments: argparse.Namespace, recording: Recording) -> int:
     for name, each in result.differences.items():
         line = f"{name:24} {each.count:8} {each.first_tick:10}  {each.recorded} → {each.recomputed}"
         print(line + (f"; {each.worst:.3g} at tick {each.worst_tick}" if each.worst else ""))
-    return _DIFFERENT
+    return _EXIT_DIFFERENT
 
 
-_QUEUE = 10_000  # messages queued for a subscriber; further messages are lost
-_PATIENCE = 1.0  # s for the gateway to accept a message
+_QUEUE_LENGTH = 10_000  # messages queued for a subscriber; further messages are lost
+_SEND_TIMEOUT = 1.0  # s for the gateway to accept a message
 
 
 class Wire:
@@ -164,7 +164,9 @@ class Wire:
         if fault:
             raise RecordingError(f"--address: {fault}")
         folder = "" if keys is None else str(keys)
-        config = Config(address, "", GATEWAY_TOPICS, _QUEUE, keys=folder, stream_key="--address")
+        config = Config(
+            address, "", GATEWAY_TOPICS, _QUEUE_LENGTH, keys=folder, stream_key="--address"
+        )
         self._gateway = Gateway(config)
         try:
             self._gateway.wait()
@@ -182,7 +184,7 @@ class Wire:
         """Publish one message as soon as the gateway has room for it."""
         if topic not in schema.TOPICS:  # topic of another version
             return
-        self._link.wait_for_room(_PATIENCE)
+        self._link.wait_for_room(_SEND_TIMEOUT)
         index = GATEWAY_TOPICS.index(topic.decode())
         self._link.publish(index, pack(message), REPEATED_COUNTS.get(topic, 0))
 

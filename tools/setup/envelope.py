@@ -31,12 +31,12 @@ SHAPES = ("rectangle", "disc")
 SIZES = (2, 3, 4, 5, 6, 8, 10, 15, 20, 30, 40, 60, 90)  # mm: width or diameter
 FRICTIONS = (0.2, 0.4, 0.6, 0.8)
 MASSES = (0.05, 0.2, 0.5, 1.0, 2.0)  # kg
-_SETTLE = 3.0  # s for the grip to settle
-_LIFT = 1.0  # s in which the weight is applied
-_AFTER = 1.0  # s of observation afterwards
-_STEPS = 20  # steps in which the weight is applied
-_TURNED = math.radians(5.0)
-_AWAY = 0.010  # m, displacement along the faces at which the object counts as lost
+_SETTLING_TIME = 3.0  # s for the grip to settle
+_LOAD_TIME = 1.0  # s in which the weight is applied
+_OBSERVATION_TIME = 1.0  # s of observation afterwards
+_LOAD_STEP_COUNT = 20  # steps in which the weight is applied
+_TURN_MIN = math.radians(5.0)
+_SLIDE_MAX = 0.010  # m, displacement along the faces at which the object counts as lost
 _GRAVITY = 9.81  # m/s²
 _COLOURS = {HELD: "#009E73", TURNED: "#E69F00", LOST: "#D55E00", REFUSED: "#777777"}
 
@@ -167,22 +167,22 @@ def grasped(
     with SimulatedDaemon(changed) as hand:
         hand.grasp(force)
         angle = float(hand.plant.object_pose[2])
-        hand.run(_SETTLE)
+        hand.run(_SETTLING_TIME)
         if hand.mode != "holding":
             return Cell(REFUSED, math.nan)
         before = hand.plant.object_pose.copy()
         # Friction of the table opposes the load, so add it.
         pull = weight * (1.0 + settings.simulation.table_friction)
-        for k in range(_STEPS):
-            load, phi = pull * (k + 1) / _STEPS, float(hand.plant.object_pose[2])
+        for k in range(_LOAD_STEP_COUNT):
+            load, phi = pull * (k + 1) / _LOAD_STEP_COUNT, float(hand.plant.object_pose[2])
             hand.plant.apply_load(-load * math.sin(phi), load * math.cos(phi))
-            hand.run(_LIFT / _STEPS)
-        hand.run(_AFTER)
+            hand.run(_LOAD_TIME / _LOAD_STEP_COUNT)
+        hand.run(_OBSERVATION_TIME)
         shifted = math.dist(hand.plant.object_pose[:2], before[:2])
-        if hand.mode != "holding" or shifted > _AWAY:
+        if hand.mode != "holding" or shifted > _SLIDE_MAX:
             return Cell(LOST, math.nan)
         turned = abs(float(hand.plant.object_pose[2]) - angle)
-        return Cell(TURNED if turned > _TURNED else HELD, turned)
+        return Cell(TURNED if turned > _TURN_MIN else HELD, turned)
 
 
 def _keep(
@@ -236,7 +236,7 @@ def _draw(
             for j in range(len(masses)):
                 for x, cell in enumerate(found[shape][k * len(masses) + j]):
                     axes_.barh(j, 0.94, 0.92, x - 0.47, color=_COLOURS[cell.outcome])
-                    if cell.turned > _TURNED:
+                    if cell.turned > _TURN_MIN:
                         text = f"{math.degrees(cell.turned):.0f}°"
                         axes_.text(x, j, text, ha="center", va="center", fontsize=6)
             axes_.set(yticks=range(len(masses)), yticklabels=[f"{each:g} kg" for each in masses])

@@ -35,9 +35,9 @@ from softfinger.tools.terminal.terminal import KeyDecoder, Terminal, TerminalGon
 
 STEP_ANGLE = math.radians(5.0)  # rad, object rotation per press of an arrow key
 _STEPS = ((1.0, 0.1), (5.0, 0.5), (math.inf, 1.0))  # (upper force limit [N], step below it [N])
-_BETWEEN = 1.0  # s, presses within this time accumulate
-_SURE = 3.0  # s within which a second d confirms disarming
-_SIMPLE = {"a": "arm", "r": "release", " ": "stop", "c": "clear", "d": "disarm", "w": "demo"}
+_ACCUMULATION_TIME = 1.0  # s, presses within this time accumulate
+_CONFIRMATION_TIME = 3.0  # s within which a second d confirms disarming
+_COMMAND_KEYS = {"a": "arm", "r": "release", " ": "stop", "c": "clear", "d": "disarm", "w": "demo"}
 _GRIPPING = ("grasping", "holding", "rotating")
 
 
@@ -60,12 +60,12 @@ class HandKeys:
             self._change_force(1.0 if key in "+=" else -1.0, now)
         elif key == "g":
             self._grasp(now)
-        elif key == "d" and self._gripping and now - self._asked > _SURE:
+        elif key == "d" and self._gripping and now - self._asked > _CONFIRMATION_TIME:
             self._asked = now
             self._commander.refuse(now, "disarm: it lets the object fall; d again to do it")
-        elif key in _SIMPLE:
+        elif key in _COMMAND_KEYS:
             self._target = None
-            self._commander.send(now, _SIMPLE[key], _SIMPLE[key])
+            self._commander.send(now, _COMMAND_KEYS[key], _COMMAND_KEYS[key])
 
     def force(self, now: float) -> float:
         """Return the force of the next grasp, or the requested force of the current grip [N].
@@ -87,7 +87,7 @@ class HandKeys:
         """Return True shortly after a force key, while the chosen force is not yet published."""
         reply = self._commander.reply
         refused = reply is not None and not reply.ok and reply.at >= self._pressed
-        return now - self._pressed < _BETWEEN and not refused
+        return now - self._pressed < _ACCUMULATION_TIME and not refused
 
     def _change_force(self, sign: float, now: float) -> None:
         """Change the force by one step; a current grip is changed immediately."""
@@ -124,9 +124,9 @@ class HandKeys:
         self._commander.send(now, label, "rotate", angle=self._target)
 
 
-REDRAW = 0.1  # s, shortest time between redraws
-PLAIN_STEP = 0.1  # s between reads of the stream in plain mode
-PLAIN_LINE = 1.0  # s between plain lines
+REDRAW_INTERVAL = 0.1  # s, shortest time between redraws
+PLAIN_READ_INTERVAL = 0.1  # s between reads of the stream in plain mode
+PLAIN_LINE_INTERVAL = 1.0  # s between plain lines
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -202,7 +202,7 @@ class _MonitorStop(StopCondition):
         self._no_wait: bool = args.no_wait
         self._keys: Path | None = args.keys
         self.beside = args.lifeline is not None  # started by the daemon, in the same process group
-        self._patience = time.monotonic() + WAIT_MAX
+        self._wait_until = time.monotonic() + WAIT_MAX
 
     def __enter__(self) -> Self:
         super().__enter__()
@@ -226,7 +226,7 @@ class _MonitorStop(StopCondition):
         status = feed.status(now)
         if status == "lost":
             self.why = "the stream has ended"
-        elif status == "waiting" and now > self._patience:
+        elif status == "waiting" and now > self._wait_until:
             self.why = no_stream(address, self._keys)
         if self.why:
             self.end()
@@ -284,7 +284,7 @@ def _page_loop(
         page.force = hand.force(now)
         width, height = terminal.size()
         terminal.draw(page.lines(width, height, now, commander.reply))
-        due = max(due + REDRAW, time.monotonic() + 0.5 * REDRAW)
+        due = max(due + REDRAW_INTERVAL, time.monotonic() + 0.5 * REDRAW_INTERVAL)
 
 
 def _read(keyboard: int) -> bytes:
@@ -299,7 +299,7 @@ def _run_plain(address: str, subscriber: StreamReader, ending: _MonitorStop) -> 
     with contextlib.suppress(BrokenPipeError):
         said_status, due = "live", 0.0
         while not ending.is_met:
-            ending.wait(PLAIN_STEP)
+            ending.wait(PLAIN_READ_INTERVAL)
             now = time.monotonic()
             subscriber.drain(now)
             ending.watch(feed, address, now)
@@ -310,7 +310,7 @@ def _run_plain(address: str, subscriber: StreamReader, ending: _MonitorStop) -> 
             for event in feed.news():
                 _say(f"{event.clock()} {event.level} {event.kind}: {event.text}")
             if status in ("live", "stale") and now >= due:
-                due = now + PLAIN_LINE
+                due = now + PLAIN_LINE_INTERVAL
                 _say(f"{_clock()} {printable(told(feed.state))}")
         return
     # The reader has closed the pipe. Python flushes its output again at exit; send that to

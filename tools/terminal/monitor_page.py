@@ -34,14 +34,14 @@ from softfinger.tools.terminal.text_layout import (
 WIDTH, HEIGHT = 80, 24  # smallest size into which everything fits
 CENTRE = 34  # width of the numbers, columns
 MAP_LINES = 11  # height of each map at the smallest page size
-OLD = 1.0  # s, age above which a frame is marked as old
+OLD_AGE = 1.0  # s, age above which a frame is marked as old
 REPLY_TIME = 12.0  # s for which a reply is shown
-LATE = 0.05  # s, delay above which a message is shown
+DELAY_MIN = 0.05  # s, delay above which a message is shown
 
 GOOD, WARN, BAD = "#1fa883", "#e69f00", "bold #ff6a3d"
 KEY = "bold #56b4e9"
 ALARM = "bold #ffffff on #b8360b"
-SIDE = {"left": KEY, "right": "bold #e69f00"}
+FINGER_STYLES = {"left": KEY, "right": "bold #e69f00"}
 _BADGES = {
     "disarmed": "bold #ffffff on #5a6068",
     "armed": "bold #ffffff on #0067a8",
@@ -160,7 +160,7 @@ class MonitorPage:
             what = f" the stream has schema {feed.state.schema}, this page knows {SCHEMA}"
             return Text(what + " and shows the fields it knows", WARN)
         lately = feed.waited(now)
-        if lately > LATE:
+        if lately > DELAY_MIN:
             what = f" this machine is busy: the simulated hand runs {lately:.2f} s behind"
             return truncated(
                 Text(f"{what} ({format_value(feed.state.behind_s, 2)} s in all)", WARN), width
@@ -189,7 +189,7 @@ class MonitorPage:
     ) -> list[Text]:
         """Draw title, ``lines`` of map and scale, each at most ``box`` columns wide."""
         frame = self.feed.frames.get(name)
-        title = Text(name.upper(), SIDE[name])
+        title = Text(name.upper(), FINGER_STYLES[name])
         picture = [Text() for _ in range(lines)]
         if frame is None:
             picture[lines // 2] = centred(Text("no frames", DIM), box)
@@ -197,7 +197,7 @@ class MonitorPage:
         unit, factor, decimals = ("counts", 1.0, 0) if counts else ("kPa", 1e-3, 1)
         touch = getattr(self.feed.state, name).contact
         text, style = ("contact", GOOD) if touch else ("free", DIM)
-        if now - frame.arrived > OLD:
+        if now - frame.arrived > OLD_AGE:
             text, style = "old", WARN
         peak = Text(f"{frame.grid.max() * factor:.{decimals}f} {unit}")
         title = justified(Text.assemble(title, (f" {text}", style)), peak, box)
@@ -223,7 +223,7 @@ class MonitorPage:
         line = Text(" " * 8)
         for name in FINGERS:
             here = getattr(self.feed.state, name).valid
-            line.append(f"{name if here else name + ' —':^10} ", SIDE[name])
+            line.append(f"{name if here else name + ' —':^10} ", FINGER_STYLES[name])
         return line
 
     def _row(self, label: str, key: str, factor: float, decimals: int, unit: str, std: str) -> Text:

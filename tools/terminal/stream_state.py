@@ -53,8 +53,8 @@ GLOSSARY = (  # meanings of the words on the pages
 )
 # Fraction of the requested force above which the grip is reported as raised.
 _INCREASED_RATIO = 1.01
-_DRAIN_LIMIT = 4000  # messages read per call, so that a flood of messages cannot block drawing
-_MESSAGE_LIMIT = 4_000_000  # bytes; the largest grid is 131 kB
+_DRAIN_COUNT_MAX = 4000  # messages read per call, so that a flood of messages cannot block drawing
+_MESSAGE_SIZE_MAX = 4_000_000  # bytes; the largest grid is 131 kB
 
 
 def field(record: object, *path: str) -> Any:
@@ -290,10 +290,10 @@ class StreamReader:
 
     def __init__(self, context: zmq.Context[Any], address: str, feed: StreamState) -> None:
         self.feed = feed
-        self._socket = subscribe(context, address, *feed.topics, queue=_DRAIN_LIMIT)
+        self._socket = subscribe(context, address, *feed.topics, queue=_DRAIN_COUNT_MAX)
 
     def drain(self, now: float) -> None:
-        for message in drain(self._socket, _DRAIN_LIMIT):
+        for message in drain(self._socket, _DRAIN_COUNT_MAX):
             self.feed.read(message, now)
 
 
@@ -349,7 +349,7 @@ class Commander:
         attempts = Attempts({"command": command, **self._envelope, **fields}, REPLY_TIMEOUT)
         request = self._context.socket(zmq.REQ)
         request.setsockopt(zmq.LINGER, 0)
-        request.setsockopt(zmq.MAXMSGSIZE, _MESSAGE_LIMIT)
+        request.setsockopt(zmq.MAXMSGSIZE, _MESSAGE_SIZE_MAX)
         request.connect(self._address)
         request.send(msgpack.packb(attempts.request), zmq.NOBLOCK)
         self._pending.append(_Pending(label, request, attempts, now))

@@ -36,8 +36,8 @@ COLOURS = {
     OBJECT: (0, 158, 115),
 }
 
-_ARROW = 1.6e-3  # m, length of a force arrow per newton
-_ARROW_LONGEST = 0.045  # m
+_ARROW_SCALE = 1.6e-3  # m, length of a force arrow per newton
+_ARROW_MAX = 0.045  # m
 _HALF_TURN = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 61)
 _TURN = np.linspace(0.0, 2.0 * np.pi, 61)
 _UNIT_CIRCLE = np.column_stack((np.cos(_TURN), np.sin(_TURN)))
@@ -170,7 +170,7 @@ def _finger(hand: HandGeometry, name: str, state: FingerState) -> DrawnPart:
     part = DrawnPart([(name, 5.2e-3, link), (name, 2.4e-3, base), (name, 1e-3, skin)], [])
     if face is not None and push is not None:
         force = state.force if math.isfinite(state.force) else 0.0
-        at, way = push[0], min(_ARROW * force, _ARROW_LONGEST) * push[1]
+        at, way = push[0], min(_ARROW_SCALE * force, _ARROW_MAX) * push[1]
         end, back, aside = at + way, -0.2 * way, 0.12 * np.array([way[1], -way[0]])
         arrow = np.array([at, end, end + back + aside, end, end + back - aside])
         part.lines.extend([(OBJECT, 2e-3, face), (name, 1.8e-3, arrow)])

@@ -42,15 +42,15 @@ if TYPE_CHECKING:
 TOPICS = (*StreamState().topics, schema.TRUTH)
 SECONDS = 60.0  # s of history that a page gets when it opens
 STEP = 0.1  # s between two rows of the plots
-_TRAIL = 60  # rows shown as a trail on the landscape
-_EVENTS = 50  # events shown
-_LATELY = 5.0  # s for which a warning is shown
-_NEAR = 0.8  # fraction of a limit from which the value is reported
-_DARK = 2.0  # standard deviations of a cell's noise that a pressure map draws as zero
-_SMALLEST = 10.0  # smallest full scale, also in standard deviations
-_PATIENCE = 0.35  # s without a message after which the last one is shown as old
-_PERIODS = 4.0  # the same in periods of the stream; the longer time applies
-_MOST = 1e6  # limit of drawn numbers, since messages may contain any value
+_TRAIL_LENGTH = 60  # rows shown as a trail on the landscape
+_EVENT_COUNT = 50  # events shown
+_WARNING_TIME = 5.0  # s for which a warning is shown
+_LIMIT_FRACTION = 0.8  # fraction of a limit from which the value is reported
+_DARK_SIGMA = 2.0  # standard deviations of a cell's noise that a pressure map draws as zero
+_FULL_SCALE_MIN = 10.0  # smallest full scale, also in standard deviations
+_OLD_TIME = 0.35  # s without a message after which the last one is shown as old
+_OLD_PERIODS = 4.0  # the same in periods of the stream; the longer time applies
+_NUMBER_MAX = 1e6  # limit of drawn numbers, since messages may contain any value
 _DEGREE = math.degrees(1.0)
 
 
@@ -113,7 +113,7 @@ def _row(number: int, state: HandState) -> list[Any]:
     """Make a row of the plots, with NaN for values that the hand lacks."""
     row = [number, state.timestamp, printable(state.mode)]
     for value, factor in zip(_values(state), _FACTORS.values(), strict=True):
-        row.append(round(min(max(factor * value, -_MOST), _MOST), 4))
+        row.append(round(min(max(factor * value, -_NUMBER_MAX), _NUMBER_MAX), 4))
     if not state.object.valid:
         row[_COLUMNS["object.angle"]] = row[_COLUMNS["object.width"]] = math.nan
     return row
@@ -157,7 +157,7 @@ class Pictures:
         self._settings_text = ""  # as received
         self.seen = self.unreadable = 0  # number of states; number of messages
         self.clear()
-        self._know(Settings())
+        self._read_settings(Settings())
 
     def clear(self) -> None:
         """Discard everything except the hand's settings, before data of another time are read."""
@@ -201,15 +201,17 @@ class Pictures:
             settings, unknown = read_settings(message)
             if unknown:
                 self._say(f"settings not known here: {printable(', '.join(unknown))}")
-            self._know(settings)
+            self._read_settings(settings)
         self.feed.process(topic, message, self._moment())
         if self._foxglove is not None:
             self._foxglove.take(topic, message)
 
-    def _know(self, settings: Settings) -> None:
+    def _read_settings(self, settings: Settings) -> None:
         """Lay out the scene for a hand, with panels and plots only for the parts that it has."""
         self._settings, self._fingers = settings, fingers_of(settings)
-        self._pressure = heatmap.FullScale(heatmap.round_up(_SMALLEST * settings.tactile.noise))
+        self._pressure = heatmap.FullScale(
+            heatmap.round_up(_FULL_SCALE_MIN * settings.tactile.noise)
+        )
         hand, rows, cols = geometry_of(settings), settings.tactile.rows, settings.tactile.cols
         a = hand.tip_radius
         half, top = hand.half_separation + 1.3 * a, hand.reach + 1.9 * a
@@ -285,8 +287,8 @@ class Pictures:
             "mode": feed.mode,
             "age": feed.age(now),
             "patience": {
-                "state": max(_PATIENCE, _PERIODS / feed.rate),
-                "frame": max(_PATIENCE, _PERIODS / settings.stream.tactile_rate),
+                "state": max(_OLD_TIME, _OLD_PERIODS / feed.rate),
+                "frame": max(_OLD_TIME, _OLD_PERIODS / settings.stream.tactile_rate),
             },
             "fault": feed.fault,
             "place": place,
@@ -296,7 +298,7 @@ class Pictures:
             "facts": [part for fact in self._facts(now) for part in fact],
             "panels": self._maps(now) | {"hand": self._planar(), "landscape": self._contacts()},
             "events": [
-                (each.timestamp, each.clock(), *each[1:]) for each in feed.events[-_EVENTS:]
+                (each.timestamp, each.clock(), *each[1:]) for each in feed.events[-_EVENT_COUNT:]
             ],
             "recording": self.recording,
             "first": self._first,
@@ -328,7 +330,7 @@ class Pictures:
         full = self._pressure.follow(peak, now)
         maps = {}
         for name, frame in frames.items():
-            unit, factor, dark = "kPa", 1e-3, _DARK * self._settings.tactile.noise
+            unit, factor, dark = "kPa", 1e-3, _DARK_SIGMA * self._settings.tactile.noise
             if math.isnan(frame.scale):
                 unit, factor, dark = "counts", 1.0, 0.0
             lines, dots, (rows, cols) = [], [], frame.grid.shape
@@ -354,7 +356,9 @@ class Pictures:
     def _contacts(self) -> dict[str, Any]:
         """Return each contact on the landscape, in mm and degrees, with its trail."""
         lines, dots = [], []
-        states = [self.feed.state, *(state for state, _ in reversed(self._past))][: 1 + _TRAIL]
+        states = [self.feed.state, *(state for state, _ in reversed(self._past))][
+            : 1 + _TRAIL_LENGTH
+        ]
         for name in self._fingers:
             tips = takewhile(touches, (state.finger(name) for state in states))
             if trail := [(_DEGREE * tip.theta, 1e3 * tip.d) for tip in tips]:
@@ -366,8 +370,8 @@ class Pictures:
         """Return recent warnings, reasons for invalid fingers, and values near their limits."""
         state, safety, feed = self.feed.state, self._settings.safety, self.feed
         last = [each for each in feed.events[-1:] if each.level == "warning"]
-        notes = [each.text for each in last if self.time - each.timestamp < _LATELY]
-        notes += filter(None, [why_invalid(state), self._raised()])
+        notes = [each.text for each in last if self.time - each.timestamp < _WARNING_TIME]
+        notes += filter(None, [why_invalid(state), self._force_increase()])
         used = [
             (value / getattr(safety, f"{key}_max"), name, key)
             for name in self._fingers
@@ -377,13 +381,13 @@ class Pictures:
         notes += [
             f"{name} {key} at {ratio:.0%} of safety.{key}_max"
             for ratio, name, key in sorted(used, reverse=True)
-            if ratio >= _NEAR
+            if ratio >= _LIMIT_FRACTION
         ]
         if self.states and state.schema != schema.SCHEMA:
             notes.append(f"the stream has schema {state.schema}, this page knows {schema.SCHEMA}")
         return notes
 
-    def _raised(self) -> str:
+    def _force_increase(self) -> str:
         """Return a description of the grip's goal if the daemon has raised the force."""
         grip = self.feed.grip()
         return grip if "raised" in grip else ""
@@ -438,7 +442,7 @@ def _panel(name: str, title: str, *box: float, **more: Any) -> dict[str, Any]:
 
 def _flat(points: FloatArray) -> FloatArray:
     """Return x and y alternately, rounded to four decimals (at most a tenth of a pixel)."""
-    return np.clip(points, -_MOST, _MOST).round(4).ravel()
+    return np.clip(points, -_NUMBER_MAX, _NUMBER_MAX).round(4).ravel()
 
 
 def _packed(shown: dict[str, Any] | list[Any]) -> str:
