@@ -23,7 +23,7 @@ from softfinger.daemon.client.connection import (
     still_waiting,
 )
 from softfinger.daemon.errors import HandClosed, Reason, Refused
-from softfinger.daemon.types import UNLEASED
+from softfinger.daemon.types import NO_LEASE_COMMANDS
 from softfinger.daemon.wire.keys import ClientKeys, load_client
 from softfinger.daemon.wire.local_stop import stop_locally
 
@@ -52,7 +52,7 @@ class Attempts:
 
     def __init__(self, request: dict[str, Any], timeout: float) -> None:
         """Create a policy; ``timeout`` [s] applies to all attempts together."""
-        harmless = request.get("command") in UNLEASED
+        harmless = request.get("command") in NO_LEASE_COMMANDS
         self.request = request if harmless else {**request, "key": secrets.token_hex(8)}
         self.timeout = timeout
         self._end = _now() + timeout

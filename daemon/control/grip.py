@@ -102,7 +102,7 @@ class Grip:
         return self._state.is_steering and self.angle.value != self.target_angle
 
     def start(self, measured: float, force: float) -> None:
-        """Take over from the approach at a measured force ``felt`` and go to ``force`` [N]."""
+        """Take over from the approach at the ``measured`` force and go to ``force`` [N]."""
         kernels.start(self._state.array, self._grasp.array, self.force.windows, measured)
         self.target_angle = math.nan
         self.retarget(force)
@@ -121,7 +121,7 @@ class Grip:
         self._state.force_rate = change / self._control.force_time
 
     def limit_force(self, force_max: float, duration: float) -> None:
-        """Limit the force to ``most`` [N] from now on, and reach it within ``seconds``."""
+        """Limit the force to ``force_max`` [N] from now on; reach it within ``duration`` [s]."""
         self.commanded_max = force_max
         self.retarget(force_max)
         self._state.force_rate = abs(self.force.value - force_max) / duration

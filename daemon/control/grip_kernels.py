@@ -86,7 +86,7 @@ def start(
     force_windows: FloatArray,
     measured: float,
 ) -> None:
-    """Take over from the approach at a measured force ``felt`` [N]."""
+    """Take over from the approach at the ``measured`` force [N]."""
     g = grips[0]
     q = grasps[0].q
     slip_monitor.reset(g.slip)

@@ -313,7 +313,7 @@ class Control:
         return None
 
     def limit_force(self, force_max: float, duration: float) -> None:
-        """Reduce the grip force to ``most`` [N] within ``seconds``, and limit it from then on."""
+        """Limit the grip force to ``force_max`` [N], and reach it within ``duration`` [s]."""
         if isinstance(self.state, Gripping):
             self.grip.limit_force(force_max, duration)
             self._change(self.state)

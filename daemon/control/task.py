@@ -28,7 +28,7 @@ class TaskEnded(SoftfingerError):
 class Task:
     """Issue the commands of a script, each once the hand has reached the mode of the last one.
 
-    With ``lasting`` the script restarts after a fault. Only simulated hands do so, because real
+    With ``restarts`` the script restarts after a fault. Only simulated hands do so, because real
     hardware must not start moving by itself after a fault.
     """
 

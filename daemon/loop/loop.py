@@ -35,7 +35,7 @@ EventSink = Callable[[str, str, str], None]
 _START_AGE_MAX = 0.2
 
 
-def start_age(settings: Settings, waits: bool) -> float:
+def command_age_max(settings: Settings, waits: bool) -> float:
     """Return the maximum age [s] of a command that stiffens or moves the hand.
 
     An older command may predate a stop by the servo watchdog, which leaves the hand in another
@@ -98,7 +98,7 @@ class Loop:
             self.torque,
             perception,
             self.emit,
-            start_age(settings, clock.waits),
+            command_age_max(settings, clock.waits),
         )
         self._after_opening: Breach | None = None  # fault to latch once the hand is open
         self.statistics = Statistics()

@@ -102,7 +102,7 @@ class Publishing:
         wall = state.wall - (state.t - frame.t_sample)
         data = perception.published()
         number = self._numbers[perception.finger]
-        sensor = perception.finger, perception.facts
+        sensor = perception.finger, perception.info
         self._publisher.send(schema.TACTILE, frame, data, *sensor, wall, n, number)
 
     def _rates(self, state: State) -> Rates:

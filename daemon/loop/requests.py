@@ -26,7 +26,7 @@ from softfinger.daemon.perception.perception import Perception
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.safety.safety import Safety
 from softfinger.daemon.safety.torque_state import TorqueState
-from softfinger.daemon.types import FINGERS, GRIP_FRACTION, UNLEASED, State
+from softfinger.daemon.types import FINGERS, GRIP_FRACTION, NO_LEASE_COMMANDS, State
 
 AGE_MAX = 1.0  # s, age limit of every command except status and stop
 _COMPLIANCE_RANGE = (0.01, 1.0)  # rad/(N·m)
@@ -93,7 +93,7 @@ class Lease:
 
     def check(self, command: Command, now: float) -> None:
         """Raise Refused while another client has the lease."""
-        if command.name in UNLEASED:
+        if command.name in NO_LEASE_COMMANDS:
             return
         if now < self._until and command.client != self._owner:
             owner = self._owner or "an unnamed client"
@@ -112,7 +112,7 @@ class Lease:
 
     def renew(self, command: Command, now: float) -> None:
         """Take or extend the lease after a command was executed."""
-        if command.name not in UNLEASED:
+        if command.name not in NO_LEASE_COMMANDS:
             self._owner = command.client
             self._until = now + self.seconds
 
@@ -129,16 +129,16 @@ class Requests:
         torque: TorqueState,
         perception: Perception,
         emit: Callable[[str, str, str], None],
-        start_age: float = math.inf,
+        command_age_max: float = math.inf,
     ) -> None:
         """Prepare to execute requests.
 
         Parameters
         ----------
         emit : sends an event
-        start_age : maximum age [s] of a command that can stiffen or move the hand
+        command_age_max : maximum age [s] of a command that can stiffen or move the hand
         """
-        self._start_age = start_age
+        self._command_age_max = command_age_max
         self._settings = settings
         self._state = state
         self._control = control
@@ -236,7 +236,7 @@ class Requests:
         if name == "status":
             return
         streamed = name == "hold" and self._control.mode in GRIPPING_MODES
-        longest = AGE_MAX if streamed or name in SAFE_COMMANDS else self._start_age
+        longest = AGE_MAX if streamed or name in SAFE_COMMANDS else self._command_age_max
         if age > longest:
             text = f"{name}: {age:.2f} s old when its turn came, at most {longest:g} s is allowed"
             raise Refused(f"{text}; send it again", Reason.LATE)

@@ -20,7 +20,7 @@ from softfinger.daemon.perception.hand_estimator import HandEstimator
 from softfinger.daemon.perception.unloaded_cells import UnloadedCells
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.tactile.base import TactileSensor
-from softfinger.daemon.types import FINGERS, Event, Frame, SensorFacts, State
+from softfinger.daemon.types import FINGERS, Event, Frame, SensorInfo, State
 from softfinger.kinematics.estimation.estimator import ContactEstimate
 
 _TARE_FRAME_COUNT = 16
@@ -153,7 +153,7 @@ class FingerPerception:
             self._quantum = self._converter.quantum
         self._readings: NDArray[Any] | None = None  # newest frame: counts above zero, or Pa
         self._publishes_pressure = settings.stream.tactile_unit == "Pa"
-        self.facts = self._facts(settings, model)
+        self.info = self._info(settings, model)
         self._events = events
         self._zero: NDArray[np.uint16] | None = None  # used without a converter
         live = np.ones(model.grid.shape, np.bool_) if active is None else active
@@ -214,7 +214,7 @@ class FingerPerception:
         return frame
 
     def published(self) -> NDArray[np.uint16]:
-        """Return the newest frame's data [rows, cols] for subscribers, in the unit of ``facts``."""
+        """Return the newest frame's data [rows, cols] for subscribers, in the unit of ``info``."""
         assert self.frame is not None
         assert self._readings is not None
         if not self._publishes_pressure:
@@ -222,10 +222,10 @@ class FingerPerception:
         if self._converter is None:
             return self._readings
         # With a zero below that of the calibration, a cell may exceed the range of the scale.
-        steps = np.minimum(self._readings * (1.0 / self.facts.scale), _PRESSURE_STEPS)
+        steps = np.minimum(self._readings * (1.0 / self.info.scale), _PRESSURE_STEPS)
         return np.rint(steps).astype(np.uint16)
 
-    def _facts(self, settings: Settings, model: FingerModel) -> SensorFacts:
+    def _info(self, settings: Settings, model: FingerModel) -> SensorInfo:
         scale = settings.tactile.pascal_per_count
         if self._converter is not None:
             scale = (
@@ -234,7 +234,7 @@ class FingerPerception:
                 else self._converter.quantum
             )
         grid = model.grid
-        return SensorFacts(
+        return SensorInfo(
             *grid.pitches,
             *grid.centre,
             rotation=grid.rotation,

@@ -7,7 +7,7 @@ that arrived before a stop, whose stamp counts fewer stops, are refused, except 
 A client may give a request a unique ``key`` and send the same map again if it was refused as late.
 The daemon then carries out the command at most once, and only if it has carried out no other
 command since that refusal: the newest command prevails. Commands that can only make the hand safer
-(`UNLEASED`) are carried out every time.
+(`NO_LEASE_COMMANDS`) are carried out every time.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import msgpack
 
 from softfinger.daemon.errors import Reason, Refused
-from softfinger.daemon.types import UNLEASED
+from softfinger.daemon.types import NO_LEASE_COMMANDS
 from softfinger.daemon.wire.loop_link import Ask, Link, machine_time
 
 if TYPE_CHECKING:  # the gateway process does not need this module
@@ -124,7 +124,7 @@ class CommandServer:
     def _answer(self, ask: Ask, request: dict[str, Any], handler: Handler) -> bytes:
         """Return the reply to a request; a request with a key is carried out at most once."""
         name, place = request["command"], (ask.name, ask.payload)
-        keyed = request.pop("key", None) is not None and name not in UNLEASED
+        keyed = request.pop("key", None) is not None and name not in NO_LEASE_COMMANDS
         present = _Outcome(self._stops, self._changes, b"")
         first = self._outcomes.pop(place, present) if keyed else present
         reply, late = first.reply, False

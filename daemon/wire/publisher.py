@@ -17,7 +17,7 @@ from typing import Any
 
 import msgpack
 
-from softfinger.daemon.types import HandFacts
+from softfinger.daemon.types import HandInfo
 from softfinger.daemon.wire.fields import FieldSource, Getter, members
 from softfinger.daemon.wire.loop_link import Link
 from softfinger.daemon.wire.schema import COMMAND, EVENT, SETTINGS, TOPICS
@@ -120,9 +120,9 @@ class Publisher:
         if self._link.wanted & _COMMANDS:
             self.send(COMMAND, self._count(COMMAND), wall, t, tick, request, error)
 
-    def settings(self, wall: float, t: float, facts: HandFacts) -> None:
+    def settings(self, wall: float, t: float, info: HandInfo) -> None:
         """Publish ``hand/settings``, once."""
-        packed = self._pack[SETTINGS](self._count(SETTINGS), wall, t, facts)
+        packed = self._pack[SETTINGS](self._count(SETTINGS), wall, t, info)
         self._link.publish(_INDEX[SETTINGS], packed, REPEATED_COUNTS[SETTINGS])
 
     def _count(self, topic: bytes) -> int:

@@ -141,8 +141,8 @@ _MASK_DEPTH = 1e3  # m, lowers the height of masked cells out of reach of any fa
 def _is_outlier(state: EstimatorState, frame: FloatArray, height: FloatArray) -> bool:
     """Return True if the largest cell is too high above its neighbours to be part of a contact.
 
-    A contact about as wide as a cell produces at most ``signal.confined``. In a wider contact, no
-    cell reads twice the mean of its neighbours.
+    A contact about as wide as a cell produces at most ``signal.narrow_contact_max``. In a wider
+    contact, no cell reads twice the mean of its neighbours.
     """
     rows = state.grid.rows
     cols = state.grid.cols

@@ -20,7 +20,7 @@ from softfinger.daemon.gateway import bounds
 from softfinger.daemon.gateway.bounds import Config
 from softfinger.daemon.gateway.supervisor import Gateway
 from softfinger.daemon.loop import build
-from softfinger.daemon.loop.loop import start_age
+from softfinger.daemon.loop.loop import command_age_max
 from softfinger.daemon.loop.requests import Command, Lease, parse
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.wire.command_server import decode
@@ -637,7 +637,7 @@ def test_a_command_that_is_too_old_has_no_effect(make, name, mode, oldest):
 
 def test_a_shorter_watchdog_of_real_servos_bounds_the_age_of_a_start():
     def age(waits: bool = False, **servos: Any) -> float:
-        return start_age(Settings.model_validate({"servos": servos}), waits)
+        return command_age_max(Settings.model_validate({"servos": servos}), waits)
 
     real = {"backend": "dynamixel", "port": "/dev/ttyUSB0"}
     assert age(**real, watchdog=0.1) == 0.1

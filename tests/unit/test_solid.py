@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from softfinger import ContactEstimator, ContactTable, Fingertip, Material, SensorGrid
-from softfinger.daemon.loop.build import facts
+from softfinger.daemon.loop.build import hand_info
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
 from softfinger.kinematics.estimation.estimator import Readings
@@ -241,7 +241,7 @@ def test_a_hand_with_solid_tips_grasps_turns_and_releases(make):
             assert abs(shear) > 0.2
             assert contact.shear_x == pytest.approx(shear, abs=0.15)
     assert state.fault == ""
-    assert json.loads(facts(daemon.settings, daemon.models).table_left)["form"] == "solid"
+    assert json.loads(hand_info(daemon.settings, daemon.models).table_left)["form"] == "solid"
     command(daemon, "release")
     daemon.loop.advance(1.5)
     assert state.mode == "armed"

@@ -37,7 +37,7 @@ _FRAMES = 64
 _PRESSED = 0.005, 0.2  # m, rad: contact in the sensors' frames
 
 
-class Comparison(NamedTuple):
+class PublishedValue(NamedTuple):
     """Row with a published value and the value of this project."""
 
     quantity: str
@@ -66,20 +66,20 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def comparisons() -> Iterator[Comparison]:
+def comparisons() -> Iterator[PublishedValue]:
     """Yield all rows; each is computed when it is requested."""
     for rows in (_tips, _energy, _relaxation, _sensors, _hands):
         yield from rows()
 
 
 def between(quantity: str, low: float, high: float, source: str, ours: float, form: str = ".2f",
-            unit: str = "", why: str = "") -> Comparison:  # fmt: skip
+            unit: str = "", why: str = "") -> PublishedValue:  # fmt: skip
     """Return a row that agrees if ``ours`` is within [low, high], to the digits of ``form``."""
     shown = [f"{each:{form}}" for each in (low, high, ours)]
     inside = float(shown[0]) <= float(shown[2]) <= float(shown[1])
     verdict = "agree" if inside else "disagree"
     text = f"{shown[0]} to {shown[1]}{unit}" if low < high else f"{shown[0]}{unit}"
-    return Comparison(quantity, text, source, f"{shown[2]}{unit}", verdict, why)
+    return PublishedValue(quantity, text, source, f"{shown[2]}{unit}", verdict, why)
 
 
 def exponent(d: FloatArray, force: FloatArray) -> float:
@@ -100,7 +100,7 @@ def _table(law: str) -> Callable[..., FloatArray]:
     return lambda d, theta, name: np.asarray(getattr(table(d, theta), name))
 
 
-def _tips() -> Iterator[Comparison]:
+def _tips() -> Iterator[PublishedValue]:
     source = "Human Inspired Dexterity in Robotic Manipulation, table 7.1"
     for law in _LAWS:
         zeta = exponent(DEPTHS, _table(law)(DEPTHS, 0.0 * DEPTHS, "force"))
@@ -111,8 +111,9 @@ def _tips() -> Iterator[Comparison]:
     yield between("γ of the contact's radius, c N^γ: springs", 0.0, 1.0 / 3.0,
                   "Xydas & Kao, IJRR 18(9), 1999",
                   exponent(math.pi * MODULUS * DEPTHS**2, radius))  # fmt: skip
-    yield Comparison("γ of the contact's radius: solid", "0.00 to 0.33", "the same", "—", "unknown",
-                     "the data have the pressure under the base, not on the face")  # fmt: skip
+    yield PublishedValue(
+        "γ of the contact's radius: solid", "0.00 to 0.33", "the same", "—", "unknown",
+        "the data have the pressure under the base, not on the face")  # fmt: skip
     springs = _table("springs")
     hertz = 4.0 / 3.0 * MODULUS / 0.75 * math.sqrt(RADIUS)
     d = np.linspace(0.004, 0.0079, 3901)
@@ -121,7 +122,7 @@ def _tips() -> Iterator[Comparison]:
                   "π E d² = 4/3 E* √a d^(3/2)", 1e3 * float(crossing), ".1f", " mm")  # fmt: skip
 
 
-def _energy() -> Iterator[Comparison]:
+def _energy() -> Iterator[PublishedValue]:
     from softfinger.tools.paper import sheared_rolling
 
     source = "Inoue & Hirai, the paper that this model is from"
@@ -138,36 +139,42 @@ def _energy() -> Iterator[Comparison]:
     theta = np.radians(np.linspace(-11.5, 9.2, 208))
     rolled = sheared_rolling.rolled(0.006, 0.05, theta)
     before = sheared_rolling.angle_of_minimum(theta, rolled["F on the base"])
-    yield Comparison("tilt of the least force in rolling, d = 6 mm: springs", "slightly before 0°",
-                 source, f"{before:.1f}°", "agree" if -3.0 < before < 0.0 else "disagree",
-                 "where 5 % of the motion is not rolled off, but shears the tip")  # fmt: skip
+    yield PublishedValue(
+        "tilt of the least force in rolling, d = 6 mm: springs", "slightly before 0°",
+        source, f"{before:.1f}°", "agree" if -3.0 < before < 0.0 else "disagree",
+        "where 5 % of the motion is not rolled off, but shears the tip")  # fmt: skip
     d, chosen = 1e-3 * np.arange(8, 33) / 4.0, Material.constant(1.0)
     for face in ("frictionless", "sticking"):
         solid = ContactTable.build(replace(_LAWS["solid, bonded"], face=face), chosen)(d, 0.0).force
         springs = _table("springs")(d, 0.0 * d, "force")
         modulus = float(np.polyfit(solid, springs, 1)[0])
         over = modulus * solid - springs
-        yield Comparison(f"Fig. 7's offset from springs, 2 to 8 mm: solid, bonded, {face}",
-                     "one constant", source, f"{over.min():.1f} to {over.max():.1f} N", "disagree",
-                     f"by the E that comes nearest to it, {1e-6 * modulus:.3f} MPa")  # fmt: skip
+        yield PublishedValue(
+            f"Fig. 7's offset from springs, 2 to 8 mm: solid, bonded, {face}",
+            "one constant", source, f"{over.min():.1f} to {over.max():.1f} N", "disagree",
+            f"by the E that comes nearest to it, {1e-6 * modulus:.3f} MPa")  # fmt: skip
 
 
-def _relaxation() -> Iterator[Comparison]:
+def _relaxation() -> Iterator[PublishedValue]:
     times = Settings().tip.relaxation_times
-    yield Comparison("relaxation of a fingerpad", "4 ms, 70 ms, 1.4 s", "Pawluk & Howe, 1999",
-                 ", ".join(f"{t:g} s" for t in times), "unknown",
-                 "the times are theirs; how much, `calibrate relaxation` tells")  # fmt: skip
-    yield Comparison("a grasp with time", "more stable", "Tiezzi & Kao, T-RO 23(2), 2007", "—",
-                 "unknown", "nobody has looked at it here")  # fmt: skip
-    yield Comparison("softening over the first cycles", "all elastomers tried",
-                 "Case et al., Soft Robotics 2015", "none", "disagree",
-                 "tips here are as they were before")  # fmt: skip
-    yield Comparison("shear on a face that sticks", "depends on the path",
-                 "HydroShear, arXiv 2603.00446", "one path", "disagree",
-                 "the table holds a press straight along the normal")  # fmt: skip
+    yield PublishedValue(
+        "relaxation of a fingerpad", "4 ms, 70 ms, 1.4 s", "Pawluk & Howe, 1999",
+        ", ".join(f"{t:g} s" for t in times), "unknown",
+        "the times are theirs; how much, `calibrate relaxation` tells")  # fmt: skip
+    yield PublishedValue(
+        "a grasp with time", "more stable", "Tiezzi & Kao, T-RO 23(2), 2007", "—",
+        "unknown", "nobody has looked at it here")  # fmt: skip
+    yield PublishedValue(
+        "softening over the first cycles", "all elastomers tried",
+        "Case et al., Soft Robotics 2015", "none", "disagree",
+        "tips here are as they were before")  # fmt: skip
+    yield PublishedValue(
+        "shear on a face that sticks", "depends on the path",
+        "HydroShear, arXiv 2603.00446", "one path", "disagree",
+        "the table holds a press straight along the normal")  # fmt: skip
 
 
-def _sensors() -> Iterator[Comparison]:
+def _sensors() -> Iterator[PublishedValue]:
     for name in ("ideal", "velostat", "capacitive"):
         d, angle, force = _errors(Settings() if name == "ideal" else load(Path(name)))
         for quantity, ours, published, unit, source in (
@@ -193,7 +200,7 @@ def _errors(settings: Settings) -> tuple[float, float, float]:
     return float(of_d), float(of_tilt), float(of_force)
 
 
-def _hands() -> Iterator[Comparison]:
+def _hands() -> Iterator[PublishedValue]:
     from softfinger.tools.benchmarks.reflex import overloaded
 
     answers = [overloaded({}, 0.0, 13.0, seed).answer for seed in range(1, _TRIALS + 1)]
@@ -201,8 +208,10 @@ def _hands() -> Iterator[Comparison]:
     yield between("from a slip's onset to a firmer grip, at most", 0, 40,
                   "answers of 35 to 40 ms, arXiv 2602.16127; people 100 ms, Delhaye 2024",
                   1e3 * max(answers), ".0f", " ms", simulated)  # fmt: skip
-    yield Comparison("friction in the servos' gears", "depends on the load",
-                     "Rhoban, arXiv 2410.08650", f"{Settings().simulation.joint_friction:g} N·m",
-                     "disagree", "by default Coulomb's, the same under any load")  # fmt: skip
-    yield Comparison("all of it, on a hand of metal", "—", "nobody yet", "—", "unknown",
-                     "no hand of metal has been run with this daemon")  # fmt: skip
+    yield PublishedValue(
+        "friction in the servos' gears", "depends on the load",
+        "Rhoban, arXiv 2410.08650", f"{Settings().simulation.joint_friction:g} N·m",
+        "disagree", "by default Coulomb's, the same under any load")  # fmt: skip
+    yield PublishedValue(
+        "all of it, on a hand of metal", "—", "nobody yet", "—", "unknown",
+        "no hand of metal has been run with this daemon")  # fmt: skip

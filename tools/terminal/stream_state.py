@@ -34,7 +34,7 @@ from softfinger.daemon.client.connection import (
     unpack,
 )
 from softfinger.daemon.client.stream import read
-from softfinger.daemon.types import FINGERS, GRIP_FRACTION, UNLEASED
+from softfinger.daemon.types import FINGERS, GRIP_FRACTION, NO_LEASE_COMMANDS
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.local_stop import stop_locally
 
@@ -227,7 +227,7 @@ class StreamState:
                 self.commanded = force
             elif answered.command == "grasp":
                 self.commanded = self.force_default
-        if answered.command not in UNLEASED and self._lease > 0.0:
+        if answered.command not in NO_LEASE_COMMANDS and self._lease > 0.0:
             self._lease_holder = client, now + self._lease
 
     def _read_settings(self, message: schema.HandSettings, _: float) -> None:
