@@ -171,12 +171,12 @@ class State:
     timing: Timing = field(default_factory=Timing)
 
 
-class Parts(NamedTuple):
+class SceneParts(NamedTuple):
     """Fingers of the scene, and the presence of servos and sensors."""
 
     fingers: tuple[bool, bool]
-    servos: bool
-    sensors: bool
+    has_servos: bool
+    has_sensors: bool
 
 
 class TimeSpread(NamedTuple):

@@ -98,11 +98,11 @@ class Loop:
             self.torque,
             perception,
             self.emit,
-            command_age_max(settings, clock.waits),
+            command_age_max(settings, clock.pauses_when_late),
         )
         self._after_opening: Breach | None = None  # fault to latch once the hand is open
         self.statistics = Statistics()
-        self._lateness = Lateness(settings, self.state.timing, clock.waits)
+        self._lateness = Lateness(settings, self.state.timing, clock.pauses_when_late)
         self._publishing = None
         if publisher is not None:
             self._publishing = Publishing(settings, publisher, sensors, self.statistics)

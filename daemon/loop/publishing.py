@@ -11,7 +11,7 @@ from __future__ import annotations
 from softfinger.daemon.loop.timing import Statistics
 from softfinger.daemon.perception.perception import FingerPerception
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.types import Frame, Parts, State, Truth
+from softfinger.daemon.types import Frame, SceneParts, State, Truth
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.publisher import Publisher, bit
 from softfinger.daemon.wire.schema import Rates
@@ -28,12 +28,12 @@ def every(rate: float, wanted: float) -> int:
     return max(round(rate / wanted), 1)
 
 
-def parts(settings: Settings) -> Parts:
+def parts(settings: Settings) -> SceneParts:
     """Return the parts that the scene of these settings has."""
-    return Parts(
+    return SceneParts(
         fingers=("left" in settings.scene.fingers, "right" in settings.scene.fingers),
-        servos=settings.servos.backend != "none",
-        sensors=settings.tactile.backend != "none",
+        has_servos=settings.servos.backend != "none",
+        has_sensors=settings.tactile.backend != "none",
     )
 
 

@@ -144,7 +144,7 @@ def check_servo(
     if not low <= volts <= high:
         wrong(f"supply is {volts:.1f} V, not in {low:.1f} … {high:.1f} V", "check the supply")
     firmware = table[reg.FIRMWARE_VERSION]
-    if settings.servos.watchdog > 0.0 and not model.small and firmware < _WATCHDOG_FIRMWARE:
+    if settings.servos.watchdog > 0.0 and not model.is_x330 and firmware < _WATCHDOG_FIRMWARE:
         wrong(
             f"firmware {firmware} has no bus watchdog",
             f"update it to {_WATCHDOG_FIRMWARE} or later, or set servos.watchdog = 0",

@@ -112,7 +112,7 @@ class DynamixelServos:
             for f in map(FINGERS.index, profile.scene.fingers)
         ]
         if waiting is None:
-            patience = _BUSY_TIME if self._clock.waits else 0.0
+            patience = _BUSY_TIME if self._clock.pauses_when_late else 0.0
             port = SerialPort(servos.port, servos.baud, max(servos.reply_timeout, patience))
             port.openPort()
         else:

@@ -20,8 +20,8 @@ from softfinger.daemon.types import (
     Frame,
     HandInfo,
     ObjectPose,
-    Parts,
     Reading,
+    SceneParts,
     SensorInfo,
     State,
     TimeSpread,
@@ -93,13 +93,13 @@ class StateSource(NamedTuple):
     """Source of a ``hand/state``."""
 
     state: State
-    scene: Parts
+    scene: SceneParts
     step: int = 1
 
 
 class _Finger(NamedTuple):
     state: State
-    scene: Parts
+    scene: SceneParts
     i: int
 
 
@@ -114,9 +114,9 @@ def _invalid(f: _Finger) -> Invalid:
     scene, state = f.scene, f.state
     if not scene.fingers[f.i]:
         return Invalid.NOT_IN_SCENE
-    if scene.servos and not state.reading.valid:
+    if scene.has_servos and not state.reading.valid:
         return Invalid.SERVO_NOT_READ
-    return state.contacts[f.i].invalid if scene.sensors else Invalid.NONE
+    return state.contacts[f.i].invalid if scene.has_sensors else Invalid.NONE
 
 
 def _frame_age(f: _Finger) -> float:

@@ -142,7 +142,9 @@ def set_budget(
     budget.baseline, budget.slope = known.baseline, known.slope
     budget.smooth, budget.rotation = known.smooth, known.rotation
     budget.tilt_error = _SOLID_TILT_ERROR if options.is_solid else 0.0
-    budget.systematic = max(*budget.sizes, budget.smooth, budget.rotation, budget.tilt_error) > 0.0
+    budget.has_common_errors = (
+        max(*budget.sizes, budget.smooth, budget.rotation, budget.tilt_error) > 0.0
+    )
     budget.cells_per_sample = 1.0
     level, weights = options.patch_level, NEIGHBOURS if pattern is None else pattern
     norm = float(np.sqrt((weights**2).sum()))

@@ -186,7 +186,7 @@ def _estimate(state: EstimatorState, model: Model, frame: FloatArray, cells: Cel
     if reason != Invalid.NONE:
         reason = _fault_in_readings(state, frame, cells.height, reason)
     _to_tilts(state, state.fit.covariance, estimate.covariance)
-    if state.budget.systematic or estimate.undetected > 0.0:
+    if state.budget.has_common_errors or estimate.undetected > 0.0:
         _to_tilts(state, state.budget.covariance, estimate.systematic)
         for i in range(4):
             for j in range(4):

@@ -392,7 +392,7 @@ def _check_fit(state: EstimatorState, model: Model, cells: Cells) -> float:
     estimate.residual = misfit - fit.readings
     expected = undetected = 0.0
     budget.shared[:] = 0.0
-    if budget.systematic:
+    if budget.has_common_errors:
         expected = set_shared_errors(state, cells)
         estimate.shared = math.sqrt(budget.shared[DEPTH, DEPTH]) / fit.d
     beyond = misfit - expected - variance * freedom

@@ -156,7 +156,7 @@ class Budget(Record):
     tilt_error: float  # relative tilt error of a solid tip over d/a
     row_correlation: float  # correlation of neighbours in a row
     cells_per_sample: float  # Σρ², cells per independent noise sample
-    systematic: bool  # True if any error other than the correlation is set
+    has_common_errors: bool  # True if any error other than the correlation is set
     is_correlated: bool
     widening: Annotated[FloatArray, DEPTHS, 5]  # factors of the standard deviations, used-up cells
     responses: Annotated[FloatArray, PARAMETERS, SOURCES]  # Jᵀq

@@ -11,7 +11,7 @@ import msgpack
 import numpy as np
 
 from softfinger.daemon.loop.timing import Statistics, record
-from softfinger.daemon.types import Frame, HandInfo, Parts, SensorInfo, State
+from softfinger.daemon.types import Frame, HandInfo, SceneParts, SensorInfo, State
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.publisher import packer
 from softfinger.kinematics.estimation.invalid import Invalid
@@ -76,7 +76,7 @@ def arguments(topic: bytes) -> tuple[Any, ...]:
     """Return the arguments from which a sample of the topic's message is made."""
     state, wall, t = sample_state(), 1.7e9 + 0.25, 12.5
     if topic == schema.STATE:
-        return state, Parts(fingers=(True, True), servos=True, sensors=True), 5
+        return state, SceneParts(fingers=(True, True), has_servos=True, has_sensors=True), 5
     if topic == schema.TACTILE:
         counts = np.arange(20, dtype=np.uint16).reshape(4, 5) * 3000
         frame = Frame(seq=77, t_sample=12.48, t_arrival=12.49, valid=True, data=counts)

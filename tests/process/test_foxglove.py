@@ -26,7 +26,7 @@ from softfinger.tools.viewing.hand_drawing import hand_parts
 from tests.conftest import until
 from tests.harness.daemon_process import started
 from tests.harness.fake_daemon import FakeDaemon, event, frame, state
-from tests.process.test_strangers import place
+from tests.process.test_untrusted_clients import place
 
 TOPICS = {
     "hand/state": "hand.state",

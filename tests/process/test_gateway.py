@@ -35,7 +35,7 @@ from softfinger.daemon.wire.publisher import GATEWAY_TOPICS, Publisher
 from tests.conftest import Addresses, until
 from tests.harness.daemon_process import SOFTFINGER, ask, python
 from tests.harness.terminal_process import TerminalProcess
-from tests.process.test_strangers import place
+from tests.process.test_untrusted_clients import place
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import zmq
 
-from softfinger.daemon.types import Contact, Frame, HandInfo, Parts, SensorInfo, State
+from softfinger.daemon.types import Contact, Frame, HandInfo, SceneParts, SensorInfo, State
 from softfinger.daemon.wire.publisher import bit
 from softfinger.daemon.wire.schema import COMMAND, EVENT, STATE, TACTILE
 from tests.conftest import until
@@ -18,7 +18,7 @@ from tests.harness.golden_wire import message_maker
 
 state_message = message_maker(STATE)
 
-BOTH = Parts((True, True), servos=True, sensors=False)
+BOTH = SceneParts((True, True), has_servos=True, has_sensors=False)
 
 
 def subscribe(context: zmq.Context[Any], address: str, topic: bytes = b"") -> zmq.Socket[Any]:

@@ -78,7 +78,7 @@ class EmulatorClock:
     deadline to the next by the same amount as the daemon's, within `_AHEAD_TIME`.
     """
 
-    waits = False
+    pauses_when_late = False
 
     def __init__(self, deadline: Deadline) -> None:
         self.servos: PtyServoBus | None = None
