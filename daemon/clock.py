@@ -19,7 +19,7 @@ from softfinger.daemon.types import FINGERS
 class Clock(Protocol):
     """Time for the pipeline, in seconds."""
 
-    waits: bool  # the hand's time pauses while this machine is late
+    pauses_when_late: bool  # the hand's time pauses while this machine is late
 
     def now(self) -> float:
         """Return the monotonic time [s]."""
@@ -114,7 +114,7 @@ class RealClock:
     host = staticmethod(time.monotonic)
     wall = staticmethod(time.time)
     behind = 0.0
-    waits = False
+    pauses_when_late = False
 
     def __init__(self, spin: float = 0.0) -> None:
         self._spin = spin
@@ -139,7 +139,7 @@ class HandClock:
     from ``due`` how far its time may advance.
     """
 
-    waits = True
+    pauses_when_late = True
 
     def __init__(self, machine: LoopClock, due: Deadline | None = None) -> None:
         self._machine = machine
@@ -179,7 +179,7 @@ class VirtualClock:
     """
 
     behind = 0.0
-    waits = True
+    pauses_when_late = True
 
     def __init__(self, start: float = 0.0) -> None:
         self._now = start

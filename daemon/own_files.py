@@ -15,15 +15,15 @@ from pathlib import Path
 from typing import BinaryIO, Literal, TextIO
 
 from softfinger.kinematics.compiled.own_folder import (
-    JUDGED,
+    HAS_OWNERS,
     NO_FOLLOW,
     require_own,
     user_cache,
 )
 
-MOST = 16 << 20  # bytes, largest file read at once, and largest unpacked part of a file
+SIZE_MAX = 16 << 20  # bytes, largest file read at once, and largest unpacked part of a file
 
-_SHARED = stat.S_IWOTH
+_WORLD_WRITABLE = stat.S_IWOTH
 
 
 def open_regular(path: Path) -> BinaryIO:
@@ -35,7 +35,7 @@ def open_regular(path: Path) -> BinaryIO:
     return open(path, "rb", opener=lambda name, flags: os.open(name, flags | no_wait))
 
 
-def read_file(path: Path, most: int = MOST) -> bytes:
+def read_file(path: Path, most: int = SIZE_MAX) -> bytes:
     """Return a file's bytes. Raises OSError as `open_regular`, or for more than ``most`` bytes."""
     with open_regular(path) as file:
         data = file.read(most + 1)
@@ -44,14 +44,14 @@ def read_file(path: Path, most: int = MOST) -> bytes:
     return data
 
 
-def unpacked_most(file: BinaryIO) -> int:
+def unpacked_size_max(file: BinaryIO) -> int:
     """Return the limit of a file's unpacked size: 32 times its size on disk, at least 8 MiB.
 
     Recordings compress to between a third and a tenth. Holes in a sparse file do not count as size.
     """
     found = os.fstat(file.fileno())
-    room = 512 * found.st_blocks if JUDGED else found.st_size
-    return max(MOST // 2, 32 * min(found.st_size, room))
+    room = 512 * found.st_blocks if HAS_OWNERS else found.st_size
+    return max(SIZE_MAX // 2, 32 * min(found.st_size, room))
 
 
 def runtime_folder() -> Path:
@@ -114,7 +114,7 @@ def write_bytes(path: Path) -> BinaryIO:
 def _open(path: str, flags: int) -> int:
     try:
         there = os.lstat(path)
-        _refuse_strange(path, there)
+        _refuse_foreign(path, there)
         # Follow an existing link of our own, but no link that is created after this check.
         follow = stat.S_ISLNK(there.st_mode)
     except FileNotFoundError:
@@ -123,7 +123,7 @@ def _open(path: str, flags: int) -> int:
     descriptor = os.open(path, flags, 0o666)
     try:
         found = os.fstat(descriptor)
-        _refuse_strange(path, found)
+        _refuse_foreign(path, found)
         if stat.S_ISREG(found.st_mode) and not flags & os.O_APPEND:
             os.ftruncate(descriptor, 0)
     except BaseException:
@@ -132,9 +132,9 @@ def _open(path: str, flags: int) -> int:
     return descriptor
 
 
-def _refuse_strange(path: str, found: os.stat_result) -> None:
-    strange = JUDGED and found.st_uid not in (os.geteuid(), 0)
+def _refuse_foreign(path: str, found: os.stat_result) -> None:
+    strange = HAS_OWNERS and found.st_uid not in (os.geteuid(), 0)
     link = stat.S_ISLNK(found.st_mode)
-    if strange and (link or Path(path).parent.stat().st_mode & _SHARED):
+    if strange and (link or Path(path).parent.stat().st_mode & _WORLD_WRITABLE):
         what = "a link" if link else "a file in a folder that all may write in"
         raise PermissionError(errno.EPERM, f"{what}, of another user", path)

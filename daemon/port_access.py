@@ -5,10 +5,10 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-_NO_USERS = ("root", "wheel")  # groups that a user should not join only to open a port
+_SYSTEM_GROUPS = ("root", "wheel")  # groups that a user should not join only to open a port
 
 
-def bring_it(path: str) -> str:
+def port_group_remedy(path: str) -> str:
     """Return advice for a missing port; a port outside /dev belongs to an emulated hand."""
     return "plug the adapter in" if path.startswith("/dev/") else "start `softfinger emulate`"
 
@@ -22,7 +22,7 @@ def grant(path: str) -> str:
         group = grp.getgrgid(status.st_gid)
     except (OSError, KeyError):
         return f"sudo chmod a+rw {path}"
-    if group.gr_name in _NO_USERS or not status.st_mode & 0o020:
+    if group.gr_name in _SYSTEM_GROUPS or not status.st_mode & 0o020:
         return f"sudo chmod a+rw {path}, until it is plugged in again; for good, a udev rule"
     user = os.environ.get("USER", "")
     if user in group.gr_mem and status.st_gid not in os.getgroups():

@@ -20,7 +20,7 @@ if TYPE_CHECKING:  # a client that only sends commands needs no NumPy
 FINGERS = ("left", "right")
 STREAM_ADDRESS = "tcp://127.0.0.1:9872"  # default addresses
 COMMAND_ADDRESS = "tcp://127.0.0.1:9873"
-UNLEASED = frozenset({"stop", "disarm", "status"})  # these only make the hand safer
+NO_LEASE_COMMANDS = frozenset({"stop", "disarm", "status"})  # these only make the hand safer
 GRIP_FRACTION = 0.9  # largest grip force as a fraction of `safety.force_max`
 Event = tuple[str, str, str]  # level, kind, text
 
@@ -123,7 +123,7 @@ class Goal:
 
 
 @dataclass(slots=True)
-class Warmth:
+class ServoHeatEstimate:
     """Temperatures of a servo from the thermal model in `safety.heat`; 0 while unknown."""
 
     winding: float = 0.0  # [°C]
@@ -165,16 +165,18 @@ class State:
     contacts: list[Contact] = field(default_factory=lambda: [Contact(), Contact()])
     object: ObjectPose = field(default_factory=ObjectPose)
     goal: Goal = field(default_factory=Goal)
-    heat: list[Warmth] = field(default_factory=lambda: [Warmth(), Warmth()])
+    heat: list[ServoHeatEstimate] = field(
+        default_factory=lambda: [ServoHeatEstimate(), ServoHeatEstimate()]
+    )
     timing: Timing = field(default_factory=Timing)
 
 
-class Parts(NamedTuple):
+class SceneParts(NamedTuple):
     """Fingers of the scene, and the presence of servos and sensors."""
 
     fingers: tuple[bool, bool]
-    servos: bool
-    sensors: bool
+    has_servos: bool
+    has_sensors: bool
 
 
 class TimeSpread(NamedTuple):
@@ -186,7 +188,7 @@ class TimeSpread(NamedTuple):
     max: float
 
 
-class SensorFacts(NamedTuple):
+class SensorInfo(NamedTuple):
     """Properties of a tactile sensor that are published with each frame; see ``hand/tactile``."""
 
     pitch: float  # distance between columns [m]
@@ -200,7 +202,7 @@ class SensorFacts(NamedTuple):
     calibration: str  # name and date, empty without a calibration
 
 
-class HandFacts(NamedTuple):
+class HandInfo(NamedTuple):
     """Facts that stay constant while a daemon runs, as JSON texts; empty if not available."""
 
     version: str

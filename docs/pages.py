@@ -126,7 +126,7 @@ def stream() -> str:
 def commands() -> str:
     """List the hand's commands from the table of modes."""
     from softfinger.daemon.control.modes import COMMANDS, Mode
-    from softfinger.daemon.types import UNLEASED
+    from softfinger.daemon.types import NO_LEASE_COMMANDS
     from softfinger.tools.terminal.send import _EPILOG
 
     parts = [
@@ -141,7 +141,7 @@ def commands() -> str:
     for name, (modes, numbers) in COMMANDS.items():
         given = ", ".join(f"`{key}`" + " (optional)" * (not numbers[key]) for key in numbers)
         where = "any" if modes == set(Mode) else ", ".join(m for m in Mode if m in modes)
-        leased = "no" if name in UNLEASED | {"stop"} else "yes"
+        leased = "no" if name in NO_LEASE_COMMANDS | {"stop"} else "yes"
         parts.append(_row(f"`{name}`", given, where, leased))
     return "".join(parts)
 

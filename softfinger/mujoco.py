@@ -37,10 +37,10 @@ from softfinger.daemon.simulation.physics.outline import rim_on_plane
 from softfinger.daemon.simulation.physics.plant import settle
 from softfinger.daemon.simulation.physics.plant_state import (
     FloatArray,
+    FloatTriple,
     Parameters,
     Plant,
     Sample,
-    Three,
     TipContact,
 )
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand, set_parameters
@@ -53,10 +53,10 @@ from softfinger.kinematics.contact.table_record import Table
 Work = tuple[FloatArray, FloatArray, FloatArray]
 
 _ROWS = 4  # rows per tip: d, θ, shear along and across the tilt
-_NEAR = 0.005  # m, gap within which a contact may begin in the next step
-_LEAST = 1e-9  # smallest contact depth [m], friction force [N] and sin θ with a tilt direction
+_GAP_MAX = 0.005  # m, gap within which a contact may begin in the next step
+_VALUE_MIN = 1e-9  # smallest contact depth [m], friction force [N] and sin θ with a tilt direction
 _SHEAR = 2  # row of the shear along the tilt
-_LEFT_OUT = (
+_UNSUPPORTED = (
     "tip_relaxation",
     "tip_micro_slip",
     "tip_creep_time",
@@ -70,10 +70,10 @@ class Touch(Record):
     """One tip on a face in 3D; vectors are in world coordinates."""
 
     contact: TipContact
-    normal: Three  # m, unit vector from the tip's centre into the face
-    along: Three  # t, unit vector in the face, opposite to the lean of the tip's axis
-    across: Three  # m × t, the rotation axis of θ
-    shear: Three  # displacement of the face relative to the tip [m]
+    normal: FloatTriple  # m, unit vector from the tip's centre into the face
+    along: FloatTriple  # t, unit vector in the face, opposite to the lean of the tip's axis
+    across: FloatTriple  # m × t, the rotation axis of θ
+    shear: FloatTriple  # displacement of the face relative to the tip [m]
     shear_across: float  # [m]
 
 
@@ -87,7 +87,7 @@ def _set_frame(touch: Touch, geometry: FloatArray) -> None:
     t[:] = tip.cosine * m - geometry[4:7]
     tip.sine = math.sqrt((t * t).sum())
     tip.theta = math.atan2(tip.sine, tip.cosine)
-    if tip.sine < _LEAST:
+    if tip.sine < _VALUE_MIN:
         least = np.argmin(np.abs(m))
         t[:] = -m[least] * m
         t[least] += 1.0
@@ -136,7 +136,7 @@ def press(
         tip, first = touch.contact, _ROWS * k
         tip.d = geometry[k, 0]
         tip.travel = rates[:] = 0.0
-        if tip.d > -_NEAR:
+        if tip.d > -_GAP_MAX:
             _set_frame(touch, geometry[k])
             for i in range(3):
                 slide = of[2, i] - of[0, i]
@@ -146,7 +146,7 @@ def press(
                 rows[first + 3] += touch.across[i] * slide
             rates[:] = (rows[first : first + _ROWS] * velocity).sum(axis=1)
             tip.travel = max(p.step * rates[0], 0.0)
-        if tip.d + tip.travel <= _LEAST:
+        if tip.d + tip.travel <= _VALUE_MIN:
             clear_contact(tip)
             touch.shear[:] = rows[first : first + _ROWS] = 0.0
             continue
@@ -201,7 +201,7 @@ def solve(
     for k in range(len(touches)):
         f, tangent = force[_ROWS * k : _ROWS * (k + 1)], touches[k].contact.tangent
         normal = max(f[0] - tangent * f[2], 0.0)
-        f[2:] *= min(p.friction * normal / max(math.hypot(f[2], f[3]), _LEAST), 1.0)
+        f[2:] *= min(p.friction * normal / max(math.hypot(f[2], f[3]), _VALUE_MIN), 1.0)
         f[0] = normal + tangent * f[2]
     passive -= (force.reshape(n, 1) * rows).sum(axis=0)
     own[:] = -(force.reshape(n, 1) * inertial).sum(axis=0)
@@ -243,7 +243,7 @@ class SoftTips:
         if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
             raise SettingsError("integrator: found RK4, expected Euler, implicit or implicitfast")
         simulation = settings.simulation
-        if found := [name for name in _LEFT_OUT if np.any(getattr(simulation, name))]:
+        if found := [name for name in _UNSUPPORTED if np.any(getattr(simulation, name))]:
             raise SettingsError(f"{found[0]}: not in MuJoCo")
         self._tips = [model.geom(name).id for name in tips]
         self._touching = [model.geom(name).id for name in touching]
@@ -297,12 +297,12 @@ class SoftTips:
             self._all["shear"] = self._own[:] = dt = 0.0
             self._due = -math.inf
         for k, tip in enumerate(self._tips):
-            away = [mujoco.mj_geomDistance(model, data, tip, g, _NEAR, None) for g in touching]
+            away = [mujoco.mj_geomDistance(model, data, tip, g, _GAP_MAX, None) for g in touching]
             touched = touching[away.index(min(away))]
-            gap = mujoco.mj_geomDistance(model, data, tip, touched, _NEAR, fromto)
+            gap = mujoco.mj_geomDistance(model, data, tip, touched, _GAP_MAX, fromto)
             geometry[k, 0], geometry[k, 7:] = -gap, fromto[:3]
             geometry[k, 1:4], geometry[k, 4:7] = data.geom_xpos[tip], data.geom_xmat[tip, 2::3]
-            for i, geom in ((0, tip), (2, touched)) if gap < _NEAR else ():
+            for i, geom in ((0, tip), (2, touched)) if gap < _GAP_MAX else ():
                 place, turn = self._jacobians[k, i : i + 2]
                 mujoco.mj_jac(model, data, place, turn, fromto[3:], model.geom_bodyid[geom])
         law, work = (self._all, self._parameters.array), self._work
@@ -419,7 +419,7 @@ class MujocoHand(SimulatedHand):
                 mujoco.mj_step1(self.model, data)  # updates the contacts for feel
                 state.position[:], state.velocity[:] = data.qpos, data.qvel
                 state.current[:] = data.act
-                self._done = plant.steps = self._done + 1
+                self._done = plant.step_count = self._done + 1
                 feel(plant.array, self.tips._all, self._ring)
 
 

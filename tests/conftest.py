@@ -228,4 +228,4 @@ def exact_solid_data(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         estimator, "solid_data", lambda tip: replace(data(tip), error=0.0, pressure_error=0.0)
     )
-    monkeypatch.setattr(error_budget, "_LEAN", 0.0)
+    monkeypatch.setattr(error_budget, "_SOLID_TILT_ERROR", 0.0)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from softfinger.daemon.profile.settings import Settings
     from softfinger.daemon.wire.keys import ClientKeys
 
-PATIENCE = 5.0  # s, how long `--no-wait` waits for the first message
+WAIT_MAX = 5.0  # s, how long `--no-wait` waits for the first message
 
 
 def add_profile(parser: argparse.ArgumentParser) -> None:
@@ -127,7 +127,7 @@ def waiting(address: str, folder: Path | None) -> str:
 
 def no_stream(address: str, folder: Path | None) -> str:
     """Return the message for a stream that did not arrive in time."""
-    return f"no stream from {address} within {PATIENCE:g} s; is softfinger running?{_hint(folder)}"
+    return f"no stream from {address} within {WAIT_MAX:g} s; is softfinger running?{_hint(folder)}"
 
 
 def _hint(folder: Path | None) -> str:
@@ -212,7 +212,7 @@ def add_stream(
     parser.add_argument(
         "--no-wait",
         action="store_true",
-        help=f"exit with an error if nothing arrives for {PATIENCE:g} s (monitor: or at its end)",
+        help=f"exit with an error if nothing arrives for {WAIT_MAX:g} s (monitor: or at its end)",
     )
     add_duration(parser)
 

@@ -32,9 +32,9 @@ from softfinger.tools.extras import require
 Case = TypeVar("Case")
 Result = TypeVar("Result")
 
-_CONNECT = 10.0  # s to wait for the scheduler to answer
-_REDRAW = 0.1  # s between redraws of a bar
-_BAR = 20  # columns
+_CONNECT_TIMEOUT = 10.0  # s to wait for the scheduler to answer
+_REDRAW_INTERVAL = 0.1  # s between redraws of a bar
+_BAR_WIDTH = 20  # columns
 
 
 class SweepError(SoftfingerError):
@@ -52,12 +52,12 @@ class Progress:
 
     def __call__(self, done: int, note: str = "") -> None:
         """Show ``done`` of the total, with ``note`` in place of the percentage."""
-        if not self.on or time.monotonic() - self._shown < _REDRAW:
+        if not self.on or time.monotonic() - self._shown < _REDRAW_INTERVAL:
             return
         self._shown = time.monotonic()
         fraction = min(done / self._total, 1.0)
-        full = round(fraction * _BAR)
-        bar = "█" * full + "·" * (_BAR - full)
+        full = round(fraction * _BAR_WIDTH)
+        bar = "█" * full + "·" * (_BAR_WIDTH - full)
         line = f"{self._what} {bar} {note or f'{fraction:4.0%}'}"
         columns = shutil.get_terminal_size().columns
         print(f"\r{line[: columns - 1]}\x1b[K", end="", file=sys.stderr, flush=True)
@@ -221,7 +221,7 @@ def _cluster(address: str) -> Iterator[Executor]:
 
     connect: Any = Client
     try:
-        client = connect(address, timeout=_CONNECT)
+        client = connect(address, timeout=_CONNECT_TIMEOUT)
     except (OSError, ValueError) as error:
         raise SweepError(f"--scheduler {address}: no Dask scheduler answers: {error}") from None
     with client:

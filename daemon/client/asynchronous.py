@@ -10,7 +10,7 @@ import zmq
 import zmq.asyncio
 
 from softfinger.daemon.client.command_client import (
-    AGAIN_AFTER,
+    RETRY_DELAY,
     Attempts,
     HandClient,
     accepted,
@@ -136,7 +136,7 @@ class AsyncHand(HandClient[Coroutine[Any, Any, None]]):
         where, keys = self.command_address, self._keys
         reply = await asyncio.to_thread(send_once, where, attempts, keys)
         while attempts.again(reply):
-            await asyncio.sleep(AGAIN_AFTER)
+            await asyncio.sleep(RETRY_DELAY)
             if not attempts.remaining():  # the computer was suspended
                 break
             reply = await asyncio.to_thread(send_once, where, attempts, keys)

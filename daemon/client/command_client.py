@@ -15,15 +15,15 @@ import zmq
 
 from softfinger import SoftfingerError
 from softfinger.daemon.client.connection import (
-    PATIENCE,
-    SILENCE,
+    REPLY_TIMEOUT,
+    SILENCE_TIME,
     both_addresses,
     default_addresses,
     is_host,
     still_waiting,
 )
 from softfinger.daemon.errors import HandClosed, Reason, Refused
-from softfinger.daemon.types import UNLEASED
+from softfinger.daemon.types import NO_LEASE_COMMANDS
 from softfinger.daemon.wire.keys import ClientKeys, load_client
 from softfinger.daemon.wire.local_stop import stop_locally
 
@@ -31,10 +31,11 @@ _Done = TypeVar("_Done")
 
 _log = logging.getLogger(__name__)
 
-AGAIN_AFTER = 0.05  # s until a late command is sent again
+RETRY_DELAY = 0.05  # s until a late command is sent again
 _CLOCK = getattr(time, "CLOCK_BOOTTIME", None)  # Linux only
-LOCALLY = 0.5  # s, timeout of a stop over the local socket
-UNCONFIRMED = "the servos have not confirmed torque off yet"  # if ``torque_off`` is ``unconfirmed``
+LOCAL_STOP_TIMEOUT = 0.5  # s, timeout of a stop over the local socket
+# if ``torque_off`` is ``unconfirmed``.
+UNCONFIRMED_TEXT = "the servos have not confirmed torque off yet"
 
 
 class NoAnswer(SoftfingerError):
@@ -51,7 +52,7 @@ class Attempts:
 
     def __init__(self, request: dict[str, Any], timeout: float) -> None:
         """Create a policy; ``timeout`` [s] applies to all attempts together."""
-        harmless = request.get("command") in UNLEASED
+        harmless = request.get("command") in NO_LEASE_COMMANDS
         self.request = request if harmless else {**request, "key": secrets.token_hex(8)}
         self.timeout = timeout
         self._end = _now() + timeout
@@ -61,8 +62,8 @@ class Attempts:
         return max(self._end - _now(), 0.0)
 
     def again(self, reply: dict[str, Any]) -> bool:
-        """Return True if the command must be sent again after `AGAIN_AFTER` s."""
-        return reply.get("reason") == Reason.LATE and self.remaining() > 2.0 * AGAIN_AFTER
+        """Return True if the command must be sent again after `RETRY_DELAY` s."""
+        return reply.get("reason") == Reason.LATE and self.remaining() > 2.0 * RETRY_DELAY
 
 
 def _now() -> float:
@@ -71,7 +72,10 @@ def _now() -> float:
 
 
 def send(
-    address: str, request: dict[str, Any], timeout: float = PATIENCE, keys: ClientKeys | None = None
+    address: str,
+    request: dict[str, Any],
+    timeout: float = REPLY_TIMEOUT,
+    keys: ClientKeys | None = None,
 ) -> dict[str, Any]:
     """Send one command and return the reply. Raises NoAnswer after ``timeout`` s.
 
@@ -83,7 +87,7 @@ def send(
     attempts = Attempts(request, timeout)
     reply = send_once(address, attempts, keys)
     while attempts.again(reply):
-        time.sleep(AGAIN_AFTER)
+        time.sleep(RETRY_DELAY)
         if not attempts.remaining():  # the computer was suspended
             break
         reply = send_once(address, attempts, keys)
@@ -94,7 +98,7 @@ def send_once(address: str, attempts: Attempts, keys: ClientKeys | None = None) 
     """Make one attempt and return the reply; see `send`."""
     request, timeout, remaining = attempts.request, attempts.timeout, attempts.remaining()
     if request.get("command") == "stop":
-        stopped = stop_locally(address, min(remaining, LOCALLY))
+        stopped = stop_locally(address, min(remaining, LOCAL_STOP_TIMEOUT))
         if stopped is not None:
             return stopped
     answer = f"answer to {request['command']} from {address}"
@@ -109,7 +113,7 @@ def send_once(address: str, attempts: Attempts, keys: ClientKeys | None = None) 
         except zmq.ZMQError as error:
             raise NoAnswer(f"{address}: {error}") from None
         socket.send(msgpack.packb(request))
-        silence = min(SILENCE, remaining)
+        silence = min(SILENCE_TIME, remaining)
         answered = socket.poll(math.ceil(silence * 1e3))
         if not answered and silence < remaining:
             _log.warning(still_waiting(answer, timeout))
@@ -153,7 +157,7 @@ def accepted(reply: dict[str, Any]) -> dict[str, Any]:
         text = str(reply.get("error", "refused without a reason"))
         raise Refused(text, str(reply.get("reason", "")))
     if reply.get("torque_off") == "unconfirmed":
-        _log.warning(UNCONFIRMED)
+        _log.warning(UNCONFIRMED_TEXT)
     return {key: value for key, value in reply.items() if key != "ok"}
 
 
@@ -183,7 +187,7 @@ class HandClient(Generic[_Done]):
         commands: str | None = None,
         *,
         client: str = "",
-        timeout: float = PATIENCE,
+        timeout: float = REPLY_TIMEOUT,
         keys: Path | None = None,
     ) -> None:
         usual = default_addresses()

@@ -12,11 +12,11 @@ import zmq
 from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.types import COMMAND_ADDRESS, STREAM_ADDRESS
 
-PATIENCE = 5.0  # s, default timeout of a reply or a first message
-SILENCE = 1.0  # s of waiting, after which a warning is logged
+REPLY_TIMEOUT = 5.0  # s, default timeout of a reply or a first message
+SILENCE_TIME = 1.0  # s of waiting, after which a warning is logged
 
-_QUEUE = 100_000  # messages queued for a slow program
-_MESSAGE_LIMIT = 4_000_000  # bytes; the largest grid is 131 kB
+_QUEUE_LENGTH = 100_000  # messages queued for a slow program
+_MESSAGE_SIZE_MAX = 4_000_000  # bytes; the largest grid is 131 kB
 
 
 def default_addresses() -> tuple[str, str]:
@@ -57,7 +57,7 @@ def is_host(named: str) -> bool:
 
 
 def subscribe(
-    context: zmq.Context[Any], address: str, *topics: bytes, queue: int = _QUEUE
+    context: zmq.Context[Any], address: str, *topics: bytes, queue: int = _QUEUE_LENGTH
 ) -> zmq.Socket[Any]:
     """Return a socket that is subscribed to topics and queues up to ``queue`` messages.
 
@@ -67,7 +67,7 @@ def subscribe(
     try:
         socket.setsockopt(zmq.LINGER, 0)
         socket.setsockopt(zmq.RCVHWM, queue)
-        socket.setsockopt(zmq.MAXMSGSIZE, _MESSAGE_LIMIT)
+        socket.setsockopt(zmq.MAXMSGSIZE, _MESSAGE_SIZE_MAX)
         socket.setsockopt(zmq.RECONNECT_IVL_MAX, 500)
         for topic in topics:
             socket.setsockopt(zmq.SUBSCRIBE, topic)

@@ -21,13 +21,13 @@ import numpy as np
 import zmq
 from numpy.typing import NDArray
 
-from softfinger.daemon.client.connection import SILENCE, still_waiting, subscribe, unpack
+from softfinger.daemon.client.connection import SILENCE_TIME, still_waiting, subscribe, unpack
 from softfinger.daemon.errors import HandClosed, HandFault, NoStream, NotInTime
 from softfinger.daemon.wire.schema import SCHEMA, STATE, TOPICS, HandState, fields_of
 
 _Record = TypeVar("_Record")
 
-_REPEATED = 1000  # messages that are remembered to recognise repetitions
+_STORED_MESSAGE_COUNT = 1000  # messages that are remembered to recognise repetitions
 
 _log = logging.getLogger(__name__)
 
@@ -83,7 +83,7 @@ class Gaps:
     def __init__(self) -> None:
         self.lost = 0
         self._last: dict[str, int] = {}
-        self._received: deque[int] = deque(maxlen=_REPEATED)
+        self._received: deque[int] = deque(maxlen=_STORED_MESSAGE_COUNT)
 
     def take(self, message: dict[str, Any]) -> bool:
         """Count one more message; return False if it was received before."""
@@ -179,7 +179,7 @@ class Subscriber(Generic[_Record]):
                 self._require_open()
                 yield None
         now = time.monotonic()
-        end, warn_at = now + timeout, now + SILENCE
+        end, warn_at = now + timeout, now + SILENCE_TIME
         while True:
             self._require_open()
             yield math.ceil(1e3 * (min(end, max(warn_at, now)) - now))

@@ -16,9 +16,9 @@ from softfinger.daemon.profile.load import profile_text
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import GRIP_FRACTION
 
-KEPT = Path(__file__).with_name("envelope.toml")
+PACKAGED_MAP = Path(__file__).with_name("envelope.toml")
 HELD, TURNED, LOST, REFUSED = "htlr"
-MEANING = {
+OUTCOME_TEXTS = {
     HELD: "held",
     TURNED: "held, but turned by more than 5°",
     LOST: "slips out",
@@ -30,14 +30,14 @@ _SECTIONS = ("hand", "tip", "material")
 
 def identity(settings: Settings) -> dict[str, Any]:
     """Return the settings that identify the hand of a map."""
-    told = {name: getattr(settings, name).model_dump(mode="json") for name in _SECTIONS}
-    return told | {"control": {"law": settings.control.law}}
+    identifying = {name: getattr(settings, name).model_dump(mode="json") for name in _SECTIONS}
+    return identifying | {"control": {"law": settings.control.law}}
 
 
-def raised(settings: Settings, force: float) -> float:
+def increased_force_limit(settings: Settings, force: float) -> float:
     """Return the force [N] up to which the slip monitor may raise a grip of ``force`` [N]."""
-    most = GRIP_FRACTION * settings.safety.force_max
-    return max(min(force + settings.control.grip_raise_max, most), force)
+    force_max = GRIP_FRACTION * settings.safety.force_max
+    return max(min(force + settings.control.grip_raise_max, force_max), force)
 
 
 def _difference(found: dict[str, Any], expected: dict[str, Any]) -> str:
@@ -66,7 +66,7 @@ class Envelope:
         """
         own, control = settings.control.envelope, settings.control
         try:
-            found = tomllib.loads(profile_text(Path(own or KEPT)))
+            found = tomllib.loads(profile_text(Path(own or PACKAGED_MAP)))
             other = _difference(found["identity"], identity(settings))
             frictions, self._masses, sizes = found["friction"], found["mass"], found["size"]
             width, count = settings.object.width, len(self._masses)
@@ -75,14 +75,14 @@ class Envelope:
             # For each mass, the outcomes of a block and of a disc.
             rows = zip(*(found[shape][row : row + count] for shape in found["shapes"]), strict=True)
             self._outcomes = ["".join(cells[column] for cells in shapes) for shapes in rows]
-            self._raised = found["raised"]
+            self._force_limit = found["raised"]
         except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
             raise SettingsError(
                 f"control.envelope: {own}: no map of `softfinger envelope --keep`: {error!r}"
             ) from None
         if own and other:
             raise SettingsError(f"control.envelope: {own} is another hand's: {other}")
-        self._known = not other
+        self._is_valid = not other
         self._settings = settings
 
     def warning(self, force: float) -> str:
@@ -92,11 +92,11 @@ class Envelope:
         and the mass whose weight is `control.object_load`. The mass is scaled by the ratio of the
         force limit of the map to the force limit of this grip.
         """
-        if not self._known:
+        if not self._is_valid:
             return ""
         settings, control = self._settings, self._settings.control
         mass = control.object_load / _GRAVITY
-        scaled = mass * self._raised / raised(settings, force)
+        scaled = mass * self._force_limit / increased_force_limit(settings, force)
         heavier = min(bisect_left(self._masses, scaled), len(self._masses) - 1)
         outcome = self._outcomes[heavier]
         if HELD in outcome or TURNED in outcome:
@@ -104,6 +104,6 @@ class Envelope:
         return (
             f"outside of what this hand holds in simulation: {1e3 * settings.object.width:g} mm "
             f"(object.width) at friction {control.tip_friction:g} (control.tip_friction) and "
-            f"{mass:.2g} kg (control.object_load) with {force:g} N: {MEANING[outcome[0]]}; "
+            f"{mass:.2g} kg (control.object_load) with {force:g} N: {OUTCOME_TEXTS[outcome[0]]}; "
             "see docs/envelope.md"
         )

@@ -17,10 +17,10 @@ _GOAL_OFFSET = 0.35
 _TILT_RESERVE = 0.1
 
 
-def off_range(angle: float, low: float, high: float) -> str:
+def range_text(angle: float, low: float, high: float) -> str:
     """Return the found and expected part of a message for an angle [rad] outside its range."""
-    found, least, most = (f"{math.degrees(each):.1f}°" for each in (angle, low, high))
-    return f"found {found} ({angle:.4g} rad), expected {least} to {most} ({low:.2f} to {high:.2f})"
+    found, lower, upper = (f"{math.degrees(each):.1f}°" for each in (angle, low, high))
+    return f"found {found} ({angle:.4g} rad), expected {lower} to {upper} ({low:.2f} to {high:.2f})"
 
 
 class Fingers:
@@ -32,7 +32,7 @@ class Fingers:
         self.reading, self.pose, self.grasp = state.reading, state.object, grasp
         self._settings, self._contacts = settings, state.contacts
         dt, smooth = 1.0 / settings.loop.rate, settings.control.smooth_time
-        self._joints = [Setpoint(dt, smooth, SetpointState()) for _ in FINGERS]
+        self._setpoints = [Setpoint(dt, smooth, SetpointState()) for _ in FINGERS]
 
     # Contacts
 
@@ -53,74 +53,75 @@ class Fingers:
         Jacobians, and the tilt of each tip changes by the sum of both angles. The joint and tilt
         limits bound the range.
         """
-        settings, present = self._settings, self.pose.angle
-        lean = 1.0 / max(self.grasp.jacobian_rotation[0] + self.grasp.jacobian_rotation[1], 0.1)
+        settings, present_angle = self._settings, self.pose.angle
+        rotation = self.grasp.jacobian_rotation[0] + self.grasp.jacobian_rotation[1]
+        joint_ratio = 1.0 / max(rotation, 0.1)
         low, high = -math.inf, math.inf
         for index, sense in ((0, 1.0), (1, -1.0)):
             contact, q = self._contacts[index], self.reading.q[index]
             depth = 1.0 - contact.d / settings.tip.radius
             reach = math.asin(max(depth, 0.0)) - settings.safety.theta_margin - _TILT_RESERVE
-            low = max(low, (-reach - contact.theta) / (1.0 + lean))
-            high = min(high, (reach - contact.theta) / (1.0 + lean))
+            low = max(low, (-reach - contact.theta) / (1.0 + joint_ratio))
+            high = min(high, (reach - contact.theta) / (1.0 + joint_ratio))
             down, up = settings.hand.q_min[index] - q, settings.hand.q_max[index] - q
-            ends = sorted((sense * down / lean, sense * up / lean))
+            ends = sorted((sense * down / joint_ratio, sense * up / joint_ratio))
             low, high = max(low, ends[0]), min(high, ends[1])
-        return present + min(low, 0.0), present + max(high, 0.0)
+        return present_angle + min(low, 0.0), present_angle + max(high, 0.0)
 
-    def why_not_turn(self, angle: float) -> str:
+    def turn_refusal(self, angle: float) -> str:
         """Return the reason why the object can't turn to ``angle`` [rad], or an empty text."""
         if not self.pose.valid:
             return "the object's angle is not known"
         low, high = self.turning_range()
-        return "" if low <= angle <= high else f"angle: {off_range(angle, low, high)} in this grip"
+        return "" if low <= angle <= high else f"angle: {range_text(angle, low, high)} in this grip"
 
     # Setpoints
 
     def hold_here(self) -> None:
         """Set all setpoints to the present joint angles, at rest."""
         for index, q in enumerate(self.reading.q):
-            self._joints[index].reset(q)
+            self._setpoints[index].reset(q)
 
-    def go_to(self, index: int, q: float) -> None:
+    def set_target(self, index: int, q: float) -> None:
         """Set the target of one joint's setpoint to ``q`` [rad]."""
-        self._joints[index].target = q
+        self._setpoints[index].target = q
 
-    def close(self, touching: set[int]) -> set[int]:
+    def close_fingers(self, touching: set[int]) -> set[int]:
         """Close the fingers without contact, and return the fingers in contact.
 
         A finger whose contact is new, so that it is not in ``touching``, stops at its present
         angle. ``touching`` is the result of the last tick.
         """
-        law, now = self._settings.control, set[int]()
+        law, now_touching = self._settings.control, set[int]()
         for index in self.indices:
             contact = self._contacts[index]
             if not (contact.valid and contact.contact and contact.force > law.contact_force):
-                self.go_to(index, self._settings.hand.q_max[index])
+                self.set_target(index, self._settings.hand.q_max[index])
                 continue
-            now.add(index)
+            now_touching.add(index)
             if index not in touching:
-                self._joints[index].reset(self.reading.q[index])
-        return now
+                self._setpoints[index].reset(self.reading.q[index])
+        return now_touching
 
-    def ramp(self, rate: float) -> bool:
+    def advance_setpoints(self, rate: float) -> bool:
         """Advance the setpoints at ``rate`` [rad/s] or less; return True if all have arrived."""
-        arrived = [joint.step(rate) for joint in self._joints]
+        arrived = [joint.step(rate) for joint in self._setpoints]
         return all(arrived)
 
     @property
-    def distance(self) -> float:
+    def distance_max(self) -> float:
         """Largest distance of a joint from the target of its setpoint [rad]."""
-        return max(abs(self.reading.q[i] - self._joints[i].target) for i in self.indices)
+        return max(abs(self.reading.q[i] - self._setpoints[i].target) for i in self.indices)
 
     # Goals
 
-    def rest(self, goal: Goal, current: float) -> None:
+    def follow_setpoints(self, goal: Goal, current: float) -> None:
         """Set goals that make the joints follow their setpoints with at most ``current`` [A]."""
         for index in self.indices:
-            goal.q[index] = self._joints[index].value
+            goal.q[index] = self._setpoints[index].value
             goal.current[index] = current
 
-    def pull(self, goal: Goal, torques: tuple[float, float]) -> None:
+    def apply_torques(self, goal: Goal, torques: tuple[float, float]) -> None:
         """Set goals that make the joints apply ``torques`` [N·m], positive closing."""
         for index in self.indices:
             current = torques[index] / self._settings.control.torque_constant

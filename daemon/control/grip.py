@@ -41,16 +41,18 @@ class Grip:
         control = settings.control
         dt = 1.0 / settings.loop.rate
         self._control = control
-        self._alone = None if len(fingers) == 2 else fingers[0]
+        self._single_finger = None if len(fingers) == 2 else fingers[0]
         self._grasp = grasp
         self._state = state = GripState()
         self.force = Setpoint(dt, control.smooth_time, state.force)  # mean of both tips [N]
         self.angle = Setpoint(dt, control.smooth_time, state.angle)  # of the object [rad]
         self.slip = state.slip
         self.commanded = 0.0  # commanded force [N]
-        self.most = math.inf  # upper bound of the commanded force, set by `ease` [N]
+        self.commanded_max = (
+            math.inf
+        )  # upper bound of the commanded force, set by `limit_force` [N]
         self.target = 0.0  # commanded force, or more to prevent slip [N]
-        self.slipped = False  # the object has turned in the grip in this tick
+        self.has_slipped = False  # the object has turned in the grip in this tick
         self.target_angle = math.nan  # of the object [rad], NaN unless it is steered
         set_law(state.slip.law, settings)
         law = state.law
@@ -64,8 +66,8 @@ class Grip:
         law.torque_error = control.torque_error
         law.friction_speed = control.friction_speed
         law.torque_max = settings.safety.current_max * control.torque_constant
-        law.decay = math.exp(-2.0 * dt / control.smooth_time)
-        law.upright = control.law == "upright"
+        law.turn_decay = math.exp(-2.0 * dt / control.smooth_time)
+        law.is_blind = control.law == "upright"
         hand = settings.hand
         law.half_separation = 0.5 * hand.pivot_separation
         law.length, law.offset = hand.finger_length, hand.finger_offset
@@ -75,19 +77,19 @@ class Grip:
         state.joint_stiffness = control.joint_stiffness
 
     @property
-    def upright(self) -> bool:
+    def is_blind(self) -> bool:
         """True if the law grips without the object's angle."""
-        return self._state.law.upright
+        return self._state.law.is_blind
 
     @property
-    def shaking(self) -> bool:
+    def is_dithering(self) -> bool:
         """True while the dither that brings the object upright is running or due."""
         state = self._state
-        awaited = state.law.upright and self._alone is None and not state.steering
+        awaited = state.law.is_blind and self._single_finger is None and not state.is_steering
         return awaited and state.dither_elapsed < state.law.dither_time
 
     @property
-    def turning_on(self) -> float:
+    def stopping_ratio(self) -> float:
         """Ratio of the earliest stopping angle to the present angle; 0 unless |angle| grows."""
         angle, speed = self.angle.value, self.angle.speed
         if speed * angle <= 0.0:
@@ -95,55 +97,57 @@ class Grip:
         return 1.0 + min(speed * self._control.smooth_time / angle, 1.0)
 
     @property
-    def turning(self) -> bool:
+    def is_turning(self) -> bool:
         """True while the setpoint of the object's angle is moving to its target."""
-        return self._state.steering and self.angle.value != self.target_angle
+        return self._state.is_steering and self.angle.value != self.target_angle
 
-    def start(self, felt: float, force: float) -> None:
-        """Take over from the approach at a measured force ``felt`` and go to ``force`` [N]."""
-        kernels.start(self._state.array, self._grasp.array, self.force.windows, felt)
+    def start(self, measured: float, force: float) -> None:
+        """Take over from the approach at the ``measured`` force and go to ``force`` [N]."""
+        kernels.start(self._state.array, self._grasp.array, self.force.windows, measured)
         self.target_angle = math.nan
         self.retarget(force)
 
     def retarget(self, force: float) -> None:
         """Go to another grip force [N]; a lower one scales the force increase down with it."""
-        force = min(force, self.most)
+        force = min(force, self.commanded_max)
         if force < self.commanded:
-            self.slip.needed *= force / self.commanded
+            self.slip.needed_force *= force / self.commanded
         self.commanded = self._state.commanded = force
         self._state.dither_elapsed = 0.0
-        self.target = self.force.target = max(force, min(self.slip.needed, self.slip.force_limit))
+        needed_force = min(self.slip.needed_force, self.slip.force_limit)
+        self.target = self.force.target = max(force, needed_force)
         change_min = max(0.1 * force, 0.5 * self._control.grip_raise_max)
         change = max(abs(force - self.force.value), change_min)
         self._state.force_rate = change / self._control.force_time
 
-    def ease(self, most: float, seconds: float) -> None:
-        """Limit the force to ``most`` [N] from now on, and reach it within ``seconds``."""
-        self.most = most
-        self.retarget(most)
-        self._state.force_rate = abs(self.force.value - most) / seconds
+    def limit_force(self, force_max: float, duration: float) -> None:
+        """Limit the force to ``force_max`` [N] from now on; reach it within ``duration`` [s]."""
+        self.commanded_max = force_max
+        self.retarget(force_max)
+        self._state.force_rate = abs(self.force.value - force_max) / duration
 
-    def load_needs(self) -> float:
+    def force_for_load(self) -> float:
         """Return the force [N] for the load, with the slip margin and the hidden load."""
         law, grasp = self.slip.law, self._grasp
-        load = self.slip.guarded
+        load = self.slip.assumed_load
         if not law.has_shear and law.object_load == 0.0:  # friction may hide a load of this size
             load = max(load, law.joint_friction / max(grasp.load_arm, 0.5 * law.width))
         spare = law.friction * (1.0 - law.margin) - grasp.shear
-        return max(load / max(spare, 0.3 * law.friction), self.slip.needed)
+        return max(load / max(spare, 0.3 * law.friction), self.slip.needed_force)
 
     def steer(self, present: float, angle: float) -> None:
         """Turn the object from its ``present`` angle to ``angle`` [rad] and hold it there."""
         if math.isnan(self.target_angle):
             self.angle.reset(present)
         self.target_angle = self.angle.target = angle
-        self._state.steering = True
+        self._state.is_steering = True
 
     def set_joint_stiffness(self, joint_stiffness: float) -> None:
         """Set the antisymmetric joint stiffness [N·m/rad] without a step in the torques."""
         state, (q1, q2) = self._state, self._grasp.q
-        lean = 0.5 * (q1 - q2)
-        state.offset = lean + (state.offset - lean) * state.joint_stiffness / joint_stiffness
+        present = 0.5 * (q1 - q2)
+        ratio = state.joint_stiffness / joint_stiffness
+        state.offset = present + (state.offset - present) * ratio
         state.joint_stiffness = joint_stiffness
 
     def begin_holding(self) -> None:
@@ -155,10 +159,10 @@ class Grip:
 
         Set ``holding`` if the grip is settled, so that only loads move the joints.
         """
-        if self._alone is not None:
-            return self._torque_alone(reading, False)
+        if self._single_finger is not None:
+            return self._single_torque(reading, False)
         dq1, dq2 = reading.dq
-        torque1, torque2, self.target, self.slipped = kernels.grip_torques(
+        torque1, torque2, self.target, self.has_slipped = kernels.grip_torques(
             self._state.array,
             self._grasp.array,
             self.force.windows,
@@ -175,13 +179,13 @@ class Grip:
         The joints are still read. Constant torques would keep the object turning, without damping
         or steering.
         """
-        if self._alone is not None:
-            return self._torque_alone(reading, True)
+        if self._single_finger is not None:
+            return self._single_torque(reading, True)
         dq1, dq2 = reading.dq
         return kernels.hold_goal(self._state.array, self._grasp.array, (dq1, dq2))
 
-    def _torque_alone(self, reading: Reading, frames_late: bool) -> tuple[float, float]:
-        finger = self._alone
+    def _single_torque(self, reading: Reading, frames_late: bool) -> tuple[float, float]:
+        finger = self._single_finger
         assert finger is not None
         grip, grasp, dq = self._state.array, self._grasp.array, reading.dq[finger]
         torque = kernels.single_torque(grip, grasp, self.force.windows, finger, dq, frames_late)

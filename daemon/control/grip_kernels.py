@@ -21,13 +21,13 @@ from softfinger.kinematics.hand.upright import upright_spring
 
 FloatArray = NDArray[np.float64]
 
-_SURE = 2.0  # standard deviations of the torque constant, allowed in the force limit
+_TORQUE_ERROR_SIGMA = 2.0  # standard deviations of the torque constant, allowed in the force limit
 _ARM_MIN = 0.1  # of the finger's length
 _INTEGRAL_RATIO = 0.3  # limit of the integral term, as a fraction of the force target
 _DISTRIBUTE_BANDWIDTH = 2.0  # Hz, integral control of the force difference of the tips
 _DISTRIBUTE_ANGLE = 3e-3  # rad that this may turn the object
-_QUIET = 3.0  # standard deviations of the angle, dead band of the joints at rest
-_LONGEST_PAUSE = 0.05  # s, largest time step of the dither, after a pause between ticks
+_DEAD_BAND = 3.0  # standard deviations of the angle, dead band of the joints at rest
+_DITHER_STEP_MAX = 0.05  # s, largest time step of the dither, after a pause between ticks
 _STIFFNESS_MIN = 100.0  # N/m, lower bound, since the gains are divided by it
 _ROTATION_MIN = 0.1  # lower bound of the object's rotation per antisymmetric angle
 
@@ -46,8 +46,8 @@ class GripLaw(Record):
     friction_speed: float  # from which friction is fully compensated [rad/s]
     torque_max: float  # [N·m]
     torque_error: float  # relative error of the torque constants
-    decay: float  # factor per tick of the turning rate without frames
-    upright: bool  # the object is brought upright by dither, without its measured angle
+    turn_decay: float  # factor per tick of the turning rate without frames
+    is_blind: bool  # the object is brought upright by dither, without its measured angle
     half_separation: float  # half the distance of the pivots [m]
     length: float  # of a finger [m]
     offset: float  # of a finger [m]
@@ -67,14 +67,14 @@ class GripState(Record):
     commanded: float  # force [N]
     force_rate: float  # [N/s]
     joint_stiffness: float  # [N·m/rad]
-    steering: bool  # the object's angle has a target
+    is_steering: bool  # the object's angle has a target
     integral: float  # [N]
     grip_force: float  # feed-forward and feedback together [N]
     offset_rate: float  # rate of the offset that turns the object [rad/s]
     offset: float  # goal of (q1 − q2)/2 [rad]
     dither_elapsed: float  # time since the dither began [s]
-    seen: float  # time of the last tick with equal torques or start [s]
-    shift: float  # part of the offset that balances the tip forces [rad]
+    last_time: float  # time of the last tick with equal torques or start [s]
+    balance_offset: float  # part of the offset that balances the tip forces [rad]
     closing_friction: float  # fraction of the joint friction compensated for closing
     torque: Pair  # last torques of both joints [N·m]
 
@@ -84,17 +84,17 @@ def start(
     grips: Records[GripState],
     grasps: Records[GraspState],
     force_windows: FloatArray,
-    felt: float,
+    measured: float,
 ) -> None:
-    """Take over from the approach at a measured force ``felt`` [N]."""
+    """Take over from the approach at the ``measured`` force [N]."""
     g = grips[0]
     q = grasps[0].q
     slip_monitor.reset(g.slip)
-    setpoint.reset(g.force, force_windows, felt)
-    g.integral = g.shift = g.closing_friction = g.dither_elapsed = 0.0
+    setpoint.reset(g.force, force_windows, measured)
+    g.integral = g.balance_offset = g.closing_friction = g.dither_elapsed = 0.0
     g.offset = 0.5 * (q[0] - q[1])
-    g.steering = False
-    g.seen = grasps[0].t
+    g.is_steering = False
+    g.last_time = grasps[0].t
 
 
 @kernel
@@ -129,26 +129,26 @@ def grip_torques(
         dq,
         g.torque,
     )
-    if g.slip.reflex and g.force.target > g.force.value:
+    if g.slip.reflex_triggered and g.force.target > g.force.value:
         setpoint.reset(g.force, force_windows, g.force.target)
     target = setpoint.advance(g.force, force_windows, g.force_rate)
     bound = _INTEGRAL_RATIO * g.force.target
-    grip_force = target + _correction(g, target, mean(grasp.force), bound)
+    grip_force = target + _force_feedback(g, target, mean(grasp.force), bound)
     load = grasp.load_arm * g.slip.load
     g.grip_force = min(grip_force, _force_limit(g, load, mean(grasp.moment_arm)))
-    if g.law.upright and not g.steering:
+    if g.law.is_blind and not g.is_steering:
         torque1, torque2 = _equal_torques(g, grasp, target, dq)
-        return torque1, torque2, g.force.target, g.slip.turned
+        return torque1, torque2, g.force.target, g.slip.has_turned
     offset_rate = 0.0
-    if g.steering:
+    if g.is_steering:
         offset_rate = _steer(g, angle_windows, grasp, angle)
     g.offset_rate = offset_rate
-    if setpoint.arrived(g.force) and not (g.steering and not setpoint.arrived(g.angle)):
+    if setpoint.has_arrived(g.force) and not (g.is_steering and not setpoint.has_arrived(g.angle)):
         _distribute(g, grasp)
-    close = _closing(grasp, g.force.speed, offset_rate)
-    g.closing_friction = min(max(close / g.law.friction_speed, -1.0), 1.0)
-    torque1, torque2 = _torques(g, grasp, close, offset_rate, dq)
-    return torque1, torque2, g.force.target, g.slip.turned
+    closing_rate = _closing_rate(grasp, g.force.speed, offset_rate)
+    g.closing_friction = min(max(closing_rate / g.law.friction_speed, -1.0), 1.0)
+    torque1, torque2 = _torques(g, grasp, closing_rate, offset_rate, dq)
+    return torque1, torque2, g.force.target, g.slip.has_turned
 
 
 @kernel
@@ -160,9 +160,9 @@ def hold_goal(
     It is called instead of :func:`grip_torques`.
     """
     g = grips[0]
-    g.offset_rate *= g.law.decay
+    g.offset_rate *= g.law.turn_decay
     g.offset += g.offset_rate * g.law.dt
-    return _torques(g, grasps[0], _closing(grasps[0], 0.0, g.offset_rate), g.offset_rate, dq)
+    return _torques(g, grasps[0], _closing_rate(grasps[0], 0.0, g.offset_rate), g.offset_rate, dq)
 
 
 @kernel
@@ -182,7 +182,7 @@ def single_torque(
     grasp = grasps[0]
     arm = grasp.moment_arm[finger]
     stiffness = max(grasp.stiffness[finger], _STIFFNESS_MIN)
-    close = 0.0
+    closing_rate = 0.0
     if not frames_late:
         target = setpoint.advance(g.force, force_windows, g.force_rate)
         # The object can't yield, so friction of the tip on it may take some of the torque.
@@ -190,11 +190,11 @@ def single_torque(
         reach = law.length * math.sin(q) + law.offset * math.cos(q) + law.radius
         limit = _force_limit(g, g.slip.law.friction * g.force.target * max(reach, 0.0), arm)
         bound = max(limit - g.force.target, 0.0)
-        g.grip_force = min(target + _correction(g, target, grasp.force[finger], bound), limit)
-        close = g.force.speed / (stiffness * arm)
-    damping = g.law.damping * math.sqrt(stiffness * arm * arm) * (close - dq)
-    geared = _geared(g.law, arm * g.grip_force, close)
-    torque: float = geared + damping + _friction(g.law, close)
+        g.grip_force = min(target + _force_feedback(g, target, grasp.force[finger], bound), limit)
+        closing_rate = g.force.speed / (stiffness * arm)
+    damping = g.law.damping * math.sqrt(stiffness * arm * arm) * (closing_rate - dq)
+    motor_torque = _motor_torque(g.law, arm * g.grip_force, closing_rate)
+    torque: float = motor_torque + damping + _friction(g.law, closing_rate)
     g.torque[finger] = torque
     return torque
 
@@ -205,17 +205,17 @@ def _mean_stiffness(grasp: GraspState) -> float:
 
 
 @inner_kernel
-def _turning(grasp: GraspState) -> float:
+def _rotation_per_offset(grasp: GraspState) -> float:
     """Return the derivative of the object's angle by the antisymmetric joint angle."""
-    both: float = grasp.jacobian_rotation[0] + grasp.jacobian_rotation[1]
-    return max(both, _ROTATION_MIN)
+    rotation_per_offset: float = grasp.jacobian_rotation[0] + grasp.jacobian_rotation[1]
+    return max(rotation_per_offset, _ROTATION_MIN)
 
 
 @inner_kernel
-def _correction(g: GripState, target: float, felt: float, bound: float) -> float:
+def _force_feedback(g: GripState, target: float, measured: float, bound: float) -> float:
     """Return the feedback part of the force [N]; ``bound`` limits its integral term."""
     law = g.law
-    error = target - felt
+    error = target - measured
     # Anti-windup: do not integrate while a torque is at its limit.
     full = abs(g.torque[0]) >= law.torque_max or abs(g.torque[1]) >= law.torque_max
     if not full or error < 0.0:
@@ -232,7 +232,7 @@ def _force_limit(g: GripState, load: float, arm: float) -> float:
     for the torque [N·m] of the detected ``load``. ``arm`` is the moment arm of the force [m].
     """
     law = g.law
-    force: float = g.force.target * (1.0 + _SURE * law.torque_error)
+    force: float = g.force.target * (1.0 + _TORQUE_ERROR_SIGMA * law.torque_error)
     return force + (law.friction + load) / max(arm, _ARM_MIN * law.length)
 
 
@@ -240,12 +240,12 @@ def _force_limit(g: GripState, load: float, arm: float) -> float:
 def _steer(g: GripState, windows: FloatArray, grasp: GraspState, angle: float) -> float:
     """Move the antisymmetric goal, and return its rate [rad/s]."""
     target = setpoint.advance(g.angle, windows, g.law.rotate_speed)
-    rotation = _turning(grasp)
+    rotation = _rotation_per_offset(grasp)
     offset_rate = g.angle.speed / rotation
     if not math.isnan(angle):
         error = target - angle
-        if setpoint.arrived(g.angle):  # dead band, so that joints at rest do not follow noise
-            noise = _QUIET * grasp.angle_std
+        if setpoint.has_arrived(g.angle):  # dead band, so that joints at rest do not follow noise
+            noise = _DEAD_BAND * grasp.angle_std
             error -= min(max(error, -noise), noise)
         g.offset += g.law.rotate_bandwidth * error / rotation * g.law.dt
     g.offset += offset_rate * g.law.dt
@@ -264,15 +264,15 @@ def _distribute(g: GripState, grasp: GraspState) -> None:
         * (grasp.normal[0] - grasp.normal[1])
         / (_mean_stiffness(grasp) * mean(grasp.moment_arm))
     )
-    limit = _DISTRIBUTE_ANGLE / _turning(grasp)
-    shift = g.shift - 2.0 * math.pi * _DISTRIBUTE_BANDWIDTH * off * g.law.dt
-    shift = min(max(shift, -limit), limit)
-    g.offset += shift - g.shift
-    g.shift = shift
+    limit = _DISTRIBUTE_ANGLE / _rotation_per_offset(grasp)
+    balance_offset = g.balance_offset - 2.0 * math.pi * _DISTRIBUTE_BANDWIDTH * off * g.law.dt
+    balance_offset = min(max(balance_offset, -limit), limit)
+    g.offset += balance_offset - g.balance_offset
+    g.balance_offset = balance_offset
 
 
 @inner_kernel
-def _closing(grasp: GraspState, rate: float, offset_rate: float) -> float:
+def _closing_rate(grasp: GraspState, rate: float, offset_rate: float) -> float:
     """Return the closing rate [rad/s] for a force ``rate`` [N/s] during a turn."""
     arm = grasp.moment_arm
     rotation = grasp.jacobian_rotation
@@ -284,22 +284,26 @@ def _closing(grasp: GraspState, rate: float, offset_rate: float) -> float:
 
 @inner_kernel
 def _torques(
-    g: GripState, grasp: GraspState, close: float, offset_rate: float, dq: tuple[float, float]
+    g: GripState,
+    grasp: GraspState,
+    closing_rate: float,
+    offset_rate: float,
+    dq: tuple[float, float],
 ) -> tuple[float, float]:
     """Return the torques of two fingers at commanded rates of closing and offset [rad/s]."""
     law = g.law
     arm = mean(grasp.moment_arm)
     damping = law.damping * math.sqrt(_mean_stiffness(grasp) * arm * arm)
-    damping *= close - 0.5 * (dq[0] + dq[1])
+    damping *= closing_rate - 0.5 * (dq[0] + dq[1])
     error = g.offset - 0.5 * (grasp.q[0] - grasp.q[1])
     steering = g.joint_stiffness * error
     steering += law.damping * math.sqrt(g.joint_stiffness) * (offset_rate - 0.5 * (dq[0] - dq[1]))
-    lever = grasp.moment_arm if law.upright else grasp.energy_arm
+    arms = grasp.moment_arm if law.is_blind else grasp.energy_arm
     for k in range(2):
         sense = 1.0 - 2.0 * k
-        rate = close + sense * offset_rate
-        geared = _geared(law, lever[k] * g.grip_force, rate)
-        g.torque[k] = geared + damping + sense * steering + _friction(law, rate)
+        rate = closing_rate + sense * offset_rate
+        motor_torque = _motor_torque(law, arms[k] * g.grip_force, rate)
+        g.torque[k] = motor_torque + damping + sense * steering + _friction(law, rate)
     return g.torque[0], g.torque[1]
 
 
@@ -313,42 +317,45 @@ def _equal_torques(
     so that joint friction leaves no bias. After that, the joints hold their antisymmetric angle.
     """
     law, q = g.law, grasp.q
-    close = _closing(grasp, g.force.speed, 0.0)
+    closing_rate = _closing_rate(grasp, g.force.speed, 0.0)
     g.offset_rate = 0.0
-    g.closing_friction = min(max(close / law.friction_speed, -1.0), 1.0)
+    g.closing_friction = min(max(closing_rate / law.friction_speed, -1.0), 1.0)
     closed = mean(q)
     arm = law.length * math.cos(closed) - law.offset * math.sin(closed)
     damping = law.damping * math.sqrt(_mean_stiffness(grasp) * arm * arm)
-    damped = damping * (close - 0.5 * (dq[0] + dq[1]))
-    common = _geared(law, arm * g.grip_force, close) + damped + _friction(law, close)
+    damped = damping * (closing_rate - 0.5 * (dq[0] + dq[1]))
+    common = (
+        _motor_torque(law, arm * g.grip_force, closing_rate) + damped + _friction(law, closing_rate)
+    )
     antisymmetric = 0.5 * (q[0] - q[1])
     steering = -0.5 * damping * (dq[0] - dq[1])
     if g.dither_elapsed < law.dither_time:
         lengths = (law.half_separation, law.length, law.offset, law.radius)
         depth = mean(grasp.d)
         spring = min(
-            upright_spring(closed, depth, target, grasp.tip_turning, lengths), g.joint_stiffness
+            upright_spring(closed, depth, target, grasp.tilt_moment_ratio, lengths),
+            g.joint_stiffness,
         )
         # The hold that follows must start with the present torque of the spring.
         g.offset = antisymmetric * (1.0 - spring / g.joint_stiffness)
         # The amplitude grows during the first period and fades throughout.
         phase = law.dither_rate * g.dither_elapsed
-        size = min(phase / (2.0 * math.pi), 1.0) * (1.0 - g.dither_elapsed / law.dither_time)
-        steering = size * law.dither_torque * math.sin(phase) - spring * antisymmetric
-        if g.dither_elapsed > 0.0 or setpoint.arrived(g.force):
+        amplitude = min(phase / (2.0 * math.pi), 1.0) * (1.0 - g.dither_elapsed / law.dither_time)
+        steering = amplitude * law.dither_torque * math.sin(phase) - spring * antisymmetric
+        if g.dither_elapsed > 0.0 or setpoint.has_arrived(g.force):
             # Use the clock instead of counting ticks: late ticks must not slow the dither down to
             # the resonance of the fingers on the tips, at 1 to 2 Hz.
-            g.dither_elapsed += min(max(grasp.t - g.seen, 0.0), _LONGEST_PAUSE)
+            g.dither_elapsed += min(max(grasp.t - g.last_time, 0.0), _DITHER_STEP_MAX)
     else:
         steering += g.joint_stiffness * (g.offset - antisymmetric)
-    g.seen = grasp.t
+    g.last_time = grasp.t
     g.torque[0] = common + steering
     g.torque[1] = common - steering
     return g.torque[0], g.torque[1]
 
 
 @inner_kernel
-def _geared(law: GripLaw, torque: float, rate: float) -> float:
+def _motor_torque(law: GripLaw, torque: float, rate: float) -> float:
     """Return the motor torque for a tip torque [N·m] at the commanded joint ``rate`` [rad/s].
 
     A joint at rest gets the torque that it needs to close.

@@ -18,34 +18,34 @@ class Mode(StrEnum):
     FAULT = "fault"  # torque off until the fault is cleared
 
 
-GRIPPING = frozenset({Mode.GRASPING, Mode.HOLDING, Mode.ROTATING})
-HELD = frozenset({Mode.HOLDING, Mode.ROTATING})
+GRIPPING_MODES = frozenset({Mode.GRASPING, Mode.HOLDING, Mode.ROTATING})
+HOLDING_MODES = frozenset({Mode.HOLDING, Mode.ROTATING})
 
-_ON = frozenset(Mode) - {Mode.DISARMED, Mode.FAULT}
-_ANY = frozenset(Mode)
+_TORQUE_MODES = frozenset(Mode) - {Mode.DISARMED, Mode.FAULT}
+_ALL_MODES = frozenset(Mode)
 
 # command → (modes in which it is accepted, its numeric arguments: name → required)
 COMMANDS: dict[str, tuple[frozenset[Mode], dict[str, bool]]] = {
     "arm": (frozenset({Mode.DISARMED}), {}),
-    "disarm": (_ANY - {Mode.FAULT}, {}),
+    "disarm": (_ALL_MODES - {Mode.FAULT}, {}),
     "tare": (frozenset({Mode.DISARMED, Mode.ARMED}), {}),
     "move": (frozenset({Mode.ARMED, Mode.MOVING}), {"left": False, "right": False}),
     "grasp": (
-        frozenset({Mode.ARMED, Mode.MOVING}) | GRIPPING,
+        frozenset({Mode.ARMED, Mode.MOVING}) | GRIPPING_MODES,
         {"force": False},
     ),
-    "rotate": (GRIPPING, {"angle": True}),  # waits for the grip to hold
+    "rotate": (GRIPPING_MODES, {"angle": True}),  # waits for the grip to hold
     "hold": (  # streamed setpoints; does not change the mode of a grip
-        frozenset({Mode.ARMED, Mode.MOVING}) | GRIPPING,
+        frozenset({Mode.ARMED, Mode.MOVING}) | GRIPPING_MODES,
         {"force": False, "angle": False},
     ),
-    "release": (_ON, {}),
-    "set": (_ON, {"compliance": True}),
+    "release": (_TORQUE_MODES, {}),
+    "set": (_TORQUE_MODES, {"compliance": True}),
     "demo": (frozenset({Mode.DISARMED}), {}),  # restarts the task of the profile
-    "stop": (_ANY, {}),
+    "stop": (_ALL_MODES, {}),
     "clear": (frozenset({Mode.FAULT}), {}),
-    "status": (_ANY, {}),
+    "status": (_ALL_MODES, {}),
 }
 
 # These commands never stiffen or move the hand, so they are accepted even if they arrived late.
-HARMLESS = frozenset({"disarm", "tare", "clear"})
+SAFE_COMMANDS = frozenset({"disarm", "tare", "clear"})

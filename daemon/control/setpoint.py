@@ -29,7 +29,7 @@ class SetpointState(Record):
     value: float
     speed: float  # [1/s]
     ramp: float  # value before smoothing; moves to the target at the given rate
-    idle: int  # ticks since the ramp reached the target
+    idle_count: int  # ticks since the ramp reached the target
     dt: float  # [s]
     first: RunningMean
     second: RunningMean
@@ -40,7 +40,7 @@ def reset(s: SetpointState, windows: FloatArray, value: float) -> None:
     """Set the setpoint to ``value``, at rest."""
     s.target = s.ramp = s.value = value
     s.speed = 0.0
-    s.idle = s.first.length + s.second.length
+    s.idle_count = s.first.length + s.second.length
     s.first.index = 0
     s.second.index = 0
     s.first.sum = value * s.first.length
@@ -49,9 +49,9 @@ def reset(s: SetpointState, windows: FloatArray, value: float) -> None:
 
 
 @inner_kernel
-def arrived(s: SetpointState) -> bool:
+def has_arrived(s: SetpointState) -> bool:
     """Return True if the setpoint is at rest at its target."""
-    there: bool = s.idle >= s.first.length + s.second.length and s.ramp == s.target
+    there: bool = s.idle_count >= s.first.length + s.second.length and s.ramp == s.target
     return there
 
 
@@ -69,23 +69,23 @@ def _add(mean: RunningMean, windows: FloatArray, start: int, value: float) -> fl
 @inner_kernel
 def advance(s: SetpointState, windows: FloatArray, rate: float) -> float:
     """Advance by one tick towards the target at ``rate`` [1/s] or less; return the new value."""
-    left = s.target - s.ramp
+    remaining = s.target - s.ramp
     last = s.value
-    if left == 0.0:
+    if remaining == 0.0:
         length = s.first.length + s.second.length
-        if s.idle >= length:
+        if s.idle_count >= length:
             return last
-        s.idle += 1
-        if s.idle >= length:
+        s.idle_count += 1
+        if s.idle_count >= length:
             reset(s, windows, s.target)  # clears the rounding errors of the running sums
             return s.target
     else:
         step_max = rate * s.dt
-        s.idle = 0
-        if abs(left) <= step_max:
+        s.idle_count = 0
+        if abs(remaining) <= step_max:
             s.ramp = s.target
         else:
-            s.ramp += step_max if left > 0.0 else -step_max
+            s.ramp += step_max if remaining > 0.0 else -step_max
     smooth = _add(s.first, windows, 0, s.ramp)
     s.value = _add(s.second, windows, s.first.length, smooth)
     s.speed = (s.value - last) / s.dt
@@ -95,7 +95,7 @@ def advance(s: SetpointState, windows: FloatArray, rate: float) -> float:
 @kernel
 def _step(setpoints: Records[SetpointState], windows: FloatArray, rate: float) -> bool:
     advance(setpoints[0], windows, rate)
-    return arrived(setpoints[0])
+    return has_arrived(setpoints[0])
 
 
 @kernel

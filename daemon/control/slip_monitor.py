@@ -5,18 +5,19 @@ In each tick, with the names of `SlipLaw`, `SlipState` and `GraspState`:
     r         torque residual of the joints, low-pass filtered; r̄ is its mean
     L         load on each tip: r̄ − offset = load_arm L + load_curvature L²           (`load_of`)
     load      min(4 max(|L| − friction/(2 load_arm), 0), |L| + friction/slope)
-    needed    max(load, shear of solid tips, object_load/2)/(tip_friction (1 − margin) − shear)
+    needed    max(load, shear of solid tips, object_load/2)/(tip_friction (1 − margin) − shear),
+              `needed_force` of the state
     force     min(max(commanded, needed), force_limit)
 
 **Offset.** Gear friction and the errors of modulus and torque constant cause a residual without a
-load. It is measured when holding begins. Later it follows r̄ slowly (_SETTLING), and it follows the
+load. It is measured when holding begins. Later it follows r̄ slowly (_SETTLING_TIME). It follows the
 commanded torque at once while the joints stand still, because friction carries torque that is added
-to a joint that sticks. It stays within `friction` of its start, or a further _RELAXATION of the
-tips' moment below it, because rubber relaxes.
+to a joint that sticks. It stays within `friction` of its start, or a further _RELAXATION_SHARE of
+the tips' moment below it, because rubber relaxes.
 
 **Load.** Friction hides a load of up to friction/load_arm, 2 N for each tip of the default hand.
 Half of it is ignored. From there on the load is increased by the hidden part. An increase of the
-grip force by more than _SHARE_UNCONFIRMED needs a confirmation: the object has turned, both joints
+grip force by more than _UNCONFIRMED_SHARE needs a confirmation: the object has turned, both joints
 have yielded at once, or |L| exceeds twice the friction.
 
 **Sudden events** increase the force at once by all that is allowed: torques that jump beyond their
@@ -25,7 +26,7 @@ object beyond the shear deformation μ (d1 + d2)/2W of the tips. A sliding tip s
 than its friction, so the size of a sudden load is unknown. For a pull the two torques jump alike,
 for a twist in opposite directions; a sideways push looks like a twist.
 
-An increase stays for _HOLD_TIME and then decreases by raise_max in _DECAY_TIME.
+An increase stays for _HOLD_TIME and then decreases by increase_max in _DECAY_TIME.
 
 Limits of the method:
 
@@ -46,24 +47,24 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import GRIP_FRACTION
 from softfinger.kinematics.compiled.kernel import inner_kernel
 from softfinger.kinematics.compiled.layout import Pair, Record
-from softfinger.kinematics.hand.grasp_state import Two, load_of
+from softfinger.kinematics.hand.grasp_state import FloatPair, load_of
 
 _AVERAGE_TIME = 0.1  # s; a velocity flickers by one unit of 0.024 rad/s
-_SETTLING = 1.0  # s in which the residual of a new hold settles
+_SETTLING_TIME = 1.0  # s in which the residual of a new hold settles
 _HOLD_TIME = 1.0  # s for which an increase outlasts its reason
 _DECAY_TIME = 2.0  # s in which it then decreases by `grip_raise_max`, and rotations are forgotten
-_SUDDEN = 0.7  # part of the friction force with its margin from which a sudden load counts
-_ROTATION_RAISE = 0.5  # relative increase after a rotation of the object
+_SUDDEN_SHARE = 0.7  # part of the friction force with its margin from which a sudden load counts
+_ROTATION_INCREASE = 0.5  # relative increase after a rotation of the object
 _ROTATION_MARGIN = 1.5  # times the rotation by shear deformation
 _GATE = 4.0  # standard deviations of torques and angle beyond which a jump is no noise
 _JUMP_MIN = 0.01  # N·m, least jump
 _SHEAR_JUMP = 0.6  # N, least jump of solid tips' shear: six standard deviations
 _YIELD_SPEED = 0.01  # rad/s, half a unit of velocity
-_STANDS = 1e-3  # rad that a standing joint may be off its average of _SETTLING: below a count
+_STANDSTILL = 1e-3  # rad from a joint's average over _SETTLING_TIME if it stands: below a count
 _AGREEMENT = 0.25  # part of the mean that each joint and each tip must show
 _FRICTION_MAX = 0.3  # N·m; a larger torque in the free approach was no friction
-_SHARE_UNCONFIRMED = 0.3  # of the commanded force
-_RELAXATION = 0.2  # part of a tip's force that rubber may lose during a hold
+_UNCONFIRMED_SHARE = 0.3  # of the commanded force
+_RELAXATION_SHARE = 0.2  # part of a tip's force that rubber may lose during a hold
 _ARM_MIN = 0.2  # of the object's width, lower bound of the load's lever arm
 _SPARE_MIN = 0.3  # of the friction, lower bound of what rolling leaves of it
 
@@ -80,8 +81,8 @@ class SlipLaw(Record):
     load_friction: float  # part of the tip's moment that gears hold until the joint opens
     object_load: float  # [N]
     has_shear: bool  # the frames show shear
-    raise_max: float  # [N]
-    raise_ratio: float  # of the commanded force
+    increase_max: float  # [N]
+    increase_ratio: float  # of the commanded force
 
 
 class SlipState(Record):
@@ -92,24 +93,24 @@ class SlipState(Record):
     residual: Pair  # of the joints' torques, averaged [N·m]
     variance: Pair  # of the mean residual and of half the difference [N²·m²]
     speed: Pair  # of the joints, averaged [rad/s]
-    q: Pair  # joint angles, averaged over _SETTLING [rad]
+    q: Pair  # joint angles, averaged over _SETTLING_TIME [rad]
     torque: float  # mean torque of both joints in the last tick [N·m]
     is_watched: bool  # the residual at the begin of holding is known
     offset: float  # residual without a load [N·m]
-    start: float  # offset at the begin of holding beyond friction [N·m]
-    age: float  # time since then, up to _SETTLING [s]
+    start_offset: float  # offset at the begin of holding beyond friction [N·m]
+    holding_time: float  # time since then, up to _SETTLING_TIME [s]
     load: float  # on each tip, with the hidden part [N]
-    guarded: float  # the largest of this, the shear of solid tips and the declared load [N]
-    is_confirmed: bool  # the load may increase the force by more than _SHARE_UNCONFIRMED
+    assumed_load: float  # the largest of this, the shear of solid tips and the declared load [N]
+    is_confirmed: bool  # the load may increase the force by more than _UNCONFIRMED_SHARE
     pull: float  # load in the frames of solid tips, averaged [N]
     twist: float  # likewise of a twist [N]
     rotation_seen: Pair  # `unexplained_rotation` up to this tick [rad]
     rotation: Pair  # unexplained rotation of the last _DECAY_TIME, of each tip [rad]
-    turned: bool  # the object has turned in the grip in this tick
-    reflex: bool  # a sudden event in this tick
-    needed: float  # force, kept for _HOLD_TIME [N]
+    has_turned: bool  # the object has turned in the grip in this tick
+    reflex_triggered: bool  # a sudden event in this tick
+    needed_force: float  # force, kept for _HOLD_TIME [N]
     force_limit: float  # [N]
-    idle: float  # time since the force was needed [s]
+    idle_time: float  # time since the force was needed [s]
 
 
 def set_law(law: SlipLaw, settings: Settings) -> None:
@@ -123,17 +124,18 @@ def set_law(law: SlipLaw, settings: Settings) -> None:
     law.load_friction = control.load_held
     law.object_load = control.object_load
     law.has_shear = settings.tip.physics == "solid"
-    law.raise_max, law.raise_ratio = control.grip_raise_max, control.grip_raise_share
+    law.increase_max, law.increase_ratio = control.grip_raise_max, control.grip_raise_share
 
 
 @inner_kernel
 def reset(s: SlipState) -> None:
     """Reset everything but the law and the torque: there is no object, or a new one."""
-    s.is_watched = s.is_confirmed = s.turned = s.reflex = False
-    s.friction = s.offset = s.start = s.age = s.load = s.guarded = s.pull = s.twist = 0.0
+    s.is_watched = s.is_confirmed = s.has_turned = s.reflex_triggered = False
+    s.friction = s.offset = s.start_offset = s.holding_time = 0.0
+    s.load = s.assumed_load = s.pull = s.twist = 0.0
     s.residual[:] = s.variance[:] = s.speed[:] = s.q[:] = 0.0
     s.rotation_seen[:] = s.rotation[:] = 0.0
-    s.needed = s.force_limit = s.idle = 0.0
+    s.needed_force = s.force_limit = s.idle_time = 0.0
 
 
 @inner_kernel
@@ -143,11 +145,11 @@ def begin(s: SlipState, grasp: GraspState) -> None:
     if not s.is_watched:
         return
     s.offset = mean(s.residual)
-    s.start = s.offset - clip(s.offset, s.friction)
+    s.start_offset = s.offset - clip(s.offset, s.friction)
     s.rotation_seen[:] = grasp.unexplained_rotation
     s.rotation[:] = 0.0
     s.q[:] = grasp.q
-    s.age = _AVERAGE_TIME
+    s.holding_time = _AVERAGE_TIME
 
 
 @inner_kernel
@@ -170,7 +172,7 @@ def update(
     commanded: float,
     holding: bool,
     closing: float,
-    dq: Two,
+    dq: FloatPair,
     torques: Pair,
 ) -> float:
     """Return the grip force [N]: ``commanded``, or more if the load needs it.
@@ -185,16 +187,16 @@ def update(
     s.friction = min(free_torque, _FRICTION_MAX) + law.load_friction * moment
     is_held = holding and s.is_watched and grasp.load_arm > 0.0
     # Rolling takes a part of the friction that grows with the grip force.
-    spare = law.friction * (1.0 - law.margin) - grasp.shear
-    bearing = max(spare, _SPARE_MIN * law.friction)
-    sudden_min = _SUDDEN * max(spare, 0.0) * mean(grasp.normal)
-    sudden = _follow_torques(s, grasp, closing, dq, is_held, sudden_min)
+    spare_friction = law.friction * (1.0 - law.margin) - grasp.shear
+    usable_friction = max(spare_friction, _SPARE_MIN * law.friction)
+    sudden_min = _SUDDEN_SHARE * max(spare_friction, 0.0) * mean(grasp.normal)
+    sudden = _detect_torque_jump(s, grasp, closing, dq, is_held, sudden_min)
     pull = max(abs(grasp.pull_shear) - grasp.shear * mean(grasp.normal), 0.0)
-    sudden = _follow_shear(s, pull, grasp.twist_shear, is_held, sudden_min) or sudden
-    s.turned = False
+    sudden = _detect_shear_jump(s, pull, grasp.twist_shear, is_held, sudden_min) or sudden
+    s.has_turned = False
     if is_held:
         _estimate_load(s, grasp, mean(torques) - s.torque)
-        s.turned = _has_turned(s, grasp)
+        s.has_turned = _has_turned(s, grasp)
     s.rotation_seen[:] = grasp.unexplained_rotation
     s.torque = mean(torques)
     # The torques cannot judge a grip that bears less than the joints' friction hides.
@@ -203,32 +205,34 @@ def update(
     if law.has_shear:  # a load beyond the shear is an error of the force
         s.load = min(s.load, pull + _SHEAR_JUMP)
     if grasp.sensor_fault:
-        s.load = pull = s.needed = 0.0
-        s.turned = sudden = s.is_confirmed = False
-    s.guarded = max(s.load, pull, 0.5 * law.object_load)
-    s.reflex = s.turned or sudden
-    s.is_confirmed = s.is_confirmed or s.reflex
-    s.force_limit = _force_limit(s, commanded, 0.5 * law.object_load / bearing)
-    needed = s.guarded / bearing
-    if s.turned:
-        needed = max(needed, (1.0 + _ROTATION_RAISE) * max(commanded, s.needed))
+        s.load = pull = s.needed_force = 0.0
+        s.has_turned = sudden = s.is_confirmed = False
+    s.assumed_load = max(s.load, pull, 0.5 * law.object_load)
+    s.reflex_triggered = s.has_turned or sudden
+    s.is_confirmed = s.is_confirmed or s.reflex_triggered
+    s.force_limit = _force_limit(s, commanded, 0.5 * law.object_load / usable_friction)
+    needed_force = s.assumed_load / usable_friction
+    if s.has_turned:
+        turned_force = (1.0 + _ROTATION_INCREASE) * max(commanded, s.needed_force)
+        needed_force = max(needed_force, turned_force)
     if sudden:
-        needed = s.force_limit
-    _keep_needed(s, needed, commanded)
-    return min(max(commanded, s.needed), s.force_limit)
+        needed_force = s.force_limit
+    _update_needed_force(s, needed_force, commanded)
+    return min(max(commanded, s.needed_force), s.force_limit)
 
 
 @inner_kernel
-def _keep_needed(s: SlipState, needed: float, commanded: float) -> None:
+def _update_needed_force(s: SlipState, needed_force: float, commanded: float) -> None:
     """Keep an increase for _HOLD_TIME; then let it decrease."""
-    if needed >= s.needed:
-        s.needed = min(needed, s.force_limit)
-        s.idle = 0.0
+    if needed_force >= s.needed_force:
+        s.needed_force = min(needed_force, s.force_limit)
+        s.idle_time = 0.0
         return
-    s.idle += s.law.dt
-    if s.idle > _HOLD_TIME:
-        s.needed = max(s.needed - s.law.raise_max / _DECAY_TIME * s.law.dt, needed)
-        s.is_confirmed = s.is_confirmed and s.needed > commanded
+    s.idle_time += s.law.dt
+    if s.idle_time > _HOLD_TIME:
+        decrease = s.law.increase_max / _DECAY_TIME * s.law.dt
+        s.needed_force = max(s.needed_force - decrease, needed_force)
+        s.is_confirmed = s.is_confirmed and s.needed_force > commanded
 
 
 @inner_kernel
@@ -238,53 +242,54 @@ def _force_limit(s: SlipState, commanded: float, declared: float) -> float:
     A ``declared`` load needs no confirmation.
     """
     law = s.law
-    share = law.raise_ratio if s.is_confirmed else min(law.raise_ratio, _SHARE_UNCONFIRMED)
-    increase = min(max(share * commanded, declared - commanded), law.raise_ratio * commanded)
-    return max(min(commanded + min(increase, law.raise_max), law.force_max), commanded)
+    share = law.increase_ratio if s.is_confirmed else min(law.increase_ratio, _UNCONFIRMED_SHARE)
+    increase = min(max(share * commanded, declared - commanded), law.increase_ratio * commanded)
+    return max(min(commanded + min(increase, law.increase_max), law.force_max), commanded)
 
 
 @inner_kernel
-def _follow_torques(
-    s: SlipState, grasp: GraspState, closing: float, dq: Two, is_held: bool, sudden_min: float
+def _detect_torque_jump(
+    s: SlipState, grasp: GraspState, closing: float, dq: FloatPair, is_held: bool, sudden_min: float
 ) -> bool:
     """Average the residuals; return True if both jumped while both joints yielded.
 
     A wrong current or frame affects one joint alone, or moves no joint.
     """
-    known = closing * (s.friction if closing < 0.0 else s.law.joint_friction)
-    off1 = grasp.torque_residual[0] - known - s.residual[0]
-    off2 = grasp.torque_residual[1] - known - s.residual[1]
-    jump_min = _JUMP_MIN + s.friction * max(1.0 - s.age / _SETTLING, 0.0)
+    known_torque = closing * (s.friction if closing < 0.0 else s.law.joint_friction)
+    deviation1 = grasp.torque_residual[0] - known_torque - s.residual[0]
+    deviation2 = grasp.torque_residual[1] - known_torque - s.residual[1]
+    jump_min = _JUMP_MIN + s.friction * max(1.0 - s.holding_time / _SETTLING_TIME, 0.0)
     sudden = False
     for k in range(2):  # a pull, and a twist
         sense = 1.0 - 2.0 * k
-        off = 0.5 * (off1 + sense * off2)
-        before = 0.5 * (s.residual[0] + sense * s.residual[1])
-        before -= s.offset if k == 0 else clip(before, s.friction)
-        agrees = min(off1 * off, sense * off2 * off) > _AGREEMENT * off * off
-        yield1 = math.copysign(s.speed[0] - dq[0], off * (s.speed[0] - dq[0]))
-        yield2 = math.copysign(s.speed[1] - dq[1], sense * off * (s.speed[1] - dq[1]))
-        jumps = abs(off) > _GATE * math.sqrt(s.variance[k]) + jump_min
-        grows = abs(before + off) > abs(before)
+        deviation = 0.5 * (deviation1 + sense * deviation2)
+        last = 0.5 * (s.residual[0] + sense * s.residual[1])
+        last -= s.offset if k == 0 else clip(last, s.friction)
+        agreement = min(deviation1 * deviation, sense * deviation2 * deviation)
+        agrees = agreement > _AGREEMENT * deviation * deviation
+        yield1 = math.copysign(s.speed[0] - dq[0], deviation * (s.speed[0] - dq[0]))
+        yield2 = math.copysign(s.speed[1] - dq[1], sense * deviation * (s.speed[1] - dq[1]))
+        jumps = abs(deviation) > _GATE * math.sqrt(s.variance[k]) + jump_min
+        grows = abs(last + deviation) > abs(last)
         if is_held and agrees and jumps and grows and min(yield1, yield2) > _YIELD_SPEED:
             curvature = grasp.load_curvature if k == 0 else 0.0
-            load, slope = load_of(before + off, grasp.load_arm, curvature)
+            load, slope = load_of(last + deviation, grasp.load_arm, curvature)
             hidden = s.friction / max(slope, _ARM_MIN * s.law.width)
             sudden = sudden or abs(load) + 0.5 * hidden > sudden_min
     weight = 1.0 if sudden else s.law.dt / _AVERAGE_TIME
     if not sudden:
         for k in range(2):
-            off = 0.5 * (off1 + (1.0 - 2.0 * k) * off2)
-            s.variance[k] += (off * off - s.variance[k]) * s.law.dt / _SETTLING
-    s.residual[0] += off1 * weight
-    s.residual[1] += off2 * weight
+            deviation = 0.5 * (deviation1 + (1.0 - 2.0 * k) * deviation2)
+            s.variance[k] += (deviation * deviation - s.variance[k]) * s.law.dt / _SETTLING_TIME
+    s.residual[0] += deviation1 * weight
+    s.residual[1] += deviation2 * weight
     for k in range(2):
         s.speed[k] += (dq[k] - s.speed[k]) * s.law.dt / _AVERAGE_TIME
     return sudden
 
 
 @inner_kernel
-def _follow_shear(
+def _detect_shear_jump(
     s: SlipState, pull: float, twist: float, is_held: bool, sudden_min: float
 ) -> bool:
     """Average the load [N] in the frames of solid tips; return True if it jumped."""
@@ -305,29 +310,30 @@ def _estimate_load(s: SlipState, grasp: GraspState, torque_change: float) -> Non
     if s.residual[0] * s.residual[1] > 0.0:
         smaller = min(abs(s.residual[0]), abs(s.residual[1]))
     residual = clip(mean(s.residual), 2.0 * smaller + s.friction)  # a load shows in both joints
-    s.age = min(s.age + law.dt, _SETTLING)
-    stands = True
+    s.holding_time = min(s.holding_time + law.dt, _SETTLING_TIME)
+    is_standing = True
     for k in range(2):
-        s.q[k] += (grasp.q[k] - s.q[k]) * law.dt / _SETTLING
-        stands = stands and abs(grasp.q[k] - s.q[k]) < _STANDS
-    if stands:
+        s.q[k] += (grasp.q[k] - s.q[k]) * law.dt / _SETTLING_TIME
+        is_standing = is_standing and abs(grasp.q[k] - s.q[k]) < _STANDSTILL
+    if is_standing:
         s.offset += torque_change
-    relaxed = _RELAXATION * mean(grasp.normal) * mean(grasp.moment_arm)
-    off = residual - s.offset
-    if -s.friction - relaxed < off < s.friction:
-        s.offset += off * law.dt / s.age
-    s.offset = min(max(s.offset, s.start - s.friction - relaxed), s.start + s.friction)
+    relaxation = _RELAXATION_SHARE * mean(grasp.normal) * mean(grasp.moment_arm)
+    deviation = residual - s.offset
+    if -s.friction - relaxation < deviation < s.friction:
+        s.offset += deviation * law.dt / s.holding_time
+    lowest = s.start_offset - s.friction - relaxation
+    s.offset = min(max(s.offset, lowest), s.start_offset + s.friction)
     # Friction that decreases or changes its direction is no load.
-    off = residual - s.offset
-    beyond = residual - s.start
-    off = min(max(off, min(beyond, 0.0)), max(beyond, 0.0))
-    load, slope = load_of(off, grasp.load_arm, grasp.load_curvature)
+    deviation = residual - s.offset
+    increase = residual - s.start_offset
+    deviation = min(max(deviation, min(increase, 0.0)), max(increase, 0.0))
+    load, slope = load_of(deviation, grasp.load_arm, grasp.load_curvature)
     load = abs(load)
     hidden = s.friction / grasp.load_arm
     s.is_confirmed = s.is_confirmed or load > 2.0 * hidden
-    certain = load - (0.5 + max(1.0 - s.age / _SETTLING, 0.0)) * hidden
+    certain_load = load - (0.5 + max(1.0 - s.holding_time / _SETTLING_TIME, 0.0)) * hidden
     hidden = s.friction / max(slope, _ARM_MIN * law.width)
-    s.load = min(max(4.0 * certain, 0.0), load + hidden, law.friction * s.force_limit)
+    s.load = min(max(4.0 * certain_load, 0.0), load + hidden, law.friction * s.force_limit)
 
 
 @inner_kernel

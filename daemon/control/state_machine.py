@@ -6,15 +6,16 @@ Off          DISARMED   torque is off                    `arm` → Armed
              FAULT      torque is off                    `clear` → Off (DISARMED)
 Armed        ARMED      joints hold where they are       `move` → Travelling (MOVING);
                                                          `grasp`, `hold` → Approaching
-Travelling   MOVING     joints go to commanded angles    arrived, or _GRACE over → Armed;
+Travelling   MOVING     joints go to commanded angles    arrived, or timed out → Armed;
                                                          `grasp`, `hold` → Approaching
-             RELEASING  joints go to the open angles     arrived, or _GRACE over → Armed
+             RELEASING  joints go to the open angles     arrived, or timed out → Armed
 Approaching  GRASPING   fingers close; the first one to  all touch → Pressing; at the joint limits
-                        touch waits for the other        for _GRACE → Armed
+                        touch waits for the other        for _ARRIVAL_TIMEOUT → Armed
 Pressing     GRASPING   the force increases              force reached → Settled, then Turning if
                                                          an angle was commanded
-Settled      HOLDING    force and angle are constant:    `grasp`, `hold` or `ease` with another
-                        only loads move the joints       value, contact lost and back → Changing
+Settled      HOLDING    force and angle are constant:    `grasp`, `hold`, `limit_force` with
+                        only loads move the joints       another value, contact lost and back
+                                                         → Changing
 Changing     HOLDING    force or angle changes           force and angle reached → Settled
 Turning      ROTATING   the object turns                 angle reached → Settled
 
@@ -23,10 +24,10 @@ Transitions that several states have in common:
 - all: a fault → Off (FAULT); `stop`, `disarm` → Off (DISARMED), but a fault stays until `clear`
 - with torque: `release` → Travelling (RELEASING)
 - Settled, Changing, Turning: `rotate` → Turning
-- Approaching, Pressing, Settled, Changing, Turning: tips touch each other for _EMPTY → Travelling
-  (RELEASING)
-- Pressing, Settled, Changing, Turning: a contact is missing for _LOST → Armed. Until then the
-  joints hold their positions (`ContactLoss`).
+- Approaching, Pressing, Settled, Changing, Turning: tips touch each other for _EMPTY_TIME →
+  Travelling (RELEASING)
+- Pressing, Settled, Changing, Turning: a contact is missing for _CONTACT_LOSS_TIME → Armed.
+  Until then the joints hold their positions (`ContactLoss`).
 
 Each transition creates a new object of one of the classes below. Timers and flags are attributes of
 the state that uses them, so they end with it. `control.modes` lists the commands of each mode,
@@ -48,34 +49,34 @@ from softfinger.daemon.types import FINGERS, Event, Goal, State
 
 # rad between a joint and its goal, below which it has arrived: five times the position error due to
 # the default joint friction at the default servos.stiffness.
-_ARRIVED = 0.03
+_ARRIVAL_DISTANCE = 0.03
 # s that a joint may take to arrive after its setpoint has; after that, friction holds it.
-_GRACE = 1.0
+_ARRIVAL_TIMEOUT = 1.0
 # Fraction of the force target: the force scatters by 0.3 to 0.6 % (1 σ) with simulated sensors.
-_FORCE_REACHED = 0.03
+_FORCE_TOLERANCE = 0.03
 # Fraction of the force target: additional force above it that gear friction may hold, at most.
 # It is 6 % in the small hand.
-_HELD_OVER = 0.12
+_HELD_FORCE_MAX = 0.12
 # Fraction of the force target: the error that joint friction may cause. 0.05 N·m at the default
 # finger are a tenth of 6 N. The integral term removes this error within seconds.
-_NEAR = 0.1
+_FRICTION_TOLERANCE = 0.1
 # s after which such a force counts as reached: ten times the settling time without friction.
-_STUCK = 2.0
+_STUCK_TIME = 2.0
 # rad off the angle's target: the angle scatters by 0.5 to 2 mrad (1 σ) with simulated sensors.
-_ANGLE_REACHED = math.radians(0.5)
+_ANGLE_TOLERANCE = math.radians(0.5)
 # s for which force and angle must stay at their targets: five frames at 25 Hz, and twice the
 # default smooth_time.
-_SETTLED = 0.2
+_SETTLING_TIME = 0.2
 # Fraction of the force target. A streamed target may never rest, so a grip also settles when it
 # follows its setpoint within this distance of the target.
-_FOLLOWED = 0.25
+_STREAM_TOLERANCE = 0.25
 # Smaller changes of a streamed setpoint or of the force increase are ignored as noise: a fraction
 # of the force, and rad (1 σ of the angle).
-_FORCE_FLICKER, _ANGLE_FLICKER = 0.02, 2e-3
+_FORCE_NOISE, _ANGLE_NOISE = 0.02, 2e-3
 # s without a contact before it counts as lost: two frames at 25 Hz could show it again.
-_LOST = 0.1
+_CONTACT_LOSS_TIME = 0.1
 # s for which the tips must seem to touch each other: more than one frame at 25 Hz.
-_EMPTY = 0.05
+_EMPTY_TIME = 0.05
 
 
 class ControlState:
@@ -97,7 +98,7 @@ class Armed(ControlState):
 
     mode = Mode.ARMED
     current: float  # limit [A]
-    following: int = 0  # remaining ticks in which the setpoints follow the joints
+    following_count: int = 0  # remaining ticks in which the setpoints follow the joints
 
 
 @dataclass
@@ -109,7 +110,7 @@ class Travelling(ControlState):
 
 
 @dataclass
-class Order:
+class GraspCommand:
     """Commanded values of a grasp, stored until it has settled."""
 
     force: float  # [N]
@@ -122,7 +123,7 @@ class Approaching(ControlState):
     """The fingers close."""
 
     mode = Mode.GRASPING
-    order: Order
+    command: GraspCommand
     touching: set[int] = field(default_factory=set)  # fingers
     arrived_for: float = 0.0  # time since the setpoints reached the joint limits [s]
     empty_for: float = 0.0  # time for which the tips have seemed to touch each other [s]
@@ -144,7 +145,7 @@ class GripHistory:
     empty_for: float = 0.0  # time for which the tips have seemed to touch each other [s]
     settled_force: float = math.nan  # commanded force when the grip last settled [N]
     settled_angle: float = math.nan  # commanded angle when the grip last settled [rad]
-    raise_reported: bool = False
+    increase_reported: bool = False
     turn_end_reported: bool = False
 
 
@@ -154,7 +155,7 @@ class Gripping(ControlState):
 
     history: GripHistory
     reached_for: float = 0.0  # time for which force and angle have been at their targets [s]
-    near_for: float = 0.0  # time for which the force error has been within _NEAR [s]
+    near_for: float = 0.0  # time for which the force error has been within _FRICTION_TOLERANCE [s]
 
 
 @dataclass(kw_only=True)
@@ -162,7 +163,7 @@ class Pressing(Gripping):
     """The force increases to its target."""
 
     mode = Mode.GRASPING
-    order: Order
+    command: GraspCommand
 
 
 class Settled(Gripping):
@@ -208,11 +209,11 @@ class Control:
         last, self.state = self.state, state
         if state.mode is not last.mode:
             self.events.append(("info", "mode", f"{last.mode.value} → {state.mode.value}"))
-        waits = isinstance(last, Approaching | Pressing) and last.order.angle is not None
+        waits = isinstance(last, Approaching | Pressing) and last.command.angle is not None
         if waits and not isinstance(state, Approaching | Gripping):
             self._warn("rotate", f"rotate: dropped, since the grasp ended in {state.mode.value}")
 
-    def _stay(self) -> None:
+    def _enter_armed(self) -> None:
         self._enter(Armed(self._settings.safety.current_move))
 
     def _warn(self, kind: str, text: str) -> None:
@@ -228,7 +229,7 @@ class Control:
     def arm(self) -> None:
         """Switch torque on and hold the joints at their positions."""
         # Torque is switched on at the end of the first tick. Until the second, the joints may move.
-        self._enter(Armed(self._settings.safety.current_move, following=2))
+        self._enter(Armed(self._settings.safety.current_move, following_count=2))
 
     def disarm(self) -> None:
         """Switch torque off. This also clears a fault."""
@@ -244,14 +245,14 @@ class Control:
         if self.mode is not Mode.MOVING:
             self.fingers.hold_here()
         for name, q in angles.items():
-            self.fingers.go_to(FINGERS.index(name), q)
+            self.fingers.set_target(FINGERS.index(name), q)
         self._enter(Travelling(Mode.MOVING))
 
     def release(self) -> None:
         """Open the fingers to the hand's open angles."""
         self.fingers.hold_here()
         for index in self.fingers.indices:
-            self.fingers.go_to(index, self._settings.hand.open_angle[index])
+            self.fingers.set_target(index, self._settings.hand.open_angle[index])
         self._enter(Travelling(Mode.RELEASING))
 
     def grasp(self, force: float, is_streamed: bool = False) -> None:
@@ -263,20 +264,22 @@ class Control:
         state = self.state
         if isinstance(state, Gripping):
             if isinstance(state, Pressing):
-                state.order.is_streamed = is_streamed
+                state.command.is_streamed = is_streamed
             self.grip.retarget(force)
             self._change(state)
         elif isinstance(state, Approaching):
-            self._enter(Approaching(Order(force, is_streamed, state.order.angle), state.touching))
+            self._enter(
+                Approaching(GraspCommand(force, is_streamed, state.command.angle), state.touching)
+            )
         else:
             self.fingers.hold_here()
-            self._enter(Approaching(Order(force, is_streamed)))
+            self._enter(Approaching(GraspCommand(force, is_streamed)))
 
     def rotate(self, angle: float) -> None:
         """Turn the object to ``angle`` [rad]; during a grasp, wait until the grip has settled."""
         state = self.state
         if isinstance(state, Approaching | Pressing):
-            state.order.angle = angle
+            state.command.angle = angle
         elif isinstance(state, Gripping):
             self.grip.steer(self.fingers.pose.angle, angle)
             state.history.turn_end_reported = False
@@ -300,7 +303,7 @@ class Control:
         if angle is None:
             return None
         if isinstance(state, Approaching | Pressing):
-            state.order.angle = angle
+            state.command.angle = angle
         elif isinstance(state, Gripping):
             low, high = self.fingers.turning_range()
             angle = min(max(angle, low), high)
@@ -309,10 +312,10 @@ class Control:
             return angle
         return None
 
-    def ease(self, most: float, seconds: float) -> None:
-        """Reduce the grip force to ``most`` [N] within ``seconds``, and limit it from then on."""
+    def limit_force(self, force_max: float, duration: float) -> None:
+        """Limit the grip force to ``force_max`` [N], and reach it within ``duration`` [s]."""
         if isinstance(self.state, Gripping):
-            self.grip.ease(most, seconds)
+            self.grip.limit_force(force_max, duration)
             self._change(self.state)
 
     def set(self, compliance: float) -> None:
@@ -323,8 +326,8 @@ class Control:
         """Leave Settled if the commanded force or angle differs from its settled value."""
         grip, force, angle = self.grip, state.history.settled_force, state.history.settled_angle
         if isinstance(state, Settled) and not (
-            abs(grip.commanded - force) < _FORCE_FLICKER * force
-            and (math.isnan(grip.target_angle) or abs(grip.target_angle - angle) < _ANGLE_FLICKER)
+            abs(grip.commanded - force) < _FORCE_NOISE * force
+            and (math.isnan(grip.target_angle) or abs(grip.target_angle - angle) < _ANGLE_NOISE)
         ):
             self._enter(Changing(state.history))
 
@@ -337,21 +340,21 @@ class Control:
         if not goal.valid:
             return
         current = self._current()  # of the state before any transition in this tick
-        if isinstance(self.state, Armed) and self.state.following:
-            self.state.following -= 1
+        if isinstance(self.state, Armed) and self.state.following_count:
+            self.state.following_count -= 1
             self.fingers.hold_here()
         elif isinstance(self.state, Travelling):
             self._travel(self.state, dt)
         elif isinstance(self.state, Approaching):
             self._approach(self.state, dt)
         if isinstance(self.state, Gripping):  # also if it began in this tick
-            self._hold(self.state, dt, goal)
+            self._step_grip(self.state, dt, goal)
         else:
-            self.fingers.rest(goal, current)
+            self.fingers.follow_setpoints(goal, current)
         if isinstance(self.state, Gripping):
             goal.force, goal.angle = self.grip.target, self.grip.target_angle
         elif isinstance(self.state, Approaching):
-            goal.force = self.state.order.force
+            goal.force = self.state.command.force
 
     def hold_goal(self, goal: Goal) -> None:
         """Hold the goals while frames are late; called instead of :meth:`step`.
@@ -359,7 +362,7 @@ class Control:
         The goals of a grip are torques: the joints stay damped, and a turn comes to rest.
         """
         if goal.valid and isinstance(self.state, Gripping) and self.state.history.loss is None:
-            self.fingers.pull(goal, self.grip.hold_goal(self.fingers.reading))
+            self.fingers.apply_torques(goal, self.grip.hold_goal(self.fingers.reading))
 
     def _current(self) -> float:
         """Return the current limit [A] for joints that follow their setpoints."""
@@ -370,41 +373,41 @@ class Control:
             return self._settings.safety.current_move
         # A tip that reaches the object before the sensor detects contact must not exceed the
         # commanded force.
-        pressed = 0.5 * state.order.force * self._settings.hand.finger_length * law.driving
+        pressed = 0.5 * state.command.force * self._settings.hand.finger_length * law.driving
         # A joint that does not move under this torque, without contact, has more friction than in
         # the settings; `free_torque` is the measured torque.
         pressed += max(law.joint_friction, float(self.fingers.grasp.free_torque.max()))
         return min(law.approach_current, pressed / law.torque_constant)
 
     def _travel(self, state: Travelling, dt: float) -> None:
-        if not self.fingers.ramp(self._settings.control.move_speed):
+        if not self.fingers.advance_setpoints(self._settings.control.move_speed):
             return
         state.arrived_for += dt
-        off = self.fingers.distance
-        if off < _ARRIVED:
-            self._stay()
-        elif state.arrived_for > _GRACE:
+        off = self.fingers.distance_max
+        if off < _ARRIVAL_DISTANCE:
+            self._enter_armed()
+        elif state.arrived_for > _ARRIVAL_TIMEOUT:
             text = f"{state.mode.value} ended {math.degrees(off):.1f}° short of its goal"
             self._warn("short", text)
-            self._stay()
+            self._enter_armed()
 
     def _approach(self, state: Approaching, dt: float) -> None:
-        state.touching = self.fingers.close(state.touching)
+        state.touching = self.fingers.close_fingers(state.touching)
         if len(state.touching) == len(self.fingers.indices):
             state.empty_for = self._empty_for(state.empty_for, dt)
             if not state.empty_for:
-                self.grip.most = math.inf
-                self.grip.start(self.fingers.force, state.order.force)
-                self._enter(Pressing(GripHistory(), order=state.order))
-        elif self.fingers.ramp(self._settings.control.approach_speed):
+                self.grip.commanded_max = math.inf
+                self.grip.start(self.fingers.force, state.command.force)
+                self._enter(Pressing(GripHistory(), command=state.command))
+        elif self.fingers.advance_setpoints(self._settings.control.approach_speed):
             state.arrived_for += dt
-            if state.arrived_for > _GRACE:
+            if state.arrived_for > _ARRIVAL_TIMEOUT:
                 self._warn("grasp", "nothing to grasp within the joints' limits")
                 self.fingers.hold_here()
-                self._stay()
+                self._enter_armed()
 
     def _empty_for(self, before: float, dt: float) -> float:
-        """Return how long [s] the tips have seemed to touch each other; release after _EMPTY.
+        """Return how long [s] the tips have seemed to touch each other; release after _EMPTY_TIME.
 
         Tips that press against each other would roll off to one side. Both sensors then measure the
         same contact, so the estimated object width is 0 within its error.
@@ -412,7 +415,7 @@ class Control:
         pose, width_min = self.fingers.pose, self._settings.object.width_min
         if not pose.valid or pose.width >= width_min:
             return 0.0
-        if before + dt > _EMPTY:
+        if before + dt > _EMPTY_TIME:
             text = (
                 f"nothing between the tips: {pose.width * 1e3:.1f} mm, "
                 f"less than object.width_min {width_min * 1e3:g} mm; opening"
@@ -421,59 +424,59 @@ class Control:
             self.release()
         return before + dt
 
-    def _hold(self, state: Gripping, dt: float, goal: Goal) -> None:
+    def _step_grip(self, state: Gripping, dt: float, goal: Goal) -> None:
         fingers, grip, history = self.fingers, self.grip, state.history
         if not fingers.in_contact:
-            self._lose(history, dt, goal)
+            self._handle_contact_loss(history, dt, goal)
             return
         if history.loss is not None:  # while the force builds up again, joint motion is not a load
             history.loss, state.reached_for = None, 0.0
             if isinstance(state, Settled):
                 self._enter(state := Changing(history))
         is_settled = isinstance(state, Settled)
-        fingers.pull(goal, grip.torques(fingers.reading, fingers.pose, is_settled))
-        self._report_raise(history)
+        fingers.apply_torques(goal, grip.torques(fingers.reading, fingers.pose, is_settled))
+        self._report_increase(history)
         if not is_settled:
-            self._watch_settling(state, dt)
+            self._check_settled(state, dt)
         history.empty_for = self._empty_for(history.empty_for, dt)
 
-    def _lose(self, history: GripHistory, dt: float, goal: Goal) -> None:
-        """Hold the joints while a contact is missing; end the grip after _LOST."""
+    def _handle_contact_loss(self, history: GripHistory, dt: float, goal: Goal) -> None:
+        """Hold the joints while a contact is missing; end the grip after _CONTACT_LOSS_TIME."""
         if history.loss is None:
             self.fingers.hold_here()
             # A sensor that fails must not make the joints press harder than before.
             pressed = max(goal.current[index] for index in self.fingers.indices)
             history.loss = ContactLoss(min(pressed, self._settings.safety.current_move))
         loss = history.loss
-        self.fingers.rest(goal, loss.current)
+        self.fingers.follow_setpoints(goal, loss.current)
         loss.lost_for += dt
-        if loss.lost_for > _LOST:
+        if loss.lost_for > _CONTACT_LOSS_TIME:
             self._warn("lost", "contact lost; the joints hold where they are")
             self._enter(Armed(loss.current))
 
-    def _watch_settling(self, state: Gripping, dt: float) -> None:
-        """Enter Settled once force and angle have stayed at their targets for _SETTLED."""
+    def _check_settled(self, state: Gripping, dt: float) -> None:
+        """Enter Settled once force and angle have stayed at their targets for _SETTLING_TIME."""
         grip, pose, history = self.grip, self.fingers.pose, state.history
         is_reached = True
         if not isinstance(state, Pressing):
             self._end_turn_before_slip(history)
-            is_reached = not abs(pose.angle - grip.target_angle) >= _ANGLE_REACHED  # True for NaN
+            is_reached = not abs(pose.angle - grip.target_angle) >= _ANGLE_TOLERANCE  # True for NaN
         if not isinstance(state, Turning):
-            streamed = isinstance(state, Pressing) and state.order.is_streamed
-            near = abs(self.fingers.force - grip.target) < _NEAR * grip.target
-            state.near_for = state.near_for + dt if near and not grip.shaking else 0.0
-            stuck = state.near_for > _STUCK
+            streamed = isinstance(state, Pressing) and state.command.is_streamed
+            near = abs(self.fingers.force - grip.target) < _FRICTION_TOLERANCE * grip.target
+            state.near_for = state.near_for + dt if near and not grip.is_dithering else 0.0
+            stuck = state.near_for > _STUCK_TIME
             is_reached = is_reached and (stuck or self._is_force_reached(streamed))
         state.reached_for = state.reached_for + dt if is_reached else 0.0
-        if state.reached_for <= _SETTLED:
+        if state.reached_for <= _SETTLING_TIME:
             return
-        if pose.valid and math.isnan(grip.target_angle) and not grip.upright:
+        if pose.valid and math.isnan(grip.target_angle) and not grip.is_blind:
             grip.steer(pose.angle, pose.angle)
         grip.begin_holding()
         history.settled_force, history.settled_angle = grip.commanded, grip.target_angle
         self._enter(Settled(history))
-        if isinstance(state, Pressing) and (angle := state.order.angle) is not None:
-            if refusal := self.fingers.why_not_turn(angle):
+        if isinstance(state, Pressing) and (angle := state.command.angle) is not None:
+            if refusal := self.fingers.turn_refusal(angle):
                 self._warn("rotate", f"rotate: {refusal}")
             else:
                 self.rotate(angle)
@@ -485,33 +488,33 @@ class Control:
         """
         grip = self.grip
         wanted = grip.force.value if is_streamed else grip.target
-        over = _FORCE_REACHED + min(self._settings.control.load_held, _HELD_OVER)
+        over = _FORCE_TOLERANCE + min(self._settings.control.load_held, _HELD_FORCE_MAX)
         off = self.fingers.force - wanted
-        is_near = abs(wanted - grip.target) < _FOLLOWED * grip.target
-        is_there = -_FORCE_REACHED * grip.target < off < over * grip.target
-        return is_near and is_there and not grip.shaking
+        is_near = abs(wanted - grip.target) < _STREAM_TOLERANCE * grip.target
+        is_there = -_FORCE_TOLERANCE * grip.target < off < over * grip.target
+        return is_near and is_there and not grip.is_dithering
 
     def _end_turn_before_slip(self, history: GripHistory) -> None:
         """End a turn at the present angle if the tips would slip beyond it."""
         law, angle = self._settings.control, self.fingers.pose.angle
         shear_max = law.tip_friction * (1.0 - law.slip_margin)
-        if self.fingers.grasp.shear * self.grip.turning_on > shear_max:
+        if self.fingers.grasp.shear * self.grip.stopping_ratio > shear_max:
             if not history.turn_end_reported:
                 text = f"turning ended at {math.degrees(angle):.1f}°: the tips would slip"
                 self._warn("slip", text)
             history.turn_end_reported = True
             self.grip.steer(angle, angle)
 
-    def _report_raise(self, history: GripHistory) -> None:
+    def _report_increase(self, history: GripHistory) -> None:
         """Report slip, and the begin of each force increase against it."""
         grip = self.grip
-        if grip.slipped:
+        if grip.has_slipped:
             self._warn("slip", "the object turns in the grip")
         if grip.target <= grip.commanded:
-            history.raise_reported = False
-        elif not history.raise_reported and grip.target > (1 + _FORCE_FLICKER) * grip.commanded:
-            history.raise_reported = True
-            why = "the object turns in it" if grip.slipped else "a load came at once"
-            if grip.slip.guarded > 0.0:
-                why = f"each tip may bear {grip.slip.guarded:.1f} N along its face"
+            history.increase_reported = False
+        elif not history.increase_reported and grip.target > (1 + _FORCE_NOISE) * grip.commanded:
+            history.increase_reported = True
+            why = "the object turns in it" if grip.has_slipped else "a load came at once"
+            if grip.slip.assumed_load > 0.0:
+                why = f"each tip may bear {grip.slip.assumed_load:.1f} N along its face"
             self._warn("slip", f"grip raised above {grip.commanded:.1f} N: {why}")

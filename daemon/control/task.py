@@ -17,28 +17,28 @@ from softfinger.daemon.types import State
 
 Step = tuple[dict[str, Any], Mode, float]  # command, mode that ends the step, pause after it [s]
 
-_PATIENCE = 10.0  # s, timeout of a step
-_PAUSE = 2.0  # s before a restart, so that a user can read the message
+_STEP_TIMEOUT = 10.0  # s, timeout of a step
+_RESTART_PAUSE = 2.0  # s before a restart, so that a user can read the message
 
 
-class TaskOver(SoftfingerError):
+class TaskEnded(SoftfingerError):
     """The task can't continue. The message gives the reason."""
 
 
 class Task:
     """Issue the commands of a script, each once the hand has reached the mode of the last one.
 
-    With ``lasting`` the script restarts after a fault. Only simulated hands do so, because real
+    With ``restarts`` the script restarts after a fault. Only simulated hands do so, because real
     hardware must not start moving by itself after a fault.
     """
 
     def __init__(self, settings: Settings) -> None:
         self._script = partial(demo, settings.task.force, settings.task.angle)
-        self.lasting = settings.simulated
+        self.restarts = settings.simulated
         self._steps = self._script()
-        self._mode: str = Mode.DISARMED  # mode that ends the present step
-        self._rest = 0.5
-        self._left = self._rest
+        self._end_mode: str = Mode.DISARMED  # mode that ends the present step
+        self._pause = 0.5
+        self._remaining = self._pause
         self._waited = 0.0
 
     @staticmethod
@@ -51,31 +51,32 @@ class Task:
 
         Raises
         ------
-        TaskOver
+        TaskEnded
             After a fault, after the hand was disarmed, or when a step times out.
         """
-        if state.mode != self._mode:
+        if state.mode != self._end_mode:
             if state.mode in (Mode.FAULT, Mode.DISARMED):
-                raise TaskOver(f"the hand is in {state.mode}")
-            self._left = self._rest
+                raise TaskEnded(f"the hand is in {state.mode}")
+            self._remaining = self._pause
             self._waited += dt
-            if self._waited > _PATIENCE:
-                raise TaskOver(f"still {state.mode} after {_PATIENCE:g} s")
+            if self._waited > _STEP_TIMEOUT:
+                raise TaskEnded(f"still {state.mode} after {_STEP_TIMEOUT:g} s")
             return None
-        self._left -= dt
-        if self._left > 0.0:
+        self._remaining -= dt
+        if self._remaining > 0.0:
             return None
-        request, self._mode, self._rest = next(self._steps)
-        self._left, self._waited = self._rest, 0.0
+        request, self._end_mode, self._pause = next(self._steps)
+        self._remaining, self._waited = self._pause, 0.0
         return request
 
-    def begin_again(self, state: State, reason: str) -> str:
+    def restart(self, state: State, reason: str) -> str:
         """Pause, leave the present mode and restart the script; return the event's text."""
         way_out, says = ("clear", "clears it") if state.mode == Mode.FAULT else ("stop", "stops it")
         self._steps = chain([({"command": way_out}, Mode.DISARMED, 0.5)], self._script())
-        self._mode = state.mode
-        self._left, self._waited = _PAUSE, 0.0
-        return f"{reason}; the task {says} and begins again in {_PAUSE:g} s: the hand is simulated"
+        self._end_mode = state.mode
+        self._remaining, self._waited = _RESTART_PAUSE, 0.0
+        pause = f"{_RESTART_PAUSE:g} s"
+        return f"{reason}; the task {says} and begins again in {pause}: the hand is simulated"
 
 
 def demo(force: float, angle: float) -> Iterator[Step]:

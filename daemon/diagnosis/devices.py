@@ -32,7 +32,7 @@ from softfinger.daemon.servos.checks import (
 )
 from softfinger.daemon.servos.control_table import ServoModel, by_name
 from softfinger.daemon.servos.exchange import (
-    EXCHANGES,
+    EXCHANGE_COUNT,
     choose_reads,
     judge_exchanges,
     time_exchanges,
@@ -41,8 +41,8 @@ from softfinger.daemon.servos.joint import GOAL_SIZE
 from softfinger.daemon.servos.port import latency_file
 from softfinger.daemon.servos.protocol import GroupWrite, ServoLine, open_line
 from softfinger.daemon.servos.provisioning import (
-    ALONE,
     FACTORY_ID,
+    ONE_SERVO_ONLY,
     SEARCH_TIME,
     plan,
     provision,
@@ -52,10 +52,10 @@ from softfinger.daemon.servos.torque import goal_address
 from softfinger.daemon.tactile.base import make_sensor
 from softfinger.daemon.types import FINGERS, Frame
 
-_LISTEN = 0.5  # s, time to receive a board's frames
-_REST_NOISE = 3.0  # times a cell's noise, limit of a tared board's median cell at rest
-_OFF_RATE = 0.1  # allowed relative error of a board's rate
-_SAME_POISSON = 0.02  # tolerance of ν, limited by the accuracy of the presses
+_LISTEN_TIME = 0.5  # s, time to receive a board's frames
+_REST_NOISE_RATIO = 3.0  # times a cell's noise, limit of a tared board's median cell at rest
+_RATE_TOLERANCE = 0.1  # allowed relative error of a board's rate
+_POISSON_TOLERANCE = 0.02  # tolerance of ν, limited by the accuracy of the presses
 
 
 def check_servos(settings: Settings) -> list[Finding]:
@@ -109,11 +109,11 @@ def _try_exchange(
     address = goal_address(mode, model, firmwares[0])
     held = [line.read(servo_id, address, GOAL_SIZE[mode]) for servo_id in ids]
     limp = not any(each.table[reg.TORQUE_ENABLE] for each in found)
-    write, what = None, f"{EXCHANGES} of a tick's reads (no writes: torque is on)"
+    write, what = None, f"{EXCHANGE_COUNT} of a tick's reads (no writes: torque is on)"
     if limp and len(set(firmwares)) == 1 and None not in held:
         group = GroupWrite(line.port, address, GOAL_SIZE[mode], ids)
         write = partial(group.send, [value for value in held if value is not None])
-        what = f"{EXCHANGES} of a tick's reads and writes"
+        what = f"{EXCHANGE_COUNT} of a tick's reads and writes"
     times = time_exchanges(line.port, reads, write)
     return [*results, judge_exchanges(times, settings, what, emulated(settings))]
 
@@ -157,14 +157,14 @@ def _search(settings: Settings, model: ServoModel) -> list[Finding]:
         problem = f"nothing answers on {servos.port} at any rate"
         return [Finding("FAIL", "servos", problem, "check the bus's power and cable")]
     what = plan(found, settings, model, model.baud_rates)
-    lines = [Finding("FAIL", "servos", str(each), ALONE) for each in found.garbled]
+    lines = [Finding("FAIL", "servos", str(each), ONE_SERVO_ONLY) for each in found.garbled]
     for change in what.changes:
         same = change.servo.id == change.id
         other = f"servos.baud = {change.servo.baud}" if same else "servos.ids as it is"
         fix = f"softfinger doctor --fix makes it {change.name}: {change}; or set {other}"
         lines.append(Finding("note", "found", str(change.servo), fix))
     for each in what.strangers:
-        fix = ALONE if what.missing and each.number == model.number else ""
+        fix = ONE_SERVO_ONLY if what.missing and each.number == model.number else ""
         lines.append(Finding("note", "found", str(each), fix))
     return lines
 
@@ -193,7 +193,7 @@ def check_law(settings: Settings, finger: int) -> Finding:
     for key, wanted in calibration.wants.items():
         found = getattr(tip, key)
         near = isinstance(wanted, float) and key == "poisson"
-        if found != wanted and not (near and abs(found - wanted) <= _SAME_POISSON):
+        if found != wanted and not (near and abs(found - wanted) <= _POISSON_TOLERANCE):
             problem = (
                 f"tip.{key} is {found!r}, where the presses of `calibrate law` want {wanted!r}"
             )
@@ -216,7 +216,7 @@ def check_board(settings: Settings, finger: int) -> Finding:
         return Finding("FAIL", name, str(error), "check tactile.port, its baud and its cable")
     try:
         before, start = sensor.counters(), time.monotonic()
-        time.sleep(_LISTEN)
+        time.sleep(_LISTEN_TIME)
         frame = sensor.latest()  # a plugin may read its board only in this call
         after, spent = sensor.counters(), time.monotonic() - start
     finally:
@@ -229,12 +229,12 @@ def check_board(settings: Settings, finger: int) -> Finding:
         fix = "check its cable and what else loads the USB hub"
         return Finding("warn", name, f"{found}, but {lost} bytes were damaged or lost", fix)
     rest = 0.0 if frame is None else _rest(settings, finger, frame)
-    if rest > _REST_NOISE * tactile.noise:
+    if rest > _REST_NOISE_RATIO * tactile.noise:
         text = f"{found}, but half of them read {rest / 1e3:.1f} kPa or more, expected 0 at rest"
         fix = "`softfinger calibrate tare`, or `softfinger send tare` at each start"
         return Finding("warn", name, text, fix)
     # The measuring time may contain one frame more or less.
-    if abs(frames - tactile.rate * spent) > max(_OFF_RATE * tactile.rate * spent, 1.5):
+    if abs(frames - tactile.rate * spent) > max(_RATE_TOLERANCE * tactile.rate * spent, 1.5):
         text = f"{found}, not {tactile.rate:g}"
         fix = f"set tactile.rate = {rate:.0f}, unless this machine is busy"
         return Finding("warn", name, text, fix)

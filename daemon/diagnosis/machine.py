@@ -15,12 +15,12 @@ from softfinger.daemon.loop.realtime import GRANT_LATENCY, GRANT_MEMORY_LOCK, GR
 from softfinger.daemon.loop.warm_up import is_built, parts
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.base import Finding
-from softfinger.kinematics.compiled.kernel_folder import damaged, find_folder
+from softfinger.kinematics.compiled.kernel_folder import damaged, find_kernel_folder
 
 _MEMORY = 1 << 30  # bytes, more than the daemon maps
-_WAKE_UPS = 100
+_WAKE_UP_COUNT = 100
 _PERIOD = 0.002  # s
-_OLDEST = 1_700_000_000.0  # Unix time [s], an earlier clock was never set
+_CLOCK_MIN = 1_700_000_000.0  # Unix time [s], an earlier clock was never set
 
 
 def check_machine() -> list[Finding]:
@@ -73,7 +73,7 @@ def check_idle_states(path: Path) -> Finding:
 
 def check_wall_clock(now: float) -> Finding:
     """Check that Unix time ``now`` [s], which is in every published message, is plausible."""
-    if now >= _OLDEST:
+    if now >= _CLOCK_MIN:
         return Finding("pass", "wall clock", time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(now)))
     date = time.strftime("%Y-%m-%d", time.gmtime(now))
     problem = f"says {date}: published timestamps will be wrong"
@@ -84,7 +84,7 @@ def wake_ups() -> list[float]:
     """Measure the lateness [s] of sleeps until a deadline, like those of the daemon's ticks."""
     late = []
     deadline = time.monotonic()
-    for _ in range(_WAKE_UPS):
+    for _ in range(_WAKE_UP_COUNT):
         deadline += _PERIOD
         time.sleep(max(deadline - time.monotonic(), 0.0))
         late.append(time.monotonic() - deadline)
@@ -105,7 +105,7 @@ def check_wake_ups(late: list[float]) -> Finding:
 def check_kernels(settings: Settings) -> list[Finding]:
     """Check that compiled kernels can be stored and that those of this scene are present."""
     try:
-        with find_folder() as folder:
+        with find_kernel_folder() as folder:
             place, spoilt = folder.path, len(damaged(folder))
     except (OSError, RuntimeError) as error:
         problem = f"can't be used, so every start compiles: {error}"

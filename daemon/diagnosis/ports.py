@@ -16,7 +16,7 @@ from softfinger.daemon.client.command_client import NoAnswer, send
 from softfinger.daemon.errors import AddressError, KeyFileError
 from softfinger.daemon.gateway.endpoints import IN_USE, bind
 from softfinger.daemon.own_files import runtime_fault, runtime_folder
-from softfinger.daemon.port_access import bring_it, grant
+from softfinger.daemon.port_access import grant, port_group_remedy
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.base import Finding
 from softfinger.daemon.wire.keys import load_client
@@ -60,7 +60,7 @@ def check_port(path: str, key: str, mode_of_daemon: str = "") -> Finding:
     except OSError as error:
         dangling = Path(path).is_symlink()
         why = "leads nowhere" if dangling else (error.strerror or "not found").lower()
-        fix = f"{bring_it(path)}, or set {key} to one of the ports there are"
+        fix = f"{port_group_remedy(path)}, or set {key} to one of the ports there are"
         return Finding("FAIL", path, why, fix)
     if not stat.S_ISCHR(mode.st_mode):
         return Finding("FAIL", path, "is not a serial port", f"set {key}")
@@ -158,7 +158,7 @@ def _pseudo_terminal(folder: Path, link: Path) -> int:
     return int(match[1]) if match else -1
 
 
-_PATIENCE = 0.5  # s for a daemon to answer
+_TIMEOUT = 0.5  # s for a daemon to answer
 
 
 def check_addresses(settings: Settings) -> list[Finding]:
@@ -192,7 +192,7 @@ def daemon_mode(address: str, keys: str = "") -> str:
     """
     try:
         own = load_client(Path(keys)) if keys else None
-        reply = send(address, {"command": "status"}, _PATIENCE, own)
+        reply = send(address, {"command": "status"}, _TIMEOUT, own)
     except (NoAnswer, KeyFileError, OSError):
         return ""
     return str(reply.get("mode", "running")) if reply.get("ok") else "starting"

@@ -22,8 +22,8 @@ from softfinger.daemon.servos.protocol import ServoLine, open_line
 from softfinger.daemon.servos.register_table import REGISTERS
 from softfinger.daemon.types import FINGERS
 
-_LARGEST = 1 << 20  # bytes, largest file that is read
-_PASSES = 2  # a lower limit may be rejected until the upper one is written
+_FILE_SIZE_MAX = 1 << 20  # bytes, largest file that is read
+_PASS_COUNT = 2  # a lower limit may be rejected until the upper one is written
 
 
 class StoredServo(Section):
@@ -112,13 +112,13 @@ def _restore(
     tables: list[bytes] = []
     # Write the operating mode first, because it resets gains, profiles and goals.
     order = sorted(REGISTERS, key=lambda each: each.address != reg.OPERATING_MODE)
-    for turn in range(_PASSES + 1):
+    for turn in range(_PASS_COUNT + 1):
         table = line.read(servo_id, 0, CHECKED)
         if table is None:
             result.append(Finding("warn", name, "not restored: its registers could not be read"))
             return
         tables.append(table)
-        for each in order if turn < _PASSES else ():
+        for each in order if turn < _PASS_COUNT else ():
             if each.name in values and each.value_in(table) != values[each.name]:
                 line.store(each.address, {servo_id: each.packed(values[each.name])})
     for each in REGISTERS:
@@ -139,7 +139,7 @@ def _restore(
 def _stored(path: Path) -> dict[int, StoredServo]:
     """Return the servos of a file by ID. Raises ServoError for a file of another kind."""
     try:
-        stored = StoredServos.model_validate_json(read_file(path, _LARGEST))
+        stored = StoredServos.model_validate_json(read_file(path, _FILE_SIZE_MAX))
     except OSError as error:
         raise ServoError(f"{path}: {error.strerror or error}") from None
     except ValidationError as error:

@@ -9,42 +9,44 @@ from __future__ import annotations
 from typing import NamedTuple
 
 # The process
-MEMORY = 128 << 20  # bytes of data; Python and libzmq use a third of it
-DESCRIPTORS = 64  # file descriptors besides those of clients
-CLIENTS = 256  # connections for commands and stream together
-STALLED = 3.0  # s of CPU time within one step, after which the kernel ends the process
-BLOCKED = 30.0  # s of elapsed time likewise; longer, since a busy machine delays the process
-GAP = 0.05  # s; after a longer gap between polls, requests are dated to the earlier poll
+MEMORY_MAX = 128 << 20  # bytes of data; Python and libzmq use a third of it
+DESCRIPTOR_COUNT = 64  # file descriptors besides those of clients
+CLIENT_COUNT_MAX = 256  # connections for commands and stream together
+STEP_CPU_TIME_MAX = 3.0  # s of CPU time within one step, after which the kernel ends the process
+STEP_TIME_MAX = 30.0  # s of elapsed time likewise; longer, since a busy machine delays the process
+POLL_GAP_MAX = 0.05  # s; after a longer gap between polls, requests are dated to the earlier poll
 
 # A connection
-HANDSHAKE = 2.0  # s, timeout of the handshake
-QUEUE = 64  # requests, answers or subscriptions of one client, queued in its socket
-FRAMES = 4  # size limit of one message part, in units of commands.max_bytes
-PARTS = 16  # parts of a request, including the routing frame and the envelope
-ENVELOPE = 1024  # bytes of the routing frame and the envelope
-SUBSCRIPTION = 1024  # bytes; messages of the handshake are longer than any topic
-SUBSCRIPTIONS = 64  # read in one turn
-TELL_AGAIN = 0.1  # s between two repetitions of messages for late subscribers
-KEYS_CHECKED = 0.5  # s between two checks of the key folder
+HANDSHAKE_TIMEOUT = 2.0  # s, timeout of the handshake
+SOCKET_QUEUE_LENGTH = 64  # requests, answers or subscriptions of one client, queued in its socket
+PART_SIZE_RATIO = 4  # size limit of one message part, in units of commands.max_bytes
+PART_COUNT_MAX = 16  # parts of a request, including the routing frame and the envelope
+ENVELOPE_SIZE_MAX = 1024  # bytes of the routing frame and the envelope
+SUBSCRIPTION_SIZE_MAX = 1024  # bytes; messages of the handshake are longer than any topic
+SUBSCRIPTIONS_PER_TURN = 64  # read in one turn
+REPEAT_INTERVAL = 0.1  # s between two repetitions of messages for late subscribers
+KEY_CHECK_INTERVAL = 0.5  # s between two checks of the key folder
 
 # A stop
-PURGE = 0.02  # s after a stop for which requests are refused, except status; repeated in a flood
-LONGEST_HELD = 0.25  # s for which answers wait for the end of that time
+# s after a stop for which requests are refused, except status; repeated in a flood.
+REFUSAL_TIME = 0.02
+ANSWER_DELAY_MAX = 0.25  # s for which answers wait for the end of that time
 
 # Requests
-UNDER_WAY = 16  # requests that the loop has not answered yet
-URGENT = 32  # likewise of requests that look like a stop, which are counted separately
-URGENT_BYTES = 256  # size limit of a request that counts as urgent
-WAITING_EACH = 64  # queued requests of one client
-WAITING = 2048  # queued requests of all clients
-ALL_RATE = 2000.0  # requests per second of all clients together
-LEAST_RATE = 2.0  # requests per second that every client may send
-REST = 0.05  # s without a request, after which a client above its rate is accepted again
+UNANSWERED_MAX = 16  # requests that the loop has not answered yet
+# likewise of requests that look like a stop, which are counted separately.
+URGENT_UNANSWERED_MAX = 32
+URGENT_SIZE_MAX = 256  # size limit of a request that counts as urgent
+CLIENT_QUEUE_LENGTH = 64  # queued requests of one client
+TOTAL_QUEUE_LENGTH = 2048  # queued requests of all clients
+TOTAL_RATE = 2000.0  # requests per second of all clients together
+CLIENT_RATE_MIN = 2.0  # requests per second that every client may send
+RECOVERY_TIME = 0.05  # s without a request, after which a client above its rate is accepted again
 
 # Turns
-TEND = 0.01  # s, longest wait of a step
-TURN = 0.004  # s of reading requests in one step
-LAST_WORDS = 0.2  # s for which queued messages are still sent after the loop has ended
+STEP_WAIT_MAX = 0.01  # s, longest wait of a step
+TURN_TIME = 0.004  # s of reading requests in one step
+LINGER_TIME = 0.2  # s for which queued messages are still sent after the loop has ended
 
 
 class Config(NamedTuple):

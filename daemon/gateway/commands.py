@@ -24,17 +24,17 @@ import zmq
 from softfinger.daemon.errors import Reason
 from softfinger.daemon.gateway import bounds
 from softfinger.daemon.gateway.bounds import Config
-from softfinger.daemon.gateway.endpoints import NOW, Admission, Endpoint
+from softfinger.daemon.gateway.endpoints import NO_WAIT, Admission, Endpoint
 from softfinger.daemon.wire.command_server import refusal
 from softfinger.daemon.wire.loop_link import ASK, Ask
 
-_STOP = msgpack.packb("command") + msgpack.packb("stop")  # can't occur within a text
-_FORM = refusal(
+_PACKED_STOP = msgpack.packb("command") + msgpack.packb("stop")  # can't occur within a text
+_MALFORMED_REFUSAL = refusal(
     "envelope: expected the command in one frame, alone or behind an empty frame that ends an "
-    f"envelope of at most {bounds.PARTS - 2} frames and {bounds.ENVELOPE} bytes",
+    f"envelope of at most {bounds.PART_COUNT_MAX - 2} frames and {bounds.ENVELOPE_SIZE_MAX} bytes",
     Reason.REQUEST,
 )
-_FULL = refusal("too many commands wait already", Reason.BUSY)
+_QUEUE_FULL_REFUSAL = refusal("too many commands wait already", Reason.BUSY)
 
 
 class Client:
@@ -55,7 +55,7 @@ class Client:
         left = min(self._left + passed * per_second, per_second) - 1.0
         self._left = max(left, 0.0)
         self._then = now
-        self._behind = left < 0.0 or (self._behind and passed < bounds.REST)
+        self._behind = left < 0.0 or (self._behind and passed < bounds.RECOVERY_TIME)
         return self._behind
 
 
@@ -79,11 +79,11 @@ class CommandEndpoint(Endpoint):
         self.refused = 0  # requests refused because of their number
         self.stops = 0  # stops known to have preceded the requests that are read now
         self._fence = 0  # stops so far
-        self._looked = clock()  # time of the last poll
+        self._last_poll = clock()  # time of the last poll
         self._dated: float | None = None  # last poll before a gap, while its requests may remain
         self._left = 0  # requests that may remain from before the gap
-        self._since = 0.0  # time of a stop, of a gap, or of the last check of `_came`
-        self._came = 0  # requests since then, except status
+        self._since = 0.0  # time of a stop, of a gap, or of the last check of `_arrived`
+        self._arrived = 0  # requests since then, except status
         self._held: list[list[bytes]] = []  # answers
         self._held_for = 0.0  # s; each step counts for at most PURGE, so that stalls don't count
         self._clients: OrderedDict[bytes, Client] = OrderedDict()
@@ -93,37 +93,37 @@ class CommandEndpoint(Endpoint):
         self._urgent: deque[Ask] = deque()
         self.count = 0  # queued requests, without urgent ones
         self._under_way = [0, 0]  # requests with the loop: normal, urgent
-        limit = bounds.FRAMES * config.max_bytes
+        limit = bounds.PART_SIZE_RATIO * config.max_bytes
         super().__init__(admission, zmq.ROUTER, config.commands, "commands.address", config, limit)
 
     def fence(self, stops: int) -> None:
         """Stamp requests as older than the last stop until all earlier requests have been read."""
         self._fence = stops
-        self._since, self._came = self._clock(), 0
+        self._since, self._arrived = self._clock(), 0
 
     def read(self) -> None:
-        """Read requests for up to `bounds.TURN`, and pass on as many as the loop may have."""
+        """Read requests for up to `bounds.TURN_TIME`, and pass on as many as the loop may have."""
         began = self._clock()
-        if began - self._looked > bounds.GAP:
+        if began - self._last_poll > bounds.POLL_GAP_MAX:
             if self._dated is None:
-                self._dated = self._looked
-            self._left = bounds.CLIENTS * bounds.QUEUE
-            self._since, self._came = began, 0
-        self._held_for += min(began - self._looked, bounds.PURGE)
-        self._looked = began
-        if self.stops == self._fence or self._held_for > bounds.LONGEST_HELD:
+                self._dated = self._last_poll
+            self._left = bounds.CLIENT_COUNT_MAX * bounds.SOCKET_QUEUE_LENGTH
+            self._since, self._arrived = began, 0
+        self._held_for += min(began - self._last_poll, bounds.REFUSAL_TIME)
+        self._last_poll = began
+        if self.stops == self._fence or self._held_for > bounds.ANSWER_DELAY_MAX:
             held, self._held = self._held, []
             for answer in held:
                 self._send(answer)
-        while (now := self._clock()) < began + bounds.TURN:
+        while (now := self._clock()) < began + bounds.TURN_TIME:
             parts = self._parts()
             if not parts:
                 self._note_empty(now)
                 break
             self._take([part.bytes for part in parts], self._admission.name(parts[-1]), now)
-        while self._urgent and self._under_way[True] < bounds.URGENT:
+        while self._urgent and self._under_way[True] < bounds.URGENT_UNANSWERED_MAX:
             self._pass_on(self._urgent.popleft())
-        while self._turns and self._under_way[False] < bounds.UNDER_WAY:
+        while self._turns and self._under_way[False] < bounds.UNANSWERED_MAX:
             client = self._turns.popleft()
             self._pass_on(client.waiting.popleft())
             self.count -= 1
@@ -136,29 +136,31 @@ class CommandEndpoint(Endpoint):
         The thread of libzmq may still deliver one. They count as read only after `PURGE` seconds in
         which few requests arrived.
         """
-        if now - self._since > bounds.PURGE:
-            if self._came <= bounds.ALL_RATE * bounds.PURGE:
+        if now - self._since > bounds.REFUSAL_TIME:
+            if self._arrived <= bounds.TOTAL_RATE * bounds.REFUSAL_TIME:
                 self.stops, self._dated = self._fence, None
-            self._since, self._came = now, 0
+            self._since, self._arrived = now, 0
 
     def _take(self, parts: list[bytes], name: str, now: float) -> None:
         """Queue one message of a client, or refuse it."""
         # As with a REP socket, the frames up to the first empty one are returned with the reply.
         ends = parts.index(b"", 1) + 1 if b"" in parts[1:-1] else 1
         route, payload = parts[:ends], parts[-1]
-        if sum(map(len, route)) > bounds.ENVELOPE or len(parts) > bounds.PARTS:
+        if sum(map(len, route)) > bounds.ENVELOPE_SIZE_MAX or len(parts) > bounds.PART_COUNT_MAX:
             ends, route = 0, parts[:1]
         client = self._client(parts[0], now)
-        self._came += b"status" not in payload
+        self._arrived += b"status" not in payload
         self._left -= 1
         if self._left < 0:  # more requests than the queues can have held
             self._dated = None
-        is_urgent = _STOP in payload and len(payload) <= bounds.URGENT_BYTES and not client.urgent
-        if client.floods(self._share(parts[0], now), now) and not is_urgent:
+        is_urgent = (
+            _PACKED_STOP in payload and len(payload) <= bounds.URGENT_SIZE_MAX and not client.urgent
+        )
+        if client.floods(self._client_rate(parts[0], now), now) and not is_urgent:
             self.refused += 1
             self._answer(route, self._too_many)
         elif ends + 1 != len(parts):
-            self._answer(route, _FORM)
+            self._answer(route, _MALFORMED_REFUSAL)
         elif len(payload) > self._config.max_bytes:
             text = f"message of {len(payload)} bytes; at most {self._config.max_bytes}"
             self._answer(route, refusal(text, Reason.REQUEST))
@@ -170,9 +172,12 @@ class CommandEndpoint(Endpoint):
         if ask.urgent:
             client.urgent = True
             self._urgent.append(ask)
-        elif len(client.waiting) >= bounds.WAITING_EACH or self.count >= bounds.WAITING:
+        elif (
+            len(client.waiting) >= bounds.CLIENT_QUEUE_LENGTH
+            or self.count >= bounds.TOTAL_QUEUE_LENGTH
+        ):
             self.refused += 1
-            self._answer(ask.route, _FULL)
+            self._answer(ask.route, _QUEUE_FULL_REFUSAL)
         else:
             if not client.waiting:
                 self._turns.append(client)
@@ -183,17 +188,17 @@ class CommandEndpoint(Endpoint):
         client = self._clients.get(identity)
         if client is None:
             client = self._clients[identity] = Client(self._config.per_second, now)
-            if len(self._clients) > bounds.CLIENTS:
+            if len(self._clients) > bounds.CLIENT_COUNT_MAX:
                 self._clients.popitem(last=False)
         return client
 
-    def _share(self, identity: bytes, now: float) -> float:
+    def _client_rate(self, identity: bytes, now: float) -> float:
         """Return the request rate [1/s] allowed for each client; it is lower if many send."""
         if now > self._active_until:
             self._active_until = now + 1.0
             self._active.clear()
         self._active.add(identity)
-        share = max(bounds.ALL_RATE / len(self._active), bounds.LEAST_RATE)
+        share = max(bounds.TOTAL_RATE / len(self._active), bounds.CLIENT_RATE_MIN)
         return min(self._config.per_second, share)
 
     def _pass_on(self, ask: Ask) -> None:
@@ -218,4 +223,4 @@ class CommandEndpoint(Endpoint):
 
     def _send(self, message: list[bytes]) -> None:
         with contextlib.suppress(zmq.ZMQError):  # the client has disconnected
-            self.socket.send_multipart(message, NOW)
+            self.socket.send_multipart(message, NO_WAIT)

@@ -24,12 +24,12 @@ from softfinger.daemon.gateway.bounds import Config
 from softfinger.daemon.wire.keys import ServerKeys, load_server
 from softfinger.daemon.wire.loop_link import repeated
 
-NOW = int(zmq.NOBLOCK)
+NO_WAIT = int(zmq.NOBLOCK)
 IN_USE = "is in use; is another softfinger running?"
 _DOMAIN = "softfinger"
 
 
-class StartAnew(SoftfingerError):
+class RestartNeeded(SoftfingerError):
     """All connections must end, and clients must reconnect. The message gives the reason."""
 
 
@@ -59,7 +59,7 @@ class Admission(ThreadAuthenticator):
         # If the authenticator fails, libzmq then rejects all clients instead of accepting them.
         socket.setsockopt(zmq.ZAP_DOMAIN, _DOMAIN.encode())
         socket.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)
-        socket.setsockopt(zmq.HANDSHAKE_IVL, int(1e3 * bounds.HANDSHAKE))
+        socket.setsockopt(zmq.HANDSHAKE_IVL, int(1e3 * bounds.HANDSHAKE_TIMEOUT))
 
     def callback(self, domain: str, key: bytes) -> bool:
         """Return True if the client with this key is accepted. The authenticator calls this."""
@@ -79,14 +79,14 @@ class Admission(ThreadAuthenticator):
 
         Raises
         ------
-        StartAnew
+        RestartNeeded
             If a key was removed or the authenticator has ended.
         """
         if now < self._look_at:
             return
-        self._look_at = now + bounds.KEYS_CHECKED
+        self._look_at = now + bounds.KEY_CHECK_INTERVAL
         if not self.is_alive():
-            raise StartAnew("the authenticator has ended")
+            raise RestartNeeded("the authenticator has ended")
         if self._folder is None or self._keys is None:
             return
         try:
@@ -95,10 +95,10 @@ class Admission(ThreadAuthenticator):
             except NoDescriptor:  # connections use them all, so new keys can't be read
                 found = self._keys.left(self._folder)
         except KeyFileError as error:
-            raise StartAnew(str(error)) from None
+            raise RestartNeeded(str(error)) from None
         gone = [name for key, name in self._keys.clients.items() if key not in found.clients]
         if gone or found.secret != self._keys.secret:
-            raise StartAnew(f"access.keys: shut out: {', '.join(gone) or 'all clients'}")
+            raise RestartNeeded(f"access.keys: shut out: {', '.join(gone) or 'all clients'}")
         self._keys = found
 
 
@@ -155,10 +155,12 @@ class Endpoint:
         """
         self.socket: zmq.Socket[Any] = admission.context.socket(kind)
         # The options affect only connections made after they were set, so set them before bind.
-        self.socket.setsockopt(zmq.LINGER, int(1e3 * bounds.LAST_WORDS))
+        self.socket.setsockopt(zmq.LINGER, int(1e3 * bounds.LINGER_TIME))
         self.socket.setsockopt(zmq.MAXMSGSIZE, limit)
-        self.socket.setsockopt(zmq.SNDHWM, bounds.QUEUE if kind == zmq.ROUTER else config.queue)
-        self.socket.setsockopt(zmq.RCVHWM, bounds.QUEUE)
+        self.socket.setsockopt(
+            zmq.SNDHWM, bounds.SOCKET_QUEUE_LENGTH if kind == zmq.ROUTER else config.queue
+        )
+        self.socket.setsockopt(zmq.RCVHWM, bounds.SOCKET_QUEUE_LENGTH)
         admission.guard(self.socket)
         try:
             self._path = bind(self.socket, address, config.ipc_mode)
@@ -171,7 +173,7 @@ class Endpoint:
         found: list[zmq.Frame] = []
         with contextlib.suppress(zmq.Again):
             while not found or found[-1].more:
-                found[bounds.PARTS :] = [self.socket.recv(NOW, copy=False)]
+                found[bounds.PART_COUNT_MAX :] = [self.socket.recv(NO_WAIT, copy=False)]
         return found
 
     def close(self) -> None:
@@ -193,13 +195,20 @@ class StreamEndpoint(Endpoint):
         self._tell_at = 0.0  # earliest time of the next repetition
         self.wanted = 0  # topics with subscribers, as bits
         super().__init__(
-            *(admission, zmq.XPUB, config.stream, config.stream_key, config, bounds.SUBSCRIPTION)
+            *(
+                admission,
+                zmq.XPUB,
+                config.stream,
+                config.stream_key,
+                config,
+                bounds.SUBSCRIPTION_SIZE_MAX,
+            )
         )
         self.socket.setsockopt(zmq.XPUB_VERBOSE, 1)  # reports each subscriber of a topic
 
     def read(self, now: float) -> None:
         """Read subscriptions, and repeat stored messages for new subscribers."""
-        for _ in range(bounds.SUBSCRIPTIONS):
+        for _ in range(bounds.SUBSCRIPTIONS_PER_TURN):
             parts = self._parts()
             if not parts:
                 break
@@ -216,7 +225,7 @@ class StreamEndpoint(Endpoint):
                 for message in kept if self._came_late >> topic & 1 else ():
                     self._send(topic, message)
             self._came_late = 0
-            self._tell_at = now + bounds.TELL_AGAIN
+            self._tell_at = now + bounds.REPEAT_INTERVAL
 
     def _matching(self, *prefixes: bytes) -> int:
         """Return the topics that begin with any of the prefixes, as bits."""
@@ -230,4 +239,4 @@ class StreamEndpoint(Endpoint):
 
     def _send(self, topic: int, message: bytes) -> None:
         """Send one message to all subscribers of its topic; slow subscribers lose it."""
-        self.socket.send_multipart((self._topics[topic], message), NOW)
+        self.socket.send_multipart((self._topics[topic], message), NO_WAIT)

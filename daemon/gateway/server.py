@@ -23,13 +23,20 @@ from softfinger.daemon.errors import AddressError, KeyFileError
 from softfinger.daemon.gateway import bounds
 from softfinger.daemon.gateway.bounds import Config
 from softfinger.daemon.gateway.commands import CommandEndpoint
-from softfinger.daemon.gateway.endpoints import NOW, Admission, Endpoint, StartAnew, StreamEndpoint
+from softfinger.daemon.gateway.endpoints import (
+    NO_WAIT,
+    Admission,
+    Endpoint,
+    RestartNeeded,
+    StreamEndpoint,
+)
 from softfinger.daemon.wire import loop_link
 from softfinger.daemon.wire.loop_link import Channel
 
-_STEPS = 0.5  # s between two restarts of the timers that end a stalled process
-_LATEST = 0  # index of the topic that is also published in one frame
-_TURN = 5e-4  # s that the authenticator thread waits for the interpreter during a flood
+_TIMER_INTERVAL = 0.5  # s between two restarts of the timers that end a stalled process
+_LATEST_TOPIC = 0  # index of the topic that is also published in one frame
+# s that the authenticator thread waits for the interpreter during a flood.
+_AUTHENTICATOR_WAIT = 5e-4
 
 
 class Server:
@@ -67,7 +74,7 @@ class Server:
             if config.latest:
                 place = config.latest, "stream.latest"
                 self._latest = Endpoint(
-                    self._admission, zmq.PUB, *place, config, bounds.SUBSCRIPTION
+                    self._admission, zmq.PUB, *place, config, bounds.SUBSCRIPTION_SIZE_MAX
                 )
             if config.commands:
                 self.commands = CommandEndpoint(self._admission, config, channel.send, clock)
@@ -76,7 +83,7 @@ class Server:
             self.close()
             raise
 
-    def step(self, seconds: float = bounds.TEND) -> None:
+    def step(self, seconds: float = bounds.STEP_WAIT_MAX) -> None:
         """Wait up to ``seconds`` for messages of the loop or of clients, and handle them."""
         self._poller.poll(int(1e3 * seconds))
         now = self._clock()
@@ -84,8 +91,8 @@ class Server:
         for kind, *fields in self.channel.receive():
             if kind == loop_link.PUBLISH and self.stream is not None:
                 self.stream.publish(*fields)
-                if self._latest is not None and fields[0] == _LATEST:
-                    self._latest.socket.send(fields[2], NOW)
+                if self._latest is not None and fields[0] == _LATEST_TOPIC:
+                    self._latest.socket.send(fields[2], NO_WAIT)
             elif kind == loop_link.REPLY and self.commands is not None:
                 self.commands.reply(*fields)
             elif kind == loop_link.FENCE and self.commands is not None:
@@ -93,7 +100,7 @@ class Server:
         wanted = refused = stops = 0
         if self.stream is not None:
             self.stream.read(now)
-            wanted = self.stream.wanted | (self._latest is not None) << _LATEST
+            wanted = self.stream.wanted | (self._latest is not None) << _LATEST_TOPIC
         if self.commands is not None:
             self.commands.read()
             refused, stops = self.commands.refused, self.commands.stops
@@ -103,7 +110,7 @@ class Server:
         self.channel.flush()
 
     def close(self) -> None:
-        """Send queued messages for up to `bounds.LAST_WORDS`, and disconnect all clients."""
+        """Send queued messages for up to `bounds.LINGER_TIME`, and disconnect all clients."""
         for endpoint in (self.stream, self._latest, self.commands):
             if endpoint is not None:
                 endpoint.close()
@@ -117,8 +124,8 @@ def main(words: list[str]) -> int:
     Returns
     -------
     int
-        0 when the loop has ended, 1 if the sockets could not be bound, `loop_link.ANEW` if all
-        clients must reconnect.
+        0 when the loop has ended, 1 if the sockets could not be bound, `loop_link.RESTART_STATUS`
+        if all clients must reconnect.
     """
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # it must still send the last messages of the loop
@@ -129,30 +136,30 @@ def main(words: list[str]) -> int:
     except (AddressError, KeyFileError) as error:
         channel.send(loop_link.FAILED, str(error))
         return 1
-    sys.setswitchinterval(_TURN)
+    sys.setswitchinterval(_AUTHENTICATOR_WAIT)
     channel.send(loop_link.READY)
     lived = 0.0
     try:
         while not channel.over:
             server.step()
             now = time.monotonic()
-            if now - lived > _STEPS:
+            if now - lived > _TIMER_INTERVAL:
                 lived = now
                 # SIGPROF and SIGALRM have no handlers, so each of them ends the process.
-                signal.setitimer(signal.ITIMER_PROF, bounds.STALLED)
-                signal.setitimer(signal.ITIMER_REAL, bounds.BLOCKED)
-    except StartAnew as reason:
+                signal.setitimer(signal.ITIMER_PROF, bounds.STEP_CPU_TIME_MAX)
+                signal.setitimer(signal.ITIMER_REAL, bounds.STEP_TIME_MAX)
+    except RestartNeeded as reason:
         channel.send(loop_link.NOTICE, str(reason))
-        return loop_link.ANEW
+        return loop_link.RESTART_STATUS
     server.close()
     return 0
 
 
 def _be_bounded() -> None:
     """Limit memory, prefer this process when memory runs out, and drop real-time scheduling."""
-    resource.setrlimit(resource.RLIMIT_DATA, (bounds.MEMORY, bounds.MEMORY))
+    resource.setrlimit(resource.RLIMIT_DATA, (bounds.MEMORY_MAX, bounds.MEMORY_MAX))
     _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
-    wanted = bounds.CLIENTS + bounds.DESCRIPTORS
+    wanted = bounds.CLIENT_COUNT_MAX + bounds.DESCRIPTOR_COUNT
     if most != resource.RLIM_INFINITY:
         wanted = min(wanted, most)
     resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, most))

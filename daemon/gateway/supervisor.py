@@ -17,10 +17,11 @@ from softfinger.daemon.wire import loop_link
 from softfinger.daemon.wire.loop_link import Channel, Link
 
 _ROOT = Path(__file__).parents[3]  # folder that contains the package
-_PATIENCE = 60.0  # s, timeout for binding the sockets, unless the process ends before
-_LASTED = 10.0  # s of running after which the restart delay is reset
-_LOOK, _LOOKS = 1.0, 2  # s between checks; a process found stopped this many times is killed
-_AGAIN = 0.1, 2.0  # s from an exit to the next start: first delay, longest delay
+_BIND_TIMEOUT = 60.0  # s, timeout for binding the sockets, unless the process ends before
+_STABLE_TIME = 10.0  # s of running after which the restart delay is reset
+# s between checks; a process found stopped this many times is killed.
+_CHECK_INTERVAL, _STOPPED_COUNT_MAX = 1.0, 2
+_RESTART_DELAYS = 0.1, 2.0  # s from an exit to the next start: first delay, longest delay
 
 
 class Gateway:
@@ -64,7 +65,7 @@ class Gateway:
 
     def _meet(self) -> None:
         """Wait until the process has bound its sockets. Raises AddressError."""
-        select.select([self._channel], [], [], _PATIENCE)
+        select.select([self._channel], [], [], _BIND_TIMEOUT)
         for kind, *fields in self._channel.receive():
             if kind == loop_link.READY:
                 self.link.offer(self._channel)
@@ -73,17 +74,17 @@ class Gateway:
         raise AddressError("the process that serves clients could not be started")
 
     def _watch(self) -> None:
-        wait, longest = _AGAIN
+        wait, longest = _RESTART_DELAYS
         while True:
             began = time.monotonic()
             status = self._wait()
             if self._closing.is_set():
                 return
-            if status != loop_link.ANEW:
+            if status != loop_link.RESTART_STATUS:
                 cause = f"signal {-status}" if status < 0 else f"status {status}"
                 self.link.notices.append(f"the process that serves clients ended ({cause})")
-            if time.monotonic() - began > _LASTED:
-                wait = _AGAIN[0]
+            if time.monotonic() - began > _STABLE_TIME:
+                wait = _RESTART_DELAYS[0]
             error_before = ""
             while not self._closing.wait(wait):
                 wait = min(2.0 * wait, longest)
@@ -105,10 +106,10 @@ class Gateway:
         process, stopped = self._process, 0
         while True:
             try:
-                return process.wait(_LOOK)
+                return process.wait(_CHECK_INTERVAL)
             except subprocess.TimeoutExpired:
                 stopped = stopped + 1 if _is_stopped(process.pid) else 0
-            if stopped == _LOOKS:
+            if stopped == _STOPPED_COUNT_MAX:
                 self.link.notices.append("the process that serves clients was stopped")
                 process.kill()
 

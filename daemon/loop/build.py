@@ -26,13 +26,13 @@ from softfinger.daemon.profile.factory import make_material, make_table
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.base import Servos, make_servos
 from softfinger.daemon.tactile.base import TactileSensor, make_sensor
-from softfinger.daemon.types import FINGERS, HandFacts
+from softfinger.daemon.types import FINGERS, HandInfo
 from softfinger.daemon.wire.command_server import CommandServer
 from softfinger.daemon.wire.local_stop import LocalStop
 from softfinger.daemon.wire.publisher import GATEWAY_TOPICS, Publisher
 from softfinger.kinematics.contact.table import ContactTable
 
-_LOOK_AGAIN = 0.2  # s between two connection attempts
+_RETRY_INTERVAL = 0.2  # s between two connection attempts
 
 if TYPE_CHECKING:
     from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
@@ -96,7 +96,9 @@ class Daemon:
         self.loop = Loop(settings, self.clock, self.servos, perception, publisher, server, on_event)
         self.loop.publish_truth(self.hand)
         if publisher is not None:
-            publisher.settings(self.clock.wall(), self.clock.now(), facts(settings, self.models))
+            publisher.settings(
+                self.clock.wall(), self.clock.now(), hand_info(settings, self.models)
+            )
 
     def _connect(self, servos: Servos, on_event: EventSink | None) -> None:
         """Connect, retrying for up to ``servos.open_timeout`` while servos do not answer."""
@@ -113,7 +115,7 @@ class Daemon:
                     text = f"{silent}; waiting up to servos.open_timeout = {patience:g} s"
                     on_event("warning", "servos", text)
                     told = True
-            time.sleep(_LOOK_AGAIN)
+            time.sleep(_RETRY_INTERVAL)
 
     def _bind(self) -> tuple[Publisher, CommandServer]:
         stream, commands = self.settings.stream, self.settings.commands
@@ -189,7 +191,7 @@ class Daemon:
         self.close()
 
 
-def facts(settings: Settings, models: tuple[FingerModel, FingerModel]) -> HandFacts:
+def hand_info(settings: Settings, models: tuple[FingerModel, FingerModel]) -> HandInfo:
     """Return the settings, calibrations and table errors that each subscriber receives once."""
     calibrations = [
         "" if model.calibration is None else model.calibration.model_dump_json() for model in models
@@ -204,4 +206,4 @@ def facts(settings: Settings, models: tuple[FingerModel, FingerModel]) -> HandFa
         )
         for model in models
     ]
-    return HandFacts(__version__, settings.model_dump_json(), *calibrations, *tables)
+    return HandInfo(__version__, settings.model_dump_json(), *calibrations, *tables)

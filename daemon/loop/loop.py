@@ -12,9 +12,9 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 from softfinger.daemon.clock import LoopClock
-from softfinger.daemon.control.modes import GRIPPING, Mode
+from softfinger.daemon.control.modes import GRIPPING_MODES, Mode
 from softfinger.daemon.control.state_machine import Control
-from softfinger.daemon.control.task import Task, TaskOver
+from softfinger.daemon.control.task import Task, TaskEnded
 from softfinger.daemon.errors import Refused, ServoError
 from softfinger.daemon.loop.publishing import Publishing
 from softfinger.daemon.loop.requests import Requests
@@ -31,17 +31,18 @@ from softfinger.daemon.wire.publisher import Publisher
 
 EventSink = Callable[[str, str, str], None]
 
-_START_AGE = 0.2  # s, age limit of commands that stiffen or move the hand, except holds in a grip
+# s, age limit of commands that stiffen or move the hand, except holds in a grip.
+_START_AGE_MAX = 0.2
 
 
-def start_age(settings: Settings, waits: bool) -> float:
+def command_age_max(settings: Settings, waits: bool) -> float:
     """Return the maximum age [s] of a command that stiffens or moves the hand.
 
     An older command may predate a stop by the servo watchdog, which leaves the hand in another
     state. With ``waits``, the servos' time and their watchdog pause while this machine is late.
     """
     watchdog = 0.0 if settings.simulated or waits else settings.servos.watchdog
-    return min(_START_AGE, watchdog or _START_AGE)
+    return min(_START_AGE_MAX, watchdog or _START_AGE_MAX)
 
 
 class Commands(Protocol):
@@ -97,11 +98,11 @@ class Loop:
             self.torque,
             perception,
             self.emit,
-            start_age(settings, clock.waits),
+            command_age_max(settings, clock.pauses_when_late),
         )
         self._after_opening: Breach | None = None  # fault to latch once the hand is open
         self.statistics = Statistics()
-        self._lateness = Lateness(settings, self.state.timing, clock.waits)
+        self._lateness = Lateness(settings, self.state.timing, clock.pauses_when_late)
         self._publishing = None
         if publisher is not None:
             self._publishing = Publishing(settings, publisher, sensors, self.statistics)
@@ -227,9 +228,9 @@ class Loop:
             reading.valid = False
             state.read_error = str(error)
             self._fail(str(error))
-        self._heat.follow()
+        self._heat.update()
         if reading.valid and self.perception.fingers:
-            gripping = state.mode in GRIPPING and state.goal.valid
+            gripping = state.mode in GRIPPING_MODES and state.goal.valid
             self.perception.filter.predict(reading, state.goal if gripping else None)
 
     def _decide(self) -> None:
@@ -253,7 +254,7 @@ class Loop:
             self._react(breach)
         if self._heat.due and (action := self._heat.act(control, control.events)):
             self._requests.end_grip(action)
-        if self._safety.must_hold and state.mode in GRIPPING:
+        if self._safety.must_hold and state.mode in GRIPPING_MODES:
             control.hold_goal(state.goal)
         else:
             control.step(self.period, state.goal)
@@ -340,9 +341,9 @@ class Loop:
             request = task.next(self.state, self.period)
             if request is not None:
                 self.command(request, by_task=True)
-        except (TaskOver, Refused) as reason:
-            if task.lasting:
-                self.emit("warning", "task", task.begin_again(self.state, str(reason)))
+        except (TaskEnded, Refused) as reason:
+            if task.restarts:
+                self.emit("warning", "task", task.restart(self.state, str(reason)))
             else:
                 self._end_task(str(reason))
 

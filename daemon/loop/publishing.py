@@ -11,7 +11,7 @@ from __future__ import annotations
 from softfinger.daemon.loop.timing import Statistics
 from softfinger.daemon.perception.perception import FingerPerception
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.types import Frame, Parts, State, Truth
+from softfinger.daemon.types import Frame, SceneParts, State, Truth
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.publisher import Publisher, bit
 from softfinger.daemon.wire.schema import Rates
@@ -28,12 +28,12 @@ def every(rate: float, wanted: float) -> int:
     return max(round(rate / wanted), 1)
 
 
-def parts(settings: Settings) -> Parts:
+def parts(settings: Settings) -> SceneParts:
     """Return the parts that the scene of these settings has."""
-    return Parts(
+    return SceneParts(
         fingers=("left" in settings.scene.fingers, "right" in settings.scene.fingers),
-        servos=settings.servos.backend != "none",
-        sensors=settings.tactile.backend != "none",
+        has_servos=settings.servos.backend != "none",
+        has_sensors=settings.tactile.backend != "none",
     )
 
 
@@ -102,14 +102,14 @@ class Publishing:
         wall = state.wall - (state.t - frame.t_sample)
         data = perception.published()
         number = self._numbers[perception.finger]
-        sensor = perception.finger, perception.facts
+        sensor = perception.finger, perception.info
         self._publisher.send(schema.TACTILE, frame, data, *sensor, wall, n, number)
 
     def _rates(self, state: State) -> Rates:
         """Return the rates [Hz] since the previous call, by machine time."""
         frames = [0, 0]
         for perception in self._perceptions:
-            frames[perception.finger] = perception.frames
+            frames[perception.finger] = perception.frame_count
         t = state.t + state.timing.behind_s
         last, self._counted = self._counted, (t, state.seq, *frames, self._states, self._maps)
         dt, *counts = (now - before for now, before in zip(self._counted, last, strict=True))

@@ -22,19 +22,21 @@ from functools import partial
 from softfinger.daemon.profile.settings import Settings
 
 _SWITCH_INTERVAL = 2e-4  # s
-_SHARE = 0.25  # interval of keep-alive messages, as a fraction of the watchdog time
+_KEEP_ALIVE_FRACTION = 0.25  # interval of keep-alive messages, as a fraction of the watchdog time
 _NEVER = float("inf")
-_LATENCY = "/dev/cpu_dma_latency"
+_LATENCY_DEVICE = "/dev/cpu_dma_latency"
 
 # Commands that grant a user the requested permissions.
-_LIMITS = "/etc/security/limits.d/softfinger.conf"
-_RULE = "/etc/udev/rules.d/99-softfinger.rules"
-_LATENCY_RULE = 'KERNEL=="cpu_dma_latency", GROUP="dialout", MODE="0660"'
+_LIMITS_FILE = "/etc/security/limits.d/softfinger.conf"
+_UDEV_RULE_FILE = "/etc/udev/rules.d/99-softfinger.rules"
+_LATENCY_UDEV_RULE = 'KERNEL=="cpu_dma_latency", GROUP="dialout", MODE="0660"'
 
-GRANT_PRIORITY = f'echo "$USER - rtprio 80" | sudo tee -a {_LIMITS}, then log in again'
-GRANT_MEMORY_LOCK = f'echo "$USER - memlock unlimited" | sudo tee -a {_LIMITS}, then log in again'
+GRANT_PRIORITY = f'echo "$USER - rtprio 80" | sudo tee -a {_LIMITS_FILE}, then log in again'
+GRANT_MEMORY_LOCK = (
+    f'echo "$USER - memlock unlimited" | sudo tee -a {_LIMITS_FILE}, then log in again'
+)
 GRANT_LATENCY = (
-    f"echo '{_LATENCY_RULE}' | sudo tee -a {_RULE} && sudo udevadm control --reload "
+    f"echo '{_LATENCY_UDEV_RULE}' | sudo tee -a {_UDEV_RULE_FILE} && sudo udevadm control --reload "
     "&& sudo udevadm trigger /dev/cpu_dma_latency"
 )
 
@@ -46,7 +48,7 @@ _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 # their argument struct sched_attr: size, policy, flags, nice, priority, runtime, deadline, period.
 _ATTRIBUTE_CALLS = {"x86_64": (314, 315), "aarch64": (274, 275)}
 _ATTRIBUTES = struct.Struct("=IIQiIQQQ")
-_SHORTEST, _LONGEST = 100_000, 100_000_000  # ns, range of slices that the kernel accepts
+_SLICE_MIN, _SLICE_MAX = 100_000, 100_000_000  # ns, range of slices that the kernel accepts
 
 
 class RealTime:
@@ -68,7 +70,7 @@ class RealTime:
         if wanted.priority:
             self._schedule(wanted.priority)
         if wanted.slice:
-            self._shorten_slice(min(max(round(wanted.slice * 1e9), _SHORTEST), _LONGEST))
+            self._shorten_slice(min(max(round(wanted.slice * 1e9), _SLICE_MIN), _SLICE_MAX))
         if wanted.cpus:
             self._keep_to_processors(wanted.cpus)
         if wanted.lock_memory:
@@ -200,16 +202,18 @@ class RealTime:
     def _hold_latency(self) -> None:
         """Keep processors out of deep idle states while the file stays open."""
         try:
-            descriptor = os.open(_LATENCY, os.O_WRONLY | os.O_CLOEXEC)
+            descriptor = os.open(_LATENCY_DEVICE, os.O_WRONLY | os.O_CLOEXEC)
         except OSError as error:
-            text = f"{_LATENCY} refused ({error.strerror}): wake-ups take what idle states take"
+            text = (
+                f"{_LATENCY_DEVICE} refused ({error.strerror}): wake-ups take what idle states take"
+            )
             self._refused(text, "" if isinstance(error, FileNotFoundError) else GRANT_LATENCY)
             return
         try:
             os.write(descriptor, bytes(4))
         except OSError as error:
             os.close(descriptor)
-            self._refused(f"{_LATENCY} refused ({error.strerror})")
+            self._refused(f"{_LATENCY_DEVICE} refused ({error.strerror})")
         else:
             self._granted("idle states held off", partial(os.close, descriptor))
 
@@ -258,7 +262,7 @@ class Service:
         """
         # A name that begins with @ denotes an abstract socket, whose first byte is zero.
         self._address = "\0" + address[1:] if address.startswith("@") else address
-        self._every = watchdog * _SHARE if watchdog > 0.0 else _NEVER
+        self._every = watchdog * _KEEP_ALIVE_FRACTION if watchdog > 0.0 else _NEVER
         self._due = -_NEVER
         self._ready = False
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)

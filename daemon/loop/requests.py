@@ -12,20 +12,26 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from softfinger.daemon.control.envelope import Envelope
-from softfinger.daemon.control.fingers import off_range
-from softfinger.daemon.control.modes import COMMANDS, GRIPPING, HARMLESS, HELD, Mode
+from softfinger.daemon.control.fingers import range_text
+from softfinger.daemon.control.modes import (
+    COMMANDS,
+    GRIPPING_MODES,
+    HOLDING_MODES,
+    SAFE_COMMANDS,
+    Mode,
+)
 from softfinger.daemon.control.state_machine import Control
 from softfinger.daemon.errors import Reason, Refused, ServoError, TactileError
 from softfinger.daemon.perception.perception import Perception
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.safety.safety import Safety
 from softfinger.daemon.safety.torque_state import TorqueState
-from softfinger.daemon.types import FINGERS, GRIP_FRACTION, UNLEASED, State
+from softfinger.daemon.types import FINGERS, GRIP_FRACTION, NO_LEASE_COMMANDS, State
 
-LONGEST_AGE = 1.0  # s, age limit of every command except status and stop
-_COMPLIANCE = (0.01, 1.0)  # rad/(N·m)
-_ENVELOPE = frozenset({"command", "client"})
-_FIRST = {Mode.DISARMED: "arm first", Mode.FAULT: "clear the fault first"}
+AGE_MAX = 1.0  # s, age limit of every command except status and stop
+_COMPLIANCE_RANGE = (0.01, 1.0)  # rad/(N·m)
+_ENVELOPE_KEYS = frozenset({"command", "client"})
+_MODE_REMEDIES = {Mode.DISARMED: "arm first", Mode.FAULT: "clear the fault first"}
 
 
 class Command(NamedTuple):
@@ -45,7 +51,7 @@ def parse(request: dict[str, Any], mode: Mode) -> Command:
     if not isinstance(client, str) or len(client) > 64:
         raise _malformed("client: expected a text of at most 64 characters")
     heard, parameters = COMMANDS[name]
-    unknown = sorted(set(request) - _ENVELOPE - set(parameters))
+    unknown = sorted(set(request) - _ENVELOPE_KEYS - set(parameters))
     if unknown:
         known = ", ".join(parameters) or "no parameters"
         raise _malformed(f"{name}: unknown parameter {unknown[0][:40]!r}; expected {known}")
@@ -62,7 +68,7 @@ def parse(request: dict[str, Any], mode: Mode) -> Command:
             raise _malformed(f"{name}: {key}: expected a finite number, found {value}")
         numbers[key] = float(value)
     if mode not in heard:
-        hint = _FIRST.get(mode) or f"possible while {', '.join(sorted(heard))}"
+        hint = _MODE_REMEDIES.get(mode) or f"possible while {', '.join(sorted(heard))}"
         if name == "clear":
             hint = "there is no fault"
         raise Refused(f"{name}: not while {mode.value}; {hint}", Reason.MODE)
@@ -87,7 +93,7 @@ class Lease:
 
     def check(self, command: Command, now: float) -> None:
         """Raise Refused while another client has the lease."""
-        if command.name in UNLEASED:
+        if command.name in NO_LEASE_COMMANDS:
             return
         if now < self._until and command.client != self._owner:
             owner = self._owner or "an unnamed client"
@@ -106,7 +112,7 @@ class Lease:
 
     def renew(self, command: Command, now: float) -> None:
         """Take or extend the lease after a command was executed."""
-        if command.name not in UNLEASED:
+        if command.name not in NO_LEASE_COMMANDS:
             self._owner = command.client
             self._until = now + self.seconds
 
@@ -123,16 +129,16 @@ class Requests:
         torque: TorqueState,
         perception: Perception,
         emit: Callable[[str, str, str], None],
-        start_age: float = math.inf,
+        command_age_max: float = math.inf,
     ) -> None:
         """Prepare to execute requests.
 
         Parameters
         ----------
         emit : sends an event
-        start_age : maximum age [s] of a command that can stiffen or move the hand
+        command_age_max : maximum age [s] of a command that can stiffen or move the hand
         """
-        self._start_age = start_age
+        self._command_age_max = command_age_max
         self._settings = settings
         self._state = state
         self._control = control
@@ -182,7 +188,7 @@ class Requests:
         if name in ("clear", "arm"):
             self._reopen(name)
         self._check(name, numbers)
-        begins = control.mode not in GRIPPING
+        begins = control.mode not in GRIPPING_MODES
         angle = self._handlers[name](**numbers)
         self._lease.renew(command, state.t)
         reply: dict[str, Any] = {"mode": control.mode.value}
@@ -215,7 +221,7 @@ class Requests:
         if action == "stop" and control.torque:
             control.stop()
             self._torque.off()
-        elif action == "release" and control.mode in GRIPPING | {Mode.MOVING}:
+        elif action == "release" and control.mode in GRIPPING_MODES | {Mode.MOVING}:
             control.release()
         else:
             return False
@@ -229,8 +235,8 @@ class Requests:
         """
         if name == "status":
             return
-        streamed = name == "hold" and self._control.mode in GRIPPING
-        longest = LONGEST_AGE if streamed or name in HARMLESS else self._start_age
+        streamed = name == "hold" and self._control.mode in GRIPPING_MODES
+        longest = AGE_MAX if streamed or name in SAFE_COMMANDS else self._command_age_max
         if age > longest:
             text = f"{name}: {age:.2f} s old when its turn came, at most {longest:g} s is allowed"
             raise Refused(f"{text}; send it again", Reason.LATE)
@@ -249,7 +255,7 @@ class Requests:
                 Reason.STATE,
                 "the servos have not confirmed torque off yet: check their cable and their power",
             )
-        begins = name == "grasp" or (name == "hold" and self._control.mode not in GRIPPING)
+        begins = name == "grasp" or (name == "hold" and self._control.mode not in GRIPPING_MODES)
         if begins or name in ("arm", "clear"):
             cause = self._safety.cause(state, gripping=name != "arm")
             refuse_if(cause, Reason.STATE, cause)
@@ -269,7 +275,7 @@ class Requests:
         elif name == "hold":
             refuse_if(not numbers, Reason.REQUEST, "force or angle is missing")
         if begins:
-            taring = any(perception.taring for perception in fingers)
+            taring = any(perception.is_taring for perception in fingers)
             refuse_if(taring, Reason.STATE, "tare is still at work")
             text = "each finger needs a tactile sensor in this scene"
             refuse_if(not fingers, Reason.SCENE, text)
@@ -285,11 +291,11 @@ class Requests:
             turns = len(settings.scene.fingers) == 2 and settings.scene.object_model
             text = "needs both fingers and the object model in the scene"
             refuse_if(not turns, Reason.SCENE, text)
-            if self._control.mode in HELD and (name == "rotate" or not state.object.valid):
-                text = self._control.fingers.why_not_turn(numbers["angle"])
+            if self._control.mode in HOLDING_MODES and (name == "rotate" or not state.object.valid):
+                text = self._control.fingers.turn_refusal(numbers["angle"])
                 refuse_if(text, Reason.BOUNDS if state.object.valid else Reason.STATE, text)
         if name == "set":
-            compliance, (low, high) = numbers["compliance"], _COMPLIANCE
+            compliance, (low, high) = numbers["compliance"], _COMPLIANCE_RANGE
             text = f"compliance: found {compliance:g} rad/(N·m), expected {low:g} to {high:g}"
             refuse_if(not low <= compliance <= high, Reason.BOUNDS, text)
 
@@ -302,7 +308,7 @@ class Requests:
                 raise Refused(f"move: this scene has no {name} finger", Reason.SCENE)
             low, high = hand.q_min[index], hand.q_max[index]
             if not low <= q <= high:
-                raise Refused(f"move: {name}: {off_range(q, low, high)}", Reason.BOUNDS)
+                raise Refused(f"move: {name}: {range_text(q, low, high)}", Reason.BOUNDS)
 
     def _reconnect(self) -> None:
         """Reconnect servos that have stopped answering. Only a ``clear`` command does this.

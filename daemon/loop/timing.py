@@ -23,20 +23,24 @@ from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 TIMES = ("wake", "compute", "bus", "publish")
 QUANTILES = (0.5, 0.99, 0.999)
 
-_LOWEST = -29  # lower edge of the first bin, 2^-30 s = 0.93 ns; shorter times are counted there
+# Lower edge of the first bin, 2^-30 s = 0.93 ns; shorter times are counted there.
+_LOWEST_EXPONENT = -29
 _OCTAVES = 36  # up to 64 s; longer times are counted in the last bin
-_PARTS = 32  # bins per octave
-_BINS = _OCTAVES * _PARTS
-_EDGES = np.ldexp(
-    0.5 + 0.5 * np.arange(1, _PARTS + 1) / _PARTS, np.arange(_OCTAVES)[:, None] + _LOWEST
+_BINS_PER_OCTAVE = 32  # bins per octave
+_BIN_COUNT = _OCTAVES * _BINS_PER_OCTAVE
+_BIN_EDGES = np.ldexp(
+    0.5 + 0.5 * np.arange(1, _BINS_PER_OCTAVE + 1) / _BINS_PER_OCTAVE,
+    np.arange(_OCTAVES)[:, None] + _LOWEST_EXPONENT,
 )
-_UPPER = np.append(_EDGES.ravel()[:-1], np.inf)  # upper edge of each bin; the last bin is unbounded
+# Upper edge of each bin; the last bin is unbounded.
+_UPPER_EDGES = np.append(_BIN_EDGES.ravel()[:-1], np.inf)
 
-LATE = 0.05  # s, smallest lateness that is reported
-EVERY = 60.0  # s, minimum time between reports; the reported lateness at least doubles each time
-RECENT = 0.25  # s after a late tick during which a fault may be attributed to it
+LATENESS_MIN = 0.05  # s, smallest lateness that is reported
+# s, minimum time between reports; the reported lateness at least doubles each time.
+REPORT_INTERVAL = 60.0
+ATTRIBUTION_TIME = 0.25  # s after a late tick during which a fault may be attributed to it
 # Limits that a late tick alone can break.
-_BY_TIME = frozenset({"servos.bus", "servos.silent", "tactile.silent", "loop.overruns"})
+_TIME_LIMITS = frozenset({"servos.bus", "servos.silent", "tactile.silent", "loop.overruns"})
 
 Event = tuple[str, str, str]
 Counts = NDArray[np.int64]
@@ -48,8 +52,10 @@ def _bin(value: float) -> int:
     if not value > 0.0:
         return 0
     mantissa, exponent = math.frexp(value)  # 0.5 ≤ mantissa < 1
-    place = (exponent - _LOWEST) * _PARTS + int((mantissa - 0.5) * 2.0 * _PARTS)
-    return min(max(place, 0), _BINS - 1)
+    place = (exponent - _LOWEST_EXPONENT) * _BINS_PER_OCTAVE + int(
+        (mantissa - 0.5) * 2.0 * _BINS_PER_OCTAVE
+    )
+    return min(max(place, 0), _BIN_COUNT - 1)
 
 
 @kernel
@@ -67,7 +73,7 @@ class Statistics:
     """Hold the histograms of one loop. The loop passes both arrays to `record` once per tick."""
 
     def __init__(self) -> None:
-        self.counts: Counts = np.zeros((len(TIMES), _BINS), np.int64)
+        self.counts: Counts = np.zeros((len(TIMES), _BIN_COUNT), np.int64)
         self.largest: FloatArray = np.zeros(len(TIMES))
         record(self.counts, self.largest, (0.0, 0.0, 0.0, 0.0))  # compiles before the first tick
         self.counts[:] = 0
@@ -83,7 +89,7 @@ class Statistics:
         for name, until, largest in zip(
             TIMES, self.counts.cumsum(axis=1), self.largest, strict=True
         ):
-            upper = _UPPER[until.searchsorted(until[-1] * np.array(QUANTILES))]
+            upper = _UPPER_EDGES[until.searchsorted(until[-1] * np.array(QUANTILES))]
             p50, p99, p999 = np.minimum(upper, largest).tolist()
             spreads[name] = TimeSpread(p50, p99, p999, float(largest))
         return spreads
@@ -120,16 +126,16 @@ class Lateness:
         """
         timing = self._timing
         gap = 0.0 if own_doing else timing.tick_s - self._period
-        if gap > LATE:
-            timing.busy_s, self._busy_until = gap, t + RECENT
+        if gap > LATENESS_MIN:
+            timing.busy_s, self._busy_until = gap, t + ATTRIBUTION_TIME
         elif t > self._busy_until:
             timing.busy_s = 0.0
         if self._waits:  # the hand will also wait for this tick's lateness before the next one
             self._sum = timing.behind_s + max(timing.wake_late_s - self._period, 0.0)
-        elif gap > LATE:
+        elif gap > LATENESS_MIN:
             self._sum += gap
         new = self._sum - self._reported[0]
-        if new > max(LATE, self._reported[0]) and t - self._reported[1] > EVERY:
+        if new > max(LATENESS_MIN, self._reported[0]) and t - self._reported[1] > REPORT_INTERVAL:
             self._reported = (self._sum, t)
             return "warning", "late", self._text(new)
         return None
@@ -148,9 +154,9 @@ class Lateness:
         at_work : time that the current tick has taken so far [s]
         """
         timing = self._timing
-        if self._waits or name not in _BY_TIME:
+        if self._waits or name not in _TIME_LIMITS:
             return text
-        if at_work > max(timing.busy_s, LATE):
+        if at_work > max(timing.busy_s, LATENESS_MIN):
             timing.busy_s = at_work
         if not timing.busy_s:
             return text

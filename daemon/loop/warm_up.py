@@ -27,7 +27,7 @@ from softfinger.kinematics.hand.grasp_state import total_tilt
 from softfinger.kinematics.hand.servo_heat import (
     HeatState,
     follow,
-    lasting_square,
+    sustained_square,
     time_to_limit,
     winding_std,
 )
@@ -196,7 +196,7 @@ def _joints(scene: WantedScene) -> None:
         follow(heat.array, 1.0, 0.5, 25.0)
     winding_std(heat.array)
     time_to_limit(heat.array, 1.0, 70.0)
-    lasting_square(heat.array, 70.0)
+    sustained_square(heat.array, 70.0)
     Setpoint(1.0 / scene.settings.loop.rate, scene.settings.control.smooth_time, SetpointState())
     Statistics()
 

@@ -37,12 +37,12 @@ from softfinger.daemon.perception.hand_state import (
     TORQUE,
     D,
     HandFilter,
-    Past,
-    begin,
+    HistoryRow,
     correct,
-    expected_variance,
     interpolate,
+    predicted_variance,
     reset,
+    reset_all,
 )
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 from softfinger.kinematics.compiled.layout import Records
@@ -58,21 +58,21 @@ ANGLE_JUMP = 0.12  # rad; correct frames stay within 0.04 of the prediction
 D_JUMP = 1e-3  # m
 REJECTED_MAX = 2  # rejected frames in a row before the sensor is reported
 _OUTLIER_GATE = 5.0
-_SUPPORT = 0.5  # part of a jump that the other tip must show as well to support it
+_JUMP_SUPPORT = 0.5  # part of a jump that the other tip must show as well to support it
 _SPEED_SUPPORT = 0.1  # rad/s, speed of the joints that supports a rotation
-_CONTINUES = 0.06  # rad from frame to frame, a rotation that goes on
-_RESTART = 50  # rejected frames after which the contact starts again from the frames
-_FIRM = 1.0  # N on each tip; below, an object may rock between the tips
-_RATE_TIME = 0.005  # s, least interval over which rates of d and θ are computed
+_CONTINUED_ROTATION = 0.06  # rad from frame to frame, a rotation that goes on
+_RESTART_COUNT = 50  # rejected frames after which the contact starts again from the frames
+_NORMAL_FORCE_MIN = 1.0  # N on each tip; below, an object may rock between the tips
+_RATE_INTERVAL_MIN = 0.005  # s, least interval over which rates of d and θ are computed
 # A footprint that grows within the response of the cells looks wider and flatter: relative change
 # per var(d)/d², from the fit of a paraboloid to a mean of paraboloids.
-_WIDER, _FLATTER, _SPREAD_MAX = 1.4, 2.0, 0.1
-_SLOPE_KEPT = 0.9  # low-pass filter of ∂ ln F/∂d from frame to frame
+_WIDENING, _FLATTENING, _SPREAD_MAX = 1.4, 2.0, 0.1
+_SLOPE_SMOOTHING = 0.9  # low-pass filter of ∂ ln F/∂d from frame to frame
 _AMPLITUDE_ERROR = 0.02  # relative, of the pressure model
-_AMPLITUDES = 1e-3, 1e3  # bounds of a frame's amplitude over the model's
+_AMPLITUDE_RANGE = 1e-3, 1e3  # bounds of a frame's amplitude over the model's
 _FIRST_D_ERROR = 0.5  # prior of the first d of a contact, relative
 _FIRST_ANGLE_ERROR = 1.0  # rad, prior of the first angle
-_LOAD = 0.05  # N·m, standard deviation of a load on the object before it is gripped
+_LOAD_STD = 0.05  # N·m, standard deviation of a load on the object before it is gripped
 
 
 class FrameContact(NamedTuple):
@@ -85,7 +85,7 @@ class FrameContact(NamedTuple):
     shear: float
 
 
-class PastMotion(NamedTuple):
+class FingerMotion(NamedTuple):
     """Integrals of the predicted motion of one finger at one time."""
 
     d: float
@@ -96,7 +96,7 @@ class PastMotion(NamedTuple):
 
 
 @inner_kernel
-def _motion_at(history: Records[Past], newest: int, t: float, finger: int) -> PastMotion:
+def _motion_at(history: Records[HistoryRow], newest: int, t: float, finger: int) -> FingerMotion:
     """Interpolate the history at time ``t``; beyond its ends, return the end."""
     size = len(history)
     before = after = newest
@@ -114,7 +114,7 @@ def _motion_at(history: Records[Past], newest: int, t: float, finger: int) -> Pa
         after = row
     first = history[before]
     last = history[after]
-    return PastMotion(
+    return FingerMotion(
         interpolate(first.d[finger], last.d[finger], fraction),
         interpolate(first.spread[finger], last.spread[finger], fraction),
         interpolate(first.angle, last.angle, fraction),
@@ -125,20 +125,20 @@ def _motion_at(history: Records[Past], newest: int, t: float, finger: int) -> Pa
 
 @inner_kernel
 def _rates(
-    h: HandFilter, history: Records[Past], finger: int, scan: float, sense: float
+    h: HandFilter, history: Records[HistoryRow], finger: int, scan: float, sense: float
 ) -> tuple[float, float]:
     """Return the rates of d [m/s] and θ [rad/s] at the ``scan``: their slopes by the latency.
 
     They are secants over one standard deviation of the latency, since the joints may have stopped
     meanwhile. Rates within the resolution of the velocities are 0.
     """
-    span = max(math.sqrt(max(h.covariance[LATENCY, LATENCY], 0.0)), _RATE_TIME)
-    early = _motion_at(history, h.newest, scan - span, finger)
+    span = max(math.sqrt(max(h.covariance[LATENCY, LATENCY], 0.0)), _RATE_INTERVAL_MIN)
+    first = _motion_at(history, h.newest_row, scan - span, finger)
     end = min(scan + span, h.t)
-    late = _motion_at(history, h.newest, end, finger)
-    span = max(end - (scan - span), _RATE_TIME)
-    d_rate = (late.d - early.d) / span
-    theta_rate = (late.angle - early.angle - sense * (late.q - early.q)) / span
+    last = _motion_at(history, h.newest_row, end, finger)
+    span = max(end - (scan - span), _RATE_INTERVAL_MIN)
+    d_rate = (last.d - first.d) / span
+    theta_rate = (last.angle - first.angle - sense * (last.q - first.q)) / span
     if abs(d_rate) < h.velocity_unit * h.length:
         d_rate = 0.0
     if abs(theta_rate) < 2.0 * h.velocity_unit:
@@ -170,7 +170,7 @@ def _set_footprint_slopes(h: HandFilter, finger: int, d_rate: float) -> None:
 @kernel
 def update(
     hands: Records[HandFilter],
-    history: Records[Past],
+    history: Records[HistoryRow],
     finger: int,
     t: float,
     found: FrameContact,
@@ -193,7 +193,7 @@ def update(
     theta_noise = covariance[1, 1] - systematic[1, 1]
     sense = -1.0 if finger == 0 else 1.0
     scan = t - h.mean[LATENCY]
-    at_scan = _motion_at(history, h.newest, scan, finger)
+    at_scan = _motion_at(history, h.newest_row, scan, finger)
     d_rate, theta_rate = _rates(h, history, finger, scan, sense)
     d_since = tip.travel[0] - at_scan.d
     q_since = tip.travel[1] - at_scan.q
@@ -202,35 +202,35 @@ def update(
     is_fitted = covariance[3, 3] > 0.0
     gain_is_fixed = not (is_fitted or h.gain_is_known)
     tilt = total_tilt(found.theta, found.tilt_y)
-    shown, _, stiffness, _, _, _, _ = lookup(table, found.d, tilt)
-    log_slope = stiffness / shown
+    frame_force, _, stiffness, _, _, _, _ = lookup(table, found.d, tilt)
+    log_slope = stiffness / frame_force
     d = found.d
     gain = found.gain
     if is_fitted:
         spread = min(at_scan.spread / (d * d), _SPREAD_MAX)
-        gain /= at_scan.relaxation * (1.0 - _FLATTER * spread)
-        d /= 1.0 + _WIDER * spread
+        gain /= at_scan.relaxation * (1.0 - _FLATTENING * spread)
+        d /= 1.0 + _WIDENING * spread
     elif h.gain_is_known:
         d -= math.log(at_scan.relaxation) / log_slope
-    begins = not tip.in_contact
-    if begins:
+    is_new_contact = not tip.in_contact
+    if is_new_contact:
         tip.touch_time = h.t
         _begin_contact(h, finger, sense, face + rotation_since)
     # Cells that still respond to the touch show motion from before it, which no history has.
-    is_responding = h.t - tip.touch_time < h.response
-    if begins or is_responding:
+    cells_respond = h.t - tip.touch_time < h.response
+    if is_new_contact or cells_respond:
         reset(h, D + finger, d + d_since, (_FIRST_D_ERROR * d) ** 2)
-    d_then = h.mean[D + finger] - d_since
-    angle_then = h.mean[ANGLE] + 0.5 * sense * h.mean[TAPER] - rotation_since
-    angle_innovation = face - (angle_then + h.mean[ANGLE_BIAS + finger])
-    d_innovation = d - (d_then + h.mean[D_BIAS + finger])
-    is_held = tip.in_contact and other.in_contact and not is_responding
-    if is_held and min(h.grasp.normal[0], h.grasp.normal[1]) > _FIRM:
+    d_at_scan = h.mean[D + finger] - d_since
+    angle_at_scan = h.mean[ANGLE] + 0.5 * sense * h.mean[TAPER] - rotation_since
+    angle_innovation = face - (angle_at_scan + h.mean[ANGLE_BIAS + finger])
+    d_innovation = d - (d_at_scan + h.mean[D_BIAS + finger])
+    is_held = tip.in_contact and other.in_contact and not cells_respond
+    if is_held and min(h.grasp.normal[0], h.grasp.normal[1]) > _NORMAL_FORCE_MIN:
         _set_angle_slopes(h, finger, sense, theta_rate)
-        angle_variance = expected_variance(h) + theta_noise
+        angle_variance = predicted_variance(h) + theta_noise
         h.slopes[:] = 0.0
         _set_footprint_slopes(h, finger, d_rate)
-        d_variance = expected_variance(h) + d_noise
+        d_variance = predicted_variance(h) + d_noise
         h.slopes[:] = 0.0
         speed = abs(tip.speed) + abs(other.speed)
         jump = d_innovation if is_fitted else 0.0
@@ -244,16 +244,16 @@ def update(
     tip.shared_variance[0] = systematic[0, 0]
     tip.shared_variance[1] = systematic[1, 1]
     if gain_is_fixed:  # GAIN is a state, so its part of the error is not shared
-        by_gain = h.prior[GAIN + finger] ** 0.5 / log_slope
+        by_gain = h.prior_variance[GAIN + finger] ** 0.5 / log_slope
         tip.shared_variance[0] = max(systematic[0, 0] - by_gain * by_gain, 0.0)
-    tip.has_new_frame = not is_responding
-    _update_angle(h, finger, sense, angle_innovation, theta_noise, theta_rate, begins)
+    tip.has_new_frame = not cells_respond
+    _update_angle(h, finger, sense, angle_innovation, theta_noise, theta_rate, is_new_contact)
     tip.in_contact = True
     if gain_is_fixed:
-        expected, _, stiffness, _, _, _, _ = lookup(table, max(d_then, D_MIN), tilt)
-        kept = 0.0 if begins else _SLOPE_KEPT
-        tip.log_slope = interpolate(stiffness / expected, tip.log_slope, kept)
-        innovation = math.log(shown / (at_scan.relaxation * expected))
+        expected, _, stiffness, _, _, _, _ = lookup(table, max(d_at_scan, D_MIN), tilt)
+        smoothing = 0.0 if is_new_contact else _SLOPE_SMOOTHING
+        tip.log_slope = interpolate(stiffness / expected, tip.log_slope, smoothing)
+        innovation = math.log(frame_force / (at_scan.relaxation * expected))
         innovation -= h.mean[MODULUS + finger] + h.mean[GAIN + finger]
         _set_d_slopes(h, finger, tip.log_slope, d_rate)
         h.slopes[MODULUS + finger] = h.slopes[GAIN + finger] = 1.0
@@ -266,8 +266,10 @@ def update(
         ratio = (covariance[0, 3] - systematic[0, 3]) / (d_noise * gain)
         gain_noise = (covariance[3, 3] - systematic[3, 3]) / (gain * gain)
         own_noise = max(gain_noise - ratio * ratio * d_noise, 0.0)
-        d_left = d - (h.mean[D + finger] - d_since + h.mean[D_BIAS + finger])
-        innovation = math.log(min(max(gain, _AMPLITUDES[0]), _AMPLITUDES[1])) - ratio * d_left
+        d_residual = d - (h.mean[D + finger] - d_since + h.mean[D_BIAS + finger])
+        innovation = (
+            math.log(min(max(gain, _AMPLITUDE_RANGE[0]), _AMPLITUDE_RANGE[1])) - ratio * d_residual
+        )
         innovation -= h.mean[MODULUS + finger] + h.mean[GAIN + finger]
         _set_d_slopes(h, finger, -ratio, d_rate)
         h.slopes[D_BIAS + finger] = -ratio
@@ -293,21 +295,21 @@ def _begin_contact(h: HandFilter, finger: int, sense: float, face: float) -> Non
     If the other tip does not touch, all states start again.
     """
     for state in (MODULUS, GAIN, TORQUE):
-        reset(h, state + finger, h.expected[state + finger], h.prior[state + finger])
+        reset(h, state + finger, h.prior_mean[state + finger], h.prior_variance[state + finger])
     reset(h, D_BIAS + finger, 0.0, 0.0)
     reset(h, ANGLE_BIAS + finger, 0.0, 0.0)
     h.grasp.rejected_count[:] = 0.0
     h.tip[finger].d_innovation = 0.0
     if h.tip[1 - finger].in_contact:
         return
-    begin(h)
+    reset_all(h)
     reset(h, ANGLE, face - 0.5 * sense * h.mean[TAPER], _FIRST_ANGLE_ERROR**2)
     for k in range(2):
         measured = h.grasp.free_torque[k]
         if measured > 0.0:
-            h.mean[FRICTION] += 0.5 * (measured - h.expected[FRICTION])
+            h.mean[FRICTION] += 0.5 * (measured - h.prior_mean[FRICTION])
             h.covariance[FRICTION, FRICTION] *= 0.5
-    h.covariance[FRICTION, FRICTION] += _LOAD * _LOAD
+    h.covariance[FRICTION, FRICTION] += _LOAD_STD * _LOAD_STD
 
 
 @inner_kernel
@@ -318,15 +320,15 @@ def _update_angle(
     innovation: float,
     noise: float,
     theta_rate: float,
-    begins: bool,
+    is_new_contact: bool,
 ) -> None:
     """Update by the angle of a frame. Beyond the gate the object has turned, unpredicted."""
     before = h.mean[ANGLE] + h.mean[ANGLE_BIAS + finger]
     _set_angle_slopes(h, finger, sense, theta_rate)
-    if innovation * innovation > GATE * GATE * (expected_variance(h) + noise):
+    if innovation * innovation > GATE * GATE * (predicted_variance(h) + noise):
         h.covariance[ANGLE, ANGLE] += innovation * innovation
     correct(h, ANGLE_CHANNEL + finger, innovation, noise, math.inf)
-    if not begins:
+    if not is_new_contact:
         rotation = h.mean[ANGLE] + h.mean[ANGLE_BIAS + finger] - before
         h.grasp.unexplained_rotation[finger] += rotation
 
@@ -341,12 +343,14 @@ def _update_footprint(h: HandFilter, finger: int, innovation: float, noise: floa
     d_innovation = innovation / h.slopes[D + finger]
     other = h.tip[1 - finger].d_innovation
     h.tip[finger].d_innovation = d_innovation
-    if innovation * innovation > GATE * GATE * (expected_variance(h) + noise):
+    if innovation * innovation > GATE * GATE * (predicted_variance(h) + noise):
         if d_innovation * other < 0.0:
-            moved = min(d_innovation * d_innovation, other * other)
+            sideways_variance = min(d_innovation * d_innovation, other * other)
             for i in range(2):
                 for j in range(2):
-                    h.covariance[D + i, D + j] += moved if i == j else -moved
+                    h.covariance[D + i, D + j] += (
+                        sideways_variance if i == j else -sideways_variance
+                    )
         elif h.tip[finger].gain_is_fixed:
             h.covariance[GAIN + finger, GAIN + finger] += innovation * innovation
     correct(h, FOOTPRINT + finger, innovation, noise, GATE)
@@ -378,13 +382,15 @@ def _is_rejected(
     has_moved = abs(d_innovation) > max(D_JUMP, _OUTLIER_GATE * math.sqrt(d_variance))
     if has_moved:
         other_d = abs(grasp.d_innovation[1 - finger])
-        has_moved = speed < _SPEED_SUPPORT and other_d < _SUPPORT * abs(d_innovation)
+        has_moved = speed < _SPEED_SUPPORT and other_d < _JUMP_SUPPORT * abs(d_innovation)
     if has_turned:
         was_rejected = grasp.rejected_count[finger] > 0.0
-        continues = was_rejected and abs(angle_innovation - last) > _CONTINUES
-        both_show_it = angle_innovation * other > _SUPPORT * angle_innovation * angle_innovation
+        continues = was_rejected and abs(angle_innovation - last) > _CONTINUED_ROTATION
+        both_show_it = (
+            angle_innovation * other > _JUMP_SUPPORT * angle_innovation * angle_innovation
+        )
         has_turned = not (both_show_it and (speed > _SPEED_SUPPORT or continues))
-    if grasp.rejected_count[finger] >= _RESTART or not (has_turned or has_moved):
+    if grasp.rejected_count[finger] >= _RESTART_COUNT or not (has_turned or has_moved):
         grasp.rejected_count[finger] = 0.0
         return False
     grasp.rejected_count[finger] += 1.0

@@ -38,7 +38,7 @@ class GraspState(Record):
     shear: float  # shear force over normal force in the balance without a load
     angle_std: float  # standard deviation of the object's angle [rad]
     taper: float  # angle α between the object's faces [rad]
-    tip_turning: float  # ∂U/∂θ over F θ d of an upright tip; constant
+    tilt_moment_ratio: float  # ∂U/∂θ over F θ d of an upright tip; constant
 
     # Lever arms
     moment_arm: Pair  # ∂(d1 + d2)/∂q [m]

@@ -22,7 +22,7 @@ from softfinger.daemon.perception.hand_state import (
     ANGLE,
     ANGLE_BIAS,
     BALANCE,
-    CURRENT_TIME,
+    CURRENT_OFF_TIME_MAX,
     D_BIAS,
     FRICTION,
     GAIN,
@@ -35,25 +35,25 @@ from softfinger.daemon.perception.hand_state import (
     HandFilter,
     TrackedTip,
     correct,
-    expected_variance,
     interpolate,
     motion_of,
+    predicted_variance,
 )
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 from softfinger.kinematics.compiled.layout import Records
 from softfinger.kinematics.contact.lookup import lookup
-from softfinger.kinematics.hand.grasp_state import holding_levers, load_torques, total_tilt
+from softfinger.kinematics.hand.grasp_state import holding_moment_arms, load_torques, total_tilt
 
 FloatArray = NDArray[np.float64]
 
 _TORQUE_NOISE = 0.05  # N·m of moving joints
 _CLOSING_MIN = 0.03  # rad/s, above the resolution of the velocity: the friction opposes closing
 _BALANCE_ERROR = 0.05  # relative, of the normal forces, and …
-_RUBBING = 0.4  # N, friction of the object on a table, …
-_RUBBING_TIME = 0.1  # s, correlation time of both
+_SUPPORT_FRICTION = 0.4  # N, friction of the object on a table, …
+_BALANCE_TIME = 0.1  # s, correlation time of both
 # A bias is significant beyond all of these
 _BIAS_GATE = 5.0  # standard deviations
-_BIAS_OWN = 0.8  # of the other sensor's bias, because a part of a bias appears in both
+_BIAS_RATIO_MIN = 0.8  # of the other sensor's bias, because a part of a bias appears in both
 _D_BIAS_MIN, ANGLE_BIAS_MIN = 0.1, 0.06  # of d; rad
 
 
@@ -113,35 +113,35 @@ def _update_by_torques(h: HandFilter, dt: float) -> None:
     torque = 0.5 * (h.tip[0].torque + h.tip[1].torque)
     h.torque_max = max(h.torque_max, torque)
     innovation = torque - h.mean[FRICTION] - _set_torque_slopes(h)
-    if h.closing > _CLOSING_MIN:
-        innovation -= h.inertia * (h.closing - h.last_closing) / dt
+    if h.closing_speed > _CLOSING_MIN:
+        innovation -= h.inertia * (h.closing_speed - h.last_closing_speed) / dt
         h.slopes[FRICTION] = 1.0
         # After the torque has decreased, the gears hold between nothing and all of the decrease.
-        held = min(h.torque_max - torque, h.load_held * torque)
-        variance = _TORQUE_NOISE * _TORQUE_NOISE + held * held
-        if innovation < -GATE * math.sqrt(expected_variance(h) + variance):
+        held_torque = min(h.torque_max - torque, h.load_held * torque)
+        variance = _TORQUE_NOISE * _TORQUE_NOISE + held_torque * held_torque
+        if innovation < -GATE * math.sqrt(predicted_variance(h) + variance):
             h.covariance[FRICTION, FRICTION] += innovation * innovation  # a load has gone
         correct(h, TORQUES, innovation, variance, GATE)
     h.slopes[:] = 0.0
     normal = h.grasp.normal
-    least = min(normal[0], normal[1])
-    if least > 0.0 and h.t > h.balance_time:
+    normal_min = min(normal[0], normal[1])
+    if normal_min > 0.0 and h.t > h.balance_time:
         for k in range(2):
             sense = 1.0 - 2.0 * k
             h.slopes[MODULUS + k] = sense
             h.slopes[D + k] = sense * _log_slope(h, k)
-        error = _BALANCE_ERROR + _RUBBING / least
-        variance = error * error * max(_RUBBING_TIME / (h.t - h.balance_time), 1.0)
+        error = _BALANCE_ERROR + _SUPPORT_FRICTION / normal_min
+        variance = error * error * max(_BALANCE_TIME / (h.t - h.balance_time), 1.0)
         correct(h, BALANCE, math.log(normal[1] / normal[0]), variance, GATE)
     h.balance_time = h.t
 
 
 @inner_kernel
-def _law_error(tip: TrackedTip, fraction: float) -> float:
+def _relative_law_error(tip: TrackedTip, fraction: float) -> float:
     """Return the relative error of F by table and law; ``fraction`` is d over the radius."""
     t = min(max(fraction, 0.0), 1.0) * (LAW_POINTS - 1.001)
     k = int(t)
-    return interpolate(tip.law[k], tip.law[k + 1], t - k)
+    return interpolate(tip.law_error[k], tip.law_error[k + 1], t - k)
 
 
 @inner_kernel
@@ -160,14 +160,14 @@ def _write_tip(h: HandFilter, finger: int, theta: float, table: FloatArray) -> T
     grasp.stiffness[finger] = stiffness
     h.slopes[D + finger] = stiffness
     h.slopes[MODULUS + finger] = force
-    by_state = expected_variance(h)
+    by_state = predicted_variance(h)
     h.slopes[:] = 0.0
     h.slopes[ANGLE] = 1.0
     h.slopes[TAPER] = finger - 0.5
-    theta_variance = expected_variance(h) + tip.shared_variance[1]
+    theta_variance = predicted_variance(h) + tip.shared_variance[1]
     h.slopes[:] = 0.0
     d_shared = tip.shared_variance[0]
-    law = _law_error(tip, d / h.radius) * force
+    law = _relative_law_error(tip, d / h.radius) * force
     by_angle = modulus * by_tilt * (theta / tilt if tilt > 0.0 else 0.0)
     force_variance = by_state + stiffness * stiffness * d_shared
     force_variance += by_angle * by_angle * theta_variance + law * law
@@ -206,7 +206,7 @@ def write_grasp(hands: Records[HandFilter], table1: FloatArray, table2: FloatArr
     grasp.jacobian_rotation[0] = turn1
     grasp.jacobian_rotation[1] = turn2
     d = h.mean[D], h.mean[D + 1]
-    energy_arm1, energy_arm2, shear, normal1, normal2 = holding_levers(
+    energy_arm1, energy_arm2, shear, normal1, normal2 = holding_moment_arms(
         table1, table2, d, theta, taper, motion
     )
     grasp.energy_arm[0] = energy_arm1
@@ -264,7 +264,7 @@ def _write_consistency(h: HandFilter) -> None:
         grasp.angle_bias[k] = h.mean[ANGLE_BIAS + k]
         variance = h.covariance[ANGLE_BIAS + k, ANGLE_BIAS + k]
         grasp.angle_bias_std[k] = math.sqrt(max(variance, 0.0))
-        grasp.gain_change[k] = h.mean[GAIN + k] - h.expected[GAIN + k]
+        grasp.gain_change[k] = h.mean[GAIN + k] - h.prior_mean[GAIN + k]
         grasp.gain_std[k] = math.sqrt(max(h.covariance[GAIN + k, GAIN + k], 0.0))
     for k in range(2):
         has_bias = _has_bias(grasp, k)
@@ -272,7 +272,7 @@ def _write_consistency(h: HandFilter) -> None:
         if (
             has_bias
             or grasp.rejected_count[k] > REJECTED_MAX
-            or grasp.current_off_time[k] > CURRENT_TIME
+            or grasp.current_off_time[k] > CURRENT_OFF_TIME_MAX
         ):
             grasp.sensor_fault = True
 
@@ -285,11 +285,11 @@ def _has_bias(grasp: GraspState, finger: int) -> bool:
     in_d: bool = abs(grasp.d_bias[finger]) > max(
         _D_BIAS_MIN * grasp.d[finger],
         _BIAS_GATE * grasp.d_bias_std[finger],
-        _BIAS_OWN * abs(grasp.d_bias[1 - finger]),
+        _BIAS_RATIO_MIN * abs(grasp.d_bias[1 - finger]),
     )
     in_angle = abs(grasp.angle_bias[finger]) > max(
         ANGLE_BIAS_MIN,
         _BIAS_GATE * grasp.angle_bias_std[finger],
-        _BIAS_OWN * abs(grasp.angle_bias[1 - finger]),
+        _BIAS_RATIO_MIN * abs(grasp.angle_bias[1 - finger]),
     )
     return in_d or in_angle

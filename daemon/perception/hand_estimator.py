@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from softfinger.daemon.perception import frame_channels, grasp_kernels
 from softfinger.daemon.perception import hand_state as states
 from softfinger.daemon.perception.frame_channels import FrameContact
-from softfinger.daemon.perception.hand_state import HISTORY, LAW_POINTS, HandFilter, Past
+from softfinger.daemon.perception.hand_state import HISTORY_TIME, LAW_POINTS, HandFilter, HistoryRow
 from softfinger.daemon.perception.prior import UNKNOWN, Prior
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.control_table import COUNTS_PER_TURN, VELOCITY_UNIT
@@ -63,7 +63,7 @@ class HandEstimator:
         """Take each tip's table, its material, whose law has an error, and its priors."""
         hand, gear = settings.hand, settings.servos.gear_ratio
         self._fingers = [FINGERS.index(finger) for finger in sorted(settings.scene.fingers)]
-        self._with_object = settings.scene.object_model
+        self._estimates_object = settings.scene.object_model
         self._age_max = settings.safety.frame_age_fault * (1.0 / settings.tactile.rate)
         self._tables = tables[0].data, tables[1].data
         self._state = state = HandFilter()
@@ -71,7 +71,7 @@ class HandEstimator:
         state.length = hand.finger_length
         state.offset = hand.finger_offset
         state.radius = settings.tip.radius
-        state.count = 2.0 * math.pi / (COUNTS_PER_TURN * gear)
+        state.encoder_resolution = 2.0 * math.pi / (COUNTS_PER_TURN * gear)
         state.velocity_unit = VELOCITY_UNIT / gear
         state.latency = settings.tactile.latency
         state.response = settings.tactile.response
@@ -87,17 +87,21 @@ class HandEstimator:
         ratios = np.linspace(1e-3, 1.0, LAW_POINTS)
         for finger, table in enumerate(tables):
             law = 0.0 if materials is None else materials[finger].force_error(ratios)
-            state.tip[finger].law[:] = np.hypot(law, table.max_error)
+            state.tip[finger].law_error[:] = np.hypot(law, table.max_error)
             state.tip[finger].relaxation = 1.0 + sum(settings.tip.relaxation)
         self._priors = priors
-        self._history: Any = np.zeros(round(HISTORY * settings.loop.rate) + 2, dtype=Past.dtype)
+        self._history: Any = np.zeros(
+            round(HISTORY_TIME * settings.loop.rate) + 2, dtype=HistoryRow.dtype
+        )
         self._history["t"] = -math.inf
         self._history["relaxation"] = 1.0 + sum(settings.tip.relaxation)
         self.grasp = state.grasp
         self._set_prior(settings, priors)
-        self.grasp.tip_turning = 0.5 * sum(_tip_turning(table, state.radius) for table in tables)
-        self._joints_known = False
-        self._has_news = True  # a frame came since the calibration factors were written
+        self.grasp.tilt_moment_ratio = 0.5 * sum(
+            _tilt_moment_ratio(table, state.radius) for table in tables
+        )
+        self._joints_read = False
+        self._factors_outdated = True  # a frame came since the calibration factors were written
         self._in_contact = [False, False]
         self._invalid = [Invalid.NO_FRAME] * 2  # reason why the newest estimate is not used
 
@@ -109,9 +113,9 @@ class HandEstimator:
                 (states.MODULUS, (math.log(prior.modulus[0]), prior.modulus[1])),
                 (states.GAIN, (math.log(prior.gain[0]), prior.gain[1])),
                 (states.TORQUE, (prior.torque[0] - 1.0, prior.torque[1])),
-                (states.ENCODER, (0.0, state.count / math.sqrt(12.0))),
+                (states.ENCODER, (0.0, state.encoder_resolution / math.sqrt(12.0))),
             ):
-                state.expected[at + finger], state.prior[at + finger] = mean, error**2
+                state.prior_mean[at + finger], state.prior_variance[at + finger] = mean, error**2
             self.grasp.gain_prior_std[finger] = self.grasp.gain_std[finger] = prior.gain[1]
         for at, mean, error in (
             (states.ANGLE, 0.0, 1.0),
@@ -119,9 +123,9 @@ class HandEstimator:
             (states.LATENCY, 0.0, _LATENCY_ERROR),
             (states.FRICTION, settings.control.joint_friction, _FRICTION_ERROR),
         ):
-            state.expected[at], state.prior[at] = mean, error**2
-        state.mean[:] = state.expected
-        state.covariance[:] = np.diag(state.prior)
+            state.prior_mean[at], state.prior_variance[at] = mean, error**2
+        state.mean[:] = state.prior_mean
+        state.covariance[:] = np.diag(state.prior_variance)
         self.grasp.nis[:] = 1.0
 
     def predict(self, reading: Reading, goal: Goal | None = None) -> None:
@@ -129,7 +133,7 @@ class HandEstimator:
 
         ``goal`` is the goal that the servos had, if a grip set their currents.
         """
-        self._joints_known = True
+        self._joints_read = True
         q1, q2 = reading.q
         dq1, dq2 = reading.dq
         current1, current2 = reading.current
@@ -160,11 +164,11 @@ class HandEstimator:
         board that is frozen or sends old data, so it is not used.
         """
         contact.seq, contact.t, contact.t_arrival = frame.seq, frame.t_sample, frame.t_arrival
-        self._invalid[finger] = estimate.invalid if frame.valid else Invalid.FRAME
+        self._invalid[finger] = estimate.invalid if frame.valid else Invalid.BAD_FRAME
         if self._invalid[finger]:
             return  # the joints carry the contact on, and its age grows
         # Without a reading of the joints, the frame is used alone.
-        in_contact = estimate.contact and self._joints_known
+        in_contact = estimate.contact and self._joints_read
         if in_contact and self._in_contact[finger] and not has_changed:
             contact.t_valid = frame.t_arrival
             return
@@ -180,10 +184,10 @@ class HandEstimator:
             estimate.systematic,
             self._tables[finger],
         ):
-            self._invalid[finger] = Invalid.JOINTS
+            self._invalid[finger] = Invalid.CONTRADICTS_JOINTS
             return
         self._in_contact[finger] = in_contact
-        self._has_news = True
+        self._factors_outdated = True
         contact.t_valid = frame.t_arrival
         contact.contact, contact.gain = estimate.contact, estimate.gain
         contact.tilt_y, contact.misfit = estimate.tilt_y, estimate.misfit
@@ -199,7 +203,7 @@ class HandEstimator:
                 contact,
                 estimate,
                 self._tables[finger],
-                tip.law,
+                tip.law_error,
                 self._priors[finger],
                 self._state.radius,
             )
@@ -207,15 +211,15 @@ class HandEstimator:
     def write_contacts(self, t: float, contacts: list[Contact], pose: ObjectPose) -> None:
         """Write the estimates of time ``t`` into contacts and pose."""
         in_contact = self._in_contact
-        pose.valid = in_contact[0] and in_contact[1] and self._with_object
+        pose.valid = in_contact[0] and in_contact[1] and self._estimates_object
         pose.angle = pose.width = 0.0
         if in_contact[0] or in_contact[1]:
             result = grasp_kernels.write_grasp(self._state.array, *self._tables)
             tips = result.left, result.right
             if pose.valid:
                 pose.angle, pose.width = result.angle, result.width
-        if self._has_news:
-            self._has_news = False
+        if self._factors_outdated:
+            self._factors_outdated = False
             for finger in self._fingers:
                 self._write_factors(contacts[finger], finger)
             pose.nis_torque = self.grasp.nis.item(states.TORQUES)
@@ -260,7 +264,7 @@ def _commanded_current(goal: Goal, finger: int, q: float) -> float:
     return goal.current[finger] if goal.q[finger] - q > _GOAL_DISTANCE else 0.0
 
 
-def _tip_turning(table: ContactTable, radius: float) -> float:
+def _tilt_moment_ratio(table: ContactTable, radius: float) -> float:
     """Return ∂U/∂θ over F θ d near upright: 2/3 for springs, about 0 for solid rubber."""
     d, theta = 0.15 * radius, 0.05
     contact = table(d, theta)

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from softfinger.daemon.perception.grasp import GraspState
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 from softfinger.kinematics.compiled.layout import Pair, Record, Records
-from softfinger.kinematics.hand.grasp_state import Motion, Two, held_motion
+from softfinger.kinematics.hand.grasp_state import FloatPair, Motion, held_motion
 
 FloatArray = NDArray[np.float64]
 
@@ -37,10 +37,10 @@ D, ENCODER, D_BIAS, ANGLE_BIAS, MODULUS, GAIN, TORQUE = range(0, 14, 2)
 ANGLE, TAPER, LATENCY, FRICTION, STATES = range(14, 19)
 
 # Measurement channels, in the order of `grasp.CHANNELS`; the first four are pairs.
-ANGLE_CHANNEL, FOOTPRINT, AMPLITUDE, EDGE, TORQUES, BALANCE = 0, 2, 4, 6, 8, 9
+ANGLE_CHANNEL, FOOTPRINT, AMPLITUDE, ENCODER_CHANNEL, TORQUES, BALANCE = 0, 2, 4, 6, 8, 9
 
-HISTORY = 0.5  # s of joint motion that is stored; an older frame is treated as this old
-CURRENT_TIME = 0.1  # s for which a current may differ from its goal
+HISTORY_TIME = 0.5  # s of joint motion that is stored; an older frame is treated as this old
+CURRENT_OFF_TIME_MAX = 0.1  # s for which a current may differ from its goal
 LAW_POINTS = 17  # nodes over d, from 0 to the radius
 
 # Random walks in a grip, per √s. The sources are in docs/estimation.md.
@@ -91,12 +91,12 @@ class TrackedTip(Record):
     free_torque_max: Pair  # maxima in the present window of _TOUCH_DELAY and in the one before
     window_start: float  # [s]
     travel: Pair  # integrals of predicted motion: of d [m], of the joint [rad]
-    law: Annotated[FloatArray, LAW_POINTS]  # relative error of F by table and law, over d
+    law_error: Annotated[FloatArray, LAW_POINTS]  # relative error of F by table and law, over d
     relaxation_state: Annotated[FloatArray, 3]  # low-pass filtered lasting forces [N]
     relaxation: float  # factor ρ of the tip's force over its lasting force
 
 
-class Past(Record):
+class HistoryRow(Record):
     """Predicted motion at one instant, as the cells show it: a row of the history."""
 
     t: float
@@ -112,15 +112,15 @@ class HandFilter(Record):
 
     mean: Annotated[FloatArray, STATES]
     covariance: Annotated[FloatArray, STATES, STATES]
-    expected: Annotated[FloatArray, STATES]  # means before a contact, and …
-    prior: Annotated[FloatArray, STATES]  # … variances
+    prior_mean: Annotated[FloatArray, STATES]  # means before a contact, and …
+    prior_variance: Annotated[FloatArray, STATES]  # … variances
     slopes: Annotated[FloatArray, STATES]  # of the measurement; 0 between two updates
-    cross: Annotated[FloatArray, STATES]  # scratch
+    scratch: Annotated[FloatArray, STATES]
     half_separation: float  # of the pivots [m]
     length: float  # of a finger [m]
     offset: float  # of a fingertip [m]
     radius: float  # of a tip [m]
-    count: float  # of an encoder [rad]
+    encoder_resolution: float  # of an encoder [rad]
     velocity_unit: float  # [rad/s]
     latency: float  # `tactile.latency` [s]
     response: float  # `tactile.response` [s]
@@ -132,10 +132,10 @@ class HandFilter(Record):
     is_single: bool  # the hand has one finger
     gain_is_known: bool  # `estimator.free_gain` is false
     t: float  # of the last reading [s]
-    newest: int  # row of the history
+    newest_row: int  # row of the history
     rotation: float  # integral of the predicted rotation [rad]
-    closing: float  # mean speed of both joints, averaged [rad/s]
-    last_closing: float  # in the tick before
+    closing_speed: float  # mean speed of both joints, averaged [rad/s]
+    last_closing_speed: float  # in the tick before
     torque_max: float  # largest mean torque in this grip [N·m]
     balance_time: float  # of the last update by torques and balance [s]
     tip: Annotated[Records[TrackedTip], 2]
@@ -146,14 +146,14 @@ class HandFilter(Record):
 
 
 @inner_kernel
-def expected_variance(h: HandFilter) -> float:
-    """Return the variance slopesᵀ P slopes; write P slopes into `cross`."""
+def predicted_variance(h: HandFilter) -> float:
+    """Return the variance slopesᵀ P slopes; write P slopes into `scratch`."""
     expected = 0.0
     for i in range(STATES):
         total = 0.0
         for j in range(STATES):
             total += h.covariance[i, j] * h.slopes[j]
-        h.cross[i] = total
+        h.scratch[i] = total
         expected += h.slopes[i] * total
     return max(expected, 0.0)
 
@@ -166,7 +166,7 @@ def correct(h: HandFilter, channel: int, innovation: float, variance: float, gat
     there (Huber), and one that is not finite is ignored. `grasp.nis` averages the normalised
     squared innovation of each ``channel``.
     """
-    expected = expected_variance(h)
+    expected = predicted_variance(h)
     square = innovation * innovation
     nis = min(square / (expected + variance), gate * gate)
     if nis < math.inf:
@@ -176,14 +176,14 @@ def correct(h: HandFilter, channel: int, innovation: float, variance: float, gat
     if 0.0 < total < math.inf and abs(innovation) < math.inf:
         inverse = 1.0 / total
         for i in range(STATES):
-            gain = h.cross[i] * inverse
+            gain = h.scratch[i] * inverse
             h.mean[i] += gain * innovation
             for j in range(STATES):
-                h.covariance[i, j] -= gain * h.cross[j]
+                h.covariance[i, j] -= gain * h.scratch[j]
         for k in range(TORQUE, TORQUE + 2):
-            error = h.mean[k] - h.expected[k]
+            error = h.mean[k] - h.prior_mean[k]
             error = min(max(error, -_TORQUE_ERROR_MAX), _TORQUE_ERROR_MAX)
-            h.mean[k] = h.expected[k] + error
+            h.mean[k] = h.prior_mean[k] + error
         h.mean[LATENCY] = min(max(h.mean[LATENCY], -h.latency), _LATENCY_MAX)
     h.slopes[:] = 0.0
 
@@ -198,10 +198,10 @@ def reset(h: HandFilter, state: int, mean: float, variance: float) -> None:
 
 
 @inner_kernel
-def begin(h: HandFilter) -> None:
+def reset_all(h: HandFilter) -> None:
     """Reset all states to their priors."""
     for state in range(STATES):
-        reset(h, state, h.expected[state], h.prior[state])
+        reset(h, state, h.prior_mean[state], h.prior_variance[state])
     h.torque_max = 0.0
 
 
@@ -236,12 +236,12 @@ def _walk_pair(h: HandFilter, state: int, common: float, opposite: float, dt: fl
 @kernel
 def predict(
     hands: Records[HandFilter],
-    history: Records[Past],
+    history: Records[HistoryRow],
     t: float,
-    q: Two,
-    dq: Two,
-    current: Two,
-    goal: Two,
+    q: FloatPair,
+    dq: FloatPair,
+    current: FloatPair,
+    goal: FloatPair,
 ) -> None:
     """Predict the state at time ``t`` by a reading of the joints [rad, rad/s, A].
 
@@ -260,12 +260,12 @@ def predict(
         if not tip.in_contact:
             _measure_free_torque(h, k, t, dt, dq[k] - last_speed[k])
     h.t = t
-    if dt > HISTORY:  # after a pause the encoders are the only source
+    if dt > HISTORY_TIME:  # after a pause the encoders are the only source
         dt = 0.0
         for k in range(2):
             h.tip[k].q = h.tip[k].encoder = q[k]
-    h.last_closing = h.closing
-    h.closing += (0.5 * (dq[0] + dq[1]) - h.closing) * min(dt / _VELOCITY_TIME, 1.0)
+    h.last_closing_speed = h.closing_speed
+    h.closing_speed += (0.5 * (dq[0] + dq[1]) - h.closing_speed) * min(dt / _VELOCITY_TIME, 1.0)
     _move(h, dq, dt)
     if h.tip[0].in_contact or h.tip[1].in_contact:
         _add_process_noise(h, dt)
@@ -276,21 +276,21 @@ def predict(
 
 
 @inner_kernel
-def _store(h: HandFilter, history: Records[Past], t: float, dt: float) -> None:
+def _store(h: HandFilter, history: Records[HistoryRow], t: float, dt: float) -> None:
     """Store this tick's motion, low-pass filtered by the response of the cells."""
-    kept = math.exp(-dt / h.response) if h.response > 0.0 else 0.0
-    last = history[h.newest]
-    h.newest = (h.newest + 1) % len(history)
-    row = history[h.newest]
+    smoothing = math.exp(-dt / h.response) if h.response > 0.0 else 0.0
+    last = history[h.newest_row]
+    h.newest_row = (h.newest_row + 1) % len(history)
+    row = history[h.newest_row]
     row.t = t
-    row.angle = interpolate(h.rotation, last.angle, kept)
+    row.angle = interpolate(h.rotation, last.angle, smoothing)
     for k in range(2):
         tip = h.tip[k]
-        row.d[k] = interpolate(tip.travel[0], last.d[k], kept)
+        row.d[k] = interpolate(tip.travel[0], last.d[k], smoothing)
         lag = tip.travel[0] - last.d[k]
-        row.spread[k] = kept * (last.spread[k] + (1.0 - kept) * lag * lag)
-        row.q[k] = interpolate(tip.travel[1], last.q[k], kept)
-        row.relaxation[k] = interpolate(tip.relaxation, last.relaxation[k], kept)
+        row.spread[k] = smoothing * (last.spread[k] + (1.0 - smoothing) * lag * lag)
+        row.q[k] = interpolate(tip.travel[1], last.q[k], smoothing)
+        row.relaxation[k] = interpolate(tip.relaxation, last.relaxation[k], smoothing)
 
 
 @inner_kernel
@@ -300,7 +300,7 @@ def interpolate(first: float, last: float, fraction: float) -> float:
 
 
 @inner_kernel
-def _move(h: HandFilter, dq: Two, dt: float) -> None:
+def _move(h: HandFilter, dq: FloatPair, dt: float) -> None:
     """Move joints, tips and object with the measured velocities ``dq`` [rad/s]."""
     left = h.tip[0]
     right = h.tip[1]
@@ -315,29 +315,29 @@ def _move(h: HandFilter, dq: Two, dt: float) -> None:
         turn1 = turn2 = 0.0
     step1 = dq[0] * dt
     step2 = dq[1] * dt
-    deeper1 = by1 * step1
-    deeper2 = by2 * step2
+    d_step1 = by1 * step1
+    d_step2 = by2 * step2
     if not h.is_single:
-        deeper1 = deeper2 = deeper1 + deeper2
+        d_step1 = d_step2 = d_step1 + d_step2
     rotation = turn1 * step1 - turn2 * step2
     left.q += step1
     right.q += step2
     left.travel[1] += step1
     right.travel[1] += step2
     # An impossible step, as by a taper of half a turn, would stay in the state for ever.
-    if not (abs(deeper1) + abs(deeper2) < h.radius and abs(rotation) < _ROTATION_MAX):
+    if not (abs(d_step1) + abs(d_step2) < h.radius and abs(rotation) < _ROTATION_MAX):
         return
-    left.travel[0] += deeper1
-    right.travel[0] += deeper2
+    left.travel[0] += d_step1
+    right.travel[0] += d_step2
     h.rotation += rotation
     if left.in_contact:
-        h.mean[D] += deeper1
+        h.mean[D] += d_step1
     if right.in_contact:
-        h.mean[D + 1] += deeper2
+        h.mean[D + 1] += d_step2
     h.mean[ANGLE] += rotation
     if dt > 0.0:
         rotation_error = _MOTION_ERROR * rotation
-        closing_error = _MOTION_ERROR * deeper1
+        closing_error = _MOTION_ERROR * d_step1
         sideways_error = 0.5 * _SIDEWAYS_ERROR * (arm1 * step1 - arm2 * step2)
         samples = _MOTION_TIME / dt
         h.covariance[ANGLE, ANGLE] += rotation_error * rotation_error * samples
@@ -345,16 +345,16 @@ def _move(h: HandFilter, dq: Two, dt: float) -> None:
     for k in range(2):
         # The rounding of a velocity moves encoder, tips and object together.
         variance = h.velocity_unit * h.velocity_unit / 12.0 * _VELOCITY_TIME * dt
-        h.cross[:] = 0.0
-        h.cross[ENCODER + k] = 1.0
-        h.cross[ANGLE] = turn1 if k == 0 else -turn2
+        h.scratch[:] = 0.0
+        h.scratch[ENCODER + k] = 1.0
+        h.scratch[ANGLE] = turn1 if k == 0 else -turn2
         by = by1 if k == 0 else by2
         for i in range(2):
             if i == k or not h.is_single:
-                h.cross[D + i] = by
+                h.scratch[D + i] = by
         for i in (D, D + 1, ENCODER + k, ANGLE):
             for j in (D, D + 1, ENCODER + k, ANGLE):
-                h.covariance[i, j] += variance * h.cross[i] * h.cross[j]
+                h.covariance[i, j] += variance * h.scratch[i] * h.scratch[j]
 
 
 @inner_kernel
@@ -389,22 +389,23 @@ def _read_encoder(h: HandFilter, finger: int, q: float, step: float) -> None:
     at = ENCODER + finger
     jump = q - tip.encoder
     tip.encoder = q
-    half = 0.5 * h.count
+    resolution = h.encoder_resolution
+    half = 0.5 * resolution
     if abs(jump) > half:
         # The joint passed this edge since the last reading. After several counts at once, only
         # the last count but one is certain.
         found = q - math.copysign(half, jump)
-        spread = max(step, 0.05 * h.count) if abs(jump) < 1.5 * h.count else h.count
+        spread = max(step, 0.05 * resolution) if abs(jump) < 1.5 * resolution else resolution
     elif abs(q - tip.q) > half:
         found = q - math.copysign(half, q - tip.q)
-        spread = h.count
-    elif h.covariance[at, at] > h.count * h.count / 6.0:
+        spread = resolution
+    elif h.covariance[at, at] > resolution * resolution / 6.0:
         found = q
-        spread = h.count
+        spread = resolution
     else:
         return
     h.slopes[at] = 1.0
-    correct(h, EDGE + finger, found - tip.q, spread * spread / 12.0, math.inf)
+    correct(h, ENCODER_CHANNEL + finger, found - tip.q, spread * spread / 12.0, math.inf)
     tip.q += h.mean[at]
     h.mean[at] = 0.0
     if abs(q - tip.q) > half:

@@ -17,19 +17,19 @@ from numpy.typing import NDArray
 from softfinger.daemon.perception.calibration_file import Converter, least_end
 from softfinger.daemon.perception.finger_model import FingerModel, make_estimator
 from softfinger.daemon.perception.hand_estimator import HandEstimator
-from softfinger.daemon.perception.zero import UnpressedCells
+from softfinger.daemon.perception.unloaded_cells import UnloadedCells
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.tactile.base import TactileSensor
-from softfinger.daemon.types import FINGERS, Event, Frame, SensorFacts, State
+from softfinger.daemon.types import FINGERS, Event, Frame, SensorInfo, State
 from softfinger.kinematics.estimation.estimator import ContactEstimate
 
-_TARE_FRAMES = 16
-_ZERO_EVERY = 8  # frames between updates of the zero; thermal drift takes seconds
-_STEPS = 65535  # quantisation steps of a published pressure
-_REMEMBERED = 2.0  # s of frames that are remembered
-_REPEATED = 0.1  # s of repeated frames that are no coincidence
-_DISTINCT = 5  # lower bound of the number of these frames
-_CELLS = 4  # cells that must change between frames; one or two noisy cells repeat by chance
+_TARE_FRAME_COUNT = 16
+_ZERO_INTERVAL = 8  # frames between updates of the zero; thermal drift takes seconds
+_PRESSURE_STEPS = 65535  # quantisation steps of a published pressure
+_STORED_TIME = 2.0  # s of frames that are remembered
+_REPEATED_TIME = 0.1  # s of repeated frames that are no coincidence
+_REPEATED_COUNT_MIN = 5  # lower bound of the number of these frames
+_CHANGED_CELLS_MIN = 4  # between frames; one or two noisy cells repeat by chance
 
 
 class Perception:
@@ -66,14 +66,14 @@ class Perception:
         for each in self.fingers:
             frame = each.update()
             if frame is not None:
-                if each.repeats.long:
+                if each.repeats.is_fault:
                     frame = replace(frame, valid=False)
                 contact = state.contacts[each.finger]
-                self.filter.update(each.finger, frame, each.estimate, contact, each.changes)
+                self.filter.update(each.finger, frame, each.estimate, contact, each.has_changed)
         self.filter.write_contacts(state.t, state.contacts, state.object)
 
 
-class Repeats:
+class RepeatDetector:
     """Detector of sequences of frames that are repeated in the same order.
 
     A noisy sensor never repeats a frame. A sensor without noise may send the same frame for a long
@@ -84,33 +84,35 @@ class Repeats:
     def __init__(self, rate: float, enabled: bool = True) -> None:
         """Create a detector for a frame ``rate`` [Hz]; ``enabled`` if repetitions are faults."""
         self._enabled = enabled
-        self.lag = 0  # period of the repetition in frames, 0 for none
-        self._run = 0  # consecutive frames with this period
-        self._enough = max(round(_REPEATED * rate), _DISTINCT)
-        self._digests: deque[int] = deque(maxlen=round(_REMEMBERED * rate))  # newest first
+        self.period = 0  # period of the repetition in frames, 0 for none
+        self._repeated_count = 0  # consecutive frames with this period
+        self._fault_count = max(round(_REPEATED_TIME * rate), _REPEATED_COUNT_MIN)
+        self._digests: deque[int] = deque(maxlen=round(_STORED_TIME * rate))  # newest first
         self._last: NDArray[np.uint16] | None = None  # frame
 
     @property
-    def again(self) -> bool:
+    def is_repeating(self) -> bool:
         """True if the last two frames arrived before in this order."""
-        return self._enabled and self._run > 1
+        return self._enabled and self._repeated_count > 1
 
     @property
-    def long(self) -> bool:
+    def is_fault(self) -> bool:
         """True if the frames have repeated for too long to be a coincidence."""
-        return self.again and self._run >= self._enough
+        return self.is_repeating and self._repeated_count >= self._fault_count
 
-    def differs(self, data: NDArray[np.uint16]) -> bool:
+    def update(self, data: NDArray[np.uint16]) -> bool:
         """Process a frame; return True if it differs from the last one."""
         last, self._last = self._last, data.copy()
         changed = np.count_nonzero(data != last)
         if not changed:
             return False
         digest, digests = hash(data.tobytes()), self._digests
-        lag = digests.index(digest) + 1 if changed >= _CELLS and digest in digests else 0
+        is_stored = changed >= _CHANGED_CELLS_MIN and digest in digests
+        lag = digests.index(digest) + 1 if is_stored else 0
         digests.appendleft(digest)
-        self._run = self._run + 1 if lag and lag == self.lag else min(lag, 1)
-        self.lag = lag
+        continues = lag > 0 and lag == self.period
+        self._repeated_count = self._repeated_count + 1 if continues else min(lag, 1)
+        self.period = lag
         return True
 
 
@@ -131,17 +133,17 @@ class FingerPerception:
         self.finger = model.finger
         self.sensor = sensor
         self.frame: Frame | None = None
-        self.frames = 0  # frames received
-        self.changes = True  # the newest frame is neither equal to the last nor a repetition
-        self.changed = 0.0  # arrival time of the last frame that differed from the one before [s]
+        self.frame_count = 0  # frames received
+        self.has_changed = True  # the newest frame is neither equal to the last nor a repetition
+        self.changed_time = 0.0  # arrival of the last frame that differed from its predecessor [s]
         # A recording that plays in a loop repeats itself.
-        self.repeats = Repeats(settings.tactile.rate, tactile.backend != "replay")
+        self.repeats = RepeatDetector(settings.tactile.rate, tactile.backend != "replay")
         self.estimate = ContactEstimate()  # of the last valid frame
         active = getattr(sensor, "live", None)  # some recordings lack cells
         self._estimator = make_estimator(
             settings, model.material, model.finger, active, calibration
         )
-        self._full = float(tactile.full_count)
+        self._full_count = float(tactile.full_count)
         self._scale = tactile.pascal_per_count  # Pa per unit of the readings
         self._quantum = tactile.pascal_per_count  # Pa per count
         self._converter: Converter | None = None
@@ -150,56 +152,56 @@ class FingerPerception:
             self._scale = 1.0
             self._quantum = self._converter.quantum
         self._readings: NDArray[Any] | None = None  # newest frame: counts above zero, or Pa
-        self._as_pressure = settings.stream.tactile_unit == "Pa"
-        self.facts = self._facts(settings, model)
+        self._publishes_pressure = settings.stream.tactile_unit == "Pa"
+        self.info = self._info(settings, model)
         self._events = events
         self._zero: NDArray[np.uint16] | None = None  # used without a converter
         live = np.ones(model.grid.shape, np.bool_) if active is None else active
-        self._unpressed = UnpressedCells(model.grid, settings.tip.radius, live)
+        self._unloaded = UnloadedCells(model.grid, settings.tip.radius, live)
         self._noise = tactile.noise  # of a cell, from the settings [Pa]
         self._tare_sum: NDArray[np.uint32] | int = 0
-        self._tare_left = 0
+        self._tare_remaining_count = 0
 
     @property
     def noise(self) -> float:
         """Measured standard deviation of a cell [Pa]; 0 if it is unknown."""
-        return self._unpressed.scatter * self._quantum
+        return self._unloaded.scatter * self._quantum
 
     @property
     def full_count(self) -> float:
         """Reading of a saturated cell [counts]."""
-        return self._full
+        return self._full_count
 
     @property
-    def taring(self) -> bool:
+    def is_taring(self) -> bool:
         """True while the zero is being measured."""
-        return self._tare_left > 0
+        return self._tare_remaining_count > 0
 
     def tare(self) -> None:
         """Set the zero of each cell to its mean over the next frames."""
         self._tare_sum = 0
-        self._tare_left = _TARE_FRAMES
-        self._unpressed.forget_zero()
+        self._tare_remaining_count = _TARE_FRAME_COUNT
+        self._unloaded.reset_zero()
 
     def update(self) -> Frame | None:
         """Estimate and return the newest frame, or return None if there is no new one."""
         frame, last = self.sensor.latest(), self.frame
         if frame is None or frame is last:
             return None
-        differs = self.repeats.differs(frame.data)
-        self.changes = differs and not self.repeats.again
+        differs = self.repeats.update(frame.data)
+        self.has_changed = differs and not self.repeats.is_repeating
         if differs:
-            self.changed = frame.t_arrival
+            self.changed_time = frame.t_arrival
         self.frame = frame
-        self.frames += 1
+        self.frame_count += 1
         counts = frame.data
-        if self._tare_left and frame.valid:
-            self._learn_zero(counts)
+        if self._tare_remaining_count and frame.valid:
+            self._measure_zero(counts)
         if frame.valid:
-            if self.frames % _ZERO_EVERY == 1:
-                self._unpressed.follow(counts)
-                self._estimator.noise = max(self._noise, self._unpressed.noise * self._quantum)
-            counts = self._unpressed.corrected(counts, int(self._full))
+            if self.frame_count % _ZERO_INTERVAL == 1:
+                self._unloaded.update(counts)
+                self._estimator.noise = max(self._noise, self._unloaded.noise * self._quantum)
+            counts = self._unloaded.corrected(counts, int(self._full_count))
         if self._converter is not None:
             readings: NDArray[Any] = self._converter(counts)
         elif self._zero is not None:
@@ -212,41 +214,43 @@ class FingerPerception:
         return frame
 
     def published(self) -> NDArray[np.uint16]:
-        """Return the newest frame's data [rows, cols] for subscribers, in the unit of ``facts``."""
+        """Return the newest frame's data [rows, cols] for subscribers, in the unit of ``info``."""
         assert self.frame is not None
         assert self._readings is not None
-        if not self._as_pressure:
+        if not self._publishes_pressure:
             return self.frame.data
         if self._converter is None:
             return self._readings
         # With a zero below that of the calibration, a cell may exceed the range of the scale.
-        steps = np.minimum(self._readings * (1.0 / self.facts.scale), _STEPS)
+        steps = np.minimum(self._readings * (1.0 / self.info.scale), _PRESSURE_STEPS)
         return np.rint(steps).astype(np.uint16)
 
-    def _facts(self, settings: Settings, model: FingerModel) -> SensorFacts:
+    def _info(self, settings: Settings, model: FingerModel) -> SensorInfo:
         scale = settings.tactile.pascal_per_count
         if self._converter is not None:
             scale = (
-                self._converter.largest / _STEPS if self._as_pressure else self._converter.quantum
+                self._converter.largest / _PRESSURE_STEPS
+                if self._publishes_pressure
+                else self._converter.quantum
             )
         grid = model.grid
-        return SensorFacts(
+        return SensorInfo(
             *grid.pitches,
             *grid.centre,
             rotation=grid.rotation,
             unit=settings.stream.tactile_unit,
             scale=scale,
-            calibrated=self._as_pressure and self._converter is not None,
+            calibrated=self._publishes_pressure and self._converter is not None,
             calibration="" if model.calibration is None else model.calibration.identity,
         )
 
-    def _learn_zero(self, counts: NDArray[np.uint16]) -> None:
+    def _measure_zero(self, counts: NDArray[np.uint16]) -> None:
         self._tare_sum = self._tare_sum + counts.astype(np.uint32)
-        self._tare_left -= 1
-        if self._tare_left:
+        self._tare_remaining_count -= 1
+        if self._tare_remaining_count:
             return
-        mean = self._tare_sum / _TARE_FRAMES
-        ends = self._full - np.round(mean)
+        mean = self._tare_sum / _TARE_FRAME_COUNT
+        ends = self._full_count - np.round(mean)
         if not np.median(ends) > 0.0:  # above such a zero no contact could be measured
             side = FINGERS[self.finger]
             text = f"{side} sensor's zero stays: most cells are full where nothing presses"

@@ -24,12 +24,12 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.profile.validation import problems, shown
 
 _PROFILES = Path(softfinger.__file__).parent / "config"
-_MOST = 256 << 10  # bytes; the reference, which contains every key, has 21 kB
-_DEEPEST = 8  # nesting depth of tables and arrays
-_TOLD = 20  # largest number of reported errors
+_FILE_SIZE_MAX = 256 << 10  # bytes; the reference, which contains every key, has 21 kB
+_DEPTH_MAX = 8  # nesting depth of tables and arrays
+_ERROR_COUNT_MAX = 20  # largest number of reported errors
 # A dotted key of 16 parts or more. tomllib needs minutes for a key of thousands of parts.
 _DEEP_KEY = re.compile(r"""(?<![\w-])(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*){16}""")
-_LEAD = re.compile(r"\w+ should (be |have )?")  # start of pydantic's messages
+_MESSAGE_START = re.compile(r"\w+ should (be |have )?")  # start of pydantic's messages
 
 
 def load(
@@ -66,7 +66,8 @@ def checked(
         settings = Settings.model_validate(data)
     except ValidationError as error:
         told = error.errors(include_url=False)
-        found, more = [_line(details) for details in told[:_TOLD]], len(told) - _TOLD
+        found = [_line(details) for details in told[:_ERROR_COUNT_MAX]]
+        more = len(told) - _ERROR_COUNT_MAX
     else:
         if directory is not None:
             settings = _with_directory(settings, directory)
@@ -108,7 +109,7 @@ def profile_text(path: Path) -> str:
     Raises OSError as `read_file`, UnicodeDecodeError, and RecursionError for keys with too many
     parts.
     """
-    text = read_file(path, _MOST).decode("utf-8-sig")
+    text = read_file(path, _FILE_SIZE_MAX).decode("utf-8-sig")
     if _DEEP_KEY.search(text):
         raise RecursionError
     return text
@@ -169,7 +170,7 @@ def _tuples(value: Any, depth: int = 0) -> Any:
     Raises RecursionError beyond the depth of any profile, and ValueError for integers beyond TOML's
     range.
     """
-    if depth > _DEEPEST:
+    if depth > _DEPTH_MAX:
         raise RecursionError
     if isinstance(value, dict):
         return {key: _tuples(item, depth + 1) for key, item in value.items()}
@@ -214,7 +215,7 @@ def _line(
         return f"{key}: found an unknown key, expected a known one{nearest}"
     if details["type"] in ("model_type", "model_attributes_type", "dict_type"):
         return f"{key}: found {shown(details['input'])}, expected a table"
-    expected = _LEAD.sub("", details["msg"], count=1)
+    expected = _MESSAGE_START.sub("", details["msg"], count=1)
     if details["type"] == "less_than_equal" and not above and _is_length(location):
         metres = 1e-3 * float(details["input"])
         expected += f" m; {details['input']:g} mm are {metres:g}" if metres < 1.0 else " m"

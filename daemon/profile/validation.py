@@ -15,8 +15,8 @@ from softfinger.daemon.backends import backend
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS, GRIP_FRACTION
 
-_LONGEST = 60  # longest value in a message, in characters
-_DITHER_TICKS = 8  # ticks per period of the dither; fewer give no separate oscillation
+_VALUE_LENGTH_MAX = 60  # longest value in a message, in characters
+_DITHER_TICKS_MIN = 8  # ticks per period of the dither; fewer give no separate oscillation
 _TCP = re.compile(r"tcp://(127(?:\.\d{1,3}){3}|localhost|\[::1\]):(\d{1,5})")
 _ANY_TCP = re.compile(r"tcp://([\w.-]+|\*|\[[0-9a-fA-F:.]+(?:%\w+)?\]):(\d{1,5})")
 
@@ -26,10 +26,10 @@ def problems(settings: Settings) -> list[str]:
     return [problem for check in _CHECKS for problem in check(settings)]
 
 
-_WIDE = 2.0  # tip diameters, a larger sensor probably belongs to another tip
+_SENSOR_WIDTH_MAX = 2.0  # tip diameters, a larger sensor probably belongs to another tip
 
 
-def sensor_doubts(settings: Settings) -> list[str]:
+def sensor_warnings(settings: Settings) -> list[str]:
     """Return warnings about the sensors' size under these tips, one per line."""
     tip, tactile = settings.tip, settings.tactile
     if tactile.backend == "none":
@@ -37,7 +37,7 @@ def sensor_doubts(settings: Settings) -> list[str]:
     sides = tactile.cols * tactile.pitch, tactile.rows * (tactile.pitch_y or tactile.pitch)
     size = f"{sides[0] * 1e3:.4g} × {sides[1] * 1e3:.4g} mm"
     doubts = []
-    if min(sides) > _WIDE * 2.0 * tip.radius:
+    if min(sides) > _SENSOR_WIDTH_MAX * 2.0 * tip.radius:
         doubts.append(
             f"tactile.rows, cols, pitch: found a sensor of {size} for a tip of "
             f"{tip.radius * 2e3:.4g} mm diameter; is it another tip's, or tip.radius wrong?"
@@ -67,7 +67,9 @@ def shown(value: Any) -> str:
         text = '"' + "".join(each if each.isprintable() else "?" for each in value) + '"'
     else:
         text = str(value)
-    return text if len(text) <= _LONGEST else text[: _LONGEST - 2] + "…" + text[-1]
+    return (
+        text if len(text) <= _VALUE_LENGTH_MAX else text[: _VALUE_LENGTH_MAX - 2] + "…" + text[-1]
+    )
 
 
 def _fingers(settings: Settings) -> Iterator[str]:
@@ -143,17 +145,17 @@ def _measured_tip(settings: Settings) -> Iterator[str]:
         )
     else:
         file = 'the file of `softfinger calibrate law` with tip.physics = "measured"'
-        yield from _lacking(settings, "calibration", file)
+        yield from _missing(settings, "calibration", file)
 
 
-def _lacking(settings: Settings, key: str, expected: str) -> Iterator[str]:
+def _missing(settings: Settings, key: str, expected: str) -> Iterator[str]:
     """Check a text in the tactile settings that each finger of the scene needs."""
     for name in settings.scene.fingers:
         if not getattr(settings.tactile, key)[FINGERS.index(name)]:
             yield f'tactile.{key}: found "" for {name}, expected {expected}'
 
 
-def _above(key: str, found: float, unit: str, limit: float, why: str) -> Iterator[str]:
+def _too_large(key: str, found: float, unit: str, limit: float, why: str) -> Iterator[str]:
     if found > limit:
         yield f"{key}: found {found:g} {unit}, expected at most {limit:g} {unit}, {why}"
 
@@ -165,11 +167,11 @@ def _solid_tip(settings: Settings) -> Iterator[str]:
     if settings.material.law != "constant":
         yield f'material.law: found "{settings.material.law}", expected "constant" for a solid tip'
     why = "0.4 of a solid tip's radius"
-    yield from _above("safety.d_max", settings.safety.d_max, "m", 0.4 * tip.radius, why)
+    yield from _too_large("safety.d_max", settings.safety.d_max, "m", 0.4 * tip.radius, why)
     if tactile.backend == "none":
         return
     why = "a quarter of a solid tip's radius: more of it hides θ"
-    blurred = list(_above("tactile.blur", tactile.blur, "m", 0.25 * tip.radius, why))
+    blurred = list(_too_large("tactile.blur", tactile.blur, "m", 0.25 * tip.radius, why))
     yield from blurred
     if not [*blurred, *_blur(settings)]:
         yield from _cells_under(settings)
@@ -179,10 +181,10 @@ def _cells_under(settings: Settings) -> Iterator[str]:
     """Check the number of cells under a solid tip, whose whole base shows the contact."""
     from softfinger.daemon.profile.factory import make_grid, make_tip
     from softfinger.kinematics.estimation.error_budget import Uncertainty
-    from softfinger.kinematics.estimation.estimator import CELLS_MIN, within_rim
+    from softfinger.kinematics.estimation.estimator import CELLS_MIN, cells_within_rim
 
     known = Uncertainty(centre=settings.tactile.centre_error, pitch=settings.tactile.pitch_error)
-    cells = within_rim(make_grid(settings), make_tip(settings), known).sum()
+    cells = cells_within_rim(make_grid(settings), make_tip(settings), known).sum()
     if cells < CELLS_MIN:
         yield (
             f"tactile.pitch, tactile.centre: found {cells} cells well within a solid tip's rim, "
@@ -232,9 +234,9 @@ def _dither(settings: Settings) -> Iterator[str]:
         return
     limit = settings.safety.current_max * control.torque_constant
     why = "what safety.current_max gives"
-    yield from _above("control.dither_torque", control.dither_torque, "N·m", limit, why)
-    limit, why = settings.loop.rate / _DITHER_TICKS, f"{_DITHER_TICKS} ticks a period"
-    yield from _above("control.dither_frequency", control.dither_frequency, "Hz", limit, why)
+    yield from _too_large("control.dither_torque", control.dither_torque, "N·m", limit, why)
+    limit, why = settings.loop.rate / _DITHER_TICKS_MIN, f"{_DITHER_TICKS_MIN} ticks a period"
+    yield from _too_large("control.dither_frequency", control.dither_frequency, "Hz", limit, why)
 
 
 def _cells(settings: Settings) -> Iterator[str]:
@@ -252,12 +254,12 @@ def _blur(settings: Settings) -> Iterator[str]:
     tactile = settings.tactile
     height = tactile.rows * (tactile.pitch_y or tactile.pitch)
     limit = 0.5 * min(height, tactile.cols * tactile.pitch)
-    yield from _above("tactile.blur", tactile.blur, "m", limit, "half the sensor")
+    yield from _too_large("tactile.blur", tactile.blur, "m", limit, "half the sensor")
 
 
 def _recordings(settings: Settings) -> Iterator[str]:
     if settings.tactile.backend == "replay":
-        yield from _lacking(settings, "recording", "a recording")
+        yield from _missing(settings, "recording", "a recording")
 
 
 def _clock(settings: Settings) -> Iterator[str]:

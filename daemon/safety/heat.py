@@ -3,15 +3,15 @@
 If a servo is predicted to reach ``safety.temperature_max`` within ``heat_warn``, `safety.limits`
 warns and a grip is reduced to the largest force that never reaches the limit. The force stays at or
 above the value that the load needs, including the slip margin. If that is not enough, an error is
-reported _AHEAD seconds before the limit, and ``heat_action`` is performed in the last _LAST
-seconds. The reduction lasts until the grip ends, even if another force is commanded.
+reported _ERROR_TIME seconds before the limit, and ``heat_action`` is performed in the last
+_ACTION_TIME seconds. The reduction lasts until the grip ends, even if another force is commanded.
 """
 
 from __future__ import annotations
 
 import math
 
-from softfinger.daemon.control.modes import GRIPPING
+from softfinger.daemon.control.modes import GRIPPING_MODES
 from softfinger.daemon.control.state_machine import Control
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.control_table import by_name
@@ -23,20 +23,22 @@ from softfinger.kinematics.hand.servo_heat import (
     HeatLaw,
     HeatState,
     follow,
-    lasting_square,
+    sustained_square,
     time_to_limit,
     winding_std,
 )
 
-_EVERY = 0.5  # s between two updates of the thermal model
-_SMOOTH = 5.0  # s, averaging time of the squared current
-_STEP = 0.5  # °C, half a step of the thermometer, whose rounded reading reaches the limit early
-_BELOW = 3.0  # °C below the limit, target temperature of a reduced grip
-_EASED = 0.97  # a reduction to more than this fraction of the force is skipped
-_AT_ONCE = 0.6  # smallest fraction in one reduction, because the first estimate is uncertain
-_SETTLES = 10.0  # s after a reduction until the next evaluation
-_AHEAD, _LAST = 30.0, 3.0  # s
-_WINDING, _COUPLING = 0.04, 0.4  # the winding's share of heat capacity and thermal resistance
+_UPDATE_INTERVAL = 0.5  # s between two updates of the thermal model
+_AVERAGING_TIME = 5.0  # s, averaging time of the squared current
+# °C, half a step of the thermometer, whose rounded reading reaches the limit early.
+_HALF_STEP = 0.5
+_TARGET_MARGIN = 3.0  # °C below the limit, target temperature of a reduced grip
+_FRACTION_MAX = 0.97  # a reduction to more than this fraction of the force is skipped
+_FRACTION_MIN = 0.6  # smallest fraction in one reduction, because the first estimate is uncertain
+_SETTLING_TIME = 10.0  # s after a reduction until the next evaluation
+_ERROR_TIME, _ACTION_TIME = 30.0, 3.0  # s
+# the winding's share of heat capacity and thermal resistance.
+_WINDING_SHARE, _COUPLING_SHARE = 0.04, 0.4
 
 
 def set_law(law: HeatLaw, settings: Settings) -> tuple[float, float]:
@@ -50,10 +52,10 @@ def set_law(law: HeatLaw, settings: Settings) -> tuple[float, float]:
     model = by_name(servos.model)
     rise = servos.heat_rise or model.case_resistance * model.resistance
     time = servos.heat_time or model.case_resistance * model.heat_capacity
-    law.share = _WINDING / (1.0 - _WINDING)
-    law.case_time = (1.0 - _WINDING) * time
-    law.winding_time = _WINDING * _COUPLING * time
-    law.heating = rise / (_WINDING * time)
+    law.share = _WINDING_SHARE / (1.0 - _WINDING_SHARE)
+    law.case_time = (1.0 - _WINDING_SHARE) * time
+    law.winding_time = _WINDING_SHARE * _COUPLING_SHARE * time
+    law.heating = rise / (_WINDING_SHARE * time)
     return rise, time
 
 
@@ -72,12 +74,12 @@ class HeatWatch:
         self._heat = [0.0, 0.0]  # ∫ I² dt since the last update [A² s]
         self._square = [0.0, 0.0]  # smoothed mean square of the current [A²]
         self._t = math.nan  # time of the last reading [s]
-        self._passed = 0.0  # s since the last update
-        self._eased = -math.inf  # time of the last force reduction [s]
-        self._told = False  # the error that a reduction is not enough was reported
+        self._elapsed = 0.0  # s since the last update
+        self._reduction_time = -math.inf  # time of the last force reduction [s]
+        self._error_reported = False  # the error that a reduction is not enough was reported
         self.due = False  # the model was updated in this tick
 
-    def follow(self) -> None:
+    def update(self) -> None:
         """Add this tick's reading, and update the model when an update is due."""
         reading = self._state.reading
         dt = reading.t - self._t
@@ -87,59 +89,61 @@ class HeatWatch:
             return
         for i in self._fingers:
             self._heat[i] += reading.current[i] * reading.current[i] * dt
-        self._passed += dt
-        if self._passed >= _EVERY:
-            self._look()
+        self._elapsed += dt
+        if self._elapsed >= _UPDATE_INTERVAL:
+            self._update()
 
-    def _look(self) -> None:
-        passed, self._passed = self._passed, 0.0
+    def _update(self) -> None:
+        passed, self._elapsed = self._elapsed, 0.0
         self.due = True
         for i in self._fingers:
             square, self._heat[i] = self._heat[i] / passed, 0.0
-            self._square[i] += (square - self._square[i]) * min(passed / _SMOOTH, 1.0)
+            self._square[i] += (square - self._square[i]) * min(passed / _AVERAGING_TIME, 1.0)
             if not self._state.reading.temperature[i]:
                 continue  # no temperature has been read yet
             # Limit the step to suit the winding's time constant, also after a long gap without
             # readings.
-            for _ in range(max(round(passed / _EVERY), 1)):
-                step = min(passed, _EVERY)
+            for _ in range(max(round(passed / _UPDATE_INTERVAL), 1)):
+                step = min(passed, _UPDATE_INTERVAL)
                 follow(self._states[i].array, square, step, self._state.reading.temperature[i])
             heat, told = self._states[i], self._state.heat[i]
             told.winding, told.case, told.ambient = heat.x[[WINDING, CASE, AMBIENT]].tolist()
             told.winding_std = winding_std(heat.array)
             told.case_std = math.sqrt(heat.p.item(CASE, CASE))
-            limit = self._limits.temperature_max - _STEP
+            limit = self._limits.temperature_max - _HALF_STEP
             told.time_to_limit = time_to_limit(heat.array, self._square[i], limit)
 
     def act(self, control: Control, events: list[Event]) -> str:
         """Reduce the force of a grip that gets too hot; return a ``heat_action`` due now, or ''."""
         state = self._state
-        if state.mode not in GRIPPING:
-            self._told = False
+        if state.mode not in GRIPPING_MODES:
+            self._error_reported = False
             return ""
         i = min(self._fingers, key=lambda k: state.heat[k].time_to_limit)
         left = state.heat[i].time_to_limit
         if left > self._limits.heat_warn:
-            self._told = False
+            self._error_reported = False
             return ""
         who = f"{FINGERS[i]} servo at {self._limits.temperature_max:g} °C in {left:.0f} s"
-        if state.t - self._eased < _SETTLES and left > _LAST:
+        if state.t - self._reduction_time < _SETTLING_TIME and left > _ACTION_TIME:
             return ""  # the last reduction has not taken effect yet
         now = state.goal.force
-        square = lasting_square(self._states[i].array, self._limits.temperature_max - _BELOW)
+        square = sustained_square(
+            self._states[i].array, self._limits.temperature_max - _TARGET_MARGIN
+        )
         lasts = now * math.sqrt(square / max(self._square[i], 1e-6))
-        eased = max(min(lasts, now), _AT_ONCE * now, control.grip.load_needs())
-        if eased < _EASED * now:
-            self._eased = state.t
-            control.ease(eased, _LAST)
+        eased = max(min(lasts, now), _FRACTION_MIN * now, control.grip.force_for_load())
+        if eased < _FRACTION_MAX * now:
+            self._reduction_time = state.t
+            control.limit_force(eased, _ACTION_TIME)
             text = f"{who}: grip eased from {now:.1f} to {eased:.1f} N"
             events.append(("warning", "servos.heat", text))
             return ""
-        if left > _AHEAD:
+        if left > _ERROR_TIME:
             return ""
         action = self._limits.heat_action
-        if not self._told:
-            self._told = True
+        if not self._error_reported:
+            self._error_reported = True
             text = f"{who}, and the load needs the grip: {action}"
             events.append(("error", "servos.heat", text))
-        return action if left < _LAST and action != "hold" else ""
+        return action if left < _ACTION_TIME and action != "hold" else ""

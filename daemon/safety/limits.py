@@ -19,30 +19,32 @@ from typing import Literal
 
 import numpy as np
 
-from softfinger.daemon.control.modes import GRIPPING, HELD, Mode
+from softfinger.daemon.control.modes import GRIPPING_MODES, HOLDING_MODES, Mode
 from softfinger.daemon.perception.frame_channels import ANGLE_JUMP, REJECTED_MAX
 from softfinger.daemon.perception.grasp import GraspState
 from softfinger.daemon.perception.grasp_kernels import ANGLE_BIAS_MIN
-from softfinger.daemon.perception.hand_state import CURRENT_TIME
+from softfinger.daemon.perception.hand_state import CURRENT_OFF_TIME_MAX
 from softfinger.daemon.perception.perception import FingerPerception
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.safety.wiring import WiringWatch
 from softfinger.daemon.servos.control_table import VOLTAGE_UNIT, by_name, hardware_error_names
 from softfinger.daemon.types import FINGERS, Contact, Reading, State
 
-_NOISY = 1.5  # times ``tactile.noise``; more noise is mentioned in the message
-_NEAR = 0.9  # fraction of a fault's bound at which a warning starts
-_PULL = 2.0  # A/rad, expected pull towards the goal; every servo model's own loop is stiffer
-_SLOW = 0.05  # rad/s, below which a joint counts as standing still
-_RISE = 0.2  # relative rise of the commanded force, and fraction of it that must be measured
-_DEAF = 0.3  # s in which the measured force must follow
-_AT_ONCE = 0.02  # rad, tolerance of one step beyond the distance at maximum velocity
-_APART = 0.1  # rad, allowed difference between the angle and the integrated velocity
-_MEMORY = 0.1  # s, time window of that difference, because the velocity lags
-_LATE = 0.02  # s between two readings, or 3 ticks, after which the window restarts
-_MEAN = 0.72  # s, time constant of the fraction of failed readings
-_FAILED = 0.75  # fraction that is reported; reached after 1 s without a good reading
-_GAP = 0.1  # s between two readings, after which the step is not checked either
+_NOISE_RATIO = 1.5  # times ``tactile.noise``; more noise is mentioned in the message
+_WARNING_FRACTION = 0.9  # fraction of a fault's bound at which a warning starts
+# A/rad, expected pull towards the goal; every servo model's own loop is stiffer.
+_CURRENT_PER_ERROR = 2.0
+_STANDSTILL_SPEED = 0.05  # rad/s, below which a joint counts as standing still
+# relative rise of the commanded force, and fraction of it that must be measured.
+_FORCE_RISE_MIN = 0.2
+_RESPONSE_TIME = 0.3  # s in which the measured force must follow
+_STEP_TOLERANCE = 0.02  # rad, tolerance of one step beyond the distance at maximum velocity
+_DRIFT_MAX = 0.1  # rad, allowed difference between the angle and the integrated velocity
+_DRIFT_TIME = 0.1  # s, time window of that difference, because the velocity lags
+_LATE_TIME = 0.02  # s between two readings, or 3 ticks, after which the window restarts
+_FAILURE_TIME = 0.72  # s, time constant of the fraction of failed readings
+_FAILED_FRACTION_MAX = 0.75  # fraction that is reported; reached after 1 s without a good reading
+_GAP_TIME = 0.1  # s between two readings, after which the step is not checked either
 
 
 class JointMotion:
@@ -57,36 +59,36 @@ class JointMotion:
         self.jumped = 0
         self._fingers = tuple(fingers)
         self._velocity_max = velocity_max
-        self._late = max(_LATE, 3.0 * period)
-        self._gap = max(_GAP, self._late)
-        self._requested = -math.inf  # time of the request of the last good reading [s]
+        self._late_time = max(_LATE_TIME, 3.0 * period)
+        self._gap_time = max(_GAP_TIME, self._late_time)
+        self._request_time = -math.inf  # time of the request of the last good reading [s]
         self._t = -math.inf  # time of the last good reading [s]
         self._q = [0.0, 0.0]
-        self._apart = [0.0, 0.0]  # angle less integrated velocity [rad]
+        self._drift = [0.0, 0.0]  # angle less integrated velocity [rad]
 
-    def follow(self, requested: float, reading: Reading) -> None:
+    def update(self, requested: float, reading: Reading) -> None:
         """Check a reading that was requested at time ``requested``."""
         self.jumped = 0
         t = reading.t
         if not reading.valid or t == self._t:
             return
         # Each reading was measured at some time between request and reply.
-        longest, dt = t - self._requested, t - self._t
-        q, before, apart = reading.q, self._q, self._apart
-        if longest < self._gap:
-            limit = self._velocity_max * longest + _AT_ONCE
-            keep = 1.0 - dt / _MEMORY if longest < self._late else 0.0
+        longest, dt = t - self._request_time, t - self._t
+        q, before, apart = reading.q, self._q, self._drift
+        if longest < self._gap_time:
+            limit = self._velocity_max * longest + _STEP_TOLERANCE
+            keep = 1.0 - dt / _DRIFT_TIME if longest < self._late_time else 0.0
             for i in self._fingers:
                 step = q[i] - before[i]
                 before[i] = q[i]
                 off = apart[i] = keep * (apart[i] + step - reading.dq[i] * dt)
-                if not (-limit <= step <= limit and -_APART <= off <= _APART):
+                if not (-limit <= step <= limit and -_DRIFT_MAX <= off <= _DRIFT_MAX):
                     self.jumped |= 1 << i
                     apart[i] = 0.0
         else:
             before[:] = q
             apart[:] = 0.0, 0.0
-        self._t, self._requested = t, requested
+        self._t, self._request_time = t, requested
 
 
 class View:
@@ -108,7 +110,9 @@ class View:
         self._t = math.nan  # time of the last state [s]
         self.motion = JointMotion(self.fingers, self.limits.velocity_max, 1.0 / settings.loop.rate)
         servos = settings.servos  # in current mode the daemon's own stiffness sets the pull
-        self.pull = min(_PULL, 0.5 * servos.stiffness) if servos.mode == "current" else _PULL
+        self.pull = _CURRENT_PER_ERROR
+        if servos.mode == "current":
+            self.pull = min(self.pull, 0.5 * servos.stiffness)
         self.bad_goal = False  # a goal since the last check was not finite
         self.grip_width = math.nan  # object width at the start of the grip [m]
         self._target = math.nan  # commanded grip force at the last tick [N]
@@ -121,13 +125,14 @@ class View:
             high = high or model.voltage_max * VOLTAGE_UNIT
         self.voltage = (low, high)
 
-    def follow(self, state: State) -> None:
+    def update(self, state: State) -> None:
         """Record the parts of this tick's state that later checks compare with."""
-        self.motion.follow(state.t, state.reading)
-        self.wiring.follow(state)
+        self.motion.update(state.t, state.reading)
+        self.wiring.update(state)
         passed, self._t = state.t - self._t, state.t
         if passed > 0.0:
-            self.failed += min(passed / _MEAN, 1.0) * ((not state.reading.valid) - self.failed)
+            weight = min(passed / _FAILURE_TIME, 1.0)
+            self.failed += weight * ((not state.reading.valid) - self.failed)
         if not self.holds(state):
             self.grip_width = math.nan
         elif math.isnan(self.grip_width):
@@ -138,11 +143,11 @@ class View:
         target, last = state.goal.force, self._target
         self._target = target
         felt = 0.5 * (state.contacts[0].force + state.contacts[1].force)
-        if not (state.mode in GRIPPING and self.touched(state) and target > felt):
+        if not (state.mode in GRIPPING_MODES and self.touched(state) and target > felt):
             self.rise_t = math.inf
-        elif target > (1.0 + _RISE) * last and self.rise_t == math.inf:
+        elif target > (1.0 + _FORCE_RISE_MIN) * last and self.rise_t == math.inf:
             self.rise_t, self.rise_felt = state.t, felt
-        elif abs(felt - self.rise_felt) > _RISE * (target - self.rise_felt):
+        elif abs(felt - self.rise_felt) > _FORCE_RISE_MIN * (target - self.rise_felt):
             self.rise_t = math.inf
 
     def touched(self, state: State) -> bool:
@@ -152,7 +157,7 @@ class View:
 
     def holds(self, state: State) -> bool:
         """Return True if `touched` is true in a grip that has settled."""
-        return state.mode in HELD and self.touched(state)
+        return state.mode in HOLDING_MODES and self.touched(state)
 
 
 def _touches(contact: Contact) -> bool:
@@ -227,7 +232,7 @@ def _servos_silent(view: View, state: State, _: float) -> str:
 @Limit("servos.silent", "share of the last second's servo readings that failed, with and without "
     "torque", "warn", ("servos.reply_timeout",), "servos")  # fmt: skip
 def _servos_late(view: View, _: State, fraction: float) -> str:
-    if view.failed <= fraction * _FAILED:
+    if view.failed <= fraction * _FAILED_FRACTION_MAX:
         return ""
     allowed = 1e3 * view.settings.servos.reply_timeout
     return (
@@ -242,10 +247,10 @@ def _servos_frozen(view: View, state: State, _: float) -> str:
     frozen = state.reading.frozen
     if not frozen:
         return ""
-    return f"servos: old readings from {_named(view, frozen)}: its own clock stands still"
+    return f"servos: old readings from {_names(view, frozen)}: its own clock stands still"
 
 
-def _named(view: View, bits: int) -> str:
+def _names(view: View, bits: int) -> str:
     return " and ".join(FINGERS[i] for i in view.fingers if bits >> i & 1)
 
 
@@ -290,14 +295,14 @@ def _servos_voltage(view: View, state: State, _: float, i: int) -> str:
 
 # --- joints ---------------------------------------------------------------------------------------
 
-_PAST_STOP = 0.1  # rad, tolerance for a joint that is pushed beyond its limit
+_STOP_TOLERANCE = 0.1  # rad, tolerance for a joint that is pushed beyond its limit
 
 
 @Limit("joint.angle", "joint angle, 0.1 rad past its limits", "fault", ("hand.q_min", "hand.q_max"),
     "servos").each  # fmt: skip
 def _joint_angle(view: View, state: State, _: float, i: int) -> str:
     hand, q = view.settings.hand, state.reading.q[i]
-    inside = hand.q_min[i] - _PAST_STOP <= q <= hand.q_max[i] + _PAST_STOP
+    inside = hand.q_min[i] - _STOP_TOLERANCE <= q <= hand.q_max[i] + _STOP_TOLERANCE
     return "" if inside else f"{FINGERS[i]} joint at {q:.3f} rad, outside its limits"
 
 
@@ -314,14 +319,14 @@ def _joint_jump(view: View, _: State, __: float) -> str:
     if not view.motion.jumped:
         return ""
     return (
-        f"{_named(view, view.motion.jumped)} joint's angle went where its velocity did not: its "
+        f"{_names(view, view.motion.jumped)} joint's angle went where its velocity did not: its "
         "encoder, or what turns it, has slipped"
     )
 
 
-_OFF = 0.05  # rad, position error above which a current must pull the joint
-_FELT = 0.04  # A, smallest expected current that is checked
-_PULLED = 0.25  # required fraction of the expected current
+_POSITION_ERROR_MIN = 0.05  # rad, position error above which a current must pull the joint
+_EXPECTED_CURRENT_MIN = 0.04  # A, smallest expected current that is checked
+_CURRENT_FRACTION_MIN = 0.25  # required fraction of the expected current
 
 
 @Limit("joint.dead", "joint that stands 0.05 rad off its goal without current for 0.05 s", "fault",
@@ -336,11 +341,11 @@ def _joint_dead(view: View, state: State, _: float, i: int) -> str:
     if not (state.torque and goal.valid) or view.settings.servos.mode == "position":
         return ""
     error = goal.q[i] - reading.q[i]
-    if abs(error) < _OFF or abs(reading.dq[i]) > _SLOW:
+    if abs(error) < _POSITION_ERROR_MIN or abs(reading.dq[i]) > _STANDSTILL_SPEED:
         return ""
     expected = min(goal.current[i], view.pull * abs(error))
     toward = math.copysign(1.0, error) * reading.current[i]
-    if not (expected > _FELT and toward < _PULLED * expected):
+    if not (expected > _EXPECTED_CURRENT_MIN and toward < _CURRENT_FRACTION_MIN * expected):
         return ""
     return (
         f"{FINGERS[i]} joint stands {math.degrees(abs(error)):.1f}° off its goal and takes "
@@ -363,13 +368,13 @@ _FULL_CURRENT = 0.9  # fraction of a goal's current limit at which no reserve is
     ("safety.stall_error", "safety.stall_time"), "servos", in_turn=True,
     lasts="stall_time").each  # fmt: skip
 def _joint_stall(view: View, state: State, _: float, i: int) -> str:
-    if not state.torque or not state.goal.valid or state.mode in GRIPPING:
+    if not state.torque or not state.goal.valid or state.mode in GRIPPING_MODES:
         return ""
     reading, goal = state.reading, state.goal
     by_current = view.settings.servos.mode != "position"
     error, current = abs(goal.q[i] - reading.q[i]), abs(reading.current[i])
     full = _FULL_CURRENT * (goal.current[i] if by_current else view.limits.current_max)
-    stands = current >= full and abs(reading.dq[i]) < _SLOW
+    stands = current >= full and abs(reading.dq[i]) < _STANDSTILL_SPEED
     if not (stands and error > view.limits.stall_error):
         return ""
     off = f"{math.degrees(error):.1f}° off its goal"
@@ -389,7 +394,9 @@ def _joint_blocked(view: View, state: State, _: float, i: int) -> str:
     if state.mode != Mode.GRASPING or not goal.valid or not view.sensors or contact.contact:
         return ""
     full = reading.current[i] >= _FULL_CURRENT * goal.current[i] > 0.0
-    stands = abs(reading.dq[i]) < _SLOW and goal.q[i] - reading.q[i] > _OFF
+    stands = (
+        abs(reading.dq[i]) < _STANDSTILL_SPEED and goal.q[i] - reading.q[i] > _POSITION_ERROR_MIN
+    )
     if not (full and stands):
         return ""
     return (
@@ -399,15 +406,15 @@ def _joint_blocked(view: View, state: State, _: float, i: int) -> str:
     )
 
 
-_ALL = 0.95  # fraction of the maximum current at which the grip force cannot rise
+_CURRENT_FRACTION_MAX = 0.95  # fraction of the maximum current at which the grip force cannot rise
 
 
 @Limit("joint.strained", "grip that takes all the current there may be", "warn",
     ("safety.current_max",), "servos", in_turn=True, lasts=1.0).each  # fmt: skip
 def _joint_strained(view: View, state: State, fraction: float, i: int) -> str:
     limit = view.limits.current_max
-    well = abs(state.reading.current[i]) < _ALL * fraction * limit
-    if not state.torque or state.mode not in GRIPPING or well:
+    well = abs(state.reading.current[i]) < _CURRENT_FRACTION_MAX * fraction * limit
+    if not state.torque or state.mode not in GRIPPING_MODES or well:
         return ""
     return f"{FINGERS[i]} joint grips with all of its {limit:g} A"
 
@@ -426,7 +433,7 @@ def _goal_lost(view: View, state: State, _: float) -> str:
     lost = state.reading.lost
     if not lost:
         return ""
-    return f"servos: none of the goals sent lately reached {_named(view, lost)}: check the cable"
+    return f"servos: none of the goals sent lately reached {_names(view, lost)}: check the cable"
 
 
 @Limit("goal.number", "non-finite goal: it is not sent", "fault", needs="servos")
@@ -448,7 +455,7 @@ LIMITS += [
 
 @Limit("tip.force", "normal force of a tip", "fault", ("safety.force_max",), "sensors").each
 @Limit("tip.force", "normal force of a tip", "warn", ("safety.force_max",), "sensors",
-    fraction=_NEAR).each  # fmt: skip
+    fraction=_WARNING_FRACTION).each  # fmt: skip
 def _tip_force(view: View, state: State, fraction: float, i: int) -> str:
     bound, contact = fraction * view.limits.force_max, state.contacts[i]
     if not _touches(contact) or contact.force <= bound:
@@ -458,7 +465,7 @@ def _tip_force(view: View, state: State, fraction: float, i: int) -> str:
 
 @Limit("tip.displacement", "displacement of a tip", "fault", ("safety.d_max",), "sensors").each
 @Limit("tip.displacement", "displacement of a tip", "warn", ("safety.d_max",), "sensors",
-    fraction=_NEAR).each  # fmt: skip
+    fraction=_WARNING_FRACTION).each  # fmt: skip
 def _tip_displacement(view: View, state: State, fraction: float, i: int) -> str:
     bound, contact = fraction * view.limits.d_max, state.contacts[i]
     if not _touches(contact) or contact.d <= bound:
@@ -466,11 +473,13 @@ def _tip_displacement(view: View, state: State, fraction: float, i: int) -> str:
     return f"{FINGERS[i]} tip at {contact.d * 1e3:.2f} mm, above {bound * 1e3:g} mm"
 
 
-_TILT = "|θ| against asin(1 − d/a) less a margin"
+_TILT_TEXT = "|θ| against asin(1 − d/a) less a margin"
 
 
-@Limit("tip.tilt", _TILT, "fault", ("safety.theta_margin",), "sensors").each
-@Limit("tip.tilt", _TILT, "warn", ("safety.theta_margin",), "sensors", fraction=_NEAR).each
+@Limit("tip.tilt", _TILT_TEXT, "fault", ("safety.theta_margin",), "sensors").each
+@Limit(
+    "tip.tilt", _TILT_TEXT, "warn", ("safety.theta_margin",), "sensors", fraction=_WARNING_FRACTION
+).each
 def _tip_tilt(view: View, state: State, fraction: float, i: int) -> str:
     """|θ| ≤ fraction·(asin(1 − d/a) − margin).
 
@@ -515,15 +524,15 @@ def _tactile_silent(view: View, state: State, _: float, i: int) -> str:
         elif what != "frame":
             cure = f": {sensor.estimate.invalid.text}" if sensor.estimate.invalid else ""
             noise = view.settings.tactile.noise
-            if sensor.noise > _NOISY * noise:
+            if sensor.noise > _NOISE_RATIO * noise:
                 cure += f"; its cells' noise is {sensor.noise:.0f} Pa, tactile.noise is {noise:g}"
     return (
-        _doubt(view, state, i)
+        _sensor_fault(view, state, i)
         or f"tactile: no {what} of the {FINGERS[i]} sensor for {age:.3f} s{cure}"
     )
 
 
-def _doubt(view: View, state: State, finger: int) -> str:
+def _sensor_fault(view: View, state: State, finger: int) -> str:
     """Explain why a sensor's frames are rejected; empty text if they are accepted."""
     side, found = FINGERS[finger], view.grasp
     if found.rejected_count[finger] > REJECTED_MAX:
@@ -546,19 +555,19 @@ def _doubt(view: View, state: State, finger: int) -> str:
             "displacement than its joint's closing and torque say: tare it"
         )
     for sensor in view.sensors:
-        if sensor.finger == finger and sensor.repeats.long:
-            return f"{side} sensor sends the same {sensor.repeats.lag} frames again"
+        if sensor.finger == finger and sensor.repeats.is_fault:
+            return f"{side} sensor sends the same {sensor.repeats.period} frames again"
     return ""
 
 
-_GAIN_DOUBTED = 1.5  # prior standard deviations of gain error at which it is reported
+_GAIN_SIGMA = 1.5  # prior standard deviations of gain error at which it is reported
 
 
-def _gain_doubt(view: View, finger: int) -> str:
+def _gain_fault(view: View, finger: int) -> str:
     """Describe a gain error that is larger than usual; empty text if there is none."""
     grasp = view.grasp
     off, unsure = grasp.gain_change[finger], grasp.gain_std[finger]
-    if not abs(off) - unsure > _GAIN_DOUBTED * grasp.gain_prior_std[finger]:
+    if not abs(off) - unsure > _GAIN_SIGMA * grasp.gain_prior_std[finger]:
         return ""
     return (
         f"{FINGERS[finger]} sensor reads {math.exp(off):.0%} of what the joints and the other tip "
@@ -566,7 +575,7 @@ def _gain_doubt(view: View, finger: int) -> str:
     )
 
 
-def _enter_witnesses(finger: int, side: str) -> None:
+def _add_consistency_checks(finger: int, side: str) -> None:
     @Limit(f"witness.{side}_sensor", "a tip's frames, by the joints and the other tip", "warn",
         ("tactile.gain_error",), "sensors", in_turn=True)  # fmt: skip
     def _sensor(view: View, state: State, _: float) -> str:
@@ -574,14 +583,14 @@ def _enter_witnesses(finger: int, side: str) -> None:
             return ""
         # Check the gain only in a grip: after release the cells may relax more slowly than the
         # shape.
-        return _doubt(view, state, finger) or (
-            _gain_doubt(view, finger) if view.holds(state) else ""
+        return _sensor_fault(view, state, finger) or (
+            _gain_fault(view, finger) if view.holds(state) else ""
         )
 
     @Limit(f"witness.{side}_current", "a joint's current in a grip, by its goal", "warn",
         (), "servos", in_turn=True)  # fmt: skip
     def _current(view: View, state: State, _: float) -> str:
-        if not view.grasp.current_off_time[finger] > CURRENT_TIME:
+        if not view.grasp.current_off_time[finger] > CURRENT_OFF_TIME_MAX:
             return ""
         return (
             f"{side} joint's current reads {state.reading.current[finger]:.2f} A where its goal is "
@@ -590,13 +599,13 @@ def _enter_witnesses(finger: int, side: str) -> None:
 
 
 for _finger, _side in enumerate(FINGERS):
-    _enter_witnesses(_finger, _side)
+    _add_consistency_checks(_finger, _side)
 
 
 @Limit("witness.force", "the force felt, for 0.3 s after the one asked for rose", "fault", (),
     "sensors", in_turn=True)  # fmt: skip
-def _witness_force(view: View, state: State, _: float) -> str:
-    if not state.t - view.rise_t > _DEAF:
+def _force_response(view: View, state: State, _: float) -> str:
+    if not state.t - view.rise_t > _RESPONSE_TIME:
         return ""
     return (
         f"the force asked for rose to {state.goal.force:.1f} N and the tips feel "
@@ -608,7 +617,7 @@ def _witness_force(view: View, state: State, _: float) -> str:
     "fault", ("safety.frozen_after",), "sensors", in_turn=True)  # fmt: skip
 def _tactile_frozen(view: View, state: State, _: float) -> str:
     for sensor in view.sensors:
-        same = 0.0 if sensor.frame is None else sensor.frame.t_arrival - sensor.changed
+        same = 0.0 if sensor.frame is None else sensor.frame.t_arrival - sensor.changed_time
         if same > view.limits.frozen_after > 0.0 and state.contacts[sensor.finger].contact:
             side = FINGERS[sensor.finger]
             return f"tactile: {side} sensor frozen, the same frame for {same:.2f} s"
@@ -644,20 +653,22 @@ def _tactile_misfit(_: View, state: State, __: float, i: int) -> str:
 
 # --- the hand and its grip ------------------------------------------------------------------------
 
-_SURE = 4.0  # smallest significant difference, in summed standard deviations of both tilts
-_ANGLE = "object's angle by one finger against the other's"
+_ANGLE_SIGMA = 4.0  # smallest significant difference, in summed standard deviations of both tilts
+_ANGLE_TEXT = "object's angle by one finger against the other's"
 _ANGLE_KEYS = ("safety.residual_angle", "object.taper")
 
 
-@Limit("hand.angle", _ANGLE, "fault", _ANGLE_KEYS, "sensors", in_turn=True, lasts=0.2)
-@Limit("hand.angle", _ANGLE, "warn", _ANGLE_KEYS, "sensors", in_turn=True, lasts=0.2, fraction=0.5)
+@Limit("hand.angle", _ANGLE_TEXT, "fault", _ANGLE_KEYS, "sensors", in_turn=True, lasts=0.2)
+@Limit(
+    "hand.angle", _ANGLE_TEXT, "warn", _ANGLE_KEYS, "sensors", in_turn=True, lasts=0.2, fraction=0.5
+)
 def _hand_angle(view: View, state: State, fraction: float) -> str:
     if not view.touched(state) or len(view.sensors) < 2:
         return ""
     left, right = (sensor.estimate for sensor in view.sensors)  # of the newest frames only
     if not (left.contact and right.contact):
         return ""
-    unsure = _SURE * (left.tilt_x_std + right.tilt_x_std)
+    unsure = _ANGLE_SIGMA * (left.tilt_x_std + right.tilt_x_std)
     bound = max(fraction * view.limits.residual_angle, unsure)
     q = state.reading.q
     apart = (left.tilt_x - q[0]) - (right.tilt_x + q[1]) + view.settings.object.taper

@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from softfinger.daemon.control.modes import GRIPPING, Mode
+from softfinger.daemon.control.modes import GRIPPING_MODES, Mode
 from softfinger.daemon.perception.grasp import GraspState
 from softfinger.daemon.perception.perception import FingerPerception
 from softfinger.daemon.profile.settings import Settings
@@ -20,8 +20,8 @@ from softfinger.daemon.safety.limits import LIMITS, Check, Limit, View
 from softfinger.daemon.servos.base import Servos
 from softfinger.daemon.types import Goal, State
 
-_AGAIN = 1.0  # s without violation before a warning may be repeated
-_EASE = 0.95  # hysteresis: a reported warning clears below this fraction of its bound
+_REPEAT_TIME = 1.0  # s without violation before a warning may be repeated
+_HYSTERESIS = 0.95  # hysteresis: a reported warning clears below this fraction of its bound
 
 BUS = "servos.bus"  # limit for errors raised by the servo backend
 TORQUE_OFF = "torque.off"  # limit for unconfirmed torque off, see `safety.torque_state`
@@ -51,13 +51,13 @@ class _Watch:
     ) -> None:
         """Run the check, and record a violation that has lasted long enough."""
         limit = self.limit
-        found = self.check(view, state, limit.fraction * (_EASE if self.reported else 1.0))
+        found = self.check(view, state, limit.fraction * (_HYSTERESIS if self.reported else 1.0))
         if not found:
             if self.since < math.inf:
                 self.since = math.inf
                 self._ended = state.t
                 faults.pop(self, None)
-            if self.reported and state.t - self._ended > _AGAIN:
+            if self.reported and state.t - self._ended > _REPEAT_TIME:
                 self.reported = False
             return
         self.since = min(self.since, state.t)
@@ -120,14 +120,14 @@ class Safety:
         New warnings are appended to ``warnings``.
         """
         view, found = self._view, self._found
-        view.follow(state)
+        view.update(state)
         for watch in self._each_tick:
             watch.check_limit(view, state, found, self.warnings)
         view.bad_goal = False
         if self._in_turn:
             self._turn = (self._turn + 1) % len(self._in_turn)
             self._in_turn[self._turn].check_limit(view, state, found, self.warnings)
-        gripping = state.mode in GRIPPING
+        gripping = state.mode in GRIPPING_MODES
         oldest, contacts = state.t - self._hold_age, state.contacts
         late = any(contacts[i].t_valid < oldest for i in view.fingers)
         self.must_hold = gripping and self._has_sensors and late
@@ -144,7 +144,7 @@ class Safety:
 
         With ``gripping``, the limits of a grip are checked in every mode. Nothing is changed.
         """
-        gripping = gripping or state.mode in GRIPPING
+        gripping = gripping or state.mode in GRIPPING_MODES
         view = self._view
         for watch in self._faults:
             if watch.limit.gripping and not gripping:
@@ -157,7 +157,7 @@ class Safety:
     def opens_first(self, breach: Breach, mode: Mode | str) -> bool:
         """Return True if the hand opens before this fault turns its torque off."""
         commanded = self._limits.frame_age_action == "open"
-        return commanded and breach.name == "tactile.silent" and mode in GRIPPING
+        return commanded and breach.name == "tactile.silent" and mode in GRIPPING_MODES
 
     # Goals
 
@@ -174,7 +174,7 @@ class Safety:
             self._sent_current[:] = (0.0, 0.0)
         self._sent_seq = state.seq
         for i, low, high in self._ends:
-            self._bound_one(goal, i, low, high, present[i])
+            self._bound_goal(goal, i, low, high, present[i])
             if not goal.valid:
                 return
             self._sent_q[i] = q[i]
@@ -182,7 +182,7 @@ class Safety:
         if goal.valid:
             servos.write(goal)
 
-    def _bound_one(self, goal: Goal, i: int, low: float, high: float, present: float) -> None:
+    def _bound_goal(self, goal: Goal, i: int, low: float, high: float, present: float) -> None:
         q, current = goal.q[i], goal.current[i]
         if not (math.isfinite(q) and math.isfinite(current)):
             goal.valid = False

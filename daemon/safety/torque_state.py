@@ -18,9 +18,9 @@ from softfinger.daemon.servos.base import Servos
 from softfinger.daemon.servos.control_table import WATCHDOG_UNIT
 from softfinger.daemon.types import Reading, State
 
-_TRY = 0.5  # fraction of the watchdog time for tries before the bus falls silent
-_TRY_UNGUARDED = 0.05  # s of tries before a report if servos.watchdog = 0
-_LAST_TRIES = 15  # tries when the daemon ends
+_TRY_FRACTION = 0.5  # fraction of the watchdog time for tries before the bus falls silent
+_TRY_TIME_UNGUARDED = 0.05  # s of tries before a report if servos.watchdog = 0
+_CLOSING_TRY_COUNT = 15  # tries when the daemon ends
 
 
 class TorqueState:
@@ -42,7 +42,7 @@ class TorqueState:
         self._fail = fail
         self._emit = emit
         watchdog = settings.watchdog
-        self._patience = _TRY * watchdog or _TRY_UNGUARDED
+        self._try_time = _TRY_FRACTION * watchdog or _TRY_TIME_UNGUARDED
         # The servo counts in whole units and may react one unit late.
         units = math.ceil(watchdog / WATCHDOG_UNIT - 1e-9) + 1 if watchdog else 0
         self._silence = units * WATCHDOG_UNIT
@@ -50,7 +50,7 @@ class TorqueState:
         self._silent_until = -math.inf
         self._first = math.inf  # time of the first request for torque off [s]
         self._reported = False
-        self._gone = False  # the port is gone, so nothing can be sent
+        self._port_gone = False  # the port is gone, so nothing can be sent
         self._last_try = -1  # seq of the tick with the last try
         self._unused = Reading()  # buffer for readings that this tick no longer uses
 
@@ -116,7 +116,7 @@ class TorqueState:
 
     def end(self) -> None:
         """Turn torque off if it may be on; if that fails, the silent bus trips the watchdogs."""
-        for _ in range(_LAST_TRIES):
+        for _ in range(_CLOSING_TRY_COUNT):
             if not self._state.torque:
                 return
             self._last_try = -1
@@ -147,9 +147,9 @@ class TorqueState:
 
     def _try(self, servos: Servos, reading: Reading) -> None:
         self._last_try = self._state.seq
-        self._gone = True
+        self._port_gone = True
         confirmed = servos.torque_off(reading)
-        self._gone = False
+        self._port_gone = False
         if not confirmed:
             return
         state = self._state
@@ -167,10 +167,10 @@ class TorqueState:
         t = self._state.t
         if t < self._silent_until:
             return True
-        if t - self._tried_since < self._patience:
+        if t - self._tried_since < self._try_time:
             return False
         self._report()
-        silence = 0.0 if self._gone else self._silence
+        silence = 0.0 if self._port_gone else self._silence
         self._silent_until = self._tried_since = t + silence
         return silence > 0.0
 
@@ -183,7 +183,7 @@ class TorqueState:
         text = f"torque off not confirmed by the servos for {state.t - self._first:.2f} s: "
         if not self._silence:
             text += "cut their power (servos.watchdog = 0: nothing else stops them)"
-        elif self._gone:
+        elif self._port_gone:
             text += "the port is gone, their watchdogs stop them"
         else:
             text += "the bus is kept silent until their watchdogs stop them"

@@ -13,17 +13,17 @@ from collections.abc import Sequence
 from softfinger.daemon.control.modes import Mode
 from softfinger.daemon.types import FINGERS, State
 
-_STILL = 0.02  # rad, largest motion of a joint that waits for the other one
-_MOVED = 0.05  # rad, smallest closing motion of the other joint
+_STANDING_MAX = 0.02  # rad, largest motion of a joint that waits for the other one
+_CLOSING_MIN = 0.05  # rad, smallest closing motion of the other joint
 # Smallest tilt of the tip as a fraction of that motion. With swapped IDs a tip tilts by about the
 # angle that its finger turns: 0.9 of it on a sliding object in the simulated hand. With correct
 # wiring the fraction is 0.25.
-_TILTED = 0.5
-_SURE = 2.0  # standard deviations of the tilt, added to the threshold
-_PRESSED = 1.0  # N, smallest rise of the tip's force
-_SETTLED = 0.07  # s after a touch, for the frames' latency and the joint's stopping time
-_AGAINST = math.radians(4.0)  # rad, rotation opposite to the command
-_SENSES = (1.0, -1.0)  # sign of a tip's tilt when its finger closes
+_TILT_RATIO = 0.5
+_TILT_SIGMA = 2.0  # standard deviations of the tilt, added to the threshold
+_FORCE_RISE_MIN = 1.0  # N, smallest rise of the tip's force
+_SETTLING_TIME = 0.07  # s after a touch, for the frames' latency and the joint's stopping time
+_WRONG_ROTATION = math.radians(4.0)  # rad, rotation opposite to the command
+_TILT_SIGNS = (1.0, -1.0)  # sign of a tip's tilt when its finger closes
 
 
 class WiringWatch:
@@ -31,7 +31,7 @@ class WiringWatch:
 
     def __init__(self, fingers: Sequence[int]) -> None:
         self.swapped = ""  # description of the swap, empty if none was found
-        self._both = len(fingers) == len(FINGERS)
+        self._has_two_fingers = len(fingers) == len(FINGERS)
         self._touching = -1  # the only finger in contact, -1 for none or both
         self._since = 0.0  # start of that contact [s]
         self._q = [0.0, 0.0]  # joint angles after the touch [rad]
@@ -41,54 +41,54 @@ class WiringWatch:
         self._goal = math.nan  # commanded object angle [rad]
         self._sense = 0.0  # direction of that turn
 
-    def follow(self, state: State) -> None:
+    def update(self, state: State) -> None:
         """Check one tick's state."""
         self.swapped = ""
-        if not self._both or not state.reading.valid:
+        if not self._has_two_fingers or not state.reading.valid:
             return
         if state.mode == Mode.GRASPING:
-            self._follow_approach(state)
+            self._check_approach(state)
         else:
             self._touching = -1
         if state.mode == Mode.ROTATING:
-            self._follow_turn(state)
+            self._check_turn(state)
         else:
             self._turn = math.nan
 
-    def _follow_approach(self, state: State) -> None:
+    def _check_approach(self, state: State) -> None:
         left, right = (each.valid and each.contact for each in state.contacts)
         finger = -1 if left == right else 0 if left else 1
         if finger != self._touching or finger < 0:
             self._touching, self._since, self._tilt = finger, state.t, math.nan
             return
         contact, q = state.contacts[finger], state.reading.q
-        if math.isnan(self._tilt) or state.t - self._since < _SETTLED:
+        if math.isnan(self._tilt) or state.t - self._since < _SETTLING_TIME:
             self._q[:], self._tilt, self._force = q, contact.theta, contact.force
             return
         other = 1 - finger
         closed = q[other] - self._q[other]
-        if abs(q[finger] - self._q[finger]) > _STILL:
+        if abs(q[finger] - self._q[finger]) > _STANDING_MAX:
             return
-        tilted = _SENSES[finger] * (contact.theta - self._tilt)
-        sure = _SURE * contact.theta_std
-        turned = closed > _MOVED and tilted > _TILTED * closed + sure
-        pressed = contact.force - self._force > _PRESSED
+        tilted = _TILT_SIGNS[finger] * (contact.theta - self._tilt)
+        sure = _TILT_SIGMA * contact.theta_std
+        turned = closed > _CLOSING_MIN and tilted > _TILT_RATIO * closed + sure
+        pressed = contact.force - self._force > _FORCE_RISE_MIN
         if turned or pressed:
             self.swapped = (
                 f"the {FINGERS[finger]} tip is moved while the {FINGERS[finger]} joint stands and "
                 f"the {FINGERS[other]} one closes: are servos.ids swapped?"
             )
 
-    def _follow_turn(self, state: State) -> None:
+    def _check_turn(self, state: State) -> None:
         angle, goal = state.object.angle, state.goal.angle
         if goal != self._goal:  # also true for NaN; a streamed goal changes at each tick
             self._goal, self._turn = goal, math.nan
         if math.isnan(self._turn):
-            if state.object.valid and abs(goal - angle) > 0.5 * _AGAINST:
+            if state.object.valid and abs(goal - angle) > 0.5 * _WRONG_ROTATION:
                 self._turn, self._sense = angle, math.copysign(1.0, goal - angle)
             return
         against = self._sense * (self._turn - angle)
-        if state.object.valid and against > _AGAINST:
+        if state.object.valid and against > _WRONG_ROTATION:
             self.swapped = (
                 f"the object turned by {math.degrees(against):.0f}° against its commanded turn: "
                 "are servos.ids swapped?"

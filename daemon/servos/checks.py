@@ -31,9 +31,9 @@ OLD_PROTOCOL = (
     "for 2.0), or use one that speaks it",
 )
 _WATCHDOG_FIRMWARE = 38
-_LONG = 0.5  # s, value of servos.fault_after above which a notice is given
-_CONSTANT_OFF = 1.3  # allowed ratio of a torque constant to the data sheet's
-_NEAR_LIMIT = 10  # °C below the temperature limit
+_FAULT_AFTER_LONG = 0.5  # s, value of servos.fault_after above which a notice is given
+_CONSTANT_RATIO_MAX = 1.3  # allowed ratio of a torque constant to the data sheet's
+_TEMPERATURE_MARGIN = 10  # °C below the temperature limit
 # rad beyond the hand's limits at which an angle is implausible. The cause is a wrong zero, or a
 # servo that lost its turn count when it was switched off.
 ANGLE_MARGIN = 0.25
@@ -144,7 +144,7 @@ def check_servo(
     if not low <= volts <= high:
         wrong(f"supply is {volts:.1f} V, not in {low:.1f} … {high:.1f} V", "check the supply")
     firmware = table[reg.FIRMWARE_VERSION]
-    if settings.servos.watchdog > 0.0 and not model.small and firmware < _WATCHDOG_FIRMWARE:
+    if settings.servos.watchdog > 0.0 and not model.is_x330 and firmware < _WATCHDOG_FIRMWARE:
         wrong(
             f"firmware {firmware} has no bus watchdog",
             f"update it to {_WATCHDOG_FIRMWARE} or later, or set servos.watchdog = 0",
@@ -199,7 +199,7 @@ def notice_servo(
         (servos.mode == "position", "in position mode nothing bounds its current"),
         (not servos.watchdog, "servos.watchdog = 0: nothing stops it if daemon or line fail"),
         (
-            servos.fault_after > _LONG,
+            servos.fault_after > _FAULT_AFTER_LONG,
             f"servos.fault_after = {servos.fault_after:g} s: without an answer its last reading is "
             "used for so long",
         ),
@@ -217,7 +217,7 @@ def notice_servo(
             f"firmware {firmware} has no fast sync read (needs {model.fast_read_firmware}); the "
             "slower sync read is used",
         ),
-        (present >= limit - _NEAR_LIMIT, f"{present} °C, near its limit of {limit} °C"),
+        (present >= limit - _TEMPERATURE_MARGIN, f"{present} °C, near its limit of {limit} °C"),
     )
     found = [Finding("warn", name, text) for true, text in notices if true]
     found += check_registers(name, model, table, settings, finger, "warn")
@@ -234,7 +234,7 @@ def notice_strength(name: str, model: ServoModel, settings: Settings) -> list[Fi
         text = f"{force:.3g} N may be asked for, and it stalls at {bound:.2g} N on this finger"
         found.append(Finding("warn", name, text, "lower safety.force_max and safety.current_max"))
     given = settings.control.torque_constant
-    if constant and not 1.0 / _CONSTANT_OFF < given / constant < _CONSTANT_OFF:
+    if constant and not 1.0 / _CONSTANT_RATIO_MAX < given / constant < _CONSTANT_RATIO_MAX:
         text = f"control.torque_constant is {given:g} N·m/A, its data sheet's {constant:.3g}"
         found.append(Finding("warn", name, text, f"control.torque_constant = {constant:.3g}"))
     if model.gear_loss and not settings.control.joint_load_friction:

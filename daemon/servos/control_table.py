@@ -154,7 +154,7 @@ class ServoModel:
     size: tuple[float, float, float]  # mm
     modes: tuple[int, ...] = tuple(MODE_NAMES)
     pwm_slope: int | None = None  # default of register 62, None if the model lacks it
-    small: bool = False  # X330 frame, whose indirect map moved with firmware 53
+    is_x330: bool = False  # X330 frame, whose indirect map moved with firmware 53
     gear_loss: float = 0.0  # fraction of the gear torque lost to friction, if published
 
     @property
@@ -206,7 +206,7 @@ class ServoModel:
 
     def indirect_blocks(self, firmware: int) -> tuple[tuple[int, int, int], ...]:
         """Return (first address register, first data register, entries) of each indirect block."""
-        if not self.small:
+        if not self.is_x330:
             return ((INDIRECT_ADDRESS, 224, 28), (578, 634, 28))
         if firmware <= 52:
             return ((INDIRECT_ADDRESS, 208, 20),)

@@ -34,7 +34,7 @@ from softfinger.daemon.servos.exchange import (
     CHECK,
     ENABLED,
     HEALTH,
-    LENGTHS,
+    LENGTH_COUNT,
     PRESENT,
     Span,
     TickReads,
@@ -42,26 +42,26 @@ from softfinger.daemon.servos.exchange import (
     note_slow_replies,
 )
 from softfinger.daemon.servos.joint import Joint, JointScale
-from softfinger.daemon.servos.port import BITS_PER_BYTE, PortGone, SerialPort
+from softfinger.daemon.servos.port import BITS_PER_BYTE, PortLost, SerialPort
 from softfinger.daemon.servos.protocol import GroupRead, PacketHandler, ServoLine
 from softfinger.daemon.servos.torque import Torque
 from softfinger.daemon.types import FINGERS, Goal, Reading
 
 _log = logging.getLogger(__name__)
 
-_MOTION = struct.Struct("<hii").unpack_from  # current, velocity, position
-_SUPPLY = struct.Struct("<HB").unpack_from  # voltage, temperature
-_CLOCK = struct.Struct("<H").unpack_from
-_HEALTH_EVERY = 0.25  # s
-_CHECK_EVERY = 0.01  # s
+_unpack_motion = struct.Struct("<hii").unpack_from  # current, velocity, position
+_unpack_supply = struct.Struct("<HB").unpack_from  # voltage, temperature
+_unpack_clock = struct.Struct("<H").unpack_from
+_HEALTH_INTERVAL = 0.25  # s
+_CHECK_INTERVAL = 0.01  # s
 _CHECK_FRACTION = 0.05  # largest fraction of the line's capacity used by checks
-_SENT_LATELY = 0.035  # s for which a goal counts as recent
-_FROZEN = 0.1  # s in which a servo's 1 ms clock must advance
-_DOUBTFUL = 32  # requests with varying span lengths after a missing reply
-_PATIENCE = 0.2  # s for a reply during the checks; `clear` blocks the loop for this time
+_RECENT_TIME = 0.035  # s for which a goal counts as recent
+_FROZEN_TIME = 0.1  # s in which a servo's 1 ms clock must advance
+_VARIED_READ_COUNT = 32  # requests with varying span lengths after a missing reply
+_CHECK_TIMEOUT = 0.2  # s for a reply during the checks; `clear` blocks the loop for this time
 # s for a reply of an emulated hand, which the machine may delay while the hand's time pauses
-_BUSY = 0.04
-_LAST_TRIES = 10  # tries of torque off when closing
+_BUSY_TIME = 0.04
+_CLOSING_TRY_COUNT = 10  # tries of torque off when closing
 
 
 class DynamixelServos:
@@ -83,9 +83,9 @@ class DynamixelServos:
         self._reads: TickReads | None = None
         self._waiting: SerialPort | None = None  # open port, waiting for the servos to answer
         self._turn = 0  # index of the last span length
-        self._doubtful = 0  # coming requests whose replies could be confused
+        self._varied_reads = 0  # coming requests whose replies could be confused
         self._next_health = self._next_check = -math.inf  # clock time of the next reads
-        self._check_every = _CHECK_EVERY
+        self._check_interval = _CHECK_INTERVAL
         self._retries = 0
         self._alerts = 0
 
@@ -106,13 +106,13 @@ class DynamixelServos:
         self.close()
         servos, profile = self._settings, self._profile
         model = by_name(servos.model)
-        stored = max(2, round(_SENT_LATELY * profile.loop.rate))
+        stored = max(2, round(_RECENT_TIME * profile.loop.rate))
         self._joints = [
             Joint(f, servos.ids[f], JointScale.of(servos, f, model), sent=deque(maxlen=stored))
             for f in map(FINGERS.index, profile.scene.fingers)
         ]
         if waiting is None:
-            patience = _BUSY if self._clock.waits else 0.0
+            patience = _BUSY_TIME if self._clock.pauses_when_late else 0.0
             port = SerialPort(servos.port, servos.baud, max(servos.reply_timeout, patience))
             port.openPort()
         else:
@@ -128,15 +128,15 @@ class DynamixelServos:
             port.closePort()
             raise
         more = len(self._joints) * (PRESENT[0] - CHECK[0]) * BITS_PER_BYTE / servos.baud
-        self._check_every = max(_CHECK_EVERY, more / _CHECK_FRACTION)
-        self._doubtful = 0
+        self._check_interval = max(_CHECK_INTERVAL, more / _CHECK_FRACTION)
+        self._varied_reads = 0
         self._next_health = self._next_check = -math.inf
         self._line, self._torque = line, torque
 
     def _check(self, line: ServoLine, model: ServoModel) -> TickReads:
         """Check servos, adapter and group reads; set the joints' own limits and the notices."""
         port = line.port
-        allowed, port.reply_timeout = port.reply_timeout, max(port.reply_timeout, _PATIENCE)
+        allowed, port.reply_timeout = port.reply_timeout, max(port.reply_timeout, _CHECK_TIMEOUT)
         try:
             found = examine(line, self._profile, model)
             self._judge(found, port, allowed)
@@ -199,14 +199,14 @@ class DynamixelServos:
         """
         now = self._clock.now()
         if now >= self._next_health:
-            self._next_health = now + _HEALTH_EVERY
+            self._next_health = now + _HEALTH_INTERVAL
             found = self._exchange(HEALTH, reading)
             if found is not None:
                 self._take_health(found, reading)
         elif now >= self._next_check:
             found = self._exchange(CHECK, reading)
             if found is not None:
-                self._next_check = now + self._check_every
+                self._next_check = now + self._check_interval
                 self._check_torque(found, reading, now)
         else:
             self._exchange(PRESENT, reading)
@@ -217,9 +217,9 @@ class DynamixelServos:
             raise ServoError("servos: not connected")
         reading.seq += 1
         turn = 0
-        if self._doubtful:
-            self._doubtful -= 1
-            turn = self._turn = self._turn % (LENGTHS - 1) + 1
+        if self._varied_reads:
+            self._varied_reads -= 1
+            turn = self._turn = self._turn % (LENGTH_COUNT - 1) + 1
         group = self._reads.spans[span][turn]
         result = group.exchange()
         if result == COMM_RX_CORRUPT:
@@ -230,14 +230,14 @@ class DynamixelServos:
                 result = group.exchange(deadline)
         reading.valid = result == COMM_SUCCESS
         if not reading.valid:
-            self._doubtful = _DOUBTFUL
+            self._varied_reads = _VARIED_READ_COUNT
             return None
         reading.t = self._clock.now()
         at = reg.PRESENT_CURRENT - group.start
         alert = 0
         for joint in self._joints:
             f, scale = joint.finger, joint.scale
-            current, velocity, position = _MOTION(group.data[joint.id], at)
+            current, velocity, position = _unpack_motion(group.data[joint.id], at)
             reading.q[f] = joint.q = scale.angle(position)
             reading.dq[f] = joint.dq = scale.rate(velocity)
             reading.current[f] = scale.amperes(current)
@@ -253,7 +253,7 @@ class DynamixelServos:
     def _take_health(self, group: GroupRead, reading: Reading) -> None:
         at = reg.PRESENT_INPUT_VOLTAGE - group.start
         for joint in self._joints:
-            voltage, temperature = _SUPPLY(group.data[joint.id], at)
+            voltage, temperature = _unpack_supply(group.data[joint.id], at)
             reading.voltage[joint.finger] = voltage * reg.VOLTAGE_UNIT
             reading.temperature[joint.finger] = float(temperature)
 
@@ -264,10 +264,10 @@ class DynamixelServos:
         reading.lost = reading.frozen = 0
         for joint in self._joints:
             table = group.data[joint.id]
-            (ticks,) = _CLOCK(table, reg.REALTIME_TICK - start)
+            (ticks,) = _unpack_clock(table, reg.REALTIME_TICK - start)
             if ticks != joint.ticks:
                 joint.ticks, joint.ticked = ticks, now
-            elif now - joint.ticked > _FROZEN:
+            elif now - joint.ticked > _FROZEN_TIME:
                 reading.frozen |= 1 << joint.finger
             if not torque.holds_goal(joint, table, start):
                 reading.lost |= 1 << joint.finger
@@ -362,13 +362,13 @@ class DynamixelServos:
         if line is None or torque is None:
             return
         try:
-            for _ in range(_LAST_TRIES):
+            for _ in range(_CLOSING_TRY_COUNT):
                 if not torque.may_be_on:
                     break
                 self.torque_off(reading)
             if torque.may_be_on:
                 _log.error("servos: torque off not confirmed; their bus watchdog stops them")
-        except PortGone:
+        except PortLost:
             _log.error("servos: the port went away with torque on; their bus watchdog stops them")
         except Exception as error:
             _log.error("servos: torque off not confirmed: %s", error)

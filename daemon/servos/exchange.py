@@ -17,7 +17,7 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.base import Finding, Status
 from softfinger.daemon.servos.port import SerialPort
-from softfinger.daemon.servos.protocol import TRIES, FastGroupRead, GroupRead, PacketHandler
+from softfinger.daemon.servos.protocol import TRY_COUNT, FastGroupRead, GroupRead, PacketHandler
 
 Span = tuple[int, int]  # first and last register
 # Spans of one exchange: most ticks; with the goals and the bus watchdog; with the supply; from
@@ -28,13 +28,13 @@ HEALTH: Span = (reg.PRESENT_CURRENT, reg.PRESENT_TEMPERATURE)
 ENABLED: Span = (reg.TORQUE_ENABLE, reg.PRESENT_POSITION + 3)
 # A late reply could be mistaken for the reply to the next request. After a request without a reply,
 # the next requests therefore use spans of different lengths, which distinguishes the replies.
-LENGTHS = 11  # per span: the shortest one and up to ten registers before it
+LENGTH_COUNT = 11  # per span: the shortest one and up to ten registers before it
 
-EXCHANGES = 50  # number that `doctor` times
-_WAIT = 0.1  # s for a timed reply, even if `servos.reply_timeout` is shorter
-_AT_START = 9  # reads at connect, of which the fastest gives the minimum reply time
-_FULL = 0.8  # largest fraction of a tick for a reply
-_LOST_WARN, _LOST_FAIL = 0.02, 0.2  # fraction of failed exchanges
+EXCHANGE_COUNT = 50  # number that `doctor` times
+_TIMED_REPLY_TIMEOUT = 0.1  # s for a timed reply, even if `servos.reply_timeout` is shorter
+_CONNECT_READ_COUNT = 9  # reads at connect, of which the fastest gives the minimum reply time
+_REPLY_FRACTION_MAX = 0.8  # largest fraction of a tick for a reply
+_FAILED_FRACTION_WARN, _FAILED_FRACTION_FAIL = 0.02, 0.2  # fraction of failed exchanges
 
 
 class TickReads:
@@ -51,7 +51,7 @@ class TickReads:
         self.spans = {
             (first, last): [
                 kind(port, handler, first - more, last + 1 - first + more, ids)
-                for more in range(LENGTHS)
+                for more in range(LENGTH_COUNT)
             ]
             for first, last in (PRESENT, CHECK, HEALTH, ENABLED)
         }
@@ -60,7 +60,7 @@ class TickReads:
     def answered(self) -> bool:
         """Return True if all servos answer each of these group reads."""
         return all(
-            any(lengths[0].exchange() == COMM_SUCCESS for _ in range(TRIES))
+            any(lengths[0].exchange() == COMM_SUCCESS for _ in range(TRY_COUNT))
             for lengths in self.spans.values()
         )
 
@@ -105,14 +105,14 @@ def time_exchanges(
     port: SerialPort,
     reads: TickReads,
     write: Callable[[], None] | None = None,
-    count: int = EXCHANGES,
+    count: int = EXCHANGE_COUNT,
 ) -> ExchangeTimes:
     """Time ``count`` exchanges, reading and writing as a tick does, without pauses.
 
     A read waits on the wire for the preceding write, so its duration includes both. With ``write``
     None only reads are timed. Each reply may take up to 0.1 s.
     """
-    allowed, port.reply_timeout = port.reply_timeout, max(port.reply_timeout, _WAIT)
+    allowed, port.reply_timeout = port.reply_timeout, max(port.reply_timeout, _TIMED_REPLY_TIMEOUT)
     group, durations, failed = reads.spans[PRESENT][0], [], 0
     try:
         for _ in range(count):
@@ -147,7 +147,7 @@ def judge_exchanges(
     rate, allowed = settings.loop.rate, settings.servos.reply_timeout
     failed = f"{times.failed:.0%} failed"
     if times.failed == 1.0:
-        text = f"{what}: none was answered within {_WAIT * 1e3:g} ms"
+        text = f"{what}: none was answered within {_TIMED_REPLY_TIMEOUT * 1e3:g} ms"
         return Finding("FAIL", "exchange", text, "check the cable, and lower servos.baud")
     text = f"{what}: p50 {_ms(times.p50)}, p99 {_ms(times.p99)}, {failed}"
     if decisive > min(1.0 / rate, allowed):
@@ -157,34 +157,34 @@ def judge_exchanges(
         )
         return Finding("FAIL", "exchange", text, _remedy(decisive, settings))
     status: Status = "pass"
-    if times.failed > _LOST_WARN:
-        status = "FAIL" if times.failed > _LOST_FAIL else "warn"
+    if times.failed > _FAILED_FRACTION_WARN:
+        status = "FAIL" if times.failed > _FAILED_FRACTION_FAIL else "warn"
     fix = "" if status == "pass" else "check the cable and its plugs, and lower servos.baud"
     return Finding(status, "exchange", text, fix)
 
 
 def note_slow_replies(port: SerialPort, reads: TickReads, settings: Settings) -> list[Finding]:
     """Return a notice if the fastest of a few reads takes most of a tick."""
-    least = time_exchanges(port, reads, count=_AT_START).least
+    least = time_exchanges(port, reads, count=_CONNECT_READ_COUNT).least
     rate = settings.loop.rate
-    if least * rate <= _FULL:
+    if least * rate <= _REPLY_FRACTION_MAX:
         return []
     text = (
         f"a reply of the servos takes at least {_ms(least)}, {least * rate:.0%} of a tick of "
         f"{_ms(1.0 / rate)} (loop.rate = {rate:g}): ticks will be late"
     )
-    fix = f"{_remedy(least, settings)}; `softfinger doctor` times {EXCHANGES} exchanges"
+    fix = f"{_remedy(least, settings)}; `softfinger doctor` times {EXCHANGE_COUNT} exchanges"
     return [Finding("warn", "servos", text, fix)]
 
 
 def _remedy(duration: float, settings: Settings) -> str:
     """Return the settings that allow replies of this duration [s]."""
-    rate = _FULL / duration
+    rate = _REPLY_FRACTION_MAX / duration
     digit = 10.0 ** max(len(str(int(rate))) - 2, 0)
     parts = []
     if duration > settings.servos.reply_timeout:
         parts.append(f"servos.reply_timeout = {1.5 * duration:.2g}")
-    if duration * settings.loop.rate > _FULL:
+    if duration * settings.loop.rate > _REPLY_FRACTION_MAX:
         parts.append(f"loop.rate = {max(rate // digit * digit, 1.0):g}")
     return f"set {' and '.join(parts)}; or an adapter that waits less (latency timer 1 ms)"
 

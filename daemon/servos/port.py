@@ -17,7 +17,7 @@ import serial
 from dynamixel_sdk.port_handler import PortHandler
 
 from softfinger.daemon.errors import ServoError
-from softfinger.daemon.port_access import bring_it, grant
+from softfinger.daemon.port_access import grant, port_group_remedy
 
 with contextlib.suppress(ModuleNotFoundError):  # Windows supports only simulated servos
     import termios
@@ -25,7 +25,7 @@ with contextlib.suppress(ModuleNotFoundError):  # Windows supports only simulate
 BITS_PER_BYTE = 10
 # s for a reply outside the loop (setup, calibration). It covers a new servo with its factory return
 # delay behind a slow adapter on a busy machine.
-UNHURRIED = 0.5
+UNPACED_TIMEOUT = 0.5
 _READ_SIZE = 4096
 _SYSFS = Path("/sys/class/tty")
 
@@ -36,7 +36,7 @@ def latency_file(path: str, sysfs: Path = _SYSFS) -> Path | None:
     return place if place.exists() else None
 
 
-class PortGone(ServoError):
+class PortLost(ServoError):
     """The open port disappeared: adapter unplugged or without power."""
 
 
@@ -131,8 +131,8 @@ class SerialPort(PortHandler):  # type: ignore[misc]
         self.received += data
         return True
 
-    def _gone(self, error: object) -> PortGone:
-        return PortGone(
+    def _gone(self, error: object) -> PortLost:
+        return PortLost(
             f"{self.port_name}: the port is gone ({error}): plug the adapter in and power the bus"
         )
 
@@ -141,7 +141,7 @@ def _why_not(path: str, error: Exception) -> str:
     code = getattr(error, "errno", None)
     if code == errno.ENOENT or not Path(path).exists():
         return (
-            f"{path}: no such port: {bring_it(path)}, or set servos.port; "
+            f"{path}: no such port: {port_group_remedy(path)}, or set servos.port; "
             "`softfinger doctor` lists the ports there are"
         )
     if code == errno.EACCES:

@@ -42,9 +42,9 @@ from dynamixel_sdk.robotis_def import (
 )
 
 from softfinger.daemon.servos.control_table import crc16
-from softfinger.daemon.servos.port import UNHURRIED, SerialPort
+from softfinger.daemon.servos.port import UNPACED_TIMEOUT, SerialPort
 
-TRIES = 3  # tries of an exchange outside the tick
+TRY_COUNT = 3  # tries of an exchange outside the tick
 _HEADER = b"\xff\xff\xfd"
 _PREFIX = _HEADER + b"\x00"
 _STUFFED = _HEADER + b"\xfd"
@@ -53,8 +53,8 @@ _STATUS_SIZE = 11  # bytes of a status packet without data
 _FAST_SYNC_READ = 0x8A  # not defined by dynamixel-sdk 3
 _OLD_HEADER = b"\xff\xff"  # Protocol 1.0: header, ID, length, instruction or error, checksum
 _OLD_STATUS = 6  # bytes of a reply to a ping in Protocol 1.0
-_OLD_WAIT = 0.5  # s; an emulated servo on a busy machine takes longer than 0.1 s
-_ERROR = 0x7F  # error code in a servo's error byte; the highest bit is the alert
+_OLD_TIMEOUT = 0.5  # s; an emulated servo on a busy machine takes longer than 0.1 s
+_ERROR_MASK = 0x7F  # error code in a servo's error byte; the highest bit is the alert
 
 
 def packed(packet_id: int, instruction: int, parameters: bytes = b"") -> bytes:
@@ -110,7 +110,7 @@ class PacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
                 continue
             if len(packet) == _STATUS_SIZE + length:
                 return list(packet[9:-2]), result, packet[8]
-            if packet[8] & _ERROR:
+            if packet[8] & _ERROR_MASK:
                 return [0] * length, result, packet[8]
 
     def rxPacket(self, port: SerialPort, fast_option: bool = False) -> tuple[Any, int]:
@@ -193,7 +193,7 @@ class GroupRead:
                 packet, result = handler.rxPacket(self.port, False)
                 if result != COMM_SUCCESS:
                     return result
-                if packet[8] & _ERROR:  # data of an error reply are invalid
+                if packet[8] & _ERROR_MASK:  # data of an error reply are invalid
                     handler.refused += 1
                     return int(COMM_RX_CORRUPT)
                 if len(packet) != _STATUS_SIZE + self._length:
@@ -226,7 +226,7 @@ class FastGroupRead(GroupRead):
         for servo_id in self.data:
             if packet[at + 1] != servo_id:
                 return int(COMM_RX_CORRUPT)
-            if packet[at] & _ERROR:  # data of an error reply are invalid
+            if packet[at] & _ERROR_MASK:  # data of an error reply are invalid
                 handler.refused += 1
                 return int(COMM_RX_CORRUPT)
             self.errors[servo_id] = packet[at]
@@ -259,7 +259,7 @@ class ServoLine:
         self.port = port
         self.handler = handler or PacketHandler()
 
-    def ping(self, servo_id: int, tries: int = TRIES) -> int | None:
+    def ping(self, servo_id: int, tries: int = TRY_COUNT) -> int | None:
         """Return the servo's model number, or None without a reply."""
         for _ in range(tries):
             number, result, _ = self.handler.ping(self.port, servo_id)
@@ -272,7 +272,7 @@ class ServoLine:
         port = self.port
         body = bytes((servo_id, 2, INST_PING))
         request = _OLD_HEADER + body + bytes((~sum(body) & 0xFF,))
-        port.send(request, _OLD_STATUS, time.monotonic() + _OLD_WAIT)
+        port.send(request, _OLD_STATUS, time.monotonic() + _OLD_TIMEOUT)
         while True:
             came = bytes(port.received).replace(request, b"")  # an adapter may echo the request
             reply = came[max(came.find(_OLD_HEADER), 0) :][:_OLD_STATUS]
@@ -299,10 +299,10 @@ class ServoLine:
 
     def read(self, servo_id: int, address: int, length: int) -> bytes | None:
         """Return a span of registers, or None without a valid reply."""
-        for _ in range(TRIES):
+        for _ in range(TRY_COUNT):
             data, result, error = self.handler.readTxRx(self.port, servo_id, address, length)
             if result == COMM_SUCCESS:
-                return None if error & _ERROR else bytes(data)
+                return None if error & _ERROR_MASK else bytes(data)
         return None
 
     def write(self, address: int, values: Mapping[int, bytes]) -> None:
@@ -316,7 +316,7 @@ class ServoLine:
     def store(self, address: int, values: Mapping[int, bytes]) -> list[int]:
         """Write each servo's bytes and read them back; return the IDs of servos that failed."""
         waiting = dict(values)
-        for _ in range(TRIES):
+        for _ in range(TRY_COUNT):
             self.write(address, waiting)
             for servo_id, data in list(waiting.items()):
                 if self.read(servo_id, address, len(data)) == data:
@@ -329,7 +329,7 @@ class ServoLine:
 @contextlib.contextmanager
 def open_line(path: str, baud: int, low_latency: bool = True) -> Iterator[ServoLine]:
     """Yield a line on its own port, closed at the end. Raises ServoError if it can't be opened."""
-    port = SerialPort(path, baud, UNHURRIED, low_latency)
+    port = SerialPort(path, baud, UNPACED_TIMEOUT, low_latency)
     port.openPort()
     try:
         yield ServoLine(port)

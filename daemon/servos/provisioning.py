@@ -35,13 +35,13 @@ from softfinger.daemon.types import FINGERS
 
 SEARCH_TIME = 0.8  # s to listen at each rate, enough for 253 servos at 1 Mbaud
 FACTORY_ID = 1
-ALONE = (
+ONE_SERVO_ONLY = (
     "connect one servo alone, then `softfinger doctor --fix`; then the next one beside it, and the "
     "same again"
 )
-_PROBES = 8  # reads of the whole table
-_REBOOT_LIMIT = 2.0  # s until a servo must answer after a reboot
-_WRITTEN = 0.05  # s for a packet to leave the adapter and be stored in EEPROM
+_READ_COUNT = 8  # reads of the whole table
+_REBOOT_TIMEOUT = 2.0  # s until a servo must answer after a reboot
+_WRITE_TIME = 0.05  # s for a packet to leave the adapter and be stored in EEPROM
 
 
 # --- finding servos ------------------------------------------------------------------------------
@@ -140,7 +140,7 @@ def is_garbled(line: ServoLine, servo_id: int) -> bool:
     equal.
     """
     handler, damaged, silent = line.handler, 0, 0
-    for _ in range(_PROBES):
+    for _ in range(_READ_COUNT):
         before = handler.damaged
         result = handler.readTxRx(line.port, servo_id, 0, CHECKED)[1]
         damaged += handler.damaged > before
@@ -265,7 +265,7 @@ def provision(settings: Settings) -> list[Finding]:
             elif number != model.number:
                 result.append(Finding("warn", name, *other_model(number, model)))
             elif is_garbled(line, servo_id):
-                result.append(Finding("warn", name, "its replies come damaged", ALONE))
+                result.append(Finding("warn", name, "its replies come damaged", ONE_SERVO_ONLY))
             else:
                 _set_up(line, settings, finger, model, result)
     return result
@@ -274,14 +274,14 @@ def provision(settings: Settings) -> list[Finding]:
 def _unknown(settings: Settings, found: Found, what: Plan) -> list[Finding]:
     """Explain why the missing servos could not be identified."""
     if found.garbled or found.old:
-        garbled = [Finding("warn", "servos", str(each), ALONE) for each in found.garbled]
+        garbled = [Finding("warn", "servos", str(each), ONE_SERVO_ONLY) for each in found.garbled]
         return garbled + [replace(each, status="warn") for each in found.old_protocol()]
     names = [servo_name(settings.servos.ids[finger], finger) for finger in what.missing]
     fit = ", ".join(f"ID {each.id} at {each.baud} baud" for each in what.strangers)
     if not fit:
         fix = "check its power and cable"
         return [Finding("warn", name, "no answer at any rate", fix) for name in names]
-    return [Finding("warn", name, f"may be any of {fit}", ALONE) for name in names]
+    return [Finding("warn", name, f"may be any of {fit}", ONE_SERVO_ONLY) for name in names]
 
 
 def _identify(path: str, change: Change, model: ServoModel, result: list[Finding]) -> None:
@@ -309,7 +309,7 @@ def _identify(path: str, change: Change, model: ServoModel, result: list[Finding
         if change.baud != change.servo.baud:
             index = model.baud_rates.index(change.baud)
             line.write(reg.BAUD_RATE, {new: bytes((index,))})
-            time.sleep(_WRITTEN)
+            time.sleep(_WRITE_TIME)
     with open_line(path, change.baud) as line:
         if line.ping(new) != model.number:
             return failed(f"no answer after its rate was set to {change.baud} baud")
@@ -379,7 +379,7 @@ def _torque_off(line: ServoLine, servo_id: int, name: str, result: list[Finding]
 
 def _reboot(line: ServoLine, servo_id: int) -> bool:
     line.handler.reboot(line.port, servo_id)
-    end = time.monotonic() + _REBOOT_LIMIT
+    end = time.monotonic() + _REBOOT_TIMEOUT
     while time.monotonic() < end:
         # Each ping waits for its deadline, which paces this loop.
         if line.ping(servo_id, tries=1) is not None:

@@ -16,8 +16,8 @@ from softfinger.daemon.servos.control_table import by_name
 from softfinger.daemon.servos.joint import JointScale, current_toward
 from softfinger.daemon.types import FINGERS, Goal, Reading
 
-_HEALTH_EVERY = 0.25  # s between two readings of temperature and supply
-_OVERLOAD = 2.0  # s at the current limit until an overload error
+_HEALTH_INTERVAL = 0.25  # s between two readings of temperature and supply
+_OVERLOAD_TIME = 2.0  # s at the current limit until an overload error
 
 
 class MotorHeat(Protocol):
@@ -93,7 +93,7 @@ class SimulatedServos:
             reading.dq[joint] = self._dq[joint] = scale.rate(scale.velocity_counts(dq[joint]))
             current = self._hand.measured_current(joint)
             reading.current[joint] = scale.amperes(scale.current_counts(current))
-        if reading.t - self._health_read >= _HEALTH_EVERY:
+        if reading.t - self._health_read >= _HEALTH_INTERVAL:
             self._read_health(reading)
         self._seq += 1
         reading.seq = self._seq
@@ -101,7 +101,7 @@ class SimulatedServos:
         reading.valid = True
 
     def _read_health(self, reading: Reading) -> None:
-        passed = min(reading.t - self._health_read, _HEALTH_EVERY * 2.0)
+        passed = min(reading.t - self._health_read, _HEALTH_INTERVAL * 2.0)
         self._health_read = reading.t
         currents = [abs(each) for each in self._hand.current.tolist()]
         voltage = self._model.supply - reg.SAG * sum(currents)
@@ -116,7 +116,7 @@ class SimulatedServos:
             self._pressed[joint] = self._pressed[joint] + passed if pressed else 0.0
             hot, over = (
                 heat.sensed > self._model.temperature_limit,
-                self._pressed[joint] > _OVERLOAD,
+                self._pressed[joint] > _OVERLOAD_TIME,
             )
             errors = self._errors[joint] = hot << reg.OVERHEATING | over << reg.OVERLOAD
             reading.hardware[joint] = errors

@@ -25,9 +25,9 @@ _GOAL_BYTES = (
     *range(reg.GOAL_CURRENT, reg.GOAL_CURRENT + 2),
     *range(reg.GOAL_POSITION, reg.GOAL_POSITION + 4),
 )
-_COPIES = 2  # copies of each torque-off packet, because it has no reply
-_ON_WITHIN = 50  # reply timeouts allowed for torque on, which blocks the loop
-_STILL = 8  # counts, allowed motion of a limp joint before torque on (0.7°)
+_PACKET_COUNT = 2  # copies of each torque-off packet, because it has no reply
+_ON_TIMEOUTS = 50  # reply timeouts allowed for torque on, which blocks the loop
+_MOTION_MAX = 8  # counts, allowed motion of a limp joint before torque on (0.7°)
 
 
 def goal_address(mode: int, model: ServoModel, firmware: int) -> int:
@@ -80,7 +80,7 @@ class Torque:
         ServoError
             Torque on failed or could not be verified. Torque may be on.
         """
-        self._not_after = time.monotonic() + _ON_WITHIN * self._line.port.reply_timeout
+        self._not_after = time.monotonic() + _ON_TIMEOUTS * self._line.port.reply_timeout
         self._refuse_hardware_errors()
         # Writing 0 ends a watchdog stop, during which goals are read-only.
         self._store_all(reg.BUS_WATCHDOG, b"\x00", "watchdog cleared")
@@ -106,7 +106,7 @@ class Torque:
         There is no reply; the caller reads the registers.
         """
         self.goals = None
-        for _ in range(_COPIES):
+        for _ in range(_PACKET_COUNT):
             for group in self._offs:
                 group.send([b"\x00"] * len(group.ids))
 
@@ -131,7 +131,7 @@ class Torque:
             packed = {each: struct.pack("<i", counts) for each, counts in positions.items()}
             self._store(reg.GOAL_POSITION, packed, "goal position")
             after = self._positions()
-            if all(abs(after[i] - positions[i]) <= _STILL for i in after):
+            if all(abs(after[i] - positions[i]) <= _MOTION_MAX for i in after):
                 return positions
 
     def _choose_goals(self) -> GroupWrite:

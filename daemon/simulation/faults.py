@@ -23,7 +23,7 @@ FloatArray = NDArray[np.float64]
 
 SERVOS = "servos"
 OBJECT = "object"
-LATE = 0.010  # s, delay of a late reply
+LATE_REPLY_DELAY = 0.010  # s, delay of a late reply
 
 
 @dataclass(slots=True)
@@ -33,7 +33,7 @@ class LineFaults:
     lose: float = 0.0  # an instruction is lost
     lose_writes: float = 0.0  # an instruction other than a read is lost, in addition
     drop: float = 0.0  # a reply is lost
-    late: float = 0.0  # a reply arrives LATE seconds later
+    late: float = 0.0  # a reply arrives LATE_REPLY_DELAY seconds later
     truncate: float = 0.0  # the end of a reply is missing
     corrupt: float = 0.0  # one bit of a reply is flipped
     duplicate: float = 0.0  # a reply is sent twice
@@ -41,8 +41,8 @@ class LineFaults:
 
 
 LINE_FAULTS = tuple(field.name.replace("_", "-") for field in fields(LineFaults))
-_AILMENTS = ("overheat", "overload", "undervoltage", "stuck", "jump", "frozen", "refuse")
-SERVO_FAULTS = ("silent", "answer", "reboot", *_AILMENTS, "recover")
+_SERVO_FAILURES = ("overheat", "overload", "undervoltage", "stuck", "jump", "frozen", "refuse")
+SERVO_FAULTS = ("silent", "answer", "reboot", *_SERVO_FAILURES, "recover")
 BOARD_FAULTS = {  # kind → probability if none is given
     "torn": 0.1,
     "noisy": 0.1,
@@ -52,7 +52,7 @@ BOARD_FAULTS = {  # kind → probability if none is given
     "saturated": 1.0,
     "zero": 1.0,
 }
-_UNVALUED = ("unplug", "plug", "well")
+_WITHOUT_VALUE = ("unplug", "plug", "well")
 
 
 class FaultSource:
@@ -81,7 +81,7 @@ class FaultSource:
         rates, chance = self.rates, self._random.random
         if chance() < rates.drop:
             return []
-        delay = rates.delay + (LATE if chance() < rates.late else 0.0)
+        delay = rates.delay + (LATE_REPLY_DELAY if chance() < rates.late else 0.0)
         if chance() < rates.truncate:
             reply = reply[: self._random.randrange(len(reply))]
         if reply and chance() < rates.corrupt:
@@ -93,7 +93,7 @@ class FaultSource:
         return [(delay, reply)] * copies
 
 
-LONGEST_REPLAY = 3.0  # s
+REPLAY_TIME_MAX = 3.0  # s
 
 
 class MeasurementFault(NamedTuple):
@@ -110,10 +110,10 @@ MEASUREMENT_FAULTS = {
     "shift-y": MeasurementFault(0.0, -255.0, 255.0),  # cells, to higher rows
     "mirror": MeasurementFault(0.0, 0.0, 1.0),  # 1: the order of the columns is reversed
     "drift": MeasurementFault(0.0, -1.0, 1.0),  # offset of all cells, fraction of the largest count
-    "replay": MeasurementFault(0.0, 0.0, LONGEST_REPLAY),  # s of frames that are repeated
+    "replay": MeasurementFault(0.0, 0.0, REPLAY_TIME_MAX),  # s of frames that are repeated
     "current": MeasurementFault(1.0, -100.0, 100.0),  # factor of the measured current
 }
-SUDDEN = ("mirror", "replay")  # these are either on or off
+SWITCHED_FAULTS = ("mirror", "replay")  # these are either on or off
 
 
 class FaultError(SoftfingerError, ValueError):
@@ -130,7 +130,7 @@ class FaultEvent(NamedTuple):
     over: float = 0.0  # s in which the fault grows
 
     def __str__(self) -> str:
-        value = "" if self.kind in _UNVALUED else f"={self.value:g}"
+        value = "" if self.kind in _WITHOUT_VALUE else f"={self.value:g}"
         return f"{self.part}: {self.kind}{value}" + f" within {self.over:g} s" * bool(self.over)
 
 
@@ -167,8 +167,8 @@ _FORMS = (
     _Form(LINE_FAULTS, "=PROBABILITY", (SERVOS,)),
     _Form(MEASUREMENT_FAULTS, "=NUMBER", FINGERS, sided=True),
     _Form(("push", "twist"), "=NUMBER", (OBJECT,)),  # N along its faces, away from the palm; N·m
-    _Form(_UNVALUED[:2], "", (SERVOS,), sided=True),
-    _Form(_UNVALUED[2:], "", (SERVOS, *FINGERS), sided=True),
+    _Form(_WITHOUT_VALUE[:2], "", (SERVOS,), sided=True),
+    _Form(_WITHOUT_VALUE[2:], "", (SERVOS, *FINGERS), sided=True),
 )
 _WORD = re.compile(r"(?:([^:]*):)?([a-z-]+)(?:=([^@]*))?(?:@(.*?)(?:\.\.(.*))?)?")
 
@@ -229,7 +229,7 @@ def _parse(word: str, ids: tuple[int, ...]) -> list[FaultEvent]:
     if form is None:
         known = (f"{', '.join(each.kinds)} {each.value}".strip() for each in _FORMS)
         raise refused(f"expected one of {'; '.join(known)}")
-    if end is not None and (kind not in MEASUREMENT_FAULTS or kind in SUDDEN):
+    if end is not None and (kind not in MEASUREMENT_FAULTS or kind in SWITCHED_FAULTS):
         raise refused(f"{kind} comes at once, at {start}")
     if form.value == _ID and value not in ids:
         raise refused("no servo has that ID")

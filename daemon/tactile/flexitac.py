@@ -17,10 +17,10 @@ from softfinger.daemon.tactile.decoder import Decoded, Decoder
 from softfinger.daemon.tactile.serial_reader import BITS_PER_BYTE, SerialReader
 
 MARKER = b"\xaa\x55"
-_LEVELS = 12  # frames that a search compares before it drops the oldest
-_MARKERS_KEPT = 96  # to recognise a grid of another size
-_GAP = 1e-3  # s, a longer pause is a gap between frames
-_SMALLEST_GRID = 16  # cells, closer markers are a pattern in the image
+_SEARCH_FRAME_COUNT = 12  # frames that a search compares before it drops the oldest
+_MARKER_COUNT_MAX = 96  # to recognise a grid of another size
+_GAP_TIME = 1e-3  # s, a longer pause is a gap between frames
+_CELL_COUNT_MIN = 16  # cells, closer markers are a pattern in the image
 
 
 class FlexiTacDecoder(Decoder):
@@ -44,13 +44,15 @@ class FlexiTacDecoder(Decoder):
     def __init__(self, rows: int, cols: int, byte_time: float = 5e-6) -> None:
         """``byte_time`` is the transmission time of a byte [s]."""
         super().__init__(rows, cols, len(MARKER) + rows * cols)
-        self._longest = 1.25 * self.frame_bytes * byte_time + _GAP  # s, for one frame
+        self._longest = 1.25 * self.frame_bytes * byte_time + _GAP_TIME  # s, for one frame
         self._t_whole = -math.inf  # time when the last returned frame was complete
         self._start = 0  # position of the buffer's first byte in the stream
         # End position in the stream and read time of each piece in the buffer.
         self._pieces: deque[tuple[int, float]] = deque()
         self._ambiguous = 0
-        self._markers: deque[int] = deque(maxlen=_MARKERS_KEPT)  # in the stream, while not locked
+        self._markers: deque[int] = deque(
+            maxlen=_MARKER_COUNT_MAX
+        )  # in the stream, while not locked
 
     def feed(self, data: bytes, t: float) -> Decoded | None:
         self._buffer += data
@@ -79,7 +81,7 @@ class FlexiTacDecoder(Decoder):
     def found_cells(self) -> int:
         """Cells per frame from the most common marker distance while not locked, otherwise 0."""
         apart = Counter(b - a for a, b in combinations(self._markers, 2))
-        spacings = [each for each in apart if each >= _SMALLEST_GRID + len(MARKER)]
+        spacings = [each for each in apart if each >= _CELL_COUNT_MIN + len(MARKER)]
         spacing = max(spacings, key=lambda each: (apart[each], -each), default=0)
         return spacing - len(MARKER) if apart[spacing] > 2 and spacing != self.frame_bytes else 0
 
@@ -133,7 +135,7 @@ class FlexiTacDecoder(Decoder):
         """
         buffer, stride = self._buffer, self.frame_bytes
         rivals = self._between()
-        for level in range(1, _LEVELS + 1):
+        for level in range(1, _SEARCH_FRAME_COUNT + 1):
             here = level * stride
             if len(buffer) < here + len(MARKER):
                 return "undecided"
@@ -170,7 +172,7 @@ class FlexiTacDecoder(Decoder):
     def _in_one_go(self) -> bool:
         """Return True if the frame at the buffer's start arrived after a gap and without one."""
         first, whole = self._pieces[0][1], self._pieces[-1][1]
-        return first - self._t_whole > _GAP and whole - first < self._longest
+        return first - self._t_whole > _GAP_TIME and whole - first < self._longest
 
     def _take(self) -> Decoded:
         count = self.rows * self.cols

@@ -28,22 +28,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softfinger.daemon.errors import RecordingError
-from softfinger.daemon.own_files import open_regular, read_file, unpacked_most
+from softfinger.daemon.own_files import open_regular, read_file, unpacked_size_max
 from softfinger.daemon.tactile import tekscan
 
 FloatArray = NDArray[np.float64]
 TRUTHS = ("d", "theta", "force")
 _TIMES = ("t", "time", "times", "timestamp", "timestamps")
-_FULL = 65535
-_OUTSIDE = f"frames: found readings outside 0 to {_FULL} counts"
-_SHOWN = 8  # arrays listed in a message
-_SAMPLE = 200  # largest number of frames used to estimate zero and noise
-_NOISE_MOST = 6.0  # standard deviations, largest negative noise
-_CLIPPED_LEAST = 3  # cells that must share the largest reading
+_COUNT_MAX = 65535
+_RANGE_ERROR = f"frames: found readings outside 0 to {_COUNT_MAX} counts"
+_LISTED_COUNT_MAX = 8  # arrays listed in a message
+_SAMPLE_COUNT_MAX = 200  # largest number of frames used to estimate zero and noise
+_NOISE_SIGMA_MAX = 6.0  # standard deviations, largest negative noise
+_CLIPPED_COUNT_MIN = 3  # cells that must share the largest reading
 _UNITS = {1e-3: "ms", 1e-6: "µs", 1e-9: "ns"}  # units of times that are not in s
-_DATES = (1e9, 4e9)  # Unix time [s], from 2001 to 2096
-_OFF_MOST = 100.0  # times the expected interval, up to which times are in s
-_OFF_NAMED = 10.0  # times the expected interval, from which a note is given
+_DATE_RANGE = (1e9, 4e9)  # Unix time [s], from 2001 to 2096
+_INTERVAL_RATIO_MAX = 100.0  # times the expected interval, up to which times are in s
+_INTERVAL_RATIO_NOTED = 10.0  # times the expected interval, from which a note is given
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ def load_recording(
     pascal_per_count: float,
     rate: float,
     noise: float = 0.0,
-    full_count: int = _FULL,
+    full_count: int = _COUNT_MAX,
 ) -> FrameRecording:
     """Read a recording.
 
@@ -147,7 +147,7 @@ def _archive(path: Path, notes: list[str]) -> dict[str, NDArray[Any]]:
         wanted |= {name: name for name in ("live", *TRUTHS) if name in names}
         if times := next((name for name in _TIMES if name in names), None):
             wanted["t"] = times
-        left = unpacked_most(file)
+        left = unpacked_size_max(file)
         for ours, name in wanted.items():
             part = _part(archive, name)
             left -= part.file_size
@@ -162,13 +162,13 @@ def _frames_among(archive: zipfile.ZipFile, names: list[str], notes: list[str]) 
     """Return the name of the array with the frames. Raises ValueError if it is ambiguous."""
     if "frames" in names:
         return "frames"
-    shapes = {name: _shape(archive, name) for name in names[: 4 * _SHOWN]}
+    shapes = {name: _shape(archive, name) for name in names[: 4 * _LISTED_COUNT_MAX]}
     stacks = [name for name, (shape, kind) in shapes.items() if len(shape) == 3 and kind in "uif"]
     if len(stacks) == 1:
         notes.append(f"no array 'frames' in it; the frames are {stacks[0]!r}, its only 3-d array")
         return stacks[0]
-    described = [f"{name} {shape}" for name, (shape, _) in [*shapes.items()][:_SHOWN]]
-    described += ["…"] * (len(names) > _SHOWN)
+    described = [f"{name} {shape}" for name, (shape, _) in [*shapes.items()][:_LISTED_COUNT_MAX]]
+    described += ["…"] * (len(names) > _LISTED_COUNT_MAX)
     raise ValueError(
         f"no array 'frames' in it; found {', '.join(described) or 'no array'}: name the one "
         "[n, rows, cols] frames"
@@ -192,7 +192,7 @@ def _shape(archive: zipfile.ZipFile, name: str) -> tuple[tuple[int, ...], str]:
 
 def _array(path: Path) -> NDArray[Any]:
     with open_regular(path) as file:
-        return _read_array(file, min(path.stat().st_size, unpacked_most(file)))
+        return _read_array(file, min(path.stat().st_size, unpacked_size_max(file)))
 
 
 def _read_header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
@@ -222,7 +222,7 @@ def _export(path: Path, scale: float, rate: float, noise: float) -> FrameRecordi
     if not math.isnan(sum(export.pitch)):
         found = replace(found, pitch=export.pitch)
     if math.isfinite(export.full):
-        found = replace(found, full_count=max(min(int(export.full / scale), _FULL), 1))
+        found = replace(found, full_count=max(min(int(export.full / scale), _COUNT_MAX), 1))
     return replace(found, notes=tuple(notes))
 
 
@@ -241,14 +241,14 @@ def _checked(
             raise ValueError(f"live: found shape {live.shape}, expected {frames.shape[1:]}")
     whole = frames.dtype.kind != "f"
     scale = 1.0 if whole else scale
-    frames, live = _without_dead(frames, live, _FULL * scale)
+    frames, live = _without_dead(frames, live, _COUNT_MAX * scale)
     _check_below(frames, live, noise / scale if whole else noise, notes)
     largest = float(frames[:, live].max())
-    if largest > _FULL * scale:
+    if largest > _COUNT_MAX * scale:
         k, i, j = np.unravel_index(int(frames.argmax()), frames.shape)
-        expected = f"at most {_FULL} counts"
+        expected = f"at most {_COUNT_MAX} counts"
         if not whole and math.isfinite(largest):
-            expected += f", set tactile.pascal_per_count to {largest / _FULL:.3g} or more"
+            expected += f", set tactile.pascal_per_count to {largest / _COUNT_MAX:.3g} or more"
         raise ValueError(_place(frames, int(k), int(i), int(j), expected))
     count = len(frames)
     t = np.arange(count) / rate
@@ -267,7 +267,7 @@ def _without_dead(
         unknown = np.isnan(frames)
         live = live & ~unknown.all(axis=0)
         if not live.any():
-            raise ValueError(f"{_OUTSIDE}: every cell is NaN in all frames")
+            raise ValueError(f"{_RANGE_ERROR}: every cell is NaN in all frames")
         wrong = np.argwhere((unknown | np.isinf(frames)) & live)
         if wrong.size:
             k, i, j = wrong[0].tolist()
@@ -285,15 +285,15 @@ def _check_below(
     lowest = float(frames.min())
     if lowest >= 0.0:
         return
-    sample = frames[:: max(len(frames) // _SAMPLE, 1)][:, live].astype(np.float64)
+    sample = frames[:: max(len(frames) // _SAMPLE_COUNT_MAX, 1)][:, live].astype(np.float64)
     middle = float(np.median(sample))
     noise = max(noise, 1.4826 * float(np.median(np.abs(sample - middle))))
     k, i, j = np.unravel_index(int(frames.argmin()), frames.shape)
     if middle < -noise:
         expected = f"0 or noise; half of the cells read {middle:.3g} or less: tare them"
         raise ValueError(_place(frames, int(k), int(i), int(j), expected))
-    if lowest < -_NOISE_MOST * noise:
-        expected = f"0 or more, or noise, which reaches to {-_NOISE_MOST * noise:.3g}"
+    if lowest < -_NOISE_SIGMA_MAX * noise:
+        expected = f"0 or more, or noise, which reaches to {-_NOISE_SIGMA_MAX * noise:.3g}"
         raise ValueError(_place(frames, int(k), int(i), int(j), expected))
     share = np.count_nonzero(frames < 0) / (len(frames) * np.count_nonzero(live))
     notes.append(
@@ -305,7 +305,7 @@ def _check_below(
 def _place(frames: NDArray[Any], k: int, i: int, j: int, expected: str) -> str:
     value = frames[k, i, j].item()
     return (
-        f"{_OUTSIDE}: frame {k + 1} of {len(frames)}, row "
+        f"{_RANGE_ERROR}: frame {k + 1} of {len(frames)}, row "
         f"{i + 1}, cell {j + 1} (frames[{k}, {i}, {j}]) is {value:.10g}, expected {expected}"
     )
 
@@ -333,7 +333,7 @@ def _seconds(t: NDArray[Any], rate: float, notes: list[str]) -> FloatArray:
         return since
     step = float(np.median(steps))
     for factor in (1.0, *_UNITS):
-        if _DATES[0] <= first * factor < _DATES[1]:  # the times are dates
+        if _DATE_RANGE[0] <= first * factor < _DATE_RANGE[1]:  # the times are dates
             break
     else:
         factor = _factor(t, step, rate)
@@ -342,7 +342,7 @@ def _seconds(t: NDArray[Any], rate: float, notes: list[str]) -> FloatArray:
             f"t: taken as {_UNITS[factor]}: a frame comes every {step * factor:.4g} s, by "
             f"tactile.rate every {1.0 / rate:.4g} s"
         )
-    elif not 1.0 / _OFF_NAMED < step * rate < _OFF_NAMED:
+    elif not 1.0 / _INTERVAL_RATIO_NOTED < step * rate < _INTERVAL_RATIO_NOTED:
         notes.append(
             f"t: taken as s: a frame comes every {step:.4g} s, by tactile.rate every "
             f"{1.0 / rate:.4g} s"
@@ -355,7 +355,7 @@ def _factor(t: NDArray[Any], step: float, rate: float) -> float:
     whole = t.dtype.kind in "ui"
     if whole and (np.diff(t) == 1).all() and len(t) > 2:
         raise ValueError("t: whole numbers that rise by 1, expected times in s, or no t")
-    if not whole and step * rate <= _OFF_MOST:
+    if not whole and step * rate <= _INTERVAL_RATIO_MAX:
         return 1.0
     return min((1.0, *_UNITS)[whole:], key=lambda factor: abs(math.log(step * factor * rate)))
 
@@ -366,7 +366,7 @@ def _clipped(found: FrameRecording, scale: float, full: int) -> str:
     top = int(counts.max())
     at_top = counts == top
     cells = np.count_nonzero(at_top.any(axis=0))
-    if top == 0 or top >= full or cells < _CLIPPED_LEAST:
+    if top == 0 or top >= full or cells < _CLIPPED_COUNT_MIN:
         return ""
     # If readings are round numbers, the next smaller one is just as frequent.
     below = int(counts[~at_top].max(initial=0))

@@ -15,7 +15,7 @@ from softfinger.daemon.profile.settings import TactileSettings
 from softfinger.daemon.tactile.frame_files import FrameRecording, load_recording
 from softfinger.daemon.types import FINGERS, Frame
 
-_PITCH_OFF = 0.01  # relative tolerance between the pitch in a file and in the settings
+_PITCH_TOLERANCE = 0.01  # relative tolerance between the pitch in a file and in the settings
 
 
 def pitch_difference(recording: FrameRecording, pitch: tuple[float, float]) -> str:
@@ -27,7 +27,7 @@ def pitch_difference(recording: FrameRecording, pitch: tuple[float, float]) -> s
         return ""
     wanted = pitch[0], pitch[1] or pitch[0]
     pairs = zip(recording.pitch, wanted, strict=True)
-    if all(abs(found / each - 1.0) < _PITCH_OFF for found, each in pairs):
+    if all(abs(found / each - 1.0) < _PITCH_TOLERANCE for found, each in pairs):
         return ""
     x, y = (each * 1e3 for each in recording.pitch)
     return (

@@ -22,12 +22,12 @@ from softfinger.daemon.profile.settings import TactileSettings
 from softfinger.daemon.tactile.decoder import Decoded, Decoder
 from softfinger.daemon.types import Frame
 
-_CHUNK = 65536  # bytes per read, the capacity of a Linux tty
+_READ_SIZE = 65536  # bytes per read, the capacity of a Linux tty
 BITS_PER_BYTE = 10  # start bit, eight data bits, stop bit
-_SETTLE = 5e-4  # s without a byte, counts as a gap between frames
-_PATIENCE = 0.1  # s beyond the transmission time of a frame until the request is repeated
-_SHORTEST_WAIT = 3e-4  # s, shorter timed waits cost more than the wake-ups they save
-_LONGEST_WAIT = 2e-3  # s, limits the delay if the number of missing bytes is wrong
+_GAP_TIME = 5e-4  # s without a byte, counts as a gap between frames
+_REQUEST_TIMEOUT = 0.1  # s beyond the transmission time of a frame until the request is repeated
+_WAIT_MIN = 3e-4  # s, shorter timed waits cost more than the wake-ups they save
+_WAIT_MAX = 2e-3  # s, limits the delay if the number of missing bytes is wrong
 
 
 class SensorClock:
@@ -118,7 +118,7 @@ class SerialReader:
         self._thread.start()
         self._event.wait(self.settings.open_timeout)
         if self._latest is None or not self._latest.valid:
-            trouble = self._trouble()
+            trouble = self._problem()
             self.close()
             self._port_lost = True
             raise TactileError(f"{self._path}: {trouble}")
@@ -160,7 +160,7 @@ class SerialReader:
                 with contextlib.suppress(OSError):
                     os.close(end)
 
-    def _trouble(self) -> str:
+    def _problem(self) -> str:
         if self._port_lost:
             return self._error
         within = f"within tactile.open_timeout = {self.settings.open_timeout:g} s"
@@ -184,7 +184,7 @@ class SerialReader:
                 timeout = self._ask(port)
                 continue
             try:
-                data = os.read(port, _CHUNK)
+                data = os.read(port, _READ_SIZE)
             except BlockingIOError:
                 timeout = None
                 continue
@@ -198,30 +198,27 @@ class SerialReader:
             if decoder.lost and not self._error:
                 self._invalidate(decoder.diagnosis())
             if decoder.pending:
-                timeout = _SETTLE
+                timeout = _GAP_TIME
             else:
-                timeout = self._patience if decoded is None else self._ask(port)
+                timeout = self._request_timeout if decoded is None else self._ask(port)
             wait = decoder.missing * self._byte_time
             # The remaining bytes are being sent: wait for the frame's end instead of its next byte.
-            if (
-                wait > _SHORTEST_WAIT
-                and select.select((stop,), (), (), min(wait, _LONGEST_WAIT))[0]
-            ):
+            if wait > _WAIT_MIN and select.select((stop,), (), (), min(wait, _WAIT_MAX))[0]:
                 return None
 
     @property
-    def _patience(self) -> float | None:
+    def _request_timeout(self) -> float | None:
         """Longest time to wait for a requested frame [s]; None for boards that are not polled."""
         if not self.request:
             return None
-        return self._decoder.frame_bytes * self._byte_time + _PATIENCE
+        return self._decoder.frame_bytes * self._byte_time + _REQUEST_TIMEOUT
 
     def _ask(self, port: int) -> float | None:
         """Request a frame from a polled board; return the longest time to wait for it [s]."""
         if self.request:
             with contextlib.suppress(OSError):  # the next read reports a lost port
                 os.write(port, self.request)
-        return self._patience
+        return self._request_timeout
 
     def _hand_over(self, decoded: Decoded | None) -> None:
         if decoded is None:

@@ -23,12 +23,12 @@ from numpy.typing import NDArray
 
 from softfinger.daemon.errors import SoftfingerError
 
-_MOST = 1024  # largest number of rows or cols
-_HEADER_MOST = 1000  # largest number of header lines
-_LARGEST = 1e12  # largest reading, in its unit
-_RAW_FULL = 255  # the manufacturer's electronics has 8 bits
-_NEARLY = 0.995  # fraction of the saturation pressure, which is also rounded
-_EDGES = ' \t,;"'  # characters that a spreadsheet adds at the ends of lines
+_SIZE_MAX = 1024  # largest number of rows or cols
+_HEADER_LINES_MAX = 1000  # largest number of header lines
+_READING_MAX = 1e12  # largest reading, in its unit
+_RAW_SATURATION = 255  # the manufacturer's electronics has 8 bits
+_SATURATION_FRACTION = 0.995  # fraction of the saturation pressure, which is also rounded
+_EDGE_CHARACTERS = ' \t,;"'  # characters that a spreadsheet adds at the ends of lines
 _LENGTHS = {
     **dict.fromkeys(("", "mm", "millimeters", "millimetres", "millimeter", "millimetre"), 1e-3),
     **dict.fromkeys(("cm", "centimeters", "centimetres", "centimeter", "centimetre"), 1e-2),
@@ -105,17 +105,17 @@ def parse(text: str, seconds_per_frame: float = 0.01) -> Export:
     pitch = _pitch(header)
     factor = _unit(header, pitch)
     raw = factor == 0.0
-    wrong = np.argwhere((np.abs(values) > _LARGEST) | (raw & (values < 0.0)))
+    wrong = np.argwhere((np.abs(values) > _READING_MAX) | (raw & (values < 0.0)))
     if wrong.size:
         k, i, j = wrong[0].tolist()
         raise TekscanError(f"frame {numbers[k]}: row {i + 1}, cell {j + 1} is {values[k, i, j]}")
-    full = _RAW_FULL if raw and values.max() <= _RAW_FULL else math.inf
+    full = _RAW_SATURATION if raw and values.max() <= _RAW_SATURATION else math.inf
     if not raw:
         rounding = 0.5 * factor * 10.0 ** -_digits(values)
         values *= factor
         if "SATURATION_PRESSURE" in header:
             units = {**_PRESSURES, "": factor, **_per_area()}
-            full = _NEARLY * _quantity(header, "SATURATION_PRESSURE", units) - rounding
+            full = _SATURATION_FRACTION * _quantity(header, "SATURATION_PRESSURE", units) - rounding
     step = seconds_per_frame
     if "SECONDS_PER_FRAME" in header:
         step = _quantity(header, "SECONDS_PER_FRAME", _TIMES)
@@ -154,11 +154,11 @@ def _digits(values: NDArray[np.float64]) -> int:
 def _header(lines: list[str]) -> tuple[dict[str, str], int]:
     header: dict[str, str] = {}
     in_comments = False
-    for number, line in enumerate(lines[:_HEADER_MOST]):
-        match = re.match(r"(\w+)[\s,;:=]*(.*)", line.strip(_EDGES))
+    for number, line in enumerate(lines[:_HEADER_LINES_MAX]):
+        match = re.match(r"(\w+)[\s,;:=]*(.*)", line.strip(_EDGE_CHARACTERS))
         if match is None:
             continue
-        key, value = match[1].upper(), match[2].strip(_EDGES)
+        key, value = match[1].upper(), match[2].strip(_EDGE_CHARACTERS)
         if key == "ASCII_DATA":
             return header, number + 1
         if in_comments and match[1].isupper():
@@ -181,9 +181,9 @@ def _frames(
     separator = ""
     for number, text in enumerate(lines[first:], first + 1):
         line = text.strip()
-        if not line.strip(_EDGES):
+        if not line.strip(_EDGE_CHARACTERS):
             continue
-        if line.lstrip(_EDGES).startswith("@@"):
+        if line.lstrip(_EDGE_CHARACTERS).startswith("@@"):
             break
         if re.match(r'"?[^\W\d]{2}', line):  # a row starts with a number or a single B
             match = re.match(r'"?[^\W\d]+[\s:#,;]*(\d{1,9})\b', line)
@@ -228,12 +228,12 @@ def _separator(line: str, cols: int) -> str:
 
 def _cells(line: str, separator: str, cols: int) -> list[str]:
     if separator == " ":
-        return line.split(None, _MOST)
+        return line.split(None, _SIZE_MAX)
     if '"' in line:
         cells = next(csv.reader([line], delimiter=separator[0], skipinitialspace=True))
     else:
-        cells = line.split(separator, 2 * _MOST)
-    while len(cells) > cols and not cells[-1].strip(_EDGES):
+        cells = line.split(separator, 2 * _SIZE_MAX)
+    while len(cells) > cols and not cells[-1].strip(_EDGE_CHARACTERS):
         cells.pop()
     return cells
 
@@ -278,8 +278,8 @@ def _count(header: dict[str, str], key: str) -> int:
     if key not in header:
         raise TekscanError(f"{key} is missing")
     text = header[key]
-    if not re.fullmatch(r"[0-9]{1,4}", text) or not 1 <= int(text) <= _MOST:
-        raise TekscanError(f"{key}: found {text!r}, expected 1 to {_MOST}")
+    if not re.fullmatch(r"[0-9]{1,4}", text) or not 1 <= int(text) <= _SIZE_MAX:
+        raise TekscanError(f"{key}: found {text!r}, expected 1 to {_SIZE_MAX}")
     return int(text)
 
 
@@ -290,7 +290,7 @@ def _quantity(header: dict[str, str], key: str, units: dict[str, float]) -> floa
         value = _number(match[1].rstrip(",")) if match else math.nan
     except ValueError:
         value = math.nan
-    unit = _plain(match[2]) if match else ""
+    unit = _plain_unit(match[2]) if match else ""
     if not math.isfinite(value) or unit not in units:
         known = ", ".join(name for name in units if 0 < len(name) <= 4)
         raise TekscanError(f"{key}: found {header[key]!r}, expected a number in one of {known}")
@@ -311,7 +311,7 @@ def _pitch(header: dict[str, str]) -> tuple[float, float]:
 def _unit(header: dict[str, str], pitch: tuple[float, float]) -> float:
     """Return the unit of the readings [Pa], 0 for raw ones."""
     text = header.get("UNITS", "")
-    unit = _plain(text)
+    unit = _plain_unit(text)
     if unit in _RAW:
         return 0.0
     if unit in _PRESSURES or unit in _per_area():
@@ -333,7 +333,7 @@ def _per_area() -> dict[str, float]:
     }
 
 
-def _plain(unit: str) -> str:
+def _plain_unit(unit: str) -> str:
     """Normalise a unit, including the notations of a square."""
     plain = re.sub(r"[\s\[\]()]", "", unit.translate(_SQUARES)).lower()
     return re.sub(r"(sq|square)([a-z]+)", r"\g<2>2", plain)

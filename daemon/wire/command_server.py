@@ -7,7 +7,7 @@ that arrived before a stop, whose stamp counts fewer stops, are refused, except 
 A client may give a request a unique ``key`` and send the same map again if it was refused as late.
 The daemon then carries out the command at most once, and only if it has carried out no other
 command since that refusal: the newest command prevails. Commands that can only make the hand safer
-(`UNLEASED`) are carried out every time.
+(`NO_LEASE_COMMANDS`) are carried out every time.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import msgpack
 
 from softfinger.daemon.errors import Reason, Refused
-from softfinger.daemon.types import UNLEASED
+from softfinger.daemon.types import NO_LEASE_COMMANDS
 from softfinger.daemon.wire.loop_link import Ask, Link, machine_time
 
 if TYPE_CHECKING:  # the gateway process does not need this module
@@ -28,12 +28,12 @@ if TYPE_CHECKING:  # the gateway process does not need this module
 
 Handler = Callable[[dict[str, Any], float], dict[str, Any]]  # request, its age [s]
 
-_PAST_WITHIN = 0.4  # s that the answer to a local stop waits for the gateway
-_A_TICK = 2  # commands carried out per tick, without stops
-_UNPACKED = 4096  # bytes after which no more requests are unpacked in a tick
-_KEYS = 256  # requests whose outcome is stored
-_KEY_LENGTH = 64
-_VALUES = (str, int, float)  # bool is a subclass of int
+_ANSWER_TIMEOUT = 0.4  # s that the answer to a local stop waits for the gateway
+_COMMANDS_PER_TICK = 2  # commands carried out per tick, without stops
+_UNPACKED_SIZE_MAX = 4096  # bytes after which no more requests are unpacked in a tick
+_OUTCOME_COUNT_MAX = 256  # requests whose outcome is stored
+_KEY_LENGTH_MAX = 64
+_VALUE_TYPES = (str, int, float)  # bool is a subclass of int
 
 
 class _Outcome(NamedTuple):
@@ -82,7 +82,7 @@ class CommandServer:
             self._serve_local(self._local, handler)
         self._unpack(handler)
         waiting, done = self._link.unpacked, 0
-        while waiting and done < _A_TICK:
+        while waiting and done < _COMMANDS_PER_TICK:
             ask, request = waiting.popleft()
             done += ask.stops == self._stops
             self._link.reply(ask, self._answer(ask, request, handler))
@@ -96,7 +96,7 @@ class CommandServer:
         """Unpack the requests that arrived; carry out a stop at once, several as one."""
         stopped, waiting = b"", self._link.unpacked
         size = 0  # bytes
-        while self._link.asked and size < _UNPACKED:
+        while self._link.asked and size < _UNPACKED_SIZE_MAX:
             ask = self._link.asked.popleft()
             size += len(ask.payload)
             try:
@@ -124,7 +124,7 @@ class CommandServer:
     def _answer(self, ask: Ask, request: dict[str, Any], handler: Handler) -> bytes:
         """Return the reply to a request; a request with a key is carried out at most once."""
         name, place = request["command"], (ask.name, ask.payload)
-        keyed = request.pop("key", None) is not None and name not in UNLEASED
+        keyed = request.pop("key", None) is not None and name not in NO_LEASE_COMMANDS
         present = _Outcome(self._stops, self._changes, b"")
         first = self._outcomes.pop(place, present) if keyed else present
         reply, late = first.reply, False
@@ -142,7 +142,7 @@ class CommandServer:
                 reply, late = refusal(str(refused), refused.reason), refused.reason == Reason.LATE
         if keyed:
             self._outcomes[place] = first._replace(reply=b"" if late else reply)
-            if len(self._outcomes) > _KEYS:
+            if len(self._outcomes) > _OUTCOME_COUNT_MAX:
                 self._outcomes.popitem(last=False)
         return reply
 
@@ -151,7 +151,7 @@ class CommandServer:
         if local.take():
             self._stopped = accepted(handler({"command": "stop"}, 0.0))
             self.raise_fence()
-            self._answer_by = time.monotonic() + _PAST_WITHIN
+            self._answer_by = time.monotonic() + _ANSWER_TIMEOUT
         if self._stopped is not None and (
             self._link.stops == self._stops or time.monotonic() > self._answer_by
         ):
@@ -194,15 +194,15 @@ def decode(payload: bytes) -> dict[str, Any]:
     plain = {
         key: value
         for key, value in request.items()
-        if isinstance(key, str) and (value is None or isinstance(value, _VALUES))
+        if isinstance(key, str) and (value is None or isinstance(value, _VALUE_TYPES))
     }
     if request["command"] == "stop":
         return plain
     if len(plain) < len(request):
         raise _malformed("expected texts as keys, and numbers and texts as values")
     key = plain.get("key", "-")
-    if not isinstance(key, str) or not 0 < len(key) <= _KEY_LENGTH:
-        raise _malformed(f"key: expected a text of 1 to {_KEY_LENGTH} characters")
+    if not isinstance(key, str) or not 0 < len(key) <= _KEY_LENGTH_MAX:
+        raise _malformed(f"key: expected a text of 1 to {_KEY_LENGTH_MAX} characters")
     return plain
 
 

@@ -22,10 +22,10 @@ from softfinger.daemon.errors import AddressError
 from softfinger.daemon.own_files import home_folder, shared_folder
 from softfinger.kinematics.compiled.own_folder import require_own
 
-_ANY = ("localhost", "*", "0.0.0.0", "[::]")  # also addresses of this machine
-_LONGEST = 4096  # bytes
-_ASKERS = 16  # senders that wait for the answer
-_A_TICK = 4  # datagrams read per tick; the system queues only a few more
+_LOCAL_HOSTS = ("localhost", "*", "0.0.0.0", "[::]")  # also addresses of this machine
+_DATAGRAM_SIZE_MAX = 4096  # bytes
+_SENDER_COUNT_MAX = 16  # senders that wait for the answer
+_DATAGRAMS_PER_TICK = 4  # datagrams read per tick; the system queues only a few more
 
 
 class LocalStop:
@@ -53,19 +53,19 @@ class LocalStop:
                 f"commands.address: the local socket for stop: {error.filename or ''} "
                 f"{error.strerror or error}"
             ) from None
-        self._askers: deque[Any] = deque(maxlen=_ASKERS)
+        self._senders: deque[Any] = deque(maxlen=_SENDER_COUNT_MAX)
 
     def take(self) -> bool:
         """Read queued datagrams; return True if a stop arrived."""
         came = False
-        for _ in range(_A_TICK):
+        for _ in range(_DATAGRAMS_PER_TICK):
             try:
-                _, asker = self._socket.recvfrom(_LONGEST)
+                _, asker = self._socket.recvfrom(_DATAGRAM_SIZE_MAX)
             except OSError:  # the queue is empty
                 break
             came = True
             if asker:
-                self._askers.append(asker)
+                self._senders.append(asker)
         return came
 
     def fileno(self) -> int:
@@ -74,9 +74,9 @@ class LocalStop:
 
     def answer(self, reply: bytes) -> None:
         """Send the reply to all senders of a stop."""
-        while self._askers:
+        while self._senders:
             with contextlib.suppress(OSError):  # the sender has ended
-                self._socket.sendto(reply, self._askers.popleft())
+                self._socket.sendto(reply, self._senders.popleft())
 
     def close(self) -> None:
         """Close the socket and remove its file."""
@@ -105,7 +105,7 @@ def stop_locally(address: str, seconds: float) -> dict[str, Any] | None:
                 asking.bind("")  # the system chooses a name, for the answer
                 asking.connect(str(folder / name))
                 asking.send(b"stop")
-                reply = msgpack.unpackb(asking.recv(_LONGEST))
+                reply = msgpack.unpackb(asking.recv(_DATAGRAM_SIZE_MAX))
             except (OSError, ValueError, msgpack.UnpackException):
                 continue
         if isinstance(reply, dict):
@@ -119,7 +119,7 @@ def _name(address: str) -> str:
     if kind == "ipc":
         return f"stop-{hashlib.sha256(os.path.realpath(place).encode()).hexdigest()[:16]}"
     host, _, port = place.rpartition(":")
-    host = "127.0.0.1" if host in _ANY else host.strip("[]")
+    host = "127.0.0.1" if host in _LOCAL_HOSTS else host.strip("[]")
     if not ipaddress.ip_address(host).is_loopback:
         raise ValueError(f"{address} is not of this machine")
     return f"stop-{host}-{port}"

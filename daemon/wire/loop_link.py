@@ -29,12 +29,12 @@ ASK = "ask"  # the fields of `Ask`
 REPORT = "report"  # `Link.wanted`, `Link.refused`, `Link.stops`
 NOTICE = "notice"  # a warning
 
-ANEW = 3  # exit status of a gateway that must be restarted and has sent the reason
+RESTART_STATUS = 3  # exit status of a gateway that must be restarted and has sent the reason
 
-_ROOM = 1 << 20  # bytes of the socket buffer; the kernel may allow less
+_BUFFER_SIZE = 1 << 20  # bytes of the socket buffer; the kernel may allow less
 _CHUNK = 1 << 16  # bytes received at a time
-_LARGEST = 64 << 20  # bytes of a message
-_NOTICES = 20
+_MESSAGE_SIZE_MAX = 64 << 20  # bytes of a message
+_NOTICE_COUNT_MAX = 20
 _FIRST, _AGAIN = (msgpack.packb("again") + msgpack.packb(again) for again in (False, True))
 
 
@@ -63,7 +63,7 @@ def pair() -> tuple[socket.socket, socket.socket]:
     """Return both ends of a new socket pair: the loop's and the gateway's."""
     ends = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
     for end in ends:
-        end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _ROOM)
+        end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER_SIZE)
     return ends
 
 
@@ -79,7 +79,7 @@ class Channel:
         end.setblocking(False)
         self._end = end
         self._unsent = bytearray()
-        self._unpacker = msgpack.Unpacker(max_buffer_size=_LARGEST)
+        self._unpacker = msgpack.Unpacker(max_buffer_size=_MESSAGE_SIZE_MAX)
         self.over = False  # the other end has disconnected
 
     def fileno(self) -> int:
@@ -129,7 +129,7 @@ class Link:
         self.stops = 0  # stops known to have preceded the requests that arrive now
         self.asked: deque[Ask] = deque()  # urgent requests first
         self.unpacked: deque[tuple[Ask, dict[str, Any]]] = deque()  # requests that wait for a tick
-        self.notices: deque[str] = deque(maxlen=_NOTICES)  # warnings of the gateway
+        self.notices: deque[str] = deque(maxlen=_NOTICE_COUNT_MAX)  # warnings of the gateway
         self.called = False  # the descriptor of `watch` is readable
         self._other = -1  # descriptor of `watch`
         self._fence = 0

@@ -17,7 +17,7 @@ from typing import Any
 
 import msgpack
 
-from softfinger.daemon.types import HandFacts
+from softfinger.daemon.types import HandInfo
 from softfinger.daemon.wire.fields import FieldSource, Getter, members
 from softfinger.daemon.wire.loop_link import Link
 from softfinger.daemon.wire.schema import COMMAND, EVENT, SETTINGS, TOPICS
@@ -76,7 +76,7 @@ def _packer(record: type[Any]) -> Pack:
 
 _INDEX = {topic: index for index, topic in enumerate(TOPICS)}
 GATEWAY_TOPICS = [topic.decode() for topic in TOPICS]
-KEPT = {SETTINGS: 1, EVENT: 50}  # messages that are repeated for late subscribers
+REPEATED_COUNTS = {SETTINGS: 1, EVENT: 50}  # messages that are repeated for late subscribers
 
 
 def bit(topic: bytes) -> int:
@@ -111,7 +111,7 @@ class Publisher:
     def event(self, wall: float, t: float, level: str, kind: str, text: str) -> None:
         """Publish ``hand/event``."""
         packed = self._pack[EVENT](self._count(EVENT), wall, t, level, kind, text)
-        self._link.publish(_INDEX[EVENT], packed, KEPT[EVENT])
+        self._link.publish(_INDEX[EVENT], packed, REPEATED_COUNTS[EVENT])
 
     def command(
         self, wall: float, t: float, tick: int, request: dict[str, Any], error: str
@@ -120,10 +120,10 @@ class Publisher:
         if self._link.wanted & _COMMANDS:
             self.send(COMMAND, self._count(COMMAND), wall, t, tick, request, error)
 
-    def settings(self, wall: float, t: float, facts: HandFacts) -> None:
+    def settings(self, wall: float, t: float, info: HandInfo) -> None:
         """Publish ``hand/settings``, once."""
-        packed = self._pack[SETTINGS](self._count(SETTINGS), wall, t, facts)
-        self._link.publish(_INDEX[SETTINGS], packed, KEPT[SETTINGS])
+        packed = self._pack[SETTINGS](self._count(SETTINGS), wall, t, info)
+        self._link.publish(_INDEX[SETTINGS], packed, REPEATED_COUNTS[SETTINGS])
 
     def _count(self, topic: bytes) -> int:
         self._counts[topic] += 1

@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from softfinger.daemon.types import (
     FINGERS,
     Frame,
-    HandFacts,
+    HandInfo,
     ObjectPose,
-    Parts,
     Reading,
-    SensorFacts,
+    SceneParts,
+    SensorInfo,
     State,
     TimeSpread,
     Truth,
@@ -95,13 +95,13 @@ class StateSource(NamedTuple):
     """Source of a ``hand/state``."""
 
     state: State
-    scene: Parts
+    scene: SceneParts
     step: int = 1
 
 
 class _Finger(NamedTuple):
     state: State
-    scene: Parts
+    scene: SceneParts
     i: int
 
 
@@ -115,10 +115,10 @@ _goal = _state.of(lambda s: s.goal)
 def _invalid(f: _Finger) -> Invalid:
     scene, state = f.scene, f.state
     if not scene.fingers[f.i]:
-        return Invalid.ABSENT
-    if scene.servos and not state.reading.valid:
-        return Invalid.SERVO
-    return state.contacts[f.i].invalid if scene.sensors else Invalid.NONE
+        return Invalid.NOT_IN_SCENE
+    if scene.has_servos and not state.reading.valid:
+        return Invalid.SERVO_NOT_READ
+    return state.contacts[f.i].invalid if scene.has_sensors else Invalid.NONE
 
 
 def _frame_age(f: _Finger) -> float:
@@ -265,7 +265,7 @@ class TactileSource(NamedTuple):
     frame: Frame
     data: NDArray[np.uint16]  # as published [rows, cols]
     finger: int
-    facts: SensorFacts
+    info: SensorInfo
     wall: float
     step: int = 1
     number: int = 0
@@ -273,7 +273,7 @@ class TactileSource(NamedTuple):
 
 _tactile = FieldSource[TactileSource]()
 _frame = _tactile.of(lambda m: m.frame)
-_facts = _tactile.of(lambda m: m.facts)
+_info = _tactile.of(lambda m: m.info)
 
 
 @topic(
@@ -300,15 +300,15 @@ class TactileFrame:
     finger: str = _tactile("", "left or right", lambda m: FINGERS[m.finger])
     rows: int = _tactile("", "number of cells along y", lambda m: m.data.shape[0])
     cols: int = _tactile("", "number of cells along x", lambda m: m.data.shape[1])
-    pitch: float = _facts("m", "distance between the columns")
-    pitch_y: float = _facts("m", "distance between the rows")
-    centre_x: float = _facts("m", "x offset of the tip's centre from the grid's centre")
-    centre_y: float = _facts("m", "y offset of the tip's centre from the grid's centre")
-    rotation: float = _facts("rad", "rotation of the sensor's axes relative to the finger's")
-    unit: str = _facts("", "`count`: as sent by the board; `Pa`: as used by the estimator")
-    scale: float = _facts("Pa", "pressure per step of the data, exact for linear sensors")
-    calibrated: bool = _facts("", "data × scale is the calibrated pressure")
-    calibration: str = _facts("", "name and date of the calibration, or empty")
+    pitch: float = _info("m", "distance between the columns")
+    pitch_y: float = _info("m", "distance between the rows")
+    centre_x: float = _info("m", "x offset of the tip's centre from the grid's centre")
+    centre_y: float = _info("m", "y offset of the tip's centre from the grid's centre")
+    rotation: float = _info("rad", "rotation of the sensor's axes relative to the finger's")
+    unit: str = _info("", "`count`: as sent by the board; `Pa`: as used by the estimator")
+    scale: float = _info("Pa", "pressure per step of the data, exact for linear sensors")
+    calibrated: bool = _info("", "data × scale is the calibrated pressure")
+    calibration: str = _info("", "name and date of the calibration, or empty")
     data: bytes = _tactile(
         "",
         "rows × cols little-endian uint16, row-major",
@@ -421,10 +421,10 @@ class SettingsSource(NamedTuple):
     seq: int
     wall: float
     t: float
-    facts: HandFacts
+    info: HandInfo
 
 
-_hand_facts = FieldSource[SettingsSource]().of(lambda m: m.facts)
+_hand_info = FieldSource[SettingsSource]().of(lambda m: m.info)
 
 
 @topic(
@@ -436,14 +436,14 @@ _hand_facts = FieldSource[SettingsSource]().of(lambda m: m.facts)
 class HandSettings(_Announcement):
     """One ``hand/settings``."""
 
-    version: str = _hand_facts("", "version of softfinger")
-    settings: str = _hand_facts("", "all settings as JSON")
-    calibration_left: str = _hand_facts("", "calibration of the left sensor as JSON, or empty")
-    calibration_right: str = _hand_facts("", "calibration of the right sensor as JSON, or empty")
-    table_left: str = _hand_facts(
+    version: str = _hand_info("", "version of softfinger")
+    settings: str = _hand_info("", "all settings as JSON")
+    calibration_left: str = _hand_info("", "calibration of the left sensor as JSON, or empty")
+    calibration_right: str = _hand_info("", "calibration of the right sensor as JSON, or empty")
+    table_left: str = _hand_info(
         "", "contact table of the left tip: form, tolerance, certificate (bound on the error)"
     )
-    table_right: str = _hand_facts("", "contact table of the right tip")
+    table_right: str = _hand_info("", "contact table of the right tip")
 
 
 class CommandSource(NamedTuple):

@@ -40,18 +40,19 @@ from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 FloatArray = NDArray[np.float64]
 Kind = Literal["power", "cubic"]
 
-DEAD = 0.2  # of the median response; cells below it are dead
+DEAD_RESPONSE = 0.2  # of the median response; cells below it are dead
 _EXPONENTS = (0.3, 3.0)
-_RESTLESS = 8.0  # times the median noise, above which a cell is not at rest
-_FEW_CELLS = 4  # number of cells not at rest at which the tare fails; fewer may be faulty
+_UNREST_SIGMA = 8.0  # times the median noise, above which a cell is not at rest
+_UNREST_CELL_COUNT = 4  # number of cells not at rest at which the tare fails; fewer may be faulty
 _TILT_MIN = math.radians(3.0)  # smallest range of tilts that determines the rotation
-_UPRIGHT = math.radians(0.5)
-_PRESSED = 6.0  # times the noise; the largest cell under a contact reads more
-_LAGS = 8  # cells, largest lag of the noise correlation
-_SEEN = 4.0  # standard errors for a significant result
-_ENDED = 4.0  # standard deviations of the noise; a zero below it is affected by clipping at 0
-_HELD = 2.0  # shortest hold, over the longest time constant
-_ROUNDS = 25  # alternating iterations for strengths and press
+_UPRIGHT_ERROR = math.radians(0.5)
+_PRESSED_SIGMA = 6.0  # times the noise; the largest cell under a contact reads more
+_LAG_MAX = 8  # cells, largest lag of the noise correlation
+_SIGNIFICANT_SIGMA = 4.0  # standard errors for a significant result
+# Standard deviations of the noise; a zero below it is affected by clipping at 0.
+_CLIPPED_SIGMA = 4.0
+_HOLD_RATIO_MIN = 2.0  # shortest hold, over the longest time constant
+_ITERATIONS = 25  # alternating iterations for strengths and press
 
 
 class CalibrationError(SoftfingerError, ValueError):
@@ -85,8 +86,8 @@ def tare(frames: ArrayLike) -> Tare:
     if len(stack) < 2:
         raise CalibrationError("tare: one frame is too few, expected at least two")
     noise = stack.std(axis=0, ddof=1)
-    restless = np.count_nonzero(noise > _RESTLESS * max(float(np.median(noise)), 0.5))
-    if restless >= _FEW_CELLS:
+    restless = np.count_nonzero(noise > _UNREST_SIGMA * max(float(np.median(noise)), 0.5))
+    if restless >= _UNREST_CELL_COUNT:
         raise CalibrationError(f"tare: {restless} cells don't rest; does something touch the tip?")
     zero = stack.mean(axis=0)
     excess = float(np.maximum(stack - zero, 0.0).mean())
@@ -101,29 +102,29 @@ def noise_correlation(stack: FloatArray) -> tuple[FloatArray, float]:
     n, rows, cols = stack.shape
     noise = stack - stack.mean(axis=0)
     std = noise.std(axis=0)
-    rests = (std > 0.0) & (std <= _RESTLESS * np.median(std))  # not dead or faulty
+    rests = (std > 0.0) & (std <= _UNREST_SIGMA * np.median(std))  # not dead or faulty
     noise *= rests
     common = noise.sum(axis=(1, 2)) / max(np.count_nonzero(rests), 1)
     noise -= common[:, None, None] * rests
     own = float(noise.var())
     noise /= np.where(rests, std, 1.0)
-    shape = rows + _LAGS, cols + _LAGS
+    shape = rows + _LAG_MAX, cols + _LAG_MAX
     power = (np.abs(np.fft.fft2(noise, shape)) ** 2).sum(axis=0)
     products = np.fft.ifft2(power).real
     # Average over both signs of one lag, that is, over both diagonal directions.
-    both = 0.5 * (products + np.roll(products[:, ::-1], 1, axis=1))[:_LAGS, :_LAGS]
-    pairs = (n - 1.0) * np.outer(rows - np.arange(_LAGS), cols - np.arange(_LAGS))
-    if rows < _LAGS or cols < _LAGS or not both[0, 0] > 0.0:
+    both = 0.5 * (products + np.roll(products[:, ::-1], 1, axis=1))[:_LAG_MAX, :_LAG_MAX]
+    pairs = (n - 1.0) * np.outer(rows - np.arange(_LAG_MAX), cols - np.arange(_LAG_MAX))
+    if rows < _LAG_MAX or cols < _LAG_MAX or not both[0, 0] > 0.0:
         return np.empty((0, 0)), float(common.std(ddof=1))
     rho = both / pairs / (both[0, 0] / pairs[0, 0])
-    rho[np.abs(rho) < _SEEN / np.sqrt(pairs)] = 0.0
+    rho[np.abs(rho) < _SIGNIFICANT_SIGMA / np.sqrt(pairs)] = 0.0
     used = np.argwhere(rho != 0.0).max(axis=0) + 1
     rho = rho[: used[0], : used[1]]
     twice = np.where(np.arange(max(used)) > 0, 2.0, 1.0)
     together = float(twice[: used[0]] @ rho @ twice[: used[1]])
     own *= max(together, 0.0) / (rows * cols)
     drift = math.sqrt(max(float(common.var(ddof=1)) - own, 0.0))
-    if drift < _SEEN * math.sqrt(own / n):
+    if drift < _SIGNIFICANT_SIGMA * math.sqrt(own / n):
         drift = 0.0
     return (rho if rho.size > 1 else np.empty((0, 0))), drift
 
@@ -155,7 +156,7 @@ def equilibrate(loads: Sequence[ArrayLike], zero: FloatArray) -> Equilibration:
     typical = float(np.median(response))
     if not typical > 0.0:
         raise CalibrationError("equilibrate: most cells read nothing above their zero")
-    active = response > DEAD * typical
+    active = response > DEAD_RESPONSE * typical
     target = np.array([reading[active].mean() for reading in readings])
     if (target <= 0.0).any():
         raise CalibrationError("equilibrate: a pressure reads nothing above the zero")
@@ -196,7 +197,7 @@ def fit_curve(
         "power" or "cubic".
     readings
         x = (counts − zero)·gain, float64 [n, rows, cols]; non-negative and without noise far from
-        the contact, see :func:`cleared`.
+        the contact, see :func:`above_zero`.
     force
         Known forces [n] [N].
     area
@@ -267,7 +268,7 @@ def _power(
     return (exponent, factor / full**exponent, 0.0, 0.0), errors
 
 
-def cleared(readings: FloatArray, noise: FloatArray, frames: int) -> FloatArray:
+def above_zero(readings: FloatArray, noise: FloatArray, frames: int) -> FloatArray:
     """Set mean readings [rows, cols] over ``frames`` frames to 0 if they are within 4 σ of it.
 
     Clipped noise has a positive mean, whose sum over all cells may be as large as a contact.
@@ -276,7 +277,7 @@ def cleared(readings: FloatArray, noise: FloatArray, frames: int) -> FloatArray:
     return np.where(readings > level, readings, 0.0)
 
 
-def without_end(means: FloatArray, zero: FloatArray, noise: float) -> FloatArray:
+def without_clipping(means: FloatArray, zero: FloatArray, noise: float) -> FloatArray:
     """Correct the mean counts of many frames for noise that is clipped at 0.
 
     ``zero`` and ``noise`` are the mean and the standard deviation of the counts of a tare. For
@@ -289,7 +290,7 @@ def without_end(means: FloatArray, zero: FloatArray, noise: float) -> FloatArray
     ended = z * above + density
     std = np.sqrt((z * z + 1.0) * above + z * density - ended * ended)
     level = float(np.median(zero))
-    if not 0.0 < level < _ENDED * noise:
+    if not 0.0 < level < _CLIPPED_SIGMA * noise:
         return means - zero
     sigma = level / float(np.interp(level / noise, ended / std, ended))
 
@@ -334,13 +335,13 @@ def fit_centre(
     if s.shape != (len(stack),):
         raise CalibrationError("centre: each press needs its tilt, 0 for upright ones")
     tilted = float(np.ptp(s)) > math.sin(_TILT_MIN)
-    if not tilted and float(np.abs(s).max()) > math.sin(_UPRIGHT):
+    if not tilted and float(np.abs(s).max()) > math.sin(_UPRIGHT_ERROR):
         raise CalibrationError(
             f"centre: the tilts differ by less than {math.degrees(_TILT_MIN):g}°, so that tilt "
             "can't be separated from place; press upright alone, or upright and tilted further"
         )
     for k, frame in enumerate(stack):
-        if not frame.max() > _PRESSED * noise:
+        if not frame.max() > _PRESSED_SIGMA * noise:
             raise CalibrationError(f"centre: press {k + 1} is no clean contact")
     used = np.broadcast_to(True if active is None else active, stack.shape)
     force = (stack * used).sum(axis=(1, 2)) * math.prod(grid.pitches)
@@ -348,7 +349,7 @@ def fit_centre(
     found, residual, std = fit_place(presses, tip, material, grid, tilted)
     # Add the uncertainty of the upright orientation, which moves the centroid by lever times angle.
     lever = (0.5 if tip.physics == "solid" else 1.0) * tip.radius
-    std = math.hypot(std, lever * _UPRIGHT / math.sqrt(3.0 * len(s)))
+    std = math.hypot(std, lever * _UPRIGHT_ERROR / math.sqrt(3.0 * len(s)))
     return Centre(found.centre, found.rotation if tilted else None, residual, std)
 
 
@@ -447,16 +448,16 @@ def fit_relaxation(t: ArrayLike, force: ArrayLike, times: tuple[float, ...]) -> 
     if at.size < 8 or not load.max() > 0.0:
         raise CalibrationError("relaxation: expected at least eight frames of one press and hold")
     noise = float(np.std(np.diff(load[at.size // 2 :]))) / math.sqrt(2.0)
-    held = int(np.argmax(load >= load.max() - _SEEN * noise))  # start of the hold
+    held = int(np.argmax(load >= load.max() - _SIGNIFICANT_SIGMA * noise))  # start of the hold
     told = [k for k, time in enumerate(times) if time > 2.0 * (at[-1] - at[0]) / (at.size - 1)]
-    if told and at[-1] - at[held] < _HELD * max(times[k] for k in told):
+    if told and at[-1] - at[held] < _HOLD_RATIO_MIN * max(times[k] for k in told):
         raise CalibrationError(
-            f"relaxation: found {at[-1] - at[held]:.1f} s of hold, expected at least {_HELD:g} "
-            f"times the longest of tip.relaxation_times, {max(times):g} s"
+            f"relaxation: found {at[-1] - at[held]:.1f} s of hold, expected at least "
+            f"{_HOLD_RATIO_MIN:g} times the longest of tip.relaxation_times, {max(times):g} s"
         )
     lasting = np.maximum(load, 0.0)
     lasting[held:] = load[-1]
-    for _ in range(_ROUNDS):
+    for _ in range(_ITERATIONS):
         memory = np.array([follow(at, lasting, times[k]) for k in told]).reshape(-1, at.size)
         columns = np.stack([lasting, *(lasting - memory)], axis=1)[held:]
         fits = []

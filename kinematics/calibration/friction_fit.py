@@ -12,20 +12,22 @@ from softfinger.kinematics.calibration.calibration import CalibrationError
 
 FloatArray = NDArray[np.float64]
 
-RUN_MAX = 3600.0  # s, longest recording; limits memory
+DURATION_MAX = 3600.0  # s, longest recording; limits memory
 _STEP = 0.01  # s, time grid for motion and torque
-_AROUND = 6  # steps on either side for the fit of velocity and acceleration
-_GAP = 0.035  # s, longest gap in the data to interpolate across
-_MOVES = 0.2  # rad/s, above which static friction is mostly gone (XL330: 0.12 rad/s)
-_RESTS = 0.02  # rad/s, below which a joint is at rest; one count of 1.5 mrad in 0.08 s
-_AWAY = 5e-3  # rad from rest at break-away: three counts, ten times the compliance of the gears
-_SLOW = 0.1, 20  # rad/s, number of steps: fastest goal for a break-away with little inertia
-_SECONDS = 0.5  # s, shortest motion in each direction
-_SHARED = 0.2  # s, correlation time of the remaining errors
-_FEWEST = 3  # break-aways needed for a mean
+_WINDOW = 6  # steps on either side for the fit of velocity and acceleration
+_GAP_MAX = 0.035  # s, longest gap in the data to interpolate across
+_SLIDING_SPEED = 0.2  # rad/s, above which static friction is mostly gone (XL330: 0.12 rad/s)
+_REST_SPEED = 0.02  # rad/s, below which a joint is at rest; one count of 1.5 mrad in 0.08 s
+# rad from rest at break-away: three counts, ten times the compliance of the gears.
+_BREAK_AWAY_DISTANCE = 5e-3
+# rad/s, number of steps: fastest goal for a break-away with little inertia.
+_BREAK_AWAY_RATE = 0.1, 20
+_MOTION_TIME_MIN = 0.5  # s, shortest motion in each direction
+_CORRELATION_TIME = 0.2  # s, correlation time of the remaining errors
+_BREAK_AWAY_COUNT_MIN = 3  # break-aways needed for a mean
 # N·m·s/rad, mean and standard deviation of the prior. Values identified for such servos are 0.015
 # to 0.051 (model M4 of Rhoban's BAM, arXiv 2410.08650).
-_VISCOUS = 0.02, 0.02
+_VISCOUS_PRIOR = 0.02, 0.02
 _INERTIA_ERROR = 0.5  # relative error of the configured inertia
 
 
@@ -74,26 +76,28 @@ def fit_friction(
         an hour.
     """
     at, angle, led, given = (np.asarray(each, np.float64) for each in (t, q, goal, torque))
-    if at.size and at[-1] - at[0] > RUN_MAX:
-        raise CalibrationError(too_long(at[-1] - at[0]))
+    if at.size and at[-1] - at[0] > DURATION_MAX:
+        raise CalibrationError(duration_error(at[-1] - at[0]))
     grid = np.arange(at[0], at[-1], _STEP) if at.size else at
-    if grid.size <= 2 * _AROUND:
+    if grid.size <= 2 * _WINDOW:
         raise CalibrationError(_too_little(0.0, 0.0))
     shown, push = np.interp(grid, at, angle), np.interp(grid, at, given)
     place, rate, acceleration = _motion(shown)
     after = np.clip(np.searchsorted(at, grid, "right"), 1, at.size - 1)
-    whole = at[after] - at[after - 1] < _GAP
+    whole = at[after] - at[after - 1] < _GAP_MAX
     # Use only instants with one direction of motion throughout the smoothing window.
-    closes, opens = (_throughout(whole & (sign * rate > _MOVES)) for sign in (1.0, -1.0))
+    closes, opens = (_throughout(whole & (sign * rate > _SLIDING_SPEED)) for sign in (1.0, -1.0))
     seconds = [float(np.count_nonzero(each)) * _STEP for each in (closes, opens)]
-    if min(seconds) < _SECONDS:
+    if min(seconds) < _MOTION_TIME_MIN:
         raise CalibrationError(_too_little(*seconds))
     used = closes | opens
     x = place - place[used].mean()
     columns = np.stack([np.sign(rate), rate, acceleration, x**0, x, x * x], axis=1)
     found, std = _least_squares(columns[used], push[used], inertia, step)
     breaks = _break_aways(shown, rate, push - columns[:, 3:] @ found[3:], np.interp(grid, at, led))
-    stiction, stiction_std = breaks.mean(axis=0) if len(breaks) >= _FEWEST else (math.nan, math.nan)
+    stiction, stiction_std = (
+        breaks.mean(axis=0) if len(breaks) >= _BREAK_AWAY_COUNT_MIN else (math.nan, math.nan)
+    )
     return FrictionFit(
         max(float(found[0]), 0.0),
         float(std[0]),
@@ -104,43 +108,45 @@ def fit_friction(
     )
 
 
-def too_long(seconds: float) -> str:
+def duration_error(seconds: float) -> str:
     """Return the error message for a recording of ``seconds`` that is too long."""
-    return f"found {seconds:.0f} s of data, expected {RUN_MAX:g} s at most"
+    return f"found {seconds:.0f} s of data, expected {DURATION_MAX:g} s at most"
 
 
 def _too_little(closing: float, opening: float) -> str:
     return (
-        f"found {closing:.1f} s of closing and {opening:.1f} s of opening above {_MOVES:g} rad/s "
-        f"in air, expected {_SECONDS:g} s of each at least"
+        f"found {closing:.1f} s of closing and {opening:.1f} s of opening above "
+        f"{_SLIDING_SPEED:g} rad/s in air, expected {_MOTION_TIME_MIN:g} s of each at least"
     )
 
 
 def _motion(q: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return angle, velocity and acceleration from a parabola fitted around each instant."""
-    offsets = _STEP * np.arange(-_AROUND, _AROUND + 1)
+    offsets = _STEP * np.arange(-_WINDOW, _WINDOW + 1)
     fits = np.linalg.pinv(np.stack([offsets**0, offsets, 0.5 * offsets**2], axis=1))
-    padded = np.pad(q, _AROUND, mode="edge")
+    padded = np.pad(q, _WINDOW, mode="edge")
     place, rate, acceleration = (np.convolve(padded, fit[::-1], "valid") for fit in fits)
     return place, rate, acceleration
 
 
 def _throughout(holds: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return True where the condition holds at all neighbours of an instant."""
-    size = 2 * _AROUND + 1
-    return np.convolve(np.pad(holds, _AROUND), np.ones(size), "valid") > size - 0.5
+    size = 2 * _WINDOW + 1
+    return np.convolve(np.pad(holds, _WINDOW), np.ones(size), "valid") > size - 0.5
 
 
 def _least_squares(
     columns: FloatArray, values: FloatArray, inertia: float, step: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return the least-squares solution and its standard deviations."""
-    prior = np.array([0.0, _VISCOUS[0], inertia, 0.0, 0.0, 0.0])
-    weight = np.diag([0.0, _VISCOUS[1] ** -2, (_INERTIA_ERROR * inertia) ** -2, 0.0, 0.0, 0.0])
+    prior = np.array([0.0, _VISCOUS_PRIOR[0], inertia, 0.0, 0.0, 0.0])
+    weight = np.diag(
+        [0.0, _VISCOUS_PRIOR[1] ** -2, (_INERTIA_ERROR * inertia) ** -2, 0.0, 0.0, 0.0]
+    )
     rounding = step * step / 12.0
     variance = rounding
     for _ in range(2):  # the second pass uses the noise found by the first
-        per_sample = _STEP / _SHARED / variance
+        per_sample = _STEP / _CORRELATION_TIME / variance
         covariance = np.linalg.inv(per_sample * columns.T @ columns + weight)
         found = covariance @ (per_sample * columns.T @ values + weight @ prior)
         variance = max(float(np.mean((values - columns @ found) ** 2)), rounding)
@@ -159,11 +165,11 @@ def _break_aways(q: FloatArray, rate: FloatArray, push: FloatArray, goal: FloatA
     torque and the one before.
     """
     found = []
-    speed, steps = _SLOW
-    rests = _throughout(np.abs(rate) < _RESTS)
+    speed, steps = _BREAK_AWAY_RATE
+    rests = _throughout(np.abs(rate) < _REST_SPEED)
     for last in np.flatnonzero(rests[:-1] & ~rests[1:]):
         way = q[last:] - q[last]
-        away = np.flatnonzero(np.abs(way) > _AWAY)
+        away = np.flatnonzero(np.abs(way) > _BREAK_AWAY_DISTANCE)
         led = goal[max(last - steps, 0) : last + int(away[0]) + steps] if away.size else goal
         if np.abs(led[steps:] - led[:-steps]).max(initial=0.0) > speed * steps * _STEP:
             continue

@@ -10,11 +10,11 @@ from numpy.typing import ArrayLike, NDArray
 from softfinger.kinematics.calibration.calibration import CalibrationError
 from softfinger.kinematics.hand.servo_heat import COPPER, HeatLaw
 
-_DOUBT = (0.4, 0.4, 3.0)  # prior standard deviations of rise and time (relative), ambient [°C]
-_READING = 0.4  # °C, error of a reading in whole degrees, including other errors of that kind
+_PRIOR_STD = (0.4, 0.4, 3.0)  # prior standard deviations of rise and time (relative), ambient [°C]
+_READING_ERROR = 0.4  # °C, error of a reading in whole degrees, including other errors of that kind
 _STEP = 1.0  # s
-_LEAST = 8.0  # °C, smallest temperature rise of the case
-_ROUNDS = 12
+_RISE_MIN = 8.0  # °C, smallest temperature rise of the case
+_ITERATIONS = 12
 
 
 class HeatFit(NamedTuple):
@@ -61,9 +61,9 @@ def fit_heat(law: HeatLaw, t: ArrayLike, current: ArrayLike, reading: ArrayLike)
     """
     at, square, shown = (np.asarray(each, np.float64) for each in (t, np.square(current), reading))
     warmed = float(shown.max() - shown[0]) if shown.size else 0.0
-    if warmed < _LEAST:
+    if warmed < _RISE_MIN:
         raise CalibrationError(
-            f"heat: found {warmed:.0f} °C of warming, expected {_LEAST:g} at least: "
+            f"heat: found {warmed:.0f} °C of warming, expected {_RISE_MIN:g} at least: "
             "hold longer, or with more force"
         )
     grid = np.arange(at[0], at[-1], _STEP)
@@ -73,11 +73,11 @@ def fit_heat(law: HeatLaw, t: ArrayLike, current: ArrayLike, reading: ArrayLike)
     def rows(x: NDArray[np.float64]) -> NDArray[np.float64]:
         case = forecast(law, squares, np.exp(x[0]), np.exp(x[1]), shown[0], x[2])
         # Equal readings share one rounding error, so each degree counts once, not every second.
-        weight = np.sqrt(warmed / grid.size) / _READING
-        return np.concatenate([(case - readings) * weight, (x - prior) / _DOUBT])
+        weight = np.sqrt(warmed / grid.size) / _READING_ERROR
+        return np.concatenate([(case - readings) * weight, (x - prior) / _PRIOR_STD])
 
     x, off, steps = prior.copy(), rows(prior), np.array([1e-3, 1e-3, 1e-2])
-    for _ in range(_ROUNDS):
+    for _ in range(_ITERATIONS):
         slopes = np.stack([(rows(x + step) - off) / step.max() for step in np.diag(steps)], axis=1)
         x -= np.linalg.lstsq(slopes, off, rcond=None)[0]
         off = rows(x)

@@ -9,19 +9,21 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from softfinger.kinematics.calibration.calibration import CalibrationError
-from softfinger.kinematics.calibration.friction_fit import RUN_MAX, too_long
+from softfinger.kinematics.calibration.friction_fit import DURATION_MAX, duration_error
 
 FloatArray = NDArray[np.float64]
 
 _STEP = 1e-3  # s, time grid, and spacing of the delays tried first
-_LONGEST, _EARLY = 0.2, 0.02  # s, range of latencies tried: up to 0.2, from −0.02
-_MOVES, _SMOOTHED = 2e-3, 0.05  # m/s, s: a ramp closes faster than this, averaged over this time
-_BESIDE = 0.2  # s, time before and after a ramp that belongs to it
-_LEAST = 8e-4  # m, smallest closing of a ramp, seven encoder counts
-_FEWEST = 8  # smallest number of frames
-_CLOCKS = 1e-3  # s, standard deviation of the times of ticks, readings and frames
-_WIDER, _SPREAD_MAX = 1.4, 0.1  # widening of a growing footprint, see `perception.frame_channels`
-_ROUNDS = 3  # alternating iterations for the touch and the fit
+_DELAY_MIN, _DELAY_MAX = -0.02, 0.2  # s, range of latencies tried
+# m/s, s: a ramp closes faster than this, averaged over this time.
+_CLOSING_SPEED_MIN, _RATE_TIME = 2e-3, 0.05
+_RAMP_MARGIN = 0.2  # s, time before and after a ramp that belongs to it
+_CLOSING_MIN = 8e-4  # m, smallest closing of a ramp, seven encoder counts
+_FRAME_COUNT_MIN = 8  # smallest number of frames
+_TIME_ERROR = 1e-3  # s, standard deviation of the times of ticks, readings and frames
+# Widening of a growing footprint, see `perception.frame_channels`.
+_WIDENING, _SPREAD_MAX = 1.4, 0.1
+_ITERATIONS = 3  # alternating iterations for the touch and the fit
 
 
 class LatencyFit(NamedTuple):
@@ -70,22 +72,22 @@ def fit_latency(
     """
     t, d, std = (np.asarray(each, np.float64) for each in frames)
     read, closed = (np.asarray(each, np.float64) for each in joints)
-    if t.size < _FEWEST or read.size < 2:
+    if t.size < _FRAME_COUNT_MIN or read.size < 2:
         raise CalibrationError(_too_little(0.0))
-    if read[-1] - read[0] > RUN_MAX:
-        raise CalibrationError(too_long(read[-1] - read[0]))
+    if read[-1] - read[0] > DURATION_MAX:
+        raise CalibrationError(duration_error(read[-1] - read[0]))
     grid = np.arange(read[0], read[-1], _STEP)
     closing = np.interp(grid, read, closed - closed[0])
     rate = _rate(closing)
     ramps, widest = _ramps(t, grid, closing, rate)
     used = ramps.any(axis=1)
-    if np.count_nonzero(used) < _FEWEST:
+    if np.count_nonzero(used) < _FRAME_COUNT_MIN:
         raise CalibrationError(_too_little(widest))
     encoder, scale_error = errors
     data = _Ramps(t[used], d[used], np.hypot(std[used], encoder), ramps[used])
     touch = -math.inf
-    for _ in range(_ROUNDS if response > 0.0 else 1):
-        shown, spread = _shown(np.maximum(closing, touch), response)
+    for _ in range(_ITERATIONS if response > 0.0 else 1):
+        shown, spread = _filtered_closing(np.maximum(closing, touch), response)
         fit, offset = _fit(data, grid, shown, spread, scale_error, latency)
         touch = -offset / fit.scale
     # The error of an encoder at rest is constant, and half of it shifts the ramp.
@@ -118,11 +120,11 @@ def _fit(
         wide = np.minimum(np.interp(at, grid, spread) / data.d**2, _SPREAD_MAX)
         rows = np.column_stack([np.interp(at, grid, shown), data.of]) / data.std[:, None]
         rows = np.vstack([rows, [1.0 / scale_error, *np.zeros(data.of.shape[1])]])
-        values = np.append(data.d / (1.0 + _WIDER * wide) / data.std, 1.0 / scale_error)
+        values = np.append(data.d / (1.0 + _WIDENING * wide) / data.std, 1.0 / scale_error)
         x = np.linalg.lstsq(rows, values, rcond=None)[0]
         return x, values - rows @ x
 
-    delays = np.arange(-_EARLY, _LONGEST, _STEP) - latency
+    delays = np.arange(_DELAY_MIN, _DELAY_MAX, _STEP) - latency
     costs = np.array([float(np.sum(np.square(solve(delay)[1]))) for delay in delays])
     best = int(np.argmin(costs))
     near = slice(max(best - 5, 0), best + 6)
@@ -136,18 +138,20 @@ def _fit(
     alike = float(np.clip(off[1:] @ off[:-1] / (off @ off), 0.0, 0.9))
     std = math.sqrt(excess * (1.0 + alike) / (1.0 - alike) / bend)
     residual = float(np.sqrt(np.mean(np.square(off * data.std))))
-    result = LatencyFit(delay, math.hypot(std, _CLOCKS), float(x[0]), residual, data.of.shape[1])
+    result = LatencyFit(
+        delay, math.hypot(std, _TIME_ERROR), float(x[0]), residual, data.of.shape[1]
+    )
     return result, float(np.median(x[1:]))
 
 
 def _too_little(widest: float) -> str:
     return (
         f"found a ramp of {widest * 1e3:.1f} mm by the joints, expected "
-        f"{_LEAST * 1e3:g} mm at least while both tips touch"
+        f"{_CLOSING_MIN * 1e3:g} mm at least while both tips touch"
     )
 
 
-def _shown(closing: FloatArray, response: float) -> tuple[FloatArray, FloatArray]:
+def _filtered_closing(closing: FloatArray, response: float) -> tuple[FloatArray, FloatArray]:
     """Return ``closing`` as shown by cells with a first-order lag, and its spread [m²]."""
     if response == 0.0:
         return closing, np.zeros_like(closing)
@@ -164,7 +168,7 @@ def _shown(closing: FloatArray, response: float) -> tuple[FloatArray, FloatArray
 
 def _rate(closing: FloatArray) -> FloatArray:
     """Return the smoothed speed of closing [m/s]."""
-    around = np.full(round(_SMOOTHED / _STEP) | 1, 1.0)
+    around = np.full(round(_RATE_TIME / _STEP) | 1, 1.0)
     smooth = np.convolve(np.pad(closing, around.size // 2, mode="edge"), around, "valid")
     return np.asarray(np.gradient(smooth / around.size, _STEP))
 
@@ -173,7 +177,8 @@ def _ramps(
     t: FloatArray, grid: FloatArray, closing: FloatArray, rate: FloatArray
 ) -> tuple[NDArray[np.bool_], float]:
     """Return a mask of the frames of each ramp, [n, ramps], and the largest closing [m]."""
-    near = np.convolve(np.abs(rate) > _MOVES, np.ones(2 * round(_BESIDE / _STEP) + 1), "same") > 0.5
+    window = np.ones(2 * round(_RAMP_MARGIN / _STEP) + 1)
+    near = np.convolve(np.abs(rate) > _CLOSING_SPEED_MIN, window, "same") > 0.5
     number = np.cumsum(near & ~np.append(False, near[:-1])) * near  # number of the ramp, 0 for none
     index = np.clip(np.searchsorted(grid, t), 0, grid.size - 1)
     widths = {
@@ -181,5 +186,5 @@ def _ramps(
         for k in np.unique(number[index])
         if k > 0
     }
-    wide = [k for k, width in widths.items() if width > _LEAST]
+    wide = [k for k, width in widths.items() if width > _CLOSING_MIN]
     return np.equal.outer(number[index], wide), max(widths.values(), default=0.0)

@@ -22,11 +22,11 @@ from softfinger.kinematics.contact.tip_curves import (
 from softfinger.kinematics.estimation.measured import sum_weights
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
-_FEWEST = 6  # smallest number of presses
-_UPRIGHT = math.radians(1.0)
-_TILTED = math.radians(5.0)
-_POOR = 0.05  # largest error of the curves over the force, and over the radius
-_STAGE = 2e-3  # smallest relative error of a stage and sensor
+_PRESS_COUNT_MIN = 6  # smallest number of presses
+_UPRIGHT_TILT = math.radians(1.0)
+_TILTED_MIN = math.radians(5.0)
+_CURVE_ERROR_MAX = 0.05  # largest error of the curves over the force, and over the radius
+_STAGE_ERROR = 2e-3  # smallest relative error of a stage and sensor
 
 
 class CurvesError(SoftfingerError, ValueError):
@@ -59,16 +59,17 @@ def fit_measured(presses: PressSums, radius: float, grid: SensorGrid) -> TipCurv
     """
     used = presses.d > 0.0
     d, theta = presses.d[used], presses.theta[used]
-    tilted = np.abs(theta) > _TILTED
+    tilted = np.abs(theta) > _TILTED_MIN
     if (
-        len(d) < _FEWEST
+        len(d) < _PRESS_COUNT_MIN
         or len(np.unique(d)) < 3
         or tilted.sum() < 2
-        or not (np.abs(theta) < _UPRIGHT).any()
+        or not (np.abs(theta) < _UPRIGHT_TILT).any()
     ):
         raise CurvesError(
             f"found {len(d)} presses of {len(np.unique(d))} depths, {tilted.sum()} of them tilted; "
-            f"expected at least {_FEWEST} of 3 depths, upright ones, and 2 tilted by 5° or more"
+            f"expected at least {_PRESS_COUNT_MIN} of 3 depths, upright ones, and 2 tilted by 5° "
+            f"or more"
         )
     frames = [each for each, use in zip(presses.frames, used, strict=True) if use]
     first = replace(grid, centre=(0.0, 0.0), rotation=0.0)
@@ -94,7 +95,9 @@ def fit_measured(presses: PressSums, radius: float, grid: SensorGrid) -> TipCurv
                 found = np.concatenate([np.zeros((1, SQUARES)), found[:-1]])  # t · lever increases
             return name == "extent" or rises(found, root, square)
 
-        best = _best((t, q, times), y, np.hypot(sigma, _STAGE * np.abs(y)), powers, squares, valid)
+        best = _best_fit(
+            (t, q, times), y, np.hypot(sigma, _STAGE_ERROR * np.abs(y)), powers, squares, valid
+        )
         if best is None:
             raise CurvesError(f"no smooth curve that rises goes through the presses' {name}")
         return tuple(map(tuple, best.tolist()))
@@ -129,11 +132,11 @@ def fit_measured(presses: PressSums, radius: float, grid: SensorGrid) -> TipCurv
         ]
     )
     missed = [
-        _beyond(misses[k] / sums[0], scatter[m] / sums[0], _STAGE * smallest)
+        _excess_error(misses[k] / sums[0], scatter[m] / sums[0], _STAGE_ERROR * smallest)
         for k, m, smallest in ((0, 0, 1.0), (1, 0, 1.0), (2, 1, radius), (3, 2, radius))
     ]
     force_error, lever_error = max(missed[:2]), max(missed[2:])
-    if max(force_error, lever_error / radius) > _POOR:
+    if max(force_error, lever_error / radius) > _CURVE_ERROR_MAX:
         raise CurvesError(
             f"every smooth curve that rises misses the presses' force by {force_error:.1%} or "
             f"their centroid by {lever_error * 1e3:.2f} mm"
@@ -141,7 +144,7 @@ def fit_measured(presses: PressSums, radius: float, grid: SensorGrid) -> TipCurv
     return replace(law, force_error=force_error, lever_error=lever_error)
 
 
-def _beyond(misses: FloatArray, noise: FloatArray, smallest: float) -> float:
+def _excess_error(misses: FloatArray, noise: FloatArray, smallest: float) -> float:
     """Return the standard deviation of residuals in excess of their noise, weighted by noise."""
     weight = 1.0 / (noise**2 + smallest**2)
     return math.sqrt(max(float(weight @ (misses**2 - noise**2)) / float(weight.sum()), 0.0))
@@ -164,7 +167,7 @@ def _noise(frames: Sequence[FloatArray], weights: FloatArray) -> FloatArray:
 def _place(sums: FloatArray, theta: FloatArray) -> tuple[tuple[float, float], float]:
     """Return the tip's centre [m] from upright presses and the rotation [rad] from tilted ones."""
     x, y = sums[1:3] / sums[0]
-    weight = np.where(np.abs(theta) < _UPRIGHT, sums[0], 0.0)
+    weight = np.where(np.abs(theta) < _UPRIGHT_TILT, sums[0], 0.0)
     weight /= weight.sum()
     centre = float(weight @ x), float(weight @ y)
     along = np.sin(theta) * sums[0]
@@ -172,7 +175,7 @@ def _place(sums: FloatArray, theta: FloatArray) -> tuple[tuple[float, float], fl
     return centre, math.atan2(-float(along @ (y - centre[1])), float(along @ (x - centre[0])))
 
 
-def _best(
+def _best_fit(
     points: tuple[FloatArray, FloatArray, FloatArray],
     y: FloatArray,
     sigma: FloatArray,

@@ -20,14 +20,14 @@ from softfinger.kinematics.estimation.estimator import ContactEstimator
 from softfinger.kinematics.sensing.footprint import FloatArray
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
-_UNIT = Material.constant(1.0)
+_UNIT_MATERIAL = Material.constant(1.0)
 _STEP = 1e-5  # m, step of numerical derivatives
-_SHIFT = 2e-4  # m, step in position; larger because rim cells change by whole sample points
+_PLACE_STEP = 2e-4  # m, step in position; larger because rim cells change by whole sample points
 _ROTATION_STEP = 1e-4  # rad
-_TURNS = 8  # initial rotations to try
-_GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
-_NARROW = 4e-3  # tolerance of ν
-_SAME_D, _SAME_THETA = 5e-5, 0.009  # m, rad; presses that differ by less are repetitions
+_ROTATION_STARTS = 8  # initial rotations to try
+_GOLDEN_RATIO = 0.5 * (math.sqrt(5.0) - 1.0)
+_POISSON_TOLERANCE = 4e-3  # tolerance of ν
+_REPEATED_D, _REPEATED_THETA = 5e-5, 0.009  # m, rad; presses that differ by less are repetitions
 _DRIFT_MIN = 0.02  # smallest significant drift of E, relative; the accuracy of presses and tables
 
 
@@ -47,7 +47,7 @@ class Presses:
     used: NDArray[np.bool_]
 
     def of(
-        self, tip: Fingertip, grid: SensorGrid, d: FloatArray, law: Material = _UNIT
+        self, tip: Fingertip, grid: SensorGrid, d: FloatArray, law: Material = _UNIT_MATERIAL
     ) -> FloatArray:
         """Return the modelled pressures of these presses for a modulus of 1 Pa, [used cells]."""
         made = [
@@ -102,7 +102,7 @@ def first_cycle(d: FloatArray, theta: FloatArray, force: FloatArray) -> float | 
     neither. The mean is over all pairs of ``d`` [n] [m] and ``theta`` [n] [rad] that are pressed
     more than once; the result is None if there are none.
     """
-    poses = np.round(np.stack([d / _SAME_D, theta / _SAME_THETA], axis=1))
+    poses = np.round(np.stack([d / _REPEATED_D, theta / _REPEATED_THETA], axis=1))
     _, which = np.unique(poses, axis=0, return_inverse=True)
     again = [force[which == pose] for pose in range(which.max() + 1)]
     more = [float(each[0] / each[1:].mean()) for each in again if len(each) > 1]
@@ -130,7 +130,7 @@ class TipFit:
     force_error: float = math.nan
     trend: Trend | None = None
     valid: float = 0.0
-    law: Material = _UNIT
+    law: Material = _UNIT_MATERIAL
 
     @property
     def material(self) -> Material:
@@ -142,7 +142,9 @@ def _scaled(law: Material, factor: float) -> Material:
     return Material(tuple(each * Fraction(factor) for each in law.coefficients), name=law.name)
 
 
-def fit_tip(presses: Presses, tip: Fingertip, grid: SensorGrid, law: Material = _UNIT) -> TipFit:
+def fit_tip(
+    presses: Presses, tip: Fingertip, grid: SensorGrid, law: Material = _UNIT_MATERIAL
+) -> TipFit:
     """Fit the modulus and the zero of d of one ``tip`` model by Gauss-Newton."""
     readings = presses.frames[presses.used]
     offset = 0.0
@@ -166,7 +168,7 @@ def compare_tips(
     radius: float,
     grid: SensorGrid,
     active: NDArray[np.bool_],
-    material: Material = _UNIT,
+    material: Material = _UNIT_MATERIAL,
 ) -> list[TipFit]:
     """Fit spring and solid models of the tip and return the fits, the best one first.
 
@@ -191,22 +193,22 @@ def _best_poisson(presses: Presses, tip: Fingertip, grid: SensorGrid) -> TipFit:
     def at(poisson: float) -> TipFit:
         return fit_tip(presses, replace(tip, poisson=poisson), grid)
 
-    inner = golden_section(lambda poisson: at(poisson).chi2, *POISSON, _NARROW)
+    inner = golden_section(lambda poisson: at(poisson).chi2, *POISSON, _POISSON_TOLERANCE)
     return min((at(poisson) for poisson in (inner, *POISSON)), key=lambda fit: fit.chi2)
 
 
 def golden_section(cost: Callable[[float], float], low: float, high: float, within: float) -> float:
     """Return the minimum of ``cost`` between ``low`` and ``high`` to the tolerance ``within``."""
-    left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
+    left, right = high - _GOLDEN_RATIO * (high - low), low + _GOLDEN_RATIO * (high - low)
     at_left, at_right = cost(left), cost(right)
     while high - low > within:
         if at_left < at_right:
             high, right, at_right = right, left, at_left
-            left = high - _GOLDEN * (high - low)
+            left = high - _GOLDEN_RATIO * (high - low)
             at_left = cost(left)
         else:
             low, left, at_left = left, right, at_right
-            right = low + _GOLDEN * (high - low)
+            right = low + _GOLDEN_RATIO * (high - low)
             at_right = cost(right)
     return 0.5 * (low + high)
 
@@ -266,7 +268,7 @@ def fit_place(
         return float(np.linalg.norm(presses.of(tip, tried, depths) - readings))
 
     if rotate:
-        turns = 2.0 * math.pi * np.arange(_TURNS) / _TURNS
+        turns = 2.0 * math.pi * np.arange(_ROTATION_STARTS) / _ROTATION_STARTS
         grid = min((replace(grid, rotation=float(each)) for each in turns), key=misfit)
     owner = np.broadcast_to(
         np.arange(len(depths))[:, None, None], presses.used.shape
@@ -278,8 +280,8 @@ def fit_place(
         columns = [np.where(owner == k, by_depth, 0.0) for k in range(len(depths))]
         x, y = grid.centre
         tried: Sequence[tuple[SensorGrid, float]] = [
-            (replace(grid, centre=(x + _SHIFT, y)), _SHIFT),
-            (replace(grid, centre=(x, y + _SHIFT)), _SHIFT),
+            (replace(grid, centre=(x + _PLACE_STEP, y)), _PLACE_STEP),
+            (replace(grid, centre=(x, y + _PLACE_STEP)), _PLACE_STEP),
         ]
         if rotate:
             tried = [

@@ -79,7 +79,7 @@ class KernelCompiler(CompilerBase):
 
     def compile_extra(self, func: Any) -> Any:
         """Compile ``func``."""
-        with _remembering(self.state.flags):
+        with _with_cached_lookups(self.state.flags):
             return super().compile_extra(func)
 
     def define_pipelines(self) -> list[Any]:
@@ -109,7 +109,7 @@ class _Arguments(tuple[Any, ...]):
 
 
 @contextmanager
-def _remembering(flags: Any) -> Iterator[None]:
+def _with_cached_lookups(flags: Any) -> Iterator[None]:
     """Let Numba cache the signatures of its own functions and type sizes within this context."""
     arithmetic = frozenset(flags.fastmath.flags), flags.error_model
 

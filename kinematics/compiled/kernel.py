@@ -22,7 +22,7 @@ from softfinger.kinematics.compiled import plain
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 # Minor versions of Numba with which `compiler`, which uses private interfaces, was tested.
-TESTED = ("0.63", "0.64", "0.65", "0.66", "0.67", "0.68")
+TESTED_NUMBA = ("0.63", "0.64", "0.65", "0.66", "0.67", "0.68")
 
 # index(k) converts k to an unsigned index. Numba checks signed indices for negative values, which
 # count from the end, and this check prevents vectorisation. Do not mix both kinds in a sum.
@@ -36,14 +36,14 @@ class JitDisabled(SoftfingerError):
     """Error raised if Numba's compilation is disabled."""
 
 
-def _chosen() -> tuple[ModuleType, str]:
+def _chosen_compiler() -> tuple[ModuleType, str]:
     """Return the compiling module, and the reason if it is `plain`, else an empty text."""
     if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
         raise JitDisabled(
             "NUMBA_DISABLE_JIT is set: the kernels run compiled only; unset it to go on"
         )
-    if ".".join(numba.__version__.split(".")[:2]) not in TESTED:
-        return plain, f"Numba {numba.__version__} is not one of {', '.join(TESTED)}"
+    if ".".join(numba.__version__.split(".")[:2]) not in TESTED_NUMBA:
+        return plain, f"Numba {numba.__version__} is not one of {', '.join(TESTED_NUMBA)}"
     try:
         from softfinger.kinematics.compiled import compiler
     except (ImportError, AttributeError) as error:
@@ -51,7 +51,7 @@ def _chosen() -> tuple[ModuleType, str]:
     return compiler, ""
 
 
-_compiler, why_plain = _chosen()
+_compiler, why_plain = _chosen_compiler()
 
 
 def kernel(function: Function) -> Function:

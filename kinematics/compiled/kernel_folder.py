@@ -48,7 +48,7 @@ _KERNEL, _MARK = ".kernel", ".built"
 def kernel_folder() -> OwnFolder | None:
     """Return the current cache folder, created if absent; warn and return None if that fails."""
     try:
-        return find_folder()
+        return find_kernel_folder()
     except (OSError, RuntimeError) as error:
         warnings.warn(
             f"compiled kernels can't be kept, so every start compiles anew: {error} "
@@ -59,7 +59,7 @@ def kernel_folder() -> OwnFolder | None:
         return None
 
 
-def find_folder() -> OwnFolder:
+def find_kernel_folder() -> OwnFolder:
     """Return the current folder in NUMBA_CACHE_DIR if set, else in the user's cache directory.
 
     Raises the exceptions of :class:`OwnFolder`, and RuntimeError without a home directory.
@@ -88,7 +88,7 @@ def keep(folder: OwnFolder, name: str, content: bytes) -> None:
 def kept(folder: OwnFolder, name: str) -> bytes | None:
     """Return a stored kernel, or None if it is missing or (with a warning) damaged."""
     try:
-        return _sound(folder.read(name + _KERNEL))
+        return _without_checksum(folder.read(name + _KERNEL))
     except FileNotFoundError:
         return None
     except (OSError, ValueError) as error:
@@ -96,7 +96,7 @@ def kept(folder: OwnFolder, name: str) -> bytes | None:
         return None
 
 
-def _sound(data: bytes) -> bytes:
+def _without_checksum(data: bytes) -> bytes:
     content = data[_DIGEST:]
     if hashlib.sha256(content).digest() != data[:_DIGEST]:
         raise ValueError("kernels are damaged")
@@ -109,7 +109,7 @@ def damaged(folder: OwnFolder) -> list[str]:
     for name in folder.names():
         if name.endswith(_KERNEL):
             try:
-                _sound(folder.read(name))
+                _without_checksum(folder.read(name))
             except (OSError, ValueError):
                 found.append(name)
     return found

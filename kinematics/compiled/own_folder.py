@@ -15,7 +15,7 @@ from pathlib import Path
 
 # Windows has no owners or modes that show who may write, and folders cannot be held open. Nothing
 # is checked there; the access control lists of the user's profile protect the folder.
-JUDGED = hasattr(os, "geteuid")
+HAS_OWNERS = hasattr(os, "geteuid")
 NO_FOLLOW: int = getattr(os, "O_NOFOLLOW", 0)
 _PLAIN: int = NO_FOLLOW | getattr(os, "O_BINARY", 0)
 
@@ -32,7 +32,7 @@ def fault(path: Path, found: os.stat_result) -> str:
     ``found`` is the status of the path. The owner must be this user or root. Folders with the
     sticky bit, such as /tmp, are allowed: their entries can only be replaced by the entry's owner.
     """
-    if not JUDGED:
+    if not HAS_OWNERS:
         return ""
     if found.st_uid not in (0, os.geteuid()):
         return f"{path}: belongs to user {found.st_uid}, expected {os.geteuid()}, who runs this"
@@ -42,7 +42,7 @@ def fault(path: Path, found: os.stat_result) -> str:
 
 
 def _written_by_others(path: Path, found: os.stat_result) -> str:
-    if not JUDGED:
+    if not HAS_OWNERS:
         return ""
     others = stat.S_IWOTH | (0 if _alone_in(found.st_gid) else stat.S_IWGRP)
     mode = stat.S_IMODE(found.st_mode)
@@ -77,10 +77,10 @@ def require_own(folder: Path) -> None:
 
     Raises PermissionError, FileNotFoundError or NotADirectoryError.
     """
-    _judge(folder, folder.lstat())
+    _check_owner(folder, folder.lstat())
 
 
-def _judge(folder: Path, found: os.stat_result) -> None:
+def _check_owner(folder: Path, found: os.stat_result) -> None:
     if not stat.S_ISDIR(found.st_mode):
         raise NotADirectoryError(f"{folder}: found a link or a file, expected a folder")
     check_above(folder)
@@ -128,11 +128,11 @@ class OwnFolder:
         require_own(path)
         self.path = path
         self.descriptor: int | None = None
-        if not JUDGED:
+        if not HAS_OWNERS:
             return
         self.descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY | NO_FOLLOW)
         try:
-            _judge(path, os.fstat(self.descriptor))
+            _check_owner(path, os.fstat(self.descriptor))
             if not os.access(path, os.W_OK | os.X_OK):
                 raise PermissionError(f"{path}: may not be written to")
         except OSError:

@@ -27,7 +27,7 @@ from softfinger.kinematics.contact.tip_curves import TipCurves
 FloatArray = NDArray[np.float64]
 
 HALF_PI = math.pi / 2
-LARGEST = 1.0  # m, largest radius; a larger value was probably given in millimetres
+RADIUS_MAX = 1.0  # m, largest radius; a larger value was probably given in millimetres
 POISSON = (0.45, 0.4995)  # range of Poisson's ratio covered by the solid tip's data
 
 
@@ -83,9 +83,9 @@ class Fingertip:
         radius = float(self.radius)
         if not (radius > 0.0 and math.isfinite(radius)):
             raise ValueError(f"the tip's radius must be positive and finite, not {self.radius!r}")
-        if radius > LARGEST:
+        if radius > RADIUS_MAX:
             raise ValueError(
-                f"the tip's radius must be in metres, at most {LARGEST:g}, not {radius:g}; "
+                f"the tip's radius must be in metres, at most {RADIUS_MAX:g}, not {radius:g}; "
                 f"{radius:g} mm is {radius * 1e-3:g}"
             )
         object.__setattr__(self, "radius", radius)
@@ -98,7 +98,7 @@ class Fingertip:
         return np.asarray(np.arctan2(h, np.sqrt(depth * (self.radius + h))))
 
 
-class Closed(NamedTuple):
+class ClosedForms(NamedTuple):
     """Results of the closed forms: arrays of the broadcast shape of d and θ, or NumPy scalars."""
 
     force: FloatArray  # F [N]
@@ -143,7 +143,7 @@ _quiet = np.errstate(invalid="ignore", divide="ignore", over="ignore")
 
 
 @_quiet
-def closed_forms(modulus: float, d: ArrayLike, theta: ArrayLike) -> Closed:
+def closed_forms(modulus: float, d: ArrayLike, theta: ArrayLike) -> ClosedForms:
     """Return force, energy and partials for a constant ``modulus`` [Pa].
 
     ``d`` [m] and ``theta`` [rad] broadcast. The results are zero for d ≤ 0 and NaN for NaN. The
@@ -157,4 +157,4 @@ def closed_forms(modulus: float, d: ArrayLike, theta: ArrayLike) -> Closed:
     energy = energy_d * depth / 3.0
     six = force, energy, force_d, force * slope, energy_d, 2.0 * energy * slope
     nothing = 0.0 * tilt + np.where(np.isnan(depth), depth, 0.0)  # propagates NaN
-    return Closed(*(np.where(depth > 0.0, each, nothing)[()] for each in six))
+    return ClosedForms(*(np.where(depth > 0.0, each, nothing)[()] for each in six))

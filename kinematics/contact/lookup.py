@@ -32,29 +32,28 @@ from softfinger.kinematics.contact.table_record import (
     OCTAVES,
     SLAB_BITS,
     Lanes,
-    Six,
+    SixFloats,
     Table,
-    Triple,
+    ThreeFloats,
     lanes,
 )
 
 FloatArray = NDArray[np.float64]
 
 HALF_PI = math.pi / 2
-_NEAR = 0.25 * math.pi
-LOWEST = 0.5**OCTAVES  # h at the end of the domain
-_H_MIN = LOWEST * (1.0 + 2.0**-52)  # smallest number above LOWEST
-_END = LOWEST * (1.0 - 1e-12)  # h below this is outside by more than rounding
+H_END = 0.5**OCTAVES  # h at the end of the domain
+_H_MIN = H_END * (1.0 + 2.0**-52)  # smallest number above H_END
+_END = H_END * (1.0 - 1e-12)  # h below this is outside by more than rounding
 
 _MANTISSA = 52
 _FRACTION = (1 << _MANTISSA) - 1
 _ONE = 1023 << _MANTISSA  # bits of 1.0
-_FIRST = ((1023 - OCTAVES) << _MANTISSA) + 1  # bits of the smallest number above LOWEST
+_FIRST = ((1023 - OCTAVES) << _MANTISSA) + 1  # bits of the smallest number above H_END
 
 
 @inlined_kernel
 def _slab(h: float) -> tuple[int, float]:
-    """Return the slab index of h in (LOWEST, 1] and h's position in the slab from −1 to 1.
+    """Return the slab index of h in (H_END, 1] and h's position in the slab from −1 to 1.
 
     Both come from the bits of the float: the exponent gives the octave, and the mantissa gives the
     slab and the position. A slab includes its upper end but not its lower end.
@@ -76,7 +75,7 @@ def _ratios(table: Table, h: float, y: float) -> Lanes:
 
 
 @inner_kernel
-def _springs_lookup(table: Table, d: float, theta: float) -> Six:
+def _springs_lookup(table: Table, d: float, theta: float) -> SixFloats:
     """Evaluate :func:`lookup` for a spring tip."""
     if math.isnan(d) or math.isnan(theta):
         nan = math.nan
@@ -122,7 +121,7 @@ def _springs_lookup(table: Table, d: float, theta: float) -> Six:
 
 
 @inner_kernel
-def lookup_at(table: Table, d: float, theta: float) -> Six:
+def lookup_at(table: Table, d: float, theta: float) -> SixFloats:
     """Evaluate :func:`lookup` for one table record."""
     if table.is_solid:
         return solid_lookup(table, d, theta)
@@ -131,8 +130,8 @@ def lookup_at(table: Table, d: float, theta: float) -> Six:
 
 @inner_kernel
 def normal_at(
-    table: Table, d: float, theta: float, forces: Triple, tangent: float, inverse_cosine: float
-) -> Triple:
+    table: Table, d: float, theta: float, forces: ThreeFloats, tangent: float, inverse_cosine: float
+) -> ThreeFloats:
     """Return N = ∂U/∂d, ∂N/∂d and ∂N/∂θ within the domain.
 
     ``forces`` are F, ∂F/∂d and ∂F/∂θ at the same d and θ.
@@ -154,7 +153,7 @@ def stiffness_ahead(table: Table, scale: float, depth: float) -> float:
 
 
 @kernel
-def lookup(tables: Records[Table], d: float, theta: float) -> Six:
+def lookup(tables: Records[Table], d: float, theta: float) -> SixFloats:
     """Return (F, U, ∂F/∂d, ∂F/∂θ, ∂U/∂d, ∂U/∂θ, inside) at displacement d [m] and tilt θ [rad].
 
     The values are zero for d ≤ 0 and NaN for NaN. Outside the domain, d and θ are clamped to the

@@ -18,11 +18,11 @@ FloatArray = NDArray[np.float64]
 
 MIN_POINTS = 4
 _DEGREES = range(11)  # degrees of the modulus to try
-_GOOD = 1e-9  # negligible misfit, relative to the largest stress
-_NEAR = 1.5  # a lower degree is accepted up to this multiple of the smallest misfit
-_BAD = 0.05  # misfit at which the fit fails, relative to the largest stress
-_FLOOR = 1e-3  # smallest modulus, relative to the mean
-_BEYOND = 0.1  # weight of the points that extend the curve
+_NEGLIGIBLE_MISFIT = 1e-9  # negligible misfit, relative to the largest stress
+_MISFIT_RATIO_MAX = 1.5  # a lower degree is accepted up to this multiple of the smallest misfit
+_MISFIT_MAX = 0.05  # misfit at which the fit fails, relative to the largest stress
+_MODULUS_MIN = 1e-3  # smallest modulus, relative to the mean
+_EXTENSION_WEIGHT = 0.1  # weight of the points that extend the curve
 _SMOOTHING = 1e-7  # weight of the modulus's second differences; prevents oscillation between points
 
 
@@ -79,16 +79,16 @@ def fit_law(strain: ArrayLike, stress: ArrayLike) -> tuple[list[Fraction], Float
     x, y = _checked(strain, stress)
     top = float(y[-1])
     points, values = _continued(x, y / top)
-    weights = np.where(np.arange(points.size) < x.size, 1.0, _BEYOND)
+    weights = np.where(np.arange(points.size) < x.size, 1.0, _EXTENSION_WEIGHT)
     tried: list[tuple[float, FloatArray]] = []
     for degree in _DEGREES:
         if degree <= max(2 * x.size, 3):
             modulus = _positive_modulus(points, values, weights, degree)
             misfit = float(np.max(np.abs(_integrals(x, degree) @ modulus - y / top)))
             tried.append((misfit, modulus))
-    enough = _NEAR * min(misfit for misfit, _ in tried) + _GOOD
+    enough = _MISFIT_RATIO_MAX * min(misfit for misfit, _ in tried) + _NEGLIGIBLE_MISFIT
     misfit, modulus = next(one for one in tried if one[0] <= enough)
-    if misfit > _BAD:
+    if misfit > _MISFIT_MAX:
         raise MaterialError(
             f"no smooth monotone law comes near the points: the best misses one by "
             f"{misfit * top:.4g} Pa of {top:.4g} Pa"
@@ -114,14 +114,14 @@ def _continued(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _positive_modulus(x: FloatArray, y: FloatArray, weights: FloatArray, degree: int) -> FloatArray:
-    """Return the modulus's Bernstein coefficients, at least _FLOOR, that best fit the points."""
+    """Fit the modulus's Bernstein coefficients, at least _MODULUS_MIN, to the points."""
     matrix = _integrals(x, degree) * weights[:, None]
     smooth = np.zeros((max(degree - 1, 0), degree + 1))
     for i in range(degree - 1):
         smooth[i, i : i + 3] = 1.0, -2.0, 1.0
     rows = np.concatenate([matrix, _SMOOTHING * smooth])
     right = np.concatenate([y * weights, np.zeros(len(smooth))])
-    floor = _FLOOR * float(y[-1] / x[-1])
+    floor = _MODULUS_MIN * float(y[-1] / x[-1])
     return floor + nonnegative(rows, right - rows @ np.full(degree + 1, floor))
 
 

@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 from softfinger.kinematics.contact.closed_form import (
-    Closed,
+    ClosedForms,
     Fingertip,
     closed_forms,
     flatten,
@@ -36,8 +36,8 @@ from softfinger.kinematics.contact.material import Material
 FloatArray = NDArray[np.float64]
 
 _NODES = 18  # Gauss points per piece; 14 give an error of 1e-10 in ∂F/∂θ, 18 only rounding
-_MORE_NODES = 26  # for laws of degree above 8, where 18 points may give an error of 1e-11
-_DEEPEST = 2.0**-14  # smallest graded piece, relative to the scale of the singular point
+_NODES_HIGH_DEGREE = 26  # for laws of degree above 8, where 18 points may give an error of 1e-11
+_PIECE_MIN = 2.0**-14  # smallest graded piece, relative to the scale of the singular point
 
 
 def gauss_rule(nodes: int = _NODES) -> FloatArray:
@@ -55,7 +55,7 @@ def circle_rule(degree: int) -> FloatArray:
 
 def nodes_for(degree: int) -> int:
     """Return the number of Gauss points per piece for a law of ``degree``."""
-    return _NODES if degree <= 8 else _MORE_NODES
+    return _NODES if degree <= 8 else _NODES_HIGH_DEGREE
 
 
 @inner_kernel
@@ -110,7 +110,7 @@ def ratios(
     count = circle.shape[1]
     nodes = gauss.shape[1]
     # There are poles at y = 0 (unless y0 = 0) and at y² = −2 sin θ, and none if h = 0.
-    start = max(2.0 * y0, _DEEPEST * min(y1, math.sqrt(h))) if h > 0.0 else y1
+    start = max(2.0 * y0, _PIECE_MIN * min(y1, math.sqrt(h))) if h > 0.0 else y1
     sum_f = 0.0
     sum_u = 0.0
     sum_fd = 0.0
@@ -191,7 +191,7 @@ def ratios_at(
 
 def integrate(
     tip: Fingertip, material: Material, d: ArrayLike, theta: ArrayLike, nodes: int | None = None
-) -> Closed:
+) -> ClosedForms:
     """Integrate force, energy and first partials for any material, to a relative error of 1e-14.
 
     ``d`` [m] and ``theta`` [rad] broadcast. The results are zero for d ≤ 0, and NaN outside the
@@ -221,4 +221,4 @@ def integrate(
     six = (
         each * ratio for each, ratio in zip(closed, (r_f, r_u, r_fd, r_ft, r_f, r_ut), strict=True)
     )
-    return Closed(*(row.reshape(shape) for row in six))
+    return ClosedForms(*(row.reshape(shape) for row in six))

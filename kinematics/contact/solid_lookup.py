@@ -16,9 +16,9 @@ from softfinger.kinematics.contact.material_fit import MaterialError
 from softfinger.kinematics.contact.solid_data import FloatArray, solid_data, with_partials
 from softfinger.kinematics.contact.table_record import (
     Lanes,
-    Six,
+    SixFloats,
     Table,
-    Triple,
+    ThreeFloats,
     lanes,
     set_piece,
 )
@@ -73,7 +73,7 @@ def energy_lanes(table: Table, t: float, square: float) -> Lanes:
 
 
 @inlined_kernel
-def _held(table: Table, t: float, square: float) -> Triple:
+def _clamped(table: Table, t: float, square: float) -> ThreeFloats:
     """Return F/(N cos θ) = 1 − sin² θ q_0 and its partials by t and sin² θ."""
     if not table.sticks:
         return 1.0, 0.0, 0.0
@@ -84,7 +84,7 @@ def _held(table: Table, t: float, square: float) -> Triple:
 
 
 @inner_kernel
-def solid_lookup(table: Table, d: float, theta: float) -> Six:
+def solid_lookup(table: Table, d: float, theta: float) -> SixFloats:
     """Evaluate `lookup.lookup`.
 
     For |θ| beyond the data, the energy is constant in θ at fixed d, the partials are those of that
@@ -111,7 +111,7 @@ def solid_lookup(table: Table, d: float, theta: float) -> Six:
     normal = size * (2.5 * g + 0.5 * t * g_t)
     stiffness = 0.25 * table.modulus * a * t * (15.0 * g + t * (9.0 * g_t + t * g_tt))
     normal_theta = chain * size * (2.5 * g_s + 0.5 * t * g_ts)
-    held, held_t, held_s = _held(table, t, square)
+    held, held_t, held_s = _clamped(table, t, square)
     return (
         c * normal * held,
         size * depth * g,
@@ -131,7 +131,7 @@ def solid_stiffness_ahead(table: Table, scale: float, depth: float) -> float:
 
 
 @inner_kernel
-def solid_normal(table: Table, d: float, theta: float) -> Triple:
+def solid_normal(table: Table, d: float, theta: float) -> ThreeFloats:
     """Evaluate `lookup.normal_at` for a sticking face."""
     within = abs(theta) <= table.tilt
     s = math.sin(theta)

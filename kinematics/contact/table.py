@@ -52,7 +52,7 @@ class Certificate(NamedTuple):
 # Builds a ContactForces of plain floats in a quarter of the time of ContactForces(…).
 _numbers: Any = tuple.__new__
 
-_EDGE = 1.0 - 1e-12  # scales d and θ so that rounding does not put edge points outside
+_EDGE_FACTOR = 1.0 - 1e-12  # scales d and θ so that rounding does not put edge points outside
 
 _LAW_ERROR = 0.05  # relative force error due to the law's misfit, above which build warns
 
@@ -180,7 +180,7 @@ class ContactTable:
     def _warn(self, d: FloatArray, theta: FloatArray) -> None:
         """Issue a RuntimeWarning, in the user's code, for points outside the domain except NaN."""
         within = np.empty(d.size, dtype=np.bool_)
-        lookups(self.data, d * _EDGE, theta * _EDGE, np.empty((6, d.size)), within)
+        lookups(self.data, d * _EDGE_FACTOR, theta * _EDGE_FACTOR, np.empty((6, d.size)), within)
         outside = np.flatnonzero(~(within | np.isnan(d) | np.isnan(theta)))
         if outside.size:
             first = outside[0]

@@ -21,7 +21,7 @@ from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
 from softfinger.kinematics.contact.closed_form import Fingertip
-from softfinger.kinematics.contact.lookup import LOWEST
+from softfinger.kinematics.contact.lookup import H_END
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.quadrature import (
     circle_rule,
@@ -45,16 +45,16 @@ from softfinger.kinematics.contact.table_record import (
 FloatArray = NDArray[np.float64]
 
 ROUNDING = 16.0 * np.finfo(float).eps  # rounding of the closed forms and the kernel's last products
-_MORE_V, _MORE_U = 4, 6  # computed Chebyshev coefficients in h and y beyond those stored
+_EXTRA_V, _EXTRA_U = 4, 6  # computed Chebyshev coefficients in h and y beyond those stored
 _SLAB_ENDS = np.arange(1, 1 + (1 << SLAB_BITS)) / (1 << SLAB_BITS)
-# Edges of the slabs in h, from LOWEST to 1.
+# Edges of the slabs in h, from H_END to 1.
 _EDGES = [
-    LOWEST,
-    *(LOWEST * 2.0**k * (1.0 + piece) for k in range(OCTAVES) for piece in _SLAB_ENDS),
+    H_END,
+    *(H_END * 2.0**k * (1.0 + piece) for k in range(OCTAVES) for piece in _SLAB_ENDS),
 ]
 
 
-class _Worst(NamedTuple):
+class _WorstError(NamedTuple):
     """Bound on the relative error of a piece, and the place of its largest error."""
 
     bound: float
@@ -91,7 +91,7 @@ def build(tip: Fingertip, material: Material, tolerance: float) -> Table:
     law, splits = LawTerms.of(material), 1
     while True:
         last = material.is_linear or splits == SPLITS_MAX
-        table = _made(tip, law, tolerance, splits, math.inf if last else tolerance)
+        table = _build_pieces(tip, law, tolerance, splits, math.inf if last else tolerance)
         if table.max_error <= tolerance:
             return table
         if last:
@@ -103,15 +103,17 @@ def build(tip: Fingertip, material: Material, tolerance: float) -> Table:
     )
 
 
-def _made(tip: Fingertip, law: LawTerms, tolerance: float, splits: int, limit: float) -> Table:
+def _build_pieces(
+    tip: Fingertip, law: LawTerms, tolerance: float, splits: int, limit: float
+) -> Table:
     """Build a table with ``splits`` pieces per slab; stop when its error exceeds ``limit``."""
     table = Table()
     table.is_closed, table.splits, table.tolerance = law.material.is_linear, splits, tolerance
     table.radius, table.modulus = tip.radius, law.modulus
     table.inverse_radius = 1.0 / tip.radius
-    table.deepest = (1.0 - LOWEST) * tip.radius
-    worst = _Worst(ROUNDING, 0.5, 0.0)
-    for found in () if table.is_closed else _filled(table, law):
+    table.deepest = (1.0 - H_END) * tip.radius
+    worst = _WorstError(ROUNDING, 0.5, 0.0)
+    for found in () if table.is_closed else _fill(table, law):
         worst = max(worst, found)
         if worst.bound > limit:
             break
@@ -120,10 +122,10 @@ def _made(tip: Fingertip, law: LawTerms, tolerance: float, splits: int, limit: f
     return table
 
 
-def _filled(table: Table, law: LawTerms) -> Iterator[_Worst]:
+def _fill(table: Table, law: LawTerms) -> Iterator[_WorstError]:
     """Set the coefficients piece by piece; yield the error bound of each piece."""
     # Extra coefficients in each direction give the truncation error.
-    rows, width = POWERS_V + _MORE_V, POWERS_U + _MORE_U
+    rows, width = POWERS_V + _EXTRA_V, POWERS_U + _EXTRA_U
     mask = np.zeros((rows, width), dtype=np.bool_)
     mask[:POWERS_V, :POWERS_U] = True
     x, u = _nodes(rows)[0], 0.5 * (_nodes(width)[0] + 1.0)
@@ -148,7 +150,7 @@ def _filled(table: Table, law: LawTerms) -> Iterator[_Worst]:
 
 def _bound(
     values: FloatArray, lost: FloatArray, rounding: FloatArray, h: FloatArray, y: FloatArray
-) -> _Worst:
+) -> _WorstError:
     """Return the bound on a piece's relative error and the approximate place of the largest.
 
     ``values`` [5, h, y] are the ratios at the nodes of the piece; ``lost`` are the Chebyshev
@@ -157,7 +159,7 @@ def _bound(
     each is less than half of the one before, because the ratios are analytic well beyond the piece.
     ``rounding`` [5] is absolute.
     """
-    everywhere = _dense(len(h)) @ _terms(values) @ _dense(len(y)).T
+    everywhere = _dense_nodes(len(h)) @ _terms(values) @ _dense_nodes(len(y)).T
     size = np.abs(everywhere)
     size[3] = np.maximum(size[3], size[0])
     smallest = 0.99 * size.min(axis=(1, 2))
@@ -166,10 +168,10 @@ def _bound(
     total = each.sum(axis=(1, 2)) + 2.0 * beyond + rounding
     bounds = total / smallest
     k = int(np.argmax(bounds))
-    here = np.abs(_dense(len(h)) @ lost[k] @ _dense(len(y)).T)
+    here = np.abs(_dense_nodes(len(h)) @ lost[k] @ _dense_nodes(len(y)).T)
     i, j = np.unravel_index(int(np.argmax(here)), here.shape)
     # Dense points are in increasing order, four per node; the nodes are in decreasing order.
-    return _Worst(float(bounds[k]) + ROUNDING, float(h[-1 - i // 4]), float(y[-1 - j // 4]))
+    return _WorstError(float(bounds[k]) + ROUNDING, float(h[-1 - i // 4]), float(y[-1 - j // 4]))
 
 
 def _rounding(terms: FloatArray, steep: float, low: float, splits: int) -> FloatArray:
@@ -206,12 +208,12 @@ def _nodes(count: int) -> tuple[FloatArray, FloatArray]:
 
 
 @cache
-def _dense(count: int) -> FloatArray:
+def _dense_nodes(count: int) -> FloatArray:
     """Return ``count`` Chebyshev polynomials at points dense enough to resolve all of them."""
     return np.asarray(chebyshev.chebvander(np.cos(np.linspace(np.pi, 0.0, 4 * count)), count - 1))
 
 
-def _tilt(at: _Worst) -> float:
+def _tilt(at: _WorstError) -> float:
     """Return θ [rad] at the h and y of ``at``."""
     complement = 1.0 - (at.h * at.y) ** 2
     return math.asin(min(at.h * math.sqrt((1.0 - at.y) * (1.0 + at.y) / complement), 1.0))

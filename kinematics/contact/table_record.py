@@ -18,8 +18,8 @@ from softfinger.kinematics.compiled.layout import Record
 
 FloatArray = NDArray[np.float64]
 Lanes: TypeAlias = tuple[float, float, float, float, float]
-Six: TypeAlias = tuple[float, float, float, float, float, float, bool]
-Triple: TypeAlias = tuple[float, float, float]
+SixFloats: TypeAlias = tuple[float, float, float, float, float, float, bool]
+ThreeFloats: TypeAlias = tuple[float, float, float]
 
 LANES = 5
 POWERS_U, POWERS_V = 12, 6  # terms in each variable

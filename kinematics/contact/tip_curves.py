@@ -91,11 +91,13 @@ class TipCurves:
         powers = np.arange(POWERS - FIRST)
         g = np.array(self.push)[FIRST:] * (2.0 / (5.0 + powers))[:, None] / self.radius**2
         return np.asarray(
-            _shifted(POWERS - FIRST, self.root).T @ g @ _shifted(SQUARES, self.square)
+            _shifted_polynomial(POWERS - FIRST, self.root).T
+            @ g
+            @ _shifted_polynomial(SQUARES, self.square)
         )
 
 
-def _shifted(count: int, end: float) -> FloatArray:
+def _shifted_polynomial(count: int, end: float) -> FloatArray:
     """Return the powers of u = end/2 (1 + x) by powers of x, [power of u, power of x]."""
     return np.array(
         [[(0.5 * end) ** i * math.comb(i, k) for k in range(count)] for i in range(count)]

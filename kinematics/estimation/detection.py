@@ -21,7 +21,7 @@ from softfinger.kinematics.sensing.footprint import (
 )
 
 _HYSTERESIS = 0.5  # detection level during a contact over that for a new one; avoids flicker
-STRONG = 6.0  # in noise standard deviations; above it the largest cell is tested first
+STRONG_PEAK = 6.0  # in noise standard deviations; above it the largest cell is tested first
 
 
 @inner_kernel
@@ -62,7 +62,7 @@ def activity(state: EstimatorState, frame: FloatArray, height: FloatArray) -> No
     grid = state.grid
     last = frame.shape[0]
     total, energy, peak = totals(frame, height)
-    signal.finite = math.isfinite(total) and math.isfinite(peak)
+    signal.is_finite = math.isfinite(total) and math.isfinite(peak)
     signal.peak = peak
     signal.mean = total / max(float(signal.number), 1.0)
     signal.energy = energy
@@ -70,8 +70,8 @@ def activity(state: EstimatorState, frame: FloatArray, height: FloatArray) -> No
     cell = -1
     level = state.options.peak_level * signal.noise
     patch = signal.patch_level * signal.noise
-    if signal.finite and peak >= level:
-        if peak > STRONG * signal.noise:
+    if signal.is_finite and peak >= level:
+        if peak > STRONG_PEAK * signal.noise:
             cell = next_above(frame, height, 0, last, peak)
             contact = neighbourhood(frame, height, grid, cell) > patch
         at = last if contact else next_above(frame, height, 0, last, level)
@@ -96,7 +96,7 @@ def shows_pattern(state: EstimatorState, frame: FloatArray, cells: Cells) -> boo
     for k in range(frame.shape[0]):
         projection += cells.pattern[k] * frame[k] if cells.height[k] >= 0.0 else 0.0
     level = state.options.patch_level * state.signal.noise
-    return bool(projection > (_HYSTERESIS if state.estimate.warm else 1.0) * level)
+    return bool(projection > (_HYSTERESIS if state.estimate.has_last_contact else 1.0) * level)
 
 
 @inner_kernel
@@ -134,15 +134,15 @@ def presses_outside(
     return False
 
 
-_DEAD = 1e3  # m, lowers the height of masked cells out of reach of any face
+_MASK_DEPTH = 1e3  # m, lowers the height of masked cells out of reach of any face
 
 
 @inner_kernel
 def _is_outlier(state: EstimatorState, frame: FloatArray, height: FloatArray) -> bool:
     """Return True if the largest cell is too high above its neighbours to be part of a contact.
 
-    A contact about as wide as a cell produces at most ``signal.confined``. In a wider contact, no
-    cell reads twice the mean of its neighbours.
+    A contact about as wide as a cell produces at most ``signal.narrow_contact_max``. In a wider
+    contact, no cell reads twice the mean of its neighbours.
     """
     rows = state.grid.rows
     cols = state.grid.cols
@@ -158,7 +158,7 @@ def _is_outlier(state: EstimatorState, frame: FloatArray, height: FloatArray) ->
     noise = state.signal.noise
     return bool(
         number > 0
-        and reading > 10.0 * noise + state.signal.confined
+        and reading > 10.0 * noise + state.signal.narrow_contact_max
         and reading > 2.0 * max(total, 0.0) / max(number, 1) + 12.0 * noise
     )
 
@@ -174,13 +174,13 @@ def without_outliers(state: EstimatorState, frame: FloatArray, height: FloatArra
     rejected = 0
     activity(state, frame, height)
     while (
-        signal.peak > 10.0 * signal.noise + signal.confined
+        signal.peak > 10.0 * signal.noise + signal.narrow_contact_max
         and signal.row >= 0
         and rejected < OUTLIERS_MAX
         and _is_outlier(state, frame, height)
     ):
         at = signal.row * cols + signal.col
-        height[at] -= _DEAD
+        height[at] -= _MASK_DEPTH
         signal.number -= 1
         state.outliers[rejected] = at
         rejected += 1
@@ -192,5 +192,5 @@ def without_outliers(state: EstimatorState, frame: FloatArray, height: FloatArra
 def restore_outliers(state: EstimatorState, rejected: int, height: FloatArray) -> None:
     """Unmask the outliers."""
     for k in range(rejected):
-        height[state.outliers[k]] += _DEAD
+        height[state.outliers[k]] += _MASK_DEPTH
         state.signal.number += 1

@@ -9,7 +9,7 @@ other errors are propagated linearly:
     rotation           (n × z) rotation                                          (likewise)
     solid tip's data   n lean d/a                                                (likewise)
     correlated noise   standard deviations times √(C_ii/(JᵀJ)⁻¹_ii),
-                       C = (JᵀJ)⁻¹ JᵀRJ (JᵀJ)⁻¹, at no tilt                      (`widen`)
+                       C = (JᵀJ)⁻¹ JᵀRJ (JᵀJ)⁻¹, at no tilt           (`widen_covariance`)
     smooth misfit      Σ r_k r_(k−1) − n ρ₁ σ² − decrement                 (`undetected_misfit`)
 
 The patterns q are errors that are the same in every frame: a shift of all cells, its slopes in x
@@ -58,15 +58,15 @@ from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
 NEIGHBOURS = np.outer((1.0, 2.0, 2.0, 2.0, 1.0), (1.0, 2.0, 2.0, 2.0, 1.0))  # see `detection`
 NEIGHBOURS[2, 2] = 0.0
-_PEAK = 4.5  # largest cell under noise alone, in standard deviations
-_FEW = 48.0  # cells, below which smooth and rough misfits cannot be distinguished
+_NOISE_PEAK = 4.5  # largest cell under noise alone, in standard deviations
+_CELL_COUNT_MIN = 48.0  # cells, below which smooth and rough misfits cannot be distinguished
 # Fractions of a smooth error's square that appear in d (and the gain), in each tilt, and in the
 # residuals. Errors of curves, hysteresis and crosstalk are nearly as symmetric as the pressure.
-_SMOOTH_IN_DEPTH, _SMOOTH_IN_TILT, _SMOOTH_LEFT = 0.15, 0.06, 0.2
+_SMOOTH_IN_DEPTH, _SMOOTH_IN_TILT, _SMOOTH_IN_RESIDUALS = 0.15, 0.06, 0.2
 # Relative tilt error of the solid model over d/a, from frames of independent finite elements up to
 # 20° and 7 mm. There the error is 4 % for a bonded tip and negligible for a lying one.
-_LEAN = 0.1
-_SURE = 6.0  # threshold of the neighbours' products in standard deviations of the noise
+_SOLID_TILT_ERROR = 0.1
+_PRODUCT_SIGMA = 6.0  # threshold of the neighbours' products in standard deviations of the noise
 
 
 @dataclass(frozen=True)
@@ -141,26 +141,29 @@ def set_budget(
     budget.sizes[PRESSURE] = modulus
     budget.baseline, budget.slope = known.baseline, known.slope
     budget.smooth, budget.rotation = known.smooth, known.rotation
-    budget.lean = _LEAN if options.is_solid else 0.0
-    budget.systematic = max(*budget.sizes, budget.smooth, budget.rotation, budget.lean) > 0.0
+    budget.tilt_error = _SOLID_TILT_ERROR if options.is_solid else 0.0
+    budget.has_common_errors = (
+        max(*budget.sizes, budget.smooth, budget.rotation, budget.tilt_error) > 0.0
+    )
     budget.cells_per_sample = 1.0
     level, weights = options.patch_level, NEIGHBOURS if pattern is None else pattern
     norm = float(np.sqrt((weights**2).sum()))
     if known.correlation is not None and known.correlation.size > 1:
-        rho = both_ways(known.correlation)
-        budget.correlated = True
+        rho = mirrored(known.correlation)
+        budget.is_correlated = True
         budget.cells_per_sample = float((rho**2).sum())
-        budget.along = float(known.correlation[0, 1]) if known.correlation.shape[1] > 1 else 0.0
+        if known.correlation.shape[1] > 1:
+            budget.row_correlation = float(known.correlation[0, 1])
         _set_widening(state, rho, grid, tip, material)
-        with_centre = float((weights * _fitted(rho, 5)).sum()) if pattern is None else 0.0
+        with_centre = float((weights * _cropped(rho, 5)).sum()) if pattern is None else 0.0
         variance = float(quadratic(weights, rho)) - with_centre**2
-        level = (level * math.sqrt(max(variance, 0.0)) + _PEAK * max(with_centre, 0.0)) / norm
+        level = (level * math.sqrt(max(variance, 0.0)) + _NOISE_PEAK * max(with_centre, 0.0)) / norm
     # A shift of up to twice the baseline's standard deviation must not be detected as a contact.
     shift = 2.0 * known.baseline / options.noise * weights.sum() / norm
     options.patch_level = level + max(shift, 0.0)
 
 
-def both_ways(correlation: FloatArray | None) -> FloatArray:
+def mirrored(correlation: FloatArray | None) -> FloatArray:
     """Extend a correlation to lags of both signs, [2 rows − 1, 2 cols − 1]."""
     assert correlation is not None
     rows, cols = correlation.shape
@@ -169,7 +172,7 @@ def both_ways(correlation: FloatArray | None) -> FloatArray:
     )
 
 
-def _fitted(rho: FloatArray, size: int) -> FloatArray:
+def _cropped(rho: FloatArray, size: int) -> FloatArray:
     """Return the centre [size, size] of ``rho``, padded with zeros."""
     out = np.zeros((size, size))
     for i in range(size):
@@ -224,7 +227,7 @@ def _set_widening(
 
 
 @inner_kernel
-def widen(state: EstimatorState) -> float:
+def widen_covariance(state: EstimatorState) -> float:
     """Widen ``fit.inverse`` by correlated noise; return the number of cells used up by the fit."""
     inverse = state.fit.inverse
     table = state.budget.widening
@@ -270,14 +273,14 @@ def undetected_misfit(state: EstimatorState, cells: Cells, beyond: float) -> flo
     variance = state.signal.variance
     cols = state.grid.cols
     # Near the floor, clipping biases the readings above the pressure.
-    lowest = max(state.signal.floor, 0.0) + 2.0 * fit.clip
+    lowest = max(state.signal.floor, 0.0) + 2.0 * fit.clip_noise
     total, number = _neighbours_products(
         cells, lowest, index(fit.first_row * cols), index(fit.last_row * cols)
     )
     # The residuals do not include the decrement of the last step yet.
-    total -= number * variance * state.budget.along + fit.decrement
-    total = beyond if number < _FEW else min(total, beyond)
-    if total <= _SURE * variance * math.sqrt(number * state.budget.cells_per_sample):
+    total -= number * variance * state.budget.row_correlation + fit.decrement
+    total = beyond if number < _CELL_COUNT_MIN else min(total, beyond)
+    if total <= _PRODUCT_SIGMA * variance * math.sqrt(number * state.budget.cells_per_sample):
         return 0.0
     return total
 
@@ -361,7 +364,7 @@ def set_shared_errors(state: EstimatorState, cells: Cells) -> float:
     for i in range(4):
         for j in range(4):
             shared[i, j] = parts[i] * parts[j] * inverse[i, j]
-    remaining = _SMOOTH_LEFT * smooth
+    remaining = _SMOOTH_IN_RESIDUALS * smooth
     displacement = budget.displacement
     for source in range(SOURCES):
         size = budget.sizes[source]
@@ -378,7 +381,7 @@ def set_shared_errors(state: EstimatorState, cells: Cells) -> float:
             remaining -= displacement[i] * budget.responses[i, source] * size
             for j in range(PARAMETERS):
                 shared[i, j] += displacement[i] * displacement[j]
-    along = budget.lean * fit.d / state.grid.radius
+    along = budget.tilt_error * fit.d / state.grid.radius
     for i in range(2):
         for j in range(2):
             # Components along the tilt and across it.

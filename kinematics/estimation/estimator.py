@@ -20,7 +20,7 @@ from softfinger.kinematics.estimation.cell_centres import cell_centres
 from softfinger.kinematics.estimation.error_budget import NEIGHBOURS, Uncertainty, set_budget
 from softfinger.kinematics.estimation.frame_pipeline import D_MAX, estimate_frame
 from softfinger.kinematics.estimation.invalid import REASONS, Invalid
-from softfinger.kinematics.estimation.moments import set_start
+from softfinger.kinematics.estimation.moments import tabulate_moments
 from softfinger.kinematics.estimation.state import HEIGHT, PATTERN, ROWS, EstimatorState, Y
 from softfinger.kinematics.sensing.footprint import FloatArray, Grid
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
@@ -84,8 +84,8 @@ class ContactEstimate:
     peak: float = 0.0  # largest cell [Pa]
     cells: int = 0  # cells in the fit
     iterations: int = 0
-    rejected: int = 0  # outliers excluded
-    second: bool = False  # a second contact presses outside the footprint
+    rejected_count: int = 0  # outliers excluded
+    has_second_contact: bool = False  # a second contact presses outside the footprint
     misfit: bool = False
     shear_x: float = 0.0  # force along the face [N], for solid tips
     shear_y: float = 0.0
@@ -115,7 +115,7 @@ class ContactEstimate:
 
 
 # Accepted frame types and their saturation readings.
-_FULL = {
+_SATURATION_COUNTS = {
     np.dtype(np.uint8): 255.0,
     np.dtype(np.uint16): 65535.0,
     np.dtype(np.float32): math.inf,
@@ -155,8 +155,8 @@ class Readings:
 
 
 _RESULTS = (
-    "d", "gain", "chi2", "tilt_x", "tilt_y", "r_squared", "peak", "cells", "iterations", "rejected",
-    "contact", "second", "shear_x", "shear_y", "invalid",
+    "d", "gain", "chi2", "tilt_x", "tilt_y", "r_squared", "peak", "cells", "iterations",
+    "rejected_count", "contact", "has_second_contact", "shear_x", "shear_y", "invalid",
 )  # fmt: skip
 
 # Parameters of the fit and the activity test. They can be changed in `ContactEstimator.state`.
@@ -168,15 +168,16 @@ _R_SQUARED_MIN = 0.8  # smallest explained fraction of the squared pressure for 
 # Smallest number of model points per tip radius, for linear and for nonlinear laws. Up to 25° the
 # bias is at most a quarter of the noise floor at a noise of 0.2 % of the modulus. Within 4° of the
 # domain's limit it is up to four times that floor.
-_FINENESS, _BENT = 22.0, 31.0
+_FINENESS_LINEAR, _FINENESS_NONLINEAR = 22.0, 31.0
 _DEEPEST, _SINE_MAX = 0.95, 3.0 / math.sqrt(10.0)  # limits of d/a and sin θ in a spring fit
-_OVER = 1.01  # a fit near the limits of a solid tip's data may exceed them by this factor
+_STEP_MARGIN = 1.01  # a fit near the limits of a solid tip's data may exceed them by this factor
 _SHEAR_PRIOR = 0.1  # standard deviation of a solid tip's shear over its normal force
-_RIM = {"bonded": 0.03, "lying": 0.05}  # width of the excluded rim of a solid tip over the radius
+# Width of the excluded rim of a solid tip over the radius.
+_RIM_WIDTH = {"bonded": 0.03, "lying": 0.05}
 CELLS_MIN = 9  # smallest number of cells to estimate a solid tip's contact and shear
 
 
-def within_rim(grid: SensorGrid, tip: Fingertip, known: Uncertainty) -> NDArray[np.bool_]:
+def cells_within_rim(grid: SensorGrid, tip: Fingertip, known: Uncertainty) -> NDArray[np.bool_]:
     """Return a mask [rows, cols] of the cells away from a solid tip's rim.
 
     The model may be wrong at the rim. The stress of a bonded base is singular there and depends on
@@ -184,7 +185,7 @@ def within_rim(grid: SensorGrid, tip: Fingertip, known: Uncertainty) -> NDArray[
     these cells and by 0.6 % without them. A tilted lying base pulls at the rim in the model, where
     real rubber lifts off. The mask also allows for an uncertain position of the tip.
     """
-    margin = max(_RIM[tip.base] * tip.radius, 2.0 * (known.centre + known.pitch * tip.radius))
+    margin = max(_RIM_WIDTH[tip.base] * tip.radius, 2.0 * (known.centre + known.pitch * tip.radius))
     cells = grid.on(tip)
     x, y = (
         np.abs(start + pitch * (np.arange(count) + 0.5)) + 0.5 * pitch
@@ -256,7 +257,7 @@ class ContactEstimator:
         alive = np.ones(grid.shape, np.bool_) if active is None else np.asarray(active, dtype=bool)
         is_solid = tip.physics == "solid"
         if is_solid:
-            alive = alive & within_rim(grid, tip, known)
+            alive = alive & cells_within_rim(grid, tip, known)
             if alive.sum() < CELLS_MIN:
                 raise ValueError(
                     f"a solid tip needs {CELLS_MIN} active cells within its rim, got {alive.sum()}"
@@ -280,8 +281,8 @@ class ContactEstimator:
             pattern = self._pattern(tip, alive)
             known = _with_data_errors(known, tip, options.free_gain)
         set_budget(state, known, grid, tip, material, pattern)
-        options.undetected = self._undetected(tip, material, pattern)
-        set_start(state.moments, grid, tip, material, options.deepest)
+        options.undetected = self._smallest_detectable_d(tip, material, pattern)
+        tabulate_moments(state.moments, grid, tip, material, options.deepest)
         records: Any = state.estimate.array
         self._estimate = records
         self._results = self._estimate[list(_RESULTS)]  # a view
@@ -311,23 +312,23 @@ class ContactEstimator:
         self._rows = np.zeros((ROWS, alive.size))
         self._rows[HEIGHT : Y + 1] = cell_centres(cells, alive, tip.radius + 3.0 * grid.blur)
         state.signal.number = int(np.count_nonzero(self._rows[HEIGHT] >= 0.0))
-        fewest, pixels, weights = cells, np.zeros(0), Weights()
+        model_cells, pixels, weights = cells, np.zeros(0), Weights()
         if options.is_solid:
-            fewest = Grid()  # no points
-            fewest.assign(cells)
-            fewest.rows = fewest.cols = 0
+            model_cells = Grid()  # no points
+            model_cells.assign(cells)
+            model_cells.rows = model_cells.cols = 0
             images = grid.images(tip).reshape(-1, *grid.shape)[:, *self._window]
             pixels = padded(images.reshape(len(images), -1))
             weights = weights_of(tip, material)
             options.deepest, options.sine_max = weights.table.deepest, math.sin(weights.table.tilt)
-            options.step_deepest = _OVER * options.deepest
-            options.step_sine = _OVER * options.sine_max
+            options.step_deepest = _STEP_MARGIN * options.deepest
+            options.step_sine = _STEP_MARGIN * options.sine_max
         else:
             options.deepest = options.step_deepest = _DEEPEST * tip.radius
             options.sine_max = options.step_sine = _SINE_MAX
 
-        fineness = _FINENESS if material.is_linear else _BENT
-        points = points_of(fewest, material, grid.blur, count_for(cells, fineness))
+        fineness = _FINENESS_LINEAR if material.is_linear else _FINENESS_NONLINEAR
+        points = points_of(model_cells, material, grid.blur, count_for(cells, fineness))
         # Arguments of the kernel other than the state and the frame.
         self._arrays = self._rows, pixels, weights.array, *points
 
@@ -339,14 +340,16 @@ class ContactEstimator:
         self._rows[PATTERN] = pattern[self._window].ravel()
         return np.asarray(pattern)
 
-    def _undetected(self, tip: Fingertip, material: Material, pattern: FloatArray | None) -> float:
+    def _smallest_detectable_d(
+        self, tip: Fingertip, material: Material, pattern: FloatArray | None
+    ) -> float:
         """Return the d [m] of the smallest upright contact that the activity test detects.
 
         The test compares a frame with the ``pattern`` or, if it is None, examines the cells around
         the largest reading.
         """
         options = self._options
-        whole = pattern is not None
+        uses_pattern = pattern is not None
         pattern = NEIGHBOURS if pattern is None else pattern
         noise = math.hypot(options.noise, self._quantum / math.sqrt(12.0))
         level = options.patch_level * noise * math.sqrt((pattern**2).sum())
@@ -356,13 +359,13 @@ class ContactEstimator:
         for _ in range(14):
             d = math.sqrt(low * high)
             frame = self.grid.pressure(tip, material, d)
-            felt = True
-            if not whole:
-                felt = frame.max() > options.peak_level * noise
+            is_detected = True
+            if not uses_pattern:
+                is_detected = frame.max() > options.peak_level * noise
                 row, col = np.unravel_index(frame.argmax(), frame.shape)
                 frame = np.pad(frame, (rows // 2, cols // 2))[row : row + rows, col : col + cols]
-            felt = felt and (pattern * frame).sum() > level
-            low, high = (low, d) if felt else (d, high)
+            is_detected = is_detected and (pattern * frame).sum() > level
+            low, high = (low, d) if is_detected else (d, high)
         return high
 
     @property
@@ -400,7 +403,7 @@ class ContactEstimator:
         before, seq, last = self._estimate.copy(), self._seq, self._last
         self._last = ContactEstimate(cells_per_sample=self.state.budget.cells_per_sample)
         try:
-            estimate.warm = False
+            estimate.has_last_contact = False
             found = self.update(frame, pascal_per_count)
             found.covariance[:] = estimate.covariance
             found.systematic[:] = estimate.systematic
@@ -435,7 +438,7 @@ class ContactEstimator:
         """
         if seq is not None and seq == self._seq:
             return self._last
-        full = _FULL.get(frame.dtype) if isinstance(frame, np.ndarray) else None
+        full = _SATURATION_COUNTS.get(frame.dtype) if isinstance(frame, np.ndarray) else None
         if full is None:
             kind = getattr(frame, "dtype", type(frame).__name__)
             raise ValueError(f"a frame is uint8, uint16, float32 or float64, got {kind}")
@@ -465,7 +468,7 @@ class ContactEstimator:
 
     def reset(self) -> None:
         """Discard the last estimate, so that the next frame is estimated from scratch."""
-        self.state.estimate.warm = False
+        self.state.estimate.has_last_contact = False
         self._seq = None
 
 

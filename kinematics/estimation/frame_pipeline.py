@@ -11,13 +11,13 @@ import math
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 from softfinger.kinematics.compiled.layout import Records
 from softfinger.kinematics.estimation.detection import (
-    STRONG,
+    STRONG_PEAK,
     presses_outside,
     restore_outliers,
     shows_pattern,
     without_outliers,
 )
-from softfinger.kinematics.estimation.gauss_newton import energy_of, fit
+from softfinger.kinematics.estimation.gauss_newton import fit, squared_sum
 from softfinger.kinematics.estimation.invalid import Invalid
 from softfinger.kinematics.estimation.moments import start
 from softfinger.kinematics.estimation.state import (
@@ -35,36 +35,36 @@ from softfinger.kinematics.sensing.springs_pressure import points_in
 
 # Noise clipped at 0 raises the sums of neighbourhoods. This increase of the level restores the
 # false alarm rate.
-CLIPPED_MORE = 0.5
+CLIPPED_LEVEL_INCREASE = 0.5
 GAIN_MIN, GAIN_MAX = 0.05, 20.0  # outside, the contact is not of this tip on this sensor
 D_MAX = 0.75  # largest valid d over the radius
 # Largest relative error of d that a smooth misfit may cause. The curved face of a disc causes this
 # much, which the covariance includes. With a gain far from 1 the limit is small, because both
 # together indicate a different tip, which the covariance does not include.
 UNDETECTED_MAX = 0.6
-UNDETECTED_MAX_FAR = 0.03
+UNDETECTED_MAX_FAR_GAIN = 0.03
 GAIN_FAR = 2.0
-# If at least the fraction ABOVE_MOST of the cells under the tip exceeds both levels (in noise and
-# over the peak), the sensor needs a tare. A solid tip presses all cells, but 5 % of them are below
-# 0.32 of the peak.
-ABOVE_MOST, ABOVE_NOISE, ABOVE_PEAK = 0.95, 3.0, 0.4
-FULL_MOST = 0.5  # largest fraction of saturated cells among those above half of the peak
+# If at least ABOVE_FRACTION of the cells under the tip exceeds both levels (in noise and over the
+# peak), the sensor needs a tare. A solid tip presses all cells, but 5 % of them are below 0.32 of
+# the peak.
+ABOVE_FRACTION, ABOVE_NOISE, ABOVE_PEAK = 0.95, 3.0, 0.4
+FULL_FRACTION_MAX = 0.5  # largest fraction of saturated cells among those above half of the peak
 ZERO_MAX = 0.22  # largest zero error over the peak for which linear propagation holds
 SHARED_MAX = 0.5  # largest standard deviation of d due to known uncertainties, over d
 
 
 @inner_kernel
-def _likelihood(state: EstimatorState, model: Model, frame: FloatArray, cells: Cells) -> Invalid:
+def _fit_frame(state: EstimatorState, model: Model, frame: FloatArray, cells: Cells) -> Invalid:
     """Fit by maximum likelihood from the last estimate, or from the frame alone if that fails."""
     estimate = state.estimate
     options = state.options
     signal = state.signal
-    energy = energy_of(state)
-    reason = Invalid.UNSETTLED
+    energy = squared_sum(state)
+    reason = Invalid.NOT_CONVERGED
     for attempt in range(2):
-        if attempt == 0 and not estimate.warm:
+        if attempt == 0 and not estimate.has_last_contact:
             continue
-        estimate.second = False
+        estimate.has_second_contact = False
         if attempt == 1:
             start(state, frame, cells)
         if not options.free_gain:
@@ -73,30 +73,30 @@ def _likelihood(state: EstimatorState, model: Model, frame: FloatArray, cells: C
         if fit(state, model, frame, cells, tolerance):
             misfit, scatter = _set_r_squared(state)
             if estimate.r_squared < options.r_squared_min:
-                reason = Invalid.MODEL
+                reason = Invalid.MODEL_MISMATCH
                 continue
             # Search for a second contact only if the residual exceeds the noise and a small
             # fraction of the energy. A solid tip presses its whole base, so it is not searched.
             if not options.is_solid and misfit > 8.0 * scatter + 0.003 * energy:
                 level = max(5.0 * signal.noise, 0.15 * estimate.peak / signal.scale)
                 level += 2.0 * state.budget.baseline / signal.scale
-                estimate.second = presses_outside(state, frame, cells.height, level)
-            if not estimate.second:
-                return _tip_problem(state)
-            reason = Invalid.SECOND
+                estimate.has_second_contact = presses_outside(state, frame, cells.height, level)
+            if not estimate.has_second_contact:
+                return _check_fit_of_tip(state)
+            reason = Invalid.SECOND_CONTACT
     return reason
 
 
 @inner_kernel
-def _tip_problem(state: EstimatorState) -> Invalid:
+def _check_fit_of_tip(state: EstimatorState) -> Invalid:
     """Check that the misfit is compatible with the tip's model and that d is certain enough."""
     estimate = state.estimate
     zero = math.hypot(state.budget.baseline, state.budget.slope)
     if estimate.shared > SHARED_MAX or zero > ZERO_MAX * estimate.peak:
         return Invalid.UNCERTAIN
     near = 1.0 / GAIN_FAR < estimate.gain < GAIN_FAR
-    if estimate.undetected > (UNDETECTED_MAX if near else UNDETECTED_MAX_FAR):
-        return Invalid.MODEL
+    if estimate.undetected > (UNDETECTED_MAX if near else UNDETECTED_MAX_FAR_GAIN):
+        return Invalid.MODEL_MISMATCH
     return Invalid.NONE
 
 
@@ -106,7 +106,7 @@ def _set_r_squared(state: EstimatorState) -> tuple[float, float]:
 
     Returns the unexplained part [Pa²] and the scatter of the noise.
     """
-    energy = energy_of(state)
+    energy = squared_sum(state)
     budget = state.budget
     estimate = state.estimate
     number = float(state.signal.number)
@@ -152,7 +152,7 @@ def _to_tilts(state: EstimatorState, covariance: Matrix, rotated: Matrix) -> Non
 
 
 @inner_kernel
-def _cause(
+def _fault_in_readings(
     state: EstimatorState, frame: FloatArray, height: FloatArray, reason: Invalid
 ) -> Invalid:
     """Return the fault in the readings that explains a failed estimate, or else ``reason``."""
@@ -164,29 +164,29 @@ def _cause(
             above += frame[k] > level
             pressed += frame[k] > 0.5 * signal.peak
             full += frame[k] * signal.scale >= signal.saturation
-    if full > FULL_MOST * pressed:
+    if full > FULL_FRACTION_MAX * pressed:
         return Invalid.SATURATED
-    return Invalid.ABOVE_ZERO if above > ABOVE_MOST * state.signal.number else reason
+    return Invalid.ABOVE_ZERO if above > ABOVE_FRACTION * state.signal.number else reason
 
 
 @inner_kernel
 def _estimate(state: EstimatorState, model: Model, frame: FloatArray, cells: Cells) -> Invalid:
     """Estimate a frame with a contact and return the reason for which it is invalid, if any."""
     estimate = state.estimate
-    reason = _likelihood(state, model, frame, cells)
+    reason = _fit_frame(state, model, frame, cells)
     fit = state.fit
-    if state.options.is_solid and reason == Invalid.UNSETTLED:
+    if state.options.is_solid and reason == Invalid.NOT_CONVERGED:
         # A contact of this tip converges within the data or is explained at their limit.
         unexplained = fit.misfit > (1.0 - state.options.r_squared_min) * fit.readings
-        reason = Invalid.MODEL if unexplained or not fit.limited else reason
+        reason = Invalid.MODEL_MISMATCH if unexplained or not fit.is_limited else reason
     if reason == Invalid.NONE and not GAIN_MIN < estimate.gain < GAIN_MAX:
-        reason = Invalid.MODEL
+        reason = Invalid.MODEL_MISMATCH
     if reason == Invalid.NONE and not estimate.d < D_MAX * state.grid.radius:
-        reason = Invalid.BEYOND
+        reason = Invalid.OUT_OF_RANGE
     if reason != Invalid.NONE:
-        reason = _cause(state, frame, cells.height, reason)
+        reason = _fault_in_readings(state, frame, cells.height, reason)
     _to_tilts(state, state.fit.covariance, estimate.covariance)
-    if state.budget.systematic or estimate.undetected > 0.0:
+    if state.budget.has_common_errors or estimate.undetected > 0.0:
         _to_tilts(state, state.budget.covariance, estimate.systematic)
         for i in range(4):
             for j in range(4):
@@ -195,21 +195,21 @@ def _estimate(state: EstimatorState, model: Model, frame: FloatArray, cells: Cel
 
 
 @inner_kernel
-def _begin(state: EstimatorState, scale: float, step: float) -> None:
+def _reset_results(state: EstimatorState, scale: float, step: float) -> None:
     """Set the unit of the frame and clear the last results except the contact."""
     options = state.options
     signal = state.signal
     grid = state.grid
     signal.scale = scale
-    signal.clipped = step > 0.0
+    signal.is_clipped = step > 0.0
     signal.variance = options.noise**2 + step * step / 12.0
     signal.noise = math.sqrt(signal.variance) / scale
     signal.saturation = options.saturation * scale
     signal.floor = options.floor * scale if step > 0.0 or options.floor > 0.0 else -math.inf
-    signal.patch_level = options.patch_level + (CLIPPED_MORE if step > 0.0 else 0.0)
+    signal.patch_level = options.patch_level + (CLIPPED_LEVEL_INCREASE if step > 0.0 else 0.0)
     # A contact no wider than a cell strains it by at most about pitch²/2a²; allow gains up to 3.
     pitch = max(grid.pitch_x, grid.pitch_y)
-    signal.confined = 6.0 * options.modulus * (pitch / grid.radius) ** 2 / scale
+    signal.narrow_contact_max = 6.0 * options.modulus * (pitch / grid.radius) ** 2 / scale
     estimate = state.estimate
     estimate.chi2 = 0.0
     estimate.tilt_x = 0.0
@@ -217,7 +217,7 @@ def _begin(state: EstimatorState, scale: float, step: float) -> None:
     estimate.r_squared = 0.0
     estimate.cells = 0
     estimate.iterations = 0
-    estimate.second = False
+    estimate.has_second_contact = False
     estimate.undetected = 0.0
     estimate.shared = 0.0
     estimate.shear_x = 0.0
@@ -257,18 +257,18 @@ def estimate_frame(
     model = Model(points, Images(pixels, weights[0]))
     estimate = state.estimate
     signal = state.signal
-    _begin(state, scale, step)
+    _reset_results(state, scale, step)
     rejected = without_outliers(state, frame, cells.height)
     unexplained = False
-    if state.options.is_solid and signal.finite:
+    if state.options.is_solid and signal.is_finite:
         # Every contact matches the pattern. A strong signal without it is not a contact of this
         # tip, and a small shift of all zeros is not a signal.
         level = max(signal.mean, signal.peak - signal.mean)
-        strong = signal.contact and level > STRONG * signal.noise
+        strong = signal.contact and level > STRONG_PEAK * signal.noise
         signal.contact = shows_pattern(state, frame, cells)
         unexplained = strong and not signal.contact
     estimate.peak = signal.peak * scale
-    estimate.rejected = rejected
+    estimate.rejected_count = rejected
     estimate.contact = signal.contact or unexplained
     reason = Invalid.NONE
     if signal.contact:
@@ -281,9 +281,9 @@ def estimate_frame(
         estimate.covariance[0, 0] = state.options.undetected**2
         estimate.systematic[0, 0] = state.options.undetected**2
         if unexplained:
-            reason = _cause(state, frame, cells.height, Invalid.MODEL)
-    estimate.warm = signal.contact and reason == Invalid.NONE
-    if not signal.finite:
+            reason = _fault_in_readings(state, frame, cells.height, Invalid.MODEL_MISMATCH)
+    estimate.has_last_contact = signal.contact and reason == Invalid.NONE
+    if not signal.is_finite:
         reason = Invalid.NOT_FINITE
     elif not signal.mean > -3.0 * signal.noise:
         # A baseline far below zero means that the sensor needs a tare.

@@ -12,7 +12,7 @@ from softfinger.kinematics.compiled.kernel import fast_inner_kernel, index, inne
 from softfinger.kinematics.estimation.error_budget import (
     set_shared_errors,
     undetected_misfit,
-    widen,
+    widen_covariance,
 )
 from softfinger.kinematics.estimation.state import (
     DEPTH,
@@ -130,7 +130,7 @@ def free_noise(square: float, floor: float) -> float:
 
 
 @inner_kernel
-def energy_of(state: EstimatorState) -> float:
+def squared_sum(state: EstimatorState) -> float:
     """Return Σ p² [Pa²] of all cells."""
     energy: float = state.signal.energy * state.signal.scale * state.signal.scale
     return energy
@@ -149,7 +149,7 @@ def _clip_noise(
     clip = math.sqrt(signal.variance)
     number = float(signal.number) - inside_number
     if number >= 16.0:
-        free_square = max(energy_of(state) - inside * signal.scale * signal.scale, 0.0) / number
+        free_square = max(squared_sum(state) - inside * signal.scale * signal.scale, 0.0) / number
         clip = min(clip, free_noise(free_square, signal.floor))
     return clip
 
@@ -159,14 +159,14 @@ def compare(state: EstimatorState, frame: FloatArray, cells: Cells, first: int, 
     """Compute ``residual`` and ``factor`` of each cell, and their sums, from readings and model.
 
     A cell cannot read below 0, even where solid rubber pulls, or below the floor. A saturated cell
-    counts only if the model is below saturation. With ``fit.clip`` > 0 the noise is clipped at the
-    floor. Otherwise cells with a model below the floor do not count.
+    counts only if the model is below saturation. With ``fit.clip_noise`` > 0, the floor clips the
+    noise. Otherwise cells with a model below the floor do not count.
     """
     fit = state.fit
     saturation = state.signal.saturation
     scale = state.signal.scale
     floor = state.signal.floor
-    clip = fit.clip
+    clip = fit.clip_noise
     clipped = clip > 0.0
     per_clip = 1.0 / clip if clipped else 0.0
     # Without a floor, ``floor`` is far below every reading.
@@ -199,7 +199,7 @@ def compare(state: EstimatorState, frame: FloatArray, cells: Cells, first: int, 
         weight += 1.0 if counts else 0.0
     fit.misfit = misfit
     fit.readings = readings
-    fit.weight = weight
+    fit.counted_cells = weight
 
 
 @fast_inner_kernel
@@ -230,7 +230,8 @@ def _accumulate(fit: Fit, cells: Cells, first: int, last: int) -> None:
         r2 += a2 * residual
         r3 += a3 * residual
     g2 = gain * gain
-    fit.right[0], fit.right[1], fit.right[2], fit.right[3] = r0, gain * r1, gain * r2, gain * r3
+    fit.gradient[0], fit.gradient[1] = r0, gain * r1
+    fit.gradient[2], fit.gradient[3] = gain * r2, gain * r3
     fit.normal[0, 0], fit.normal[1, 0], fit.normal[2, 0] = s00, gain * s01, gain * s02
     fit.normal[3, 0], fit.normal[1, 1], fit.normal[2, 1] = gain * s03, g2 * s11, g2 * s12
     fit.normal[3, 1], fit.normal[2, 2], fit.normal[3, 2] = g2 * s13, g2 * s22, g2 * s23
@@ -259,7 +260,7 @@ def _accumulate_shear(
     normal[row, 0], normal[row, 1], normal[row, 2] = t0, gain * t1, gain * t2
     normal[row, 3], normal[row, row] = gain * t3, own
     normal[SHEAR_Y, SHEAR_X] = other
-    fit.right[row] = right
+    fit.gradient[row] = right
 
 
 @inner_kernel
@@ -273,7 +274,9 @@ def linearise(state: EstimatorState, model: Model, frame: FloatArray, cells: Cel
     first, last = press(state, model, cells)
     fit.first_row = first // state.grid.cols
     fit.last_row = last // state.grid.cols
-    fit.clip = _clip_noise(state, frame, cells, first, last) if state.signal.clipped else 0.0
+    fit.clip_noise = 0.0
+    if state.signal.is_clipped:
+        fit.clip_noise = _clip_noise(state, frame, cells, first, last)
     compare(state, frame, cells, index(first), index(last))
     _accumulate(fit, cells, index(first), index(last))
     cost: float = fit.misfit - fit.readings
@@ -287,7 +290,7 @@ def linearise(state: EstimatorState, model: Model, frame: FloatArray, cells: Cel
         prior = state.signal.variance / (likely * likely)
         for k in range(2):
             fit.normal[SHEAR_X + k, SHEAR_X + k] += prior
-            fit.right[SHEAR_X + k] -= prior * fit.shear[k]
+            fit.gradient[SHEAR_X + k] -= prior * fit.shear[k]
             cost += prior * fit.shear[k] * fit.shear[k]
     return cost
 
@@ -335,8 +338,8 @@ def solve(fit: Fit, first: int, last: int) -> bool:
             for k in range(max(i, j), last):
                 value += lower[k, i] * lower[k, j]
             fit.inverse[i, j] = value * scale[i] * scale[j]
-            fit.step[i] += fit.inverse[i, j] * fit.right[j]
-        fit.decrement += fit.step[i] * fit.right[i]
+            fit.step[i] += fit.inverse[i, j] * fit.gradient[j]
+        fit.decrement += fit.step[i] * fit.gradient[i]
     return math.isfinite(fit.decrement)
 
 
@@ -352,12 +355,12 @@ def _apply_step(state: EstimatorState) -> bool:
     fit.shear[0] += fit.step[SHEAR_X]
     fit.shear[1] += fit.step[SHEAR_Y]
     tilt = math.hypot(fit.n_x, fit.n_y)
-    fit.limited = tilt > options.step_sine
-    if fit.limited:
+    fit.is_limited = tilt > options.step_sine
+    if fit.is_limited:
         fit.n_x *= options.step_sine / tilt
         fit.n_y *= options.step_sine / tilt
     d = fit.d + fit.step[DEPTH]
-    fit.limited = fit.limited or d > options.step_deepest
+    fit.is_limited = fit.is_limited or d > options.step_deepest
     fit.d = min(max(d, 0.3 * shallow, 1e-4 * state.grid.radius), options.step_deepest)
     return bool(d == fit.d)
 
@@ -383,13 +386,13 @@ def _check_fit(state: EstimatorState, model: Model, cells: Cells) -> float:
     budget = state.budget
     variance = state.signal.variance
     first, last = parameters(state.options)
-    freedom = fit.weight - (last - first)
+    freedom = fit.counted_cells - (last - first)
     misfit = max(fit.misfit - fit.decrement, 0.0)
-    estimate.cells = int(fit.weight)
+    estimate.cells = int(fit.counted_cells)
     estimate.residual = misfit - fit.readings
     expected = undetected = 0.0
     budget.shared[:] = 0.0
-    if budget.systematic:
+    if budget.has_common_errors:
         expected = set_shared_errors(state, cells)
         estimate.shared = math.sqrt(budget.shared[DEPTH, DEPTH]) / fit.d
     beyond = misfit - expected - variance * freedom
@@ -399,12 +402,12 @@ def _check_fit(state: EstimatorState, model: Model, cells: Cells) -> float:
         for i in range(PARAMETERS):
             for j in range(PARAMETERS):
                 budget.shared[i, j] += undetected * fit.inverse[i, j]
-    if budget.correlated:
-        freedom = fit.weight - widen(state) - (last - first - 4.0)
+    if budget.is_correlated:
+        freedom = fit.counted_cells - widen_covariance(state) - (last - first - 4.0)
     freedom = max(freedom, 1.0)
     estimate.chi2 = misfit / (variance * freedom + expected)
     excess = max(estimate.chi2 - 3.0 * math.sqrt(2.0 * budget.cells_per_sample / freedom), 1.0)
-    return variance * excess if fit.weight > 4.0 else -1.0
+    return variance * excess if fit.counted_cells > 4.0 else -1.0
 
 
 @inner_kernel
@@ -491,7 +494,7 @@ def fit(
         shear_y = fit.shear[1]
         halvings = 0
         kept = not _apply_step(state)
-        limited = limited + 1 if fit.limited else 0
+        limited = limited + 1 if fit.is_limited else 0
         if limited == _LIMITED_MAX:
             return False
         if fit.decrement <= tolerance * variance and not kept:

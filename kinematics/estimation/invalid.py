@@ -26,18 +26,18 @@ class Invalid(IntEnum):
     ABOVE_ZERO = 3, "all cells read above zero: tare"
     OUTLIERS = 4, "too many outliers"
     SATURATED = 5, "saturated"
-    SECOND = 6, "two contacts"
-    UNSETTLED = 7, "the fit does not settle"
-    MODEL = 8, "not this tip"
-    BEYOND = 9, "deeper or steeper than the model holds"
+    SECOND_CONTACT = 6, "two contacts"
+    NOT_CONVERGED = 7, "the fit does not settle"
+    MODEL_MISMATCH = 8, "not this tip"
+    OUT_OF_RANGE = 9, "deeper or steeper than the model holds"
     UNCERTAIN = 10, "too uncertain: press more, or calibrate"
     # Set by the daemon, which tracks estimates over time.
     NO_FRAME = 11, "no frame yet"
-    FRAME = 12, "the board is gone, or its frames repeat"
+    BAD_FRAME = 12, "the board is gone, or its frames repeat"
     STALE = 13, "no valid frame for too long"
-    JOINTS = 14, "contradicts the joints"
-    ABSENT = 15, "not in the scene"
-    SERVO = 16, "servo not read"
+    CONTRADICTS_JOINTS = 14, "contradicts the joints"
+    NOT_IN_SCENE = 15, "not in the scene"
+    SERVO_NOT_READ = 16, "servo not read"
 
 
 REASONS = tuple(Invalid)

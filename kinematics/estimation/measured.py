@@ -16,16 +16,16 @@ from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.tip_curves import Curve
 from softfinger.kinematics.estimation.error_budget import Uncertainty
 from softfinger.kinematics.estimation.estimator import ContactEstimate
-from softfinger.kinematics.estimation.frame_pipeline import ABOVE_MOST, ABOVE_PEAK
+from softfinger.kinematics.estimation.frame_pipeline import ABOVE_FRACTION, ABOVE_PEAK
 from softfinger.kinematics.estimation.invalid import Invalid
 from softfinger.kinematics.sensing.footprint import FloatArray
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
-_TOUCHED = 5.0  # contact threshold of the sum, in standard deviations
-_BEYOND = 1.02  # extrapolation limit of the curves over the measured depth and tilt
-_EXTENT = 0.08  # largest relative difference between measured and expected extent
-_TURNS = 20  # largest number of iterations between d and θ
-_NEAR = 1e-7  # convergence tolerance over the range
+_CONTACT_SIGMA = 5.0  # contact threshold of the sum, in standard deviations
+_EXTRAPOLATION_MAX = 1.02  # extrapolation limit of the curves over the measured depth and tilt
+_EXTENT_ERROR_MAX = 0.08  # largest relative difference between measured and expected extent
+_ITERATIONS_MAX = 20  # largest number of iterations between d and θ
+_TOLERANCE = 1e-7  # convergence tolerance over the range
 
 
 def sum_weights(
@@ -102,17 +102,19 @@ class MeasuredEstimator:
         alive = np.ones(grid.shape, np.bool_) if active is None else active
         self.grid = grid
         self._law = law
-        self._root, self._slope = law.root, math.sin(law.tilt)
+        self._root_max, self._tilt_sine_max = law.root, math.sin(law.tilt)
         self._known = known = known or Uncertainty()
         self._weights = sum_weights(grid, tip.radius, alive)
-        self._under = self._weights[0] > 0.0
-        self._rest, self._noise = np.array(law.rest), np.array(law.noise)
+        self._used = self._weights[0] > 0.0
+        self._zero_sums, self._noise = np.array(law.rest), np.array(law.noise)
         # Sums due to a common shift of all cells, and the moment due to a slope of the zeros [N·m].
         self._shift = known.baseline * self._weights.sum(axis=1)
         self._zero_moment = known.slope / tip.radius * 0.5 * self._weights[3].sum()
-        self._felt = _TOUCHED * math.hypot(math.sqrt(self._noise[0, 0]), self._shift[0])
+        sum_std = math.hypot(math.sqrt(self._noise[0, 0]), self._shift[0])
+        self._contact_threshold = _CONTACT_SIGMA * sum_std
         # Largest undetected d: its force is at the contact threshold.
-        self._hidden = tip.radius * self._root_of(self._felt, 0.0, self._root) ** 2
+        root = self._root_of(self._contact_threshold, 0.0, self._root_max)
+        self._undetected_d = tip.radius * root**2
         self._seq: int | None = None
         self._last = ContactEstimate()
 
@@ -137,11 +139,11 @@ class MeasuredEstimator:
             return result
         if frame.shape != self.grid.shape:
             raise ValueError(f"a frame must have shape {self.grid.shape}, got {frame.shape}")
-        readings = float(pascal_per_count) * frame.ravel()[self._under].astype(np.float64)
+        readings = float(pascal_per_count) * frame.ravel()[self._used].astype(np.float64)
         finite = bool(np.isfinite(readings).all())
-        sums = self._weights[:, self._under] @ readings - self._rest
+        sums = self._weights[:, self._used] @ readings - self._zero_sums
         result.peak = max(float(readings.max(initial=0.0)), 0.0) if finite else 0.0
-        result.contact = finite and bool(sums[0] > self._felt)
+        result.contact = finite and bool(sums[0] > self._contact_threshold)
         result.d = result.tilt_x = result.tilt_y = 0.0
         result.covariance[:] = result.systematic[:] = 0.0
         result.invalid = Invalid.NONE if finite else Invalid.NOT_FINITE
@@ -149,10 +151,10 @@ class MeasuredEstimator:
             result.invalid = self._contact(sums, result)
             # If nearly all cells read high, the sensor has not been tared.
             above = np.count_nonzero(readings > ABOVE_PEAK * result.peak)
-            if result.invalid and above > ABOVE_MOST * readings.size:
+            if result.invalid and above > ABOVE_FRACTION * readings.size:
                 result.invalid = Invalid.ABOVE_ZERO
         else:
-            result.covariance[0, 0] = result.systematic[0, 0] = self._hidden**2
+            result.covariance[0, 0] = result.systematic[0, 0] = self._undetected_d**2
         self._seq = seq
         return result
 
@@ -165,8 +167,8 @@ class MeasuredEstimator:
         for _ in range(24):
             value, by_t, _ = _curve(self._law.shown, t, q)
             before = t
-            t = min(max(t - (value - force) / by_t, 0.3 * t), _BEYOND * self._root)
-            if abs(t - before) < _NEAR * self._root:
+            t = min(max(t - (value - force) / by_t, 0.3 * t), _EXTRAPOLATION_MAX * self._root_max)
+            if abs(t - before) < _TOLERANCE * self._root_max:
                 break
         return t
 
@@ -174,10 +176,10 @@ class MeasuredEstimator:
         """Set the contact from the sums; check its extent and that it is within the curves."""
         force, along, across, square = sums.tolist()
         moment = math.hypot(along, across)
-        s_max = _BEYOND * self._slope
+        s_max = _EXTRAPOLATION_MAX * self._tilt_sine_max
         s = target = step = 0.0
-        t = self._root_of(force, 0.0, self._root)
-        for _ in range(_TURNS):
+        t = self._root_of(force, 0.0, self._root_max)
+        for _ in range(_ITERATIONS_MAX):
             lever = max(_curve(self._law.lever, t, s * s)[0], 1e-9 * self._law.radius)
             target = moment / (force * lever)
             before = step
@@ -186,11 +188,11 @@ class MeasuredEstimator:
                 step *= 0.5
             s += step
             t = self._root_of(force, s * s, t)
-            if abs(step) < _NEAR:
+            if abs(step) < _TOLERANCE:
                 break
         c_x, c_y = (along / moment, across / moment) if moment > 0.0 else (1.0, 0.0)
         std, covariances = self._covariances(t, s, c_x, c_y)
-        s *= 1.0 - std * std / (std * std + self._slope * self._slope)
+        s *= 1.0 - std * std / (std * std + self._tilt_sine_max * self._tilt_sine_max)
         t = self._root_of(force, s * s, t)
         result.d = self._law.radius * t * t
         result.tilt_x, result.tilt_y = math.asin(s * c_x), math.asin(s * c_y)
@@ -199,10 +201,12 @@ class MeasuredEstimator:
             out[:3, :3] = found * np.outer(per_tilt, per_tilt)
         extent = force * _curve(self._law.extent, t, s * s)[0]
         # A second contact changes the mean squared radius by more than 8 % and its noise.
-        agrees = abs(square - extent) < _EXTENT * extent + _TOUCHED * math.sqrt(self._noise[3, 3])
-        if not (t < _BEYOND * self._root * (1.0 - 1e-9) and target < s_max + 3.0 * std):
-            return Invalid.BEYOND
-        return Invalid.NONE if agrees else Invalid.MODEL
+        tolerance = _EXTENT_ERROR_MAX * extent + _CONTACT_SIGMA * math.sqrt(self._noise[3, 3])
+        agrees = abs(square - extent) < tolerance
+        t_max = _EXTRAPOLATION_MAX * self._root_max * (1.0 - 1e-9)
+        if not (t < t_max and target < s_max + 3.0 * std):
+            return Invalid.OUT_OF_RANGE
+        return Invalid.NONE if agrees else Invalid.MODEL_MISMATCH
 
     def _covariances(
         self, t: float, s: float, c_x: float, c_y: float
@@ -231,21 +235,21 @@ class MeasuredEstimator:
         rotation = np.array([[1.0, 0.0, 0.0], [0.0, c_x, c_y], [0.0, -c_y, c_x]])
         random = rotation @ self._noise[:3, :3] @ rotation.T
         shift = rotation @ self._shift[:3]
-        grown = known.gain * shown * np.array([1.0, lever * s, 0.0])
-        placed = math.hypot(law.lever_error, known.centre)
-        turned = math.hypot(placed, known.rotation * lever * s)
-        missed = (shown * np.array([law.force_error, placed, turned])) ** 2
-        missed[1:] += self._zero_moment**2
-        shared = np.outer(shift, shift) + np.outer(grown, grown) + np.diag(missed)
+        by_gain = known.gain * shown * np.array([1.0, lever * s, 0.0])
+        centre_error = math.hypot(law.lever_error, known.centre)
+        rotation_error = math.hypot(centre_error, known.rotation * lever * s)
+        curve_errors = (shown * np.array([law.force_error, centre_error, rotation_error])) ** 2
+        curve_errors[1:] += self._zero_moment**2
+        shared = np.outer(shift, shift) + np.outer(by_gain, by_gain) + np.diag(curve_errors)
         errors = jacobian @ (random + shared) @ jacobian.T
-        prior = self._slope * self._slope
-        drawn = np.array([[errors[0, 1], 0.0], [errors[1, 1], 0.0], [0.0, errors[2, 2]]]) / (
+        prior = self._tilt_sine_max * self._tilt_sine_max
+        shrinkage = np.array([[errors[0, 1], 0.0], [errors[1, 1], 0.0], [0.0, errors[2, 2]]]) / (
             errors.diagonal()[1:] + prior
         )
-        jacobian -= drawn @ jacobian[1:]
-        towards = prior * drawn @ drawn.T
+        jacobian -= shrinkage @ jacobian[1:]
+        prior_error = prior * shrinkage @ shrinkage.T
         both = (
-            rotation.T @ (jacobian @ each @ jacobian.T + towards) @ rotation
+            rotation.T @ (jacobian @ each @ jacobian.T + prior_error) @ rotation
             for each in (random + shared, shared)
         )
         return math.sqrt(errors[1, 1]), (next(both), next(both))

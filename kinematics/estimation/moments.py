@@ -23,13 +23,13 @@ from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 # the footprint, even if the contact has moved slightly.
 _MARGIN = 0.75
 _BLUR_MARGIN = 2.0  # additional margin, in standard deviations of the blur
-_TILT = 0.2  # rad, tilt at which the lever is computed; it hardly depends on the tilt
-_WEAK = 15.0  # peak in noise standard deviations, below which neighbourhoods are used
+_TILT = 0.2  # rad, tilt at which the arm of the centroid is computed; it hardly depends on the tilt
+_WEAK_PEAK = 15.0  # peak in noise standard deviations, below which neighbourhoods are used
 _SINE_MAX = 0.95
-_ANY = -1e300  # a level below every reading
+_NO_LEVEL = -1e300  # a level below every reading
 
 
-def set_start(
+def tabulate_moments(
     m: Moments, grid: SensorGrid, tip: Fingertip, material: Material, deepest: float
 ) -> None:
     """Tabulate the moments of the model over d up to ``deepest`` [m]."""
@@ -45,20 +45,20 @@ def set_start(
         m.extent[k] = square - middle[0] ** 2 - middle[1] ** 2
         n_x, n_y = grid.to_sensor(math.sin(_TILT), 0.0)
         moved = [float((tilted * at).sum() / max(float(tilted.sum()), 1e-9)) for at in (x, y)]
-        m.lever[k] = (moved[0] * n_x + moved[1] * n_y) / (n_x * n_x + n_y * n_y)
-    m.lever[0] = m.lever[1]
-    m.lever[:] = np.maximum(m.lever, 0.1 * tip.radius)
+        m.centroid_arm[k] = (moved[0] * n_x + moved[1] * n_y) / (n_x * n_x + n_y * n_y)
+    m.centroid_arm[0] = m.centroid_arm[1]
+    m.centroid_arm[:] = np.maximum(m.centroid_arm, 0.1 * tip.radius)
 
 
 @inner_kernel
-def _at(values: FloatArray, t: float) -> float:
+def _interpolate(values: FloatArray, t: float) -> float:
     """Interpolate a table at the position t."""
     k = min(int(t), START_POINTS - 2)
     return float(values[k] + (t - k) * (values[k + 1] - values[k]))
 
 
 @inner_kernel
-def _place_of(values: FloatArray, value: float) -> float:
+def _inverse(values: FloatArray, value: float) -> float:
     """Return the position at which an increasing table has ``value``, clamped to its ends."""
     for k in range(START_POINTS - 1):
         if value < values[k + 1]:
@@ -75,14 +75,14 @@ def start(state: EstimatorState, frame: FloatArray, cells: Cells) -> None:
     estimate = state.estimate
     if state.options.is_solid:
         # A solid tip presses its whole base, and its extent hardly depends on d.
-        sums_above(m, frame, cells, _ANY)
+        sums_above(m, frame, cells, _NO_LEVEL)
         m.gain = 1.0
         if m.total > 0.0:
             m.x /= m.total
             m.y /= m.total
         _set_contact(state, False)
     else:
-        weak = signal.peak <= _WEAK * signal.noise
+        weak = signal.peak <= _WEAK_PEAK * signal.noise
         if weak:
             _sums_of_weak(state, frame, cells)
         else:
@@ -173,9 +173,9 @@ def _set_contact(state: EstimatorState, by_extent: bool) -> None:
     """
     m = state.moments
     force = m.total * state.signal.scale
-    t = _place_of(m.extent, m.trace) if by_extent else _place_of(m.force, force)
+    t = _inverse(m.extent, m.trace) if by_extent else _inverse(m.force, force)
     t = max(t, 0.25)
     m.d = state.options.deepest * (t / (START_POINTS - 1)) ** 2
-    m.gain = force / _at(m.force, t) if by_extent else 1.0
-    lever = _at(m.lever, t)
-    _set_normal(m, m.x / lever, m.y / lever)
+    m.gain = force / _interpolate(m.force, t) if by_extent else 1.0
+    centroid_arm = _interpolate(m.centroid_arm, t)
+    _set_normal(m, m.x / centroid_arm, m.y / centroid_arm)

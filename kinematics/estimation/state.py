@@ -57,7 +57,7 @@ class Signal(Record):
     scale: float  # Pa per count
     variance: float  # noise of a cell [Pa²]
     noise: float  # standard deviation of a cell [counts]
-    confined: float  # largest reading of a contact as wide as a cell [counts]
+    narrow_contact_max: float  # largest reading of a contact as wide as a cell [counts]
     patch_level: float
     saturation: float  # [Pa]
     floor: float  # [Pa]; −inf for none
@@ -67,9 +67,9 @@ class Signal(Record):
     col: int
     mean: float  # [counts]
     energy: float  # Σ p² [counts²]
-    clipped: bool  # no cell reads below the floor
+    is_clipped: bool  # no cell reads below the floor
     contact: bool
-    finite: bool
+    is_finite: bool
 
 
 class Estimate(Record):
@@ -84,11 +84,11 @@ class Estimate(Record):
     peak: float  # [Pa]
     cells: int
     iterations: int
-    rejected: int
+    rejected_count: int
     contact: bool
     invalid: int  # an `Invalid`
-    second: bool
-    warm: bool
+    has_second_contact: bool
+    has_last_contact: bool
     shear_x: float  # force on the face [N], for solid tips
     shear_y: float
     n_x: float
@@ -116,7 +116,7 @@ class Moments(Record):
     # Moments of the model at the depths deepest · (k/(START_POINTS − 1))²:
     force: Depths  # Σ p, upright [Pa]
     extent: Depths  # trace of the pressure's covariance, upright [m²]
-    lever: Depths  # centroid over sin of the tilt [m]
+    centroid_arm: Depths  # centroid over sin of the tilt [m]
 
 
 class Fit(Record):
@@ -130,14 +130,14 @@ class Fit(Record):
     shear: Pair
     first_row: int  # range of cells pressed by the model
     last_row: int
-    clip: float  # noise of cells clipped at the floor [Pa]; 0 without clipping
+    clip_noise: float  # noise of cells clipped at the floor [Pa]; 0 without clipping
     decrement: float  # predicted decrease of the sum of squares
     misfit: float  # Σ (reading − model)²
     readings: float  # Σ reading²
-    weight: float  # number of cells that count
-    limited: bool  # the last step was clamped to the limits of the model
+    counted_cells: float  # number of cells that count
+    is_limited: bool  # the last step was clamped to the limits of the model
     normal: Normal  # JᵀJ
-    right: Column  # Jᵀr
+    gradient: Column  # Jᵀr
     step: Column
     scale: Column
     lower: Normal
@@ -153,11 +153,11 @@ class Budget(Record):
     slope: float  # standard deviation of a slope of the zeros, at the rim [Pa]
     smooth: float  # relative pressure error
     rotation: float  # of the sensor [rad]
-    lean: float  # relative tilt error of a solid tip over d/a
-    along: float  # correlation of neighbours in a row
+    tilt_error: float  # relative tilt error of a solid tip over d/a
+    row_correlation: float  # correlation of neighbours in a row
     cells_per_sample: float  # Σρ², cells per independent noise sample
-    systematic: bool  # True if any error other than the correlation is set
-    correlated: bool
+    has_common_errors: bool  # True if any error other than the correlation is set
+    is_correlated: bool
     widening: Annotated[FloatArray, DEPTHS, 5]  # factors of the standard deviations, used-up cells
     responses: Annotated[FloatArray, PARAMETERS, SOURCES]  # Jᵀq
     squares: Annotated[FloatArray, SOURCES]  # qᵀq

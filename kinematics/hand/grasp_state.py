@@ -21,7 +21,7 @@ from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 from softfinger.kinematics.contact.lookup import lookup
 from softfinger.kinematics.hand.geometry import tip_position, tip_velocity
 
-Two = tuple[float, float]  # (left, right)
+FloatPair = tuple[float, float]  # (left, right)
 Motion = tuple[float, float, float, float, float, float, float]  # result of `held_motion`
 
 _SHEAR_STEPS = 3  # fixed-point iterations for the shears; each adds two digits
@@ -35,7 +35,11 @@ def total_tilt(tilt_x: float, tilt_y: float) -> float:
 
 @inner_kernel
 def held_motion(
-    q: Two, d: Two, angle: float, taper: float, lengths: tuple[float, float, float, float]
+    q: FloatPair,
+    d: FloatPair,
+    angle: float,
+    taper: float,
+    lengths: tuple[float, float, float, float],
 ) -> Motion:
     """Return (arm1, arm2, turn1, turn2, slide, width, across) of a held object.
 
@@ -106,11 +110,11 @@ def sheared_gradient(
 
 
 @inner_kernel
-def holding_levers(
+def holding_moment_arms(
     data1: NDArray[float64],
     data2: NDArray[float64],
-    d: Two,
-    theta: Two,
+    d: FloatPair,
+    theta: FloatPair,
     taper: float,
     motion: Motion,
 ) -> tuple[float, float, float, float, float]:
@@ -124,7 +128,7 @@ def holding_levers(
     Equilibrium of the object gives T W = N slide + ∂U1/∂θ1 + ∂U2/∂θ2 for the mean shear force T.
     The shear forces of the tips are T − N tan(α/2) at the left and T + N tan(α/2) at the right,
     since tapered faces push the object out; α is the ``taper`` [rad]. F is the mean force of both
-    tips, so the levers τ/F [m] do not depend on a common modulus. N is the mean of the normal
+    tips, so the moment arms τ/F [m] do not depend on a common modulus. N is the mean of the normal
     forces N1 and N2 [N], which differ if friction with the surroundings acts on the object.
     ``data1`` and ``data2`` are the data of the contact tables. All results are zero unless both
     tips are in contact.
@@ -207,14 +211,14 @@ def _unexplained(
 def load_torques(
     data1: NDArray[float64],
     data2: NDArray[float64],
-    d: Two,
-    theta: Two,
+    d: FloatPair,
+    theta: FloatPair,
     taper: float,
     motion: Motion,
-    rolled: Two,
-    torques: Two,
+    rolled: FloatPair,
+    torques: FloatPair,
 ) -> tuple[float, float, float, float]:
-    """Return the residual torques and the load model (δ1, δ2, lever, bow) of a held object.
+    """Return the residual torques and the load model of a held object.
 
     δ1 and δ2 [N·m] are the parts of the joint torques that only a load along the object's t can
     explain. If each tip carries L [N] of a load 2 L, the torques are
@@ -223,12 +227,13 @@ def load_torques(
         τ2 = −N2 v2·n2 − ∂U2/∂θ2 − T2 lever2     T2 = rolled2 − L
 
     with n_i and t_i of the face at each tip. ``rolled`` [N] are the shears that rolling, the
-    turning moments and the ``taper`` [rad] cause without a load (:func:`holding_levers`). N and
-    ∂U/∂θ include the effect of the shears. ``motion`` is the result of :func:`held_motion`; for
+    turning moments and the ``taper`` [rad] cause without a load (:func:`holding_moment_arms`). N
+    and ∂U/∂θ include the effect of the shears. ``motion`` is the result of :func:`held_motion`; for
     parallel faces ±v_i·n is arm_i and lever_i is W turn_i.
 
-    δ_i is the residual of τ_i at L = 0. A load gives exactly (δ1 + δ2)/2 = lever L + bow L². All
-    results are zero unless both tips are in contact, and if a load would not change the torques.
+    δ_i is the residual of τ_i at L = 0. A load gives exactly
+    (δ1 + δ2)/2 = moment_arm L + curvature L². The results are (δ1, δ2, moment_arm, curvature), all
+    zero unless both tips are in contact, and if a load would not change the torques.
     """
     d1, d2 = d
     theta1, theta2 = theta
@@ -256,7 +261,7 @@ def load_torques(
 
 @inner_kernel
 def load_of(torque: float, moment_arm: float, curvature: float) -> tuple[float, float]:
-    """Solve torque = lever L + bow L² [N·m]; return the load L [N] and the slope ∂torque/∂L [m].
+    """Solve torque = moment_arm L + curvature L² [N·m]; return L [N] and the slope ∂torque/∂L [m].
 
     Torques beyond the vertex of the parabola, which no load can cause, use the smallest slope.
     """

@@ -26,11 +26,11 @@ FloatArray = NDArray[np.float64]
 
 WINDING, CASE, AMBIENT, HEATING = range(4)
 COPPER = 0.0039  # 1/K, temperature coefficient of the winding's resistance
-LONGEST = 3600.0  # s, largest time to a limit that is reported
-_ROOM = 25.0  # °C
-_STILL = 30.0  # K above ambient at which τ_c is defined
-_FIRST = (6.0, 0.5, 8.0, 0.35)  # initial standard deviations of W, C, A [°C] and k
-_WANDER = (0.03, 0.01, 0.2, 0.01)  # random walks of W, C, A [°C/√s] and k [1/√s]
+TIME_MAX = 3600.0  # s, largest time to a limit that is reported
+_ROOM_TEMPERATURE = 25.0  # °C
+_CONVECTION_DIFFERENCE = 30.0  # K above ambient at which τ_c is defined
+_INITIAL_STD = (6.0, 0.5, 8.0, 0.35)  # initial standard deviations of W, C, A [°C] and k
+_RANDOM_WALK = (0.03, 0.01, 0.2, 0.01)  # random walks of W, C, A [°C/√s] and k [1/√s]
 _STEP_STD = 0.12  # °C, standard deviation of the case temperature at a step of the reading
 _STAY_STD = 6.0  # °C, standard deviation of a constant reading over 1 s
 _COUPLING = 0.25  # unobservable error of τ_w, as a fraction of W − C
@@ -64,9 +64,9 @@ def follow(states: Records[HeatState], square: float, dt: float, reading: float)
         s.known = True
         s.reading = reading
         for i in range(4):
-            s.p[i, i] = _FIRST[i] * _FIRST[i]
+            s.p[i, i] = _INITIAL_STD[i] * _INITIAL_STD[i]
         s.x[WINDING] = s.x[CASE] = reading
-        s.x[AMBIENT] = min(reading, _ROOM)
+        s.x[AMBIENT] = min(reading, _ROOM_TEMPERATURE)
         s.x[HEATING] = 1.0
         return
     _predict(s, square, dt)
@@ -81,17 +81,17 @@ def follow(states: Records[HeatState], square: float, dt: float, reading: float)
 
 
 @inner_kernel
-def _draught(over: float) -> float:
+def _convection_factor(over: float) -> float:
     """Return g of a case ``over`` K above ambient, at least that of 1 K."""
-    return math.sqrt(math.sqrt(max(over, 1.0) / _STILL))
+    return math.sqrt(math.sqrt(max(over, 1.0) / _CONVECTION_DIFFERENCE))
 
 
 @inner_kernel
 def _predict(s: HeatState, square: float, dt: float) -> None:
     law, x, p, f = s.law, s.x, s.p, s.scratch
-    heating = law.heating * square * (1.0 + COPPER * (x[WINDING] - _ROOM))
+    heating = law.heating * square * (1.0 + COPPER * (x[WINDING] - _ROOM_TEMPERATURE))
     flow = (x[WINDING] - x[CASE]) / law.winding_time
-    loss = _draught(x[CASE] - x[AMBIENT]) / law.case_time
+    loss = _convection_factor(x[CASE] - x[AMBIENT]) / law.case_time
     f[:] = 0.0
     for i in range(4):
         f[i, i] = 1.0
@@ -114,7 +114,7 @@ def _predict(s: HeatState, square: float, dt: float) -> None:
         for i in range(4):
             p[i, j] = f[i, 0] * row0 + f[i, 1] * row1 + f[i, 2] * row2 + f[i, 3] * row3
     for i in range(4):
-        p[i, i] += _WANDER[i] * _WANDER[i] * dt
+        p[i, i] += _RANDOM_WALK[i] * _RANDOM_WALK[i] * dt
 
 
 @inner_kernel
@@ -144,38 +144,38 @@ def winding_std(states: Records[HeatState]) -> float:
 def time_to_limit(states: Records[HeatState], square: float, limit: float) -> float:
     """Return the time [s] until the case reaches ``limit`` [°C] at a mean squared current [A²].
 
-    The result is at most LONGEST. The winding is integrated implicitly, so the steps may grow.
+    The result is at most TIME_MAX. The winding is integrated implicitly, so the steps may grow.
     """
     s = states[0]
     law = s.law
     winding, case, ambient = s.x[WINDING], s.x[CASE], s.x[AMBIENT]
     heating = law.heating * square * s.x[HEATING]
     t = 0.0
-    while t < LONGEST:
+    while t < TIME_MAX:
         if case >= limit:
             return t
         dt = 1.0 + 0.02 * t
-        source = heating * (1.0 - COPPER * _ROOM) + case / law.winding_time
+        source = heating * (1.0 - COPPER * _ROOM_TEMPERATURE) + case / law.winding_time
         loss = 1.0 / law.winding_time - heating * COPPER
         winding = (winding + dt * source) / max(1.0 + dt * loss, 0.1)
-        outward = (case - ambient) * _draught(case - ambient) / law.case_time
+        outward = (case - ambient) * _convection_factor(case - ambient) / law.case_time
         rate = law.share * (winding - case) / law.winding_time - outward
         if rate > 0.0 and case + dt * rate >= limit:
             left: float = t + (limit - case) / rate
-            return min(left, LONGEST)
+            return min(left, TIME_MAX)
         case += dt * rate
         t += dt
-    return LONGEST
+    return TIME_MAX
 
 
 @kernel
-def lasting_square(states: Records[HeatState], limit: float) -> float:
+def sustained_square(states: Records[HeatState], limit: float) -> float:
     """Return the mean squared current [A²] at which the case settles at ``limit`` [°C]."""
     s = states[0]
     law = s.law
     over = max(limit - s.x[AMBIENT], 0.0)
-    flow = over * _draught(over) / (law.case_time * law.share)  # (W − C)/τ_w [K/s]
+    flow = over * _convection_factor(over) / (law.case_time * law.share)  # (W − C)/τ_w [K/s]
     winding = limit + flow * law.winding_time
-    heating = law.heating * s.x[HEATING] * (1.0 + COPPER * (winding - _ROOM))
+    heating = law.heating * s.x[HEATING] * (1.0 + COPPER * (winding - _ROOM_TEMPERATURE))
     square: float = flow / heating
     return square

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 
-_MATCHED = 0.75  # points; narrower blurs use moment-matching weights, wider ones Gaussian samples
+# Points; narrower blurs use moment-matching weights, wider ones Gaussian samples.
+_MOMENT_MATCHED_MAX = 0.75
 _CUTOFF = 4.5  # standard deviations at which the Gaussian is truncated
 
 
@@ -55,7 +56,7 @@ def stencil(width: float) -> FloatArray:
     """
     if width == 0.0:
         return np.ones(1)
-    if width < _MATCHED:
+    if width < _MOMENT_MATCHED_MAX:
         square = width * width
         far = (3.0 * square * square - square) / 24.0
         near = 0.5 * square - 4.0 * far

@@ -20,7 +20,7 @@ from softfinger.kinematics.sensing.solid_pressure import SolidPressure, images
 from softfinger.kinematics.sensing.springs_pressure import SpringsPressure, count_for
 
 _PITCH_MAX = 0.1  # m; a larger value was probably given in millimetres
-_FINE = 150.0  # smallest number of sample points per tip radius
+_POINTS_PER_RADIUS = 150.0  # smallest number of sample points per tip radius
 
 
 @dataclass(frozen=True)
@@ -160,7 +160,7 @@ def _images(grid: SensorGrid, tip: Fingertip) -> FloatArray:
 @lru_cache(maxsize=16)
 def _springs(grid: SensorGrid, tip: Fingertip, material: Material) -> SpringsPressure:
     cells = grid.on(tip)
-    return SpringsPressure(cells, material, grid.blur, count_for(cells, _FINE))
+    return SpringsPressure(cells, material, grid.blur, count_for(cells, _POINTS_PER_RADIUS))
 
 
 def normal(d: float, tilt_x: float, tilt_y: float, radius: float) -> tuple[float, float]:

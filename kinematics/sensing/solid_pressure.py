@@ -26,7 +26,7 @@ from softfinger.kinematics.sensing.footprint import FloatArray, Grid, IntArray
 
 MODES = 32
 IMAGES = 2 * MODES
-_AT_ONCE = 4  # images added per pass; IMAGES is a multiple of it
+_IMAGES_PER_PASS = 4  # images added per pass; IMAGES is a multiple of it
 ROOT_TERMS, SQUARE_TERMS = 12, 6  # largest number of terms of a mode's polynomial
 
 # Sample points per side of a cell: inside, cut by the rim, and with blur.
@@ -260,7 +260,7 @@ def add_images(weights: Weights, of: FloatArray, pixels: FloatArray, out: FloatA
     The last group may include the images of shear, whose weights are 0 here.
     """
     count = out.shape[0]
-    for j in range(0, weights.images, _AT_ONCE):
+    for j in range(0, weights.images, _IMAGES_PER_PASS):
         _add_images(of, j, pixels, index(j * count), index(count), out)
 
 
@@ -326,7 +326,7 @@ def render_solid(
 
 def padded(images: FloatArray) -> FloatArray:
     """Return images [·, cells] as one flat array, padded so that `add_images` can read past it."""
-    return np.concatenate([images.ravel(), np.zeros((_AT_ONCE - 1) * images.shape[1])])
+    return np.concatenate([images.ravel(), np.zeros((_IMAGES_PER_PASS - 1) * images.shape[1])])
 
 
 class SolidPressure:

@@ -38,7 +38,7 @@ FloatArray = NDArray[np.float64]
 STRESS, BY_D, BY_X, BY_Y = range(4)  # planes: pressure [Pa] and its partials by d, n_x and n_y
 PLANES = 4
 Cells = tuple[int, int]  # half-open range
-_LEAST_SPREAD = 1e-12
+_SPREAD_MIN = 1e-12
 # Gauss-Legendre rule on the rectangle of a point, scaled to width 1.
 _NODES, _WEIGHTS = (0.5 * each for each in np.polynomial.legendre.leggauss(3))
 
@@ -134,7 +134,7 @@ def _set_strains(
     w = face.w
     size_x, size_y = half
     rim = a2 - y * y
-    least = _LEAST_SPREAD * a2 * math.sqrt(a2)
+    least = _SPREAD_MIN * a2 * math.sqrt(a2)
     for k in range(first, last):
         x = points.x[k]
         # ε > 0 where f = ℓ² − z² > 0; f is close to linear up to the rim and beyond.

@@ -24,11 +24,11 @@ from softfinger.gym.environment import FORCE, Observation, SoftFingerEnv
 from softfinger.tools import style
 from softfinger.tools.sweep import Sweep, add_sweep
 
-DRAWN, KEPT, EPISODES = 24, 6, 2  # samples, elites, episodes per sample
+SAMPLE_COUNT, ELITE_COUNT, EPISODES = 24, 6, 2  # samples, elites, episodes per sample
 STEPS = 200
 FEATURES = 5
-_GENTLE = 0.2  # scales the weights, since an action of 1 is a fast 1 rad/s
-_FRESH = 0.2  # added to the standard deviation against premature convergence
+_WEIGHT_SCALE = 0.2  # scales the weights, since an action of 1 is a fast 1 rad/s
+_ADDED_STD = 0.2  # added to the standard deviation against premature convergence
 
 Weights = NDArray[np.float64]
 
@@ -41,7 +41,7 @@ def policy(weights: Weights) -> Policy:
         own = (observation["goal"] - contacts[:, 2]) / FORCE
         touching = contacts[:, 0] > 0.0
         features = [np.ones(2), own, own[::-1], touching, joints[2:4]]
-        action: NDArray[np.float32] = np.tanh(_GENTLE * weights @ np.array(features)).astype(
+        action: NDArray[np.float32] = np.tanh(_WEIGHT_SCALE * weights @ np.array(features)).astype(
             np.float32
         )
         return action
@@ -71,11 +71,11 @@ def learn(
     mean, std = np.zeros(FEATURES), np.ones(FEATURES)
     began = time.monotonic()
     for k in range(generations):
-        rows = mean + std * rng.standard_normal((DRAWN, FEATURES))
+        rows = mean + std * rng.standard_normal((SAMPLE_COUNT, FEATURES))
         tried = Sweep(f"{k + 1}", partial(returns, 1000 + EPISODES * k, True), list(rows))
         found = np.array(list(tried.run(processes, scheduler)))
-        best = rows[np.argsort(found)[-KEPT:]]
-        mean, std = best.mean(axis=0), best.std(axis=0) + _FRESH / (k + 1)
+        best = rows[np.argsort(found)[-ELITE_COUNT:]]
+        mean, std = best.mean(axis=0), best.std(axis=0) + _ADDED_STD / (k + 1)
         curve.append(returns(0, False, mean))
         spent = time.monotonic() - began
         print(f"{k + 1:3}  {curve[-1]:6.1f} of {STEPS}  {spent:5.0f} s", flush=True)

@@ -32,9 +32,9 @@ FORCES = 1.0, 12.0  # N, grip force for an action of -1 and of 1
 ANGLE = 0.25  # rad, object angle for an action of 1
 WHITE = 50e3  # Pa, pressure shown as white (255) in an image
 LOST = 0.03  # m, displacement at which the object counts as lost
-_DEEP = 0.004  # m, tip displacement when an episode starts with a grip by the joints alone
-_PATIENCE = 3.0  # s, longest wait for that grip
-_MOST = 200.0  # bound of every float observation, in SI units
+_START_D = 0.004  # m, tip displacement when an episode starts with a grip by the joints alone
+_GRIP_TIMEOUT = 3.0  # s, longest wait for that grip
+_OBSERVATION_MAX = 200.0  # bound of every float observation, in SI units
 
 
 class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
@@ -109,10 +109,10 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._empty = np.zeros(cells[1:], np.uint16)
         self.observation_space: Any = spaces.Dict(
             {
-                "joints": spaces.Box(-_MOST, _MOST, (6,), np.float32),
-                "contacts": spaces.Box(-_MOST, _MOST, (6,), np.float32),
+                "joints": spaces.Box(-_OBSERVATION_MAX, _OBSERVATION_MAX, (6,), np.float32),
+                "contacts": spaces.Box(-_OBSERVATION_MAX, _OBSERVATION_MAX, (6,), np.float32),
                 "pressure": spaces.Box(0, 65535, cells, np.uint16),
-                "goal": spaces.Box(-_MOST, _MOST, (1,), np.float32),
+                "goal": spaces.Box(-_OBSERVATION_MAX, _OBSERVATION_MAX, (1,), np.float32),
             }
         )
         self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
@@ -172,7 +172,7 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
         def held() -> bool:
             for i in range(2):
-                touching[i] = touching[i] or state.contacts[i].d > _DEEP
+                touching[i] = touching[i] or state.contacts[i].d > _START_D
                 q[i] = min(q[i] + (0.0 if touching[i] else 0.25 * REACH), reach[i])
             self._command("move", left=q[0], right=q[1])
             return all(touching)
@@ -180,7 +180,7 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._until(held)
 
     def _until(self, condition: Callable[[], bool]) -> None:
-        finish = self._loop.state.t + _PATIENCE
+        finish = self._loop.state.t + _GRIP_TIMEOUT
         while not condition() and self._loop.state.t < finish:
             self._loop.advance(STEP)
 

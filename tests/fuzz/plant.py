@@ -42,7 +42,7 @@ def past_limit(radius, d, theta, curvature):
 @kernel
 def is_sound(plant):
     """Return True if all values of the hand are finite."""
-    state, felt = plant.state, plant.felt
+    state, felt = plant.state, plant.sensed_contact
     total = plant.energy
     for j in range(5):
         total += state.position[j] + state.velocity[j]
@@ -59,7 +59,7 @@ def is_sound(plant):
 def carry_out(plants, data, ring, commands):
     """Execute the commands one by one; return the error found and the index of its command."""
     plant = plants[0]
-    goals, state, felt = plant.goals, plant.state, plant.felt
+    goals, state, felt = plant.goals, plant.state, plant.sensed_contact
     for k in range(commands.shape[0]):
         joint = int(commands[k, 0])
         goals.mode[joint] = int(commands[k, 1])

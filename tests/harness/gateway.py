@@ -57,7 +57,7 @@ class Served:
     def _is_open(self) -> bool:
         """Return True if incoming commands are executed."""
         if self._clock is not None:
-            self._clock.sleep_until(self._clock.now() + bounds.PURGE)
+            self._clock.sleep_until(self._clock.now() + bounds.REFUSAL_TIME)
         self.settle()
         return self.link.stops == self.server._stops
 

@@ -11,7 +11,7 @@ import msgpack
 import numpy as np
 
 from softfinger.daemon.loop.timing import Statistics, record
-from softfinger.daemon.types import Frame, HandFacts, Parts, SensorFacts, State
+from softfinger.daemon.types import Frame, HandInfo, SceneParts, SensorInfo, State
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.publisher import packer
 from softfinger.kinematics.estimation.invalid import Invalid
@@ -76,11 +76,11 @@ def arguments(topic: bytes) -> tuple[Any, ...]:
     """Return the arguments from which a sample of the topic's message is made."""
     state, wall, t = sample_state(), 1.7e9 + 0.25, 12.5
     if topic == schema.STATE:
-        return state, Parts(fingers=(True, True), servos=True, sensors=True), 5
+        return state, SceneParts(fingers=(True, True), has_servos=True, has_sensors=True), 5
     if topic == schema.TACTILE:
         counts = np.arange(20, dtype=np.uint16).reshape(4, 5) * 3000
         frame = Frame(seq=77, t_sample=12.48, t_arrival=12.49, valid=True, data=counts)
-        facts = SensorFacts(
+        facts = SensorInfo(
             pitch=0.0013,
             pitch_y=0.0014,
             centre_x=1e-4,
@@ -105,7 +105,7 @@ def arguments(topic: bytes) -> tuple[Any, ...]:
         frame = Frame(77, t_sample=12.48, t_arrival=12.49, valid=True, data=np.zeros((4, 5), "<u2"))
         return state, (frame, None)
     if topic == schema.SETTINGS:
-        facts = HandFacts("0.1.0", '{"loop":{"rate":500.0}}', "", "{}", "{}", "{}")
+        facts = HandInfo("0.1.0", '{"loop":{"rate":500.0}}', "", "{}", "{}", "{}")
         return 1, 1.7e9, 10.0, facts
     if topic == schema.COMMAND:
         request = {"command": "grasp", "force": 5.0, "client": "notebook"}

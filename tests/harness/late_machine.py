@@ -6,7 +6,7 @@ from softfinger.daemon.clock import VirtualClock
 class LateMachine(VirtualClock):
     """Replacement for the real clock; ``late_by`` holds the delays of the next wake-ups [s]."""
 
-    waits = False
+    pauses_when_late = False
 
     def __init__(self, start: float = 0.0) -> None:
         super().__init__(start)

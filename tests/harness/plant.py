@@ -7,7 +7,7 @@ from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.table import ContactTable
-from softfinger.tools.watched import Watched
+from softfinger.tools.simulated_daemon import SimulatedDaemon
 
 MODULUS = 0.304e6
 WIDTH = 0.040
@@ -53,7 +53,7 @@ def settled(hand: SimulatedHand, goals, current: float, seconds: float = 2.0) ->
     run(hand, seconds)
 
 
-def push_along(hand: Watched, force: float, rate: float, start: float = 0.0) -> float:
+def push_along(hand: SimulatedDaemon, force: float, rate: float, start: float = 0.0) -> float:
     """Push the object along its faces from ``start`` to ``force`` [N] at ``rate`` [N/s].
 
     A positive force is directed away from the palm; the push is kept. Returns the largest fraction

@@ -8,7 +8,7 @@ from typing import Any
 import msgpack
 
 from softfinger.daemon.errors import Refused
-from softfinger.daemon.loop.build import Daemon, facts
+from softfinger.daemon.loop.build import Daemon, hand_info
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.wire.command_server import Handler
 from softfinger.daemon.wire.loop_link import Link
@@ -79,7 +79,9 @@ def published(
     with Daemon(settings, hand=load(path, changes=(*common, *hand))) as daemon:
         publisher = daemon.publisher
         publisher._link = Keeping(taken)
-        publisher.settings(daemon.clock.wall(), daemon.clock.now(), facts(settings, daemon.models))
+        publisher.settings(
+            daemon.clock.wall(), daemon.clock.now(), hand_info(settings, daemon.models)
+        )
         daemon.loop._server = script
         daemon.loop.advance(seconds)
     return taken

@@ -6,7 +6,7 @@ import numpy as np
 
 from softfinger.daemon.control.modes import Mode
 from softfinger.daemon.perception.grasp import GraspState
-from softfinger.daemon.perception.perception import Repeats
+from softfinger.daemon.perception.perception import RepeatDetector
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.safety.limits import LIMITS
 from softfinger.daemon.safety.safety import Safety
@@ -26,8 +26,8 @@ class Sensor:
     def __init__(self, finger: int) -> None:
         self.finger = finger
         self.frame: Frame | None = None
-        self.changed = 0.0
-        self.repeats = Repeats(100.0)
+        self.changed_time = 0.0
+        self.repeats = RepeatDetector(100.0)
         self.estimate = ContactEstimate()
         self.full_count = SETTINGS.tactile.full_count
         self.noise = 0.0
@@ -36,7 +36,7 @@ class Sensor:
     def give(self, t: float, data: Any) -> None:
         last, self.frame = self.frame, Frame(0, t, t, True, np.array(data, np.uint16))
         if last is None or not np.array_equal(last.data, self.frame.data):
-            self.changed = t
+            self.changed_time = t
 
 
 def safety(has_servos: bool = True, has_sensors: bool = True, **parts: Any) -> Safety:

@@ -8,7 +8,7 @@ import pytest
 
 from softfinger import Fingertip, Material, SensorGrid
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.types import Frame, HandFacts, SensorFacts
+from softfinger.daemon.types import Frame, HandInfo, SensorInfo
 from softfinger.daemon.wire import schema
 from softfinger.tools.analysis.analyse import analyse, open_source, write_csv
 from softfinger.tools.recordings.record import RecordingWriter
@@ -47,9 +47,9 @@ def check(path: Path) -> None:
 
 def save_stream(path: Path, counts: np.ndarray, settings: Settings) -> None:
     writer = RecordingWriter(path)
-    facts = HandFacts("0.1.0", settings.model_dump_json(), "", "", "", "")
+    facts = HandInfo("0.1.0", settings.model_dump_json(), "", "", "", "")
     writer.add(schema.SETTINGS, message_maker(schema.SETTINGS)(1, 1e9, 1.0, facts))
-    sensor = SensorFacts(PITCH, PITCH, 0.0, 0.0, 0.0, "count", SCALE, False, "")
+    sensor = SensorInfo(PITCH, PITCH, 0.0, 0.0, 0.0, "count", SCALE, False, "")
     for k, data in enumerate(counts):
         frame = Frame(k + 1, 0.01 * k, 0.01 * k, True, data)
         message = message_maker(schema.TACTILE)(frame, data, 0, sensor, 1e9 + 0.01 * k)

@@ -10,7 +10,7 @@ from softfinger.daemon.perception.calibration_file import load_calibration
 from softfinger.daemon.wire.schema import STATE
 from softfinger.tools.cli import main
 from softfinger.tools.recordings.reader import Recording
-from softfinger.tools.watched import Watched
+from softfinger.tools.simulated_daemon import SimulatedDaemon
 from tests.harness.recorded_hand import record_hand
 from tests.unit.test_control import grasped
 
@@ -40,7 +40,7 @@ def test_a_daemon_begins_with_what_grips_told(start, profile, addresses, tmp_pat
     assert f"gain {found[0].gain[0]:.3f} ± " in capsys.readouterr().out
 
     wrong = {"simulation": {"tactile_gain": (0.6, 1.4)}, "tactile": {"calibration": files}}
-    with Watched(wrong) as after:
+    with SimulatedDaemon(wrong) as after:
         first = grasped(after, 8.0).force
         assert first[-250:].mean() == pytest.approx(8.0, rel=0.05)
         assert first.max() < 1.12 * 8.0

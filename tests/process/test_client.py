@@ -16,8 +16,8 @@ import pytest
 from softfinger import AsyncHand, Hand, HandFault, HandState, NoAnswer, NoStream, NotInTime, Refused
 from softfinger.daemon.client import command_client
 from softfinger.daemon.client.asynchronous import AsyncSubscription
-from softfinger.daemon.client.command_client import UNCONFIRMED
-from softfinger.daemon.client.connection import SILENCE, still_waiting
+from softfinger.daemon.client.command_client import UNCONFIRMED_TEXT
+from softfinger.daemon.client.connection import SILENCE_TIME, still_waiting
 from softfinger.daemon.client.hand import Subscription
 from softfinger.daemon.client.stream import Gaps, read, to_columns
 from softfinger.daemon.errors import HandClosed, SettingsError
@@ -100,7 +100,7 @@ def test_waiting_ends_in_time(hand):
 
 def test_who_waits_for_a_daemon_says_for_what(addresses, caplog):
     stream, commands = addresses
-    timeout = SILENCE + 0.05
+    timeout = SILENCE_TIME + 0.05
     unanswered = rf"no answer to arm from {commands} within 1\.05 s"
 
     async def ask() -> None:
@@ -195,7 +195,7 @@ def test_a_late_command_is_sent_again_with_its_key_and_a_refused_one_is_not(fake
     assert caught.value.reason == "mode"
     assert len(fake.requests) == 4
     assert len(set(fake.keys)) == 2
-    monkeypatch.setattr(command_client, "AGAIN_AFTER", 100.0)  # no time is left for a second try
+    monkeypatch.setattr(command_client, "RETRY_DELAY", 100.0)  # no time is left for a second try
     fake.replies["arm"] = LATE
     with pytest.raises(Refused, match="old when its turn came") as caught:
         arm(fake, 60.0)
@@ -361,7 +361,7 @@ def test_torque_that_is_not_confirmed_off_is_warned_of(fake, hand, caplog):
     assert not caplog.messages
     fake.replies["disarm"] = {"ok": True, "torque_off": "unconfirmed"}
     hand.disarm()
-    assert caplog.messages == [UNCONFIRMED]
+    assert caplog.messages == [UNCONFIRMED_TEXT]
 
 
 def test_a_closed_hand_says_so(hand):

@@ -27,7 +27,7 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import checks
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.simulation.emulator.emulator import EmulatedServos
-from softfinger.kinematics.compiled.kernel_folder import find_folder
+from softfinger.kinematics.compiled.kernel_folder import find_kernel_folder
 from softfinger.tools.cli import main
 from softfinger.tools.setup import doctor
 from tests.conftest import Addresses
@@ -77,7 +77,7 @@ def hands(tmp_path: Path) -> Iterator[Callable[..., Hand]]:
 def short(monkeypatch: pytest.MonkeyPatch) -> None:
     """Measure this machine for less long than on metal, and leave its sockets alone."""
     monkeypatch.setattr(doctor, "check_addresses", lambda _: [])
-    monkeypatch.setattr(machine, "_WAKE_UPS", 5)
+    monkeypatch.setattr(machine, "_WAKE_UP_COUNT", 5)
 
 
 def scanned(capsys: pytest.CaptureFixture[str], folder: Path, *words: str) -> list[str]:
@@ -350,7 +350,7 @@ def test_memory_idle_states_and_clocks(tmp_path, monkeypatch):
 def test_kernels_are_told_where_they_are_or_are_not(tmp_path, monkeypatch):
     scene = Settings.model_validate({"servos": {"backend": "none"}, "tactile": {"backend": "none"}})
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    monkeypatch.setattr(warm_up, "kernel_folder", find_folder)
+    monkeypatch.setattr(warm_up, "kernel_folder", find_kernel_folder)
     (found,) = kernels.check_kernels(scene)
     assert found.status == "warn"
     assert "contact table, joints and timing not compiled yet" in found.text
@@ -382,7 +382,7 @@ def profile(addresses: Addresses) -> Settings:
 def test_free_and_taken_sockets(addresses, monkeypatch):
     settings = profile(addresses)
     assert [each.status for each in ports.check_addresses(settings)] == ["pass", "pass"]
-    monkeypatch.setattr("softfinger.daemon.diagnosis.ports._PATIENCE", 0.05)
+    monkeypatch.setattr("softfinger.daemon.diagnosis.ports._TIMEOUT", 0.05)
     host, port = addresses[0].removeprefix("tcp://").split(":")
     with socket.create_server((host, int(port))):
         taken, free = ports.check_addresses(settings)

@@ -21,12 +21,12 @@ from softfinger.daemon.client.stream import read
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.wire import schema
 from softfinger.tools import cli
-from softfinger.tools.viewing.foxglove_server import CLIENTS, PROTOCOLS
-from softfinger.tools.viewing.planar import hand_parts
+from softfinger.tools.viewing.foxglove_server import CLIENT_COUNT_MAX, PROTOCOLS
+from softfinger.tools.viewing.hand_drawing import hand_parts
 from tests.conftest import until
 from tests.harness.daemon_process import started
 from tests.harness.fake_daemon import FakeDaemon, event, frame, state
-from tests.process.test_strangers import place
+from tests.process.test_untrusted_clients import place
 
 TOPICS = {
     "hand/state": "hand.state",
@@ -219,7 +219,7 @@ def test_a_client_that_takes_nothing_makes_room_for_another(stranger):
     fake.changes = {"fault": "x" * 30_000}  # states that fill a buffer soon
     with ExitStack() as stack:
         lazy = []
-        for _ in range(CLIENTS):
+        for _ in range(CLIENT_COUNT_MAX):
             client = stack.enter_context(
                 socket.create_connection(place(address.removeprefix("ws://")), timeout=WAIT)
             )
@@ -234,7 +234,7 @@ def test_a_client_that_takes_nothing_makes_room_for_another(stranger):
         for client in lazy:
             for channel in range(len(TOPICS)):
                 client.sendall(masked({"subscriptions": [{"id": 1, "channelId": channel}]}))
-        until(lambda: connections(address) < CLIENTS)
+        until(lambda: connections(address) < CLIENT_COUNT_MAX)
         with connected(address) as line:
             Client(line)  # is welcomed
 

@@ -35,7 +35,7 @@ from softfinger.daemon.wire.publisher import GATEWAY_TOPICS, Publisher
 from tests.conftest import Addresses, until
 from tests.harness.daemon_process import SOFTFINGER, ask, python
 from tests.harness.terminal_process import TerminalProcess
-from tests.process.test_strangers import place
+from tests.process.test_untrusted_clients import place
 
 
 @pytest.fixture
@@ -176,9 +176,9 @@ def test_its_memory_has_a_bound_and_it_yields_to_the_loop(addresses):
     try:
         limits = Path(f"/proc/{gateway.process}/limits").read_text(encoding="ascii")
         (data,) = [line for line in limits.splitlines() if line.startswith("Max data size")]
-        assert int(data.split()[3]) <= bounds.MEMORY
+        assert int(data.split()[3]) <= bounds.MEMORY_MAX
         (files,) = [line for line in limits.splitlines() if line.startswith("Max open files")]
-        assert int(files.split()[3]) <= bounds.CLIENTS + bounds.DESCRIPTORS
+        assert int(files.split()[3]) <= bounds.CLIENT_COUNT_MAX + bounds.DESCRIPTOR_COUNT
         assert os.sched_getscheduler(gateway.process) == os.SCHED_OTHER
     finally:
         gateway.close()
@@ -207,8 +207,9 @@ def test_a_loop_whose_gateway_reads_nothing_drops_messages_and_goes_on(addresses
 def test_a_stop_on_this_machine_needs_no_place_among_the_clients(
     ticking, addresses, inline, monkeypatch
 ):
-    monkeypatch.setattr(supervisor, "_LOOKS", math.inf)  # a stopped gateway is not replaced
-    monkeypatch.setattr(command_client, "LOCALLY", 60.0)  # a busy machine has no other way here
+    # A stopped gateway is not replaced, and a busy machine has no other way here.
+    monkeypatch.setattr(supervisor, "_STOPPED_COUNT_MAX", math.inf)
+    monkeypatch.setattr(command_client, "LOCAL_STOP_TIMEOUT", 60.0)
     where = ["--address", ",".join(addresses)]
     with (
         Hand(*addresses, timeout=60.0) as hand,

@@ -15,7 +15,7 @@ import zmq.auth
 from softfinger import Hand, NoStream
 from softfinger.daemon.client.command_client import NoAnswer, send
 from softfinger.daemon.errors import KeyFileError, NoDescriptor
-from softfinger.daemon.gateway.endpoints import Admission, StartAnew
+from softfinger.daemon.gateway.endpoints import Admission, RestartNeeded
 from softfinger.daemon.wire.keys import load_client, load_server, make_keys
 from tests.conftest import Addresses, until
 from tests.harness.gateway import Served
@@ -124,10 +124,10 @@ def test_strangers_that_leave_no_descriptor_shut_nobody_out_and_keep_nobody_in(
             load_server(folder)
         keys.look(1.0)
         (clients / "alice.key").unlink()
-        with pytest.raises(StartAnew, match="shut out: alice"):
+        with pytest.raises(RestartNeeded, match="shut out: alice"):
             keys.look(2.0)
         clients.chmod(0o777)
-        with pytest.raises(StartAnew, match="may be written by others"):
+        with pytest.raises(RestartNeeded, match="may be written by others"):
             keys.look(3.0)
     finally:
         keys.stop()

@@ -296,10 +296,10 @@ def test_no_wait_ends_without_a_stream_and_with_it(fake):
 
 DAEMON = """
 import signal, sys, threading
-from softfinger.tools.processes.beside import MonitorBeside
+from softfinger.tools.processes.child_processes import MonitorProcess
 over = threading.Event()
 signal.signal(signal.SIGINT, lambda *_: over.set())
-with MonitorBeside(sys.argv[1], sys.argv[2], on_end=over.set) as page:
+with MonitorProcess(sys.argv[1], sys.argv[2], on_end=over.set) as page:
     open(sys.argv[3], "w").write(str(page.process.pid))
     over.wait(300.0)
 print("ended", over.is_set(), flush=True)

@@ -55,12 +55,12 @@ for module, names in (
 WORK = """
 import gymnasium
 from softfinger import read_recording
-from softfinger.tools.ending import Ending
+from softfinger.tools.stop_condition import StopCondition
 
 from pathlib import Path
 
 recorded = read_recording(Path(sys.argv[1]))
-with Ending(0.0) as ending:
+with StopCondition(0.0) as ending:
     ending.begin()
     assert ending.wait(60.0)
 environment = gymnasium.make("softfinger.gym:SoftFinger-Grasp-v0")

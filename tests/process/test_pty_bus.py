@@ -11,7 +11,7 @@ import pytest
 import serial
 
 from softfinger.daemon.servos import control_table as reg
-from softfinger.daemon.simulation.emulator.pty_bus import PASSAGE, PtyServoBus
+from softfinger.daemon.simulation.emulator.pty_bus import PASSAGE_TIME, PtyServoBus
 from softfinger.daemon.simulation.servo_model import framing
 from softfinger.daemon.simulation.servo_model.framing import BROADCAST, frame
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
@@ -70,13 +70,13 @@ def test_replies_take_the_wires_time_and_the_return_delay_one_after_another(wire
     write = frame(BROADCAST, framing.WRITE, b"\x41\x00\x01")
     wire.send(write)
     wire.send(PING)
-    due = (len(write) + len(PING) + PONG) * 10 / 57600 + 500e-6 - 2 * PASSAGE
+    due = (len(write) + len(PING) + PONG) * 10 / 57600 + 500e-6 - 2 * PASSAGE_TIME
     assert wire.when(due - 1e-5) == b""
     assert len(wire.when(2e-5)) == PONG
     wires.append(wire := Wire(make_bus(), 57600, spin=0.0))
     wire.send(frame(BROADCAST, framing.PING))
     byte = 10 / 57600
-    first = (len(PING) + PONG) * byte + 500e-6 - 2 * PASSAGE
+    first = (len(PING) + PONG) * byte + 500e-6 - 2 * PASSAGE_TIME
     assert wire.when(first - 1e-5) == b""
     assert len(wire.when(2e-5)) == PONG
     second = PONG * byte + 500e-6  # the replies of a group follow each other

@@ -242,7 +242,7 @@ def test_temperature_and_supply_come_with_the_joints(bus, servos):
 
 
 def test_both_kinds_of_read_give_the_same_joints(bus, servos, monkeypatch):
-    monkeypatch.setattr(dynamixel, "_HEALTH_EVERY", math.inf)  # one wide read, and no other
+    monkeypatch.setattr(dynamixel, "_HEALTH_INTERVAL", math.inf)  # one wide read, and no other
     wide = read(servos, Reading())
     narrow = read(servos, Reading())
     assert wide.temperature[0] > 0.0

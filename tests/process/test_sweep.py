@@ -66,7 +66,7 @@ def test_a_cluster_gives_the_same_and_outlives_a_worker(tmp_path):
 
 def test_a_scheduler_that_is_not_there_is_told(monkeypatch, capsys):
     pytest.importorskip("distributed")
-    monkeypatch.setattr("softfinger.tools.sweep._CONNECT", 0.2)
+    monkeypatch.setattr("softfinger.tools.sweep._CONNECT_TIMEOUT", 0.2)
     words = ["--size", "40", "--mass", "1", "--friction", "0.6", "--shape", "disc"]
     assert main(["envelope", *words, "--scheduler", "tcp://127.0.0.1:9"]) == 1
     assert "tcp://127.0.0.1:9: no Dask scheduler answers" in capsys.readouterr().err
@@ -100,7 +100,7 @@ def test_another_sweeps_journal_is_refused(tmp_path):
 
 
 ENVELOPE = "envelope --shape rectangle --size 3 40 --mass 1 --friction 0.6 --keep"
-CAMPAIGN = "bench witnesses --only '6 N: honest' --trials 2 --json"
+CAMPAIGN = "bench faults --only '6 N: honest' --trials 2 --json"
 
 
 @pytest.mark.extended

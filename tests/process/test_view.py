@@ -26,8 +26,8 @@ from websockets.sync.client import connect
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.publisher import pack
-from softfinger.tools.ending import Ending
 from softfinger.tools.recordings.reader import Recording
+from softfinger.tools.stop_condition import StopCondition
 from softfinger.tools.viewing.page import listen
 from softfinger.tools.viewing.pictures import TOPICS, Pictures, Row
 from softfinger.tools.viewing.sources import Playback, ViewError, follow
@@ -405,7 +405,7 @@ def test_a_recording_is_shown_from_any_place(recorded):
     states = [message for _, message in recording.messages([schema.STATE])]
     kept = Kept()
     playback = Playback(recording, kept.pictures, 0.01)
-    with Ending() as ending:
+    with StopCondition() as ending:
         thread = threading.Thread(target=playback.run, args=(ending,))
         thread.start()
         try:
@@ -476,7 +476,7 @@ def test_while_a_picture_is_drawn_states_wait(context, addresses):
     kept, drawn = Kept(live=True), threading.Event()
     kept.pictures.draw, draw = drawn.wait, kept.pictures.draw
     arguments = argparse.Namespace(address=addresses[0], keys=None, rate=100.0, no_wait=False)
-    with Ending() as ending:
+    with StopCondition() as ending:
         words = arguments, None, kept.pictures, ending, kept.said.append
         thread = threading.Thread(target=follow, args=words)
         thread.start()

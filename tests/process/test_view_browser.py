@@ -11,8 +11,8 @@ import pytest
 
 from softfinger import Hand
 from softfinger.tools.recordings.reader import Recording
-from softfinger.tools.terminal.feed import MEANINGS
-from softfinger.tools.viewing.planar import COLOURS
+from softfinger.tools.terminal.stream_state import GLOSSARY
+from softfinger.tools.viewing.hand_drawing import COLOURS
 from tests.conftest import until
 from tests.harness.daemon_process import PATIENCE
 from tests.harness.daemon_process import ask as command
@@ -383,7 +383,7 @@ def test_the_page_keeps_up_survives_sleep_and_reload_and_asks_nobody_else(page, 
         assert "Watching" in page.text("aside")
         page.click("#help")
         explained = page("document.querySelector('#explained').innerText")
-        assert not [each for each in sum(MEANINGS, ()) if each not in explained]
+        assert not [each for each in sum(GLOSSARY, ()) if each not in explained]
         page.click("#explained button")
         until(lambda: page.text(".fault") == "Fault: <b>tip.force</b>: 31 N")
         page.key("Space", " ", text=" ")

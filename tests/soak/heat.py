@@ -13,12 +13,12 @@ import sys
 from copy import copy
 from typing import NamedTuple
 
-from softfinger.daemon.control.modes import GRIPPING
+from softfinger.daemon.control.modes import GRIPPING_MODES
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.safety.heat import HeatWatch
 from softfinger.daemon.simulation.servo_model.servo_joint import ServoHeat
 from softfinger.daemon.types import State
-from softfinger.tools.watched import Watched
+from softfinger.tools.simulated_daemon import SimulatedDaemon
 
 LIMIT = 70.0  # °C
 _DT = 0.5  # s
@@ -70,7 +70,7 @@ class Bench:
         reading.t = self.t
         reading.current[0] = noisy
         reading.temperature[0] = float(round(self.plant.sensed))
-        self._watch.follow()
+        self._watch.update()
         return self.state.heat[0].time_to_limit
 
 
@@ -121,11 +121,11 @@ def held(seed: int, seconds: float = 400.0) -> Held:
         0.2 * chance.uniform(0.75, 1.33),
     )
     simulation = {"servo_heat": factors, "ambient": chance.uniform(25.0, 40.0), "seed": seed}
-    with Watched({"simulation": simulation}) as hand:
+    with SimulatedDaemon({"simulation": simulation}) as hand:
         hand.grasp(chance.uniform(20.0, 26.0))
         hand.run(seconds)
         told = [text for _, kind, text in hand.events if kind == "servos.heat"]
-        return Held(hand.mode not in GRIPPING, hand.state.goal.force, told)
+        return Held(hand.mode not in GRIPPING_MODES, hand.state.goal.force, told)
 
 
 def main(argv: list[str] | None = None) -> int:

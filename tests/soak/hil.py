@@ -30,8 +30,8 @@ from softfinger.daemon.client.command_client import NoAnswer
 from softfinger.daemon.client.hand import Hand
 from softfinger.daemon.errors import NoStream
 from softfinger.tools.benchmarks.rigs import SOFTFINGER, RigError
-from softfinger.tools.ending import Ending
 from softfinger.tools.recordings.reader import Recording
+from softfinger.tools.stop_condition import StopCondition
 from tests.soak.rig import CASES, End, Rig, judge_wire
 
 SECONDS = 3600.0
@@ -309,9 +309,9 @@ def _conclude(account: Account) -> None:
 def subscribe(address: str) -> None:
     """Print "ready" at the first state, and at the end the number of received and lost states."""
     received = 0
-    with Ending() as ending, Hand(address, timeout=60.0) as hand, hand.stream(1.0) as states:
+    with StopCondition() as ending, Hand(address, timeout=60.0) as hand, hand.stream(1.0) as states:
         ending.begin()
-        while not ending.over:
+        while not ending.is_met:
             with suppress(NoStream):  # the daemon may be gone
                 next(states)
                 received += 1

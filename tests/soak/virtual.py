@@ -33,7 +33,7 @@ from softfinger.daemon.errors import Refused, ServoError
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.loop.publishing import Publishing
 from softfinger.daemon.perception.frame_channels import REJECTED_MAX
-from softfinger.daemon.perception.hand_state import CURRENT_TIME
+from softfinger.daemon.perception.hand_state import CURRENT_OFF_TIME_MAX
 from softfinger.daemon.profile.load import checked
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS, GRIP_FRACTION, Frame, Goal, Reading
@@ -607,7 +607,7 @@ class Soak:
         if mode not in ("disarmed", "fault"):
             self._judge_ages(mode)
         self._judge_forces(state.t)
-        self._judge_witnesses(mode)
+        self._judge_sensor_faults(mode)
 
     def _judge_torque(self) -> None:
         if self.servos.armed:
@@ -660,7 +660,7 @@ class Soak:
         found = f"{force:.2f} N for {t - self._above[key]:.3f} s, bound {bound:.2f} N"
         self.must(name, t - self._above[key] <= _TOO_LONG, found)
 
-    def _judge_witnesses(self, mode: str) -> None:
+    def _judge_sensor_faults(self, mode: str) -> None:
         if not self._covered():
             self._uncovered_t = self.daemon.loop.state.t
         for name in self._doubts(mode in _GRIPPING):
@@ -681,10 +681,10 @@ class Soak:
             if (
                 found.rejected_count[finger] > REJECTED_MAX
                 or (held and found.has_bias[finger])
-                or sensor.repeats.long
+                or sensor.repeats.is_fault
             ):
                 yield f"{side}_sensor"
-            if found.current_off_time[finger] > CURRENT_TIME:
+            if found.current_off_time[finger] > CURRENT_OFF_TIME_MAX:
                 yield f"{side}_current"
 
     def _names(self, name: str) -> None:

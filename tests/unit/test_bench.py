@@ -15,10 +15,17 @@ from softfinger.tools.benchmarks import (
     bench,
     control,
     estimator,
+    faults,
     measuring,
     reflex,
     tick,
-    witnesses,
+)
+from softfinger.tools.benchmarks.faults import (
+    BOUNDED,
+    SETTLES,
+    FaultCase,
+    GripTrial,
+    measure,
 )
 from softfinger.tools.benchmarks.measuring import (
     Report,
@@ -27,13 +34,6 @@ from softfinger.tools.benchmarks.measuring import (
 )
 from softfinger.tools.benchmarks.rigs import RigError
 from softfinger.tools.benchmarks.virtual_grip import VirtualGrip, Watch
-from softfinger.tools.benchmarks.witnesses import (
-    BOUNDED,
-    SETTLES,
-    GripTrial,
-    WitnessCase,
-    measure,
-)
 
 
 def test_turns_and_times(monkeypatch):
@@ -92,9 +92,9 @@ def test_a_measurement_that_misses_its_aim_is_no_success(monkeypatch, capsys):
         asked.append((trials, only))
         return [Report("part", [{"name": "x"}], failed=trials == 7)]
 
-    monkeypatch.setattr(witnesses, "measure", measure)
-    assert cli.main(["bench", "witnesses"]) == 0
-    assert cli.main(["bench", "witnesses", "--trials", "7", "--only", "honest"]) == 1
+    monkeypatch.setattr(faults, "measure", measure)
+    assert cli.main(["bench", "faults"]) == 0
+    assert cli.main(["bench", "faults", "--trials", "7", "--only", "honest"]) == 1
     assert asked == [(None, ""), (7, "honest")]
     capsys.readouterr()
 
@@ -103,9 +103,9 @@ def test_a_measurement_that_misses_its_aim_is_no_success(monkeypatch, capsys):
     ("words", "text"),
     [
         (["tik"], "found 'tik', expected one of estimator"),
-        (["witnesses", "--only", "no such lie"], "no case of witnesses has this in its name"),
+        (["faults", "--only", "no such lie"], "no case of faults has this in its name"),
         (["tick", "--full"], "--full: for reflex alone"),
-        (["--trials", "3"], "--trials: for witnesses or robustness alone"),
+        (["--trials", "3"], "--trials: for faults or robustness alone"),
     ],
 )
 def test_refusals_come_before_the_measurements(words, text, capsys):
@@ -137,11 +137,11 @@ ASKEW = {"object_angle": math.radians(5.0)}
     ("way", "low", "high"),
     [
         (control.WAYS["energy"], 4.0, 5.0),
-        (control.LATE["two-phased, 0 ms"], 0.0, 0.2),
-        (control.LATE["two-phased, 300 ms"], 0.0, 1.0),
-        (control.LATE["energy, 0.5 Hz, 300 ms"], 0.0, 1.0),
-        (control.LATE["energy, 4 Hz, 0 ms"], 0.0, 0.2),
-        (control.LATE["energy, 4 Hz, 50 ms"], 5.0, 45.0),
+        (control.LATE_LIMITS["two-phased, 0 ms"], 0.0, 0.2),
+        (control.LATE_LIMITS["two-phased, 300 ms"], 0.0, 1.0),
+        (control.LATE_LIMITS["energy, 0.5 Hz, 300 ms"], 0.0, 1.0),
+        (control.LATE_LIMITS["energy, 4 Hz, 0 ms"], 0.0, 0.2),
+        (control.LATE_LIMITS["energy, 4 Hz, 50 ms"], 5.0, 45.0),
         (control.LIMITS["torque constants 5 % apart"], 1.5, 3.0),
         (control.LIMITS["tips without tangential coupling"], 0.2, 1.2),
     ],
@@ -237,7 +237,7 @@ def test_a_watch_measures_forces_times_and_places():
     ],
 )
 def test_what_misses_an_aim(aim, changes, missed):
-    case = WitnessCase("a case", aim, 6.0, "left:drift=0.2@0..2", ("left_sensor",), comes=2.0)
+    case = FaultCase("a case", aim, 6.0, "left:drift=0.2@0..2", ("left_sensor",), comes=2.0)
     met = GripTrial(("left_sensor",), settled=1.0, events=[(1.29, "witness.left_sensor")])
     assert met.missed(case) == []
     assert replace(met, **changes).missed(case) == missed

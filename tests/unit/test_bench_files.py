@@ -14,9 +14,9 @@ from softfinger import Fingertip, Material, SensorGrid
 from softfinger.daemon.clock import VirtualClock
 from softfinger.daemon.errors import RecordingError, TactileError
 from softfinger.daemon.perception.finger_model import make_models
-from softfinger.daemon.perception.zero import UnpressedCells
+from softfinger.daemon.perception.unloaded_cells import UnloadedCells
 from softfinger.daemon.profile.settings import Settings, TactileSettings
-from softfinger.daemon.profile.validation import sensor_doubts
+from softfinger.daemon.profile.validation import sensor_warnings
 from softfinger.daemon.tactile.frame_files import load_recording
 from softfinger.daemon.tactile.replay import ReplayTactile
 from softfinger.tools.analysis.analyse import analyse, open_source
@@ -444,7 +444,7 @@ def test_a_sensor_of_another_size_than_the_tip_wants_is_told(changes, told):
         section, name = key.split(".")
         tables.setdefault(section, {})[name] = value
     settings = Settings.model_validate(tables)
-    doubts = sensor_doubts(settings)
+    doubts = sensor_warnings(settings)
     events: list[tuple[str, str, str]] = []
     make_models(settings, lambda *event: events.append(event))
     warned = [text for level, _, text in events if level == "warning"]
@@ -456,7 +456,7 @@ def test_a_sensor_of_another_size_than_the_tip_wants_is_told(changes, told):
 def test_a_solid_tips_sensor_covers_its_base():
     solid = {"tip": {"physics": "solid"}, "material": {"law": "constant"}}
     settings = Settings.model_validate({**solid, "tactile": {"rows": 28}})
-    (doubt,) = sensor_doubts(settings)
+    (doubt,) = sensor_warnings(settings)
     assert "smaller than the tip's base, 40 mm wide" in doubt
 
 
@@ -465,11 +465,11 @@ def test_a_solid_tips_sensor_covers_its_base():
 def test_the_noise_of_a_sensor_no_larger_than_its_tip_is_seen_from_frame_to_frame(zero, noise):
     rng = np.random.default_rng(5)
     grid = SensorGrid(24, 24, PITCH)
-    cells = UnpressedCells(grid, 0.020, np.ones(grid.shape, bool))
+    cells = UnloadedCells(grid, 0.020, np.ones(grid.shape, bool))
     press = 2000.0 * (np.hypot(*(np.indices(grid.shape) - 11.5)) < 5.0)
     for _ in range(60):
         frame = zero + press + noise * rng.standard_normal(grid.shape)
-        cells.follow(np.clip(np.round(frame), 0, 65535).astype(np.uint16))
+        cells.update(np.clip(np.round(frame), 0, 65535).astype(np.uint16))
     assert cells.noise == 0.0
     assert cells.scatter == pytest.approx(noise, rel=0.2, abs=0.4)
 

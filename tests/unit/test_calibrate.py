@@ -183,7 +183,7 @@ def test_subscribers_get_counts_or_the_calibrated_pressure(bench, tmp_path):
         with Daemon(each, wire=False) as daemon:
             daemon.loop.advance(0.05)
             (perception,) = daemon.loop.perception.fingers
-            frame, facts = perception.frame, perception.facts
+            frame, facts = perception.frame, perception.info
             shown = perception.published()
             message = tactile_message(frame, shown, 0, facts, 1.0)
         assert message["centre_x"] == calibration.centre.centre[0]

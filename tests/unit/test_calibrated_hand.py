@@ -183,7 +183,7 @@ class Bench:
 
     def tare(self, base: float) -> None:
         self.perception.tare()
-        while self.perception.taring:
+        while self.perception.is_taring:
             self.feel(np.zeros((44, 44)), base)
 
 

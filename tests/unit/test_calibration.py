@@ -8,7 +8,7 @@ import pytest
 
 from softfinger.kinematics.calibration.calibration import (
     CalibrationError,
-    cleared,
+    above_zero,
     equilibrate,
     fit_centre,
     fit_curve,
@@ -144,9 +144,9 @@ def test_the_modulus_of_a_compression_run_with_an_unknown_zero():
 def test_clipped_noise_far_from_the_contact_is_cleared():
     noise = np.full((32, 32), 3.0)
     reading = np.maximum(3.0 * RNG.standard_normal((16, 32, 32)).mean(axis=0), 0.0)
-    assert cleared(reading, noise, 16).sum() <= 0.01 * reading.sum() + 8.0
+    assert above_zero(reading, noise, 16).sum() <= 0.01 * reading.sum() + 8.0
     reading[4, 4] = 50.0
-    assert cleared(reading, noise, 16)[4, 4] == 50.0
+    assert above_zero(reading, noise, 16)[4, 4] == 50.0
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from softfinger.daemon.gateway import bounds
 from softfinger.daemon.gateway.bounds import Config
 from softfinger.daemon.gateway.supervisor import Gateway
 from softfinger.daemon.loop import build
-from softfinger.daemon.loop.loop import start_age
+from softfinger.daemon.loop.loop import command_age_max
 from softfinger.daemon.loop.requests import Command, Lease, parse
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.wire.command_server import decode
@@ -105,7 +105,7 @@ def test_multipart_nonsense_and_clients_that_go_away_change_nothing(server, cont
 def test_what_came_before_a_fence_is_refused_and_what_comes_after_is_not(
     context, addresses, monkeypatch, under_way
 ):
-    monkeypatch.setattr(bounds, "UNDER_WAY", under_way)
+    monkeypatch.setattr(bounds, "UNANSWERED_MAX", under_way)
     with Served(commands=addresses[1]) as served:
         early = Asking(context, served, addresses[1], "arm")
         until(lambda: [served.settle(1), served.link.asked][1])
@@ -189,8 +189,8 @@ def test_a_proxy_may_stand_between(context, addresses):
         ([ARM], 0, True),
         ([b"", ARM], 1, True),
         ([b"id", b"", ARM], 2, True),
-        ([*[b"hop"] * (bounds.PARTS - 3), b"", ARM], bounds.PARTS - 2, True),
-        ([*[b"hop"] * (bounds.PARTS - 2), b"", ARM], 0, False),
+        ([*[b"hop"] * (bounds.PART_COUNT_MAX - 3), b"", ARM], bounds.PART_COUNT_MAX - 2, True),
+        ([*[b"hop"] * (bounds.PART_COUNT_MAX - 2), b"", ARM], 0, False),
         ([b"x" * 700, b"x" * 400, b"", ARM], 0, False),
         ([b"", ARM, ARM], 1, False),  # a REQ socket that sends two frames
         ([b"id", ARM], 0, False),
@@ -253,12 +253,12 @@ def test_age_is_counted_from_before_a_stall_of_either_process(context, addresses
         # libzmq's own thread may come later than the gateway's look after the stall.
         until(lambda: [served.serve(aged), asking.socket.poll(0)][1])
         assert msgpack.unpackb(asking.socket.recv())["reason"] == "late"
-        pass_time(clock, bounds.GAP / 2)
+        pass_time(clock, bounds.POLL_GAP_MAX / 2)
         served.serve(aged)
         asking.send("arm")
         until(lambda: [served.serve(aged), asking.socket.poll(0)][1])
         assert msgpack.unpackb(asking.socket.recv()) == {"ok": True, "count": 1}
-        assert 0.0 <= aged.ages[0] <= bounds.GAP
+        assert 0.0 <= aged.ages[0] <= bounds.POLL_GAP_MAX
 
 
 def keyed(name: str = "arm", key: str = "k") -> bytes:
@@ -286,7 +286,7 @@ def test_a_late_command_is_carried_out_when_it_is_repeated_unless_another_was_me
         until(lambda: [served.serve(aged), asking.socket.poll(0)][1])
         assert msgpack.unpackb(asking.socket.recv())["reason"] == "late"
         for _ in range(4):  # the gap is over
-            pass_time(clock, bounds.PURGE / 2)
+            pass_time(clock, bounds.REFUSAL_TIME / 2)
             served.serve(aged)
         if meanwhile == "signal":
             served.server.raise_fence()
@@ -320,7 +320,7 @@ def test_a_fence_is_passed_only_after_some_time_without_a_gap(context, addresses
     with Served(commands=addresses[1], clock=clock) as served:
         served.server.raise_fence()
         served.settle()
-        pass_time(clock, 2.0 * bounds.GAP)
+        pass_time(clock, 2.0 * bounds.POLL_GAP_MAX)
         served.settle()
         assert served.link.stops == 0
         until(lambda: served._is_open())
@@ -377,7 +377,9 @@ def test_of_setpoints_that_wait_only_the_newest_is_carried_out(context, addresse
         until(lambda: [served.settle(1), commands.count + len(served.link.asked) == 40][1])
         until(lambda: [served.serve(note), collected()][1])
         assert {19, 119} <= set(forces), "the newest of each connection"
-        assert len(forces) <= 2 * -(-40 // bounds.UNDER_WAY), "of those that the loop has at a time"
+        assert len(forces) <= 2 * -(-40 // bounds.UNANSWERED_MAX), (
+            "of those that the loop has at a time"
+        )
         refused = {each["reason"] for found in replies for each in found if not each["ok"]}
         assert refused == {"superseded"}
 
@@ -402,22 +404,22 @@ def test_long_requests_are_unpacked_over_several_ticks_and_a_stop_before_them(co
             socket.setsockopt(zmq.LINGER, 0)
             socket.connect(addresses[1])
         long = msgpack.packb({"command": "move", "x": [[[1]] * 60] * 20})
-        for _ in range(bounds.UNDER_WAY):
+        for _ in range(bounds.UNANSWERED_MAX):
             client.send(long)
         asked = served.link.asked
-        until(lambda: [served.settle(1), len(asked) == bounds.UNDER_WAY][1])
+        until(lambda: [served.settle(1), len(asked) == bounds.UNANSWERED_MAX][1])
         stopper.send(msgpack.packb({"command": "stop"}))
-        until(lambda: [served.settle(1), len(asked) == bounds.UNDER_WAY + 1][1])
+        until(lambda: [served.settle(1), len(asked) == bounds.UNANSWERED_MAX + 1][1])
         served.server.serve(note)
         assert heard == ["stop"]
-        assert len(asked) == bounds.UNDER_WAY - -(-4096 // len(long))
+        assert len(asked) == bounds.UNANSWERED_MAX - -(-4096 // len(long))
         replies: list[str] = []
 
         def answered() -> bool:
             served.serve(note)
             while client.poll(0):
                 replies.append(msgpack.unpackb(client.recv())["reason"])
-            return len(replies) == bounds.UNDER_WAY
+            return len(replies) == bounds.UNANSWERED_MAX
 
         until(answered)
         assert set(replies) == {"request"}
@@ -635,7 +637,7 @@ def test_a_command_that_is_too_old_has_no_effect(make, name, mode, oldest):
 
 def test_a_shorter_watchdog_of_real_servos_bounds_the_age_of_a_start():
     def age(waits: bool = False, **servos: Any) -> float:
-        return start_age(Settings.model_validate({"servos": servos}), waits)
+        return command_age_max(Settings.model_validate({"servos": servos}), waits)
 
     real = {"backend": "dynamixel", "port": "/dev/ttyUSB0"}
     assert age(**real, watchdog=0.1) == 0.1

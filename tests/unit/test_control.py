@@ -11,7 +11,7 @@ from softfinger.daemon.control.setpoint import Setpoint, SetpointState
 from softfinger.daemon.control.state_machine import Settled
 from softfinger.daemon.errors import Refused
 from softfinger.daemon.profile.load import load
-from softfinger.tools.watched import Watched
+from softfinger.tools.simulated_daemon import SimulatedDaemon
 
 PAPER: dict[str, dict[str, Any]] = {
     "material": {"law": "constant"},
@@ -22,19 +22,19 @@ ANGLE = math.radians(10.0)
 KNOWN = 0.06  # share of a grip's force that one grip's torques leave unsure
 
 
-def watched(sections: dict[str, dict[str, Any]], **simulation: float) -> Watched:
+def watched(sections: dict[str, dict[str, Any]], **simulation: float) -> SimulatedDaemon:
     plant = sections.get("simulation", {}) | simulation
-    return Watched(sections | {"simulation": plant})
+    return SimulatedDaemon(sections | {"simulation": plant})
 
 
-def grasped(hand: Watched, force: float = 10.0, seconds: float = 2.0) -> Any:
+def grasped(hand: SimulatedDaemon, force: float = 10.0, seconds: float = 2.0) -> Any:
     """Grasp and return what was seen from the first touch of both tips on."""
     hand.grasp(force)
     seen = hand.watch(seconds)
     return seen.since(int(np.flatnonzero((seen.force > 0.3).all(axis=1))[0]))
 
 
-def settled(hand: Watched, angle: float) -> float:
+def settled(hand: SimulatedDaemon, angle: float) -> float:
     """Turn to ``angle`` and return when the object stays within 0.2° of it [s]."""
     hand.command("rotate", angle=angle)
     seen = hand.watch(2.0)
@@ -266,7 +266,7 @@ def test_a_step_of_the_setpoint_never_overshoots():
 
 def test_the_small_hand_grasps_and_turns():
     profile = Path(__file__).parents[2] / "config" / "small.toml"
-    with Watched(load(profile).model_dump()) as hand:
+    with SimulatedDaemon(load(profile).model_dump()) as hand:
         seen = grasped(hand, force=1.0)
         assert seen.force.max() < 1.1
         assert seen.force[-250:].mean() == pytest.approx(1.0, rel=0.08), "gears hold some of it"
@@ -369,7 +369,7 @@ FORCE = 8.0  # N
 def test_a_sensor_with_flaws_grasps_turns_and_holds_and_nothing_is_falsely_warned_of(
     profile, off, angle
 ):
-    with Watched(load(Path(profile)).model_dump()) as hand:
+    with SimulatedDaemon(load(Path(profile)).model_dump()) as hand:
         hand.run(0.3)
         hand.command("tare")
         hand.grasp(FORCE)
@@ -391,7 +391,7 @@ def test_a_sensor_with_flaws_grasps_turns_and_holds_and_nothing_is_falsely_warne
 @pytest.mark.extended
 def test_a_hand_that_does_not_know_of_its_cells_response_takes_it_for_latency():
     sections = load(Path("velostat"), changes=["tactile.response=0"]).model_dump()
-    with Watched(sections) as hand:
+    with SimulatedDaemon(sections) as hand:
         hand.grasp(FORCE)
         hand.run(4.0)
         hand.command("rotate", angle=math.radians(8.0))
@@ -404,7 +404,7 @@ def test_a_hand_that_does_not_know_of_its_cells_response_takes_it_for_latency():
 def test_a_force_that_friction_keeps_a_little_off_counts_as_reached_after_2_s(
     monkeypatch, share, holds
 ):
-    with Watched({}) as hand:
+    with SimulatedDaemon({}) as hand:
         hand.grasp(6.0)
         monkeypatch.setattr(type(hand.control.fingers), "force", property(lambda _: share * 6.0))
         while not hand.plant.normal.min() > 4.0:

@@ -53,7 +53,7 @@ def test_the_laws_that_are_found_on_other_elements_are_as_which_model_says() -> 
             (control.WAYS, "upright (blind)"),
             (control.LIMITS, "torque constants 5 % apart"),
             (control.LIMITS, "tips without tangential coupling"),
-            (control.LATE, "two-phased, 300 ms"),
+            (control.LATE_LIMITS, "two-phased, 300 ms"),
         )
     ],
 )

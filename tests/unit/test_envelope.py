@@ -8,7 +8,7 @@ from softfinger.daemon.control.envelope import Envelope
 from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.profile.settings import Settings
 from softfinger.tools.cli import main
-from softfinger.tools.watched import Watched
+from softfinger.tools.simulated_daemon import SimulatedDaemon
 
 
 def settings(width: float = 0.040, **control: Any) -> Settings:
@@ -39,7 +39,7 @@ def test_outside_of_it_the_reply_says_what_and_why():
 
 def test_a_grasp_outside_is_warned_of_in_its_reply():
     for width, warned in ((0.002, True), (0.040, False)):
-        with Watched({"object": {"width": width, "width_min": 0.0005}}) as hand:
+        with SimulatedDaemon({"object": {"width": width, "width_min": 0.0005}}) as hand:
             hand.run(0.3)
             hand.command("arm")
             hand.run(0.2)

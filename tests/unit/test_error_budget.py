@@ -257,14 +257,14 @@ def test_with_all_that_a_profile_declares_errors_are_as_large_as_it_says(profile
             rotation=rng.normal(0.0, known.rotation),
         )
         gain = math.exp(rng.normal(0.0, known.gain))
-        firmness = math.exp(rng.normal(0.0, known.modulus))
+        modulus_factor = math.exp(rng.normal(0.0, known.modulus))
         zero = rng.normal(0.0, known.baseline) + rng.normal(0.0, known.slope) * across
         zero = zero + rng.normal(0.0, known.slope) * across[:, None]
         for _ in range(5):
             d = math.exp(rng.uniform(math.log(5e-4), math.log(7e-3)))
             tilt, azimuth = math.radians(rng.uniform(0.0, 20.0)), rng.uniform(0.0, 2.0 * math.pi)
             truth = d, *tilts(tilt, azimuth)
-            frame = firmness * gain * true.pressure(tip, material, *truth)
+            frame = modulus_factor * gain * true.pressure(tip, material, *truth)
             width = 0.6 * math.sqrt(2.0 * tip.radius * d) / board.pitch
             frame = frame + known.smooth * smooth_error(frame, width, hand % 3, rng) + zero
             frame += rng.normal(0.0, board.noise, frame.shape)
@@ -282,7 +282,7 @@ def test_with_all_that_a_profile_declares_errors_are_as_large_as_it_says(profile
             variance = slopes @ covariance @ slopes
             # Springs' force has the modulus besides; a solid tip's frame shows their product.
             variance += (known.modulus * c.force) ** 2 if physics == "springs" else 0.0
-            true_force = firmness * float(table(d, tilt).force)
+            true_force = modulus_factor * float(table(d, tilt).force)
             forces.append(abs(c.force - true_force) < 1.96 * math.sqrt(variance))
             inside.append(np.abs(error) < 1.96 * np.sqrt(covariance.diagonal()))
     assert len(squares) > 0.6 * frames

@@ -125,7 +125,7 @@ def test_one_hot_cell_is_no_contact(estimator):
     frame = rng.normal(0.0, 600.0, (44, 44))
     frame[25, 20] = 1e5
     e = estimator(frame)
-    assert (e.contact, e.d, e.rejected) == (False, 0.0, 1)
+    assert (e.contact, e.d, e.rejected_count) == (False, 0.0, 1)
 
 
 def test_one_hot_cell_beside_or_in_a_contact_changes_nothing(estimator):
@@ -139,7 +139,7 @@ def test_one_hot_cell_beside_or_in_a_contact_changes_nothing(estimator):
             frame[cell] = 1.2e5
             e = estimator(frame)
             assert e.valid
-            assert e.rejected == 1
+            assert e.rejected_count == 1
             assert abs(e.d - without.d) < 1.5 * without.d_std
 
 
@@ -174,8 +174,8 @@ def test_what_is_not_one_contact_is_not_valid(estimator):
         e = estimator(frame)
         assert e.contact
         assert not e.valid
-    assert estimator(large + small).second
-    assert not estimator(large).second
+    assert estimator(large + small).has_second_contact
+    assert not estimator(large).has_second_contact
 
 
 @pytest.mark.parametrize(

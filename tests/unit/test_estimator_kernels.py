@@ -68,7 +68,7 @@ def test_activity_matches_its_plain_twin():
         activity(state.array, frame.ravel(), height)
         found = state.signal
         assert found.contact == expected
-        assert found.finite
+        assert found.is_finite
         inner = frame[active]
         assert found.mean == pytest.approx(inner.mean())
         assert found.energy == pytest.approx((inner**2).sum())
@@ -99,7 +99,7 @@ def test_cells_near_the_floor_are_compared_with_what_they_read_on_average(floor)
     state = EstimatorState()
     state.grid.rows = state.grid.cols = 1
     state.signal.scale, state.signal.saturation, state.signal.floor = 1.0, math.inf, floor
-    state.fit.clip = noise
+    state.fit.clip_noise = noise
     rows = np.zeros((ROWS, 1))
     for model in np.linspace(max(floor - 1.9 * noise, 20.0), floor + 6.0 * noise, 9):
         rows[STRESS] = rows[MODEL] = model
@@ -109,12 +109,12 @@ def test_cells_near_the_floor_are_compared_with_what_they_read_on_average(floor)
         misfit = pytest.approx(residual**2, abs=2 * abs(residual) * 1e-3 * noise)
         assert state.fit.misfit == misfit
         assert rows[FACTOR, 0] == pytest.approx(float(response), abs=5e-3)
-        assert state.fit.weight == 1.0
+        assert state.fit.counted_cells == 1.0
     below = floor - (CLIP_BELOW + 0.1) * noise
     if below > 0.0:
         rows[STRESS] = rows[MODEL] = below
         compare(state.array, np.array([3300.0]), rows)
-        assert state.fit.weight == 0.0
+        assert state.fit.counted_cells == 0.0
 
 
 @pytest.mark.parametrize("ratio", [0.0, 0.3, 1.0, 2.0, 2.8])

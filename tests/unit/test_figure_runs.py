@@ -57,7 +57,7 @@ def test_the_path_is_the_papers(path):
 @pytest.fixture(scope="module")
 def sheets() -> tuple[Sheet, ...]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(slow_turn, "_SWING", 2.0)  # s
+        patch.setattr(slow_turn, "_SWING_TIME", 2.0)  # s
         slow_turn.slow_turn.cache_clear()
         found = slow_turn.slow_turn()
         slow_turn.slow_turn.cache_clear()
@@ -82,13 +82,13 @@ def test_forces_are_the_energys_slopes():
 @pytest.mark.extended
 def test_the_path_lies_on_the_floor_of_the_valley(sheets):
     equations, _, land = sheets
-    for lean in slow_turn.LEANS:
-        angle, v = land[f"angle at {lean} deg"], land[f"V at {lean} deg"]
+    for antisymmetric in slow_turn.ANTISYMMETRIC_ANGLES:
+        angle, v = land[f"angle at {antisymmetric} deg"], land[f"V at {antisymmetric} deg"]
         parabola = np.polyfit(angle[15:26], v[15:26], 2)
         assert parabola[0] > 0.1  # mJ/°²
         floor = -0.5 * parabola[1] / parabola[0]
         order = np.argsort(equations["lean"])
-        path = np.interp(lean, equations["lean"][order], equations["angle"][order])
+        path = np.interp(antisymmetric, equations["lean"][order], equations["angle"][order])
         assert floor == pytest.approx(path, abs=0.05)
 
 

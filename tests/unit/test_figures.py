@@ -17,7 +17,7 @@ from softfinger.kinematics.contact.material import Material
 from softfinger.tools import cli, style
 from softfinger.tools.paper import experiment_pages, figures, validate
 from softfinger.tools.paper.model_pages import double_integrals
-from softfinger.tools.paper.validate import Beside
+from softfinger.tools.paper.validate import PublishedValue
 from tests.harness.paper_tip import CHECKPOINTS
 
 NUMBERS = ("fig3", "fig4a", "fig4b", "fig5a", "fig5b", "fig7", "fig10", "fig10_shear")
@@ -276,7 +276,7 @@ def test_without_matplotlib_the_numbers_are_written(tmp_path, capsys, monkeypatc
 
 
 @pytest.fixture(scope="module")
-def rows() -> dict[str, Beside]:
+def rows() -> dict[str, PublishedValue]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(validate, "_TRIALS", 1)  # each takes a second
         return {each.quantity: each for each in validate.comparisons()}
@@ -290,7 +290,7 @@ def test_every_row_has_its_source_and_a_verdict_and_every_disagreement_a_reason(
         assert each.verdict == "agree" or each.why, each.quantity
 
 
-def test_springs_are_no_rubber_and_say_so(rows: dict[str, Beside]) -> None:
+def test_springs_are_no_rubber_and_say_so(rows: dict[str, PublishedValue]) -> None:
     springs = rows["ζ of F = C d^ζ, 1 to 7 mm: springs"]
     assert (springs.ours, springs.verdict) == ("2.00", "disagree")
     crossing = (4.0 / (3.0 * 0.75 * np.pi)) ** 2 * 20.0

@@ -44,11 +44,13 @@ def is_served(served: Served, context: Context, address: str) -> bool:
 def test_the_loop_is_given_few_requests_at_a_time_and_answers_all(
     served, context, addresses, clock
 ):
-    clients = [Asking(context, served, addresses[1], "arm") for _ in range(2 * bounds.UNDER_WAY)]
-    until(lambda: served.settle() or served.service.commands.count == bounds.UNDER_WAY)
+    clients = [
+        Asking(context, served, addresses[1], "arm") for _ in range(2 * bounds.UNANSWERED_MAX)
+    ]
+    until(lambda: served.settle() or served.service.commands.count == bounds.UNANSWERED_MAX)
     clock.sleep_until(clock.now() + 2.0)  # a machine that is busy
     served.settle()
-    assert len(served.link.asked) == bounds.UNDER_WAY
+    assert len(served.link.asked) == bounds.UNANSWERED_MAX
     assert is_served(served, context, addresses[1])
     told = [client.told() for client in clients]
     assert [reply.get("heard") for reply in told] == ["arm"] * len(clients)
@@ -57,8 +59,9 @@ def test_the_loop_is_given_few_requests_at_a_time_and_answers_all(
 @pytest.mark.parametrize(
     ("kind", "message"),
     [
-        (zmq.DEALER, b"x" * (bounds.FRAMES * 200 + 1)),  # a frame longer than four requests
-        (zmq.XSUB, b"\x01" + b"x" * bounds.SUBSCRIPTION),  # longer than any topic
+        # A frame longer than four requests
+        (zmq.DEALER, b"x" * (bounds.PART_SIZE_RATIO * 200 + 1)),
+        (zmq.XSUB, b"\x01" + b"x" * bounds.SUBSCRIPTION_SIZE_MAX),  # longer than any topic
     ],
 )
 def test_a_message_that_is_far_too_long_is_hung_up_on(served, context, addresses, kind, message):
@@ -107,7 +110,7 @@ def test_subscribers_that_come_and_go_do_not_have_all_told_again_each_time(
         until(lambda: served.settle() or not served.publisher.wanted & bit(STATE))
         other.close()
     assert not reader.poll(0)
-    clock.sleep_until(clock.now() + 2.0 * bounds.TELL_AGAIN)
+    clock.sleep_until(clock.now() + 2.0 * bounds.REPEAT_INTERVAL)
     until(lambda: [served.settle(), reader.poll(0)][1])
     reader.recv_multipart()
     assert not reader.poll(50)

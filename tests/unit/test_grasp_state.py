@@ -9,7 +9,7 @@ from softfinger import ContactTable, Fingertip, Material
 from softfinger.kinematics.contact.lookup import lookup
 from softfinger.kinematics.hand.grasp_state import (
     held_motion,
-    holding_levers,
+    holding_moment_arms,
     load_of,
     load_torques,
     sheared_gradient,
@@ -22,7 +22,7 @@ from tests.harness.plant import PAPER
 from tests.harness.reference_hand import ReferenceHand
 
 # Inner kernels, made callable.
-holding_levers = called(holding_levers)
+holding_moment_arms = called(holding_moment_arms)
 sheared_gradient = called(sheared_gradient)
 held_motion = called(held_motion)
 load_of = called(load_of)
@@ -56,7 +56,7 @@ def test_levers_are_the_torques_that_balance_the_grasp(grasp, delta):
         state = grasp.steer(state, delta)
     c = HAND.contacts(state.q, state.pose, WIDTH)
     data = grasp.table.data
-    lever1, lever2, *rest = holding_levers(
+    lever1, lever2, *rest = holding_moment_arms(
         data, data, tuple(c.d), tuple(c.theta), 0.0, motion_of(state)
     )
     forces = grasp.forces(state)
@@ -115,7 +115,9 @@ def test_what_holds_a_tapering_object_balances_it(grasp, taper):
     a, data = HAND.tip_radius, grasp.table.data
     theta = (angle - 0.5 * taper + q[0], angle + 0.5 * taper - q[1])
     motion = held_motion(q, d, angle, taper, LENGTHS)
-    lever1, lever2, mean, normal1, normal2 = holding_levers(data, data, d, theta, taper, motion)
+    lever1, lever2, mean, normal1, normal2 = holding_moment_arms(
+        data, data, d, theta, taper, motion
+    )
     lean = math.tan(0.5 * taper)
     normal = 0.5 * (normal1 + normal2)
     shear = (mean - lean * normal, mean + lean * normal)
@@ -146,7 +148,7 @@ def test_each_tip_has_its_own_table(grasp):
     def levers(left, right, q1, q2, d1, d2, angle):
         motion = held_motion((q1, q2), (d1, d2), angle, 0.2, LENGTHS)
         theta = angle - 0.1 + q1, angle + 0.1 - q2
-        return holding_levers(left, right, (d1, d2), theta, 0.2, motion)
+        return holding_moment_arms(left, right, (d1, d2), theta, 0.2, motion)
 
     here = levers(soft, stiff, q1, q2, d1, d2, angle)
     mirrored = levers(stiff, soft, q2, q1, d2, d1, -angle)
@@ -202,7 +204,7 @@ def test_without_two_contacts_there_are_no_levers_and_no_load(table):
     rolled = (0.0, 0.0)
     found = load_torques(data, data, (0.0, 1e-3), (0.1, -0.1), 0.0, motion, rolled, (0.5, 0.5))
     assert found == (0.0, 0.0, 0.0, 0.0)
-    assert holding_levers(data, data, (0.0, 1e-3), (0.1, -0.1), 0.0, motion) == (0.0,) * 5
+    assert holding_moment_arms(data, data, (0.0, 1e-3), (0.1, -0.1), 0.0, motion) == (0.0,) * 5
 
 
 def test_torques_that_no_load_explains_give_a_finite_one(table):
@@ -225,7 +227,7 @@ def test_load_on_a_tapering_object_is_told_from_what_presses_it_out(table, taper
     theta = (q[0] - 0.5 * taper, 0.5 * taper - q[1])
     data, lean = table.data, math.tan(0.5 * taper)
     motion = held_motion(q, d, angle, taper, LENGTHS)
-    _, _, mean, normal1, normal2 = holding_levers(data, data, d, theta, taper, motion)
+    _, _, mean, normal1, normal2 = holding_moment_arms(data, data, d, theta, taper, motion)
     out = 0.5 * lean * (normal1 + normal2)
     rolled = (mean - out, mean + out)
     # The torques of both tips' energies, each with the shear that it bears.

@@ -260,7 +260,7 @@ def test_advance_is_idempotent_and_split_ways_are_bit_identical():
     hands[2].advance(1.0)
 
     def state(hand):
-        parts = ("state", "gears", "felt", "energy", "samples")
+        parts = ("state", "gears", "sensed_contact", "energy", "sample_count")
         return [hand.plant.array[part].tobytes() for part in parts]
 
     before = state(hands[0])
@@ -279,15 +279,15 @@ def test_samples_stand_at_the_frames_instants_between_sub_steps():
         for joint in range(2):
             h.drive(joint, BOUNDED, True, 0.6, 0.4)
         h.advance(5.15)
-    assert hand.samples == finer.samples == 20
-    for number in range(hand.samples - 5, hand.samples):
+    assert hand.sample_count == finer.sample_count == 20
+    for number in range(hand.sample_count - 5, hand.sample_count):
         sample, exact = hand.sample(number), finer.sample(number)
         assert sample.t == number / 130.0
         # A tick's motion is 1e-4 rad and 4e-6 m: a sample that isn't interpolated is off by that.
         np.testing.assert_allclose(sample.d, exact.d, atol=8e-7)
         np.testing.assert_allclose(sample.theta, exact.theta, atol=1e-5)
     with pytest.raises(LookupError):
-        hand.sample(hand.samples)
+        hand.sample(hand.sample_count)
     with pytest.raises(LookupError):
         hand.sample(0)
 

@@ -69,7 +69,7 @@ def test_bristles_far_stiffer_than_the_step_stick_too():
     assert hand.q[0] == pytest.approx(0.6 * presliding, abs=presliding)
     assert abs(hand.dq[0]) < 1e-9
     assert hand.plant.state.bristles[0] == pytest.approx(0.6 * presliding, rel=1e-6)
-    assert hand.plant.guarded == 0
+    assert hand.plant.limited_step_count == 0
 
 
 # Slip.
@@ -135,7 +135,7 @@ def test_a_level_that_changes_at_rest_adds_no_torque_to_the_bristles():
         load(hand, [motor], 0.02)  # longer than the motor's lag
         gears = hand.plant.gears[0]
         assert gears.friction == pytest.approx(FRICTION + share * motor, rel=1e-6)
-        return gears.friction * gears.bent / PRESLIDING
+        return gears.friction * gears.limited_deflection / PRESLIDING
 
     bent = 0.6 * FRICTION
     assert torque(0.0) == pytest.approx(bent, rel=1e-6)
@@ -183,7 +183,7 @@ def errors(torque: float, rate: float, stribeck: float, counts: Iterable[int]) -
         run(hand, SECONDS)
         state = (hand.q[0], hand.dq[0], hand.plant.state.bristles[0])
         found.append(np.abs((np.array(state) - exact) / SCALE).max())
-        assert hand.plant.guarded == 0
+        assert hand.plant.limited_step_count == 0
     return found
 
 

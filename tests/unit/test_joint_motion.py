@@ -40,7 +40,7 @@ class Joint:
         reading.t = max(reading.t, self.t + self.random.uniform(0.0003, 0.004) + held)
         reading.q[0] = COUNT * round(self.q / COUNT)
         reading.dq[0] = RATE * round(self.dq / RATE)
-        self.motion.follow(self.t, reading)
+        self.motion.update(self.t, reading)
         return self.motion.jumped
 
 

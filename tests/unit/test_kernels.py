@@ -44,7 +44,7 @@ def test_numba_alone_compiles_where_its_private_parts_are_not_known(why, monkeyp
         monkeypatch.setitem(sys.modules, "softfinger.kinematics.compiled.compiler", None)
     else:
         monkeypatch.setattr(numba, "__version__", why)
-    chosen, text = decorators._chosen()
+    chosen, text = decorators._chosen_compiler()
     assert chosen is plain
     assert why in text
 

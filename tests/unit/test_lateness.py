@@ -14,7 +14,7 @@ from softfinger.daemon.loop import build as build_module
 from softfinger.daemon.loop import timing
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.loop.publishing import parts
-from softfinger.daemon.loop.timing import EVERY, RECENT, Lateness
+from softfinger.daemon.loop.timing import ATTRIBUTION_TIME, REPORT_INTERVAL, Lateness
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import Timing
 from softfinger.daemon.wire.schema import STATE
@@ -85,7 +85,7 @@ def test_what_a_simulated_hand_does_is_the_same_however_late_the_machine(undistu
 def test_a_simulated_hand_waits_for_the_machine_and_says_so_now_and_then(
     on_late_machine, monkeypatch
 ):
-    monkeypatch.setattr(timing, "EVERY", 5.0)
+    monkeypatch.setattr(timing, "REPORT_INTERVAL", 5.0)
     daemon, machine, events = on_late_machine("auto", task={"name": "demo"})
     machine.work(60.0)  # building everything is no lateness
     machine.late_by = [0.0] * 100 + [0.4] + [0.0] * 50 + [0.5]
@@ -135,7 +135,7 @@ def test_a_fault_of_another_kind_names_no_busy_machine(on_late_machine):
     advance_to(daemon, "fault", 3.0)
     assert daemon.loop.state.fault_name == "servos.temperature"
     assert "busy" not in daemon.loop.state.fault
-    daemon.loop.advance(RECENT)
+    daemon.loop.advance(ATTRIBUTION_TIME)
     assert daemon.loop.state.timing.busy_s == 0.0
 
 
@@ -180,8 +180,8 @@ def looked(late: float, seconds: float) -> list[tuple[str, str, str]]:
 
 
 def test_lateness_is_told_when_it_has_doubled():
-    told = [event for event in looked(0.06, 17.0 * EVERY) if event[1] == "late"]
-    assert len(told) == 6  # at 0, 1, 2, 4, 8 and 16 times EVERY
+    told = [event for event in looked(0.06, 17.0 * REPORT_INTERVAL) if event[1] == "late"]
+    assert len(told) == 6  # at 0, 1, 2, 4, 8 and 16 times REPORT_INTERVAL
 
 
 def test_virtual_time_moves_only_by_waiting_and_never_back():

@@ -354,7 +354,7 @@ def test_every_row_is_named_once_a_level_and_its_settings_exist():
 def test_a_sensor_without_a_sound_estimate_is_told_with_its_reason_and_noise():
     sensor = Sensor(0)
     sensor.sensor = GivenFrames()
-    sensor.estimate = ContactEstimate(invalid=Invalid.MODEL)
+    sensor.estimate = ContactEstimate(invalid=Invalid.MODEL_MISMATCH)
     judge, state = safety(sensors=[sensor]), sound()
     state.contacts[0].t_valid = OLD
     sensor.noise = 1.2 * SETTINGS.tactile.noise

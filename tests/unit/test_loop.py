@@ -222,7 +222,7 @@ def test_a_tare_of_full_sensors_leaves_the_zero_and_is_told(make):
     blinded(daemon, daemon.settings.tactile.full_count)
     command(daemon, "tare")
     daemon.loop.advance(0.5)
-    assert not perception.taring
+    assert not perception.is_taring
     assert perception._estimator.saturation == before
     text = "right sensor's zero stays: most cells are full where nothing presses"
     assert events.count(("warning", "tare", text)) == 1

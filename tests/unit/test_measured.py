@@ -140,7 +140,7 @@ def test_a_frame_is_read_by_them_and_its_errors_are_known(law, d, degrees):
         squares.append(off**2 / found.covariance.diagonal()[:3])
     assert (np.mean(squares, axis=0) < 2.0).all()
     assert not estimator(NOISE * rng.standard_normal((32, 32))).contact
-    assert estimator(weird(0.008, 0.0)).invalid == Invalid.BEYOND
+    assert estimator(weird(0.008, 0.0)).invalid == Invalid.OUT_OF_RANGE
     two = weird(d, 0.0) + np.roll(weird(d, 0.0), 8, axis=0)
     assert not estimator(two).valid
     assert estimator(np.full((32, 32), 20e3)).invalid == Invalid.ABOVE_ZERO

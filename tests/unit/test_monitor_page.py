@@ -17,15 +17,15 @@ from rich.text import Text
 
 from softfinger.kinematics.estimation.invalid import Invalid
 from softfinger.tools.terminal import heatmap
-from softfinger.tools.terminal.feed import Feed, ShownReply
 from softfinger.tools.terminal.heatmap import picture, resample
 from softfinger.tools.terminal.monitor_page import MonitorPage
+from softfinger.tools.terminal.stream_state import ShownReply, StreamState
 from softfinger.tools.terminal.terminal import KeyDecoder
 from tests.harness import fake_daemon
 
 
-def fed(now: float = 0.0) -> Feed:
-    feed = Feed()
+def fed(now: float = 0.0) -> StreamState:
+    feed = StreamState()
     for k in range(50):
         give(feed, b"hand/state", fake_daemon.state(0.02 * k, k) | {"mono_ns": 20_000_000 * k}, now)
     for side in (0, 1):
@@ -33,11 +33,13 @@ def fed(now: float = 0.0) -> Feed:
     return feed
 
 
-def give(feed: Feed, topic: bytes, record: object, now: float = 0.0) -> None:
+def give(feed: StreamState, topic: bytes, record: object, now: float = 0.0) -> None:
     feed.read([topic, msgpack.packb(record)], now)
 
 
-def shown(feed: Feed, now: float = 0.0, width: int = 80, height: int = 24, **more: Any) -> str:
+def shown(
+    feed: StreamState, now: float = 0.0, width: int = 80, height: int = 24, **more: Any
+) -> str:
     reply = more.pop("reply", None)
     lines = MonitorPage(feed, "tcp://127.0.0.1:9872", **more).lines(width, height, now, reply)
     return check(lines, width, height)
@@ -63,7 +65,7 @@ def test_too_small_says_so(size):
 
 
 def test_nothing_known_shows_dashes():
-    text = shown(Feed())
+    text = shown(StreamState())
     assert "waiting for a daemon" in text
     assert text.count("—") >= 22
     assert "nan" not in text
@@ -109,14 +111,14 @@ def test_status_follows_the_age():
     feed = fed()
     assert [feed.status(now) for now in (0.4, 0.6, 1.9, 2.1)] == ["live", "stale", "stale", "lost"]
     assert "◐ stale" in shown(feed, 0.6)
-    slow = Feed()
+    slow = StreamState()
     for k in range(100):  # one state a second: a pause of 2 s is no loss
         give(slow, b"hand/state", fake_daemon.state(k, k) | {"mono_ns": k * 10**9}, float(k))
     assert [slow.status(99 + age) for age in (2.0, 4.0, 11.0)] == ["live", "stale", "lost"]
 
 
 def test_the_rates_are_those_of_states_and_ticks():
-    feed = Feed()
+    feed = StreamState()
     assert math.isnan(feed.rate)
     give(feed, b"hand/stats", {"rates": {"tick": 400.0}}, 0.0)
     assert "tick 400 Hz" in shown(feed)
@@ -127,7 +129,7 @@ def test_the_rates_are_those_of_states_and_ticks():
 
 
 def test_a_busy_machine_is_told_while_a_simulated_hand_waits_for_it():
-    feed = Feed()
+    feed = StreamState()
     states = [fake_daemon.state(1.0, seq) | {"mono_ns": 10**9 * (seq - 98)} for seq in (99, 100)]
     give(feed, b"hand/state", states[0] | {"behind_s": 1.55}, 10.0)
     assert "busy" not in shown(feed, 10.0)
@@ -138,7 +140,7 @@ def test_a_busy_machine_is_told_while_a_simulated_hand_waits_for_it():
 
 
 def test_a_new_daemon_begins_a_new_story():
-    feed = Feed()
+    feed = StreamState()
     for k in range(10):
         state = fake_daemon.state(0.0, 1000 + k) | {"mono_ns": (k + 1) * 10**7}
         give(feed, b"hand/state", state, 3.0)
@@ -175,7 +177,7 @@ TEXTS = ["first", "second", "third"]
 
 
 def test_events_told_again_are_shown_once_and_in_their_order():
-    feed = Feed()
+    feed = StreamState()
     give(feed, b"hand/event", told(3, 103.0, "third"))  # between subscription and telling again
     for seq in (1, 2, 3):
         give(
@@ -253,7 +255,7 @@ FIELDS += ["settings", "command", "client", "ok", "error", "again", "wake", "com
     st.lists(st.lists(st.binary(max_size=20), max_size=4), max_size=3),
 )
 def test_no_stream_breaks_the_page(records, garbage):
-    feed = Feed()
+    feed = StreamState()
     for topic, record in records:
         give(feed, topic, record)
     for message in garbage:
@@ -264,11 +266,11 @@ def test_no_stream_breaks_the_page(records, garbage):
 
 
 def test_a_frame_that_lies_about_its_size_is_skipped():
-    feed = Feed()
+    feed = StreamState()
     good = fake_daemon.frame(0.0, 0, size=8)
     for change in ({"rows": 9}, {"cols": -8, "rows": -8}, {"rows": True}, {"finger": "thumb"}):
         give(feed, b"hand/tactile", good | change)
-    assert (feed.skipped, feed.frames) == (4, {})
+    assert (feed.skipped_count, feed.frames) == (4, {})
     give(feed, b"hand/tactile", good)
     assert feed.frames["left"].grid.shape == (8, 8)
 

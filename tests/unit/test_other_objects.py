@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from softfinger.daemon.control.state_machine import Gripping
-from softfinger.tools.watched import Watched
+from softfinger.tools.simulated_daemon import SimulatedDaemon
 from tests.harness.reference_hand import ReferenceHand
 
 HAND = ReferenceHand()
 SLOW: dict[str, Any] = {"rate": 25.0}
 
 
-class Rig(Watched):
+class Rig(SimulatedDaemon):
     """A watched hand, brought to holding."""
 
     def grasp(self, force: float, seconds: float = 2.5) -> None:

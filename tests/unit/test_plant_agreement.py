@@ -277,7 +277,7 @@ def test_agreement_with_an_adaptive_solver_and_order_two(name, loss):
         hand = start(scene, loss, count)
         hand.advance(hand.t + SECONDS)
         errors.append(np.abs((compared(hand, scene) - exact) / scale).max())
-        assert hand.plant.guarded == 0  # smooth, so that the method alone is seen
+        assert hand.plant.limited_step_count == 0  # smooth, so that the method alone is seen
         assert hand.d.min() > 0.001
     assert errors[0] / errors[1] == pytest.approx(4, rel=0.1)
     assert errors[2] < 1e-6

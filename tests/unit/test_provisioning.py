@@ -11,7 +11,7 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos import provisioning
 from softfinger.daemon.servos.control_table import by_name
-from softfinger.daemon.servos.port import UNHURRIED, PortGone
+from softfinger.daemon.servos.port import UNPACED_TIMEOUT, PortLost
 from softfinger.daemon.servos.protocol import ServoLine
 from softfinger.daemon.servos.provisioning import (
     Found,
@@ -110,7 +110,7 @@ class Bus:
         self.t = 0.0
 
     @contextlib.contextmanager
-    def line(self, path: str, baud: int, timeout: float = UNHURRIED) -> Iterator[ServoLine]:
+    def line(self, path: str, baud: int, timeout: float = UNPACED_TIMEOUT) -> Iterator[ServoLine]:
         if baud < 0:
             raise ServoError("no such rate")
         port = DirectPort(self.bus, baud, timeout, self.t)
@@ -168,11 +168,11 @@ def test_a_search_recognises_servos_of_protocol_1(wired):
 
 def test_a_port_that_goes_away_ends_a_search(wired, monkeypatch):
     def gone(*_: object) -> None:
-        raise PortGone("the port is gone")
+        raise PortLost("the port is gone")
 
     wired()
     monkeypatch.setattr(ServoLine, "ping_all", gone)
-    with pytest.raises(PortGone):
+    with pytest.raises(PortLost):
         search("line")
 
 

@@ -17,7 +17,7 @@ from softfinger.kinematics.calibration.calibration import CalibrationError, fit_
 from softfinger.kinematics.contact.table import ContactTable
 from softfinger.tools.benchmarks.rigs import SOLID
 from softfinger.tools.cli import main
-from softfinger.tools.watched import Watched
+from softfinger.tools.simulated_daemon import SimulatedDaemon
 
 STRENGTHS, TIMES = (0.2, 0.15, 0.25), (0.004, 0.07, 1.4)
 SPEED = 0.02  # m/s
@@ -129,7 +129,7 @@ def grip(aware: bool, tip: dict[str, Any]) -> tuple[float, float, list[str]]:
     sections.setdefault("simulation", {})["tip_relaxation"] = STRENGTHS
     if aware:
         sections.setdefault("tip", {})["relaxation"] = STRENGTHS
-    with Watched(sections) as hand:
+    with SimulatedDaemon(sections) as hand:
         hand.grasp(8.0)
         hand.run(3.0)
         first = float(np.mean(hand.plant.force)) / 8.0
@@ -160,10 +160,10 @@ def test_calibrate_finds_it_in_a_run_of_frames(tmp_path, capsys):
     tip, material = make_tip(profile), make_material(profile.material)
     lasting = ContactTable.build(tip, material)(d, 0.0 * d).force
     h = np.array([follow(t, lasting, time) for time in TIMES])
-    firmness = 1.0 + np.array([0.0, 0.2, 0.3]) @ (1.0 - h / np.maximum(lasting, 1e-12))
+    relaxation_factor = 1.0 + np.array([0.0, 0.2, 0.3]) @ (1.0 - h / np.maximum(lasting, 1e-12))
     pressures = [grid.pressure(tip, material, each, 0.0) for each in d]
     counts = [rho * p / profile.tactile.pascal_per_count
-              for rho, p in zip(firmness, pressures, strict=True)]  # fmt: skip
+              for rho, p in zip(relaxation_factor, pressures, strict=True)]  # fmt: skip
     run, file = tmp_path / "press.npz", tmp_path / "left.json"
     np.savez(run, frames=np.rint(counts).astype(np.uint16), d=d)
     assert main(["calibrate", "relaxation", str(file), "--recording", str(run)]) == 0

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from softfinger.daemon.perception.zero import UnpressedCells
+from softfinger.daemon.perception.unloaded_cells import UnloadedCells
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from softfinger.tools.benchmarks.robustness import ROWS, HandCase, drawn, grip
 from softfinger.tools.benchmarks.virtual_grip import VirtualGrip
@@ -94,40 +94,40 @@ def frames(zero: float, cells: int = 32, pressed: int = 200) -> np.ndarray:
     return np.where(inside, pressed + zero, zero).astype(np.uint16)
 
 
-def unpressed(side: float = 0.058) -> UnpressedCells:
+def unpressed(side: float = 0.058) -> UnloadedCells:
     grid = SensorGrid(32, 32, side / 32)
-    return UnpressedCells(grid, 0.02, np.ones(grid.shape, np.bool_))
+    return UnloadedCells(grid, 0.02, np.ones(grid.shape, np.bool_))
 
 
 def test_a_zero_that_rises_is_taken_off_and_full_cells_stay_full():
     cells = unpressed()
     for zero in (3, 4, 9):
-        cells.follow(frames(zero))
-    assert cells.shift == 6
+        cells.update(frames(zero))
+    assert cells.zero_shift == 6
     counts = frames(9)
     counts[16, 16] = 255
     corrected = cells.corrected(counts, 255)
     assert corrected[16, 16] == 255
     assert corrected[0, 0] == 3
     assert corrected[16, 14] == 203
-    cells.forget_zero()
+    cells.reset_zero()
     assert cells.corrected(counts, 255) is counts
 
 
 def test_a_second_contact_beside_the_tip_is_no_zero():
     cells = unpressed()
-    cells.follow(frames(3))
+    cells.update(frames(3))
     touched = frames(3)
     touched[:, :6] = 100
-    cells.follow(touched)
-    assert cells.shift == 0
+    cells.update(touched)
+    assert cells.zero_shift == 0
 
 
 def test_a_sensor_that_the_tip_fills_tells_nothing():
     cells = unpressed(side=0.018)
     for zero in (3, 9):
-        cells.follow(frames(zero))
-    assert cells.shift == 0
+        cells.update(frames(zero))
+    assert cells.zero_shift == 0
     assert cells.noise == 0.0
 
 
@@ -137,5 +137,5 @@ def test_the_noise_is_that_of_cells_which_nothing_presses(zero, sigma):
     cells, rng = unpressed(), np.random.default_rng(1)
     for _ in range(40):
         noisy = frames(zero) + rng.normal(0.0, sigma, (32, 32))
-        cells.follow(np.clip(np.rint(noisy), 0, 255).astype(np.uint16))
+        cells.update(np.clip(np.rint(noisy), 0, 255).astype(np.uint16))
     assert cells.noise == pytest.approx(sigma, rel=0.25)

@@ -64,7 +64,7 @@ def test_a_demo_that_cannot_clear_its_fault_tries_again(make):
 def test_a_demo_whose_step_never_ends_begins_again(make):
     daemon = make(task={"name": "demo"})
     events = holding_demo(daemon)
-    daemon.loop._task._mode = "moving"  # which it never comes to
+    daemon.loop._task._end_mode = "moving"  # which it never comes to
     advance_to(daemon, "disarmed", 13.0)
     assert events[0][2].startswith("still holding after 10 s; the task stops it and begins again")
     advance_to(daemon, "holding", 6.0)
@@ -73,7 +73,7 @@ def test_a_demo_whose_step_never_ends_begins_again(make):
 def test_metals_demo_ends_with_the_first_fault(make):
     metal = Settings.model_validate({"task": {"name": "demo"}, "servos": {"backend": "dynamixel"}})
     task = Task.named(metal)
-    assert not task.lasting
+    assert not task.restarts
     daemon = make()
     daemon.loop._task = task
     events = holding_demo(daemon)

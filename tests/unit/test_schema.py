@@ -9,7 +9,7 @@ import msgpack
 import pytest
 
 from softfinger.daemon.client.stream import read
-from softfinger.daemon.types import Parts, State
+from softfinger.daemon.types import SceneParts, State
 from softfinger.daemon.wire import schema, schema_docs
 from softfinger.daemon.wire.publisher import packer
 from tests.harness.golden_wire import arguments, flat, golden_file, message_maker, sample
@@ -56,7 +56,7 @@ def test_the_json_schema_names_every_field(topic):
 def test_what_is_no_number_yet_goes_out_as_it_is():
     state = State()  # no reading yet: its time is −∞, and a grip's goal is no number
     assert message_maker(schema.INPUT)(state, (None, None))["reading"]["t"] == -math.inf
-    sent = message_maker(schema.STATE)(state, Parts((True, True), True, True))
+    sent = message_maker(schema.STATE)(state, SceneParts((True, True), True, True))
     assert math.isnan(sent["goal_force"])
 
 

@@ -130,7 +130,7 @@ def test_a_lasting_contact_creeps_up_and_its_mark_fades():
 
 def test_a_slow_cell_follows_a_step_to_63_per_cent_in_its_response_time():
     model = sensor(response=0.06)
-    assert model.remembers
+    assert model.has_memory
     final = counts(sensor(), CONTACTS[1]).sum()
     counts(model, (0.0, 0.0, 0.0), 0.0)
     begin = counts(model, CONTACTS[1], 1e-9).sum()
@@ -262,7 +262,7 @@ def test_all_at_once_is_the_same_for_a_seed():
         "gain_drift": 0.01,
     }
     first, again, other = (sensor(seed=seed, **flaws) for seed in ((1, 0), (1, 0), (1, 1)))
-    assert first.remembers
+    assert first.has_memory
     assert (counts(other, CONTACTS[1]) != counts(sensor(**flaws), CONTACTS[1])).any()
     for k, contact in enumerate(CONTACTS * 3):
         np.testing.assert_array_equal(

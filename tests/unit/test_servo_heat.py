@@ -14,15 +14,15 @@ from softfinger.daemon.safety.heat import set_law
 from softfinger.daemon.servos.control_table import by_name
 from softfinger.daemon.simulation.servo_model.servo_joint import ServoHeat
 from softfinger.kinematics.hand.servo_heat import (
-    LONGEST,
+    TIME_MAX,
     HeatState,
     follow,
-    lasting_square,
+    sustained_square,
     time_to_limit,
 )
 from softfinger.tools.calibration import joints as calibrating
 from softfinger.tools.cli import main
-from softfinger.tools.watched import Watched
+from softfinger.tools.simulated_daemon import SimulatedDaemon
 from tests.harness.golden_recording import RECORDING
 from tests.soak.heat import Bench, foreseen, least_at_half_load
 
@@ -64,7 +64,7 @@ def test_the_time_to_the_limit_is_that_of_the_equations(square):
     reached.terminal = True
     solved = solve_ivp(
         lambda _, x: derivative(state, x, square),
-        (0.0, LONGEST),
+        (0.0, TIME_MAX),
         state.x,
         events=reached,
         rtol=1e-8,
@@ -75,14 +75,14 @@ def test_the_time_to_the_limit_is_that_of_the_equations(square):
 def test_the_lasting_current_settles_at_the_limit():
     state = law(HeatState())
     follow(state.array, 0.0, 0.5, 30.0)
-    square = lasting_square(state.array, LIMIT)
+    square = sustained_square(state.array, LIMIT)
     solved = solve_ivp(
         lambda _, x: derivative(state, x, square), (0.0, 4e4), state.x, method="LSODA"
     )
     assert solved.y[1, -1] == pytest.approx(LIMIT, abs=0.1)
-    assert time_to_limit(state.array, square, LIMIT + 1.0) == LONGEST
+    assert time_to_limit(state.array, square, LIMIT + 1.0) == TIME_MAX
     state.x[2] = LIMIT + 5.0
-    assert lasting_square(state.array, LIMIT) == 0.0
+    assert sustained_square(state.array, LIMIT) == 0.0
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -151,10 +151,10 @@ def test_a_hold_that_hardly_warms_tells_nothing(tmp_path, capsys):
     assert "found 0 °C of warming, expected 8 at least" in capsys.readouterr().err
 
 
-def hot(force: float, seconds: float, **sections: dict[str, Any]) -> Watched:
+def hot(force: float, seconds: float, **sections: dict[str, Any]) -> SimulatedDaemon:
     """A grip on servos that soon get too hot: half the frames a hand has."""
     sections |= {"simulation": {"servo_heat": FAST, "ambient": 35.0}, "tactile": {"rate": 50.0}}
-    hand = Watched(sections)
+    hand = SimulatedDaemon(sections)
     hand.grasp(force)
     hand.run(2.0)
     assert hand.mode == Mode.HOLDING
@@ -164,7 +164,7 @@ def hot(force: float, seconds: float, **sections: dict[str, Any]) -> Watched:
     return hand
 
 
-def heat_events(hand: Watched) -> list[tuple[str, str]]:
+def heat_events(hand: SimulatedDaemon) -> list[tuple[str, str]]:
     return [(level, text) for level, kind, text in hand.events if kind == "servos.heat"]
 
 

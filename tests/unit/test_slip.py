@@ -9,7 +9,7 @@ from softfinger.daemon.control.grip import Grip
 from softfinger.daemon.perception.grasp import GraspState
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import ObjectPose, Reading
-from softfinger.tools.watched import Watched as Hand
+from softfinger.tools.simulated_daemon import SimulatedDaemon as Hand
 from tests.harness.plant import push_along
 from tests.unit.test_control import KNOWN, PAPER, grasped
 
@@ -88,7 +88,7 @@ def test_an_object_that_turns_in_the_grip_is_gripped_more_firmly():
             assert any("N: the object turns in it" in text for _, _, text in hand.events) == held
 
 
-class Watched:
+class GripUnderLoad:
     """A grip of a made-up object, whose loads are set."""
 
     def __init__(self, asked: float = FORCE, **control: float) -> None:
@@ -125,7 +125,7 @@ class Watched:
 
 
 def test_what_friction_may_be_is_not_a_load_and_what_it_can_not_is():
-    watched = Watched(friction_speed=1e6)  # nothing is given for what closing takes
+    watched = GripUnderLoad(friction_speed=1e6)  # nothing is given for what closing takes
     watched.run(1.5, 500, holding=False)
     watched.grip.begin_holding()
     assert watched.run(1.5, 500) == FORCE
@@ -138,9 +138,9 @@ def test_what_friction_may_be_is_not_a_load_and_what_it_can_not_is():
     assert found == pytest.approx(expected, rel=0.01)
 
 
-def at_rest(asked: float = FORCE) -> Watched:
+def at_rest(asked: float = FORCE) -> GripUnderLoad:
     """A grip that has been held for a while."""
-    watched = Watched(asked, friction_speed=1e6)
+    watched = GripUnderLoad(asked, friction_speed=1e6)
     watched.run(0.0, 500, holding=False, normal=asked)
     watched.grip.begin_holding()
     watched.run(0.0, 600, normal=asked)
@@ -202,7 +202,7 @@ def test_what_one_joint_alone_shows_is_no_sudden_load():
         watched.held.torque_residual = [0.0, torque]
         for _ in range(5):
             watched.grip.torques(Reading(), ObjectPose(), True)
-            assert not watched.grip.slip.reflex
+            assert not watched.grip.slip.reflex_triggered
 
 
 @pytest.mark.parametrize(
@@ -228,10 +228,10 @@ def test_noise_of_the_currents_is_no_load_and_a_load_in_it_is(force):
         assert watched.grip.target == force
     watched.held.torque_residual = [0.35, 0.35]
     watched.grip.torques(Reading(dq=[GIVES_WAY, GIVES_WAY]), ObjectPose(), True)
-    assert watched.grip.slip.reflex
+    assert watched.grip.slip.reflex_triggered
 
 
-def standing(load: float, asked: float = 4.0) -> Watched:
+def standing(load: float, asked: float = 4.0) -> GripUnderLoad:
     """A grip under a load that has come slowly, while no joint moved."""
     watched = at_rest(asked)
     for part in np.linspace(0.0, load, 500):
@@ -243,14 +243,14 @@ def standing(load: float, asked: float = 4.0) -> Watched:
 def test_torque_alone_raises_a_grip_by_three_tenths_unless_it_is_more_than_friction_can_hold():
     assert standing(1.7 * FRICTION).grip.target == pytest.approx(1.3 * 4.0)
     assert standing(3.0 * FRICTION).grip.target > 1.5 * 4.0
-    declared = Watched(4.0, object_load=6.0)
+    declared = GripUnderLoad(4.0, object_load=6.0)
     declared.grip.begin_holding()
     assert declared.run(0.0, 500) == pytest.approx(0.5 * 6.0 / (0.6 * 0.8))
 
 
 def test_friction_that_the_approach_has_shown_hides_as_much():
     for shown, raised in ((0.05, True), (0.2, False), (5.0, False)):
-        watched = Watched(friction_speed=1e6)
+        watched = GripUnderLoad(friction_speed=1e6)
         watched.held.free_torque = [shown, shown]
         watched.run(0.0, 500, holding=False)
         watched.grip.begin_holding()
@@ -265,7 +265,7 @@ def test_a_channel_that_is_named_ends_what_it_raised():
     assert watched.run(2.0 * FRICTION, 1, speed=GIVES_WAY) == FORCE + 10.0
     watched.held.sensor_fault = True
     assert watched.run(2.0 * FRICTION, 1, speed=GIVES_WAY) == FORCE
-    assert not watched.grip.slip.reflex
+    assert not watched.grip.slip.reflex_triggered
 
 
 def test_the_raise_is_bounded_by_its_setting_and_by_the_force_that_is_a_fault():
@@ -273,13 +273,13 @@ def test_the_raise_is_bounded_by_its_setting_and_by_the_force_that_is_a_fault():
         *((2.0, 10.0, 12.0), (100.0, 10.0, 27.0), (0.0, 10.0, 10.0)),
         (10.0, 0.5, 15.0),
     ):
-        watched = Watched(grip_raise_max=more, grip_raise_share=share)
+        watched = GripUnderLoad(grip_raise_max=more, grip_raise_share=share)
         watched.grip.begin_holding()
         assert watched.run(50.0, 500) == pytest.approx(expected)
 
 
 def test_a_grip_weaker_than_what_friction_hides_is_not_raised_on_torques():
-    watched = Watched(2.0)
+    watched = GripUnderLoad(2.0)
     watched.held.normal = [2.0, 2.0]
     watched.grip.begin_holding()
     assert {watched.run(4.0, 1, normal=2.0) for _ in range(1000)} == {2.0}
@@ -288,7 +288,7 @@ def test_a_grip_weaker_than_what_friction_hides_is_not_raised_on_torques():
 
 
 def test_no_load_shows_before_holding_begins_and_friction_that_turns_round_is_none():
-    watched = Watched()
+    watched = GripUnderLoad()
     assert {watched.run(20.0, 1, holding=False) for _ in range(500)} == {FORCE}
     watched.run(2.0, 500, holding=False)
     watched.grip.begin_holding()

@@ -106,5 +106,5 @@ def test_a_name_is_judged_by_what_was_made_wrong(soak):
         soak._hear("warning", "witness.right_sensor", "")
     soak.hand.object_pose[1] += 0.02  # the object's edge lies under the tips
     soak.hand.refresh()
-    soak._judge_witnesses("holding")
+    soak._judge_sensor_faults("holding")
     soak._hear("warning", "witness.right_sensor", "")

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from softfinger import ContactEstimator, ContactTable, Fingertip, Material, SensorGrid
-from softfinger.daemon.loop.build import facts
+from softfinger.daemon.loop.build import hand_info
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
 from softfinger.kinematics.estimation.estimator import Readings
@@ -194,7 +194,7 @@ def test_dead_full_and_lone_cells_are_left_out():
     readings = Readings(saturation=45e3)
     found = ContactEstimator(TIPS[0], RUBBER, GRID, NOISE, active=active, readings=readings)(frame)
     assert found.valid
-    assert found.rejected == 1
+    assert found.rejected_count == 1
     error = np.array([found.d, found.tilt_x, found.tilt_y]) - truth
     assert (np.abs(error) < 4.0 * np.sqrt(np.diag(found.covariance)[:3])).all()
 
@@ -241,7 +241,7 @@ def test_a_hand_with_solid_tips_grasps_turns_and_releases(make):
             assert abs(shear) > 0.2
             assert contact.shear_x == pytest.approx(shear, abs=0.15)
     assert state.fault == ""
-    assert json.loads(facts(daemon.settings, daemon.models).table_left)["form"] == "solid"
+    assert json.loads(hand_info(daemon.settings, daemon.models).table_left)["form"] == "solid"
     command(daemon, "release")
     daemon.loop.advance(1.5)
     assert state.mode == "armed"
@@ -303,7 +303,7 @@ def test_a_strong_signal_is_never_no_contact(frame):
     for _ in range(20):
         found = estimator.update(frame + NOISE * rng.standard_normal(GRID.shape))
         assert found.contact
-        assert found.invalid in (Invalid.MODEL, Invalid.ABOVE_ZERO)
+        assert found.invalid in (Invalid.MODEL_MISMATCH, Invalid.ABOVE_ZERO)
 
 
 @pytest.mark.parametrize(("kind", "scale"), [(np.uint8, 300.0), (np.uint16, 4.0)])
@@ -318,5 +318,5 @@ def test_heavy_noise_is_not_taken_for_a_free_tip(times):
     rng = np.random.default_rng(7)
     estimator = ContactEstimator(TIPS[0], RUBBER, GRID, NOISE)
     found = [estimator(times * NOISE * rng.standard_normal(GRID.shape)).invalid for _ in range(50)]
-    assert set(found) <= {Invalid.MODEL, Invalid.OUTLIERS, Invalid.NONE}
+    assert set(found) <= {Invalid.MODEL_MISMATCH, Invalid.OUTLIERS, Invalid.NONE}
     assert found.count(Invalid.NONE) < 10

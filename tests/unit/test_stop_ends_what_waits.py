@@ -37,7 +37,7 @@ class Scene:
         self.arrived: deque[list[zmq.Frame]] = deque()
         self.replies: list[dict[str, Any]] = []
         self.served = Served(commands=f"ipc://{folder}/c", per_second=1e6, clock=self.clock)
-        self.reading = 0.4 * bounds.TURN  # s that a message takes: few at a look
+        self.reading = 0.4 * bounds.TURN_TIME  # s that a message takes: few at a look
         self.now = 0
         self.stopped_at = 0
         self.asked = 0
@@ -78,7 +78,7 @@ class Scene:
             self.busy = what == "busy loop"
             self.served.server.serve(self._carry_out)
         elif what == "time":
-            self.pass_time(bounds.PURGE)
+            self.pass_time(bounds.REFUSAL_TIME)
         else:
             self.served.server.raise_fence()
             self.stopped_at = self.now
@@ -152,7 +152,11 @@ def test_a_backlog_that_libzmq_hands_on_bit_by_bit_dies_with_a_stop():
 
 def test_a_flood_does_not_date_commands_by_a_gap_for_ever():
     """No more can have waited than the connections hold, though the socket is never empty."""
-    with patch.object(bounds, "CLIENTS", 1), patch.object(bounds, "QUEUE", 20), played() as scene:
+    with (
+        patch.object(bounds, "CLIENT_COUNT_MAX", 1),
+        patch.object(bounds, "SOCKET_QUEUE_LENGTH", 20),
+        played() as scene,
+    ):
         door = scene.served.service.commands
         scene.pass_time(0.5)
         for _ in range(100):

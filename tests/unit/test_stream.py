@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import zmq
 
-from softfinger.daemon.types import Contact, Frame, HandFacts, Parts, SensorFacts, State
+from softfinger.daemon.types import Contact, Frame, HandInfo, SceneParts, SensorInfo, State
 from softfinger.daemon.wire.publisher import bit
 from softfinger.daemon.wire.schema import COMMAND, EVENT, STATE, TACTILE
 from tests.conftest import until
@@ -18,7 +18,7 @@ from tests.harness.golden_wire import message_maker
 
 state_message = message_maker(STATE)
 
-BOTH = Parts((True, True), servos=True, sensors=False)
+BOTH = SceneParts((True, True), has_servos=True, has_sensors=False)
 
 
 def subscribe(context: zmq.Context[Any], address: str, topic: bytes = b"") -> zmq.Socket[Any]:
@@ -60,7 +60,7 @@ def test_tactile_data_is_little_endian_uint16_row_major(context, addresses, serv
     until(lambda: wanted(served, TACTILE))
     assert not publisher.wanted & bit(STATE)
     data = np.arange(12, dtype=np.uint16).reshape(3, 4) * 1000
-    facts = SensorFacts(0.002, 0.003, 1e-4, -2e-4, 0.1, "count", 4.0, False, "A17 2026-01-02")
+    facts = SensorInfo(0.002, 0.003, 1e-4, -2e-4, 0.1, "count", 4.0, False, "A17 2026-01-02")
     publisher.send(TACTILE, Frame(7, 1.0, 1.25, True, data), data, 1, facts, 99.0)
     topic, message = receive(socket, served)
     assert topic == b"hand/tactile"
@@ -151,7 +151,7 @@ def test_a_subscriber_that_keeps_the_newest_state_alone_gets_it_in_one_frame(
 
 def test_who_comes_late_is_told_settings_and_events_again(context, addresses, served):
     publisher = served.publisher
-    publisher.settings(98.0, 0.5, HandFacts("0.1.0", "{}", "", "", "{}", "{}"))
+    publisher.settings(98.0, 0.5, HandInfo("0.1.0", "{}", "", "", "{}", "{}"))
     for k in range(60):
         publisher.event(99.0 + k, 1.0 + k, "info", "mode", f"event {k + 1}")
     served.settle()  # before anybody subscribes: that may be quicker
@@ -184,9 +184,9 @@ def test_who_comes_late_is_told_settings_and_events_again(context, addresses, se
 
 
 def test_a_long_message_comes_in_pieces_and_whole(context, addresses, served):
-    facts = HandFacts("0.1.0", "x" * 150_000, "", "", "{}", "{}")
+    facts = HandInfo("0.1.0", "x" * 150_000, "", "", "{}", "{}")
     grid = np.arange(256 * 256, dtype=np.uint16).reshape(256, 256)
-    sensor = SensorFacts(0.002, 0.003, 0.0, 0.0, 0.0, "count", 4.0, False, "")
+    sensor = SensorInfo(0.002, 0.003, 0.0, 0.0, 0.0, "count", 4.0, False, "")
     served.publisher.settings(98.0, 0.5, facts)
     served.settle()  # before anybody subscribes: else it comes twice
     socket = subscribe(context, addresses[0])

@@ -9,7 +9,7 @@ import pytest
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.kinematics.hand.upright import upright_spring
-from softfinger.tools.watched import Watched
+from softfinger.tools.simulated_daemon import SimulatedDaemon
 from tests.harness.plant import CONSTANT, CURRENT, PAPER, WIDTH, make, push_along
 
 LENGTHS = (0.05, 0.08, 0.0, 0.02)  # half the pivots' separation, finger, its offset, radius
@@ -80,7 +80,7 @@ def test_the_upright_law_needs_no_angle(sense, angle_known, simulation):
         "scene": {"object_model": angle_known},
         "simulation": {"object_angle": sense * START, **simulation},
     }
-    with Watched(sections) as hand:
+    with SimulatedDaemon(sections) as hand:
         hand.grasp(FORCE)
         hand.run(4.5)
         assert hand.mode == "holding"
@@ -97,8 +97,10 @@ def test_solid_tips_come_upright_too() -> None:
     # Bonded rubber has no local minimum: the law's spring is another one, by the tips' own table.
     sections = load(Path("solid")).model_dump(include={"tip", "material", "estimator", "safety"})
     simulation = {"object_angle": START}
-    with Watched({**sections, "control": {"law": "upright"}, "simulation": simulation}) as hand:
-        assert hand.estimator.grasp.tip_turning < 0.0
+    with SimulatedDaemon(
+        {**sections, "control": {"law": "upright"}, "simulation": simulation}
+    ) as hand:
+        assert hand.estimator.grasp.tilt_moment_ratio < 0.0
         hand.grasp(FORCE)
         hand.run(4.5)
         assert hand.mode == "holding"
@@ -107,7 +109,9 @@ def test_solid_tips_come_upright_too() -> None:
 
 def test_ticks_that_come_late_do_not_make_the_dither_slow() -> None:
     # At a quarter of its frequency it would swing the object out of the grip.
-    with Watched({"control": {"law": "upright"}, "simulation": {"object_angle": START}}) as hand:
+    with SimulatedDaemon(
+        {"control": {"law": "upright"}, "simulation": {"object_angle": START}}
+    ) as hand:
         hand.grasp(FORCE)
         hand.run(0.8)
         clock = hand._daemon.clock
@@ -119,7 +123,7 @@ def test_ticks_that_come_late_do_not_make_the_dither_slow() -> None:
 
 
 def test_a_raised_grip_that_comes_back_does_not_hold_the_dither_at_one_side():
-    with Watched({"control": {"law": "upright"}}) as hand:
+    with SimulatedDaemon({"control": {"law": "upright"}}) as hand:
         hand.grasp(FORCE)
         hand.run(4.5)
         push_along(hand, 13.0, 11.0)
@@ -138,7 +142,7 @@ def test_a_small_hand_brings_its_object_upright():
     sections = load(Path("small")).model_dump(exclude_unset=True)
     sections["control"]["law"] = "upright"
     sections["simulation"]["object_angle"] = START
-    with Watched(sections) as hand:
+    with SimulatedDaemon(sections) as hand:
         hand.grasp(0.8)
         hand.run(4.5)
         assert hand.mode == "holding"

@@ -15,8 +15,7 @@ from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.table import ContactTable
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from softfinger.tools.terminal.heatmap import LEVELS
-from softfinger.tools.viewing.known import HEIGHT, THETA_END, WIDTH, landscape, read_settings
-from softfinger.tools.viewing.planar import (
+from softfinger.tools.viewing.hand_drawing import (
     finger_lines,
     footprint,
     grid_of,
@@ -24,6 +23,7 @@ from softfinger.tools.viewing.planar import (
     on_picture,
     tip_circle,
 )
+from softfinger.tools.viewing.landscape import HEIGHT, THETA_END, WIDTH, landscape, read_settings
 from tests.harness.reference_hand import ReferenceHand
 
 TIP = Fingertip(radius=0.020)

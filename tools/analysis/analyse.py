@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from softfinger.daemon.errors import RecordingError, SettingsError, SoftfingerError
 from softfinger.daemon.own_files import write_text
 from softfinger.daemon.profile.settings import Settings, TactileSettings
-from softfinger.daemon.profile.validation import sensor_doubts
+from softfinger.daemon.profile.validation import sensor_warnings
 from softfinger.daemon.tactile.frame_files import FrameRecording, load_recording
 from softfinger.daemon.tactile.replay import GivenFrames, pitch_difference
 from softfinger.daemon.types import FINGERS, Frame, State
@@ -239,7 +239,7 @@ def _frames_alone(path: Path, settings: Settings, own: bool) -> Source:
             "set tactile.rows, tactile.cols and tactile.pitch"
         )
     settings = settings.model_copy(update={"tactile": tactile.model_copy(update=changes)})
-    for doubt in sensor_doubts(settings):
+    for doubt in sensor_warnings(settings):
         to_stderr("analyse")(f"{path}: {doubt}")
 
     def frames(progress: OnProgress) -> Iterator[tuple[int, float, Counts]]:

@@ -26,14 +26,14 @@ MEASUREMENTS = {
     "tick": "the tick back to back, in place and over ptys",
     "control": "error of an object's angle that remains with each grip law",
     "reflex": "sudden larger loads on a grip: held or lost, slide, reaction time",
-    "witnesses": "true force of grips with faulty measurements, a quarter of an hour",
+    "faults": "true force of grips with faulty measurements, a quarter of an hour",
     "robustness": "true force of grips by hands that differ from their settings",
 }
 # These run on virtual time, so other load on the machine does not affect them.
-SWEPT = ("reflex", "witnesses", "robustness")
+SWEPT = ("reflex", "faults", "robustness")
 PAGE = ("estimator", "tick")
 _PAGE_COLUMNS = ("median", "p99", "unit", "aim ≤", "relative error", "RMS of d [µm]")
-_CASES = ("witnesses", "robustness")
+_CASES = ("faults", "robustness")
 # Options that apply to some measurements only.
 _OWN = {"full": ("reflex",), "trials": _CASES, "only": _CASES}
 FAILED = 1  # exit status; 2 is for invalid arguments

@@ -26,16 +26,16 @@ from softfinger.daemon.control.grip import Grip
 from softfinger.daemon.types import ObjectPose, Reading
 from softfinger.tools.benchmarks.measuring import Report, Row, figure
 from softfinger.tools.benchmarks.rigs import SENSORS, SOLID, Sections, merged
-from softfinger.tools.watched import Watched
+from softfinger.tools.simulated_daemon import SimulatedDaemon
 
 _FORCE = 10.0  # N
-_ASKEW = math.radians(5.0)
-_DRAWS = 12
-_FOUND = 5.0  # s from the grasp command until the object's angle is read
-_STEERED = 2.0  # s before that, during which the angle is steered to 0
+_ANGLE_STD = math.radians(5.0)
+_DRAW_COUNT = 12
+_READ_TIME = 5.0  # s from the grasp command until the object's angle is read
+_STEERING_TIME = 2.0  # s before that, during which the angle is steered to 0
 DELAYS = (0.0, 0.05, 0.1, 0.2, 0.3)  # s
 # Hz, angle integral that is stable for all these delays: ω times the delay is below π/2
-_SLOW = 0.5
+_SLOW_BANDWIDTH = 0.5
 
 
 class Altered(Grip):
@@ -44,7 +44,7 @@ class Altered(Grip):
     The torque constants of the two joints differ by the fraction ``apart`` of their mean.
     """
 
-    def __init__(self, hand: Watched, delay: float = 0.0, apart: float = 0.0) -> None:
+    def __init__(self, hand: SimulatedDaemon, delay: float = 0.0, apart: float = 0.0) -> None:
         fingers = hand.control.fingers
         super().__init__(hand.settings, fingers.indices, fingers.grasp)
         ticks = round(delay * hand.settings.loop.rate)
@@ -74,25 +74,25 @@ class TwoPhased(Altered):
         self.force.step(state.force_rate)
         if pose.valid and not math.isnan(self.target_angle):
             error = self.target_angle - pose.angle
-            rate = 2.0 * math.pi * _SLOW * error / sum(grasp.jacobian_rotation)
+            rate = 2.0 * math.pi * _SLOW_BANDWIDTH * error / sum(grasp.jacobian_rotation)
             state.offset += rate * state.law.dt
         bias = 0.5 * self.force.value * sum(grasp.moment_arm)
         damping = state.law.damping * math.sqrt(state.joint_stiffness)
-        lean = state.joint_stiffness * (state.offset - 0.5 * (q1 - q2))
-        return bias + lean - damping * dq1, bias - lean - damping * dq2
+        steering = state.joint_stiffness * (state.offset - 0.5 * (q1 - q2))
+        return bias + steering - damping * dq1, bias - steering - damping * dq2
 
 
-_AS_SET: Sections = {}
+_DEFAULT: Sections = {}
 
 
 class Way(NamedTuple):
     """Law to test: settings of `control`, the plant's tips and sensors, and the aim [°]."""
 
-    control: Mapping[str, Any] = _AS_SET
-    tips: Sections = _AS_SET
+    control: Mapping[str, Any] = _DEFAULT
+    tips: Sections = _DEFAULT
     aim: float | None = None
     is_steered: bool = False  # to 0, with the measured angle
-    law: Callable[[Watched], Grip] | None = None  # replaces the daemon's law
+    law: Callable[[SimulatedDaemon], Grip] | None = None  # replaces the daemon's law
     force: float = _FORCE
     weight: tuple[float, float] = (0.0, 0.0)  # N along x and y, applied once the grip is firm
 
@@ -117,7 +117,7 @@ WAYS = {
 
 
 def _upright(
-    law: Callable[[Watched], Grip] | None = None,
+    law: Callable[[SimulatedDaemon], Grip] | None = None,
     force: float = _FORCE,
     width: float = 0.0,
     weight: tuple[float, float] = (0.0, 0.0),
@@ -142,12 +142,12 @@ LIMITS = {
     **{f"joint friction {each:g} N·m": _upright(joint_friction=each) for each in (0.1, 0.15, 0.2)},
     **{f"an object of {1e3 * width:g} mm": _upright(width=width) for width in (0.06, 0.07, 0.09)},
 }
-LATE = {
+LATE_LIMITS = {
     f"{name}, {1e3 * delay:g} ms": Way(control, is_steered=True, law=partial(law, delay=delay))
     for name, control, law in (
         ("two-phased", {}, TwoPhased),
         ("energy, 4 Hz", {}, Altered),
-        (f"energy, {_SLOW:g} Hz", {"rotate_bandwidth": _SLOW}, Altered),
+        (f"energy, {_SLOW_BANDWIDTH:g} Hz", {"rotate_bandwidth": _SLOW_BANDWIDTH}, Altered),
     )
     for delay in DELAYS
 }
@@ -155,21 +155,25 @@ LATE = {
 
 def measure(brief: bool = False) -> list[Report]:
     """Return tables of the remaining angles [°]; with few draws, p99 is close to the maximum."""
-    plants = drawn(2 if brief else _DRAWS)
-    title = f"left of {math.degrees(_ASKEW):g}° after {_FOUND:g} s at {_FORCE:g} N"
+    plants = drawn(2 if brief else _DRAW_COUNT)
+    title = f"left of {math.degrees(_ANGLE_STD):g}° after {_READ_TIME:g} s at {_FORCE:g} N"
     return [
         Report(f"{title}{of}", [row(name, way, plants) for name, way in ways.items()])
-        for of, ways in (("", WAYS), (", upright, limits", LIMITS), (", its angle late", LATE))
+        for of, ways in (
+            ("", WAYS),
+            (", upright, limits", LIMITS),
+            (", its angle late", LATE_LIMITS),
+        )
     ]
 
 
-def drawn(count: int = _DRAWS) -> list[dict[str, Any]]:
+def drawn(count: int = _DRAW_COUNT) -> list[dict[str, Any]]:
     """Return the differences between each plant and the settings, the same for all laws."""
     rng = np.random.default_rng(16)
     return [
         {
             "seed": k,
-            "object_angle": _ASKEW * (-1.0) ** k,
+            "object_angle": _ANGLE_STD * (-1.0) ** k,
             "object_position": (rng.uniform(-0.003, 0.003), 0.080),
             "modulus_scale": rng.uniform(0.7, 1.3),
             "tip_friction": rng.uniform(0.2, 0.8),
@@ -190,17 +194,20 @@ def row(name: str, way: Way, plants: list[dict[str, Any]]) -> Row:
 def left(way: Way, simulation: Mapping[str, Any]) -> float:
     """Return the remaining angle of the object [°] on this plant; NaN if it is not held."""
     sections = merged({"simulation": simulation, "control": way.control}, way.tips)
-    with Watched(sections) as hand:
+    with SimulatedDaemon(sections) as hand:
         if way.law is not None:
             hand.control.grip = way.law(hand)
         hand.grasp(way.force)
         begun = hand.now
-        while min(hand.plant.force) < 0.7 * way.force and hand.now < begun + _FOUND - _STEERED:
+        while (
+            min(hand.plant.force) < 0.7 * way.force
+            and hand.now < begun + _READ_TIME - _STEERING_TIME
+        ):
             hand.run(hand.loop.period)
         hand.plant.apply_load(*way.weight)
-        hand.run(begun + _FOUND - _STEERED - hand.now)
+        hand.run(begun + _READ_TIME - _STEERING_TIME - hand.now)
         if way.is_steered:  # do not wait for a force, because not every law measures it
             hand.control.grip.steer(hand.state.object.angle, 0.0)
-        hand.run(_STEERED)
+        hand.run(_STEERING_TIME)
         is_held = min(hand.plant.force) > 0.0
         return math.degrees(abs(float(hand.plant.object_pose[2]))) if is_held else math.nan

@@ -48,14 +48,14 @@ LINEAR = Material.constant(MODULUS)
 SIZE, WIDTH = 44, 0.058  # cells per side, m
 NOISE = 0.002 * MODULUS
 _PASCAL_PER_COUNT = 4.0
-_FRAMES = 32
+_FRAME_COUNT = 32
 _STEPS = (1e-7, 1e-5, 1e-5, 1e-4)
 
 LOOKUP_ERROR = "relative error"
 _LAW = Material.table_i()
-_DEEPEST, _STEEPEST = 0.008, math.radians(30.0)  # m, rad
-_SINGLE = 16  # number of points used in turn by calls with floats
-_CALL_NS = 800.0  # aim for one call, ns
+_D_MAX, _TILT_MAX = 0.008, math.radians(30.0)  # m, rad
+_SINGLE_POINT_COUNT = 16  # number of points used in turn by calls with floats
+_CALL_AIM_NS = 800.0  # aim for one call, ns
 
 
 def rms_errors(found: FloatArray, truth: Truth) -> dict[str, float]:
@@ -85,17 +85,19 @@ def measure(brief: bool = False, rounds: int = 25) -> list[Report]:
 def lookups(rounds: int, count: int = 512) -> Report:
     """Return the times per point [ns] for ``count`` points at once and one by one."""
     rng = np.random.default_rng(3)
-    even = rng.uniform(0.0, _DEEPEST, count)
-    spread = 10.0 ** rng.uniform(-6.0, np.log10(_DEEPEST), count)
+    even = rng.uniform(0.0, _D_MAX, count)
+    spread = 10.0 ** rng.uniform(-6.0, np.log10(_D_MAX), count)
     d = np.where(np.arange(count) % 2 == 0, even, spread)
-    theta = rng.uniform(-_STEEPEST, _STEEPEST, count)
+    theta = rng.uniform(-_TILT_MAX, _TILT_MAX, count)
     exact = np.stack(integrate(TIP, _LAW, d, theta, 40))
     tables = {f"table to {each:g}": ContactTable.build(TIP, _LAW, each) for each in (1e-6, 1e-9)}
-    single = list(zip(d[:_SINGLE].tolist(), theta[:_SINGLE].tolist(), strict=True))
+    single = list(
+        zip(d[:_SINGLE_POINT_COUNT].tolist(), theta[:_SINGLE_POINT_COUNT].tolist(), strict=True)
+    )
     rows = []
     for way, chosen, points, aim in (
         ("", [(d, theta)], count, None),
-        (", called", single, _SINGLE, _CALL_NS),
+        (", called", single, _SINGLE_POINT_COUNT, _CALL_AIM_NS),
     ):
         subjects = {
             f"{name}{way}": partial(call_with_each, table, chosen) for name, table in tables.items()
@@ -116,7 +118,7 @@ def lookups(rounds: int, count: int = 512) -> Report:
 def _spline(d: FloatArray, theta: FloatArray, force: FloatArray, rounds: int) -> dict[str, Any]:
     """Return time per point and error of SciPy's bicubic spline of F alone."""
     interpolate: Any = import_module("scipy.interpolate")
-    at = np.linspace(0.0, _DEEPEST, 129), np.linspace(-_STEEPEST, _STEEPEST, 65)
+    at = np.linspace(0.0, _D_MAX, 129), np.linspace(-_TILT_MAX, _TILT_MAX, 65)
     spline = interpolate.RectBivariateSpline(*at, integrate(TIP, _LAW, *np.meshgrid(*at)).force.T)
     name = "SciPy's RectBivariateSpline, F alone"
     taken = interleave({name: partial(spline.ev, d, theta)}, rounds)[name]
@@ -126,7 +128,7 @@ def _spline(d: FloatArray, theta: FloatArray, force: FloatArray, rounds: int) ->
 
 def frames_to_contacts(rounds: int) -> Report:
     """Return times and errors for frames, and the bound."""
-    noise = np.random.default_rng(4).standard_normal((_FRAMES, SIZE, SIZE))
+    noise = np.random.default_rng(4).standard_normal((_FRAME_COUNT, SIZE, SIZE))
     frames = GRID.pressure(TIP, LINEAR, *TRUTH) + NOISE * noise
     empty, deep = NOISE * noise, GRID.pressure(TIP, LINEAR, *_CORNER) + NOISE * noise
 
@@ -146,7 +148,7 @@ def frames_to_contacts(rounds: int) -> Report:
     }
     subjects: dict[str, Callable[[], object]] = {name: run for name, (run, _, _) in cases.items()}
     subjects["decode: cobs"] = decode(frames)
-    times = {name: taken / _FRAMES for name, taken in interleave(subjects, rounds).items()}
+    times = {name: taken / _FRAME_COUNT for name, taken in interleave(subjects, rounds).items()}
     # The minimum is least affected by other load.
     quickest = {name: float(np.min(taken)) for name, taken in times.items()}
     rows = []
@@ -197,7 +199,7 @@ def centroid_and_extent(frames: FloatArray) -> FloatArray:
     return found
 
 
-def settled(settings: Settings, truth: Truth, count: int = _FRAMES) -> FloatArray:
+def settled(settings: Settings, truth: Truth, count: int = _FRAME_COUNT) -> FloatArray:
     """Return d and tilts [count, 3] from frames of a profile's sensor that was pressed for 1 s."""
     model = make_sensor_model(settings, 0)
     estimator = make_estimator(settings, make_material(settings.material))

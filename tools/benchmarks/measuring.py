@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from softfinger.daemon.errors import SoftfingerError
-from softfinger.tools.terminal.typeset import plain_table, table_text
+from softfinger.tools.terminal.text_layout import plain_table, table_text
 
 # Result of one measurement; each key is a column heading, with "name" first.
 Row = dict[str, Any]

@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from statistics import fmean
 from typing import Any, NamedTuple
 
-from softfinger.daemon.control.modes import GRIPPING
+from softfinger.daemon.control.modes import GRIPPING_MODES
 from softfinger.tools.benchmarks.measuring import Report, Row, figure
 from softfinger.tools.benchmarks.rigs import SENSORS, SOLID, RigError, Sections, merged
 from softfinger.tools.benchmarks.virtual_grip import VirtualGrip
@@ -32,14 +32,15 @@ TIPS: dict[str, Sections] = {
 MASSES = (0.1, 0.5, 2.0)  # kg
 STANDING = (0.0, 3.0, 6.0, 8.0, 9.0)  # N
 OVERLOADS = (12.5, 13.0, 14.0, 15.0, 16.0, 18.0)  # N; friction at a grip of 10 N holds 12 N
-THIN = (0.0, 6.0, 9.0), (13.0, 15.0, 18.0)  # the loads used unless all are requested
+REDUCED_LOADS = (0.0, 6.0, 9.0), (13.0, 15.0, 18.0)  # the loads used unless all are requested
 _FORCE = 10.0  # N
-_TRIALS = 3  # number of trials for each case
-_ANSWER, _SAID = 22.0, 200.0  # ms, aims
-_GRIP = 5.0  # s within which the grip must hold
-_RISES, _STANDS = 1.0, 1.5  # s in which the standing load is applied, s for which it then stays
-_STEPS = 50  # steps in which it is applied
-_LOOK = 1.0  # s of the larger load, and s to wait for the mode after a loss
+_TRIAL_COUNT = 3  # number of trials for each case
+_RESPONSE_AIM, _REPORT_AIM = 22.0, 200.0  # ms, aims
+_GRIP_TIMEOUT = 5.0  # s within which the grip must hold
+# s in which the standing load is applied, s for which it then stays.
+_LOAD_TIME, _STANDING_TIME = 1.0, 1.5
+_LOAD_STEP_COUNT = 50  # steps in which it is applied
+_OBSERVATION_TIME = 1.0  # s of the larger load, and s to wait for the mode after a loss
 
 
 class Overload(NamedTuple):
@@ -58,12 +59,12 @@ def measure(
 
     ``sweep`` maps cases to outcomes, in one process or in many.
     """
-    standing, overloads = (STANDING, OVERLOADS) if full else THIN
+    standing, overloads = (STANDING, OVERLOADS) if full else REDUCED_LOADS
     loads = [
         *itertools.product((0.0,), overloads, ("twist",)),
         *itertools.product(standing, overloads, ("push",)),
     ]
-    trials = _TRIALS
+    trials = _TRIAL_COUNT
     if brief:
         loads, trials = loads[-1:], 1
     hands = {
@@ -95,14 +96,15 @@ def _table(
         told = row(f"{standing:g} N, then a {kind} of {overload:g} N", found)
         rows.append(told | {"trials": trials, "no grip": trials - len(found)})
     said = [each["said ms"] for each in rows if each["held %"] < 100.0]
-    note = f"  said that the object has gone: in {max(said, default=0.0):.0f} ms, aim ≤ {_SAID:g}"
+    slowest = max(said, default=0.0)
+    note = f"  said that the object has gone: in {slowest:.0f} ms, aim ≤ {_REPORT_AIM:g}"
     return Report(f"{name}, answer", rows, notes=(note,) if said else ())
 
 
 def row(name: str, found: Sequence[Overload]) -> Row:
     """Return the percentage held and the largest slide of those held, with the times."""
     answers = [1e3 * each.answer for each in found if math.isfinite(each.answer)]
-    times: Row = figure(name, "ms", answers, _ANSWER) if answers else {"name": name}
+    times: Row = figure(name, "ms", answers, _RESPONSE_AIM) if answers else {"name": name}
     held = [each for each in found if not each.lost]
     return times | {
         "greatest": max(answers, default=math.nan),
@@ -126,13 +128,13 @@ def overloaded(
         grip.command("arm")
         loop.advance(0.1)
         grip.command("grasp", force=_FORCE)
-        if not grip.until("holding", _GRIP):
+        if not grip.until("holding", _GRIP_TIMEOUT):
             raise RigError(f"the hand does not hold: {state.mode} {state.fault}")
         loop.advance(1.0 + chance.uniform(0.0, 0.02))
-        for k in range(_STEPS):
-            grip.plant.load(push=standing * (k + 1) / _STEPS)
-            loop.advance(_RISES / _STEPS)
-        loop.advance(_STANDS)
+        for k in range(_LOAD_STEP_COUNT):
+            grip.plant.load(push=standing * (k + 1) / _LOAD_STEP_COUNT)
+            loop.advance(_LOAD_TIME / _LOAD_STEP_COUNT)
+        loop.advance(_STANDING_TIME)
         begin, slid, gone, said = fmean(grip.along()), 0.0, math.inf, math.inf
 
         def look() -> None:
@@ -141,12 +143,12 @@ def overloaded(
                 slid = max(slid, abs(fmean(grip.along()) - begin))
             else:
                 gone = min(gone, state.t)
-            if gone < math.inf and state.mode not in GRIPPING:
+            if gone < math.inf and state.mode not in GRIPPING_MODES:
                 said = min(said, state.t)
 
         grip.look = look
         arm = 0.5 * grip.settings.simulation.object_width if kind == "twist" else 1.0
-        answer = grip.answer(f"{kind}={arm * overload}", _LOOK)
-        while gone < math.inf and said == math.inf and state.t < gone + _LOOK:
+        answer = grip.answer(f"{kind}={arm * overload}", _OBSERVATION_TIME)
+        while gone < math.inf and said == math.inf and state.t < gone + _OBSERVATION_TIME:
             loop.advance(loop.period)
         return Overload(answer, slid, gone < math.inf, said - gone if gone < math.inf else math.nan)

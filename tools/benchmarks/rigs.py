@@ -35,7 +35,7 @@ SENSORS: dict[str, Sections] = {  # sensors with defects; the ideal sensor has n
     name: load(Path(name)).model_dump(exclude_unset=True) for name in ("velostat", "capacitive")
 }
 SOFTFINGER = (sys.executable, "-m", "softfinger")
-_KEPT = 16  # number of frames that take turns
+_FRAME_COUNT = 16  # number of frames that take turns
 
 
 class RigError(SoftfingerError):
@@ -171,7 +171,7 @@ def can(daemon: Daemon) -> None:
     loop, period = daemon.loop, 1.0 / daemon.settings.tactile.rate
     fingers = loop.perception.fingers
     grids: list[list[NDArray[np.uint16]]] = [[] for _ in fingers]
-    for _ in range(_KEPT):
+    for _ in range(_FRAME_COUNT):
         loop.advance(period)
         for kept, finger in zip(grids, fingers, strict=True):
             assert finger.frame is not None

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from softfinger.daemon.control.modes import GRIPPING
+from softfinger.daemon.control.modes import GRIPPING_MODES
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.emulator.emulator import DEFAULT_BOARD
 from softfinger.daemon.simulation.faults import parse_faults
@@ -23,14 +23,16 @@ from softfinger.tools.benchmarks.measuring import Report
 from softfinger.tools.benchmarks.rigs import Sections, merged
 from softfinger.tools.benchmarks.virtual_grip import VirtualGrip, Watch
 
-_TRIALS, _HANDS = 20, 400
-_GRIP, _REST, _LOOK = 8.0, 1.2, 6.0  # s: limit for the grip to hold, undisturbed hold, observation
-_NEAR, _FAR, _LOST = 0.2, 0.3, 0.01  # relative force errors; m
-_SAID = 2.0  # s within which a force error above `_NEAR` must be reported
-_STRONG, _BRIEFLY = 1.4, 0.1  # unloaded: ratio to the requested force, longest time above it [s]
-_WITNESS = "witness."
-_GAIN_OFF = math.log(1.3)  # log of the gain error above which naming a sensor is correct
-_BORNE = 0.8  # fraction of the friction limit up to which no load should be lost
+_TRIAL_COUNT, _HAND_COUNT = 20, 400
+# s: limit for the grip to hold, undisturbed hold, observation.
+_GRIP_TIMEOUT, _REST_TIME, _OBSERVATION_TIME = 8.0, 1.2, 6.0
+_ERROR_MAX, _ERROR_FAR, _SLIDE_MAX = 0.2, 0.3, 0.01  # relative force errors; m
+_REPORT_TIME_MAX = 2.0  # s within which a force error above `_ERROR_MAX` must be reported
+# unloaded: ratio to the requested force, longest time above it [s].
+_EXCESS_RATIO, _EXCESS_TIME_MAX = 1.4, 0.1
+_EVENT_PREFIX = "witness."
+_GAIN_ERROR_MIN = math.log(1.3)  # log of the gain error above which naming a sensor is correct
+_LOAD_FRACTION = 0.8  # fraction of the friction limit up to which no load should be lost
 
 # Full scale of 127.5 kPa, as tactile boards have; the simulated sensor has 262 kPa.
 _EIGHT_BITS: Sections = {"tactile": {**DEFAULT_BOARD, "backend": "simulated"}}
@@ -57,8 +59,8 @@ def _hand(**simulation: Any) -> Sections:
     return {"simulation": simulation}
 
 
-_BOTH = tuple(f"{side}_sensor" for side in FINGERS)
-_RUBBER = (0.1, 0.2, 0.2)
+_BOTH_SENSORS = tuple(f"{side}_sensor" for side in FINGERS)
+_RELAXATION = (0.1, 0.2, 0.2)
 ROWS = (
     HandCase("as set", 6.0),
     HandCase("joint friction 0.12 N·m", 6.0, _hand(joint_friction=0.12)),
@@ -70,7 +72,7 @@ ROWS = (
             6.0,
             daemon=board,
             words=f"drift={drift}@0..{s}",
-            false=_BOTH,
+            false=_BOTH_SENSORS,
         )
         for of, board in (("", {}), (", 8 bits", _EIGHT_BITS))
         for drift, s in ((-0.05, 20), (-0.02, 20), (0.05, 20), (-0.05, 120))
@@ -79,20 +81,25 @@ ROWS = (
         HandCase(f"frames {ms} ms older", force, _hand(tactile_delay=_LATENCY + 1e-3 * ms))
         for ms, force in ((15, 12.0), (30, 6.0), (10, 20.0))
     ),
-    HandCase("rubber that relaxes", 6.0, _hand(tip_relaxation=_RUBBER)),
+    HandCase("rubber that relaxes", 6.0, _hand(tip_relaxation=_RELAXATION)),
     HandCase("cells of 80 ms", 6.0, _hand(tactile_response=0.08)),
-    HandCase("both of these", 6.0, _hand(tip_relaxation=_RUBBER, tactile_response=0.08)),
+    HandCase("both of these", 6.0, _hand(tip_relaxation=_RELAXATION, tactile_response=0.08)),
     HandCase(
         "both gains and currents halve in 5 s",
         6.0,
         words="gain=0.5@0..5 left:current=0.5@0..5 right:current=0.5@0..5",
-        false=(*_BOTH, "left_current", "right_current"),
+        false=(*_BOTH_SENSORS, "left_current", "right_current"),
     ),
-    HandCase("both images wander by 6 cells in 60 s", 6.0, words="shift-x=6@0..60", false=_BOTH),
+    HandCase(
+        "both images wander by 6 cells in 60 s", 6.0, words="shift-x=6@0..60", false=_BOTH_SENSORS
+    ),
 )
 
 _ENSEMBLE = "hand "
-NAMES = (*(case.name for case in ROWS), *(f"{_ENSEMBLE}{seed}" for seed in range(1, _HANDS + 1)))
+NAMES = (
+    *(case.name for case in ROWS),
+    *(f"{_ENSEMBLE}{seed}" for seed in range(1, _HAND_COUNT + 1)),
+)
 
 
 def drawn(seed: int) -> HandCase:
@@ -132,7 +139,7 @@ def drawn(seed: int) -> HandCase:
     drifts = {side: span(-0.05, 0.05) for side in FINGERS}
     over = span(10.0, 120.0)
     words = " ".join(f"{side}:drift={drift:.4f}@0..{over:.1f}" for side, drift in drifts.items())
-    off = (abs(math.log(gain)) > _GAIN_OFF for gain in gains)
+    off = (abs(math.log(gain)) > _GAIN_ERROR_MIN for gain in gains)
     pushed, turned = chance.random() < 0.5, chance.random() < 0.5
     return HandCase(
         f"{_ENSEMBLE}{seed}",
@@ -141,7 +148,12 @@ def drawn(seed: int) -> HandCase:
         {"material": {"modulus_error": 0.05 if calibrated else 0.0}},
         span(0.85, 1.15),
         words,
-        load=chance.choice((-1.0, 1.0)) * span(0.0, _BORNE) * 2.0 * friction * force * pushed,
+        load=chance.choice((-1.0, 1.0))
+        * span(0.0, _LOAD_FRACTION)
+        * 2.0
+        * friction
+        * force
+        * pushed,
         within=chance.choice((0.0, 0.3, 2.0)),
         turn=span(-0.14, 0.14) * turned,
         # A drifting zero is also a fault of the sensor.
@@ -160,8 +172,8 @@ class Outcome:
     held: bool = False  # the grip reached the hold
     settled: float = math.nan  # mean of both tips at the end; NaN if the object was released
     peak: float = 0.0  # of either tip, without a load
-    above: float = 0.0  # longest time above `_STRONG`, without a load
-    first_off: float = math.inf  # first time at which the mean error exceeded `_NEAR`
+    above: float = 0.0  # longest time above `_EXCESS_RATIO`, without a load
+    first_off: float = math.inf  # first time at which the mean error exceeded `_ERROR_MAX`
     named: float = math.inf  # first time at which a channel was named
     accused: tuple[str, ...] = ()  # named channels without a fault
     raised: bool = False  # without a load, more force was requested than commanded
@@ -169,9 +181,9 @@ class Outcome:
     end: str = ""  # fault or mode
 
     def well(self) -> bool:
-        """Return True if the force is within `_NEAR`, or the error was reported in time."""
-        near = self.held and abs(self.settled - 1.0) <= _NEAR and self.above == 0.0
-        told = self.named - self.first_off <= _SAID and not self.raised
+        """Return True if the force is within `_ERROR_MAX`, or the error was reported in time."""
+        near = self.held and abs(self.settled - 1.0) <= _ERROR_MAX and self.above == 0.0
+        told = self.named - self.first_off <= _REPORT_TIME_MAX and not self.raised
         return near or (self.first_off < math.inf and told)
 
 
@@ -183,7 +195,7 @@ def grip(case: HandCase, seed: int = 1) -> Outcome:
         loop, state = hand.loop, hand.state
         hand.command("arm")
         loop.advance(0.1 + chance.uniform(0.0, 0.02))
-        watch, begin = Watch(case.force, _STRONG), state.t
+        watch, begin = Watch(case.force, _EXCESS_RATIO), state.t
         loaded = False
 
         def look() -> None:
@@ -195,19 +207,20 @@ def grip(case: HandCase, seed: int = 1) -> Outcome:
 
         hand.look = look
         hand.command("grasp", force=case.force)
-        found.held = hand.until("holding", _GRIP)
-        loop.advance(_REST + chance.uniform(0.0, 0.02))
+        found.held = hand.until("holding", _GRIP_TIMEOUT)
+        loop.advance(_REST_TIME + chance.uniform(0.0, 0.02))
         over = 0.0
         if case.words:
             over = max(event.over for event in parse_faults(case.words.split(), ()))
             hand.begin(case.words)
-        loop.advance(over + _LOOK)
+        loop.advance(over + _OBSERVATION_TIME)
         if case.turn:
             hand.command("rotate", angle=case.turn)
             loop.advance(2.0)
-        gripped = state.mode in GRIPPING
+        gripped = state.mode in GRIPPING_MODES
         found.settled = watch.settled() if gripped else math.nan
-        found.peak, found.above, found.first_off = watch.peak, watch.above, watch.first_off(_NEAR)
+        found.peak, found.above = watch.peak, watch.above
+        found.first_off = watch.first_off(_ERROR_MAX)
         if case.load and gripped and hand.between():
             loaded = True
             for k in range(_STEPS := 20):
@@ -216,7 +229,9 @@ def grip(case: HandCase, seed: int = 1) -> Outcome:
             loop.advance(2.0)
             found.lost = not hand.between()
         found.end = state.fault_name or str(state.mode)
-        names = [(t - begin, k.removeprefix(_WITNESS)) for t, k in hand.alarms if _WITNESS in k]
+        names = [
+            (t - begin, k.removeprefix(_EVENT_PREFIX)) for t, k in hand.alarms if _EVENT_PREFIX in k
+        ]
     found.accused = tuple(dict.fromkeys(name for _, name in names if name not in case.false))
     found.first_off -= begin
     # A report about any channel counts as an explanation of a force error.
@@ -235,8 +250,10 @@ def measure(
     sweep: Callable[..., Iterable[Any]] = map,
 ) -> list[Report]:
     """Return a table of the rows and one of the ensemble; ``brief`` runs a few of each."""
-    trials = trials or (1 if brief else _TRIALS)
-    hands = [drawn(seed) for seed in range(1, (4 if brief else trials * _HANDS // _TRIALS) + 1)]
+    trials = trials or (1 if brief else _TRIAL_COUNT)
+    hands = [
+        drawn(seed) for seed in range(1, (4 if brief else trials * _HAND_COUNT // _TRIAL_COUNT) + 1)
+    ]
     rows = [case for case in ROWS if only in case.name]
     if only:
         hands = [case for case in hands if only in case.name]
@@ -281,9 +298,9 @@ def _ensemble(hands: list[HandCase], found: list[Outcome]) -> Report:
     off = [abs(each.settled - 1.0) for each in found]
     loaded = [each for case, each in zip(hands, found, strict=True) if case.load]
     rows = [
-        share("true force within 20 %", "≥ 90 %", sum(each <= _NEAR for each in off)),
-        share("within 30 %", "≥ 98 %", sum(each <= _FAR for each in off)),
-        share("above 1.4 for 0.1 s, unloaded", "0", sum(e.above > _BRIEFLY for e in found)),
+        share("true force within 20 %", "≥ 90 %", sum(each <= _ERROR_MAX for each in off)),
+        share("within 30 %", "≥ 98 %", sum(each <= _ERROR_FAR for each in off)),
+        share("above 1.4 for 0.1 s, unloaded", "0", sum(e.above > _EXCESS_TIME_MAX for e in found)),
         share("objects lost", "≤ 1 %", sum(e.lost for e in loaded), max(len(loaded), 1)),
         share("healthy channel accused", "≤ 2 %", sum(bool(e.accused) for e in found)),
         share("did not come to hold", "", sum(not each.held for each in found)),

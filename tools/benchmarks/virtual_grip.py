@@ -17,20 +17,20 @@ from softfinger.daemon.errors import Refused
 from softfinger.daemon.simulation.faults import OBJECT, parse_faults
 from softfinger.daemon.types import FINGERS
 from softfinger.tools.benchmarks.rigs import Sections, merged
-from softfinger.tools.watched import Watched
+from softfinger.tools.simulated_daemon import SimulatedDaemon
 
-TOO_MUCH = 1.3  # ratio to the requested force
-GONE = 0.1  # m of slide, above which the object counts as lost
+EXCESS_RATIO = 1.3  # ratio to the requested force
+LOST_SLIDE = 0.1  # m of slide, above which the object counts as lost
 _TORQUE_ERROR = 0.1  # largest relative error of the joints' torque constant
-_RAISED = 1.25  # ratio of goal currents that counts as a firmer grip
-_LAST = 0.5  # s at the end over which the settled force is averaged
-_SLIPS = 0.999  # fraction of the friction limit that counts as slip
+_INCREASED_RATIO = 1.25  # ratio of goal currents that counts as a firmer grip
+_AVERAGING_TIME = 0.5  # s at the end over which the settled force is averaged
+_SLIP_FRACTION = 0.999  # fraction of the friction limit that counts as slip
 
 
 class Watch:
     """Record true forces and the object's position, tick by tick."""
 
-    def __init__(self, asked: float, too_much: float = TOO_MUCH) -> None:
+    def __init__(self, asked: float, too_much: float = EXCESS_RATIO) -> None:
         self.asked = asked  # N
         self.too_much = too_much  # ratio to it
         self.peak = 0.0  # largest force of either tip relative to the requested force
@@ -50,11 +50,11 @@ class Watch:
         self.above = max(self.above, t - self._below)
         self._place = self._place or place
         if torque:
-            self.slid = min(max(self.slid, math.dist(place, self._place)), GONE)
+            self.slid = min(max(self.slid, math.dist(place, self._place)), LOST_SLIDE)
 
     def settled(self) -> float:
         """Return the mean relative force at the end."""
-        end = self._mean[-1][0] - _LAST
+        end = self._mean[-1][0] - _AVERAGING_TIME
         return fmean(ratio for t, ratio in self._mean if t > end)
 
     def first_off(self, share: float) -> float:
@@ -68,7 +68,7 @@ class Watch:
         return math.inf
 
 
-class VirtualGrip(Watched):
+class VirtualGrip(SimulatedDaemon):
     """Grip on virtual time; ``look`` is called after each tick."""
 
     def __init__(self, daemon: Sections, hand: Sections | None = None, torque: float = 1.0) -> None:
@@ -146,7 +146,7 @@ class VirtualGrip(Watched):
             if self._slips():
                 onset = min(onset, stuck)
             stuck = state.t
-            if sum(state.goal.current) > _RAISED * calm:
+            if sum(state.goal.current) > _INCREASED_RATIO * calm:
                 answered = min(answered, state.t)
         return answered - onset if onset < math.inf else math.nan
 
@@ -162,6 +162,6 @@ class VirtualGrip(Watched):
         return min(self.plant.force.tolist()) > 0.0 and not self.plant.on_other_tip.any()
 
     def _slips(self) -> bool:
-        most = _SLIPS * self.settings.simulation.tip_friction
+        most = _SLIP_FRACTION * self.settings.simulation.tip_friction
         tips = zip(self.plant.tangential.tolist(), self.plant.normal.tolist(), strict=True)
         return any(abs(along) >= most * normal for along, normal in tips)

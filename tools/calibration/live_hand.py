@@ -10,7 +10,7 @@ from typing import Any, Self
 
 import zmq
 
-from softfinger.daemon.client.connection import PATIENCE, drain, subscribe, unpack
+from softfinger.daemon.client.connection import REPLY_TIMEOUT, drain, subscribe, unpack
 from softfinger.daemon.client.hand import Hand
 from softfinger.daemon.client.stream import no_stream, read
 from softfinger.daemon.errors import HandFault
@@ -73,8 +73,8 @@ class LiveHand:
     def states(self) -> Iterator[HandState]:
         """Yield the newest state repeatedly and store all messages; may raise NoStream."""
         while True:
-            if not self._socket.poll(int(1e3 * PATIENCE)):
-                raise no_stream(self._address[0], STATE, PATIENCE)
+            if not self._socket.poll(int(1e3 * REPLY_TIMEOUT)):
+                raise no_stream(self._address[0], STATE, REPLY_TIMEOUT)
             newest = None
             for frames in drain(self._socket, _MOST):
                 with contextlib.suppress(ValueError):  # skip invalid messages

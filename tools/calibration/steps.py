@@ -36,14 +36,14 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS
 from softfinger.kinematics.calibration.calibration import (
     CalibrationError,
-    cleared,
+    above_zero,
     equilibrate,
     fit_centre,
     fit_curve,
     fit_modulus,
     fit_relaxation,
     tare,
-    without_end,
+    without_clipping,
 )
 from softfinger.kinematics.calibration.measured_fit import CurvesError, PressSums, fit_measured
 from softfinger.kinematics.calibration.press_fit import (
@@ -110,7 +110,7 @@ class Step:
         means = [frames.mean(axis=0) for frames in self.loads.frames]
         if tare is None or self.settings.tactile.threshold:
             return [(each - zero) * gain for each in means]
-        return [without_end(each, zero, tare.noise) * gain for each in means]
+        return [without_clipping(each, zero, tare.noise) * gain for each in means]
 
     @cached_property
     def readings(self) -> list[FloatArray]:
@@ -118,7 +118,7 @@ class Step:
         noise = self.calibration.tare.noise if self.calibration.tare else 0.0
         spread = np.full(self.converter.zero.shape, noise)
         return [
-            cleared(np.maximum(each, 0.0), spread, len(frames))
+            above_zero(np.maximum(each, 0.0), spread, len(frames))
             for each, frames in zip(self.over, self.loads.frames, strict=True)
         ]
 

@@ -43,9 +43,9 @@ MODULUS = TABLE_I_MAXIMUM  # the paper's choice [Pa]
 MILLI = 1e-3
 MPA = 1e-6
 _NODES = 64  # Gauss nodes of the double integrals
-_STEEP = 25  # degrees at which the slope over the tilt is reported
+_STEEP_TILT = 25  # degrees at which the slope over the tilt is reported
 _FITTED = slice(10, None)  # displacements from 1 to 8 mm, to which exponents are fitted
-_NEAR = 1e-4  # step of finite differences, relative or in rad
+_STEP = 1e-4  # step of finite differences, relative or in rad
 DEPTHS = (2, 4, 6, 8)  # mm
 TILTS = (0, 5, 10, 15, 20, 25, 30)  # degrees
 
@@ -158,14 +158,14 @@ class Plotted:
 
     def local_exponent(self, d: Numbers, theta: Numbers) -> FloatArray:
         """Return d ln(integral) / d ln(d); d in mm, θ in degrees."""
-        above, below = (self.integral(d * (1.0 + step), theta) for step in (_NEAR, -_NEAR))
-        return np.log(above / below) / math.log((1.0 + _NEAR) / (1.0 - _NEAR))
+        above, below = (self.integral(d * (1.0 + step), theta) for step in (_STEP, -_STEP))
+        return np.log(above / below) / math.log((1.0 + _STEP) / (1.0 - _STEP))
 
     def steepness(self, d: Numbers) -> FloatArray:
         """Return the integral's slope over θ at 25° [unit/rad]; d in mm."""
-        step = math.degrees(_NEAR)
-        above, below = (self.integral(d, np.float64(_STEEP + each)) for each in (step, -step))
-        return (above - below) / (2.0 * _NEAR)
+        step = math.degrees(_STEP)
+        above, below = (self.integral(d, np.float64(_STEEP_TILT + each)) for each in (step, -step))
+        return (above - below) / (2.0 * _STEP)
 
     def at_zero_tilt(self, d: Numbers) -> FloatArray:
         """Return the paper's continuous line: πEd² or πEd³/3, in the figure's unit; d in mm."""
@@ -201,7 +201,7 @@ def over_tilt(name: str, quantity: Plotted) -> tuple[Sheet, ...]:
     for d in DEPTHS:
         columns |= quantity.columns(np.float64(d), theta, f"at d = {d} mm")
     depths = np.array(DEPTHS, dtype=np.float64)
-    head = f"d{quantity.symbol}/dtheta at {_STEEP} deg [{quantity.unit}/rad]"
+    head = f"d{quantity.symbol}/dtheta at {_STEEP_TILT} deg [{quantity.unit}/rad]"
     rate = {"d [mm]": depths, head: quantity.steepness(depths)}
     return Sheet(name, columns), Sheet(f"{name}_rate", rate)
 
@@ -254,11 +254,11 @@ def _key(axes: Axes, quantity: Plotted) -> None:
 
 def _tilt_curves(quantity: Plotted, axes: Axes, numbers: Sheet, rates: Sheet) -> None:
     theta = numbers["theta"]
-    rate = rates[f"d{quantity.symbol}/dtheta at {_STEEP} deg"]
+    rate = rates[f"d{quantity.symbol}/dtheta at {_STEEP_TILT} deg"]
     for d, at, style in zip(DEPTHS, rate, ordered(len(DEPTHS)), strict=True):
         closed = numbers[f"{quantity.symbol} at d = {d} mm"]
         integral = numbers[f"{quantity.symbol} by eq. {quantity.equation} at d = {d} mm"]
-        label = f"d = {d} mm: {at:.1f} {quantity.unit}/rad at {_STEEP}°"
+        label = f"d = {d} mm: {at:.1f} {quantity.unit}/rad at {_STEEP_TILT}°"
         axes.plot(theta, closed, **style, label=label)
         look = CIRCLE | {"ms": 4, "mec": style["color"], "clip_on": False}
         axes.plot(theta[::10], integral[::10], **look)

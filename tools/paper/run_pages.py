@@ -44,14 +44,14 @@ TILTED = math.radians(11.5)  # rotation of the finger about its root
 ROLLED = math.radians(20.7)  # rolling of the object back
 _SPEED = 0.002  # m/s, compression
 _GAP = 0.5e-3  # m, gap before compression
-_DEEPEST = 0.4 * RADIUS
+_D_MAX = 0.4 * RADIUS
 _ROOT_DEPTH = 0.004  # m, displacement at the end of the finger's rotation
-_GIVES = math.radians(3.0)
+_MOTION_MARGIN = math.radians(3.0)
 _WIDTH = 0.040
 _HALF_SEPARATION = 0.050
 _ROLL_STEPS = 104  # frames during the rolling
-_LATE = 2  # frames in transit
-_SURE = 1.0  # mm of displacement above which relative errors are shown
+_LATE_FRAME_COUNT = 2  # frames in transit
+_RELATIVE_D_MIN = 1.0  # mm of displacement above which relative errors are shown
 _ROLLED_AT = 4  # mm, displacement of the path that is shown through rotation and rolling
 _PATH = -12.5, 10.5
 _SCALES = {"d": 1e3, "theta": 1.0}  # scale of the errors shown
@@ -68,7 +68,7 @@ def run_compression(tilt: float) -> dict[str, FloatArray]:
             "compression_speed": _SPEED,
         },
     }
-    seconds = (_DEEPEST + _GAP) / math.cos(tilt) / _SPEED
+    seconds = (_D_MAX + _GAP) / math.cos(tilt) / _SPEED
     with _daemon(sections) as daemon:
         return _columns(_frames(daemon, round(seconds / SCAN)), daemon)
 
@@ -93,7 +93,7 @@ def run_rotation() -> dict[str, FloatArray]:
         loop.advance(0.3)
         loop.command({"command": "arm"})
         # Command a larger angle, because the servo yields under the force.
-        loop.command({"command": "move", "left": TILTED + _GIVES})
+        loop.command({"command": "move", "left": TILTED + _MOTION_MARGIN})
         assert daemon.hand is not None
         rows: list[Row] = []
         while loop.state.mode == "moving" or not rows:
@@ -153,7 +153,7 @@ def _frames(
         place(hand, 0.0)
         loop.advance(3.0 * SCAN)  # wait until older frames have arrived
     last = loop.state.contacts[0].seq
-    for k in range(count + _LATE):
+    for k in range(count + _LATE_FRAME_COUNT):
         if place is not None:
             place(hand, min(k / (count - 1), 1.0))
         loop.advance(SCAN)
@@ -236,7 +236,7 @@ def compression() -> tuple[Sheet, ...]:
 
 def _deep_errors(run: Sheet, symbol: str) -> FloatArray:
     """Return the errors beyond 1 mm: d [µm], θ [degrees], force or energy [%]."""
-    deep = run["d"] > _SURE
+    deep = run["d"] > _RELATIVE_D_MIN
     truth, found = run[symbol][deep], run[f"{symbol} estimated"][deep]
     relative = symbol in ("F", "U")
     return np.asarray(
@@ -254,7 +254,7 @@ def _forces(axes: Axes, *sheets: Sheet) -> None:
 def _errors(symbol: str, axes: Axes, *sheets: Sheet) -> None:
     axes.axhline(0.0, color=GREY, linewidth=0.7)
     for tilt, style, run in zip(TILTS, ordered(len(TILTS)), sheets, strict=False):
-        d, off = run["d"][run["d"] > _SURE], _deep_errors(run, symbol)
+        d, off = run["d"][run["d"] > _RELATIVE_D_MIN], _deep_errors(run, symbol)
         axes.plot(d, off, **style | {"linewidth": 0.9}, label=f"{tilt}°")
 
 

@@ -93,7 +93,7 @@ def plant(d: float, share: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     return theta, base, energy
 
 
-def least(theta: FloatArray, values: FloatArray) -> float:
+def angle_of_minimum(theta: FloatArray, values: FloatArray) -> float:
     """Return the angle of the minimum [degrees], from a parabola through three points."""
     k = int(np.clip(np.argmin(values), 1, len(values) - 2))
     near = slice(k - 1, k + 2)
@@ -111,7 +111,10 @@ def sheared_rolling() -> tuple[Sheet, ...]:
         d = depth * MILLI
         for share in _EACH:
             curves = rolled(d, share, theta)
-            angles = {f"least {name} [deg]": least(theta, each) for name, each in curves.items()}
+            angles = {
+                f"least {name} [deg]": angle_of_minimum(theta, each)
+                for name, each in curves.items()
+            }
             rows.append({"d [mm]": depth, "share [%]": 100.0 * share, **angles})
             if depth == DEPTH and share in SHARES:
                 columns[f"F on the base, {share:.0%} [N]"] = curves[_FORCE]
@@ -121,8 +124,8 @@ def sheared_rolling() -> tuple[Sheet, ...]:
         {
             "d [mm]": depth,
             "share [%]": 100.0 * SHARE,
-            "least N cos theta + T sin theta [deg]": least(tilt, base),
-            "least U [deg]": least(tilt, energy),
+            "least N cos theta + T sin theta [deg]": angle_of_minimum(tilt, base),
+            "least U [deg]": angle_of_minimum(tilt, energy),
         }
         for depth, (tilt, base, energy) in seen.items()
     ]
@@ -142,7 +145,7 @@ def _curves(name: str, axes: Axes, model: Sheet, run: Sheet, *_: Sheet) -> None:
     for share, style in zip(SHARES, ordered(len(SHARES)), strict=True):
         ratio = model[f"{name}, {share:.0%}"] / upright
         axes.plot(theta, ratio, **style, label=f"{share:.0%} not rolled off")
-        where = least(np.radians(theta), ratio)
+        where = angle_of_minimum(np.radians(theta), ratio)
         axes.plot(where, np.interp(where, theta, ratio), "v", ms=6, color=style["color"])
     axes.plot(run["theta"][::13], run[name][::13] / upright, **DOT, label=f"plant, {SHARE:.0%}")
 

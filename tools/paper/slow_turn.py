@@ -24,17 +24,17 @@ import numpy as np
 from softfinger.kinematics.hand.geometry import HandGeometry, tip_velocity
 from softfinger.tools.paper.model_pages import MODULUS
 from softfinger.tools.paper.sheets import FigurePage, FloatArray, Panel, Sheet, summary
+from softfinger.tools.simulated_daemon import SimulatedDaemon
 from softfinger.tools.style import INK, KINDS, ordered
-from softfinger.tools.watched import Watched
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 FORCE, WIDTH = 10.0, 0.040  # N on each tip's base, m
 REACH = math.radians(8.0)  # object angle reached to both sides
-LEANS = (-4, -2, 0, 2, 4)  # degrees
-_SWING = 4.0  # s from 0 to REACH
-_ASIDE = np.radians(np.linspace(-2.5, 2.5, 41))
+ANTISYMMETRIC_ANGLES = (-4, -2, 0, 2, 4)  # degrees
+_SWING_TIME = 4.0  # s from 0 to REACH
+_SIDE_ANGLES = np.radians(np.linspace(-2.5, 2.5, 41))
 _STEPS = 64
 _FRICTION = 0.6
 _SIDES = np.array([1.0, -1.0])
@@ -167,7 +167,7 @@ def valley(floor: Held, aside: FloatArray, start: Held) -> FloatArray:
     V is minimised over all other coordinates. The tips have rolled there from ``start`` in one
     step. The value is NaN where a tip would slip.
     """
-    lean = 0.5 * float(floor.q[0] - floor.q[1])
+    antisymmetric = 0.5 * float(floor.q[0] - floor.q[1])
     torque = float(start.torques().mean())
     found = np.full(aside.size, np.nan)
     near = np.append(floor.pose[:2], floor.q.mean())
@@ -175,7 +175,7 @@ def valley(floor: Held, aside: FloatArray, start: Held) -> FloatArray:
         angle = float(floor.pose[2] + more)
 
         def pose(x: FloatArray, angle: float = angle) -> Held:
-            q = np.array([x[2] + lean, x[2] - lean])
+            q = np.array([x[2] + antisymmetric, x[2] - antisymmetric])
             return held(q, np.array([x[0], x[1], angle]), start)
 
         def residual(x: FloatArray, of: Callable[[FloatArray], Held] = pose) -> FloatArray:
@@ -200,13 +200,13 @@ def swing() -> list[dict[str, float]]:
         "simulation": _FREE,
     }
     rows = []
-    with Watched(sections) as hand:
+    with SimulatedDaemon(sections) as hand:
         hand.grasp(FORCE)
         hand.run(_GRIP)
         start, t = hand.state.t, 0.0
-        while t < 4.0 * _SWING:
+        while t < 4.0 * _SWING_TIME:
             t = hand.state.t - start
-            wanted = REACH * _triangle(t / _SWING)
+            wanted = REACH * _triangle(t / _SWING_TIME)
             hand.command("hold", force=FORCE, angle=wanted)
             hand.loop.advance(0.02)
             found = Held(
@@ -240,19 +240,19 @@ def slow_turn() -> tuple[Sheet, ...]:
     back = np.r_[there[-2::-1], -np.linspace(0.0, REACH, _STEPS + 1)]
     start = gripped()
     path = [start, *turned(np.r_[there, back], start)]
-    lean = np.array([0.5 * (each.q[0] - each.q[1]) for each in path])
+    antisymmetric = np.array([0.5 * (each.q[0] - each.q[1]) for each in path])
     equations = {
         "angle [deg]": [math.degrees(each.pose[2]) for each in path],
-        "lean [deg]": np.degrees(lean),
+        "lean [deg]": np.degrees(antisymmetric),
         "energy of both tips [mJ]": [1e3 * each.energy() for each in path],
         "V [mJ]": [1e3 * potential(each, start) for each in path],
         "shear force [N]": [each.gradient()[2][0] for each in path],
     }
     landscape: dict[str, FloatArray] = {}
-    for each in LEANS:
-        floor = path[int(np.argmin(np.abs(lean - math.radians(each))))]
-        landscape[f"angle at {each} deg [deg]"] = np.degrees(floor.pose[2] + _ASIDE)
-        landscape[f"V at {each} deg [mJ]"] = 1e3 * valley(floor, _ASIDE, start)
+    for each in ANTISYMMETRIC_ANGLES:
+        floor = path[int(np.argmin(np.abs(antisymmetric - math.radians(each))))]
+        landscape[f"angle at {each} deg [deg]"] = np.degrees(floor.pose[2] + _SIDE_ANGLES)
+        landscape[f"V at {each} deg [mJ]"] = 1e3 * valley(floor, _SIDE_ANGLES, start)
     return (
         Sheet("slow_turn_equations", equations),
         summary("slow_turn_plant", swing()),
@@ -261,9 +261,14 @@ def slow_turn() -> tuple[Sheet, ...]:
 
 
 def _landscape(axes: Axes, equations: Sheet, _: Sheet, land: Sheet) -> None:
-    for lean, look in zip(LEANS, ordered(len(LEANS)), strict=True):
+    for antisymmetric, look in zip(
+        ANTISYMMETRIC_ANGLES, ordered(len(ANTISYMMETRIC_ANGLES)), strict=True
+    ):
         axes.plot(
-            land[f"angle at {lean} deg"], land[f"V at {lean} deg"], **look, label=f"lean {lean}°"
+            land[f"angle at {antisymmetric} deg"],
+            land[f"V at {antisymmetric} deg"],
+            **look,
+            label=f"lean {antisymmetric}°",
         )
     axes.plot(equations["angle"], equations["V"], color=INK, lw=2.0, label="slow turn")
 

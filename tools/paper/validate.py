@@ -21,7 +21,7 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.table import ContactTable
-from softfinger.tools.terminal.typeset import plain_table, table_text
+from softfinger.tools.terminal.text_layout import plain_table, table_text
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -37,7 +37,7 @@ _FRAMES = 64
 _PRESSED = 0.005, 0.2  # m, rad: contact in the sensors' frames
 
 
-class Beside(NamedTuple):
+class PublishedValue(NamedTuple):
     """Row with a published value and the value of this project."""
 
     quantity: str
@@ -66,20 +66,20 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def comparisons() -> Iterator[Beside]:
+def comparisons() -> Iterator[PublishedValue]:
     """Yield all rows; each is computed when it is requested."""
-    for rows in (_tips, _energy, _memory, _sensors, _hands):
+    for rows in (_tips, _energy, _relaxation, _sensors, _hands):
         yield from rows()
 
 
 def between(quantity: str, low: float, high: float, source: str, ours: float, form: str = ".2f",
-            unit: str = "", why: str = "") -> Beside:  # fmt: skip
+            unit: str = "", why: str = "") -> PublishedValue:  # fmt: skip
     """Return a row that agrees if ``ours`` is within [low, high], to the digits of ``form``."""
     shown = [f"{each:{form}}" for each in (low, high, ours)]
     inside = float(shown[0]) <= float(shown[2]) <= float(shown[1])
     verdict = "agree" if inside else "disagree"
     text = f"{shown[0]} to {shown[1]}{unit}" if low < high else f"{shown[0]}{unit}"
-    return Beside(quantity, text, source, f"{shown[2]}{unit}", verdict, why)
+    return PublishedValue(quantity, text, source, f"{shown[2]}{unit}", verdict, why)
 
 
 def exponent(d: FloatArray, force: FloatArray) -> float:
@@ -100,7 +100,7 @@ def _table(law: str) -> Callable[..., FloatArray]:
     return lambda d, theta, name: np.asarray(getattr(table(d, theta), name))
 
 
-def _tips() -> Iterator[Beside]:
+def _tips() -> Iterator[PublishedValue]:
     source = "Human Inspired Dexterity in Robotic Manipulation, table 7.1"
     for law in _LAWS:
         zeta = exponent(DEPTHS, _table(law)(DEPTHS, 0.0 * DEPTHS, "force"))
@@ -111,8 +111,14 @@ def _tips() -> Iterator[Beside]:
     yield between("γ of the contact radius, c N^γ: springs", 0.0, 1.0 / 3.0,
                   "Xydas & Kao, IJRR 18(9), 1999",
                   exponent(math.pi * MODULUS * DEPTHS**2, radius))  # fmt: skip
-    yield Beside("γ of the contact radius: solid", "0.00 to 0.33", "the same", "—", "unknown",
-                     "the data contain the pressure under the base, not on the face")  # fmt: skip
+    yield PublishedValue(
+        "γ of the contact radius: solid",
+        "0.00 to 0.33",
+        "the same",
+        "—",
+        "unknown",
+        "the data contain the pressure under the base, not on the face",
+    )
     springs = _table("springs")
     hertz = 4.0 / 3.0 * MODULUS / 0.75 * math.sqrt(RADIUS)
     d = np.linspace(0.004, 0.0079, 3901)
@@ -121,53 +127,84 @@ def _tips() -> Iterator[Beside]:
                   "π E d² = 4/3 E* √a d^(3/2)", 1e3 * float(crossing), ".1f", " mm")  # fmt: skip
 
 
-def _energy() -> Iterator[Beside]:
+def _energy() -> Iterator[PublishedValue]:
     from softfinger.tools.paper import sheared_rolling
 
     source = "Inoue & Hirai, the source of this model"
     for law in _LAWS:
         energy = _table(law)(np.full(TILTS.shape, 0.004), TILTS, "energy")
-        least = math.degrees(TILTS[int(np.argmin(energy))])
+        minimum = math.degrees(TILTS[int(np.argmin(energy))])
         why = (
             ""
-            if least == 0.0
-            else f"at a fixed d, the energy decreases up to {least:.0f}° (tested: 0 to 20°)"
+            if minimum == 0.0
+            else f"at a fixed d, the energy decreases up to {minimum:.0f}° (tested: 0 to 20°)"
         )
-        yield between(f"tilt of minimum U at d = 4 mm: {law}", 0.0, 0.0, source, least, ".1f",
+        yield between(f"tilt of minimum U at d = 4 mm: {law}", 0.0, 0.0, source, minimum, ".1f",
                       "°", why)  # fmt: skip
     theta = np.radians(np.linspace(-11.5, 9.2, 208))
     rolled = sheared_rolling.rolled(0.006, 0.05, theta)
-    before = sheared_rolling.least(theta, rolled["F on the base"])
-    yield Beside("tilt of minimum force while rolling, d = 6 mm: springs", "slightly before 0°",
-                 source, f"{before:.1f}°", "agree" if -3.0 < before < 0.0 else "disagree",
-                 "if 5 % of the rolling motion shears the tip instead")  # fmt: skip
+    before = sheared_rolling.angle_of_minimum(theta, rolled["F on the base"])
+    yield PublishedValue(
+        "tilt of minimum force while rolling, d = 6 mm: springs",
+        "slightly before 0°",
+        source,
+        f"{before:.1f}°",
+        "agree" if -3.0 < before < 0.0 else "disagree",
+        "if 5 % of the rolling motion shears the tip instead",
+    )
     d, chosen = 1e-3 * np.arange(8, 33) / 4.0, Material.constant(1.0)
     for face in ("frictionless", "sticking"):
         solid = ContactTable.build(replace(_LAWS["solid, bonded"], face=face), chosen)(d, 0.0).force
         springs = _table("springs")(d, 0.0 * d, "force")
         modulus = float(np.polyfit(solid, springs, 1)[0])
         over = modulus * solid - springs
-        yield Beside(f"Fig. 7's offset from springs, 2 to 8 mm: solid, bonded, {face}",
-                     "constant", source, f"{over.min():.1f} to {over.max():.1f} N", "disagree",
-                     f"with the best-fitting E, {1e-6 * modulus:.3f} MPa")  # fmt: skip
+        yield PublishedValue(
+            f"Fig. 7's offset from springs, 2 to 8 mm: solid, bonded, {face}",
+            "constant",
+            source,
+            f"{over.min():.1f} to {over.max():.1f} N",
+            "disagree",
+            f"with the best-fitting E, {1e-6 * modulus:.3f} MPa",
+        )
 
 
-def _memory() -> Iterator[Beside]:
+def _relaxation() -> Iterator[PublishedValue]:
     times = Settings().tip.relaxation_times
-    yield Beside("relaxation of a fingerpad", "4 ms, 70 ms, 1.4 s", "Pawluk & Howe, 1999",
-                 ", ".join(f"{t:g} s" for t in times), "unknown",
-                 "the published times; `calibrate relaxation` measures the amplitudes")  # fmt: skip
-    yield Beside("stability of a grasp over time", "increases", "Tiezzi & Kao, T-RO 23(2), 2007",
-                 "—", "unknown", "not investigated here")  # fmt: skip
-    yield Beside("softening in the first load cycles", "all tested elastomers",
-                 "Case et al., Soft Robotics 2015", "none", "disagree",
-                 "the simulated tips do not change")  # fmt: skip
-    yield Beside("shear on a sticking face", "depends on the path",
-                 "HydroShear, arXiv 2603.00446", "one path", "disagree",
-                 "the data contain only straight presses along the normal")  # fmt: skip
+    yield PublishedValue(
+        "relaxation of a fingerpad",
+        "4 ms, 70 ms, 1.4 s",
+        "Pawluk & Howe, 1999",
+        ", ".join(f"{t:g} s" for t in times),
+        "unknown",
+        "the published times; `calibrate relaxation` measures the amplitudes",
+    )
+    yield PublishedValue(
+        "stability of a grasp over time",
+        "increases",
+        "Tiezzi & Kao, T-RO 23(2), 2007",
+        "—",
+        "unknown",
+        "not investigated here",
+    )
+    yield PublishedValue(
+        "softening in the first load cycles",
+        "all tested elastomers",
+        "Case et al., Soft Robotics 2015",
+        "none",
+        "disagree",
+        "the simulated tips do not change",
+    )
+    yield PublishedValue(
+        "shear on a sticking face",
+        "depends on the path",
+        "HydroShear, arXiv 2603.00446",
+        "one path",
+        "disagree",
+        "the data contain only straight presses along the normal",
+    )
 
 
-def _sensors() -> Iterator[Beside]:
+def _sensors() -> Iterator[PublishedValue]:
     for name in ("ideal", "velostat", "capacitive"):
         d, angle, force = _errors(Settings() if name == "ideal" else load(Path(name)))
         for quantity, ours, published, unit, source in (
@@ -193,7 +230,7 @@ def _errors(settings: Settings) -> tuple[float, float, float]:
     return float(of_d), float(of_tilt), float(of_force)
 
 
-def _hands() -> Iterator[Beside]:
+def _hands() -> Iterator[PublishedValue]:
     from softfinger.tools.benchmarks.reflex import overloaded
 
     answers = [overloaded({}, 0.0, 13.0, seed).answer for seed in range(1, _TRIALS + 1)]
@@ -201,8 +238,19 @@ def _hands() -> Iterator[Beside]:
     yield between("maximum time from the onset of slip to a force increase", 0, 40,
                   "reaction in 35 to 40 ms, arXiv 2602.16127; humans 100 ms, Delhaye 2024",
                   1e3 * max(answers), ".0f", " ms", simulated)  # fmt: skip
-    yield Beside("friction in the servo gears", "depends on the load",
-                     "Rhoban, arXiv 2410.08650", f"{Settings().simulation.joint_friction:g} N·m",
-                     "disagree", "Coulomb friction that is independent of the load")  # fmt: skip
-    yield Beside("all results on physical hardware", "—", "none yet", "—", "unknown",
-                     "softfinger has not been tested on physical hardware")  # fmt: skip
+    yield PublishedValue(
+        "friction in the servo gears",
+        "depends on the load",
+        "Rhoban, arXiv 2410.08650",
+        f"{Settings().simulation.joint_friction:g} N·m",
+        "disagree",
+        "Coulomb friction that is independent of the load",
+    )
+    yield PublishedValue(
+        "all results on physical hardware",
+        "—",
+        "none yet",
+        "—",
+        "unknown",
+        "softfinger has not been tested on physical hardware",
+    )

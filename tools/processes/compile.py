@@ -38,8 +38,8 @@ from softfinger.tools.sweep import Progress, processors
 Tell = Callable[[str, str, str], None]
 
 _ROOT = Path(__file__).parents[3]
-_MEMORY = 400e6  # bytes, upper bound for one process
-_LOOK = 0.2  # s between two checks
+_MEMORY_MAX = 400e6  # bytes, upper bound for one process
+_CHECK_INTERVAL = 0.2  # s between two checks
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -137,13 +137,13 @@ class _Build:
     def run(self) -> None:
         """Build all parts; end all processes if interrupted."""
         built: dict[str, Future[str]] = {}
-        jobs = max(1, min(processors(), len(self._missing), int(_available() / _MEMORY)))
+        jobs = max(1, min(processors(), len(self._missing), int(_available() / _MEMORY_MAX)))
         pool = ThreadPoolExecutor(jobs)
         try:
             for part in self._missing:
                 built[part.name] = pool.submit(self._build, part, built.get(part.after))
             with self._bar as show:
-                while wait(built.values(), _LOOK).not_done:
+                while wait(built.values(), _CHECK_INTERVAL).not_done:
                     at = "; ".join(f"{name}: {kernel}" for name, kernel in list(self._at.items()))
                     show(self._begun, f"{self._so_far()}: {at}")
         finally:

@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING
 from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.own_files import runtime_fault
 from softfinger.tools.arguments import add_settings, own_runtime_folder, profile
-from softfinger.tools.ending import Interrupted, Signals
+from softfinger.tools.stop_condition import Interrupted, Signals
 
 if TYPE_CHECKING:
     from softfinger.daemon.profile.settings import Settings
 
-_LOOK = 0.1  # s between two queries about the motion of a plate or joint
+_QUERY_INTERVAL = 0.1  # s between two queries about the motion of a plate or joint
 _FAULTS = """\
 faults, each KIND[=VALUE][@START], any number of them:
   tactile boards   torn, noisy (=PROBABILITY a frame), silent, frozen, wrong-size, saturated, zero;
@@ -163,7 +163,7 @@ def _serve(settings: Settings, arguments: argparse.Namespace, signals: Signals) 
     build_kernels(with_board(settings), print_event, EMULATED)
     servos = EmulatedServos(arguments.baud, arguments.factory, arguments.ids)
     with contextlib.ExitStack() as made:
-        with signals.held():
+        with signals.deferred():
             try:
                 emulator = Emulator(
                     settings,
@@ -208,7 +208,7 @@ def _send(folder: Path, words: str) -> int:
             left = json.loads(reply)["wait"]
             if left == 0.0:
                 return 0
-            time.sleep(min(left, _LOOK))
+            time.sleep(min(left, _QUERY_INTERVAL))
             reply = send_words(folder, kind)
     except NoEmulator as error:
         reply = f"error: {error}"

@@ -23,7 +23,7 @@ from typing import Any, TextIO
 
 from softfinger.daemon.own_files import write_text
 
-_KEPT = 1000  # lines kept for a slow reader; older lines are dropped
+_LINE_COUNT_MAX = 1000  # lines kept for a slow reader; older lines are dropped
 _PRIORITIES = {"error": "<3>", "warning": "<4>", "": "<6>", "info": "<6>"}  # see sd-daemon(3)
 _LEVELS = {logging.DEBUG: "info", logging.INFO: "info", logging.WARNING: "warning"}
 
@@ -41,7 +41,9 @@ class EventLog:
         if file is not None:
             self._file = write_text(file, append=True)
         self._journal = file is None and _is_journal()
-        self._lines: deque[tuple[float, str, str, str, dict[str, Any]]] = deque(maxlen=_KEPT)
+        self._lines: deque[tuple[float, str, str, str, dict[str, Any]]] = deque(
+            maxlen=_LINE_COUNT_MAX
+        )
         self._news = threading.Event()
         self._closing = False
         self._thread = threading.Thread(target=self._write, name="event log", daemon=True)

@@ -18,9 +18,13 @@ from softfinger.daemon.loop.realtime import Service
 from softfinger.daemon.profile.settings import Settings, TaskSettings
 from softfinger.daemon.types import State
 from softfinger.tools.arguments import add_duration, add_profile, add_split, profile
-from softfinger.tools.ending import Interrupted, Signals
-from softfinger.tools.processes.beside import MonitorBeside, NoRecorder, RecorderBeside
+from softfinger.tools.processes.child_processes import (
+    MonitorProcess,
+    RecorderError,
+    RecorderProcess,
+)
 from softfinger.tools.processes.event_log import EventLog
+from softfinger.tools.stop_condition import Interrupted, Signals
 
 _STARTED = time.monotonic()
 _DETAIL = "realtime"  # kind of event that is logged only with --verbose
@@ -124,14 +128,14 @@ def _serve(
         if arguments.record is not None:
             try:
                 recording = _record(arguments, settings, daemon)
-            except NoRecorder as error:
+            except RecorderError as error:
                 log.plain(f"softfinger: {error}")
                 return 1
         page: AbstractContextManager[Any] = nullcontext()
         log.quiet = arguments.monitor  # the page now uses the terminal
         if arguments.monitor:
             addresses = settings.stream.address, settings.commands.address
-            page = MonitorBeside(*addresses, loop.end, settings.access.keys)
+            page = MonitorProcess(*addresses, loop.end, settings.access.keys)
         with page:
             loop.run(arguments.duration)
         log.quiet = False
@@ -172,7 +176,7 @@ def _service(loop: Any) -> Iterator[None]:
 
 
 def _record(arguments: argparse.Namespace, settings: Settings, daemon: Any) -> Any:
-    """Start a recorder and wait until it has subscribed; raise NoRecorder on failure."""
+    """Start a recorder and wait until it has subscribed; raise RecorderError on failure."""
     from softfinger.daemon.wire import schema
     from softfinger.daemon.wire.publisher import bit
 
@@ -187,7 +191,7 @@ def _record(arguments: argparse.Namespace, settings: Settings, daemon: Any) -> A
     for name in ("split_size", "split_time"):
         if (value := getattr(arguments, name)) is not None:
             words += [f"--{name.replace('_', '-')}", str(value)]
-    return RecorderBeside(words, subscribed, ended, settings.access.keys)
+    return RecorderProcess(words, subscribed, ended, settings.access.keys)
 
 
 def _scene(settings: Settings) -> str:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, BinaryIO, Protocol
 
 from softfinger.daemon.errors import RecordingError
-from softfinger.daemon.own_files import MOST, open_regular, unpacked_most
+from softfinger.daemon.own_files import SIZE_MAX, open_regular, unpacked_size_max
 from softfinger.daemon.wire import schema
 from softfinger.tools.extras import require
 from softfinger.tools.recordings.channels import ENCODING, PROFILE, Converter, from_json, topic_of
@@ -26,14 +26,14 @@ if TYPE_CHECKING:
     from mcap.records import Statistics
     from numpy.typing import NDArray
 
-_MESSAGE_MOST = 1 << 20  # bytes; a frame of the largest grid has 0.2 MB
-_SETTINGS_MOST = 4 << 20  # bytes; includes calibrations of each cell
-_CHUNK_MOST = 64 << 20  # bytes unpacked; chunks usually have 1 to 8 MB
+_MESSAGE_SIZE_MAX = 1 << 20  # bytes; a frame of the largest grid has 0.2 MB
+_SETTINGS_SIZE_MAX = 4 << 20  # bytes; includes calibrations of each cell
+_CHUNK_SIZE_MAX = 64 << 20  # bytes unpacked; chunks usually have 1 to 8 MB
 # bytes counted at least for each channel or message, because each takes time to read
-_RECORD_LEAST = 512
-_CHANNELS_MOST = 64
-_OTHERS_SHOWN = 3  # channels of other programs named in a message
-_FIELDS_MOST = 500  # fields in one message
+_RECORD_SIZE_MIN = 512
+_CHANNEL_COUNT_MAX = 64
+_OTHERS_NAMED_MAX = 3  # channels of other programs named in a message
+_FIELD_COUNT_MAX = 500  # fields in one message
 _HEADER, _FOOTER, _CHANNEL, _MESSAGE, _CHUNK, _STATISTICS, _DATA_END = 1, 2, 4, 5, 6, 11, 15
 _RECORD = struct.Struct("<BQ")  # head of each record: kind, size of the content
 _BEFORE_DATA = struct.Struct("<HIQQ")  # head of a message: channel, number, log time, publish time
@@ -118,15 +118,15 @@ class Recording:
         if self.truncated and not self.damage:
             self._damaged(None)
         if self._profile != PROFILE and not self._names:
-            names = ", ".join(sorted(self._other_names.values())[:_OTHERS_SHOWN]) or "none"
+            names = ", ".join(sorted(self._other_names.values())[:_OTHERS_NAMED_MAX]) or "none"
             damage = f"; {self.damage}" if self.damage else ""
             raise RecordingError(
                 f"{path}: profile {self._profile!r}, expected {PROFILE!r} or channels of this "
                 f"stream, such as hand/state in JSON; its channels: {names}{damage}"
             )
         if self.others and self._say is not None:
-            names = ", ".join([*self.others][:_OTHERS_SHOWN])
-            more = ", …" if len(self.others) > _OTHERS_SHOWN else ""
+            names = ", ".join([*self.others][:_OTHERS_NAMED_MAX])
+            more = ", …" if len(self.others) > _OTHERS_NAMED_MAX else ""
             self._say(
                 f"{path}: {sum(self.others.values())} messages of {len(self.others)} channels of "
                 f"other programs are left out ({names}{more})"
@@ -179,7 +179,9 @@ class Recording:
                 continue
             topic, convert = selected[channel]
             try:
-                if len(data) > (_SETTINGS_MOST if topic == schema.SETTINGS else _MESSAGE_MOST):
+                if len(data) > (
+                    _SETTINGS_SIZE_MAX if topic == schema.SETTINGS else _MESSAGE_SIZE_MAX
+                ):
                     raise ValueError(f"a message of {len(data) >> 20} MB")
                 message = convert(_plain(loads(data)))
             except ValueError as error:
@@ -200,7 +202,7 @@ class Recording:
         self.chunks = 0
         with open_regular(self.path) as file:
             file.seek(len(_MAGIC))
-            self._left = unpacked_most(file)
+            self._left = unpacked_size_max(file)
             try:
                 for kind, content in _records(file, (_CHANNEL, _MESSAGE, _CHUNK, _DATA_END)):
                     if kind == _DATA_END:
@@ -240,12 +242,12 @@ class Recording:
     def _take_record(self, kind: int, content: bytes) -> tuple[int, int, bytes] | None:
         """Process a channel record (returns None) or a message."""
         if kind == _CHANNEL:
-            self._count(max(0, _RECORD_LEAST - len(content)))
+            self._count(max(0, _RECORD_SIZE_MIN - len(content)))
             self._learn(content)
             return None
         channel, _, log_time, _ = _BEFORE_DATA.unpack_from(content)
         if channel not in self._other_names:
-            self._count(max(0, _RECORD_LEAST - len(content)))
+            self._count(max(0, _RECORD_SIZE_MIN - len(content)))
         return channel, log_time, content[_BEFORE_DATA.size :]
 
     def _count(self, unpacked: int) -> None:
@@ -265,8 +267,8 @@ class Recording:
             self._other_names[channel.id] = channel.topic
             return
         self._names[channel.id] = name if known else channel.topic
-        if len(self._names) > _CHANNELS_MOST:
-            raise ValueError(f"more than {_CHANNELS_MOST} channels")
+        if len(self._names) > _CHANNEL_COUNT_MAX:
+            raise ValueError(f"more than {_CHANNEL_COUNT_MAX} channels")
 
     def check(self) -> bool:
         """Read every message; return True if the file is complete and undamaged."""
@@ -371,9 +373,9 @@ def _records(file: IO[bytes], wanted: Collection[int]) -> Iterator[tuple[int, by
             file.seek(length, os.SEEK_CUR)
             continue
         skipped = 0
-        if length > MOST and kind == _MESSAGE:
+        if length > SIZE_MAX and kind == _MESSAGE:
             length, skipped = _BEFORE_DATA.size, length - _BEFORE_DATA.size
-        elif length > (_CHUNK_MOST if kind == _CHUNK else MOST):
+        elif length > (_CHUNK_SIZE_MAX if kind == _CHUNK else SIZE_MAX):
             raise ValueError(f"a record of {length >> 20} MB")
         content = file.read(length)
         if len(content) < length:
@@ -392,7 +394,7 @@ def _plain(message: dict[str, Any]) -> dict[str, Any]:
         values = [value for each in maps for value in each.values()]
         maps = [value for value in values if isinstance(value, dict)]
         count += len(values)
-        if count > _FIELDS_MOST or list in map(type, values):
+        if count > _FIELD_COUNT_MAX or list in map(type, values):
             break
     else:
         if not maps:
@@ -402,7 +404,7 @@ def _plain(message: dict[str, Any]) -> dict[str, Any]:
 
 def _unpacked(method: str, data: memoryview, size: int, crc: int) -> bytes:
     """Unpack a chunk's records; raise ValueError for a wrong checksum or an excessive size."""
-    if size > _CHUNK_MOST:
+    if size > _CHUNK_SIZE_MAX:
         raise ValueError(f"a chunk of {size >> 20} MB")
     if method == "zstd":
         import zstandard

@@ -20,7 +20,7 @@ from softfinger.daemon.errors import RecordingError
 from softfinger.daemon.wire import schema
 from softfinger.tools.arguments import (
     ALL,
-    PATIENCE,
+    WAIT_MAX,
     add_split,
     add_stream,
     client_keys,
@@ -29,7 +29,6 @@ from softfinger.tools.arguments import (
     topic,
     waiting,
 )
-from softfinger.tools.ending import Ending
 from softfinger.tools.extras import require
 from softfinger.tools.recordings.channels import (
     ENCODING,
@@ -42,6 +41,7 @@ from softfinger.tools.recordings.channels import (
     to_json,
 )
 from softfinger.tools.recordings.reader import Recording
+from softfinger.tools.stop_condition import StopCondition
 
 _EPILOG = """\
 Recording ends with Ctrl-C or after --duration. The messages written and lost are then printed.
@@ -49,17 +49,17 @@ With --split-size or --split-time, recording continues in FILE-2.mcap, FILE-3.mc
 `replay --recompute` needs --topics all; `run --record` records all topics from the first tick on.
 Exit status: 0 everything was written, 1 not everything was written, with the reason."""
 
-_SILENCE = 2.0  # s without a message before a notice is printed
+_SILENCE_TIME = 2.0  # s without a message before a notice is printed
 # s between two reads of the socket; waking up for each message would cost more than processing it.
-_STEP = 0.1
-_BACKLOG = 10.0  # s for processing queued messages after the end is requested
-_QUIET = 0.5  # s to wait at the end for messages still in transit on a busy machine
-_SHOW = 0.5  # s between progress lines, and between flushes
-_BATCH = 1000  # messages between two checks of the time
+_POLL_INTERVAL = 0.1
+_BACKLOG_TIMEOUT = 10.0  # s for processing queued messages after the end is requested
+_TRANSIT_TIME = 0.5  # s to wait at the end for messages still in transit on a busy machine
+_PROGRESS_INTERVAL = 0.5  # s between progress lines, and between flushes
+_BATCH_SIZE = 1000  # messages between two checks of the time
 
 
 # A killed recorder loses at most the incomplete chunk, i.e. the messages since the last flush.
-CHUNK = 256 * 1024  # bytes before compression: a fifth of a second of state at 1 kHz
+CHUNK_SIZE = 256 * 1024  # bytes before compression: a fifth of a second of state at 1 kHz
 
 
 class RecordingWriter:
@@ -88,7 +88,7 @@ class RecordingWriter:
         # Repeated messages that came before any other message.
         self._early: list[tuple[bytes, dict[str, Any]]] = []
         try:
-            self._file = path.open("xb", buffering=4 * CHUNK)  # a chunk is written at once
+            self._file = path.open("xb", buffering=4 * CHUNK_SIZE)  # a chunk is written at once
         except FileExistsError:
             raise RecordingError(f"{path}: exists already; nothing is written over it") from None
         except FileNotFoundError:
@@ -97,7 +97,7 @@ class RecordingWriter:
             raise RecordingError(f"{path}: {error.strerror}") from None
         try:
             # Larger than the limit at which `add` ends a chunk.
-            self._mcap = Writer(self._file, 2 * CHUNK)
+            self._mcap = Writer(self._file, 2 * CHUNK_SIZE)
             self._mcap.start(PROFILE, LIBRARY)
             self._wrote()
         except OSError as error:
@@ -170,7 +170,7 @@ class RecordingWriter:
             raise self._failed(error) from None
         self._added += 1
         self._filled += len(data)
-        if self._filled > CHUNK:
+        if self._filled > CHUNK_SIZE:
             self.flush()
 
     def _open(self, name: str, topic: bytes) -> tuple[int, Converter]:
@@ -225,14 +225,14 @@ def run(arguments: argparse.Namespace) -> int:
         state = f"was damaged ({damage}), its sound part is kept" if damage else "sound"
         print(f"{arguments.file}: {messages} messages; {state}")
         return 0
-    with Ending(arguments.duration, arguments.lifeline) as ending:
+    with StopCondition(arguments.duration, arguments.lifeline) as ending:
         return _Recorder(arguments, ending).record()
 
 
 class _Recorder:
     """State of one call of ``record``: socket, files and counters."""
 
-    def __init__(self, arguments: argparse.Namespace, ending: Ending) -> None:
+    def __init__(self, arguments: argparse.Namespace, ending: StopCondition) -> None:
         self._arguments = arguments
         self._ending = ending
         self._keys = client_keys(arguments.keys)  # fail before a file is created
@@ -269,47 +269,49 @@ class _Recorder:
         began = shown = last = time.monotonic()
         ending.begin()
         failure = ""
-        while not ending.over:
+        while not ending.is_met:
             taken = self._take_batch(socket)
-            if taken < _BATCH:
-                ending.wait(_STEP)
+            if taken < _BATCH_SIZE:
+                ending.wait(_POLL_INTERVAL)
             now = time.monotonic()
             if taken:
                 last = now
-            elif not self._messages and now - began > _SILENCE:
-                if arguments.no_wait and now - began > PATIENCE:
+            elif not self._messages and now - began > _SILENCE_TIME:
+                if arguments.no_wait and now - began > WAIT_MAX:
                     failure = no_stream(arguments.address, arguments.keys)
                     break
                 if not self._waiting:
                     self._waiting = True
                     to_stderr("record")(waiting(arguments.address, arguments.keys))
-            if now - shown >= _SHOW:
+            if now - shown >= _PROGRESS_INTERVAL:
                 self._writers[-1].flush()
                 self._show(now - began, now - last)
                 shown = now
         # Messages sent before a signal may still be in transit, e.g. the daemon's last ones.
-        self._read_remaining(socket, _QUIET if ending.asked or not ending.over else 0.0)
+        self._read_remaining(
+            socket, _TRANSIT_TIME if ending.is_requested or not ending.is_met else 0.0
+        )
         return failure
 
     def _take_batch(self, socket: zmq.Socket[bytes]) -> int:
-        """Process at most ``_BATCH`` waiting messages; return their number."""
+        """Process at most ``_BATCH_SIZE`` waiting messages; return their number."""
         count = 0
-        for message in drain(socket, _BATCH):
+        for message in drain(socket, _BATCH_SIZE):
             self._take(message)
             count += 1
         return count
 
     def _read_remaining(self, socket: zmq.Socket[bytes], quiet: float) -> None:
         """Process the waiting messages, and those that arrive within ``quiet`` s of waiting."""
-        end = time.monotonic() + _BACKLOG
+        end = time.monotonic() + _BACKLOG_TIMEOUT
         while time.monotonic() < end:
-            if self._take_batch(socket) < _BATCH:
+            if self._take_batch(socket) < _BATCH_SIZE:
                 if quiet <= 0.0:
                     return
                 began = time.monotonic()
-                socket.poll(int(_STEP * 1e3))
+                socket.poll(int(_POLL_INTERVAL * 1e3))
                 # A stall of the process counts as one step.
-                quiet -= min(time.monotonic() - began, _STEP)
+                quiet -= min(time.monotonic() - began, _POLL_INTERVAL)
 
     def _take(self, frames: list[bytes]) -> None:
         try:
@@ -344,7 +346,7 @@ class _Recorder:
             f"{elapsed:8.1f} s  {self._messages} messages  {size:.1f} MB  "
             f"{size / max(elapsed, 1e-3):.2f} MB/s  {lost} lost"
         )
-        if silent > _SILENCE:
+        if silent > _SILENCE_TIME:
             line += f"  silent for {silent:.0f} s"
         print(f"\r{line:<79.79}", end="", file=sys.stderr, flush=True)
 

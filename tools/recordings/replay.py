@@ -13,9 +13,9 @@ from softfinger.daemon.gateway.supervisor import Gateway
 from softfinger.daemon.profile.settings import StreamSettings
 from softfinger.daemon.profile.validation import address_problem
 from softfinger.daemon.wire import schema
-from softfinger.daemon.wire.publisher import GATEWAY_TOPICS, KEPT, pack
+from softfinger.daemon.wire.publisher import GATEWAY_TOPICS, REPEATED_COUNTS, pack
 from softfinger.tools.arguments import add_range, number, to_stderr
-from softfinger.tools.ending import Ending
+from softfinger.tools.stop_condition import StopCondition
 
 if TYPE_CHECKING:
     from softfinger.tools.recordings.reader import Recording
@@ -31,7 +31,7 @@ From the first tick on, the same code and settings give identical bits.
 Exit status: 0 identical or published, 1 the file can't be read, 3 states differ."""
 
 _SUBSCRIBER_WAIT = 10.0  # s to wait for a subscriber
-_DIFFERENT = 3
+_EXIT_DIFFERENT = 3
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -85,13 +85,15 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _publish(arguments: argparse.Namespace, recording: Recording) -> None:
     sent = 0
-    with Ending() as ending, Wire(arguments.address, arguments.keys) as wire:
+    with StopCondition() as ending, Wire(arguments.address, arguments.keys) as wire:
         if not arguments.no_wait:
             to_stderr("replay")(
                 f"waiting up to {_SUBSCRIBER_WAIT:g} s for a subscriber at {arguments.address}"
             )
             waited = time.monotonic() + _SUBSCRIBER_WAIT
-            while not ending.asked and time.monotonic() < waited and not wire.subscribed(0.1):
+            while (
+                not ending.is_requested and time.monotonic() < waited and not wire.subscribed(0.1)
+            ):
                 pass
         began, first = time.monotonic(), None
         for topic, message in recording.messages(start=arguments.start, end=arguments.end):
@@ -102,9 +104,9 @@ def _publish(arguments: argparse.Namespace, recording: Recording) -> None:
                 if first is None:
                     began, first = time.monotonic(), stamp
                 due = began + (stamp - first) / arguments.speed
-                while not ending.asked and (left := due - time.monotonic()) > 0.0:
+                while not ending.is_requested and (left := due - time.monotonic()) > 0.0:
                     wire.subscribed(min(left, 0.1))
-            if ending.asked:
+            if ending.is_requested:
                 break
             wire.send(topic, message)
             sent += 1
@@ -143,11 +145,11 @@ def _recompute(arguments: argparse.Namespace, recording: Recording) -> int:
     for name, each in result.differences.items():
         line = f"{name:24} {each.count:8} {each.first_tick:10}  {each.recorded} → {each.recomputed}"
         print(line + (f"; {each.worst:.3g} at tick {each.worst_tick}" if each.worst else ""))
-    return _DIFFERENT
+    return _EXIT_DIFFERENT
 
 
-_QUEUE = 10_000  # messages queued for a subscriber; further messages are lost
-_PATIENCE = 1.0  # s for the gateway to accept a message
+_QUEUE_LENGTH = 10_000  # messages queued for a subscriber; further messages are lost
+_SEND_TIMEOUT = 1.0  # s for the gateway to accept a message
 
 
 class Wire:
@@ -162,7 +164,9 @@ class Wire:
         if fault:
             raise RecordingError(f"--address: {fault}")
         folder = "" if keys is None else str(keys)
-        config = Config(address, "", GATEWAY_TOPICS, _QUEUE, keys=folder, stream_key="--address")
+        config = Config(
+            address, "", GATEWAY_TOPICS, _QUEUE_LENGTH, keys=folder, stream_key="--address"
+        )
         self._gateway = Gateway(config)
         try:
             self._gateway.wait()
@@ -180,9 +184,9 @@ class Wire:
         """Publish one message as soon as the gateway has room for it."""
         if topic not in schema.TOPICS:  # topic of another version
             return
-        self._link.wait_for_room(_PATIENCE)
+        self._link.wait_for_room(_SEND_TIMEOUT)
         index = GATEWAY_TOPICS.index(topic.decode())
-        self._link.publish(index, pack(message), KEPT.get(topic, 0))
+        self._link.publish(index, pack(message), REPEATED_COUNTS.get(topic, 0))
 
     def __enter__(self) -> Wire:
         return self

@@ -14,11 +14,11 @@ from typing import Any, NamedTuple
 from softfinger.daemon.control.envelope import (
     HELD,
     LOST,
-    MEANING,
+    OUTCOME_TEXTS,
     REFUSED,
     TURNED,
     identity,
-    raised,
+    increased_force_limit,
 )
 from softfinger.daemon.own_files import write_text
 from softfinger.daemon.profile.settings import Settings
@@ -31,12 +31,12 @@ SHAPES = ("rectangle", "disc")
 SIZES = (2, 3, 4, 5, 6, 8, 10, 15, 20, 30, 40, 60, 90)  # mm: width or diameter
 FRICTIONS = (0.2, 0.4, 0.6, 0.8)
 MASSES = (0.05, 0.2, 0.5, 1.0, 2.0)  # kg
-_SETTLE = 3.0  # s for the grip to settle
-_LIFT = 1.0  # s in which the weight is applied
-_AFTER = 1.0  # s of observation afterwards
-_STEPS = 20  # steps in which the weight is applied
-_TURNED = math.radians(5.0)
-_AWAY = 0.010  # m, displacement along the faces at which the object counts as lost
+_SETTLING_TIME = 3.0  # s for the grip to settle
+_LOAD_TIME = 1.0  # s in which the weight is applied
+_OBSERVATION_TIME = 1.0  # s of observation afterwards
+_LOAD_STEP_COUNT = 20  # steps in which the weight is applied
+_TURN_MIN = math.radians(5.0)
+_SLIDE_MAX = 0.010  # m, displacement along the faces at which the object counts as lost
 _GRAVITY = 9.81  # m/s²
 _COLOURS = {HELD: "#009E73", TURNED: "#E69F00", LOST: "#D55E00", REFUSED: "#777777"}
 
@@ -95,7 +95,9 @@ def run(arguments: argparse.Namespace) -> int:
         tuple(sorted(arguments.mass or MASSES)),  # sorted, as the reader of the map requires
         tuple(sorted(arguments.size or SIZES)),
     )
-    print(f"{arguments.force:g} N; " + "; ".join(f"{k}: {text}" for k, text in MEANING.items()))
+    print(
+        f"{arguments.force:g} N; " + "; ".join(f"{k}: {text}" for k, text in OUTCOME_TEXTS.items())
+    )
     found: dict[str, list[list[Cell]]] = {shape: [] for shape in shapes}
     frictions, masses, sizes = axes
     results = sweep(settings, shapes, axes, arguments)
@@ -145,7 +147,7 @@ def grasped(
     The daemon's settings contain the object's width or diameter ``size`` [m], friction and weight
     (``mass`` in kg). They do not contain its shape: the daemon assumes a block.
     """
-    from softfinger.tools.watched import Watched
+    from softfinger.tools.simulated_daemon import SimulatedDaemon
 
     weight = mass * _GRAVITY
     changed: dict[str, dict[str, Any]] = settings.model_dump(exclude_unset=True)
@@ -162,25 +164,25 @@ def grasped(
     }
     for name, values in changes.items():
         changed[name] = changed.get(name, {}) | values
-    with Watched(changed) as hand:
+    with SimulatedDaemon(changed) as hand:
         hand.grasp(force)
         angle = float(hand.plant.object_pose[2])
-        hand.run(_SETTLE)
+        hand.run(_SETTLING_TIME)
         if hand.mode != "holding":
             return Cell(REFUSED, math.nan)
         before = hand.plant.object_pose.copy()
         # Friction of the table opposes the load, so add it.
         pull = weight * (1.0 + settings.simulation.table_friction)
-        for k in range(_STEPS):
-            load, phi = pull * (k + 1) / _STEPS, float(hand.plant.object_pose[2])
+        for k in range(_LOAD_STEP_COUNT):
+            load, phi = pull * (k + 1) / _LOAD_STEP_COUNT, float(hand.plant.object_pose[2])
             hand.plant.apply_load(-load * math.sin(phi), load * math.cos(phi))
-            hand.run(_LIFT / _STEPS)
-        hand.run(_AFTER)
+            hand.run(_LOAD_TIME / _LOAD_STEP_COUNT)
+        hand.run(_OBSERVATION_TIME)
         shifted = math.dist(hand.plant.object_pose[:2], before[:2])
-        if hand.mode != "holding" or shifted > _AWAY:
+        if hand.mode != "holding" or shifted > _SLIDE_MAX:
             return Cell(LOST, math.nan)
         turned = abs(float(hand.plant.object_pose[2]) - angle)
-        return Cell(TURNED if turned > _TURNED else HELD, turned)
+        return Cell(TURNED if turned > _TURN_MIN else HELD, turned)
 
 
 def _keep(
@@ -193,9 +195,10 @@ def _keep(
     frictions, masses, sizes = axes
     lines = [
         "# What the hand holds, by `softfinger envelope --keep`; a row for each friction and mass,",
-        "# a letter for each size: " + ", ".join(f"{k} {text}" for k, text in MEANING.items()),
+        "# a letter for each size: "
+        + ", ".join(f"{k} {text}" for k, text in OUTCOME_TEXTS.items()),
         f"force = {force!r}",
-        f"raised = {raised(settings, force)!r}",
+        f"raised = {increased_force_limit(settings, force)!r}",
         f"friction = {json.dumps([float(each) for each in frictions])}",
         f"mass = {json.dumps([float(each) for each in masses])}",
         f"size = {json.dumps([round(1e-3 * each, 6) for each in sizes])}",
@@ -233,7 +236,7 @@ def _draw(
             for j in range(len(masses)):
                 for x, cell in enumerate(found[shape][k * len(masses) + j]):
                     axes_.barh(j, 0.94, 0.92, x - 0.47, color=_COLOURS[cell.outcome])
-                    if cell.turned > _TURNED:
+                    if cell.turned > _TURN_MIN:
                         text = f"{math.degrees(cell.turned):.0f}°"
                         axes_.text(x, j, text, ha="center", va="center", fontsize=6)
             axes_.set(yticks=range(len(masses)), yticklabels=[f"{each:g} kg" for each in masses])
@@ -241,6 +244,6 @@ def _draw(
             if k == len(frictions) - 1:
                 axes_.set_xlabel("width or diameter [mm]")
         for outcome, colour in _COLOURS.items():
-            grid[0, 0].barh([0], [0], color=colour, label=MEANING[outcome])
+            grid[0, 0].barh([0], [0], color=colour, label=OUTCOME_TEXTS[outcome])
         figure.legend(loc="outside lower center", ncols=2)
         style.save(figure, path)

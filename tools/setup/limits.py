@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from softfinger.daemon.profile.settings import Settings
 from softfinger.tools.arguments import add_profile, profile
-from softfinger.tools.terminal.typeset import plain_table, table_text
+from softfinger.tools.terminal.text_layout import plain_table, table_text
 
 if TYPE_CHECKING:
     from softfinger.daemon.safety.limits import Limit

@@ -9,7 +9,7 @@ from dataclasses import replace
 from softfinger.daemon.diagnosis.ports import serial_ports
 from softfinger.daemon.errors import ServoError
 from softfinger.daemon.servos.control_table import BAUD_RATES
-from softfinger.daemon.servos.provisioning import ALONE, SEARCH_TIME, FoundServo, search
+from softfinger.daemon.servos.provisioning import ONE_SERVO_ONLY, SEARCH_TIME, FoundServo, search
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -53,7 +53,7 @@ def run(arguments: argparse.Namespace) -> int:
             # An emulated servo may answer at several rates; they are joined in one line.
             print(f"{path}: {servo.told(', '.join(at))}", flush=True)
         for garbled in found.garbled:
-            print(f"{path}: {garbled}\n  → {ALONE}", flush=True)
+            print(f"{path}: {garbled}\n  → {ONE_SERVO_ONLY}", flush=True)
         for old in found.old_protocol():
             print(f"{path}: {old}", flush=True)
         if not found.servos and not found.garbled and not found.old:

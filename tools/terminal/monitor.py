@@ -20,31 +20,31 @@ from typing import Any, Self
 import zmq
 
 from softfinger.tools.arguments import (
-    PATIENCE,
+    WAIT_MAX,
     add_stream,
     addresses,
     client_keys,
     no_stream,
     to_stderr,
 )
-from softfinger.tools.ending import Ending, known
-from softfinger.tools.terminal.feed import Commander, Feed, FeedSubscriber, printable
+from softfinger.tools.stop_condition import StopCondition, available_signals
 from softfinger.tools.terminal.monitor_page import MonitorPage
 from softfinger.tools.terminal.status import told
+from softfinger.tools.terminal.stream_state import Commander, StreamReader, StreamState, printable
 from softfinger.tools.terminal.terminal import KeyDecoder, Terminal, TerminalGone
 
 STEP_ANGLE = math.radians(5.0)  # rad, object rotation per press of an arrow key
 _STEPS = ((1.0, 0.1), (5.0, 0.5), (math.inf, 1.0))  # (upper force limit [N], step below it [N])
-_BETWEEN = 1.0  # s, presses within this time accumulate
-_SURE = 3.0  # s within which a second d confirms disarming
-_SIMPLE = {"a": "arm", "r": "release", " ": "stop", "c": "clear", "d": "disarm", "w": "demo"}
+_ACCUMULATION_TIME = 1.0  # s, presses within this time accumulate
+_CONFIRMATION_TIME = 3.0  # s within which a second d confirms disarming
+_COMMAND_KEYS = {"a": "arm", "r": "release", " ": "stop", "c": "clear", "d": "disarm", "w": "demo"}
 _GRIPPING = ("grasping", "holding", "rotating")
 
 
 class HandKeys:
     """Convert key presses to commands."""
 
-    def __init__(self, feed: Feed, commander: Commander) -> None:
+    def __init__(self, feed: StreamState, commander: Commander) -> None:
         self._feed = feed
         self._commander = commander
         self._target: float | None = None  # object angle [rad]
@@ -60,12 +60,12 @@ class HandKeys:
             self._change_force(1.0 if key in "+=" else -1.0, now)
         elif key == "g":
             self._grasp(now)
-        elif key == "d" and self._gripping and now - self._asked > _SURE:
+        elif key == "d" and self._gripping and now - self._asked > _CONFIRMATION_TIME:
             self._asked = now
             self._commander.refuse(now, "disarm: it lets the object fall; d again to do it")
-        elif key in _SIMPLE:
+        elif key in _COMMAND_KEYS:
             self._target = None
-            self._commander.send(now, _SIMPLE[key], _SIMPLE[key])
+            self._commander.send(now, _COMMAND_KEYS[key], _COMMAND_KEYS[key])
 
     def force(self, now: float) -> float:
         """Return the force of the next grasp, or the requested force of the current grip [N].
@@ -76,8 +76,8 @@ class HandKeys:
         if not self._gripping or self._adding(now):
             return feed.force_default if math.isnan(self._chosen) else self._chosen
         # The grip may have been commanded before this page was started.
-        known = (feed.commanded, feed.state.goal_force, self._chosen)
-        return next((force for force in known if not math.isnan(force)), math.nan)
+        candidates = (feed.commanded, feed.state.goal_force, self._chosen)
+        return next((force for force in candidates if not math.isnan(force)), math.nan)
 
     @property
     def _gripping(self) -> bool:
@@ -87,7 +87,7 @@ class HandKeys:
         """Return True shortly after a force key, while the chosen force is not yet published."""
         reply = self._commander.reply
         refused = reply is not None and not reply.ok and reply.at >= self._pressed
-        return now - self._pressed < _BETWEEN and not refused
+        return now - self._pressed < _ACCUMULATION_TIME and not refused
 
     def _change_force(self, sign: float, now: float) -> None:
         """Change the force by one step; a current grip is changed immediately."""
@@ -124,9 +124,9 @@ class HandKeys:
         self._commander.send(now, label, "rotate", angle=self._target)
 
 
-REDRAW = 0.1  # s, shortest time between redraws
-PLAIN_STEP = 0.1  # s between reads of the stream in plain mode
-PLAIN_LINE = 1.0  # s between plain lines
+REDRAW_INTERVAL = 0.1  # s, shortest time between redraws
+PLAIN_READ_INTERVAL = 0.1  # s between reads of the stream in plain mode
+PLAIN_LINE_INTERVAL = 1.0  # s between plain lines
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -151,13 +151,13 @@ def run(args: argparse.Namespace) -> int:
         _lower_priority()
     keys = client_keys(args.keys)
     context: zmq.Context[Any] = zmq.Context(io_threads=1)
-    feed = Feed()
+    feed = StreamState()
     try:
         if keys is not None:
             keys.guard(context)
-        subscriber = FeedSubscriber(context, state, feed)
+        subscriber = StreamReader(context, state, feed)
         commander = Commander(context, commands, args.client)
-        with _Ending(args) as ending:
+        with _MonitorStop(args) as ending:
             if _is_page(args):
                 page = MonitorPage(feed, state, guarded=keys is not None)
                 _run_page(page, subscriber, commander, ending)
@@ -188,10 +188,10 @@ def _is_page(args: argparse.Namespace) -> bool:
     return (sys.stdout.encoding or "").lower().replace("-", "") == "utf8"
 
 
-class _Ending(Ending):
-    """Ending that also handles suspension, and ends without a stream if ``--no-wait`` is given."""
+class _MonitorStop(StopCondition):
+    """Stop condition of the monitor: also suspension, and no stream with ``--no-wait``."""
 
-    signals = known("SIGINT", "SIGTERM", "SIGHUP")
+    signals = available_signals("SIGINT", "SIGTERM", "SIGHUP")
 
     def __init__(self, args: argparse.Namespace) -> None:
         super().__init__(args.duration, args.lifeline)
@@ -202,7 +202,7 @@ class _Ending(Ending):
         self._no_wait: bool = args.no_wait
         self._keys: Path | None = args.keys
         self.beside = args.lifeline is not None  # started by the daemon, in the same process group
-        self._patience = time.monotonic() + PATIENCE
+        self._wait_until = time.monotonic() + WAIT_MAX
 
     def __enter__(self) -> Self:
         super().__enter__()
@@ -219,21 +219,21 @@ class _Ending(Ending):
         self.suspend = True
         self.wake()
 
-    def watch(self, feed: Feed, address: str, now: float) -> None:
+    def watch(self, feed: StreamState, address: str, now: float) -> None:
         """Request the end if ``--no-wait`` is given and there is no stream."""
-        if not self._no_wait or self.over:
+        if not self._no_wait or self.is_met:
             return
         status = feed.status(now)
         if status == "lost":
             self.why = "the stream has ended"
-        elif status == "waiting" and now > self._patience:
+        elif status == "waiting" and now > self._wait_until:
             self.why = no_stream(address, self._keys)
         if self.why:
             self.end()
 
 
 def _run_page(
-    page: MonitorPage, subscriber: FeedSubscriber, commander: Commander, ending: _Ending
+    page: MonitorPage, subscriber: StreamReader, commander: Commander, ending: _MonitorStop
 ) -> None:
     keyboard = sys.stdin.fileno() if sys.stdin is not None and sys.stdin.isatty() else None
     page.keys = keyboard is not None
@@ -241,10 +241,10 @@ def _run_page(
     page.coloured = terminal.coloured
     ending.terminal = terminal
     try:
-        while not ending.over:
+        while not ending.is_met:
             with terminal:
                 _page_loop(page, terminal, keyboard, subscriber, commander, ending)
-            if ending.suspend and not ending.over:  # Ctrl-Z: return the terminal to the shell
+            if ending.suspend and not ending.is_met:  # Ctrl-Z: return the terminal to the shell
                 ending.suspend = False
                 os.kill(os.getpid(), signal.SIGSTOP)
     except TerminalGone:
@@ -255,16 +255,16 @@ def _page_loop(
     page: MonitorPage,
     terminal: Terminal,
     keyboard: int | None,
-    subscriber: FeedSubscriber,
+    subscriber: StreamReader,
     commander: Commander,
-    ending: _Ending,
+    ending: _MonitorStop,
 ) -> None:
     keys = KeyDecoder()
     hand = HandKeys(page.feed, commander)
     due = time.monotonic()
-    while not (ending.over or ending.suspend):
+    while not (ending.is_met or ending.suspend):
         keyboards = [] if keyboard is None else [keyboard]
-        for each in ending.ready(due - time.monotonic(), *keyboards):
+        for each in ending.wait_readable(due - time.monotonic(), *keyboards):
             typed = _read(each)
             if not typed:
                 keyboard = None  # the keyboard was closed; keep showing the page
@@ -284,7 +284,7 @@ def _page_loop(
         page.force = hand.force(now)
         width, height = terminal.size()
         terminal.draw(page.lines(width, height, now, commander.reply))
-        due = max(due + REDRAW, time.monotonic() + 0.5 * REDRAW)
+        due = max(due + REDRAW_INTERVAL, time.monotonic() + 0.5 * REDRAW_INTERVAL)
 
 
 def _read(keyboard: int) -> bytes:
@@ -294,12 +294,12 @@ def _read(keyboard: int) -> bytes:
         return b""
 
 
-def _run_plain(address: str, subscriber: FeedSubscriber, ending: _Ending) -> None:
+def _run_plain(address: str, subscriber: StreamReader, ending: _MonitorStop) -> None:
     feed = subscriber.feed
     with contextlib.suppress(BrokenPipeError):
         said_status, due = "live", 0.0
-        while not ending.over:
-            ending.wait(PLAIN_STEP)
+        while not ending.is_met:
+            ending.wait(PLAIN_READ_INTERVAL)
             now = time.monotonic()
             subscriber.drain(now)
             ending.watch(feed, address, now)
@@ -310,7 +310,7 @@ def _run_plain(address: str, subscriber: FeedSubscriber, ending: _Ending) -> Non
             for event in feed.news():
                 _say(f"{event.clock()} {event.level} {event.kind}: {event.text}")
             if status in ("live", "stale") and now >= due:
-                due = now + PLAIN_LINE
+                due = now + PLAIN_LINE_INTERVAL
                 _say(f"{_clock()} {printable(told(feed.state))}")
         return
     # The reader has closed the pipe. Python flushes its output again at exit; send that to

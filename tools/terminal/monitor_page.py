@@ -15,33 +15,33 @@ from rich.text import Text
 from softfinger.daemon.types import FINGERS
 from softfinger.daemon.wire.schema import SCHEMA
 from softfinger.tools.terminal import heatmap
-from softfinger.tools.terminal.feed import MEANINGS, Feed, ShownReply
 from softfinger.tools.terminal.status import why_invalid
-from softfinger.tools.terminal.typeset import (
+from softfinger.tools.terminal.stream_state import GLOSSARY, ShownReply, StreamState
+from softfinger.tools.terminal.text_layout import (
     DIM,
-    aligned,
-    apart,
     centred,
-    cut,
-    faded,
-    micro,
-    narrow,
+    dimmed,
+    format_aligned,
+    format_microseconds,
+    format_narrow,
+    format_value,
+    justified,
     rule,
-    short,
+    truncated,
     wrapped,
 )
 
 WIDTH, HEIGHT = 80, 24  # smallest size into which everything fits
 CENTRE = 34  # width of the numbers, columns
 MAP_LINES = 11  # height of each map at the smallest page size
-OLD = 1.0  # s, age above which a frame is marked as old
+OLD_AGE = 1.0  # s, age above which a frame is marked as old
 REPLY_TIME = 12.0  # s for which a reply is shown
-LATE = 0.05  # s, delay above which a message is shown
+DELAY_MIN = 0.05  # s, delay above which a message is shown
 
 GOOD, WARN, BAD = "#1fa883", "#e69f00", "bold #ff6a3d"
 KEY = "bold #56b4e9"
 ALARM = "bold #ffffff on #b8360b"
-SIDE = {"left": KEY, "right": "bold #e69f00"}
+FINGER_STYLES = {"left": KEY, "right": "bold #e69f00"}
 _BADGES = {
     "disarmed": "bold #ffffff on #5a6068",
     "armed": "bold #ffffff on #0067a8",
@@ -87,7 +87,7 @@ _ROWS = (
 class MonitorPage:
     """Page that shows a feed; ``now`` is monotonic time [s]."""
 
-    feed: Feed
+    feed: StreamState
     address: str
     coloured: bool = True  # the terminal has more than 16 colours
     keys: bool = True  # a keyboard is available
@@ -115,7 +115,7 @@ class MonitorPage:
             self._ticks(),
         ]
         if status in ("stale", "lost"):
-            numbers = [faded(line) for line in numbers]
+            numbers = [dimmed(line) for line in numbers]
         return [
             self._header(width, now, status),
             self._notice(width, now, status),
@@ -133,35 +133,39 @@ class MonitorPage:
         if status == "waiting":
             right = Text("○ no stream yet ", WARN)
         elif status == "live":
-            right = Text.assemble(("● live ", GOOD), (f"{short(feed.rate, 0)} Hz ", DIM))
+            right = Text.assemble(("● live ", GOOD), (f"{format_value(feed.rate, 0)} Hz ", DIM))
         else:
             sign, style = ("◐ stale", WARN) if status == "stale" else ("○ lost", BAD)
-            right = Text(f"{sign} {short(feed.age(now), 1)} s ", style)
-        unreadable = f"{feed.skipped} unreadable  " if feed.skipped else ""
+            right = Text(f"{sign} {format_value(feed.age(now), 1)} s ", style)
+        unreadable = f"{feed.skipped_count} unreadable  " if feed.skipped_count else ""
         width_left = width - left.cell_len - right.cell_len - 2
         address = f"{self.address}  " if len(self.address + unreadable) <= width_left else ""
-        return apart(left, Text.assemble((unreadable, WARN), (address, DIM), right), width)
+        return justified(left, Text.assemble((unreadable, WARN), (address, DIM), right), width)
 
     def _notice(self, width: int, now: float, status: str) -> Text:
         feed = self.feed
         if status == "lost":
             return Text(" the stream has stopped; everything below is old", BAD)
         if feed.fault:
-            fault = cut(Text(f" FAULT {feed.fault}"), width - len(self._way_out) - 1)
-            line = apart(fault, Text(self._way_out), width)
+            fault = truncated(Text(f" FAULT {feed.fault}"), width - len(self._way_out) - 1)
+            line = justified(fault, Text(self._way_out), width)
             line.stylize(ALARM)
             return line
         if status == "waiting":
             what = " waiting for a daemon; start one with: softfinger run"
-            return cut(Text(what + " (or it requires --keys)" * (not self.guarded), WARN), width)
+            return truncated(
+                Text(what + " (or it requires --keys)" * (not self.guarded), WARN), width
+            )
         if feed.state.schema != SCHEMA:
             what = f" the stream has schema {feed.state.schema}, this page knows {SCHEMA}"
             return Text(what + " and shows the fields it knows", WARN)
         lately = feed.waited(now)
-        if lately > LATE:
+        if lately > DELAY_MIN:
             what = f" this machine is busy: the simulated hand runs {lately:.2f} s behind"
-            return cut(Text(f"{what} ({short(feed.state.behind_s, 2)} s in all)", WARN), width)
-        return cut(Text(f" {why_invalid(feed.state)}", WARN), width)
+            return truncated(
+                Text(f"{what} ({format_value(feed.state.behind_s, 2)} s in all)", WARN), width
+            )
+        return truncated(Text(f" {why_invalid(feed.state)}", WARN), width)
 
     def _body(self, width: int, lines: int, now: float) -> list[Text]:
         """Draw titles, both maps with the numbers between them, their scale and the object."""
@@ -185,7 +189,7 @@ class MonitorPage:
     ) -> list[Text]:
         """Draw title, ``lines`` of map and scale, each at most ``box`` columns wide."""
         frame = self.feed.frames.get(name)
-        title = Text(name.upper(), SIDE[name])
+        title = Text(name.upper(), FINGER_STYLES[name])
         picture = [Text() for _ in range(lines)]
         if frame is None:
             picture[lines // 2] = centred(Text("no frames", DIM), box)
@@ -193,10 +197,10 @@ class MonitorPage:
         unit, factor, decimals = ("counts", 1.0, 0) if counts else ("kPa", 1e-3, 1)
         touch = getattr(self.feed.state, name).contact
         text, style = ("contact", GOOD) if touch else ("free", DIM)
-        if now - frame.arrived > OLD:
+        if now - frame.arrived > OLD_AGE:
             text, style = "old", WARN
         peak = Text(f"{frame.grid.max() * factor:.{decimals}f} {unit}")
-        title = apart(Text.assemble(title, (f" {text}", style)), peak, box)
+        title = justified(Text.assemble(title, (f" {text}", style)), peak, box)
         rows, cols = frame.grid.shape
         height, columns = heatmap.fit(rows, cols, lines, box, frame.aspect)
         above = (lines - height) // 2
@@ -219,7 +223,7 @@ class MonitorPage:
         line = Text(" " * 8)
         for name in FINGERS:
             here = getattr(self.feed.state, name).valid
-            line.append(f"{name if here else name + ' —':^10} ", SIDE[name])
+            line.append(f"{name if here else name + ' —':^10} ", FINGER_STYLES[name])
         return line
 
     def _row(self, label: str, key: str, factor: float, decimals: int, unit: str, std: str) -> Text:
@@ -228,11 +232,11 @@ class MonitorPage:
             finger = getattr(self.feed.state, name)
             value, style = getattr(finger, key), "default" if finger.valid else DIM
             if key == "temperature":
-                style = BAD if finger.time_to_limit < self.feed.warm else style
+                style = BAD if finger.time_to_limit < self.feed.heat_warning_time else style
                 value = value or math.nan  # 0 means unknown
             spread = factor * getattr(finger, std) if std else math.nan
-            shown = aligned(factor * value, decimals)
-            beside = "" if math.isnan(spread) else "±" + narrow(spread)
+            shown = format_aligned(factor * value, decimals)
+            beside = "" if math.isnan(spread) else "±" + format_narrow(spread)
             line.append(shown, style).append(f"{beside:<{11 - len(shown)}}", DIM)
         return line.append(f" {unit}", DIM)
 
@@ -243,9 +247,9 @@ class MonitorPage:
         )
         return Text.assemble(
             (f"{'object':<8}", DIM),
-            (f"{aligned(angle, 2):<6}", "bold"),
+            (f"{format_aligned(angle, 2):<6}", "bold"),
             (f"{' °':<5}", DIM),
-            (f"{aligned(width, 2):<6}", "bold"),
+            (f"{format_aligned(width, 2):<6}", "bold"),
             (" mm wide", DIM),
         )
 
@@ -253,18 +257,20 @@ class MonitorPage:
         """Return rate and overruns, then median, tail and maximum of the times of all ticks."""
         times, overruns = self.feed.times, self.feed.state.overruns
         rate = math.nan if times is None else times.rates.tick
-        line = Text(f" tick {short(rate, 0)} Hz").append("  overruns ", DIM)
+        line = Text(f" tick {format_value(rate, 0)} Hz").append("  overruns ", DIM)
         known = str(overruns) if self.feed.mode else "—"
         line.append(known, WARN if overruns > 0 else "default").append("  p50/p99/max", DIM)
         for label, name in (("compute", "compute"), ("late", "wake")):
             of = getattr(times, name, None)
             values = [math.nan] * 3 if of is None else (of.p50, of.p99, of.max)
-            line.append(f"  {label} ", DIM).append("/".join(micro(value) for value in values))
+            line.append(f"  {label} ", DIM).append(
+                "/".join(format_microseconds(value) for value in values)
+            )
         return line.append(" µs", DIM)
 
     def _messages(self, width: int, count: int, now: float, reply: ShownReply | None) -> list[Text]:
         """Draw commander and last reply, then texts too long for their line, then events."""
-        who = cut(Text(self.feed.commander(now)), 16)
+        who = truncated(Text(self.feed.commander(now)), 16)
         title = Text(f"events ─ {who} commands the hand" if who else "events")
         full: list[Text] = []
         if Text(self.feed.fault).cell_len > width - len(self._way_out) - 8:
@@ -289,7 +295,7 @@ class MonitorPage:
             style = _LEVELS.get(event.level, "default")
             line = Text.assemble((f" {event.clock()}", DIM), (f" {event.kind:<9} ", style))
             lines.append(
-                cut(line.append(event.text, style if event.level != "info" else ""), width)
+                truncated(line.append(event.text, style if event.level != "info" else ""), width)
             )
         return lines + [Text() for _ in range(count - len(lines))]
 
@@ -308,8 +314,10 @@ class MonitorPage:
 
 
 def _meanings(width: int, lines: int) -> list[Text]:
-    explained = MEANINGS + _KEYS_EXPLAINED
-    named = [cut(Text.assemble((f" {name:>15}  ", KEY), text), width) for name, text in explained]
+    explained = GLOSSARY + _KEYS_EXPLAINED
+    named = [
+        truncated(Text.assemble((f" {name:>15}  ", KEY), text), width) for name, text in explained
+    ]
     return named + [Text() for _ in range(lines - len(named))]
 
 
@@ -336,5 +344,5 @@ def _too_small(width: int, height: int) -> list[Text]:
         "q quits, space stops",
     ]
     lines = [Text() for _ in range(max(0, (height - len(text)) // 2))]
-    lines += [centred(cut(Text(line, WARN), width), width) for line in text]
+    lines += [centred(truncated(Text(line, WARN), width), width) for line in text]
     return (lines + [Text() for _ in range(height)])[:height]

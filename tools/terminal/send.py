@@ -10,8 +10,8 @@ import sys
 from collections.abc import Iterator
 from typing import Any
 
-from softfinger.daemon.client.command_client import UNCONFIRMED, NoAnswer, send
-from softfinger.daemon.client.connection import PATIENCE
+from softfinger.daemon.client.command_client import UNCONFIRMED_TEXT, NoAnswer, send
+from softfinger.daemon.client.connection import REPLY_TIMEOUT
 from softfinger.daemon.control.modes import COMMANDS
 from softfinger.daemon.errors import KeyFileError
 from softfinger.tools.arguments import add_daemon, client_keys, command_address, seconds
@@ -38,9 +38,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--timeout",
         type=seconds,
-        default=PATIENCE,
+        default=REPLY_TIMEOUT,
         metavar="S",
-        help=f"seconds to wait for the reply (default {PATIENCE:g})",
+        help=f"seconds to wait for the reply (default {REPLY_TIMEOUT:g})",
     )
 
 
@@ -61,7 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
         return 2
     print(json.dumps(reply, ensure_ascii=False))
     if reply.get("torque_off") == "unconfirmed":
-        print(f"send: {UNCONFIRMED}", file=sys.stderr)
+        print(f"send: {UNCONFIRMED_TEXT}", file=sys.stderr)
         return 3
     return 0 if reply.get("ok") else 1
 

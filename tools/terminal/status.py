@@ -56,5 +56,5 @@ def why_invalid(state: HandState) -> str:
     return "; ".join(
         f"{name} not valid: {reason}"
         for name, reason in reasons.items()
-        if reason not in ("", Invalid.ABSENT.text)
+        if reason not in ("", Invalid.NOT_IN_SCENE.text)
     )

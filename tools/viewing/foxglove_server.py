@@ -25,21 +25,21 @@ from softfinger.daemon.types import FINGERS
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.schema import HandState
 from softfinger.tools.recordings import channels
-from softfinger.tools.terminal.feed import number
-from softfinger.tools.viewing.planar import COLOURS, Drawn, hand_parts
+from softfinger.tools.terminal.stream_state import number
+from softfinger.tools.viewing.hand_drawing import COLOURS, DrawnPart, hand_parts
 
 LAYOUT = Path(__file__).with_name("foxglove_layout.json")
 ORIGINS = ("https://app.foxglove.dev", "file://")  # Foxglove in the browser and on the desktop
 PROTOCOLS = (Subprotocol("foxglove.sdk.v1"), Subprotocol("foxglove.websocket.v1"))
-CLIENTS = 8
+CLIENT_COUNT_MAX = 8
 SCENE = "hand/scene"
 _FRAME = "hand"  # coordinate frame: x from the left to the right pivot, y away from the palm [m]
 _LIST = {"type": "array", "items": {"type": "object", "properties": {}}}
 _ENTITIES = {"type": "object", "properties": {"deletions": _LIST, "entities": _LIST}}
 _HEAD = struct.Struct("<BIQ")  # head of a message: kind, subscription, time [ns]
-_EVENTS = 50  # events kept for new subscribers, as many as the daemon repeats
-_QUEUE = 500  # messages queued for a client; further messages are dropped
-_PATIENCE = 2.0  # s for a client to accept a message
+_EVENT_COUNT = 50  # events kept for new subscribers, as many as the daemon repeats
+_QUEUE_LENGTH = 500  # messages queued for a client; further messages are dropped
+_SEND_TIMEOUT = 2.0  # s for a client to accept a message
 
 
 class _Client:
@@ -47,7 +47,7 @@ class _Client:
 
     def __init__(self) -> None:
         self.subscribed: dict[str, int] = {}
-        self.queue: asyncio.Queue[bytes] = asyncio.Queue(_QUEUE)
+        self.queue: asyncio.Queue[bytes] = asyncio.Queue(_QUEUE_LENGTH)
 
     def give(self, channel: str, stamp: float, data: bytes) -> None:
         """Queue a message if the client subscribes to its channel and the queue has room."""
@@ -60,7 +60,7 @@ class _Client:
         try:
             while True:
                 message = await self.queue.get()
-                async with asyncio.timeout(_PATIENCE):
+                async with asyncio.timeout(_SEND_TIMEOUT):
                     await socket.send(message)
         except (TimeoutError, ConnectionClosed):
             socket.transport.abort()
@@ -72,7 +72,7 @@ class Foxglove:
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
         self._clients: list[_Client] = []
-        self._events: deque[tuple[float, bytes]] = deque(maxlen=_EVENTS)
+        self._events: deque[tuple[float, bytes]] = deque(maxlen=_EVENT_COUNT)
         self._frames: dict[str, dict[str, Any]] = {}  # newest frame by channel
         tactile = schema.TACTILE.decode()
         described = {SCENE: ("foxglove.SceneUpdate", _ENTITIES)}
@@ -92,7 +92,7 @@ class Foxglove:
 
     async def serve(self, socket: ServerConnection) -> None:
         """Serve one client until it leaves, stops reading or sends an invalid request."""
-        if len(self._clients) == CLIENTS:
+        if len(self._clients) == CLIENT_COUNT_MAX:
             return
         client = _Client()
         self._clients.append(client)
@@ -159,7 +159,7 @@ class Foxglove:
             self._events.append((stamp, data))
 
 
-def _entity(name: str, part: Drawn, stamp: float) -> dict[str, Any]:
+def _entity(name: str, part: DrawnPart, stamp: float) -> dict[str, Any]:
     lines = [
         {"type": 0, "pose": _pose(0.0, 0.0), "thickness": width, "scale_invariant": False}
         | {"points": [_point(x, y) for x, y in points.tolist()], "color": _colour(colour)}

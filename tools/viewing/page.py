@@ -34,26 +34,26 @@ from softfinger.daemon.client.command_client import NoAnswer, send
 from softfinger.daemon.loop.warm_up import LANDSCAPE
 from softfinger.daemon.profile.settings import Settings
 from softfinger.tools.arguments import client_keys, to_stderr
-from softfinger.tools.ending import Ending
 from softfinger.tools.processes.compile import build_kernels
 from softfinger.tools.recordings.reader import Recording
-from softfinger.tools.terminal.feed import MEANINGS, judge
+from softfinger.tools.stop_condition import StopCondition
+from softfinger.tools.terminal.stream_state import GLOSSARY, judge
 from softfinger.tools.viewing.foxglove_server import LAYOUT, ORIGINS, PROTOCOLS, Foxglove
 from softfinger.tools.viewing.pictures import Pictures, Row
 from softfinger.tools.viewing.recorder import PageRecorder
 from softfinger.tools.viewing.sources import Playback, ViewError, follow
 
-_HELP = "".join(f"<dt><b>{words}</b><dd>{meaning}" for words, meaning in MEANINGS)
+_HELP = "".join(f"<dt><b>{words}</b><dd>{meaning}" for words, meaning in GLOSSARY)
 _WEB = Path(__file__).with_name("web")
 _LOOPBACK = "127.0.0.1"
 _PORT = 9090  # default port
-_NICE = 5  # lower priority than all real-time threads
-_AT_ONCE = 40  # commands of all pages waiting for an answer
-_PATIENCE = 5.0  # s for the head of a request, sufficient for a busy browser
-_NAME = 40  # characters of a command's name that are shown
+_NICENESS = 5  # lower priority than all real-time threads
+_WAITING_COUNT_MAX = 40  # commands of all pages waiting for an answer
+_REQUEST_TIMEOUT = 5.0  # s for the head of a request, sufficient for a busy browser
+_NAME_LENGTH_MAX = 40  # characters of a command's name that are shown
 _NO_COMMAND = (ValueError, TypeError, LookupError, AttributeError, OverflowError, RecursionError)
-_BUFFER = 256 << 10  # bytes queued for a page or a Foxglove client
-_LARGEST = 65536  # bytes, largest message accepted from a page or a Foxglove client
+_BUFFER_SIZE = 256 << 10  # bytes queued for a page or a Foxglove client
+_MESSAGE_SIZE_MAX = 65536  # bytes, largest message accepted from a page or a Foxglove client
 _HEADERS = {
     "Cache-Control": "no-store",  # the page may contain a token, which changes with each start
     "Content-Security-Policy": "frame-ancestors 'none'; base-uri 'none'; form-action 'none'",
@@ -69,8 +69,8 @@ def _page() -> str:
         (_WEB / name).read_text("utf-8")
         for name in ("page.html", "page.css", "charts.js", "controls.js", "page.js")
     )
-    parts = {"MEANINGS": _HELP, "STYLE": style, "SCRIPTS": "".join(scripts)}
-    return re.sub("MEANINGS|STYLE|SCRIPTS", lambda word: parts[word[0]], html)
+    parts = {"GLOSSARY": _HELP, "STYLE": style, "SCRIPTS": "".join(scripts)}
+    return re.sub("GLOSSARY|STYLE|SCRIPTS", lambda word: parts[word[0]], html)
 
 
 _PAGE = _page()
@@ -115,7 +115,7 @@ class Site:
         self._stale = stale
         self._ended = asyncio.Event()
         self._hosts: set[str] = set()  # valid host names of this server
-        self._at_once = asyncio.Semaphore(_AT_ONCE)
+        self._at_once = asyncio.Semaphore(_WAITING_COUNT_MAX)
         self.waiting: list[asyncio.Future[_Published]] = []  # pages waiting for the next picture
         self.record: Callable[[], str] = lambda: ""  # starts or ends a recording
         # Receives the text by which a page requests each picture.
@@ -156,8 +156,8 @@ class Site:
                 (each for each in offered if each in PROTOCOLS), None
             ),
             compression=None,  # no benefit on a local connection
-            open_timeout=_PATIENCE,
-            max_size=_LARGEST,
+            open_timeout=_REQUEST_TIMEOUT,
+            max_size=_MESSAGE_SIZE_MAX,
             logger=quiet,
         )
         await self._ended.wait()
@@ -269,7 +269,7 @@ class Site:
         """
         try:
             asked = json.loads(text)
-            name = str(asked["command"])[:_NAME]
+            name = str(asked["command"])[:_NAME_LENGTH_MAX]
             age = time.monotonic() - float(asked.pop("seen", "nan"))
             # This fails for values that msgpack cannot represent: deep nesting, long integers.
             msgpack.packb(asked)
@@ -312,13 +312,13 @@ def listen(host: str, port: int | None) -> socket.socket:
             raise ViewError(f"{at} can't be used: {error.strerror}") from None
         return listen(host, 0)
     # A small buffer, because data in the system's buffer count as accepted although not yet read.
-    listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER_SIZE)
     return listener
 
 
-def show(arguments: argparse.Namespace, ending: Ending) -> None:
+def show(arguments: argparse.Namespace, ending: StopCondition) -> None:
     """Serve the page until the end; raise SoftfingerError if nothing can be shown."""
-    os.nice(_NICE)
+    os.nice(_NICENESS)
     recording = None if arguments.file is None else Recording(arguments.file, _say)
     build_kernels(Settings(), lambda _level, _kind, text: _say(text), LANDSCAPE)
     keys = client_keys(arguments.keys)

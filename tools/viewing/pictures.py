@@ -22,35 +22,35 @@ import orjson
 from numpy.typing import NDArray
 
 from softfinger.daemon.client.stream import Gaps
-from softfinger.daemon.control.modes import COMMANDS, GRIPPING, Mode
+from softfinger.daemon.control.modes import COMMANDS, GRIPPING_MODES, Mode
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.physics.simulated_hand import geometry_of
 from softfinger.daemon.types import FINGERS
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.schema import HandState
 from softfinger.tools.terminal import heatmap
-from softfinger.tools.terminal.feed import Feed, number, printable, text
 from softfinger.tools.terminal.status import why_invalid
-from softfinger.tools.terminal.typeset import micro, short
-from softfinger.tools.viewing import planar
-from softfinger.tools.viewing.known import THETA_END, fingers_of, landscape, read_settings
-from softfinger.tools.viewing.planar import GOAL, OBJECT, FloatArray, touches
+from softfinger.tools.terminal.stream_state import StreamState, number, printable, text
+from softfinger.tools.terminal.text_layout import format_microseconds, format_value
+from softfinger.tools.viewing import hand_drawing
+from softfinger.tools.viewing.hand_drawing import GOAL, OBJECT, FloatArray, touches
+from softfinger.tools.viewing.landscape import THETA_END, fingers_of, landscape, read_settings
 
 if TYPE_CHECKING:
     from softfinger.tools.viewing.foxglove_server import Foxglove
 
-TOPICS = (*Feed().topics, schema.TRUTH)
+TOPICS = (*StreamState().topics, schema.TRUTH)
 SECONDS = 60.0  # s of history that a page gets when it opens
 STEP = 0.1  # s between two rows of the plots
-_TRAIL = 60  # rows shown as a trail on the landscape
-_EVENTS = 50  # events shown
-_LATELY = 5.0  # s for which a warning is shown
-_NEAR = 0.8  # fraction of a limit from which the value is reported
-_DARK = 2.0  # standard deviations of a cell's noise that a pressure map draws as zero
-_SMALLEST = 10.0  # smallest full scale, also in standard deviations
-_PATIENCE = 0.35  # s without a message after which the last one is shown as old
-_PERIODS = 4.0  # the same in periods of the stream; the longer time applies
-_MOST = 1e6  # limit of drawn numbers, since messages may contain any value
+_TRAIL_LENGTH = 60  # rows shown as a trail on the landscape
+_EVENT_COUNT = 50  # events shown
+_WARNING_TIME = 5.0  # s for which a warning is shown
+_LIMIT_FRACTION = 0.8  # fraction of a limit from which the value is reported
+_DARK_SIGMA = 2.0  # standard deviations of a cell's noise that a pressure map draws as zero
+_FULL_SCALE_MIN = 10.0  # smallest full scale, also in standard deviations
+_OLD_TIME = 0.35  # s without a message after which the last one is shown as old
+_OLD_PERIODS = 4.0  # the same in periods of the stream; the longer time applies
+_NUMBER_MAX = 1e6  # limit of drawn numbers, since messages may contain any value
 _DEGREE = math.degrees(1.0)
 
 
@@ -113,7 +113,7 @@ def _row(number: int, state: HandState) -> list[Any]:
     """Make a row of the plots, with NaN for values that the hand lacks."""
     row = [number, state.timestamp, printable(state.mode)]
     for value, factor in zip(_values(state), _FACTORS.values(), strict=True):
-        row.append(round(min(max(factor * value, -_MOST), _MOST), 4))
+        row.append(round(min(max(factor * value, -_NUMBER_MAX), _NUMBER_MAX), 4))
     if not state.object.valid:
         row[_COLUMNS["object.angle"]] = row[_COLUMNS["object.width"]] = math.nan
     return row
@@ -157,11 +157,11 @@ class Pictures:
         self._settings_text = ""  # as received
         self.seen = self.unreadable = 0  # number of states; number of messages
         self.clear()
-        self._know(Settings())
+        self._read_settings(Settings())
 
     def clear(self) -> None:
         """Discard everything except the hand's settings, before data of another time are read."""
-        self.feed = Feed()
+        self.feed = StreamState()
         self.states = 0  # number of states since then
         self.time = math.nan  # time of the newest state [Unix s]
         self._truth: dict[str, Any] | None = None
@@ -201,15 +201,17 @@ class Pictures:
             settings, unknown = read_settings(message)
             if unknown:
                 self._say(f"settings not known here: {printable(', '.join(unknown))}")
-            self._know(settings)
-        self.feed.sort_in(topic, message, self._moment())
+            self._read_settings(settings)
+        self.feed.process(topic, message, self._moment())
         if self._foxglove is not None:
             self._foxglove.take(topic, message)
 
-    def _know(self, settings: Settings) -> None:
+    def _read_settings(self, settings: Settings) -> None:
         """Lay out the scene for a hand, with panels and plots only for the parts that it has."""
         self._settings, self._fingers = settings, fingers_of(settings)
-        self._pressure = heatmap.FullScale(heatmap.round_up(_SMALLEST * settings.tactile.noise))
+        self._pressure = heatmap.FullScale(
+            heatmap.round_up(_FULL_SCALE_MIN * settings.tactile.noise)
+        )
         hand, rows, cols = geometry_of(settings), settings.tactile.rows, settings.tactile.cols
         a = hand.tip_radius
         half, top = hand.half_separation + 1.3 * a, hand.reach + 1.9 * a
@@ -285,8 +287,8 @@ class Pictures:
             "mode": feed.mode,
             "age": feed.age(now),
             "patience": {
-                "state": max(_PATIENCE, _PERIODS / feed.rate),
-                "frame": max(_PATIENCE, _PERIODS / settings.stream.tactile_rate),
+                "state": max(_OLD_TIME, _OLD_PERIODS / feed.rate),
+                "frame": max(_OLD_TIME, _OLD_PERIODS / settings.stream.tactile_rate),
             },
             "fault": feed.fault,
             "place": place,
@@ -296,7 +298,7 @@ class Pictures:
             "facts": [part for fact in self._facts(now) for part in fact],
             "panels": self._maps(now) | {"hand": self._planar(), "landscape": self._contacts()},
             "events": [
-                (each.timestamp, each.clock(), *each[1:]) for each in feed.events[-_EVENTS:]
+                (each.timestamp, each.clock(), *each[1:]) for each in feed.events[-_EVENT_COUNT:]
             ],
             "recording": self.recording,
             "first": self._first,
@@ -309,14 +311,14 @@ class Pictures:
         feed, state = self.feed, self.feed.state
         angle = state.goal_angle if math.isfinite(state.goal_angle) else state.object.angle
         force = feed.commanded if math.isfinite(feed.commanded) else state.goal_force
-        gripping = feed.mode in GRIPPING
+        gripping = feed.mode in GRIPPING_MODES
         return {
             "force": force if gripping else math.nan,
             "angle": math.degrees(angle) if gripping else math.nan,
         }
 
     def _planar(self) -> dict[str, Any]:
-        parts = planar.hand_parts(self._settings, self.feed.state, self._truth).values()
+        parts = hand_drawing.hand_parts(self._settings, self.feed.state, self._truth).values()
         lines = [(colour, wide, _flat(each)) for part in parts for colour, wide, each in part.lines]
         texts = [(colour, *_flat(at), words) for part in parts for colour, at, words in part.texts]
         return {"lines": lines, "texts": texts}
@@ -328,16 +330,16 @@ class Pictures:
         full = self._pressure.follow(peak, now)
         maps = {}
         for name, frame in frames.items():
-            unit, factor, dark = "kPa", 1e-3, _DARK * self._settings.tactile.noise
+            unit, factor, dark = "kPa", 1e-3, _DARK_SIGMA * self._settings.tactile.noise
             if math.isnan(frame.scale):
                 unit, factor, dark = "counts", 1.0, 0.0
             lines, dots, (rows, cols) = [], [], frame.grid.shape
-            grid, contact = planar.grid_of(frame.source), self.feed.state.finger(name)
+            grid, contact = hand_drawing.grid_of(frame.source), self.feed.state.finger(name)
             if grid is not None:
-                lines.append((name, 1.0, _flat(planar.tip_circle(grid, tip))))
+                lines.append((name, 1.0, _flat(hand_drawing.tip_circle(grid, tip))))
             if grid is not None and touches(contact):
                 tilts = contact.theta, contact.tilt_y if math.isfinite(contact.tilt_y) else 0.0
-                if place := planar.footprint(grid, tip, contact.d, *tilts):
+                if place := hand_drawing.footprint(grid, tip, contact.d, *tilts):
                     lines.append(("white", 1.5, _flat(place[0])))
                     dots.append((name, *_flat(place[1])))
             levels = heatmap.levels_of(frame.grid - dark, full - dark)
@@ -354,7 +356,9 @@ class Pictures:
     def _contacts(self) -> dict[str, Any]:
         """Return each contact on the landscape, in mm and degrees, with its trail."""
         lines, dots = [], []
-        states = [self.feed.state, *(state for state, _ in reversed(self._past))][: 1 + _TRAIL]
+        states = [self.feed.state, *(state for state, _ in reversed(self._past))][
+            : 1 + _TRAIL_LENGTH
+        ]
         for name in self._fingers:
             tips = takewhile(touches, (state.finger(name) for state in states))
             if trail := [(_DEGREE * tip.theta, 1e3 * tip.d) for tip in tips]:
@@ -366,8 +370,8 @@ class Pictures:
         """Return recent warnings, reasons for invalid fingers, and values near their limits."""
         state, safety, feed = self.feed.state, self._settings.safety, self.feed
         last = [each for each in feed.events[-1:] if each.level == "warning"]
-        notes = [each.text for each in last if self.time - each.timestamp < _LATELY]
-        notes += filter(None, [why_invalid(state), self._raised()])
+        notes = [each.text for each in last if self.time - each.timestamp < _WARNING_TIME]
+        notes += filter(None, [why_invalid(state), self._force_increase()])
         used = [
             (value / getattr(safety, f"{key}_max"), name, key)
             for name in self._fingers
@@ -377,13 +381,13 @@ class Pictures:
         notes += [
             f"{name} {key} at {ratio:.0%} of safety.{key}_max"
             for ratio, name, key in sorted(used, reverse=True)
-            if ratio >= _NEAR
+            if ratio >= _LIMIT_FRACTION
         ]
         if self.states and state.schema != schema.SCHEMA:
             notes.append(f"the stream has schema {state.schema}, this page knows {schema.SCHEMA}")
         return notes
 
-    def _raised(self) -> str:
+    def _force_increase(self) -> str:
         """Return a description of the grip's goal if the daemon has raised the force."""
         grip = self.feed.grip()
         return grip if "raised" in grip else ""
@@ -394,20 +398,22 @@ class Pictures:
         fingers = [state.finger(name) for name in self._fingers]
 
         def each(key: str, factor: float, decimals: int) -> str:
-            return " / ".join(short(factor * getattr(finger, key), decimals) for finger in fingers)
+            return " / ".join(
+                format_value(factor * getattr(finger, key), decimals) for finger in fingers
+            )
 
         facts = [
             ("Age of the pressure maps", f"{each('frame_age_s', 1e3, 0)} ms"),
             ("Servos", f"{each('temperature', 1.0, 0)} °C, {each('voltage', 1.0, 1)} V"),
             ("Messages lost", f"{sum(gaps.lost for gaps in self._gaps.values())}"),
-            ("Messages unreadable", f"{feed.skipped}"),
+            ("Messages unreadable", f"{feed.skipped_count}"),
             ("Loop overruns", f"{state.overruns}"),
         ]
         if times is not None:
-            facts.append(("Loop rate", f"{short(times.rates.tick, 0)} Hz"))
+            facts.append(("Loop rate", f"{format_value(times.rates.tick, 0)} Hz"))
             named = {"Loop work": times.compute, "Loop late": times.wake, "Servo bus": times.bus}
             for name, of in named.items():
-                median, tail, most = map(micro, (of.p50, of.p99, of.max))
+                median, tail, most = map(format_microseconds, (of.p50, of.p99, of.max))
                 facts.append((name, f"median {median}, p99 {tail}, max {most} µs"))
         if who := feed.commander(now):
             facts.append(("Commanded by", who))
@@ -436,7 +442,7 @@ def _panel(name: str, title: str, *box: float, **more: Any) -> dict[str, Any]:
 
 def _flat(points: FloatArray) -> FloatArray:
     """Return x and y alternately, rounded to four decimals (at most a tenth of a pixel)."""
-    return np.clip(points, -_MOST, _MOST).round(4).ravel()
+    return np.clip(points, -_NUMBER_MAX, _NUMBER_MAX).round(4).ravel()
 
 
 def _packed(shown: dict[str, Any] | list[Any]) -> str:

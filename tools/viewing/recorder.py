@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from softfinger.tools.processes.beside import RecorderBeside
+    from softfinger.tools.processes.child_processes import RecorderProcess
 
 
 class PageRecorder:
@@ -24,12 +24,12 @@ class PageRecorder:
         self._keys = keys
         self._show = show
         self._lock = threading.Lock()
-        self._process: RecorderBeside | None = None
+        self._process: RecorderProcess | None = None
 
     def toggle(self) -> str:
         """Start a recording or end the running one; return a line about the result."""
         try:
-            from softfinger.tools.processes.beside import NoRecorder, RecorderBeside
+            from softfinger.tools.processes.child_processes import RecorderError, RecorderProcess
         except ImportError:  # termios is missing
             return "✗ record: only on Linux and macOS; use softfinger record"
         with self._lock:
@@ -38,8 +38,8 @@ class PageRecorder:
             path = Path(time.strftime("softfinger-%Y%m%d-%H%M%S.mcap")).absolute()
             words = [str(path), "--address", self._address]
             try:
-                self._process = RecorderBeside(words, path.exists, self._failed, self._keys)
-            except NoRecorder as error:
+                self._process = RecorderProcess(words, path.exists, self._failed, self._keys)
+            except RecorderError as error:
                 return f"✗ record: {error}"
             self._show({"file": path.name, "since": time.time()})
             return f"✓ recording to {path}"

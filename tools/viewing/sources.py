@@ -18,17 +18,18 @@ from softfinger.daemon.client.stream import read
 from softfinger.daemon.errors import SoftfingerError
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.keys import ClientKeys
-from softfinger.tools.arguments import PATIENCE, no_stream, waiting
-from softfinger.tools.ending import Ending
+from softfinger.tools.arguments import WAIT_MAX, no_stream, waiting
 from softfinger.tools.recordings.reader import Recording
-from softfinger.tools.terminal.feed import number, printable
+from softfinger.tools.stop_condition import StopCondition
+from softfinger.tools.terminal.stream_state import number, printable
 from softfinger.tools.viewing.pictures import SECONDS, TOPICS, Pictures
 
-_SILENCE = 2.0  # s without a message before a notice is printed
-_REST = 1.0  # s, longest pause between two pictures if drawing is slow
-_MARKS = 2_000  # largest number of marks in a recording
-_SPEEDS = 0.1, 10.0
-_QUEUE = 5_000  # messages queued between reads: 2 s of state and truth at 1 kHz with their frames
+_SILENCE_TIME = 2.0  # s without a message before a notice is printed
+_DRAW_PAUSE_MAX = 1.0  # s, longest pause between two pictures if drawing is slow
+_MARK_COUNT_MAX = 2_000  # largest number of marks in a recording
+_SPEED_RANGE = 0.1, 10.0
+# messages queued between reads: 2 s of state and truth at 1 kHz with their frames.
+_QUEUE_LENGTH = 5_000
 
 
 class ViewError(SoftfingerError):
@@ -39,7 +40,7 @@ def follow(
     arguments: argparse.Namespace,
     keys: ClientKeys | None,
     pictures: Pictures,
-    ending: Ending,
+    ending: StopCondition,
     say: Callable[[str], None],
 ) -> None:
     """Show the stream selected by ``arguments`` until the end; may raise ViewError."""
@@ -47,27 +48,29 @@ def follow(
     try:
         if keys is not None:
             keys.guard(context)
-        socket = subscribe(context, arguments.address, *TOPICS, queue=_QUEUE)
+        socket = subscribe(context, arguments.address, *TOPICS, queue=_QUEUE_LENGTH)
         begun = last = time.monotonic()
         silent, rest = False, 1.0 / arguments.rate
         while not ending.wait(rest):
             began, worked = time.monotonic(), time.thread_time()
-            for message in drain(socket, _QUEUE):
+            for message in drain(socket, _QUEUE_LENGTH):
                 last = began
                 try:
                     pictures.take(*unpack(message))
                 except ValueError:
                     pictures.unreadable += 1
-            if arguments.no_wait and last == begun and began - begun > PATIENCE:
+            if arguments.no_wait and last == begun and began - begun > WAIT_MAX:
                 raise ViewError(no_stream(arguments.address, arguments.keys))
-            if silent != (began - last > _SILENCE):
+            if silent != (began - last > _SILENCE_TIME):
                 silent = not silent
                 where = waiting(arguments.address, arguments.keys)
                 say(where if silent else "the stream has begun")
             pictures.draw()
             # Limit the load to half of the time, even on a slow machine.
             worked = time.thread_time() - worked
-            rest = max(1.0 / arguments.rate - (time.monotonic() - began), min(worked, _REST))
+            rest = max(
+                1.0 / arguments.rate - (time.monotonic() - began), min(worked, _DRAW_PAUSE_MAX)
+            )
     except zmq.ZMQError as error:
         raise ViewError(f"{arguments.address}: {error}") from None
     finally:
@@ -85,7 +88,7 @@ def marks_of(recording: Recording) -> list[tuple[float, str, str, str]]:
             at = event.timestamp - recording.start
             level, kind, text = map(printable, (event.level, event.kind, event.text))
             marks.append((round(at, 3), level, kind, text))
-        if len(marks) == _MARKS:
+        if len(marks) == _MARK_COUNT_MAX:
             break
     return marks
 
@@ -107,7 +110,7 @@ class Playback:
         name, _, value = wish.partition(" ")
         with contextlib.suppress(ValueError):
             if name == "speed":
-                if _SPEEDS[0] <= (speed := float(value)) <= _SPEEDS[1]:
+                if _SPEED_RANGE[0] <= (speed := float(value)) <= _SPEED_RANGE[1]:
                     self.speed = speed
             elif wish in ("play", "pause"):
                 self.playing = wish == "play"
@@ -116,7 +119,7 @@ class Playback:
             elif math.isfinite(place := float(wish)):
                 self._target = min(max(place, 0.0), self._recording.duration)
 
-    def run(self, ending: Ending) -> None:
+    def run(self, ending: StopCondition) -> None:
         """Play until the end is requested."""
         recording, pictures = self._recording, self._pictures
         # Search the marks with a separate reader: this takes seconds for a long recording, and the
@@ -127,7 +130,7 @@ class Playback:
         # Settings may occur only once.
         for message in islice(recording.messages([schema.SETTINGS]), 1):
             pictures.take(*message)
-        while not ending.over:
+        while not ending.is_met:
             begun = time.monotonic()
             if (target := self._target) is not None:
                 self._target, self.position = None, target

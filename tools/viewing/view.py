@@ -7,8 +7,8 @@ import sys
 from pathlib import Path
 
 from softfinger.tools.arguments import add_stream, addresses, number, seconds
-from softfinger.tools.ending import Ending
 from softfinger.tools.extras import require
+from softfinger.tools.stop_condition import StopCondition
 
 _EPILOG = """\
 Serves a page for browsers on this machine. The printed address with the token opens a page with
@@ -80,6 +80,6 @@ def run(arguments: argparse.Namespace) -> int:
     require("view")
     from softfinger.tools.viewing.page import show
 
-    with Ending(arguments.duration) as ending:
+    with StopCondition(arguments.duration) as ending:
         show(arguments, ending)
     return 0

@@ -46,12 +46,14 @@ from softfinger.daemon.types import FINGERS
 
 _STEP = 0.002  # s, largest delay of the physics
 _REQUESTS = ("report", "forget", "place")  # words to the control socket that are not faults
-_TURNS = {"closed": 6.0, "open": -6.0, "zero": 0.0}  # rad; the joint stops are closer than 6 rad
-_TURNING = 0.3  # A of motor current that corresponds to the force of a person's hand
+# rad; the joint stops are closer than 6 rad.
+_TURN_GOALS = {"closed": 6.0, "open": -6.0, "zero": 0.0}
+_TURN_CURRENT = 0.3  # A of motor current that corresponds to the force of a person's hand
 _TURN_TIME = 1.0  # s
-_STALL = 0.05  # s; the part of a pause beyond this does not count as the hand's time
-_AHEAD = 0.002  # s by which the hand's time may be ahead of the daemon, which waits for replies
-_HELD = 0.0005  # s between two checks for a new deadline
+_STALL_TIME = 0.05  # s; the part of a pause beyond this does not count as the hand's time
+# s by which the hand's time may be ahead of the daemon, which waits for replies.
+_AHEAD_TIME = 0.002
+_POLL_INTERVAL = 0.0005  # s between two checks for a new deadline
 # Board for profiles without one: the same as in config/hil.toml.
 DEFAULT_BOARD = {
     "backend": "flexitac",
@@ -73,10 +75,10 @@ class EmulatorClock:
     Otherwise a process that was stopped for a minute would have to simulate that minute, and could
     not answer meanwhile. A daemon whose own time waits for a busy machine sets deadlines. While
     that daemon uses the ``servos`` and their torque is on, the emulator's time advances from one
-    deadline to the next by the same amount as the daemon's, within `_AHEAD`.
+    deadline to the next by the same amount as the daemon's, within `_AHEAD_TIME`.
     """
 
-    waits = False
+    pauses_when_late = False
 
     def __init__(self, deadline: Deadline) -> None:
         self.servos: PtyServoBus | None = None
@@ -87,14 +89,14 @@ class EmulatorClock:
         self._origin = self._last = time.monotonic()
 
     def now(self) -> float:
-        """Return the hand's time [s]; the time since the last call counts up to `_STALL`."""
+        """Return the hand's time [s]; the time since the last call counts up to `_STALL_TIME`."""
         now = time.monotonic()
-        self._origin += max(now - self._last - _STALL, 0.0)
+        self._origin += max(now - self._last - _STALL_TIME, 0.0)
         self._last = now
         t = now - self._origin
         if (deadline := self._deadline.t) != self._seen:
             step = max(deadline - self._seen, 0.0)
-            self._bound = min(self._bound + step, min(t, self._bound) + step + _AHEAD)
+            self._bound = min(self._bound + step, min(t, self._bound) + step + _AHEAD_TIME)
             self._seen = deadline
         self.held = False
         if t > self._bound and self.servos is not None:
@@ -113,7 +115,7 @@ class EmulatorClock:
     def sleep_until(self, t: float) -> float:
         """Sleep until the hand's time ``t``, and return the delay of the wake-up [s]."""
         while (delay := t - self.now()) > 0.0:
-            time.sleep(min(delay, 0.5 * _STALL))
+            time.sleep(min(delay, 0.5 * _STALL_TIME))
         return -delay
 
 
@@ -268,7 +270,7 @@ class Emulator:
         if servos is not None:
             due = min(due, servos.next_event())
         # While the hand's time is held, no event becomes due, so avoid a busy loop.
-        wait = max(due - start, _HELD if self.clock.held else 0.0)
+        wait = max(due - start, _POLL_INTERVAL if self.clock.held else 0.0)
         ready = [key for key, _ in self._selector.select(wait)]
         t = self.clock.now()
         asked = servos in [key.fileobj for key in ready]
@@ -371,13 +373,15 @@ class Emulator:
         now = self.clock.now()
         turns = [word.partition("=") for word in words]
         for finger, _, pose in turns:
-            if finger not in FINGERS or pose not in _TURNS or self._servos is None:
-                return f"error: turn: expected left or right={'|'.join(_TURNS)}, and servos"
+            if finger not in FINGERS or pose not in _TURN_GOALS or self._servos is None:
+                return f"error: turn: expected left or right={'|'.join(_TURN_GOALS)}, and servos"
             if self._servos.bus.servos[FINGERS.index(finger)].torque_on:
                 return f"error: turn: torque of the {finger} servo is on"
         for finger, _, pose in turns:
             joint = FINGERS.index(finger)
-            self.hand.drive(joint, reg.CURRENT_BASED_POSITION_MODE, True, _TURNS[pose], _TURNING)
+            self.hand.drive(
+                joint, reg.CURRENT_BASED_POSITION_MODE, True, _TURN_GOALS[pose], _TURN_CURRENT
+            )
             self._turned = now + _TURN_TIME
         return json.dumps({"wait": max(0.0, self._turned - now)})
 

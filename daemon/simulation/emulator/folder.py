@@ -22,10 +22,10 @@ from softfinger.kinematics.compiled.own_folder import require_own
 LINKS = ("servos", "tactile-left", "tactile-right")
 _LOCK = ".emulator.lock"
 _CONTROL = "control"
-_LONGEST = 4096  # bytes of a message
-_LONGEST_REPLY = 1 << 17
-_CLIENTS = 8  # at a time
-_PATIENCE = 10.0  # s, timeout of a client, also on a busy machine
+_MESSAGE_SIZE_MAX = 4096  # bytes of a message
+_REPLY_SIZE_MAX = 1 << 17
+_CLIENT_COUNT_MAX = 8  # at a time
+_CLIENT_TIMEOUT = 10.0  # s, timeout of a client, also on a busy machine
 
 
 class FolderError(SoftfingerError):
@@ -128,7 +128,7 @@ class ControlPort:
                     raise FolderError(f"{folder / _CONTROL}: is in the way; move it elsewhere")
                 os.unlink(_CONTROL, dir_fd=self._folder)
             self._listener.bind(_address(self._folder))
-            self._listener.listen(_CLIENTS)
+            self._listener.listen(_CLIENT_COUNT_MAX)
             self._listener.setblocking(False)
             selector.register(self._listener, selectors.EVENT_READ, self._accept)
         except BaseException:
@@ -151,12 +151,12 @@ class ControlPort:
             self._clients.append(client)
             answer = partial(self._answer, client)
             self._selector.register(client, selectors.EVENT_READ, answer)
-            if len(self._clients) > _CLIENTS:
+            if len(self._clients) > _CLIENT_COUNT_MAX:
                 self._hang_up(self._clients[0])
 
     def _answer(self, client: socket.socket) -> None:
         try:
-            data = client.recv(_LONGEST)
+            data = client.recv(_MESSAGE_SIZE_MAX)
             if data:
                 client.send(self._handle(data.decode("utf-8", "replace")).encode())
                 return
@@ -183,10 +183,10 @@ def send_words(folder: Path, text: str) -> str:
         with _directory(folder) as descriptor:
             client = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
             with client:
-                client.settimeout(_PATIENCE)
+                client.settimeout(_CLIENT_TIMEOUT)
                 client.connect(_address(descriptor))
                 client.send(text.encode())
-                reply = client.recv(_LONGEST_REPLY)
+                reply = client.recv(_REPLY_SIZE_MAX)
     except OSError:
         raise NoEmulator(f"{folder}: no emulator answers here") from None
     if not reply:

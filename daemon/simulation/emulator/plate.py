@@ -20,10 +20,10 @@ from softfinger.daemon.types import FINGERS
 from softfinger.kinematics.contact.lookup import lookup
 from softfinger.kinematics.contact.table import ContactTable
 
-_CLEAR = 1e-3  # m above the tip, where the plate tilts and waits
-_LIFT = 0.02  # m/s
-_FILL = 0.1  # s to inflate a bladder
-_BETWEEN = 1.0  # s without contact between two presses
+_CLEARANCE = 1e-3  # m above the tip, where the plate tilts and waits
+_LIFT_SPEED = 0.02  # m/s
+_FILL_TIME = 0.1  # s to inflate a bladder
+_PAUSE = 1.0  # s without contact between two presses
 
 _UNITS = {
     "depth": {"mm": 1e-3, "m": 1.0},
@@ -137,7 +137,7 @@ class Plate:
 
     def __init__(self) -> None:
         self._t = [0.0]
-        self._d = [-_CLEAR]
+        self._d = [-_CLEARANCE]
         self._doing: list[tuple[PlatePress | None, bool]] = [
             (None, False)
         ]  # from each knot on: the press, and True if the plate is at rest
@@ -146,18 +146,18 @@ class Plate:
 
     def go(self, presses: Sequence[PlatePress], t: float) -> None:
         """Lift off and perform ``presses`` from ``t`` on."""
-        d, (press, _) = max(self(t).d, -_CLEAR), self._doing[self._leg(t)]
+        d, (press, _) = max(self(t).d, -_CLEARANCE), self._doing[self._leg(t)]
         self._t, self._d, self._doing, self._reported = [t], [d], [], -1
-        self._add((d + _CLEAR) / _LIFT, -_CLEAR, press)
+        self._add((d + _CLEARANCE) / _LIFT_SPEED, -_CLEARANCE, press)
         for press in presses:
-            d = press.d if press.d > 0.0 else -_CLEAR
-            travel = (d + _CLEAR) / press.speed + (_FILL if press.pressure > 0.0 else 0.0)
+            d = press.d if press.d > 0.0 else -_CLEARANCE
+            travel = (d + _CLEARANCE) / press.speed + (_FILL_TIME if press.pressure > 0.0 else 0.0)
             self._add(travel, d, press)
             self.arrives = self._t[-1]
             if press.hold < math.inf:
                 self._add(press.hold, d, press, rests=True)
-                self._add((d + _CLEAR) / _LIFT, -_CLEAR, press)
-                self._add(_BETWEEN, -_CLEAR, None)
+                self._add((d + _CLEARANCE) / _LIFT_SPEED, -_CLEARANCE, press)
+                self._add(_PAUSE, -_CLEARANCE, None)
         stays = presses[-1].hold == math.inf
         self._doing.append((presses[-1], True) if stays else (None, False))
 

@@ -23,14 +23,15 @@ _TCGETS2 = 0x802C542A  # struct termios2: four flag words, line, 19 control char
 _TERMIOS2 = struct.Struct("=4IB19s2I")
 _BITS_PER_BYTE = 10  # start bit, eight data bits, stop bit
 _READ_SIZE = 4096
-_AT_A_TIME = 4  # reads in one turn, so that a busy client leaves time for other tasks
-_GAP = 0.02  # s of silence that end a packet; more than 1.5 ms, since this process may be delayed
+_READS_PER_TURN = 4  # reads in one turn, so that a busy client leaves time for other tasks
+# s of silence that end a packet; more than 1.5 ms, since this process may be delayed.
+_GAP_TIME = 0.02
 # s: typical latency of a pseudo-terminal from a write to the wake-up of the reader. A paced bus
 # subtracts it in both directions, since the simulated wire has its own transmission time.
-PASSAGE = 15e-6
+PASSAGE_TIME = 15e-6
 # s by which a reading may be older than its reply. Servos also measure at intervals of their own.
 # This allows the physics to be computed outside the exchange.
-_LAG = 0.0005
+_LAG_TIME = 0.0005
 
 
 def open_pty() -> tuple[int, int, str]:
@@ -72,8 +73,8 @@ class PtyServoBus:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.bus = bus
-        bus.parser.gap = _GAP
-        bus.lag = _LAG
+        bus.parser.gap = _GAP_TIME
+        bus.lag = _LAG_TIME
         self._baud = baud
         self._spin = spin
         self._clock = clock
@@ -135,7 +136,7 @@ class PtyServoBus:
     def service(self, t: float) -> None:
         """Read bytes at time t [s], advance the servos, and send the replies that are due."""
         if self.plugged:
-            for _ in range(_AT_A_TIME):
+            for _ in range(_READS_PER_TURN):
                 try:
                     data = os.read(self._master, _READ_SIZE)
                 except OSError:  # no data
@@ -161,12 +162,12 @@ class PtyServoBus:
         if baud <= 0:
             return False
         byte_time = _BITS_PER_BYTE / baud
-        free_at = max(self._free_at, t - PASSAGE) + len(data) * byte_time
+        free_at = max(self._free_at, t - PASSAGE_TIME) + len(data) * byte_time
         replies = self.bus.exchange(data, t, baud)
         for reply in replies:
             free_at += reply.delay + len(reply.data) * byte_time
             due = free_at + reply.late
-            self._queue(due - PASSAGE, reply.data)
+            self._queue(due - PASSAGE_TIME, reply.data)
             if not reply.late:
                 self._arrives = due
         self._free_at = free_at

@@ -24,9 +24,9 @@ from softfinger.daemon.simulation.emulator.pty_bus import open_pty
 from softfinger.daemon.tactile import cobs
 from softfinger.daemon.types import Frame
 
-_TTY_ROOM = 2048  # unread bytes; a tty reports at most 4095, so the limit must be below
+_TTY_SIZE_MAX = 2048  # unread bytes; a tty reports at most 4095, so the limit must be below
 _DRAIN = 4096
-_RETRY = 5e-4  # s until the source is asked again for a late frame
+_RETRY_TIME = 5e-4  # s until the source is asked again for a late frame
 _NOISE_LENGTH = 64  # bytes, longest burst of noise between frames
 
 
@@ -56,7 +56,7 @@ class FrameWriter:
 
     def send(self, frame: bytes) -> bool:
         """Write one frame, or drop it if the client has not read the earlier ones."""
-        if not self.flush() or self._unread_bytes() > min(len(frame), _TTY_ROOM):
+        if not self.flush() or self._unread_bytes() > min(len(frame), _TTY_SIZE_MAX):
             self.dropped += 1
             return False
         self._remaining = frame
@@ -166,7 +166,7 @@ class TactileBoard:
         self._due += self._delay
         frame = self._source.latest()
         if frame is None or frame.seq == self._seq:
-            self._due = min(self._due, t + _RETRY)
+            self._due = min(self._due, t + _RETRY_TIME)
             return
         self._seq = frame.seq
         if not self._requested or not self.plugged:

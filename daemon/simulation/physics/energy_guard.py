@@ -49,14 +49,15 @@ def elastic_energy(plant: Plant) -> float:
         beyond += max(q - p.stop_high[finger], 0.0)
         energy += 0.5 * p.stop_stiffness * beyond * beyond
         gears = plant.gears[finger]
-        energy += 0.5 * gears.friction / p.presliding * gears.bent * gears.bent
+        deflection = gears.limited_deflection
+        energy += 0.5 * gears.friction / p.presliding * deflection * deflection
         energy += stage.on_object[finger].energy
         energy += stage.on_tip[finger].energy
     return energy
 
 
 @inner_kernel
-def on_rim(plant: Plant) -> bool:
+def is_on_rim(plant: Plant) -> bool:
     """Return True if the rim of a backing plate is in contact."""
     stage = plant.stages[0]
     depth = 0.0
@@ -71,13 +72,13 @@ def open_guard(plant: Plant) -> None:
     energy = kinetic_energy(plant) + elastic_energy(plant) + weight_energy(plant)
     if energy != plant.energy:
         plant.energy = energy
-        plant.allowed = energy
+        plant.energy_limit = energy
 
 
 @inner_kernel
 def work_done(plant: Plant) -> float:
     """Return an upper bound of the work of motors and loads since the earlier state [J]."""
-    before, now = plant.earlier, plant.state
+    before, now = plant.last_state, plant.state
     work = 0.0
     for j in range(5):
         displacement = now.position[j] - before.position[j]
@@ -93,29 +94,29 @@ def work_done(plant: Plant) -> float:
 def guard_step(plant: Plant, was_on_rim: bool) -> int:
     """Remove the excess energy of a step from its velocities.
 
-    After a change the caller must evaluate the state again and call :func:`enter_changed`.
+    After a change the caller must evaluate the state again and call :func:`allow_changed_energy`.
 
     Returns
     -------
     int
         0 if nothing was changed, and 1 if the motion was slowed. 2 if the kinetic energy was too
         small and the motion was stopped; the step must then be shortened with :func:`shorten` until
-        :func:`is_allowed`.
+        :func:`is_within_limit`.
     """
     moving = kinetic_energy(plant)
     weight = weight_energy(plant)
     energy = moving + elastic_energy(plant) + weight
     work = work_done(plant)
-    limit = plant.allowed + work
-    if was_on_rim or on_rim(plant):
+    limit = plant.energy_limit + work
+    if was_on_rim or is_on_rim(plant):
         allowed = min(limit, plant.energy + work)
     else:
         allowed = limit + plant.parameters.tolerance * max(limit - weight, 0.0)
     if energy <= allowed + _ROUNDING * (moving + abs(energy) + abs(weight)):
         plant.energy = energy
-        plant.allowed = min(energy, limit)
+        plant.energy_limit = min(energy, limit)
         return 0
-    plant.guarded += 1
+    plant.limited_step_count += 1
     remaining = moving - (energy - allowed)
     scale = math.sqrt(remaining / moving) if remaining > 0.0 else 0.0
     for j in range(5):
@@ -126,14 +127,14 @@ def guard_step(plant: Plant, was_on_rim: bool) -> int:
 @inner_kernel
 def shorten(plant: Plant, scale: float) -> None:
     """Scale the changes of positions, shears and bristles in this step by ``scale``."""
-    before, now = plant.earlier, plant.state
+    before, now = plant.last_state, plant.state
     for j in range(5):
         now.position[j] = before.position[j] + scale * (now.position[j] - before.position[j])
     for j in range(2):
         now.shear[j] = before.shear[j] + scale * (now.shear[j] - before.shear[j])
         bent = now.bristles[j] - before.bristles[j]
         now.bristles[j] = before.bristles[j] + scale * bent
-        layers, earlier = plant.layers[j], plant.earlier_layers[j]
+        layers, earlier = plant.layers[j], plant.last_layers[j]
         mean = square = 0.0
         for k in range(LAYERS):  # array expressions would load Numba's ufuncs at each start
             layers[k] = earlier[k] + scale * (layers[k] - earlier[k])
@@ -147,23 +148,23 @@ def shorten(plant: Plant, scale: float) -> None:
 
 
 @inner_kernel
-def is_allowed(plant: Plant) -> bool:
+def is_within_limit(plant: Plant) -> bool:
     """Return True if the energy of a state at rest is within the allowed energy."""
     energy = elastic_energy(plant) + weight_energy(plant)
-    return bool(energy <= plant.allowed + work_done(plant))
+    return bool(energy <= plant.energy_limit + work_done(plant))
 
 
 @inner_kernel
-def enter_changed(plant: Plant) -> None:
+def allow_changed_energy(plant: Plant) -> None:
     """Update the energies after :func:`guard_step` has changed the state."""
     energy = kinetic_energy(plant) + elastic_energy(plant) + weight_energy(plant)
     plant.energy = energy
-    plant.allowed = min(energy, plant.allowed + work_done(plant))
+    plant.energy_limit = min(energy, plant.energy_limit + work_done(plant))
 
 
 @inner_kernel
-def enter_relaxed(plant: Plant) -> None:
+def allow_relaxed_energy(plant: Plant) -> None:
     """Update the energies after relaxation of the tips, which changes the allowed energy too."""
     energy = kinetic_energy(plant) + elastic_energy(plant) + weight_energy(plant)
-    plant.allowed += energy - plant.energy
+    plant.energy_limit += energy - plant.energy
     plant.energy = energy

@@ -45,7 +45,8 @@ from softfinger.kinematics.contact.table_record import Table
 
 STIFFNESS = 1e5  # N/m, of each corner, normal to the palm and along it
 LOSS = 1e-3  # s, damping over stiffness
-_FAR = 1.5  # radii, half the distance of the tips beyond which their contact is not evaluated
+# Radii, half the distance of the tips beyond which their contact is not evaluated.
+_DISTANCE_MAX = 1.5
 
 
 @inner_kernel
@@ -124,7 +125,7 @@ def touch_palm(
             side.stiffness = up.stiffness
             side.damping = loss if coming else 0.0
             side.shear = 1 + corner
-            plant.coupled = plant.coupled or coming
+            plant.has_extra_rows = plant.has_extra_rows or coming
     plant.palm_energy = energy
 
 
@@ -134,7 +135,7 @@ def tips_are_far(plant: Plant) -> bool:
     left, right = plant.fingers[0], plant.fingers[1]
     apart_x = right.x - left.x
     apart_y = right.y - left.y
-    far = 2.0 * _FAR * plant.parameters.radius
+    far = 2.0 * _DISTANCE_MAX * plant.parameters.radius
     return bool(apart_x * apart_x + apart_y * apart_y > far * far)
 
 
@@ -219,14 +220,14 @@ def touch_each_other(plant: Plant, table: Table, now: Motion, stage: Stage, is_f
     for finger in range(2):
         tip = stage.on_tip[finger]
         stage.extra_rate[CORNERS + finger] = tip.shear_rate if touching else 0.0
-        if is_first and plant.tips_near and not near:
+        if is_first and plant.tips_may_touch and not near:
             clear_contact(tip)
             plant.state.extra_shear[CORNERS + finger] = 0.0
     if not is_first:
         return
-    plant.tips_near = near
+    plant.tips_may_touch = near
     if touching:
-        plant.coupled = True
+        plant.has_extra_rows = True
         for finger in range(2):
             tip = stage.on_tip[finger]
             for r in range(3):

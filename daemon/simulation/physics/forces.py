@@ -150,7 +150,7 @@ def bend_bristles(plant: Plant, finger: int, now: Motion, is_first: bool) -> flo
         stiffness = min(stiffness, before_slip / (p.step * abs(rate)))
     plant.drag[finger] = damping
     gears.friction = friction
-    gears.bent = bent
+    gears.limited_deflection = bent
     if is_first:
         gears.stiffness = stiffness
     return torque
@@ -199,14 +199,14 @@ def evaluate_hand(plant: Plant, table: Table, now: Motion, stage: Stage, is_firs
     ny = math.sin(now.position[4])
     with_object = p.shape != NO_OBJECT
     free_object(plant, now)
-    if is_first and plant.coupled:
-        plant.coupled = False
+    if is_first and plant.has_extra_rows:
+        plant.has_extra_rows = False
         clear_extra(plant)
     if with_object:
         touch_palm(plant, now, stage, nx, ny, is_first)
     for finger in range(2):
         torque = 0.0
-        if p.present[finger] != 0:
+        if p.finger_present[finger] != 0:
             place_finger(plant, finger, now.position[finger])
             if with_object:
                 tip = stage.on_object[finger]
@@ -216,7 +216,7 @@ def evaluate_hand(plant: Plant, table: Table, now: Motion, stage: Stage, is_firs
                 forces[3] += tip.forces[2]
                 forces[4] += tip.forces[3]
         forces[finger] = torque
-    if p.present[0] != 0 and p.present[1] != 0:
+    if p.finger_present[0] != 0 and p.finger_present[1] != 0:
         touch_each_other(plant, table, now, stage, is_first)
     for finger in range(2):
         plant.external[finger] = forces[finger]

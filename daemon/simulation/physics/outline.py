@@ -11,7 +11,7 @@ from softfinger.daemon.simulation.physics.plant_state import DISC, Parameters, T
 from softfinger.kinematics.compiled.kernel import inner_kernel
 
 FACE = -1.0  # code of a plane face, in place of a radius of curvature
-_SMALLEST = 1e-12  # m
+_DISTANCE_MIN = 1e-12  # m
 
 
 @inner_kernel
@@ -24,7 +24,7 @@ def nearest(p: Parameters, u: float, v: float) -> tuple[float, float, float, flo
     at a corner, ``FACE`` on a face, or the radius of a disc.
     """
     if p.shape == DISC:
-        away = max(math.sqrt(u * u + v * v), _SMALLEST)
+        away = max(math.sqrt(u * u + v * v), _DISTANCE_MIN)
         return -u / away, -v / away, away - p.roundness, p.roundness
     best = -math.inf
     face = 0
@@ -96,7 +96,7 @@ def rim_on_disc(p: Parameters, tip: TipContact, away: float) -> float:
     rim: float = p.roundness - clear
     if rim > 0.0:
         force = p.rim_stiffness * rim
-        inverse = 1.0 / max(clear, _SMALLEST)
+        inverse = 1.0 / max(clear, _DISTANCE_MIN)
         outwards = beyond if across > 0.0 else -beyond
         tip.rim_energy = 0.5 * force * rim
         # ∂(away)/∂d = −1.

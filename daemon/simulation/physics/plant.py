@@ -19,11 +19,11 @@ import math
 
 from softfinger.daemon.simulation.physics.energy_guard import (
     HALVINGS,
-    enter_changed,
-    enter_relaxed,
+    allow_changed_energy,
+    allow_relaxed_energy,
     guard_step,
-    is_allowed,
-    on_rim,
+    is_on_rim,
+    is_within_limit,
     open_guard,
     shorten,
 )
@@ -91,7 +91,7 @@ def load_motors(plant: Plant, now: Motion, k: Motion, g: float) -> None:
 def finish_stage(plant: Plant, k: Motion, g: float) -> None:
     """Solve for the velocities of ``k`` and add their effect to its other rates."""
     solve(plant, k)
-    if plant.coupled:
+    if plant.has_extra_rows:
         add_extra_shears(plant, k, g)
     for j in range(5):
         k.position[j] += g * k.velocity[j]
@@ -113,20 +113,20 @@ def first_stage(plant: Plant, g: float) -> None:
         k.shear[j] = stage.on_object[j].shear_rate
         k.current[j] = 0.0
     for j in range(SHEARS):
-        k.extra_shear[j] = stage.extra_rate[j] if plant.coupled else 0.0
+        k.extra_shear[j] = stage.extra_rate[j] if plant.has_extra_rows else 0.0
     set_motor_slopes(plant, g)
     load_motors(plant, state, k, g)
     factorise(plant, g)
-    if plant.coupled:
+    if plant.has_extra_rows:
         take_extra_stiffness(plant, k, g)
     take_stiffness(plant, k, g)
     finish_stage(plant, k, g)
 
 
 @inner_kernel
-def go_to_second_stage(plant: Plant, h: float) -> None:
+def begin_second_stage(plant: Plant, h: float) -> None:
     """Move to the second stage: y + h k1."""
-    state, k, later = plant.state, plant.first, plant.later
+    state, k, later = plant.state, plant.first, plant.stage_state
     for j in range(5):
         later.position[j] = state.position[j] + h * k.position[j]
         later.velocity[j] = state.velocity[j] + h * k.velocity[j]
@@ -145,22 +145,22 @@ def second_stage(plant: Plant, g: float) -> None:
     for j in range(5):
         inertia = p.joint_inertia if j < 2 else p.mass if j < 4 else p.inertia
         plant.load[j] = plant.forces[j] - 2.0 * inertia * first.velocity[j]
-        k.position[j] = plant.later.velocity[j] - 2.0 * first.position[j]
+        k.position[j] = plant.stage_state.velocity[j] - 2.0 * first.position[j]
     for j in range(2):
         k.shear[j] = stage.on_object[j].shear_rate - 2.0 * first.shear[j]
         k.current[j] = first.current[j]
     for j in range(SHEARS):
         rate = stage.extra_rate[j] - 2.0 * first.extra_shear[j]
-        k.extra_shear[j] = rate if plant.coupled else 0.0
-    load_motors(plant, plant.later, k, g)
+        k.extra_shear[j] = rate if plant.has_extra_rows else 0.0
+    load_motors(plant, plant.stage_state, k, g)
     take_stiffness(plant, k, g)
-    if plant.coupled:
+    if plant.has_extra_rows:
         take_extra_stiffness(plant, k, g)
     finish_stage(plant, k, g)
 
 
 @inner_kernel
-def go_on(plant: Plant, h: float) -> None:
+def advance_state(plant: Plant, h: float) -> None:
     """Advance the state by y + h (3 k1 + k2)/2, except held parts."""
     p, state, first, second = plant.parameters, plant.state, plant.first, plant.second
     for j in range(2):
@@ -189,34 +189,34 @@ def go_on(plant: Plant, h: float) -> None:
 
 
 @inner_kernel
-def go_back(plant: Plant, table: Table) -> None:
+def limit_energy(plant: Plant, table: Table) -> None:
     """Shorten a step until its energy is allowed, or undo it after HALVINGS attempts."""
     for _ in range(HALVINGS):
         shorten(plant, 0.5)
         evaluate_state(plant, table)
-        if is_allowed(plant):
+        if is_within_limit(plant):
             return
     shorten(plant, 0.0)
     evaluate_state(plant, table)
 
 
 @inner_kernel
-def enter_bristles(plant: Plant) -> None:
+def store_bristles(plant: Plant) -> None:
     """Limit the bristle deflections, and store the friction level for the next step."""
     for joint in range(2):
         gears = plant.gears[joint]
         gears.level = gears.friction
-        gears.deflection = gears.bent
-        plant.state.bristles[joint] = gears.bent
+        gears.deflection = gears.limited_deflection
+        plant.state.bristles[joint] = gears.limited_deflection
 
 
 # --- contacts of the tips at the times of the sensor frames --------------------------------------
 
 
 @inner_kernel
-def feels_tip(plant: Plant, finger: int) -> bool:
+def senses_other_tip(plant: Plant, finger: int) -> bool:
     """Return True if a tip's sensed contact is the other tip, since it presses more."""
-    if not plant.tips_near:
+    if not plant.tips_may_touch:
         return False
     stage = plant.stages[0]
     stronger = stage.on_tip[finger].force > stage.on_object[finger].force
@@ -224,9 +224,9 @@ def feels_tip(plant: Plant, finger: int) -> bool:
 
 
 @inner_kernel
-def felt_contact(plant: Plant, finger: int) -> TipContact:
+def sensed_contact_of(plant: Plant, finger: int) -> TipContact:
     """Return the sensed contact of a tip."""
-    if feels_tip(plant, finger):
+    if senses_other_tip(plant, finger):
         return plant.stages[0].on_tip[finger]
     return plant.stages[0].on_object[finger]
 
@@ -235,37 +235,39 @@ def felt_contact(plant: Plant, finger: int) -> TipContact:
 def take_sample(plant: Plant, ring: Records[Sample]) -> None:
     """Write the due sample into ``ring``, interpolated between the last contact and the present."""
     p = plant.parameters
-    due = plant.samples * p.sample_period
-    back = min((plant.steps * p.step - due) / p.step, 1.0)
-    row = ring[plant.samples % len(ring)]
-    row.number = plant.samples
+    due = plant.sample_count * p.sample_period
+    back = min((plant.step_count * p.step - due) / p.step, 1.0)
+    row = ring[plant.sample_count % len(ring)]
+    row.number = plant.sample_count
     row.t = due
     for finger in range(2):
-        now, before = felt_contact(plant, finger), plant.felt[finger]
+        now, before = sensed_contact_of(plant, finger), plant.sensed_contact[finger]
         # Do not interpolate between contacts with different bodies.
-        same = feels_tip(plant, finger) == (plant.on_other_tip[finger] != 0)
+        same = senses_other_tip(plant, finger) == (plant.on_other_tip[finger] != 0)
         fraction = back if same else 0.0
         row.d[finger] = now.d - fraction * (now.d - before.d)
         row.theta[finger] = now.theta - fraction * (now.theta - before.theta)
         row.gain[finger] = now.gain - fraction * (now.gain - before.gain)
-        row.firmness[finger] = 1.0 if feels_tip(plant, finger) else plant.firmness[finger]
+        row.relaxation_factor[finger] = plant.relaxation_factor[finger]
+        if senses_other_tip(plant, finger):
+            row.relaxation_factor[finger] = 1.0
         row.curvature[finger] = now.curvature
         row.tangential[finger] = now.tangential - fraction * (now.tangential - before.tangential)
-    plant.samples += 1
+    plant.sample_count += 1
 
 
 @inner_kernel
 def settle(plant: Plant, ring: Records[Sample]) -> None:
     """Take the samples that are due, then store the present contacts of the tips."""
     p, stage = plant.parameters, plant.stages[0]
-    while plant.samples * p.sample_period <= plant.steps * p.step:
+    while plant.sample_count * p.sample_period <= plant.step_count * p.step:
         take_sample(plant, ring)
     for finger in range(2):
         plant.state.shear[finger] = stage.on_object[finger].shear
-        if plant.tips_near:
+        if plant.tips_may_touch:
             plant.state.extra_shear[CORNERS + finger] = stage.on_tip[finger].shear
-        plant.felt[finger] = felt_contact(plant, finger)
-        plant.on_other_tip[finger] = 1 if feels_tip(plant, finger) else 0
+        plant.sensed_contact[finger] = sensed_contact_of(plant, finger)
+        plant.on_other_tip[finger] = 1 if senses_other_tip(plant, finger) else 0
 
 
 # --- the steps -----------------------------------------------------------------------------------
@@ -287,24 +289,24 @@ def step(plants: Records[Plant], tables: Records[Table], ring: Records[Sample], 
     relaxing = p.creep > 0.0 or p.micro_slip
     evaluate_state(plant, data)
     open_guard(plant)
-    enter_bristles(plant)
+    store_bristles(plant)
     settle(plant, ring)
     for _ in range(count):
         if scripted:
-            t = plant.steps * h
+            t = plant.step_count * h
             state.velocity[2] = (script_x(plant, t + h) - script_x(plant, t)) / h
             evaluate_state(plant, data)
-        plant.earlier = plant.state
-        plant.earlier_layers[:] = plant.layers
-        was_on_rim = on_rim(plant)
+        plant.last_state = plant.state
+        plant.last_layers[:] = plant.layers
+        was_on_rim = is_on_rim(plant)
         first_stage(plant, g)
-        go_to_second_stage(plant, h)
-        evaluate_hand(plant, data, plant.later, plant.stages[1], False)
+        begin_second_stage(plant, h)
+        evaluate_hand(plant, data, plant.stage_state, plant.stages[1], False)
         second_stage(plant, g)
-        go_on(plant, h)
-        plant.steps += 1
+        advance_state(plant, h)
+        plant.step_count += 1
         if scripted:
-            state.position[2] = script_x(plant, plant.steps * h)
+            state.position[2] = script_x(plant, plant.step_count * h)
         if relaxing:
             relax_shears(plant)
         # Slip: this limits the shears, and `settle` stores them.
@@ -314,18 +316,18 @@ def step(plants: Records[Plant], tables: Records[Table], ring: Records[Sample], 
         else:
             changed = guard_step(plant, was_on_rim)
             if changed == 2:
-                go_back(plant, data)
+                limit_energy(plant, data)
             elif changed == 1:
                 # New bristles of the slowed gears are not deflected either.
-                enter_bristles(plant)
+                store_bristles(plant)
                 evaluate_state(plant, data)
             if changed != 0:
-                enter_changed(plant)
-        enter_bristles(plant)
+                allow_changed_energy(plant)
+        store_bristles(plant)
         settle(plant, ring)
-        if p.remembers:
+        if p.tips_relax:
             # The relaxation factor is constant within a step; the energy change between steps
             # comes from the tip itself, so the guard allows it.
             relax_tips(plant)
             evaluate_state(plant, data)
-            enter_relaxed(plant)
+            allow_relaxed_energy(plant)

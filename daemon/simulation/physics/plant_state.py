@@ -14,8 +14,8 @@ from softfinger.kinematics.compiled.layout import Pair, Record, Records
 
 FloatArray = NDArray[np.float64]
 
-Three = Annotated[FloatArray, 3]
-Five = Annotated[FloatArray, 5]
+FloatTriple = Annotated[FloatArray, 3]
+FloatFive = Annotated[FloatArray, 5]
 Flags = Annotated[NDArray[np.int64], 2]  # 0 or 1 for each finger
 
 # Shapes of the object.
@@ -43,8 +43,8 @@ class Motion(Record):
     The rates of the bristles are those of the joints.
     """
 
-    position: Five  # [rad], [rad], [m], [m], [rad]
-    velocity: Five
+    position: FloatFive  # [rad], [rad], [m], [m], [rad]
+    velocity: FloatFive
     shear: Pair  # d_t of the tips on the object [m]
     extra_shear: Shears  # [m]
     bristles: Pair  # deflection of the gear bristles [rad]
@@ -59,7 +59,7 @@ class Sample(Record):
     d: Pair
     theta: Pair
     gain: Pair
-    firmness: Pair
+    relaxation_factor: Pair
     curvature: Pair
     tangential: Pair
 
@@ -89,15 +89,15 @@ class Parameters(Record):
     shear_coupling: float  # of d_t with d and θ: 1 for springs, 0 for bristles
     creep: float  # fraction of a stuck shear that relaxes in a sub-step
     micro_slip: bool  # the edge of the footprint slips before the rest
-    remembers: bool  # the tips relax
-    relaxation: Three  # stiffness of each Prony term relative to the long-term stiffness
-    relaxed: Three  # fraction of each term that relaxes in a sub-step
+    tips_relax: bool
+    relaxation: FloatTriple  # stiffness of each Prony term relative to the long-term stiffness
+    relaxation_step: FloatTriple  # fraction of each term that relaxes in a sub-step
     rim_stiffness: float  # [N/m]
     tolerance: float  # relative energy gain allowed in smooth steps
     half_separation: float  # of the pivots [m]
     length: float  # of a finger [m]
     offset: float  # of the tip from the finger's axis [m]
-    present: Flags  # the tip takes part
+    finger_present: Flags  # the tip takes part
     shape: int  # of the object
     half_width: float  # [m]
     half_height: float  # [m]
@@ -149,7 +149,7 @@ class Goals(Record):
     stiffness: Pair  # of the servos' position loops, relative to the factory setting
     damping: Pair  # in excess of the factory setting, relative to its stiffness [s]
     duty: Pair  # limit of the motor voltage as a fraction of the supply
-    load: Three  # external force x, y [N] and torque [N·m] on the object
+    load: FloatTriple  # external force x, y [N] and torque [N·m] on the object
 
 
 class Finger(Record):
@@ -168,7 +168,7 @@ class Gears(Record):
 
     deflection: float  # of the bristles at the begin of the step [rad]
     level: float  # friction level at the begin of the step [N·m]
-    bent: float  # last evaluated deflection, within its limits [rad]
+    limited_deflection: float  # last evaluated deflection, within its limits [rad]
     friction: float  # last evaluated friction level [N·m]
     stiffness: float  # of the bristles, in the matrix of the step [N·m/rad]
 
@@ -202,9 +202,9 @@ class TipContact(Record):
     rim_d: float  # its derivatives by d [N] and by θ [N·m]
     rim_theta: float
     rows: Annotated[FloatArray, 3, 4]  # ∂d, ∂θ and the increments of d_t by the coordinates
-    stiffness: Three  # along each row
-    damping: Three
-    along: Three  # forces along the rows, with losses
+    stiffness: FloatTriple  # along each row
+    damping: FloatTriple
+    along: FloatTriple  # forces along the rows, with losses
     forces: Annotated[FloatArray, 4]  # generalised forces on the coordinates
 
 
@@ -219,7 +219,7 @@ class Stage(Record):
 class ExtraRow(Record):
     """Row over the coordinates for a contact that occurs only in some scenes."""
 
-    row: Five
+    row: FloatFive
     stiffness: float
     damping: float
     shear: int  # 1 + index of its extra shear, 0 for none
@@ -228,7 +228,7 @@ class ExtraRow(Record):
 class Factors(Record):
     """Matrix of the step over all coordinates, factorised as L D Lᵀ."""
 
-    inverse: Five  # inverse pivots
+    inverse: FloatFive  # inverse pivots
     lower: Annotated[FloatArray, 5, 5]
 
 
@@ -238,33 +238,34 @@ class Plant(Record):
     parameters: Parameters
     goals: Goals
     state: Motion
-    felt: Annotated[Records[TipContact], 2]  # present contact of each tip, the stronger of two
+    # Present contact of each tip, the stronger of two
+    sensed_contact: Annotated[Records[TipContact], 2]
     on_other_tip: Flags  # this contact is with the other tip
-    steps: int  # sub-steps done
-    samples: int  # number of samples taken
+    step_count: int  # sub-steps done
+    sample_count: int  # number of samples taken
     energy: float  # kinetic, elastic and gravitational [J]
-    allowed: float  # upper limit of the energy, from the work done on the hand [J]
-    guarded: int  # sub-steps whose energy was reduced to this limit
-    earlier: Motion  # state before the step
-    later: Motion  # state of the second stage
+    energy_limit: float  # upper limit of the energy, from the work done on the hand [J]
+    limited_step_count: int  # sub-steps whose energy was reduced to this limit
+    last_state: Motion  # state before the step
+    stage_state: Motion  # state of the second stage
     first: Motion  # k1 of the step
     second: Motion  # k2 of the step
     stages: Annotated[Records[Stage], 2]
     fingers: Annotated[Records[Finger], 2]
     gears: Annotated[Records[Gears], 2]
-    forces: Five  # on the coordinates, except those of the motors
-    drag: Five  # friction over velocity
+    forces: FloatFive  # on the coordinates, except those of the motors
+    drag: FloatFive  # friction over velocity
     external: Pair  # last evaluated torque of the contacts on each joint [N·m]
-    load: Five  # right-hand side of the equations of the step
+    load: FloatFive  # right-hand side of the equations of the step
     motor_by_q: Pair  # slopes of the motor torques, for the matrix
     motor_by_rate: Pair
     layers: Annotated[FloatArray, 2, LAYERS]  # shear of each tip's layers [m]
-    earlier_layers: Annotated[FloatArray, 2, LAYERS]  # before the step
+    last_layers: Annotated[FloatArray, 2, LAYERS]  # before the step
     shear_variance: Pair  # their variance [m²]
-    memory: Annotated[FloatArray, 2, 3]  # relaxation state of each tip and Prony term [N]
-    firmness: Pair  # relaxation factor of each tip: force relative to the long-term force
+    relaxation_state: Annotated[FloatArray, 2, 3]  # of each tip and Prony term [N]
+    relaxation_factor: Pair  # force of each tip relative to the long-term force
     palm_energy: float  # [J]
-    tips_near: bool  # the contact of both tips was evaluated
-    coupled: bool  # an extra row may be active in this step
+    tips_may_touch: bool  # the contact of both tips was evaluated
+    has_extra_rows: bool  # an extra row may be active in this step
     extra: Annotated[Records[ExtraRow], EXTRA_ROWS]
     factors: Factors

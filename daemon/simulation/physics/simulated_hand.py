@@ -35,15 +35,15 @@ from softfinger.daemon.types import FINGERS
 from softfinger.kinematics.contact.table import ContactTable
 from softfinger.kinematics.hand.geometry import HandGeometry
 
-SPARE_SAMPLES = 8
-LONGEST_ADVANCE = 10.0  # s of simulated time in one kernel call
+SPARE_SAMPLE_COUNT = 8
+ADVANCE_MAX = 10.0  # s of simulated time in one kernel call
 
 _MODES = (CURRENT_MODE, POSITION_MODE, CURRENT_BASED_POSITION_MODE)
 
 STANDARD_GRAVITY = 9.80665  # m/s²
-LONGEST_STEP = 0.25e-3  # s
-SHORTEST_STEP = 0.05e-3  # s
-PHASE_A_STEP = 0.25  # rad, largest phase of the fastest oscillation per sub-step
+STEP_MAX = 0.25e-3  # s
+STEP_MIN = 0.05e-3  # s
+PHASE_MAX = 0.25  # rad, largest phase of the fastest oscillation per sub-step
 ELECTRIC_TIME = 1e-3  # s, lag of the servo's current behind its reference
 FULL_EFFORT_ERROR = 0.27  # rad of position error at which the loop commands the stall current
 TABLE_SPEED = 0.0005  # m/s, below which the friction of the table on the object is viscous
@@ -75,7 +75,7 @@ def stiff_step(settings: Settings, table: ContactTable) -> float:
     else:
         turning = (shape.half_width / shape.gyration) ** 2
         fastest = math.sqrt(stiffness / simulation.object_mass * max(1.0, turning))
-    step = min(max(PHASE_A_STEP / fastest, SHORTEST_STEP), LONGEST_STEP)
+    step = min(max(PHASE_MAX / fastest, STEP_MIN), STEP_MAX)
     # An integer number of sub-steps per millisecond keeps ticks and frames on the grid.
     return 1e-3 / math.ceil(1e-3 / step - 1e-9)
 
@@ -96,15 +96,15 @@ def set_parameters(p: Parameters, settings: Settings, table: ContactTable, step:
     if simulation.tip_creep_time > 0.0:
         p.creep = -math.expm1(-step / simulation.tip_creep_time)
     p.micro_slip = simulation.tip_micro_slip
-    p.remembers = any(simulation.tip_relaxation)
+    p.tips_relax = any(simulation.tip_relaxation)
     p.relaxation[:] = simulation.tip_relaxation
-    p.relaxed[:] = [-math.expm1(-step / each) for each in simulation.tip_relaxation_times]
+    p.relaxation_step[:] = [-math.expm1(-step / each) for each in simulation.tip_relaxation_times]
     p.rim_stiffness = RIM_STIFFNESS
     p.tolerance = LOSSLESS_TOLERANCE if simulation.tip_loss == 0.0 else 0.0
     p.half_separation = 0.5 * settings.hand.pivot_separation
     p.length = settings.hand.finger_length
     p.offset = settings.hand.finger_offset
-    p.present[:] = [name in settings.scene.fingers for name in FINGERS]
+    p.finger_present[:] = [name in settings.scene.fingers for name in FINGERS]
     _object(p, settings)
     _joints(p, settings)
     _script(p, settings)
@@ -182,7 +182,7 @@ def _script(p: Parameters, settings: Settings) -> None:
     contacts = geometry_of(settings).contacts(settings.hand.open_angle, pose, width)
     ways = COMPRESSION_DEPTH * settings.tip.radius - contacts.d
     ways = np.maximum(ways / max(math.cos(simulation.object_angle), 0.1), 0.0)
-    p.script_travel[:] = ways * p.present
+    p.script_travel[:] = ways * p.finger_present
 
 
 class SimulatedHand:
@@ -232,7 +232,7 @@ class SimulatedHand:
         self.start = start
         self.plant = Plant()
         set_parameters(self.plant.parameters, settings, table, self.step)
-        self.plant.firmness[:] = 1.0 + sum(settings.simulation.tip_relaxation)
+        self.plant.relaxation_factor[:] = 1.0 + sum(settings.simulation.tip_relaxation)
         state, simulation = self.plant.state, settings.simulation
         state.position[:2] = settings.hand.open_angle
         state.position[2:4] = simulation.object_position
@@ -243,7 +243,7 @@ class SimulatedHand:
         goals.stiffness[:] = goals.duty[:] = 1.0
         # Store as many samples as may be in transit to the reader of a sensor.
         latest = simulation.tactile_delay + simulation.tactile_jitter
-        stored = math.ceil(latest * settings.tactile.rate) + SPARE_SAMPLES
+        stored = math.ceil(latest * settings.tactile.rate) + SPARE_SAMPLE_COUNT
         self._ring = np.zeros(stored, Sample.dtype)
         self._ring["number"] = -1
         self._rows = [Sample(self._ring[k : k + 1]) for k in range(stored)]
@@ -255,7 +255,7 @@ class SimulatedHand:
         self.current = state.current  # A
         self.object_pose = state.position[2:]  # x, y, φ
         self.object_velocity = state.velocity[2:]
-        felt: Any = self.plant.felt
+        felt: Any = self.plant.sensed_contact
         self.d = felt.array["d"]  # m, negative: a gap
         self.theta = felt.array["theta"]  # rad
         self.force = felt.array["force"]  # F on the tip's base [N]
@@ -288,7 +288,7 @@ class SimulatedHand:
     def _advance(self, t: float) -> None:
         # The addend 1e-6 prevents rounding down when t is a multiple of the sub-step.
         remaining = int((t - self.start) * self._per_step + 1e-6) - self._done
-        steps_max = int(LONGEST_ADVANCE * self._per_step)
+        steps_max = int(ADVANCE_MAX * self._per_step)
         while remaining > 0:
             count = min(remaining, steps_max)
             self._run(count)
@@ -350,9 +350,9 @@ class SimulatedHand:
         self.apply_load(-push * math.sin(angle), push * math.cos(angle), twist)
 
     @property
-    def samples(self) -> int:
+    def sample_count(self) -> int:
         """Number of contact samples; sample k was taken at ``start`` + k / tactile.rate."""
-        return self.plant.samples
+        return self.plant.sample_count
 
     def sample(self, number: int) -> Sample:
         """Return sample ``number``, which is valid until a newer one replaces it.
@@ -361,7 +361,7 @@ class SimulatedHand:
         """
         row = self._rows[number % len(self._rows)]
         if row.number != number:
-            raise LookupError(f"sample {number} is not kept; {self.samples} were taken")
+            raise LookupError(f"sample {number} is not kept; {self.sample_count} were taken")
         return row
 
     def energy(self) -> float:

@@ -82,7 +82,7 @@ def factorise(plant: Plant, g: float) -> None:
                 by = weight * tip.rows[r, i]
                 for j in range(4):
                     full[at, finger if j == 0 else 1 + j] += by * tip.rows[r, j]
-    for number in range(EXTRA_ROWS if plant.coupled else 0):
+    for number in range(EXTRA_ROWS if plant.has_extra_rows else 0):
         extra = plant.extra[number]
         weight = g * (extra.damping + g * extra.stiffness)
         if weight == 0.0:

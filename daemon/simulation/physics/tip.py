@@ -72,10 +72,11 @@ from softfinger.kinematics.contact.table_record import Table
 D_MIN = 1e-9  # m, lower limit of d for a contact
 _FADE_FROM = 1.15  # rad, where w(θ) begins to fade
 _FADE_TO = 1.35  # rad, where w(θ) reaches 0
-_CLOSEST = 1e-3  # of the radius, lower bound of the distance from the tip's centre to a corner
-_WITHIN = 5e-13  # relative tolerance of the friction limit
-_LIMP = 0.02  # lower bound of the relaxation factor of a tip that recovers late
-_BEFORE_RIM = 0.03  # of the radius, from the end of the soft range to the rim at θ = 0
+# Of the radius, lower bound of the distance from the tip's centre to a corner.
+_CORNER_DISTANCE_MIN = 1e-3
+_FRICTION_TOLERANCE = 5e-13  # relative tolerance of the friction limit
+_RELAXATION_MIN = 0.02  # lower bound of the relaxation factor of a tip that recovers late
+_RIM_ROUNDING = 0.03  # of the radius, from the end of the soft range to the rim at θ = 0
 
 
 @inner_kernel
@@ -178,8 +179,8 @@ def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) 
         d_soft = d
         d_soft_d = 1.0
         d_soft_theta = 0.0
-        if d > radius * (1.0 - _BEFORE_RIM - abs(sine)):
-            bent = math.sqrt(sine * sine + _BEFORE_RIM * _BEFORE_RIM)
+        if d > radius * (1.0 - _RIM_ROUNDING - abs(sine)):
+            bent = math.sqrt(sine * sine + _RIM_ROUNDING * _RIM_ROUNDING)
             limit = radius * (1.0 - bent)
             if d > limit:
                 d_soft = limit
@@ -223,7 +224,7 @@ def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) 
         tangential = t0 + t1 * shear
         friction = p.friction
         # The tolerance keeps a shear that was just limited from being limited again.
-        stuck = friction * normal * (1.0 + _WITHIN)
+        stuck = friction * normal * (1.0 + _FRICTION_TOLERANCE)
         if abs(tangential) > stuck or curvature * (shear - neutral) ** 2 > at_neutral:
             slope_there = n1 + 2.0 * n2 * neutral
             highest = neutral + shear_limit(t1, at_neutral, slope_there, curvature, friction)
@@ -348,7 +349,7 @@ def touch_object(
     # during an impact. Losses use the present stiffness.
     travel = max(p.step * rate_d, 0.0)
     if d + travel <= D_MIN:
-        tip.gain = fade(theta)[0] * p.factor * plant.firmness[finger]
+        tip.gain = fade(theta)[0] * p.factor * plant.relaxation_factor[finger]
         clear_contact(tip)
         return
     theta_q = side
@@ -358,7 +359,7 @@ def touch_object(
     if curved >= 0.0:
         # m points to the centre of curvature, which is fixed in the object: the corner, or the
         # centre of the disc.
-        inverse = 1.0 / max(distance + curved, _CLOSEST * radius)
+        inverse = 1.0 / max(distance + curved, _CORNER_DISTANCE_MIN * radius)
         theta_q -= v_t * inverse
         theta_x = -my * inverse
         theta_y = mx * inverse
@@ -380,7 +381,7 @@ def touch_object(
     tip.slip_rate = t_q * q_rate - my * x_rate + mx * y_rate + rotation_t * rotation_rate
     tip.shear = now.shear[finger]
     tip.shear_variance = plant.shear_variance[finger]
-    contact_forces(p, table, tip, p.factor * plant.firmness[finger])
+    contact_forces(p, table, tip, p.factor * plant.relaxation_factor[finger])
     if rim + travel > 0.0:
         stiffen_by_rim(p, tip)
     tangent = tip.tangent
@@ -446,12 +447,13 @@ def relax_tips(plant: Plant) -> None:
     p = plant.parameters
     for finger in range(2):
         tip = plant.stages[0].on_object[finger]
-        lasting = tip.force / plant.firmness[finger]
-        firmness = 1.0
+        lasting = tip.force / plant.relaxation_factor[finger]
+        state = plant.relaxation_state[finger]
+        factor = 1.0
         for k in range(3):
-            plant.memory[finger, k] += p.relaxed[k] * (lasting - plant.memory[finger, k])
+            state[k] += p.relaxation_step[k] * (lasting - state[k])
             if lasting > 0.0:
-                firmness += p.relaxation[k] * (1.0 - plant.memory[finger, k] / lasting)
+                factor += p.relaxation[k] * (1.0 - state[k] / lasting)
             else:
-                firmness += p.relaxation[k]
-        plant.firmness[finger] = max(firmness, _LIMP)
+                factor += p.relaxation[k]
+        plant.relaxation_factor[finger] = max(factor, _RELAXATION_MIN)

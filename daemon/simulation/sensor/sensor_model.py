@@ -33,7 +33,7 @@ from softfinger.kinematics.sensing.springs_pressure import SpringsPressure, coun
 
 FloatArray = NDArray[np.float64]
 
-PLAYS = 4
+PLAY_COUNT = 4
 _FINENESS = 60.0  # points of the model per radius of the tip, at least
 
 
@@ -82,7 +82,7 @@ class SensorModel:
         else:
             blur = flaws.tactile_blur
             self._springs = SpringsPressure(self._cells, material, blur, self._count)
-        self._plays = np.zeros((PLAYS if flaws.tactile_hysteresis > 0.0 else 0, *shape))
+        self._plays = np.zeros((PLAY_COUNT if flaws.tactile_hysteresis > 0.0 else 0, *shape))
         self._creep_lag, self._response_lag = np.zeros((2, 2, *shape))
         self._offset = np.zeros(shape)  # counts
         self._warmer = np.zeros(1)  # relative drift of the gain
@@ -98,7 +98,7 @@ class SensorModel:
         return self._sensitivity > 0.0
 
     @property
-    def remembers(self) -> bool:
+    def has_memory(self) -> bool:
         """True if readings also depend on earlier contacts."""
         flaws = self._flaws
         return (
@@ -246,31 +246,31 @@ class SensorModel:
 # --- effects of a soft, resistive sensor: in place, on arrays [rows, cols] -----------------------
 
 
-def hysteresis(pressure: FloatArray, excess: float, memory: FloatArray) -> None:
+def hysteresis(pressure: FloatArray, excess: float, state: FloatArray) -> None:
     """Apply hysteresis: each cell reads more during unloading than during loading.
 
-    This is a Prandtl-Ishlinskii model: the output of a cell is the mean of PLAYS generalised play
-    operators with the states ``memory`` [PLAYS, rows, cols]. Each state follows an increasing
+    This is a Prandtl-Ishlinskii model: the output of a cell is the mean of PLAY_COUNT generalised
+    play operators with the states ``state`` [PLAY_COUNT, rows, cols]. Each follows an increasing
     pressure p at once. It follows a decreasing one only when it is above (1 + h_k) p, with h_k
     evenly distributed over 0 … 2·excess. So the loading curve is the pressure itself, the unloading
     curve ends at (1 + excess) p, loops are closed, inner loops lie inside, and zero pressure always
     reads 0.
     """
-    widths = 2.0 * excess * (np.arange(PLAYS) + 0.5) / PLAYS
-    np.minimum(memory, (1.0 + widths)[:, None, None] * pressure, out=memory)
-    np.maximum(memory, pressure, out=memory)
-    memory.mean(axis=0, out=pressure)
+    widths = 2.0 * excess * (np.arange(PLAY_COUNT) + 0.5) / PLAY_COUNT
+    np.minimum(state, (1.0 + widths)[:, None, None] * pressure, out=state)
+    np.maximum(state, pressure, out=state)
+    state.mean(axis=0, out=pressure)
 
 
-def lag(pressure: FloatArray, time: float, elapsed: float, memory: FloatArray) -> FloatArray:
+def lag(pressure: FloatArray, time: float, elapsed: float, state: FloatArray) -> FloatArray:
     """Return each cell's pressure with a first-order lag, z of dz/dt = (p − z)/time.
 
     p + share · z is the creep of a standard linear solid. The solution is exact for a pressure that
-    changed linearly during ``elapsed`` [s]. ``memory`` [2, rows, cols] has the last p and z, and is
+    changed linearly during ``elapsed`` [s]. ``state`` [2, rows, cols] has the last p and z, and is
     updated.
     """
-    before = memory[0]
-    lagged: FloatArray = memory[1]
+    before = state[0]
+    lagged: FloatArray = state[1]
     ratio = elapsed / time
     decay = math.exp(-ratio)
     # Mean of the decay over the interval; for short intervals it is 1 − r/2 + …

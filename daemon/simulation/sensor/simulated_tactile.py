@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from softfinger.daemon.clock import Clock
 from softfinger.daemon.profile.factory import make_grid, make_material, make_tip
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.simulation.faults import LONGEST_REPLAY
+from softfinger.daemon.simulation.faults import REPLAY_TIME_MAX
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.daemon.simulation.sensor.sensor_model import SensorModel
 from softfinger.daemon.types import Frame
@@ -80,12 +80,13 @@ class SimulatedTactile:
         self._relaxation = list(
             zip(simulation.tip_relaxation, simulation.tip_relaxation_times, strict=True)
         )
-        self._memory = [0.0] * len(self._relaxation)  # lagged plate force of each term [N]
+        # Lagged plate force of each term [N]
+        self._relaxation_state = [0.0] * len(self._relaxation)
         self._pressed = -1  # number of the newest sample applied to the cells
         self._frame: Frame | None = None
         self._faults = hand.measurement_faults[finger]
         self._given: deque[NDArray[np.uint16]] = deque(
-            maxlen=math.ceil(LONGEST_REPLAY * tactile.rate)
+            maxlen=math.ceil(REPLAY_TIME_MAX * tactile.rate)
         )
         self._replayed: Iterator[NDArray[np.uint16]] | None = None
         self._lost = 0
@@ -125,7 +126,7 @@ class SimulatedTactile:
     def _read(self, number: int, arrival: float) -> None:
         """Compute the frame of a sample, if the plant still has it, and make it the newest."""
         # Cells with memory also depend on the samples without a computed frame.
-        first = self._pressed + 1 if self._model.remembers else number
+        first = self._pressed + 1 if self._model.has_memory else number
         for each in range(first, number):
             self._press(each)
         if not self._press(number):
@@ -149,21 +150,21 @@ class SimulatedTactile:
             self._replayed = itertools.cycle(list(self._given)[-last:])
         return next(self._replayed)
 
-    def _relaxed(self, d: float, theta: float) -> float:
+    def _relaxation_factor(self, d: float, theta: float) -> float:
         """Return a tip's relaxation factor under the plate, one frame later, as in the plant."""
         lasting = float(self._hand.table(d, theta).force)
-        firmness = 1.0
+        state, factor = self._relaxation_state, 1.0
         for k, (strength, time) in enumerate(self._relaxation):
-            self._memory[k] += (lasting - self._memory[k]) * -math.expm1(-self._period / time)
-            firmness += strength * (1.0 - self._memory[k] / lasting if lasting > 0.0 else 1.0)
-        return max(firmness, 0.0)
+            state[k] += (lasting - state[k]) * -math.expm1(-self._period / time)
+            factor += strength * (1.0 - state[k] / lasting if lasting > 0.0 else 1.0)
+        return max(factor, 0.0)
 
     def _press(self, number: int) -> bool:
         """Apply sample ``number`` to the cells; return False if the plant no longer has it."""
         if self.stage is not None:
             touch = self.stage(number * self._period)
-            firmness = self._relaxed(max(touch.d, 0.0), touch.theta)
-            self._model.press(touch.d, touch.theta, 0.0, number * self._period, 0.0, firmness)
+            factor = self._relaxation_factor(max(touch.d, 0.0), touch.theta)
+            self._model.press(touch.d, touch.theta, 0.0, number * self._period, 0.0, factor)
             if touch.pressure > 0.0:
                 self._model.press_evenly(touch.pressure)
             return True
@@ -183,9 +184,9 @@ class SimulatedTactile:
         # Remove the part of the factor due to curvature, which the sensor model computes itself.
         factor *= math.sqrt(1.0 + curvature * self._radius)
         # Force is proportional to d²: half a tip on the edge of the face has half the force.
-        firmness = float(sample.firmness[finger])
-        d *= math.sqrt(factor / firmness)
-        self._model.press(d, theta, 0.0, number * self._period, curvature, firmness)
+        relaxation_factor = float(sample.relaxation_factor[finger])
+        d *= math.sqrt(factor / relaxation_factor)
+        self._model.press(d, theta, 0.0, number * self._period, curvature, relaxation_factor)
         return True
 
 

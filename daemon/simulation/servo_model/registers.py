@@ -74,7 +74,7 @@ def _items_of(model: ServoModel, firmware: int) -> list[Item]:
         _setting(reg.DRIVE_MODE, 1, 0, 0, model.drive_mode_max),
         _setting(reg.OPERATING_MODE, 1, reg.POSITION_MODE, 0, reg.CURRENT_BASED_POSITION_MODE),
         _setting(reg.SHADOW_ID, 1, 255, 0, 255),
-        _setting(reg.PROTOCOL_TYPE, 1, 2, 2 if model.small else 1, 2),
+        _setting(reg.PROTOCOL_TYPE, 1, 2, 2 if model.is_x330 else 1, 2),
         _setting(reg.HOMING_OFFSET, 4, 0, -_OFFSET_MAX, _OFFSET_MAX),
         _setting(reg.MOVING_THRESHOLD, 4, 10, 0, 1023),
         _setting(reg.TEMPERATURE_LIMIT, 1, model.temperature_limit, 0, 100),

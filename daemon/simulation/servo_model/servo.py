@@ -23,18 +23,18 @@ from softfinger.daemon.simulation.servo_model import framing
 from softfinger.daemon.simulation.servo_model.registers import ControlTable
 from softfinger.daemon.simulation.servo_model.servo_joint import (
     POSITION_MODES,
-    SENSE,
-    STEP,
+    SENSE_INTERVAL,
+    STEP_TIME,
     ServoHealth,
     ServoHeat,
     ServoJoint,
 )
 
 REBOOT_TIME = 0.34  # s without an answer
-JUMP = 130  # counts (0.2 rad at the shaft) by which the zero of the encoder jumps
-FAR = 0.05  # rad between goal and present angle at torque on, above which a goal counts as far
-_WATCHED = frozenset((reg.GOAL_CURRENT, reg.GOAL_POSITION))
-_TUNED = (reg.PWM_LIMIT, reg.POSITION_D_GAIN, reg.POSITION_P_GAIN, reg.GOAL_PWM)
+JUMP_COUNTS = 130  # counts (0.2 rad at the shaft) by which the zero of the encoder jumps
+FAR_GOAL = 0.05  # rad between goal and present angle at torque on, above which a goal counts as far
+_WATCHED_REGISTERS = frozenset((reg.GOAL_CURRENT, reg.GOAL_POSITION))
+_TUNING_REGISTERS = (reg.PWM_LIMIT, reg.POSITION_D_GAIN, reg.POSITION_P_GAIN, reg.GOAL_PWM)
 _CLEAR_FIRMWARE = 42
 _CLEAR_KEY = b"\x01DXL\x22"
 
@@ -172,12 +172,12 @@ class EmulatedServo:
             self._stop()
         if t >= self._next_step:
             if self.torque_on and self._joint.moves_by_itself():
-                self._next_step = t + STEP
+                self._next_step = t + STEP_TIME
                 self._joint.follow()
             else:
                 self._next_step = math.inf
         if t >= self._next_sense:
-            self._next_sense = t + SENSE
+            self._next_sense = t + SENSE_INTERVAL
             self._sense()
 
     # --- instructions ----------------------------------------------------------------------
@@ -207,7 +207,7 @@ class EmulatedServo:
             self._effect(item.address, value, t)
         torque = self._memory[reg.TORQUE_ENABLE]
         if torque and self._joint.moves_by_itself():
-            self._next_step = min(self._next_step, t + STEP)
+            self._next_step = min(self._next_step, t + STEP_TIME)
         if limp and torque:
             goal = self.table.get(reg.GOAL_POSITION)
             self.recorder.torque_on(t, self._joint, self.mode, goal)
@@ -295,7 +295,7 @@ class EmulatedServo:
             case "stuck":
                 self._joint.stuck = self._joint.encoder()
             case "jump":
-                self._joint.shift += JUMP
+                self._joint.shift += JUMP_COUNTS
             case "frozen":
                 self.frozen = True
             case "refuse":
@@ -321,7 +321,7 @@ class EmulatedServo:
             self._joint.aim()
         elif address == reg.BUS_WATCHDOG:
             self._watched = t
-        elif address in _TUNED:
+        elif address in _TUNING_REGISTERS:
             self._joint.tune()
 
     def _reset_mode(self) -> None:
@@ -357,7 +357,7 @@ class EmulatedServo:
             table.set(reg.TORQUE_ENABLE, 1)
         self._joint.hold()
         self._next_step = math.inf
-        self._next_sense = t + SENSE
+        self._next_sense = t + SENSE_INTERVAL
         self._joint.drive()
 
     # --- internal events -------------------------------------------------------------------
@@ -409,11 +409,11 @@ class BusRecorder:
 
     def goals(self, values: dict[int, int], joint: ServoJoint, torque: bool, refused: bool) -> None:
         """Record a write, except goals near the present angle while torque is off."""
-        goals = _WATCHED & values.keys()
+        goals = _WATCHED_REGISTERS & values.keys()
         self._refused += refused and bool(goals)
         for address in goals:
             value = values[address]
-            if address == reg.GOAL_POSITION and not torque and _away(joint, value) <= FAR:
+            if address == reg.GOAL_POSITION and not torque and _away(joint, value) <= FAR_GOAL:
                 continue
             least, greatest = self._goals.get(address, (value, value))
             self._goals[address] = min(least, value), max(greatest, value)
@@ -424,7 +424,7 @@ class BusRecorder:
         self._torque_t = self._last = t
         if mode in POSITION_MODES:
             away = _away(joint, position)
-            self._far += away > FAR
+            self._far += away > FAR_GOAL
             self._farthest = max(self._farthest, away)
 
     def heard(self, t: float, torque: bool) -> None:

@@ -19,9 +19,9 @@ from softfinger.daemon.servos.control_table import ServoModel, by_name
 from softfinger.daemon.servos.joint import JointScale
 from softfinger.daemon.simulation.servo_model.registers import ControlTable
 
-STEP = 0.001  # s, step of trajectories and velocity mode
+STEP_TIME = 0.001  # s, step of trajectories and velocity mode
 OVERLOAD_TIME = 2.0  # s at the current limit
-SENSE = 0.010  # s between checks of heat, voltage and overload
+SENSE_INTERVAL = 0.010  # s between checks of heat, voltage and overload
 _VOLTAGE = 0  # bit of the hardware error status
 POSITION_MODES = (
     reg.POSITION_MODE,
@@ -30,7 +30,7 @@ POSITION_MODES = (
 )
 _PER_VELOCITY = reg.VELOCITY_UNIT * reg.COUNTS_PER_TURN / (2.0 * math.pi)  # counts/s per unit
 _PER_ACCELERATION = reg.ACCELERATION_UNIT * reg.COUNTS_PER_TURN / (2.0 * math.pi)
-_ARRIVED = 20  # counts, tolerance of arrival at the goal
+_ARRIVAL_COUNTS = 20  # counts, tolerance of arrival at the goal
 _PRESENT = struct.Struct("<HBBhhiiiiHB")  # registers 120 … 146
 
 
@@ -132,15 +132,15 @@ class ServoJoint:
         return mode == reg.VELOCITY_MODE
 
     def follow(self) -> None:
-        """Advance the trajectory, or the position of velocity mode, by one STEP."""
+        """Advance the trajectory, or the position of velocity mode, by one STEP_TIME."""
         mode = self._memory[reg.OPERATING_MODE]
         if mode in POSITION_MODES:
-            self.profile.step(STEP)
+            self.profile.step(STEP_TIME)
         elif mode == reg.VELOCITY_MODE:
             limit = self._table.get(reg.VELOCITY_LIMIT)
             speed = min(max(self._table.get(reg.GOAL_VELOCITY), -limit), limit)
             self.profile.velocity = speed * _PER_VELOCITY
-            self.profile.position += self.profile.velocity * STEP
+            self.profile.position += self.profile.velocity * STEP_TIME
         self.drive()
 
     # --- plant -------------------------------------------------------------------------------
@@ -153,7 +153,7 @@ class ServoJoint:
         """
         get, (d, _, p) = self._table.get, self._model.position_gains
         stiffness = get(reg.POSITION_P_GAIN) / p
-        damping = (get(reg.POSITION_D_GAIN) - d) / 16.0 / (p / 128.0) * STEP
+        damping = (get(reg.POSITION_D_GAIN) - d) / 16.0 / (p / 128.0) * STEP_TIME
         duty = min(abs(get(reg.GOAL_PWM)), get(reg.PWM_LIMIT)) / 885.0
         self._plant.tune(self._joint, stiffness, damping, duty)
 
@@ -191,7 +191,7 @@ class ServoJoint:
             duty = self._load * plant.current.item(joint) + self._speed * plant.dq.item(joint)
             pwm = max(-885, min(885, round(self.sign * 885.0 * duty)))
         busy = profile.busy
-        arrived = not busy and abs(profile.target - position) <= _ARRIVED
+        arrived = not busy and abs(profile.target - position) <= _ARRIVAL_COUNTS
         _PRESENT.pack_into(
             memory,
             reg.REALTIME_TICK,
@@ -209,11 +209,12 @@ class ServoJoint:
         )
 
 
-ROOM = 25.0  # °C
-_LAG = 4.0  # s, lag of the thermometer
+ROOM_TEMPERATURE = 25.0  # °C
+_THERMOMETER_LAG = 4.0  # s, lag of the thermometer
 _CONVECTION = 0.006  # 1/K, relative increase of the cooling with the temperature difference
-_LONGEST = 1.0  # s, longest step
-_NEAR = 1e-6  # counts; without this tolerance, rounding of the square root prevents arrival
+_STEP_MAX = 1.0  # s, longest step
+# counts; without this tolerance, rounding of the square root prevents arrival.
+_ARRIVAL_TOLERANCE = 1e-6
 
 
 class Profile:
@@ -259,7 +260,9 @@ class Profile:
         distance = self.target - self.position
         if distance == 0.0 and self.velocity == 0.0:
             return
-        if abs(distance) < _NEAR and abs(self.velocity) <= max(self.acceleration * dt, _NEAR):
+        if abs(distance) < _ARRIVAL_TOLERANCE and abs(self.velocity) <= max(
+            self.acceleration * dt, _ARRIVAL_TOLERANCE
+        ):
             self.hold(self.target)
             return
         limit = self.speed if self.speed > 0.0 else math.inf
@@ -292,7 +295,7 @@ class ServoHeat:
     def __init__(
         self, model: ServoModel, heating: float = 1.0, cooling: float = 1.0, capacity: float = 1.0
     ) -> None:
-        self.ambient = self.winding = self.case = self.sensed = ROOM
+        self.ambient = self.winding = self.case = self.sensed = ROOM_TEMPERATURE
         self._resistance = 1.08 * heating * model.resistance
         self._winding = 0.05 * capacity * model.heat_capacity  # J/K
         self._case = 0.93 * capacity * model.heat_capacity
@@ -319,15 +322,15 @@ class ServoHeat:
     def step(self, current: float, seconds: float) -> None:
         """Advance by ``seconds`` with a constant ``current`` [A]."""
         while seconds > 0.0:
-            dt = min(seconds, _LONGEST)
+            dt = min(seconds, _STEP_MAX)
             seconds -= dt
-            copper = 1.0 + 0.0039 * (self.winding - ROOM)
+            copper = 1.0 + 0.0039 * (self.winding - ROOM_TEMPERATURE)
             inward = self._coupling * (self.winding - self.case)
             over = self.case - self.ambient
             outward = self._cooling * (1.0 + _CONVECTION * max(over, 0.0)) * over
             heat = self._resistance * copper * current * current
             self.winding += (heat - inward) * dt / self._winding
-            self.sensed += (self.case - self.sensed) * dt / _LAG
+            self.sensed += (self.case - self.sensed) * dt / _THERMOMETER_LAG
             self.case += (inward - outward) * dt / self._case
 
 
@@ -359,13 +362,13 @@ class ServoHealth:
         self._overload = 0.0
 
     def sense(self, table: ControlTable, current: float, pressed: bool) -> list[int]:
-        """Advance by SENSE seconds and return the bits of the present hardware errors.
+        """Advance by SENSE_INTERVAL seconds and return the bits of the present hardware errors.
 
         ``current`` is in A; ``pressed`` is True if it is at the configured limit.
         """
         self._current = abs(current)
-        self.heat.step(current, SENSE)
-        self._overload = self._overload + SENSE if pressed else 0.0
+        self.heat.step(current, SENSE_INTERVAL)
+        self._overload = self._overload + SENSE_INTERVAL if pressed else 0.0
         errors = []
         if self.heat.sensed > table.get(reg.TEMPERATURE_LIMIT):
             errors.append(reg.OVERHEATING)

@@ -18,30 +18,30 @@ from functools import partial
 from statistics import median
 from typing import Any
 
-from softfinger.daemon.control.modes import GRIPPING
+from softfinger.daemon.control.modes import GRIPPING_MODES
 from softfinger.daemon.simulation.emulator.emulator import DEFAULT_BOARD
 from softfinger.daemon.types import FINGERS
 from softfinger.tools.benchmarks.measuring import Report, Row
 from softfinger.tools.benchmarks.rigs import SOLID, Sections
 from softfinger.tools.benchmarks.virtual_grip import VirtualGrip, Watch
 
-_TRIALS = 20
+_TRIAL_COUNT = 20
 _FORCES = (6.0, 12.0)  # N, requested forces
-_WITNESS = "witness."  # prefix of the kinds of events that name a faulty measurement
+_EVENT_PREFIX = "witness."  # prefix of the kinds of events that name a faulty measurement
 
 # Aims: forces relative to the requested force; times in s.
 SETTLES = "settled at 0.8 … 1.2, not raised"
 BOUNDED = "≤ 50 ms above 1.3, named ≤ 0.3 s"
-_SETTLED = (0.8, 1.2)
-_TOO_LONG = 0.05  # s above 1.3
-_NAMED = 0.3  # s since the error reached half of its final value
-_LOST = 0.010  # m
+_SETTLED_RANGE = (0.8, 1.2)
+_EXCESS_TIME_MAX = 0.05  # s above 1.3
+_REPORT_TIME_MAX = 0.3  # s since the error reached half of its final value
+_SLIDE_MAX = 0.010  # m
 
 # Phases of a trial [s].
-_GRIP = 2.5  # limit until the hand holds
-_REST = 1.2  # undisturbed hold
-_LOOK = 5.0  # observation after the fault
-_REPEATED = 1.0  # repeated frames before another force is requested
+_GRIP_TIMEOUT = 2.5  # limit until the hand holds
+_REST_TIME = 1.2  # undisturbed hold
+_OBSERVATION_TIME = 5.0  # observation after the fault
+_REPEATED_LAG = 1.0  # repeated frames before another force is requested
 
 _SENSORS = ("left_sensor", "right_sensor")
 # Full scale of 127.5 kPa, as tactile boards have; the simulated sensor has 262 kPa.
@@ -49,7 +49,7 @@ _EIGHT_BITS: Sections = {"tactile": {**DEFAULT_BOARD, "backend": "simulated"}}
 
 
 @dataclass(frozen=True)
-class WitnessCase:
+class FaultCase:
     """One kind of grip.
 
     ``words`` are faults in the form of `softfinger emulate --fault`, with ``{side}`` for a finger.
@@ -67,9 +67,9 @@ class WitnessCase:
     settings: Sections = field(default_factory=dict)
 
 
-def _cases(force: float) -> Iterator[WitnessCase]:
-    settles = partial(WitnessCase, aim=SETTLES, force=force)
-    bounded = partial(WitnessCase, aim=BOUNDED, force=force)
+def _cases(force: float) -> Iterator[FaultCase]:
+    settles = partial(FaultCase, aim=SETTLES, force=force)
+    bounded = partial(FaultCase, aim=BOUNDED, force=force)
     yield settles("honest")
     for who, side, false in (
         ("one sensor", "{side}:", ("{side}_sensor",)),
@@ -127,26 +127,30 @@ class GripTrial:
 
     def see(self, watch: Watch, mode: str, fault: str, events: list[tuple[float, str]]) -> None:
         """Record the results of the observation and the final state."""
-        self.settled = watch.settled() if mode in GRIPPING else math.nan
+        self.settled = watch.settled() if mode in GRIPPING_MODES else math.nan
         self.peak, self.above, self.slid = watch.peak, watch.above, watch.slid
         self.end, self.events = fault or mode, events
 
     def named(self, rightly: bool) -> list[tuple[float, str]]:
         """Return (time, channel) of the channels that were named, either correctly or wrongly."""
-        names = [(t, k.removeprefix(_WITNESS)) for t, k in self.events if k.startswith(_WITNESS)]
+        names = [
+            (t, k.removeprefix(_EVENT_PREFIX))
+            for t, k in self.events
+            if k.startswith(_EVENT_PREFIX)
+        ]
         return [(t, name) for t, name in names if (name in self.false) == rightly]
 
-    def missed(self, case: WitnessCase) -> list[str]:
+    def missed(self, case: FaultCase) -> list[str]:
         """Return the parts of the aim that were missed."""
-        low, high = _SETTLED
+        low, high = _SETTLED_RANGE
         named = min((t for t, _ in self.named(True)), default=math.inf) - 0.5 * case.comes
         wrong = {
             "not held": not self.held and not case.before,
             "named wrongly": bool(self.named(False)),
             "force": case.aim == SETTLES and not low <= self.settled <= high,
             "raised": case.aim == SETTLES and any(kind == "slip" for _, kind in self.events),
-            "too strong": case.aim == BOUNDED and self.above > _TOO_LONG,
-            "not named": case.aim == BOUNDED and named > _NAMED,
+            "too strong": case.aim == BOUNDED and self.above > _EXCESS_TIME_MAX,
+            "not named": case.aim == BOUNDED and named > _REPORT_TIME_MAX,
         }
         return [why for why, true in wrong.items() if true]
 
@@ -161,7 +165,7 @@ def measure(
 
     ``brief`` runs one trial of each. ``sweep`` maps trials to outcomes, in one process or in many.
     """
-    trials, reports = trials or (1 if brief else _TRIALS), []
+    trials, reports = trials or (1 if brief else _TRIAL_COUNT), []
     cases = [each for aim in (SETTLES, BOUNDED) for each in CASES if each.aim == aim]
     cases = [case for case in cases if only in case.name]
     seeds = range(1, trials + 1)
@@ -181,11 +185,11 @@ def measure(
     return reports
 
 
-def _outcome(drawn: tuple[WitnessCase, int]) -> dict[str, Any]:
+def _outcome(drawn: tuple[FaultCase, int]) -> dict[str, Any]:
     return asdict(trial(*drawn))
 
 
-def trial(case: WitnessCase, seed: int) -> GripTrial:
+def trial(case: FaultCase, seed: int) -> GripTrial:
     """Run one trial of a case."""
     chance = random.Random(f"{case.name} {seed}")
     side = chance.choice(FINGERS)
@@ -199,22 +203,22 @@ def trial(case: WitnessCase, seed: int) -> GripTrial:
         loop.advance(0.1 + chance.uniform(0.0, 0.02))
         watch, begin = grip.watched(case.force), state.t
         grip.command("grasp", force=case.force)
-        found.held = grip.until("holding", _GRIP)
-        loop.advance(_REST + chance.uniform(0.0, 0.02))
+        found.held = grip.until("holding", _GRIP_TIMEOUT)
+        loop.advance(_REST_TIME + chance.uniform(0.0, 0.02))
         if words and not case.before:
             watch, begin = grip.watched(case.force), state.t
             grip.begin(words)
         if case.then:
-            loop.advance(_REPEATED)
+            loop.advance(_REPEATED_LAG)
             watch.asked = case.then
             grip.command("grasp", force=case.then)
-        loop.advance(case.comes + _LOOK)
+        loop.advance(case.comes + _OBSERVATION_TIME)
         events = [(t - begin, kind) for t, kind in grip.alarms if t >= begin]
         found.see(watch, state.mode, state.fault_name, events)
     return found
 
 
-def summary(case: WitnessCase, found: Sequence[GripTrial]) -> Row:
+def summary(case: FaultCase, found: Sequence[GripTrial]) -> Row:
     """Return a case's row: median and extremes, missed aims, and times of events."""
     settled = [each.settled for each in found if not math.isnan(each.settled)]
     missed = [each.missed(case) for each in found]
@@ -228,7 +232,7 @@ def summary(case: WitnessCase, found: Sequence[GripTrial]) -> Row:
         "peak": max(each.peak for each in found),
         "above ms": 1e3 * max(each.above for each in found),
         "slid mm": 1e3 * median(each.slid for each in found),
-        "lost": sum(each.slid > _LOST for each in found),
+        "lost": sum(each.slid > _SLIDE_MAX for each in found),
         "named": _firsts([each.named(True) for each in found]),
         "named wrongly": _firsts([each.named(False) for each in found]),
         "missed": _counts(why for each in missed for why in each),

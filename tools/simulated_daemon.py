@@ -18,7 +18,7 @@ from softfinger.daemon.types import Event
 
 
 @dataclass(frozen=True)
-class Seen:
+class TrueStates:
     """True state of the simulated hand at each tick."""
 
     t: NDArray[np.float64]  # s
@@ -26,9 +26,9 @@ class Seen:
     angle: NDArray[np.float64]  # rad
     slip: NDArray[np.float64]  # |T|/μN, the larger of both tips
 
-    def since(self, index: int) -> Seen:
+    def since(self, index: int) -> TrueStates:
         """Return the part of the record from this tick on."""
-        return Seen(self.t[index:], self.force[index:], self.angle[index:], self.slip[index:])
+        return TrueStates(self.t[index:], self.force[index:], self.angle[index:], self.slip[index:])
 
     def settled(self, off: NDArray[np.bool_]) -> float:
         """Return the time of the last tick at which ``off`` is True [s]."""
@@ -36,7 +36,7 @@ class Seen:
         return float(self.t[where[-1]] - self.t[0]) if len(where) else 0.0
 
 
-class Watched:
+class SimulatedDaemon:
     """Daemon on virtual time whose simulated hand can be observed; raises SettingsError."""
 
     def __init__(
@@ -90,9 +90,9 @@ class Watched:
         """Advance by ``seconds`` without recording."""
         self.loop.advance(seconds)
 
-    def watch(self, seconds: float) -> Seen:
+    def watch(self, seconds: float) -> TrueStates:
         """Advance by ``seconds``; return the true state at each tick."""
-        return Seen(*(np.array(column) for column in zip(*self._ticks(seconds), strict=True)))
+        return TrueStates(*(np.array(column) for column in zip(*self._ticks(seconds), strict=True)))
 
     def _ticks(self, seconds: float) -> Iterator[tuple[float, tuple[float, ...], float, float]]:
         loop, plant = self.loop, self.plant

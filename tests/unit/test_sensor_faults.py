@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from softfinger.daemon.perception.hand_state import ANGLE, TAPER
-from softfinger.daemon.perception.perception import Repeats
+from softfinger.daemon.perception.perception import RepeatDetector
 from softfinger.tools.benchmarks.rigs import SOLID
-from softfinger.tools.watched import Watched as Hand
+from softfinger.tools.simulated_daemon import SimulatedDaemon as Hand
 from tests.unit.test_control import grasped
 
 FORCE = 6.0
@@ -186,10 +186,10 @@ def test_a_real_load_and_a_real_turn_are_no_lie(load: tuple[float, float, float]
         assert not [event for event in hand.events if event[1].startswith("witness")]
 
 
-def given(repeats: Repeats, frames: list[float]) -> bool:
+def given(repeats: RepeatDetector, frames: list[float]) -> bool:
     for number in frames:  # a tenth more is more in one cell alone
-        repeats.differs(np.array([number, number, number, 10.0 * number]).astype(np.uint16))
-    return repeats.long
+        repeats.update(np.array([number, number, number, 10.0 * number]).astype(np.uint16))
+    return repeats.is_fault
 
 
 SEQUENCES: dict[str, tuple[Callable[[], list[float]], bool]] = {
@@ -209,5 +209,5 @@ SEQUENCES: dict[str, tuple[Callable[[], list[float]], bool]] = {
 @pytest.mark.parametrize("name", SEQUENCES)
 def test_only_an_order_that_comes_again_is_a_repetition(name: str) -> None:
     frames, expected = SEQUENCES[name]
-    assert given(Repeats(100.0), frames()) is expected
-    assert not given(Repeats(100.0, enabled=False), frames())
+    assert given(RepeatDetector(100.0), frames()) is expected
+    assert not given(RepeatDetector(100.0, enabled=False), frames())

@@ -20,16 +20,27 @@ import numpy as np
 import zmq
 from numpy.typing import NDArray
 
-from softfinger.daemon.client.command_client import AGAIN_AFTER, LOCALLY, UNCONFIRMED, Attempts
-from softfinger.daemon.client.connection import PATIENCE, SILENCE, drain, subscribe, unpack
+from softfinger.daemon.client.command_client import (
+    LOCAL_STOP_TIMEOUT,
+    RETRY_DELAY,
+    UNCONFIRMED_TEXT,
+    Attempts,
+)
+from softfinger.daemon.client.connection import (
+    REPLY_TIMEOUT,
+    SILENCE_TIME,
+    drain,
+    subscribe,
+    unpack,
+)
 from softfinger.daemon.client.stream import read
-from softfinger.daemon.types import FINGERS, GRIP_FRACTION, UNLEASED
+from softfinger.daemon.types import FINGERS, GRIP_FRACTION, NO_LEASE_COMMANDS
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.local_stop import stop_locally
 
-LATELY = 3.0  # s, window over which waits for a busy machine are summed and shown
-EVENTS = 200  # number of events kept
-MEANINGS = (  # meanings of the words on the pages
+RECENT_TIME = 3.0  # s, window over which waits for a busy machine are summed and shown
+EVENT_COUNT_MAX = 200  # number of events kept
+GLOSSARY = (  # meanings of the words on the pages
     ("d", "displacement of the object's face into the tip"),
     ("θ", "tilt of the object's face against the tip"),
     ("force", "F(d, θ), contact force on the tip, normal to the face"),
@@ -40,9 +51,10 @@ MEANINGS = (  # meanings of the words on the pages
     ("current, bound", "motor current, and the limit that its goal allows"),
     ("object", "angle and width of the object between the tips"),
 )
-_RAISED = 1.01  # fraction of the requested force above which the grip is reported as raised
-_DRAIN_LIMIT = 4000  # messages read per call, so that a flood of messages cannot block drawing
-_MESSAGE_LIMIT = 4_000_000  # bytes; the largest grid is 131 kB
+# Fraction of the requested force above which the grip is reported as raised.
+_INCREASED_RATIO = 1.01
+_DRAIN_COUNT_MAX = 4000  # messages read per call, so that a flood of messages cannot block drawing
+_MESSAGE_SIZE_MAX = 4_000_000  # bytes; the largest grid is 131 kB
 
 
 def field(record: object, *path: str) -> Any:
@@ -99,7 +111,7 @@ class ShownEvent(NamedTuple):
             return "--:--:--"
 
 
-class Feed:
+class StreamState:
     """Process the stream's messages and keep the data that a page shows.
 
     ``now`` is monotonic time [s] in all methods. ``events`` are sorted by the time at which they
@@ -109,20 +121,21 @@ class Feed:
 
     def __init__(self) -> None:
         self.state = read(schema.HandState, None)
-        self.state_at = -math.inf
+        self.state_time = -math.inf
         self.mode = self.fault = ""  # of the last state
         self.frames: dict[str, ShownFrame] = {}
         self.events: list[ShownEvent] = []
-        self._news: deque[ShownEvent] = deque(maxlen=EVENTS)
-        self._heard: deque[tuple[float, float]] = deque(maxlen=2 * EVENTS)
+        self._news: deque[ShownEvent] = deque(maxlen=EVENT_COUNT_MAX)
+        self._event_times: deque[tuple[float, float]] = deque(maxlen=2 * EVENT_COUNT_MAX)
         self.times: schema.LoopStatistics | None = None  # statistics of all ticks so far
-        self.warm = 0.0  # s to a servo's temperature limit below which a warning is shown
-        self._commanding = "", -math.inf  # holder of the commander's lease, end of the lease
+        # s to a servo's temperature limit below which a warning is shown
+        self.heat_warning_time = 0.0
+        self._lease_holder = "", -math.inf  # holder of the commander's lease, end of the lease
         self._lease = math.nan  # s
         self.commanded = math.nan  # N, force of the last grasp command of any client
         self.force_default = math.nan  # N, force of a grasp command without a force
         self.force_limit = math.inf  # N, highest grip force that a command may request
-        self.skipped = 0
+        self.skipped_count = 0
         self._waits: deque[tuple[float, float]] = deque(maxlen=10_000)
         self._period = 0.0  # s between states, smoothed
         self.topics: dict[bytes, Callable[[Any, float], None]] = {
@@ -137,17 +150,17 @@ class Feed:
     def read(self, message: list[bytes], now: float) -> None:
         """Process one raw message."""
         try:
-            self.sort_in(*unpack(message), now)
+            self.process(*unpack(message), now)
         except ValueError:
-            self.skipped += 1
+            self.skipped_count += 1
 
-    def sort_in(self, topic: bytes, record: dict[str, Any], now: float) -> None:
+    def process(self, topic: bytes, record: dict[str, Any], now: float) -> None:
         """Process one message that is already unpacked."""
         try:
             if topic in self.topics:
                 self.topics[topic](read(schema.TOPICS[topic].record, record), now)
         except (ValueError, TypeError, RecursionError):
-            self.skipped += 1
+            self.skipped_count += 1
 
     def _read_state(self, state: schema.HandState, now: float) -> None:
         before = self.state
@@ -155,13 +168,13 @@ class Feed:
             self._waits.clear()
             self.frames.clear()
             self._period = 0.0
-            self.times, self._commanding = None, ("", -math.inf)
+            self.times, self._lease_holder = None, ("", -math.inf)
             self.commanded = math.nan
         elif before.mono_ns and 0.0 < (step := 1e-9 * (state.mono_ns - before.mono_ns)) < 60.0:
             self._period = step if self._period == 0.0 else 0.9 * self._period + 0.1 * step
             if (waited := state.behind_s - before.behind_s) > 0.0:
                 self._waits.append((now, waited))
-        self.state, self.state_at = state, now
+        self.state, self.state_time = state, now
         self.mode, self.fault = printable(state.mode), printable(state.fault)
 
     def _read_frame(self, frame: schema.TactileFrame, now: float) -> None:
@@ -182,9 +195,9 @@ class Feed:
         # A repeated event, sent for a late subscriber, keeps its original seq and time. An event of
         # another daemon has a different time.
         name = event.seq, event.timestamp
-        if event.again and name in self._heard:
+        if event.again and name in self._event_times:
             return
-        self._heard.append(name)
+        self._event_times.append(name)
         self._happened(event.timestamp, event.level, event.kind, event.text)
 
     def _happened(self, timestamp: float, *texts: str) -> None:
@@ -194,7 +207,7 @@ class Feed:
             self.events.append(event)
         else:
             insort(self.events, event, key=lambda each: each.timestamp)
-        del self.events[:-EVENTS]
+        del self.events[:-EVENT_COUNT_MAX]
 
     def _read_stats(self, times: schema.LoopStatistics, _: float) -> None:
         self.times = times
@@ -214,8 +227,8 @@ class Feed:
                 self.commanded = force
             elif answered.command == "grasp":
                 self.commanded = self.force_default
-        if answered.command not in UNLEASED and self._lease > 0.0:
-            self._commanding = client, now + self._lease
+        if answered.command not in NO_LEASE_COMMANDS and self._lease > 0.0:
+            self._lease_holder = client, now + self._lease
 
     def _read_settings(self, message: schema.HandSettings, _: float) -> None:
         settings = json.loads(message.settings or "{}")
@@ -224,7 +237,7 @@ class Feed:
         self.force_default = number(settings, "control", "force_default")
         limit = number(settings, "safety", "force_max")
         self.force_limit = math.inf if math.isnan(limit) else GRIP_FRACTION * limit
-        self.warm = 0.0 if math.isnan(warm) else warm
+        self.heat_warning_time = 0.0 if math.isnan(warm) else warm
 
     def news(self) -> list[ShownEvent]:
         """Return the events received since the last call."""
@@ -234,7 +247,7 @@ class Feed:
 
     def commander(self, now: float) -> str:
         """Return the holder of the commander's lease; empty if there is none or it is unnamed."""
-        client, until = self._commanding
+        client, until = self._lease_holder
         return client if now < until else ""
 
     def grip(self) -> str:
@@ -242,13 +255,14 @@ class Feed:
         force, angle = self.state.goal_force, math.degrees(self.state.goal_angle)
         if not math.isfinite(force):
             return ""
-        raised = f", raised from {self.commanded:.1f} N" if force > _RAISED * self.commanded else ""
+        is_raised = force > _INCREASED_RATIO * self.commanded
+        raised = f", raised from {self.commanded:.1f} N" if is_raised else ""
         turned = f", object to {angle:z.1f}°" if math.isfinite(angle) else ""
         return f"grip: goal {force:.1f} N{raised}{turned}"
 
     def age(self, now: float) -> float:
         """Return the time since the last state [s]; infinite before the first."""
-        return now - self.state_at
+        return now - self.state_time
 
     def status(self, now: float) -> str:
         """Return ``waiting`` before the first state, then ``live``, ``stale`` or ``lost``."""
@@ -261,7 +275,7 @@ class Feed:
 
     def waited(self, now: float) -> float:
         """Return the time that a simulated hand recently waited for a busy machine [s]."""
-        while self._waits and self._waits[0][0] < now - LATELY:
+        while self._waits and self._waits[0][0] < now - RECENT_TIME:
             self._waits.popleft()
         return sum(waited for _, waited in self._waits)
 
@@ -271,15 +285,15 @@ class Feed:
         return 1.0 / self._period if self._period else math.nan
 
 
-class FeedSubscriber:
+class StreamReader:
     """Subscriber socket that passes all waiting messages to a feed."""
 
-    def __init__(self, context: zmq.Context[Any], address: str, feed: Feed) -> None:
+    def __init__(self, context: zmq.Context[Any], address: str, feed: StreamState) -> None:
         self.feed = feed
-        self._socket = subscribe(context, address, *feed.topics, queue=_DRAIN_LIMIT)
+        self._socket = subscribe(context, address, *feed.topics, queue=_DRAIN_COUNT_MAX)
 
     def drain(self, now: float) -> None:
-        for message in drain(self._socket, _DRAIN_LIMIT):
+        for message in drain(self._socket, _DRAIN_COUNT_MAX):
             self.feed.read(message, now)
 
 
@@ -326,13 +340,16 @@ class Commander:
         if len(self._pending) >= self.OPEN_LIMIT and command != "stop":
             self.refuse(now, f"{label}: dropped, the daemon doesn't answer")
             return
-        if command == "stop" and (stopped := stop_locally(self._address, LOCALLY)) is not None:
+        if (
+            command == "stop"
+            and (stopped := stop_locally(self._address, LOCAL_STOP_TIMEOUT)) is not None
+        ):
             self.reply = judge(now, label, stopped)
             return
-        attempts = Attempts({"command": command, **self._envelope, **fields}, PATIENCE)
+        attempts = Attempts({"command": command, **self._envelope, **fields}, REPLY_TIMEOUT)
         request = self._context.socket(zmq.REQ)
         request.setsockopt(zmq.LINGER, 0)
-        request.setsockopt(zmq.MAXMSGSIZE, _MESSAGE_LIMIT)
+        request.setsockopt(zmq.MAXMSGSIZE, _MESSAGE_SIZE_MAX)
         request.connect(self._address)
         request.send(msgpack.packb(attempts.request), zmq.NOBLOCK)
         self._pending.append(_Pending(label, request, attempts, now))
@@ -356,10 +373,11 @@ class Commander:
             try:
                 payload = each.socket.recv(zmq.NOBLOCK)
             except zmq.Again:
-                overdue = now - each.sent >= PATIENCE
-                if overdue or (not each.warned and now - each.sent >= SILENCE):
+                overdue = now - each.sent >= REPLY_TIMEOUT
+                if overdue or (not each.warned and now - each.sent >= SILENCE_TIME):
                     each.warned = True
-                    so_far = f"within {PATIENCE:g} s" if overdue else f"yet, {PATIENCE:g} s at most"
+                    timeout = f"{REPLY_TIMEOUT:g} s"
+                    so_far = f"within {timeout}" if overdue else f"yet, {timeout} at most"
                     self.refuse(now, f"{each.label}: no answer from {self._address} {so_far}")
                 if overdue:
                     self._close(each)
@@ -369,7 +387,7 @@ class Commander:
             except (ValueError, RecursionError, msgpack.UnpackException):
                 record = None
             if isinstance(record, dict) and each.attempts.again(record):
-                each.late, each.again_at = record, now + AGAIN_AFTER
+                each.late, each.again_at = record, now + RETRY_DELAY
             else:
                 self._end(each, now, record)
 
@@ -386,7 +404,7 @@ def judge(now: float, label: str, record: Any) -> ShownReply:
     """Convert the daemon's answer to the command shown as ``label`` into a reply for the page."""
     if field(record, "ok") is True:
         if text(record, "torque_off") == "unconfirmed":
-            return ShownReply(now, False, f"{label}: {UNCONFIRMED}")
+            return ShownReply(now, False, f"{label}: {UNCONFIRMED_TEXT}")
         return ShownReply(now, True, f"{label}: ok")
     why = text(record, "error") or "an answer that can't be read"
     named = why.split(":")[0] == label.split()[0]  # the daemon's message already names the command

@@ -63,7 +63,7 @@ sys.exit(cli.main(sys.argv[2:]))
     [
         ("argparse", ["limits"], -signal.SIGINT),
         ("pydantic", ["run"], -signal.SIGINT),
-        ("softfinger.tools.terminal.feed", ["monitor"], -signal.SIGINT),
+        ("softfinger.tools.terminal.stream_state", ["monitor"], -signal.SIGINT),
         ("softfinger.daemon.safety.limits", ["limits"], 130),  # a keyboard interrupt again
     ],
 )

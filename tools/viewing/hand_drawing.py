@@ -22,7 +22,7 @@ from softfinger.daemon.types import FINGERS
 from softfinger.daemon.wire.schema import FingerState, HandState, TactileFrame, TrueState
 from softfinger.kinematics.hand.geometry import HandGeometry
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
-from softfinger.tools.viewing.known import fingers_of
+from softfinger.tools.viewing.landscape import fingers_of
 
 FloatArray = NDArray[np.float64]
 GOAL, OBJECT = "goal", "object"  # colour names, in addition to those of the fingers
@@ -36,14 +36,14 @@ COLOURS = {
     OBJECT: (0, 158, 115),
 }
 
-_ARROW = 1.6e-3  # m, length of a force arrow per newton
-_ARROW_LONGEST = 0.045  # m
+_ARROW_SCALE = 1.6e-3  # m, length of a force arrow per newton
+_ARROW_MAX = 0.045  # m
 _HALF_TURN = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 61)
 _TURN = np.linspace(0.0, 2.0 * np.pi, 61)
 _UNIT_CIRCLE = np.column_stack((np.cos(_TURN), np.sin(_TURN)))
 
 
-class Drawn(NamedTuple):
+class DrawnPart(NamedTuple):
     """Part of a picture; empty if it is not present at the moment."""
 
     lines: list[tuple[str, float, FloatArray]]  # (colour name, width [m], points [n, 2] [m])
@@ -137,17 +137,17 @@ def _true_outline(settings: Settings, truth: dict[str, Any]) -> list[FloatArray]
 
 def hand_parts(
     settings: Settings, state: HandState, truth: dict[str, Any] | None = None
-) -> dict[str, Drawn]:
+) -> dict[str, DrawnPart]:
     """Return all parts of the moving hand by name; ``truth`` is a ``hand/truth`` message."""
     hand = geometry_of(settings)
     half = hand.half_separation + 0.012
-    parts = {"palm": Drawn([(GOAL, 2.4e-3, np.array([(-half, 0.0), (half, 0.0)]))], [])}
+    parts = {"palm": DrawnPart([(GOAL, 2.4e-3, np.array([(-half, 0.0), (half, 0.0)]))], [])}
     for name in fingers_of(settings):
         parts[name] = _finger(hand, name, state.finger(name))
     held = _held(hand, state, settings.simulation.object_height)
-    parts["object"] = Drawn([(OBJECT, 1.4e-3, outline) for outline in held], [])
+    parts["object"] = DrawnPart([(OBJECT, 1.4e-3, outline) for outline in held], [])
     true = [] if truth is None else _true_outline(settings, truth)
-    parts["simulated"] = Drawn([(GOAL, 0.6e-3, outline) for outline in true], [])
+    parts["simulated"] = DrawnPart([(GOAL, 0.6e-3, outline) for outline in true], [])
     return parts
 
 
@@ -162,15 +162,15 @@ def _held(hand: HandGeometry, state: HandState, height: float) -> list[FloatArra
     return [outline] if np.isfinite(outline).all() else []
 
 
-def _finger(hand: HandGeometry, name: str, state: FingerState) -> Drawn:
+def _finger(hand: HandGeometry, name: str, state: FingerState) -> DrawnPart:
     """Return one finger with its tip, the contact line on the face and the force arrow."""
     contact = (state.d, state.theta) if touches(state) else ()
     q = state.q if math.isfinite(state.q) else 0.0
     link, base, skin, face, push = finger_lines(hand, FINGERS.index(name), q, *contact)
-    part = Drawn([(name, 5.2e-3, link), (name, 2.4e-3, base), (name, 1e-3, skin)], [])
+    part = DrawnPart([(name, 5.2e-3, link), (name, 2.4e-3, base), (name, 1e-3, skin)], [])
     if face is not None and push is not None:
         force = state.force if math.isfinite(state.force) else 0.0
-        at, way = push[0], min(_ARROW * force, _ARROW_LONGEST) * push[1]
+        at, way = push[0], min(_ARROW_SCALE * force, _ARROW_MAX) * push[1]
         end, back, aside = at + way, -0.2 * way, 0.12 * np.array([way[1], -way[0]])
         arrow = np.array([at, end, end + back + aside, end, end + back - aside])
         part.lines.extend([(OBJECT, 2e-3, face), (name, 1.8e-3, arrow)])

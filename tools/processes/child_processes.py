@@ -20,11 +20,11 @@ from typing import Any
 from softfinger.daemon.errors import SoftfingerError
 
 # Restores the terminal if the monitor was killed.
-LEAVE = "\x18\x1b[0m\x1b[?2004l\x1b[?25h\x1b[?1049l"
-_PATIENCE = 20.0  # s for a recorder to subscribe, or to close its file
+RESTORE_TERMINAL = "\x18\x1b[0m\x1b[?2004l\x1b[?25h\x1b[?1049l"
+_RECORDER_TIMEOUT = 20.0  # s for a recorder to subscribe, or to close its file
 
 
-class NoRecorder(SoftfingerError):
+class RecorderError(SoftfingerError):
     """The recorder did not start; the message is the recorder's."""
 
 
@@ -53,7 +53,7 @@ class _Lifeline:
             self._ours = -1
 
 
-class MonitorBeside:
+class MonitorProcess:
     """Run the monitor on this process's terminal until `close`.
 
     ``on_end`` is called once, from a signal handler in the main thread, when the monitor has ended.
@@ -98,16 +98,16 @@ class MonitorBeside:
         if self.process.wait() < 0 and self._attributes is not None:
             with contextlib.suppress(OSError, termios.error):
                 termios.tcsetattr(self._terminal, termios.TCSANOW, self._attributes)
-                os.write(self._terminal, LEAVE.encode())
+                os.write(self._terminal, RESTORE_TERMINAL.encode())
 
-    def __enter__(self) -> MonitorBeside:
+    def __enter__(self) -> MonitorProcess:
         return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
 
 
-class RecorderBeside:
+class RecorderProcess:
     """Run ``record`` with the arguments ``words``; the first one is the file.
 
     ``failed`` is set once the recording is known to be incomplete.
@@ -120,7 +120,7 @@ class RecorderBeside:
         on_end: Callable[[str], None],
         keys: str = "",
     ) -> None:
-        """Start the recorder and wait until ``subscribed()``; raise NoRecorder if that fails.
+        """Start the recorder and wait until ``subscribed()``; raise RecorderError if that fails.
 
         ``on_end`` is called from a thread, with the reason, if the recorder ends before `close`.
         """
@@ -140,12 +140,12 @@ class RecorderBeside:
             text=True,
             start_new_session=True,
         )
-        deadline = time.monotonic() + _PATIENCE
+        deadline = time.monotonic() + _RECORDER_TIMEOUT
         while not subscribed():
             if self._process.poll() is not None or time.monotonic() > deadline:
                 self._process.kill()
                 output = " ".join(text.strip() for text in self._process.communicate())
-                raise NoRecorder(output.strip() or "the recorder did not start")
+                raise RecorderError(output.strip() or "the recorder did not start")
             time.sleep(0.01)
         self._watch = threading.Thread(target=self._wait, name="recorder", daemon=True)
         self._watch.start()
@@ -168,7 +168,7 @@ class RecorderBeside:
         if self._watch.is_alive():
             self._process.send_signal(signal.SIGTERM)
         self._lifeline.close()
-        self._watch.join(_PATIENCE)
+        self._watch.join(_RECORDER_TIMEOUT)
         if self._watch.is_alive():
             self._process.kill()
             self._watch.join()

@@ -28,7 +28,7 @@ def table_text(table: Table, width: int) -> str:
     return "\n".join(line.rstrip() for line in printed.get().splitlines())
 
 
-def cut(line: Text, columns: int) -> Text:
+def truncated(line: Text, columns: int) -> Text:
     """Shorten ``line`` to at most ``columns`` columns, with an ellipsis at the cut."""
     line.truncate(max(columns, 0), overflow="ellipsis")
     return line
@@ -42,7 +42,7 @@ def wrapped(line: Text, columns: int) -> list[Text]:
     return list(lines)
 
 
-def apart(left: Text, right: Text, width: int) -> Text:
+def justified(left: Text, right: Text, width: int) -> Text:
     """Place ``left`` and ``right`` at the two ends of ``width`` columns."""
     return Text.assemble(left, " " * max(1, width - left.cell_len - right.cell_len), right)
 
@@ -55,21 +55,21 @@ def centred(line: Text, width: int) -> Text:
 
 def rule(width: int, title: Text, note: Text | None = None) -> Text:
     """Return a horizontal rule with a title at its left end and a note at its right end."""
-    head = f"─ {cut(title, width - 4)} " if title else ""
+    head = f"─ {truncated(title, width - 4)} " if title else ""
     if not note:
         return Text(head + "─" * (width - len(head)), DIM)
-    cut(note, width - len(head) - 6)
+    truncated(note, width - len(head) - 6)
     fill = "─" * (width - len(head) - note.cell_len - 3)
     return Text.assemble((f"{head}{fill} ", DIM), note, (" ─", DIM))
 
 
-def faded(line: Text) -> Text:
+def dimmed(line: Text) -> Text:
     """Return ``line`` in the faded style of outdated data, except the maps."""
     maps = [span for span in line.spans if isinstance(span.style, Style) and span.style.bgcolor]
     return Text(line.plain, DIM, spans=maps)
 
 
-def aligned(value: float, decimals: int) -> str:
+def format_aligned(value: float, decimals: int) -> str:
     """Format a number at most 7 columns wide, with the decimal point in the fourth column."""
     if not math.isfinite(value):
         return "  —"
@@ -77,17 +77,17 @@ def aligned(value: float, decimals: int) -> str:
     return shown if len(shown) <= 7 else f"{value:.1e}"
 
 
-def narrow(value: float) -> str:
+def format_narrow(value: float) -> str:
     """Format a standard deviation in 4 columns."""
     return f"{value:.2f}" if value < 9.995 else f"{value:.0f}" if value < 9999.5 else "many"
 
 
-def short(value: float, decimals: int) -> str:
+def format_value(value: float, decimals: int) -> str:
     """Format a number; a missing number becomes a dash."""
     return f"{value:.{decimals}f}" if math.isfinite(value) else "—"
 
 
-def micro(seconds: float) -> str:
+def format_microseconds(seconds: float) -> str:
     """Format a time in at most 4 columns: in µs, or from 10 ms on in ms with its unit."""
     if not math.isfinite(seconds):
         return "—"

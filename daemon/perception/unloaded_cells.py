@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
-_BESIDE = 2.0  # pitches from the rim of the tip, beyond which a cell is unloaded
-_FEWEST = 50  # cells; with fewer, zero and noise are not estimated
-_AVERAGED = 8  # frames, time constant of the noise average
-_CLIPPED = 0.25  # fraction of cells that read 0, above which noise counts as clipped at 0
+_RIM_DISTANCE = 2.0  # pitches from the rim of the tip, beyond which a cell is unloaded
+_CELL_COUNT_MIN = 50  # cells; with fewer, zero and noise are not estimated
+_AVERAGED_FRAME_COUNT = 8  # frames, time constant of the noise average
+_CLIPPED_FRACTION = 0.25  # fraction of cells that read 0, above which noise counts as clipped at 0
 _CLIPPED_VARIANCE = 0.5 - 0.5 / math.pi  # part of the variance that clipping leaves
 
 
-class UnpressedCells:
+class UnloadedCells:
     """Estimator of one sensor's zero shift and noise."""
 
     def __init__(self, grid: SensorGrid, radius: float, live: NDArray[np.bool_]) -> None:
@@ -31,16 +31,16 @@ class UnpressedCells:
         x = (np.arange(grid.cols) - 0.5 * (grid.cols - 1)) * pitch_x - centre_x
         y = (np.arange(grid.rows) - 0.5 * (grid.rows - 1)) * pitch_y - centre_y
         distance = np.hypot(*np.meshgrid(x, y))
-        reach = radius + _BESIDE * max(grid.pitches) + 3.0 * grid.blur
+        reach = radius + _RIM_DISTANCE * max(grid.pitches) + 3.0 * grid.blur
         cells = np.flatnonzero(live & (distance > reach))
-        self._cells = cells if cells.size >= _FEWEST else cells[:0]
+        self._cells = cells if cells.size >= _CELL_COUNT_MIN else cells[:0]
         self._live = np.flatnonzero(live)
-        self._before: NDArray[np.float64] | None = None  # last readings of the live cells
-        self._squares: NDArray[np.float64] | None = None  # their squared changes, averaged
-        self._zeros = 0.0  # fraction of the live cells that read 0
+        self._last_readings: NDArray[np.float64] | None = None  # last readings of the live cells
+        self._squared_changes: NDArray[np.float64] | None = None  # their squared changes, averaged
+        self._zero_fraction = 0.0  # fraction of the live cells that read 0
         self._reference: float | None = None  # median of the unloaded cells at the tare
         self._variance: float | None = None
-        self.shift = 0  # increase of the zero since the tare [counts]
+        self.zero_shift = 0  # increase of the zero since the tare [counts]
 
     @property
     def noise(self) -> float:
@@ -53,48 +53,50 @@ class UnpressedCells:
 
         Most cells are constant, except while a tip moves. The value is 0 if the noise is unknown.
         """
-        if self._squares is None:
+        if self._squared_changes is None:
             return self.noise
-        variance = 0.5 * float(np.median(self._squares))
-        return math.sqrt(variance / (_CLIPPED_VARIANCE if self._zeros > _CLIPPED else 1.0))
+        variance = 0.5 * float(np.median(self._squared_changes))
+        return math.sqrt(
+            variance / (_CLIPPED_VARIANCE if self._zero_fraction > _CLIPPED_FRACTION else 1.0)
+        )
 
-    def forget_zero(self) -> None:
+    def reset_zero(self) -> None:
         """Reset the zero shift; the next frame sets a new reference."""
-        self.shift = 0
+        self.zero_shift = 0
         self._reference = None
 
-    def follow(self, counts: NDArray[np.uint16]) -> None:
+    def update(self, counts: NDArray[np.uint16]) -> None:
         """Update the estimates with a frame of raw ``counts``."""
         if not self._cells.size:
-            self._compare(counts.ravel()[self._live].astype(np.float64))
+            self._update_changes(counts.ravel()[self._live].astype(np.float64))
             return
         read = counts.ravel()[self._cells].astype(np.float64)
         level = float(np.median(read))
         if self._reference is None:
             self._reference = level
-        self.shift = round(level - self._reference)
+        self.zero_shift = round(level - self._reference)
         # Use only readings above the median, since readings below it may be clipped. Limit the
         # deviation to three standard deviations, since some cells may be loaded. Subtract the
         # quantisation error (1/12), which the error budget adds separately.
         above = np.maximum(read - level, 0.0)
-        most = 3.0 * max(self.noise, 1.0) if self._variance is not None else math.inf
-        square = 2.0 * float(np.square(np.minimum(above, most)).mean()) - 1.0 / 12.0
+        deviation_max = 3.0 * max(self.noise, 1.0) if self._variance is not None else math.inf
+        square = 2.0 * float(np.square(np.minimum(above, deviation_max)).mean()) - 1.0 / 12.0
         square = max(square, 0.0)
-        before = square if self._variance is None else self._variance
-        self._variance = before + (square - before) / _AVERAGED
+        previous = square if self._variance is None else self._variance
+        self._variance = previous + (square - previous) / _AVERAGED_FRAME_COUNT
 
-    def _compare(self, read: NDArray[np.float64]) -> None:
-        before, self._before = self._before, read
-        if before is None:
+    def _update_changes(self, read: NDArray[np.float64]) -> None:
+        previous, self._last_readings = self._last_readings, read
+        if previous is None:
             return
-        squares = np.square(read - before)
-        last = squares if self._squares is None else self._squares
-        self._squares = last + (squares - last) / _AVERAGED
-        self._zeros = 1.0 - np.count_nonzero(read) / read.size
+        squares = np.square(read - previous)
+        last = squares if self._squared_changes is None else self._squared_changes
+        self._squared_changes = last + (squares - last) / _AVERAGED_FRAME_COUNT
+        self._zero_fraction = 1.0 - np.count_nonzero(read) / read.size
 
     def corrected(self, counts: NDArray[np.uint16], full: int) -> NDArray[np.uint16]:
         """Return the counts minus the zero shift; counts at ``full`` are not changed."""
-        if self.shift == 0:
+        if self.zero_shift == 0:
             return counts
-        moved = np.clip(counts.astype(np.int32) - self.shift, 0, full)
+        moved = np.clip(counts.astype(np.int32) - self.zero_shift, 0, full)
         return np.where(counts >= full, counts, moved).astype(np.uint16)

@@ -12,12 +12,12 @@ from collections.abc import Callable, Iterator
 from typing import Any, Self
 
 
-def known(*names: str) -> tuple[signal.Signals, ...]:
+def available_signals(*names: str) -> tuple[signal.Signals, ...]:
     """Return those of the named signals that exist on this system."""
     return tuple(each for each in signal.Signals if each.name in names)
 
 
-class Ending:
+class StopCondition:
     """Context in which a signal, a time limit or a closed pipe requests the end of a subcommand.
 
     Parameters
@@ -31,7 +31,7 @@ class Ending:
     signals: tuple[signal.Signals, ...] = (signal.SIGINT, signal.SIGTERM)
 
     def __init__(self, duration: float | None = None, lifeline: int | None = None) -> None:
-        self._asked = False
+        self._is_requested = False
         self._duration = math.inf if duration is None else duration
         self._deadline = math.inf
         self._lifeline = [] if lifeline is None else [lifeline]
@@ -41,21 +41,21 @@ class Ending:
         self._deadline = time.monotonic() + self._duration
 
     @property
-    def asked(self) -> bool:
+    def is_requested(self) -> bool:
         """True if a signal has come or the lifeline was closed."""
-        return self._asked
+        return self._is_requested
 
     @property
-    def over(self) -> bool:
+    def is_met(self) -> bool:
         """True if the subcommand should end."""
-        return self.asked or time.monotonic() >= self._deadline
+        return self.is_requested or time.monotonic() >= self._deadline
 
     def wait(self, seconds: float) -> bool:
         """Wait at most ``seconds`` for the end; return True if it has come."""
-        self.ready(seconds)
-        return self.over
+        self.wait_readable(seconds)
+        return self.is_met
 
-    def ready(self, seconds: float, *others: int) -> list[int]:
+    def wait_readable(self, seconds: float, *others: int) -> list[int]:
         """Wait at most ``seconds`` for the end, a signal or readable descriptors among ``others``.
 
         Returns the readable descriptors. A signal that does not request the end also interrupts the
@@ -63,15 +63,15 @@ class Ending:
         """
         left = min(seconds, self._deadline - time.monotonic())
         watched = [self._wakes.fileno(), *self._lifeline, *others]
-        ready = select.select(watched, [], [], max(0.0, left))[0]
-        if self._wakes.fileno() in ready and not self._asked:
+        readable = select.select(watched, [], [], max(0.0, left))[0]
+        if self._wakes.fileno() in readable and not self._is_requested:
             self._wakes.recv(4096)
-        self._asked |= bool(set(self._lifeline).intersection(ready))
-        return [each for each in ready if each in others]
+        self._is_requested |= bool(set(self._lifeline).intersection(readable))
+        return [each for each in readable if each in others]
 
     def end(self, *_: object) -> None:
         """Request the end; may be called from a signal handler."""
-        self._asked = True
+        self._is_requested = True
         self.wake()
 
     def wake(self, *_: object) -> None:
@@ -99,7 +99,7 @@ class Interrupted(BaseException):
 
 # Signals whose default action would end the process at once, leaving the torque to the servo
 # watchdog. SIGHUP means that the terminal was closed.
-_ENDING = known("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGUSR2", "SIGALRM")
+_TERMINATING = available_signals("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGUSR2", "SIGALRM")
 
 
 class Signals:
@@ -107,30 +107,30 @@ class Signals:
 
     def __init__(self) -> None:
         self._end_running: Callable[[], None] | None = None
-        self._ended = self._held = False
-        for number in _ENDING:
+        self._has_ended = self._deferred = False
+        for number in _TERMINATING:
             signal.signal(number, self._end)
 
     def hand_over(self, end: Callable[[], None]) -> None:
         """Let signals call ``end`` from now on; raise Interrupted if one has already come."""
         self._end_running = end
-        if self._ended:
+        if self._has_ended:
             raise Interrupted
 
     @contextlib.contextmanager
-    def held(self) -> Iterator[None]:
+    def deferred(self) -> Iterator[None]:
         """Defer signals within this context; raise Interrupted at its end if one came."""
-        self._held = True
+        self._deferred = True
         try:
             yield
         finally:
-            self._held = False
-        if self._ended:
+            self._deferred = False
+        if self._has_ended:
             raise Interrupted
 
     def _end(self, *_: Any) -> None:
-        first, self._ended = not self._ended, True
+        first, self._has_ended = not self._has_ended, True
         if self._end_running is not None:
             self._end_running()
-        elif first and not self._held:  # a second signal must not interrupt the shutdown
+        elif first and not self._deferred:  # a second signal must not interrupt the shutdown
             raise Interrupted
