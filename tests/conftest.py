@@ -1,7 +1,7 @@
-"""What several tests share: addresses of their own, whole daemons, and conditions to wait for.
+"""Provide shared fixtures: private addresses, complete daemons, and waiting for conditions.
 
-Each test process has its own loopback addresses and folders, so that several run beside each
-other; whatever a test started, in this process or below it, ends with the test.
+Each test process has its own loopback addresses and folders, so test processes can run in parallel.
+All processes that a test starts, directly or indirectly, end with the test.
 """
 
 from __future__ import annotations
@@ -32,33 +32,34 @@ from tests.harness.daemon_process import Running
 from tests.harness.loop import Make
 from tests.harness.perturbed import Perturbation
 
-# The same examples on every machine, however slow; --hypothesis-profile=search looks for others.
+# All machines use the same examples without a deadline; --hypothesis-profile=search tries new ones.
 hypothesis.settings.register_profile("same", deadline=None, derandomize=True, max_examples=50)
 hypothesis.settings.register_profile("search", deadline=None, max_examples=1000)
 hypothesis.settings.load_profile("same")
 
 _PORTS = itertools.count(9872)
-_OUR_OWN: set[int] = set()  # processes that no test started
+_OUR_OWN: set[int] = set()  # children of this process that no test started
 PERTURBATION = pytest.StashKey[Perturbation]()
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Add the option of `tests.harness.perturbed`."""
+    """Add the option that enables `tests.harness.perturbed`."""
     help_text = "move results by a unit in the last place, to find tests that depend on rounding"
     parser.addoption("--perturb", type=int, metavar="SEED", help=help_text)
 
 
 def pytest_report_header() -> str:
-    """The arithmetic, for whoever reads of a test that failed on one machine alone."""
+    """Show the arithmetic in the header, to help with tests that fail on only one machine."""
     return f"arithmetic: {arithmetic.described()}"
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """End as on Ctrl-C when asked to; orphans of what tests started come to this process."""
+    """Treat SIGTERM like Ctrl-C, and adopt orphaned descendants of tests."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     descendants.adopt_orphans()
-    resource_tracker.ensure_running()  # not by a test: with its end the semaphores' names were lost
+    # If a test started it, semaphores would be lost when that test ends.
+    resource_tracker.ensure_running()
     _OUR_OWN.update(descendants.running())
     if not hasattr(config, "workerinput"):
         descendants.end_with_this_process()
@@ -69,9 +70,9 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out extended tests, unless ``-m`` selects tests or the command line names their file.
+    """Skip extended tests, unless ``-m`` selects tests or the command line names their file.
 
-    Begin with those that wait longest, so that the others compute meanwhile.
+    Tests that mostly wait run first, in parallel with the tests that compute.
     """
     if not config.option.markexpr:
         named = {Path(each.partition("::")[0]).resolve() for each in config.args}
@@ -84,7 +85,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
-    """Spare the garbage collector the million objects of all modules, which are there to stay."""
+    """Exclude the million permanent objects of all modules from garbage collection."""
     if session.config.stash.get(PERTURBATION, None) is not None:
         session.config.stash[PERTURBATION].enter_modules()
     gc.collect()
@@ -92,34 +93,34 @@ def pytest_collection_finish(session: pytest.Session) -> None:
 
 
 def pytest_unconfigure() -> None:
-    """A test process that crashed leaves what it started to the one that started it."""
+    """End processes left by a crashed test process, which this process has adopted."""
     descendants.end(descendants.running() - _OUR_OWN)
 
 
 @pytest.fixture(autouse=True)
 def ended_with_the_test() -> Iterator[None]:
-    """Ends the processes that a test started and left; gives pytest Ctrl-C and collector back."""
+    """End the test's remaining child processes; restore signal handlers and garbage collection."""
     before = descendants.running()
     handlers = {each: signal.getsignal(each) for each in _SIGNALS}
     yield
     for each, handler in handlers.items():
         signal.signal(each, handler)
-    gc.enable()  # which a daemon's command in this process has switched off
+    gc.enable()  # a daemon running in this process disables it
     descendants.end(descendants.running() - before)
 
 
 @pytest.fixture
 def context() -> Iterator[zmq.Context[zmq.Socket[bytes]]]:
-    """A ZeroMQ context that drops what was not sent when the test ends."""
+    """Yield a ZeroMQ context; unsent messages are dropped when the test ends."""
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     yield context
     context.destroy(linger=0)
 
 
 def own_addresses() -> tuple[str, str]:
-    """Two TCP addresses that nobody else has: stream and commands.
+    """Return two unused TCP addresses, for the stream and for commands.
 
-    This process has a loopback host to itself, by its number, and takes new ports there each time.
+    The loopback host is derived from the process ID, and each call uses new ports.
     """
     number = os.getpid()
     host = f"127.{64 + (number >> 16)}.{number >> 8 & 255}.{number & 255}"
@@ -128,13 +129,16 @@ def own_addresses() -> tuple[str, str]:
 
 @pytest.fixture
 def addresses() -> tuple[str, str]:
-    """Two TCP addresses that are this test's alone."""
+    """Return TCP addresses used only by this test."""
     return own_addresses()
 
 
 def write_profile(path: Path, addresses: tuple[str, str], text: str = "") -> Path:
-    """Write a profile on these addresses, with ``text`` added to it; of 100 ticks a second, where
-    it names no other rate: daemons of several tests share the processors."""
+    """Write a profile with these addresses and ``text``.
+
+    The loop rate is 100 Hz unless ``text`` sets it, because the daemons of several tests share the
+    processors.
+    """
     stream, commands = addresses
     rate = "" if "loop.rate" in text else "loop.rate = 100.0\n"
     head = f'stream.address = "{stream}"\ncommands.address = "{commands}"\n'
@@ -144,13 +148,13 @@ def write_profile(path: Path, addresses: tuple[str, str], text: str = "") -> Pat
 
 @pytest.fixture
 def profile(tmp_path: Path, addresses: tuple[str, str]) -> Profile:
-    """Writes a profile on the test's addresses, with a text added to it."""
+    """Return a function that writes a profile with the test's addresses and additional text."""
     return lambda text="", name="profile.toml": write_profile(tmp_path / name, addresses, text)
 
 
 @pytest.fixture
 def start() -> Iterator[Start]:
-    """Starts daemons that are killed when the test ends before them."""
+    """Return a function that starts daemons, which are killed at the latest when the test ends."""
 
     def run(*words: str) -> Running:
         running = Running(*words)
@@ -162,7 +166,7 @@ def start() -> Iterator[Start]:
 
 
 class Told(NamedTuple):
-    """What a subcommand left: exit status, standard output and error."""
+    """Result of a subcommand: exit status, standard output and error."""
 
     returncode: int
     stdout: str
@@ -177,16 +181,16 @@ Start = Callable[..., Running]
 
 @pytest.fixture
 def inline(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Inline:
-    """Runs a subcommand in this process, for tests of its work and not of its process."""
-    monkeypatch.setattr(os, "nice", lambda _: 0)  # the tests' own priority stays
-    # Whichever test comes first on a machine compiles, and none is about being told so.
+    """Return a function that runs a subcommand in this process."""
+    monkeypatch.setattr(os, "nice", lambda _: 0)  # keep the priority of the test process
+    # Suppress messages about compiling kernels, which only the first test on a machine prints.
     monkeypatch.setattr(kernels, "print_event", lambda *_: None)
 
     def run(*words: object) -> Told:
         capsys.readouterr()
         try:
             status = main(list(map(str, words)))
-        except SystemExit as ended:  # argparse's
+        except SystemExit as ended:  # raised by argparse
             status = int(ended.code or 0)
         return Told(status, *capsys.readouterr())
 
@@ -194,19 +198,22 @@ def inline(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) 
 
 
 def until(condition: Callable[[], object], seconds: float = 150.0) -> None:
-    """Call ``condition`` until it holds, less often in time; ``seconds`` only bound a hang."""
+    """Poll ``condition`` at increasing intervals; the time-out only catches hangs."""
     begin = time.monotonic()
     while not condition():
         waited = time.monotonic() - begin
         if waited > seconds:
             raise TimeoutError(f"not within {seconds:g} s: {condition}")
-        # Leaves the processor to what is waited for.
+        # Sleep, so that the awaited process gets the processor.
         select.select([], [], [], min(0.002 + 0.01 * waited, 0.02))
 
 
 @pytest.fixture
 def make() -> Iterator[Make]:
-    """Daemons on virtual time without sockets; sections are given as keyword arguments."""
+    """Return a function that builds daemons on virtual time without sockets.
+
+    Keyword arguments are sections of the settings.
+    """
 
     def build(**sections: Any) -> Daemon:
         loop = {"clock": "virtual"} | sections.pop("loop", {})
@@ -221,7 +228,7 @@ def make() -> Iterator[Make]:
 
 @pytest.fixture
 def exact_solid_data(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A solid tip's data have no error of their own, as for frames that are made of them."""
+    """Set the errors of the solid tip's data to zero, for frames generated from the same data."""
     from softfinger.kinematics.estimation import error_budget, estimator
 
     data = estimator.solid_data

@@ -1,10 +1,9 @@
-"""Describe the arithmetic of a test run, which affects the last bits of results, or change it.
+"""Describe or change the arithmetic of a test run, which affects the last bits of results.
 
 ``python -m tests.harness.arithmetic MODULE …`` runs ``python -m MODULE …`` with a different
-arithmetic: OpenBLAS uses the kernels of an older processor, NumPy does not use the SIMD loops that
-it selects by processor, and Numba compiles for a generic processor. The generic kernels have their
-own folder, because the folder's name depends on the target processor
-(`kinematics.compiled.kernel_folder`).
+arithmetic: OpenBLAS uses the kernels of an older processor, NumPy uses only its baseline SIMD
+loops, and Numba compiles for a generic processor. Generic kernels have their own cache folder,
+because the folder's name depends on the target processor (`kinematics.compiled.kernel_folder`).
 """
 
 import ctypes
@@ -16,23 +15,23 @@ import llvmlite.binding
 import numpy as np
 from numpy._core import _multiarray_umath
 
-# Environment variables that select an arithmetic other than the processor's own.
+# Environment variables that replace the processor's default arithmetic.
 VARIABLES = (
     "OPENBLAS_CORETYPE",
     "NPY_DISABLE_CPU_FEATURES",
     "NUMBA_CPU_NAME",
     "NUMBA_CPU_FEATURES",
 )
-_AVX512 = ("skylakex", "cooperlake", "sapphirerapids")  # OpenBLAS cores that use it
+_AVX512 = ("skylakex", "cooperlake", "sapphirerapids")  # OpenBLAS cores that use AVX-512
 
 
 def chosen() -> dict[str, str]:
-    """Return the variables that are set; empty in a usual run."""
+    """Return the variables that are set; usually none."""
     return {name: os.environ[name] for name in VARIABLES if os.environ.get(name)}
 
 
 def blas_core() -> str:
-    """Return the processor whose kernels OpenBLAS uses; empty if NumPy uses another BLAS."""
+    """Return the processor type of the OpenBLAS kernels, or "" if NumPy uses another BLAS."""
     library = ctypes.CDLL(np.linalg._umath_linalg.__file__)
     for name in ("scipy_openblas_get_corename64_", "openblas_get_corename64_"):
         if hasattr(library, name):
@@ -43,7 +42,7 @@ def blas_core() -> str:
 
 
 def simd() -> list[str]:
-    """Return the SIMD extensions that NumPy uses in addition to its build baseline."""
+    """Return the SIMD extensions that NumPy uses beyond its baseline."""
     has = _multiarray_umath.__cpu_features__
     return [name for name in _multiarray_umath.__cpu_dispatch__ if has[name]]
 
@@ -56,7 +55,7 @@ def described() -> str:
 
 
 def other() -> dict[str, str]:
-    """Return variables that select a different arithmetic supported by this processor."""
+    """Return variables that select a different arithmetic that this processor supports."""
     core = blas_core().lower()
     if platform.machine() == "aarch64":
         older = "CORTEXA57" if core == "armv8" else "ARMV8"
@@ -70,7 +69,7 @@ def other() -> dict[str, str]:
 
 
 def main() -> None:
-    """Replace this process by the command with the other arithmetic."""
+    """Replace this process with the command, using the other arithmetic."""
     variables = other()
     named = " ".join(f"{name}='{value}'" for name, value in variables.items())
     print(f"usual arithmetic: {described()}", f"now with {named}", sep="\n", flush=True)

@@ -1,4 +1,4 @@
-"""Call inner kernels from Python: they have no wrapper for this, so tests compile one."""
+"""Compile test wrappers for inner kernels, which Python cannot call directly."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Run ``softfinger`` in real processes: subcommands that end by themselves, and daemons."""
+"""Run ``softfinger`` in separate processes: daemons, and subcommands that end by themselves."""
 
 import shutil
 import signal
@@ -11,7 +11,7 @@ from typing import Any
 from softfinger.daemon.client.command_client import send
 
 SOFTFINGER = [sys.executable, "-m", "softfinger"]
-# Settings of a hand that tolerates the stalls of a busy machine, for tests not about time-outs.
+# Settings that tolerate the stalls of a busy machine, for tests that do not concern time-outs.
 PATIENCE = {
     "servos.open_timeout": 60.0,
     "servos.reply_timeout": 0.1,
@@ -26,18 +26,18 @@ PATIENT = [word for key, value in PATIENCE.items() for word in ("--set", f"{key}
 
 
 def python(*words: object, **options: Any) -> subprocess.CompletedProcess[str]:
-    """Run a program in this Python until it ends; return status and output."""
+    """Run a program in this Python to its end; return status and output."""
     call = [sys.executable, *map(str, words)]
     return subprocess.run(call, capture_output=True, text=True, check=False, **options)
 
 
 def softfinger(*words: object, **options: Any) -> subprocess.CompletedProcess[str]:
-    """Run a subcommand until it ends; return status and output."""
+    """Run a subcommand to its end; return status and output."""
     return python("-m", "softfinger", *words, **options)
 
 
 def pip_installed(package: Path, folder: Path) -> Path:
-    """Install one package of this tree with pip and return its location."""
+    """Install one package of this repository with pip and return its location."""
     shutil.copytree(package, folder / "source")  # builds leave files in the source folder
     options = ("--no-deps", "--no-build-isolation", "--no-index", "--quiet")
     words = ("install", *options, "--target", folder / "site", folder / "source")
@@ -67,7 +67,7 @@ def until_it_says(words: Sequence[str | Path], text: str) -> None:
 
 
 class Running:
-    """Process of ``softfinger run``, ready when constructed."""
+    """Process of ``softfinger run`` that is ready once constructed."""
 
     def __init__(self, *words: str) -> None:
         self.lines: list[str] = []

@@ -1,7 +1,7 @@
 """Find and end processes that tests started, directly or indirectly.
 
-As a program with one argument, it waits for the end of its standard input and then kills every
-process with this word in its environment.
+Run as a program with a word as its argument, the module waits for the end of standard input and
+then kills every process whose environment contains this word.
 """
 
 import contextlib
@@ -19,7 +19,7 @@ _PR_SET_CHILD_SUBREAPER = 36  # from <linux/prctl.h>
 
 @contextlib.contextmanager
 def ending(process: subprocess.Popen[Any]) -> Iterator[subprocess.Popen[Any]]:
-    """Context that kills a process at its end, where ``with`` alone would wait forever."""
+    """Context that kills a process on exit, whereas ``with`` alone would wait forever."""
     with process:
         try:
             yield process
@@ -28,12 +28,12 @@ def ending(process: subprocess.Popen[Any]) -> Iterator[subprocess.Popen[Any]]:
 
 
 def adopt_orphans() -> None:
-    """Make this process the parent of descendants whose own parent ends."""
+    """Adopt descendants whose own parent ends."""
     ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
 
 
 def end_with_this_process() -> None:
-    """Kill all processes started from now on when this process ends, even by SIGKILL."""
+    """Kill all processes started from now on when this process ends, even after SIGKILL."""
     word = f"TESTS_OF_PROCESS={os.getpid()}"
     _watching.append(
         subprocess.Popen(
@@ -50,7 +50,7 @@ _watching: list[subprocess.Popen[bytes]] = []  # their standard input closes whe
 
 
 def running(process: int | None = None) -> set[int]:
-    """Return the IDs of a process's children, by default of this process."""
+    """Return the IDs of a process's children (default: this process)."""
     tasks = Path(f"/proc/{process or os.getpid()}/task").glob("*/children")
     found: set[int] = set()
     for task in tasks:
@@ -71,7 +71,7 @@ def end(processes: set[int]) -> None:
 
 
 def _sweep(word: bytes) -> bool:
-    """Kill every process with ``word`` in its environment; return True if there was one."""
+    """Kill every process with ``word`` in its environment; return True if any was found."""
     found = False
     for folder in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):  # the process has ended or belongs to another user

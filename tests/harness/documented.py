@@ -1,7 +1,7 @@
-"""Execute `softfinger` commands of the documentation's shell blocks in the test process.
+"""Execute `softfinger` commands from the documentation's shell blocks in the test process.
 
-Commands that run until they are interrupted are only parsed, together with their profile. An
-emulated hand is started as a separate process and replaces the previous one.
+Commands without an end are only parsed, together with their profile. An emulated hand runs in a
+separate process and replaces the previous one.
 """
 
 import contextlib
@@ -26,7 +26,7 @@ from tests.harness.daemon_process import SOFTFINGER, Running
 
 _BUSY = "DOCUMENTED_BUSY"  # set for processes started by a command, which run separately
 _ENDLESS = {"run", "monitor", "view", "replay", "envelope", "bench"}
-# Options with which such commands end by themselves and are run.
+# Options that let such commands end by themselves, so they are run.
 _ENDS = {"--record", "--recompute"}
 _SHOWN = re.compile(r"# (?P<mode>\w+)(?: (?P<force>[\d.]+) N)?(?:.*?(?P<angle>-?[\d.]+)°)?")
 _CLIENT = """\
@@ -50,7 +50,7 @@ def parse(words: list[str]) -> None:
 
 
 class Softfinger:
-    """The command as a program in ``folder``; `serve` executes one call of it."""
+    """The ``softfinger`` command as a program in ``folder``; `serve` executes one call."""
 
     def __init__(self, folder: Path) -> None:
         client, command = folder / "client.py", folder / "softfinger"
@@ -97,7 +97,7 @@ class Softfinger:
             return _await(words[1])
         if name == "emulate" and "--send" not in words:
             return self._emulate(words)
-        if name == "run":  # for a recording; the default addresses are in use
+        if name == "run":  # `run` for a recording uses the default addresses
             for each in ("stream", "commands"):
                 words += ["--set", f"{each}.address=ipc://{Path.cwd()}/{each}"]
             return subprocess.run([*SOFTFINGER, *words, "--duration", "1"], check=False).returncode
@@ -108,7 +108,7 @@ class Softfinger:
                 return main(words)
 
     def _run(self, words: list[str]) -> int:
-        """Run the daemon of an emulated hand; later commands are sent to it."""
+        """Run the daemon for an emulated hand; later commands go to this daemon."""
         self._end_daemon()
         stream, commands = (f"ipc://{Path.cwd()}/{each}" for each in ("stream", "commands"))
         own = ("--set", f"stream.address={stream}", "--set", f"commands.address={commands}")
@@ -162,7 +162,7 @@ def _await(shown: str) -> int:
 
 
 def _patient_doctor() -> contextlib.ExitStack:
-    """Patch the doctor for a busy machine on which other processes use the sockets."""
+    """Patch the doctor for a busy machine on which other processes use sockets."""
     from softfinger.daemon.diagnosis import machine
     from softfinger.tools.setup import doctor
 

@@ -1,4 +1,4 @@
-"""Run emulated hands in a thread or in a process, and access their servos with the SDK."""
+"""Run emulated hands in a thread or process, and access their servos with the SDK."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from tests.harness.daemon_process import SOFTFINGER
 
 HIL = Path(__file__).parents[2] / "config" / "hil.toml"
 _COMPILED = re.compile(r"^(compil(ing|ed) .*|.*: \d+ of about \d+, .*)\n", re.MULTILINE)
-READY_WITHIN = 200.0  # s, includes the compilation of kernels
+READY_WITHIN = 200.0  # s, includes kernel compilation
 
 
 @contextlib.contextmanager
 def emulated(
     folder: Path, *faults: str, settings: Settings | None = None, **options: Any
 ) -> Iterator[Emulator]:
-    """Run an emulator in a thread of this process; it is ready when the context starts."""
+    """Run an emulator in a thread; it is ready when the context is entered."""
     made = Emulator(settings or Settings(), folder, faults=faults, **options)
     ready = threading.Event()
     runner = threading.Thread(target=made.run, args=(ready.set,), daemon=True)
@@ -64,7 +64,7 @@ class EmulatorProcess:
         return self
 
     def end(self, number: int = signal.SIGTERM) -> tuple[int, str, str]:
-        """Send a signal; return exit status and remaining output without lines about kernels."""
+        """Send a signal; return exit status and remaining output without kernel messages."""
         self.popen.send_signal(number)
         out, err = self.popen.communicate(timeout=300)
         return self.popen.returncode, out, _COMPILED.sub("", err)
@@ -79,7 +79,7 @@ class EmulatorProcess:
 
 
 class PatientPort(PortHandler):
-    """Port that waits longer for a reply than the SDK's 34 ms, which a busy machine may exceed."""
+    """Port that waits longer than the SDK's 34 ms for a reply, because the machine may be busy."""
 
     patience = 60_000.0  # ms
 
@@ -88,7 +88,7 @@ class PatientPort(PortHandler):
 
 
 class SdkServos:
-    """Client that uses the manufacturer's SDK on the servos' port."""
+    """Access to the servos through the manufacturer's SDK."""
 
     def __init__(self, folder: Path, baud: int = 2_000_000) -> None:
         self.port = PatientPort(str(folder / "servos"))
@@ -132,12 +132,12 @@ class SdkServos:
 
 
 def board(folder: Path, finger: int, timeout: float = 60.0, **changes: object) -> FlexiTac:
-    """Open the daemon's backend on one board of the emulated hand."""
+    """Open the daemon's backend for one board of the emulated hand."""
     tactile = load(HIL, folder).tactile
     tactile = tactile.model_copy(update={"open_timeout": timeout, **changes})
     return FlexiTac(tactile, RealClock(), finger)
 
 
 def send(folder: Path, words: str) -> int:
-    """Return the exit status of ``softfinger emulate --send``."""
+    """Run ``softfinger emulate --send`` and return its exit status."""
     return main(["emulate", "--dir", str(folder), "--send", words])

@@ -1,6 +1,6 @@
 """Publisher and command server on real sockets, with a hand computed from formulas.
 
-It is used to test clients of the stream; the test controls all messages.
+They are used to test clients; the test controls all messages.
 """
 
 from __future__ import annotations
@@ -83,8 +83,8 @@ class FakeDaemon:
 
     ``changes`` are merged into every state. ``requests`` contains the received commands and
     ``keys`` the client key of each. ``replies`` maps a command to its reply, or to a list of
-    replies given one after the other. No states are sent while ``silent`` is set, no answers while
-    ``deaf`` is set, and no frames for the fingers in ``dead``.
+    successive replies. No states are sent while ``silent`` is set, no replies while ``deaf`` is
+    set, and no frames for the fingers in ``dead``.
     """
 
     def __init__(self) -> None:

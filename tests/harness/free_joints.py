@@ -22,7 +22,7 @@ STALL = 3.21  # A at full supply voltage
 
 
 class FreeJoints:
-    """``count`` joints at rest at angle 0, with the interface required by a servo bus."""
+    """``count`` joints, initially at rest at angle 0, with the interface that a servo bus needs."""
 
     def __init__(self, count: int = 2, start: float = 0.0) -> None:
         self._start = start

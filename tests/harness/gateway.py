@@ -1,4 +1,4 @@
-"""Run a gateway in the test's own process, step by step."""
+"""Run a gateway step by step in the test process."""
 
 from __future__ import annotations
 
@@ -66,18 +66,19 @@ class Served:
         for _ in range(times):
             self.service.step(0.0)
             self.link.look()
-        while select.select([self.service.channel], [], [], 0)[0]:  # long messages need more steps
+        # Long messages take several steps.
+        while select.select([self.service.channel], [], [], 0)[0]:
             self.service.step(0.0)
 
     def serve(self, handler: Handler) -> None:
-        """Run one step of the gateway, one tick of the loop, and one step for the answers."""
+        """Run one gateway step, one loop tick, and one gateway step for the replies."""
         self.service.step(0.0)
         self.server.serve(handler)
         self.service.step(0.0)
 
     @contextmanager
     def serving(self, handler: Handler) -> Iterator[None]:
-        """Answer commands in a thread."""
+        """Serve commands in a thread."""
         over = threading.Event()
 
         def serve() -> None:

@@ -1,7 +1,7 @@
-"""Make the golden recording: a grasp, a turn, a refused command, a release and a stop.
+"""Generate the golden recording: a grasp, a turn, a refused command, a release and a stop.
 
-``python -m tests.harness.golden_recording`` makes it again, after an intended change of the hand's
-behaviour. The file next to it names the machine and the packages used.
+Run ``python -m tests.harness.golden_recording`` after an intended change of the hand's behaviour.
+The JSON file next to it lists the machine and package versions used.
 """
 
 import json
@@ -24,7 +24,7 @@ MADE_ON = GOLDEN / "grasp_and_turn.json"
 _COMMANDS = {
     50: {"command": "arm"},
     51: {"command": "grasp", "force": 6.0},
-    500: {"command": "move", "left": 0.1},  # refused during a hold
+    500: {"command": "move", "left": 0.1},  # refused while holding
     550: {"command": "rotate", "angle": 0.1},
     800: {"command": "release"},
     930: {"command": "stop"},
@@ -33,7 +33,7 @@ _SMALL_GRID = ("tactile.rows=20", "tactile.cols=20", "tactile.pitch=0.0029")
 
 
 def machine_class() -> dict[str, str]:
-    """Return the properties of the machine that determine the last bits of the results."""
+    """Return the machine properties that affect the last bits of the results."""
     return {
         "processor": os.environ.get("NUMBA_CPU_NAME") or llvmlite.binding.get_host_cpu_name(),
         "chosen": " ".join(f"{name}={value}" for name, value in arithmetic.chosen().items()),

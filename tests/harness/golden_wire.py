@@ -1,6 +1,6 @@
-"""Make samples of every topic's message, and their golden bytes in ``tests/golden/``.
+"""Generate sample messages for every topic, and their golden bytes in ``tests/golden/``.
 
-``python -m tests.harness.golden_wire`` writes the bytes again, after a field was added.
+Run ``python -m tests.harness.golden_wire`` after adding a field.
 """
 
 from collections.abc import Callable
@@ -18,13 +18,13 @@ from softfinger.kinematics.estimation.invalid import Invalid
 
 
 def message_maker(topic: bytes) -> Callable[..., dict[str, Any]]:
-    """Return the function that makes a topic's map from its source's arguments."""
+    """Return the function that builds a topic's message from its arguments."""
     pack = packer(topic)
     return lambda *arguments: msgpack.unpackb(pack(*arguments))
 
 
 def golden_file(topic: bytes) -> Path:
-    """Return the file with a topic's golden bytes."""
+    """Return the path of a topic's golden bytes."""
     name = f"{topic.decode().replace('/', '-')}.msgpack"
     return Path(__file__).parents[1] / "golden" / name
 
@@ -37,7 +37,7 @@ class SampleTruth:
 
 
 def sample_state() -> State:
-    """Return a state in which all fields have different values."""
+    """Return a state whose fields all have different values."""
     state = State(seq=1234, t=12.5, wall=1.7e9 + 0.25, mode="holding", fault="", torque=True)
     state.reading.seq, state.reading.t, state.reading.valid = 1234, 12.4995, True
     state.timing.tick_s, state.timing.compute_s = 0.002, 15.5e-6
@@ -73,7 +73,7 @@ def sample_state() -> State:
 
 
 def arguments(topic: bytes) -> tuple[Any, ...]:
-    """Return the arguments from which a sample of the topic's message is made."""
+    """Return the arguments of the topic's sample message."""
     state, wall, t = sample_state(), 1.7e9 + 0.25, 12.5
     if topic == schema.STATE:
         return state, SceneParts(fingers=(True, True), has_servos=True, has_sensors=True), 5
@@ -120,7 +120,7 @@ def sample(topic: bytes) -> dict[str, Any]:
 
 
 def flat(message: dict[str, Any], outer: str = "") -> dict[str, Any]:
-    """Flatten nested maps: ``left.q`` for q in ``left``."""
+    """Flatten nested maps: q in ``left`` becomes ``left.q``."""
     found: dict[str, Any] = {}
     for key, value in message.items():
         name = f"{outer}{key}"

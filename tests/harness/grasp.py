@@ -1,14 +1,14 @@
-"""Reference model of a grasp: two rotational fingers, two soft tips and an object in balance.
+"""Reference model of a grasp: two rotational fingers, two soft tips, an object at equilibrium.
 
-The energy is that of both tips and of gravity. A tip's energy with the shear d_t is
+The energy is the sum of both tips' energies and gravity. A tip's energy with the shear d_t is
 
     U(d, θ, d_t) = U₀(d, θ) + F(d, θ) (sin θ d_t + cos θ d_t²/d)
 
 with U₀ and F from the contact table. For a constant modulus this is πE[d³/(3cos²θ) + d² d_t tan θ +
 d d_t²], the parallel-distributed model. The shear force is T = ∂U/∂d_t and the normal force N =
-∂U/∂d − T tan θ. Shears follow the rolling increments of `reference_hand`, which are not integrable
-in general, so a grasp depends on its path: motions are divided into small steps that accumulate the
-shears. The grasp is in balance if the energy is stationary along those increments.
+∂U/∂d − T tan θ. Shears follow the rolling increments of `reference_hand`, which are in general not
+integrable, so a grasp depends on its path: motions are divided into small steps that accumulate the
+shears. The grasp is at equilibrium if the energy is stationary along those increments.
 """
 
 from dataclasses import dataclass
@@ -23,12 +23,13 @@ from tests.harness.reference_hand import ReferenceHand
 
 FloatArray = NDArray[np.float64]
 
-_TOLERANCE = 1e-11  # relative to the contact forces, for balance; rounding errors are about 1e-14
-_STEP = 1e-6  # step of differences of forces: rad for rotations, tip radii for displacements
+# Equilibrium tolerance relative to the contact forces; rounding errors are about 1e-14.
+_TOLERANCE = 1e-11
+_STEP = 1e-6  # step for force differences: rad for rotations, tip radii for displacements
 
 
 class GraspError(SoftfingerError, ValueError):
-    """The grasp does not exist: a contact opens or leaves the range, or balance is not found."""
+    """Raised if a contact opens or leaves its range, or if no equilibrium is found."""
 
 
 def sheared_contact(
@@ -64,13 +65,13 @@ class GraspState:
 
 @dataclass(frozen=True)
 class GraspForces:
-    """Forces of a grasp, each of shape (2,), left first."""
+    """Grasp forces, each of shape (2,), left first."""
 
     force: FloatArray  # F on the tip's base, the sum over a pressure grid [N]
     normal: FloatArray  # N [N]
     tangential: FloatArray  # T [N]
     turning: FloatArray  # ∂U/∂θ, moment that turns the object relative to the tip [N·m]
-    torque: FloatArray  # joint torques in balance, positive closing [N·m]
+    torque: FloatArray  # joint torques at equilibrium, positive closing [N·m]
 
 
 class Grasp:
@@ -90,7 +91,7 @@ class Grasp:
         self._weight = np.array(weight, dtype=np.float64)
 
     def symmetric(self, d: float) -> GraspState:
-        """Return a state with both tips pressed by ``d`` [m], object upright and no shear force.
+        """Return a state with both tips indented by ``d`` [m], object upright and no shear force.
 
         Raises ValueError if the fingers cannot reach it, GraspError outside the tip's range.
         """
@@ -102,24 +103,25 @@ class Grasp:
         return state
 
     def gradient(self, state: GraspState) -> FloatArray:
-        """Return the energy's derivative (5,) along the rolling increments of (q1, q2, x, y, φ).
+        """Return the energy derivative (5,) along the rolling increments of (q1, q2, x, y, φ).
 
-        The first two elements are the joint torques in balance; the last three vanish in balance.
+        The first two elements are the equilibrium joint torques; the last three vanish at
+        equilibrium.
         """
         return self._evaluate(state.coordinates, state)[0]
 
     def forces(self, state: GraspState) -> GraspForces:
-        """Return forces and moments of both contacts and the joint torques."""
+        """Return the forces and moments of both contacts and the joint torques."""
         d, theta, _ = self.hand.variables(state.coordinates, self.width).T
         _, by_d, turning, tangential, _ = sheared_contact(self.table, d, theta, state.shear)
         normal, torque = by_d - tangential * np.tan(theta), self.gradient(state)[:2]
         return GraspForces(self.table(d, theta).force, normal, tangential, turning, torque)
 
     def balance(self, state: GraspState, q: ArrayLike | None = None) -> GraspState:
-        """Move the joints to ``q`` (2,) in one step and let the object roll to its balance.
+        """Move the joints to ``q`` (2,) in one step and let the object roll to equilibrium.
 
         Use small steps, because the shears are integrated along a straight path. Raises GraspError
-        if a contact opens or leaves the table, or if no balance is found.
+        if a contact opens or leaves the table, or if no equilibrium is found.
         """
         x = state.coordinates
         if q is not None:
@@ -146,7 +148,7 @@ class Grasp:
         return GraspState(x[:2].copy(), x[2:].copy(), shear)
 
     def steer(self, state: GraspState, delta: float) -> GraspState:
-        """Turn both fingers by ``delta`` [rad] to the right (q1 + δ, q2 − δ), in balance.
+        """Turn both fingers by ``delta`` [rad] to the right (q1 + δ, q2 − δ), at equilibrium.
 
         The object turns in the opposite direction, by about 2(a − d + L sin q + e cos q)/W per
         radian.

@@ -1,6 +1,6 @@
-"""Control a headless Chromium through DevTools: open pages and evaluate scripts in them.
+"""Control a headless Chromium through DevTools: open pages and evaluate scripts.
 
-The browser stores all data in a folder of the test and makes only the requests of the page.
+The browser stores all data in a test folder and makes only requests from the page.
 """
 
 import json
@@ -16,7 +16,7 @@ from websockets.sync.client import connect
 
 from tests.conftest import until
 
-WAIT = 60.0  # s for one answer
+WAIT = 60.0  # s to wait for one reply
 _NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 _FLAGS = (
     "--headless=new",
@@ -35,12 +35,12 @@ _FLAGS = (
 
 
 def browser_path() -> str | None:
-    """Return the browser on this machine; None if there is none."""
+    """Return the path of the installed browser, or None."""
     return next((path for name in _NAMES if (path := shutil.which(name))), None)
 
 
 class Browser:
-    """One page in one browser; ``requests`` contains the addresses requested by the page."""
+    """One page in one browser; ``requests`` contains the addresses that the page requested."""
 
     def __init__(self, path: str, folder: Path) -> None:
         words = [*_FLAGS, f"--user-data-dir={folder}"]
@@ -72,7 +72,7 @@ class Browser:
         self.ask("Page.navigate", url=url)
 
     def resize(self, width: int, height: int, ratio: int = 1) -> None:
-        """Set the page's size; ``ratio`` is the number of device pixels per pixel."""
+        """Set the page size; ``ratio`` is the number of device pixels per CSS pixel."""
         size = {"width": width, "height": height, "deviceScaleFactor": ratio, "mobile": ratio > 1}
         self.ask("Emulation.setDeviceMetricsOverride", **size)
 
@@ -89,7 +89,7 @@ class Browser:
         self.ask("Emulation.setEmulatedMedia", features=[feature])
 
     def ask(self, method: str, **parameters: Any) -> Any:
-        """Send one command and wait for its answer; raise RuntimeError if it is an error."""
+        """Send one command and wait for its reply; raise RuntimeError if it is an error."""
         self._number += 1
         message = {"id": self._number, "method": method, "params": parameters}
         self._socket.send(json.dumps(message))
@@ -103,7 +103,7 @@ class Browser:
                 self.requests.append(answer["params"]["request"]["url"])
 
     def close(self) -> None:
-        """End the browser and the processes it started."""
+        """End the browser and its child processes."""
         os.killpg(self.process.pid, signal.SIGKILL)
         self.process.wait()
         self._socket.close()

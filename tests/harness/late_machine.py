@@ -1,10 +1,13 @@
-"""Clock of a machine that advances only by work and sleep, and wakes up late on request."""
+"""Simulate the clock of a machine that wakes up late on request."""
 
 from softfinger.daemon.clock import VirtualClock
 
 
 class LateMachine(VirtualClock):
-    """Replacement for the real clock; ``late_by`` holds the delays of the next wake-ups [s]."""
+    """Replacement for the real clock that advances only by work and sleep.
+
+    ``late_by`` holds the delays of the next wake-ups [s].
+    """
 
     pauses_when_late = False
 
@@ -13,7 +16,7 @@ class LateMachine(VirtualClock):
         self.late_by: list[float] = []
 
     def work(self, seconds: float) -> None:
-        """Advance the time by work of this duration."""
+        """Advance the clock by a working time."""
         self._now += seconds
 
     def sleep_until(self, t: float) -> float:

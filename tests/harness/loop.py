@@ -22,7 +22,7 @@ def torque_of(daemon: Daemon) -> Any:
 
 
 def advance_to(daemon: Daemon, mode: str, seconds: float) -> None:
-    """Advance until the hand is in ``mode``; fail if it is not within ``seconds``."""
+    """Advance until the hand is in ``mode``; fail after ``seconds``."""
     finish = daemon.clock.now() + seconds
     while daemon.loop.state.mode != mode:
         assert daemon.clock.now() < finish, f"{daemon.loop.state.mode}, not {mode}"
@@ -44,7 +44,7 @@ def refusal(daemon: Daemon, name: str, **numbers: float) -> str:
 
 
 def heard(daemon: Daemon) -> list[Event]:
-    """Return a list that collects the daemon's events from now on."""
+    """Return a list that collects the daemon's future events."""
     events: list[Event] = []
     daemon.loop._on_event = lambda *event: events.append(event)
     return events

@@ -1,4 +1,4 @@
-"""Print the newest Python release on this machine, from the path or from pyenv."""
+"""Print the newest Python release on this machine, found on PATH or in pyenv."""
 
 import os
 import re
@@ -17,7 +17,7 @@ def candidates() -> list[Path]:
 
 
 def main() -> None:
-    """Ask each program for its version; skip those that do not answer, such as pyenv's shims."""
+    """Ask each program for its version; skip programs that do not reply, such as pyenv's shims."""
     found = []
     for path in candidates():
         done = subprocess.run([path, "-c", _TELL], capture_output=True, text=True, check=False)

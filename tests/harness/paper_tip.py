@@ -47,7 +47,7 @@ def tilts(theta: float, azimuth: float) -> tuple[float, float]:
 def dense(
     grid: SensorGrid, material: Material, contact: Any, pieces: int = 16, margin: int = 6
 ) -> np.ndarray[Any, Any]:
-    """Return pressure with ``pieces`` samples per cell side, blurred, averaged over cells."""
+    """Return the blurred pressure averaged over cells, from ``pieces`` samples per cell side."""
     from scipy.ndimage import gaussian_filter  # slow import, needed by few tests
 
     d, tilt_x, tilt_y = contact
@@ -72,7 +72,7 @@ def dense(
 def fisher(
     grid: SensorGrid, material: Material, truth: Any, noise: float, free_gain: bool
 ) -> np.ndarray[Any, Any]:
-    """Return the inverse Fisher information of (d, tilt_x, tilt_y[, gain]), numerically."""
+    """Return the numerical inverse Fisher information of (d, tilt_x, tilt_y[, gain])."""
     columns = []
     for k, step in enumerate((1e-7, 1e-5, 1e-5, 1e-4)[: 4 if free_gain else 3]):
         ends = []
@@ -91,11 +91,11 @@ def errors(estimate: Any, truth: Any) -> np.ndarray[Any, Any]:
 
 
 def board(pascal_per_count: float = 1.0, **range_: int) -> TactileSettings:
-    """Return the settings of a board for this sensor, with 16 bits by default."""
+    """Return board settings for this sensor, with 16 bits by default."""
     return TactileSettings(pascal_per_count=pascal_per_count, **range_)
 
 
 def flawed(**flaws: float) -> SimulationSettings:
-    """Return the settings of a simulated sensor with only these defects."""
+    """Return settings of a simulated sensor that has only these defects."""
     named = {"noise": 0.0, **flaws}
     return SimulationSettings(**{f"tactile_{name}": value for name, value in named.items()})

@@ -1,4 +1,4 @@
-"""Make simulated hands for tests, position them and let them run."""
+"""Build, position and run simulated hands for tests."""
 
 import math
 
@@ -36,7 +36,7 @@ def place(hand: SimulatedHand, q, pose, dq=(0, 0), velocity=(0, 0, 0)) -> None:
 
 
 def hold_with(hand: SimulatedHand, currents) -> None:
-    """Apply constant currents from the start, independent of the joints' speed."""
+    """Apply constant currents from the start, regardless of joint velocity."""
     hand.plant.parameters.no_load_speed = 1e9
     hand.current[:] = currents
     for joint in range(2):
@@ -56,8 +56,8 @@ def settled(hand: SimulatedHand, goals, current: float, seconds: float = 2.0) ->
 def push_along(hand: SimulatedDaemon, force: float, rate: float, start: float = 0.0) -> float:
     """Push the object along its faces from ``start`` to ``force`` [N] at ``rate`` [N/s].
 
-    A positive force is directed away from the palm; the push is kept. Returns the largest fraction
-    of friction used.
+    A positive force points away from the palm and remains applied. Returns the maximum fraction of
+    friction used.
     """
     dt, used = 0.02, 0.0
     count = max(round(abs(force - start) / (rate * dt)), 1)

@@ -1,4 +1,4 @@
-"""Run the simulated hand on the virtual clock; return or record its published messages."""
+"""Run the simulated hand on the virtual clock, and return or record its published messages."""
 
 from collections import deque
 from pathlib import Path
@@ -19,7 +19,7 @@ Messages = list[tuple[bytes, dict[str, Any]]]
 
 
 class Script:
-    """Replacement for the command server that gives commands at their ticks."""
+    """Replacement for the command server that issues commands on their ticks."""
 
     refused_by_pace = 0
 
@@ -43,7 +43,7 @@ class Script:
 
 
 class Keeping(Link):
-    """Replacement for the link to the gateway that stores the published messages."""
+    """Replacement for the gateway link that stores published messages."""
 
     def __init__(self, taken: Messages) -> None:
         super().__init__()
@@ -96,7 +96,7 @@ def record_hand(
     profile: str | None = None,
     hand: tuple[str, ...] = (),
 ) -> None:
-    """Record a run with the commands in ``due`` at their ticks (500 per second).
+    """Record a run in which the commands in ``due`` are issued on their ticks (500 per second).
 
     Topics in ``without`` are omitted.
     """

@@ -1,4 +1,4 @@
-"""States for tests of the limits, and a `Safety` object that judges them."""
+"""Provide states for tests of the limits, and a `Safety` object to check them."""
 
 from typing import Any, cast
 
@@ -44,7 +44,7 @@ def safety(has_servos: bool = True, has_sensors: bool = True, **parts: Any) -> S
 
 
 def sound(mode: Mode = Mode.HOLDING) -> State:
-    """Return a state without faults at 5 s."""
+    """Return a state at 5 s without faults."""
     state = State(t=5.0, mode=mode, torque=True, seq=10)
     state.reading.t = 5.0
     state.reading.valid = True
@@ -72,14 +72,14 @@ def sound(mode: Mode = Mode.HOLDING) -> State:
 
 
 class Deaf:
-    """Servos that accept any goal and ignore it."""
+    """Servos that accept and ignore all goals."""
 
     def write(self, _: Goal) -> None:
         pass
 
 
 def bounded(judge: Safety, state: State) -> None:
-    """Limit the state's goal as before sending it to the servos."""
+    """Limit the state's goal as is done before sending it to the servos."""
     judge.write(cast(Servos, Deaf()), state)
 
 
@@ -88,7 +88,7 @@ def goal(q: tuple[float, float], current: tuple[float, float]) -> Goal:
 
 
 def later(state: State, dt: float) -> None:
-    """Advance the time, with all data as fresh as before."""
+    """Advance the time without changing the age of the data."""
     state.t += dt
     state.reading.t += dt
     state.seq += 1
@@ -104,7 +104,7 @@ def levers(lever: float) -> GraspState:
 
 
 def judged(judge: Safety, state: State, seconds: float = 0.0) -> tuple[str, str]:
-    """Return the fault after ``seconds`` of this state, with every limit checked at least once."""
+    """Return the fault after ``seconds`` in this state, with every limit checked at least once."""
     found = None
     for _ in range(max(round(seconds / 0.002), len(LIMITS)) + len(LIMITS)):
         found = judge.judge(state)

@@ -1,6 +1,6 @@
-"""Emulated servo buses for tests: called directly, or on a pty served by a thread.
+"""Emulated servo buses, called directly or served on a pty by a thread.
 
-The thread is for tests of behaviour; timing tests run the bus in a separate process.
+Timing tests run the bus in a separate process instead of a thread.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from softfinger.daemon.simulation.servo_model.servo import EmulatedServo
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 from tests.harness.free_joints import FreeJoints
 
-_LOOK = 0.005  # s between checks for changes made by the test
+_LOOK = 0.005  # s between checks for changes by the test
 RADIAN = 2.0 * math.pi / COUNTS_PER_TURN
 
 
@@ -41,7 +41,7 @@ def make_bus(
     t: float = 0.0,
     **options: Any,
 ) -> ServoBus:
-    """Return factory-new servos on free joints at positions ``counts``, at time ``t``."""
+    """Return servos with factory settings on free joints at positions ``counts``, at time ``t``."""
     plant, chosen = FreeJoints(len(ids), t), by_name(model)
     eeprom = servo.prepared(chosen, reg.CURRENT_BASED_POSITION_MODE) if prepared else {}
     for joint, count in enumerate(counts):
@@ -62,33 +62,33 @@ def make_bus(
 
 
 def hand_bus(t: float = 0.0, servos: dict[str, Any] | None = None, **options: Any) -> ServoBus:
-    """Return servos prepared for the hand by settings with these ``servos``, on free joints."""
+    """Return servos on free joints, configured for the hand with these ``servos`` settings."""
     settings = Settings.model_validate({"servos": servos or {}})
     return ServoBus.from_settings(settings, FreeJoints(2, t), t=t, **options)
 
 
 def put_fault(bus: ServoBus, text: str, t: float) -> None:
-    """Apply a fault given in words, e.g. ``silent=2``."""
+    """Apply a fault in text form, e.g. ``silent=2``."""
     kind, _, value = text.partition("=")
     bus.fault(kind, float(value), t)
 
 
 def backend_settings(path: str, **servos: Any) -> Settings:
-    """Return settings of the Dynamixel backend on this port, with time-outs for a busy machine."""
+    """Return Dynamixel backend settings for this port, with time-outs for a busy machine."""
     waits = {"reply_timeout": 1.0, "watchdog": 2.0}
     values = {"backend": "dynamixel", "port": path} | waits | servos
     return Settings.model_validate({"servos": values})
 
 
 def connected(bus: RunningBus, **servos: Any) -> DynamixelServos:
-    """Return the Dynamixel backend, connected to a running bus."""
+    """Return a Dynamixel backend connected to a running bus."""
     backend = DynamixelServos(backend_settings(bus.path, **servos), RealClock())
     backend.connect()
     return backend
 
 
 class BusClient:
-    """Client of a bus with its own time; it parses replies with the independent parser."""
+    """Bus client with its own time that uses the independent parser for replies."""
 
     def __init__(self, bus: ServoBus) -> None:
         self.bus = bus
@@ -100,7 +100,7 @@ class BusClient:
     def ask(
         self, instruction: int, parameters: bytes = b"", packet_id: int = 1
     ) -> tuple[int, bytes]:
-        """Return (error byte, data) of the single reply."""
+        """Return (error byte, data) of the only reply."""
         (packet,) = PacketParser().feed(self.send(packet_id, instruction, parameters), 0.0)
         assert packet.valid
         assert packet.instruction == framing.STATUS
@@ -122,11 +122,11 @@ class BusClient:
 
 
 class DirectPort(SerialPort):
-    """Port connected to a bus in this thread: a reply is available at once or never.
+    """Port connected to a bus in this thread: a reply is available immediately or never.
 
     The bus uses the time of ``clock``. Without a clock, it uses ``t``, which the test sets; waiting
     for a missing reply then advances ``t`` to the deadline. With ``baud`` 0, the port receives at
-    every rate.
+    any rate.
     """
 
     def __init__(
@@ -160,7 +160,7 @@ class DirectPort(SerialPort):
 
 
 class RunningBus:
-    """Bus on a pty in monotonic time, served by a thread until :meth:`close`."""
+    """Bus on a pty in monotonic time, served by a thread until closed."""
 
     def __init__(
         self,
@@ -210,7 +210,7 @@ class RunningBus:
                 self.port.service(self._now())
 
     def _now(self) -> float:
-        """Return monotonic time less stalls of this process, which must not affect servos."""
+        """Return monotonic time without this process's stalls, which must not affect the servos."""
         looked, self._looked = self._looked, time.monotonic()
         self._stood += max(self._looked - looked - 0.5, 0.0)
         return self._looked - self._stood

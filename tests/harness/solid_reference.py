@@ -1,8 +1,8 @@
 """Compute frames of a solid tip with finite elements, for tests/golden/solid_frames.npz.
 
-``python -m tests.harness.solid_reference OUT`` uses neo-Hookean elements on meshes different from
-those of the data file's fit, and not the fit's polynomials, modes or linear law. It needs
-pypardiso.
+``python -m tests.harness.solid_reference OUT`` uses neo-Hookean elements. Its meshes differ from
+those of the data file's fit, and it uses none of the fit's polynomials, modes or linear material
+law. It requires pypardiso.
 """
 
 import argparse
@@ -17,10 +17,10 @@ from research.solid_tip.rubber import Body, Strained
 POISSON, RADIUS, PITCH, CELLS = 0.49, 20.0, 58.0 / 44, 44  # mm
 AREAS = np.pi * np.diff(RING_EDGES**2)
 BLOCKS = ("bonded", "lying", "bonded-sticking", "lying-sticking")
-# Block, tilt [°], mesh, slices; and the depths [mm] of the stored frames.
+# Block, tilt [°], mesh, slices, and depths [mm] of the stored frames.
 COARSE = Meridian(9, 2, 0.2)
 TILTED = (
-    ("bonded", 15.0, Meridian(9, 8, 0.2), 8),  # finer at the rim
+    ("bonded", 15.0, Meridian(9, 8, 0.2), 8),  # refined at the rim
     ("bonded", 20.0, COARSE, 10),
     ("lying", 15.0, COARSE, 9),
 )
@@ -32,11 +32,11 @@ class _Rings(SolidTip):
     edges = RING_EDGES
 
     def __init__(self) -> None:
-        """Set only the rings, which are needed to make frames."""
+        """Create only the rings, which suffice to compute frames."""
 
 
 def row(block: str, theta: float, press: Strained) -> dict[str, object]:
-    """Return one line of the file; lengths in radii, stresses in E."""
+    """Return one row of the file; lengths in radii, stresses in E."""
     force = press.push * np.cos(theta) - press.shear * np.sin(theta)
     pressure = press.base * (force / (press.base[0] @ AREAS))
     frame = _Rings().frame(pressure, PITCH / RADIUS, CELLS)
@@ -45,7 +45,7 @@ def row(block: str, theta: float, press: Strained) -> dict[str, object]:
 
 
 def main() -> None:
-    """Compute the presses and write the file."""
+    """Compute the contacts and write the file."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path)
     arguments = parser.parse_args()

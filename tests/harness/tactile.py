@@ -29,13 +29,13 @@ RATE = 200.0  # Hz
 
 
 def image(number: int) -> NDArray[np.uint16]:
-    """Return a different image for each number, in which no cell equals its transpose."""
+    """Return a different image for each number; no cell equals its transpose."""
     cells = np.arange(ROWS * COLS, dtype=np.uint16).reshape(ROWS, COLS)
     return (cells * 7 + 3 * (cells // COLS) + number) % 160
 
 
 class _Images:
-    """Source of a board's frames that returns a new image at each call."""
+    """Source of board frames that returns a new image at each call."""
 
     def __init__(self) -> None:
         self.number = 0
@@ -48,7 +48,7 @@ class _Images:
 
 
 def why_not_open(sensor: TactileSensor) -> str:
-    """Return the error message if the sensor cannot be opened, otherwise an empty text."""
+    """Return the error message of opening the sensor, or "" on success."""
     try:
         sensor.open()
     except TactileError as error:
@@ -105,7 +105,7 @@ class Rig:
         self._stack.close()
 
     def wait(self, condition: Callable[[Frame], object]) -> Frame:
-        """Advance the time until a frame fulfils ``condition``."""
+        """Advance the time until a frame satisfies ``condition``."""
 
         def holds() -> bool:
             if not isinstance(self.clock, RealClock):
@@ -117,7 +117,7 @@ class Rig:
         return self.sensor.latest()
 
     def unplug(self) -> None:
-        """Remove the board's port, in the thread that serves it."""
+        """Unplug the board's port, in the thread that serves it."""
         self._unplug.set()
 
     def _serve(self) -> None:

@@ -1,4 +1,4 @@
-"""Run a process on its own pseudo-terminal and reproduce the screen that a user would see."""
+"""Run a process on a pseudo-terminal and reconstruct its screen."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from typing import Any
 
 import pyte
 
-_CAPACITY = 1 << 16  # capacity of a terminal's buffer, bytes
+_CAPACITY = 1 << 16  # bytes, capacity of a terminal buffer
 ENVIRONMENT = {"TERM": "xterm-256color", "COLORTERM": "truecolor", "LANG": "C.UTF-8"}
 
 
 class TerminalProcess:
-    """Run ``command`` with a pty as controlling terminal; ``screen`` shows its output."""
+    """Run ``command`` with a pty as its controlling terminal; ``screen`` holds its output."""
 
     def __init__(self, command: list[str], columns: int = 80, lines: int = 24) -> None:
         self.master, self.slave = pty.openpty()
@@ -50,8 +50,8 @@ class TerminalProcess:
     def pump(self, seconds: float = 0.02) -> None:
         """Read the available output; if there is none, wait up to ``seconds`` for it.
 
-        At most one terminal buffer is read, because a page may be written faster than it is
-        processed.
+        At most one terminal buffer is read, because the process may write faster than this one
+        reads.
         """
         end = len(self.written) + _CAPACITY
         while len(self.written) < end and select.select([self.master], [], [], seconds)[0]:
@@ -64,7 +64,7 @@ class TerminalProcess:
         return "\n".join(self.screen.display)
 
     def wait(self, condition: Callable[[], Any], seconds: float = 150.0) -> None:
-        """Read output until ``condition`` holds; fail with the page if it does not."""
+        """Read output until ``condition`` is true; fail with the screen's text otherwise."""
         deadline = time.monotonic() + seconds
         while not condition():
             self.pump()
@@ -82,24 +82,24 @@ class TerminalProcess:
         os.write(self.master, keys)
 
     def press(self, key: bytes, text: str) -> None:
-        """Press a key until ``text`` is shown; on a busy machine the first press may be lost."""
+        """Press a key until ``text`` appears; on a busy machine the first key press may be lost."""
         while text not in self.text():
             self.type(key)
             later = time.monotonic() + 1.0
             self.wait(lambda later=later: text in self.text() or time.monotonic() > later)
 
     def ended(self) -> int:
-        """Wait for the end of the process; return its exit status."""
+        """Wait for the process to end; return its exit status."""
         self.wait(lambda: self.process.poll() is not None)
         self.pump()
         return self.process.returncode
 
     def is_restored(self) -> bool:
-        """Return True if the terminal's modes, main screen, cursor and pasting are restored."""
+        """Return True if terminal modes, main screen, cursor and bracketed paste are restored."""
         self.pump()
         pairs = ((b"\x1b[?1049h", b"\x1b[?1049l"), (b"\x1b[?25l", b"\x1b[?25h"))
         pairs += ((b"\x1b[?2004h", b"\x1b[?2004l"),)
-        # Of each pair, the page must have sent both sequences, and the restoring one last.
+        # Both sequences of each pair must have been sent, the restoring one last.
         given = all(0 <= self.written.rfind(a) < self.written.rfind(b) for a, b in pairs)
         return given and termios.tcgetattr(self.slave) == self.attributes
 

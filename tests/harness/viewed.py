@@ -1,4 +1,4 @@
-"""Run ``softfinger view`` as a process and receive its pictures like a page."""
+"""Run ``softfinger view`` as a process and receive its pictures as a page does."""
 
 import json
 import subprocess
@@ -10,14 +10,14 @@ from websockets.sync.client import connect
 
 from tests.harness.daemon_process import SOFTFINGER
 
-WAIT = 60.0  # s for one picture
+WAIT = 60.0  # s to wait for one picture
 
 
 class Viewed:
-    """Process that serves when constructed.
+    """Process that is serving once constructed.
 
-    ``address`` is the address of the page, ``commanding`` the one with the token. ``folder`` is the
-    working directory, which also receives recordings.
+    ``address`` is the page's address, ``commanding`` the one with the token. ``folder`` is the
+    working directory, where recordings are also stored.
     """
 
     def __init__(self, *words: str, folder: Path | None = None) -> None:
@@ -53,7 +53,7 @@ class Viewed:
 
 
 class Watcher:
-    """Connection of a page that requests pictures."""
+    """A page's connection, which requests pictures."""
 
     def __init__(self, host: str, query: str = "", **more: Any) -> None:
         waits: Any = {"open_timeout": WAIT, "ping_timeout": None}

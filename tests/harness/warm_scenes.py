@@ -1,9 +1,9 @@
-"""Run many kinds of scene in a process and report the kernels that were compiled or loaded.
+"""Run many kinds of scene in a process and report the kernels compiled or loaded.
 
 ``python -m tests.harness.warm_scenes FOLDER SCENE…`` prints one line of JSON per scene. A
 calibration file is written to FOLDER. For the scene with an emulated hand, FOLDER must contain the
-hand's ports. Each scene runs in a fork of a process that has not called any kernel yet, so that
-scenes do not warm up kernels for each other.
+hand's ports. Each scene runs in a fork of a process that has not called any kernel yet, so scenes
+do not warm up kernels for each other.
 """
 
 import contextlib
@@ -67,7 +67,7 @@ class Watch(event.Listener):
         self.heard: list[str] = []
 
     def on_start(self, event: Any) -> None:
-        """Record the callers of the compiler from the stack."""
+        """Record the compiler's callers from the stack."""
         frame, names = sys._getframe(), []
         while frame is not None and len(names) < 40:
             if "/numba/" not in frame.f_code.co_filename:
@@ -80,7 +80,7 @@ class Watch(event.Listener):
 
 
 def run(settings: Settings) -> dict[str, Any]:
-    """Run the script; report compilations before the first tick, in no part, and after."""
+    """Run the script; report compilations before the first tick, outside all parts, and later."""
     watch = Watch()
     modes, faults = [], []
     with event.install_listener("numba:compiler_lock", watch):
@@ -91,7 +91,7 @@ def run(settings: Settings) -> dict[str, Any]:
     with event.install_listener("numba:compiler_lock", watch), hand:
         for wait, request in SCRIPT:
             hand.loop.advance(wait)
-            for _ in range(300):  # in real time a busy machine may take long
+            for _ in range(300):  # in real time, a busy machine may take long
                 if hand.loop.state.mode not in ("grasping", "rotating"):
                     break
                 hand.loop.advance(0.1)
@@ -107,7 +107,7 @@ def run(settings: Settings) -> dict[str, Any]:
 
 
 def calibrated(folder: Path) -> dict[str, Any]:
-    """Return settings of a left sensor with a calibration, so that its frames are pressures."""
+    """Return settings with a calibrated left sensor, whose frames are thus pressures."""
     settings = Settings()
     cells = [[0.0] * settings.tactile.cols for _ in range(settings.tactile.rows)]
     tare = TareStep(date=now(), zero=cells, noise=1520.0, frames=16)
@@ -118,7 +118,7 @@ def calibrated(folder: Path) -> dict[str, Any]:
 
 
 def main(folder: Path, names: list[str]) -> None:
-    """Run each of the named scenes in a fork."""
+    """Run each named scene in a fork."""
     sections = {**SCENES, CALIBRATED: calibrated(folder)}
     scenes = {
         name: Settings.model_validate({"loop": {"clock": "virtual"}, **scene})

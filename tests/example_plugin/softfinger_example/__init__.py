@@ -1,1 +1,1 @@
-"""Backends of another package, as small as they can be."""
+"""Minimal backends in a separate package."""

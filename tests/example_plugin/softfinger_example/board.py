@@ -1,4 +1,4 @@
-"""A board whose cells all read the same, up and down in turn."""
+"""Tactile board whose cells all show the same alternating count."""
 
 import numpy as np
 from pydantic import Field
@@ -10,13 +10,13 @@ from softfinger.daemon.types import Frame
 
 
 class PulseSettings(Section):
-    """``[plugins.pulsing]``."""
+    """Settings of the section ``[plugins.pulsing]``."""
 
     height: int = Field(default=3, ge=0, le=1000)  # counts
 
 
 class PulsingBoard:
-    """A frame every 1/rate s, made when it is asked for."""
+    """Board that generates a frame every 1/rate s, on demand."""
 
     Settings = PulseSettings
 
@@ -35,7 +35,7 @@ class PulsingBoard:
         self._frame = Frame(1, self._start, self._start, True, np.zeros(self._shape, np.uint16))
 
     def latest(self) -> Frame | None:
-        """The frame that is due."""
+        """Return the latest due frame."""
         frame = self._frame
         if frame is not None:
             number = 1 + int((self._clock.now() - self._start) / self._period)
@@ -46,9 +46,9 @@ class PulsingBoard:
         return self._frame
 
     def counters(self) -> dict[str, int]:
-        """How many frames there were."""
+        """Return the number of frames generated."""
         return {"frames": 0 if self._frame is None else self._frame.seq}
 
     def close(self) -> None:
-        """Deliver nothing more."""
+        """Deliver no further frames."""
         self._frame = None

@@ -1,4 +1,4 @@
-"""Joints that follow their goals at once while torque is on."""
+"""Servos whose joints follow their goals immediately while torque is on."""
 
 from softfinger.daemon.clock import Clock
 from softfinger.daemon.profile.settings import Settings
@@ -6,7 +6,7 @@ from softfinger.daemon.types import Goal, Reading
 
 
 class FollowingServos:
-    """No bus, no motor: what was written is what is read."""
+    """Servos without bus and motor: the last goal is the measured position."""
 
     def __init__(self, settings: Settings, clock: Clock) -> None:
         self._clock = clock
@@ -14,10 +14,10 @@ class FollowingServos:
         self._on = False
 
     def connect(self) -> None:
-        """Nothing to connect."""
+        """Do nothing, as there is no bus."""
 
     def read(self, reading: Reading) -> None:
-        """Angles as they are, at rest."""
+        """Return the current angles, with zero velocity."""
         reading.seq += 1
         reading.t = self._clock.now()
         reading.q[:] = self._q
@@ -28,20 +28,20 @@ class FollowingServos:
         self._on = True
 
     def torque_off(self, reading: Reading) -> bool:
-        """Follow nothing any more."""
+        """Ignore goals from now on."""
         self._on = False
         self.read(reading)
         return True
 
     def write(self, goal: Goal) -> None:
-        """Be there."""
+        """Move to the goal immediately if torque is on."""
         if self._on:
             self._q = list(goal.q)
 
     def counters(self) -> dict[str, int]:
-        """Nothing goes wrong."""
+        """Return no errors."""
         return {}
 
     def close(self) -> None:
-        """Let go."""
+        """Do nothing, as nothing is open."""
         self._on = False
