@@ -12,8 +12,8 @@ from softfinger.kinematics.compiled.kernel import kernel
 from tests.fuzz import Report
 from tests.harness.plant import BOUNDED, CURRENT, PAPER, POSITION, TABLE_I, make
 
-LONGER = 10  # in one of three hands, factor on the step chosen by the plant
-EACH = 400  # commands for each hand
+LONGER = 10  # in one of three hands, the step is multiplied by this factor
+EACH = 400  # commands per hand
 SHAPES = ("rectangle", "rectangle", "disc", "wedge", "none")
 # Columns: joint, mode, torque on, goal, current, three load components, load set, reset, seconds,
 # quiet.
@@ -155,7 +155,7 @@ def abuse(seed: int, count: int = EACH) -> str:
 
 
 def fuzz(count: int, seed: int) -> Report:
-    """Send ``count`` commands in total, EACH of them to a hand of its own."""
+    """Send ``count`` commands in total, with a new hand after every EACH commands."""
     hands = max(count // EACH, 1)
     found = [abuse(each) for each in range(1000 * seed, 1000 * seed + hands)]
     return Report(hands, [each for each in found if each])

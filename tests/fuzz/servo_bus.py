@@ -38,7 +38,7 @@ def fuzz(count: int, seed: int) -> Report:
     t = 0.0
     for _ in range(count):
         packet = mutated(source, source.choice(SEEDS))
-        if source.random() < 0.7:  # most packets get a valid CRC, so that the bus processes them
+        if source.random() < 0.7:  # most packets get a valid CRC, so the bus processes them
             packet = packet[:-2] + crc16(packet[:-2]).to_bytes(2, "little")
         t += source.choice((0.0, 0.0002, 0.002, 0.02))
         bus.feed(packet, t)
@@ -49,7 +49,10 @@ def fuzz(count: int, seed: int) -> Report:
 
 
 def _answers_alone(bus: ServoBus, servo: EmulatedServo, t: float) -> bool:
-    """Return True if the servo answers a ping with the others silent, as all may share one ID."""
+    """Return True if the servo replies to a ping while the others are silent.
+
+    The others are silenced because all servos may have the same ID.
+    """
     for each in bus.servos:
         each.silent = each is not servo
     servo.table.set(reg.PROTOCOL_TYPE, 2)  # a write may have set it to 1

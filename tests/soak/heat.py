@@ -23,19 +23,19 @@ from softfinger.tools.simulated_daemon import SimulatedDaemon
 LIMIT = 70.0  # °C
 _DT = 0.5  # s
 _MODELS = ("XM430-W350", "XL330-M288")
-_LONG = 8000.0  # s, long enough to reach a steady state
+_LONG = 8000.0  # s, long enough to reach steady state
 
 
 class Foreseen(NamedTuple):
     """Result of the prediction for one hold."""
 
     warned: float  # s from the warning until the reading reached the limit
-    told: float  # s predicted when 60 s were left
-    lasted: float  # s in total
+    told: float  # s predicted when 60 s remained
+    lasted: float  # s, total duration
 
 
 class Bench:
-    """Servo with hidden constants, and the daemon's watch on its readings."""
+    """Servo with hidden constants, and the daemon's temperature prediction for it."""
 
     def __init__(self, seed: int) -> None:
         self.chance = chance = random.Random(seed)
@@ -62,7 +62,7 @@ class Bench:
         return low
 
     def step(self, current: float) -> float:
-        """Advance by _DT with this current [A]; return the predicted time until the limit [s]."""
+        """Advance by _DT at this current [A]; return the predicted time until the limit [s]."""
         self.t += _DT
         noisy = current * (1.0 + 0.03 * self.chance.gauss(0.0, 1.0))
         self.plant.step(current, _DT)
@@ -75,7 +75,7 @@ class Bench:
 
 
 def foreseen(seed: int) -> Foreseen:
-    """Hold with too high a current until the reading reaches the limit."""
+    """Hold an excessive current until the reading reaches the limit."""
     bench = Bench(seed)
     chance = bench.chance
     current = bench.lasting_current() * chance.uniform(1.15, 1.8)
@@ -91,9 +91,9 @@ def foreseen(seed: int) -> Foreseen:
 
 
 def least_at_half_load(seed: int, seconds: float = 3600.0) -> float:
-    """Hold half the lasting current, with the room 8 °C warmer from half-time.
+    """Hold half the lasting current; at half-time the room becomes 8 °C warmer.
 
-    Returns the shortest predicted time until the limit [s].
+    Returns the minimum predicted time until the limit [s].
     """
     bench = Bench(seed)
     current, least = 0.5 * bench.lasting_current(), _LONG
@@ -105,15 +105,15 @@ def least_at_half_load(seed: int, seconds: float = 3600.0) -> float:
 
 
 class Held(NamedTuple):
-    """Result of a grip that was too hard to last."""
+    """Result of a grip with more force than the servos can sustain."""
 
-    dropped: bool  # by the fault of a hot servo, or in any other way
+    dropped: bool  # the object was dropped, by the fault of a hot servo or otherwise
     force: float  # N requested at the end
     events: list[str]
 
 
 def held(seed: int, seconds: float = 400.0) -> Held:
-    """Grip with 20 to 26 N with a complete hand whose servos have a fifth of the heat capacity."""
+    """Grip with 20 to 26 N on a complete hand whose servos have a fifth of the heat capacity."""
     chance = random.Random(seed)
     factors = (
         chance.uniform(0.9, 1.33),
@@ -129,7 +129,7 @@ def held(seed: int, seconds: float = 400.0) -> Held:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Print the share of runs that met each aim; return 1 if an aim was missed."""
+    """Print the fraction of runs that met each aim; return 1 if an aim was missed."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seed", type=int, default=0, help="of the first run")
     parser.add_argument("--runs", type=int, default=40)

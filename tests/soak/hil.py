@@ -1,10 +1,10 @@
-"""Soak in real time with hardware in the loop: ``python -m tests.soak.hil``, one hour.
+"""Real-time hardware-in-the-loop soak: ``python -m tests.soak.hil``, one hour.
 
 The daemon's process runs on an emulated hand, with a recorder, three subscribers and a client that
-grasps, turns, moves, releases and streams setpoints at 50 Hz. Meanwhile, servos, boards and the
-daemon itself are disturbed by faults. The emulated hand's record of the servo bus is judged every
-few seconds. The memory of each process must stay constant, all lost messages must be counted, the
-ticks at the end must be as punctual as at the beginning, and three of ten grasps must reach a hold.
+grasps, turns, moves, releases and streams setpoints at 50 Hz. Meanwhile, faults disturb servos,
+boards and the daemon itself. Every few seconds the emulated hand's record of the servo bus is
+checked. The memory of each process must stay constant, all lost messages must be counted, the ticks
+at the end must be as punctual as at the beginning, and three of ten grasps must reach a hold.
 Faults caused by a busy machine are counted, reported and cleared.
 """
 
@@ -36,21 +36,21 @@ from tests.soak.rig import CASES, End, Rig, judge_wire
 
 SECONDS = 3600.0
 SUBSCRIBERS = 3
-_LOOK = 5.0  # s between two checks of bus and memory
-# s at both ends in which lateness and memory are compared, at most a third of the run
+_LOOK = 5.0  # s between checks of bus and memory
+# Length of the compared windows at both ends, in s; at most a third of the run.
 _WINDOW = 600.0
-_FLAT = 2.0  # MB by which a process may grow
+_FLAT = 2.0  # MB, maximum growth of a process
 _FAULT_EVERY = 40.0  # s on average
 _FAULT_FOR = 0.3
-_SETPOINT = 0.02  # s between two setpoints
-_STREAM = 3.0  # s for which setpoints are streamed
+_SETPOINT = 0.02  # s between setpoints
+_STREAM = 3.0  # s, duration of a setpoint stream
 _SPLIT = 300  # s per file of the recorder, which keeps an index until the file is closed
-# Faults after stops that leave the object tilted; it is then put upright.
+# Faults that leave the object tilted after a stop; it is then put upright.
 _ASKEW = ("hand.angle", "tip.tilt")
-_DROPPED = 20.0  # s without a grip after which the object, which has slipped away, is put back
-_HELD = 0.3  # fraction of grasps that must reach a hold
-_MANY = 50  # number of grasps from which that is required
-_BEGUN = 1500  # largest difference between the states received by the first and the last listener
+_DROPPED = 20.0  # s without a grip after which an object that slipped away is put back
+_HELD = 0.3  # minimum fraction of grasps that must reach a hold
+_MANY = 50  # number of grasps above which this is required
+_BEGUN = 1500  # maximum difference between the numbers of states received by any two listeners
 
 
 @dataclass
@@ -60,25 +60,25 @@ class Account:
     seconds: float = 0.0
     ticks: int = 0
     overruns: int = 0
-    modes: Counter[str] = field(default_factory=Counter)  # number of checks in each mode
+    modes: Counter[str] = field(default_factory=Counter)  # number of checks per mode
     done: Counter[str] = field(default_factory=Counter)  # accepted commands
     injected: Counter[str] = field(default_factory=Counter)
     faults: Counter[str] = field(default_factory=Counter)
     held: int = 0  # grips that reached a hold
     placed: int = 0  # number of times the object was put upright
-    # (received, lost) of each subscriber
+    # (received, lost) per subscriber
     received: list[tuple[int, int]] = field(default_factory=list)
     recorded: tuple[int, int] = 0, 0  # states in the recorder's files, lost states
     wrong: list[str] = field(default_factory=list)
-    # MB of private memory of each process.
+    # MB of private memory per process, at each check.
     memory: dict[str, list[float]] = field(default_factory=dict)
-    # s, lateness of each state's tick.
+    # s by which the tick of each state was late.
     late: array[float] = field(default_factory=lambda: array("f"))
-    # (time [s], number of `late` values at that time)
+    # (time [s], number of `late` values so far)
     looked: list[tuple[float, int]] = field(default_factory=list)
 
     def growth(self) -> dict[str, float]:
-        """Return the growth of each process's memory after the first window [MB]."""
+        """Return each process's memory growth after the first window [MB]."""
         looks = [t for t, _ in self.looked]
         warm = int(np.searchsorted(looks, self.window))
         return {
@@ -88,11 +88,11 @@ class Account:
 
     @property
     def window(self) -> float:
-        """Length of the beginning and the end [s]."""
+        """Length of the window at the beginning and at the end [s]."""
         return min(_WINDOW, self.seconds / 3.0)
 
     def lateness(self) -> tuple[float, float]:
-        """Return p99.9 of the ticks' lateness in the first and in the last window [s]."""
+        """Return p99.9 of the tick delays in the first and last window [s]."""
         times, counts = np.array(self.looked).reshape(-1, 2).T
         first = int(np.interp(self.window, times, counts))
         last = int(np.interp(self.seconds - self.window, times, counts))
@@ -208,7 +208,7 @@ def _next(chance: random.Random, mode: str) -> dict[str, object] | None:
 
 
 def _teleoperate(rig: Rig, account: Account, chance: random.Random) -> None:
-    """Stream force and angle for a while, in the way of a teleoperator's hand."""
+    """Stream force and angle setpoints for a while, as a teleoperation device does."""
     force, swing, pace = chance.uniform(4, 10), chance.uniform(0.02, 0.15), chance.uniform(2, 8)
     begin = time.monotonic()
     while (t := time.monotonic() - begin) < _STREAM:
@@ -226,7 +226,7 @@ def _inject(rig: Rig, account: Account, chance: random.Random) -> End:
 
 
 def _listen(rig: Rig, account: Account, seconds: float) -> None:
-    """Receive states for ``seconds`` and record the lateness of their ticks."""
+    """Receive states for ``seconds`` and record their tick delays."""
     end = time.monotonic() + seconds
     while (left := end - time.monotonic()) > 0:
         account.late.extend(state["wake_late_s"] for state in rig.states(left))
@@ -234,7 +234,7 @@ def _listen(rig: Rig, account: Account, seconds: float) -> None:
 
 @contextmanager
 def _listeners(rig: Rig, account: Account) -> Iterator[dict[str, int]]:
-    """Run recorder and subscribers; yield the name and ID of each process."""
+    """Run recorder and subscribers; yield each process's name and ID."""
     assert rig.daemon is not None
     assert rig.hand is not None
     file = rig.folder / "soak.mcap"
@@ -307,7 +307,7 @@ def _conclude(account: Account) -> None:
 
 
 def subscribe(address: str) -> None:
-    """Print "ready" at the first state, and at the end the number of received and lost states."""
+    """Print "ready" at the first state, and finally the numbers of received and lost states."""
     received = 0
     with StopCondition() as ending, Hand(address, timeout=60.0) as hand, hand.stream(1.0) as states:
         ending.begin()

@@ -25,21 +25,22 @@ from softfinger.daemon.simulation.emulator.folder import NoEmulator, send_words
 from softfinger.daemon.wire.schema import STATE
 from softfinger.tools.benchmarks.rigs import HIL, SOFTFINGER, RigError, emulator
 
-_PATIENCE = 300.0  # s for a process to become ready, including the compilation of kernels
+_PATIENCE = 300.0  # s to wait for a process to become ready, including kernel compilation
 _STATE_RATE = 250.0  # Hz
-# Only for the start: a busy machine may delay the emulated hand's first bytes.
+# Only for start-up, because a busy machine may delay the emulated hand's first bytes.
 _PATIENT = [word for key in ("servos", "tactile") for word in ("--set", f"{key}.open_timeout=60")]
-_POLL = 0.003  # s between two polls of the stream
+_POLL = 0.003  # s between polls of the stream
 _SLACK = 0.05  # s by which a process may be late
-_RESOLUTION = 0.0016  # rad, one count of the servo's encoder
+_RESOLUTION = 0.0016  # rad, one encoder count
 _CURRENT_UNIT = 0.0027  # A
-_ROOM = 1 << 18  # bytes that a daemon without memory may still allocate
+_ROOM = 1 << 18  # bytes that the daemon may still allocate when its memory is limited
 
 
 class Rig:
     """Emulated hand and daemon as two processes that can be restarted.
 
-    The data sent to the servos are read from the emulated hand's record, never from the daemon.
+    Checks of the data sent to the servos use the emulated hand's record, never the daemon's
+    reports.
     """
 
     def __init__(self) -> None:
@@ -73,7 +74,7 @@ class Rig:
             self.start_daemon(*words)
 
     def start_daemon(self, *more: str) -> None:
-        """Start the daemon and wait for its first answer; may raise RigError."""
+        """Start the daemon and wait for its first reply; may raise RigError."""
         end = time.monotonic() + _PATIENCE
         words = ["run", "--config", str(self.config), "--dir", str(self.ports), *_PATIENT, *more]
         log = str(self.folder / "daemon.log")
@@ -137,7 +138,7 @@ class Rig:
         return reply
 
     def report(self, more: str = "") -> dict[str, Any]:
-        """Return the record of the servo bus; ``more``: ``forget`` starts a new record."""
+        """Return the record of the servo bus; ``forget`` in ``more`` starts a new record."""
         report: dict[str, Any] = json.loads(self.send(f"report {more}"))
         return report
 
@@ -146,7 +147,7 @@ class Rig:
         return send(self.commands, request, timeout)
 
     def status(self, timeout: float = 0.5) -> dict[str, Any] | None:
-        """Return the daemon's status; None if it does not answer."""
+        """Return the daemon's status, or None if it does not reply."""
         try:
             status = self.ask({"command": "status"}, timeout)
         except NoAnswer:
@@ -168,7 +169,7 @@ Inject = Callable[[Rig, random.Random], End]
 
 
 def _sent(begin: str, end: str = "well", *, places: tuple[Any, ...] = ("",)) -> Inject:
-    """Return a fault that sends words to the emulated hand; ``{}`` stands for one of ``places``."""
+    """Return a fault that sends words to the emulated hand, with one of ``places`` for ``{}``."""
 
     def inject(rig: Rig, chance: random.Random) -> End:
         place = chance.choice(places)
@@ -195,7 +196,7 @@ def _stood_still(rig: Rig, chance: random.Random) -> End:
 
 
 def _without_memory(rig: Rig, chance: random.Random) -> End:
-    """Limit the daemon's address space to almost its present size, and send requests meanwhile."""
+    """Limit the daemon's address space to slightly above its current size, and send requests."""
     assert rig.daemon is not None
     process = rig.daemon.pid
     _, hard = resource.prlimit(process, resource.RLIMIT_AS)
@@ -229,7 +230,7 @@ CASES: dict[str, Inject] = {
 
 
 def judge_wire(rig: Rig) -> str:
-    """Return an error found in the emulated hand's record of the servo bus, or an empty text.
+    """Return an error found in the emulated hand's record of the servo bus, or "".
 
     Goals must be within their limits. While torque is on, packets must keep arriving, and torque
     must not be switched on far from the goal.

@@ -1,13 +1,14 @@
-"""Soak on the virtual clock: random sequences of commands, loads and faults, each from a seed.
+"""Virtual-time soak: random sequences of commands, loads and faults, each from a seed.
 
-``python -m tests.soak.virtual`` runs a thousand sequences of 10 s. Most of them grip; from there
-they are loaded, turned, disturbed by faulty measurements and stopped. The daemon is complete except
-for its sockets. Requirements are judged from the plant and from the data sent to the servos, never
-from the daemon's own reports. The number of judgements of each requirement is counted, and a soak
-that never judges one of them fails. The tests run a few sequences.
+``python -m tests.soak.virtual`` runs a thousand sequences of 10 s. Most of them grip; the grips are
+then loaded, turned, disturbed by faulty measurements and stopped. The daemon is complete except for
+its sockets. Requirements are checked against the plant and the data sent to the servos, never
+against the daemon's own reports. The number of checks of each requirement is counted, and a soak
+that never checks one of them fails. The tests run a few sequences.
 
-``--ticks 14400000`` runs one hand for eight hours of its time, with its stream recorded and read.
-It counts violations, continues, and fails if memory grows or a state is inconsistent.
+``--ticks 14400000`` runs one hand for eight hours of virtual time, with its stream recorded and
+read. Violations are counted without ending the run, which fails if memory grows or a state is
+inconsistent.
 """
 
 import argparse
@@ -43,30 +44,30 @@ from softfinger.daemon.wire.schema import INPUT, TOPICS
 from softfinger.tools.recordings.record import RecordingWriter
 
 SEQUENCES, TICKS = 1000, 5000
-LONG = 1_000_000  # ticks from which a sequence counts as long
+LONG = 1_000_000  # ticks; longer sequences count as long
 HELD = 0.3  # fraction of the sequences that must reach a hold
 _GRIPPING = ("grasping", "holding", "rotating")
-_COMMAND_EVERY = 150  # ticks between two commands on average
-_DISTURBED_EVERY = 800  # ticks between two loads or faults on average
+_COMMAND_EVERY = 150  # average ticks between commands
+_DISTURBED_EVERY = 800  # average ticks between loads or faults
 _DISTURBED_FOR = 500
-_WILD = 0.1  # fraction of the commands that are drawn regardless of the mode
+_WILD = 0.1  # fraction of commands drawn regardless of the mode
 _LOOKS = 96  # memory checks in a long sequence
-_WARM = 2  # memory checks during the warm-up: ten minutes of eight hours
-_FLAT = 2.0  # MB by which memory may grow after the warm-up
+_WARM = 2  # memory checks excluded as warm-up: ten minutes of eight hours
+_FLAT = 2.0  # MB, maximum memory growth after the warm-up
 _STREAM = {"state_rate": 20.0, "tactile_rate": 10.0}  # Hz, in a long sequence
 _SPLIT = 16e6  # bytes per file of its recording
-# In "deaf", written data are lost but readings arrive. In "jumped", the angle is off by 0.2 rad.
-# In "numb", angle, velocity and current stay constant.
+# With "deaf", written data are lost but readings arrive. With "jumped", the angle is off by 0.2
+# rad. With "numb", angle, velocity and current stay constant.
 SERVO_FAULTS = (
     *("silent", "gone", "deaf", "alert", "hot", "low", "fast", "stuck", "strayed"),
     *("jumped", "numb"),
 )
-_ENCODER = ("fast", "strayed", "jumped", "numb")  # the frames also disagree with the joint
+_ENCODER = ("fast", "strayed", "jumped", "numb")  # the joint angle also contradicts the frames
 _UNHEARD = ("silent", "gone", "deaf")  # the servo does not receive torque off
-_WATCHDOG = 100  # ticks (0.2 s) within which the servo watchdogs then stop the motors
-_LOST = 20  # consecutive lost goals that are noticed
+_WATCHDOG = 100  # ticks (0.2 s) until the servo watchdogs stop the motors
+_LOST = 20  # consecutive lost goals that are detected
 SENSOR_FAULTS = ("no frames", "frozen", "full", "zero", "noise", "invalid")
-# Faulty measurements of a sensor or a servo's current: range of values, channel that may be named.
+# Faults of a sensor or current measurement: range of values, channel that may be named.
 LIES = {
     "gain": ((0.5, 1.6), "sensor"),
     "shift-x": ((-4.0, 4.0), "sensor"),
@@ -77,12 +78,12 @@ LIES = {
     "current": ((0.4, 2.5), "current"),
 }
 LOADS = ("push", "twist")
-_TOO_LONG = 0.05  # s for which a tip's force may exceed its bound
-_TOO_MUCH = 1.3  # ratio to the requested force without a reason for more
-_UNSURE = 1.2  # ratio to the highest raised force, because tips that carry a load differ
-_REMEMBERED = 5.0  # s after a load or a faulty measurement in which a grip may still be raised
-_RETARGETED = 0.5  # s in which the force of the previous request may persist
-_UNCOVERED = 1.0  # s after which a tip near the object's edge no longer counts
+_TOO_LONG = 0.05  # s, maximum time for which a tip's force may exceed its bound
+_TOO_MUCH = 1.3  # maximum ratio to the requested force if there is no reason for more
+_UNSURE = 1.2  # ratio to the maximum raised force, because tips that carry a load differ
+_REMEMBERED = 5.0  # s after a load or a measurement fault during which a grip may still be raised
+_RETARGETED = 0.5  # s for which the force of the previous request may persist
+_UNCOVERED = 1.0  # s after which a tip near the object's edge is no longer considered
 
 # Requirements, each of which is counted.
 STOPPED = {mode: f"no torque after a stop while {mode}" for mode in ("holding", "rotating")}
@@ -116,7 +117,7 @@ class Judge:
         self._broken = broken
 
     def __call__(self, name: str, holds: bool, *found: object) -> None:
-        """Count ``name``; if it does not hold, raise AssertionError with ``found``."""
+        """Count ``name``; if the requirement is violated, raise AssertionError with ``found``."""
         self._judged[name] += 1
         if not holds and self._broken is not None:
             self._broken[name] += 1
@@ -125,7 +126,7 @@ class Judge:
 
 
 class Listener(Link):
-    """Replacement for the gateway that reads and records all published messages."""
+    """Replacement for the gateway that receives and records all published messages."""
 
     def __init__(self, folder: Path) -> None:
         super().__init__()
@@ -169,7 +170,7 @@ class FaultyServos:
         self.finger = 0
         self.last_good = -math.inf
         self.torque = False
-        self.armed = False  # armed, and no event has ended this state
+        self.armed = False  # armed, and this state has not been ended by an event
         self._last = 0.0  # angle of a joint that is numb [rad]
         self._unheard = 0
 
@@ -260,7 +261,7 @@ class FaultyServos:
 
 
 class FaultySensor:
-    """Sensor whose frames stop, freeze or become faulty on demand."""
+    """Sensor whose frames stop, freeze or become wrong on demand."""
 
     def __init__(self, sensor: Any, settings: Settings, source: np.random.Generator) -> None:
         self._sensor = sensor
@@ -269,7 +270,7 @@ class FaultySensor:
         self._given: Frame | None = None
         self._seen: Frame | None = None
         self.fault = ""
-        self.last_sent = 0.0  # arrival of the last valid frame of a sensor without fault [s]
+        self.last_sent = 0.0  # arrival of the last valid frame of a fault-free sensor [s]
 
     def open(self) -> None:
         self._sensor.open()
@@ -318,7 +319,8 @@ class Account:
     modes: Counter[str] = field(default_factory=Counter)  # ticks in each mode
     faults: Counter[str] = field(default_factory=Counter)  # latched faults by name
     injected: Counter[str] = field(default_factory=Counter)
-    named: Counter[str] = field(default_factory=Counter)  # named channel, with the actual fault
+    # Named channels, together with the actual fault.
+    named: Counter[str] = field(default_factory=Counter)
     commands: Counter[str] = field(default_factory=Counter)  # accepted commands
     refused: int = 0
     failures: list[str] = field(default_factory=list)
@@ -328,7 +330,7 @@ class Account:
 
     @property
     def growth(self) -> float:
-        """Largest growth of memory after the warm-up [MB]."""
+        """Maximum memory growth after the warm-up [MB]."""
         return max(self.memory) - self.memory[0] if self.memory else 0.0
 
     @property
@@ -337,7 +339,7 @@ class Account:
         return [name for name in ASSERTIONS if not self.judged[name]]
 
     def lines(self) -> list[str]:
-        """Return a report for people."""
+        """Return a readable report."""
         return [
             *(f"{self.judged[name]:>10}  {name}" for name in ASSERTIONS),
             f"{self.held} of {self.sequences} sequences came to hold; {self.ticks} ticks in "
@@ -362,7 +364,7 @@ class Account:
 
 
 class Soak:
-    """One sequence: a daemon on the virtual clock, random actions and requirements."""
+    """One sequence: a daemon on the virtual clock, random actions, and requirements."""
 
     def __init__(
         self, seed: int = 1, account: Account | None = None, listener: Listener | None = None
@@ -398,20 +400,20 @@ class Soak:
         self.hand.plant.parameters.torque_constant *= chance.uniform(0.9, 1.1)
         self.count = 0  # ticks so far
         self.held = False
-        self.off_by = math.inf  # tick by which torque must be off
+        self.off_by = math.inf  # tick until which torque must be off
         self._off_name = OFF
         self._failed = ""
         self._deadline = clock.now()
         self._next_command = 1
         self._next_disturbance = self._after(_DISTURBED_EVERY)
         self._well_at = math.inf  # tick at which a disturbance ends
-        self._lie = ""  # kind of the current faulty measurement
+        self._lie = ""  # kind of the current measurement fault
         self._false: set[str] = set()  # channels that have been faulty and may be named
         self._loaded = 0.0  # N along the faces
-        # s, last times of these states
+        # s, most recent times of these conditions
         self._loaded_t = self._lied_t = self._uncovered_t = -math.inf
         self._asked: list[tuple[float, float]] = []  # (time [s], force [N]); empty without a grip
-        # Start of the current period above the bound [s].
+        # Start of the current interval above the bound [s].
         self._above = {MOST: math.inf, CALM: math.inf}
 
     def close(self) -> None:
@@ -479,7 +481,7 @@ class Soak:
             self._carried_out(request, str(mode))
 
     def _carried_out(self, request: dict[str, Any], mode: str) -> None:
-        """Record the consequences of an accepted command."""
+        """Record the effects of an accepted command."""
         name = request["command"]
         if name == "arm":
             self.servos.armed, self.off_by = True, math.inf
@@ -488,14 +490,14 @@ class Soak:
         if name == "grasp" or (name == "hold" and ("force" in request or mode not in _GRIPPING)):
             force = request.get("force", self.settings.control.force_default)
             t = self.daemon.clock.now()
-            if not self._asked:  # a motion may have pressed harder
+            if not self._asked:  # a motion may have applied a higher force
                 self._asked.append((t, max(self.hand.force.tolist())))
             self._asked.append((t, force))
         elif name in ("arm", "move", "release", "stop", "disarm"):
             self._asked.clear()
 
     def _must_end(self, name: str) -> None:
-        """Require that motors are off from now on and that goals are no longer sent."""
+        """Require that the motors are off from now on and that no goals are sent."""
         if not self.servos.armed:
             return
         self.servos.armed = False
@@ -517,7 +519,7 @@ class Soak:
         return chance.uniform(low, high)
 
     def _disturb(self) -> None:
-        """Start a load, a faulty measurement, or a fault of a servo or a sensor."""
+        """Start a load, a measurement fault, or a fault of a servo or a sensor."""
         self._mend()
         chance, t = self._random, self.daemon.clock.now()
         self._well_at = self.count + self._after(_DISTURBED_FOR)
@@ -545,7 +547,7 @@ class Soak:
         self.account.injected[kind] += 1
 
     def _load(self, kind: str) -> None:
-        """Apply a load up to the limit of the grip, and in some cases above it."""
+        """Apply a load up to the grip's limit, and sometimes above it."""
         chance, friction = self._random, self.settings.simulation.tip_friction
         force = self._asked[-1][1] if self._asked else 5.0
         share = chance.uniform(-0.7, 0.7) if chance.random() < 0.8 else chance.uniform(-1.6, 1.6)
@@ -564,7 +566,7 @@ class Soak:
         self.hand.load()
 
     def _put_object_back(self) -> None:
-        """Put the object back if loads have moved it and the fingers leave room at its place."""
+        """Put the object back if loads have moved it and the fingers leave room for it."""
         hand, (x, y) = self.hand, self.settings.simulation.object_position
         pose = hand.object_pose.copy()
         if hand.force.any() or (math.dist(pose[:2], (x, y)) < 0.003 and abs(pose[2]) < 0.03):
@@ -629,7 +631,7 @@ class Soak:
             self.must(FRAME, age <= most + 1e-9, f"{mode} on one {age:.3f} s old")
 
     def _judge_forces(self, t: float) -> None:
-        """Check that no force of the plant exceeds its bound for long."""
+        """Check that each force of the plant exceeds its bound only briefly."""
         control, most = self.settings.control, self.settings.safety.force_max
         if self._loaded:
             self._loaded_t = t
@@ -650,7 +652,7 @@ class Soak:
         bound = _TOO_MUCH * asked
         if loaded:
             bound = max(bound, _UNSURE * min(raised, GRIP_FRACTION * most))
-        bound += 2.0 * friction  # once for its compensation, once for holding
+        bound += 2.0 * friction  # once for the compensation, once for static friction
         lied = t < self._lied_t + _REMEMBERED
         name = RAISED if loaded else LIED if lied else CALM
         self._must_end_soon(CALM, name, force, bound, t)
@@ -688,7 +690,7 @@ class Soak:
                 yield f"{side}_current"
 
     def _names(self, name: str) -> None:
-        """Check that a channel named as faulty is faulty, unless the object has slipped away."""
+        """Check that a channel reported as faulty is faulty, unless the object has slipped away."""
         t = self.daemon.loop.state.t
         wrong = self._lie or self.servos.fault or "".join(each.fault for each in self.sensors)
         self.account.named[f"{name} ({wrong or ('load' if self._loaded else 'nothing')})"] += 1
@@ -699,7 +701,7 @@ class Soak:
             )
 
     def _covered(self) -> bool:
-        """Return True if, in the plant, the object's faces cover the footprints of both tips."""
+        """Return True if the plant's object covers the footprints of both tips."""
         hand, simulation = self.hand, self.settings.simulation
         x, y, angle = hand.object_pose.tolist()
         sine, cosine, radius = math.sin(angle), math.cos(angle), self.settings.tip.radius
@@ -720,7 +722,7 @@ def resident() -> float:
 
 
 def sequence(seed: int, ticks: int, account: Account) -> None:
-    """Run the sequence of ``seed`` and add violations to the account."""
+    """Run the sequence with ``seed`` and add violations to the account."""
     soak = Soak(seed, account)
     try:
         soak.run(ticks)
@@ -733,7 +735,7 @@ def sequence(seed: int, ticks: int, account: Account) -> None:
 
 
 def long_sequence(seed: int, ticks: int, account: Account) -> None:
-    """Run one hand for a long time with a listener, and check the memory meanwhile."""
+    """Run one hand for a long time with a listener and memory checks."""
     with tempfile.TemporaryDirectory() as folder:
         listener = Listener(Path(folder))
         soak = Soak(seed, account, listener)
@@ -765,7 +767,7 @@ def main() -> int:
     account.seconds = time.monotonic() - begin
     print("\n".join(account.lines()))
     few = account.held < HELD * account.sequences
-    # A long sequence may contain a few violations of forces.
+    # A long sequence may contain a few force violations.
     broken = account.failures or account.broken[STATE]
     return 1 if broken or account.never or few or account.growth > _FLAT else 0
 
