@@ -1,1 +1,1 @@
-"""Tests that start processes, pseudo-terminals or whole daemons in real time."""
+"""Tests with processes, pseudo-terminals or daemons in real time."""

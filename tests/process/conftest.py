@@ -1,4 +1,4 @@
-"""What several of these tests share: buses, backends on them, a daemon, and a made-up one."""
+"""Provide shared fixtures: servo buses, connected backends, a daemon and a fake daemon."""
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
@@ -19,33 +19,33 @@ Connect = Callable[..., DynamixelServos]
 
 @pytest.fixture
 def running() -> Iterator[Run]:
-    """Starts buses that end with the test: a given one, or the settings' servos."""
+    """Return a function that runs a given bus, or the settings' servos, until the test ends."""
     with ExitStack() as stack:
         yield lambda *bus, **options: stack.enter_context(closing(RunningBus(*bus, **options)))
 
 
 @pytest.fixture
 def bus(running: Run) -> RunningBus:
-    """A bus with the settings' servos."""
+    """Return a running bus with the settings' servos."""
     return running()
 
 
 @pytest.fixture
 def connect(running: Run) -> Iterator[Connect]:
-    """Connects backends, which close before their buses end."""
+    """Return a function that connects backends; they are closed before their buses."""
     with ExitStack() as stack:
         yield lambda bus, **servos: stack.enter_context(closing(connected(bus, **servos)))
 
 
 @pytest.fixture
 def fake() -> Iterator[FakeDaemon]:
-    """A daemon's sockets, with formulas behind them."""
+    """Return sockets like a daemon's, with a hand computed from formulas."""
     with FakeDaemon() as fake:
         yield fake
 
 
 class Shared(NamedTuple):
-    """A daemon of several tests, each of which leaves it disarmed."""
+    """Daemon shared by several tests, each of which leaves it disarmed."""
 
     running: Running
     profile: Path
@@ -67,8 +67,8 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Shared]:
 
 @pytest.fixture
 def daemon(shared: Shared) -> Iterator[Shared]:
-    """The module's daemon, disarmed and without a fault before a test and after it."""
+    """Return the module's daemon, disarmed and without faults before and after the test."""
     yield shared
     assert ask(shared.commands, "stop")["ok"]
-    ask(shared.commands, "clear")  # refused where there is no fault
+    ask(shared.commands, "clear")  # refused if there is no fault
     assert ask(shared.commands, "status")["mode"] == "disarmed"

@@ -1,4 +1,4 @@
-"""``softfinger analyse``: recorded frames of every kind become contacts, as the daemon's would."""
+"""``softfinger analyse`` computes contacts from recorded frames as the daemon does."""
 
 import csv
 from pathlib import Path
@@ -21,7 +21,7 @@ TILT = 0.1
 
 @pytest.fixture(scope="module")
 def counts() -> np.ndarray:
-    """A press to 5 mm at 0.1 rad, without noise but for the counts' rounding."""
+    """Return the counts of an indentation up to 5 mm at 0.1 rad; rounding is the only noise."""
     grid = SensorGrid(rows=44, cols=44, pitch=PITCH)
     material = Material.table_i()
     frames = [grid.pressure(TIP, material, d, TILT, 0.0) for d in DEPTHS[1:]]
@@ -57,7 +57,7 @@ def save_stream(path: Path, counts: np.ndarray, settings: Settings) -> None:
     writer.close()
 
 
-def test_frames_that_can_not_be_used_are_counted_by_their_reason(counts, tmp_path):
+def test_unusable_frames_are_counted_by_reason(counts, tmp_path):
     np.save(tmp_path / "untared.npy", np.full_like(counts, 5000))
     made = Settings.model_validate({"tactile": {"pascal_per_count": SCALE, "pitch": PITCH}})
     (contacts,) = analyse(open_source(tmp_path / "untared.npy", made, False), print)
@@ -66,7 +66,7 @@ def test_frames_that_can_not_be_used_are_counted_by_their_reason(counts, tmp_pat
     assert rows_of(tmp_path / "out.csv")[0]["invalid"] == "all cells read above zero: tare"
 
 
-def test_every_kind_of_file_gives_the_same_contacts(counts, tmp_path):
+def test_all_file_types_give_the_same_contacts(counts, tmp_path):
     np.savez(tmp_path / "press.npz", frames=counts, t=np.arange(len(counts)) / 100, d=DEPTHS)
     folder = tmp_path / "frames"
     folder.mkdir()
@@ -80,7 +80,7 @@ def test_every_kind_of_file_gives_the_same_contacts(counts, tmp_path):
     save_stream(tmp_path / "run.mcap", counts, Settings())
     np.save(tmp_path / "press.npy", counts)
     for name in ("press.npz", "press.npy", "frames", "export.asf", "run.mcap"):
-        # The export tells its pitch: a wrong one in the settings must not matter there.
+        # The export contains its pitch, so a wrong pitch in the settings must not affect it.
         wrong = {"rows": 10, "cols": 10, "pitch": 0.002} if name == "export.asf" else {}
         tactile = Settings().tactile.model_copy(update=wrong)
         settings = Settings().model_copy(update={"tactile": tactile})
@@ -91,7 +91,7 @@ def test_every_kind_of_file_gives_the_same_contacts(counts, tmp_path):
     assert float(rows_of(tmp_path / "press.npz.csv")[10]["d_true_m"]) == DEPTHS[10]
 
 
-def test_a_recorded_hand_of_another_material_needs_no_settings(counts, tmp_path):
+def test_a_recording_supplies_the_settings_of_its_material(counts, tmp_path):
     law = Settings().material.model_copy(update={"law": "constant", "modulus": 1e6})
     save_stream(tmp_path / "a.mcap", counts, Settings().model_copy(update={"material": law}))
     own = analyse(open_source(tmp_path / "a.mcap", Settings(), own=True), lambda n: None)
@@ -99,7 +99,7 @@ def test_a_recorded_hand_of_another_material_needs_no_settings(counts, tmp_path)
     assert own[0].values["gain"][20] < 0.5 * mine[0].values["gain"][20]
 
 
-def test_a_recording_without_frames_is_told(inline, tmp_path):
+def test_a_recording_without_frames_is_an_error(inline, tmp_path):
     path = tmp_path / "a.mcap"
     path.write_bytes(b"\x89MCAP0\r\n")
     done = inline("analyse", path)
@@ -107,7 +107,7 @@ def test_a_recording_without_frames_is_told(inline, tmp_path):
     assert done.stderr.splitlines()[-1] == f"analyse: {path}: no tactile frames in it"
 
 
-def test_frames_alone_need_settings_that_fit(inline, counts, tmp_path):
+def test_frames_without_settings_need_matching_settings(inline, counts, tmp_path):
     path = tmp_path / "small.npy"
     np.save(path, counts[:3, :5, :5])
     done = inline("analyse", path)
@@ -120,7 +120,7 @@ def test_frames_alone_need_settings_that_fit(inline, counts, tmp_path):
     assert inline("analyse", path, "--set", "tip.radius=0").returncode == 2
 
 
-def test_from_the_command_line(inline, counts, tmp_path):
+def test_command_line_output(inline, counts, tmp_path):
     path = tmp_path / "press.npz"
     np.savez(path, frames=counts)
     done = inline("analyse", path, "--set", "tactile.noise=20.0")

@@ -1,4 +1,4 @@
-"""The record of what was on the servos' wire, by the bus itself and through the control socket."""
+"""The bus's record of wire traffic, read directly and through the control socket."""
 
 import json
 import struct
@@ -17,7 +17,7 @@ UNIT = by_name("XM430-W350").current_unit
 
 
 class Hand(BusClient):
-    """The settings' servos: left closes with rising counts, right with falling ones."""
+    """Servos of the settings: left closes with rising counts, right with falling ones."""
 
     def __init__(self) -> None:
         super().__init__(hand_bus(10.0))
@@ -27,7 +27,7 @@ class Hand(BusClient):
         return next(each for each in self.bus.report(self.t) if each["id"] == servo)
 
 
-def test_extremes_of_goals_refused_ones_too():
+def test_extreme_goals_are_recorded_including_refused_ones():
     hand = Hand()
     assert hand.report(1)["goal_q"] is None
     assert hand.report(1)["goal_current"] is None
@@ -39,7 +39,7 @@ def test_extremes_of_goals_refused_ones_too():
     assert left["goal_q"] == pytest.approx([-50 * RADIAN, 100 * RADIAN])
     assert left["goals_refused"] == 0
     assert hand.report(2)["goal_q"] is None
-    # Beyond the model's range, beyond the configured limit, and with torque stopped.
+    # Exceeds the model's range, then the configured limit, then sent while torque is off.
     assert hand.write(reg.GOAL_CURRENT, 5000, 2) == framing.DATA_RANGE
     assert hand.report(1)["goal_current"][1] == pytest.approx(5000 * UNIT)
     hand.write(reg.CURRENT_LIMIT, 200, 2)
@@ -51,7 +51,7 @@ def test_extremes_of_goals_refused_ones_too():
     assert hand.report(1)["goals_refused"] == 0
 
 
-def test_goals_through_group_writes_and_indirect_addresses():
+def test_goals_by_group_writes_and_indirect_addresses_are_recorded():
     hand = Hand()
     places = (reg.GOAL_CURRENT, reg.GOAL_CURRENT + 1, *range(116, 120))
     for servo in (1, 2):
@@ -63,17 +63,18 @@ def test_goals_through_group_writes_and_indirect_addresses():
     data = struct.pack("<HHB", 224, 6, 1) + goal + b"\x02" + goal
     hand.bus.feed(frame(BROADCAST, framing.SYNC_WRITE, data), hand.t)
     assert hand.report(1)["goal_q"] == pytest.approx([40 * RADIAN] * 2)
-    assert hand.report(2)["goal_q"] == pytest.approx([-40 * RADIAN] * 2)  # the right one's sense
+    # The right joint has the opposite direction.
+    assert hand.report(2)["goal_q"] == pytest.approx([-40 * RADIAN] * 2)
     assert hand.report(2)["goal_current"] == pytest.approx([-10 * UNIT] * 2)
 
 
-def test_torque_on_far_from_the_goal():
+def test_torque_on_far_from_the_goal_is_recorded():
     hand = Hand()
     hand.write(reg.GOAL_POSITION, 2048 + 10, 4)
     hand.write(reg.GOAL_CURRENT, 20, 2)
     assert hand.report(1)["goal_q"] is None, "the angle that a limp joint has is no way to go"
     hand.write(reg.TORQUE_ENABLE, 1, 1)
-    hand.write(reg.TORQUE_ENABLE, 1, 1)  # it was on
+    hand.write(reg.TORQUE_ENABLE, 1, 1)  # already on
     on = hand.report(1)["torque_on"]
     assert hand.report(1)["torque"]
     assert (on["count"], on["far"], on["t"]) == (1, 0, hand.t)
@@ -89,7 +90,7 @@ def test_torque_on_far_from_the_goal():
     assert hand.report(2)["torque_on"]["count"] == 0
 
 
-def test_silence_and_the_watchdog():
+def test_silence_and_watchdog_trips_are_recorded():
     hand = Hand()
     hand.later(3.0)
     assert hand.report(1)["quiet"] is None
@@ -114,7 +115,7 @@ def test_silence_and_the_watchdog():
     assert state["longest_quiet"] == pytest.approx(0.53)
 
 
-def test_a_report_through_the_control_socket(tmp_path, capsys):
+def test_the_report_is_sent_through_the_control_socket(tmp_path, capsys):
     settings = Settings.model_validate({"tactile": {"backend": "none"}})
     with emulated(tmp_path, settings=settings):
         assert send(tmp_path, "undervoltage=2 report forget") == 0

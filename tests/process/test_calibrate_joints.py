@@ -1,4 +1,4 @@
-"""`softfinger calibrate joints` on the emulated hand, whose joints a person's hand turns."""
+"""`softfinger calibrate joints` on an emulated hand whose joints are turned by hand."""
 
 import shlex
 import sys
@@ -11,7 +11,8 @@ from softfinger.tools.calibration.joints import put
 from softfinger.tools.cli import main
 from tests.harness.emulated import HIL, SdkServos, emulated
 
-TRUTH = [  # what the hand is, and the profile doesn't know; the object lies out of reach
+# The emulated hand's true values, which differ from the profile; the object is out of reach.
+TRUTH = [
     "servos.ids=[2,1]",
     "servos.direction=[-1,1]",
     "servos.zero=[1500,2300]",
@@ -37,7 +38,7 @@ def by_hand(folder, turn="{finger}={pose}"):
     return ["--move", f"{program} --send 'turn {turn}'"]
 
 
-def test_a_wrong_profile_is_set_right(hand, tmp_path, capsys):
+def test_a_wrong_profile_is_corrected(hand, tmp_path, capsys):
     folder, _ = hand
     file = tmp_path / "my.toml"
     servos = SdkServos(folder)
@@ -51,7 +52,7 @@ def test_a_wrong_profile_is_set_right(hand, tmp_path, capsys):
     found = load(file, folder)
     assert (found.servos.ids, found.servos.direction) == ((2, 1), (-1, 1))
     assert found.servos.zero == pytest.approx((1500, 5300), abs=5)
-    # The emulated stops are 0.05 rad outside, 0.03 rad are kept from them.
+    # The emulated stops are 0.05 rad outside the limits, of which 0.03 rad are kept as a margin.
     assert found.hand.q_min == pytest.approx((-0.42, -0.32), abs=0.01)
     assert found.hand.q_max == pytest.approx((0.92, 0.82), abs=0.01)
     assert "ids = [2, 1] # left, right" in file.read_text()
@@ -66,7 +67,7 @@ def test_a_wrong_profile_is_set_right(hand, tmp_path, capsys):
         ("left=ajar", "it ended with 1"),
     ],
 )
-def test_a_finger_moved_otherwise_is_refused(hand, tmp_path, capsys, turn, told):
+def test_moving_the_wrong_finger_is_refused(hand, tmp_path, capsys, turn, told):
     folder, _ = hand
     assert calibrate(folder, tmp_path / "a.toml", "--config", "hil", *by_hand(folder, turn)) == 1
     error = capsys.readouterr().err
@@ -74,7 +75,7 @@ def test_a_finger_moved_otherwise_is_refused(hand, tmp_path, capsys, turn, told)
     assert not (tmp_path / "a.toml").exists()
 
 
-def test_torque_a_still_finger_and_the_encoders_wrap_are_refused(
+def test_enabled_torque_a_stationary_finger_and_encoder_wrap_are_refused(
     hand, tmp_path, capsys, monkeypatch
 ):
     folder, emulator = hand
@@ -95,7 +96,7 @@ def test_torque_a_still_finger_and_the_encoders_wrap_are_refused(
     assert "past the encoder's wrap" in capsys.readouterr().err
 
 
-def test_only_what_was_found_changes_in_a_profile():
+def test_only_calibrated_values_change_in_a_profile():
     text = '# mine\n[hand]\nq_min = [0, 0] # stop\n[servos] # a\nport = "x"\n[tactile]\nrows = 8\n'
     text = put(put(text, "hand", {"q_min": [-0.5, 0.1]}), "servos", {"zero": [1, 2]})
     assert text == (

@@ -1,4 +1,4 @@
-"""`softfinger calibrate` live: a board on a pty pressed load by load."""
+"""`softfinger calibrate` with a live board on a pty, load by load."""
 
 import contextlib
 import io
@@ -22,7 +22,7 @@ FRAMES = 12
 
 
 class Bench:
-    """A board's frames of the made-up sensor; each Enter puts the next load on."""
+    """Frames of the simulated sensor's board; each Enter key applies the next load."""
 
     def __init__(self) -> None:
         self.sensor = MadeUp()
@@ -38,7 +38,7 @@ class Bench:
         return Frame(self._number, t, t, True, images[self._number % len(images)])
 
     def readline(self) -> str:
-        """As the standard input of the tool."""
+        """Replace the tool's standard input."""
         if not self.loads:
             return ""
         self._images[0] = self.sensor.counts(self.loads.pop(0), 64)
@@ -47,7 +47,7 @@ class Bench:
 
 @pytest.fixture(scope="module")
 def live(tmp_path_factory):
-    """All steps that are done load by load, live; the folder, the sensor, and all that was said."""
+    """Run all load-by-load steps live; return the folder, the sensor and all messages."""
     folder = tmp_path_factory.mktemp("live")
     bench = Bench()
     rig = Rig("cobs", folder, source=bench)
@@ -82,7 +82,7 @@ def live(tmp_path_factory):
     return folder
 
 
-def test_load_by_load_from_a_board(live):
+def test_a_board_is_calibrated_load_by_load(live):
     found = load_calibration(live / "sensor.json")
     sensor = MadeUp()
     assert (found.sensor.label, found.sensor.finger, found.tare.frames) == ("A17", "left", FRAMES)
@@ -101,13 +101,13 @@ def test_load_by_load_from_a_board(live):
     assert (live / "sensor.tare.png").stat().st_size > 5000
 
 
-def test_a_tip_without_memory_is_found_to_have_none(live):
+def test_relaxation_is_zero_for_a_tip_without_relaxation(live):
     said = (live / "relaxation").read_text()
     found = [float(each) for each in said.partition("[")[2].partition("]")[0].split(", ")]
     assert found == pytest.approx([0.0, 0.0, 0.0], abs=0.02)
 
 
-def test_loads_that_never_come_change_nothing(tmp_path, capsys, monkeypatch):
+def test_missing_loads_change_nothing(tmp_path, capsys, monkeypatch):
     profile = tmp_path / "press.toml"
     profile.write_text(PROFILE.replace('clock = "virtual"', 'clock = "real"'))
     monkeypatch.setattr(sys, "stdin", type("Ended", (), {"readline": lambda _: ""})())
@@ -119,7 +119,7 @@ def test_loads_that_never_come_change_nothing(tmp_path, capsys, monkeypatch):
     assert not file.exists()
 
 
-def test_without_matplotlib_the_step_is_done_and_the_missing_picture_told(
+def test_without_matplotlib_the_step_succeeds_and_reports_the_missing_plot(
     live, tmp_path, capsys, monkeypatch
 ):
     for name in [each for each in sys.modules if each.split(".")[0] == "matplotlib"]:

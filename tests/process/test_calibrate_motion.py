@@ -1,4 +1,4 @@
-"""`calibrate friction` and `calibrate latency` move a hand on ptys by its running daemon."""
+"""`calibrate friction` and `calibrate latency` move a hand on ptys through its running daemon."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -12,9 +12,10 @@ from tests.conftest import own_addresses
 from tests.harness.daemon_process import Running
 from tests.harness.emulated import HIL, EmulatorProcess
 
-FRICTION, AT_REST, LATENCY = 0.09, 0.13, 0.035  # of the hand; the profile has 0.05 and 0.015
-BYTES = 5.13e-3  # s of a frame on the wire
-COUNT = 1.78 * 2.69e-3  # N·m of one count of the current
+# True values of the hand; the profile has 0.05 and 0.015.
+FRICTION, AT_REST, LATENCY = 0.09, 0.13, 0.035
+BYTES = 5.13e-3  # s, duration of a frame on the wire
+COUNT = 1.78 * 2.69e-3  # N·m per current count
 PLANT = {
     "simulation.joint_friction": FRICTION,
     "simulation.joint_stribeck": AT_REST - FRICTION,
@@ -27,7 +28,7 @@ Calibrate = Callable[..., int]
 
 @pytest.fixture(scope="module")
 def hand(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Hand]]:
-    """A profile of the hand, and a client of the daemon on it."""
+    """Yield a profile of the hand, and a client of its daemon."""
     folder = tmp_path_factory.mktemp("hand")
     addresses = own_addresses()
     profile = folder / "my.toml"
@@ -46,7 +47,7 @@ def hand(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Hand]
 
 @pytest.fixture
 def calibrate(hand: tuple[Path, Hand]) -> Calibrate:
-    """Runs a step on the module's hand, which ends disarmed."""
+    """Return a function that runs a step on the module's hand, which is disarmed afterwards."""
     profile, client = hand
     address = f"{client.stream_address},{client.command_address}"
     where = ["--dir", str(profile.parent), "--address", address, "--move", "true"]
@@ -57,12 +58,12 @@ def calibrate(hand: tuple[Path, Hand]) -> Calibrate:
     return run
 
 
-def test_the_daemon_sweeps_a_joint(hand, calibrate, capsys):
+def test_friction_is_calibrated_by_sweeping_a_joint(hand, calibrate, capsys):
     profile, client = hand
     assert calibrate("friction", "--set", 'scene.fingers=["left"]') == 0
     told = capsys.readouterr()
     assert "nothing may be between or beside the fingers; sweeps left 0° to -23°" in told.err
-    # A tenth of the friction that is more at rest is left at the speeds of the sweep.
+    # At the sweep's velocities, a tenth of the additional static friction remains.
     found = load(profile, profile.parent)
     assert found.control.joint_friction == pytest.approx(FRICTION, abs=2 * COUNT)
     shown = float(told.out.split("at break-away ")[1].split(" ")[0])
@@ -70,7 +71,7 @@ def test_the_daemon_sweeps_a_joint(hand, calibrate, capsys):
     assert client.state().mode == "disarmed"
 
 
-def test_the_daemon_grasps_with_several_forces(hand, calibrate, capsys):
+def test_latency_is_calibrated_by_grasps_at_several_forces(hand, calibrate, capsys):
     profile, client = hand
     assert calibrate("latency", "--force", "8") == 0
     told = capsys.readouterr()
@@ -80,7 +81,7 @@ def test_the_daemon_grasps_with_several_forces(hand, calibrate, capsys):
     assert client.state().mode == "disarmed"
 
 
-def test_a_touch_ends_the_sweep_and_torque(hand, calibrate, capsys):
+def test_a_contact_during_the_sweep_turns_torque_off(hand, calibrate, capsys):
     profile, client = hand
     before = profile.read_text(encoding="utf-8")
     assert calibrate("friction", "--set", "hand.q_min=[-0.1,-0.1]") == 1
@@ -89,7 +90,7 @@ def test_a_touch_ends_the_sweep_and_torque(hand, calibrate, capsys):
     assert profile.read_text(encoding="utf-8") == before
 
 
-def test_a_hand_at_work_is_left_alone(hand, calibrate, capsys):
+def test_a_hand_in_use_is_not_moved(hand, calibrate, capsys):
     _, client = hand
     client.arm()
     client.grasp(force=5.0)

@@ -1,4 +1,4 @@
-"""`softfinger calibrate scales`: what grips told is kept, and the next daemon begins with it."""
+"""`softfinger calibrate scales` stores factors from grips, which the next daemon starts with."""
 
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,9 @@ from tests.unit.test_control import grasped
 
 
 @pytest.mark.extended
-def test_a_daemon_begins_with_what_grips_told(start, profile, addresses, tmp_path, capsys):
+def test_a_daemon_starts_with_factors_from_earlier_grips(
+    start, profile, addresses, tmp_path, capsys
+):
     start("--config", str(profile("loop.rate = 500.0\nsimulation.tactile_gain = [0.6, 1.4]\n")))
     files = tuple(str(tmp_path / f"{name}.json") for name in ("left", "right"))
 
@@ -48,7 +50,7 @@ def test_a_daemon_begins_with_what_grips_told(start, profile, addresses, tmp_pat
         assert not [event for event in after.events if event[1].startswith("witness")]
 
 
-def test_a_recordings_last_state_tells_as_much(tmp_path, capsys):
+def test_factors_can_be_taken_from_the_last_state_of_a_recording(tmp_path, capsys):
     run, file = tmp_path / "run.mcap", tmp_path / "left.json"
     due: dict[int, dict[str, Any]] = {
         100: {"command": "arm"},

@@ -1,4 +1,4 @@
-"""The command line, as real processes: run, send, signals, a second daemon, bad settings."""
+"""The command line in separate processes: run, send, signals, a second daemon, invalid settings."""
 
 import json
 import os
@@ -37,13 +37,13 @@ def test_arm_grasp_and_stop_from_the_command_line(daemon, inline):
     assert (status, reply["torque"], reply["fault"]) == (0, False, "")
 
 
-def test_sigusr1_stops(daemon):
+def test_sigusr1_stops_the_hand(daemon):
     assert ask(daemon.commands, "arm")["ok"]
     daemon.running.process.send_signal(signal.SIGUSR1)
     until(lambda: ask(daemon.commands, "status")["mode"] == "disarmed")
 
 
-def test_duration_ends_by_itself_and_settings_come_from_the_command_line(profile, inline):
+def test_duration_and_settings_on_the_command_line(profile, inline):
     path = str(profile(""))
     done = inline("run", "--config", path, "--set", "loop.rate=quick", "--set", "tip.radius=9")
     assert done.returncode == 2
@@ -56,15 +56,15 @@ def test_duration_ends_by_itself_and_settings_come_from_the_command_line(profile
     assert "ended, torque off" in done.stderr
 
 
-def test_a_second_daemon_says_so_and_ends(daemon):
+def test_a_second_daemon_reports_the_used_address_and_exits(daemon):
     second = softfinger("run", "--config", str(daemon.profile))
     assert second.returncode == 1
-    # Both are; which is found first depends on what starts beside what.
+    # Both addresses are in use; which is found first depends on the order of start-up.
     taken = (f"stream.address: {daemon.addresses[0]}", f"commands.address: {daemon.commands}")
     assert any(f"{each} is in use; is another softfinger" in second.stderr for each in taken)
 
 
-def test_a_missing_port_is_named(profile, inline):
+def test_a_missing_serial_port_is_named(profile, inline):
     text = '[servos]\nbackend = "dynamixel"\nport = "/dev/absent"\n[tactile]\nbackend = "none"\n'
     done = inline("run", "--config", profile(text))
     assert done.returncode == 1
@@ -73,7 +73,7 @@ def test_a_missing_port_is_named(profile, inline):
     assert "Traceback" not in done.stderr
 
 
-def test_send_without_a_daemon_or_with_nonsense(addresses, inline):
+def test_send_without_a_daemon_or_with_an_invalid_command(addresses, inline):
     done = inline("send", "arm", "--address", addresses[1], "--timeout", "0.1")
     assert done.returncode == 2
     assert f"send: no answer to arm from {addresses[1]} within 0.1 s" in done.stderr
@@ -88,9 +88,10 @@ def test_send_without_a_daemon_or_with_nonsense(addresses, inline):
 @pytest.mark.parametrize(
     "number", [pytest.param(signal.SIGINT, marks=pytest.mark.extended), signal.SIGTERM]
 )
-def test_a_signal_during_start_up_ends_it_without_a_trace(profile, number):
+def test_a_signal_during_start_up_exits_without_a_traceback(profile, number):
     process = started("run", "--config", profile(""))
-    first = process.stderr.readline()  # said once the handlers are there, before the kernels
+    # Printed once the signal handlers are installed, before compilation.
+    first = process.stderr.readline()
     process.send_signal(number)
     said = first + process.communicate(timeout=300)[1]
     assert process.returncode == 0
@@ -106,7 +107,7 @@ def test_a_signal_during_start_up_ends_it_without_a_trace(profile, number):
         pytest.param(signal.SIGALRM, marks=pytest.mark.extended),
     ],
 )
-def test_signals_that_would_end_a_process_at_once_turn_torque_off_first(profile, addresses, number):
+def test_fatal_signals_turn_torque_off_first(profile, addresses, number):
     process = started("run", "--config", profile(""))
     assert ask(addresses[1], "arm")["ok"]
     process.send_signal(number)
@@ -116,9 +117,9 @@ def test_signals_that_would_end_a_process_at_once_turn_torque_off_first(profile,
 
 
 @pytest.mark.extended
-def test_a_reader_of_the_log_that_stops_reading_stops_nothing(profile, addresses):
+def test_a_log_reader_that_stops_reading_does_not_block_the_daemon(profile, addresses):
     process = started("run", "--config", profile(""))
-    process.stderr.close()  # from now on each line written to it fails
+    process.stderr.close()  # from now on, every write to it fails
     assert ask(addresses[1], "arm")["ok"]
     assert ask(addresses[1], "status")["mode"] == "armed"
     process.terminate()
@@ -126,19 +127,20 @@ def test_a_reader_of_the_log_that_stops_reading_stops_nothing(profile, addresses
 
 
 def stalled(daemon: Any, context: Any, *requests: dict[str, Any]) -> list[dict[str, Any]]:
-    """The replies to requests that waited while the daemon stood still for half a second."""
+    """Return replies to requests that waited while the daemon was stalled for half a second."""
     socket = context.socket(zmq.DEALER)
     socket.connect(daemon.commands)
     socket.send_multipart([b"", msgpack.packb({"command": "status"})])
-    assert socket.poll(60_000)  # it is connected
+    assert socket.poll(60_000)  # the client is connected
     socket.recv_multipart()
     daemon.running.process.send_signal(signal.SIGSTOP)
     for request in requests:
         socket.send_multipart([b"", msgpack.packb(request)])
-    socket.send_multipart([b"", b"x" * 5000])  # too long: the gateway refuses it by itself
-    assert socket.poll(60_000)  # and has those before it, too
+    # Exceeds the size limit, so the gateway refuses it itself.
+    socket.send_multipart([b"", b"x" * 5000])
+    assert socket.poll(60_000)  # the gateway also has all earlier requests
     assert msgpack.unpackb(socket.recv_multipart()[-1])["reason"] == "request"
-    select.select([], [], [], 0.5)  # the stall itself
+    select.select([], [], [], 0.5)  # the stall
     daemon.running.process.send_signal(signal.SIGCONT)
     replies = []
     for _ in requests:
@@ -147,15 +149,15 @@ def stalled(daemon: Any, context: Any, *requests: dict[str, Any]) -> list[dict[s
     return replies
 
 
-def test_a_command_that_waited_through_a_stall_starts_nothing(daemon, context):
+def test_a_command_received_during_a_stall_is_refused(daemon, context):
     (arm,) = stalled(daemon, context, {"command": "arm"})
     assert (arm["ok"], arm["reason"]) == (False, "late")
     assert ask(daemon.commands, "status")["torque"] is False
     (disarm,) = stalled(daemon, context, {"command": "disarm"})
-    assert disarm["ok"] or disarm["reason"] == "late"  # after more than 1 s on a busy machine
+    assert disarm["ok"] or disarm["reason"] == "late"  # after more than 1 s, on a busy machine
 
 
-def test_a_stop_that_waited_through_a_stall_stops_and_ends_what_waited_with_it(daemon, context):
+def test_a_stop_received_during_a_stall_also_cancels_waiting_commands(daemon, context):
     assert ask(daemon.commands, "arm")["ok"]
     move = {"command": "move", "left": 0.1}
     replies = stalled(daemon, context, move, {"command": "stop"}, move)
@@ -166,12 +168,12 @@ def test_a_stop_that_waited_through_a_stall_stops_and_ends_what_waited_with_it(d
     ]
 
 
-def test_a_client_that_waits_for_its_reply_is_served_after_a_stall(daemon):
+def test_a_client_waiting_for_its_reply_is_served_after_a_stall(daemon):
     with Hand(*daemon.addresses, timeout=60.0) as hand, ThreadPoolExecutor() as pool:
         hand.status()
         daemon.running.process.send_signal(signal.SIGSTOP)
         arming = pool.submit(hand.arm)
-        select.select([], [], [], 0.5)  # the stall itself
+        select.select([], [], [], 0.5)  # the stall
         daemon.running.process.send_signal(signal.SIGCONT)
         arming.result(60.0)
         assert hand.status()["torque"] is True
@@ -197,7 +199,7 @@ def test_characters_that_a_pipe_cannot_encode_are_replaced(words):
     assert ascii_alone.stdout == plain.stdout.encode("ascii", "replace").decode()
 
 
-def test_a_compiler_that_is_switched_off_is_told_in_one_line():
+def test_a_disabled_compiler_is_reported_in_one_line():
     done = softfinger("limits", env=os.environ | {"NUMBA_DISABLE_JIT": "1"})
     assert done.returncode == 1
     assert done.stdout == ""

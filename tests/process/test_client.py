@@ -1,4 +1,4 @@
-"""The client for programs, against a real daemon and against streams that a daemon never sends."""
+"""The Python client, with a real daemon and with streams that a real daemon never sends."""
 
 import asyncio
 import inspect
@@ -28,7 +28,7 @@ from tests.harness import fake_daemon
 from tests.harness.daemon_process import python
 from tests.harness.fake_daemon import FakeDaemon
 
-IN_VAIN = 6.0  # s in which a busy machine, too, brings some state
+IN_VAIN = 6.0  # s, enough for a state to arrive even on a busy machine
 
 
 @pytest.fixture
@@ -63,7 +63,7 @@ def test_grasp_turn_and_release_on_a_running_daemon(daemon):
         assert hand.wait_for(lambda state: not state.torque, 60.0).mode == "disarmed"
 
 
-def test_the_same_from_asyncio(daemon):
+def test_grasp_turn_and_release_with_asyncio(daemon):
     async def session() -> tuple[str, int]:
         async with AsyncHand(*daemon.addresses, timeout=60.0) as hand:
             await hand.arm()
@@ -76,7 +76,7 @@ def test_the_same_from_asyncio(daemon):
                 seen = (await frames.next(60.0)).counts.size
             states = await hand.collect(0.1)
             assert [each.seq for each in states] == sorted({each.seq for each in states})
-            await hand.arm()  # it is
+            await hand.arm()  # already armed
             assert (await hand.state()).mode == "holding"
             with pytest.raises(NotInTime, match="mode holding"):
                 await hand.wait_for(lambda state: state.mode == "releasing", IN_VAIN)
@@ -85,7 +85,7 @@ def test_the_same_from_asyncio(daemon):
     assert asyncio.run(session()) == ("holding", 44 * 44)
 
 
-def test_a_fault_ends_the_waiting(fake, hand):
+def test_a_fault_ends_a_wait(fake, hand):
     hand.state()
     fake.changes = {"mode": "fault", "fault": "servo 1: overload"}
     with pytest.raises(HandFault, match="servo 1: overload"):
@@ -93,12 +93,12 @@ def test_a_fault_ends_the_waiting(fake, hand):
     assert hand.wait_for(lambda state: state.mode == "fault", 60.0).fault == "servo 1: overload"
 
 
-def test_waiting_ends_in_time(hand):
+def test_a_wait_times_out_with_the_last_state(hand):
     with pytest.raises(NotInTime, match="not within 6 s; the last state: mode holding"):
         hand.wait_for(lambda state: state.mode == "released", IN_VAIN)
 
 
-def test_who_waits_for_a_daemon_says_for_what(addresses, caplog):
+def test_waiting_for_a_daemon_names_the_awaited_data(addresses, caplog):
     stream, commands = addresses
     timeout = SILENCE_TIME + 0.05
     unanswered = rf"no answer to arm from {commands} within 1\.05 s"
@@ -123,7 +123,7 @@ def test_who_waits_for_a_daemon_says_for_what(addresses, caplog):
     assert caplog.messages == said + said
 
 
-def test_a_time_that_is_waited_for_is_rounded():
+def test_the_displayed_waiting_time_is_rounded():
     assert still_waiting("state", 9.99947).endswith("waiting up to 10 s")
     assert still_waiting("state", 86400.0).endswith("waiting up to 86400 s")
 
@@ -141,7 +141,7 @@ def test_a_time_that_is_waited_for_is_rounded():
         (5, 5.0),
     ],
 )
-def test_whatever_is_a_number_is_sent_as_one(fake, hand, given, sent):
+def test_all_number_types_are_sent_as_numbers(fake, hand, given, sent):
     hand.grasp(force=given)
     assert fake.requests[-1] == {"command": "grasp", "force": sent}
     asyncio.run(grasp_async(fake, given))
@@ -157,7 +157,7 @@ async def grasp_async(fake: FakeDaemon, force: Any) -> None:
     "given",
     [True, np.bool_(True), "5", np.array([5.0]), [5.0], 1j, np.array("5"), 10**400, object(), b"5"],
 )
-def test_what_is_no_number_is_refused_by_its_parameters_name(fake, hand, given):
+def test_a_value_that_is_not_a_number_is_refused_by_parameter_name(fake, hand, given):
     with pytest.raises(Refused, match="hold: angle: expected a number, found") as caught:
         hand.hold(force=5.0, angle=given)
     assert caught.value.reason == "request"
@@ -185,7 +185,7 @@ def arm_async(fake: FakeDaemon, timeout: float) -> None:
 
 
 @pytest.mark.parametrize("arm", [arm_blocking, arm_async])
-def test_a_late_command_is_sent_again_with_its_key_and_a_refused_one_is_not(fake, arm, monkeypatch):
+def test_a_late_command_is_repeated_with_its_key_and_a_refused_one_is_not(fake, arm, monkeypatch):
     fake.replies["arm"] = [LATE, LATE, {"ok": True}, MODE]
     arm(fake, 60.0)
     assert len(fake.requests) == 3
@@ -195,7 +195,8 @@ def test_a_late_command_is_sent_again_with_its_key_and_a_refused_one_is_not(fake
     assert caught.value.reason == "mode"
     assert len(fake.requests) == 4
     assert len(set(fake.keys)) == 2
-    monkeypatch.setattr(command_client, "RETRY_DELAY", 100.0)  # no time is left for a second try
+    # No time remains for a second attempt.
+    monkeypatch.setattr(command_client, "RETRY_DELAY", 100.0)
     fake.replies["arm"] = LATE
     with pytest.raises(Refused, match="old when its turn came") as caught:
         arm(fake, 60.0)
@@ -203,7 +204,7 @@ def test_a_late_command_is_sent_again_with_its_key_and_a_refused_one_is_not(fake
     assert len(fake.requests) == 5
 
 
-def test_a_cancelled_command_is_not_sent_again(fake):
+def test_a_cancelled_command_is_not_repeated(fake):
     async def cancelled() -> None:
         async with AsyncHand(fake.state_address, fake.command_address, timeout=60.0) as hand:
             arming = asyncio.create_task(hand.command("arm"))
@@ -214,13 +215,13 @@ def test_a_cancelled_command_is_not_sent_again(fake):
                 await arming
 
     fake.replies["arm"] = LATE
-    asyncio.run(cancelled())  # waits for the attempt that is under way
+    asyncio.run(cancelled())  # waits for the attempt in progress
     count, published = len(fake.requests), fake.published
     until(lambda: fake.published > published + 50)  # half a second
     assert len(fake.requests) == count
 
 
-def test_state_is_never_one_that_has_waited(fake, hand):
+def test_state_returns_a_current_state(fake, hand):
     first = hand.state()
     before = fake.published
     until(lambda: fake.published > before + 20)
@@ -228,19 +229,19 @@ def test_state_is_never_one_that_has_waited(fake, hand):
     assert hand.state().seq >= 5 * (latest - 1) > first.seq
 
 
-def test_gaps_are_counted_by_the_step_of_the_topic():
+def test_gaps_are_counted_with_the_step_of_the_topic():
     gaps = Gaps()
-    for seq in (5, 10, 16, 30, 36):  # which one of five is up to the sender
+    for seq in (5, 10, 16, 30, 36):  # the sender chooses which one of five is sent
         gaps.take({"seq": seq, "seq_step": 5})
     assert gaps.lost == 2
-    gaps.take({"seq": 5, "seq_step": 5})  # started again: no loss
+    gaps.take({"seq": 5, "seq_step": 5})  # a restart, not a loss
     gaps.take({"seq": 10, "seq_step": 5})
     assert gaps.lost == 2
-    for finger in ("left", "right"):  # each finger counts for itself
+    for finger in ("left", "right"):  # counted separately per finger
         for seq in (1, 2, 4):
             gaps.take({"seq": seq, "finger": finger})
     assert gaps.lost == 4
-    for seq, number in ((10, 1), (15, 2), (16, 4)):  # frames, by their own number
+    for seq, number in ((10, 1), (15, 2), (16, 4)):  # frames are counted by their own number
         gaps.take({"seq": seq, "seq_step": 1, "number": number, "finger": "middle"})
     assert gaps.lost == 5
     again = Gaps()
@@ -248,14 +249,14 @@ def test_gaps_are_counted_by_the_step_of_the_topic():
     assert [again.take({"seq": seq, "again": True}) for seq in (3, 4, 5)] == [True, True, False]
     assert again.take({"seq": 8, "again": False})
     assert again.lost == 2
-    assert again.take({"seq": 7, "again": True})  # it fills a gap
+    assert again.take({"seq": 7, "again": True})  # fills a gap
     assert again.lost == 1
     assert again.take({"seq": 1, "again": False})  # another daemon
     assert again.take({"seq": 5, "again": False})
     assert not again.take({"seq": 5, "again": True})
 
 
-def test_another_schema_is_told_once_and_its_known_fields_kept(fake, hand):
+def test_an_unknown_schema_is_reported_once_and_known_fields_are_kept(fake, hand):
     fake.changes = {"schema": 7, "news": [1, 2], "overruns": "many"}
     until(lambda: fake.published > 2)
     with hand.stream(timeout=60.0) as states:
@@ -265,7 +266,7 @@ def test_another_schema_is_told_once_and_its_known_fields_kept(fake, hand):
         assert (state.schema, state.mode, state.overruns) == (7, "holding", 0)
 
 
-def test_what_cannot_be_read_is_counted_and_passed_over(fake, hand):
+def test_unreadable_messages_are_counted_and_skipped(fake, hand):
     with hand.stream(timeout=60.0) as states:
         next(states)
         for payload in (b"\xc1", b"", msgpack.packb([1]), b"\x91" * 5000):
@@ -277,13 +278,13 @@ def test_what_cannot_be_read_is_counted_and_passed_over(fake, hand):
     "changes",
     [{"rows": 43}, {"rows": -44, "cols": -44}, {"rows": True}, {"data": "text"}, {"cols": None}],
 )
-def test_a_grid_that_is_not_what_it_says(changes):
+def test_a_frame_that_contradicts_its_header_is_rejected(changes):
     message = {**fake_daemon.frame(0.0, 0), **changes}
     with pytest.raises(ValueError, match="hand/tactile"):
         read(TactileFrame, message)
 
 
-def test_a_frame_tells_where_its_cells_are_and_what_they_mean():
+def test_a_frame_has_cell_positions_and_units():
     told = {"pitch_y": 0.002, "centre_x": 1e-4, "unit": "Pa", "scale": 0.5, "calibrated": True}
     message = {**fake_daemon.frame(0.0, 1), **told, "calibration": "A17 2026"}
     frame = read(TactileFrame, message)
@@ -293,7 +294,7 @@ def test_a_frame_tells_where_its_cells_are_and_what_they_mean():
     assert np.array_equal(frame.pressure(), 0.5 * frame.counts)
 
 
-def test_missing_fields_are_not_a_number():
+def test_missing_fields_are_nan():
     state = read(HandState, {"left": {"force": "much"}, "object": 3})
     assert math.isnan(state.left.force)
     assert math.isnan(state.object.width)
@@ -314,7 +315,7 @@ def test_missing_fields_are_not_a_number():
         ("import softfinger.daemon.gateway.server", {"pydantic", "numpy"}),
     ],
 )
-def test_clients_and_the_gateway_load_nothing_of_the_daemon(code, absent):
+def test_clients_and_the_gateway_import_nothing_of_the_daemon(code, absent):
     done = python("-c", f"import sys; {code}; print(*sys.modules)")
     loaded = set(done.stdout.split())
     assert any(name.startswith("softfinger.daemon.") for name in loaded), done.stderr
@@ -323,7 +324,7 @@ def test_clients_and_the_gateway_load_nothing_of_the_daemon(code, absent):
 
 
 def _face(cls: type) -> dict[str, object]:
-    """The public methods, each with its parameters and their defaults."""
+    """Return the public methods with their parameters and defaults."""
     found = {name: member for name, member in vars(cls).items() if not name.startswith("_")}
     return {
         name: list(inspect.signature(member).parameters.values()) if callable(member) else None
@@ -331,7 +332,7 @@ def _face(cls: type) -> dict[str, object]:
     }
 
 
-def test_both_hands_have_the_same_methods():
+def test_synchronous_and_asyncio_hands_have_the_same_methods():
     untyped = [re.sub(r"Async", "", repr(_face(cls))) for cls in (Hand, AsyncHand)]
     assert untyped[0] == untyped[1]
     assert _face(Subscription) == _face(AsyncSubscription)
@@ -340,7 +341,7 @@ def test_both_hands_have_the_same_methods():
         assert commands | {"status", "collect", "state", "close"} <= set(dir(cls))
 
 
-def test_a_cell_may_be_run_twice(fake, hand):
+def test_commands_that_are_already_fulfilled_succeed(fake, hand):
     fake.replies = {
         name: {"ok": False, "error": f"{name}: not while it is so"}
         for name in ("arm", "disarm", "clear")
@@ -356,7 +357,7 @@ def test_a_cell_may_be_run_twice(fake, hand):
             refused()
 
 
-def test_torque_that_is_not_confirmed_off_is_warned_of(fake, hand, caplog):
+def test_unconfirmed_torque_off_causes_a_warning(fake, hand, caplog):
     hand.disarm()
     assert not caplog.messages
     fake.replies["disarm"] = {"ok": True, "torque_off": "unconfirmed"}
@@ -364,7 +365,7 @@ def test_torque_that_is_not_confirmed_off_is_warned_of(fake, hand, caplog):
     assert caplog.messages == [UNCONFIRMED_TEXT]
 
 
-def test_a_closed_hand_says_so(hand):
+def test_a_closed_hand_raises_a_clear_error(hand):
     states = hand.stream()
     other = hand.stream()
     other.close()
@@ -397,7 +398,7 @@ def test_a_closed_hand_says_so(hand):
     ],
 )
 @pytest.mark.parametrize("given", [False, True], ids=["environment", "argument"])
-def test_one_text_names_both_addresses(monkeypatch, named, addresses, given):
+def test_one_string_names_both_addresses(monkeypatch, named, addresses, given):
     monkeypatch.setenv("SOFTFINGER_ADDRESS", "" if given else named)
     with Hand(named if given else None) as hand:
         assert (hand.stream_address, hand.command_address) == addresses
@@ -407,11 +408,11 @@ def test_one_text_names_both_addresses(monkeypatch, named, addresses, given):
             Hand()
 
 
-def test_status_is_a_line_for_people_and_a_state_for_programs(fake, inline):
+def test_status_prints_one_line_or_the_complete_state_as_json(fake, inline):
     left, right = fake_daemon.finger(0.0, 0), fake_daemon.finger(0.0, 1)
     fake.changes = {"left": left, "right": right}
     before = fake.published
-    until(lambda: fake.published > before + 1)  # the changes are in what comes now
+    until(lambda: fake.published > before + 1)  # the changes are in all further states
     told = inline("status", "--address", fake.state_address)
     assert told.returncode == 0
     line = re.fullmatch(r"(\w+) (\S+) N \(\S+ ± \S+, \S+ ± \S+\), (\S+)°, (\S+) mm\n", told.stdout)

@@ -1,4 +1,4 @@
-"""Kernels compiled ahead: `softfinger compile`, its processes, what is said; none in the loop."""
+"""Ahead-of-time compilation with `softfinger compile`, and a loop that never compiles."""
 
 import contextlib
 import json
@@ -26,19 +26,19 @@ BARE = ["--set", "servos.backend=dynamixel", "--set", "tactile.backend=none"]
 
 
 def environment(folder: Path) -> dict[str, str]:
-    """An own, cold cache."""
+    """Return an environment with a separate, empty cache."""
     own = os.environ | {"XDG_CACHE_HOME": str(folder)}
     own.pop("NUMBA_CACHE_DIR", None)
     return own
 
 
 def compiled(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
-    """The whole command."""
+    """Run the complete command."""
     return softfinger("compile", *BARE, *words, env=environment(folder))
 
 
 def steep(folder: Path) -> Path:
-    """A profile whose material no table reaches the tolerance for."""
+    """Return a profile whose material cannot reach the table tolerance."""
     strain = [0.1 * k for k in range(11)]
     stress = [1e5 * (math.exp(9.0 * each) - 1.0) for each in strain]
     file = folder / "steep.toml"
@@ -47,16 +47,16 @@ def steep(folder: Path) -> Path:
 
 
 @pytest.mark.extended
-def test_a_part_is_compiled_once_and_its_kernels_are_as_many_as_the_bar_says(tmp_path):
+def test_a_part_is_compiled_once_and_has_the_kernel_count_of_the_progress_bar(tmp_path):
     table = named("contact table")
     settings = Settings().model_dump_json()
     own = {"input": f"{settings}\n{table.name}\n", "env": environment(tmp_path)}
     done = python("-m", "softfinger.tools.processes.compile", **own)
     *kernels, last = done.stdout.splitlines()
     assert last == "done"
-    # Counted for the newest Numba: the lowest one tells of a third fewer.
+    # The count is for the newest Numba; the oldest supported one reports a third fewer.
     assert 0.6 * table.kernels <= len(kernels) <= 1.2 * table.kernels
-    # The other part, as if it had been compiled, too.
+    # Mark the other part as compiled.
     (mark,) = (tmp_path / "softfinger").glob("kernels-*/contact-table-springs.built")
     mark.with_name("joints-and-timing-springs.built").touch()
     again = compiled(tmp_path)
@@ -68,14 +68,14 @@ def test_a_part_is_compiled_once_and_its_kernels_are_as_many_as_the_bar_says(tmp
     assert first == "compiling kernels, on the first start only: contact table"
     assert part.startswith("contact table: ")
     assert last.startswith("compiled in ")
-    # What can't be built is told, and by the exit status, too.
+    # A failed compilation is reported in the output and by the exit status.
     mark.unlink()
     bad = compiled(tmp_path, "--config", str(steep(tmp_path)))
     assert bad.returncode == 1
     assert "contact table was not compiled ahead: SettingsError: table.tolerance" in bad.stderr
 
 
-def test_ctrl_c_before_a_thread_has_begun_is_no_error(monkeypatch):
+def test_ctrl_c_before_a_compiler_thread_starts_is_passed_on(monkeypatch):
     def interrupted(_: threading.Thread) -> None:
         raise KeyboardInterrupt
 
@@ -85,7 +85,7 @@ def test_ctrl_c_before_a_thread_has_begun_is_no_error(monkeypatch):
         kernels.build_kernels(Settings(), lambda *_: None, bar=False)
 
 
-def test_one_line_says_that_numba_alone_compiles_and_why(monkeypatch):
+def test_compilation_without_parallel_processes_is_explained_in_one_line(monkeypatch):
     monkeypatch.setattr(kernels, "is_built", lambda *_: False)
     monkeypatch.setattr(kernels, "why_plain", "Numba 99.0 is new")
     monkeypatch.setattr(kernels._Build, "run", lambda _: None)
@@ -96,7 +96,7 @@ def test_one_line_says_that_numba_alone_compiles_and_why(monkeypatch):
     ]
 
 
-def test_ctrl_c_ends_every_process(tmp_path):
+def test_ctrl_c_ends_every_compiler_process(tmp_path):
     with ending(started("compile", env=environment(tmp_path))) as process:
         assert process.stderr.readline().startswith("compiling kernels, on the first start only:")
         until(psutil.Process(process.pid).children)
@@ -133,7 +133,7 @@ def test_no_kernel_is_compiled_or_loaded_in_a_running_loop(tmp_path, names):
         blind = name in ("servos without sensors", "position mode")
         wanted = {"disarmed"} | ({"armed"} if servos else set())
         wanted |= {"grasping"} if servos and not blind else set()
-        # A machine that is too busy for the real-time scene is no fault of its kernels.
+        # Missing modes in the real-time scene only show that the machine is busy.
         timely = name != STAND_IN
         wanted |= {"holding", "releasing"} if servos and not blind and timely else set()
         assert wanted <= set(scene["modes"]), (name, scene["faults"])

@@ -1,4 +1,4 @@
-"""What tests started ends with them: their own children, and what those left behind them."""
+"""All processes started by a test end with it, including orphaned descendants."""
 
 import subprocess
 import sys
@@ -19,7 +19,7 @@ if sys.argv[1] == "waits":
 
 
 @pytest.mark.parametrize("parent", ["waits", "ends"])
-def test_all_that_runs_below_a_test_is_ended(parent):
+def test_all_descendants_of_a_test_are_ended(parent):
     before = descendants.running()
     words = [sys.executable, "-c", PARENT, parent]
     process = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
@@ -33,7 +33,7 @@ def test_all_that_runs_below_a_test_is_ended(parent):
     assert not descendants.running() - before
 
 
-def test_what_a_killed_process_had_started_is_killed():
+def test_children_of_a_killed_process_are_killed():
     code = f"from tests.harness import descendants\ndescendants.end_with_this_process()\n{PARENT}"
     words = [sys.executable, "-c", code, "waits"]
     with descendants.ending(subprocess.Popen(words, stdout=subprocess.PIPE, text=True)) as process:

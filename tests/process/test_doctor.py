@@ -1,4 +1,4 @@
-"""`softfinger doctor` and `softfinger scan`: against emulated hands, and its checks one by one."""
+"""`softfinger doctor` and `softfinger scan` with emulated hands, and single checks."""
 
 import contextlib
 import os
@@ -37,7 +37,7 @@ from tests.harness.gateway import Served
 
 
 class Hand:
-    """A stand-in hand in a thread, and the doctor's view of it."""
+    """Emulated hand in a thread, with access for the doctor."""
 
     def __init__(self, folder: Path, **options: Any) -> None:
         self.folder = folder
@@ -48,14 +48,14 @@ class Hand:
         self.emulator = self._stack.enter_context(running)
 
     def registers(self) -> list[bytes]:
-        """What the servos hold, but for the registers that live."""
+        """Return the servos' registers without those that change by themselves."""
         live = slice(reg.REALTIME_TICK, reg.PRESENT_TEMPERATURE + 1)
         bus = self.emulator._servos.bus
         memories = [bytes(servo.table.memory) for servo in bus.servos]
         return [memory[: live.start] + memory[live.stop :] for memory in memories]
 
     def doctor(self, capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, list[str]]:
-        """Its status and lines; the emulator shares this process, so its replies may be late."""
+        """Return the doctor's status and lines; in the emulator's process, replies may be late."""
         late = ("servos.reply_timeout=1", "servos.open_timeout=0.1", "loop.rate=20")
         words += ("--set", "servos.watchdog=0.5", "--set", "servos.fault_after=0.5")
         words += tuple(word for each in late for word in ("--set", each))
@@ -75,13 +75,13 @@ def hands(tmp_path: Path) -> Iterator[Callable[..., Hand]]:
 
 @pytest.fixture(autouse=True)
 def short(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Measure this machine for less long than on metal, and leave its sockets alone."""
+    """Shorten the measurements of this machine and skip its sockets."""
     monkeypatch.setattr(doctor, "check_addresses", lambda _: [])
     monkeypatch.setattr(machine, "_WAKE_UP_COUNT", 5)
 
 
 def scanned(capsys: pytest.CaptureFixture[str], folder: Path, *words: str) -> list[str]:
-    """What it says of what answers."""
+    """Return the servos that `scan` reports."""
     main(["scan", str(folder / "servos"), "--baud", "2000000", "--baud", "1000000", *words])
     lines = capsys.readouterr().out.splitlines()
     return [line.removeprefix(f"{folder}/servos: ") for line in lines]
@@ -91,7 +91,7 @@ def with_status(lines: list[str], status: str) -> list[str]:
     return [line[7:] for line in lines if line.startswith(status)]
 
 
-def test_factory_new_servos_fail_and_are_repaired_only_when_asked(hands, capsys):
+def test_servos_with_factory_settings_fail_and_are_only_repaired_on_request(hands, capsys):
     hand = hands(factory=True)
     before = hand.registers()
     status, lines = hand.doctor(capsys)
@@ -113,7 +113,7 @@ def test_factory_new_servos_fail_and_are_repaired_only_when_asked(hands, capsys)
     assert hand.registers() == before
 
 
-def test_registers_are_stored_before_a_change_and_written_back(hands, capsys, tmp_path):
+def test_registers_are_stored_before_a_change_and_restored(hands, capsys, tmp_path):
     hand, path = hands(factory=True), tmp_path / "before.json"
     before = [memory[: reg.RAM] for memory in hand.registers()]
     status, lines = hand.doctor(capsys, "--save", str(path), "--fix")
@@ -127,12 +127,12 @@ def test_registers_are_stored_before_a_change_and_written_back(hands, capsys, tm
     assert f"{tmp_path}/none.json: No such file or directory" in lines[-1] + "".join(lines)
 
 
-def test_boards_are_listened_to(hands, capsys):
+def test_boards_are_checked(hands, capsys):
     hand = hands()
     status, lines = hand.doctor(capsys)
     assert status == 0, lines
     for side in ("left", "right"):
-        # On a busy machine they may be told as slow, which is no failure.
+        # On a busy machine the boards may be reported as slow, which is not a failure.
         assert [line for line in lines if f" tactile {side}: 32 × 32 cells, " in line]
     hand.emulator.request("left:drift=0.1")
     status, lines = hand.doctor(capsys)
@@ -144,7 +144,7 @@ def test_boards_are_listened_to(hands, capsys):
     assert status == 1
     assert "256 cells" in next(line for line in lines if line.startswith("FAIL   tactile left"))
     assert "       → set tactile.rows and tactile.cols" in lines
-    assert scanned(capsys, hand.folder, "--wait", "1") == [  # which answer at any rate
+    assert scanned(capsys, hand.folder, "--wait", "1") == [  # servos that reply, at any rate
         f"ID {servo} at 2000000, 1000000 baud: XM430-W350, firmware 48" for servo in (1, 2)
     ]
     assert main(["doctor"]) == 0
@@ -153,7 +153,7 @@ def test_boards_are_listened_to(hands, capsys):
     assert lines[-1].endswith(" 0 failed")
 
 
-def test_a_tip_of_another_law_than_its_presses_want_is_told(tmp_path):
+def test_a_tip_model_other_than_the_calibrated_one_is_reported(tmp_path):
     def tips(**tip: Any) -> Settings:
         tactile = {"calibration": (str(tmp_path / "left.json"), "")}
         return Settings.model_validate({"tip": tip, "tactile": tactile})
@@ -176,7 +176,7 @@ def test_a_tip_of_another_law_than_its_presses_want_is_told(tmp_path):
     assert devices.check_law(tips(), 0).status == "FAIL"
 
 
-def test_a_missing_port_and_a_missing_servo(hands, capsys):
+def test_a_missing_port_and_a_missing_servo_fail(hands, capsys):
     hand = hands()
     hand.emulator.request("silent=2 right:unplug")
     status, lines = hand.doctor(capsys)
@@ -214,7 +214,7 @@ def test_servos_at_another_rate_are_found(hands, capsys):
 
 @pytest.mark.waits
 @pytest.mark.extended
-def test_a_servo_with_another_id_is_found_and_changed_only_when_asked(hands, capsys):
+def test_a_servo_id_is_only_changed_on_request(hands, capsys):
     hand = hands(ids=(1, 7), baud=2_000_000)
     servo = hand.emulator._servos.bus.servos[1]
     found = "note   found: ID 7 at 2000000 baud: XM430-W350, firmware 48"
@@ -239,14 +239,14 @@ def test_a_servo_with_another_id_is_found_and_changed_only_when_asked(hands, cap
 
 @pytest.fixture
 def terminal() -> Iterator[str]:
-    """A pseudo-terminal's path."""
+    """Return the path of a pseudo-terminal."""
     master, slave = os.openpty()
     yield os.ttyname(slave)
     os.close(slave)
     os.close(master)
 
 
-def test_ports_that_can_not_be_used(tmp_path, terminal, monkeypatch):
+def test_unusable_ports_fail(tmp_path, terminal, monkeypatch):
     missing = ports.check_port(str(tmp_path / "none"), "servos.port")
     assert (missing.status, missing.text) == ("FAIL", "no such file or directory")
     assert "servos.port" in missing.fix
@@ -264,16 +264,16 @@ def test_ports_that_can_not_be_used(tmp_path, terminal, monkeypatch):
 
 
 @pytest.mark.parametrize("locked", [True, False])
-def test_who_has_a_port_is_named(terminal, locked):
+def test_the_process_using_a_port_is_named(terminal, locked):
     path = terminal
-    # The master's owner, this process, counts as no user of it.
+    # This process owns the pty's master and does not count as a user of the port.
     script = (
         "import fcntl, os, sys; d = os.open(sys.argv[1], os.O_RDWR | os.O_NOCTTY)\n"
         f"if {locked}: fcntl.flock(d, fcntl.LOCK_EX)\n"
         "print('open', flush=True); sys.stdin.read()"
     )
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-    # Its command line is that of a daemon's process.
+    # The command line is that of a daemon process.
     words = [sys.executable, "-c", script, path, "softfinger", "run"]
     with ending(subprocess.Popen(words, **pipes)) as other:
         assert other.stdout.readline() == "open\n"
@@ -292,8 +292,8 @@ def test_who_has_a_port_is_named(terminal, locked):
     assert ports.check_port(path, "servos.port").status == "pass"
 
 
-def test_latency_timer_is_judged_and_repaired(tmp_path, monkeypatch):
-    path, sysfs = "/dev/ttyUSB7", tmp_path / "sys"  # a made-up adapter
+def test_latency_timer_is_checked_and_repaired(tmp_path, monkeypatch):
+    path, sysfs = "/dev/ttyUSB7", tmp_path / "sys"  # a fake adapter
     timer = sysfs / "ttyUSB7" / "device" / "latency_timer"
     timer.parent.mkdir(parents=True)
     timer.write_text("16\n")
@@ -312,10 +312,10 @@ def test_latency_timer_is_judged_and_repaired(tmp_path, monkeypatch):
     assert checks.check_latency_timer("/dev/pts/0", 0.004, sysfs) is None
 
 
-# This machine.
+# Checks of the machine.
 
 
-def test_scheduling_is_tried_and_taken_back(monkeypatch):
+def test_scheduling_check_restores_the_scheduler(monkeypatch):
     before = os.sched_getscheduler(0)
     assert machine.check_scheduling().status in ("pass", "warn")
     assert os.sched_getscheduler(0) == before
@@ -329,7 +329,7 @@ def test_scheduling_is_tried_and_taken_back(monkeypatch):
     assert "rtprio" in found.fix
 
 
-def test_memory_idle_states_and_clocks(tmp_path, monkeypatch):
+def test_memory_idle_state_and_clock_checks(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
     assert machine.check_memory_lock(resource.RLIM_INFINITY).status == "pass"
     assert machine.check_memory_lock(1 << 30).status == "pass"
@@ -347,7 +347,7 @@ def test_memory_idle_states_and_clocks(tmp_path, monkeypatch):
     assert len(machine.wake_ups()) == 5
 
 
-def test_kernels_are_told_where_they_are_or_are_not(tmp_path, monkeypatch):
+def test_missing_damaged_and_writable_kernel_files_cause_warnings(tmp_path, monkeypatch):
     scene = Settings.model_validate({"servos": {"backend": "none"}, "tactile": {"backend": "none"}})
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     monkeypatch.setattr(warm_up, "kernel_folder", find_kernel_folder)
@@ -379,7 +379,7 @@ def profile(addresses: Addresses) -> Settings:
     )
 
 
-def test_free_and_taken_sockets(addresses, monkeypatch):
+def test_unused_and_used_sockets(addresses, monkeypatch):
     settings = profile(addresses)
     assert [each.status for each in ports.check_addresses(settings)] == ["pass", "pass"]
     monkeypatch.setattr("softfinger.daemon.diagnosis.ports._TIMEOUT", 0.05)
@@ -392,7 +392,7 @@ def test_free_and_taken_sockets(addresses, monkeypatch):
     assert free.status == "pass"
 
 
-def test_a_running_daemon_is_recognised(addresses):
+def test_a_running_daemon_is_detected(addresses):
     with Served(commands=addresses[1]) as served, served.serving(lambda *_: {"mode": "holding"}):
         _, found = ports.check_addresses(profile(addresses))
     assert found.status == "warn"

@@ -1,14 +1,15 @@
-"""Every block of README and docs runs as it stands: shell, Python, profiles.
+"""Run every code block of README and docs unchanged: shell, Python, profiles.
 
-A page is run from its top in a folder of its own, beside one simulated hand; `harness.documented`
-is its `softfinger`, and says what is only parsed. Above a block may stand what excuses it:
+Each page runs from its top in its own folder, with one simulated hand. `harness.documented` is its
+`softfinger` command and describes which commands are only parsed. A mark above a block makes an
+exception:
 
-    <!-- not run: why -->                  it can't be, and why
-    <!-- not run without gymnasium -->     it needs a package that isn't installed here
-    <!-- exits 1: why -->                  its last command has to fail
+    <!-- not run: why -->                  the block cannot be run, with the reason
+    <!-- not run without gymnasium -->     the block needs a package that is not installed here
+    <!-- exits 1: why -->                  the last command of the block must fail
 
-Behind `softfinger status` stands what it shows: the test waits until the hand's mode, force and
-angle are so.
+A comment after `softfinger status` gives the expected output; the test waits until the hand has
+this mode, force and angle.
 """
 
 import contextlib
@@ -40,13 +41,13 @@ LONG = ("tutorial.md", "recordings.md")  # pages that wait for most of a minute
 MARK = re.compile(r"^ *<!-- (?:not run|exits)\b.*-->$", re.M)
 REASON = re.compile(r"not run: \S.*|not run without \w+|exits 1: \S.*")
 FENCE = re.compile(r"(?ms)^(?P<indent> *)```(?P<language>\w*)[^\n]*\n(?P<text>.*?)^(?P=indent)```$")
-STATUS = re.compile(r"(?m)^(softfinger status) +(# .*)$")  # with what the hand has to say then
-PRINTS = 20  # of a program without an end
-PATIENCE = 300.0  # s for a block
+STATUS = re.compile(r"(?m)^(softfinger status) +(# .*)$")  # with the expected status
+PRINTS = 20  # lines printed by a program without an end
+PATIENCE = 300.0  # s for one block
 
 
 class Block(NamedTuple):
-    """A fenced block, the line it begins at, and the mark above it."""
+    """A code block with its first line and the mark above it."""
 
     line: int
     language: str
@@ -55,7 +56,7 @@ class Block(NamedTuple):
 
 
 def blocks(page: Path) -> list[Block]:
-    """A page's blocks of code. Every mark must stand right above one, and have its form."""
+    """Return a page's code blocks; every mark must be valid and directly above a block."""
     text = page.read_text(encoding="utf-8")
     marks = {found.end() + 1: found[0].strip()[5:-4] for found in MARK.finditer(text)}
     found = []
@@ -75,7 +76,7 @@ def blocks(page: Path) -> list[Block]:
 
 
 class Shell:
-    """One shell for a page's blocks, whose variables stay; it tells which commands failed."""
+    """One shell for all blocks of a page, which keeps variables and reports failed commands."""
 
     def __init__(self, folder: Path, softfinger: Softfinger) -> None:
         self._folder, self._softfinger = folder, softfinger
@@ -88,7 +89,7 @@ class Shell:
             )  # fmt: skip
 
     def run(self, text: str) -> str:
-        """The exit statuses that were not 0, and their commands."""
+        """Run commands; return the failed ones with their exit statuses."""
         (self._folder / "block.sh").write_text(text)
         print(
             "failed=; trap 'failed+=\"$? $BASH_COMMAND; \"' ERR; "
@@ -112,7 +113,7 @@ class Shell:
 
 
 class Shared(NamedTuple):
-    """What the pages share."""
+    """Resources shared by all pages."""
 
     addresses: tuple[str, str]
     softfinger: Softfinger
@@ -120,7 +121,7 @@ class Shared(NamedTuple):
 
 @pytest.fixture(scope="module")
 def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Shared]:
-    """The one simulated hand, and the command that finds it."""
+    """Yield the simulated hand and the command connected to it."""
     place = tmp_path_factory.mktemp("hand")
     place.chmod(0o700)
     stream, commands = addresses = own_addresses()
@@ -138,7 +139,7 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Shared]:
 
 
 def run_python(text: str, addresses: tuple[str, str]) -> None:
-    """In this process; one that has no end is ended after some lines."""
+    """Run in this process; a program without an end is ended after PRINTS lines."""
     for usual, own in zip(USUAL, addresses, strict=True):
         text = text.replace(usual, own)
 
@@ -164,7 +165,7 @@ def run_python(text: str, addresses: tuple[str, str]) -> None:
     [pytest.param(page, marks=[pytest.mark.extended] * (page.name in LONG)) for page in PAGES],
     ids=lambda page: page.name,
 )
-def test_blocks(page, shared, tmp_path, monkeypatch):
+def test_code_blocks_run(page, shared, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("my.toml").write_text(find(Path("hil")).read_text(encoding="utf-8"))
     shell = Shell(tmp_path, shared.softfinger)
@@ -196,7 +197,7 @@ def test_blocks(page, shared, tmp_path, monkeypatch):
 
 
 def parse_only(block: Block, at: str) -> None:
-    """A marked block's own commands and code are at least words that are understood."""
+    """Check at least the commands and syntax of a block that is not run."""
     if block.language == "python":
         compile(block.text, at, "exec")
     for line in block.text.replace("\\\n", "").splitlines():

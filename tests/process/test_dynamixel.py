@@ -1,4 +1,4 @@
-"""The Dynamixel backend over the real SDK and pyserial against emulated servos on a pty."""
+"""The Dynamixel backend with the real SDK and pyserial, against emulated servos on a pty."""
 
 import math
 import struct
@@ -22,7 +22,7 @@ FIRMWARES = pytest.mark.parametrize("firmware", [44, 48], ids=["sync read", "fas
 
 
 def placed(firmware: int, *counts: int) -> ServoBus:
-    """Servos of a firmware that stand at these counts, set up for the hand."""
+    """Return servos of a firmware at these counts, configured for the hand."""
     return make_bus(
         "XM430-W350", firmware=firmware, prepared=True, counts=counts, t=time.monotonic()
     )
@@ -38,7 +38,7 @@ def read(backend: DynamixelServos) -> Reading:
 
 
 @FIRMWARES
-def test_what_is_read_is_what_the_servos_have(running, firmware, connect):
+def test_readings_match_the_servos(running, firmware, connect):
     now = time.monotonic()
     bus = running(placed(firmware, 2048, 2048))
     backend = connect(bus, zero=(2048, 2048))
@@ -58,7 +58,7 @@ def test_what_is_read_is_what_the_servos_have(running, firmware, connect):
     assert [bool(n) for n in map(str, backend.notices)] == [True] * (2 if firmware == 44 else 0)
 
 
-def test_torque_on_starts_where_the_joint_is(bus, connect):
+def test_torque_on_starts_at_the_current_position(bus, connect):
     def place() -> None:
         bus.bus.plant.q[:] = (0.4, -0.3)
         for servo in bus.bus.servos:
@@ -76,14 +76,15 @@ def test_torque_on_starts_where_the_joint_is(bus, connect):
         assert goal == expected
         assert struct.unpack_from("<h", memory, reg.GOAL_CURRENT)[0] == 0
         assert memory[reg.TORQUE_ENABLE] == 1
-        assert memory[reg.BUS_WATCHDOG] == 100  # of 0.02 s
+        assert memory[reg.BUS_WATCHDOG] == 100  # units of 0.02 s
     assert read(backend).q == pytest.approx([0.4, -0.3], abs=RADIAN)
     assert backend.torque_off(Reading())
     assert all(bus.memory(i)[reg.TORQUE_ENABLE] == 0 for i in (0, 1))
-    until(lambda: all(bus.memory(i)[reg.BUS_WATCHDOG] == 0 for i in (0, 1)))  # is not answered
+    # This write gets no reply.
+    until(lambda: all(bus.memory(i)[reg.BUS_WATCHDOG] == 0 for i in (0, 1)))
 
 
-def test_torque_on_waits_for_a_joint_that_moves_meanwhile(bus, connect, monkeypatch):
+def test_torque_on_waits_for_a_moving_joint(bus, connect, monkeypatch):
     backend = connect(bus)
     ways = [0.2, 0.1, 0.05]
     really = ServoLine.store
@@ -102,7 +103,7 @@ def test_torque_on_waits_for_a_joint_that_moves_meanwhile(bus, connect, monkeypa
         assert servo["torque_on"]["farthest"] < 0.01
 
 
-def test_torque_is_refused_where_the_joint_can_not_be(bus, connect):
+def test_torque_on_is_refused_outside_the_joint_range(bus, connect):
     bus.call(lambda: bus.bus.plant.q.__setitem__(1, 4.0))
     backend = connect(bus)
     assert [n for n in map(str, backend.notices) if "servo 2 (right): the joint is at 229°" in n]
@@ -115,7 +116,7 @@ def test_torque_is_refused_where_the_joint_can_not_be(bus, connect):
 @pytest.mark.parametrize(
     ("model", "level"), [("XM430-W350", 2), ("XL330-M288", 1), ("XC330-T288", 2)]
 )
-def test_the_joints_go_where_they_are_told(running, model, level):
+def test_joints_follow_their_goals(running, model, level):
     bus = running(servos={"model": model})
     bus.call(lambda: [s.table.set(reg.STATUS_RETURN_LEVEL, level) for s in bus.bus.servos])
     safety = SafetySettings(current_max=by_name(model).stall_current, current_move=0.1)
@@ -133,15 +134,15 @@ def test_the_joints_go_where_they_are_told(running, model, level):
     until(there)
     assert reading.valid
     counters = backend.counters()
-    counters.pop("timeouts")  # a busy machine's
+    counters.pop("timeouts")  # may happen on a busy machine
     assert counters == dict.fromkeys(counters, 0)
     backend.close()
 
 
-# --- when the bus goes wrong -------------------------------------------------------------------
+# --- bus errors -----------------------------------------------------------------------------------
 
 
-def test_a_missing_reply_costs_the_deadline_and_no_more(bus, connect):
+def test_a_missing_reply_takes_no_longer_than_the_deadline(bus, connect):
     backend = connect(bus, reply_timeout=1.0)
     reading = Reading()
     backend.read(reading)
@@ -163,7 +164,7 @@ def test_a_missing_reply_costs_the_deadline_and_no_more(bus, connect):
 
 @pytest.mark.parametrize("kind", ["corrupt", "duplicate", "truncate", "drop"])
 @FIRMWARES
-def test_unruly_replies_give_right_numbers_or_none(running, kind, firmware, connect):
+def test_corrupted_replies_never_give_wrong_readings(running, kind, firmware, connect):
     bus = running(placed(firmware, 2148, 1998))
     backend = connect(bus, reply_timeout=0.05)
     bus.fault(f"{kind}=0.4")
@@ -186,26 +187,27 @@ def test_unruly_replies_give_right_numbers_or_none(running, kind, firmware, conn
 
 
 @FIRMWARES
-def test_a_late_reply_is_not_taken_for_the_next_questions(running, firmware, connect):
+def test_a_late_reply_is_not_used_for_the_next_request(running, firmware, connect):
     bus = running(placed(firmware, 0, 0))
-    backend = connect(bus, reply_timeout=0.004, zero=(0, 0))  # a late one comes after 0.01
+    backend = connect(bus, reply_timeout=0.004, zero=(0, 0))  # a late reply arrives after 0.01 s
     reading = Reading()
 
     def at_another_place(count: int) -> None:
-        """Read the joints at ``count``: an answer to an earlier question would tell another."""
+        """Read the joints at ``count``, which differs from the positions in earlier replies."""
         bus.call(lambda: bus.bus.plant.q.__setitem__(slice(2), count * RADIAN))
         backend.read(reading)
-        if reading.valid:  # where this thread was put aside until the late one came
+        if reading.valid:  # the reply was not late because this thread was suspended
             assert reading.q == pytest.approx([count * RADIAN, -count * RADIAN])
 
     bus.fault("late=1")
-    while backend.counters()["late"] <= 20 and reading.seq < 1000:  # a busy machine hears few
+    # A busy machine receives few late replies.
+    while backend.counters()["late"] <= 20 and reading.seq < 1000:
         at_another_place(reading.seq)
     bus.fault("late=0")
     until(lambda: at_another_place(reading.seq) or reading.valid)
 
 
-def test_the_servos_own_watchdog_stops_them_and_that_is_told(bus, connect):
+def test_a_watchdog_trip_stops_the_servos_and_is_reported(bus, connect):
     backend = connect(bus, watchdog=0.5)
     backend.torque_on()
     goal = Goal(q=[0.9, 0.9], current=[0.05, 0.05])
@@ -213,7 +215,7 @@ def test_the_servos_own_watchdog_stops_them_and_that_is_told(bus, connect):
     until(lambda: bus.memory(0)[reg.BUS_WATCHDOG] == reg.WATCHDOG_ERROR)
 
     def look() -> None:
-        for _ in range(2):  # the first one looks at the supply
+        for _ in range(2):  # the first read checks the supply voltage
             backend.read(Reading())
 
     with pytest.raises(ServoError, match="its bus watchdog stopped it"):
@@ -227,8 +229,8 @@ def test_the_servos_own_watchdog_stops_them_and_that_is_told(bus, connect):
 @pytest.mark.parametrize(
     "what", ["its bus watchdog stopped it", "its bus watchdog is off, as after"]
 )
-def test_a_servo_that_stopped_by_itself_is_found_though_all_was_sent_in_time(bus, connect, what):
-    # As where an adapter held packets up that the port had taken, or power was lost for a moment.
+def test_a_servo_that_stopped_by_itself_is_detected_despite_timely_writes(bus, connect, what):
+    # This happens if an adapter delays packets or if power is lost briefly.
     backend = connect(bus)
     backend.torque_on()
     goal, reading = Goal(q=[0.1, 0.1], current=[0.05, 0.05]), Reading()
@@ -244,19 +246,19 @@ def test_a_servo_that_stopped_by_itself_is_found_though_all_was_sent_in_time(bus
     backend.torque_on()
 
 
-def test_torque_off_counts_once_every_servo_says_so(bus, connect):
+def test_torque_off_needs_confirmation_from_every_servo(bus, connect):
     backend = connect(bus, reply_timeout=0.25)
     backend.torque_on()
     bus.fault("silent=2")
     assert not backend.torque_off(Reading())
     until(lambda: not bus.servo(0).torque_on)
     bus.fault("answer=2")
-    until(lambda: backend.torque_off(Reading()))  # a busy machine's servo may answer too late
+    until(lambda: backend.torque_off(Reading()))  # on a busy machine the servo may reply too late
     assert not bus.servo(1).torque_on
 
 
 @pytest.mark.parametrize("mode", ["current-based position", "current", "position"])
-def test_goals_that_do_not_arrive_are_noticed(running, mode, connect):
+def test_lost_goals_are_detected(running, mode, connect):
     bus = running(servos={"mode": mode})
     backend = connect(bus, mode=mode)
     backend.torque_on()
@@ -283,7 +285,7 @@ def test_goals_that_do_not_arrive_are_noticed(running, mode, connect):
     until(lambda: tick().lost == 0)
 
 
-def test_a_servo_that_answers_with_the_same_bytes_again_and_again_is_noticed(bus, connect):
+def test_a_servo_that_repeats_the_same_bytes_is_detected(bus, connect):
     backend = connect(bus)
     reading = Reading()
     backend.read(reading)
@@ -299,7 +301,7 @@ def test_a_servo_that_answers_with_the_same_bytes_again_and_again_is_noticed(bus
 
 
 @FIRMWARES
-def test_an_answer_with_an_error_is_no_reading(running, firmware, connect):
+def test_a_reply_with_an_error_is_not_a_reading(running, firmware, connect):
     bus = running(placed(firmware))
     backend = connect(bus)
     reading = Reading()
@@ -312,7 +314,7 @@ def test_an_answer_with_an_error_is_no_reading(running, firmware, connect):
     assert reading.valid
 
 
-def test_close_turns_torque_off_on_a_bad_line(bus, connect):
+def test_close_turns_torque_off_on_a_noisy_line(bus, connect):
     backend = connect(bus, reply_timeout=0.1)
     backend.torque_on()
     bus.fault("drop=0.3")

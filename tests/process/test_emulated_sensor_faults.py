@@ -1,6 +1,6 @@
-"""Measurements that lie, and a hand that is not as its settings say, over serial bytes.
+"""Sensor faults, and a hand that differs from its settings, over serial bytes.
 
-The emulated hand's own true force is the judge.
+The emulated hand's true force is the reference.
 """
 
 import contextlib
@@ -16,24 +16,25 @@ from tests.soak.rig import Rig
 
 pytestmark = pytest.mark.extended
 FORCE = 6.0  # N
-LOOK, SETTLED = 3.5, 0.5  # s of the emulated hand's time, in all and in the end
+# Times of the emulated hand in s: in total, and the final interval used for means.
+LOOK, SETTLED = 3.5, 0.5
 
 GAIN = "left:gain=0.6@0..2"
 CURRENT = "left:current=2"
-REFUSED = "left:shift-x=3"  # the hand lets go
+REFUSED = "left:shift-x=3"  # fault after which the hand lets go
 
 
 @contextlib.contextmanager
 def running(hand: Sequence[str] = (), daemon: Sequence[str] = ()) -> Iterator[Rig]:
-    """Yield an emulated hand and its daemon, which share one time, and wait for a busy machine.
+    """Yield an emulated hand and its daemon on a shared clock that waits for a busy machine.
 
-    ``hand``, ``daemon``: what they are told beside the profile.
+    ``hand`` and ``daemon`` are additional settings.
     """
     with Rig() as made:
         text = made.config.read_text(encoding="utf-8").replace('loop.clock = "real"\n', "")
         made.config.write_text(text, encoding="utf-8")
         made.hand_words = tuple(word for each in hand for word in ("--set", each))
-        told = ("servos.fault_after=1.0", *daemon)  # of the hand's time
+        told = ("servos.fault_after=1.0", *daemon)  # s of the hand's time
         made.start(*(word for each in told for word in ("--set", each)))
         yield made
 
@@ -54,7 +55,7 @@ def reaches(rig: Rig, wanted: str) -> None:
 
 
 def gripped(rig: Rig) -> None:
-    """Let an honest hand hold the object at its place."""
+    """Let a hand without sensor faults hold the object at its initial position."""
 
     def done(command: str, **numbers: float) -> None:
         reply: dict[str, Any] = rig.ask({"command": command, **numbers}, 60.0)
@@ -74,7 +75,7 @@ def gripped(rig: Rig) -> None:
 
 
 def watched(rig: Rig, seconds: float = LOOK) -> Iterator[dict[str, Any]]:
-    """Yield the emulated hand's reports until it has lived for so long, or nothing drives it."""
+    """Yield the emulated hand's reports until its time is over or its servos are not driven."""
     begin = rig.report()["t"]
     while True:
         report = rig.report()
@@ -82,18 +83,18 @@ def watched(rig: Rig, seconds: float = LOOK) -> Iterator[dict[str, Any]]:
         driven = any(servo["torque"] for servo in report["servos"])
         if report["t"] > begin + seconds or not driven:
             return
-        select.select([], [], [], 0.005)  # the processor is for those who grip
+        select.select([], [], [], 0.005)  # leave the processor to the hand and daemon
 
 
 @pytest.mark.parametrize("lie", [GAIN, CURRENT, REFUSED])
-def test_a_lie_is_bounded_and_nothing_else_is_named(rig, lie):
+def test_a_sensor_fault_has_a_bounded_effect_and_is_the_only_one_reported(rig, lie):
     false = f"witness.{lie.split(':')[0]}_{'current' if lie == CURRENT else 'sensor'}"
     gripped(rig)
     before = len(rig.log())
     rig.send(lie)
     reports = list(watched(rig))
     assert max(max(report["force"]) for report in reports) < 1.3 * FORCE
-    if lie != GAIN:  # which may be believed in part, and need not be named
+    if lie != GAIN:  # a gain error may be partly accepted and need not be reported
         until(lambda: any(false in line for line in rig.log()[before:]))
     assert not [line for line in rig.log()[before:] if "witness." in line and false not in line]
     if lie == REFUSED:
@@ -123,7 +124,7 @@ def test_a_lie_is_bounded_and_nothing_else_is_named(rig, lie):
     ],
     ids=["friction", "latency", "zeros rise", "zeros sink", "gains and currents"],
 )
-def test_a_hand_that_is_not_as_its_settings_say_does_not_squeeze(
+def test_a_hand_that_differs_from_its_settings_does_not_grip_too_hard(
     hand, daemon, words, seconds, least, says
 ):
     with running(hand, daemon) as rig:

@@ -1,4 +1,4 @@
-"""`softfinger emulate`: its process, ports, boards, scenes and faults, and what it refuses."""
+"""`softfinger emulate`: process, ports, boards, scenes, faults and invalid input."""
 
 import os
 import signal
@@ -35,7 +35,7 @@ GOAL_CURRENT, GOAL_POSITION, PRESENT_POSITION = 102, 116, 132
 
 @pytest.fixture(scope="module")
 def hand(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """The folder of a running stand-in hand as it is by default."""
+    """Yield the folder of a running emulated hand with default settings."""
     folder = tmp_path_factory.mktemp("hand")
     with EmulatorProcess("--dir", folder) as process:
         process.ready()
@@ -50,7 +50,7 @@ def servos(hand: Path) -> Iterator[SdkServos]:
     made.close()
 
 
-def test_default_servos_answer_and_are_limp_in_current_based_position_mode(servos):
+def test_default_servos_reply_with_torque_off_in_current_based_position_mode(servos):
     for servo in (1, 2):
         assert servos.ping(servo) == 1020
         assert servos.read(servo, OPERATING_MODE, 1) == 5
@@ -68,13 +68,13 @@ def test_boards_send_the_default_grid(hand, finger):
     last = sensor.latest()
     sensor.close()
     assert last.data.shape == (32, 32)
-    # Nothing touches the tips: noise of about 3 counts, cut off below 0.
+    # Without contact, only noise of about 3 counts remains, clipped at 0.
     assert 0 < last.data.mean() < 3
     counters = sensor.counters()
     assert counters["resyncs"] == counters["skipped_bytes"] == 0
 
 
-def test_a_folder_in_use_is_refused_and_the_first_lives_on(hand, servos, inline):
+def test_a_folder_in_use_is_refused_and_the_first_emulator_continues(hand, servos, inline):
     status, out, err = inline("emulate", "--dir", hand)
     assert (status, out) == (1, "")
     assert "in use by another emulator (process " in err
@@ -85,15 +85,15 @@ def test_a_folder_in_use_is_refused_and_the_first_lives_on(hand, servos, inline)
 @pytest.mark.parametrize(
     "number", [pytest.param(signal.SIGINT, marks=pytest.mark.extended), signal.SIGTERM]
 )
-def test_a_signal_ends_it_cleanly_while_it_starts(tmp_path, number):
+def test_a_signal_during_start_up_ends_the_emulator_cleanly(tmp_path, number):
     with EmulatorProcess("--dir", tmp_path / "new", "--config", HIL) as process:
-        # The folder is taken as the first thing, long before anything answers.
+        # The folder is locked first, long before the servos respond.
         until((tmp_path / "new" / ".emulator.lock").exists)
         assert process.end(number) == (0, "", "")
     assert list((tmp_path / "new").iterdir()) == []
 
 
-def test_links_of_a_killed_emulator_are_replaced_and_an_interruption_is_survived(tmp_path):
+def test_links_of_a_killed_emulator_are_replaced_and_a_paused_emulator_continues(tmp_path):
     with EmulatorProcess("--dir", tmp_path, "--model", "XL330-M288", "--factory") as process:
         process.ready()
         servos = SdkServos(tmp_path)
@@ -111,14 +111,14 @@ def test_links_of_a_killed_emulator_are_replaced_and_an_interruption_is_survived
         process.popen.send_signal(signal.SIGSTOP)
         assert servos.silent(7)
         process.popen.send_signal(signal.SIGCONT)
-        assert servos.ping(7) == 1200  # the answer to the one or to the other
+        assert servos.ping(7) == 1200  # the reply to either of the two pings
         servos.close()
         assert process.end(signal.SIGHUP) == (0, "", "")
     assert not any(path.is_symlink() for path in tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("name", ["servos", "control"])
-def test_something_else_in_a_links_or_the_control_sockets_place_is_left_alone(tmp_path, name):
+def test_other_files_in_place_of_links_or_the_control_socket_are_not_replaced(tmp_path, name):
     (tmp_path / name).write_text("mine")
     with pytest.raises(EmulatorError, match=f"{name}: .*in the way"):
         Emulator(Settings(), tmp_path)
@@ -126,13 +126,13 @@ def test_something_else_in_a_links_or_the_control_sockets_place_is_left_alone(tm
     assert [path.name for path in tmp_path.iterdir()] == [name]
 
 
-def test_a_folder_that_cannot_be_made_is_told(tmp_path):
+def test_a_folder_that_cannot_be_created_is_reported(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(FolderError, match="can't be used as --dir"):
         LinkFolder(tmp_path / "file" / "hand")
 
 
-def test_links_that_lead_elsewhere_by_now_are_left_alone(tmp_path):
+def test_links_that_were_redirected_are_not_removed(tmp_path):
     folder = LinkFolder(tmp_path)
     folder.link("servos", "/dev/ours")
     folder.link("tactile-left", "/dev/ours-too")
@@ -156,14 +156,14 @@ def test_links_that_lead_elsewhere_by_now_are_left_alone(tmp_path):
         (["--ids", "1,x"], 2, "expected two IDs of 0 to 252"),
     ],
 )
-def test_what_cannot_be_emulated_is_told_in_one_line(tmp_path, inline, options, status, told):
+def test_an_invalid_hand_is_reported_in_one_line(tmp_path, inline, options, status, told):
     done = inline("emulate", "--dir", tmp_path, *options)
     assert (done.returncode, done.stdout) == (status, "")
     assert told in done.stderr.splitlines()[-1]
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_default_board_is_the_one_of_the_hil_profile(tmp_path):
+def test_the_default_board_is_that_of_the_hil_profile(tmp_path):
     hil = load(HIL, tmp_path)
     assert with_board(hil) is hil
     default = with_board(Settings()).tactile
@@ -174,7 +174,7 @@ def test_the_default_board_is_the_one_of_the_hil_profile(tmp_path):
     assert hil.simulation == Settings().simulation
 
 
-def test_time_leaves_interruptions_out(monkeypatch, tmp_path):
+def test_emulated_time_excludes_interruptions(monkeypatch, tmp_path):
     now = 100.0
     monkeypatch.setattr(module.time, "monotonic", lambda: now)
     clock = EmulatorClock(Deadline(tmp_path / Deadline.NAME, os.O_CREAT))
@@ -188,7 +188,7 @@ def test_time_leaves_interruptions_out(monkeypatch, tmp_path):
 
 
 @pytest.mark.parametrize("late", [0.0005, 0.004, 0.03, 5.0])
-def test_time_keeps_step_with_a_daemon_on_a_late_machine(monkeypatch, tmp_path, late):
+def test_emulated_time_is_synchronised_with_a_late_daemon(monkeypatch, tmp_path, late):
     machine = LateMachine(100.0)
     monkeypatch.setattr(module.time, "monotonic", machine.now)
     clock = EmulatorClock(Deadline(tmp_path / Deadline.NAME, os.O_CREAT))
@@ -198,12 +198,12 @@ def test_time_keeps_step_with_a_daemon_on_a_late_machine(monkeypatch, tmp_path, 
     apart = []
     for k in range(200):
         daemon.sleep_until(100.0 + 0.002 * k)
-        for _ in range(10):  # the emulator looks at its clock while the daemon is not on time
+        for _ in range(10):  # the emulator reads its clock while the daemon is late
             machine.work(0.1 * late * (k % 3))
             apart.append(clock.now() - daemon.now())
     assert max(apart[20:]) - min(apart[20:]) <= 0.0045
     assert daemon.behind > 100 * late or late < 0.002
-    # A reply on the wire arrives meanwhile; a daemon that is gone is waited for no longer.
+    # Time still advances for a reply on the wire, and once the daemon is gone.
     machine.work(0.01)
     stands = clock.now()
     machine.work(0.01)
@@ -221,7 +221,7 @@ def test_time_keeps_step_with_a_daemon_on_a_late_machine(monkeypatch, tmp_path, 
 # --- faults ---------------------------------------------------------------------------------------
 
 
-def test_a_scene_has_only_the_ports_it_needs(tmp_path):
+def test_a_scene_creates_only_the_ports_it_needs(tmp_path):
     (tmp_path / "one.toml").write_text(
         'scene.fingers = ["right"]\nservos.backend = "none"\n[tactile]\nrows = 16\ncols = 8\n'
         'backend = "flexitac"\n'
@@ -236,8 +236,8 @@ def test_a_scene_has_only_the_ports_it_needs(tmp_path):
 
 
 @pytest.mark.parametrize(("backend", "full"), [("glove", 1023), ("cobs", 65535)])
-def test_each_serial_framing_is_spoken(tmp_path, backend, full):
-    # Without servos the object is pressed on the tips to and fro.
+def test_each_serial_framing_is_supported(tmp_path, backend, full):
+    # Without servos, the object is pressed against the tips periodically.
     (tmp_path / "one.toml").write_text(
         f"""scene.fingers = ["left"]
 servos.backend = "none"
@@ -263,11 +263,11 @@ full_count = {full}
         assert estimate.contact
         assert 3e-4 < estimate.d < 8e-3
         assert abs(estimate.tilt_x) < 0.05
-        assert sensor.counters()["resyncs"] <= 1  # the first packet may be half a one
+        assert sensor.counters()["resyncs"] <= 1  # the first packet may be incomplete
         sensor.close()
 
 
-def test_faults_while_it_runs(tmp_path, capsys):
+def test_faults_are_injected_at_run_time(tmp_path, capsys):
     log: list[str] = []
     with emulated(tmp_path, "silent=2", tell=log.append):
         servos = SdkServos(tmp_path)
@@ -289,20 +289,22 @@ def test_faults_while_it_runs(tmp_path, capsys):
         assert again.ping(1) == 1020
         again.close()
         assert capsys.readouterr().err == ""
-        # One word that makes no sense, and none of them counts.
+        # If one word is invalid, all words are ignored.
         assert send(tmp_path, "silent=2 sillent=2") == 1
         assert "'sillent=2'" in capsys.readouterr().err
         assert SdkServos(tmp_path).ping(2) == 1020
 
 
-def test_nobody_to_tell(tmp_path, capsys):
+def test_sending_without_an_emulator_fails(tmp_path, capsys):
     assert send(tmp_path, "unplug") == 1
     assert "no emulator answers here" in capsys.readouterr().err
     assert send(tmp_path / "nowhere", "unplug") == 1
 
 
-def test_the_control_socket_survives_rude_clients_and_is_taken_away(tmp_path, monkeypatch):
-    folder = tmp_path / ("long" * 30)  # past what a socket's own path may have
+def test_the_control_socket_survives_misbehaving_clients_and_is_removed_at_the_end(
+    tmp_path, monkeypatch
+):
+    folder = tmp_path / ("long" * 30)  # too long for a socket's own path
     folder.mkdir()
     with emulated(folder):
         place = folder / "control"
@@ -320,7 +322,7 @@ def test_the_control_socket_survives_rude_clients_and_is_taken_away(tmp_path, mo
     assert not place.exists()
 
 
-def test_measurements_are_wrong_and_the_hand_is_not(tmp_path):
+def test_injected_faults_change_measurements_but_not_the_hand(tmp_path):
     log: list[str] = []
     faults = "right:drift=0.2@0.5..1", "left:current=3@0.5"
     with emulated(tmp_path, *faults, tell=log.append) as made:
@@ -338,7 +340,7 @@ def test_measurements_are_wrong_and_the_hand_is_not(tmp_path):
 
 
 def board_mean(folder: Path, finger: int) -> float:
-    """Mean count of a board's newest frame."""
+    """Return the mean count of a board's newest frame."""
     sensor = board(folder, finger)
     sensor.open()
     frame = sensor.latest()
@@ -348,11 +350,11 @@ def board_mean(folder: Path, finger: int) -> float:
 
 def test_an_object_is_put_back_and_moved_by_a_load(tmp_path):
     with emulated(tmp_path) as made:
-        made.hand.object_pose[:] = 0.07, 0.02, 1.2  # it slipped away
+        made.hand.object_pose[:] = 0.07, 0.02, 1.2  # the object slipped out
         assert made.request("place report").startswith("{")
         until(lambda: np.allclose(made.hand.object_pose, (0.0, 0.08, 0.0), atol=1e-3))
         made.request("push=5")
-        until(lambda: made.hand.object_pose[1] > 0.082)  # off along its faces, away from the palm
+        until(lambda: made.hand.object_pose[1] > 0.082)  # moved along its faces, away from the palm
         assert made.report(made.clock.now())["force"] == [0.0, 0.0]
         made.request("place twist=0.02")
         until(lambda: made.hand.object_pose[2] > 0.05)

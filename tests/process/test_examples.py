@@ -1,4 +1,4 @@
-"""The example programs, and the gym's, run as they stand."""
+"""Run the example programs unchanged, including those for the gym."""
 
 import re
 
@@ -10,11 +10,12 @@ from tests.harness.daemon_process import python
 
 
 @pytest.mark.extended
-def test_grasp_and_turn(start, profile, addresses, tmp_path):
+def test_grasp_and_turn_example(start, profile, addresses, tmp_path):
     daemon = start("--config", str(profile("")))
     stream, commands = addresses
     picture = tmp_path / "picture.png"
-    with Hand(stream, commands, timeout=60.0) as hand:  # a program before it left it armed
+    # An earlier program may have left the hand armed.
+    with Hand(stream, commands, timeout=60.0) as hand:
         hand.arm()
     where = ("--stream", stream, "--commands", commands, "--picture", picture)
     done = python("-m", "softfinger.tools.examples.grasp_and_turn", *where)
@@ -22,7 +23,7 @@ def test_grasp_and_turn(start, profile, addresses, tmp_path):
     assert re.sub(r"no .* from .* yet, waiting up to .* s\n", "", done.stderr) == ""
     ((states, lost),) = re.findall(r"(\d+) states, (\d+) lost", done.stdout)
     assert int(states) > 50
-    assert int(lost) < int(states)  # a gateway that gets no processor for long drops messages
+    assert int(lost) < int(states)  # a gateway without processor time drops messages
     force = float(re.findall(r"while holding: ([\d.]+) N", done.stdout)[0])
     assert force == pytest.approx(8.0, rel=0.1)
     pixels = imread(picture)[..., :3]
@@ -34,7 +35,7 @@ def test_grasp_and_turn(start, profile, addresses, tmp_path):
 
 
 @pytest.mark.extended
-def test_the_gyms_table_comes_from_several_processes():
+def test_the_gym_example_gets_its_table_from_several_processes():
     done = python("-m", "softfinger.gym", "1", "--processes", "2")
     assert done.returncode == 0, done.stderr
     found = re.findall(r"^(\w+) +(\w+) +([\d.]+) ± 0\.0", done.stdout, re.MULTILINE)

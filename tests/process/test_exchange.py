@@ -1,4 +1,4 @@
-"""The tick's own exchange: timed by `doctor`, tried at connect, missed while disarmed."""
+"""The exchange of one tick: timed by `doctor`, tested at connect, monitored while disarmed."""
 
 import contextlib
 import grp
@@ -29,7 +29,7 @@ from tests.harness.servos import RunningBus, backend_settings, connected
 
 
 def exchange(bus: RunningBus, rate: float = 500.0, **servos: Any) -> Finding:
-    """What `doctor` says of the tick's exchange."""
+    """Return the doctor's result for the exchange of one tick."""
     settings = backend_settings(bus.path, **servos)
     loop = settings.loop.model_copy(update={"rate": rate})
     settings = settings.model_copy(update={"loop": loop})
@@ -37,10 +37,10 @@ def exchange(bus: RunningBus, rate: float = 500.0, **servos: Any) -> Finding:
     return found
 
 
-# What doctor times.
+# Timing by the doctor.
 
 
-def test_doctor_reads_and_writes_as_a_tick_does_and_changes_nothing(running):
+def test_doctor_times_the_exchange_of_a_tick_without_changing_registers(running):
     bus = running(servos={"mode": "current-based position"})
     before = [bus.memory(i)[: reg.REALTIME_TICK] for i in (0, 1)]
     heard = bytearray()
@@ -51,11 +51,11 @@ def test_doctor_reads_and_writes_as_a_tick_does_and_changes_nothing(running):
     assert found.text.startswith("50 of a tick's reads and writes: p50 ")
     until(lambda: len(re.findall(rb"\xff\xff\xfd\x00\xfe..\x83", heard, re.DOTALL)) == 50)
     reads = re.findall(rb"\xff\xff\xfd\x00\xfe..\x8a", heard, re.DOTALL)
-    assert len(reads) == 54  # each of four spans is tried first
+    assert len(reads) == 54  # each of the four spans is tested first
     assert [bus.memory(i)[: reg.REALTIME_TICK] for i in (0, 1)] == before
 
 
-def test_late_replies_fail_with_all_numbers_and_the_settings_that_help(bus):
+def test_late_replies_fail_with_timings_and_suggested_settings(bus):
     bus.fault("delay=0.02")
     found = exchange(bus, 100.0, reply_timeout=1.0)
     assert found.status == "FAIL"
@@ -67,13 +67,13 @@ def test_late_replies_fail_with_all_numbers_and_the_settings_that_help(bus):
     assert found.fix.startswith("set servos.reply_timeout = 0.0")
 
 
-def test_the_judgement_of_what_was_timed():
+def test_assessment_of_exchange_times():
     def judged(p50: float, p99: float, failed: float = 0.0, **how: bool) -> Finding:
         return judge_exchanges(ExchangeTimes(p50, p50, p99, failed), Settings(), "50", **how)
 
     assert judged(0.0004, 0.0009).status == "pass"
     assert judged(0.0004, 0.0009).text == "50: p50 0.4 ms, p99 0.9 ms, 0% failed"
-    both = judged(0.0028, 0.003)  # less than reply_timeout, and more than a tick
+    both = judged(0.0028, 0.003)  # shorter than reply_timeout and longer than a tick
     assert (both.status, both.fix.split(";")[0]) == ("FAIL", "set loop.rate = 260")
     assert "a tick takes 2 ms (loop.rate = 500), and a reply may take 4 ms" in both.text
     slow = judged(0.016, 0.016)
@@ -88,12 +88,12 @@ def test_the_judgement_of_what_was_timed():
     assert judge_exchanges(ExchangeTimes(1.0, 1.0, 1.0, 1.0), Settings(), "50").status == "FAIL"
 
 
-# What is tried at connect.
+# Tests at connect.
 
 
-def test_a_firmware_that_claims_fast_reads_falsely_gets_sync_reads(bus):
+def test_sync_reads_replace_fast_reads_that_a_firmware_only_claims_to_support(bus):
     for i in (0, 1):
-        bus.servo(i).fast_reads = False  # its firmware number says otherwise
+        bus.servo(i).fast_reads = False  # contrary to its firmware version
     backend = connected(bus)
     (notice,) = [each for each in backend.notices if "fast sync read" in each.text]
     assert notice.fix == "the slower sync read is used instead"
@@ -104,7 +104,7 @@ def test_a_firmware_that_claims_fast_reads_falsely_gets_sync_reads(bus):
     backend.close()
 
 
-def test_servos_that_answer_no_group_read_are_refused(bus):
+def test_servos_without_group_reads_are_refused(bus):
     for i in (0, 1):
         bus.servo(i).fast_reads = False
     answers = bus.servo(1).answers_reads
@@ -115,7 +115,7 @@ def test_servos_that_answer_no_group_read_are_refused(bus):
     connected(bus).close()
 
 
-def test_slow_replies_are_told_at_the_start(bus):
+def test_slow_replies_are_reported_at_start_up(bus):
     bus.fault("delay=0.01")
     backend = connected(bus)
     (notice,) = [each for each in backend.notices if "ticks will be late" in each.text]
@@ -124,11 +124,11 @@ def test_slow_replies_are_told_at_the_start(bus):
     backend.close()
 
 
-# Patience.
+# Slow start-up of boards.
 
 
-def test_a_board_that_boots_is_waited_for_with_its_port_open(running, monkeypatch):
-    """An adapter may restart when its port is opened, so opening it again and again never ends."""
+def test_the_port_stays_open_while_a_board_boots(running, monkeypatch):
+    """An adapter may restart when its port is opened, so reopening it would never end."""
     bus, opened = running(), []
     for i in (0, 1):
         bus.servo(i).silent = True
@@ -148,10 +148,10 @@ def test_a_board_that_boots_is_waited_for_with_its_port_open(running, monkeypatc
     until(connects)
     assert len(opened) == 1
     backend.close()
-    connected(bus).close()  # the port is free again
+    connected(bus).close()  # the port is available again
 
 
-def test_doctor_waits_as_long_as_run_does(running):
+def test_doctor_waits_as_long_as_run(running):
     bus = running()
     bus.servo(1).silent = True
     settings = backend_settings(bus.path, open_timeout=60.0)
@@ -172,7 +172,7 @@ def test_doctor_waits_as_long_as_run_does(running):
 # Ports.
 
 
-def test_both_fingers_on_one_port_are_an_error_by_their_real_path(tmp_path):
+def test_two_fingers_on_one_port_are_detected_by_the_real_path(tmp_path):
     (tmp_path / "left").touch()
     (tmp_path / "again").symlink_to(tmp_path / "left")
     ports = (str(tmp_path / "left"), str(tmp_path / "again"))
@@ -200,7 +200,7 @@ def test_both_fingers_on_one_port_are_an_error_by_their_real_path(tmp_path):
         ("uucp", 0o600, "sudo chmod a+rw {}, until it is plugged in again; for good, a udev rule"),
     ],
 )
-def test_the_ports_own_group_is_advised(tmp_path, monkeypatch, group, mode, advice):
+def test_the_group_of_the_port_is_recommended(tmp_path, monkeypatch, group, mode, advice):
     port = tmp_path / "port"
     port.touch()
     port.chmod(mode)
@@ -210,10 +210,10 @@ def test_the_ports_own_group_is_advised(tmp_path, monkeypatch, group, mode, advi
     assert port_access.grant(str(tmp_path / "none")) == f"sudo chmod a+rw {tmp_path / 'none'}"
 
 
-# A daemon that gets no readings.
+# A daemon without readings.
 
 
-def test_run_tells_of_late_replies_at_the_start_and_while_it_is_disarmed(tmp_path, addresses):
+def test_run_reports_late_replies_at_start_up_and_while_disarmed(tmp_path, addresses):
     folder = tmp_path / "hand"
     with EmulatorProcess("--dir", folder, "--config", HIL).ready() as hand:
         assert hand.popen.poll() is None

@@ -1,4 +1,4 @@
-"""``softfinger export``: a recording's numbers in the files that others read."""
+"""``softfinger export`` writes a recording's values to CSV and Parquet."""
 
 import csv
 import math
@@ -24,7 +24,7 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_csv_has_every_field_with_all_its_digits(path, tmp_path):
+def test_csv_has_every_field_in_full_precision(path, tmp_path):
     export(Recording(path), tmp_path, CsvTable, [schema.STATE])
     with (tmp_path / "hand-state.csv").open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
@@ -62,11 +62,11 @@ def test_parquet_keeps_types_and_frames(path, tmp_path):
     assert frames["data"][left[5]].as_py() == raw["frames"][5].tobytes()
 
 
-def test_numbers_that_are_none_are_empty_cells(tmp_path):
+def test_nan_values_are_empty_cells(tmp_path):
     writer = RecordingWriter(tmp_path / "a.mcap")
     message = sample(schema.STATE)
     message["left"]["force"] = math.nan
-    message["news"] = 3.5  # of a newer daemon
+    message["news"] = 3.5  # field of a newer daemon
     writer.add(schema.STATE, message)
     writer.close()
     export(Recording(tmp_path / "a.mcap"), tmp_path, CsvTable, [schema.STATE])
@@ -75,7 +75,7 @@ def test_numbers_that_are_none_are_empty_cells(tmp_path):
     assert (row["left.force"], row["news"]) == ("", "3.5")
 
 
-def test_files_have_plain_names_whatever_the_topics_are_called(tmp_path):
+def test_files_have_plain_names_for_any_topic_prefix(tmp_path):
     writer = RecordingWriter(tmp_path / "a.mcap")
     for topic in (b".hidden", b"\x1b[2Jhand/../../x", b"nul\0", b"/"):
         writer.add(topic, {"timestamp": 1e9, "a": 1})
@@ -87,7 +87,7 @@ def test_files_have_plain_names_whatever_the_topics_are_called(tmp_path):
     assert {file.name for file in tmp_path.iterdir()} == names | {"a.mcap"}
 
 
-def test_from_the_command_line(path, tmp_path, inline):
+def test_command_line_output(path, tmp_path, inline):
     out = tmp_path / "out"
     words = ("--out", str(out), "--topics", "state", "--from", "100", "--to", "200")
     done = inline("export", path, *words)
@@ -102,7 +102,7 @@ def test_from_the_command_line(path, tmp_path, inline):
     assert "found topic 'dreams', the recording has hand/state, hand/tactile" in done.stderr
 
 
-def test_what_can_not_be_exported(tmp_path, inline):
+def test_invalid_exports_are_refused(tmp_path, inline):
     empty = tmp_path / "empty.mcap"
     RecordingWriter(empty).close()
     done = inline("export", empty)

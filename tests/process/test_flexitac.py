@@ -16,11 +16,11 @@ from tests.conftest import until
 from tests.harness.tactile import why_not_open
 from tests.unit.test_flexitac_decoder import CELLS, COLS, ROWS, frame, numbered
 
-LATE = 1026 * 10 / 2e6 + 0.02  # s that 32 × 32 cells take on the wire, and the latency
+LATE = 1026 * 10 / 2e6 + 0.02  # s, duration of 32 × 32 cells on the wire, plus latency
 
 
 class Board(FrameWriter):
-    """A board's port; sends what the test makes, in a thread of its own."""
+    """A board's port with a thread that sends the test's data."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -47,7 +47,7 @@ class Board(FrameWriter):
 
 @pytest.fixture
 def own_threads() -> Callable[[], set[threading.Thread]]:
-    """The threads of this test: others of this process may be a shared rig's."""
+    """Return the threads started in this test; other threads may belong to a shared rig."""
     before = set(threading.enumerate())
     return lambda: set(threading.enumerate()) - before
 
@@ -70,7 +70,7 @@ def sensor(path: object, rows: int = 32, cols: int = 32, timeout: float = 60.0) 
     return FlexiTac(tactile, RealClock(), 1)
 
 
-def test_frames_come_through_a_port_with_their_times(own_threads, board):
+def test_frames_are_received_through_a_port_with_their_times(own_threads, board):
     board.stream(lambda k: frame(numbered(1, 1024, k)[0]))
     tactile = sensor(board.path)
     assert tactile.latest() is None
@@ -78,7 +78,7 @@ def test_frames_come_through_a_port_with_their_times(own_threads, board):
     first = tactile.latest()
     until(lambda: tactile.latest().seq >= first.seq + 20)
     now = tactile.latest()
-    # A frame that was read alone; one with others behind it in the same read came earlier.
+    # Use a frame that was read alone; with others behind it, it would have arrived earlier.
     until(lambda: (n := tactile.latest()).t_arrival - n.t_sample == pytest.approx(LATE))
     assert first.t_arrival <= now.t_arrival <= time.monotonic()
     assert len(set(now.data.ravel().tolist())) == 1
@@ -88,18 +88,18 @@ def test_frames_come_through_a_port_with_their_times(own_threads, board):
     assert len(own_threads()) == 1  # the board's
 
 
-def test_a_frame_is_handed_over_while_the_line_is_quiet(board):
+def test_a_frame_is_delivered_before_the_next_one_arrives(board):
     tactile = sensor(board.path, ROWS, COLS)
     opener = threading.Thread(target=tactile.open)
     opener.start()
     until(lambda: board.send(frame(bytes(CELLS)) * 2) and tactile.counters()["bytes"] > 0)
     opener.join()
-    until(lambda: board.send(frame(b"\x07" * CELLS)))  # nothing follows
+    until(lambda: board.send(frame(b"\x07" * CELLS)))  # no further bytes follow
     until(lambda: tactile.latest().data[0, 0] == 7)
     tactile.close()
 
 
-def test_what_can_not_be_opened_is_told(tmp_path, board):
+def test_a_port_that_cannot_be_opened_is_reported(tmp_path, board):
     missing, file = tmp_path / "tactile-left", tmp_path / "file"
     assert "tactile-left: no such port; is `softfinger emulate`" in why_not_open(sensor(missing))
     file.write_text("")
@@ -110,14 +110,14 @@ def test_what_can_not_be_opened_is_told(tmp_path, board):
     assert "no marker AA 55" in why_not_open(sensor(board.path, timeout=5.0))
 
 
-def test_a_silent_port_is_told_with_its_name_and_the_timeout(own_threads, board):
+def test_a_silent_port_is_reported_with_its_name_and_time_out(own_threads, board):
     tactile = sensor(board.path, timeout=0.05)
     with pytest.raises(
         TactileError, match=rf"{board.path}: no byte came within tactile.open_timeout = 0\.05 s"
     ):
         tactile.open()
     assert not own_threads()
-    # And it can be opened once the board talks.
+    # The port can be opened once the board sends.
     board.stream(lambda k: frame(bytes(1024)))
     tactile.settings = tactile.settings.model_copy(update={"open_timeout": 60.0})
     assert why_not_open(tactile) == ""

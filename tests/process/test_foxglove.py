@@ -1,4 +1,4 @@
-"""``softfinger view --foxglove``: what a client reads from it, and who may be one."""
+"""``softfinger view --foxglove``: messages for clients, and access control."""
 
 import base64
 import json
@@ -37,11 +37,11 @@ TOPICS = {
     "hand/tactile/left": "foxglove.RawImage",
     "hand/tactile/right": "foxglove.RawImage",
 }
-WAIT = 60.0  # s for one message
+WAIT = 60.0  # s to wait for one message
 
 
 class Client:
-    """Subscribes to channels; ``next`` is a channel's next message, with its log time [s]."""
+    """Client that subscribes to channels; ``next`` returns a message and its log time [s]."""
 
     def __init__(self, socket: ClientConnection) -> None:
         self.socket = socket
@@ -60,7 +60,7 @@ class Client:
         self.socket.send(json.dumps({"op": "unsubscribe", "subscriptionIds": ended}))
 
     def next(self, topic: str = "") -> tuple[str, float, dict[str, Any]]:
-        """The next message, of this topic if one is named: its topic, log time [s] and content."""
+        """Return the next message, optionally of one topic: topic, log time [s] and content."""
         while True:
             message = self.socket.recv(timeout=WAIT)
             assert isinstance(message, bytes)
@@ -72,7 +72,7 @@ class Client:
 
 @contextmanager
 def served(fake: FakeDaemon) -> Iterator[tuple[str, Path]]:
-    """Foxglove's server of that stream: its address, and the layout."""
+    """Yield the address and layout of a Foxglove server for the stream."""
     process = started("view", "--foxglove", "0", "--address", fake.state_address, stderr=None)
     try:
         line = process.stdout.readline()
@@ -108,7 +108,7 @@ def test_a_client_reads_every_channel_of_the_running_hand() -> None:
             assert (log["level"], log["message"], log["name"]) == (3, early["text"], "start")
             assert log["timestamp"]["sec"] == int(early["timestamp"])
             client.unsubscribe("hand/state")
-            client.subscribe("hand/event")  # which is answered once that is carried out
+            client.subscribe("hand/event")  # the reply comes after the subscription is active
             client.next("hand/event")
             rest: set[str] = set()
             while not rest >= {"hand/scene", "hand/tactile/left", "hand/tactile/right"}:
@@ -117,7 +117,7 @@ def test_a_client_reads_every_channel_of_the_running_hand() -> None:
 
 
 def used_topics(layout: Any) -> set[str]:
-    """All topics that a layout names."""
+    """Return all topics used by a layout."""
     if isinstance(layout, dict):
         return set().union(*map(used_topics, layout.values()))
     if isinstance(layout, list):
@@ -136,7 +136,7 @@ def check_numbers(client: Client) -> None:
     assert message.keys() == expected.keys() == described.keys()
     assert message["left"].keys() == expected["left"].keys()
     assert 8.0 <= message["left"]["force"] <= 12.0
-    assert message["goal_force"] is None  # NaN, which JSON lacks
+    assert message["goal_force"] is None  # NaN is not available in JSON
     assert stamp == pytest.approx(message["timestamp"], abs=1e-6)
 
 
@@ -165,14 +165,15 @@ def check_scene(client: Client) -> None:
     (outline,) = named["object"]["lines"]
     points = np.array([[each["x"], each["y"]] for each in outline["points"]])
     (expected,) = hand_parts(Settings(), read(schema.HandState, state(0.0, 0)))["object"].lines
-    assert points == pytest.approx(expected[2], abs=6e-3)  # it turns by 5° at most
+    assert points == pytest.approx(expected[2], abs=6e-3)  # the object turns by at most 5°
 
 
 @pytest.fixture(scope="module")
 def stranger() -> Iterator[tuple[FakeDaemon, str]]:
-    """A made-up daemon, and where its server is."""
+    """Yield a fake daemon and the address of its Foxglove server."""
     with FakeDaemon() as fake, served(fake) as (address, _):
-        with connected(address) as line:  # a server that saw no state says so as it ends
+        # This avoids the server's warning at exit that no state arrived.
+        with connected(address) as line:
             client = Client(line)
             client.subscribe("hand/state")
             client.next("hand/state")
@@ -182,7 +183,7 @@ def stranger() -> Iterator[tuple[FakeDaemon, str]]:
 @pytest.mark.parametrize(
     "fields", [{"origin": "https://app.foxglove.dev"}, {"origin": "file://"}, {}]
 )
-def test_this_machine_and_foxglove_are_let_in(stranger, fields):
+def test_pages_of_this_machine_and_foxglove_are_accepted(stranger, fields):
     with connected(stranger[1], **fields) as line:
         assert Client(line).channels.keys() == TOPICS.keys()
 
@@ -196,13 +197,13 @@ def test_this_machine_and_foxglove_are_let_in(stranger, fields):
         {"additional_headers": {"Host": "rebound.example"}},
     ],
 )
-def test_no_other_page_is_let_in(stranger, fields):
+def test_all_other_pages_are_refused(stranger, fields):
     with pytest.raises(InvalidStatus, match="403"):
         connected(stranger[1], **fields)
 
 
 def connections(address: str) -> int:
-    """How many the server at ``address`` holds open."""
+    """Return the number of connections held by the server at ``address``."""
     port = int(address.rpartition(":")[2])
     (server,) = {
         each.pid
@@ -214,9 +215,9 @@ def connections(address: str) -> int:
 
 
 @pytest.mark.extended
-def test_a_client_that_takes_nothing_makes_room_for_another(stranger):
+def test_a_client_that_does_not_read_is_dropped_for_another(stranger):
     fake, address = stranger
-    fake.changes = {"fault": "x" * 30_000}  # states that fill a buffer soon
+    fake.changes = {"fault": "x" * 30_000}  # large states that soon fill a buffer
     with ExitStack() as stack:
         lazy = []
         for _ in range(CLIENT_COUNT_MAX):
@@ -236,13 +237,13 @@ def test_a_client_that_takes_nothing_makes_room_for_another(stranger):
                 client.sendall(masked({"subscriptions": [{"id": 1, "channelId": channel}]}))
         until(lambda: connections(address) < CLIENT_COUNT_MAX)
         with connected(address) as line:
-            Client(line)  # is welcomed
+            Client(line)  # accepted
 
 
-def test_what_asks_for_nothing_or_what_isnt_is_ended(stranger):
+def test_incomplete_and_invalid_requests_are_closed(stranger):
     _, address = stranger
     with socket.create_connection(place(address.removeprefix("ws://")), timeout=WAIT) as client:
-        client.sendall(b"GET / HTTP/1.1\r\n")  # its head has no end
+        client.sendall(b"GET / HTTP/1.1\r\n")  # an incomplete header
         assert client.recv(100) == b""
     for odd in ("{", "[]", '{"op": 3}x', '"id": 1, "channelId": 99', '"id": NaN, "channelId": 0'):
         with connected(address) as line:
@@ -259,12 +260,12 @@ REQUEST = (
 
 
 def masked(message: dict[str, Any]) -> bytes:
-    """A client's text frame, masked by zeros."""
+    """Return a client's text frame with a zero mask."""
     text = json.dumps(message).encode()
     assert len(text) < 126
     return bytes([0x81, 0x80 | len(text), 0, 0, 0, 0]) + text
 
 
-def test_foxglove_is_for_the_stream_alone(capsys):
+def test_foxglove_requires_the_live_stream(capsys):
     assert cli.main(["view", "run.mcap", "--foxglove"]) == 2
     assert "--foxglove serves the stream alone" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""The gateway's process may hang, die or be killed: the loop goes on; and a stop's own way."""
+"""The gateway process may hang, crash or be killed while the loop continues; local stops."""
 
 import asyncio
 import json
@@ -40,7 +40,7 @@ from tests.process.test_untrusted_clients import place
 
 @pytest.fixture
 def own_folder(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A runtime folder of the test's own, with a path short enough for a Unix socket's address."""
+    """Create a runtime folder whose path is short enough for a Unix socket."""
     with TemporaryDirectory(prefix="softfinger-") as folder:
         monkeypatch.setenv("XDG_RUNTIME_DIR", folder)
         monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
@@ -49,7 +49,7 @@ def own_folder(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 @pytest.fixture
 def ticking(addresses: Addresses, own_folder: Path) -> Iterator[Daemon]:
-    """A daemon that ticks in a thread; its gateway is a process."""
+    """Yield a daemon running in a thread, with its gateway in a process."""
     settings = Settings.model_validate(
         {
             "stream": {"address": addresses[0]},
@@ -66,7 +66,7 @@ def ticking(addresses: Addresses, own_folder: Path) -> Iterator[Daemon]:
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSEGV])
-def test_a_gateway_that_dies_is_started_again_while_the_loop_goes_on(ticking, addresses, number):
+def test_a_crashed_gateway_is_restarted_while_the_loop_continues(ticking, addresses, number):
     gateway, loop = ticking.gateway, ticking.loop
     with Hand(*addresses, timeout=60.0) as hand:
         hand.arm()
@@ -75,7 +75,7 @@ def test_a_gateway_that_dies_is_started_again_while_the_loop_goes_on(ticking, ad
         first, ticks = gateway.process, loop.state.seq
         os.kill(first, number)
         until(lambda: gateway.process != first)
-        # Its clients come back by themselves, and hear what they missed.
+        # Clients reconnect by themselves and receive missed events.
         with hand.events(timeout=60.0) as told:
             assert any(f"ended (signal {number})" in event.text for event in told)
         stream.skip()
@@ -85,9 +85,7 @@ def test_a_gateway_that_dies_is_started_again_while_the_loop_goes_on(ticking, ad
         assert ask(addresses[1], "status")["torque"] is True
 
 
-def test_who_subscribes_before_the_loop_has_the_new_gateway_gets_its_last_events(
-    addresses, context
-):
+def test_early_subscribers_of_a_new_gateway_receive_past_events(addresses, context):
     link = loop_link.Link()
     Publisher(link).event(0.0, 0.0, "info", "test", "while there was no gateway")
     ours, theirs = loop_link.pair()
@@ -114,7 +112,7 @@ def test_who_subscribes_before_the_loop_has_the_new_gateway_gets_its_last_events
         server.close()
 
 
-def test_the_gateway_leaves_with_its_daemon(profile, addresses, start):
+def test_the_gateway_ends_with_its_daemon(profile, addresses, start):
     running = start("--config", str(profile()))
     (gateway,) = psutil.Process(running.process.pid).children()
     running.process.kill()
@@ -151,7 +149,7 @@ sys.exit(gateway.main(sys.argv[1:]))
         ("STALLED", "select.select([], [], [], 0.5)", 0),  # as if it were stopped or starved
     ],
 )
-def test_a_gateway_that_hangs_ends_itself_and_a_busy_machine_ends_none(bound, does, status):
+def test_a_hanging_gateway_ends_itself_but_not_on_a_busy_machine(bound, does, status):
     ours, theirs = loop_link.pair()
     with ours, theirs:
         config = json.dumps(Config("", "", GATEWAY_TOPICS, 100))
@@ -160,7 +158,7 @@ def test_a_gateway_that_hangs_ends_itself_and_a_busy_machine_ends_none(bound, do
     assert ended.returncode == status
 
 
-def test_a_gateway_that_is_stopped_is_started_anew(addresses):
+def test_a_stopped_gateway_is_replaced(addresses):
     gateway = Gateway(Config(*addresses, GATEWAY_TOPICS, 100)).wait()
     try:
         stopped = gateway.process
@@ -171,7 +169,7 @@ def test_a_gateway_that_is_stopped_is_started_anew(addresses):
         gateway.close()
 
 
-def test_its_memory_has_a_bound_and_it_yields_to_the_loop(addresses):
+def test_gateway_memory_is_bounded_and_its_priority_is_normal(addresses):
     gateway = Gateway(Config(*addresses, GATEWAY_TOPICS, 100)).wait()
     try:
         limits = Path(f"/proc/{gateway.process}/limits").read_text(encoding="ascii")
@@ -184,30 +182,28 @@ def test_its_memory_has_a_bound_and_it_yields_to_the_loop(addresses):
         gateway.close()
 
 
-def test_a_loop_whose_gateway_reads_nothing_drops_messages_and_goes_on(addresses):
+def test_a_loop_with_a_stopped_gateway_drops_messages_without_waiting(addresses):
     gateway = Gateway(Config(*addresses, GATEWAY_TOPICS, 100)).wait()
     try:
         publisher = Publisher(gateway.link)
         gateway.link.look()
         os.kill(gateway.process, signal.SIGSTOP)
-        for k in range(50_000):  # would never end if it waited
+        for k in range(50_000):  # would never end if the loop waited
             publisher.event(0.0, 0.0, "info", "test", f"event {k}")
         assert len(gateway.link._channel._unsent) < 1000, (
             "less than one event more than there is room"
         )
-        with suppress(ProcessLookupError):  # who took so long had another started in its place
+        with suppress(ProcessLookupError):  # a slow gateway may have been replaced
             os.kill(gateway.process, signal.SIGCONT)
     finally:
         gateway.close()
 
 
-# --- a stop past all clients --------------------------------------------------------------------
+# --- local stop -----------------------------------------------------------------------------------
 
 
-def test_a_stop_on_this_machine_needs_no_place_among_the_clients(
-    ticking, addresses, inline, monkeypatch
-):
-    # A stopped gateway is not replaced, and a busy machine has no other way here.
+def test_a_local_stop_works_when_all_client_slots_are_used(ticking, addresses, inline, monkeypatch):
+    # Do not replace a stopped gateway, and allow only local delivery, even on a busy machine.
     monkeypatch.setattr(supervisor, "_STOPPED_COUNT_MAX", math.inf)
     monkeypatch.setattr(command_client, "LOCAL_STOP_TIMEOUT", 60.0)
     where = ["--address", ",".join(addresses)]
@@ -217,7 +213,7 @@ def test_a_stop_on_this_machine_needs_no_place_among_the_clients(
     ):
         hand.arm()
         page.shows("ARMED")
-        os.kill(ticking.gateway.process, signal.SIGSTOP)  # nobody is served
+        os.kill(ticking.gateway.process, signal.SIGSTOP)  # no client is served
         try:
             assert send(addresses[1], {"command": "stop"}, timeout=60.0)["ok"] is True
             assert ticking.loop.state.mode == "disarmed"
@@ -236,11 +232,11 @@ def test_a_stop_on_this_machine_needs_no_place_among_the_clients(
             os.kill(ticking.gateway.process, signal.SIGCONT)
         assert hand.wait_for(lambda state: not state.torque, 60.0).mode == "disarmed"
         hand.stop()
-        hand.arm()  # what comes after its answer is heard
+        hand.arm()  # commands after this reply are received
         hand.stop()
 
 
-def test_its_folder_and_file_are_the_users_alone(own_folder, addresses):
+def test_the_local_socket_is_private_to_the_user(own_folder, addresses):
     local = LocalStop(addresses[1])
     host, port = place(addresses[1])
     assert stat.S_IMODE(own_folder.stat().st_mode) == 0o700
@@ -251,7 +247,7 @@ def test_its_folder_and_file_are_the_users_alone(own_folder, addresses):
     assert list(own_folder.iterdir()) == []
 
 
-def test_a_folder_that_others_may_enter_is_not_taken(own_folder, addresses, monkeypatch, tmp_path):
+def test_a_folder_accessible_to_others_is_refused(own_folder, addresses, monkeypatch, tmp_path):
     own_folder.mkdir(mode=0o755)
     monkeypatch.setattr("softfinger.daemon.wire.local_stop._folders", lambda: iter([own_folder]))
     with pytest.raises(AddressError, match="is not this user's alone"):
@@ -263,14 +259,14 @@ def test_a_folder_that_others_may_enter_is_not_taken(own_folder, addresses, monk
     assert stop_locally(addresses[1], 0.1) is None
 
 
-def test_the_socket_of_a_daemon_that_was_killed_is_taken_over(own_folder, addresses):
+def test_the_socket_of_a_killed_daemon_is_replaced(own_folder, addresses):
     killed = LocalStop(addresses[1])
     killed._socket.close()
     assert stop_locally(addresses[1], 0.1) is None
     LocalStop(addresses[1]).close()
 
 
-def test_a_stop_for_another_machine_stops_nothing_here(own_folder, addresses):
+def test_a_stop_for_another_machine_has_no_effect_here(own_folder, addresses):
     local = LocalStop(addresses[1])
     for host in ("hand.example", "192.0.2.1", "127.0.0.2"):
         assert stop_locally(f"tcp://{host}:{place(addresses[1])[1]}", 0.1) is None
@@ -278,7 +274,7 @@ def test_a_stop_for_another_machine_stops_nothing_here(own_folder, addresses):
     local.close()
 
 
-def test_a_loop_that_ends_while_its_gateway_starts_is_no_error(addresses):
+def test_a_loop_that_ends_while_its_gateway_starts_raises_no_error(addresses):
     ours, theirs = loop_link.pair()
     config = Config(*addresses, GATEWAY_TOPICS, 10, 200, 10.0, 0o600, "")
     with ours, theirs:

@@ -1,4 +1,4 @@
-"""The glove-style board's framing as pure bytes, and its poll on a real pty."""
+"""The glove-style framing, tested on bytes, and its polling on a real pty."""
 
 import itertools
 
@@ -17,7 +17,7 @@ def counts(seed: int, rows: int = 3, cols: int = 4):
     return np.random.default_rng(seed).integers(0, 1024, (rows, cols)).astype(np.uint16)
 
 
-def test_a_frame_is_index_halves_and_newline():
+def test_a_frame_consists_of_index_value_halves_and_newline():
     data = encode_glove(np.array([[0, 31], [32, 1023]], np.uint16), 2)
     assert data == bytes([13, 11, 11, 11, 42, 12, 11, 42, 42, 10])
     decoded = GloveDecoder(2, 2).feed(data, 3.0)
@@ -33,19 +33,19 @@ def test_a_board_sends_all_its_bits(full_count):
     decoder = GloveDecoder(2, 3, bits_of(full_count))
     assert decoder.feed(data, 1.0).data.tolist() == sent.tolist()
     if full_count == 4095:
-        plain = GloveDecoder(2, 3, bits_of(65535))  # as a profile that doesn't tell
+        plain = GloveDecoder(2, 3, bits_of(65535))  # a profile without full_count
         assert plain.feed(data, 1.0) is None
         assert "full_count = 4095" in plain.diagnosis()
 
 
-def test_bytes_behind_a_frame_in_the_same_read_are_told():
+def test_trailing_bytes_after_a_frame_are_reported():
     decoder = GloveDecoder(3, 4)
     first, second, third = (encode_glove(counts(k), k) for k in range(3))
     assert decoder.feed(first + second + third[:7], 1.0).behind == 7
     assert decoder.feed(third[7:], 2.0).behind == 0
 
 
-def test_the_usual_board_has_2050_bytes_a_frame():
+def test_the_default_board_has_2050_bytes_per_frame():
     assert GloveDecoder().frame_bytes == len(encode_glove(counts(1, 32, 32))) == 2050
 
 
@@ -54,7 +54,7 @@ def test_the_usual_board_has_2050_bytes_a_frame():
     start=st.integers(0, 25),
     cuts=st.lists(st.integers(0, 130), max_size=8),
 )
-def test_any_cut_of_a_stream_gives_the_same_frames(seeds, start, cuts):
+def test_frames_do_not_depend_on_how_the_stream_is_split(seeds, start, cuts):
     stream = b"".join(encode_glove(counts(seed), k) for k, seed in enumerate(seeds))[start:]
     edges = [0, *sorted(min(cut, len(stream)) for cut in cuts), len(stream)]
     whole, pieces = GloveDecoder(3, 4), GloveDecoder(3, 4)
@@ -81,7 +81,7 @@ def test_any_cut_of_a_stream_gives_the_same_frames(seeds, start, cuts):
         (lambda data: b"\x03" + data[1:], "no half of a count"),
     ],
 )
-def test_a_damaged_frame_is_dropped_and_told(spoil, told):
+def test_a_corrupted_frame_is_dropped_and_reported(spoil, told):
     decoder = GloveDecoder(3, 4)
     good = encode_glove(counts(5))
     assert decoder.feed(good, 0.0) is not None
@@ -91,12 +91,12 @@ def test_a_damaged_frame_is_dropped_and_told(spoil, told):
     assert decoder.feed(good, 0.0) is not None
 
 
-def test_the_board_is_asked_for_each_frame_and_again_when_an_answer_is_lost(tmp_path):
+def test_each_frame_is_requested_and_requested_again_after_a_lost_reply(tmp_path):
     with Rig("glove", tmp_path, fault="torn=0.5") as rig:
         rig.sensor.open()
         first = rig.sensor.latest().seq
         until(lambda: rig.sensor.latest().seq >= first + 5)
         counters = rig.sensor.counters()
-        # It answers requests only: nothing is sent that was not asked for.
+        # The board only replies to requests.
         assert rig.board.sent <= counters["frames"] + counters["resyncs"] + 3
         assert rig.board.dropped == 0

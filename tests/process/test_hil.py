@@ -1,7 +1,7 @@
-"""Hardware in the loop: the daemon's process on the stand-in hand's, over real serial bytes.
+"""Hardware in the loop: daemon and emulated hand in separate processes, over serial bytes.
 
-The stand-in hand tells by its control socket what was on the servos' wire, and when their bus
-watchdog stopped them: where the daemon dies, stands still, or loses its port.
+The emulated hand's control socket reports the traffic on the servo wire and the watchdog trips
+after the daemon dies, stalls or loses its port.
 """
 
 import json
@@ -20,13 +20,13 @@ from tests.harness.daemon_process import Running, ask, softfinger, started
 from tests.harness.descendants import ending
 from tests.harness.emulated import HIL, EmulatorProcess
 
-WATCHDOG = 2.0  # s, well above what a busy machine holds the daemon up
+WATCHDOG = 2.0  # s, well above the delays of a busy machine
 REAL = [
-    *("--set", "loop.clock=real"),  # else the hand waits for a daemon that stands still
+    *("--set", "loop.clock=real"),  # with a shared clock, the hand would wait for a stalled daemon
     *("--set", f"servos.watchdog={WATCHDOG}", "--set", f"servos.fault_after={WATCHDOG}"),
     *("--set", "servos.reply_timeout=0.1", "--set", "servos.open_timeout=60"),
 ]
-# By the hand's time, of which little passes while the emulated hand gets no processor.
+# These use the hand's time, which hardly advances while the emulator gets no processor time.
 WAITING = [
     *("--set", "servos.fault_after=1.0", "--set", "safety.frame_age_fault=100"),
     *("--set", "servos.open_timeout=60"),
@@ -34,7 +34,7 @@ WAITING = [
 
 
 class Rig:
-    """The stand-in hand, and a daemon on it that can be started again."""
+    """The emulated hand and a daemon that can be restarted."""
 
     def __init__(self, folder: Path, addresses: Addresses, *words: str) -> None:
         self.folder = folder / "hand"
@@ -68,7 +68,7 @@ class Rig:
         assert reply["ok"], reply
 
     def at_work(self) -> list[dict[str, Any]]:
-        """From disarmed: arm, and be under way by the report that this returns."""
+        """Arm a disarmed hand and start moving; return the report on its servos."""
         self.does("arm")
         self.does("move", left=0.3, right=0.3)
         servos: list[dict[str, Any]] = []
@@ -81,7 +81,7 @@ class Rig:
         return servos
 
     def works(self) -> None:
-        """From disarmed: arm, go somewhere, be there."""
+        """Arm a disarmed hand, move to two positions and disarm."""
         self.does("arm")
         for target in (-0.1, 0.1):
             self.does("move", left=target, right=target)
@@ -114,7 +114,7 @@ def rig(tmp_path: Path, addresses: Addresses) -> Iterator[Rig]:
 
 
 @pytest.mark.waits
-def test_a_grasp_over_bytes_by_a_daemon_and_a_hand_that_wait_for_each_other(tmp_path, addresses):
+def test_a_grasp_over_serial_bytes_with_a_shared_clock(tmp_path, addresses):
     rig = Rig(tmp_path, addresses, *WAITING)
     try:
         daemon = rig.start()
@@ -128,13 +128,13 @@ def test_a_grasp_over_bytes_by_a_daemon_and_a_hand_that_wait_for_each_other(tmp_
             for process in (daemon.process, rig.hand.popen):
                 stood = hand.state().behind_s + 0.4
                 process.send_signal(signal.SIGSTOP)
-                select.select([], [], [], 0.5)  # five times what the watchdog allows
+                select.select([], [], [], 0.5)  # five times the watchdog time
                 process.send_signal(signal.SIGCONT)
                 hand.wait_for(lambda state, at=stood: state.behind_s > at, 120.0)
             with hand.stream(120.0) as states:
                 held = [next(states) for _ in range(60)]
             assert {(state.mode, state.fault) for state in held} == {("holding", "")}
-            # A frame that comes late keeps a contact from being valid for a moment.
+            # A late frame invalidates a contact for a moment.
             sound = [state for state in held if state.left.valid and state.right.valid]
             forces = [(state.left.force, state.right.force) for state in sound]
             near = [each == pytest.approx((10.0, 10.0), rel=0.05) for each in forces]
@@ -150,13 +150,13 @@ def test_a_grasp_over_bytes_by_a_daemon_and_a_hand_that_wait_for_each_other(tmp_
             assert not any(each["watchdog_fired"]["count"] for each in rig.report()["servos"])
             hand.arm()
             hand.wait_for(lambda state: state.torque, 120.0)
-        daemon.kill()  # one that is gone is waited for no longer
+        daemon.kill()  # the hand does not wait for a dead daemon
         until(rig.stopped)
     finally:
         rig.close()
 
 
-def test_a_start_waits_for_servos_that_do_not_answer_yet(tmp_path, addresses):
+def test_start_up_waits_for_servos_that_have_not_responded_yet(tmp_path, addresses):
     rig = Rig(tmp_path, addresses)
     words = ("run", "--config", rig.config, "--dir", rig.folder, "--set")
     try:
@@ -178,7 +178,7 @@ def test_a_start_waits_for_servos_that_do_not_answer_yet(tmp_path, addresses):
 
 
 def stops_in_time(rig: Rig, lose: Callable[[], object]) -> None:
-    """Each servo at work stops when the watchdog has heard nothing for its time."""
+    """Check that each servo at work stops when its watchdog times out."""
     before = rig.at_work()
     lose()
     until(rig.stopped)
@@ -190,7 +190,7 @@ def stops_in_time(rig: Rig, lose: Callable[[], object]) -> None:
 
 
 def test_servos_stop_by_themselves_and_the_hand_works_again(rig):
-    # Boards of another size than the profile's are no start.
+    # The daemon refuses to start if the boards have another size than the profile.
     where = ("--config", str(rig.config), "--dir", str(rig.folder))
     done = softfinger("run", *where, "--set", "tactile.rows=16")
     assert done.returncode == 1
@@ -199,7 +199,7 @@ def test_servos_stop_by_themselves_and_the_hand_works_again(rig):
     assert "16" in last
     assert "Traceback" not in done.stderr
 
-    # Killed: nothing is left that could say anything to the servos.
+    # Kill the daemon, so nothing is sent to the servos.
     daemon = rig.start()
     stops_in_time(rig, daemon.kill)
     daemon = rig.start()
@@ -209,7 +209,7 @@ def test_servos_stop_by_themselves_and_the_hand_works_again(rig):
     send_words(rig.folder, "forget")
     rig.works()
 
-    # Stopped for longer than the watchdog allows, then continued.
+    # Suspend the daemon for longer than the watchdog time, then continue it.
     stops_in_time(rig, lambda: daemon.process.send_signal(signal.SIGSTOP))
     daemon.process.send_signal(signal.SIGCONT)
     until(lambda: rig.status()["mode"] == "fault")
@@ -218,7 +218,7 @@ def test_servos_stop_by_themselves_and_the_hand_works_again(rig):
     send_words(rig.folder, "forget")
     rig.works()
 
-    # Unplugged, and plugged in again.
+    # Unplug the port and plug it in again.
     stops_in_time(rig, lambda: send_words(rig.folder, "unplug"))
     until(lambda: rig.status()["mode"] == "fault")
     assert rig.status()["fault_name"] == "servos.bus"
@@ -229,7 +229,7 @@ def test_servos_stop_by_themselves_and_the_hand_works_again(rig):
     send_words(rig.folder, "forget")
     rig.works()
 
-    # The other end of the line is gone for good.
+    # Remove the other end of the line permanently.
     rig.at_work()
     rig.hand.popen.kill()
     until(lambda: rig.status()["mode"] == "fault")
@@ -239,10 +239,10 @@ def test_servos_stop_by_themselves_and_the_hand_works_again(rig):
     assert "ended with a fault" in "".join(daemon.lines)
 
 
-def test_what_gets_lost_on_the_line_does_not_keep_torque_on(rig):
+def test_lost_packets_do_not_keep_torque_on(rig):
     rig.start()
 
-    # A stop of which no write arrives, though readings do, and feed the servos' watchdogs.
+    # The stop's writes are lost, but readings arrive and keep resetting the servos' watchdogs.
     rig.at_work()
     send_words(rig.folder, "lose-writes=1")
     told = softfinger("send", "stop", "--address", rig.commands)
@@ -256,7 +256,7 @@ def test_what_gets_lost_on_the_line_does_not_keep_torque_on(rig):
     assert not any(servo["torque"] for servo in rig.report()["servos"])
     rig.clears()
 
-    # Goals that no longer arrive are noticed by themselves.
+    # The daemon detects lost goals by itself.
     rig.at_work()
     send_words(rig.folder, "lose-writes=1")
     until(lambda: rig.status()["mode"] == "fault")
@@ -265,7 +265,7 @@ def test_what_gets_lost_on_the_line_does_not_keep_torque_on(rig):
     send_words(rig.folder, "lose-writes=0")
     rig.clears()
 
-    # Nine packets in ten, both ways.
+    # Lose nine of ten packets in both directions.
     rig.at_work()
     send_words(rig.folder, "lose=0.9 drop=0.9")
     rig.send("stop")
@@ -276,14 +276,14 @@ def test_what_gets_lost_on_the_line_does_not_keep_torque_on(rig):
     )
     send_words(rig.folder, "well")
     until(lambda: not rig.status()["torque"])
-    if rig.status()["mode"] == "fault":  # by when torque off was confirmed
+    if rig.status()["mode"] == "fault":  # depends on when torque off was confirmed
         rig.does("clear")
     rig.works()
 
 
 @pytest.mark.extended
-def test_swapped_ids_are_a_fault_in_the_approach(tmp_path, addresses):
-    """With zero and direction as `calibrate joints` would find them for each servo."""
+def test_swapped_ids_are_a_fault_during_the_approach(tmp_path, addresses):
+    """Use the zero offset and direction that `calibrate joints` would find for each servo."""
     hand, off = tmp_path / "hand", "simulation.object_position=[0.004, 0.08]"
     config = tmp_path / "hil.toml"
     head = f'stream.address = "{addresses[0]}"\ncommands.address = "{addresses[1]}"\n'

@@ -1,6 +1,7 @@
-"""The folder of compiled kernels: nothing compiled from other sources is run, nor by another user.
+"""The folder of compiled kernels: no kernel from other sources or another user is run.
 
-A small package of this shape, with the real decorators, is changed and run in processes of its own.
+A small package with the real decorators and the same structure is changed and run in separate
+processes.
 """
 
 import os
@@ -63,11 +64,11 @@ print(c.caller(1.0), sum(c.caller.stats.cache_hits.values()))
 
 
 class Package:
-    """The small package in a folder, with a cache folder of its own beside it."""
+    """The small package in a folder, next to its own cache folder."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.first = ""  # of each script
+        self.first = ""  # prefix of every script
         self.cache = folder / "cache"
         for name, text in FILES.items():
             self.write(name, text)
@@ -76,13 +77,13 @@ class Package:
             shutil.copy(file, folder / "softfinger" / "kinematics" / "compiled")
 
     def write(self, name: str, text: str) -> None:
-        """Write one of its files."""
+        """Write one of the package's files."""
         file = self.folder / name
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(text, encoding="utf-8")
 
     def run(self, script: str = RUN) -> tuple[list[str], str]:
-        """What the kernel gave and how often it came from the cache; what was warned of."""
+        """Return the kernel's result, the number of kernels from the cache, and the warnings."""
         environment = os.environ | {"XDG_CACHE_HOME": str(self.cache), "PYTHONPATH": ""}
         environment.pop("NUMBA_CACHE_DIR", None)
         done = python("-c", self.first + script, env=environment, cwd=self.folder)
@@ -98,7 +99,7 @@ def package(tmp_path: Path) -> Package:
     "first",
     ["", pytest.param("import numba\nnumba.__version__ = '99.0'\n", marks=pytest.mark.extended)],
 )
-def test_a_changed_callee_or_constant_is_compiled_anew(package, first):
+def test_a_changed_callee_or_constant_is_recompiled(package, first):
     package.first = first
     assert package.run() == (["3.0", "0"], "")
     package.write(
@@ -114,7 +115,7 @@ def test_a_changed_callee_or_constant_is_compiled_anew(package, first):
 
 
 @pytest.mark.extended
-def test_a_kept_kernel_runs_without_what_compiles_and_is_compiled_into_others(package):
+def test_a_cached_kernel_runs_without_the_compiler_and_can_be_compiled_into_others(package):
     assert package.run(KEPT) == (["9.0", "0", "True"], "")
     assert package.run(KEPT) == (["9.0", "1", "False"], "")
     assert package.run(KEPT.replace("ramp(3.0).sum()", "total(3.0)"))[0][0] == "9.0"
@@ -136,7 +137,7 @@ def test_own_folder_refuses_links_files_and_other_users(tmp_path, monkeypatch):
 
 
 @pytest.mark.extended
-def test_the_folder_is_the_users_own_and_those_not_used_for_longest_go(package):
+def test_the_folder_is_private_and_the_least_recently_used_ones_are_removed(package):
     base = package.cache / "softfinger"
     for age in range(7):
         old = base / f"kernels-{age:016x}"
@@ -166,7 +167,7 @@ def test_the_folder_is_the_users_own_and_those_not_used_for_longest_go(package):
     assert found == ["3.0", "0"], "compiled, but not taken from it"
     assert f"{base / new}: may be written by others (0777): chmod go-w" in told
     (base / new).chmod(0o700)
-    package.cache.chmod(0o777)  # a folder above it
+    package.cache.chmod(0o777)  # a parent folder
     found, told = package.run()
     assert found == ["3.0", "0"]
     assert f"{package.cache}: may be written by others (0777): chmod go-w" in told
@@ -187,7 +188,7 @@ SPOILT: dict[str, Callable[[Path], object]] = {
 }
 
 
-def test_a_damaged_kernel_is_compiled_anew_with_a_warning(package, tmp_path):
+def test_a_damaged_kernel_is_recompiled_with_a_warning(package, tmp_path):
     package.run()
     (file,) = package.cache.rglob("*.kernel")
     flipped(file)
@@ -197,7 +198,7 @@ def test_a_damaged_kernel_is_compiled_anew_with_a_warning(package, tmp_path):
     with OwnFolder(tmp_path / "kept") as folder:
         for name, spoil in SPOILT.items():
             if name == "another's" and os.geteuid() != 0:
-                continue  # only root gives files away
+                continue  # only root can change the owner of a file
             kernel_folder.keep(folder, "one", b"machine code")
             assert kernel_folder.kept(folder, "one") == b"machine code"
             spoil(folder.path / "one.kernel")
@@ -218,7 +219,7 @@ def test_damaged_kernels_are_found_and_removed_with_their_marks(tmp_path):
         assert folder.names() == ["two.kernel"]
 
 
-def test_a_folder_that_is_renamed_is_read_as_it_was_opened(tmp_path):
+def test_a_folder_that_is_renamed_is_still_used_as_opened(tmp_path):
     path, theirs = tmp_path / "kept", tmp_path / "theirs"
     theirs.mkdir()
     (theirs / "one.kernel").write_bytes(b"theirs")

@@ -1,4 +1,4 @@
-"""Keys: the files, and that nobody without one gets anything from the daemon's sockets."""
+"""Key files, and access control of the daemon's sockets with keys."""
 
 import errno
 import os
@@ -23,7 +23,7 @@ from tests.harness.gateway import Served
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Keys of a server, of the client local, and of alice."""
+    """Create keys of a server and of two clients, local and alice."""
     make_keys(tmp_path / "keys", ["alice"])
     return tmp_path / "keys"
 
@@ -31,7 +31,7 @@ def folder(tmp_path: Path) -> Path:
 # --- files ------------------------------------------------------------------------------------
 
 
-def test_every_file_is_its_owners_alone_and_zeromq_reads_it(folder):
+def test_key_files_are_private_and_readable_by_zeromq(folder):
     files = [path for path in folder.rglob("*") if path.is_file()]
     assert len(files) == 8
     for path in files:
@@ -42,7 +42,7 @@ def test_every_file_is_its_owners_alone_and_zeromq_reads_it(folder):
     assert {stat.S_IMODE(p.stat().st_mode) for p in folder.rglob("*") if p.is_dir()} == {0o700}
 
 
-def test_what_a_client_shows_is_what_the_server_lets_in(folder):
+def test_the_server_accepts_the_key_that_a_client_shows(folder):
     server = load_server(folder)
     assert load_server(folder / "server") == server
     assert sorted(server.clients.values()) == ["alice", "local"]
@@ -53,7 +53,7 @@ def test_what_a_client_shows_is_what_the_server_lets_in(folder):
     assert load_client(folder) == load_client(folder / "local")
 
 
-def test_a_client_is_added_and_nothing_is_overwritten(folder):
+def test_adding_a_client_overwrites_no_files(folder):
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     make_keys(folder, ["bob"])
     assert load_client(folder / "bob").public in load_server(folder).clients
@@ -64,7 +64,7 @@ def test_a_client_is_added_and_nothing_is_overwritten(folder):
     assert all(path.read_bytes() == text for path, text in before.items())
 
 
-def test_damaged_missing_and_open_files_are_told(folder):
+def test_damaged_missing_and_readable_key_files_are_reported(folder):
     with pytest.raises(KeyFileError, match=r"can't be read: .*softfinger keys"):
         load_server(folder / "nowhere")
     secret = folder / "server" / "server.key_secret"
@@ -92,7 +92,7 @@ def test_damaged_missing_and_open_files_are_told(folder):
     "which",
     ["", "server", "server/clients", "server/clients/alice.key", "server/server.key_secret"],
 )
-def test_keys_that_somebody_else_may_write_or_owns_are_refused(folder, which, monkeypatch):
+def test_keys_that_others_own_or_may_write_are_refused(folder, which, monkeypatch):
     path = folder / which if which else folder
     mode = stat.S_IMODE(path.stat().st_mode)
     path.chmod(mode | 0o022)
@@ -100,7 +100,7 @@ def test_keys_that_somebody_else_may_write_or_owns_are_refused(folder, which, mo
         load_server(folder)
     path.chmod(mode)
     load_server(folder)
-    monkeypatch.setattr(os, "geteuid", lambda: 4_242)  # whoever it is, it isn't ours
+    monkeypatch.setattr(os, "geteuid", lambda: 4_242)  # any user other than the owner
     if os.getuid() == 0:
         for each in [path, *path.parents]:
             if each.is_relative_to(folder):
@@ -110,9 +110,7 @@ def test_keys_that_somebody_else_may_write_or_owns_are_refused(folder, which, mo
         load_server(folder)
 
 
-def test_strangers_that_leave_no_descriptor_shut_nobody_out_and_keep_nobody_in(
-    folder, context, monkeypatch
-):
+def test_client_keys_are_still_revoked_without_free_file_descriptors(folder, context, monkeypatch):
     def no_descriptor_left(path: Path) -> NoReturn:
         raise OSError(errno.EMFILE, os.strerror(errno.EMFILE), str(path))
 
@@ -137,7 +135,7 @@ def test_strangers_that_leave_no_descriptor_shut_nobody_out_and_keep_nobody_in(
 
 
 class Guarded:
-    """Both of the daemon's sockets, for the holders of keys; commands are answered as they come."""
+    """Both sockets of a daemon with keys; commands are served as they arrive."""
 
     def __init__(self, addresses: Addresses, folder: Path) -> None:
         self.served = Served(*addresses, keys=str(folder))
@@ -161,7 +159,7 @@ def guarded(addresses: Addresses, folder: Path) -> Iterator[Guarded]:
 
 @pytest.fixture
 def others() -> Iterator[zmq.Context[Any]]:
-    """Where the clients live: as in life, not in the daemon's context."""
+    """Return a context for clients, separate from the daemon's as in practice."""
     others: zmq.Context[Any] = zmq.Context()
     yield others
     others.destroy(linger=0)
@@ -170,7 +168,7 @@ def others() -> Iterator[zmq.Context[Any]]:
 def ask(
     context: zmq.Context[Any], addresses: Addresses, keys: Any
 ) -> tuple[zmq.Socket[Any], zmq.Socket[Any]]:
-    """A subscriber and a command on its way, which says that it is another's."""
+    """Return a subscriber and a socket with a pending command in another client's name."""
     subscriber, commander = context.socket(zmq.SUB), context.socket(zmq.DEALER)
     for socket, address in zip((subscriber, commander), addresses, strict=True):
         socket.setsockopt(zmq.LINGER, 0)
@@ -179,7 +177,7 @@ def ask(
         if socket is subscriber:
             socket.subscribe(b"")
         socket.connect(address)
-    commander.send(msgpack.packb({"command": "arm", "client": "local"}))  # whatever it says
+    commander.send(msgpack.packb({"command": "arm", "client": "local"}))  # the name is ignored
     return subscriber, commander
 
 
@@ -194,13 +192,13 @@ def stranger(folder: Path, kind: str) -> Any:
 
 
 @pytest.mark.parametrize("kind", ["no key", "unknown key", "another server's"])
-def test_a_client_is_who_its_key_says_and_whoever_has_no_key_gets_nothing(
+def test_the_key_identifies_a_client_and_clients_without_a_key_get_nothing(
     guarded, others, addresses, folder, kind
 ):
     theirs = ask(others, addresses, stranger(folder, kind))
     ours = ask(others, addresses, load_client(folder / "alice"))
     seen = 0
-    while seen < 200:  # ours was served two hundred times, and the stranger never
+    while seen < 200:  # the client with a key receives 200 messages, the one without receives none
         guarded.step()
         if ours[0].poll(2):
             ours[0].recv_multipart()
@@ -211,7 +209,7 @@ def test_a_client_is_who_its_key_says_and_whoever_has_no_key_gets_nothing(
     assert guarded.heard == [{"command": "arm", "client": "alice"}]
 
 
-def test_who_stops_is_answered_while_others_stop_without_pause(guarded, others, addresses, folder):
+def test_a_stop_is_answered_while_others_stop_continuously(guarded, others, addresses, folder):
     stopper = others.socket(zmq.REQ)
     stopper.setsockopt(zmq.LINGER, 0)
     load_client(folder / "alice").guard(stopper)
@@ -219,7 +217,7 @@ def test_who_stops_is_answered_while_others_stop_without_pause(guarded, others, 
     stopper.send(msgpack.packb({"command": "stop"}))
 
     def answered() -> int:
-        guarded.served.server.raise_fence()  # as each stop does
+        guarded.served.server.raise_fence()  # as every stop does
         guarded.step()
         return stopper.poll(0)
 
@@ -230,9 +228,7 @@ def test_who_stops_is_answered_while_others_stop_without_pause(guarded, others, 
 # --- the daemon -------------------------------------------------------------------------------
 
 
-def test_a_client_is_shut_out_while_the_daemon_runs_and_another_is_let_in(
-    profile, addresses, folder, start
-):
+def test_clients_are_removed_and_added_while_the_daemon_runs(profile, addresses, folder, start):
     running = start(
         "--config", str(profile(f'access.keys = "{folder}"\nsafety.overruns_fault = 100000\n'))
     )
@@ -263,13 +259,13 @@ def test_a_client_is_shut_out_while_the_daemon_runs_and_another_is_let_in(
         except NoAnswer:
             return False
 
-    until(bob_is_let_in)  # the daemon looks for new keys now and then
+    until(bob_is_let_in)  # the daemon checks for new keys periodically
     with Hand(*addresses, keys=folder, timeout=60.0) as local:
         assert local.state().mode == "disarmed"
     assert running.end() == 0
 
 
-def test_the_command_makes_keys_and_refuses_to_make_them_again(tmp_path, inline):
+def test_the_command_creates_keys_only_once(tmp_path, inline):
     words = ("keys", tmp_path / "keys", "alice")
     first, again = inline(*words), inline(*words)
     assert first.returncode == 0

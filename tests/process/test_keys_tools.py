@@ -1,4 +1,4 @@
-"""Every tool that speaks with a daemon does so with keys, and says so where it lacks them."""
+"""Every client tool supports keys and reports when they are missing."""
 
 import asyncio
 import json
@@ -28,11 +28,11 @@ from tests.unit.test_schema import sample
 
 
 class Guarded(NamedTuple):
-    """A daemon that lets in the clients of ``folder`` alone."""
+    """A daemon that accepts only the clients of ``folder``."""
 
     folder: Path
     addresses: Addresses
-    recording: Path  # of itself
+    recording: Path  # made by the daemon itself
 
 
 @pytest.fixture(scope="module")
@@ -76,12 +76,12 @@ def test_tools_with_keys_see_and_command_the_hand(guarded, tmp_path, inline):
             return (await hand.wait_for(lambda state: not state.torque, 60.0)).mode
 
     assert asyncio.run(session()) == "disarmed"
-    # Who could end the daemon may stop it, too, without a key.
+    # A user who may end the daemon may also stop it without a key.
     assert ask(commands, "stop")["ok"]
 
 
 @pytest.mark.extended
-def test_tools_without_keys_see_nothing_and_say_what_may_be_missing(guarded, tmp_path, inline):
+def test_tools_without_keys_receive_nothing_and_suggest_the_option(guarded, tmp_path, inline):
     stream, commands = guarded.addresses
     path = tmp_path / "b.mcap"
     tools = [
@@ -97,7 +97,7 @@ def test_tools_without_keys_see_nothing_and_say_what_may_be_missing(guarded, tmp
         said = tool.communicate(timeout=300)[1]
         assert tool.returncode in (1, 2), tool.args
         assert "--keys" in said, tool.args
-    # Keys that can't be read are told before there is a file.
+    # Unreadable keys are reported before a file is created.
     path = tmp_path / "c.mcap"
     done = inline("record", path, "--address", stream, "--keys", tmp_path / "none")
     assert done.returncode == 1
@@ -111,7 +111,7 @@ def test_a_daemon_with_keys_records_itself(guarded):
     assert first["seq"] == 1
 
 
-def test_a_recording_is_replayed_to_holders_of_keys(addresses, tmp_path):
+def test_a_replay_is_sent_only_to_holders_of_keys(addresses, tmp_path):
     path, folder = tmp_path / "run.mcap", tmp_path / "keys"
     make_keys(folder, ["alice"])
     written(path, 20)
@@ -140,12 +140,12 @@ def test_a_recording_is_replayed_to_holders_of_keys(addresses, tmp_path):
         ("nonsense", "expected tcp://127.0.0.1:PORT"),
     ],
 )
-def test_nothing_is_replayed_to_other_machines_without_keys(address, reason):
+def test_a_replay_without_keys_stays_on_this_machine(address, reason):
     with pytest.raises(RecordingError, match=reason):
         Wire(address)
 
 
-def test_late_subscribers_of_a_replay_are_told_settings_and_events_again(addresses):
+def test_late_subscribers_of_a_replay_receive_earlier_settings_and_events(addresses):
     told = {"schema": 1, "seq": 1, "again": False, "timestamp": 1.0, "mono_ns": 5, "settings": "{}"}
     event = {"schema": 1, "seq": 7, "again": False, "timestamp": 2.0, "text": "b"}
     with Wire(addresses[0]) as wire, Hand(*addresses, timeout=60.0) as late:

@@ -1,4 +1,4 @@
-"""The demo as a process that stands still for a second while it is at work."""
+"""The demo as a process that is suspended for a second while it works."""
 
 import select
 import signal
@@ -12,8 +12,8 @@ from softfinger.daemon.wire.schema import Event
 from tests.conftest import Addresses
 from tests.harness.daemon_process import Running
 
-STILL = 1.0  # s, ten times what the watchdog and the frames' age allow
-PATIENCE = 60.0  # s for anything to happen on a busy machine
+STILL = 1.0  # s, ten times the watchdog time and the maximum frame age
+PATIENCE = 60.0  # s to wait for an event on a busy machine
 
 
 @pytest.fixture
@@ -36,7 +36,7 @@ def told(events: Subscription[Event], kind: str, text: str) -> str:
     return next(each.text for each in events if each.kind == kind and text in each.text)
 
 
-def test_a_simulated_hand_outlives_a_machine_that_stands_still(start, profile, hand):
+def test_a_simulated_hand_survives_a_suspended_machine(start, profile, hand):
     running = start("--config", str(profile('task.name = "demo"\n')))
     with hand.stream(PATIENCE) as states, hand.events(PATIENCE) as events:
         before = after(states, "holding")
@@ -44,7 +44,7 @@ def test_a_simulated_hand_outlives_a_machine_that_stands_still(start, profile, h
         for mode in ("rotating", "holding", "releasing", "grasping"):
             state = after(states, mode)
             assert state.fault == ""
-        # The hand's time has gone on by what it did, and not by what the machine did not.
+        # The hand's time advances by its own running time, not by the machine's pause.
         assert state.behind_s >= before.behind_s + 0.9 * STILL
         passed = 1e-9 * (state.mono_ns - before.mono_ns)
         assert passed == pytest.approx((state.seq - before.seq) / 100.0)
@@ -53,13 +53,14 @@ def test_a_simulated_hand_outlives_a_machine_that_stands_still(start, profile, h
 
 
 @pytest.mark.extended
-def test_on_real_time_it_faults_names_the_busy_machine_and_begins_again(start, profile, hand):
+def test_on_real_time_a_stall_is_a_fault_and_the_task_restarts(start, profile, hand):
     running = start("--config", str(profile('task.name = "demo"\nloop.clock = "real"\n')))
     with hand.stream(PATIENCE) as states, hand.events(PATIENCE) as events:
-        next(state for state in states if state.mode == "holding")  # again, where it tripped before
+        # The demo may already have faulted and restarted.
+        next(state for state in states if state.mode == "holding")
         stand_still(running)
         fault = told(events, "servos.bus", "watchdog")
         assert fault.startswith("this machine was busy for ")
         told(events, "task", "the task clears it and begins again")
         told(events, "mode", "armed → grasping")
-    assert running.end() in (0, 1)  # a busy machine may stop it at any time
+    assert running.end() in (0, 1)  # a busy machine may cause a fault at any time

@@ -1,4 +1,4 @@
-"""The hand as a robot of LeRobot: found, driven and recorded by the real package."""
+"""The hand as a LeRobot robot: found, driven and recorded by the real package."""
 
 import math
 import runpy
@@ -23,7 +23,7 @@ PACKAGE = Path(__file__).parents[2] / "lerobot_robot_softfinger"
 
 @pytest.fixture
 def make(tmp_path: Path, addresses: Addresses, monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Makes the robot as LeRobot's programs do, of the installed package."""
+    """Return a function that creates the installed robot as LeRobot's programs do."""
     monkeypatch.setenv("HF_HOME", str(tmp_path / "hf"))
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     pytest.importorskip("lerobot")
@@ -48,7 +48,7 @@ def make(tmp_path: Path, addresses: Addresses, monkeypatch: pytest.MonkeyPatch) 
 
 
 def act_until(robot: Any, action: dict[str, float], done: Callable[[dict[str, Any]], Any]) -> Any:
-    """Give one action again and again, as a policy does, until an observation is as wanted."""
+    """Send one action repeatedly, as a policy does, until an observation satisfies a condition."""
     for _ in range(20_000):
         robot.send_action(action)
         found = robot.get_observation()
@@ -70,7 +70,7 @@ def test_lerobot_drives_and_records_the_simulated_hand(make, start, profile, tmp
         make(rows=10).connect()
     robot.connect()
     first = robot.get_observation()
-    assert robot._hand.state().mode == "disarmed"  # connecting and looking left it as it was
+    assert robot._hand.state().mode == "disarmed"  # connecting and reading do not arm the hand
     assert set(first) == set(robot.observation_features)
     robot.calibrate()
 
@@ -82,7 +82,8 @@ def test_lerobot_drives_and_records_the_simulated_hand(make, start, profile, tmp
     with pytest.raises(Refused, match=r"left: found 515.7° \(9 rad\), expected"):
         robot.send_action({"left.pos": 9.0, "right.pos": 0.0})
     robot._hand.disarm()
-    with pytest.raises(Refused, match="arm first"):  # who disarmed it is not overruled
+    # A hand disarmed by another client is not armed again.
+    with pytest.raises(Refused, match="arm first"):
         robot.send_action(goal)
     robot.disconnect()
     assert not robot.is_connected
@@ -95,7 +96,7 @@ def test_lerobot_drives_and_records_the_simulated_hand(make, start, profile, tmp
     )
     assert held["left_touch"].max() > first["left_touch"].max()
     assert robot.send_action(grip)["grip.force"] == 5.0
-    assert abs(held["left.touch_age"]) < 60.0  # a frame newer than the state may have come
+    assert abs(held["left.touch_age"]) < 60.0  # a frame newer than the state may have arrived
     act_until(
         robot,
         {"grip.force": 5.0, "grip.angle": 0.1},
@@ -114,10 +115,10 @@ def test_lerobot_drives_and_records_the_simulated_hand(make, start, profile, tmp
 
 
 def record(kind, robot, first, action, moved, root):
-    """Two observations as LeRobot's own recorder writes them, and read again."""
+    """Write two observations with LeRobot's own recorder and read them."""
     try:
         from lerobot.utils.feature_utils import build_dataset_frame, hw_to_dataset_features
-    except ImportError:  # of 0.4
+    except ImportError:  # LeRobot 0.4
         from lerobot.datasets.utils import build_dataset_frame, hw_to_dataset_features
     features = hw_to_dataset_features(robot.action_features, "action", False)
     features |= hw_to_dataset_features(robot.observation_features, "observation", False)
@@ -138,7 +139,7 @@ def record(kind, robot, first, action, moved, root):
     np.testing.assert_allclose(picture, moved["left_touch"][:, :, 0], atol=1e-3)
 
 
-# Alone: the package itself imports LeRobot.
+# Run only this module, because the package imports LeRobot.
 features = runpy.run_path(str(PACKAGE / "lerobot_robot_softfinger" / "features.py"))
 STATE, image, observation = (features[name] for name in ("STATE", "image", "observation"))
 
@@ -150,7 +151,7 @@ def frame(counts: list[list[int]], t: float, scale: float = 1000.0) -> TactileFr
     return read(TactileFrame, given)
 
 
-def test_what_is_not_known_or_not_touched_is_zero():
+def test_unknown_values_and_values_without_contact_are_zero():
     state = read(HandState, sample(schema.STATE))
     left = replace(state.left, q=0.1, contact=True, d=1e-3, theta=math.nan, force=2.0)
     right = replace(state.right, q=-0.2, contact=False, d=2e-3, force=3.0)
@@ -176,7 +177,7 @@ def test_what_is_not_known_or_not_touched_is_zero():
     assert {name: found[name] for name in expected} == pytest.approx(expected)
 
 
-def test_an_image_is_linear_and_white_from_the_full_scale_on():
+def test_an_image_is_linear_and_saturates_at_full_scale():
     found = image(frame([[0, 1, 50], [100, 101, 65535]], 0.0), full_scale=100e3)
     assert found.dtype == np.uint8
     assert found.shape == (2, 3, 3)

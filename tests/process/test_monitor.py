@@ -1,4 +1,4 @@
-"""The monitor as a person meets it: the real process on a pseudo-terminal, on real sockets."""
+"""The monitor as a real process on a pseudo-terminal, with real sockets."""
 
 import json
 import math
@@ -18,7 +18,7 @@ from tests.harness.descendants import ending
 from tests.harness.fake_daemon import FakeDaemon, finger
 from tests.harness.terminal_process import TerminalProcess
 
-NOBODY = "tcp://127.0.0.1:1"  # nothing listens there
+NOBODY = "tcp://127.0.0.1:1"  # an address without a listener
 
 
 def command(fake: FakeDaemon, *more: str) -> list[str]:
@@ -26,7 +26,7 @@ def command(fake: FakeDaemon, *more: str) -> list[str]:
     return [*SOFTFINGER, "monitor", "--address", where, *more]
 
 
-def test_page_shows_the_hand_and_whether_its_stream_is_there(fake):
+def test_page_shows_the_hand_and_the_state_of_its_stream(fake):
     with TerminalProcess(command(fake)) as page:
         fake.send_event("mode", "before the page was there")
         page.shows("HOLDING", "● live", "LEFT contact", "RIGHT contact", "kPa", "▀" * 22)
@@ -35,11 +35,11 @@ def test_page_shows_the_hand_and_whether_its_stream_is_there(fake):
         fake.send_event("mode", "grasping → holding")
         page.shows("grasping → holding")
         bright = {page.screen.buffer[y][x].fg for y in range(3, 14) for x in range(22)}
-        assert len(bright) > 10  # the footprint is a hill of many colours
+        assert len(bright) > 10  # the footprint has many colours
         fake.changes = {"mode": "fault", "fault": "left: no frame for 0.1 s"}
         page.shows("FAULT left: no frame for 0.1 s", "c clears it")
         fake.silent.set()
-        page.shows("○ lost", "the stream has stopped")  # or stale first, for 1.5 s at most
+        page.shows("○ lost", "the stream has stopped")  # after being stale for at most 1.5 s
         fake.changes = {}
         fake.silent.clear()
         page.shows("● live", "HOLDING")
@@ -47,7 +47,7 @@ def test_page_shows_the_hand_and_whether_its_stream_is_there(fake):
 
 
 @pytest.mark.parametrize("how", ["ctrl-c", "hup", "exception", "duration"])
-def test_terminal_is_left_as_it_was(fake, how):
+def test_terminal_is_restored(fake, how):
     call = command(fake, *(["--duration", "1.2"] if how == "duration" else []))
     if how == "exception":
         call[1:4] = ["-c", BREAKS_AT_THE_TENTH_PAGE]
@@ -63,7 +63,7 @@ def test_terminal_is_left_as_it_was(fake, how):
         assert page.ended() == (1 if how == "exception" else 0)
         assert page.is_restored()
         after = page.written[page.written.rfind(b"\x1b[?1049l") :]
-        assert (b"the tenth page" in after) == (how == "exception")  # told on the main screen
+        assert (b"the tenth page" in after) == (how == "exception")  # printed on the main screen
 
 
 BREAKS_AT_THE_TENTH_PAGE = """
@@ -84,11 +84,11 @@ sys.exit(monitor.run(parser.parse_args()))
 """
 
 
-def test_signal_ends_it_while_the_terminal_takes_nothing(fake):
+def test_a_signal_ends_it_while_the_terminal_is_blocked(fake):
     with TerminalProcess(command(fake)) as page:
         page.shows("HOLDING")
-        termios.tcflow(page.slave, termios.TCOOFF)  # as Ctrl-S
-        until_later = fake.published + 50  # several redraws, each with other noise in the maps
+        termios.tcflow(page.slave, termios.TCOOFF)  # like Ctrl-S
+        until_later = fake.published + 50  # several redraws with different noise in the maps
         until(lambda: fake.published >= until_later)
         page.process.terminate()
         assert page.ended() == 0
@@ -121,21 +121,22 @@ def test_keys_command_the_hand(fake):
         page.shows("LEFT contact")
         page.type(b"\x1b[C")
         page.shows("✓ rotate to 10.0°")
-        page.type(b"\x1b[C")  # from the target on, although the object is still at 4.98°
+        page.type(b"\x1b[C")  # counted from the target, although the object is still at 4.98°
         page.shows("✓ rotate to 15.0°")
         page.type(b"\x1bOD")
         page.shows("✓ rotate to 10.0°")
         assert [r["command"] for r in fake.requests[-3:]] == ["rotate"] * 3
         assert fake.requests[-1]["angle"] == pytest.approx(0.17418, abs=1e-4)
         fake.replies["rotate"] = {"ok": False, "error": "rotate: angle: too much"}
-        for _ in range(2):  # a refused turn does not count: the next begins at the object's angle
+        # A refused turn does not count, so the next one starts at the object's angle.
+        for _ in range(2):
             count = len(fake.requests)
             page.type(b"\x1b[D")
             page.wait(lambda count=count: len(fake.requests) > count)
             page.shows("✗ rotate: angle: too much")
         assert fake.requests[-1]["angle"] == pytest.approx(-0.00035, abs=1e-4)
         count = len(fake.requests)
-        page.type(b"\x1b[200~gado \x1b[201~zZ\x1b[A\x1b[15~")  # a paste, and keys that are none
+        page.type(b"\x1b[200~gado \x1b[201~zZ\x1b[A\x1b[15~")  # a paste and unused keys
         page.type(b" ")
         page.shows("✓ stop: ok")
         assert [r["command"] for r in fake.requests[count:]] == ["stop"]
@@ -147,7 +148,7 @@ def test_keys_command_the_hand(fake):
 SETTINGS = {"control": {"force_default": 10.0}, "safety": {"force_max": 14.0}}
 
 
-def test_the_force_to_grasp_with_is_chosen_and_a_grip_follows(fake):
+def test_the_grasp_force_is_selected_and_updates_a_grip(fake):
     def asked() -> list[object]:
         return [each.get("force") for each in fake.requests]
 
@@ -163,14 +164,14 @@ def test_the_force_to_grasp_with_is_chosen_and_a_grip_follows(fake):
         page.type(b"++")
         page.shows("+- 12 N")
         page.type(b"+")
-        page.shows("+- 12.6 N")  # nine tenths of the force that is a fault
+        page.shows("+- 12.6 N")  # nine tenths of the force limit
         page.type(b"-" * 10)
-        page.shows("+- 4 N")  # in smaller steps below 5 N
+        page.shows("+- 4 N")  # smaller steps below 5 N
         assert fake.requests == []
         page.type(b"g")
         page.shows("✓ grasp with 4 N: ok")
         assert asked() == [4.0]
-        # In a grip they count from what it was told, by whomever, and the hand follows at once.
+        # During a grip, they change the last commanded force of any client, and the hand follows.
         fake.changes = {"goal_force": 9.0}
         page.shows("HOLDING", "+- 9 N")
         told = {"command": "grasp", "client": "", "request": '{"force": 7.0}', "ok": True}
@@ -181,7 +182,7 @@ def test_the_force_to_grasp_with_is_chosen_and_a_grip_follows(fake):
         assert asked() == [4.0, 6.0, 5.0]
 
 
-def test_a_late_command_is_sent_again_with_its_key(fake):
+def test_a_late_command_is_repeated_with_its_key(fake):
     late = {"ok": False, "error": "arm: 0.40 s old when its turn came", "reason": "late"}
     fake.replies["arm"] = [late, late, {"ok": True}]
     fake.changes = {"mode": "disarmed"}
@@ -193,18 +194,18 @@ def test_a_late_command_is_sent_again_with_its_key(fake):
 
 
 @pytest.mark.extended
-def test_beside_another_commander_of_a_real_daemon(start, profile, addresses):
+def test_with_another_commander_of_a_real_daemon(start, profile, addresses):
     stream, commands = addresses
     daemon = start("--config", str(profile("commands.lease = 60.0\n")))
     where = ["--address", f"{stream},{commands}"]
     with TerminalProcess([*SOFTFINGER, "monitor", *where]) as page:
-        page.shows("DISARMED", "running, disarmed")  # told before the page was there
+        page.shows("DISARMED", "running, disarmed")  # published before the page was opened
         page.shows("compute", "late", "25.0", "°C")
         with Hand(stream, commands, client="notebook", timeout=60.0) as hand:
             hand.arm()
             page.shows("ARMED", "notebook commands the hand")
             page.press(b"g", "✗ grasp: notebook commands the hand (")
-            page.type(b" ")  # stop needs no lease
+            page.type(b" ")  # stop requires no lease
             page.shows("✓ stop: ok", "DISARMED")
         assert daemon.end() == 0
         page.shows("○ lost")
@@ -237,7 +238,7 @@ def test_unreadable_messages_are_counted_and_harmless(fake):
         assert b"\x07" not in page.written
 
 
-def test_resized_suspended_and_continued(fake):
+def test_resize_suspend_and_continue(fake):
     with TerminalProcess(command(fake), 120, 40) as page:
         page.shows("HOLDING", "▀" * 42)
         page.resize(60, 20)
@@ -272,27 +273,27 @@ def test_plain_lines_through_a_pipe(fake):
         assert "(12.3 ± 0.1, " in text
         assert "), 5.0°, 40.0 mm" in text
         assert any("warning mode: grasping → holding" in line for line in lines)
-        plain.stdout.close()  # nobody reads any more
+        plain.stdout.close()  # the reader is gone
         assert plain.wait(300.0) == 0
         assert plain.stderr.read() == ""
 
 
 @pytest.mark.extended
-def test_no_wait_ends_without_a_stream_and_with_it(fake):
+def test_no_wait_exits_without_a_stream_and_when_the_stream_ends(fake):
     where = ["--address", NOBODY, "--no-wait"]
     with TerminalProcess([*SOFTFINGER, "monitor", *where]) as page:
         assert page.ended() == 1
         assert page.is_restored()
         assert f"no stream from {NOBODY} within 5 s" in page.written.decode()
     with TerminalProcess(command(fake, "--no-wait")) as page:
-        page.wait(lambda: b"HOLDING" in page.written)  # it may have ended by now
+        page.wait(lambda: b"HOLDING" in page.written)  # the process may already have ended
         fake.silent.set()
         assert page.ended() == 0
         assert page.is_restored()
         assert b"the stream has ended" in page.written
 
 
-# Beside a daemon
+# Together with a daemon
 
 DAEMON = """
 import signal, sys, threading
@@ -307,7 +308,7 @@ print("ended", over.is_set(), flush=True)
 
 
 class Beside(TerminalProcess):
-    """A stand-in daemon with the monitor as its child."""
+    """A stand-in daemon with the monitor as its child process."""
 
     def __init__(self, fake: FakeDaemon, folder: Path) -> None:
         file = folder / "pid"
@@ -326,7 +327,7 @@ class Beside(TerminalProcess):
 
 
 @pytest.mark.parametrize("how", ["interrupt", "the daemon is killed", "the page is killed"])
-def test_the_end_of_one_ends_both_and_gives_the_terminal_back(fake, tmp_path, how):
+def test_either_end_ends_both_and_restores_the_terminal(fake, tmp_path, how):
     with Beside(fake, tmp_path) as page:
         if how == "interrupt":
             page.type(b"\x03")
@@ -339,12 +340,12 @@ def test_the_end_of_one_ends_both_and_gives_the_terminal_back(fake, tmp_path, ho
         assert (b"ended True" in page.written) == ("daemon" not in how)
 
 
-def test_the_page_yields_to_the_daemon_and_quitting_it_ends_both(fake, tmp_path):
+def test_the_page_has_lower_priority_and_quitting_it_ends_both(fake, tmp_path):
     with Beside(fake, tmp_path) as page:
         assert os.getpriority(os.PRIO_PROCESS, page.child) == min(
             os.getpriority(os.PRIO_PROCESS, page.process.pid) + 5, 19
         )
-        page.type(b"\x1a")  # would stop the daemon with the hand stiff: it does nothing here
+        page.type(b"\x1a")  # ignored here: suspending the daemon would leave torque on
         page.type(b"q")
         assert page.ended() == 0
         assert page.is_restored()

@@ -1,4 +1,4 @@
-"""What needs no tick imports and works without what Linux alone has, as on macOS and Windows."""
+"""Modules without a tick work without Linux-only features, as on macOS and Windows."""
 
 import sys
 from pathlib import Path
@@ -28,7 +28,7 @@ PORTABLE = (
     "softfinger.tools.viewing.view",
 )
 
-# Neither stands on Windows; macOS lacks `sched_*`, epoll and some of the flags.
+# None of these exist on Windows; macOS lacks `sched_*`, epoll and some of the flags.
 ELSEWHERE = """
 import importlib, os, select, signal, sys
 import dynamixel_sdk, numba, pyarrow, zmq  # theirs is their own business
@@ -82,7 +82,7 @@ def test_modules_without_a_tick_import_without_linux():
 
 
 @pytest.mark.parametrize("system", ["darwin", "win32"])
-def test_the_daemon_says_that_it_needs_linux(system, monkeypatch, capsys):
+def test_the_daemon_reports_that_it_needs_linux(system, monkeypatch, capsys):
     monkeypatch.setattr(sys, "platform", system)
     assert main(["run"]) == 1
     said = capsys.readouterr().err

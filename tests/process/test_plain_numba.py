@@ -1,4 +1,4 @@
-"""With a Numba that the compiler was not tested with, Numba alone compiles the same kernels."""
+"""With an untested Numba version, Numba's own compiler builds the same kernels."""
 
 import os
 from pathlib import Path
@@ -11,8 +11,8 @@ from tests.harness.daemon_process import python
 from tests.harness.golden_recording import machine_class
 from tests.harness.paper_tip import MEASURED, TIP
 
-# A kind of kernel each: SIMD lanes and chosen callees in the tables, sums that may be reordered in
-# the estimator, inlined cells of a frame, records within records in the grip.
+# One test per kind of kernel: SIMD lanes and selected callees in the tables, reorderable sums in
+# the estimator, inlined cells of a frame, and nested records in the grip.
 SCRIPT = """
 import sys
 import numba
@@ -24,9 +24,9 @@ from softfinger.kinematics.compiled.kernel import why_plain
 assert why_plain.startswith("Numba 99.0 is not one of 0.63")
 tests = "kernels", "pressure_grid"
 files = [f"tests/unit/test_{name}.py" for name in tests]
-files.append("tests/unit/test_estimator_kernels.py::test_activity_matches_its_plain_twin")
+files.append("tests/unit/test_estimator_kernels.py::test_activity_matches_plain_numpy")
 files.append("tests/unit/test_table.py::test_tolerance_holds_over_the_whole_domain")
-files.append("tests/unit/test_slip.py::test_one_finger_presses_and_the_other_gets_nothing")
+files.append("tests/unit/test_slip.py::test_one_finger_alone_presses_with_the_requested_force")
 failed = pytest.main(["-q", "-n0", "-p", "no:cacheprovider", *files])
 from tests.process.test_plain_numba import figures
 
@@ -35,21 +35,22 @@ sys.exit(failed)
 """
 
 
-# The processor on which both ways have the same bits. Elsewhere one of them may fuse other products
+# Processor on which both compilers give identical bits. On others, they may fuse different products
 # with their sums.
 SAME_BITS = "znver3"
 
 
 def figures() -> str:
-    """What a table gives, to the last bit."""
+    """Return a table's values, exact to the last bit."""
     d = np.linspace(0.0, 8e-3, 200)
     found = ContactTable.build(TIP, MEASURED, 1e-9)(d, 40.0 * d)
     return " ".join(float(each).hex() for each in np.array(found[:6]).ravel())
 
 
 @pytest.mark.extended
-def test_tests_of_each_kind_of_kernel_pass_with_numba_alone_and_results_are_the_same(request):
-    kept = str(request.config.cache.mkdir("plain-numba"))  # apart: those of others are in use
+def test_plain_numba_passes_tests_of_every_kind_of_kernel_with_the_same_results(request):
+    # Use a separate cache, because the shared one is in use.
+    kept = str(request.config.cache.mkdir("plain-numba"))
     environment = os.environ | {"NUMBA_CACHE_DIR": kept}
     done = python("-c", SCRIPT, cwd=Path(__file__).parents[2], env=environment)
     assert done.returncode == 0, done.stdout + done.stderr

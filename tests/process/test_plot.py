@@ -1,4 +1,4 @@
-"""``softfinger plot``: a recording's pages, what is on them, and recordings that lack something."""
+"""``softfinger plot``: the pages of a recording and their contents, and incomplete recordings."""
 
 import math
 from collections.abc import Callable
@@ -64,7 +64,7 @@ Call = Callable[..., tuple[int, str]]
 
 @pytest.fixture
 def call(inline: Inline) -> Call:
-    """``softfinger plot`` in this process: exit status and what it says on standard error."""
+    """Run ``softfinger plot`` in this process; return exit status and standard error."""
 
     def plotted(*words: object) -> tuple[int, str]:
         status, _, said = inline("plot", *words)
@@ -82,12 +82,12 @@ def test_command_line_writes_every_page_in_print_quality(path, inline):
     assert [Path(line).name for line in done.stdout.splitlines()] == names
     for name in names:
         pixels = imread(folder / name)
-        assert pixels.shape[1] >= 1400  # 7 inch at 200 dots
+        assert pixels.shape[1] >= 1400  # 7 inches at 200 dpi
         ink = (pixels[..., :3].min(axis=2) < 0.9).mean()
         assert 0.01 < ink < 0.7
 
 
-def test_model_page_has_points_on_the_models_curves(run):
+def test_model_page_has_points_near_the_model_curves(run):
     figure = drawn(run, "angle")
     assert "measured over" in texts(figure)
     force = figure.axes[1]
@@ -96,13 +96,14 @@ def test_model_page_has_points_on_the_models_curves(run):
     model = run.models[0].table(depths * 1e-3, np.radians(points[:, 0])).force
     firm = points[:, 1] > 1.0
     assert firm.sum() > 100
-    assert np.median(np.abs(points[firm, 1] / model[firm] - 1.0)) < 0.06  # the moduli's scale
+    # The accuracy is limited by the modulus factor.
+    assert np.median(np.abs(points[firm, 1] / model[firm] - 1.0)) < 0.06
 
 
 def test_landscape_shows_the_local_minimum_and_the_path(run):
     figure = drawn(run, "landscape")
     (theta, d) = lines(figure, "local minimum over θ")[0]
-    assert np.abs(theta).max() < 0.2  # the paper's claim, found on the table's numbers
+    assert np.abs(theta).max() < 0.2  # the paper's claim, reproduced by the table
     assert d.max() > 3.0
     (angle, depth) = lines(figure, "left finger")[0]
     known = np.isfinite(depth)
@@ -114,7 +115,7 @@ def test_landscape_shows_the_local_minimum_and_the_path(run):
 
 
 @pytest.mark.extended
-def test_pages_as_svg_or_one_line(path, tmp_path, call):
+def test_pages_are_written_as_svg_or_an_error_is_one_line(path, tmp_path, call):
     words = ("--format", "svg", "--from", 1, "--to", 2)
     assert call(path, *words, "--out", tmp_path / "a" / "b") == (0, "")
     files = sorted((tmp_path / "a" / "b").iterdir())
@@ -129,7 +130,7 @@ def test_pages_as_svg_or_one_line(path, tmp_path, call):
     assert "plot: no hand/state in it" in said
 
 
-def test_without_settings_there_is_no_model(path, run):
+def test_without_settings_no_model_is_drawn(path, run):
     bare = replace(run, models=None, why_no_model="no reason")
     for page in plot.PAGES:
         with pytest.raises(Missing, match="no reason"):
@@ -137,7 +138,7 @@ def test_without_settings_there_is_no_model(path, run):
 
 
 @pytest.mark.extended
-def test_one_finger_alone(tmp_path):
+def test_a_recording_of_one_finger_is_drawn(tmp_path):
     path = tmp_path / "one.mcap"
     due = {50: {"command": "arm"}, 60: {"command": "grasp", "force": 2.0}}
     one = ('scene.fingers=["left"]', "scene.object_model=false")
@@ -150,7 +151,7 @@ def test_one_finger_alone(tmp_path):
 
 
 @pytest.mark.extended
-def test_a_recording_that_was_cut_short_is_drawn(tmp_path, path, call):
+def test_a_truncated_recording_is_drawn(tmp_path, path, call):
     whole = path.read_bytes()
     (tmp_path / "cut.mcap").write_bytes(whole[: len(whole) * 2 // 3])
     status, said = call(tmp_path / "cut.mcap", "--out", tmp_path / "cut")

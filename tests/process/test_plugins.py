@@ -1,4 +1,4 @@
-"""Backends of an installed package: found, checked, and run by a real daemon."""
+"""Backends of an installed package: discovered, checked, and run by a real daemon."""
 
 import os
 import threading
@@ -24,31 +24,31 @@ METAL = ("tactile.backend=pulsing", "servos.backend=following")
 
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The example, installed as pip installs it, into a folder of its own."""
+    """Install the example with pip into its own folder."""
     return pip_installed(EXAMPLE, tmp_path_factory.mktemp("plugin"))
 
 
 @pytest.fixture
 def here(installed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The example where this process imports from."""
+    """Put the example on the import path of this process."""
     monkeypatch.syspath_prepend(installed)
 
 
 @pytest.mark.usefixtures("here")
-def test_the_example_does_what_a_backend_has_to(caplog):
+def test_the_example_meets_the_backend_interface(caplog):
     settings = load(changes=METAL)
     check_tactile(settings)
-    assert not caplog.records  # a closed board has no frame, which is no failure
+    assert not caplog.records  # a closed board without a frame is not an error
     check_servos(settings, torque=True)
     check_shape(load(changes=["simulation.object_shape=hexagon"]))
     found = {each.subject: each for each in doctor.results(settings, False)}
     assert found["servos"].text.startswith("following: a plugin's")
     assert "44 × 44 cells" in found["tactile left"].text
-    assert "/dev/ttyUSB0" not in found  # asks nothing of ports that it may not have
+    assert "/dev/ttyUSB0" not in found  # ports of unknown backends are not checked
 
 
 @pytest.mark.usefixtures("here")
-def test_one_report_has_the_plugins_errors():
+def test_plugin_errors_are_part_of_the_report():
     wrong = (
         *METAL,
         "plugins.pulsing.height=-1",
@@ -75,7 +75,7 @@ def test_one_report_has_the_plugins_errors():
 
 
 @pytest.mark.extended
-def test_a_daemon_runs_on_them(installed, start, profile, addresses, monkeypatch):
+def test_a_daemon_runs_with_plugin_backends(installed, start, profile, addresses, monkeypatch):
     path = os.pathsep.join((str(installed), os.environ.get("PYTHONPATH", "")))
     monkeypatch.setenv("PYTHONPATH", path)
     changes = [word for each in METAL for word in ("--set", each)]
@@ -89,7 +89,7 @@ def test_a_daemon_runs_on_them(installed, start, profile, addresses, monkeypatch
     assert running.end() == 0
 
 
-def test_the_ascii_board_of_the_page_reads_a_port():
+def test_the_ascii_board_of_the_documentation_reads_a_port():
     page = (Path(__file__).parents[2] / "docs" / "plugins.md").read_text(encoding="utf-8")
     names: dict[str, Any] = {}
     exec(page.split("```python\n")[-1].split("```")[0], names)

@@ -1,4 +1,4 @@
-"""Calibration without metal: `emulate --send press` and `calibrate` on a tip of solid rubber."""
+"""Calibration without hardware: `emulate --send press` and `calibrate` on a solid rubber tip."""
 
 import json
 import math
@@ -19,7 +19,7 @@ RUBBER = ["tip.physics=solid", "tip.poisson=0.48", "safety.d_max=0.008", *LINEAR
 
 
 class Stage:
-    """A person at the stage: reads what is wanted, presses so, then Enter."""
+    """A user at the stage who applies the requested load and then presses Enter."""
 
     def __init__(self, folder, presses):
         self._folder, self._presses = folder, list(presses)
@@ -34,7 +34,7 @@ class Stage:
 
 @pytest.fixture(scope="module")
 def rubber(tmp_path_factory):
-    """A hand with tips of solid rubber, its log, and a tared calibration file."""
+    """Yield a hand with solid rubber tips, its log, and a calibration file with a tare."""
     folder = tmp_path_factory.mktemp("hand")
     log = []
     with emulated(folder, settings=load(HIL, folder, RUBBER), tell=log.append):
@@ -47,7 +47,7 @@ def calibrate(folder, step, *words):
 
 
 @pytest.mark.extended
-def test_a_tip_of_rubber_is_told_from_springs(rubber, monkeypatch, capsys):
+def test_a_rubber_tip_is_distinguished_from_springs(rubber, monkeypatch, capsys):
     folder, log = rubber
     assert calibrate(folder, "tare") == 0
     presses = [(1, 0), (2, 0), (3, -10), (4, 20), (4, 0), (3, 10)]
@@ -66,7 +66,7 @@ def test_a_tip_of_rubber_is_told_from_springs(rubber, monkeypatch, capsys):
     assert force == pytest.approx(float(pressed[1]), rel=0.03)
 
 
-def test_a_stage_moved_by_a_program(rubber, capsys):
+def test_a_stage_is_moved_by_a_program(rubber, capsys):
     folder, _ = rubber
     stage = f"{sys.executable} -m softfinger emulate --dir {folder} --send"
     move = ["--move", f"{stage} 'press force={{force}}N speed=100mm/s'"]

@@ -1,4 +1,4 @@
-"""The servo bus on a pseudo-terminal: the wire's time, rates, links, and coming and going."""
+"""The servo bus on a pseudo-terminal: timing, baud rates, links, connecting and disconnecting."""
 
 import os
 import select
@@ -22,7 +22,7 @@ PONG = 14
 
 
 class Wire:
-    """A paced bus on a clock of its own, and a client's end of it."""
+    """A paced bus with its own clock, and the client's end of the pseudo-terminal."""
 
     def __init__(self, bus: ServoBus, baud: int, **options: float) -> None:
         self.t = 1.0
@@ -36,14 +36,14 @@ class Wire:
         self.port.service(self.t)
 
     def received(self) -> bytes:
-        """What is there now: the pseudo-terminal passes bytes on a moment after they were sent."""
+        """Return the available bytes; the pseudo-terminal delivers them with a short delay."""
         data = b""
         while select.select([self.client], [], [], 0.05)[0]:
             data += self.client.read(4096)
         return data
 
     def when(self, seconds: float) -> bytes:
-        """Let time pass, serving at every event that is due in it."""
+        """Advance the time, serving every event that is due."""
         end = self.t + seconds
         while (due := self.port.next_event()) <= end:
             self.t = max(due, self.t + 1e-7)
@@ -65,7 +65,7 @@ def wires() -> Iterator[list[Wire]]:
         wire.close()
 
 
-def test_replies_take_the_wires_time_and_the_return_delay_one_after_another(wires):
+def test_replies_take_wire_time_and_return_delay_one_after_another(wires):
     wires.append(wire := Wire(make_bus(), 57600, spin=0.0))
     write = frame(BROADCAST, framing.WRITE, b"\x41\x00\x01")
     wire.send(write)
@@ -79,12 +79,12 @@ def test_replies_take_the_wires_time_and_the_return_delay_one_after_another(wire
     first = (len(PING) + PONG) * byte + 500e-6 - 2 * PASSAGE_TIME
     assert wire.when(first - 1e-5) == b""
     assert len(wire.when(2e-5)) == PONG
-    second = PONG * byte + 500e-6  # the replies of a group follow each other
+    second = PONG * byte + 500e-6  # replies of a group are sent one after another
     assert wire.when(second - 4e-5) == b""
     assert len(wire.when(6e-5)) == PONG
 
 
-def test_a_late_reply_is_late_even_unpaced(wires):
+def test_a_late_reply_is_late_even_without_pacing(wires):
     wires.append(wire := Wire(make_bus(), 0, spin=0.0))
     put_fault(wire.port.bus, "late=1", wire.t)
     wire.send(PING)
@@ -92,7 +92,7 @@ def test_a_late_reply_is_late_even_unpaced(wires):
     assert len(wire.when(0.002)) == PONG
 
 
-def test_another_rate_is_met_with_silence_and_the_right_one_answered(wires):
+def test_only_the_correct_baud_rate_is_answered(wires):
     wires.append(wire := Wire(make_bus(), 57600, spin=0.0))
     for baud, answers in ((1_000_000, 0), (57600, PONG), (4_000_000, 0), (57600, PONG)):
         wire.client.baudrate = baud
@@ -106,11 +106,11 @@ def test_another_rate_is_met_with_silence_and_the_right_one_answered(wires):
         assert len(unpaced.received()) == PONG
 
 
-def test_a_client_may_come_and_go_and_leave_the_terminal_cooked(wires):
+def test_a_client_may_reconnect_and_leave_the_terminal_in_cooked_mode(wires):
     wires.append(wire := Wire(make_bus(), 0, spin=0.0))
     wire.client.close()
     for _ in range(3):
-        # Not through pyserial: a client that sets nothing finds the terminal raw.
+        # Without pyserial: a client that sets nothing must find the terminal in raw mode.
         end = os.open(wire.port.path, os.O_RDWR | os.O_NOCTTY)
         assert not termios.tcgetattr(end)[tty.LFLAG] & (termios.ECHO | termios.ICANON)
         os.write(end, PING)
@@ -121,15 +121,15 @@ def test_a_client_may_come_and_go_and_leave_the_terminal_cooked(wires):
         os.close(end)
 
 
-def test_a_client_that_never_reads_does_not_hold_the_bus_up(wires):
+def test_a_client_that_never_reads_does_not_block_the_bus(wires):
     wires.append(wire := Wire(make_bus(), 0, spin=0.0))
     request = frame(1, framing.READ, b"\x00\x00\x93\x00")
-    for _ in range(400):  # far more than a terminal holds
+    for _ in range(400):  # far more than a terminal buffer holds
         wire.send(request)
     assert wire.port.bus.packets == 400
 
 
-def test_the_terminal_goes_and_comes_back_and_the_servos_go_on(wires):
+def test_servos_continue_while_the_terminal_is_replaced(wires):
     wires.append(wire := Wire(make_bus(), 0, spin=0.0))
     wire.port.unplug()
     assert (wire.port.plugged, wire.port.fileno()) == (False, -1)

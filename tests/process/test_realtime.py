@@ -1,4 +1,4 @@
-"""Measures for a steady tick: had and given back where allowed, told where they are not."""
+"""Measures for a steady tick: applied and reverted where permitted, otherwise reported."""
 
 import ctypes
 import json
@@ -18,7 +18,7 @@ from softfinger.tools.benchmarks.measuring import Report, attempt
 from tests.conftest import until
 from tests.harness.daemon_process import PATIENCE, python
 
-# What the system says of a process that asked for everything: before, during and after.
+# Print the system's view of a process that requests everything: before, during and after.
 HELD = """
 import json, os, sys, threading
 from pathlib import Path
@@ -59,7 +59,7 @@ finally:
     over.set()
 """
 
-# The same as a user who may do nothing of it.
+# The same for a user without permissions.
 REFUSED = """
 import json, os, resource
 from softfinger.daemon.loop.realtime import RealTime
@@ -84,7 +84,7 @@ def run(script: str) -> Any:
     return json.loads(done.stdout)
 
 
-def test_what_is_allowed_is_held_and_given_back():
+def test_permitted_measures_are_applied_and_reverted():
     answer = run(HELD)
     before, during, after = answer["told"]
     had = answer["events"][0]
@@ -103,7 +103,7 @@ def test_what_is_allowed_is_held_and_given_back():
     assert after == before
 
 
-def test_what_is_refused_is_told_with_what_is_lost_and_what_grants_it():
+def test_refused_measures_are_reported_with_their_effect_and_remedy():
     events = run(REFUSED)
     assert events[0][:2] == ["info", "realtime"]
     assert "timer slack 1 ns" in events[0][2]
@@ -120,7 +120,7 @@ def test_what_is_refused_is_told_with_what_is_lost_and_what_grants_it():
         assert any("/dev/cpu_dma_latency refused" in text and "udev" in text for text in refused)
 
 
-def test_what_is_not_wanted_is_not_asked_for():
+def test_disabled_measures_are_not_requested():
     nothing = {
         "lock_memory": False,
         "hold_latency": False,
@@ -135,13 +135,13 @@ def test_what_is_not_wanted_is_not_asked_for():
         {"loop": {"clock": "virtual"}, "realtime": {"priority": 7, "cpus": (0,)}}
     )
     affinity = os.sched_getaffinity(0)
-    with RealTime(settings) as measures:  # virtual time waits for nothing
+    with RealTime(settings) as measures:  # virtual time never waits
         assert (measures.granted, measures.refused) == (["collector frozen"], [])
         assert os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_OTHER
         assert os.sched_getaffinity(0) == affinity
 
 
-def test_a_short_slice_is_had_where_the_kernel_knows_it_and_given_back():
+def test_a_short_time_slice_is_set_if_supported_and_reverted():
     calls = _ATTRIBUTE_CALLS.get(os.uname().machine)
     if calls is None or not _set_slice(calls, 0, 3_000_000):
         pytest.skip("this kernel takes no slices")
@@ -155,14 +155,14 @@ def test_a_short_slice_is_had_where_the_kernel_knows_it_and_given_back():
 
 
 def _slice(get_call: int) -> int:
-    """What the kernel says of this thread's slices [ns]."""
+    """Return this thread's time slice as reported by the kernel [ns]."""
     told = ctypes.create_string_buffer(48)
     assert ctypes.CDLL(None).syscall(get_call, 0, told, 48, 0) == 0
     return int(struct.unpack("=IIQiIQQQ", told.raw)[5])
 
 
 @pytest.mark.parametrize("spin", [0.0, 2e-4])
-def test_a_sleep_never_ends_early_and_the_spin_is_within_it(spin):
+def test_a_sleep_never_ends_early_and_includes_the_spin(spin):
     clock, before = RealClock(spin), time.thread_time()
     for _ in range(20):
         deadline = clock.now() + 1e-3
@@ -171,12 +171,12 @@ def test_a_sleep_never_ends_early_and_the_spin_is_within_it(spin):
     assert time.thread_time() - before < 20 * 9e-4, "the whole sleep was spent awake"
 
 
-def test_ticks_over_ptys_and_their_exchanges_take_turns():
+def test_ticks_over_ptys_alternate_with_their_exchanges():
     patient = [f"{key}={value}" for key, value in PATIENCE.items()]
     reports: list[Report] = []
 
     def measured() -> bool:
-        """It fails where the hand does not hold in time, as on a machine that is busy."""
+        """Return True if it succeeded; on a busy machine the hand may not hold in time."""
         part = partial(tick.in_the_loop, "paced", 2, 2_000_000, patient)
         reports.append(attempt("paced", part))
         return not reports[-1].failed

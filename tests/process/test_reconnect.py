@@ -1,4 +1,4 @@
-"""The servos' port goes away under a running daemon and comes back: only on command, torque off."""
+"""The servo port disappears under a running daemon and is reopened only on command, torque off."""
 
 import contextlib
 from collections.abc import Callable, Iterator
@@ -16,7 +16,7 @@ from tests.harness.emulated import emulated
 
 
 class Rig:
-    """A daemon on an emulated hand's servos, both in this process."""
+    """A daemon and the emulated servos that it drives, both in this process."""
 
     def __init__(self, folder: Path, **sections: Any) -> None:
         servos = {
@@ -24,7 +24,7 @@ class Rig:
             "port": str(folder / "servos"),
             "reply_timeout": 1.0,  # the emulator shares this process's interpreter lock
             "fault_after": 3.0,
-            "watchdog": 0.0,  # a motor that was left on stays on
+            "watchdog": 0.0,  # torque that was on stays on
         }
         own = {"servos": servos, "tactile": {"backend": "none"}, "loop": {"rate": 100.0}}
         self.settings = Settings.model_validate(own | sections)
@@ -37,11 +37,11 @@ class Rig:
         self.loop = self.daemon.loop
 
     def until(self, condition: Callable[[], object]) -> None:
-        """Tick until ``condition`` holds."""
+        """Tick until ``condition`` is true."""
         until(lambda: self.loop.advance(0.1) or condition())
 
     def does(self, name: str) -> dict[str, Any]:
-        """Give a command that is to be carried out, at a tick at which the servos answered."""
+        """Issue a command that must succeed, on a tick with readings from the servos."""
         if name != "clear":
             self.until(lambda: self.loop.state.reading.valid)
         return self.loop.command({"command": name})
@@ -74,21 +74,21 @@ def rig(tmp_path: Path) -> Iterator[Rig]:
     made.close()
 
 
-def test_an_unplugged_bus_comes_back_on_command_and_limp(rig):
+def test_an_unplugged_bus_is_reopened_on_command_with_torque_off(rig):
     loop = rig.loop
     rig.does("arm")
     rig.until(lambda: rig.torque() == [1, 1])
     rig.unplug()
     rig.until(lambda: loop.state.mode == "fault")
     assert "the port is gone" in loop.state.fault
-    assert rig.torque() == [1, 1]  # nobody could tell them
-    # From then on `clear` opens the port anew.
+    assert rig.torque() == [1, 1]  # they could not be reached
+    # From here on, `clear` reopens the port.
     rig.until(lambda: loop.state.t - loop.state.reading.t > rig.settings.servos.fault_after)
     rig.refuses("clear", "no such port")
     rig.plug()
     seq = loop.state.reading.seq
     loop.advance(0.2)
-    assert loop.state.mode == "fault"  # not by itself
+    assert loop.state.mode == "fault"  # the fault is not cleared automatically
     assert not loop.state.reading.valid
     assert rig.does("clear")["mode"] == "disarmed"
     assert rig.torque() == [0, 0]
@@ -100,7 +100,7 @@ def test_an_unplugged_bus_comes_back_on_command_and_limp(rig):
     rig.until(lambda: rig.torque() == [1, 1])
 
 
-def test_clear_of_another_fault_leaves_the_port_alone(rig):
+def test_clearing_another_fault_does_not_reopen_the_port(rig):
     rig.does("arm")
     assert rig.emulator.request("overload=1") == "ok"
     rig.until(lambda: rig.loop.state.mode == "fault")
@@ -108,7 +108,7 @@ def test_clear_of_another_fault_leaves_the_port_alone(rig):
     assert ("info", "servos", "connected anew") not in rig.events
 
 
-def test_a_boards_port_comes_back_on_clear_and_on_arm(tmp_path):
+def test_a_board_port_is_reopened_on_clear_and_on_arm(tmp_path):
     board = {
         "backend": "flexitac",
         "port": (str(tmp_path / "tactile-left"), str(tmp_path / "tactile-right")),
@@ -119,8 +119,8 @@ def test_a_boards_port_comes_back_on_clear_and_on_arm(tmp_path):
         "full_count": 255,
         "rate": 50.0,
     }
-    # Frames may be late, since the emulator shares this process's interpreter lock. Then the hand
-    # waits, and does not close on what it no longer feels.
+    # Frames may be late because the emulator shares this process's interpreter lock. The hand then
+    # waits and does not close without tactile data.
     rig = Rig(tmp_path, tactile=board, safety={"frame_age_hold": 3.0, "frame_age_fault": 40.0})
     try:
         loop, left = rig.loop, rig.loop.perception.fingers[0].sensor
@@ -130,7 +130,7 @@ def test_a_boards_port_comes_back_on_clear_and_on_arm(tmp_path):
         until(lambda: left.counters()["port_lost"] == 1)
         rig.until(lambda: loop.state.mode == "fault")
         assert loop.state.fault_name == "tactile.silent"
-        for _ in range(2):  # a try that failed is no last one
+        for _ in range(2):  # a failed attempt can be repeated
             rig.refuses("clear", "no such port")
         assert rig.emulator.request("left:plug") == "ok"
         until(Path(rig.settings.tactile.port[0]).exists)
@@ -139,7 +139,7 @@ def test_a_boards_port_comes_back_on_clear_and_on_arm(tmp_path):
         seq = loop.state.contacts[0].seq
         rig.until(lambda: loop.state.contacts[0].seq > seq and loop.state.contacts[0].valid)
 
-        # While nothing grips its loss is no fault: there is nothing to clear.
+        # Without a grip, the loss is not a fault, so there is nothing to clear.
         assert rig.emulator.request("left:unplug") == "ok"
         until(lambda: left.counters()["port_lost"] == 1)
         rig.does("arm")

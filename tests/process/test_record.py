@@ -1,4 +1,4 @@
-"""Recordings: everything that was published is in them, whatever happens to the recorder."""
+"""Recordings contain everything that was published, even if the recorder is interrupted."""
 
 import contextlib
 import json
@@ -43,18 +43,18 @@ def ended(process: subprocess.Popen[str]) -> tuple[int, str, str]:
 
 
 def interrupted(process: subprocess.Popen[str]) -> tuple[int, str, str]:
-    """End a recorder as Ctrl-C does."""
+    """End a recorder with Ctrl-C."""
     process.send_signal(signal.SIGINT)
     return ended(process)
 
 
 def is_filled(path: Path) -> bool:
-    """A whole chunk of messages is in the file."""
+    """Return True if the file contains a complete chunk of messages."""
     return path.exists() and path.stat().st_size > 3000 and Recording(path).total > 0
 
 
 def written(path: Path, count: int = 400) -> list[tuple[bytes, dict[str, Any]]]:
-    """A recording of ``count`` states with frames between them, and what went into it."""
+    """Write a recording of ``count`` states with frames in between; return its messages."""
     sent: list[tuple[bytes, dict[str, Any]]] = []
     for k in range(count):
         sent.append((schema.STATE, {**sample(schema.STATE), "seq": k, "timestamp": 1e9 + k}))
@@ -67,12 +67,12 @@ def written(path: Path, count: int = 400) -> list[tuple[bytes, dict[str, Any]]]:
     return sent
 
 
-def test_what_is_read_is_what_was_published(tmp_path):
+def test_read_messages_equal_the_published_ones(tmp_path):
     sent = written(tmp_path / "a.mcap")
     recording = Recording(tmp_path / "a.mcap")
     read = list(recording.messages())
     assert read == sent
-    # The same types too, so that it can go out on the wire again, byte for byte.
+    # The types are also equal, so the messages can be published again, byte for byte.
     for (_, before), (_, after) in zip(sent, read, strict=True):
         assert {key: type(value) for key, value in before.items()} == {
             key: type(after[key]) for key in before
@@ -83,7 +83,7 @@ def test_what_is_read_is_what_was_published(tmp_path):
     assert recording.counts["hand/tactile/left"] == 20
 
 
-def test_a_recordings_states_are_columns(tmp_path):
+def test_states_of_a_recording_are_columns(tmp_path):
     states = [message for topic, message in written(tmp_path / "a.mcap") if topic == schema.STATE]
     columns = read_recording(tmp_path / "a.mcap")
     assert columns["seq"].tolist() == list(range(400))
@@ -116,7 +116,7 @@ def test_every_topic_keeps_its_bytes_and_has_a_schema(tmp_path, topic):
     described = json.loads(schema.data)["properties"]
     assert set(json.loads(raw.data)) == set(described)
     assert raw.log_time == int(golden["timestamp"] * 1e9)
-    if topic == EVENT:  # as Foxglove wants it
+    if topic == EVENT:  # as required by Foxglove
         line = json.loads(raw.data)
         assert schema.name == "foxglove.Log"
         assert (golden["level"], line["level"]) == ("warning", 3)
@@ -125,7 +125,7 @@ def test_every_topic_keeps_its_bytes_and_has_a_schema(tmp_path, topic):
         assert seconds == pytest.approx(golden["timestamp"])
 
 
-def test_the_layouts_name_only_fields_that_are_streamed():
+def test_layouts_use_only_published_fields():
     folder = Path(__file__).parents[2] / "tools" / "viewing"
     fields = {
         f"{topic.decode()}/{each.name.replace('.', '/')}"
@@ -141,7 +141,7 @@ def test_the_layouts_name_only_fields_that_are_streamed():
     assert {each.replace(".", "/") for each in (*curves, *paths)} <= fields
 
 
-def test_numbers_that_are_none_come_back_as_such(tmp_path):
+def test_non_finite_numbers_are_read_as_nan(tmp_path):
     writer = RecordingWriter(tmp_path / "a.mcap")
     message = sample(schema.STATE)
     message["left"]["force"] = math.nan
@@ -156,7 +156,7 @@ def test_numbers_that_are_none_come_back_as_such(tmp_path):
 
 
 @pytest.mark.extended
-def test_a_part_in_time_and_by_topic(tmp_path):
+def test_reading_a_time_range_and_selected_topics(tmp_path):
     sent = written(tmp_path / "a.mcap", 2000)  # several chunks
     recording = Recording(tmp_path / "a.mcap")
     assert recording.chunks > 3
@@ -168,7 +168,7 @@ def test_a_part_in_time_and_by_topic(tmp_path):
     assert seen == sorted(seen)
 
 
-def test_a_recording_cut_anywhere_is_read_up_to_there_and_closed(tmp_path):
+def test_a_truncated_recording_is_readable_up_to_the_cut_and_can_be_closed(tmp_path):
     sent = written(tmp_path / "whole.mcap", 1500)
     whole = (tmp_path / "whole.mcap").read_bytes()
     path = tmp_path / "cut.mcap"
@@ -187,11 +187,11 @@ def test_a_recording_cut_anywhere_is_read_up_to_there_and_closed(tmp_path):
         assert not closed.truncated
         assert list(closed.messages()) == read
     assert longest > 1000
-    assert recover(path) == (len(read), "")  # a sound one is left alone
+    assert recover(path) == (len(read), "")  # an intact file is not changed
     assert sorted(each.name for each in tmp_path.iterdir()) == ["cut.mcap", "whole.mcap"]
 
 
-def test_a_recording_with_flipped_bits_never_raises_more_than_its_error(tmp_path):
+def test_a_recording_with_flipped_bits_raises_only_its_documented_error(tmp_path):
     written(tmp_path / "whole.mcap", 300)
     whole = (tmp_path / "whole.mcap").read_bytes()
     path = tmp_path / "bent.mcap"
@@ -209,7 +209,7 @@ def test_a_recording_with_flipped_bits_never_raises_more_than_its_error(tmp_path
     assert whole_again < 25
 
 
-def test_files_that_are_no_recording(tmp_path):
+def test_other_files_are_rejected(tmp_path):
     path = tmp_path / "a.mcap"
     for content, reason in ((b"", "empty"), (b"seq,d\n1,2\n", "not an MCAP file")):
         path.write_bytes(content)
@@ -229,7 +229,7 @@ def test_files_that_are_no_recording(tmp_path):
         Recording(tmp_path / "other.mcap")
 
 
-def test_recording_a_running_daemon_loses_nothing_unseen(start, profile, addresses, tmp_path):
+def test_messages_lost_while_recording_a_daemon_are_counted(start, profile, addresses, tmp_path):
     start("--config", str(profile("loop.rate = 500.0\nstream.state_rate = 500.0\n")))
     path = tmp_path / "run.mcap"
     process = record(path, "--address", addresses[0])
@@ -243,7 +243,7 @@ def test_recording_a_running_daemon_loses_nothing_unseen(start, profile, address
     assert not recording.truncated
     seqs = [m["seq"] for _, m in recording.messages([schema.STATE])]
     assert len(seqs) > 10
-    # A gateway without a processor for a while loses messages: then that is told, exactly.
+    # A gateway without processor time loses messages; the reported number must then be exact.
     told = re.search(rf"(\d+) of {schema.STATE}", out)
     assert seqs[-1] - seqs[0] + 1 - len(seqs) == (int(told[1]) if told else 0)
     kinds = {message["kind"] for _, message in recording.messages([schema.EVENT])}
@@ -251,9 +251,9 @@ def test_recording_a_running_daemon_loses_nothing_unseen(start, profile, address
     assert recording.count(schema.TACTILE) > 0
 
 
-def test_a_full_disk_ends_it_with_the_reason_and_keeps_what_was_written(fake, tmp_path):
+def test_a_full_disk_ends_the_recording_with_a_message_and_keeps_earlier_data(fake, tmp_path):
     path = tmp_path / "run.mcap"
-    fake.changes = {"padding": os.urandom(10_000).hex()}  # can't be compressed away
+    fake.changes = {"padding": os.urandom(10_000).hex()}  # incompressible
 
     def small_disk() -> None:
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
@@ -269,7 +269,7 @@ def test_a_full_disk_ends_it_with_the_reason_and_keeps_what_was_written(fake, tm
     assert f"{total} messages written of " in out, "what is in the file counts"
 
 
-def test_what_was_sent_before_the_end_is_written(addresses, tmp_path):
+def test_messages_sent_before_the_end_are_written(addresses, tmp_path):
     context: zmq.Context[Any] = zmq.Context()
     publisher = context.socket(zmq.XPUB)
     publisher.setsockopt(zmq.SNDHWM, 0)
@@ -282,7 +282,7 @@ def test_what_was_sent_before_the_end_is_written(addresses, tmp_path):
     for k in range(4000):
         publisher.send(schema.STATE, zmq.SNDMORE)
         publisher.send(pack({**message, "seq": k}))
-    context.destroy(linger=-1)  # returns when all is on its way
+    context.destroy(linger=-1)  # returns after everything is sent
     process.send_signal(signal.SIGTERM)
     status, out, _ = ended(process)
     assert status == 0
@@ -291,7 +291,7 @@ def test_what_was_sent_before_the_end_is_written(addresses, tmp_path):
     assert seqs == list(range(4000))
 
 
-def test_split_files_follow_each_other(fake, tmp_path):
+def test_split_files_are_contiguous(fake, tmp_path):
     path = tmp_path / "run.mcap"
     process = record(path, "--address", fake.state_address, "--split-time", "0.2")
     files = [path, tmp_path / "run-2.mcap", tmp_path / "run-3.mcap"]
@@ -301,7 +301,7 @@ def test_split_files_follow_each_other(fake, tmp_path):
     assert seqs == list(range(seqs[0], seqs[-1] + 5, 5))
 
 
-def test_no_daemon_is_waited_for_or_not(addresses, tmp_path):
+def test_the_recorder_waits_for_a_daemon_unless_told_otherwise(addresses, tmp_path):
     process = record(tmp_path / "a.mcap", "--address", addresses[0], "--no-wait")
     status, _, error = ended(process)
     assert status == 1
@@ -310,10 +310,10 @@ def test_no_daemon_is_waited_for_or_not(addresses, tmp_path):
     assert "waiting for a stream" in process.stderr.readline()
     process.send_signal(signal.SIGTERM)
     assert ended(process)[0] == 0
-    assert not list(tmp_path.iterdir())  # nothing came, and nothing is in the next one's way
+    assert not list(tmp_path.iterdir())  # no empty file is left behind
 
 
-def test_garbage_on_the_stream_is_counted_and_left_out(fake, tmp_path):
+def test_invalid_messages_on_the_stream_are_counted_and_omitted(fake, tmp_path):
     path = tmp_path / "run.mcap"
     process = record(path, "--address", fake.state_address)
     until(lambda: is_filled(path))
@@ -327,7 +327,7 @@ def test_garbage_on_the_stream_is_counted_and_left_out(fake, tmp_path):
     assert "could not be read and were left out" in out
 
 
-def test_topics_by_name(fake, tmp_path):
+def test_topics_are_selected_by_name(fake, tmp_path):
     path = tmp_path / "a.mcap"
     process = record(path, "--address", fake.state_address, "--topics", "hand/tactile")
     until(lambda: path.exists() and path.stat().st_size > 20_000)
@@ -338,8 +338,8 @@ def test_topics_by_name(fake, tmp_path):
     assert "found topic 'dreams', expected one of state, tactile" in error
 
 
-def test_what_was_told_again_does_not_stretch_the_recordings_time(tmp_path):
-    """A daemon that runs for hours tells a recorder its first events and settings again."""
+def test_repeated_messages_do_not_extend_the_time_range(tmp_path):
+    """A recorder that starts late receives the daemon's first events and settings again."""
     path = tmp_path / "a.mcap"
     writer = RecordingWriter(path)
     old = {"schema": 1, "seq": 1, "again": True, "timestamp": 1.7e9 - 7200.0, "mono_ns": 5}
@@ -351,7 +351,7 @@ def test_what_was_told_again_does_not_stretch_the_recordings_time(tmp_path):
     recording = Recording(path)
     assert (recording.start, recording.duration) == (pytest.approx(1.7e9), pytest.approx(0.5))
     kept = [message for topic, message in recording.messages() if b"state" not in topic]
-    assert [each["timestamp"] for each in kept] == [1.7e9 - 7200.0] * 2  # as it was told
+    assert [each["timestamp"] for each in kept] == [1.7e9 - 7200.0] * 2  # the original times
     lonely = RecordingWriter(tmp_path / "b.mcap")
     lonely.add(b"hand/settings", dict(old))
     lonely.close()
@@ -359,12 +359,15 @@ def test_what_was_told_again_does_not_stretch_the_recordings_time(tmp_path):
 
 
 @pytest.mark.extended
-def test_a_damaged_chunk_is_told_and_left_out_and_recovered(tmp_path, addresses, inline):
+def test_a_damaged_chunk_is_reported_and_skipped_and_the_file_can_be_recovered(
+    tmp_path, addresses, inline
+):
     path = tmp_path / "bent.mcap"
     sent = written(path, 2000)
     assert Recording(path).check()
     bent = bytearray(path.read_bytes())
-    place = bent.index(b"\x28\xb5\x2f\xfd", len(bent) // 2) + 100  # zstd's magic begins a chunk
+    # zstd's magic number starts a chunk.
+    place = bent.index(b"\x28\xb5\x2f\xfd", len(bent) // 2) + 100
     bent[place : place + 4] = bytes(each ^ 0x55 for each in bent[place : place + 4])
     path.write_bytes(bent)
     told: list[str] = []
@@ -375,7 +378,7 @@ def test_a_damaged_chunk_is_told_and_left_out_and_recovered(tmp_path, addresses,
     assert "damaged (" in told[0]
     assert 500 < len(read) < len(sent)
     assert read[0] == sent[0]
-    assert read[-1] == sent[-1]  # what comes behind it is there
+    assert read[-1] == sent[-1]  # chunks after it are readable
     fast = ("--no-wait", "--speed", "1e6", "--address", addresses[0])
     for words in (("export", "--topics", "state"), ("replay", *fast)):
         assert "damaged (" in inline(words[0], path, *words[1:]).stderr, words
@@ -383,7 +386,7 @@ def test_a_damaged_chunk_is_told_and_left_out_and_recovered(tmp_path, addresses,
     assert Recording(path).check()
 
 
-def test_a_file_that_is_closed_leaves_no_memory(tmp_path):
+def test_a_closed_file_frees_its_memory(tmp_path):
     tracemalloc.start()
     try:
         before = tracemalloc.get_traced_memory()[0]
@@ -422,7 +425,7 @@ def disk_full(recorder: psutil.Process, path: Path) -> None:
     ],
     ids=["killed", "disk full"],
 )
-def test_a_recorder_that_ends_is_told_at_once_and_by_the_exit_status(
+def test_a_recorder_failure_is_reported_immediately_and_by_the_exit_status(
     start, profile, addresses, tmp_path, end, why
 ):
     path = tmp_path / "run.mcap"

@@ -1,4 +1,4 @@
-"""Registers that another program left: told, written by `arm`, mended, saved and restored."""
+"""Registers changed by another program: reported, written by `arm`, repaired and restored."""
 
 import json
 from typing import Any
@@ -21,7 +21,7 @@ from tests.harness.servos import RunningBus, backend_settings, connected
 
 LEFT = "servo 1 (left)"
 FIX = "`softfinger doctor --fix`"
-# What another program may leave: register, value, status of the finding, its text.
+# Values that another program may leave: register, value, status and text of the finding.
 EEPROM = [
     (reg.RETURN_DELAY_TIME, 250, "FAIL", "return delay is 500 µs, more than 50 µs"),
     (reg.SHADOW_ID, 2, "FAIL", "shadow ID is 2: it obeys what the servo with that ID is sent"),
@@ -48,7 +48,7 @@ RAM = [
 
 
 def put(bus: RunningBus, address: int, value: int, servo: int = 0) -> None:
-    """Leave a value in a register, as another program that is gone."""
+    """Set a register, as another program would."""
     bus.call(lambda: bus.servo(servo).table.set(address, value))
 
 
@@ -57,13 +57,13 @@ def held(bus: RunningBus, address: int, servo: int = 0) -> int:
 
 
 def told(bus: RunningBus, **servos: Any) -> list[Finding]:
-    """What `doctor` says of the left servo."""
+    """Return the doctor's findings on the left servo."""
     settings = backend_settings(bus.path, **servos)
     return [each for each in devices.check_servos(settings) if each.subject == LEFT]
 
 
 @pytest.mark.parametrize(("address", "value", "status", "text"), EEPROM)
-def test_what_is_left_in_eeprom_is_told_and_mended(bus, address, value, status, text):
+def test_changed_eeprom_registers_are_reported_and_repaired(bus, address, value, status, text):
     put(bus, address, value)
     (found,) = [each for each in told(bus) if each.status == status and each.text.startswith(text)]
     assert found.fix.startswith(FIX)
@@ -77,7 +77,7 @@ def test_what_is_left_in_eeprom_is_told_and_mended(bus, address, value, status, 
 
 
 @pytest.mark.parametrize("reboots", [False, True])
-def test_arm_writes_what_is_left_in_ram(bus, connect, reboots):
+def test_arm_overwrites_changed_ram_registers(bus, connect, reboots):
     if not reboots:
         for address, value in RAM:
             put(bus, address, value)
@@ -89,7 +89,7 @@ def test_arm_writes_what_is_left_in_ram(bus, connect, reboots):
         backend.torque_on()
         bus.call(lambda: bus.servo(0).reboot(bus._now()))
         until(lambda: bus.call(lambda: bus.servo(0).awake(bus._now())))
-        for address, value in RAM:  # and another program writes to it at once
+        for address, value in RAM:  # another program immediately writes to it
             put(bus, address, value)
     backend.torque_on()
     model = MODELS["XM430-W350"]
@@ -98,8 +98,8 @@ def test_arm_writes_what_is_left_in_ram(bus, connect, reboots):
     assert [held(bus, address) for address, _ in RAM] == expected
 
 
-def test_every_model_meets_its_own_factory_table():
-    """But for the mode and the return delay, which the factory sets for nobody."""
+def test_factory_settings_of_every_model_pass_the_checks():
+    """Mode and return delay are exceptions, because their factory settings never fit."""
     for name, model in MODELS.items():
         mode = "current-based position" if model.senses_current else "position"
         small = {"current_max": min(1.2, model.stall_current)}
@@ -137,7 +137,7 @@ def test_registers_are_saved_and_restored(bus, tmp_path):
     assert bus.memory(0)[: reg.RAM] == before
 
 
-def test_files_that_can_not_be_restored(bus, tmp_path):
+def test_invalid_register_files_are_refused(bus, tmp_path):
     path, settings = tmp_path / "servos.json", backend_settings(bus.path)
     with pytest.raises(ServoError, match="No such file"):
         restore_registers(settings, path)
@@ -154,10 +154,10 @@ def test_files_that_can_not_be_restored(bus, tmp_path):
     assert right == []
 
 
-# Servos that are not what is expected.
+# Servos with unexpected states and types.
 
 
-def test_a_lost_turn_is_brought_back_by_a_reboot(bus, connect):
+def test_extra_turns_of_the_position_are_removed_by_a_reboot(bus, connect):
     bus.call(lambda: setattr(bus.servo(0)._joint, "_turns", -2))
     (found,) = [each for each in told(bus) if each.status == "FAIL"]
     assert "its servo has counted 2 turns too many" in found.text
@@ -167,7 +167,7 @@ def test_a_lost_turn_is_brought_back_by_a_reboot(bus, connect):
     assert [each.status for each in told(bus)] == ["pass"]
 
 
-def test_a_servo_that_speaks_protocol_1_is_recognised(bus):
+def test_a_servo_with_protocol_1_is_recognised(bus):
     put(bus, reg.PROTOCOL_TYPE, 1)
     text = "answers Protocol 1.0, expected 2.0"
     (found,) = told(bus, open_timeout=0.1)

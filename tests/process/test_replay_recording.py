@@ -1,4 +1,4 @@
-"""Recordings replayed: on the wire as they were, and through today's code to the same states."""
+"""Replayed recordings: published unchanged, and recomputed to equal states by current code."""
 
 import json
 import re
@@ -25,12 +25,12 @@ from tests.harness.recorded_hand import Messages, Script, published
 
 @pytest.fixture(scope="module")
 def taken(tmp_path_factory: pytest.TempPathFactory) -> Messages:
-    """All that a grasp, a turn, a refused command and a stop publish."""
+    """Return all messages published during a grasp, a turn, a refused command and a stop."""
     script = Script(
         {
             50: {"command": "arm"},
             51: {"command": "grasp", "force": 6.0},
-            750: {"command": "move", "left": 0.1},  # refused while it holds
+            750: {"command": "move", "left": 0.1},  # refused while holding
             800: {"command": "rotate", "angle": 0.1},
             1100: {"command": "stop"},
         }
@@ -56,7 +56,7 @@ def _copy(message: dict[str, Any]) -> dict[str, Any]:
     return copied
 
 
-def test_the_same_inputs_give_the_same_states_to_the_last_bit(taken, tmp_path):
+def test_equal_inputs_give_bitwise_equal_states(taken, tmp_path):
     result = recompute(record(tmp_path / "a.mcap", taken))
     assert result.from_start
     assert result.ticks == result.states == 1150
@@ -65,19 +65,19 @@ def test_the_same_inputs_give_the_same_states_to_the_last_bit(taken, tmp_path):
     assert result.differences == {}
 
 
-def test_other_settings_show_where_they_first_matter(taken, tmp_path):
+def test_other_settings_report_the_first_difference(taken, tmp_path):
     recording = record(tmp_path / "a.mcap", taken)
     used = load(changes=["loop.clock=virtual", "stream.state_rate=500", "control.force_gain=0.5"])
     result = recompute(recording, used)
     assert "left.goal_current" in result.differences
-    assert "left.q" not in result.differences  # what came from outside is as it was
+    assert "left.q" not in result.differences  # inputs are unchanged
     different = result.differences["left.goal_current"]
-    assert different.first_tick > 50  # not before it was armed
+    assert different.first_tick > 50  # no difference before arming
     assert different.worst > 1e-3
     assert different.recorded != different.recomputed
 
 
-def test_a_changed_reading_is_found(taken, tmp_path):
+def test_a_changed_reading_is_detected(taken, tmp_path):
     bent = [(topic, _copy(message)) for topic, message in taken]
     for topic, message in bent:
         if topic == schema.INPUT and message["seq"] == 400:
@@ -88,7 +88,7 @@ def test_a_changed_reading_is_found(taken, tmp_path):
     assert min(each.first_tick for each in result.differences.values()) == 400
 
 
-def test_what_lacks_in_a_recording_is_told(taken, tmp_path):
+def test_missing_data_in_a_recording_is_reported(taken, tmp_path):
     def without(topic: bytes) -> Recording:
         path = tmp_path / f"{topic.decode().replace('/', '-')}.mcap"
         return record(path, [each for each in taken if each[0] != topic])
@@ -115,9 +115,7 @@ def test_what_lacks_in_a_recording_is_told(taken, tmp_path):
         recompute(record(tmp_path / "other.mcap", taken), other)
 
 
-def test_a_daemon_recorded_from_its_first_tick_recomputes_to_the_last_bit(
-    profile, tmp_path, inline
-):
+def test_a_daemon_recorded_from_its_first_tick_recomputes_bitwise(profile, tmp_path, inline):
     path = tmp_path / "run.mcap"
     words = ("--duration", "3", "--set", "task.name=demo", "--record", str(path))
     done = softfinger("run", "--config", str(profile("")), *words, *PATIENT)
@@ -130,7 +128,7 @@ def test_a_daemon_recorded_from_its_first_tick_recomputes_to_the_last_bit(
     ticks = re.search(r"(\d+) ticks, ", told.stdout)
     assert ticks is not None
     assert int(ticks[1]) > 100
-    # Other settings on the command line differ, even when a slow machine never came to the grip.
+    # Different settings give differences even if a slow machine never reached the grip.
     other = tmp_path / "other.toml"
     other.write_text(profile("safety.current_move = 0.3\n", "base.toml").read_text())
     told = inline("replay", path, "--recompute", "--config", other)
@@ -138,9 +136,7 @@ def test_a_daemon_recorded_from_its_first_tick_recomputes_to_the_last_bit(
     assert "left.goal_current" in told.stdout
 
 
-def test_a_recorder_that_can_not_start_ends_the_run_before_the_first_tick(
-    profile, tmp_path, inline
-):
+def test_a_recorder_that_cannot_start_prevents_the_first_tick(profile, tmp_path, inline):
     path = tmp_path / "run.mcap"
     path.write_text("mine")
     done = inline("run", "--config", profile(""), "--record", path)
@@ -161,7 +157,7 @@ def played(tmp_path: Path) -> tuple[Path, Messages]:
     return path, sent
 
 
-def test_messages_go_out_as_they_were(played, addresses, context):
+def test_messages_are_published_unchanged(played, addresses, context):
     path, sent = played
     socket = context.socket(zmq.SUB)
     socket.setsockopt(zmq.SUBSCRIBE, b"")
@@ -174,7 +170,7 @@ def test_messages_go_out_as_they_were(played, addresses, context):
     assert "101 of 101 messages published" in process.communicate(timeout=300)[0]
 
 
-def test_a_part_at_its_own_pace(played, addresses, inline):
+def test_a_time_range_is_replayed_at_the_original_rate(played, addresses, inline):
     words = ("--address", addresses[0], "--no-wait", "--from", "0.2", "--to", "0.4")
     done = inline("replay", played[0], *words)
     assert done.stdout.startswith(("20 of", "21 of"))

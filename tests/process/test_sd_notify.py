@@ -1,4 +1,4 @@
-"""The daemon as a service: signs of life on a real socket, unit, rules, logs, closed streams."""
+"""The daemon as a systemd service: watchdog messages on a real socket, unit, rules, logs."""
 
 import configparser
 import json
@@ -25,7 +25,7 @@ from tests.harness.descendants import ending
 
 
 class Manager:
-    """The other end of NOTIFY_SOCKET."""
+    """The service manager's end of NOTIFY_SOCKET."""
 
     def __init__(self, folder: Path) -> None:
         self.path = folder / "notify"
@@ -54,7 +54,7 @@ def manager(tmp_path: Path) -> Iterator[Manager]:
     manager.close()
 
 
-def test_ready_comes_first_and_signs_of_life_four_times_in_the_watchdogs_time(manager):
+def test_ready_is_sent_first_and_then_four_watchdog_messages_per_interval(manager):
     service = Service(str(manager.path), watchdog=2.0)
     for tick in range(1000):  # 2 s
         service.alive(tick * 0.002)
@@ -65,9 +65,9 @@ def test_ready_comes_first_and_signs_of_life_four_times_in_the_watchdogs_time(ma
     service.close()
 
 
-def test_a_manager_that_is_gone_or_does_not_read_holds_nothing_up(manager):
+def test_a_missing_or_slow_manager_does_not_block_the_daemon(manager):
     service = Service(str(manager.path), watchdog=0.004)
-    for tick in range(5000):  # far more than the socket holds
+    for tick in range(5000):  # far more than the socket buffers
         service.alive(tick * 0.002)
     manager.close()
     service.alive(1e6)
@@ -83,7 +83,7 @@ def test_a_manager_that_is_gone_or_does_not_read_holds_nothing_up(manager):
         ({"NOTIFY_SOCKET": "/run/x", "WATCHDOG_USEC": "junk"}, True),
     ],
 )
-def test_the_environment_says_whether_it_is_a_service(environment, expected):
+def test_the_environment_determines_whether_it_is_a_service(environment, expected):
     service = Service.of_environment(environment)
     assert (service is not None) is expected
     if service is not None:
@@ -91,7 +91,7 @@ def test_the_environment_says_whether_it_is_a_service(environment, expected):
         service.close()
 
 
-def test_the_running_daemon_is_ready_alive_silent_when_stopped_and_says_its_end(
+def test_the_daemon_reports_ready_alive_and_stopping_but_not_while_suspended(
     manager, profile, addresses, tmp_path
 ):
     log = tmp_path / "log"
@@ -134,7 +134,7 @@ def test_the_running_daemon_is_ready_alive_silent_when_stopped_and_says_its_end(
     assert set(records[-1]["wake_s"]) == {"p50", "p99", "p999", "max"}
 
 
-def test_an_abstract_socket_and_anothers_watchdog():
+def test_an_abstract_socket_and_a_watchdog_of_another_process():
     name = f"softfinger-test-{os.getpid()}"
     watched = {"NOTIFY_SOCKET": f"@{name}", "WATCHDOG_USEC": "1000", "WATCHDOG_PID": "1"}
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
@@ -147,7 +147,7 @@ def test_an_abstract_socket_and_anothers_watchdog():
         service.close()
 
 
-def test_the_unit_says_what_a_control_daemon_needs(tmp_path, inline):
+def test_the_unit_has_the_settings_of_a_control_daemon(tmp_path, inline):
     config = tmp_path / "my hand 100%.toml"
     config.write_text("", encoding="utf-8")
     done = inline("install-service", "--config", config, "--user", "root")
@@ -165,7 +165,7 @@ def test_the_unit_says_what_a_control_daemon_needs(tmp_path, inline):
     assert words[0] == sys.executable
     assert words[4:6] == ["run", "--no-task"], "comes back disarmed"
     assert words[6:] == ["--log", "json", "--config", str(config)]
-    # What it starts is there: the same words show the help.
+    # The started program exists: the same words print its help.
     shown = subprocess.run([*words[:-2], "--help"], capture_output=True, timeout=300, check=False)
     assert shown.returncode == 0
     analyze = shutil.which("systemd-analyze")
@@ -177,7 +177,7 @@ def test_the_unit_says_what_a_control_daemon_needs(tmp_path, inline):
         assert (verified.returncode, verified.stderr) == (0, "")
 
 
-def test_the_rules_are_keys_operators_and_quoted_values(inline):
+def test_rules_contain_only_keys_operators_and_quoted_values(inline):
     done = inline("install-service", "--udev")
     assert done.returncode == 0
     rules = [line for line in done.stdout.splitlines() if line and not line.startswith("#")]
@@ -195,14 +195,14 @@ def test_the_rules_are_keys_operators_and_quoted_values(inline):
         ("--config", "/absent.toml"),
     ],
 )
-def test_what_can_not_be_installed_is_told(inline, words):
+def test_failed_installations_are_reported(inline, words):
     done = inline("install-service", *words)
     assert done.returncode == 2
     assert done.stdout == ""
     assert done.stderr.startswith("install-service: ")
 
 
-def test_plain_lines_and_json_lines_say_the_same(tmp_path):
+def test_plain_and_json_log_lines_have_the_same_content(tmp_path):
     import logging
 
     for form in ("plain", "json"):
@@ -229,7 +229,7 @@ def test_plain_lines_and_json_lines_say_the_same(tmp_path):
     ]
 
 
-def test_in_the_journal_each_line_has_its_priority(capfd, monkeypatch):
+def test_journal_lines_have_priorities(capfd, monkeypatch):
     status = os.fstat(sys.stderr.fileno())
     monkeypatch.setenv("JOURNAL_STREAM", f"{status.st_dev}:{status.st_ino}")
     for form in ("plain", "json"):
@@ -243,14 +243,14 @@ def test_in_the_journal_each_line_has_its_priority(capfd, monkeypatch):
     assert (json.loads(line.removeprefix("<4>"))["late_s"], last[:3]) == (0.25, "<3>")
 
 
-def test_a_log_file_that_can_not_be_opened_is_told(profile, inline):
+def test_a_log_file_that_cannot_be_opened_is_reported(profile, inline):
     done = inline("run", "--config", profile(), "--log-file", "/absent/log")
     assert done.returncode == 2
     assert "--log-file /absent/log: No such file or directory" in done.stderr
 
 
 @pytest.mark.extended
-def test_the_daemon_runs_with_every_standard_stream_closed(profile):
+def test_the_daemon_runs_with_all_standard_streams_closed(profile):
     command = shlex.join(
         [*SOFTFINGER, "run", "--monitor", "--duration", "0.5", "--config", str(profile())]
     )
@@ -259,7 +259,7 @@ def test_the_daemon_runs_with_every_standard_stream_closed(profile):
 
 
 @pytest.mark.parametrize("clock", [1e30, -1e30, math.inf, math.nan])
-def test_the_log_goes_on_whatever_the_clock_says(tmp_path, monkeypatch, clock):
+def test_logging_continues_when_the_system_date_is_invalid(tmp_path, monkeypatch, clock):
     log = EventLog("plain", tmp_path / "log")
     with monkeypatch.context() as patched:
         patched.setattr("softfinger.tools.processes.event_log.time.time", lambda: clock)

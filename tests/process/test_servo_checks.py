@@ -1,4 +1,4 @@
-"""What connecting finds, with its fix, and nothing changed; temperature, supply, errors."""
+"""Checks at connect with suggested fixes and without changes; temperature, supply, errors."""
 
 import math
 import os
@@ -29,7 +29,7 @@ from tests.process.conftest import Connect
 
 
 def refusal(path: str, **servos: Any) -> list[str]:
-    """The lines of the error that connecting ends with."""
+    """Return the lines of the error raised at connect."""
     backend = DynamixelServos(backend_settings(path, **servos), RealClock())
     with pytest.raises(ServoError) as caught:
         backend.connect()
@@ -37,7 +37,7 @@ def refusal(path: str, **servos: Any) -> list[str]:
     return str(caught.value).splitlines()
 
 
-def test_connect_changes_nothing_and_stiffens_nothing(bus):
+def test_connecting_changes_nothing_and_leaves_torque_off(bus):
     live = slice(reg.REALTIME_TICK, reg.PRESENT_TEMPERATURE + 1)
 
     def settled() -> list[bytes]:
@@ -105,25 +105,25 @@ REBOOT = ": remove the cause, then `softfinger doctor --fix` reboots it"
     ],
     ids=["factory-new and overloaded", "supply and limit", "drive mode", "model"],
 )
-def test_everything_wrong_is_listed_with_its_fix(running, options, faults, registers, told):
+def test_all_problems_are_listed_with_their_fixes(running, options, faults, registers, told):
     bus = running(**options)
     for fault in faults:
         bus.fault(fault)
     for address, value in registers.items():
         bus.call(lambda at=address, value=value: bus.servo(1).table.set(at, value))
     lines = refusal(bus.path)
-    # The servo itself may have noticed the supply by now.
+    # The servo itself may already have detected the supply voltage.
     assert [line for line in lines if "input voltage" not in line] == told
 
 
-def test_a_model_without_current_control(running):
+def test_a_model_without_current_control_is_refused(running):
     bus = running(servos={"model": "XL430-W250", "mode": "position"})
     lines = refusal(bus.path, model="XL430-W250")
     assert sum("no current-based position mode" in line for line in lines) == 2
 
 
 @pytest.mark.parametrize("silent", [(2,), (1, 2)])
-def test_servos_that_do_not_answer(bus, silent):
+def test_missing_servos_are_reported(bus, silent):
     for servo in silent:
         bus.fault(f"silent={servo}")
     (line,) = refusal(bus.path, reply_timeout=0.5)
@@ -132,14 +132,14 @@ def test_servos_that_do_not_answer(bus, silent):
     assert line.startswith(missing if silent == (2,) else nothing)
 
 
-def test_the_wrong_rate_is_met_with_silence(running):
+def test_the_wrong_baud_rate_is_reported(running):
     bus = running(baud=1_000_000)
     (line,) = refusal(bus.path, baud=3_000_000, reply_timeout=0.05)
     assert "no servo answers at 3000000 baud" in line
     connected(bus, baud=1_000_000).close()
 
 
-def test_ports_that_can_not_be_used(bus):
+def test_unusable_ports_are_reported(bus):
     assert "no such port: plug the adapter in" in refusal("/dev/does-not-exist")[0]
     assert "no such port: start `softfinger emulate`" in refusal("/tmp/does-not-exist/servos")[0]
     first = connected(bus)
@@ -148,10 +148,10 @@ def test_ports_that_can_not_be_used(bus):
     first.read(reading)
     assert reading.valid
     first.close()
-    connected(bus).close()  # free again
+    connected(bus).close()  # available again
 
 
-def test_what_is_worth_knowing_is_a_notice(bus):
+def test_minor_findings_are_notices(bus):
     servo = bus.servo(0)
     bus.call(lambda: servo.table.set(reg.DRIVE_MODE, 0b0001))
     bus.call(lambda: servo.write(reg.TORQUE_ENABLE, b"\x01", time.monotonic()))
@@ -166,11 +166,11 @@ def test_what_is_worth_knowing_is_a_notice(bus):
     goal = bus.memory(0)[span]
     backend.write(Goal(q=[0.5, 0.5], current=[1.0, 1.0]))
     backend.close()
-    assert bus.memory(0)[span] == goal  # torque that was on stays as it was
+    assert bus.memory(0)[span] == goal  # torque that was on is not changed
     assert servo.torque_on
 
 
-def test_what_a_model_is_too_weak_for_is_a_notice(running):
+def test_forces_and_friction_that_overtax_a_model_are_notices(running):
     bus = running(servos={"model": "XL330-M288"})
     backend = connected(bus, model="XL330-M288")
     weak = "27 N may be asked for, and it stalls at 6.5 N on this finger"
@@ -178,25 +178,25 @@ def test_what_a_model_is_too_weak_for_is_a_notice(running):
     gears = "its gears take 0.25 of their torque, so a grip may never settle"
     assert [each.text for each in backend.notices] == 2 * [weak, constant, gears]
     backend.close()
-    for name in ("hil", "small"):  # their forces are their servos'
+    for name in ("hil", "small"):  # profiles whose forces match their servos
         settings = load(find(Path(name)), Path("/tmp"))
         assert checks.notice_strength("", by_name(settings.servos.model), settings) == []
 
 
-def test_an_adapters_latency_timer_is_asked_to_be_low(bus, tmp_path, monkeypatch):
+def test_an_adapter_is_set_to_low_latency(bus, tmp_path, monkeypatch):
     name = Path(os.path.realpath(bus.path)).name
     (tmp_path / name / "device").mkdir(parents=True)
     place = tmp_path / name / "device" / "latency_timer"
     place.write_text("16\n")
     monkeypatch.setattr(checks, "latency_file", lambda path: latency_file(path, tmp_path))
-    # The mode is not there, as on this pseudo-terminal.
+    # The low-latency mode is not available, as on this pseudo-terminal.
     text = "16 ms, so every read takes that long"
     fix = f"softfinger doctor --fix, or: echo 1 | sudo tee {place}"
     assert refusal(bus.path, reply_timeout=0.004)[0] == f"{bus.path} latency timer: {text}: {fix}"
-    backend = connected(bus)  # a reply may take longer than the timer
+    backend = connected(bus)  # the time-out is longer than the latency timer
     assert (backend.notices[0].text, backend.notices[0].fix) == (text, fix)
     backend.close()
-    # The mode is there: a driver then sets the timer to 1 ms by itself.
+    # The mode is available, so a driver sets the timer to 1 ms by itself.
     asked = []
 
     def low(_: serial.Serial, on: bool) -> None:
@@ -229,7 +229,7 @@ def read(servos: Servos, reading: Reading) -> Reading:
     return reading
 
 
-def test_temperature_and_supply_come_with_the_joints(bus, servos):
+def test_temperature_and_supply_are_read_with_the_joints(bus, servos):
     reading = read(servos, Reading())
     assert reading.valid
     assert reading.temperature == [25.0, 25.0]
@@ -241,8 +241,8 @@ def test_temperature_and_supply_come_with_the_joints(bus, servos):
     assert reading.temperature[0] == 25.0
 
 
-def test_both_kinds_of_read_give_the_same_joints(bus, servos, monkeypatch):
-    monkeypatch.setattr(dynamixel, "_HEALTH_INTERVAL", math.inf)  # one wide read, and no other
+def test_both_kinds_of_read_give_the_same_readings(bus, servos, monkeypatch):
+    monkeypatch.setattr(dynamixel, "_HEALTH_INTERVAL", math.inf)  # only one wide read
     wide = read(servos, Reading())
     narrow = read(servos, Reading())
     assert wide.temperature[0] > 0.0
@@ -251,7 +251,7 @@ def test_both_kinds_of_read_give_the_same_joints(bus, servos, monkeypatch):
     assert servos.counters()["timeouts"] == 0
 
 
-def test_an_alert_tells_which_hardware_error_it_is_and_arming_is_refused(bus, servos):
+def test_an_alert_names_the_hardware_error_and_arming_is_refused(bus, servos):
     reading = read(servos, Reading())
     assert reading.hardware == [0, 0]
     bus.fault("overload=2")
@@ -264,7 +264,7 @@ def test_an_alert_tells_which_hardware_error_it_is_and_arming_is_refused(bus, se
 
 
 class Loaded:
-    """A hand that stands, with 2 A through its left joint."""
+    """A stationary hand with 2 A through its left joint."""
 
     q = dq = np.zeros(2)
     current = np.array([2.0, 0.0])
@@ -284,18 +284,19 @@ class Loaded:
         self.driven.append((joint, torque))
 
 
-def test_simulated_servos_warm_with_their_current_and_shut_down():
+def test_simulated_servos_heat_up_with_their_current_and_shut_down():
     clock, hand = VirtualClock(), Loaded()
     servos = SimulatedServos(Settings(), hand, clock)
     servos.connect()
     reading = read(servos, Reading())
     assert reading.temperature == [25.0, 25.0]
-    assert reading.voltage == pytest.approx([12.05, 12.05], abs=0.06)  # 0.35 Ω on the way
+    assert reading.voltage == pytest.approx([12.05, 12.05], abs=0.06)  # 0.35 Ω supply resistance
     servos.torque_on()
     while not read(servos, reading).alert:
         clock.sleep_until(clock.now() + 0.05)
         assert clock.now() < 400.0
-    # 55 K of 73 J/K by 22.5 W, which is 32 W where copper is hot; and some goes into the air.
+    # 55 K times 73 J/K, heated by 22.5 W at first and 32 W with hot copper, minus losses to the
+    # air.
     assert 55.0 * 73.0 / 32.0 < clock.now() < 1.2 * 55.0 * 73.0 / 22.5
     assert (reading.alert, reading.hardware) == (0b01, [1 << 2, 0])
     assert reading.temperature == [80.0, 25.0]

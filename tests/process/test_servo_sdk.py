@@ -1,4 +1,4 @@
-"""The maker's SDK, plain and through our packet handler, against emulated servos on a pty."""
+"""The manufacturer's SDK, with its own and with our packet handler, on emulated servos on a pty."""
 
 from collections.abc import Iterator
 
@@ -30,9 +30,9 @@ def line(bus: RunningBus) -> Iterator[Line]:
     data=st.lists(st.sampled_from([0xFF, 0xFD, 0x12, 0x00]), min_size=1, max_size=28).map(bytes),
     kind=st.sampled_from([GroupRead, FastGroupRead]),
 )
-def test_any_bytes_come_and_go_unchanged(bus, line, data, kind):
+def test_arbitrary_bytes_are_transferred_unchanged(bus, line, data, kind):
     port, handler = line
-    start = 224  # indirect data pointing at itself: plain memory
+    start = 224  # indirect data that refers to itself acts as plain memory
     assert handler.writeTxRx(port, 1, start, len(data), list(data)) == (OK, 0)
     assert bus.memory(0)[start : start + len(data)] == data
     assert handler.readTxRx(port, 1, start, len(data)) == (list(data), OK, 0)
@@ -41,30 +41,30 @@ def test_any_bytes_come_and_go_unchanged(bus, line, data, kind):
     assert group.data[1] == data
 
 
-def test_other_calls_of_the_sdk_work_through_our_handler(line):
+def test_other_sdk_calls_work_with_our_handler(line):
     port, handler = line
     assert handler.ping(port, 1) == (1020, OK, 0)
     assert handler.write4ByteTxRx(port, 1, reg.PROFILE_VELOCITY, 77) == (OK, 0)
     assert handler.read4ByteTxRx(port, 1, reg.PROFILE_VELOCITY) == (77, OK, 0)
     assert handler.write1ByteTxOnly(port, 2, reg.LED, 1) == OK
-    # Nobody waits for that reply, which must not be taken for the next one's.
+    # The unread reply to this write must not be used for the next request.
     assert handler.read1ByteTxRx(port, 2, reg.LED) == (1, OK, 0)
     bulk = sdk.GroupBulkRead(port, handler)
     bulk.addParam(1, reg.PRESENT_POSITION, 4)
     bulk.addParam(2, reg.PRESENT_TEMPERATURE, 1)
     for exchange in ("txRxPacket", "fastBulkRead"):
-        assert getattr(bulk, exchange, lambda: OK)() == OK  # version 3.7 has no fast reads
+        assert getattr(bulk, exchange, lambda: OK)() == OK  # SDK version 3.7 has no fast reads
         assert bulk.getData(1, reg.PRESENT_POSITION, 4) == 2048
         assert bulk.getData(2, reg.PRESENT_TEMPERATURE, 1) == 25
     assert handler.reboot(port, 1) == (OK, 0)
 
 
-def test_the_plain_sdk_is_served_too(bus):
+def test_the_unmodified_sdk_works(bus):
     port = sdk.PortHandler(bus.path)
     handler = sdk.PacketHandler(2.0)
     assert port.openPort()
-    assert port.setBaudRate(1_000_000)  # closes and opens the pty again
-    # Its 35 ms may pass on a busy machine.
+    assert port.setBaudRate(1_000_000)  # closes and reopens the pty
+    # A busy machine may exceed the SDK's 35 ms.
     port.setPacketTimeout = lambda _: port.setPacketTimeoutMillis(60_000)
     assert handler.ping(port, 2) == (1020, OK, 0)
     read = sdk.GroupSyncRead(port, handler, reg.PRESENT_POSITION, 4)
@@ -94,7 +94,7 @@ def test_error_bytes_of_a_group_read_are_kept(bus, line):
         group = kind(*line, reg.PRESENT_POSITION, 4, [1, 2])
         assert group.exchange() == OK
         assert group.errors == {1: 0x80, 2: 0}
-        assert kind(*line, 660, 4, [1, 2]).exchange() != OK  # beyond the table
+        assert kind(*line, 660, 4, [1, 2]).exchange() != OK  # beyond the control table
 
 
 def test_noise_before_a_reply_is_skipped_and_counted():

@@ -1,4 +1,4 @@
-"""The soak in real time, in short: it runs, and judges wire, memory and what is lost."""
+"""Short run of the real-time soak: its checks of the wire, memory and lost messages."""
 
 import copy
 import math
@@ -15,11 +15,11 @@ from tests.soak.rig import judge_wire
 
 
 @pytest.mark.extended
-def test_the_soak_in_real_time_judges_wire_memory_and_streams(monkeypatch):
+def test_the_real_time_soak_checks_wire_memory_and_streams(monkeypatch):
     monkeypatch.setattr(hil, "_LOOK", 0.5)
-    monkeypatch.setattr(hil, "_FLAT", 30.0)  # MB: all of them are still warming up
+    monkeypatch.setattr(hil, "_FLAT", 30.0)  # MB, because all processes are still warming up
     account = hil.soak(4.0)
-    # A busy machine may hold up the emulated hand itself, whose watchdog then comes late.
+    # A busy machine may delay the emulated hand itself, whose watchdog then trips late.
     assert [each for each in account.wrong if "without a packet" not in each] == []
     assert account.ticks > 0
     assert {"daemon", "hand", "recorder", "subscriber 3"} <= account.memory.keys()
@@ -28,7 +28,7 @@ def test_the_soak_in_real_time_judges_wire_memory_and_streams(monkeypatch):
     assert "subscribers' states, and lost" in str(account)
 
 
-def test_a_process_that_grows_is_told():
+def test_a_growing_process_is_reported():
     account = hil.Account(seconds=30.0)
     account.looked = [(t, 0) for t in range(0, 30, 5)]
     account.memory = {"leaky": [10.0 + t for t in range(6)], "flat": [10.0] * 6}
@@ -38,7 +38,7 @@ def test_a_process_that_grows_is_told():
     assert [each.split()[0] for each in account.wrong] == ["leaky"]
 
 
-def test_a_hand_that_hardly_holds_is_told():
+def test_a_hand_that_rarely_holds_is_reported():
     for held, told in (40, []), (20, ["20 of 100 grasps came to hold"]):
         account = hil.Account(seconds=30.0, held=held)
         account.looked, account.received, account.recorded = [(0.0, 0)], [(5, 0)], (5, 0)
@@ -66,7 +66,7 @@ def judged(*servos: dict[str, Any]) -> str:
     return judge_wire(rig)
 
 
-def test_the_wire_is_judged_by_its_record():
+def test_the_wire_is_checked_by_its_record():
     assert judged(servo(), servo(goal_q=None, goal_current=None)) == ""
     for changed, told in (
         ({"goal_q": [-0.5, 1.01]}, "goal angles"),

@@ -1,4 +1,4 @@
-"""A hand with solid tips, recorded on the virtual clock: what the tools make of it."""
+"""A hand with solid tips, recorded on the virtual clock and processed by the tools."""
 
 from pathlib import Path
 
@@ -12,14 +12,14 @@ from tests.harness.recorded_hand import record_hand
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Four virtual seconds of the demo: grasped, held, and turned."""
+    """Record four virtual seconds of the demo: grasp, hold and turn."""
     path = tmp_path_factory.mktemp("solid") / "hand.mcap"
     record_hand(path, {}, 4.0, ("task.name=demo",), profile="solid")
     return path
 
 
 @pytest.mark.extended
-def test_its_recording_recomputes_to_the_last_bit(recorded, capsys):
+def test_the_recording_recomputes_bitwise(recorded, capsys):
     assert main(["replay", "--recompute", str(recorded)]) == 0
     assert "identical to the last bit" in capsys.readouterr().out
     states = [each for _, each in Recording(recorded).messages([schema.STATE])]
@@ -28,7 +28,7 @@ def test_its_recording_recomputes_to_the_last_bit(recorded, capsys):
 
 
 @pytest.mark.extended
-def test_analyse_and_plot_read_it(recorded, capsys):
+def test_analyse_and_plot_read_the_recording(recorded, capsys):
     assert main(["analyse", str(recorded)]) == 0
     assert ", 0 not usable" in capsys.readouterr().out
     out = recorded.parent / "plots"

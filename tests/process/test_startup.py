@@ -1,4 +1,7 @@
-"""A subcommand before its work: packages that are missing, Ctrl-C at an import, completion."""
+"""Behaviour of subcommands before their work starts.
+
+Missing packages, Ctrl-C during an import, shell completion.
+"""
 
 import signal
 import subprocess
@@ -30,7 +33,7 @@ from tests.process.test_record import written
         ),
     ],
 )
-def test_a_missing_package_is_named_if_it_is_needed(tmp_path, missing, words, told):
+def test_a_required_package_that_is_missing_is_named(tmp_path, missing, words, told):
     written(tmp_path / "run.mcap", 20)
     code = (
         f"import sys; sys.modules[{missing!r}] = None\n"
@@ -44,7 +47,7 @@ def test_a_missing_package_is_named_if_it_is_needed(tmp_path, missing, words, to
     assert not (tmp_path / "new.mcap").exists()
 
 
-# Presses Ctrl-C at the import of a module.
+# Program that sends Ctrl-C during a module's import.
 _AT = """
 import builtins, os, signal, sys
 from softfinger.tools import cli
@@ -64,10 +67,10 @@ sys.exit(cli.main(sys.argv[2:]))
         ("argparse", ["limits"], -signal.SIGINT),
         ("pydantic", ["run"], -signal.SIGINT),
         ("softfinger.tools.terminal.stream_state", ["monitor"], -signal.SIGINT),
-        ("softfinger.daemon.safety.limits", ["limits"], 130),  # a keyboard interrupt again
+        ("softfinger.daemon.safety.limits", ["limits"], 130),  # KeyboardInterrupt again
     ],
 )
-def test_ctrl_c_while_a_subcommand_is_imported_ends_it_as_any_process(module, words, status):
+def test_ctrl_c_during_import_ends_a_subcommand_like_any_process(module, words, status):
     done = python("-c", _AT, module, *words)
     assert (done.returncode, done.stderr) == (status, "")
 
@@ -80,8 +83,8 @@ echo "${COMPREPLY[@]}"
 """
 
 
-def test_a_tab_completes(inline, tmp_path):
-    """By the script that `softfinger completion bash` prints."""
+def test_tab_completion(inline, tmp_path):
+    """Use the script printed by `softfinger completion bash`."""
     pytest.importorskip("shtab")
     script = tmp_path / "script"
     script.write_text(inline("completion", "bash").stdout, encoding="utf-8")

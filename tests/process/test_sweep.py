@@ -1,4 +1,4 @@
-"""Sweeps give the same bits from one process, a pool, and a cluster whose worker is killed."""
+"""Sweeps give the same bits in one process, in a pool, and in a cluster whose worker is killed."""
 
 import json
 import os
@@ -23,7 +23,7 @@ def drawn(seed: int) -> float:
 
 
 def dies_once(folder: Path, seed: int) -> float:
-    """Kill the worker that comes to case 5 first."""
+    """Kill the first worker that reaches case 5."""
     if seed == 5:
         try:
             (folder / "died").touch(exist_ok=False)
@@ -39,7 +39,7 @@ def dies(seed: int) -> float:
     return drawn(seed)
 
 
-def test_results_are_the_same_in_any_number_of_processes_though_one_dies(tmp_path):
+def test_results_do_not_depend_on_the_number_of_processes_or_a_crash(tmp_path):
     assert list(Sweep("drawn", drawn, CASES).run(1)) == EXPECTED
     assert list(Sweep("drawn", partial(dies_once, tmp_path), CASES).run(2)) == EXPECTED
     assert (tmp_path / "died").exists()
@@ -52,7 +52,7 @@ def test_a_case_that_kills_each_worker_ends_the_sweep():
 
 
 @pytest.mark.extended
-def test_a_cluster_gives_the_same_and_outlives_a_worker(tmp_path):
+def test_a_cluster_gives_the_same_results_despite_a_killed_worker(tmp_path):
     distributed = pytest.importorskip("distributed")
     with distributed.LocalCluster(
         n_workers=2, threads_per_worker=1, dashboard_address=None, protocol="tcp://"
@@ -64,7 +64,7 @@ def test_a_cluster_gives_the_same_and_outlives_a_worker(tmp_path):
     assert (tmp_path / "died").exists()
 
 
-def test_a_scheduler_that_is_not_there_is_told(monkeypatch, capsys):
+def test_a_missing_scheduler_is_reported(monkeypatch, capsys):
     pytest.importorskip("distributed")
     monkeypatch.setattr("softfinger.tools.sweep._CONNECT_TIMEOUT", 0.2)
     words = ["--size", "40", "--mass", "1", "--friction", "0.6", "--shape", "disc"]
@@ -72,13 +72,13 @@ def test_a_scheduler_that_is_not_there_is_told(monkeypatch, capsys):
     assert "tcp://127.0.0.1:9: no Dask scheduler answers" in capsys.readouterr().err
 
 
-def test_an_interrupted_sweep_goes_on_from_its_journal(tmp_path):
+def test_an_interrupted_sweep_continues_from_its_journal(tmp_path):
     journal = tmp_path / "map.toml.part"
     first = Sweep("drawn", drawn, CASES, journal).run(1)
     assert [next(first) for _ in range(4)] == EXPECTED[:4]
     first.close()
     with journal.open("a", encoding="utf-8") as file:
-        file.write("[4, 0.")  # cut short
+        file.write("[4, 0.")  # truncated
     done = []
 
     def counted(seed: int) -> float:
@@ -92,7 +92,7 @@ def test_an_interrupted_sweep_goes_on_from_its_journal(tmp_path):
     assert done == CASES[4:]
 
 
-def test_another_sweeps_journal_is_refused(tmp_path):
+def test_a_journal_of_another_sweep_is_refused(tmp_path):
     journal = tmp_path / "map.toml.part"
     next(Sweep("drawn", drawn, CASES, journal).run(1))
     with pytest.raises(SweepError, match=r"map\.toml\.part: of another sweep"):
@@ -105,7 +105,7 @@ CAMPAIGN = "bench faults --only '6 N: honest' --trials 2 --json"
 
 @pytest.mark.extended
 @pytest.mark.parametrize("words", [ENVELOPE, CAMPAIGN], ids=["envelope", "campaign"])
-def test_a_tool_gives_the_same_in_one_process_and_in_two(tmp_path, words):
+def test_a_tool_gives_the_same_results_in_one_and_two_processes(tmp_path, words):
     for processes in ("1", "2"):
         assert main([*shlex.split(words), str(tmp_path / processes), "--processes", processes]) == 0
     one, two = ((tmp_path / each).read_text(encoding="utf-8") for each in ("1", "2"))
@@ -114,7 +114,7 @@ def test_a_tool_gives_the_same_in_one_process_and_in_two(tmp_path, words):
 
 
 @pytest.mark.extended
-def test_many_recordings_are_analysed_as_each_alone(tmp_path, capsys):
+def test_many_recordings_give_the_same_results_as_single_ones(tmp_path, capsys):
     files = [tmp_path / f"{name}.npy" for name in "abc"]
     rng = np.random.default_rng(1)
     for file in files[:2]:

@@ -1,4 +1,4 @@
-"""The emulated tactile board: what it puts on its pty, when, and what its faults do."""
+"""The emulated tactile board: the bytes on its pty, their timing, and its faults."""
 
 import os
 import select
@@ -21,7 +21,7 @@ SIZE = ROWS * COLS + 2
 
 
 class Source:
-    """Frames made by the test."""
+    """Source of frames made by the test."""
 
     def __init__(self) -> None:
         self.frame: Frame | None = None
@@ -36,7 +36,7 @@ class Source:
 
 
 class Client:
-    """Reads what a board wrote. A read of an empty tty first takes what is under way in it."""
+    """Client of a board; reading an empty tty first receives bytes in transit."""
 
     def __init__(self, path: str) -> None:
         self.fd = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
@@ -50,7 +50,7 @@ class Client:
                 return b"".join(parts)
 
     def expect(self, size: int) -> bytes:
-        """Wait for ``size`` bytes: the kernel hands them on in its own time."""
+        """Wait for ``size`` bytes, which the kernel may deliver with a delay."""
         got = b""
         while len(got) < size:
             assert select.select([self.fd], [], [], 60.0)[0], f"only {len(got)} of {size} bytes"
@@ -62,7 +62,7 @@ def board(source: Source, rate: float = 100.0, delay: float = 0.01) -> TactileBo
     return TactileBoard(source, ENCODERS["flexitac"], rate, delay, seed=4)
 
 
-def test_each_frame_goes_out_once_and_the_decoder_reads_it():
+def test_each_frame_is_sent_once_and_decoded():
     source = Source()
     made = board(source)
     client = Client(made.path)
@@ -81,17 +81,17 @@ def test_each_frame_goes_out_once_and_the_decoder_reads_it():
     made.close()
 
 
-def test_it_is_due_at_each_frame_delivery():
+def test_the_next_event_is_the_next_frame_delivery():
     source = Source()
     made = board(source, rate=100.0, delay=0.004)
     assert made.next_event() == -np.inf
-    # A due time that rounding put just before the frame's must not come again at once.
+    # A due time that rounding puts just before the frame must not be repeated at once.
     times = (0.0, 0.004, np.nextafter(0.014, 0.0), 0.0561)
     for seq, (t, due) in enumerate(zip(times, (0.004, 0.014, 0.024, 0.064), strict=True)):
         source.make(seq)
         made.service(t)
         assert made.next_event() == pytest.approx(due)
-    made.service(0.0562)  # a frame that is late is asked for again soon
+    made.service(0.0562)  # a late frame is checked again soon
     assert made.next_event() == pytest.approx(0.0567)
     made.service(0.0638)
     assert made.next_event() == pytest.approx(0.064)
@@ -99,11 +99,11 @@ def test_it_is_due_at_each_frame_delivery():
 
 
 @pytest.mark.parametrize("cells", [48, 1024, 44 * 44, 128 * 128])
-def test_nobody_reading_costs_whole_frames_only(cells):
+def test_without_a_reader_only_whole_frames_are_dropped(cells):
     writer = FrameWriter()
     rng = np.random.default_rng(0)
     frame = rng.bytes(cells)
-    # The kernel tells what is unread only once it has handed it on, in its own time.
+    # The kernel reports the number of unread bytes only after a delay.
     sent: list[bool] = []
     until(lambda: sent.append(writer.send(frame)) or writer.dropped >= 150)
     assert writer.dropped == sent.count(False)
@@ -115,12 +115,12 @@ def test_nobody_reading_costs_whole_frames_only(cells):
         got += client.expect(1) + client.read()
     assert got == frame * sent.count(True)
     assert client.read() == b""
-    assert writer.send(frame)  # goes on as soon as somebody reads
+    assert writer.send(frame)  # sending continues once there is a reader
     os.close(client.fd)
     writer.close()
 
 
-def test_what_a_client_writes_is_taken_and_not_echoed():
+def test_client_bytes_are_consumed_without_echo():
     made = board(Source())
     client = Client(made.path)
     os.write(client.fd, b"\x03abc\n" * 100)
@@ -131,7 +131,7 @@ def test_what_a_client_writes_is_taken_and_not_echoed():
 
 
 @pytest.mark.parametrize("kind", ["noisy", "saturated", "zero"])
-def test_what_a_fault_puts_on_the_line(kind):
+def test_bytes_on_the_line_during_faults(kind):
     source = Source()
     made = board(source)
     client = Client(made.path)

@@ -1,4 +1,4 @@
-"""What every tactile backend must do, whatever it reads."""
+"""Requirements for every tactile backend."""
 
 import threading
 
@@ -17,7 +17,7 @@ def rig(request, tmp_path):
         yield made
 
 
-def test_open_brings_a_first_good_frame(rig):
+def test_open_waits_for_a_valid_frame(rig):
     assert rig.sensor.latest() is None
     rig.sensor.open()
     frame = rig.sensor.latest()
@@ -29,7 +29,7 @@ def test_open_brings_a_first_good_frame(rig):
     assert frame.t_sample <= frame.t_arrival <= rig.clock.now() + 1e-6
 
 
-def test_a_frame_stays_the_same_object_until_a_newer_one_and_is_never_written_again(rig):
+def test_a_frame_object_is_kept_until_a_newer_one_and_never_modified(rig):
     rig.sensor.open()
     first = rig.sensor.latest()
     kept = first.data.copy()
@@ -38,22 +38,22 @@ def test_a_frame_stays_the_same_object_until_a_newer_one_and_is_never_written_ag
     assert later.t_arrival > first.t_arrival
     assert later.t_sample > first.t_sample
     assert np.array_equal(first.data, kept)
-    if rig.backend in ("simulated", "replay"):  # no time passes here by itself
+    if rig.backend in ("simulated", "replay"):  # time does not advance by itself here
         assert rig.sensor.latest() is later
 
 
-def test_numbers_and_times_only_rise(rig):
+def test_numbers_and_times_only_increase(rig):
     rig.sensor.open()
     seen = [rig.sensor.latest()]
     while len(seen) < 12:
         seen.append(rig.wait(lambda frame: frame is not seen[-1]))
     assert (np.diff([frame.seq for frame in seen]) > 0).all()
     assert (np.diff([frame.t_sample for frame in seen]) >= 0).all()
-    # Frames that were read in one go have come at the same time.
+    # Frames read in one call have the same arrival time.
     assert (np.diff([frame.t_arrival for frame in seen]) >= 0).all()
 
 
-def test_counts_are_told_as_plain_numbers(rig):
+def test_counters_are_plain_integers(rig):
     rig.sensor.open()
     rig.wait(lambda _: rig.sensor.counters()["frames"] >= 3)
     counters = rig.sensor.counters()
@@ -61,7 +61,7 @@ def test_counts_are_told_as_plain_numbers(rig):
     assert all(type(value) is int for value in counters.values())
 
 
-def test_close_ends_everything_and_may_come_again(rig):
+def test_close_releases_everything_and_may_be_repeated(rig):
     rig.sensor.close()
     rig.sensor.open()
     rig.sensor.close()
@@ -74,7 +74,7 @@ def test_close_ends_everything_and_may_come_again(rig):
 
 
 @pytest.mark.parametrize("backend", [*SERIAL, "replay"])
-def test_it_opens_again_after_close(backend, tmp_path):
+def test_it_can_be_reopened_after_close(backend, tmp_path):
     with Rig(backend, tmp_path) as rig:
         rig.sensor.open()
         rig.sensor.close()
@@ -84,7 +84,7 @@ def test_it_opens_again_after_close(backend, tmp_path):
 
 
 @pytest.mark.parametrize("backend", [*SERIAL, "replay"])
-def test_counts_are_those_that_were_sent_row_by_row(backend, tmp_path):
+def test_counts_equal_the_sent_ones_row_by_row(backend, tmp_path):
     with Rig(backend, tmp_path) as rig:
         rig.sensor.open()
         for _ in range(5):
@@ -94,17 +94,17 @@ def test_counts_are_those_that_were_sent_row_by_row(backend, tmp_path):
 
 
 @pytest.mark.parametrize("backend", [*SERIAL, "replay"])
-def test_another_grid_is_told_with_both_sizes(backend, tmp_path):
+def test_another_grid_is_reported_with_both_sizes(backend, tmp_path):
     def told() -> bool:
         with pytest.raises(TactileError) as error, Rig(backend, tmp_path, rows=16) as rig:
             rig.sensor.open()
         return "16 × 32" in str(error.value)
 
-    until(told)  # a busy machine's board may have sent nothing yet
+    until(told)  # on a busy machine the board may not have sent anything yet
 
 
 @pytest.mark.parametrize("backend", SERIAL)
-def test_torn_and_noisy_frames_are_dropped_and_counted(backend, tmp_path):
+def test_incomplete_and_noisy_frames_are_dropped_and_counted(backend, tmp_path):
     with Rig(backend, tmp_path, fault="torn=0.3") as rig:
         rig.sensor.open()
         wrong = 0
@@ -116,12 +116,12 @@ def test_torn_and_noisy_frames_are_dropped_and_counted(backend, tmp_path):
 
 
 @pytest.mark.parametrize("backend", SERIAL)
-def test_a_board_that_falls_silent_leaves_the_last_frame(backend, tmp_path):
+def test_a_silent_board_keeps_the_last_frame(backend, tmp_path):
     with Rig(backend, tmp_path, fault="silent@0.2") as rig:
         rig.sensor.open()
-        rig.wait(lambda frame: rig.images.number > 60)  # 40 of them were sent
+        rig.wait(lambda frame: rig.images.number > 60)  # 40 of which were sent
 
-        def silent() -> bool:  # earlier frames may yet be on their way
+        def silent() -> bool:  # earlier frames may still be in transit
             last, number = rig.sensor.latest(), rig.images.number
             rig.wait(lambda frame: rig.images.number > number + 10)
             assert last.valid
@@ -131,12 +131,12 @@ def test_a_board_that_falls_silent_leaves_the_last_frame(backend, tmp_path):
 
 
 @pytest.mark.parametrize("backend", SERIAL)
-def test_a_frozen_board_goes_on_with_numbers_and_times_and_one_image(backend, tmp_path):
+def test_a_frozen_board_has_new_numbers_and_times_but_the_same_image(backend, tmp_path):
     with Rig(backend, tmp_path, fault="frozen@0.2") as rig:
         rig.sensor.open()
         rig.wait(lambda frame: rig.images.number > 60)
 
-        def still() -> bool:  # earlier frames may yet be on their way
+        def still() -> bool:  # earlier frames may still be in transit
             first = rig.sensor.latest()
             later = rig.wait(lambda frame: frame.seq >= first.seq + 3)
             assert later.t_sample > first.t_sample
@@ -146,9 +146,9 @@ def test_a_frozen_board_goes_on_with_numbers_and_times_and_one_image(backend, tm
         until(still)
 
 
-# The glove-style board does so too, after 40 unanswered requests of 0.1 s each.
+# The glove-style board behaves the same, after 40 unanswered requests of 0.1 s each.
 @pytest.mark.parametrize("backend", ["flexitac", "cobs"])
-def test_a_board_that_changes_its_grid_ends_in_an_invalid_frame(backend, tmp_path):
+def test_a_board_that_changes_its_grid_gives_an_invalid_frame(backend, tmp_path):
     with Rig(backend, tmp_path, fault="wrong-size@0.2") as rig:
         rig.sensor.open()
         last = rig.wait(lambda frame: not frame.valid)
@@ -158,7 +158,7 @@ def test_a_board_that_changes_its_grid_ends_in_an_invalid_frame(backend, tmp_pat
 
 
 @pytest.mark.parametrize("backend", SERIAL)
-def test_an_unplugged_board_ends_in_an_invalid_frame_with_the_old_data(backend, tmp_path):
+def test_an_unplugged_board_gives_an_invalid_frame_with_the_old_data(backend, tmp_path):
     with Rig(backend, tmp_path) as rig:
         rig.sensor.open()
         before = rig.wait(lambda frame: frame.seq >= 3)

@@ -1,7 +1,7 @@
-"""What is no ZeroMQ client of today gets nothing from the daemon: no command in, no message out.
+"""Clients without the current ZeroMQ protocol can neither send commands nor receive messages.
 
-A web page can have a browser POST bytes of its choice to any port of this machine. They can be made
-to read as frames of ZMTP/1.0, which has no handshake that could tell a browser from a client.
+A web page can make a browser POST arbitrary bytes to any port of this machine. These bytes can form
+frames of ZMTP/1.0, whose missing handshake does not distinguish a browser from a client.
 """
 
 import contextlib
@@ -18,18 +18,18 @@ from tests.harness.daemon_process import ask
 
 
 def old_frame(body: bytes, more: bool = False) -> bytes:
-    """A frame of ZMTP/1.0: a length that counts the flags, flags, body."""
+    """Return a ZMTP/1.0 frame: length including flags, flags, body."""
     return bytes([len(body) + 1, more]) + body
 
 
 def old_command(name: str) -> bytes:
-    """What a REQ socket of ZMTP/1.0 sends, its identity first."""
+    """Return a command as a ZMTP/1.0 REQ socket sends it, identity first."""
     payload = msgpack.packb({"command": name})
     return old_frame(b"") + old_frame(b"", more=True) + old_frame(payload)
 
 
 def posted(frames: bytes, address: str) -> bytes:
-    """An HTTP request whose head is one part of a message, and whose body is ``frames``."""
+    """Return an HTTP request whose head is one message part and whose body is ``frames``."""
     for padding in range(256):
         head = (
             f"POST /{'x' * padding} HTTP/1.1\r\nHost: {address.removeprefix('tcp://')}\r\n"
@@ -44,18 +44,18 @@ def posted(frames: bytes, address: str) -> bytes:
 
 
 def place(address: str) -> tuple[str, int]:
-    """Host and port."""
+    """Return host and port."""
     host, _, port = address.removeprefix("tcp://").rpartition(":")
     return host, int(port)
 
 
 def said_to(request: bytes, address: str, wait: Callable[[], object]) -> bytes:
-    """Send ``request``, do something else, and return what was answered meanwhile."""
+    """Send ``request``, call ``wait``, and return the reply received meanwhile."""
     with socket.create_connection(place(address), timeout=60.0) as raw:
         raw.sendall(request)
         wait()
         answer = b""
-        with contextlib.suppress(OSError):  # the daemon may have hung up
+        with contextlib.suppress(OSError):  # the daemon may have closed the connection
             raw.shutdown(socket.SHUT_WR)
         with contextlib.suppress(ConnectionError):
             while part := raw.recv(4096):
@@ -64,7 +64,7 @@ def said_to(request: bytes, address: str, wait: Callable[[], object]) -> bytes:
 
 
 @pytest.mark.parametrize("wrap", [lambda frames, _: frames, posted], ids=["ZMTP/1.0", "HTTP POST"])
-def test_libzmq_by_itself_takes_them_for_commands(addresses, context, wrap):
+def test_libzmq_itself_accepts_the_bytes_as_commands(addresses, context, wrap):
     bare = context.socket(zmq.ROUTER)
     bare.bind(addresses[1])
     request = wrap(old_command("arm") + old_command("arm")[2:], addresses[1])
@@ -75,7 +75,7 @@ def test_libzmq_by_itself_takes_them_for_commands(addresses, context, wrap):
 
 
 @pytest.mark.parametrize("wrap", [lambda frames, _: frames, posted], ids=["ZMTP/1.0", "HTTP POST"])
-def test_a_web_page_commands_and_reads_nothing(daemon, wrap):
+def test_a_web_page_can_neither_send_nor_receive(daemon, wrap):
     request = wrap(old_command("arm") + old_command("arm")[2:], daemon.commands)
     with Hand(*daemon.addresses, timeout=60.0) as hand:
         answer = said_to(
@@ -83,7 +83,7 @@ def test_a_web_page_commands_and_reads_nothing(daemon, wrap):
         )
         assert b"ok" not in answer
         assert hand.state().mode == "disarmed"
-        hand.arm()  # a client is still heard
+        hand.arm()  # clients are still served
         assert hand.wait_for(lambda state: state.torque, 60.0).mode == "armed"
         hand.stop()
         request = wrap(old_frame(b"") + old_frame(b"\x01hand/"), daemon.addresses[0])

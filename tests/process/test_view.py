@@ -1,4 +1,4 @@
-"""``softfinger view``: its pictures are the stream's, and who may have them; what can go wrong."""
+"""``softfinger view``: pictures of the stream, access control, and errors."""
 
 import argparse
 import base64
@@ -47,14 +47,14 @@ GOALS = {"goal_force": 9.0, "goal_angle": 0.1}
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The simulated hand at work for 2.6 s: grasps, turns, releases."""
+    """Record 2.6 s of the simulated hand: it grasps, turns and releases."""
     path = tmp_path_factory.mktemp("recorded") / "hand.mcap"
     record_hand(path, GRASP, 2.6)
     return path
 
 
 class Kept:
-    """Pictures as they are published, in this process."""
+    """Pictures published in this process."""
 
     def __init__(self, *, live: bool = False) -> None:
         self.newest: dict[str, Any] = {}
@@ -83,7 +83,7 @@ def got(host: str, path: str, **headers: str) -> tuple[int, str]:
 
 
 def location(host: str, path: str) -> str:
-    """Where a request is sent on to."""
+    """Return the target of a redirect."""
     connection = http.client.HTTPConnection(host, timeout=60)
     connection.request("GET", path)
     answer = connection.getresponse()
@@ -92,7 +92,7 @@ def location(host: str, path: str) -> str:
 
 
 def ask(host: str, query: str, asked: Any, **more: Any) -> str:
-    """Send a command, or what is none, as a page does; its answer."""
+    """Send a command, or other text, as a page does; return the reply."""
     with connect(f"ws://{host}/command{query}", proxy=None, open_timeout=WAIT, **more) as line:
         line.send(orjson.dumps(asked).decode())
         return str(line.recv(timeout=WAIT))
@@ -102,7 +102,7 @@ ANSWERS = [("/", {}, 200), ("/nothing", {}, 404), ("/", {"Host": "evil.example"}
 
 
 @pytest.mark.parametrize(("path", "headers", "status"), ANSWERS)
-def test_no_answer_is_kept_framed_or_told_to_others(served, path, headers, status):
+def test_responses_are_not_cached_framed_or_revealed_to_other_sites(served, path, headers, status):
     _, viewed = served
     connection = http.client.HTTPConnection(viewed.host, timeout=WAIT)
     connection.request("GET", path, headers=headers)
@@ -119,29 +119,30 @@ ODD += ['{"command": "\\ud800"}', "{"]
 
 
 @pytest.mark.parametrize("odd", ODD)
-def test_what_is_no_command_is_answered(served, odd):
+def test_an_invalid_command_gets_a_reply(served, odd):
     fake, viewed = served
     query = viewed.commanding.partition("/?")[2]
     address = f"ws://{viewed.host}/command?{query}"
     with connect(address, proxy=None, open_timeout=WAIT) as line:
-        for _ in range(2):  # the page may go on
+        for _ in range(2):  # the page may continue
             line.send(odd)
             assert str(line.recv(timeout=WAIT)).startswith("✗ no command: ")
     assert fake.requests == []
 
 
-def test_ctrl_c_ends_it_while_the_daemon_does_not_answer(addresses):
+def test_ctrl_c_ends_it_while_the_daemon_does_not_reply(addresses):
     with Viewed("--address", ",".join(addresses), "--timeout", "100000") as viewed:
         query = viewed.commanding.partition("/?")[2]
         address = f"ws://{viewed.host}/command?{query}"
         with connect(address, proxy=None, open_timeout=WAIT) as line:
             line.send(orjson.dumps({"command": "arm", "seen": time.monotonic()}).decode())
-            assert any("no answer to arm" in line for line in viewed.process.stderr)  # it waits
+            # The viewer waits.
+            assert any("no answer to arm" in line for line in viewed.process.stderr)
             viewed.process.send_signal(signal.SIGINT)
-            assert viewed.process.wait(WAIT) == 1  # nothing was shown
+            assert viewed.process.wait(WAIT) == 1  # nothing was displayed
 
 
-def test_ctrl_c_ends_it_while_a_page_takes_nothing(served):
+def test_ctrl_c_ends_it_while_a_page_does_not_read(served):
     with FakeDaemon() as fake, view(fake) as viewed:
         host, _, port = viewed.host.partition(":")
         with socket.socket() as page:
@@ -156,7 +157,7 @@ def test_ctrl_c_ends_it_while_a_page_takes_nothing(served):
             def is_stuck() -> bool:
                 with suppress(BlockingIOError):
                     page.send(wish)
-                return fake.published > begun + 500  # pictures of 5 s wait for the page
+                return fake.published > begun + 500  # pictures of 5 s are queued for the page
 
             until(is_stuck)
             viewed.process.send_signal(signal.SIGINT)
@@ -169,10 +170,10 @@ WATCH = (
 )
 
 
-# What is shown
+# Contents
 
 
-def test_a_picture_has_the_streams_values() -> None:
+def test_a_picture_has_the_values_of_the_stream() -> None:
     left = {**finger(0.0, 0), "force": 7.5, "temperature": 66.0}
     with FakeDaemon() as fake:
         fake.changes = {"left": left, "schema": 2, "news": 1.5, **GOALS}
@@ -216,10 +217,10 @@ def test_a_picture_has_the_streams_values() -> None:
     for name in ("left", "right"):
         image = picture["panels"][name]["image"]
         levels = np.frombuffer(base64.b64decode(image["data"]), np.uint8).reshape(44, 44)
-        assert levels.max() > 20  # of 31: 45 kPa of 50
+        assert levels.max() > 20  # of 31 levels: 45 kPa of 50
         assert levels[20:24, 20:24].min() > 10
         assert levels[:8].max() < 6  # noise
-        assert len(picture["panels"][name]["lines"]) == 2  # the rim and the footprint
+        assert len(picture["panels"][name]["lines"]) == 2  # rim and footprint
         assert picture["panels"][name]["scale"] == ["≤ 3", "50 kPa"]
     assert len(picture["panels"]["landscape"]["dots"]) == 2
     assert picture["panels"]["hand"]["texts"][0][3] == "7.5 N"
@@ -227,10 +228,10 @@ def test_a_picture_has_the_streams_values() -> None:
     assert "0 messages could not be read" in said
 
 
-def test_free_tips_look_free() -> None:
+def test_images_of_tips_without_contact_are_blank() -> None:
     kept = Kept()
     noise = np.random.default_rng(1).normal(0.0, Settings().tactile.noise / 4.0, (44, 44))
-    counts = np.clip(noise, 0.0, None).astype("<u2")  # of 4 Pa
+    counts = np.clip(noise, 0.0, None).astype("<u2")  # units of 4 Pa
     kept.pictures.take(schema.TACTILE, {**frame(0.0, 0), "data": counts.tobytes()})
     kept.pictures.take(schema.STATE, state(0.0, 1))
     kept.pictures.draw()
@@ -239,7 +240,7 @@ def test_free_tips_look_free() -> None:
     assert levels.max() < 0.3 * (len(kept.scene["palette"]) - 1)
 
 
-def test_pages_share_one_subscription_and_a_slow_one_is_sent_nothing_that_it_did_not_ask_for():
+def test_pages_share_one_subscription_and_get_pictures_only_on_request():
     with FakeDaemon() as fake, view(fake) as viewed:
         with Watcher(viewed.host) as slow, ExitStack() as stack:
             begun = slow.next()["seq"]
@@ -275,7 +276,7 @@ def test_pages_share_one_subscription_and_a_slow_one_is_sent_nothing_that_it_did
         (("tactile.backend=none",), {"left", "right"}, "Joint angles"),
     ],
 )
-def test_what_the_scene_lacks_has_no_place(tmp_path, changes, gone, there):
+def test_panels_for_missing_parts_are_omitted(tmp_path, changes, gone, there):
     record_hand(tmp_path / "a.mcap", {}, 0.5, changes)
     kept = Kept()
     for topic, message in Recording(tmp_path / "a.mcap").messages():
@@ -287,17 +288,17 @@ def test_what_the_scene_lacks_has_no_place(tmp_path, changes, gone, there):
     assert not gone & names
 
 
-# Who may look and command
+# Access control
 
 
 @pytest.fixture(scope="module")
 def served() -> Iterator[tuple[FakeDaemon, Viewed]]:
-    """A made-up daemon and the viewer of its stream, for tests that change neither."""
+    """Yield a fake daemon and its viewer, for tests that change neither."""
     with FakeDaemon() as fake, view(fake) as viewed:
         yield fake, viewed
 
 
-def test_other_hosts_and_origins_are_refused_and_nothing_else_listens(served):
+def test_other_hosts_and_origins_are_refused_and_no_other_port_is_open(served):
     _, viewed = served
     port = viewed.host.rpartition(":")[2]
     assert got(viewed.host, "/")[0] == 200
@@ -324,7 +325,7 @@ def test_other_hosts_and_origins_are_refused_and_nothing_else_listens(served):
     assert [each.laddr.ip for each in listening if each.status == "LISTEN"] == ["127.0.0.1"]
 
 
-def test_only_the_token_brings_what_commands(served):
+def test_only_the_token_gives_access_to_commands(served):
     fake, viewed = served
     token, stop = viewed.commanding.removeprefix(viewed.address), {"command": "stop"}
     assert "STOP" in got(viewed.host, f"/{token}")[1]
@@ -343,7 +344,7 @@ def test_only_the_token_brings_what_commands(served):
     assert ask(viewed.host, token, stop)[:7] == "✗ stop:"
 
 
-def test_a_command_is_sent_once_and_not_long_after_its_picture() -> None:
+def test_a_command_is_sent_once_and_only_soon_after_its_picture() -> None:
     grasp = {"command": "grasp", "force": 5.0, "client": "page 1"}
     with (
         FakeDaemon() as fake,
@@ -353,7 +354,7 @@ def test_a_command_is_sent_once_and_not_long_after_its_picture() -> None:
         token = viewed.commanding.removeprefix(viewed.address)
 
         def press() -> str:
-            """Command by a picture of now."""
+            """Send a command that refers to a current picture."""
             return ask(viewed.host, token, {**grasp, "seen": page.next()["now"]})
 
         assert press() == "✓ grasp: ok"
@@ -370,8 +371,8 @@ def test_a_command_is_sent_once_and_not_long_after_its_picture() -> None:
         assert len(fake.requests) == 2
 
 
-def test_other_machines_need_a_code_that_works_once() -> None:
-    # Any address but the loopback's own is one that other machines may reach.
+def test_other_machines_need_a_one_time_code() -> None:
+    # Any address other than 127.0.0.1 counts as reachable from other machines.
     with FakeDaemon() as fake, view(fake, "--host", "127.0.0.2") as viewed:
         code = viewed.address.removeprefix(f"http://{viewed.host}")
         for path in ("/", "/?code=", "/?code=abc", "/?token=", "/?token=abc"):
@@ -387,8 +388,8 @@ def test_other_machines_need_a_code_that_works_once() -> None:
         assert ask(viewed.host, query, {"command": "stop"}) == "✓ stop: ok"
         with pytest.raises(InvalidStatus, match="403"):
             ask(viewed.host, query, {"command": "stop"}, origin="http://evil.example")
-        assert got(viewed.host, code)[0] == 403  # it was for one browser
-        line = viewed.process.stdout.readline()  # the next one's
+        assert got(viewed.host, code)[0] == 403  # used by one browser already
+        line = viewed.process.stdout.readline()  # the code for the next browser
         assert location(viewed.host, line.split()[1].removeprefix(f"http://{viewed.host}")) == place
         listening = psutil.Process(viewed.process.pid).net_connections()
         assert [each.laddr.ip for each in listening if each.status == "LISTEN"] == ["127.0.0.2"]
@@ -400,7 +401,7 @@ def test_other_machines_need_a_code_that_works_once() -> None:
 # A recording
 
 
-def test_a_recording_is_shown_from_any_place(recorded):
+def test_a_recording_can_be_shown_from_any_position(recorded):
     recording = Recording(recorded)
     states = [message for _, message in recording.messages([schema.STATE])]
     kept = Kept()
@@ -409,7 +410,7 @@ def test_a_recording_is_shown_from_any_place(recorded):
         thread = threading.Thread(target=playback.run, args=(ending,))
         thread.start()
         try:
-            until(lambda: playback.position > 0.3)  # it plays
+            until(lambda: playback.position > 0.3)  # playing
             playback.ask("pause")
             for place in (2.0, 0.5, 1.5):
                 playback.ask(str(place))
@@ -426,15 +427,15 @@ def test_a_recording_is_shown_from_any_place(recorded):
                     assert force == (pytest.approx(was, abs=1e-4) if math.isfinite(was) else None)
             assert playback.position == 1.5
             playback.ask("play")
-            until(lambda: not playback.playing)  # at its end
+            until(lambda: not playback.playing)  # stops at the end
             assert playback.position == pytest.approx(recording.duration)
             drawn = kept.newest
-            until(lambda: kept.newest is not drawn)  # and stays there
+            until(lambda: kept.newest is not drawn)  # stays at the end
             for odd in ("speed 0", "speed fast", "speed 1e9", "speed nan", "nan", "later"):
                 playback.ask(odd)
             playback.ask("speed 0.5")
             playback.ask("play")
-            until(lambda: 0.0 < playback.position < 1.0)  # and plays again
+            until(lambda: 0.0 < playback.position < 1.0)  # plays from the beginning again
             until(lambda: kept.newest["place"]["speed"] == 0.5)
             marks = [(kind, text) for _, _, kind, text in kept.scene["marks"]]
             assert ("mode", "disarmed → armed") in marks
@@ -447,10 +448,10 @@ def test_a_recording_is_shown_from_any_place(recorded):
             thread.join()
 
 
-# What can go wrong
+# Errors
 
 
-def test_messages_of_any_kind_are_survived() -> None:
+def test_invalid_messages_are_tolerated() -> None:
     odd: list[Any] = [None, 3, {}, {"timestamp": "now"}, {"timestamp": math.inf, "schema": 1}]
     odd += [{"timestamp": 1e9, "schema": 1, "left": 3, "mode": 5, "seq": "a", "finger": "left"}]
     odd += [{"timestamp": 1e9, "left": {"contact": True, "d": math.nan, "q": math.inf}}]
@@ -469,9 +470,9 @@ def test_messages_of_any_kind_are_survived() -> None:
     assert kept.newest["mode"] == "holding"
 
 
-def test_while_a_picture_is_drawn_states_wait(context, addresses):
+def test_states_are_queued_while_a_picture_is_drawn(context, addresses):
     publisher = context.socket(zmq.XPUB)
-    publisher.setsockopt(zmq.SNDHWM, 2000)  # as the daemon's
+    publisher.setsockopt(zmq.SNDHWM, 2000)  # same as the daemon's
     publisher.bind(addresses[0])
     kept, drawn = Kept(live=True), threading.Event()
     kept.pictures.draw, draw = drawn.wait, kept.pictures.draw
@@ -485,7 +486,8 @@ def test_while_a_picture_is_drawn_states_wait(context, addresses):
             for k in range(1, 5001):
                 publisher.send_multipart([schema.STATE, pack({**state(0.0, k), "seq_step": 1})])
                 if k % 100 == 0:
-                    select.select([], [], [], 0.005)  # as fast as libzmq's own thread takes them
+                    # Publish at the rate at which libzmq's thread accepts messages.
+                    select.select([], [], [], 0.005)
             drawn.set()
             until(lambda: kept.pictures.states == 5000)
         finally:
@@ -497,7 +499,7 @@ def test_while_a_picture_is_drawn_states_wait(context, addresses):
     assert facts[facts.index("Messages unreadable") + 1] == "0"
 
 
-def test_waiting_is_told_and_a_signal_ends_it() -> None:
+def test_waiting_is_reported_and_ended_by_a_signal() -> None:
     with FakeDaemon() as fake:
         fake.silent.set()
         with view(fake) as viewed, Watcher(viewed.host) as page:
@@ -525,7 +527,7 @@ def test_waiting_is_told_and_a_signal_ends_it() -> None:
         (("--rate", "fast"), "expected 0.1 to 100 Hz"),
     ],
 )
-def test_bad_input_is_one_clear_line(tmp_path, inline, monkeypatch, words, reason):
+def test_invalid_input_is_reported_in_one_line(tmp_path, inline, monkeypatch, words, reason):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "text.mcap").write_text("no recording")
     done = inline("view", "--no-browser", *words)
@@ -534,12 +536,12 @@ def test_bad_input_is_one_clear_line(tmp_path, inline, monkeypatch, words, reaso
     assert "Traceback" not in done.stderr
 
 
-def test_pages_whose_port_nobody_chose_get_one_each() -> None:
-    with ExitStack() as stack:  # the first one's is taken for the others
+def test_pages_without_a_chosen_port_get_different_ports() -> None:
+    with ExitStack() as stack:  # the first port is then in use
         here = "127.0.0.1"
         ports = [stack.enter_context(listen(here, None)).getsockname()[1] for _ in range(3)]
         assert len(set(ports)) == 3
         with pytest.raises(ViewError, match=f"port {ports[0]}"):
             listen(here, ports[0])
         with pytest.raises(ViewError, match=r"--host 192\.0\.2\.1 can't be used"):
-            listen("192.0.2.1", None)  # of documentation
+            listen("192.0.2.1", None)  # an address reserved for documentation

@@ -1,4 +1,4 @@
-"""The page of ``softfinger view`` in a real browser: what it shows, and what its controls do."""
+"""The page of ``softfinger view`` in a real browser: its contents and controls."""
 
 import math
 import os
@@ -28,7 +28,7 @@ pytestmark = [
 
 LEASE = 10.0  # s
 PATIENT = "\n".join(f"{key} = {value}" for key, value in PATIENCE.items())
-# The fraction of a canvas's pixels that nearly have a colour.
+# Fraction of a canvas's pixels that have nearly the given colour.
 FRACTION = """((selector, colour) => {
   const canvas = document.querySelector(`${selector} canvas`);
   const data = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data;
@@ -37,8 +37,7 @@ FRACTION = """((selector, colour) => {
     count += data[k + 3] > 200 && colour.every((value, c) => Math.abs(data[k + c] - value) < 30);
   return 4 * count / data.length;
 })"""
-# Every text that can be seen and whose contrast with its ground is below WCAG's AA: 4.5, or 3 for
-# large letters.
+# Visible texts with a contrast below WCAG AA: 4.5, or 3 for large letters.
 PALE = """(() => {
   const linear = part => part <= 10.31 ? part / 3294.6 : ((part / 255 + 0.055) / 1.055) ** 2.4;
   const parts = colour => colour.match(/[\\d.]+/g).map(Number);
@@ -62,7 +61,7 @@ PALE = """(() => {
   }
   return found;
 })()"""
-# The buttons and fields that something else covers, or that leave the window.
+# Buttons and fields that are covered or outside the window.
 COVERED = """[...document.querySelectorAll("button, input, select")].filter(each => {
   if (!each.offsetWidth || each.closest("dialog")) return false;
   each.scrollIntoView({ block: "center" });
@@ -73,13 +72,13 @@ COVERED = """[...document.querySelectorAll("button, input, select")].filter(each
 
 
 class Page:
-    """The browser's page, and what a test does there."""
+    """The browser's page, with actions for tests."""
 
     def __init__(self, browser: Browser) -> None:
         self.browser = browser
 
     def open(self, url: str) -> None:
-        """Open, and wait for the first picture."""
+        """Open an address and wait for the first picture."""
         self.browser.open(url)
         until(lambda: self("document.body?.dataset.seq"))
 
@@ -90,7 +89,7 @@ class Page:
         return str(self(f"document.querySelector('{selector}')?.textContent"))
 
     def click(self, selector: str) -> None:
-        """Once it may be pressed."""
+        """Click an element once it is enabled."""
         button = f"document.querySelector('{selector}')"
         until(lambda: self(f"!!{button} && !{button}.disabled"))
         self(f"{button}.click()")
@@ -110,7 +109,7 @@ class Page:
         self.key(f"Arrow{where}", f"Arrow{where}", windowsVirtualKeyCode=number)
 
     def type(self, selector: str, text: str) -> None:
-        """Replace what a field has, and press Enter."""
+        """Replace a field's text and press Enter."""
         self(f"document.querySelector('{selector}').select()")
         self.browser.ask("Input.insertText", text=text)
         self.key("Enter", "Enter", text="\r")
@@ -119,7 +118,7 @@ class Page:
         self.browser.ask("Input.dispatchMouseEvent", type=kind, x=at[0], y=at[1], **named)
 
     def place(self, selector: str, across: float) -> tuple[float, float]:
-        """A point on an element, at this share of its width."""
+        """Return a point on an element, at this fraction of its width."""
         left, width, top, height = self(
             "(({left, width, top, height}) => [left, width, top, height])"
             f"(document.querySelector('{selector}').getBoundingClientRect())"
@@ -130,7 +129,7 @@ class Page:
         return float(self(f"{FRACTION}('{selector}', {list(colour)})"))
 
     def lag(self) -> float:
-        """How far the page is behind the stream [s]."""
+        """Return the page's delay behind the stream [s]."""
         return float(self("Date.now() / 1000 - picture.time"))
 
 
@@ -153,10 +152,10 @@ def forces(fake: FakeDaemon) -> list[float]:
     return [each["force"] for each in fake.requests if each["command"] == "grasp"]
 
 
-# What is shown
+# Contents
 
 
-def test_every_button_brings_its_mode_and_a_lost_page_gives_the_hand_back(
+def test_every_button_reaches_its_mode_and_a_lost_page_frees_the_hand(
     start, profile, addresses, page
 ):
     start("--config", str(profile(f"{PATIENT}\ncommands.lease = {LEASE}")))
@@ -176,7 +175,8 @@ def test_every_button_brings_its_mode_and_a_lost_page_gives_the_hand_back(
             mode_is(mode)
 
         press("[name=arm]", "armed")
-        assert "page" in command(commands, "release", client="another")["error"]  # it commands
+        # The page holds the lease.
+        assert "page" in command(commands, "release", client="another")["error"]
         press("[name=grasp]", "holding")
         assert hand.state().goal_force == pytest.approx(5.0)
         page("document.querySelector('#more').open = true")
@@ -199,10 +199,10 @@ def test_every_button_brings_its_mode_and_a_lost_page_gives_the_hand_back(
         page.focus("[name=grasp]")
         page.key("Space", " ", text=" ")
         hand.wait_for(lambda state: state.mode == "disarmed", 60.0)
-        until(lambda: page.text(".reply") == "✓ stop: ok")  # and grasp was not pressed
+        until(lambda: page.text(".reply") == "✓ stop: ok")  # the grasp button was not pressed
         page.click("[name=tare]")
         until(lambda: page.text(".reply") == "✓ tare: ok")
-        hand.collect(1.0)  # the frames of which the tare is the mean
+        hand.collect(1.0)  # frames for the mean of the tare
         press("[name=arm]", "armed")
         press("[name=grasp]", "holding")
         page.click("[name=disarm]")
@@ -220,12 +220,12 @@ def test_every_button_brings_its_mode_and_a_lost_page_gives_the_hand_back(
         press("[name=stop]", "disarmed")
         press("[name=arm]", "armed")
         page.browser.open("about:blank")
-        hand.collect(LEASE + 0.5)  # by the daemon's clock, with no news of the page
+        hand.collect(LEASE + 0.5)  # by the daemon's clock, without messages from the page
         assert command(commands, "release", client="another")["ok"]
         viewed.end()
 
 
-def test_the_past_looks_past(page, fake):
+def test_stale_data_are_marked(page, fake):
     with viewing(fake) as viewed:
         page.open(viewed.commanding)
 
@@ -234,7 +234,7 @@ def test_the_past_looks_past(page, fake):
             return set(" ".join(page(names)).split()) - {"old", "card"}
 
         assert page.text(".mode") == "holding"
-        # From when the last state should have been followed by another.
+        # Time after which a state without a successor counts as stale.
         assert page("picture.patience.state + scene.period") <= 0.5
         fake.dead.add("left")
         until(lambda: old() == {"left"})
@@ -259,7 +259,7 @@ def test_the_past_looks_past(page, fake):
         until(lambda: "server doesn't answer" in page.text(".stream"))
 
 
-def test_plots_have_axes_a_cursor_zoom_and_a_pause(page, fake):
+def test_plots_have_axes_cursor_zoom_and_pause(page, fake):
     with viewing(fake) as viewed:
         page.open(viewed.address)
         until(lambda: page("past.rows.length") > 40)
@@ -287,9 +287,9 @@ def test_plots_have_axes_a_cursor_zoom_and_a_pause(page, fake):
         page.mouse("mouseMoved", page.place(plot, 0.9), button="left", buttons=1)
         page.mouse("mouseReleased", page.place(plot, 0.9), button="left", clickCount=1)
         until(lambda: page("view.end") is not None)
-        assert 5.0 < page("view.span") < 8.0  # 0.3 of 20 s, which have margins
+        assert 5.0 < page("view.span") < 8.0  # 0.3 of 20 s, including margins
         assert page.text("#hold") == "Resume"
-        assert page("/^[0-9:.]+$/.test(view.label(view.range[0], 1))")  # times of day
+        assert page("/^[0-9:.]+$/.test(view.label(view.range[0], 1))")  # labels are times of day
         page.click("#follow")
         assert page("[view.span, view.end]") == [20, None]
         page.mouse("mouseWheel", page.place(plot, 0.5), deltaX=0, deltaY=-100, modifiers=2)
@@ -326,7 +326,7 @@ def test_controls_follow_the_hand_and_the_last_value_is_always_sent(page, fake):
             return bool(page(value) == [force, force])
 
         until(lambda: shows(9.0))
-        fake.changes = {"goal_force": 12.0}  # by another client
+        fake.changes = {"goal_force": 12.0}  # set by another client
         until(lambda: shows(12.0))
         page.focus(slider)
         page.arrow("Right")
@@ -341,7 +341,7 @@ def test_controls_follow_the_hand_and_the_last_value_is_always_sent(page, fake):
         assert "is being sent" in page.text("#force output")
         fake.deaf.clear()
         until(lambda: forces(fake)[-1] == 16.5)
-        assert len(forces(fake)) <= 3  # those between were no longer wanted
+        assert len(forces(fake)) <= 3  # intermediate values are skipped
         until(lambda: page.text("#force output") == "✓ 16.5 N accepted")
         fake.changes = {"goal_force": 16.5}
         until(lambda: page("settings.force.wanted") is None)
@@ -360,7 +360,7 @@ def test_controls_follow_the_hand_and_the_last_value_is_always_sent(page, fake):
         fake.replies["grasp"] = {"ok": False, "error": "grasp: too hot for that"}
         page.key("Equal", "+", text="+")
         until(lambda: page.text("#force output") == "✗ grasp: too hot for that")
-        until(lambda: page("settings.force.wanted") is None)  # it is not what the hand does
+        until(lambda: page("settings.force.wanted") is None)  # the hand did not adopt this force
         del fake.replies["grasp"]
         until(lambda: page("document.querySelector('#force [type=number]').value") == "7.3")
 
@@ -376,10 +376,10 @@ def test_controls_follow_the_hand_and_the_last_value_is_always_sent(page, fake):
         viewed.end()
 
 
-def test_the_page_keeps_up_survives_sleep_and_reload_and_asks_nobody_else(page, fake):
+def test_the_page_keeps_up_survives_sleep_and_reload_and_is_self_contained(page, fake):
     fake.changes = {"mode": "fault", "fault": "<b>tip.force</b>: 31 N"}
     with viewing(fake) as viewed:
-        page.open(viewed.address)  # fills the browser's cache, as a second visit finds it
+        page.open(viewed.address)  # fills the browser's cache for the second visit
         assert "Watching" in page.text("aside")
         page.click("#help")
         explained = page("document.querySelector('#explained').innerText")
@@ -391,7 +391,8 @@ def test_the_page_keeps_up_survives_sleep_and_reload_and_asks_nobody_else(page, 
         page.open(viewed.commanding)
         page.click("[name=clear]")
         until(lambda: page.text(".reply") == "✓ clear: ok")
-        assert [each["command"] for each in fake.requests] == ["clear"]  # no stop without it
+        # Stop was not sent on opening.
+        assert [each["command"] for each in fake.requests] == ["clear"]
         until(lambda: page.lag() < 0.5)
 
         os.killpg(page.browser.process.pid, signal.SIGSTOP)
@@ -400,8 +401,8 @@ def test_the_page_keeps_up_survives_sleep_and_reload_and_asks_nobody_else(page, 
         os.killpg(page.browser.process.pid, signal.SIGCONT)
         until(lambda: page.lag() < 0.5)
         rows = page("past.rows.map(row => row[0])")
-        assert rows == [*range(rows[0], rows[0] + len(rows))]  # those that it slept through, too
-        page.click("[name=stop]")  # heard although the page's connection was given up meanwhile
+        assert rows == [*range(rows[0], rows[0] + len(rows))]  # including the states during sleep
+        page.click("[name=stop]")  # sent although the page's connection was closed meanwhile
         until(lambda: fake.requests[-1]["command"] == "stop")
 
         page("location.reload()")
@@ -417,7 +418,7 @@ def test_the_page_keeps_up_survives_sleep_and_reload_and_asks_nobody_else(page, 
         ]
         assert not foreign
 
-        page.browser.open("data:text/html,another page")  # of an origin of its own
+        page.browser.open("data:text/html,another page")  # a page with a different origin
         until(lambda: page("location.protocol") == "data:")
         socket = f"new WebSocket('ws://{viewed.host}/pictures')"
         page(f"({socket}).onopen = event => window.came = event.type")
@@ -439,16 +440,16 @@ def test_the_record_button_writes_a_recording(page, fake, tmp_path):
         until(lambda: page.text("[name=record]") == "Record")
         assert Recording(path).count(b"hand/state") > 0
         assert not Recording(path).truncated
-        page.click("[name=record]")  # ends with the page's server
+        page.click("[name=record]")  # stops when the page's server ends
         until(lambda: len(list(tmp_path.glob("softfinger-*.mcap"))) == 2)
         viewed.end()
         assert not any(Recording(each).truncated for each in tmp_path.glob("*.mcap"))
 
 
-# For everybody
+# Accessibility
 
 
-def test_colours_labels_and_keys_serve_everybody(page, fake):
+def test_colours_labels_and_keys_are_accessible(page, fake):
     with viewing(fake) as viewed:
         page.open(viewed.commanding)
         page("document.querySelectorAll('details').forEach(each => each.open = true)")
@@ -461,7 +462,7 @@ def test_colours_labels_and_keys_serve_everybody(page, fake):
             assert page(PALE) == []
         page.click("#theme")
         until(lambda: page("document.documentElement?.dataset.theme") == "light")
-        page.open(viewed.commanding)  # chosen here, for this browser
+        page.open(viewed.commanding)  # selected for this browser
         assert page("document.documentElement?.dataset.theme") == "light"
 
         tree = page.browser.ask("Accessibility.getFullAXTree")["nodes"]
@@ -484,7 +485,7 @@ def test_colours_labels_and_keys_serve_everybody(page, fake):
         viewed.end()
 
 
-def test_a_phone_opens_the_page_once_and_can_use_all_of_it(page, fake):
+def test_a_phone_opens_the_page_with_the_code_and_can_use_all_controls(page, fake):
     with viewing(fake, "--host", "127.0.0.2") as viewed:
         page.browser.resize(390, 844, 2)
         page.open(viewed.address)

@@ -1,4 +1,4 @@
-"""The wheel: one package, whole, whatever else the environment and the current folder hold."""
+"""The wheel contains one complete package, independent of the environment and current folder."""
 
 import contextlib
 import os
@@ -50,7 +50,7 @@ def build(what: str, source: Path, into: Path) -> subprocess.CompletedProcess[st
 
 @pytest.fixture(scope="module")
 def sdist(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What a clone's sdist unpacks to."""
+    """Return the unpacked sdist of a clone."""
     folder = tmp_path_factory.mktemp("sdist")
     built = build("sdist", copied(folder / "source"), folder)
     assert built.returncode == 0, built.stderr
@@ -69,7 +69,7 @@ def wheel(sdist: Path) -> Path:
 
 
 @pytest.mark.extended
-def test_the_sdist_carries_what_its_tests_and_pages_need(sdist):
+def test_the_sdist_contains_the_files_of_its_tests_and_pages(sdist):
     assert all((sdist / name).is_file() for name in _SOURCES)
     for folder in ("docs", "tests"):
         files = [each for each in (ROOT / folder).rglob("*") if each.is_file()]
@@ -79,7 +79,7 @@ def test_the_sdist_carries_what_its_tests_and_pages_need(sdist):
 
 @pytest.mark.extended
 @pytest.mark.parametrize("found", ["a file", "nothing"])
-def test_a_clone_without_links_is_not_built(found, tmp_path):
+def test_a_clone_without_symlinks_is_not_built(found, tmp_path):
     source = copied(tmp_path / "source")
     link = source / "softfinger" / "daemon"
     link.unlink()
@@ -94,7 +94,7 @@ def test_a_clone_without_links_is_not_built(found, tmp_path):
 
 
 @pytest.mark.extended
-def test_it_holds_one_package_with_all_its_data(wheel):
+def test_the_wheel_contains_one_package_with_all_its_data(wheel):
     names = set(zipfile.ZipFile(wheel).namelist())
     assert {name.split("/")[0].split("-")[0] for name in names} == {"softfinger"}
     for rooms in ("daemon", "kinematics", "tools"):
@@ -113,8 +113,8 @@ def test_it_holds_one_package_with_all_its_data(wheel):
 
 
 @pytest.mark.extended
-def test_a_script_beside_an_editable_clone_finds_the_package(tmp_path):
-    """The clone's folder has the package's name, and stands before what is installed."""
+def test_a_script_next_to_an_editable_clone_finds_the_package(tmp_path):
+    """The clone's folder has the package's name and precedes the installed package on the path."""
     source = copied(tmp_path / "softfinger")
     assert build("editable", source, tmp_path).returncode == 0
     (packed,) = tmp_path.glob("*.whl")
@@ -122,13 +122,13 @@ def test_a_script_beside_an_editable_clone_finds_the_package(tmp_path):
     script = tmp_path / "script.py"
     begin = f"import site; site.addsitedir({str(tmp_path / 'site')!r})\n"
     script.write_text(begin + "from softfinger import Refused, __file__ as at; print(at)\n")
-    alone = os.environ | {"PYTHONPATH": ""}  # without the site that this test itself runs in
+    alone = os.environ | {"PYTHONPATH": ""}  # without the site-packages of this test run
     told = python("-S", script, cwd=tmp_path, env=alone)
     assert told.stdout.strip() == str(source / "softfinger" / "__init__.py"), told.stderr
 
 
 @pytest.mark.extended
-def test_folders_of_the_same_names_are_in_nobodys_way(wheel, tmp_path):
+def test_folders_with_the_names_of_subpackages_do_not_interfere(wheel, tmp_path):
     site, here = tmp_path / "site", tmp_path / "here"
     zipfile.ZipFile(wheel).extractall(site)
     for folder in (site / "daemon", here / "tools", here / "daemon", here / "config"):
@@ -150,13 +150,13 @@ def test_folders_of_the_same_names_are_in_nobodys_way(wheel, tmp_path):
     )
 
 
-def test_each_pin_may_be_installed_on_the_oldest_python_that_is_promised():
-    """By what is installed here of constraints.txt; patch versions count, as 3.11.2's."""
+def test_pinned_versions_support_the_oldest_supported_python():
+    """Check the installed packages of constraints.txt, with patch versions such as 3.11.2."""
     oldest = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["requires-python"]
     assert oldest.startswith(">=")
     looked_at = 0
     for line in (ROOT / "constraints.txt").read_text().splitlines():
-        with contextlib.suppress(PackageNotFoundError):  # of an extra that no test needs
+        with contextlib.suppress(PackageNotFoundError):  # package of an extra that no test needs
             wanted = metadata(line.split("==")[0]).get("Requires-Python") or ""
             assert SpecifierSet(wanted).contains(oldest.removeprefix(">=")), f"{line}: {wanted}"
             looked_at += 1
