@@ -1,1 +1,1 @@
-"""Tests in one process: no process, pseudo-terminal or real-time daemon is started."""
+"""Tests within one process, without other processes, pseudo-terminals or real-time daemons."""

@@ -1,4 +1,4 @@
-"""Benchmarks in short: their errors and bounds, and what is judged how."""
+"""Short benchmark runs: their errors, bounds and verdicts."""
 
 import json
 import math
@@ -36,7 +36,7 @@ from softfinger.tools.benchmarks.rigs import RigError
 from softfinger.tools.benchmarks.virtual_grip import VirtualGrip, Watch
 
 
-def test_turns_and_times(monkeypatch):
+def test_interleaved_timing(monkeypatch):
     clock = [0.0]
     order: list[str] = []
     monkeypatch.setattr(measuring, "Timer", partial(Timer, timer=lambda: clock[0]))
@@ -57,13 +57,13 @@ def test_turns_and_times(monkeypatch):
 
 @pytest.fixture
 def canned(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A measurement of a tick that takes no time."""
+    """Return a tick measurement that takes no time."""
     table = Report("tick", [figure("pipeline alone, nobody subscribed", "µs", [20.0] * 5)])
     monkeypatch.setattr(tick, "measure", lambda brief: [table])
     monkeypatch.setattr(bench, "PAGE", ("tick",))
 
 
-def test_figures_are_kept(canned, tmp_path, capsys):
+def test_results_are_stored(canned, tmp_path, capsys):
     old = tmp_path / "old.json"
     assert cli.main(["bench", "tick", "--json", str(old)]) == 0
     rows = json.loads(old.read_text(encoding="utf-8"))["rows"]
@@ -74,7 +74,7 @@ def test_figures_are_kept(canned, tmp_path, capsys):
     assert "tick: pipeline alone" in capsys.readouterr().out, "the page"
 
 
-def test_a_measurement_that_fails_leaves_the_others(canned, monkeypatch, capsys):
+def test_a_failed_measurement_does_not_affect_the_others(canned, monkeypatch, capsys):
     def let_go(brief: bool) -> list[Report]:
         raise Refused("the hand let go")
 
@@ -85,7 +85,7 @@ def test_a_measurement_that_fails_leaves_the_others(canned, monkeypatch, capsys)
     assert "pipeline alone" in printed.out
 
 
-def test_a_measurement_that_misses_its_aim_is_no_success(monkeypatch, capsys):
+def test_a_missed_aim_is_not_a_success(monkeypatch, capsys):
     asked: list[tuple[int | None, str]] = []
 
     def measure(brief: bool, trials: int | None, only: str, sweep: object) -> list[Report]:
@@ -108,20 +108,20 @@ def test_a_measurement_that_misses_its_aim_is_no_success(monkeypatch, capsys):
         (["--trials", "3"], "--trials: for faults or robustness alone"),
     ],
 )
-def test_refusals_come_before_the_measurements(words, text, capsys):
+def test_invalid_options_are_refused_before_measuring(words, text, capsys):
     assert cli.main(["bench", *words]) == 2
     error = capsys.readouterr().err
     assert text in error
     assert "measuring" not in error
 
 
-def test_lookups_have_their_errors():
+def test_table_lookups_have_their_documented_errors():
     rows = estimator.lookups(1, 32).rows
     errors = {row["name"]: row[estimator.LOOKUP_ERROR] for row in rows}
     assert errors["table to 1e-09"] <= 1e-9 < errors["table to 1e-06, called"] <= 1e-6
 
 
-def test_estimates_stand_beside_the_bound():
+def test_estimates_are_reported_with_the_bound():
     table = estimator.frames_to_contacts(1)
     error = {row["name"]: row.get(estimator.ERROR) for row in table.rows}
     limit = error["Cramér-Rao bound"]
@@ -146,18 +146,18 @@ ASKEW = {"object_angle": math.radians(5.0)}
         (control.LIMITS["tips without tangential coupling"], 0.2, 1.2),
     ],
 )
-def test_what_a_law_leaves_of_the_objects_angle(way, low, high):
-    # A delay is borne where the integral's bandwidth times it is below π/2.
+def test_residual_angle_error_of_a_control_law(way, low, high):
+    # A delay is tolerated as long as its product with the integral's bandwidth is below π/2.
     assert low <= control.left(way, ASKEW) <= high
 
 
-def test_an_object_that_is_not_held_is_counted_and_leaves_the_other_draws():
+def test_an_object_that_is_not_held_is_counted_without_changing_other_draws():
     far = {"object_position": (0.0, 0.4)}
     row = control.row("energy", control.WAYS["energy"], [ASKEW, ASKEW | far])
     assert (row["n"], row["not held"]) == (1, 1)
 
 
-def test_a_part_that_fails_leaves_the_other_parts(monkeypatch, capsys):
+def test_a_failed_part_does_not_affect_the_others(monkeypatch, capsys):
     def let_go(title: str, **_: object) -> Report:
         raise RigError("the hand does not hold: grasping")
 
@@ -170,19 +170,19 @@ def test_a_part_that_fails_leaves_the_other_parts(monkeypatch, capsys):
     assert printed.out.count("hardware in the loop") == 2
 
 
-def test_a_grip_that_does_not_come_about_is_counted():
+def test_a_failed_grip_is_counted():
     outcomes = iter([None, (0.01, 0.002, False)])
     (row,) = reflex._table("springs", [(0.0, 13.0, "push")], 2, outcomes).rows
     assert (row["no grip"], row["held %"], row["median"]) == (1, 100.0, 10.0)
 
 
 @pytest.mark.extended
-def test_a_load_that_is_held_slides_and_one_that_is_lost_is_said():
+def test_a_held_load_slides_and_a_lost_load_is_reported():
     held = reflex.overloaded({}, 0.0, 13.0, 1)
     assert 0.0 < held.answer < 0.022
     assert 0.0 < held.slid < 0.02
     assert not held.lost
-    # A joint that still sticks shows a quarter of what the other does.
+    # A joint that still sticks moves a quarter as much as the other.
     sticking = reflex.overloaded({"simulation": {"object_mass": 0.5}}, 6.0, 15.0, 1)
     assert (sticking.answer < 0.022, sticking.slid < 0.012, sticking.lost) == (True, True, False)
     weak = {"control": {"grip_raise_max": 0.0}, "simulation": {"object_mass": 0.1}}
@@ -201,7 +201,7 @@ def holding(force: float = 8.0) -> VirtualGrip:
 
 
 @pytest.mark.extended
-def test_a_true_hand_meets_its_aim():
+def test_an_ideal_hand_meets_its_aim():
     (table,) = measure(trials=2, only="6 N: honest")
     (row,) = table.rows
     assert (row["met"], row["trials"], table.failed) == (2, 2, False)
@@ -210,7 +210,7 @@ def test_a_true_hand_meets_its_aim():
     assert (row["named"], row["missed"], row["events"]) == ("", "", "")
 
 
-def test_a_watch_measures_forces_times_and_places():
+def test_a_watch_measures_forces_times_and_positions():
     watch = Watch(10.0)
     for k, force in enumerate((10.0, 14.0, 15.0, 12.0, 13.5, 9.0, 9.0)):
         place = (0.0, 0.08 + (0.02 if k == 6 else 0.001 * k))
@@ -236,7 +236,7 @@ def test_a_watch_measures_forces_times_and_places():
         (BOUNDED, {"events": [(0.2, "hand.width")]}, ["not named"]),
     ],
 )
-def test_what_misses_an_aim(aim, changes, missed):
+def test_missed_aims_are_listed(aim, changes, missed):
     case = FaultCase("a case", aim, 6.0, "left:drift=0.2@0..2", ("left_sensor",), comes=2.0)
     met = GripTrial(("left_sensor",), settled=1.0, events=[(1.29, "witness.left_sensor")])
     assert met.missed(case) == []

@@ -1,4 +1,4 @@
-"""Files of frames as they come from benches: read rightly, or refused for the true reason."""
+"""Frame files from test benches: read correctly, or refused with the actual reason."""
 
 import itertools
 import re
@@ -32,7 +32,7 @@ SETTINGS = Settings.model_validate(
 
 @pytest.fixture(scope="module")
 def tared() -> np.ndarray:
-    """Presses [Pa] with a sensor's noise round its zero."""
+    """Return contact pressures [Pa] with sensor noise around zero."""
     grid = SensorGrid(44, 44, PITCH)
     clean = np.stack([grid.pressure(TIP, MATERIAL, d, 0.1 if d else 0.0, 0.0) for d in DEPTHS])
     return clean + np.random.default_rng(3).normal(0.0, NOISE, clean.shape)
@@ -44,7 +44,7 @@ def press(tared) -> np.ndarray:
 
 
 def export(frames: np.ndarray, unit: str = "kPa", scale: float = 1e-3, **form: Any) -> bytes:
-    """Write an export: ``form`` has header lines, separator, decimal sign, digits, encoding, …"""
+    """Write an export; ``form`` sets header lines, separator, decimal sign, encoding, etc."""
     point, digits = form.get("point", "."), form.get("digits", 3)
     header = [
         *("DATA_TYPE MOVIE", "SENSOR_TYPE 5051", "ROWS 44", "COLS 44", "NOISE_THRESHOLD 3"),
@@ -74,7 +74,7 @@ def check(path: Path, settings: Settings = SETTINGS, within: float = 3e-5) -> No
     assert depths(path, settings) == pytest.approx(DEPTHS, abs=within)
 
 
-# Cells that saturate
+# Saturated cells
 
 
 def clipped(frames: np.ndarray) -> tuple[np.ndarray, float]:
@@ -87,23 +87,23 @@ def clipped(frames: np.ndarray) -> tuple[np.ndarray, float]:
     [("kPa", 1e3, 3), ("kPa", 1e3, 0), ("psi", 6894.757293168, 4), ("MPa", 1e6, 5)],
 )
 @pytest.mark.parametrize("told", [True, False])
-def test_cells_above_the_headers_saturation_pressure_are_left_out(
+def test_cells_above_the_saturation_pressure_of_the_header_are_excluded(
     press, tmp_path, unit, pascal, digits, told
 ):
     frames, full = clipped(press)
-    name = f" {unit}" if told else ""  # else in the readings' unit
+    name = f" {unit}" if told else ""  # otherwise in the unit of the readings
     line = f"SATURATION_PRESSURE {full / pascal:.6f}{name}"
     path = tmp_path / "a.asf"
     path.write_bytes(export(frames, unit, 1.0 / pascal, digits=digits, header=[line]))
     settings, within = SETTINGS, 3e-5
-    if digits == 0:  # whole kPa: a third of one is more noise
+    if digits == 0:  # in whole kPa, rounding adds a third of a kPa of noise
         tactile = SETTINGS.tactile.model_copy(update={"noise": 600.0})
         settings, within = SETTINGS.model_copy(update={"tactile": tactile}), 6e-5
     check(path, settings, within)
     assert not load_recording(path, SCALE, 100.0).notes
 
 
-def test_a_replayed_export_has_its_own_saturation(press, tmp_path):
+def test_a_replayed_export_uses_its_own_saturation(press, tmp_path):
     frames, full = clipped(press)
     path = tmp_path / "a.asf"
     path.write_bytes(export(frames, header=[f"SATURATION_PRESSURE {full * 1e-3:.3f} kPa"]))
@@ -113,7 +113,7 @@ def test_a_replayed_export_has_its_own_saturation(press, tmp_path):
     assert sensor.notes == ()
 
 
-def test_without_a_saturation_pressure_cells_that_share_the_largest_reading_are_told(
+def test_cells_at_the_maximum_reading_are_reported_if_the_header_has_no_saturation(
     press, tmp_path, inline
 ):
     frames, full = clipped(press)
@@ -129,15 +129,15 @@ def test_without_a_saturation_pressure_cells_that_share_the_largest_reading_are_
 
 
 @pytest.mark.parametrize("step", [4.0, 300.0, 3000.0])
-def test_readings_that_are_round_numbers_are_not_taken_for_saturated(press, tmp_path, step):
+def test_round_readings_do_not_count_as_saturated(press, tmp_path, step):
     np.save(tmp_path / "a.npy", np.round(press / step).astype(np.uint16))
     assert not load_recording(tmp_path / "a.npy", step, 100.0).notes
     upright = SensorGrid(44, 44, PITCH).pressure(TIP, MATERIAL, 0.004)
-    np.save(tmp_path / "b.npy", upright)  # four cells in the middle read the same
+    np.save(tmp_path / "b.npy", upright)  # four cells in the middle have the same reading
     assert not load_recording(tmp_path / "b.npy", SCALE, 100.0).notes
 
 
-def test_raw_readings_end_at_255(press, tmp_path):
+def test_raw_readings_saturate_at_255(press, tmp_path):
     path = tmp_path / "a.asf"
     counts = np.minimum(np.round(press / 60.0), 255)
     assert np.count_nonzero(counts == 255) > 20
@@ -147,11 +147,11 @@ def test_raw_readings_end_at_255(press, tmp_path):
     check(path, SETTINGS.model_copy(update={"tactile": tactile}))
 
 
-# Zeros and dead cells
+# Zero offsets and dead cells
 
 
 @pytest.mark.parametrize("kind", [np.float64, np.float32, np.int16, np.int32])
-def test_a_tared_sensors_noise_below_zero_becomes_zero_and_is_told(tared, tmp_path, kind):
+def test_negative_noise_of_a_tared_sensor_is_clipped_and_reported(tared, tmp_path, kind):
     frames = tared if np.dtype(kind).kind == "f" else np.round(tared / SCALE)
     np.savez(tmp_path / "a.npz", frames=frames.astype(kind))
     (note,) = load_recording(tmp_path / "a.npz", SCALE, 100.0).notes
@@ -159,14 +159,14 @@ def test_a_tared_sensors_noise_below_zero_becomes_zero_and_is_told(tared, tmp_pa
     check(tmp_path / "a.npz")
 
 
-def test_a_tared_export_is_read_as_well(tared, tmp_path):
+def test_a_tared_export_gives_equally_accurate_contacts(tared, tmp_path):
     (tmp_path / "a.asf").write_bytes(export(tared))
     assert "below 0" in load_recording(tmp_path / "a.asf", SCALE, 100.0).notes[0]
     check(tmp_path / "a.asf")
 
 
 @pytest.mark.parametrize("value", [-5e4, np.nan, np.inf, -np.inf])
-def test_a_reading_that_is_none_is_told_with_its_place(press, tmp_path, value):
+def test_a_nan_reading_is_reported_with_its_position(press, tmp_path, value):
     frames = press.copy()
     frames[4, 10, 12] = value
     np.save(tmp_path / "a.npy", frames)
@@ -176,13 +176,13 @@ def test_a_reading_that_is_none_is_told_with_its_place(press, tmp_path, value):
     assert f"{place} is {value:.10g}" in str(caught.value)
 
 
-def test_a_zero_that_has_sunk_is_no_noise(tared, tmp_path):
+def test_a_negative_zero_offset_is_not_treated_as_noise(tared, tmp_path):
     np.save(tmp_path / "a.npy", tared - 4.0 * NOISE)
     with pytest.raises(RecordingError, match=r"half of the cells read -1\.\d+e\+03 or less: tare"):
         load_recording(tmp_path / "a.npy", SCALE, 100.0, NOISE)
 
 
-def test_more_pressure_than_counts_hold_is_told_with_the_setting(press, tmp_path):
+def test_pressure_beyond_the_count_range_is_reported_with_the_setting(press, tmp_path):
     np.save(tmp_path / "a.npy", press * 12.0)
     with pytest.raises(RecordingError, match=r"set tactile\.pascal_per_count to \d.* or more"):
         load_recording(tmp_path / "a.npy", SCALE, 100.0)
@@ -231,7 +231,7 @@ LOCALES = {
 
 
 @pytest.mark.parametrize("form", LOCALES.values(), ids=LOCALES)
-def test_every_locale_reads_the_same(press, tmp_path, form):
+def test_all_locales_give_the_same_readings(press, tmp_path, form):
     frames = press[[1, 4, 5]]
     (tmp_path / "a.asf").write_bytes(export(frames, **form))
     (tmp_path / "b.asf").write_bytes(export(frames))
@@ -241,7 +241,7 @@ def test_every_locale_reads_the_same(press, tmp_path, form):
     assert read.pitch == plain.pitch == pytest.approx((PITCH, PITCH), rel=1e-5)
 
 
-def test_commas_between_and_within_numbers_are_the_reason_where_they_can_not_be_told(tmp_path):
+def test_commas_as_separator_and_decimal_sign_are_reported_if_ambiguous(tmp_path):
     text = "ROWS 1\nCOLS 3\nUNITS kPa\nASCII_DATA @@\nFrame 1\n0,0,0\nFrame 2\n0,1,25,0\n@@\n"
     (tmp_path / "a.asf").write_text(text)
     with pytest.raises(RecordingError, match="line 8: 4 cells, expected 3: commas stand between"):
@@ -258,7 +258,7 @@ UNITS = {
 
 @pytest.mark.parametrize("encoding", ["latin-1", "utf-8", "cp437"])
 @pytest.mark.parametrize("unit", UNITS)
-def test_units_of_pressure_and_of_force_on_a_cell(press, tmp_path, unit, encoding):
+def test_units_of_pressure_and_of_force_per_cell(press, tmp_path, unit, encoding):
     path = tmp_path / "a.asf"
     frames = press[:6]
     path.write_bytes(export(frames, unit, 1.0 / UNITS[unit], digits=9, encoding=encoding))
@@ -267,13 +267,13 @@ def test_units_of_pressure_and_of_force_on_a_cell(press, tmp_path, unit, encodin
 
 
 @pytest.mark.parametrize("unit", ["stone", "mm", "N/m"])
-def test_another_unit_is_told(press, tmp_path, unit):
+def test_an_unknown_unit_is_reported(press, tmp_path, unit):
     (tmp_path / "a.asf").write_bytes(export(press[:1], unit))
     with pytest.raises(RecordingError, match=f"UNITS: found '{unit}', expected RAW or a pressure"):
         load_recording(tmp_path / "a.asf", SCALE, 100.0)
 
 
-def test_another_file_is_told_what_is_read(tmp_path):
+def test_other_files_are_refused_with_the_supported_types(tmp_path):
     (tmp_path / "a.csv").write_text("t,force\n0,1\n")
     with pytest.raises(RecordingError, match=r"expected one, \.npz or \.npy"):
         load_recording(tmp_path / "a.csv", SCALE, 100.0)
@@ -288,7 +288,7 @@ STEPS = np.cumsum([0, 10, 10, 11, 9, 10, 10, 10])  # ms
 @pytest.mark.parametrize("rate", [25.0, 100.0, 400.0])
 @pytest.mark.parametrize(("name", "factor"), [("ms", 1), ("µs", 1000), ("ns", 1_000_000)])
 @pytest.mark.parametrize("kind", [np.int64, np.float64])
-def test_times_in_other_units_are_converted_and_told_once(
+def test_times_in_other_units_are_converted_and_reported_once(
     press, tmp_path, start, rate, name, factor, kind
 ):
     t = ((STEPS + start) * factor).astype(kind)
@@ -301,40 +301,40 @@ def test_times_in_other_units_are_converted_and_told_once(
 
 @pytest.mark.parametrize("key", ["t", "time", "timestamps"])
 @pytest.mark.parametrize("start", [0.0, 3600.0, 1.7e9])
-def test_times_in_seconds_are_as_they_are(press, tmp_path, start, key):
+def test_times_in_seconds_are_not_changed(press, tmp_path, start, key):
     np.savez(tmp_path / "a.npz", frames=press, **{key: STEPS * 1e-3 + start})
     read = load_recording(tmp_path / "a.npz", SCALE, 25.0)
     assert read.t == pytest.approx(STEPS * 1e-3, abs=1e-6)
     assert not read.notes
 
 
-def test_numpys_own_times_have_their_unit(press, tmp_path):
+def test_numpy_times_keep_their_unit(press, tmp_path):
     for k, unit in enumerate(("ms", "us", "ns")):
         t = np.datetime64("2024-05-01") + STEPS.astype("m8[ms]").astype(f"m8[{unit}]")
         np.savez(tmp_path / f"{k}.npz", frames=press, t=t)
         assert load_recording(tmp_path / f"{k}.npz", SCALE, 25.0).t == pytest.approx(STEPS * 1e-3)
 
 
-def test_a_slow_recording_is_read_as_it_is_and_that_is_told(press, tmp_path):
+def test_a_slow_recording_is_read_unchanged_and_reported(press, tmp_path):
     np.savez(tmp_path / "a.npz", frames=press, t=np.arange(8) * 0.5)
     read = load_recording(tmp_path / "a.npz", SCALE, 100.0)
     assert read.t.tolist() == (np.arange(8) * 0.5).tolist()
     assert read.notes == ("t: taken as s: a frame comes every 0.5 s, by tactile.rate every 0.01 s",)
 
 
-def test_frame_numbers_are_no_times(press, tmp_path):
+def test_frame_numbers_are_not_used_as_times(press, tmp_path):
     np.savez(tmp_path / "a.npz", frames=press, t=np.arange(8))
     with pytest.raises(RecordingError, match="t: whole numbers that rise by 1, expected times"):
         load_recording(tmp_path / "a.npz", SCALE, 100.0)
 
 
-def test_times_that_do_not_rise_are_told_with_their_place(press, tmp_path):
+def test_times_that_do_not_increase_are_reported_with_their_position(press, tmp_path):
     np.savez(tmp_path / "a.npz", frames=press, t=np.array([0, 1, 2, 3, 3, 4, 5, 6]) * 0.01)
     with pytest.raises(RecordingError, match=r"must rise; t\[3\] is 0\.03, t\[4\] is 0\.03"):
         load_recording(tmp_path / "a.npz", SCALE, 100.0)
 
 
-# Readings of another scale
+# Readings with another scale
 
 
 @pytest.mark.parametrize(
@@ -348,7 +348,7 @@ def test_times_that_do_not_rise_are_told_with_their_place(press, tmp_path):
         (0.0, np.uint16, "sensor's cable"),
     ],
 )
-def test_frames_without_a_contact_are_told_with_the_largest_reading(
+def test_frames_without_contact_are_reported_with_the_maximum_reading(
     press, tmp_path, inline, scale, kind, cause
 ):
     path = tmp_path / "a.npz"
@@ -361,7 +361,7 @@ def test_frames_without_a_contact_are_told_with_the_largest_reading(
         assert f"largest reading {held['frames'].max():.4g} " in line
 
 
-def test_frames_with_a_contact_say_nothing_of_it(press, tmp_path, inline):
+def test_frames_with_contact_cause_no_message(press, tmp_path, inline):
     np.savez(tmp_path / "a.npz", frames=press)
     done = inline("analyse", tmp_path / "a.npz", "--config", "paper")
     assert "no contact" not in done.stdout
@@ -372,7 +372,7 @@ def test_frames_with_a_contact_say_nothing_of_it(press, tmp_path, inline):
 
 
 @pytest.mark.parametrize("name", ["arr_0", "pressure", "left/frames"])
-def test_a_single_stack_of_an_archive_is_taken_and_told(press, tmp_path, name):
+def test_the_only_stack_of_an_archive_is_used_and_reported(press, tmp_path, name):
     held = {name: press, "time": STEPS * 1e-3, "serial": np.array("A1"), "zero": press[0]}
     np.savez(tmp_path / "a.npz", **held)
     read = load_recording(tmp_path / "a.npz", SCALE, 100.0)
@@ -381,7 +381,7 @@ def test_a_single_stack_of_an_archive_is_taken_and_told(press, tmp_path, name):
     check(tmp_path / "a.npz")
 
 
-def test_an_archive_without_frames_is_described(press, tmp_path):
+def test_the_contents_of_an_archive_without_frames_are_listed(press, tmp_path):
     np.savez(tmp_path / "a.npz", left=press, right=press, note=np.array("x"))
     with pytest.raises(RecordingError, match=r"found left \(8, 44, 44\), right .*, note \(\)"):
         load_recording(tmp_path / "a.npz", SCALE, 100.0)
@@ -391,10 +391,10 @@ def test_an_archive_without_frames_is_described(press, tmp_path):
         load_recording(tmp_path / "b.npz", SCALE, 100.0)
 
 
-# Cells of another size
+# Cells with another pitch
 
 
-def test_a_pitch_that_contradicts_the_header_is_told(press, tmp_path, inline):
+def test_a_pitch_that_contradicts_the_header_is_reported(press, tmp_path, inline):
     path = tmp_path / "a.asf"
     path.write_bytes(export(press))
     tactile = {"rows": 44, "cols": 44, "recording": (str(path), ""), "pitch": 0.00127}
@@ -409,7 +409,7 @@ def test_a_pitch_that_contradicts_the_header_is_told(press, tmp_path, inline):
     assert (done.returncode, "its header has cells of" in done.stderr) == (1, True)
 
 
-def test_a_calibration_says_what_looks_wrong_with_its_recording(tared, tmp_path, inline):
+def test_a_calibration_reports_suspicious_recordings(tared, tmp_path, inline):
     np.save(tmp_path / "a.npy", tared[:2])
     words = ("--recording", tmp_path / "a.npy", "--config", "paper", "--no-plot")
     done = inline("calibrate", "tare", tmp_path / "left.json", *words)
@@ -418,14 +418,14 @@ def test_a_calibration_says_what_looks_wrong_with_its_recording(tared, tmp_path,
 
 
 def test_generators_differ():
-    """Each locale's bytes are others."""
+    """Check that each locale generates different bytes."""
     frame = np.full((1, 44, 44), 1234.5)
     texts = [export(frame, **form) for form in LOCALES.values()]
     same = [a == b for a, b in itertools.combinations(texts, 2)]
     assert not any(same)
 
 
-# Before the first grip
+# Checks before the first grip
 
 
 @pytest.mark.parametrize(
@@ -438,7 +438,7 @@ def test_generators_differ():
         ({"tactile.pitch_y": 0.0006}, "sensor of 58 × 26.4 mm, smaller than"),
     ],
 )
-def test_a_sensor_of_another_size_than_the_tip_wants_is_told(changes, told):
+def test_a_sensor_size_that_does_not_fit_the_tip_is_reported(changes, told):
     tables: dict[str, dict[str, Any]] = {}
     for key, value in changes.items():
         section, name = key.split(".")
@@ -453,7 +453,7 @@ def test_a_sensor_of_another_size_than_the_tip_wants_is_told(changes, told):
     assert re.search(told, " ".join(doubts))
 
 
-def test_a_solid_tips_sensor_covers_its_base():
+def test_the_sensor_of_a_solid_tip_covers_its_base():
     solid = {"tip": {"physics": "solid"}, "material": {"law": "constant"}}
     settings = Settings.model_validate({**solid, "tactile": {"rows": 28}})
     (doubt,) = sensor_warnings(settings)
@@ -462,7 +462,7 @@ def test_a_solid_tips_sensor_covers_its_base():
 
 @pytest.mark.parametrize("zero", [0.0, 50.0, 3000.0])
 @pytest.mark.parametrize("noise", [0.7, 5.0, 40.0])
-def test_the_noise_of_a_sensor_no_larger_than_its_tip_is_seen_from_frame_to_frame(zero, noise):
+def test_the_noise_of_a_sensor_as_small_as_its_tip_is_measured_between_frames(zero, noise):
     rng = np.random.default_rng(5)
     grid = SensorGrid(24, 24, PITCH)
     cells = UnloadedCells(grid, 0.020, np.ones(grid.shape, bool))
@@ -474,14 +474,14 @@ def test_the_noise_of_a_sensor_no_larger_than_its_tip_is_seen_from_frame_to_fram
     assert cells.scatter == pytest.approx(noise, rel=0.2, abs=0.4)
 
 
-def test_a_recording_goes_into_a_folder_that_exists(tmp_path):
+def test_a_recording_needs_an_existing_folder(tmp_path):
     with pytest.raises(RecordingError, match="its folder does not exist; make it first"):
         RecordingWriter(tmp_path / "no" / "a.mcap")
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("limit", [60_000, 300_000])  # kB
-def test_too_little_memory_is_told_in_a_line(press, tmp_path, limit):
+def test_insufficient_memory_is_reported_in_one_line(press, tmp_path, limit):
     np.save(tmp_path / "a.npy", press[:1])
     words = [sys.executable, "-m", "softfinger", "analyse", str(tmp_path / "a.npy")]
     words = ["prlimit", f"--as={limit * 1024}", *words, "--config", "paper"]

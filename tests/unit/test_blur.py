@@ -1,4 +1,4 @@
-"""The elastomer's blur: forward against a dense convolution, and in the estimator at the bound."""
+"""Elastomer blur: the forward model against dense convolution, the estimator at its bound."""
 
 import math
 
@@ -28,7 +28,7 @@ def test_the_forward_model_is_a_convolution_of_the_pressure(material, blur):
         assert miss.max() < 1.5e-4
 
 
-def test_the_forward_model_takes_in_what_presses_beyond_the_edge_of_an_oblong_turned_sensor():
+def test_blur_includes_pressure_beyond_the_edge_of_a_rotated_oblong_sensor():
     grid = SensorGrid(20, 30, (0.0013, 0.0017), (0.013, 0.002), rotation=0.6, blur=0.0012)
     contact = (0.005, 0.2, 0.1)
     found = grid.pressure(TIP, LINEAR, *contact)
@@ -36,7 +36,7 @@ def test_the_forward_model_takes_in_what_presses_beyond_the_edge_of_an_oblong_tu
     np.testing.assert_allclose(found, dense(grid, LINEAR, contact), atol=1e-4 * E)
 
 
-def test_stencils_have_the_gaussians_moments():
+def test_stencils_have_the_moments_of_the_gaussian():
     for width in (0.05, 0.3, 0.6, 0.74, 0.76, 1.0, 3.0):
         w = stencil(width)
         k = np.arange(len(w)) - len(w) // 2
@@ -46,7 +46,7 @@ def test_stencils_have_the_gaussians_moments():
     assert stencil(0.0).tolist() == [1.0]
 
 
-def test_a_blur_that_is_not_modelled_shows():
+def test_an_unmodelled_blur_increases_the_residuals():
     grid = SensorGrid(44, 44, PITCH, blur=0.001)
     truth = (0.004, *tilts(math.radians(15.0), 0.3))
     frame = grid.pressure(TIP, LINEAR, *truth)
@@ -58,19 +58,19 @@ def test_a_blur_that_is_not_modelled_shows():
 
 
 @pytest.mark.parametrize("blur", [-1e-4, math.nan, math.inf, 0.05])
-def test_a_blur_that_is_none_is_refused(blur):
+def test_an_invalid_blur_is_refused(blur):
     with pytest.raises(ValueError, match="blur"):
         SensorGrid(44, 44, PITCH, blur=blur)
 
 
 @pytest.mark.parametrize("reading", [math.nan, math.inf, 1e9])
-def test_cells_out_of_the_tips_reach_are_not_used_however_far_the_blur_goes(reading):
+def test_cells_beyond_the_reach_of_the_tip_are_unused_for_any_blur(reading):
     grid = SensorGrid(44, 44, PITCH, blur=0.001)
     noise = 0.002 * LINEAR.reference_modulus
     frame = grid.pressure(TIP, LINEAR, 0.012, 0.25, 0.25)
     estimator = ContactEstimator(TIP, LINEAR, grid, noise)
     usual = estimator(frame)
-    # Beyond the rim by more than three standard deviations, but in the footprint's box.
+    # Outside the rim by more than three standard deviations, but inside the footprint's box.
     frame[39, 39] = reading
     found = estimator(frame)
     assert usual.valid
@@ -78,7 +78,7 @@ def test_cells_out_of_the_tips_reach_are_not_used_however_far_the_blur_goes(read
     assert found.d == usual.d
 
 
-def test_the_settings_blurs_go_into_the_simulated_sensor_and_the_fingers_estimator():
+def test_blur_settings_apply_to_the_simulated_sensor_and_the_estimator():
     sensor, truth = {"blur": 0.001, "noise": 300.0}, {"tactile_blur": 0.001, "tactile_noise": 300.0}
     settings = Settings.model_validate({"tactile": sensor, "simulation": truth})
     counts = np.zeros((44, 44), np.uint16)

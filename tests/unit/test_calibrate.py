@@ -1,4 +1,4 @@
-"""`softfinger calibrate`: a made-up sensor, step by step, into a file that the daemon applies."""
+"""`softfinger calibrate` on a simulated sensor, step by step; the daemon applies the file."""
 
 import json
 import math
@@ -51,7 +51,7 @@ sensor = ["A17", "A18"]
 
 
 class MadeUp:
-    """A sensor whose every property is known."""
+    """Sensor with known properties."""
 
     def __init__(self) -> None:
         self.rng = np.random.default_rng(5)
@@ -72,7 +72,7 @@ class MadeUp:
 
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory):
-    """The whole calibration from recordings; the folder with profile.toml and sensor.json."""
+    """Calibrate completely from recordings; return the folder with profile.toml and sensor.json."""
     folder = tmp_path_factory.mktemp("calibration")
     (folder / "profile.toml").write_text(PROFILE)
     sensor = MadeUp()
@@ -102,12 +102,12 @@ def bench(tmp_path_factory):
     step("centre", "--recording", *presses, "--theta", *map(str, tilts))
     d = np.linspace(-0.001, 0.006, 57)
     frames = np.concatenate([sensor.press(max(x, 0.0)) for x in d])
-    run = keep("run.npz", frames, d=d + 1e-4)  # the run's zero is 0.1 mm off
+    run = keep("run.npz", frames, d=d + 1e-4)  # the run's zero offset is 0.1 mm off
     step("modulus", "--recording", run)
     return folder, sensor
 
 
-def test_each_step_finds_what_the_sensor_was_made_with(bench):
+def test_each_step_recovers_the_sensor_properties(bench):
     folder, sensor = bench
     found = load_calibration(folder / "sensor.json")
     assert found.sensor.label == "A17"
@@ -128,7 +128,7 @@ def test_each_step_finds_what_the_sensor_was_made_with(bench):
     )
 
 
-def test_counts_become_the_pressure_that_made_them(bench):
+def test_counts_are_converted_to_the_true_pressure(bench):
     folder, sensor = bench
     converter = Converter(load_calibration(folder / "sensor.json"), 20.0)
     pressure = sensor.grid.pressure(TIP, Material.constant(E), 0.004, 0.2)
@@ -165,7 +165,7 @@ def test_the_daemon_applies_the_file(bench, tmp_path):
         assert contact.tilt_y == pytest.approx(0.0, abs=0.01)
         assert contact.force == pytest.approx(math.pi * E * 0.003**2 / math.cos(0.15), rel=0.04)
         for perception in daemon.loop.perception.fingers:
-            perception.tare()  # a new zero is taken in counts, and the converter knows it
+            perception.tare()  # a new zero offset is taken in counts and used by the converter
         daemon.loop.advance(0.3)
         assert daemon.loop.state.contacts[0].d == 0.0
 
@@ -228,7 +228,7 @@ def test_the_calibration_of_another_sensor_is_refused(bench, tmp_path, tactile, 
         (["tare", "--recording", "rest.npz", "--finger", "right"], "finger left, here right"),
     ],
 )
-def test_what_cannot_be_done_is_told_and_changes_nothing(bench, capsys, words, told):
+def test_impossible_steps_are_reported_and_change_nothing(bench, capsys, words, told):
     folder, _ = bench
     before = (folder / "sensor.json").read_bytes()
     step, *words = [str(folder / word) if word.endswith(".npz") else word for word in words]
@@ -253,7 +253,7 @@ def test_what_cannot_be_done_is_told_and_changes_nothing(bench, capsys, words, t
         (lambda c: c["sensor"].pop("rows"), "sensor.rows"),
     ],
 )
-def test_a_spoilt_file_is_refused_with_the_place(bench, tmp_path, change, told):
+def test_a_corrupted_file_is_refused_with_the_position(bench, tmp_path, change, told):
     content = json.loads((bench[0] / "sensor.json").read_text())
     change(content)
     path = tmp_path / "bad.json"
@@ -273,7 +273,7 @@ def test_a_spoilt_file_is_refused_with_the_place(bench, tmp_path, change, told):
         ("curve", {"words": ["--d", "inf"]}, "d: a value that is not finite"),
     ],
 )
-def test_what_no_press_can_be_is_refused_in_a_line(step, known, told, tmp_path, capsys):
+def test_impossible_contacts_are_refused_in_one_line(step, known, told, tmp_path, capsys):
     words = known.pop("words", [])
     (tmp_path / "profile.toml").write_text(PROFILE)
     path = tmp_path / "run.npz"

@@ -1,4 +1,4 @@
-"""Calibration files in the hand: each finger's forces are by its own tip; zeros are learnt."""
+"""Calibration files in the hand: each finger uses its own tip and learns its zero offsets."""
 
 import math
 from pathlib import Path
@@ -32,8 +32,8 @@ from softfinger.kinematics.hand.grasp_state import total_tilt
 
 LEFT = 0.25e6  # Pa, a constant modulus
 STRAIN = [0.0, 0.1, 0.2, 0.4, 0.6]
-STRESS = [0.0, 14e3, 31e3, 75e3, 130e3]  # Pa, the right tip's law
-TRUE = 0.28e6  # Pa, the simulated tips'
+STRESS = [0.0, 14e3, 31e3, 75e3, 130e3]  # Pa, material law of the right tip
+TRUE = 0.28e6  # Pa, modulus of the simulated tips
 
 
 @pytest.fixture
@@ -61,7 +61,7 @@ def settings(tmp_path):
     return Settings.model_validate(raw)
 
 
-def test_what_a_calibration_measured_of_its_errors_reaches_the_estimator():
+def test_measured_calibration_errors_reach_the_estimator():
     settings = Settings.model_validate({"tactile": {"baseline_error": 300.0, "pitch_error": 0.01}})
     zero = np.zeros((settings.tactile.rows, settings.tactile.cols)).tolist()
     calibration = Calibration(
@@ -81,7 +81,7 @@ def test_what_a_calibration_measured_of_its_errors_reaches_the_estimator():
     assert uncertainty(Settings(), None) == Uncertainty(gain=0.25, smooth=0.035)
 
 
-def test_a_calibrated_law_too_far_off_its_points_is_refused_by_file_and_key(settings):
+def test_a_calibrated_law_far_from_its_points_is_refused_by_file_and_key(settings):
     path = Path(settings.tactile.calibration[1])
     strain = np.linspace(0.05, 1.0, 20)
     kinked = 1e5 * np.where(strain < 0.3, strain, 3.0 * strain - 0.6)
@@ -98,7 +98,7 @@ def test_a_calibrated_law_too_far_off_its_points_is_refused_by_file_and_key(sett
         make_models(settings)
 
 
-def test_each_tips_material_reaches_estimate_table_and_prediction(settings):
+def test_the_material_of_each_tip_reaches_estimate_table_and_prediction(settings):
     events = []
     with Daemon(settings, wire=False, on_event=lambda *event: events.append(event)) as daemon:
         told = [text for _, kind, text in events if kind == "calibration"]
@@ -125,14 +125,14 @@ def test_each_tips_material_reaches_estimate_table_and_prediction(settings):
             assert scale == pytest.approx(1.0, abs=0.1)
             assert contact.force == pytest.approx(scale * expected.force, rel=1e-9)
             assert contact.energy == pytest.approx(scale * expected.energy, rel=1e-9)
-        # The simulated tips stay the settings' own.
+        # The simulated tips use the material of the settings.
         d, theta = daemon.hand.d, daemon.hand.theta
         by_truth = math.pi * TRUE * d**2 / np.cos(theta)
         assert np.abs(daemon.hand.force / by_truth - 1.0).max() < 1e-3
 
 
 PASCAL_PER_COUNT = 150.0
-FULL = 255  # 38 kPa, less than the contact's peak of 46 kPa
+FULL = 255  # counts: 38 kPa, less than the contact's peak pressure of 46 kPa
 
 
 def counting(**tactile: object) -> Settings:
@@ -152,7 +152,7 @@ def counting(**tactile: object) -> Settings:
 
 
 def calibrated(path: Path, zero: NDArray[np.float64]) -> Calibration:
-    """A file of a tare alone, written to ``path``."""
+    """Write a calibration file with only a tare to ``path``."""
     step = TareStep(date="today", zero=zero.tolist(), noise=1.0, frames=16)
     made = Calibration(sensor=sensor_of(counting(), 0), date="today", tare=step)
     save_calibration(path, made)
@@ -160,7 +160,7 @@ def calibrated(path: Path, zero: NDArray[np.float64]) -> Calibration:
 
 
 class Bench:
-    """One finger's perception and a board whose cells rest at ``base`` counts."""
+    """One finger's perception and a board whose cells show ``base`` counts without contact."""
 
     def __init__(self, given: Settings) -> None:
         self.sensor = GivenFrames()
@@ -188,7 +188,7 @@ class Bench:
 
 
 @pytest.mark.parametrize("with_file", [False, True], ids=["counts", "calibrated"])
-def test_cells_full_over_a_new_zero_are_known_to_be_full(with_file, tmp_path):
+def test_saturated_cells_are_detected_after_a_new_zero_offset(with_file, tmp_path):
     given = counting()
     if with_file:
         calibrated(tmp_path / "left.json", np.zeros((44, 44)))
@@ -207,7 +207,7 @@ def test_cells_full_over_a_new_zero_are_known_to_be_full(with_file, tmp_path):
         assert abs(contact.d - 0.006) < 5.0 * contact.d_std < 2e-4
 
 
-def test_a_zero_below_the_calibrations_leaves_the_published_pressure_whole(tmp_path):
+def test_a_zero_offset_below_the_calibrated_one_does_not_clip_the_pressure(tmp_path):
     calibrated(tmp_path / "left.json", np.full((44, 44), 40.0))
     bench = Bench(counting(calibration=(str(tmp_path / "left.json"), "")))
     bench.tare(0.0)
@@ -219,7 +219,7 @@ def test_a_zero_below_the_calibrations_leaves_the_published_pressure_whole(tmp_p
 
 
 @pytest.mark.parametrize("stuck", [FULL - 5.0, float(FULL)])
-def test_a_cell_that_rests_all_but_full_does_not_make_the_others_full(stuck, tmp_path):
+def test_a_cell_with_a_large_zero_offset_does_not_saturate_the_others(stuck, tmp_path):
     zero = np.full((44, 44), 3.0)
     zero[22, 30] = stuck
     calibration = calibrated(tmp_path / "left.json", zero)

@@ -1,4 +1,4 @@
-"""The mathematics of calibration: each step recovers what a sensor was made with."""
+"""Calibration mathematics: each step recovers the properties of a simulated sensor."""
 
 import math
 import sys
@@ -29,7 +29,7 @@ RNG = np.random.default_rng(11)
 
 @pytest.fixture(autouse=True)
 def own_noise(monkeypatch):
-    """The same for each test, whatever ran before it in this process."""
+    """Reset the random source, so tests do not depend on each other."""
     monkeypatch.setattr(sys.modules[__name__], "RNG", np.random.default_rng(11))
 
 
@@ -45,31 +45,31 @@ def test_tare_is_the_mean_of_each_cell():
     np.testing.assert_allclose(found.noise, noise, rtol=0.08)
 
 
-def test_a_tare_while_something_presses_is_refused():
+def test_a_tare_under_load_is_refused():
     frames = 10.0 + RNG.standard_normal((20, 8, 8))
-    frames[:, 2:4, 3] *= 20.0  # two faulty cells may be as they like
+    frames[:, 2:4, 3] *= 20.0  # two faulty cells are ignored
     tare(frames)
     frames[10:, 4:6, 4:7] += 100.0
     with pytest.raises(CalibrationError, match="8 cells don't rest"):
         tare(frames)
 
 
-def test_a_tare_measures_how_noise_correlates_and_all_cells_drift():
+def test_a_tare_measures_noise_correlation_and_common_drift():
     rng = np.random.default_rng(4)
     white = 2.0 * rng.standard_normal((100, 44, 45))
     plain = tare(50.0 + white)
     assert plain.correlation.size == 0
     assert plain.drift == 0.0
-    # Each cell's noise is half its right neighbour's own.
+    # Half of each cell's noise is its right neighbour's own.
     shared = 50.0 + (white[:, :, 1:] + white[:, :, :-1]) / math.sqrt(2.0)
     shared[:, 3, 3] += 100.0 * rng.standard_normal(100)  # a faulty cell
     found = tare(shared + 0.7 * rng.standard_normal((100, 1, 1)))
     assert found.correlation.shape == (1, 2)
     np.testing.assert_allclose(found.correlation, [[1.0, 0.5]], atol=0.02)
-    assert found.drift == pytest.approx(0.7, rel=0.3)  # of 100 frames: 1 ± 0.07
+    assert found.drift == pytest.approx(0.7, rel=0.3)  # from 100 frames: 1 ± 0.07
 
 
-def test_equilibration_makes_cells_alike_and_finds_the_dead():
+def test_equilibration_equalises_cells_and_finds_dead_ones():
     gain = 1.0 + 0.2 * RNG.standard_normal((8, 8))
     gain[2, 3] = 0.0
     loads = [5.0 + gain * level + 0.5 * RNG.standard_normal((50, 8, 8)) for level in (40, 90, 160)]
@@ -83,13 +83,13 @@ def test_equilibration_makes_cells_alike_and_finds_the_dead():
 
 
 @pytest.mark.parametrize("kind", ["power", "cubic"])
-def test_the_curve_is_found_from_known_weights(kind):
-    # The sensor answers p = p(x); x is found from the model's pressure by interpolation.
+def test_the_curve_is_recovered_from_known_weights(kind):
+    # The sensor's response is p = p(x); x is interpolated from the model's pressure.
     x = np.linspace(0, 1000, 4001)
     true = 0.9 * x**1.4 if kind == "power" else 60 * x + 0.08 * x**2 + 5e-5 * x**3
     depths = (0.001, 0.0015, 0.002, 0.003, 0.004)
     readings = [np.interp(GRID.pressure(TIP, LINEAR, d), true, x) for d in depths]
-    # The stiffest scale would overflow the table.
+    # The highest stiffness would exceed the table.
     if kind == "power":
         readings = [(GRID.pressure(TIP, LINEAR, d) / 0.9) ** (1 / 1.4) for d in depths]
     found = fit_curve(kind, readings, [force(d) for d in depths], AREA, 4000.0)
@@ -101,7 +101,7 @@ def test_the_curve_is_found_from_known_weights(kind):
 
 
 @pytest.mark.parametrize("rotation", [0.0, 0.3, -2.0])
-def test_centre_and_rotation_are_found_from_tilted_presses(rotation):
+def test_centre_and_rotation_are_recovered_from_tilted_loads(rotation):
     true = SensorGrid(32, 32, 0.058 / 32, centre=(1.3e-3, -0.8e-3), rotation=rotation)
     tilts = np.radians([-15.0, -5.0, 0.0, 10.0, 20.0])
     noise = 600.0
@@ -112,10 +112,10 @@ def test_centre_and_rotation_are_found_from_tilted_presses(rotation):
     assert found.centre == pytest.approx(true.centre, abs=2e-5)
     assert found.rotation == pytest.approx(rotation, abs=5e-3)
     assert found.residual < 3e-5
-    assert 2e-5 < found.std < 2e-4  # a press is upright within half a degree
+    assert 2e-5 < found.std < 2e-4  # loads are upright to within half a degree
 
 
-def test_upright_presses_tell_the_centre_and_no_rotation():
+def test_upright_loads_determine_the_centre_but_not_the_rotation():
     true = SensorGrid(32, 32, 0.058 / 32, centre=(-2e-3, 1e-3))
     frames = [true.pressure(TIP, LINEAR, d) for d in (0.002, 0.004)]
     found = fit_centre(frames, [0.0, 0.0], TIP, LINEAR, GRID, 600.0)
@@ -125,13 +125,13 @@ def test_upright_presses_tell_the_centre_and_no_rotation():
 
 
 @pytest.mark.parametrize("tilts", [[0.2, 0.2], [0.1, 0.12], [-0.3]])
-def test_presses_tilted_alike_are_not_taken_for_upright_ones(tilts):
+def test_loads_with_the_same_tilt_do_not_count_as_upright(tilts):
     frames = [GRID.pressure(TIP, LINEAR, 0.004, t) for t in tilts]
     with pytest.raises(CalibrationError, match="tilt can't be separated from place"):
         fit_centre(frames, tilts, TIP, LINEAR, GRID, 600.0)
 
 
-def test_the_modulus_of_a_compression_run_with_an_unknown_zero():
+def test_the_modulus_is_recovered_from_a_compression_with_unknown_zero_offset():
     d = np.linspace(0.001, 0.008, 15)
     theta = np.where(np.arange(15) % 2, 0.3, 0.0)
     load = math.pi * E * (d - 2e-4) ** 2 / np.cos(theta)
@@ -141,7 +141,7 @@ def test_the_modulus_of_a_compression_run_with_an_unknown_zero():
     assert found.residual < 1e-9
 
 
-def test_clipped_noise_far_from_the_contact_is_cleared():
+def test_clipped_noise_far_from_the_contact_is_removed():
     noise = np.full((32, 32), 3.0)
     reading = np.maximum(3.0 * RNG.standard_normal((16, 32, 32)).mean(axis=0), 0.0)
     assert above_zero(reading, noise, 16).sum() <= 0.01 * reading.sum() + 8.0
@@ -166,6 +166,6 @@ def test_clipped_noise_far_from_the_contact_is_cleared():
         (lambda: fit_modulus([0.001, 0.002, 0.003], [0, 0, 0], [3, 2, 1], TIP), "does not rise"),
     ],
 )
-def test_data_that_do_not_tell_are_refused(call, told):
+def test_uninformative_data_are_refused(call, told):
     with pytest.raises(CalibrationError, match=told):
         call()

@@ -1,4 +1,4 @@
-"""Our framing: its bytes as documented, its decoder against a plain twin, its times."""
+"""The COBS framing: documented bytes, the decoder against a plain version, and its times."""
 
 import re
 import struct
@@ -13,7 +13,7 @@ from softfinger.daemon.tactile.serial_reader import SensorClock
 
 
 def plain_stuff(message: bytes) -> bytes:
-    """COBS as its definition reads, a byte at a time."""
+    """Encode with COBS byte by byte, following its definition."""
     out, block = bytearray(), bytearray()
     for k, byte in enumerate(message):
         if byte == 0:
@@ -54,12 +54,12 @@ messages = st.one_of(
 @example(bytes(300))
 @example(b"\x01" * 254)
 @example(b"\x01" * 508)
-def test_unstuffing_undoes_what_the_plain_twin_stuffed(message):
+def test_decoding_inverts_the_plain_encoder(message):
     assert unstuffed(plain_stuff(message)) == message
 
 
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16])
-def test_a_frame_is_as_documented(kind):
+def test_a_frame_has_the_documented_bytes(kind):
     assert plain_crc(b"123456789") == 0x29B1
     counts = np.array([[0, 1, 2], [253, 0, 255]], kind)
     data = encode(counts, 70000, 1.25)
@@ -71,7 +71,7 @@ def test_a_frame_is_as_documented(kind):
     assert data == plain_stuff(message + plain_crc(message).to_bytes(2, "little")) + b"\0"
 
 
-def test_frames_come_with_number_and_time_and_losses_are_told():
+def test_frames_have_numbers_and_times_and_losses_are_counted():
     decoder = CobsDecoder(2, 3)
     counts = np.arange(6, dtype=np.uint16).reshape(2, 3) * 300
     first = decoder.feed(encode(counts, 65534, 4294.0), 1.0)
@@ -80,7 +80,7 @@ def test_frames_come_with_number_and_time_and_losses_are_told():
     assert second.steps == 3
     assert second.t_sensor == pytest.approx(first.t_sensor + 1.0)
     assert decoder.counters()["missed"] == 2
-    again = decoder.feed(encode(counts, 0, 0.0), 3.0)  # it started anew
+    again = decoder.feed(encode(counts, 0, 0.0), 3.0)  # the board restarted
     assert again.steps == 1
 
 
@@ -93,7 +93,7 @@ def test_frames_come_with_number_and_time_and_losses_are_told():
         (lambda data: b"\x01" * 500 + b"\0", "packets of 500 bytes|no packet"),
     ],
 )
-def test_what_is_wrong_with_a_stream_is_told(spoil, told):
+def test_stream_errors_are_diagnosed(spoil, told):
     decoder = CobsDecoder(2, 3)
     good = encode(np.full((2, 3), 777, np.uint16), 1, 0.0)
     assert decoder.feed(spoil(good), 0.0) is None
@@ -101,17 +101,17 @@ def test_what_is_wrong_with_a_stream_is_told(spoil, told):
     assert decoder.feed(b"\0" + good, 0.0) is not None
 
 
-def test_every_single_flipped_bit_is_seen():
+def test_every_single_bit_flip_is_detected():
     good = encode(np.random.default_rng(1).integers(0, 900, (4, 5)).astype(np.uint16), 5, 0.5)
     for bit in range(8 * len(good)):
         wrong = bytearray(good)
         wrong[bit // 8] ^= 1 << bit % 8
         decoder = CobsDecoder(4, 5)
-        # Unless the flip made or took the end, in which case nothing is left that is a frame.
+        # If the flip creates or removes the delimiter, no complete frame remains.
         assert decoder.feed(bytes(wrong) + b"\0", 0.0) is None
 
 
-def test_the_sensor_clock_takes_the_least_delay_and_follows_drift_and_restarts():
+def test_the_sensor_clock_uses_the_minimum_delay_and_follows_drift_and_restarts():
     clock = SensorClock()
     rng = np.random.default_rng(2)
     misses = []
@@ -124,9 +124,9 @@ def test_the_sensor_clock_takes_the_least_delay_and_follows_drift_and_restarts()
     assert clock.arrival(0.0, 30.0) == 30.0
 
 
-def test_the_longest_frame_is_one_of_zeros():
+def test_the_longest_frame_consists_of_zeros():
     rng = np.random.default_rng(3)
-    # Half of the cells read nothing, as under a tip in the air: the worst case, all is zero bytes.
+    # Half of the cells are zero, as without contact; the worst case contains only zero bytes.
     frames = [
         encode(np.maximum(rng.normal(0, 380, (44, 44)), 0).astype(np.uint16), k, 0.01 * k)
         for k in range(30)

@@ -1,4 +1,4 @@
-"""The command line's front: first steps, profiles shown, numbers with units."""
+"""The command line's first steps, profile display, and numbers with units."""
 
 import json
 import math
@@ -12,7 +12,7 @@ from softfinger.daemon.profile.load import find, names
 from softfinger.tools.cli import SUBCOMMANDS, make_parser
 
 
-def test_no_words_name_the_first_steps_and_help_all_subcommands(inline):
+def test_without_arguments_the_first_steps_are_shown_and_help_lists_all_subcommands(inline):
     first = inline()
     assert (first.returncode, first.stderr) == (0, "")
     assert "softfinger run --monitor" in first.stdout
@@ -31,7 +31,7 @@ def test_no_words_name_the_first_steps_and_help_all_subcommands(inline):
         assert f"found {word!r}, expected a subcommand; {hint}" in wrong.stderr
 
 
-def test_the_nearest_word_is_named_for_one_that_is_not_known(inline):
+def test_the_closest_subcommand_is_suggested(inline):
     for words, word, near in (
         (("run", "--cofnig", "hil"), "--cofnig", "--config"),
         (("send", "grap", "force=3"), "grap", "grasp"),
@@ -42,7 +42,7 @@ def test_the_nearest_word_is_named_for_one_that_is_not_known(inline):
         assert f"found {word!r}, expected a known word; nearest: {near}" in wrong.stderr
     assert max(map(len, inline("limits").stdout.splitlines())) <= 120
     assert "unrecognized arguments: --zzz" in inline("run", "--zzz").stderr
-    assert inline("send").stderr.endswith("required: COMMAND\n")  # and not what it may lack
+    assert inline("send").stderr.endswith("required: COMMAND\n")  # instead of missing options
 
 
 @pytest.mark.parametrize(
@@ -56,7 +56,7 @@ def test_the_nearest_word_is_named_for_one_that_is_not_known(inline):
         ("gasp", "found 'gasp', expected a known word; nearest: grasp"),
     ],
 )
-def test_what_is_no_number_of_its_kind_is_not_sent(inline, words, said):
+def test_invalid_numbers_are_not_sent(inline, words, said):
     done = inline("send", *words.split(), "--timeout", "0.1")
     assert done.returncode == 2
     assert said in done.stderr
@@ -72,7 +72,7 @@ def test_what_is_no_number_of_its_kind_is_not_sent(inline, words, said):
         (["force=2500mN"], {"force": 2.5}),
     ],
 )
-def test_numbers_may_carry_their_unit(words, numbers):
+def test_numbers_may_have_units(words, numbers):
     from softfinger.tools.terminal.send import si_numbers
 
     assert si_numbers(words) == pytest.approx(numbers)
@@ -80,7 +80,7 @@ def test_numbers_may_carry_their_unit(words, numbers):
 
 def test_profiles_and_keys_are_shown_from_any_folder(inline, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "hil").mkdir()  # as a project may have one
+    (tmp_path / "hil").mkdir()  # a project may have such a folder
     listed = inline("config", "list").stdout.splitlines()
     assert [line.split()[0] for line in listed] == names()
     assert all(len(line.split()) > 2 for line in listed), "each says what it is"
@@ -109,7 +109,7 @@ def test_profiles_and_keys_are_shown_from_any_folder(inline, tmp_path, monkeypat
         ("tcp://10.0.0.7:1234", "tcp://10.0.0.7:1234", "tcp://10.0.0.7:1234"),
     ],
 )
-def test_one_address_serves_every_client(text, stream, commands):
+def test_one_address_suits_every_client(text, stream, commands):
     def parsed(*words: str) -> Any:
         return make_parser({words[0]})[0].parse_args([*words, "--address", text]).address
 

@@ -1,4 +1,4 @@
-"""Command server and client on real sockets; what is heard when, and how a request must look."""
+"""Command server and client on real sockets; the order and form of requests."""
 
 import os
 import select
@@ -41,7 +41,7 @@ def server(addresses: tuple[str, str]) -> Iterator[Served]:
 
 
 class Asking:
-    """A client with one request, which a served gateway and loop are to answer."""
+    """A client with one request, to be served by a gateway and a loop."""
 
     def __init__(
         self, context: zmq.Context[Any], served: Served, address: str, request: str | bytes
@@ -61,7 +61,7 @@ class Asking:
         return msgpack.unpackb(self.socket.recv())
 
 
-def test_a_plain_req_socket_gets_its_answer(server, addresses):
+def test_a_plain_req_socket_gets_its_reply(server, addresses):
     assert send(addresses[1], {"command": "arm"}, 60.0) == {"ok": True, "heard": "arm"}
     refusal = {"ok": False, "error": "not now", "reason": "lease"}
     assert send(addresses[1], {"command": "no"}, 60.0) == refusal
@@ -84,7 +84,9 @@ def test_a_plain_req_socket_gets_its_answer(server, addresses):
         (msgpack.packb({"command": "arm", "key": "k" * 65}), "key: expected a text of 1 to 64"),
     ],
 )
-def test_malformed_commands_are_refused_and_the_server_lives_on(context, addresses, payload, error):
+def test_malformed_commands_are_refused_and_the_server_continues(
+    context, addresses, payload, error
+):
     with Served(commands=addresses[1]) as served:
         reply = Asking(context, served, addresses[1], payload).told()
         assert (reply["ok"], reply["reason"]) == (False, "request")
@@ -92,17 +94,20 @@ def test_malformed_commands_are_refused_and_the_server_lives_on(context, address
         assert Asking(context, served, addresses[1], "arm").told()["ok"] is True
 
 
-def test_multipart_nonsense_and_clients_that_go_away_change_nothing(server, context, addresses):
+def test_malformed_multipart_messages_and_disconnecting_clients_have_no_effect(
+    server, context, addresses
+):
     socket = context.socket(zmq.DEALER)
     socket.connect(addresses[1])
-    socket.send_multipart([b"", b"a", b"b", b"c"])  # no client's form
+    socket.send_multipart([b"", b"a", b"b", b"c"])  # not a client's form
     socket.send(msgpack.packb({"command": "arm"}))
     socket.close(linger=1000)
     assert send(addresses[1], {"command": "arm"}, 60.0)["ok"] is True
 
 
-@pytest.mark.parametrize("under_way", [1, 16])  # the second request waits in the queue, or the link
-def test_what_came_before_a_fence_is_refused_and_what_comes_after_is_not(
+# The second request waits in the queue or on the link.
+@pytest.mark.parametrize("under_way", [1, 16])
+def test_requests_before_a_fence_are_refused_and_later_ones_are_not(
     context, addresses, monkeypatch, under_way
 ):
     monkeypatch.setattr(bounds, "UNANSWERED_MAX", under_way)
@@ -119,8 +124,8 @@ def test_what_came_before_a_fence_is_refused_and_what_comes_after_is_not(
         assert early.told() == {"ok": True, "heard": "arm"}
 
 
-def test_a_request_takes_a_short_way(context, addresses):
-    """From the socket to the handler, which `Loop.command` and `Requests.carry_out` follow."""
+def test_a_request_passes_few_functions(context, addresses):
+    """Count from the socket to the handler, followed by `Loop.command` and `Requests.carry_out`."""
     passed: set[str] = set()
     heard = []
 
@@ -151,7 +156,7 @@ def test_a_request_takes_a_short_way(context, addresses):
 ARM = msgpack.packb({"command": "arm"})
 
 
-def test_a_req_that_correlates_gets_its_answer(context, addresses):
+def test_a_correlating_req_socket_gets_its_reply(context, addresses):
     with Served(commands=addresses[1]) as served:
         client = context.socket(zmq.REQ)
         client.setsockopt(zmq.REQ_CORRELATE, 1)
@@ -163,7 +168,7 @@ def test_a_req_that_correlates_gets_its_answer(context, addresses):
             assert msgpack.unpackb(client.recv()) == {"ok": True, "heard": name}
 
 
-def test_a_proxy_may_stand_between(context, addresses):
+def test_a_proxy_may_be_used(context, addresses):
     with Served(commands=addresses[1]) as served:
         front, back = context.socket(zmq.ROUTER), context.socket(zmq.DEALER)
         port = front.bind_to_random_port("tcp://127.0.0.1")
@@ -198,7 +203,7 @@ def test_a_proxy_may_stand_between(context, addresses):
         ([b"part"] * 500, 0, False),
     ],
 )
-def test_an_envelope_goes_back_with_the_reply_and_a_malformed_one_is_answered(
+def test_the_envelope_is_returned_with_the_reply_and_a_malformed_one_is_answered(
     context, addresses, frames, envelope, heard
 ):
     with Served(commands=addresses[1]) as served:
@@ -217,7 +222,7 @@ def test_an_envelope_goes_back_with_the_reply_and_a_malformed_one_is_answered(
 
 
 class Aged:
-    """Notes the ages of what it carries out; refuses as late what is older than 0.2 s."""
+    """Handler that stores the ages of commands and refuses those older than 0.2 s as late."""
 
     def __init__(self) -> None:
         self.ages: list[float] = []
@@ -234,7 +239,7 @@ def pass_time(clock: VirtualClock, seconds: float) -> None:
 
 
 def on_the_link(served: Served) -> None:
-    """Wait until the gateway has handed something on."""
+    """Wait until the gateway has forwarded a request."""
     link = [served.link._channel]
     until(lambda: [served.service.step(0.0), select.select(link, [], [], 0)[0]][1])
 
@@ -247,10 +252,10 @@ def test_age_is_counted_from_before_a_stall_of_either_process(context, addresses
         if stalled == "loop":
             on_the_link(served)
         elif stalled == "gateway":
-            # libzmq has taken it in, or will in a moment: nobody knows since when it waits.
+            # libzmq has received it or is about to, so the start of its waiting time is unknown.
             until(lambda: served.service.commands.socket.poll(0))
         pass_time(clock, 0.5)
-        # libzmq's own thread may come later than the gateway's look after the stall.
+        # After the stall, libzmq's own thread may run later than the gateway's check.
         until(lambda: [served.serve(aged), asking.socket.poll(0)][1])
         assert msgpack.unpackb(asking.socket.recv())["reason"] == "late"
         pass_time(clock, bounds.POLL_GAP_MAX / 2)
@@ -265,7 +270,7 @@ def keyed(name: str = "arm", key: str = "k") -> bytes:
     return msgpack.packb({"command": name, "key": key})
 
 
-def test_a_key_is_carried_out_once_and_its_reply_repeated(context, addresses):
+def test_a_key_is_executed_once_and_its_reply_repeated(context, addresses):
     aged = Aged()
     with Served(commands=addresses[1], clock=VirtualClock()) as served:
         for key, count in (("a", 1), ("a", 1), ("b", 2), ("a", 1)):
@@ -275,7 +280,7 @@ def test_a_key_is_carried_out_once_and_its_reply_repeated(context, addresses):
 
 
 @pytest.mark.parametrize("meanwhile", ["", "signal", "stop", "disarm", "status"])
-def test_a_late_command_is_carried_out_when_it_is_repeated_unless_another_was_meanwhile(
+def test_a_repeated_late_command_is_executed_unless_another_one_was_meanwhile(
     context, addresses, meanwhile
 ):
     clock, aged = VirtualClock(), Aged()
@@ -293,7 +298,7 @@ def test_a_late_command_is_carried_out_when_it_is_repeated_unless_another_was_me
         elif meanwhile:
             other = Asking(context, served, addresses[1], meanwhile)
             until(lambda: [served.serve(aged), pass_time(clock, 1e-3), other.socket.poll(0)][2])
-        until(lambda: served._is_open())  # far enough from a stop to tell
+        until(lambda: served._is_open())  # long enough after a stop to distinguish requests
         count = len(aged.ages)
         asking.send(keyed())
         until(lambda: [served.serve(aged), asking.socket.poll(0)][1])
@@ -305,7 +310,7 @@ def test_a_late_command_is_carried_out_when_it_is_repeated_unless_another_was_me
             assert len(aged.ages) == count
 
 
-def test_a_disarm_is_carried_out_each_time_whatever_its_key(context, addresses):
+def test_every_disarm_is_executed_even_with_the_same_key(context, addresses):
     aged = Aged()
     with Served(commands=addresses[1], clock=VirtualClock()) as served:
         for count in (1, 2):
@@ -315,7 +320,7 @@ def test_a_disarm_is_carried_out_each_time_whatever_its_key(context, addresses):
 
 
 def test_a_fence_is_passed_only_after_some_time_without_a_gap(context, addresses):
-    """What came before a stop may be handed on by libzmq's thread after a gap, too."""
+    """After a gap, libzmq's thread may still deliver requests sent before a stop."""
     clock, aged = VirtualClock(), Aged()
     with Served(commands=addresses[1], clock=clock) as served:
         served.server.raise_fence()
@@ -329,7 +334,7 @@ def test_a_fence_is_passed_only_after_some_time_without_a_gap(context, addresses
         assert msgpack.unpackb(asking.socket.recv())["ok"]
 
 
-def test_a_setpoint_replaces_only_one_that_sets_no_more_than_it_does(context, addresses):
+def test_a_setpoint_only_replaces_one_with_the_same_or_fewer_fields(context, addresses):
     with Served(commands=addresses[1]) as served:
         stream = context.socket(zmq.DEALER)
         stream.connect(addresses[1])
@@ -351,7 +356,7 @@ def test_a_setpoint_replaces_only_one_that_sets_no_more_than_it_does(context, ad
         assert reasons == {b"force": None, b"later": None, **superseded}
 
 
-def test_of_setpoints_that_wait_only_the_newest_is_carried_out(context, addresses):
+def test_only_the_newest_waiting_setpoint_is_executed(context, addresses):
     forces = []
 
     def note(request: dict[str, Any], age: float) -> dict[str, Any]:
@@ -372,7 +377,7 @@ def test_of_setpoints_that_wait_only_the_newest_is_carried_out(context, addresse
                     found.append(msgpack.unpackb(stream.recv()))
             return all(len(found) == 20 for found in replies)
 
-        # All have come in before the loop goes on.
+        # All have been received before the loop continues.
         commands = served.service.commands
         until(lambda: [served.settle(1), commands.count + len(served.link.asked) == 40][1])
         until(lambda: [served.serve(note), collected()][1])
@@ -384,14 +389,14 @@ def test_of_setpoints_that_wait_only_the_newest_is_carried_out(context, addresse
         assert refused == {"superseded"}
 
 
-def test_a_stop_is_one_whatever_it_holds_besides():
+def test_stop_is_accepted_with_unknown_fields():
     more = {"client": "a", "how": ["now"], b"x": 4}
     assert decode(msgpack.packb({"command": "stop", **more})) == {"command": "stop", "client": "a"}
     with pytest.raises(Refused, match="numbers and texts as values"):
         decode(msgpack.packb({"command": "arm", "how": ["now"]}))
 
 
-def test_long_requests_are_unpacked_over_several_ticks_and_a_stop_before_them(context, addresses):
+def test_long_requests_are_unpacked_over_several_ticks_and_a_stop_goes_first(context, addresses):
     heard = []
 
     def note(request: dict[str, Any], age: float) -> dict[str, Any]:
@@ -426,7 +431,7 @@ def test_long_requests_are_unpacked_over_several_ticks_and_a_stop_before_them(co
 
 
 class Flood:
-    """Clients that send without waiting for answers; nothing serves yet."""
+    """Clients that send without waiting for replies; nothing is served yet."""
 
     def __init__(self, context: zmq.Context[Any], address: str, clients: int, each: int) -> None:
         self.sockets = [context.socket(zmq.DEALER) for _ in range(clients)]
@@ -437,15 +442,15 @@ class Flood:
                 socket.send(msgpack.packb({"command": "move"}))
 
     def collect(self, replies: list[dict[str, Any]]) -> int:
-        """Add what has been answered; how many there are now."""
+        """Collect replies; return their number so far."""
         for socket in self.sockets:
             while socket.poll(0):
                 replies.append(msgpack.unpackb(socket.recv()))
         return len(replies)
 
 
-def test_a_stop_goes_before_all_that_waits(context, addresses):
-    clock = VirtualClock()  # what waits while clients come gets no older
+def test_a_stop_goes_before_all_waiting_requests(context, addresses):
+    clock = VirtualClock()  # waiting requests do not age while clients connect
     with Served(commands=addresses[1], clock=clock) as served:
         flood = Flood(context, addresses[1], clients=4, each=40)
         order: list[str] = []
@@ -456,7 +461,7 @@ def test_a_stop_goes_before_all_that_waits(context, addresses):
             return {}
 
         until(lambda: [served.settle(1), len(link.asked) + queue.count == 160][1])
-        served.serve(note)  # the flood is being worked on
+        served.serve(note)  # the flood is being processed
         carried_out = len(order)
         assert carried_out > 0
         stopper = context.socket(zmq.DEALER)
@@ -470,14 +475,14 @@ def test_a_stop_goes_before_all_that_waits(context, addresses):
             served.serve(note)
 
         until(lambda: [serve(), stopper.poll(0)][1])
-        # All that was sent before the stop is answered, and none of it carried out.
+        # All requests before the stop are answered, and none is executed.
         replies: list[dict[str, Any]] = []
         until(lambda: [serve(), flood.collect(replies) == 160][1])
         assert order[carried_out:] == ["stop"]
         assert sum(reply["ok"] for reply in replies) == carried_out
 
 
-def test_a_client_that_sends_too_much_is_refused_and_others_are_not(context, addresses):
+def test_a_client_that_exceeds_its_rate_is_refused_and_others_are_not(context, addresses):
     clock = VirtualClock()
     with Served(commands=addresses[1], per_second=20.0, clock=clock) as served:
         flood = Flood(context, addresses[1], clients=1, each=60)
@@ -497,15 +502,15 @@ def test_a_client_that_sends_too_much_is_refused_and_others_are_not(context, add
             "too many commands: at most 20 a second"
         }
         assert all(reply["ok"] for reply in kind)
-        # A second later it may send again.
+        # It may send again a second later.
         clock.sleep_until(clock.now() + 1.0)
         flood.sockets[0].send(msgpack.packb({"command": "move"}))
         last: list[dict[str, Any]] = []
-        answer = {"ok": True, "heard": "move"}  # behind what is left of the flood's
+        answer = {"ok": True, "heard": "move"}  # after the remaining requests of the flood
         until(lambda: [served.serve(echo), flood.collect(last), answer in last][2])
 
 
-def test_clients_that_flood_leave_others_a_place(context, addresses):
+def test_flooding_clients_leave_room_for_others(context, addresses):
     heard = []
 
     def note(request: dict[str, Any], age: float) -> dict[str, Any]:
@@ -514,7 +519,7 @@ def test_clients_that_flood_leave_others_a_place(context, addresses):
 
     with Served(commands=addresses[1], per_second=600.0) as served:
         flood = Flood(context, addresses[1], clients=4, each=500)
-        # No place is left.
+        # No room is left.
         until(lambda: [served.service.step(0.0), served.service.commands.refused > 10][1])
         other = Asking(context, served, addresses[1], "grasp").socket
         until(lambda: [served.serve(note), other.poll(0)][1])
@@ -524,7 +529,7 @@ def test_clients_that_flood_leave_others_a_place(context, addresses):
 
 
 @pytest.mark.parametrize("mode", [0o600, 0o660])
-def test_an_ipc_file_has_the_rights_that_were_set(tmp_path_factory, mode):
+def test_an_ipc_file_has_the_configured_permissions(tmp_path_factory, mode):
     folder = tmp_path_factory.mktemp("s")
     with Served(f"ipc://{folder}/s", f"ipc://{folder}/c", ipc_mode=mode):
         for name in ("c", "s"):
@@ -532,7 +537,7 @@ def test_an_ipc_file_has_the_rights_that_were_set(tmp_path_factory, mode):
     assert list(folder.iterdir()) == []
 
 
-def test_a_signal_while_the_sockets_are_made_ends_the_start(monkeypatch, addresses):
+def test_a_signal_while_sockets_are_created_ends_the_start_up(monkeypatch, addresses):
     made: list[Gateway] = []
 
     class Noted(Gateway):
@@ -556,16 +561,16 @@ def heard(mode: Mode) -> set[str]:
     return {name for name, (modes, _) in COMMANDS.items() if mode in modes}
 
 
-def test_stop_and_status_are_heard_in_every_mode():
+def test_stop_and_status_are_accepted_in_every_mode():
     assert all({"stop", "status"} <= heard(mode) for mode in Mode)
 
 
-def test_nothing_moves_the_hand_before_it_is_armed_or_in_a_fault():
+def test_no_command_moves_a_hand_that_is_disarmed_or_has_a_fault():
     assert heard(Mode.DISARMED) == {"arm", "demo", "disarm", "tare", "stop", "status"}
     assert heard(Mode.FAULT) == {"clear", "stop", "status"}
 
 
-def test_a_good_request_is_parsed():
+def test_a_valid_request_is_parsed():
     request = {"command": "grasp", "force": 5, "client": "notebook"}
     assert parse(request, Mode.ARMED) == Command("grasp", {"force": 5.0}, "notebook")
     assert parse({"command": "grasp"}, Mode.HOLDING) == Command("grasp", {}, "")
@@ -589,7 +594,7 @@ def test_a_good_request_is_parsed():
         ({"command": "arm", "client": "x" * 65}, Mode.DISARMED, "at most 64 characters"),
     ],
 )
-def test_a_bad_request_is_refused_with_found_and_expected(request_, mode, text):
+def test_an_invalid_request_is_refused_with_found_and_expected_values(request_, mode, text):
     with pytest.raises(Refused) as caught:
         parse(request_, mode)
     assert text in str(caught.value)
@@ -612,7 +617,7 @@ def test_a_bad_request_is_refused_with_found_and_expected(request_, mode, text):
         ("clear", "fault", 1.0),
     ],
 )
-def test_a_command_that_is_too_old_has_no_effect(make, name, mode, oldest):
+def test_an_outdated_command_has_no_effect(make, name, mode, oldest):
     numbers = {"move": {"left": 0.3}, "rotate": {"angle": 0.02}, "set": {"compliance": 0.05}}
     numbers |= {"grasp": {"force": 6.0}, "hold": {"force": 6.0}}
     loop = make().loop
@@ -635,7 +640,7 @@ def test_a_command_that_is_too_old_has_no_effect(make, name, mode, oldest):
     loop.command(request, oldest - 0.01)
 
 
-def test_a_shorter_watchdog_of_real_servos_bounds_the_age_of_a_start():
+def test_a_shorter_servo_watchdog_limits_the_age_of_motion_commands():
     def age(waits: bool = False, **servos: Any) -> float:
         return command_age_max(Settings.model_validate({"servos": servos}), waits)
 
@@ -650,13 +655,13 @@ def take(lease: Lease, command: Command, now: float) -> None:
     lease.renew(command, now)
 
 
-def test_a_command_that_was_not_carried_out_takes_no_lease():
+def test_a_refused_command_takes_no_lease():
     lease = Lease(2.0)
     lease.check(Command("grasp", {}, "a"), 0.0)
     take(lease, Command("grasp", {}, "b"), 0.1)
 
 
-def test_one_commander_at_a_time():
+def test_only_one_client_commands_at_a_time():
     lease = Lease(2.0)
     take(lease, Command("arm", {}, "a"), 0.0)
     with pytest.raises(Refused, match=r"grasp: a commands the hand \(1\.0 s\)"):

@@ -1,4 +1,4 @@
-"""What the control reaches on the simulated hand, judged by the plant's truth; and its parts."""
+"""Performance of the control on the simulated hand, measured on the plant, and its parts."""
 
 import math
 from pathlib import Path
@@ -19,7 +19,8 @@ PAPER: dict[str, dict[str, Any]] = {
     "simulation": {"tactile_delay": 0.040},
 }
 ANGLE = math.radians(10.0)
-KNOWN = 0.06  # share of a grip's force that one grip's torques leave unsure
+# Fraction of the grip force that remains uncertain after one grip's torque measurements.
+KNOWN = 0.06
 
 
 def watched(sections: dict[str, dict[str, Any]], **simulation: float) -> SimulatedDaemon:
@@ -28,14 +29,14 @@ def watched(sections: dict[str, dict[str, Any]], **simulation: float) -> Simulat
 
 
 def grasped(hand: SimulatedDaemon, force: float = 10.0, seconds: float = 2.0) -> Any:
-    """Grasp and return what was seen from the first touch of both tips on."""
+    """Grasp and return the recorded values from the first contact of both tips on."""
     hand.grasp(force)
     seen = hand.watch(seconds)
     return seen.since(int(np.flatnonzero((seen.force > 0.3).all(axis=1))[0]))
 
 
 def settled(hand: SimulatedDaemon, angle: float) -> float:
-    """Turn to ``angle`` and return when the object stays within 0.2° of it [s]."""
+    """Turn to ``angle`` and return the time until the object stays within 0.2° of it [s]."""
     hand.command("rotate", angle=angle)
     seen = hand.watch(2.0)
     assert hand.mode == "holding"
@@ -48,14 +49,16 @@ def settled(hand: SimulatedDaemon, angle: float) -> float:
 
 @pytest.mark.parametrize(
     ("sections", "plant", "known", "times"),
-    [  # s until the force, and turns to and fro, have settled
+    [  # s until the force and turns to and fro have settled
         ({}, {}, KNOWN, (0.3, 0.4, 0.6)),
         (PAPER, {"object_mass": 0.07, "modulus_scale": 1.3}, 2.0 * KNOWN, (0.8, 0.6, 0.8)),
         (PAPER, {"object_mass": 0.13, "modulus_scale": 0.7}, 2.0 * KNOWN, (0.8, 0.6, 0.8)),
     ],
     ids=["100 Hz", "25 Hz, light and stiff", "25 Hz, heavy and soft"],
 )
-def test_grasps_and_turns_also_with_mass_and_modulus_30_percent_off(sections, plant, known, times):
+def test_grasps_and_turns_also_with_mass_and_modulus_off_by_30_percent(
+    sections, plant, known, times
+):
     with watched(sections, **plant) as hand:
         seen = grasped(hand)
         mean = seen.force.mean(axis=1)
@@ -70,9 +73,9 @@ def test_grasps_and_turns_also_with_mass_and_modulus_30_percent_off(sections, pl
 @pytest.mark.parametrize(
     "sections", [{}, pytest.param(PAPER, marks=pytest.mark.extended)], ids=["100 Hz", "25 Hz"]
 )
-def test_a_held_object_withstands_pushes_of_a_tenth_of_the_grip(sections):
-    # A sideways push looks like a twist, and 2 N of it that come at once raise the grip. From one
-    # push to the next the force changes by up to 2 N.
+def test_a_held_object_withstands_pushes_of_a_tenth_of_the_grip_force(sections):
+    # A sideways push looks like a twist, and a sudden push of 2 N raises the grip. Successive
+    # pushes differ by up to 2 N.
     rng = np.random.default_rng(3)
     with watched(sections) as hand:
         grasped(hand)
@@ -91,7 +94,7 @@ def test_a_held_object_withstands_pushes_of_a_tenth_of_the_grip(sections):
 
 
 @pytest.mark.parametrize("last", ["grasp", "rotate", "hold"])
-def test_an_object_that_is_taken_away_ends_the_grip(last):
+def test_removing_the_object_ends_the_grip(last):
     with watched({}) as hand:
         hand.grasp(6.0)
         while hand.contacts[0].force < 3.0:
@@ -118,7 +121,7 @@ def test_an_object_that_is_taken_away_ends_the_grip(last):
         (1.2, "", "rotate: angle: found 68.8° (1.2 rad), expected", "holding"),
     ],
 )
-def test_a_turn_asked_for_while_grasping_waits_for_the_grip_or_is_told(angle, then, told, end):
+def test_a_turn_requested_while_grasping_waits_for_the_grip_or_is_reported(angle, then, told, end):
     with watched({}) as hand:
         hand.grasp(8.0)
         reply = hand.command("rotate", angle=angle)
@@ -134,14 +137,14 @@ def test_a_turn_asked_for_while_grasping_waits_for_the_grip_or_is_told(angle, th
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_each_tip_by_itself_keeps_a_light_grip(seed):
+def test_a_light_grip_is_kept_with_tips_of_different_stiffness(seed):
     off = (0.7, 1.3)
     with watched(PAPER, seed=seed, object_mass=0.1 * off[seed % 2]) as hand:
         seen = grasped(hand, force=5.0, seconds=3.5)
         assert np.abs(seen.force[500:] / 5.0 - 1.0).max() < 2.0 * KNOWN
 
 
-def test_targets_streamed_right_after_arm_move_the_hand_smoothly():
+def test_targets_streamed_right_after_arming_move_the_hand_smoothly():
     rng = np.random.default_rng(11)
     with watched({}) as hand:
         hand.run(0.3)
@@ -160,7 +163,7 @@ def test_targets_streamed_right_after_arm_move_the_hand_smoothly():
         assert np.ptp(way, axis=0).min() > 0.02, "a stream of targets must still move the joints"
 
 
-def test_compliance_lets_the_object_yield_and_is_bounded():
+def test_compliance_lets_the_object_yield_within_bounds():
     yielded = []
     for compliance in (0.02, 0.5):
         with watched({"control": {"rotate_bandwidth": 0.0}}, table_friction=0.0) as hand:
@@ -175,7 +178,7 @@ def test_compliance_lets_the_object_yield_and_is_bounded():
     assert yielded[1] > 1.5 * yielded[0]
 
 
-def test_turning_ends_where_the_tips_would_slip():
+def test_turning_stops_where_the_tips_would_slip():
     with watched({"control": {"tip_friction": 0.3}}) as hand:
         grasped(hand)
         hand.command("rotate", angle=0.3)
@@ -195,7 +198,7 @@ def test_a_known_load_raises_the_grip_within_its_bound():
             assert any("each tip may bear 6.0 N along" in text for _, _, text in hand.events)
 
 
-def test_each_grip_that_is_raised_is_reported():
+def test_each_force_increase_is_reported():
     with watched({"control": {"object_load": 12.0}}) as hand:
         grasped(hand, force=8.0)
         hand.command("release")
@@ -207,8 +210,8 @@ def test_each_grip_that_is_raised_is_reported():
 
 
 @pytest.mark.parametrize("sections", [{}, PAPER], ids=["100 Hz", "25 Hz"])
-def test_prediction_is_within_its_own_uncertainty_in_motion(sections):
-    tactile = sections.get("tactile", {}) | {"smooth_error": 0.0}  # of an ideal sensor
+def test_prediction_during_motion_is_within_its_own_uncertainty(sections):
+    tactile = sections.get("tactile", {}) | {"smooth_error": 0.0}  # with an ideal sensor
     with watched(sections | {"tactile": tactile}) as hand:
         hand.grasp(10.0)
         hand.run(1.5)
@@ -224,7 +227,7 @@ def test_prediction_is_within_its_own_uncertainty_in_motion(sections):
         share = np.sqrt(np.mean(np.square(off), axis=0))
         assert (share < 1.5).all(), share
         assert (share > 0.2).all(), share
-        # Frames alone lag behind; the prediction doesn't.
+        # The frames lag behind; the prediction does not.
         old, new = np.abs(frames)[:150].mean(axis=0)
         assert new < 0.25 * old
         assert hand.state.object.width == pytest.approx(0.040, abs=1e-4)
@@ -235,7 +238,7 @@ def step(setpoint: Setpoint, rate: float) -> float:
     return setpoint.value
 
 
-def test_a_setpoint_keeps_its_bounds_whatever_the_targets():
+def test_a_setpoint_keeps_its_bounds_for_any_targets():
     rng = np.random.default_rng(2)
     dt, window, rate = 0.002, 0.1, 2.0
     setpoint = Setpoint(dt, window, SetpointState())
@@ -278,7 +281,7 @@ def test_the_small_hand_grasps_and_turns():
 
 
 @pytest.mark.parametrize("rate", [50.0, pytest.param(100.0, marks=pytest.mark.extended)])
-def test_a_stream_of_setpoints_is_followed_in_force_and_angle(rate):
+def test_force_and_angle_follow_a_stream_of_setpoints(rate):
     with watched({}) as hand:
         hand.run(0.3)
         hand.command("arm")
@@ -296,7 +299,7 @@ def test_a_stream_of_setpoints_is_followed_in_force_and_angle(rate):
         assert set(modes) == {"holding"}
         assert np.abs(off).max() < math.radians(1.5), "the setpoint's smoothing: 0.06 s"
         assert np.abs(np.array(forces) - 1.0).max() < 0.04 + KNOWN
-        for k in range(int(rate)):  # at rest, but for a flicker
+        for k in range(int(rate)):  # constant except for small fluctuations
             hand.command("hold", force=10.0 + 0.05 * (k % 2), angle=1e-3 * (k % 2))
             hand.run(1.0 / rate)
         assert not [event for event in hand.events if event[0] != "info"]
@@ -306,7 +309,7 @@ def test_a_stream_of_setpoints_is_followed_in_force_and_angle(rate):
         assert hand.plant.force.mean() > 15.0, "a sudden load is answered as ever"
 
 
-def test_setpoints_may_come_alone_and_are_bounded_or_refused():
+def test_force_and_angle_setpoints_may_be_sent_separately_and_are_bounded():
     with watched({}) as hand:
         grasped(hand, 8.0)
         with pytest.raises(Refused, match="hold: force or angle is missing"):
@@ -332,7 +335,7 @@ def test_setpoints_may_come_alone_and_are_bounded_or_refused():
 @pytest.mark.parametrize(
     ("action", "mode"), [("hold", "holding"), ("release", "armed"), ("stop", "disarmed")]
 )
-def test_a_commander_that_falls_silent_leaves_the_hand_as_the_settings_say(action, mode):
+def test_a_hand_whose_commander_is_silent_follows_its_settings(action, mode):
     with watched({"commands": {"lease": 0.5, "on_silence": action}}) as hand:
         hand.run(0.3)
         hand.command("arm")
@@ -348,7 +351,7 @@ def test_a_commander_that_falls_silent_leaves_the_hand_as_the_settings_say(actio
         )
 
 
-def test_a_stream_beyond_what_the_tips_bear_is_told_once():
+def test_a_stream_beyond_the_capacity_of_the_tips_is_reported_once():
     with watched({"control": {"tip_friction": 0.25}}) as hand:
         hand.run(0.3)
         hand.command("arm")
@@ -366,9 +369,7 @@ FORCE = 8.0  # N
 @pytest.mark.parametrize(
     ("profile", "off", "angle"), [("velostat", 0.06, 1.0), ("capacitive", 0.08, 0.5)]
 )
-def test_a_sensor_with_flaws_grasps_turns_and_holds_and_nothing_is_falsely_warned_of(
-    profile, off, angle
-):
+def test_an_imperfect_sensor_grasps_turns_and_holds_without_false_warnings(profile, off, angle):
     with SimulatedDaemon(load(Path(profile)).model_dump()) as hand:
         hand.run(0.3)
         hand.command("tare")
@@ -389,7 +390,7 @@ def test_a_sensor_with_flaws_grasps_turns_and_holds_and_nothing_is_falsely_warne
 
 
 @pytest.mark.extended
-def test_a_hand_that_does_not_know_of_its_cells_response_takes_it_for_latency():
+def test_an_unknown_response_time_is_attributed_to_latency():
     sections = load(Path("velostat"), changes=["tactile.response=0"]).model_dump()
     with SimulatedDaemon(sections) as hand:
         hand.grasp(FORCE)
@@ -401,7 +402,7 @@ def test_a_hand_that_does_not_know_of_its_cells_response_takes_it_for_latency():
 
 
 @pytest.mark.parametrize(("share", "holds"), [(0.92, True), (0.85, False), (1.08, True)])
-def test_a_force_that_friction_keeps_a_little_off_counts_as_reached_after_2_s(
+def test_a_force_slightly_off_due_to_friction_counts_as_reached_after_2_s(
     monkeypatch, share, holds
 ):
     with SimulatedDaemon({}) as hand:

@@ -1,4 +1,4 @@
-"""The site's pages are made, their links lead somewhere, and quoted messages the program's."""
+"""The pages of the site: they are built, links are valid, and quoted messages match the program."""
 
 import ast
 import html
@@ -18,30 +18,30 @@ LINK = re.compile(r"\]\((?!https?:)([^)#\s]*)(?:#([^)]*))?\)")
 
 @pytest.fixture(scope="module")
 def site() -> tuple[ModuleType, dict[str, str]]:
-    """The module docs/pages.py, and the site's pages as MkDocs gets them."""
+    """Return the module docs/pages.py and the site's pages as MkDocs receives them."""
     spec = importlib.util.spec_from_file_location("pages", ROOT / "docs" / "pages.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     texts = {name: make() for name, make in module.PAGES.items()}
     texts |= {path.name: path.read_text(encoding="utf-8") for path in ROOT.glob("docs/*.md")}
     row = validate.between("ζ", 1.46, 1.88, "a book", 2.0)
-    with pytest.MonkeyPatch.context() as patch:  # `test_figures` computes the rows
+    with pytest.MonkeyPatch.context() as patch:  # `test_figures` checks the rows
         patch.setattr(validate, "comparisons", lambda: iter(30 * [row]))
         return module, {name: module.on_page_markdown(text) for name, text in texts.items()}
 
 
 def written(text: str) -> str:
-    """The text without its code, in which a bracket is no link."""
+    """Return the text without code, in which brackets are not links."""
     return re.sub(r"(?ms)^ *```.*?^ *```$|`[^`\n]*`", "", text)
 
 
 def anchors(text: str) -> set[str]:
-    """What a page's headings can be linked by."""
+    """Return the anchors of a page's headings."""
     headings = re.findall(r"(?m)^#+ (.*)$", re.sub(r"(?ms)^ *```.*?^ *```$", "", text))
     return {re.sub(r"[^\w\- ]", "", each.lower()).replace(" ", "-") for each in headings}
 
 
-def test_every_page_is_made(site):
+def test_every_page_is_built(site):
     _, pages = site
     for name, text in pages.items():
         assert text.startswith("# ") or "\n# " in text, name
@@ -51,7 +51,7 @@ def test_every_page_is_made(site):
 
 
 @pytest.mark.parametrize("source", SOURCES, ids=lambda path: path.name)
-def test_links_in_the_repository(source):
+def test_links_in_the_repository_are_valid(source):
     for target, anchor in LINK.findall(written(source.read_text(encoding="utf-8"))):
         path = (source.parent / target).resolve() if target else source
         assert path.exists(), target
@@ -59,7 +59,7 @@ def test_links_in_the_repository(source):
             assert anchor in anchors(path.read_text(encoding="utf-8")), f"{target}#{anchor}"
 
 
-def test_links_on_the_site(site):
+def test_links_on_the_site_are_valid(site):
     _, pages = site
     for name, text in pages.items():
         for target, anchor in LINK.findall(written(text)):
@@ -70,13 +70,13 @@ def test_links_on_the_site(site):
                 assert anchor in anchors(pages[target or name]), f"{name}: {target}#{anchor}"
 
 
-def test_every_setting_says_what_it_is(site):
+def test_every_setting_is_described(site):
     rows = re.findall(r"(?m)^\| `(\w+)` \|.*\| (.*?) ?\|$", site[1]["configuration.md"])
     assert len(rows) > 150
     assert [key for key, meaning in rows if not meaning] == []
 
 
-def test_every_erratum_is_told(site):
+def test_every_erratum_is_listed(site):
     from softfinger.tools.paper.figures import pages
 
     text = site[1]["model.md"].replace("\\|", "|")
@@ -85,7 +85,7 @@ def test_every_erratum_is_told(site):
     assert "15.8197516322" in text  # F at 4 mm, 15°
 
 
-def test_figures_of_the_models_are_computed(site):
+def test_model_values_on_pages_are_computed(site):
     _, pages = site
     for name, row in (
         ("model.md", "| 6 | −0.9 | −0.8 | −1.8 | −1.8 | −2.8 | −3.2 | −1.8 |"),
@@ -120,12 +120,12 @@ def test_every_formula_is_typeset(site):
     assert found > 150
 
 
-def test_a_function_stands_apart_from_its_factors(site):
+def test_a_function_is_spaced_from_its_factors(site):
     shown = site[0].on_page_content(r'<span class="arithmatex">\(d \sin\theta\)</span>')
     assert [each for each in ("d", "sin") if f"<mi>{each}</mi><mspace" not in shown] == []
 
 
-def test_drawings_take_the_colours_of_the_page(site):
+def test_drawings_use_the_colours_of_the_page(site):
     shown = site[0].on_page_content('<p><img alt="x" src="pictures/axes.svg" /></p>')
     assert shown.startswith('<p><svg class="axes"')
     assert ".axes text{" in shown
@@ -140,7 +140,7 @@ ROW = re.compile(r"(?m)^\| ([^|]*) \|.*\|.*\|$")
 
 
 def texts() -> set[str]:
-    """Every text in the sources, with … for the values in it."""
+    """Return all texts in the sources, with … in place of values."""
     found = set()
     for path in [
         *ROOT.glob("daemon/**/*.py"),
@@ -156,7 +156,7 @@ def texts() -> set[str]:
     return found
 
 
-def test_every_message_is_the_programs_own():
+def test_every_quoted_message_exists_in_the_program():
     page = (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8")
     quoted = [text for row in ROW.findall(page) for text in re.findall(r"`([^`]+)`", row)]
     assert len(quoted) > 45

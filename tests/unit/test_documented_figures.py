@@ -1,4 +1,4 @@
-"""Figures of the pages that take too long for the site's build: they are the code's own."""
+"""Values on the pages that take too long to compute during the site's build."""
 
 import json
 import re
@@ -21,7 +21,7 @@ GRID = SensorGrid(44, 44, 0.058 / 44)
 
 
 @pytest.mark.extended
-def test_the_laws_that_are_found_on_other_elements_are_as_which_model_says() -> None:
+def test_tip_models_identified_from_finite_elements_match_the_page() -> None:
     page = (ROOT / "docs" / "which-model.md").read_text(encoding="utf-8").replace("−", "-")
     rows = ROW.findall(page)
     assert len(rows) == 5
@@ -57,7 +57,7 @@ def test_the_laws_that_are_found_on_other_elements_are_as_which_model_says() -> 
         )
     ],
 )
-def test_the_kept_angles_are_those_that_the_laws_leave_today(name, way) -> None:
+def test_stored_angle_errors_match_the_current_control_laws(name, way) -> None:
     content = json.loads((ROOT / "docs" / "control.json").read_text(encoding="utf-8"))
     (kept,) = (row for row in content["rows"] if row["name"] == name)
     found = control.row(name, way, control.drawn())

@@ -1,4 +1,4 @@
-"""What an emulated servo's registers do: access, units, motion, watchdog, errors, resets."""
+"""Registers of an emulated servo: access, units, motion, watchdog, errors, resets."""
 
 import math
 import struct
@@ -28,7 +28,7 @@ def client(**options: Any) -> BusClient:
     [
         (reg.MODEL_NUMBER, 1, 2, framing.ACCESS),
         (reg.PRESENT_POSITION, 1, 4, framing.ACCESS),
-        (14, 1, 1, framing.ACCESS),  # no such register
+        (14, 1, 1, framing.ACCESS),  # register does not exist
         (reg.GOAL_POSITION + 1, 1, 1, framing.ACCESS),  # within a register
         (reg.GOAL_POSITION, 1, 2, framing.DATA_LENGTH),
         (reg.TORQUE_ENABLE, 2, 1, framing.DATA_RANGE),
@@ -49,7 +49,7 @@ def client(**options: Any) -> BusClient:
         (661, 0, 2, framing.ACCESS),  # past the end
     ],
 )
-def test_what_a_write_is_answered(address: int, value: int, size: int, error: int) -> None:
+def test_status_errors_of_writes(address: int, value: int, size: int, error: int) -> None:
     c = client(model="XM430-W210")
     before = bytes(c.bus.servos[0].table.memory)
     assert c.write(address, value, size) == error
@@ -57,7 +57,7 @@ def test_what_a_write_is_answered(address: int, value: int, size: int, error: in
         assert bytes(c.bus.servos[0].table.memory) == before
 
 
-def test_configured_limits_bind() -> None:
+def test_configured_limits_are_enforced() -> None:
     c = client()
     assert c.write(reg.CURRENT_LIMIT, 500, 2) == 0
     assert c.write(reg.GOAL_CURRENT, 501, 2) == framing.DATA_LIMIT
@@ -78,11 +78,11 @@ def test_eeprom_is_locked_while_torque_is_on() -> None:
     ("instruction", "parameters"),
     [
         (0x77, b""),
-        (0x05, b""),  # action, with nothing registered
+        (0x05, b""),  # action without a registered write
         (0x20, b"\x01CTRL"),  # control table backup
     ],
 )
-def test_instructions_that_it_does_not_know(instruction: int, parameters: bytes) -> None:
+def test_unknown_instructions_are_refused(instruction: int, parameters: bytes) -> None:
     c = client()
     before = bytes(c.bus.servos[0].table.memory)
     assert c.ask(instruction, parameters) == (framing.INSTRUCTION_ERROR, b"")
@@ -104,14 +104,14 @@ def test_a_registered_write_waits_for_the_action() -> None:
     assert c.ask(framing.ACTION) == (framing.INSTRUCTION_ERROR, b"")
 
 
-def test_a_shadow_id_is_obeyed_without_an_answer() -> None:
+def test_a_shadow_id_is_executed_without_a_reply() -> None:
     c = client()
     assert c.write(reg.SHADOW_ID, 2, 1) == 0
-    assert c.write(reg.LED, 1, 1, packet_id=2) == 0  # of servo 2 alone
+    assert c.write(reg.LED, 1, 1, packet_id=2) == 0  # addressed to servo 2
     assert [servo.table.get(reg.LED) for servo in c.bus.servos] == [1, 1]
 
 
-def test_torque_goes_on_at_power_up_where_that_is_configured() -> None:
+def test_torque_on_at_power_up_if_configured() -> None:
     c = client()
     assert c.write(reg.STARTUP_CONFIGURATION, 1, 1) == 0
     c.ask(framing.REBOOT)
@@ -119,22 +119,22 @@ def test_torque_goes_on_at_power_up_where_that_is_configured() -> None:
     assert c.bus.servos[0].torque_on
 
 
-def test_protocol_1_is_spoken_where_it_is_set() -> None:
+def test_protocol_1_if_configured() -> None:
     c = client()
     c.bus.servos[0].table.set(reg.PROTOCOL_TYPE, 1)
     assert c.send(1, framing.PING) == b""
-    # The example of the e-Manual's page on Protocol 1.0.
+    # Example from the e-Manual's page on Protocol 1.0.
     asked, answered = bytes.fromhex("FFFF010201FB"), bytes.fromhex("FFFF010200FC")
     assert c.bus.feed(asked, c.t) == answered
     assert c.bus.feed(bytes.fromhex("FFFF020201FA"), c.t) == b""
     assert c.bus.feed(bytes.fromhex("FFFF010201FA"), c.t) == b""  # a wrong checksum
 
 
-# Registers that change how a goal is followed.
+# Registers that affect how a goal is followed.
 
 
 def travelled(*writes: tuple[int, int, int], time: float = 0.1) -> float:
-    """How far [counts] a goal of 300 counts brings the joint in this time."""
+    """Return the distance [counts] moved in this time towards a goal of 300 counts."""
     c = client(prepared=True)
     for address, value, size in writes:
         assert c.write(address, value, size) == 0
@@ -147,27 +147,27 @@ def travelled(*writes: tuple[int, int, int], time: float = 0.1) -> float:
 @pytest.mark.parametrize(
     ("address", "value", "size", "share"),
     [
-        (reg.POSITION_P_GAIN, 80, 2, 0.6),  # a tenth of the factory's
+        (reg.POSITION_P_GAIN, 80, 2, 0.6),  # a tenth of the factory setting
         (reg.POSITION_D_GAIN, 16_000, 2, 0.6),
         (reg.GOAL_PWM, 6, 2, 0.6),
         (reg.PWM_LIMIT, 6, 2, 0.6),
         (reg.PROFILE_VELOCITY, 5, 4, 0.1),
     ],
 )
-def test_gains_pwm_and_profile_slow_a_joint_down(address, value, size, share) -> None:
+def test_gains_pwm_and_profile_slow_a_joint(address, value, size, share) -> None:
     assert travelled() > 200.0
     assert travelled((address, value, size)) < share * travelled()
 
 
-def test_no_position_gain_and_no_pwm_leave_the_joint_where_it_is() -> None:
+def test_without_position_gain_or_pwm_the_joint_does_not_move() -> None:
     assert travelled((reg.POSITION_P_GAIN, 0, 2)) <= 1
     assert travelled((reg.GOAL_PWM, 0, 2)) <= 1
 
 
-def test_the_velocity_limit_binds_profile_and_velocity_mode() -> None:
+def test_the_velocity_limit_applies_to_profile_and_velocity_mode() -> None:
     profile = (reg.PROFILE_VELOCITY, 200, 4)
     limited = travelled((reg.VELOCITY_LIMIT, 20, 4), profile)
-    # 20 · 0.229 rpm for 0.1 s, in counts, less the joint's lag.
+    # 20 · 0.229 rpm for 0.1 s in counts, minus the joint's lag.
     assert limited < 20 * 0.229 / 60.0 * 4096 * 0.1 < travelled(profile)
     c = client()
     for address, value, size in (
@@ -184,7 +184,7 @@ def test_the_velocity_limit_binds_profile_and_velocity_mode() -> None:
 @pytest.mark.parametrize(
     ("model", "firmware"), [("XM430-W210", 48), ("XL330-M288", 52), ("XL330-M288", 53)]
 )
-def test_indirect_data_stands_for_what_it_points_to(model: str, firmware: int) -> None:
+def test_indirect_data_is_redirected_to_its_address(model: str, firmware: int) -> None:
     c = client(model=model, firmware=firmware, counts=(166, 0))
     address, data, _ = by_name(model).indirect_blocks(firmware)[0]
     for i, target in enumerate((reg.LED, *range(reg.PRESENT_POSITION, reg.PRESENT_POSITION + 4))):
@@ -193,10 +193,11 @@ def test_indirect_data_stands_for_what_it_points_to(model: str, firmware: int) -
     assert c.bus.servos[0].table.get(reg.LED) == 1
     assert c.ask(framing.READ, struct.pack("<HH", data, 5)) == (0, bytes.fromhex("01 A6000000"))
     assert c.write(data + 1, 5, 4) == framing.ACCESS  # present position is read-only
-    assert c.write(address, 20, 2) == framing.DATA_RANGE  # EEPROM can't be pointed to
+    # An indirect address must not be in EEPROM.
+    assert c.write(address, 20, 2) == framing.DATA_RANGE
 
 
-def test_velocity_mode_keeps_its_speed() -> None:
+def test_velocity_mode_keeps_its_velocity() -> None:
     c = client()
     c.write(reg.OPERATING_MODE, reg.VELOCITY_MODE, 1)
     c.write(reg.TORQUE_ENABLE, 1, 1)
@@ -205,7 +206,7 @@ def test_velocity_mode_keeps_its_speed() -> None:
     assert abs(c.read(reg.PRESENT_VELOCITY, 4) - 60) <= 2
 
 
-def test_a_profile_takes_the_time_it_should() -> None:
+def test_a_velocity_based_profile_takes_the_expected_time() -> None:
     c = client()
     c.write(reg.PROFILE_VELOCITY, 50, 4)  # 11.45 rpm: 1024 counts take 1.31 s
     c.write(reg.TORQUE_ENABLE, 1, 1)
@@ -218,7 +219,7 @@ def test_a_profile_takes_the_time_it_should() -> None:
     assert abs(c.read(reg.PRESENT_POSITION, 4) - 1024) <= 5
 
 
-def test_time_based_profile() -> None:
+def test_a_time_based_profile_takes_the_expected_time() -> None:
     c = client()
     c.write(reg.DRIVE_MODE, 4, 1)
     c.write(reg.PROFILE_VELOCITY, 2000, 4)  # ms
@@ -280,13 +281,13 @@ def test_realtime_tick_wraps() -> None:
     assert c.read(reg.REALTIME_TICK, 2) == 1
 
 
-def test_bus_watchdog_stops_and_locks_the_goals_until_zero_is_written() -> None:
+def test_a_watchdog_trip_stops_motion_and_locks_goals_until_zero_is_written() -> None:
     c = client(prepared=True)
     c.write(reg.TORQUE_ENABLE, 1, 1)
     c.write(reg.BUS_WATCHDOG, 5, 1)
     c.write(reg.GOAL_CURRENT, 40, 2)
     c.write(reg.GOAL_POSITION, 4000, 4)
-    for _ in range(20):  # packets keep it going
+    for _ in range(20):  # packets prevent a trip
         c.later(0.09)
         assert c.read(reg.BUS_WATCHDOG, 1) == 5
     assert c.bus.plant.dq[0] > 0.0
@@ -301,7 +302,7 @@ def test_bus_watchdog_stops_and_locks_the_goals_until_zero_is_written() -> None:
     assert c.write(reg.BUS_WATCHDOG, 0, 1) == 0
     assert c.write(reg.GOAL_POSITION, stood + 10, 4) == 0
     assert c.write(reg.TORQUE_ENABLE, 0, 1) == 0
-    c.write(reg.BUS_WATCHDOG, 1, 1)  # which sleeps then
+    c.write(reg.BUS_WATCHDOG, 1, 1)  # the watchdog is inactive while torque is off
     c.later(5.0)
     assert c.read(reg.BUS_WATCHDOG, 1) == 1
 
@@ -309,8 +310,8 @@ def test_bus_watchdog_stops_and_locks_the_goals_until_zero_is_written() -> None:
 @pytest.mark.parametrize(
     ("fault", "bit"), [("overheat=1", 2), ("overload=1", 5), ("undervoltage=1", 0)]
 )
-def test_hardware_errors_shut_down_until_a_reboot(fault: str, bit: int) -> None:
-    c = client(model="XL330-M288")  # its shutdown mask has all three
+def test_hardware_errors_disable_torque_until_a_reboot(fault: str, bit: int) -> None:
+    c = client(model="XL330-M288")  # its shutdown mask includes all three errors
     c.write(reg.TORQUE_ENABLE, 1, 1)
     put_fault(c.bus, fault, c.t)
     c.later(0.02)
@@ -327,8 +328,8 @@ def test_hardware_errors_shut_down_until_a_reboot(fault: str, bit: int) -> None:
     assert c.write(reg.TORQUE_ENABLE, 1, 1) == 0
 
 
-def test_an_error_outside_the_shutdown_mask_only_alerts() -> None:
-    c = client()  # XM430: mask 52 lacks the voltage bit
+def test_an_error_outside_the_shutdown_mask_only_sets_the_alert() -> None:
+    c = client()  # XM430: mask 52 does not include the voltage bit
     c.write(reg.TORQUE_ENABLE, 1, 1)
     put_fault(c.bus, "undervoltage=1", c.t)
     c.later(0.02)
@@ -336,7 +337,7 @@ def test_an_error_outside_the_shutdown_mask_only_alerts() -> None:
     assert c.bus.servos[0].torque_on is True
 
 
-def test_overload_after_its_time_at_the_current_limit() -> None:
+def test_overload_after_the_allowed_time_at_the_current_limit() -> None:
     c = client()
     c.write(reg.CURRENT_LIMIT, 30, 2)
     c.write(reg.OPERATING_MODE, reg.CURRENT_MODE, 1)
@@ -375,7 +376,7 @@ def test_reboot_resets_ram_and_keeps_eeprom() -> None:
     ratio=st.floats(0.1, 50.0),
     counts=st.integers(-100_000, 100_000),
 )
-def test_units_there_and_back(direction: int, zero: int, ratio: float, counts: int) -> None:
+def test_unit_conversions_are_inverse(direction: int, zero: int, ratio: float, counts: int) -> None:
     servos = ServoSettings(direction=(direction, direction), zero=(zero, zero), gear_ratio=ratio)
     scale = JointScale.of(servos, 1)
     assert scale.position_counts(scale.angle(counts)) == counts
@@ -390,7 +391,7 @@ def test_units_there_and_back(direction: int, zero: int, ratio: float, counts: i
 @pytest.mark.parametrize(
     ("option", "new_id", "baud"), [(0xFF, 1, 1), (1, 5, 1), (2, 5, 3)], ids=["all", "id", "baud"]
 )
-def test_factory_reset(option: int, new_id: int, baud: int) -> None:
+def test_factory_reset_options(option: int, new_id: int, baud: int) -> None:
     c = client(ids=(5, 6))
     c.write(reg.BAUD_RATE, 3, 1, packet_id=5)
     c.write(reg.RETURN_DELAY_TIME, 3, 1, packet_id=5)
@@ -400,7 +401,7 @@ def test_factory_reset(option: int, new_id: int, baud: int) -> None:
     assert c.read(reg.RETURN_DELAY_TIME, 1, packet_id=new_id) & 0xFF == 250
 
 
-def test_a_broadcast_factory_reset_of_everything_is_ignored() -> None:
+def test_a_broadcast_full_factory_reset_is_ignored() -> None:
     c = client(ids=(5, 6))
     assert c.send(BROADCAST, framing.FACTORY_RESET, b"\xff") == b""
     assert c.ask(framing.PING, packet_id=5)[0] == 0
@@ -414,9 +415,7 @@ def test_a_broadcast_factory_reset_of_everything_is_ignored() -> None:
     speed=st.floats(500, 5000),
     acceleration=st.floats(500, 1e5),
 )
-def test_a_profile_arrives_without_passing_and_within_its_limits(
-    start, target, speed, acceleration
-):
+def test_a_profile_arrives_within_its_limits_without_overshoot(start, target, speed, acceleration):
     profile = Profile()
     profile.hold(start)
     profile.aim(target, speed, acceleration)

@@ -1,4 +1,4 @@
-"""What the hand holds: tried on virtual time, kept as a map, and asked by `grasp`."""
+"""Envelope of the hand's grips: computed on virtual time, stored as a map, queried by `grasp`."""
 
 from typing import Any
 
@@ -12,32 +12,32 @@ from softfinger.tools.simulated_daemon import SimulatedDaemon
 
 
 def settings(width: float = 0.040, **control: Any) -> Settings:
-    """The built-in hand with an object of that width [m]."""
+    """Return the built-in hand with an object of this width [m]."""
     return Settings.model_validate({"object": {"width": width}, "control": control})
 
 
-def test_what_it_is_asked_for_as_it_comes_is_inside_the_packaged_map():
+def test_default_grips_are_inside_the_packaged_map():
     for width in (0.020, 0.040, 0.060, 0.090):
         assert Envelope(settings(width)).warning(10.0) == ""
 
 
-def test_outside_of_it_the_reply_says_what_and_why():
+def test_a_grip_outside_the_map_gets_a_warning_with_the_reason():
     text = Envelope(settings(0.002)).warning(10.0)
     assert "2 mm (object.width) at friction 0.6 (control.tip_friction) and 0 kg" in text
     assert "no grip comes about" in text
-    # 1 kg at a friction of 0.2 with 10 N raised to 20, or as much less as it may be raised less.
+    # 1 kg at friction 0.2 with 10 N raised to 20 N; a smaller maximum increase allows less load.
     for load, force, more in ((9.5, 10.0, 10.0), (7.3, 5.0, 10.0), (5.0, 10.0, 0.0)):
         control = {"tip_friction": 0.25, "object_load": load, "grip_raise_max": more}
         assert "slips out" in Envelope(settings(0.040, **control)).warning(force)
     held = settings(0.040, tip_friction=0.25, object_load=4.8)
     assert Envelope(held).warning(10.0) == ""
-    # Another hand, and another law: nothing is known.
+    # The map is not valid for another hand or control law.
     assert Envelope(settings(0.002, law="upright")).warning(10.0) == ""
     other = Settings.model_validate({"tip": {"radius": 0.015}, "object": {"width": 0.002}})
     assert Envelope(other).warning(10.0) == ""
 
 
-def test_a_grasp_outside_is_warned_of_in_its_reply():
+def test_a_grasp_outside_the_map_is_accepted_with_a_warning():
     for width, warned in ((0.002, True), (0.040, False)):
         with SimulatedDaemon({"object": {"width": width, "width_min": 0.0005}}) as hand:
             hand.run(0.3)
@@ -49,7 +49,7 @@ def test_a_grasp_outside_is_warned_of_in_its_reply():
 
 
 @pytest.mark.extended
-def test_a_map_is_found_printed_drawn_and_read_back(tmp_path, capsys):
+def test_a_map_is_computed_printed_drawn_and_read(tmp_path, capsys):
     kept, picture = tmp_path / "map.toml", tmp_path / "map.png"
     words = ["envelope", "--shape", "rectangle", "--size", "2", "40", "--mass", "1"]
     words += ["--friction", "0.2", "0.6", "--processes", "1"]

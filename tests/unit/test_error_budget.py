@@ -1,4 +1,4 @@
-"""The covariance carries what frames don't show: errors are as large as it says, in each case."""
+"""The covariance includes errors that frames do not show: actual errors match it in each case."""
 
 import itertools
 import math
@@ -22,7 +22,7 @@ from tests.harness.paper_tip import LINEAR, NOISE, PITCH, TIP, tilts
 
 PLACE = (2e-4, -5e-4)
 GRID = SensorGrid(44, 44, PITCH, PLACE)
-LENGTH = 1.5  # cells over which the noise is correlated
+LENGTH = 1.5  # cells, correlation length of the noise
 LAGS = np.arange(8.0)
 CORRELATION = np.exp(-(LAGS[:, None] ** 2 + LAGS**2) / (2.0 * LENGTH**2))
 SMOOTH = np.exp(-((np.arange(58) - np.arange(7, 51)[:, None]) ** 2) / LENGTH**2)
@@ -42,11 +42,11 @@ def clean(truth: tuple[float, float, float]) -> np.ndarray:
 @pytest.mark.usefixtures("exact_solid_data")
 @pytest.mark.parametrize(("d", "theta"), [(0.001, 0.0), (0.002, 0.4), (0.006, 0.2)])
 @pytest.mark.parametrize("physics", ["springs", "solid"])
-def test_correlated_noise_is_in_the_covariance(physics, d, theta):
+def test_correlated_noise_increases_the_covariance(physics, d, theta):
     tip, truth = Fingertip(0.020, physics), (d, theta, -0.5 * theta)
     frame, rng = GRID.pressure(tip, LINEAR, *truth), np.random.default_rng(12)
     frames = [frame + correlated_noise(rng) for _ in range(400)]
-    n = 4 if tip == TIP else 3  # with the gain
+    n = 4 if tip == TIP else 3  # includes the gain
 
     def nees(known: Uncertainty | None) -> tuple[float, float]:
         estimator, squares = ContactEstimator(tip, LINEAR, GRID, NOISE, known=known), []
@@ -57,23 +57,23 @@ def test_correlated_noise_is_in_the_covariance(physics, d, theta):
         return float(np.mean(squares)), len(squares) / len(frames)
 
     score, valid = nees(KNOWN)
-    assert 0.8 < score < 1.3  # of 400 frames of three numbers or four: ± 0.04
+    assert 0.8 < score < 1.3  # 400 frames with three or four values: ± 0.04
     assert valid > 0.9
     assert tip != TIP or nees(None)[0] > 5.0
 
 
-def test_what_frames_share_is_told_apart_and_nothing_known_adds_nothing():
+def test_systematic_errors_are_reported_separately_and_default_to_zero():
     frame = clean((0.003, 0.2, 0.0))
     plain = ContactEstimator(TIP, LINEAR, GRID, NOISE)(frame)
     assert not plain.systematic.any()
     shifted = ContactEstimator(TIP, LINEAR, GRID, NOISE, known=Uncertainty(centre=5e-4))(frame)
     assert (shifted.d, shifted.tilt_x, shifted.gain) == (plain.d, plain.tilt_x, plain.gain)
     np.testing.assert_allclose(shifted.covariance - shifted.systematic, plain.covariance, rtol=1e-3)
-    # The tip's place is taken for a turn about the tip's centre.
+    # An offset of the tip is interpreted as a rotation about the tip's centre.
     assert math.sqrt(shifted.systematic[2, 2]) == pytest.approx(5e-4 / 0.019, rel=0.05)
 
 
-def test_correlated_noise_raises_no_alarm_and_no_misfit():
+def test_correlated_noise_causes_no_false_contact_and_no_misfit():
     estimator = ContactEstimator(TIP, LINEAR, GRID, NOISE, known=KNOWN)
     rng = np.random.default_rng(2)
     for _ in range(300):
@@ -81,7 +81,7 @@ def test_correlated_noise_raises_no_alarm_and_no_misfit():
         assert not estimator.update(clean((0.003, 0.1, 0.0)) + correlated_noise(rng)).misfit
 
 
-def test_a_law_off_its_points_widens_what_it_says():
+def test_a_material_law_that_misses_its_points_increases_the_uncertainty():
     strain = np.linspace(0.025, 1.0, 40)
     law = Material.from_points(strain, 1e5 * np.where(strain < 0.3, strain, 3.0 * strain - 0.6))
     frame = GRID.pressure(TIP, law, 0.004)
@@ -94,7 +94,7 @@ def test_a_law_off_its_points_widens_what_it_says():
 @pytest.mark.parametrize(
     "wrong", [{"baseline": -1.0}, {"centre": math.nan}, {"correlation": np.ones(3)}]
 )
-def test_refusals(wrong):
+def test_invalid_uncertainties_are_refused(wrong):
     with pytest.raises(ValueError, match="must"):
         Uncertainty(**wrong)
 
@@ -108,7 +108,7 @@ def pressed(tip, d, x, y, grid=FLAT):
 
 
 def unloading(tip: Fingertip, d: float, x: float, y: float, sign: float) -> np.ndarray:
-    """Off by up to 10 % of what each cell read at a depth of 1.3 d."""
+    """Return errors of up to 10 % of each cell's reading at a depth of 1.3 d."""
     loaded = np.maximum(pressed(tip, 1.3 * d, x, y), 1e-9)
     strain = np.clip(pressed(tip, d, x, y) / loaded, 0.0, 1.0)
     return pressed(tip, d, x, y) + sign * 0.4 * loaded * strain * (1.0 - strain)
@@ -125,11 +125,11 @@ def power(tip: Fingertip, d: float, x: float, y: float, sign: float) -> np.ndarr
 
 
 def misplaced(by):
-    """Cells that stand, or are turned, otherwise than is known."""
+    """Return cells with an unknown offset or rotation."""
     return lambda tip, d, x, y, sign: pressed(tip, d, x, y, replace(FLAT, **by(sign)))
 
 
-# What real cells have and a sensor's model lacks, and what has to be known for it.
+# Defects of real cells that the sensor model lacks, with the uncertainty to be declared.
 IMPERFECTIONS = {
     "unloading": (Uncertainty(gain=0.1, smooth=0.04), unloading),
     "crosstalk": (Uncertainty(gain=0.02, smooth=0.01), crosstalk),
@@ -155,11 +155,11 @@ IMPERFECTIONS = {
 }
 
 
-HARMLESS = ("gain", "springs"), ("slope", "solid"), ("baseline", "solid")  # or flagged
+HARMLESS = ("gain", "springs"), ("slope", "solid"), ("baseline", "solid")  # or flagged as invalid
 
 
 def worst_nees(known, tip, imperfect, grid=FLAT, noise=NOISE):
-    """Return the largest mean NEES of (d, tilts) at 0.5 to 7 mm, where no misfit is flagged."""
+    """Return the maximum mean NEES of (d, tilts) at 0.5 to 7 mm, without flagged frames."""
     estimator = ContactEstimator(tip, LINEAR, grid, noise, known=known)
     rng, worst = np.random.default_rng(3), 0.0
     for d in (0.5e-3, 1e-3, 2e-3, 4e-3, 6e-3):
@@ -174,20 +174,21 @@ def worst_nees(known, tip, imperfect, grid=FLAT, noise=NOISE):
                     if e.contact and e.valid and not e.misfit:
                         error = np.array([e.d, e.tilt_x, e.tilt_y]) - truth
                         squares.append(error @ np.linalg.solve(e.covariance[:3, :3], error) / 3.0)
-        if len(squares) > 16:  # else flagged
+        if len(squares) > 16:  # otherwise mostly flagged
             worst = max(worst, float(np.mean(squares)))
     return worst
 
 
 @pytest.mark.parametrize("physics", ["springs", pytest.param("solid", marks=pytest.mark.extended)])
 @pytest.mark.parametrize("name", IMPERFECTIONS)
-def test_imperfections_of_real_cells_are_covered_or_flagged(name, physics, request):
+def test_sensor_imperfections_are_covered_or_flagged(name, physics, request):
     known, imperfect = IMPERFECTIONS[name]
     tip = Fingertip(0.020, physics)
-    # At each depth 32 frames of three numbers: ± 0.14.
-    # A solid tip's tilt is as uncertain as its data, too, which these frames are made of.
+    # 32 frames of three values per depth: ± 0.14. A solid tip's tilt includes the error of its
+    # data, but these frames are made from the same data.
     least, most = (0.6, 1.5) if physics == "springs" else (0.2, 1.5)
-    # Half a millimetre under springs moves d by more than neighbouring cells' differences say.
+    # With springs, an offset of 0.5 mm changes d by more than differences between neighbouring
+    # cells show.
     most = 3.0 if (name, physics) == ("centre", "springs") else most
     assert least < worst_nees(known, tip, imperfect) < most
     request.getfixturevalue("exact_solid_data")
@@ -195,7 +196,7 @@ def test_imperfections_of_real_cells_are_covered_or_flagged(name, physics, reque
         assert worst_nees(Uncertainty(), tip, imperfect) > 5.0
 
 
-# Each flaw that a profile declares, of its own size, in one hand.
+# Each defect that a profile can declare, with its own magnitude, in one hand.
 SECTIONS = {
     "sim": {},
     "velostat": load(Path("velostat")).model_dump(exclude_unset=True),
@@ -216,7 +217,7 @@ SECTIONS = {
 
 
 def smooth_error(pressure, width, kind, rng):
-    """An error of the squares of ``pressure``: cells' sensitivities, another curve or crosstalk."""
+    """Return a smooth error like cell sensitivities, a different curve or crosstalk."""
     if kind == 0:
         x, y = np.indices(pressure.shape) - 0.5 * (len(pressure) - 1)
         waves, phases = rng.normal(0.0, 1.0 / width, (64, 2)), rng.uniform(0.0, 2.0 * math.pi, 64)
@@ -240,7 +241,7 @@ def smooth_error(pressure, width, kind, rng):
         for case in itertools.product(SECTIONS, ("springs", "solid"))
     ],
 )
-def test_with_all_that_a_profile_declares_errors_are_as_large_as_it_says(profile, physics):
+def test_errors_match_the_covariance_with_all_declared_imperfections(profile, physics):
     settings = Settings.model_validate(
         merged(SECTIONS[profile], SOLID if physics == "solid" else {})
     )
@@ -280,13 +281,14 @@ def test_with_all_that_a_profile_declares_errors_are_as_large_as_it_says(profile
             slopes = c.force_theta * np.array([e.tilt_x, e.tilt_y]) / total
             slopes = np.array([c.force_d, *slopes])
             variance = slopes @ covariance @ slopes
-            # Springs' force has the modulus besides; a solid tip's frame shows their product.
+            # For springs, the force also depends on the modulus; a solid tip's frames show the
+            # product.
             variance += (known.modulus * c.force) ** 2 if physics == "springs" else 0.0
             true_force = modulus_factor * float(table(d, tilt).force)
             forces.append(abs(c.force - true_force) < 1.96 * math.sqrt(variance))
             inside.append(np.abs(error) < 1.96 * np.sqrt(covariance.diagonal()))
     assert len(squares) > 0.6 * frames
-    # What a hand's frames share is drawn 60 times: other draws make it 0.63 to 1.1.
+    # Errors shared by a hand's frames are drawn 60 times; other draws give 0.63 to 1.1.
     assert (0.55 if physics == "springs" else 0.35) < np.mean(squares) < 1.3
     assert (np.mean(inside, axis=0) > 0.9).all()
     assert np.mean(forces) > 0.9

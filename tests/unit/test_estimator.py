@@ -1,4 +1,4 @@
-"""The estimator: at the Cramér-Rao bound, honest about it, and never a silent number."""
+"""The contact estimator reaches the Cramér-Rao bound, and its covariance is consistent."""
 
 import math
 import tracemalloc
@@ -26,8 +26,9 @@ from tests.harness.paper_tip import (
 
 @pytest.mark.parametrize("material", [LINEAR, MEASURED], ids=["constant", "table_i"])
 @pytest.mark.parametrize("free_gain", [True, False])
-def test_without_noise_the_bias_stays_far_below_the_noise_floor(material, free_gain):
-    # Any azimuth, any place of the tip between the cells; the floor is that of 0.2 % noise.
+def test_without_noise_the_bias_is_far_below_the_noise_level(material, free_gain):
+    # Random azimuths and tip positions relative to the cells; the noise level is that of 0.2 %
+    # noise.
     rng = np.random.default_rng(7)
     noise = 0.002 * material.reference_modulus
     for _ in range(60):
@@ -40,7 +41,7 @@ def test_without_noise_the_bias_stays_far_below_the_noise_floor(material, free_g
         assert e.valid
         n = 4 if free_gain else 3
         sigma = np.sqrt(np.diag(e.covariance))[:n]
-        assert np.all(np.abs(errors(e, truth)[:n]) < 0.4 * sigma)  # 0.34 at other places
+        assert np.all(np.abs(errors(e, truth)[:n]) < 0.4 * sigma)  # 0.34 at other positions
         assert abs(e.d - d) < 2e-3 * d
 
 
@@ -48,8 +49,8 @@ def test_without_noise_the_bias_stays_far_below_the_noise_floor(material, free_g
 @pytest.mark.parametrize(
     ("d", "degrees", "share"), [(0.008, 25.0, 0.35), (0.008, 30.0, 1.0), (0.008, 33.5, 5.0)]
 )
-def test_the_bias_stays_small_where_the_outline_all_but_meets_the_rim(d, degrees, share, free_gain):
-    # Here 1/√(a² − x² − y²) of the outermost cells rises like one over a square root.
+def test_the_bias_is_small_where_the_footprint_nearly_reaches_the_rim(d, degrees, share, free_gain):
+    # Here 1/√(a² − x² − y²) of the outermost cells has an inverse square root singularity.
     rng = np.random.default_rng(1)
     noise = 0.002 * E
     for _ in range(25):
@@ -78,15 +79,13 @@ def test_the_bias_stays_small_where_the_outline_all_but_meets_the_rim(d, degrees
         (MEASURED, 0.006, 25.0, 0.8, 0.2, 0.0016),
     ],
 )
-def test_errors_are_at_the_cramer_rao_bound(
-    material, d, degrees, azimuth, percent, blur, free_gain
-):
+def test_errors_reach_the_cramer_rao_bound(material, d, degrees, azimuth, percent, blur, free_gain):
     grid = SensorGrid(44, 44, PITCH, centre=(2e-4, -5e-4), blur=blur)
     noise = percent / 100 * material.reference_modulus
     truth = (d, *tilts(math.radians(degrees), azimuth), 1.0)
     bound = fisher(grid, material, truth, noise, free_gain)
     clean = grid.pressure(TIP, material, *truth[:3])
-    if blur:  # not by the estimator's own forward model
+    if blur:  # do not use the estimator's own forward model
         clean = dense(grid, material, truth[:3])
     estimator = ContactEstimator(TIP, material, grid, noise, free_gain=free_gain)
     rng = np.random.default_rng(3)
@@ -101,22 +100,22 @@ def test_errors_are_at_the_cramer_rao_bound(
         miss[k] = errors(e, truth)[:n]
         nees[k] = miss[k] @ np.linalg.solve(e.covariance[:n, :n], miss[k])
     ratio = np.sqrt((miss**2).mean(axis=0) / np.diag(bound))
-    # 800 frames scatter the ratio by 2.5 %: 4.5 of that over 1.0.
+    # With 800 frames the ratio scatters by 2.5 %; 1.12 allows 4.5 times that.
     assert np.all(ratio < 1.12), ratio
     assert np.all(ratio > 0.85), ratio
-    # Four standard deviations of the mean, and a bias of a quarter of one frame's.
+    # Four standard deviations of the mean, plus a bias of a quarter of one frame's deviation.
     assert np.all(
         np.abs(miss.mean(axis=0)) < (4.0 / math.sqrt(frames) + 0.25) * np.sqrt(np.diag(bound))
     )
     # χ² with 800 n degrees of freedom, four standard deviations, and 5 % of model error.
     assert abs(nees.mean() / n - 1.0) < 4.0 * math.sqrt(2.0 / (frames * n)) + 0.05
-    # The reported covariance is the bound's.
+    # The reported covariance equals the bound.
     np.testing.assert_allclose(
         np.sqrt(np.diag(e.covariance))[:n], np.sqrt(np.diag(bound)), rtol=0.12
     )
 
 
-def test_a_turned_and_oblong_sensor_estimates_in_the_fingers_axes():
+def test_a_rotated_oblong_sensor_gives_estimates_in_finger_axes():
     grid = SensorGrid(30, 50, (0.0012, 0.0017), centre=(0.001, -0.002), rotation=0.7)
     truth = (0.003, 0.25, -0.15, 1.0)
     clean = grid.pressure(TIP, LINEAR, *truth[:3])
@@ -129,7 +128,7 @@ def test_a_turned_and_oblong_sensor_estimates_in_the_fingers_axes():
     )
 
 
-def test_measured_over_modelled_pressure_is_the_gain():
+def test_gain_is_the_ratio_of_measured_to_modelled_pressure():
     p = GRID.pressure(TIP, LINEAR, 0.003, 0.2, gain=0.6)
     e = ContactEstimator(TIP, LINEAR, GRID, NOISE)(p)
     assert e.gain == pytest.approx(0.6, rel=1e-4)
@@ -159,7 +158,7 @@ def test_warm_and_cold_starts_agree_within_the_noise():
         assert np.all(np.abs(errors(warm, truth)) < 6.0 * sigma)
 
 
-def test_a_jump_of_the_contact_is_followed_at_once():
+def test_a_jump_of_the_contact_is_followed_immediately():
     estimator = ContactEstimator(TIP, MEASURED, GRID, 300.0, free_gain=False)
     for truth in [
         (0.008, 0.5, 0.0),
@@ -174,7 +173,7 @@ def test_a_jump_of_the_contact_is_followed_at_once():
         assert (e.tilt_x, e.tilt_y) == pytest.approx(truth[1:], abs=2e-3)
 
 
-def test_update_reuses_one_result_and_skips_a_frame_seen():
+def test_update_reuses_one_result_and_skips_a_repeated_frame():
     estimator = ContactEstimator(TIP, LINEAR, GRID, NOISE)
     first = estimator.update(GRID.pressure(TIP, LINEAR, 0.003), seq=4)
     assert isinstance(first, ContactEstimate)
@@ -185,7 +184,7 @@ def test_update_reuses_one_result_and_skips_a_frame_seen():
     newer = estimator.update(GRID.pressure(TIP, LINEAR, 0.005), seq=5)
     assert newer is first
     assert newer.d == pytest.approx(0.005, rel=1e-4)
-    # A call on its own neither sees nor changes what update keeps.
+    # A direct call neither reads nor changes the state of update.
     covariance = newer.covariance.copy()
     alone = estimator(GRID.pressure(TIP, LINEAR, 0.002))
     assert alone.d == pytest.approx(0.002, rel=1e-4)
@@ -195,7 +194,7 @@ def test_update_reuses_one_result_and_skips_a_frame_seen():
     assert estimator.update(GRID.pressure(TIP, LINEAR, 0.002), seq=5).d == alone.d
 
 
-def test_the_frame_path_allocates_next_to_nothing():
+def test_the_frame_path_allocates_almost_nothing():
     estimator = ContactEstimator(TIP, LINEAR, GRID, NOISE)
     counts = np.round(GRID.pressure(TIP, LINEAR, 0.004, 0.2) / 4.0).astype(np.uint16)
     for _ in range(3):
@@ -214,7 +213,7 @@ def test_the_frame_path_allocates_next_to_nothing():
     assert peak - before < 8192  # a frame is 15 kB
 
 
-def test_every_frame_type_and_layout_gives_the_same_estimate():
+def test_all_frame_types_and_layouts_give_the_same_estimate():
     scale = 500.0
     counts = np.round(GRID.pressure(TIP, LINEAR, 0.004, 0.2, 0.1) / scale)
     estimator = ContactEstimator(TIP, LINEAR, GRID, NOISE)
@@ -229,16 +228,16 @@ def test_every_frame_type_and_layout_gives_the_same_estimate():
         np.asfortranarray(counts.astype(np.uint16)),
         wide[:, ::2],
     ):
-        # Each type has its own machine code, whose sums may run in other lanes.
+        # Each type has its own machine code, whose sums may use other SIMD lanes.
         assert estimator(frame, scale).d == pytest.approx(reference.d, abs=1e-3 * reference.d_std)
-    # Float frames can go below zero and have no quantum, so they are treated a little otherwise.
+    # Float frames can be negative and have no quantum, so they are treated slightly differently.
     for kind in (np.float32, np.float64):
         e = estimator(counts.astype(kind), scale)
         assert e.d == pytest.approx(reference.d, rel=1e-4)
         assert e.d_std < reference.d_std
 
 
-def test_quantisation_widens_the_covariance():
+def test_quantisation_increases_the_covariance():
     clean = GRID.pressure(TIP, LINEAR, 0.004, 0.2)
     estimator = ContactEstimator(TIP, LINEAR, GRID, 100.0)
     fine = estimator(np.round(clean / 4.0).astype(np.uint16), 4.0)
@@ -248,8 +247,8 @@ def test_quantisation_widens_the_covariance():
 
 
 @pytest.mark.parametrize("free_gain", [True, False])
-def test_counts_that_end_at_zero_bias_nothing(free_gain):
-    # The negative half of the noise is gone, so that the weak cells at the outline read too much.
+def test_counts_clipped_at_zero_cause_no_bias(free_gain):
+    # The negative half of the noise is clipped, so weak cells at the outline read too high.
     noise = 1520.0
     rng = np.random.default_rng(9)
     estimator = ContactEstimator(TIP, MEASURED, GRID, noise, free_gain=free_gain)
@@ -265,7 +264,7 @@ def test_counts_that_end_at_zero_bias_nothing(free_gain):
     assert np.all(np.sqrt(np.mean(np.square(score), axis=0)) < 1.12)
 
 
-def test_a_light_touch_is_found_and_noise_is_not():
+def test_a_light_touch_is_detected_and_noise_is_not():
     rng = np.random.default_rng(8)
     missed = 0
     for k in range(3000):
@@ -288,7 +287,7 @@ def test_a_light_touch_is_found_and_noise_is_not():
     assert alarms == 0
 
 
-def test_a_footprint_cut_by_the_sensors_edge_still_fits():
+def test_a_footprint_cut_off_by_the_sensor_edge_is_estimated():
     grid = SensorGrid(44, 44, PITCH, centre=(0.021, 0.0))
     rng = np.random.default_rng(5)
     truth = (0.004, 0.35, 0.1, 1.0)
@@ -305,8 +304,8 @@ def test_a_footprint_cut_by_the_sensors_edge_still_fits():
 
 
 @pytest.mark.parametrize("degrees", [36.0, 40.0, 50.0])
-def test_at_and_beyond_the_limit_the_tilt_is_still_seen(degrees):
-    # At d = 8 mm the limit is 36.87°: what is beyond must be told as beyond.
+def test_the_tilt_is_estimated_at_and_beyond_the_limit(degrees):
+    # At d = 8 mm the limit is 36.87°; larger tilts must be reported as such.
     estimator = ContactEstimator(TIP, MEASURED, GRID, 300.0, free_gain=False)
     e = estimator(GRID.pressure(TIP, MEASURED, 0.008, math.radians(degrees)))
     assert e.valid
@@ -314,7 +313,7 @@ def test_at_and_beyond_the_limit_the_tilt_is_still_seen(degrees):
     assert e.d == pytest.approx(0.008, rel=0.01)
 
 
-def test_a_model_that_does_not_fit_shows_in_chi2_and_widens_the_covariance():
+def test_a_wrong_model_increases_chi2_and_the_covariance():
     p = GRID.pressure(TIP, MEASURED, 0.005, 0.2)
     right = ContactEstimator(TIP, MEASURED, GRID, 50.0)(p)
     wrong = ContactEstimator(TIP, LINEAR, GRID, 50.0)(p)

@@ -1,4 +1,4 @@
-"""Wrong frames and arguments: a flagged estimate or a clear error, never a silent number."""
+"""Invalid frames and arguments give a flagged estimate or a clear error, never just a number."""
 
 import math
 
@@ -14,7 +14,7 @@ from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from tests.harness.paper_tip import GRID, LINEAR, MEASURED, NOISE, PITCH, TIP, A, errors
 
 
-def test_saturated_cells_are_left_out():
+def test_saturated_cells_are_excluded():
     rng = np.random.default_rng(4)
     clean = GRID.pressure(TIP, LINEAR, 0.006, 0.1)
     noisy = clean + rng.normal(0.0, NOISE, GRID.shape)
@@ -26,14 +26,14 @@ def test_saturated_cells_are_left_out():
     assert abs(aware.d - 0.006) < 4.0 * aware.d_std
     assert aware.d_std > plain.d_std
     assert aware.cells < plain.cells
-    # An 8-bit board's end is known from its type.
+    # The full scale of an 8-bit board is known from its type.
     counts = np.minimum(np.round(clean / 300.0), 255).astype(np.uint8)
     assert counts.max() == 255
     board = ContactEstimator(TIP, LINEAR, GRID, 100.0)(counts, 300.0)
     assert board.d == pytest.approx(0.006, rel=2e-3)
 
 
-def test_dead_cells_are_masked_whatever_they_hold():
+def test_dead_cells_are_masked_regardless_of_their_readings():
     rng = np.random.default_rng(6)
     active = rng.random(GRID.shape) > 0.01
     truth = (0.003, 0.2, -0.2, 1.0)
@@ -46,7 +46,7 @@ def test_dead_cells_are_masked_whatever_they_hold():
         e = estimator.update(frame)
         assert e.valid
         score.append(errors(e, truth) / np.sqrt(np.diag(e.covariance)))
-    assert np.all(np.sqrt(np.mean(np.square(score), axis=0)) < 1.2)  # of 300 frames: 1 ± 0.04
+    assert np.all(np.sqrt(np.mean(np.square(score), axis=0)) < 1.2)  # 300 frames: 1 ± 0.04
 
 
 EMPTY = np.zeros((44, 44))
@@ -54,7 +54,7 @@ EMPTY = np.zeros((44, 44))
 
 @pytest.mark.parametrize("physics", ["springs", "solid"])
 @pytest.mark.parametrize("baseline", [0.0, 1000.0])
-def test_without_contact_d_std_is_the_d_that_is_just_felt(physics, baseline):
+def test_without_contact_d_std_is_the_smallest_detectable_d(physics, baseline):
     tip, material = Fingertip(A, physics), Material.constant(0.3e6)
     known = Uncertainty(baseline=baseline)
     estimator = ContactEstimator(tip, material, GRID, 600.0, known=known)
@@ -72,31 +72,31 @@ def estimator(request):
     return ContactEstimator(TIP, MEASURED, GRID, 600.0, free_gain=request.param)
 
 
-def test_all_zero_is_no_contact_and_valid(estimator):
+def test_an_all_zero_frame_is_valid_without_contact(estimator):
     for kind in (np.uint8, np.uint16, np.float32, np.float64):
         e = estimator(EMPTY.astype(kind))
         assert (e.contact, e.valid, e.d) == (False, True, 0.0)
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-def test_one_cell_that_is_no_number_invalidates(estimator, bad):
+def test_one_nan_cell_makes_a_frame_invalid(estimator, bad):
     for frame in (EMPTY.copy(), GRID.pressure(TIP, MEASURED, 0.003, 0.1)):
         frame[22, 20] = bad
         e = estimator.update(frame)
         assert not e.valid
         assert not e.contact
         assert (e.d, e.tilt_x) == (0.0, 0.0)
-    # And leaves no trace.
+    # The next frame is not affected.
     assert estimator.update(GRID.pressure(TIP, MEASURED, 0.003, 0.1)).valid
 
 
-def test_a_number_outside_the_disc_is_not_looked_at(estimator):
+def test_nan_outside_the_tip_is_ignored(estimator):
     frame = GRID.pressure(TIP, MEASURED, 0.003, 0.1)
     frame[0, 0] = math.nan
     assert estimator(frame).valid
 
 
-def test_all_saturated_is_not_valid(estimator):
+def test_a_saturated_frame_is_invalid(estimator):
     for frame, scale in (
         (np.full((44, 44), 65535, np.uint16), 4.0),
         (np.full((44, 44), 255, np.uint8), 500.0),
@@ -107,7 +107,7 @@ def test_all_saturated_is_not_valid(estimator):
         assert e.invalid == (Invalid.SATURATED if frame.dtype != float else Invalid.ABOVE_ZERO)
 
 
-def test_a_sensor_without_a_tare_is_named(estimator):
+def test_a_sensor_without_a_tare_is_identified(estimator):
     rng = np.random.default_rng(8)
     for _ in range(20):
         zero = 20e3 + 3e3 * rng.standard_normal((44, 44))
@@ -115,12 +115,12 @@ def test_a_sensor_without_a_tare_is_named(estimator):
         assert (e.valid, e.invalid) == (False, Invalid.ABOVE_ZERO)
 
 
-def test_a_baseline_far_below_zero_is_not_valid(estimator):
+def test_a_baseline_far_below_zero_is_invalid(estimator):
     assert estimator(EMPTY - 5000.0).invalid == Invalid.BELOW_ZERO
     assert not estimator(-GRID.pressure(TIP, MEASURED, 0.004) - 2000.0).valid
 
 
-def test_one_hot_cell_is_no_contact(estimator):
+def test_one_hot_cell_is_not_a_contact(estimator):
     rng = np.random.default_rng(1)
     frame = rng.normal(0.0, 600.0, (44, 44))
     frame[25, 20] = 1e5
@@ -128,7 +128,7 @@ def test_one_hot_cell_is_no_contact(estimator):
     assert (e.contact, e.d, e.rejected_count) == (False, 0.0, 1)
 
 
-def test_one_hot_cell_beside_or_in_a_contact_changes_nothing(estimator):
+def test_one_hot_cell_near_or_in_a_contact_has_no_effect(estimator):
     rng = np.random.default_rng(2)
     for d in (0.001, 0.004):
         clean = GRID.pressure(TIP, MEASURED, d, 0.2, 0.1)
@@ -153,12 +153,12 @@ def test_one_hot_cell_beside_or_in_a_contact_changes_nothing(estimator):
         *((EMPTY, scale, "pascal_per_count") for scale in (0.0, -4.0, math.nan, math.inf)),
     ],
 )  # fmt: skip
-def test_what_is_no_frame_is_refused(frame, scale, told):
+def test_arrays_that_are_not_frames_are_refused(frame, scale, told):
     with pytest.raises(ValueError, match=told):
         ContactEstimator(TIP, MEASURED, GRID, 600.0).update(frame, scale)
 
 
-def test_what_is_not_one_contact_is_not_valid(estimator):
+def test_anything_but_one_contact_is_invalid(estimator):
     rng = np.random.default_rng(3)
     press = [GRID.pressure(TIP, MEASURED, 0.002, side * 0.5) for side in (1.0, -1.0)]
     small = GRID.pressure(TIP, MEASURED, 0.001, -0.5)
@@ -187,7 +187,7 @@ def test_what_is_not_one_contact_is_not_valid(estimator):
         ({"active": np.ones((4, 4), bool)}, "active"),
     ],
 )
-def test_wrong_arguments_are_refused(options, message):
+def test_invalid_arguments_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         ContactEstimator(TIP, LINEAR, GRID, **{"noise": 600.0, **options})
     with pytest.raises(ValueError, match="threshold"):
@@ -222,7 +222,7 @@ def _garbage(rng, grid):
     ("rows", "cols", "pitch"),
     [(44, 44, PITCH), (4, 4, 0.012), (5, 64, 0.0008), (64, 5, 0.003), (1, 1, 0.04), (1, 30, PITCH)],
 )
-def test_garbage_gives_finite_numbers_or_none_that_are_valid(free_gain, rows, cols, pitch):
+def test_random_frames_give_finite_numbers_or_are_invalid(free_gain, rows, cols, pitch):
     rng = np.random.default_rng(21)
     grid = SensorGrid(rows, cols, pitch)
     estimator = ContactEstimator(TIP, MEASURED, grid, 600.0, free_gain=free_gain)

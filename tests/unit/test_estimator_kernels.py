@@ -1,4 +1,4 @@
-"""The estimator's kernels against plain NumPy; counts that end at zero, thresholds, misfits."""
+"""The estimator's kernels against plain NumPy; clipped counts, thresholds, misfits."""
 
 import math
 
@@ -29,22 +29,22 @@ FloatArray = NDArray[np.float64]
 
 @kernel
 def activity(states: Records[EstimatorState], frame: FloatArray, height: FloatArray) -> None:
-    """:func:`detection.activity`."""
+    """Wrap :func:`detection.activity`."""
     detection.activity(states[0], frame, height)
 
 
 @kernel
 def compare(states: Records[EstimatorState], frame: FloatArray, rows: FloatArray) -> None:
-    """:func:`gauss_newton.compare` of all cells."""
+    """Apply :func:`gauss_newton.compare` to all cells."""
     cells = cells_in(rows, states[0].grid)
     gauss_newton.compare(states[0], frame, cells, index(0), index(frame.shape[0]))
 
 
-def test_activity_matches_its_plain_twin():
+def test_activity_matches_plain_numpy():
     rng = np.random.default_rng(12)
     weights = np.outer([1, 2, 2, 2, 1], [1, 2, 2, 2, 1]).astype(float)
     weights[2, 2] = 0.0
-    # Columns 2 … 21 are in reach, and rows 2 … 17.
+    # Columns 2 … 21 and rows 2 … 17 are within reach.
     active = np.zeros((20, 24), bool)
     active[2:18, 2:22] = True
     state = EstimatorState()
@@ -79,14 +79,14 @@ def test_activity_matches_its_plain_twin():
     assert seen == {True, False}
 
 
-# An inner kernel, made callable.
+# Make the inner kernel callable.
 free_noise = called(free_noise)
 
 erfc = np.vectorize(math.erfc)
 
 
 def mean_of(model, floor, noise):
-    """E[max(model + noise · e, floor)] of a standard normal e, and its slope by the model."""
+    """Return E[max(model + noise · e, floor)] for e ~ N(0, 1), and its derivative."""
     z = (model - floor) / noise
     above = 0.5 * erfc(-z / math.sqrt(2.0))
     density = np.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)
@@ -94,7 +94,7 @@ def mean_of(model, floor, noise):
 
 
 @pytest.mark.parametrize("floor", [0.0, 2000.0, 3250.0])
-def test_cells_near_the_floor_are_compared_with_what_they_read_on_average(floor):
+def test_cells_near_the_floor_are_compared_with_their_expected_reading(floor):
     noise = 1500.0
     state = EstimatorState()
     state.grid.rows = state.grid.cols = 1
@@ -118,20 +118,20 @@ def test_cells_near_the_floor_are_compared_with_what_they_read_on_average(floor)
 
 
 @pytest.mark.parametrize("ratio", [0.0, 0.3, 1.0, 2.0, 2.8])
-def test_free_cells_tell_the_noise(ratio):
+def test_noise_is_estimated_from_cells_without_contact(ratio):
     noise = 900.0
     floor = ratio * noise
     readings = noise * np.random.default_rng(1).standard_normal(2_000_000)
     readings[readings < floor] = 0.0
     assert free_noise(float(np.mean(readings**2)), floor) == pytest.approx(noise, rel=0.03)
-    # Nothing above the floor: the noise is well below it.
+    # If all readings are at the floor, the noise is well below it.
     assert free_noise(0.0, floor) == pytest.approx(floor / 3.2, rel=0.02)
 
 
 @pytest.mark.parametrize("free_gain", [True, False])
 @pytest.mark.parametrize(("d", "percent"), [(0.001, 0.1), (0.001, 0.5), (0.002, 1.0), (0.004, 2.0)])
-def test_a_threshold_of_three_counts_of_eight_bits_leaves_d_unbiased(d, percent, free_gain):
-    # Full scale 204 kPa; the envelope's largest pressure is 188 kPa.
+def test_a_threshold_of_three_8_bit_counts_leaves_d_unbiased(d, percent, free_gain):
+    # Full scale is 204 kPa; the maximum pressure of the envelope is 188 kPa.
     scale, noise = 800.0, percent / 100.0 * E
     rng = np.random.default_rng(9)
     frames, ratios, deviations = 60, [], []
@@ -153,7 +153,7 @@ def test_a_threshold_of_three_counts_of_eight_bits_leaves_d_unbiased(d, percent,
     assert np.std(ratios) < 1.3 * np.mean(deviations)
 
 
-def test_a_board_without_any_noise_is_not_corrected_for_it():
+def test_a_board_without_noise_is_not_corrected_for_clipping():
     grid = SensorGrid(44, 44, PITCH)
     estimator = ContactEstimator(TIP, LINEAR, grid, 1500.0, readings=Readings(threshold=3))
     for d in (0.001, 0.003):
@@ -162,8 +162,8 @@ def test_a_board_without_any_noise_is_not_corrected_for_it():
         assert estimator(counts.astype(np.uint8), 500.0).d == pytest.approx(d, rel=0.015)
 
 
-def test_noise_that_ends_at_zero_takes_more_to_be_a_contact():
-    # One strong cell and neighbours that stand 5.1 deviations above 0 together.
+def test_noise_clipped_at_zero_raises_the_contact_threshold():
+    # One strong cell and neighbours whose sum is 5.1 standard deviations above 0.
     frame = np.zeros((44, 44))
     weights = np.outer((1, 2, 2, 2, 1), (1, 2, 2, 2, 1)).astype(float)
     weights[2, 2] = 0.0
@@ -177,7 +177,7 @@ def test_noise_that_ends_at_zero_takes_more_to_be_a_contact():
             assert estimator((frame / scale).astype(kind), scale).contact == expected
 
 
-def test_the_covariance_grows_where_d_and_gain_can_hardly_be_told_apart():
+def test_the_covariance_grows_if_d_and_gain_are_hardly_distinguishable():
     grid = SensorGrid(44, 44, PITCH, (2e-4, 3e-4))
     rng = np.random.default_rng(2)
     truth = np.array([0.0006, 0.1, -0.1, 1.0])
@@ -194,12 +194,12 @@ def test_the_covariance_grows_where_d_and_gain_can_hardly_be_told_apart():
     assert np.mean(nees) / 4.0 == pytest.approx(1.0, abs=0.08)
 
 
-def test_a_misfit_is_flagged_and_good_frames_are_not():
+def test_a_misfit_is_flagged_and_valid_frames_are_not():
     grid = SensorGrid(44, 44, PITCH, (3e-4, -2e-4))
     rng = np.random.default_rng(5)
     noise = 0.002 * E
     x = (np.arange(44) - 21.5) * PITCH
-    # Hertz pressure of the same force over r² ≤ a d, where the linear model has 2 a d − d².
+    # Hertz pressure with the same force over r² ≤ a d, where the linear model has 2 a d − d².
     r2 = (x[None, :] - 3e-4) ** 2 + (x[:, None] + 2e-4) ** 2
     hertz = np.sqrt(np.maximum(1.0 - r2 / (0.020 * 0.003), 0.0))
     good = grid.pressure(TIP, LINEAR, 0.003)
@@ -211,7 +211,7 @@ def test_a_misfit_is_flagged_and_good_frames_are_not():
             e = estimator.update(frame)
             assert e.contact
             assert e.misfit is expected
-            # Such a pressure hides 38 % of d; smoothly, as cells that read unequally don't.
+            # This smooth pressure hides 38 % of d, unlike cells with unequal gains.
             assert e.valid is not expected
     unequal = good * rng.normal(1.0, 0.1, grid.shape)
     e = estimator(unequal)

@@ -1,4 +1,4 @@
-"""Each kind of event that the sources emit is explained, and none that they do not."""
+"""Every kind of event that the sources emit is documented, and no others."""
 
 import ast
 from collections.abc import Iterator
@@ -10,7 +10,7 @@ from softfinger.daemon.wire.event_kinds import KINDS
 
 ROOT = Path(softfinger.__file__).parents[1]
 LEVELS = ("info", "warning", "error")
-WARNS = {"_warn": "warning"}  # functions that take the kind first, and their level
+WARNS = {"_warn": "warning"}  # functions whose first argument is the kind, with their level
 
 
 def written(expression: ast.expr) -> str:
@@ -18,7 +18,7 @@ def written(expression: ast.expr) -> str:
 
 
 def emitted(source: str) -> Iterator[tuple[str, str]]:
-    """Level and kind of each event whose kind stands in the source: level, kind, text."""
+    """Yield level and kind of each event written as level, kind, text in the source."""
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Call) and (level := WARNS.get(getattr(node.func, "attr", ""))):
             yield level, written(node.args[0])
@@ -32,7 +32,7 @@ def test_events_are_found_in_calls_and_tuples():
     assert sorted(emitted(source)) == [("error", "y"), ("info", "x"), ("warning", "z")]
 
 
-def test_every_kind_of_event_is_explained_with_its_levels():
+def test_every_kind_of_event_is_documented_with_its_levels():
     levels: dict[str, set[str]] = {
         row.name: set() for row in LIMITS if row.level in ("warn", "fault")
     }
@@ -42,13 +42,13 @@ def test_every_kind_of_event_is_explained_with_its_levels():
     for folder in ("daemon", "tools/processes"):
         for file in (ROOT / folder).rglob("*.py"):
             for level, kind in emitted(file.read_text(encoding="utf-8")):
-                if kind.islower():  # a literal, not a name of `safety.limits`
+                if kind.islower():  # a literal, not a constant's name in `safety.limits`
                     levels.setdefault(kind, set()).add(level)
-    levels["torque.off"].add("info")  # by its constant's name in safety.torque_state
+    levels["torque.off"].add("info")  # safety.torque_state uses a constant
     assert {kind: set(each.levels.split(", ")) for kind, each in KINDS.items()} == levels
 
 
-def test_a_warning_or_an_error_says_what_to_do():
+def test_every_warning_and_error_has_a_remedy():
     for kind, each in KINDS.items():
         texts = [each.cause, each.remedy] if each.levels != "info" else [each.cause]
         for text in texts:

@@ -1,4 +1,4 @@
-"""The paper's experiments run in simulation: paths, errors of estimates, the slow turn."""
+"""The paper's experiments in simulation: paths, estimation errors, the slow turn."""
 
 import math
 
@@ -20,18 +20,18 @@ def path() -> tuple[Sheet, ...]:
     return run_pages.tilt_and_roll()
 
 
-def test_compression_goes_to_8_mm_at_every_angle(compression):
+def test_compression_reaches_8_mm_at_every_angle(compression):
     for tilt, run in zip(TILTS, compression, strict=False):
         assert run["d"][0] == 0.0
         assert run["d"].max() == pytest.approx(8.0, abs=0.1)
         touching = run["d"] > 0.0
         np.testing.assert_allclose(run["theta"][touching], tilt, atol=1e-9)
-        # The truth is the plant's: at the frames' instants it is the closed form's.
+        # The plant gives the true values, which equal the closed form at the frame times.
         expected = np.pi * 0.304 * run["d"] ** 2 / np.cos(np.radians(tilt))
         np.testing.assert_allclose(run["F"], expected, rtol=1e-9, atol=1e-12)
 
 
-def test_compression_is_estimated(compression):
+def test_compression_is_estimated_accurately(compression):
     errors = compression[-1]
     assert (errors["d at the first estimate"] < 0.45).all()
     assert (errors["RMS error of d"] < 20.0).all()  # µm
@@ -42,7 +42,7 @@ def test_compression_is_estimated(compression):
     assert (errors["RMS error of U"] < 2.0).all()
 
 
-def test_the_path_is_the_papers(path):
+def test_the_path_equals_that_of_the_paper(path):
     rotation, rolling, _ = path
     assert rotation["theta"][0] == pytest.approx(0.0, abs=0.1)
     assert rotation["theta"][-1] == pytest.approx(-11.5, abs=0.15)
@@ -64,8 +64,8 @@ def sheets() -> tuple[Sheet, ...]:
     return found
 
 
-def test_forces_are_the_energys_slopes():
-    """The balance, from finite differences of the energy along motions that roll."""
+def test_forces_are_energy_derivatives():
+    """Finite differences of the energy along rolling motions give the equilibrium."""
     here = slow_turn.turned(np.radians([2.0, 4.0]), slow_turn.gripped())[-1]
     step = 1e-6
     for k in range(5):
@@ -80,7 +80,7 @@ def test_forces_are_the_energys_slopes():
 
 
 @pytest.mark.extended
-def test_the_path_lies_on_the_floor_of_the_valley(sheets):
+def test_the_path_follows_the_valley_floor(sheets):
     equations, _, land = sheets
     for antisymmetric in slow_turn.ANTISYMMETRIC_ANGLES:
         angle, v = land[f"angle at {antisymmetric} deg"], land[f"V at {antisymmetric} deg"]
@@ -93,7 +93,7 @@ def test_the_path_lies_on_the_floor_of_the_valley(sheets):
 
 
 @pytest.mark.extended
-def test_the_simulated_hand_goes_the_equations_way(sheets):
+def test_the_simulated_hand_follows_the_path_of_the_equations(sheets):
     equations, plant, _ = sheets
     order = np.argsort(equations["angle"])
     assert math.degrees(slow_turn.REACH) - 0.5 < np.max(plant["angle"])

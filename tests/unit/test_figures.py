@@ -1,4 +1,4 @@
-"""The figures' numbers against published and derived values, their files, and their pictures."""
+"""Values of the figures against published and derived values, their files, and the plots."""
 
 import argparse
 import csv
@@ -27,7 +27,7 @@ LINEAR = Material.constant(0.304e6)
 
 
 def read(path: Path) -> dict[str, NDArray[np.float64]]:
-    """Columns of a CSV of numbers by their header; an empty cell is NaN."""
+    """Return the columns of a CSV file by header; empty cells are NaN."""
     rows = list(csv.reader(path.read_text(encoding="utf-8").splitlines()))
     numbers = np.array([[float(cell or "nan") for cell in row] for row in rows[1:]])
     return dict(zip(rows[0], numbers.T, strict=True))
@@ -35,7 +35,7 @@ def read(path: Path) -> dict[str, NDArray[np.float64]]:
 
 @pytest.fixture(scope="module")
 def drawn(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Figure]]:
-    """All figures, written by the command itself into a folder that it has to make; as drawn."""
+    """Return all figures, written by the command itself to a new folder."""
     path = tmp_path_factory.mktemp("figures") / "new" / "folder"
     kept, new = [], style.new_figure
     with pytest.MonkeyPatch.context() as patch:
@@ -46,7 +46,7 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Figure]]
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The numbers of the pages that are checked, written by the command without Matplotlib."""
+    """Return the folder with the values of the checked figures, written without Matplotlib."""
     path = tmp_path_factory.mktemp("numbers")
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(sys.modules, "matplotlib", None)
@@ -55,7 +55,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize(("d", "theta", "force", "energy"), CHECKPOINTS)
-def test_checkpoints_over_displacement(folder, d, theta, force, energy):
+def test_checkpoints_of_force_and_energy_versus_displacement(folder, d, theta, force, energy):
     for name, equation, unit, value in (("4b", 3, "N", force), ("5b", 10, "mJ", energy)):
         columns = read(folder / f"fig{name}.csv")
         (row,) = np.flatnonzero(columns["d [mm]"] == d)
@@ -66,8 +66,9 @@ def test_checkpoints_over_displacement(folder, d, theta, force, energy):
         assert integral == pytest.approx(value, rel=1e-11)
 
 
-def test_double_integrals_meet_the_one_dimensional_form() -> None:
-    # Another route to eqs. 3 and 10: y by hand, x by Gauss in t. Tilted close to the limit, 36.87°.
+def test_double_integrals_equal_the_one_dimensional_form() -> None:
+    # A different evaluation of eqs. 3 and 10: y analytically, x by Gauss quadrature in t, with a
+    # tilt close to the limit of 36.87°.
     a, d, theta, modulus = 0.02, 0.008, np.radians(34.0), 0.304e6
     points, weights = np.polynomial.legendre.leggauss(200)
     t = points * np.pi / 2
@@ -86,9 +87,9 @@ def test_double_integrals_meet_the_one_dimensional_form() -> None:
 def by_quadrature(
     d: float, theta: float, shear: float = 0.0, law: Material = LINEAR
 ) -> tuple[float, float]:
-    """F [N] and U [J] by SciPy, spring by spring; a shear moves each spring's end along the face.
+    """Return F [N] and U [J] by SciPy quadrature; a shear moves each spring's end along the face.
 
-    Sheared springs are of a constant modulus, as stiff sideways as along the axis.
+    The sheared springs have a constant modulus, with equal lateral and axial stiffness.
     """
     a, s, c = 0.020, np.sin(theta), np.cos(theta)
     h, rho = a - d, np.sqrt(d * (2.0 * a - d))
@@ -110,7 +111,7 @@ def by_quadrature(
 
 
 @pytest.mark.parametrize(("tilt", "name", "row"), [(0, "fig4b", 0), (30, "fig5b", 1)])
-def test_exponents_of_both_laws(folder: Path, tilt: int, name: str, row: int) -> None:
+def test_exponents_of_both_material_laws(folder: Path, tilt: int, name: str, row: int) -> None:
     symbol, upright = "FU"[row], (2.0, 3.0)[row]
     columns, fitted = read(folder / f"{name}.csv"), read(folder / f"{name}_exponents.csv")
     assert columns[f"exponent at {tilt} deg [1]"][1:] == pytest.approx(upright, abs=1e-8)
@@ -129,7 +130,7 @@ def test_exponents_of_both_laws(folder: Path, tilt: int, name: str, row: int) ->
     assert (np.diff(power) > 0.0).all(), f"{symbol} rises with a higher power, the more tilted"
 
 
-def test_rate_of_change_by_the_tilt(folder: Path) -> None:
+def test_derivative_by_tilt(folder: Path) -> None:
     theta = np.radians(25.0)
     for name, head, row in (("fig4a", "dF/dtheta", 0), ("fig5a", "dU/dtheta", 1)):
         columns = read(folder / f"{name}_rate.csv")
@@ -141,7 +142,7 @@ def test_rate_of_change_by_the_tilt(folder: Path) -> None:
         assert rate == pytest.approx(rate[0] * (columns["d [mm]"] / 2.0) ** (2 + row), rel=1e-6)
 
 
-def test_a_rolling_that_shears_the_tip_is_least_before_upright(folder: Path) -> None:
+def test_with_shear_the_minimum_is_before_upright(folder: Path) -> None:
     minima = read(folder / "fig10_shear_minima.csv")
     felt = read(folder / "fig10_shear_plant_minima.csv")
     (row,) = np.flatnonzero((minima["d [mm]"] == 6.0) & (minima["share [%]"] == 5.0))
@@ -158,7 +159,7 @@ def test_a_rolling_that_shears_the_tip_is_least_before_upright(folder: Path) -> 
     assert felt["least U [deg]"] == pytest.approx(
         minima["least U [deg]"][minima["share [%]"] == 5.0], abs=0.01
     )
-    # The plant's balance has the rim's springs, which are sheared as soon as they touch.
+    # The plant's equilibrium includes the rim's springs, which are sheared from first contact on.
     balance = felt["least N cos theta + T sin theta [deg]"]
     assert (balance < minima["least F on the base [deg]"][minima["share [%]"] == 5.0]).all()
     model, plant = read(folder / "fig10_shear.csv"), read(folder / "fig10_shear_plant.csv")
@@ -170,7 +171,7 @@ def test_a_rolling_that_shears_the_tip_is_least_before_upright(folder: Path) -> 
     )
 
 
-def test_table_i(folder: Path) -> None:
+def test_table_i_values(folder: Path) -> None:
     with (folder / "table_i.csv").open(encoding="utf-8") as file:
         entries, strains, papers, laws = zip(*list(csv.reader(file))[1:], strict=True)
     assert entries == ("Min", "20 %", "40 %", "60 %", "80 %", "100 %", "Max")
@@ -184,7 +185,7 @@ def test_table_i(folder: Path) -> None:
     assert curve["stress [MPa]"][0] == 0.0
 
 
-def test_compression_through_the_sensor(folder: Path) -> None:
+def test_compression_with_the_sensor_model(folder: Path) -> None:
     columns = read(folder / "fig7.csv")
     d = columns["d [mm]"]
     assert (d[0], d[-1]) == (0.0, 8.0)
@@ -194,14 +195,14 @@ def test_compression_through_the_sensor(folder: Path) -> None:
         law = columns[f"F of Table I's law at {tilt} deg [N]"]
         expected = np.pi * 0.304 * d**2 / np.cos(np.radians(tilt))
         np.testing.assert_allclose(model, expected, rtol=1e-12)
-        # The cells' quadrature loses some digits; the paper's sensor has three.
+        # The cells' quadrature is less accurate; the paper's sensor has three digits.
         np.testing.assert_allclose(sensed, model, rtol=1e-4)
-        # Between what the least and the greatest modulus below full compression would give.
+        # The bounds are the forces for the minimum and maximum modulus below full compression.
         assert np.all(law[1:] > 0.135 / 0.304 * model[1:])
         assert np.all(law[1:] < 0.255 / 0.304 * model[1:])
 
 
-def test_path_of_tilt_and_roll(folder: Path) -> None:
+def test_path_of_rotation_and_rolling(folder: Path) -> None:
     rotation, rolling = read(folder / "fig10a.csv"), read(folder / "fig10b.csv")
     theta = rolling["theta [deg]"]
     assert (theta[0], theta[-1]) == (-11.5, 9.2)
@@ -212,11 +213,11 @@ def test_path_of_tilt_and_roll(folder: Path) -> None:
         law = rolling[f"F/F(0) of Table I's law at d = {d} mm [1]"]
         for curve in (ratio, law):
             assert theta[np.argmin(curve)] == 0.0
-        # A modulus that rises with strain deepens the minimum.
+        # A modulus that increases with strain deepens the minimum.
         assert np.all(law[theta != 0.0] > ratio[theta != 0.0])
-        # Springs that point at the tip's centre have none.
+        # Springs that point to the tip's centre give no minimum.
         assert np.ptp(rolling[f"F of radial springs at d = {d} mm [N]"]) == 0.0
-        # The rotation ends where the rolling starts.
+        # The rotation ends where the rolling begins.
         last = rotation[f"F, d up to {d} mm [N]"][-1]
         assert last == pytest.approx(rolling[f"F at d = {d} mm [N]"][0], rel=1e-12)
         assert rotation[f"d up to {d} mm [mm]"][0] == 0.0
@@ -233,7 +234,7 @@ def test_checkpoints_of_the_appendix(of: Callable[..., experiment_pages.Terms]) 
 
 
 @pytest.mark.extended
-def test_every_picture_is_drawn_whole_with_its_errata(drawn: tuple[Path, list[Figure]]) -> None:
+def test_every_plot_is_complete_and_lists_its_errata(drawn: tuple[Path, list[Figure]]) -> None:
     folder, kept = drawn
     with (folder / "errata.csv").open(encoding="utf-8") as file:
         errata = [(row["figure"], row["holds"]) for row in csv.DictReader(file)]
@@ -241,7 +242,7 @@ def test_every_picture_is_drawn_whole_with_its_errata(drawn: tuple[Path, list[Fi
         page, picture = figures.pages()[name], imread(folder / f"{name}.png")
         height, width = picture.shape[:2]
         assert (width / style.DPI, height / style.DPI) == pytest.approx(page.size, abs=0.01)
-        # Something is drawn, in every quarter of it.
+        # Each quarter of the picture contains something.
         dark = picture[..., :3].min(axis=-1) < 0.8
         for rows in (slice(None, height // 2), slice(height // 2, None)):
             for columns in (slice(None, width // 2), slice(width // 2, None)):
@@ -251,21 +252,24 @@ def test_every_picture_is_drawn_whole_with_its_errata(drawn: tuple[Path, list[Fi
             for erratum in page.errata:
                 assert erratum.holds in text
                 assert (name, erratum.holds) in errata
-            assert all("[" in axes.get_xlabel() for axes in figure.axes[-1:])  # a unit
-            # Nothing written lies outside the sheet.
+            # The label contains a unit.
+            assert all("[" in axes.get_xlabel() for axes in figure.axes[-1:])
+            # All text lies inside the sheet.
             box = figure.get_tightbbox()
             assert min(box.x0, box.y0) > -0.02
             assert max(box.x1 - page.size[0], box.y1 - page.size[1]) < 0.02
 
 
-def test_named_figures_only(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_only_the_named_figures_are_drawn(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert cli.main(["figures", "fig3", "--out", str(tmp_path)]) == 0
     written = {"fig3.csv", "table_i.csv", "errata.csv", "fig3.png"}
     assert {path.name for path in tmp_path.iterdir()} == written
     assert {Path(line).name for line in capsys.readouterr().out.splitlines()} == written
 
 
-def test_without_matplotlib_the_numbers_are_written(tmp_path, capsys, monkeypatch):
+def test_without_matplotlib_only_the_values_are_written(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     assert cli.main(["figures", "fig4a", "--out", str(tmp_path)]) == 0
     written = {"fig4a.csv", "fig4a_rate.csv", "errata.csv"}
@@ -278,11 +282,11 @@ def test_without_matplotlib_the_numbers_are_written(tmp_path, capsys, monkeypatc
 @pytest.fixture(scope="module")
 def rows() -> dict[str, PublishedValue]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(validate, "_TRIALS", 1)  # each takes a second
+        patch.setattr(validate, "_TRIALS", 1)  # each one takes a second
         return {each.quantity: each for each in validate.comparisons()}
 
 
-def test_every_row_has_its_source_and_a_verdict_and_every_disagreement_a_reason(rows):
+def test_every_row_has_source_and_verdict_and_every_disagreement_a_reason(rows):
     assert len(rows) >= 15
     for each in rows.values():
         assert each.source
@@ -290,7 +294,7 @@ def test_every_row_has_its_source_and_a_verdict_and_every_disagreement_a_reason(
         assert each.verdict == "agree" or each.why, each.quantity
 
 
-def test_springs_are_no_rubber_and_say_so(rows: dict[str, PublishedValue]) -> None:
+def test_the_spring_model_is_stated_to_differ_from_rubber(rows: dict[str, PublishedValue]) -> None:
     springs = rows["ζ of F = C d^ζ, 1 to 7 mm: springs"]
     assert (springs.ours, springs.verdict) == ("2.00", "disagree")
     crossing = (4.0 / (3.0 * 0.75 * np.pi)) ** 2 * 20.0
@@ -302,11 +306,11 @@ def test_springs_are_no_rubber_and_say_so(rows: dict[str, PublishedValue]) -> No
 @pytest.mark.parametrize(
     ("ours", "verdict"), [(1.456, "agree"), (1.88, "agree"), (1.454, "disagree"), (2.0, "disagree")]
 )
-def test_a_figure_agrees_within_the_published_digits(ours: float, verdict: str) -> None:
+def test_a_value_agrees_within_the_published_digits(ours: float, verdict: str) -> None:
     assert validate.between("ζ", 1.46, 1.88, "a book", ours).verdict == verdict
 
 
-def test_the_command_prints_each_row_and_counts(rows, monkeypatch, capsys):
+def test_the_command_prints_all_rows_and_their_counts(rows, monkeypatch, capsys):
     monkeypatch.setattr(validate, "comparisons", lambda: iter(rows.values()))
     assert validate.run(argparse.Namespace()) == 0
     printed = capsys.readouterr().out

@@ -1,4 +1,4 @@
-"""FlexiTac framing as pure bytes."""
+"""FlexiTac framing, tested on bytes."""
 
 import itertools
 
@@ -14,16 +14,16 @@ CELLS = ROWS * COLS
 STRIDE = CELLS + 2
 
 payloads = st.binary(min_size=CELLS, max_size=CELLS)
-# Images made to contain the marker often, also split over a frame's first or last byte.
+# Images that often contain the marker, also split over a frame's first or last byte.
 nasty = st.lists(
     st.sampled_from([b"\xaa", b"\x55", b"\xaa\x55", b"\x00", b"\x01"]), min_size=CELLS
 ).map(lambda parts: b"".join(parts)[:CELLS])
 
 
 def decode(decoder: FlexiTacDecoder, pieces: list[bytes]) -> list[bytes]:
-    """The frames handed over when all is fed a byte at a time.
+    """Return the frames decoded when the data are fed byte by byte.
 
-    A lock that took long may complete several frames at once; of these only the newest comes.
+    A late lock may complete several frames at once; only the newest is returned.
     """
     found = []
     for piece in pieces:
@@ -41,18 +41,18 @@ def frame(payload: bytes) -> bytes:
 
 
 def numbered(count: int, cells: int = CELLS, first: int = 0) -> list[bytes]:
-    """Different images without a byte of the marker."""
+    """Return different images without marker bytes."""
     return [bytes([(first + k) % 100]) * cells for k in range(count)]
 
 
 def balance(decoder: FlexiTacDecoder, fed: int) -> None:
-    """Every byte is part of a frame, counted as skipped, or still held."""
+    """Check that every byte is part of a frame, counted as skipped, or still buffered."""
     counters = decoder.counters()
     held = len(decoder._buffer)
     assert counters["frames"] * decoder.frame_bytes + counters["skipped_bytes"] + held == fed
 
 
-def test_a_clean_stream_gives_every_frame_as_soon_as_the_next_marker_confirms_it():
+def test_a_clean_stream_gives_every_frame_once_the_next_marker_confirms_it():
     images = numbered(5)
     decoder = FlexiTacDecoder(ROWS, COLS)
     assert decode(decoder, [frame(image) for image in images]) == images[:4]
@@ -68,7 +68,7 @@ def test_a_clean_stream_gives_every_frame_as_soon_as_the_next_marker_confirms_it
     }
 
 
-def test_on_a_line_with_gaps_a_frame_comes_at_once_unless_it_may_be_spliced():
+def test_with_gaps_a_frame_is_delivered_at_once_unless_it_may_be_spliced():
     decoder = FlexiTacDecoder(ROWS, COLS, byte_time=1e-4)
     images = numbered(9)
     spare = bytearray(numbered(1)[0])
@@ -79,24 +79,24 @@ def test_on_a_line_with_gaps_a_frame_comes_at_once_unless_it_may_be_spliced():
         decoded = decoder.feed(frame(images[k]), 0.01 * k)
         assert decoded.data[0, 0] == k
         assert decoded.t == 0.01 * k
-    # In two pieces within its time; then in two pieces with a gap between them.
+    # Two pieces within the frame time, then two pieces with a gap in between.
     assert decoder.feed(frame(images[5])[:7], 0.05) is None
     assert decoder.feed(frame(images[5])[7:], 0.052) is not None
     assert decoder.feed(frame(images[6])[:7], 0.06) is None
     assert decoder.feed(frame(images[6])[7:], 0.07) is None
     assert decoder.settle() is not None
-    # An image with the marker in it waits for the next frame.
+    # An image that contains the marker waits for the next frame.
     assert decoder.feed(frame(bytes(spare)), 0.08) is None
     assert decoder.settle() is None
     decoded = decoder.feed(frame(images[7]), 0.09)
     assert decoded.data[0, 0] == 7
     assert decoder.counters()["frames"] == 9
-    # A line without gaps: bytes follow at once, and tell.
+    # Without gaps on the line, the following bytes confirm the frame.
     assert decoder.feed(frame(images[8]), 0.0903) is None
     assert decoder.feed(MARKER, 0.0904) is not None
 
 
-def test_one_marker_alone_is_never_locked_on():
+def test_a_single_marker_is_not_enough_for_a_lock():
     decoder = FlexiTacDecoder(ROWS, COLS)
     assert decode(decoder, [frame(bytes(CELLS))]) == []
     assert not decoder.locked
@@ -105,12 +105,12 @@ def test_one_marker_alone_is_never_locked_on():
     assert decoder.locked
 
 
-def test_bytes_behind_a_frame_in_the_same_read_are_told():
+def test_trailing_bytes_after_a_frame_are_reported():
     decoder = FlexiTacDecoder(ROWS, COLS)
     one = frame(bytes(CELLS))
     decoder.feed(one * 2 + MARKER, 1.0)
     assert decoder.feed(one[2:] + one[:5], 2.0).behind == 5
-    late = decoder.feed(one[5:] + one, 3.0)  # the second may be torn yet
+    late = decoder.feed(one[5:] + one, 3.0)  # the second frame may still be incomplete
     assert late.behind == len(one)
 
 
@@ -121,7 +121,7 @@ def test_bytes_behind_a_frame_in_the_same_read_are_told():
 )
 @example(images=[b"\xaa\x55" * 10] * 4, start=0, cuts=[])
 @example(images=[b"\x00" * 19 + b"\xaa"] * 4, start=0, cuts=[22, 44])
-def test_any_cut_of_a_stream_gives_the_same_frames(images, start, cuts):
+def test_frames_do_not_depend_on_how_the_stream_is_split(images, start, cuts):
     stream = b"".join(frame(image) for image in images)[start:]
     whole = FlexiTacDecoder(ROWS, COLS)
     expected = decode(whole, [stream])
@@ -144,9 +144,9 @@ def test_any_cut_of_a_stream_gives_the_same_frames(images, start, cuts):
     images=st.lists(nasty, min_size=2, max_size=6),
     start=st.integers(0, STRIDE),
 )
-def test_no_wrong_frame_whatever_the_images_hold(images, start):
-    """Entered anywhere, images full of AA 55: what comes out was sent, in its order."""
-    # Afterwards two frames that share no AA 55, so that a standing image can't stay ambiguous.
+def test_no_wrong_frame_for_any_images(images, start):
+    """From any starting point in images full of AA 55, only sent frames are decoded, in order."""
+    # Append two frames without a common AA 55, so that a constant image cannot stay ambiguous.
     images = [*images, *numbered(2)]
     stream = b"".join(frame(image) for image in images)[start:]
     found = decode(FlexiTacDecoder(ROWS, COLS), [stream, MARKER])
@@ -154,7 +154,7 @@ def test_no_wrong_frame_whatever_the_images_hold(images, start):
     assert images[-1] in found
 
 
-def test_a_standing_image_with_the_marker_in_it_is_not_guessed_at():
+def test_a_constant_image_that_contains_the_marker_is_ambiguous():
     image = bytearray(CELLS)
     image[7:9] = MARKER
     stream = frame(bytes(image)) * 30
@@ -162,12 +162,12 @@ def test_a_standing_image_with_the_marker_in_it_is_not_guessed_at():
     assert decode(decoder, [stream[5:]]) == []
     assert decoder.counters()["ambiguous"] > 0
     assert "several places" in decoder.diagnosis()
-    # As soon as the image changes there is one place left.
+    # Once the image changes, only one position remains.
     found = decode(decoder, [frame(image) for image in numbered(3)])
     assert found[-1] == numbered(3)[1]
 
 
-def test_a_lock_holds_through_a_standing_image_with_the_marker_in_it():
+def test_a_lock_persists_with_a_constant_image_that_contains_the_marker():
     image = bytearray(CELLS)
     image[7:9] = MARKER
     decoder = FlexiTacDecoder(ROWS, COLS)
@@ -176,15 +176,15 @@ def test_a_lock_holds_through_a_standing_image_with_the_marker_in_it():
     assert decoder.counters()["resyncs"] == 0
 
 
-def test_a_quiet_line_frees_no_frame_that_could_be_torn():
+def test_a_quiet_line_does_not_confirm_a_frame_that_could_be_incomplete():
     decoder = FlexiTacDecoder(ROWS, COLS)
     decode(decoder, [frame(image) for image in numbered(3)])
     assert decoder.settle() is not None
     torn = frame(bytes(CELLS))[:-1]
-    decoder.feed(torn + MARKER[:1], 0.0)  # one byte short, then the next marker's first half
+    decoder.feed(torn + MARKER[:1], 0.0)  # one byte missing, then the first half of the next marker
     assert decoder.pending
     assert decoder.settle() is None
-    # A loss that swallowed the next marker: the frame is refuted by what follows at once.
+    # If the next marker was lost, the following bytes reject the frame at once.
     decoder = FlexiTacDecoder(ROWS, COLS)
     decode(decoder, [frame(image) for image in numbered(3)])
     spliced = frame(bytes(CELLS))[:-4] + bytes([9]) * (CELLS - 3)
@@ -195,7 +195,7 @@ def test_a_quiet_line_frees_no_frame_that_could_be_torn():
 
 
 @pytest.mark.parametrize(("rows", "cols"), [(4, 4), (5, 5), (16, 16), (44, 44), (256, 256)])
-def test_a_grid_of_another_size_is_recognised_by_its_spacing(rows, cols):
+def test_a_grid_of_another_size_is_recognised_by_the_marker_spacing(rows, cols):
     rng = np.random.default_rng(3)
     decoder = FlexiTacDecoder(32, 32)
     cells = rows * cols
@@ -207,7 +207,7 @@ def test_a_grid_of_another_size_is_recognised_by_its_spacing(rows, cols):
     assert "1024 cells" in decoder.diagnosis()
 
 
-def test_another_size_is_recognised_behind_a_standing_image_with_markers_in_it():
+def test_another_size_is_recognised_with_a_constant_image_that_contains_markers():
     image = bytes(40) + MARKER + bytes(14) + MARKER + bytes(198)
     decoder = FlexiTacDecoder(32, 32)
     for _ in range(12):

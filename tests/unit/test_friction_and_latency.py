@@ -1,4 +1,4 @@
-"""`calibrate friction` and `calibrate latency` on hands that are not as their profile says."""
+"""`calibrate friction` and `calibrate latency` on hands that differ from their profile."""
 
 import math
 from pathlib import Path
@@ -20,12 +20,12 @@ Due = dict[int, dict[str, Any]]
 EMPTY = "simulation.object_position=[0.0,0.3]"  # out of reach
 CONFIG = Path(__file__).parents[2] / "config"
 SMALL, VELOSTAT = CONFIG / "small.toml", str(CONFIG / "velostat.toml")
-COUNT = 1.78 * 2.69e-3  # N·m of one count of an XM430's current
+COUNT = 1.78 * 2.69e-3  # N·m per current count of an XM430
 TICK = 2e-3  # s
 
 
 def sweeps(*strokes: tuple[float, float]) -> tuple[Due, float]:
-    """Strokes from 0 to an angle [rad] and back at a speed [rad/s]: commands, and their end [s]."""
+    """Return sweeps by (angle [rad], velocity [rad/s]), from 0 and back, and their end [s]."""
     due: Due = {100: {"command": "arm"}}
     tick = 150
     for wide, speed in strokes:
@@ -50,14 +50,15 @@ def calibrate(step: str, folder: Any, *words: str) -> int:
     ("friction", "more", "expected", "at_rest"),
     [(0.02, 0.0, 0.02, None), (0.2, 0.0, 0.2, None), (0.05, 0.15, 0.06, 0.2)],
 )
-def test_a_sweep_shows_friction(tmp_path, capsys, friction, more, expected, at_rest):
+def test_friction_is_measured_by_a_sweep(tmp_path, capsys, friction, more, expected, at_rest):
     due, end = sweeps((-0.05, 0.05), (-0.05, 0.05), (-0.4, 0.3), (-0.4, 0.6))
     hand = (f"simulation.joint_friction={friction}", f"simulation.joint_stribeck={more}")
     record_hand(tmp_path / "run.mcap", due, end, (EMPTY,), hand=hand)
     assert calibrate("friction", tmp_path) == 0
     told = capsys.readouterr().out
     found = load(tmp_path / "my.toml").control.joint_friction
-    # What is more at rest falls by e in 0.12 rad/s: a tenth of it is left at these speeds.
+    # The additional static friction decays by a factor e in 0.12 rad/s; at these velocities a tenth
+    # remains.
     assert found == pytest.approx(expected, abs=2 * COUNT)
     assert f"control.joint_friction = {found:g}" in told
     assert ("at break-away" in told) == (at_rest is not None)
@@ -66,17 +67,18 @@ def test_a_sweep_shows_friction(tmp_path, capsys, friction, more, expected, at_r
         assert shown == pytest.approx(at_rest, abs=3 * COUNT)
 
 
-def test_the_friction_of_a_small_servo(tmp_path):
+def test_friction_of_a_small_servo(tmp_path):
     due, end = sweeps((-0.4, 0.3), (-0.4, 0.6))
     (tmp_path / "my.toml").write_text(SMALL.read_text(encoding="utf-8"), encoding="utf-8")
     hand = ("simulation.joint_friction=0.006",)
     record_hand(tmp_path / "run.mcap", due, end, (EMPTY,), profile=str(SMALL), hand=hand)
     assert calibrate("friction", tmp_path) == 0
     found = load(tmp_path / "my.toml").control.joint_friction
-    assert found == pytest.approx(0.006 / (1.0 - 0.25), abs=1e-3)  # a quarter of the gears' torque
+    # The gears' friction is a quarter of their torque.
+    assert found == pytest.approx(0.006 / (1.0 - 0.25), abs=1e-3)
 
 
-def test_what_does_not_change_with_the_direction_is_no_friction():
+def test_torque_independent_of_direction_is_not_friction():
     t = np.arange(0.0, 16.0, 0.01)
     q = 0.2 * np.cos(2.0 * math.pi * t / 4.0)
     rate, acceleration = np.gradient(q, t), np.gradient(np.gradient(q, t), t)
@@ -95,7 +97,7 @@ def test_what_does_not_change_with_the_direction_is_no_friction():
         fit_friction([], [], [], [], 0.010, COUNT)
 
 
-def test_only_motion_in_air_counts(tmp_path, capsys):
+def test_only_motion_without_contact_is_used(tmp_path, capsys):
     due: Due = {
         100: {"command": "arm"},
         150: {"command": "grasp", "force": 8.0},
@@ -107,7 +109,7 @@ def test_only_motion_in_air_counts(tmp_path, capsys):
     assert load(tmp_path / "my.toml").control.joint_friction == 0.05
 
 
-def test_times_that_no_run_has_are_refused():
+def test_impossible_times_are_refused():
     t, still = np.array([0.0, 1e9]), np.zeros(2)
     with pytest.raises(CalibrationError, match="found 1000000000 s of data"):
         fit_friction(t, still, still, still, 0.010, COUNT)
@@ -123,12 +125,12 @@ def test_times_that_no_run_has_are_refused():
         (["--recording", "a.mcap", "b.mcap"], "expected one --recording"),
     ],
 )
-def test_what_shows_no_friction_is_refused(tmp_path, capsys, words, why):
+def test_data_without_friction_are_refused(tmp_path, capsys, words, why):
     assert calibrate("friction", tmp_path, *words) == 1
     assert why in capsys.readouterr().err
 
 
-def test_a_sweep_goes_where_nothing_is():
+def test_a_sweep_avoids_contact():
     assert _way(load(None), "left") == (0.0, -0.4)
     inward = load(None, changes=["hand.open_angle=[-0.4,-0.4]"])
     assert _way(inward, "right") == (-0.4, 0.4)
@@ -157,13 +159,14 @@ FORCES: Due = {
         pytest.param("solid", 0.045, (), marks=pytest.mark.extended),
     ],
 )
-def test_a_grip_shows_how_late_frames_are(tmp_path, capsys, profile, latency, hand):
+def test_latency_is_measured_by_a_grip(tmp_path, capsys, profile, latency, hand):
     path = None if profile is None else str(CONFIG / f"{profile}.toml")
     plant = (f"simulation.tactile_delay={latency}", *hand)
     record_hand(tmp_path / "run.mcap", FORCES, 4.4, profile=path, hand=plant)
     assert calibrate("latency", tmp_path) == 0
     told = capsys.readouterr().out
-    # Cells that follow within 60 ms hide some of it; else it is known to a few ms.
+    # Cells with a response time of 60 ms hide part of the latency; otherwise it is found to within
+    # a few ms.
     tolerance = 6e-3 if profile == "velostat" else 3e-3
     assert load(tmp_path / "my.toml").tactile.latency == pytest.approx(latency, abs=tolerance)
     assert float(told.split(" ± ")[1].split(" ms")[0]) < 1e3 * tolerance
@@ -178,7 +181,9 @@ def test_a_grip_shows_how_late_frames_are(tmp_path, capsys, profile, latency, ha
         (VELOSTAT, GRASP, (), "found a standard deviation of 1"),
     ],
 )
-def test_a_grip_that_shows_no_latency_is_refused(tmp_path, capsys, profile, due, hand, why):
+def test_a_grip_that_does_not_show_the_latency_is_refused(
+    tmp_path, capsys, profile, due, hand, why
+):
     end = 4.4 if due is FORCES else 1.8
     record_hand(tmp_path / "run.mcap", due, end, profile=profile, hand=hand)
     assert calibrate("latency", tmp_path) == 1
@@ -187,7 +192,7 @@ def test_a_grip_that_shows_no_latency_is_refused(tmp_path, capsys, profile, due,
 
 
 @pytest.mark.parametrize("delay", [-0.015, 0.037])
-def test_a_delay_is_found_from_numbers(delay):
+def test_a_delay_is_recovered_from_synthetic_data(delay):
     chance = np.random.default_rng(7)
     read = np.arange(0.0, 2.0, 0.01)
     t = np.arange(0.2, 1.9, 0.01) + 0.003

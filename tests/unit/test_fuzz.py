@@ -1,4 +1,4 @@
-"""A short run of the fuzzing of commands, profiles, calibration files and boards."""
+"""Short fuzzing runs of commands, profiles, calibration files and boards."""
 
 import pytest
 
@@ -9,7 +9,7 @@ from tests.fuzz.commands import fuzz
 @pytest.mark.parametrize(
     ("name", "count"), [("commands", 5000), ("settings", 800), ("calibration", 1200)]
 )
-def test_odd_input_is_refused_or_carried_out_and_nothing_else(name, count):
+def test_random_commands_are_refused_or_executed_without_other_errors(name, count):
     counts = fuzz(name, count, seed=11)
     assert set(counts) == {"done", "refused"}
     assert sum(counts.values()) == count
@@ -17,9 +17,9 @@ def test_odd_input_is_refused_or_carried_out_and_nothing_else(name, count):
 
 
 @pytest.mark.parametrize("target", tactile.TARGETS)
-def test_no_input_breaks_a_reader(target):
+def test_random_input_never_crashes_a_reader(target):
     report = tactile.fuzz(target, 4000, seed=7)
     assert report.wrong == []
     assert report.through > 300
-    if target == "cobs":  # the CRC lets one wrong packet in 65536 through
+    if target == "cobs":  # one of 65536 wrong packets passes the CRC
         assert report.foreign <= 2

@@ -1,4 +1,4 @@
-"""What a client may do to the gateway: each bound, and that others are served meanwhile."""
+"""The gateway's limits for clients, each of which keeps other clients served."""
 
 from collections.abc import Iterator
 
@@ -37,18 +37,18 @@ def connect(context: Context, kind: int, address: str) -> zmq.Socket[bytes]:
 
 
 def is_served(served: Served, context: Context, address: str) -> bool:
-    """A client that comes now is answered."""
+    """Return True if a new client gets a reply."""
     return bool(Asking(context, served, address, "status").told()["ok"])
 
 
-def test_the_loop_is_given_few_requests_at_a_time_and_answers_all(
+def test_few_requests_are_passed_to_the_loop_at_a_time_and_all_are_answered(
     served, context, addresses, clock
 ):
     clients = [
         Asking(context, served, addresses[1], "arm") for _ in range(2 * bounds.UNANSWERED_MAX)
     ]
     until(lambda: served.settle() or served.service.commands.count == bounds.UNANSWERED_MAX)
-    clock.sleep_until(clock.now() + 2.0)  # a machine that is busy
+    clock.sleep_until(clock.now() + 2.0)  # a busy machine
     served.settle()
     assert len(served.link.asked) == bounds.UNANSWERED_MAX
     assert is_served(served, context, addresses[1])
@@ -64,7 +64,9 @@ def test_the_loop_is_given_few_requests_at_a_time_and_answers_all(
         (zmq.XSUB, b"\x01" + b"x" * bounds.SUBSCRIPTION_SIZE_MAX),  # longer than any topic
     ],
 )
-def test_a_message_that_is_far_too_long_is_hung_up_on(served, context, addresses, kind, message):
+def test_a_client_that_sends_an_oversized_message_is_disconnected(
+    served, context, addresses, kind, message
+):
     client = context.socket(kind)
     monitor = client.get_monitor_socket(zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_DISCONNECTED)
     client.connect(addresses[kind == zmq.DEALER])
@@ -82,7 +84,7 @@ def test_a_message_that_is_far_too_long_is_hung_up_on(served, context, addresses
     assert is_served(served, context, addresses[1])
 
 
-def test_topics_that_are_none_of_ours_are_not_kept(served, context, addresses):
+def test_unknown_topics_are_not_stored(served, context, addresses):
     subscriber = connect(context, zmq.SUB, addresses[0])
     for k in range(500):
         subscriber.subscribe(f"hand/{k}")
@@ -91,12 +93,13 @@ def test_topics_that_are_none_of_ours_are_not_kept(served, context, addresses):
     assert served.service.stream._prefixes == {EVENT}
 
 
-def test_subscribers_that_come_and_go_do_not_have_all_told_again_each_time(
+def test_frequent_resubscriptions_do_not_repeat_all_messages_each_time(
     served, context, addresses, clock
 ):
-    """What late subscribers are told goes to all: 50 events for each would be a flood."""
+    """Repeats go to all subscribers, so repeating 50 events each time would be a flood."""
     served.publisher.event(0.0, 0.0, "info", "test", "told again")
-    served.settle()  # sent, to nobody: later it could reach a reader of whom is not known yet
+    # Send it before anyone subscribes, so that it cannot reach an unregistered reader later.
+    served.settle()
     reader = connect(context, zmq.SUB, addresses[0])
     reader.subscribe(EVENT)
     until(lambda: [served.settle(), reader.poll(0)][1])
@@ -116,8 +119,8 @@ def test_subscribers_that_come_and_go_do_not_have_all_told_again_each_time(
     assert not reader.poll(50)
 
 
-def test_answers_that_are_not_read_are_dropped(served, context, addresses):
-    """They neither hold up the gateway nor fill its memory: so many wait, and no more."""
+def test_unread_replies_are_dropped(served, context, addresses):
+    """Unread replies neither block the gateway nor fill its memory, as the queue is limited."""
     client = context.socket(zmq.DEALER)
     client.setsockopt(zmq.RCVHWM, 1)
     client.setsockopt(zmq.RCVBUF, 4096)

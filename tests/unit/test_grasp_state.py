@@ -1,4 +1,4 @@
-"""The planar geometry against NumPy; how a held object answers the joints, against `Grasp`."""
+"""Planar geometry against NumPy, and the held object's motion against `Grasp`."""
 
 import math
 
@@ -21,7 +21,7 @@ from tests.harness.paper_tip import E
 from tests.harness.plant import PAPER
 from tests.harness.reference_hand import ReferenceHand
 
-# Inner kernels, made callable.
+# Make the inner kernels callable.
 holding_moment_arms = called(holding_moment_arms)
 sheared_gradient = called(sheared_gradient)
 held_motion = called(held_motion)
@@ -50,7 +50,7 @@ def motion_of(state: GraspState) -> tuple[float, ...]:
 
 
 @pytest.mark.parametrize("delta", [0.0, 0.06, -0.12])
-def test_levers_are_the_torques_that_balance_the_grasp(grasp, delta):
+def test_moment_arms_are_the_equilibrium_torques_per_force(grasp, delta):
     state = grasp.symmetric(0.0035)
     if delta:
         state = grasp.steer(state, delta)
@@ -66,7 +66,7 @@ def test_levers_are_the_torques_that_balance_the_grasp(grasp, delta):
 
 
 def faces(q, d, angle: float, taper: float):
-    """Both faces' n and t, the tips' centres and velocities, and what rolls: a − d − v·t."""
+    """Return the faces' n and t, the tips' centres and velocities, and rolling a − d − v·t."""
     n, t = [], []
     for side in (-0.5, 0.5):
         at = angle + side * taper
@@ -78,16 +78,16 @@ def faces(q, d, angle: float, taper: float):
 
 
 @pytest.mark.parametrize("taper", [-0.4, 0.0, 0.2])
-def test_a_tapering_object_moves_by_the_constraints_of_its_faces(taper):
+def test_a_tapered_object_satisfies_the_constraints_of_its_faces(taper):
     q, d, angle = (0.12, 0.21), (3e-3, 4e-3), -0.1
     n, t, tips, v, rolls = faces(q, d, angle, taper)
     a = HAND.tip_radius
-    middle = tips.mean(axis=0)  # whatever point of the object
+    middle = tips.mean(axis=0)  # any point of the object
     w = [d[0] - a - n[0] @ (tips[0] - middle), d[1] - a + n[1] @ (tips[1] - middle)]
     s = [(tips[i] - middle) @ t[i] for i in range(2)]
     arm1, arm2, turn1, turn2, slide, width, across = held_motion(q, d, angle, taper, LENGTHS)
     for dq in ((1.0, 0.0), (0.0, 1.0), (0.3, -0.8)):
-        # For (Gx, Gy, φ): d_t of both tips stays, and both d change alike.
+        # Unknowns (Gx, Gy, φ): d_t of both tips is constant, and both d change equally.
         left = np.array(
             [
                 [*t[0], -w[0]],
@@ -109,7 +109,7 @@ def test_a_tapering_object_moves_by_the_constraints_of_its_faces(taper):
 
 
 @pytest.mark.parametrize("taper", [-0.4, 0.2])
-def test_what_holds_a_tapering_object_balances_it(grasp, taper):
+def test_holding_forces_balance_a_tapered_object(grasp, taper):
     q, d, angle = (0.2, 0.16), (3.1e-3, 3e-3), 0.05
     n, t, tips, v, rolls = faces(q, d, angle, taper)
     a, data = HAND.tip_radius, grasp.table.data
@@ -126,14 +126,14 @@ def test_what_holds_a_tapering_object_balances_it(grasp, taper):
     felt = [sheared_gradient(looked_up[i], d[i], theta[i], shear[i]) for i in range(2)]
     for i, each in enumerate((normal1, normal2)):
         assert felt[i][0] - shear[i] * math.tan(theta[i]) == pytest.approx(each, rel=1e-4)
-    # The forces on the object, at the contacts, and the tips' turning moments.
+    # Forces on the object at the contacts, and the tips' moments on it.
     forces = [pressed[0] * n[0] - shear[0] * t[0], -pressed[1] * n[1] + shear[1] * t[1]]
     assert sum(forces) == pytest.approx([0.0, 0.0], abs=1e-12)
     touched = [tips[0] + (a - d[0]) * n[0], tips[1] - (a - d[1]) * n[1]]
     moments = [p[0] * f[1] - p[1] * f[0] for p, f in zip(touched, forces, strict=True)]
     turning = felt[0][1] + felt[1][1]
     assert sum(moments) == pytest.approx(turning, abs=5e-4 * normal * a)
-    # The joints' torques by virtual work on each face.
+    # Joint torques by virtual work on each face.
     force = 0.5 * (looked_up[0][0] + looked_up[1][0])
     torque1 = pressed[0] * n[0] @ v[0] + shear[0] * rolls[0] + felt[0][1]
     torque2 = -pressed[1] * n[1] @ v[1] - shear[1] * rolls[1] - felt[1][1]
@@ -157,13 +157,13 @@ def test_each_tip_has_its_own_table(grasp):
     assert here[:2] != pytest.approx(levers(soft, soft, q1, q2, d1, d2, angle)[:2], rel=1e-3)
 
 
-def test_total_tilt_is_the_angle_of_the_normal_with_the_axis():
+def test_total_tilt_is_the_angle_between_normal_and_axis():
     assert total_tilt(0.3, 0.0) == pytest.approx(0.3)
     x, y = math.sin(0.2), math.sin(-0.1)
     assert math.cos(total_tilt(0.2, -0.1)) == pytest.approx(math.sqrt(1.0 - x * x - y * y))
 
 
-# The load along the faces by the joints' torques
+# Load along the faces from joint torques
 
 
 def found_load(
@@ -181,7 +181,7 @@ def found_load(
 
 @pytest.mark.parametrize("load", [0.0, 4.0, 8.0, -3.0, -6.0])
 @pytest.mark.parametrize("delta", [0.0, 0.06, -0.12])
-def test_load_is_what_the_tips_bear(table, load, delta):
+def test_load_from_torques_equals_the_load_on_the_tips(table, load, delta):
     state = Grasp(HAND, table, WIDTH).symmetric(0.0035)
     if delta:
         state = Grasp(HAND, table, WIDTH).steer(state, delta)
@@ -192,13 +192,13 @@ def test_load_is_what_the_tips_bear(table, load, delta):
     rolled = 0.5 * (shear[0] + shear[1])
     found, slope = found_load(table, state, rolled)
     assert found == pytest.approx(0.5 * load, rel=0.02, abs=0.01)
-    # An error of the torques makes one of the load as the slope says.
+    # The slope relates a torque error to a load error.
     more = 1e-5  # N·m
     again, _ = found_load(table, state, rolled, more)
     assert again - found == pytest.approx(more / slope, rel=0.02)
 
 
-def test_without_two_contacts_there_are_no_levers_and_no_load(table):
+def test_moment_arms_and_load_are_zero_without_two_contacts(table):
     motion = held_motion((0.1, 0.1), (0.0, 1e-3), 0.0, 0.0, LENGTHS)
     data = table.data
     rolled = (0.0, 0.0)
@@ -207,14 +207,14 @@ def test_without_two_contacts_there_are_no_levers_and_no_load(table):
     assert holding_moment_arms(data, data, (0.0, 1e-3), (0.1, -0.1), 0.0, motion) == (0.0,) * 5
 
 
-def test_torques_that_no_load_explains_give_a_finite_one(table):
+def test_torques_that_no_load_explains_give_a_finite_load(table):
     for torque in (-50.0, 50.0):
         for q in np.linspace(-0.5, 1.0, 7):
             motion = held_motion((q, 0.1), (1e-6, 1e-3), 0.1, 0.3, LENGTHS)
             at = (table.data, table.data, (1e-6, 1e-3), (q, -0.1), 0.3, motion)
             left1, left2, lever, bow = load_torques(*at, (0.3, 0.3), (torque, 0.5))
             if lever == 0.0:
-                continue  # a load would not show
+                continue  # a load would have no effect on the torques
             load, slope = load_of(0.5 * (left1 + left2), lever, bow)
             assert math.isfinite(load)
             assert slope > 0.0
@@ -222,7 +222,7 @@ def test_torques_that_no_load_explains_give_a_finite_one(table):
 
 @pytest.mark.parametrize("load", [0.0, 3.0])
 @pytest.mark.parametrize("taper", [-0.3, 0.3])
-def test_load_on_a_tapering_object_is_told_from_what_presses_it_out(table, taper, load):
+def test_load_on_a_tapered_object_excludes_the_normal_forces_along_it(table, taper, load):
     q, d, angle = (0.2, 0.2), (3e-3, 3e-3), 0.0
     theta = (q[0] - 0.5 * taper, 0.5 * taper - q[1])
     data, lean = table.data, math.tan(0.5 * taper)
@@ -230,7 +230,7 @@ def test_load_on_a_tapering_object_is_told_from_what_presses_it_out(table, taper
     _, _, mean, normal1, normal2 = holding_moment_arms(data, data, d, theta, taper, motion)
     out = 0.5 * lean * (normal1 + normal2)
     rolled = (mean - out, mean + out)
-    # The torques of both tips' energies, each with the shear that it bears.
+    # Torques from both tips' energies, each with its own shear.
     v, torques = HAND.tip_jacobian(q), []
     for i, shear in enumerate((rolled[0] + load, rolled[1] - load)):
         at = (i - 0.5) * taper
@@ -245,7 +245,7 @@ def test_load_on_a_tapering_object_is_told_from_what_presses_it_out(table, taper
     )
     found, _ = load_of(0.5 * (left1 + left2), lever, bow)
     assert found == pytest.approx(load, abs=2e-3)
-    # Each joint shows its part of it: one that doesn't is no load.
+    # Both joints must show the load; otherwise it is not a load.
     assert left1 == pytest.approx(left2, abs=1e-9)
 
 
@@ -272,7 +272,7 @@ def rotation(angle: float) -> np.ndarray:
 
 
 def contacts_by_rotation(hand: ReferenceHand, q, pose, width) -> np.ndarray:
-    """The plain twin: fingers as rotated vectors, the object's frame as a rotation matrix."""
+    """Reference with fingers as rotated vectors and the object's frame as a rotation matrix."""
     local = np.array([hand.finger_offset, hand.finger_length])
     left = np.array([-hand.half_separation, 0]) + rotation(-q[0]) @ local
     right = np.array([hand.half_separation, 0]) + rotation(q[1]) @ (local * [-1, 1])
@@ -283,7 +283,7 @@ def contacts_by_rotation(hand: ReferenceHand, q, pose, width) -> np.ndarray:
 
 
 @pytest.mark.parametrize("hand", HANDS)
-def test_contacts_and_their_jacobian_are_those_of_the_rotation_matrix_twin(hand):
+def test_contacts_and_jacobian_equal_those_from_rotation_matrices(hand):
     step = 1e-6 * np.eye(5)
     for q, pose in random_states(20):
         c = hand.contacts(q, pose, WIDTH)
@@ -302,7 +302,7 @@ def test_contacts_and_their_jacobian_are_those_of_the_rotation_matrix_twin(hand)
             assert inwards == pytest.approx(numeric[finger, finger], abs=1e-9)
 
 
-def test_sheared_energy_equals_its_closed_form_and_checkpoint():
+def test_sheared_energy_equals_closed_form_and_checkpoint():
     assert sheared_contact(PAPER, 0.006, math.radians(20), 0.0015)[0] == pytest.approx(
         0.10953644560057, rel=1e-12
     )
@@ -318,13 +318,13 @@ def test_sheared_energy_equals_its_closed_form_and_checkpoint():
 
 @pytest.mark.parametrize(
     ("d", "degrees", "normal", "moment"),
-    [  # d [mm], q [°], N [N], N times its lever arm [mN·m], for L 80, B 50, W 40, e 0, a 20 mm
+    [  # d [mm], q [°], N [N], N times its moment arm [mN·m], for L 80, B 50, W 40, e 0, a 20 mm
         (2, 8.6269265587, 3.8421597806, 303.895166),
         (4, 10.0786581078, 15.4013956785, 1213.098241),
         (8, 13.0028781629, 61.9376635610, 4827.960422),
     ],
 )
-def test_symmetric_grasp_table(d, degrees, normal, moment):
+def test_symmetric_grasp_values(d, degrees, normal, moment):
     grasp = Grasp(ReferenceHand(), PAPER, WIDTH)
     state = grasp.symmetric(d * 1e-3)
     forces = grasp.forces(state)
@@ -333,7 +333,7 @@ def test_symmetric_grasp_table(d, degrees, normal, moment):
     np.testing.assert_allclose(forces.tangential, 0, atol=1e-12)
     lever = 0.080 * np.cos(state.q)
     np.testing.assert_allclose(forces.normal * lever * 1e3, moment, rtol=1e-8)
-    # A joint also bears the moment by which the tilted tip turns; it is 0.1 to 0.4 % here.
+    # A joint also carries the moment of the tilted tip, here 0.1 to 0.4 %.
     turning = forces.turning * [1, -1]
     np.testing.assert_allclose(forces.torque, forces.normal * lever + turning, rtol=1e-12)
     np.testing.assert_allclose(grasp.gradient(state)[2:], 0, atol=1e-12)

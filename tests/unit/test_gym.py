@@ -1,4 +1,4 @@
-"""Gymnasium's environments: what its own checker says, seeds to the bit, and who gets what."""
+"""The Gymnasium environments: API checker, reproducible seeds, observations and rewards."""
 
 import gymnasium
 import numpy as np
@@ -17,13 +17,13 @@ pytestmark = pytest.mark.filterwarnings("error")
     "task",
     [pytest.param(task, marks=[pytest.mark.extended] * (task != "grasp")) for task in TASKS],
 )
-def test_gymnasiums_checker_has_nothing_to_say(task):
+def test_the_environment_passes_the_gymnasium_checker(task):
     env = gymnasium.make(f"SoftFinger-{task.capitalize()}-v0")
     check_env(env.unwrapped, skip_render_check=True)
     env.close()
 
 
-def test_a_seed_gives_the_same_bits_and_another_one_others():
+def test_equal_seeds_give_equal_bits_and_other_seeds_do_not():
     env = SoftFingerEnv("push")
 
     def seen(seed: int) -> list[bytes]:
@@ -39,7 +39,7 @@ def test_a_seed_gives_the_same_bits_and_another_one_others():
 
 
 @pytest.mark.extended
-def test_the_built_in_law_turns_and_holds_and_a_random_agent_does_not():
+def test_the_built_in_control_turns_and_holds_but_a_random_agent_does_not():
     for task, least, most in (("rotate", 150.0, 150.0), ("grasp", 120.0, 20.0)):
         name = f"SoftFinger-{task.capitalize()}-v0"
         by_joints, law = gymnasium.make(name), gymnasium.make(name, control="law")
@@ -50,20 +50,20 @@ def test_the_built_in_law_turns_and_holds_and_a_random_agent_does_not():
         law.close()
 
 
-def test_shaping_adds_what_the_potential_has_grown_by():
+def test_shaping_adds_the_increase_of_the_potential():
     plain, shaped = SoftFingerEnv("grasp"), SoftFingerEnv("grasp", shaped=True)
     sums = []
     for env in (plain, shaped):
         env.reset(seed=1)
         start = env._potential
         sums.append(sum(env.step(np.ones(2, np.float32))[1] for _ in range(20)))
-    assert shaped._potential > start + 2.0  # closing is worth something before the first touch
+    assert shaped._potential > start + 2.0  # closing increases the potential before first contact
     assert sums[1] - sums[0] == pytest.approx(shaped._potential - start)
     plain.close()
     shaped.close()
 
 
-def test_images_are_of_eight_bits_channel_first():
+def test_images_have_8_bits_and_the_channel_first():
     env = Images(gymnasium.make("SoftFinger-Push-v0", control="law"))
     observation, _ = env.reset(seed=1)
     assert env.observation_space.contains(observation)
@@ -73,7 +73,7 @@ def test_images_are_of_eight_bits_channel_first():
     env.close()
 
 
-def test_the_baseline_closes_each_finger_by_its_own_features():
+def test_the_baseline_closes_each_finger_based_on_its_own_features():
     def act(d: float, force: float) -> list[float]:
         contacts = np.array([d, 0.0, force, 0.0, 0.0, 0.0], np.float32)
         observed = {"contacts": contacts, "joints": np.zeros(6), "goal": np.array([6.0])}
@@ -86,7 +86,7 @@ def test_the_baseline_closes_each_finger_by_its_own_features():
 
 
 @pytest.mark.parametrize("control", ["joints", "law"])
-def test_an_action_that_is_no_number_is_refused_and_the_episode_goes_on(control):
+def test_a_nan_action_is_refused_and_the_episode_continues(control):
     task = "grasp" if control == "joints" else "rotate"
     env = SoftFingerEnv(task, control)
     env.reset(seed=1)

@@ -1,4 +1,4 @@
-"""The simulated hand: where it balances, what its servos do, its scenes and its time."""
+"""The simulated hand: equilibrium, servos, scenes and time."""
 
 import math
 
@@ -25,10 +25,10 @@ from tests.harness.plant import (
 )
 from tests.harness.reference_hand import ReferenceHand
 
-# Balance.
+# Equilibrium.
 
 
-def test_symmetric_grasp_settles_where_the_theory_puts_it():
+def test_a_symmetric_grasp_settles_at_the_theoretical_equilibrium():
     hand = make(table_friction=0.0, joint_friction=0.0)
     grasp = Grasp(ReferenceHand(), PAPER, WIDTH)
     for d, degrees, normal in [
@@ -50,7 +50,7 @@ def test_quasi_static_steering_gain(degrees, gain):
     start = grasp.symmetric(0.004)
     place(hand, start.q, start.pose)
     hand.shear[:] = start.shear
-    # The joints held stiffly and turned slowly, so that only they and the tips' energy decide.
+    # Stiff joints that turn slowly, so that only they and the tips' energy matter.
     parameters = hand.plant.parameters
     parameters.position_gain = 1e5
     parameters.rate_gain = parameters.current_limit = parameters.stall_current = 1e3
@@ -65,9 +65,10 @@ def test_quasi_static_steering_gain(degrees, gain):
     assert hand.object_pose[2] / turned == pytest.approx(gain, abs=2e-3)
 
 
-def test_load_dependent_friction_is_the_gears_efficiency():
-    # A share μ of motor's and contact's torque: (1 − μ)/(1 + μ) arrives, driven back its inverse.
-    share, rest = 0.25, 0.02  # and N·m, half of each only at rest
+def test_load_dependent_friction_equals_the_gear_efficiency():
+    # With friction as a fraction μ of motor and contact torque, (1 − μ)/(1 + μ) arrives; when
+    # backdriven, the inverse.
+    share, rest = 0.25, 0.02  # share of the torque, and N·m of which half acts only at standstill
     simulation = {"joint_friction": 0.5 * rest, "joint_stribeck": 0.5 * rest, "joint_damping": 0.0}
     simulation |= {"joint_load_friction": (0.5 * share, 0.5 * share), "joint_stribeck_speed": 50.0}
     settings = {"scene": {"fingers": ("left",)}, "simulation": simulation}
@@ -84,7 +85,7 @@ def test_load_dependent_friction_is_the_gears_efficiency():
     assert arrived[-1] == pytest.approx((driven * (1 + share) + rest) / (1 - share), rel=0.02)
 
 
-def test_gravity_pulls_a_free_object_and_a_grasp_holds_it():
+def test_gravity_accelerates_a_free_object_and_a_grasp_holds_it():
     hand = make(gravity=(0.0, -9.80665))
     run(hand, 0.1)
     t = hand.t
@@ -95,7 +96,7 @@ def test_gravity_pulls_a_free_object_and_a_grasp_holds_it():
     start = grasp.symmetric(0.004)
     place(held, start.q, start.pose)
     settled(held, (0.9, 0.9), 0.7, 1.0)
-    # The tips' push and shear in y carry the weight to 1 %, and nothing slips.
+    # The y components of the tips' forces carry the weight to within 1 %, without slip.
     along = held.tangential * np.cos(held.object_pose[2]) * [-1, 1]
     assert abs(along.sum()) == pytest.approx(0.3 * 9.80665, rel=0.01)
     place_before = held.object_pose[1]
@@ -119,7 +120,7 @@ def test_a_held_object_slips_when_the_push_exceeds_friction(friction):
         run(hand, 0.005)
         ratio = np.abs(hand.tangential) / hand.normal
         assert (ratio <= friction * (1 + 1e-9)).all()
-    # Both tips slip, at Coulomb's bound; only inertia is left of the push.
+    # Both tips slip at Coulomb's limit; only inertia balances the rest of the push.
     np.testing.assert_allclose(ratio, friction, rtol=1e-6)
     assert push == pytest.approx(2 * friction * hand.normal.mean(), rel=0.15)
 
@@ -136,16 +137,16 @@ def test_a_dropped_object_comes_to_rest_on_the_palm():
             energy = later
             if hand.t > 0.15:
                 highest = max(highest, np.abs(hand.object_velocity[1]))
-        # Flat on a face, the weight on two corners' springs of 1e5 N/m; a tip it leans on may
-        # still be creeping away.
+        # Flat on a face, the weight rests on two corner springs of 1e5 N/m; a tip that touches it
+        # may still creep.
         half = 0.5 * (0.060 if abs(math.sin(hand.object_pose[2])) < 0.5 else 0.040)
         sunk = 0.1 * 9.80665 / 2e5
         assert hand.object_pose[1] == pytest.approx(0.01 + half - sunk, abs=5e-7)
         assert np.abs(hand.object_velocity[1:]).max() < 1e-6
-    assert highest > 0.01  # the tilted one rocked before it lay still
+    assert highest > 0.01  # the tilted object rocked before it came to rest
 
 
-def test_a_collision_keeps_momentum_and_energy():
+def test_a_collision_conserves_momentum_and_energy():
     hand = make(object_mass=0.05, **LOSSLESS)
     place(hand, (0.0, 0.0), (-0.005, 0.08, 0.0), velocity=(-0.5, 0.0, 0.0))
     start = hand.energy()
@@ -158,7 +159,7 @@ def test_a_collision_keeps_momentum_and_energy():
     assert hand.force[0] == 0.0
     assert hand.object_velocity[0] > 0.3
     assert 0.05 * (hand.object_velocity[0] + 0.5) == pytest.approx(impulse, rel=1e-3)
-    # The finger takes L N dt, with the object's face upright all the while.
+    # The finger receives L N dt while the object's face stays upright.
     assert hand.plant.parameters.joint_inertia * hand.dq[0] == pytest.approx(
         -0.080 * impulse, rel=3e-3
     )
@@ -180,11 +181,11 @@ def test_position_moves_are_well_damped_and_bounded_by_the_goal_current():
         if hand.t < 0.02:
             continue
         highest = max(highest, hand.q.max())
-    assert highest < 0.1 + 0.01 * 0.3  # overshoot below 1 % of the move
+    assert highest < 0.1 + 0.01 * 0.3  # less than 1 % overshoot
     np.testing.assert_allclose(hand.q, 0.1, atol=0.01)
 
 
-def test_modes_torque_and_electrics():
+def test_modes_torque_and_current_dynamics():
     hand = make(joint_friction=0.0, joint_damping=0.0)
     place(hand, (0.0, 0.0), (0.0, 0.3, 0.0))
     hand.drive(0, CURRENT, True, 0.0, 0.2)
@@ -203,7 +204,7 @@ def test_modes_torque_and_electrics():
         hand.drive(0, BOUNDED, True, math.nan, 0.1)
 
 
-def test_end_stops_and_no_load_speed_bound_the_joints():
+def test_end_stops_and_no_load_speed_limit_the_joints():
     hand = make()
     place(hand, (0.0, 0.0), (0.0, 0.3, 0.0))
     for joint in range(2):
@@ -213,7 +214,7 @@ def test_end_stops_and_no_load_speed_bound_the_joints():
         run(hand, 0.002)
         fastest = max(fastest, np.abs(hand.dq).max())
     assert fastest < hand.plant.parameters.no_load_speed
-    # 5.4 N·m on 500 N·m/rad, behind the clearance of 0.05 rad.
+    # 5.4 N·m on 500 N·m/rad, after the clearance of 0.05 rad.
     assert 1.05 < hand.q[0] < 1.07
     assert -0.57 < hand.q[1] < -0.55
 
@@ -221,7 +222,7 @@ def test_end_stops_and_no_load_speed_bound_the_joints():
 # Scenes.
 
 
-def test_scripted_compression_presses_both_tips_in_turn_to_eight_millimetres():
+def test_scripted_compression_indents_each_tip_by_eight_millimetres():
     settings = Settings.model_validate(
         {"servos": {"backend": "none"}, "simulation": {"compression_speed": 0.01}}
     )
@@ -235,7 +236,7 @@ def test_scripted_compression_presses_both_tips_in_turn_to_eight_millimetres():
     np.testing.assert_allclose(deepest, 0.008, atol=2e-5)
     np.testing.assert_array_equal(hand.q, settings.hand.open_angle)
     assert both == 0
-    # F = πE d²/cos θ at each instant.
+    # F = πE d²/cos θ at all times.
     run(hand, 1.7)
     d = hand.d[0]
     assert d > 0.004
@@ -245,7 +246,7 @@ def test_scripted_compression_presses_both_tips_in_turn_to_eight_millimetres():
 # Time.
 
 
-def test_advance_is_idempotent_and_split_ways_are_bit_identical():
+def test_advancing_is_idempotent_and_independent_of_its_division():
     hands = [make(TABLE_I) for _ in range(3)]
     for hand in hands:
         for joint in range(2):
@@ -271,7 +272,7 @@ def test_advance_is_idempotent_and_split_ways_are_bit_identical():
         assert state(hand) == before
 
 
-def test_samples_stand_at_the_frames_instants_between_sub_steps():
+def test_samples_are_interpolated_at_the_frame_times():
     settings = Settings.model_validate({"tactile": {"rate": 130.0}})
     hand = SimulatedHand(settings, start=5.0, table=PAPER)
     finer = SimulatedHand(settings, start=5.0, table=PAPER, step=1.0 / 130.0 / 64)
@@ -283,7 +284,7 @@ def test_samples_stand_at_the_frames_instants_between_sub_steps():
     for number in range(hand.sample_count - 5, hand.sample_count):
         sample, exact = hand.sample(number), finer.sample(number)
         assert sample.t == number / 130.0
-        # A tick's motion is 1e-4 rad and 4e-6 m: a sample that isn't interpolated is off by that.
+        # A tick's motion is 1e-4 rad and 4e-6 m, the error of a sample without interpolation.
         np.testing.assert_allclose(sample.d, exact.d, atol=8e-7)
         np.testing.assert_allclose(sample.theta, exact.theta, atol=1e-5)
     with pytest.raises(LookupError):
@@ -292,7 +293,7 @@ def test_samples_stand_at_the_frames_instants_between_sub_steps():
         hand.sample(0)
 
 
-def test_sub_step_divides_the_millisecond_and_shrinks_with_stiffness():
+def test_the_step_divides_a_millisecond_and_decreases_with_stiffness():
     steps = [make(object_mass=mass).step for mass in (10.0, 0.1, 0.01, 1e-4)]
     for step in steps:
         assert 1e-3 / step == pytest.approx(round(1e-3 / step), abs=1e-9)

@@ -1,4 +1,4 @@
-"""The hand's estimator against a NumPy reference, at its beginning, and with slow cells."""
+"""The hand's estimator: against NumPy, at start-up, and with slow cells."""
 
 import math
 from dataclasses import replace
@@ -36,7 +36,7 @@ def some_hand(rng: np.random.Generator) -> HandFilter:
 
 
 @pytest.mark.parametrize("gate", [math.inf, 3.0])
-def test_a_correction_is_that_of_a_kalman_filter_with_clipped_innovations(gate):
+def test_corrections_equal_a_kalman_filter_with_clipped_innovations(gate):
     rng = np.random.default_rng(1)
     for innovation in (1e-3, -0.02, 0.5):
         hand = some_hand(rng)
@@ -55,7 +55,7 @@ def test_a_correction_is_that_of_a_kalman_filter_with_clipped_innovations(gate):
 
 
 @pytest.mark.parametrize("innovation", [math.nan, math.inf])
-def test_a_measurement_that_is_not_finite_corrects_nothing(innovation):
+def test_a_non_finite_measurement_has_no_effect(innovation):
     hand = some_hand(np.random.default_rng(2))
     mean, covariance = hand.mean.copy(), hand.covariance.copy()
     hand.slopes[0] = 1.0
@@ -65,7 +65,7 @@ def test_a_measurement_that_is_not_finite_corrects_nothing(innovation):
     assert (hand.slopes == 0.0).all()
 
 
-def test_the_consistency_of_a_channel_is_one_for_noise_as_modelled_and_four_for_twice_of_it():
+def test_channel_consistency_is_one_for_modelled_noise_and_four_for_doubled_noise():
     rng = np.random.default_rng(3)
     for factor in (1.0, 2.0):
         hand, found = some_hand(rng), []
@@ -75,7 +75,7 @@ def test_the_consistency_of_a_channel_is_one_for_noise_as_modelled_and_four_for_
             hand.covariance[:], hand.slopes[:] = covariance, slopes
             corrected(hand.array, factor * std * rng.normal(), 1e-4, math.inf)
             found.append(hand.grasp.nis[0])
-        # 4000 squares of mean 1 have a standard error of 0.022, and the first 500 settle.
+        # The mean of 4000 squares has a standard error of 0.022; the first 500 are transient.
         assert np.mean(found[500:]) == pytest.approx(factor**2, rel=0.15)
         assert not hand.grasp.nis[1:].any()
 
@@ -91,11 +91,11 @@ ESTIMATE = ContactEstimate(
     invalid=Invalid.NONE,
     d=0.003,
     tilt_x=0.1,
-    covariance=np.diag([5e-5**2, 5e-3**2, 0.0, 1e6]),  # of a gain that nothing is known of
+    covariance=np.diag([5e-5**2, 5e-3**2, 0.0, 1e6]),  # unknown gain
 )
 
 
-def test_what_frames_share_stays_however_many_come():
+def test_systematic_errors_do_not_average_out():
     settings = Settings.model_validate({"scene": {"fingers": ("left",)}})
     table = make_table(settings, make_material(settings.material))
     estimator = HandEstimator(settings, (table, table))
@@ -111,16 +111,18 @@ def test_what_frames_share_stays_however_many_come():
             first = replace(contacts[0])
     contact = contacts[0]
     assert first.d_std == pytest.approx(math.hypot(5e-5, 2e-5), rel=1e-3)
-    assert 2e-5 < contact.d_std < 1.2 * first.d_std  # a zero that may drift leaves no more
+    # No less remains, because the zero offset may drift.
+    assert 2e-5 < contact.d_std < 1.2 * first.d_std
     assert 4e-3 < contact.theta_std < first.theta_std
-    # The force's follows d's by ∂F/∂d = 2F/d, and θ's by F tan θ; a modulus is known to 20 %.
+    # The force error follows from d by ∂F/∂d = 2F/d and from θ by F tan θ; the modulus is known to
+    # within 20 %.
     by_d, by_theta = 2.0 * contact.force / contact.d * contact.d_std, contact.force * 0.1 * 4e-3
     by_modulus = 0.2 * contact.force
     assert contact.force_std == pytest.approx(math.hypot(by_d, by_theta, by_modulus), rel=0.02)
 
 
 @pytest.mark.filterwarnings("ignore:the smooth law misses")
-def test_the_law_misfit_is_in_the_force(estimator):
+def test_the_misfit_of_the_material_law_is_part_of_the_force_error(estimator):
     contacts, pose = [Contact(), Contact()], ObjectPose()
     strain = np.linspace(0.025, 1.0, 40)
     law = Material.from_points(strain, 1e5 * strain**0.7)
@@ -145,11 +147,11 @@ def frame(t: float) -> Frame:
 
 
 @pytest.mark.parametrize("read_first", [True, False])
-def test_a_tip_that_touches_at_the_start_is_felt_at_once_and_from_then_on(estimator, read_first):
+def test_a_contact_at_start_up_is_reported_from_the_first_frame_on(estimator, read_first):
     contacts, pose = [Contact(), Contact()], ObjectPose()
     if read_first:
         estimator.predict(Reading(t=5.0, q=[0.15, 0.15], valid=True))
-    # Both frames were sampled before the first reading was taken.
+    # Both frames were sampled before the first reading.
     for k in range(2):
         estimator.update(0, frame(4.98 + 0.01 * k), ESTIMATE, contacts[0])
         estimator.write_contacts(5.0, contacts, pose)
@@ -170,13 +172,13 @@ def test_a_tip_that_touches_at_the_start_is_felt_at_once_and_from_then_on(estima
 
 
 @pytest.mark.parametrize("response", [0.04, 0.08])
-def test_what_slow_cells_show_late_the_joints_make_up_for(response):
+def test_joint_motion_compensates_for_slow_cells(response):
     settings = Settings.model_validate({"tactile": {"response": response}})
     table = make_table(settings, make_material(settings.material))
     estimator = HandEstimator(settings, (table, table))
     contacts, pose = [Contact(), Contact()], ObjectPose()
     d, q = 0.003, 0.15
-    below = np.linspace(0.0, 0.01, 400)  # m of the tip from its top, in even steps of area
+    below = np.linspace(0.0, 0.01, 400)  # Depths below the tip's apex in m, in equal steps of area.
     pressure, shown, fitted = np.maximum(d - below, 0.0), q, (d, 1.0)
     follows = -math.expm1(-0.002 / response)
     off = []

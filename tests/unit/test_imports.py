@@ -1,4 +1,4 @@
-"""Imports run one way, without circles; names of classes, and the root of exceptions."""
+"""Import directions and cycles, class names, and the base class of exceptions."""
 
 import ast
 import re
@@ -11,14 +11,14 @@ from pathlib import Path
 import softfinger
 
 ROOT = Path(softfinger.__file__).parents[1]
-ORDER = ("kinematics", "daemon", "tools")  # each imports itself and those before it
+ORDER = ("kinematics", "daemon", "tools")  # each may import itself and those before it
 PAGE = ROOT / "docs" / "architecture.md"
 BUILT_IN = {"Exception", "ValueError", "RuntimeError", "OSError", "TimeoutError"}
 
 
 @cache
 def modules() -> dict[str, Path]:
-    """Every module's name below softfinger and its file."""
+    """Return the name and file of every module of softfinger."""
     files = (file for top in ORDER for file in (ROOT / top).rglob("*.py"))
     return {
         ".".join(file.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): file
@@ -32,7 +32,7 @@ def parsed(file: Path) -> ast.Module:
 
 
 def imported(file: Path) -> Iterator[str]:
-    """Modules of ours that ``file`` imports, at its top or within a function, but for types."""
+    """Return our modules that ``file`` imports, except for types."""
     waiting: list[ast.AST] = [parsed(file)]
     while waiting:
         node = waiting.pop()
@@ -45,7 +45,7 @@ def imported(file: Path) -> Iterator[str]:
         else:
             continue
         for name in (each.removeprefix("softfinger.") for each in names):
-            # `from a.b import c`: c is a module, or something in b.
+            # In `from a.b import c`, c is a module or a member of b.
             found = {name, name.rpartition(".")[0]} & modules().keys()
             if found:
                 yield max(found, key=len)
@@ -53,12 +53,12 @@ def imported(file: Path) -> Iterator[str]:
 
 @cache
 def imports() -> dict[str, set[str]]:
-    """What each module imports."""
+    """Return the imports of each module."""
     return {name: {*imported(file)} - {name} for name, file in modules().items()}
 
 
 def circle(graph: Mapping[str, set[str]]) -> list[str]:
-    """A circle in what imports what, or none."""
+    """Return an import cycle, if there is one."""
     try:
         TopologicalSorter(graph).prepare()
     except CycleError as error:
@@ -67,7 +67,7 @@ def circle(graph: Mapping[str, set[str]]) -> list[str]:
 
 
 def rooms(top: str) -> dict[str, set[str]]:
-    """What each room of ``top`` imports of its sister rooms; a module beside them is one itself."""
+    """Return each subpackage's imports from its siblings; a module next to them counts as one."""
     graph: dict[str, set[str]] = {}
     for name, others in imports().items():
         if name.startswith(f"{top}."):
@@ -77,35 +77,35 @@ def rooms(top: str) -> dict[str, set[str]]:
 
 
 def table_of_rooms() -> list[str]:
-    """The rows of the table of rooms in the architecture's page, top down."""
+    """Return the rows of the subpackage table in the architecture page, from top to bottom."""
     _, _, after = PAGE.read_text(encoding="utf-8").partition("| room |")
     return [line for line in after.partition("\n\n")[0].splitlines() if line.startswith("| `")]
 
 
-def test_circles_and_imports_are_found():
+def test_cycles_and_imports_are_found():
     graph = {"a": {"b"}, "b": {"c"}, "c": {"a", "d"}, "d": {"e"}, "e": set[str]()}
     assert set(circle(graph)) == {"a", "b", "c"}
     assert len(modules()) > 100
     assert "kinematics.compiled.kernel" in imports()["kinematics.contact.lookup"]
 
 
-def test_tools_use_the_daemon_and_both_use_kinematics():
+def test_tools_import_the_daemon_and_both_import_kinematics():
     for name, others in imports().items():
         allowed = ORDER[: ORDER.index(name.split(".")[0]) + 1]
         wrong = [each for each in others if each.split(".")[0] not in allowed]
         assert not wrong, f"{name} imports {', '.join(sorted(wrong))}"
 
 
-def test_no_files_import_in_a_circle():
+def test_modules_have_no_import_cycles():
     assert circle(imports()) == []
 
 
-def test_no_rooms_import_in_a_circle():
+def test_subpackages_have_no_import_cycles():
     for top in ORDER:
         assert circle(rooms(top)) == [], top
 
 
-def test_the_daemons_rooms_import_downwards_in_the_table_of_the_architecture():
+def test_daemon_subpackages_import_downwards_in_the_architecture_table():
     rows = (re.findall(r"`daemon/(\w+)", line.split("|")[1]) for line in table_of_rooms())
     place = {room: row for row, names in enumerate(rows) for room in names}
     graph = rooms("daemon")
@@ -115,12 +115,12 @@ def test_the_daemons_rooms_import_downwards_in_the_table_of_the_architecture():
         assert not wrong, f"daemon/{room} imports {', '.join(wrong)}, not below it in the table"
 
 
-def test_clients_and_gateway_know_neither_loop_nor_profile():
+def test_clients_and_gateway_import_neither_loop_nor_profile():
     graph = rooms("daemon")
     assert not {"loop", "profile"} & (graph["client"] | graph["gateway"])
 
 
-def test_each_class_has_a_name_of_its_own():
+def test_class_names_are_unique():
     names = Counter(
         node.name
         for file in modules().values()
@@ -130,7 +130,7 @@ def test_each_class_has_a_name_of_its_own():
     assert [name for name, count in names.items() if count > 1] == []
 
 
-def test_every_exception_derives_from_the_root():
+def test_every_exception_derives_from_the_base_class():
     alone = [
         f"{file}: {node.name}"
         for file in modules().values()

@@ -1,4 +1,4 @@
-"""Presliding friction of the joints: it sticks, breaks away and turns round as a reference does."""
+"""Presliding friction of the joints: sticking, break-away and reversal, against a reference."""
 
 import math
 from collections.abc import Iterable
@@ -10,15 +10,15 @@ from scipy.integrate import solve_ivp
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from tests.harness.plant import CONSTANT, CURRENT, PAPER, POSITION, hold_with, make, place, run
 
-FRICTION = 0.05  # N·m, of the settings' default hand
-PRESLIDING = 0.0005  # rad, likewise
-INERTIA, DAMPING = 0.010, 0.02  # kg·m², N·m·s/rad, likewise
-STRIBECK_SPEED = 0.12  # rad/s, likewise
-COUNT = 2.0 * math.pi / 4096  # rad of an encoder
+FRICTION = 0.05  # N·m, default value
+PRESLIDING = 0.0005  # rad, default value
+INERTIA, DAMPING = 0.010, 0.02  # kg·m², N·m·s/rad, default values
+STRIBECK_SPEED = 0.12  # rad/s, default value
+COUNT = 2.0 * math.pi / 4096  # rad, one encoder count
 
 
 def joint(step: float | None = None, **simulation: float) -> SimulatedHand:
-    """The left joint at 0 rad, free in air."""
+    """Return the left joint at 0 rad without contact."""
     hand = make(PAPER, step, object_shape="none", **simulation)
     hold_with(hand, (0.0, 0.0))
     place(hand, (0.0, -0.3), (0.0, 0.3, 0.0))
@@ -26,7 +26,7 @@ def joint(step: float | None = None, **simulation: float) -> SimulatedHand:
 
 
 def load(hand: SimulatedHand, torques: Iterable[float], each: float) -> np.ndarray:
-    """Give the joint these motor torques [N·m] for ``each`` [s]; its angle after each."""
+    """Apply each motor torque [N·m] for ``each`` [s]; return the angle after each."""
     found = []
     for torque in torques:
         hand.drive(0, CURRENT, True, 0.0, torque / CONSTANT)
@@ -35,11 +35,11 @@ def load(hand: SimulatedHand, torques: Iterable[float], each: float) -> np.ndarr
     return np.array(found)
 
 
-# Stick.
+# Sticking.
 
 
 @pytest.mark.parametrize("share", [0.1, 0.6, 0.98])
-def test_a_standing_load_below_stiction_bends_the_bristles_and_nothing_creeps(share):
+def test_a_constant_load_below_static_friction_causes_no_creep(share):
     hand = joint()
     (*_, angle) = load(hand, np.linspace(0.0, share * FRICTION, 200), 0.005)
     run(hand, 1.0)
@@ -50,8 +50,8 @@ def test_a_standing_load_below_stiction_bends_the_bristles_and_nothing_creeps(sh
     assert abs(hand.q[0] - before) < 1e-9 * COUNT
 
 
-def test_an_oscillating_load_below_stiction_causes_no_drift():
-    # A LuGre joint creeps here in each period (Dupont et al., 2002).
+def test_an_oscillating_load_below_static_friction_causes_no_drift():
+    # A LuGre joint creeps in each period here (Dupont et al., 2002).
     hand = joint()
     load(hand, np.linspace(0.0, 0.6 * FRICTION, 100), 0.005)
     phases = np.arange(0.0, 60.0, 0.02) * 2.0 * math.pi
@@ -60,33 +60,33 @@ def test_an_oscillating_load_below_stiction_causes_no_drift():
     np.testing.assert_allclose(turn[-1], turn[1], rtol=0, atol=1e-9 * COUNT)
 
 
-def test_bristles_far_stiffer_than_the_step_stick_too():
-    presliding, inertia = 1e-6, 1e-4  # rad, kg·m²: 0.3 ms for a swing, in steps of 0.25 ms
+def test_very_stiff_bristles_also_stick():
+    presliding, inertia = 1e-6, 1e-4  # rad, kg·m²: a period of 0.3 ms with steps of 0.25 ms
     hand = joint(2.5e-4, joint_presliding=presliding, joint_inertia=inertia)
     load(hand, np.linspace(0.0, 0.6 * FRICTION, 100), 0.005)
     run(hand, 1.0)
-    # The way there may take some slip.
+    # Some slip may occur initially.
     assert hand.q[0] == pytest.approx(0.6 * presliding, abs=presliding)
     assert abs(hand.dq[0]) < 1e-9
     assert hand.plant.state.bristles[0] == pytest.approx(0.6 * presliding, rel=1e-6)
     assert hand.plant.limited_step_count == 0
 
 
-# Slip.
+# Sliding.
 
 
-def test_break_away_is_at_the_stiction_level():
+def test_break_away_is_at_the_static_friction_torque():
     stribeck = 0.4 * FRICTION
     hand = joint(joint_stribeck=stribeck)
     torques = np.linspace(0.0, 1.2 * (FRICTION + stribeck), 1500)
     angles = load(hand, torques, 0.005)
     slipped = torques[np.argmax(angles > 1.05 * PRESLIDING)]
     assert slipped == pytest.approx(FRICTION + stribeck, rel=0.01)
-    # What is more at rest falls off, so that it runs away.
+    # The additional static friction disappears, so the joint accelerates.
     assert angles[-1] > 100 * PRESLIDING
 
 
-def test_a_reversal_turns_friction_round_over_twice_the_presliding():
+def test_friction_reverses_over_twice_the_presliding_distance():
     hand = joint(joint_damping=0.0)
     p = hand.plant.parameters
     p.position_gain, p.rate_gain = 200.0, 2.0  # A/rad, A·s/rad: the joint follows its goal
@@ -103,13 +103,13 @@ def test_a_reversal_turns_friction_round_over_twice_the_presliding():
     closing, opening = torque[turn - 200 : turn].mean(), torque[-200:].mean()
     assert closing == pytest.approx(FRICTION, rel=0.01)
     assert closing - opening == pytest.approx(2.0 * FRICTION, rel=0.01)
-    # Between them it is a straight line; its slope tells half or twice the presliding apart.
+    # The transition is a straight line, whose slope shows wrong factors of the presliding distance.
     within = slice(turn + 20, turn + 80)
     slope, _ = np.polyfit(angle[within], torque[within], 1)
     assert slope == pytest.approx(FRICTION / PRESLIDING, rel=0.02)
 
 
-def test_friction_takes_a_moving_joints_energy_and_the_bristles_give_theirs_back():
+def test_friction_dissipates_energy_and_bristles_return_theirs():
     hand = joint(joint_damping=0.0)
     place(hand, (0.0, -0.3), (0.0, 0.3, 0.0), (0.5, 0.0))
     energy, angles = [hand.energy()], []
@@ -125,14 +125,14 @@ def test_friction_takes_a_moving_joints_energy_and_the_bristles_give_theirs_back
     assert max(angles) - angles[-1] == pytest.approx(PRESLIDING, rel=0.02)
 
 
-def test_a_level_that_changes_at_rest_adds_no_torque_to_the_bristles():
+def test_a_friction_level_that_changes_at_standstill_adds_no_torque():
     share = 0.5
     hand = joint(joint_load_friction=(share, 0.0))
     hand.plant.parameters.joints_held = True
     hand.plant.state.bristles[0] = 0.6 * PRESLIDING
 
     def torque(motor: float) -> float:
-        load(hand, [motor], 0.02)  # longer than the motor's lag
+        load(hand, [motor], 0.02)  # longer than the motor's time constant
         gears = hand.plant.gears[0]
         assert gears.friction == pytest.approx(FRICTION + share * motor, rel=1e-6)
         return gears.friction * gears.limited_deflection / PRESLIDING
@@ -144,11 +144,11 @@ def test_a_level_that_changes_at_rest_adds_no_torque_to_the_bristles():
     assert torque(0.0) == pytest.approx(bent * parted, rel=1e-6), "those that leave take theirs"
 
 
-# An adaptive solver.
+# Adaptive solver.
 
 
 def reference(torque: float, rate: float, stribeck: float, seconds: float) -> np.ndarray:
-    """Angle, rate and deflection by the same equations, from rest at 0 with ``rate`` [rad/s]."""
+    """Return angle, velocity and deflection by the same equations, from 0 with ``rate`` [rad/s]."""
 
     def equations(_t, state):
         _, v, z = state
@@ -174,7 +174,7 @@ SCALE = (PRESLIDING, 0.1, PRESLIDING)
 
 
 def errors(torque: float, rate: float, stribeck: float, counts: Iterable[int]) -> list[float]:
-    """Largest error over SCALE with each number of steps."""
+    """Return the maximum error relative to SCALE for each number of steps."""
     exact, found = reference(torque, rate, stribeck, SECONDS), []
     for count in counts:
         hand = joint(SECONDS / count, joint_stribeck=stribeck)
@@ -187,7 +187,7 @@ def errors(torque: float, rate: float, stribeck: float, counts: Iterable[int]) -
     return found
 
 
-def test_stick_is_of_order_two_and_agrees_with_an_adaptive_solver():
+def test_sticking_is_second_order_and_agrees_with_an_adaptive_solver():
     coarse, fine = errors(0.6 * FRICTION, 0.0, 0.0, (400, 800))
     assert coarse < 1e-6
     assert coarse / fine == pytest.approx(4.0, rel=0.05)
@@ -195,7 +195,7 @@ def test_stick_is_of_order_two_and_agrees_with_an_adaptive_solver():
 
 @pytest.mark.parametrize("stribeck", [0.0, 0.03])
 @pytest.mark.parametrize("rate", [0.2, -0.3])
-def test_slip_and_the_stick_after_it_agree_with_an_adaptive_solver(rate, stribeck):
+def test_sliding_and_subsequent_sticking_agree_with_an_adaptive_solver(rate, stribeck):
     coarse, fine = errors(0.6 * FRICTION, rate, stribeck, (400, 12_800))
     assert coarse < 5e-3
     assert fine < 1e-4

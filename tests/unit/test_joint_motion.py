@@ -1,4 +1,4 @@
-"""Angle, velocity and current of a joint, judged together: what is found, and what never is."""
+"""Consistency checks of a joint's angle, velocity and current: detected faults, no false alarms."""
 
 import math
 import random
@@ -14,11 +14,11 @@ from tests.harness.loop import advance_to, command, grasped, refusal
 
 TICK = 0.002
 COUNT = 2.0 * math.pi / 4096
-RATE = 0.229 * 2.0 * math.pi / 60.0  # rad/s, a count of the velocity register
+RATE = 0.229 * 2.0 * math.pi / 60.0  # rad/s, one velocity count
 
 
 class Joint:
-    """A joint that turns, as its servo tells it: to whole counts, and late by some milliseconds."""
+    """A moving joint as its servo reports it: in whole counts, some milliseconds late."""
 
     def __init__(self, seed: int = 1) -> None:
         self.reading = Reading(valid=True, t=0.0)
@@ -27,16 +27,16 @@ class Joint:
         self.random = random.Random(seed)
 
     def tick(self, dq: float, lag: float = 0.02, held: float = 0.0) -> int:
-        """Turn at ``dq`` rad/s for a tick; the told velocity follows within ``lag`` s.
+        """Move at ``dq`` rad/s for a tick; the reported velocity follows within ``lag`` s.
 
-        The answer is taken ``held`` s late.
+        The reply is received ``held`` s late.
         """
         self.t += TICK
         self.q += dq * TICK
         self.dq += (dq - self.dq) * min(TICK / lag, 1.0)
         reading = self.reading
         if self.random.random() < 0.01:
-            held += 0.015  # the process was put aside
+            held += 0.015  # the process was suspended
         reading.t = max(reading.t, self.t + self.random.uniform(0.0003, 0.004) + held)
         reading.q[0] = COUNT * round(self.q / COUNT)
         reading.dq[0] = RATE * round(self.dq / RATE)
@@ -45,7 +45,7 @@ class Joint:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_what_joints_do_is_no_jump(seed):
+def test_normal_motion_is_not_a_jump(seed):
     joint = Joint(seed)
     turn = 0.0
     for k in range(20_000):
@@ -55,7 +55,7 @@ def test_what_joints_do_is_no_jump(seed):
 
 
 @pytest.mark.parametrize("jump", [0.2, -0.2, 0.12])
-def test_an_angle_that_jumps_is_found_at_once(jump):
+def test_an_angle_jump_is_detected_immediately(jump):
     joint = Joint()
     for _ in range(100):
         joint.tick(0.3)
@@ -64,13 +64,13 @@ def test_an_angle_that_jumps_is_found_at_once(jump):
     assert not joint.tick(0.3), "it is a matter of that reading alone"
 
 
-def test_an_encoder_that_walks_while_the_velocity_rests_is_found():
+def test_an_encoder_that_drifts_at_zero_velocity_is_detected():
     joint = Joint()
     seconds = next(k * TICK for k in range(200) if joint.tick(2.0, lag=math.inf))
     assert seconds < 0.1
 
 
-def test_a_velocity_without_a_motion_is_found():
+def test_a_velocity_without_motion_is_detected():
     joint = Joint()
     joint.dq = 2.5
     seconds = next(k * TICK for k in range(200) if joint.tick(0.0, lag=math.inf))
@@ -78,8 +78,8 @@ def test_a_velocity_without_a_motion_is_found():
 
 
 @pytest.mark.parametrize("seconds", [0.03, 0.06, 0.2])
-def test_a_machine_that_stood_still_while_a_joint_turned_is_no_jump(seconds):
-    """Whether before the servo was asked, or between its answer and its being taken."""
+def test_a_stall_while_a_joint_moves_is_not_a_jump(seconds):
+    """The stall may be before the request or between the reply and its reception."""
     for at_answer in (False, True):
         joint = Joint()
         for _ in range(100):
@@ -92,7 +92,7 @@ def test_a_machine_that_stood_still_while_a_joint_turned_is_no_jump(seconds):
             assert not joint.tick(3.0)
 
 
-def test_a_jump_beside_lost_readings_is_found():
+def test_a_jump_during_lost_readings_is_detected():
     joint = Joint()
     for _ in range(10):
         joint.tick(0.0)
@@ -105,7 +105,7 @@ def test_a_jump_beside_lost_readings_is_found():
 
 
 def spoil(daemon: Daemon, how: Callable[[Reading], None]) -> None:
-    """From now on readings are spoilt after they were taken."""
+    """Corrupt readings after they are taken, from now on."""
     servos = daemon.loop.torque.servos
     really = servos.read
 
@@ -121,7 +121,7 @@ def jumped(reading: Reading) -> None:
 
 
 class Stuck:
-    """An encoder and a current's sensor that stand still."""
+    """Encoder and current sensor that are stuck."""
 
     def __init__(self) -> None:
         self.q: float | None = None
@@ -137,7 +137,7 @@ class Stuck:
     [(jumped, "joint.jump", 0.01), (Stuck(), "joint.dead", 0.12)],
     ids=["jumped", "stuck"],
 )
-def test_a_grip_ends_when_a_joint_can_not_be_believed(make, how, name, within):
+def test_a_joint_fault_ends_a_grip(make, how, name, within):
     daemon = grasped(make(), 8.0)
     spoil(daemon, how)
     advance_to(daemon, "fault", within)
@@ -147,8 +147,8 @@ def test_a_grip_ends_when_a_joint_can_not_be_believed(make, how, name, within):
 @pytest.mark.parametrize(
     "mode", ["current-based position", pytest.param("current", marks=pytest.mark.extended)]
 )
-def test_grips_turns_rests_and_pushes_are_believed(make, mode):
-    """Holding still for long, at a joint's stop, on an object, and pushed off the goal."""
+def test_grips_turns_stops_and_pushes_cause_no_false_alarm(make, mode):
+    """Long holds, at a joint's stop, on an object, and pushed away from the goal."""
     daemon = make(servos={"mode": mode})
     hand: Any = daemon.hand
     command(daemon, "arm")
@@ -171,7 +171,7 @@ def test_grips_turns_rests_and_pushes_are_believed(make, mode):
     assert daemon.loop.state.fault_name == ""
 
 
-def test_position_mode_moves_and_knows_nothing_of_the_current_it_should_take(make):
+def test_position_mode_moves_without_current_checks(make):
     daemon = make(servos={"mode": "position", "model": "XL430-W250"})
     command(daemon, "arm")
     daemon.loop.advance(0.1)

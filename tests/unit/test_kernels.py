@@ -1,4 +1,4 @@
-"""The kernel decorators and their records; which sources a compiled kernel may depend on."""
+"""Kernel decorators and their records, and the sources that a compiled kernel depends on."""
 
 import importlib
 import math
@@ -29,7 +29,7 @@ def limit_twice(radius: float, d: float) -> float:
     return 2.0 * theta_limit(radius, d)
 
 
-def test_an_inner_kernel_works_in_kernels_and_refuses_python():
+def test_an_inner_kernel_works_in_kernels_but_not_in_python():
     assert limit_twice(0.02, 0.02) == 0.0
     assert limit_twice(0.02, 0.0) == pytest.approx(math.pi)
     with pytest.raises(TypeError, match=r"closed_form\.theta_limit is an inner kernel"):
@@ -37,7 +37,7 @@ def test_an_inner_kernel_works_in_kernels_and_refuses_python():
 
 
 @pytest.mark.parametrize("why", ["99.0", "compiler"])
-def test_numba_alone_compiles_where_its_private_parts_are_not_known(why, monkeypatch):
+def test_plain_numba_is_used_if_its_internals_are_unknown(why, monkeypatch):
     if why == "compiler":
         monkeypatch.setattr(numba, "__version__", "0.68.0")
         monkeypatch.delattr(compiled, "compiler", raising=False)
@@ -50,7 +50,7 @@ def test_numba_alone_compiles_where_its_private_parts_are_not_known(why, monkeyp
 
 
 def kernels() -> Iterator[Any]:
-    """Every kernel of the program, as Python's function."""
+    """Return every kernel of the program as a Python function."""
     for package in (kinematics, daemon):
         for found in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
             module = importlib.import_module(found.name)
@@ -60,7 +60,7 @@ def kernels() -> Iterator[Any]:
                     yield function
 
 
-def test_the_caches_name_covers_all_that_kernels_are_made_of():
+def test_the_cache_name_covers_all_inputs_of_kernels():
     sources = set(kernel_sources())
     assert {
         Path(plain.__file__).with_name(f"{each}.py").resolve() for each in ("compiler", "plain")
@@ -97,7 +97,7 @@ def test_a_record_is_a_view_of_its_array():
         Tip(np.zeros(1, Memory.dtype))
 
 
-def test_what_is_no_field_is_an_error():
+def test_an_unknown_field_is_an_error():
     memory = Memory()
     with pytest.raises(AttributeError):
         memory.spred = 1.0
@@ -105,7 +105,7 @@ def test_what_is_no_field_is_an_error():
         memory.newest = Tip()
 
 
-def test_arrays_are_known_by_the_aliases_of_every_numpy():
-    of_2_5 = types.GenericAlias(np.ndarray, (np.float64,))  # NDArray[np.float64] there
+def test_array_aliases_of_every_numpy_version_are_recognised():
+    of_2_5 = types.GenericAlias(np.ndarray, (np.float64,))  # NDArray[np.float64] in that version
     for alias in (NDArray[np.float64], of_2_5):
         assert _kind(Annotated[alias, 3]) == (None, np.float64, (3,))

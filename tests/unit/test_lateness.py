@@ -1,4 +1,4 @@
-"""A machine that is late: what each clock, a simulated hand, a real one and a person get of it."""
+"""Delays of the machine: effect on clocks, simulated and real hands, and messages."""
 
 import itertools
 from collections.abc import Callable, Iterator
@@ -30,7 +30,7 @@ Build = Callable[..., tuple[Daemon, LateMachine, list[tuple[str, str, str]]]]
 
 @pytest.fixture
 def on_late_machine(monkeypatch: pytest.MonkeyPatch) -> Iterator[Build]:
-    """Daemons on a machine whose lateness the test chooses, with their events."""
+    """Return a function that creates daemons on a machine with chosen delays, and their events."""
 
     def build(clock: str, **sections: Any) -> tuple[Daemon, LateMachine, list[Any]]:
         machine, events = LateMachine(), []
@@ -45,7 +45,7 @@ def on_late_machine(monkeypatch: pytest.MonkeyPatch) -> Iterator[Build]:
 
 
 def ticked(daemon: Daemon, count: int) -> dict[str, Any]:
-    """The state after so many ticks, less what depends on the machine."""
+    """Return the state after these ticks, without values that depend on the machine."""
     loop = daemon.loop
 
     def end_in_time(_: float) -> None:
@@ -58,7 +58,7 @@ def ticked(daemon: Daemon, count: int) -> dict[str, Any]:
     return {key: value for key, value in message.items() if key not in MOMENT}
 
 
-TICKS = 1600  # the demo holds the object by then and turns it
+TICKS = 1600  # by then, the demo holds the object and turns it
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +70,7 @@ def undisturbed() -> dict[str, Any]:
 
 @settings(max_examples=5)
 @given(late=st.lists(st.sampled_from([0.0, 0.0, 0.0, 1e-4, 0.0019, 0.01, 0.3, 5.0]), max_size=300))
-def test_what_a_simulated_hand_does_is_the_same_however_late_the_machine(undisturbed, late):
+def test_a_simulated_hand_behaves_the_same_for_any_delays(undisturbed, late):
     with pytest.MonkeyPatch.context() as patch:
         machine = LateMachine()
         patch.setattr(build_module, "make_clock", lambda _: HandClock(machine))
@@ -82,12 +82,12 @@ def test_what_a_simulated_hand_does_is_the_same_however_late_the_machine(undistu
     assert undisturbed["object"]["valid"]
 
 
-def test_a_simulated_hand_waits_for_the_machine_and_says_so_now_and_then(
+def test_a_simulated_hand_waits_for_the_machine_and_reports_it_occasionally(
     on_late_machine, monkeypatch
 ):
     monkeypatch.setattr(timing, "REPORT_INTERVAL", 5.0)
     daemon, machine, events = on_late_machine("auto", task={"name": "demo"})
-    machine.work(60.0)  # building everything is no lateness
+    machine.work(60.0)  # the time to build everything does not count as a delay
     machine.late_by = [0.0] * 100 + [0.4] + [0.0] * 50 + [0.5]
     daemon.loop.advance(4.0)
     state = daemon.loop.state
@@ -101,7 +101,7 @@ def test_a_simulated_hand_waits_for_the_machine_and_says_so_now_and_then(
     assert told[1:] == ["this machine is busy: the hand waited 0.50 s, 0.9 s in all"]
 
 
-def test_a_duration_is_the_machines(on_late_machine):
+def test_a_duration_uses_the_time_of_the_machine(on_late_machine):
     daemon, machine, _ = on_late_machine("auto")
     begin = machine.now()
     machine.late_by = [0.0] * 100 + [3.0]
@@ -109,7 +109,7 @@ def test_a_duration_is_the_machines(on_late_machine):
     assert machine.now() - begin == pytest.approx(5.0, abs=0.02)
 
 
-def test_a_fault_names_the_busy_machine_as_its_cause(on_late_machine):
+def test_a_fault_caused_by_a_busy_machine_says_so(on_late_machine):
     daemon, machine, events = on_late_machine("real")
     daemon.loop.advance(0.3)
     grasped(daemon, 6.0)
@@ -124,7 +124,7 @@ def test_a_fault_names_the_busy_machine_as_its_cause(on_late_machine):
     ]
 
 
-def test_a_fault_of_another_kind_names_no_busy_machine(on_late_machine):
+def test_other_faults_do_not_mention_a_busy_machine(on_late_machine):
     daemon, machine, _ = on_late_machine("real")
     daemon.loop.advance(0.3)
     grasped(daemon, 6.0)
@@ -139,7 +139,7 @@ def test_a_fault_of_another_kind_names_no_busy_machine(on_late_machine):
     assert daemon.loop.state.timing.busy_s == 0.0
 
 
-def test_work_that_takes_long_is_named_too_but_not_what_a_command_took(on_late_machine):
+def test_long_work_is_also_named_except_for_commands(on_late_machine):
     daemon, machine, _ = on_late_machine("real", task={"name": "demo"})
     servos, state = daemon.loop.torque.servos, daemon.loop.state
     really = servos.torque_on
@@ -171,7 +171,7 @@ METAL = Settings.model_validate({"servos": {"backend": "dynamixel"}})
 
 
 def looked(late: float, seconds: float) -> list[tuple[str, str, str]]:
-    """What is told of metal's ticks when each pause between two is so much too long."""
+    """Return the events for a real hand's ticks whose period is too long by ``late``."""
     timing = Timing(tick_s=0.002 + late)
     lateness = Lateness(METAL, timing, waits=False)
     ticks = round(seconds / 0.002)
@@ -179,12 +179,12 @@ def looked(late: float, seconds: float) -> list[tuple[str, str, str]]:
     return [event for event in found if event is not None]
 
 
-def test_lateness_is_told_when_it_has_doubled():
+def test_a_delay_is_reported_again_after_doubling_intervals():
     told = [event for event in looked(0.06, 17.0 * REPORT_INTERVAL) if event[1] == "late"]
     assert len(told) == 6  # at 0, 1, 2, 4, 8 and 16 times REPORT_INTERVAL
 
 
-def test_virtual_time_moves_only_by_waiting_and_never_back():
+def test_virtual_time_advances_only_by_waiting_and_never_decreases():
     clock = VirtualClock(3.0)
     assert clock.now() == clock.wall() == clock.host() == 3.0
     assert clock.sleep_until(4.5) == 0.0
@@ -193,7 +193,7 @@ def test_virtual_time_moves_only_by_waiting_and_never_back():
     assert clock.now() == 4.5
 
 
-def test_a_hands_time_stands_between_sleeps_and_ends_them_at_their_deadline():
+def test_the_time_of_a_hand_is_constant_between_sleeps_and_ends_them_on_time():
     machine = LateMachine(100.0)
     clock = HandClock(machine)
     machine.work(0.001)
@@ -202,15 +202,15 @@ def test_a_hands_time_stands_between_sleeps_and_ends_them_at_their_deadline():
     assert clock.sleep_until(100.002) == pytest.approx(0.0015)
     assert clock.now() == 100.002
     assert clock.host() == pytest.approx(100.0035)
-    clock.sleep_until(100.004)  # what is left of the period makes up for it
+    clock.sleep_until(100.004)  # the remaining period makes up for it
     assert (clock.now(), clock.host()) == (100.004, 100.004)
     assert clock.behind == 0.0
 
 
-def test_a_hands_time_leaves_out_what_the_machine_missed():
+def test_the_time_of_a_hand_excludes_stalls_of_the_machine():
     machine = LateMachine(100.0)
     clock = HandClock(machine)
-    machine.late_by = [5.0]  # it was stopped
+    machine.late_by = [5.0]  # the machine was suspended
     assert clock.sleep_until(100.002) == pytest.approx(5.0)
     assert clock.sleep_until(100.004) == 0.0, "a deadline that was missed is now"
     assert clock.now() == 100.004
@@ -236,5 +236,5 @@ def test_a_hands_time_leaves_out_what_the_machine_missed():
         ({"servos": {"backend": "none"}, "tactile": {"backend": "flexitac"}}, RealClock),
     ],
 )
-def test_only_a_hand_without_metal_has_a_time_of_its_own(sections, kind):
+def test_only_a_simulated_hand_has_its_own_time(sections, kind):
     assert type(make_clock(Settings.model_validate(sections))) is kind

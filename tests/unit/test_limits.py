@@ -1,4 +1,4 @@
-"""The limits one by one, and when they are reported or latch."""
+"""Each limit, and when limits are reported or latched."""
 
 import math
 from copy import copy
@@ -25,7 +25,7 @@ from tests.harness.safety import (
     sound,
 )
 
-Changes = dict[str, Any]  # what is put where: "reading.q.0" is the left joint's angle
+Changes = dict[str, Any]  # values by path: "reading.q.0" is the left joint's angle
 OLD = 5.0 - 11.0 / SETTINGS.tactile.rate  # s
 STALLED = {"goal.q": [0.0, 0.3], "goal.current": [0.4] * 2, "reading.current": [0.0, 0.39]}
 TOWARDS = {"goal.q": [0.3, 0.0], "goal.current": [0.4] * 2}
@@ -76,7 +76,7 @@ def put(state: State, changes: Changes) -> None:
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_each_fault_is_found_and_named(fault):
+def test_each_fault_is_detected_and_named(fault):
     judge, state = safety(), sound()
     changes, name, text = FAULTS[fault]
     put(state, changes)
@@ -86,7 +86,7 @@ def test_each_fault_is_found_and_named(fault):
     assert judge.cause(state), "and it refuses a command while it stands"
 
 
-def test_what_the_scene_lacks_is_no_cause():
+def test_limits_of_missing_servos_or_sensors_are_ignored():
     state = sound()
     for fault in ("stale", "alert", "past", "fast", "hot", "brown-out"):
         put(state, FAULTS[fault][0])
@@ -97,7 +97,7 @@ def test_what_the_scene_lacks_is_no_cause():
     assert judged(safety(has_sensors=False), state, 1.0) == ("", "")
 
 
-def test_a_short_spike_of_what_must_last_is_no_fault():
+def test_a_short_spike_of_a_condition_that_must_last_is_not_a_fault():
     judge, state = safety(), sound()
     put(state, FAULTS["current"][0])
     for _ in range(20):
@@ -113,8 +113,8 @@ def test_a_short_spike_of_what_must_last_is_no_fault():
     "changes",
     [THINNER, *(FAULTS[each][0] for each in ("current", "stalled", "dead", "brown-out"))],
 )
-def test_asking_for_a_cause_changes_nothing(changes):
-    """A limit that must last is found at the same tick, however often a command was refused."""
+def test_checking_for_a_cause_does_not_change_the_result(changes):
+    """A condition that must last is detected on the same tick, regardless of refused commands."""
     asked, alone, state = safety(), safety(), sound()
     for k in range(1500):
         if k == 100:
@@ -127,7 +127,7 @@ def test_asking_for_a_cause_changes_nothing(changes):
     assert asked.warnings == alone.warnings
 
 
-def test_late_frames_hold_the_goals_before_they_are_a_fault():
+def test_late_frames_freeze_the_goals_before_they_are_a_fault():
     state = sound()
     state.contacts[0].t_valid = 5.0 - 4.0 / SETTINGS.tactile.rate
     judge = safety()
@@ -147,8 +147,8 @@ def felt(finger: int, theta: float) -> Sensor:
     return sensor
 
 
-def test_fingers_that_see_the_object_at_two_angles_warn_and_then_are_a_fault() -> None:
-    # θ1 = φ + q1, θ2 = φ − q2: the same φ of 0.1 rad by both
+def test_fingers_that_disagree_on_the_object_angle_warn_and_then_fault() -> None:
+    # θ1 = φ + q1, θ2 = φ − q2: both give the same φ of 0.1 rad
     left, right = felt(0, 0.1 + 0.3), felt(1, 0.1 - 0.25)
     judge, state = safety(sensors=[left, right]), sound()
     state.reading.q = [0.3, 0.25]
@@ -161,18 +161,18 @@ def test_fingers_that_see_the_object_at_two_angles_warn_and_then_are_a_fault() -
     name, text = judged(judge, state, 0.5)
     assert name == "hand.angle"
     assert "12.0° apart: a joint's zero is wrong" in text
-    right.estimate.covariance[1, 1] = 0.06**2  # not known well enough to accuse anybody
+    right.estimate.covariance[1, 1] = 0.06**2  # too uncertain for a fault
     assert judged(judge, state, 0.5) == ("", "")
 
 
-def test_a_held_object_that_changes_its_width_is_a_fault():
+def test_a_change_of_width_of_a_held_object_is_a_fault():
     judge, state = safety(), sound()
     judged(judge, state)
     put(state, THINNER)
     name, text = judged(judge, state, 0.5)
     assert name == "hand.width"
     assert "changed by -4.5 mm" in text
-    state.mode = Mode.ARMED  # let go; the next object may have any width
+    state.mode = Mode.ARMED  # the object was released; the next one may have any width
     assert judged(judge, state) == ("", "")
     state.mode = Mode.HOLDING
     assert judged(judge, state, 0.5) == ("", "")
@@ -189,7 +189,7 @@ WARNINGS: dict[str, tuple[Changes, str]] = {
 
 
 @pytest.mark.parametrize("name", WARNINGS)
-def test_a_warning_is_told_once_until_it_has_been_over(name):
+def test_a_warning_is_reported_once_until_it_has_ended(name):
     judge, state = safety(), sound()
     changes, text = WARNINGS[name]
     put(state, changes)
@@ -210,8 +210,8 @@ def test_a_warning_is_told_once_until_it_has_been_over(name):
 
 
 @pytest.mark.parametrize(("good", "told"), [(1000, True), (20, True), (3, False)])
-def test_readings_that_fail_for_a_second_are_told_also_while_disarmed(good, told):
-    """Of so many readings one is good."""
+def test_readings_that_fail_for_a_second_are_reported_even_while_disarmed(good, told):
+    """Only one of several readings is valid."""
     watch, state = safety(), sound(Mode.DISARMED)
     state.torque = False
     first = math.inf
@@ -229,7 +229,7 @@ def test_readings_that_fail_for_a_second_are_told_also_while_disarmed(good, told
         assert 0.9 < first < 1.5
 
 
-def test_a_warning_at_its_limit_does_not_flicker():
+def test_a_warning_at_its_limit_does_not_repeat():
     judge, state = safety(), sound()
     for k in range(4000):
         state.heat[0].time_to_limit = 60.0 + (0.5 if k // 700 % 2 else -0.5)
@@ -238,7 +238,7 @@ def test_a_warning_at_its_limit_does_not_flicker():
     assert len(judge.warnings) == 1
 
 
-def test_each_witness_that_is_doubted_is_named():
+def test_each_faulty_channel_is_named():
     grasp = GraspState()
     grasp.gain_prior_std[:] = 0.25
     judge, state = safety(grasp=grasp), sound(Mode.RELEASING)
@@ -261,7 +261,7 @@ def test_each_witness_that_is_doubted_is_named():
     assert "reads 0.10 A where its goal is 0.20 A" in told["witness.right_current"]
 
 
-def test_a_force_that_is_not_felt_to_rise_is_a_fault():
+def test_a_force_that_does_not_increase_as_commanded_is_a_fault():
     judge, state = safety(), sound()
     state.mode = "grasping"
     for force, felt, fault in ((5.0, 5.0, False), (10.0, 6.5, False), (20.0, 6.5, True)):
@@ -276,7 +276,7 @@ def test_a_force_that_is_not_felt_to_rise_is_a_fault():
     assert "rose to 20.0 N and the tips feel 6.5 N as before" in found[1]
 
 
-def test_shear_near_friction_is_told():
+def test_shear_near_friction_is_reported():
     held = GraspState()
     judge, state = safety(grasp=held), sound()
     held.shear = 0.5
@@ -284,7 +284,7 @@ def test_shear_near_friction_is_told():
     assert [each.name for each in judge.warnings if each.name == "grip.slip"] == ["grip.slip"]
 
 
-def test_a_frozen_sensor_is_a_fault_while_something_touches():
+def test_a_frozen_sensor_is_a_fault_during_contact():
     sensor = Sensor(1)
     judge, state = safety(sensors=[sensor]), sound()
     rng = np.random.default_rng(3)
@@ -299,11 +299,11 @@ def test_a_frozen_sensor_is_a_fault_while_something_touches():
         assert (found is not None) is fault
     assert found.name == "tactile.frozen"
     assert "right sensor frozen" in found.text
-    state.contacts[1].contact = False  # an empty sensor may well read the same again and again
+    state.contacts[1].contact = False  # without contact, repeated readings are normal
     assert judged(judge, state) == ("", "")
 
 
-def test_full_cells_are_told():
+def test_saturated_cells_are_reported():
     sensor = Sensor(0)
     judge, state = safety(sensors=[sensor]), sound()
     sensor.give(5.0, np.full((4, 4), 65535))
@@ -313,7 +313,7 @@ def test_full_cells_are_told():
     ]
 
 
-# What may be pushed to a share of its bound; ages are from now on.
+# Values that may reach a fraction of their limit; ages are relative to now.
 PUSHES: dict[str, tuple[str, float]] = {
     "joint.angle": ("reading.q.{}", SETTINGS.hand.q_max[0] + 0.1),
     "joint.velocity": ("reading.dq.{}", BOUNDS.velocity_max),
@@ -330,7 +330,7 @@ PUSHES: dict[str, tuple[str, float]] = {
 @pytest.mark.parametrize("name", PUSHES)
 @pytest.mark.parametrize("finger", [0, 1])
 @pytest.mark.parametrize("share", [0.99, 1.01, math.nan])
-def test_a_fault_begins_at_its_bound_and_nan_is_past_it(name, finger, share):
+def test_a_fault_starts_at_its_limit_and_nan_exceeds_it(name, finger, share):
     state = sound()
     path, bound = PUSHES[name]
     value = share * bound
@@ -339,7 +339,7 @@ def test_a_fault_begins_at_its_bound_and_nan_is_past_it(name, finger, share):
     assert bool(row.check(View(SETTINGS), state, row.fraction)) != (share < 1.0)
 
 
-def test_every_row_is_named_once_a_level_and_its_settings_exist():
+def test_every_row_is_unique_per_level_and_its_settings_exist():
     seen = [(row.name, row.level) for row in LIMITS]
     assert len(seen) == len(set(seen))
     for row in LIMITS:
@@ -351,7 +351,7 @@ def test_every_row_is_named_once_a_level_and_its_settings_exist():
     assert missing == {"safety.current_move"}, "every limit that can be set stands in the table"
 
 
-def test_a_sensor_without_a_sound_estimate_is_told_with_its_reason_and_noise():
+def test_a_sensor_without_valid_estimates_is_reported_with_reason_and_noise():
     sensor = Sensor(0)
     sensor.sensor = GivenFrames()
     sensor.estimate = ContactEstimate(invalid=Invalid.MODEL_MISMATCH)

@@ -1,4 +1,4 @@
-"""The whole pipeline on the virtual clock: what the hand does when it is commanded; its limits."""
+"""The complete pipeline on the virtual clock: commands and limits."""
 
 import math
 import re
@@ -27,7 +27,7 @@ from tests.harness.loop import (
 state_message = message_maker(STATE)
 
 
-def test_starts_disarmed_with_torque_off_and_arming_moves_nothing(make):
+def test_start_up_is_disarmed_without_torque_and_arming_causes_no_motion(make):
     daemon = make()
     state = daemon.loop.state
     before = list(state.reading.q)
@@ -44,7 +44,7 @@ def test_starts_disarmed_with_torque_off_and_arming_moves_nothing(make):
 @pytest.mark.parametrize(
     "profile", [{}, pytest.param({"material": {"law": "constant"}}, marks=pytest.mark.extended)]
 )
-def test_grasp_reaches_10_n_within_3_s_and_holds_it_10_s(make, profile):
+def test_grasp_reaches_10_n_within_3_s_and_holds_it_for_10_s(make, profile):
     daemon = grasped(make(**profile), 10.0)
     state = daemon.loop.state
     for _ in range(100):
@@ -56,7 +56,7 @@ def test_grasp_reaches_10_n_within_3_s_and_holds_it_10_s(make, profile):
             assert abs(contact.force - daemon.hand.force[finger]) < 2.0 * contact.force_std < 2.5
 
 
-def test_move_goes_where_it_is_told_within_the_limits(make):
+def test_move_reaches_its_goal_within_the_limits(make):
     daemon = make()
     command(daemon, "arm")
     command(daemon, "move", left=-0.2, right=-0.3)
@@ -70,7 +70,7 @@ def test_move_goes_where_it_is_told_within_the_limits(make):
 
 
 @pytest.mark.parametrize("step", [3600.0, -3600.0])
-def test_a_wall_clock_that_is_set_changes_nothing_but_timestamps(make, monkeypatch, step):
+def test_setting_the_wall_clock_only_affects_timestamps(make, monkeypatch, step):
     daemon = grasped(make(), 8.0)
     loop, wall = daemon.loop, daemon.clock.wall
     before, seq = wall(), loop.state.seq
@@ -82,8 +82,8 @@ def test_a_wall_clock_that_is_set_changes_nothing_but_timestamps(make, monkeypat
     assert torque_of(daemon).all()
 
 
-def test_a_grasp_of_nothing_ends_armed_with_a_warning(make: Make) -> None:
-    # The fingers end before their tips meet.
+def test_a_grasp_without_an_object_ends_armed_with_a_warning(make: Make) -> None:
+    # The fingers reach their limits before the tips meet.
     daemon = make(simulation={"object_shape": "none"}, hand={"q_max": (0.3, 0.3)})
     events = heard(daemon)
     command(daemon, "arm")
@@ -92,7 +92,7 @@ def test_a_grasp_of_nothing_ends_armed_with_a_warning(make: Make) -> None:
     assert any(kind == "grasp" for _, kind, _ in events)
 
 
-def test_an_error_of_a_backend_ends_the_loop_with_torque_off(make, monkeypatch):
+def test_a_backend_error_ends_the_loop_with_torque_off(make, monkeypatch):
     daemon = grasped(make(), 8.0)
     assert all(torque_of(daemon))
     sensor = daemon.loop.perception.fingers[0].sensor
@@ -103,7 +103,7 @@ def test_an_error_of_a_backend_ends_the_loop_with_torque_off(make, monkeypatch):
 
 
 @pytest.mark.parametrize("rate", [25.0, 100.0])
-def test_frames_that_stop_coming_while_the_object_turns_bring_it_to_rest(make, rate):
+def test_missing_frames_during_a_turn_stop_the_object(make, rate):
     daemon = grasped(make(tactile={"rate": rate}), 8.0)
     command(daemon, "rotate", angle=0.26)
     daemon.loop.advance(0.1)
@@ -120,14 +120,14 @@ def test_frames_that_stop_coming_while_the_object_turns_bring_it_to_rest(make, r
 
 
 def blinded(daemon: Daemon, counts: int) -> None:
-    """From now on all cells of both sensors read ``counts``."""
+    """Set all cells of both sensors to ``counts`` from now on."""
     for finger in (0, 1):
         change_frames(
             daemon, finger, lambda frame: replace(frame, data=np.full_like(frame.data, counts))
         )
 
 
-def test_saturated_sensors_latch_a_fault_and_drive_nothing(make):
+def test_saturated_sensors_latch_a_fault_and_cause_no_motion(make):
     daemon = grasped(make(tactile={"full_count": 30_000}), 8.0)
     before = list(daemon.loop.state.goal.current)
     blinded(daemon, 30_000)
@@ -138,7 +138,7 @@ def test_saturated_sensors_latch_a_fault_and_drive_nothing(make):
         command(daemon, "clear")
 
 
-def test_blind_sensors_end_the_grip_without_pressing_harder(make):
+def test_sensors_without_readings_end_the_grip_without_more_force(make):
     daemon = grasped(make(), 5.0)
     blinded(daemon, 0)
     advance_to(daemon, "armed", 0.5)
@@ -146,7 +146,7 @@ def test_blind_sensors_end_the_grip_without_pressing_harder(make):
     assert daemon.hand.force.max() < 5.5
 
 
-def test_tare_is_refused_while_something_touches(make):
+def test_tare_is_refused_during_contact(make):
     daemon = grasped(make(), 5.0)
     command(daemon, "release")
     advance_to(daemon, "armed", 3.0)
@@ -162,7 +162,7 @@ def test_tare_is_refused_while_something_touches(make):
         command(daemon, "tare")
 
 
-def test_the_state_tells_what_the_grip_goes_to(make):
+def test_the_state_contains_the_goals_of_the_grip(make):
     daemon = make()
     goal = daemon.loop.state.goal
     command(daemon, "arm")
@@ -177,7 +177,7 @@ def test_the_state_tells_what_the_grip_goes_to(make):
     daemon.loop.advance(0.01)
     message = state_message(daemon.loop.state, parts(daemon.settings))
     assert (message["goal_force"], message["goal_angle"]) == (8.0, 0.1)
-    # More than was asked for, since a load would make the tips slip.
+    # Higher than requested, because the load would make the tips slip.
     for k in range(1, 101):
         daemon.hand.apply_load(0.0, 0.12 * k, 0.0)
         daemon.loop.advance(0.02)
@@ -191,7 +191,7 @@ def test_the_state_tells_what_the_grip_goes_to(make):
     assert math.isnan(goal.angle)
 
 
-def test_an_angle_beyond_the_grip_is_refused(make):
+def test_an_unreachable_angle_is_refused(make):
     daemon = grasped(make(), 8.0)
     with pytest.raises(
         Refused, match=r"found 34\.4° \(0\.6 rad\), expected .*° to .*° \(-0\.\d\d to 0\.\d\d\) in"
@@ -203,9 +203,9 @@ def test_an_angle_beyond_the_grip_is_refused(make):
     assert daemon.loop.state.fault == ""
 
 
-def test_tare_removes_a_standing_offset(make):
+def test_tare_removes_a_constant_offset(make):
     daemon = make()
-    for finger in (0, 1):  # 1.2 kPa everywhere
+    for finger in (0, 1):  # 1.2 kPa on all cells
         change_frames(daemon, finger, lambda frame: replace(frame, data=frame.data + 300))
     command(daemon, "tare")
     daemon.loop.advance(0.5)
@@ -214,7 +214,7 @@ def test_tare_removes_a_standing_offset(make):
     assert daemon.loop.state.contacts[0].force == pytest.approx(daemon.hand.force[0], rel=0.05)
 
 
-def test_a_tare_of_full_sensors_leaves_the_zero_and_is_told(make):
+def test_a_tare_of_saturated_sensors_keeps_the_zero_offset_and_is_reported(make):
     daemon = make()
     events = heard(daemon)
     perception = daemon.loop.perception.fingers[1]
@@ -231,7 +231,7 @@ def test_a_tare_of_full_sensors_leaves_the_zero_and_is_told(make):
 # --- limits at work -------------------------------------------------------------------------------
 
 
-def test_a_long_sound_grip_says_nothing(make):
+def test_a_long_normal_grip_causes_no_messages(make):
     daemon = make(task={"name": "demo"})
     events = heard(daemon)
     daemon.loop.advance(12.0)
@@ -242,7 +242,7 @@ def test_a_long_sound_grip_says_nothing(make):
     assert limited["goal.slew"] < 40
 
 
-def test_a_sensor_that_shifts_in_the_grip_is_a_fault(make):
+def test_a_sensor_that_shifts_during_a_grip_is_a_fault(make):
     daemon = make()
     events, state = heard(daemon), grasped(daemon, 8.0).loop.state
     change_frames(daemon, 1, lambda frame: replace(frame, data=np.roll(frame.data, 4, axis=1)))
@@ -255,7 +255,7 @@ def test_a_sensor_that_shifts_in_the_grip_is_a_fault(make):
     assert ("error", state.fault_name, state.fault) in events
 
 
-def test_a_frozen_sensor_is_a_fault_until_it_lives_again(make):
+def test_a_frozen_sensor_is_a_fault_until_it_recovers(make):
     daemon = grasped(make(), 5.0)
     left = daemon.loop.perception.fingers[0]
     frozen = left.frame.data.copy()
@@ -264,13 +264,13 @@ def test_a_frozen_sensor_is_a_fault_until_it_lives_again(make):
     assert daemon.loop.state.fault_name == "tactile.frozen"
     assert "left sensor frozen" in daemon.loop.state.fault
     assert "clear: tactile: left sensor frozen" in refusal(daemon, "clear")
-    del left.sensor.latest  # the class's own again
+    del left.sensor.latest  # restores the class's method
     daemon.loop.advance(0.2)
     command(daemon, "clear")
     command(daemon, "arm")
 
 
-def test_without_frames_the_hand_opens_before_the_fault_where_that_is_wanted(make):
+def test_without_frames_the_hand_opens_before_the_fault_if_configured(make):
     daemon = grasped(make(safety={"frame_age_action": "open"}), 5.0)
     events, state = heard(daemon), daemon.loop.state
     silence(daemon)
@@ -284,7 +284,7 @@ def test_without_frames_the_hand_opens_before_the_fault_where_that_is_wanted(mak
     assert [kind for level, kind, _ in events if level == "error"] == ["tactile.silent"] * 2
 
 
-def test_a_person_who_stops_the_opening_hand_finds_no_fault_later(make):
+def test_stopping_the_opening_hand_leaves_no_later_fault(make):
     daemon = grasped(make(safety={"frame_age_action": "open"}), 5.0)
     silence(daemon)
     advance_to(daemon, "releasing", 0.3)
@@ -293,7 +293,7 @@ def test_a_person_who_stops_the_opening_hand_finds_no_fault_later(make):
     assert (daemon.loop.state.mode, daemon.loop.state.fault) == ("disarmed", "")
 
 
-def test_a_joint_that_is_held_up_is_a_fault_and_can_be_cleared(make):
+def test_a_blocked_joint_is_a_fault_that_can_be_cleared(make):
     daemon = make(tactile={"backend": "none"})
     command(daemon, "arm")
     command(daemon, "move", left=0.9, right=0.9)  # onto the object
@@ -305,7 +305,7 @@ def test_a_joint_that_is_held_up_is_a_fault_and_can_be_cleared(make):
     command(daemon, "arm")
 
 
-def test_a_servo_that_is_hot_is_a_fault_that_stands_until_it_is_cooler(make):
+def test_a_hot_servo_is_a_fault_that_remains_until_it_has_cooled(make):
     daemon = grasped(make(), 5.0)
     heat = daemon.hand.servo_heat[1]
     heat.warm(70.6)

@@ -1,4 +1,4 @@
-"""Recordings with messages that are none: told, left out, and never a traceback."""
+"""Recordings with malformed messages, which are reported and omitted without a traceback."""
 
 import copy
 from pathlib import Path
@@ -52,7 +52,7 @@ def settings_message() -> dict[str, Any]:
 
 
 def recording(path: Path, spoil: tuple[str, Any] | None) -> Path:
-    """Ten frames, the fifth of which is spoilt."""
+    """Write ten frames, of which the fifth is corrupted."""
     writer = RecordingWriter(path)
     writer.add(schema.SETTINGS, settings_message())
     for k in range(10):
@@ -70,7 +70,7 @@ def recording(path: Path, spoil: tuple[str, Any] | None) -> Path:
 
 
 @pytest.mark.parametrize("spoil", SPOILT.values(), ids=SPOILT)
-def test_a_frame_that_is_none_is_told_and_left_out(tmp_path, spoil):
+def test_a_malformed_frame_is_reported_and_omitted(tmp_path, spoil):
     path = recording(tmp_path / "a.mcap", spoil)
     told: list[str] = []
     found = list(Recording(path, told.append).messages([schema.TACTILE]))
@@ -84,7 +84,7 @@ def test_a_frame_that_is_none_is_told_and_left_out(tmp_path, spoil):
 
 
 @pytest.mark.parametrize("name", ["settings", "calibration_left"])
-def test_settings_without_their_text_are_told(tmp_path, name):
+def test_settings_without_text_are_reported(tmp_path, name):
     path = tmp_path / "a.mcap"
     writer = RecordingWriter(path)
     message = settings_message()
@@ -95,7 +95,7 @@ def test_settings_without_their_text_are_told(tmp_path, name):
         recorded_settings(Recording(path))
 
 
-def test_recorded_settings_name_no_files(tmp_path):
+def test_recorded_settings_cannot_name_files(tmp_path):
     named = Settings().model_dump()
     files = ("calibration", "recording", "envelope", "keys")
     for section in named.values():
@@ -110,7 +110,7 @@ def test_recorded_settings_name_no_files(tmp_path):
 
 
 @pytest.mark.parametrize("spoilt", ["seq", "t", "reading", "left", "timestamp"])
-def test_inputs_that_are_none_are_told(tmp_path, spoilt):
+def test_malformed_inputs_are_reported(tmp_path, spoilt):
     writer = RecordingWriter(tmp_path / "a.mcap")
     for topic, message in Recording(GOLDEN).messages(end=0.1):
         if topic == schema.INPUT:

@@ -1,4 +1,4 @@
-"""Stress-strain laws: Table I, measured points, what is refused, and the kernels' tables."""
+"""Stress-strain laws: Table I, measured points, refusals, and tables for the kernels."""
 
 import math
 from fractions import Fraction
@@ -16,14 +16,14 @@ from softfinger.kinematics.contact.material import (
 from softfinger.kinematics.contact.material_fit import MaterialError, nonnegative
 from tests.harness.called import called
 
-# An inner kernel, made callable.
+# Make the inner kernel callable.
 stress_at = called(stress_at)
 
 STRAIN = np.linspace(0.0, 1.0, 201)
 
 
 def laws() -> list[Material]:
-    """One of each kind, the last of a high degree."""
+    """Return one law of each kind, the last with a high degree."""
     x = np.linspace(0.0, 0.8, 30)
     return [
         Material.constant(0.304e6),
@@ -44,32 +44,32 @@ def test_constant_modulus():
             Material.constant(modulus)
 
 
-def test_table_i_has_the_papers_slopes():
+def test_table_i_has_the_slopes_of_the_paper():
     material = Material.table_i()
     assert material.reference_modulus == 0.135e6
     assert not material.is_linear
     for tenths, modulus in zip(range(0, 12, 2), TABLE_I_MODULUS, strict=True):
         terms = enumerate(material.coefficients)
         assert sum((j + 1) * c * Fraction(tenths, 10) ** j for j, c in terms) == modulus
-    assert material.coefficients[1] == 0  # it starts with no slope of its own
+    assert material.coefficients[1] == 0  # no linear term
     slope = np.gradient(material.stress(STRAIN), STRAIN)
-    assert np.all(np.diff(slope) > -1e-6 * slope[0])  # the modulus never falls
+    assert np.all(np.diff(slope) > -1e-6 * slope[0])  # the tangent modulus never decreases
     assert slope.min() * (1 + 1e-12) >= 0.135e6
     assert slope.max() < 0.304e6
 
 
 @pytest.mark.parametrize("index", range(4))
-def test_a_law_is_smooth_rising_and_consistent(index):
+def test_a_law_is_smooth_increasing_and_consistent(index):
     material = laws()[index]
     stress, energy = material.stress(STRAIN), material.energy_density(STRAIN)
     assert stress[0] == energy[0] == 0.0
     assert np.all(np.diff(stress) > 0)
-    # Energy density is the stress's integral: Gauss on each step.
+    # The energy density is the integral of the stress, by Gauss quadrature on each step.
     points, weights = np.polynomial.legendre.leggauss(8)
     inner = STRAIN[:-1, None] + 0.5 * (points + 1) * np.diff(STRAIN)[:, None]
     parts = 0.5 * np.diff(STRAIN) * (material.stress(inner) * weights).sum(axis=1)
     np.testing.assert_allclose(energy[1:], np.cumsum(parts), rtol=1e-12)
-    # The exact polynomial, in plain arithmetic.
+    # The exact polynomial in plain arithmetic.
     powers = [float(c) for c in material.coefficients]
     for strain in (1e-9, 0.124999, 0.125, 0.3, 0.75, 1.0 - 1e-12):
         exact = math.fsum(c * strain**j for j, c in enumerate(powers, 1))
@@ -78,7 +78,7 @@ def test_a_law_is_smooth_rising_and_consistent(index):
 
 
 @pytest.mark.parametrize("index", range(4))
-def test_outside_zero_to_one(index):
+def test_strains_outside_zero_to_one(index):
     material = laws()[index]
     for strain in (0.3, 1.0, 1.7):
         np.testing.assert_allclose(
@@ -101,7 +101,7 @@ def test_outside_zero_to_one(index):
     assert material.stress(np.float32(0.5)).shape == ()
 
 
-def test_points_of_a_law_give_the_law_back():
+def test_a_law_is_recovered_from_its_points():
     original = Material.table_i()
     for x in (np.linspace(0.0, 1.0, 12), np.linspace(0.04, 1.0, 25)):
         again = Material.from_points(x, original.stress(x))
@@ -112,7 +112,7 @@ def test_points_of_a_law_give_the_law_back():
     np.testing.assert_allclose(line.reference_modulus, 1e5, rtol=1e-12)
 
 
-def test_short_curves_go_on_with_their_last_slope():
+def test_short_curves_continue_with_their_last_slope():
     x = np.linspace(0.0, 0.5, 20)
     material = Material.from_points(x, 1e5 * (x + x**2))
     np.testing.assert_allclose(material.stress(x[1:]), 1e5 * (x + x**2)[1:], rtol=5e-3)
@@ -125,7 +125,7 @@ def test_short_curves_go_on_with_their_last_slope():
     scale=st.floats(1.0, 1e9),
 )
 @settings(max_examples=60)
-def test_any_rising_points_give_a_rising_law_or_a_reason(steps, scale):
+def test_any_increasing_points_give_an_increasing_law_or_a_reason(steps, scale):
     x = np.linspace(0.0, 1.0, len(steps) + 1)
     y = scale * np.concatenate([[0.0], np.cumsum(steps)])
     try:
@@ -138,11 +138,11 @@ def test_any_rising_points_give_a_rising_law_or_a_reason(steps, scale):
     assert material.fit_error <= 0.05 * y[-1]
 
 
-def test_the_force_error_is_what_the_misfit_makes_of_the_force():
+def test_the_force_error_equals_the_effect_of_the_misfit_on_the_force():
     x = np.linspace(0.025, 1.0, 40)
     curve = 1e5 * x**0.7
     law = Material.from_points(x, curve)
-    # Upright, F = 2π h² ∫ σ/(1 − ε)³ dε: the measured curve's against the law's.
+    # For an upright tip, F = 2π h² ∫ σ/(1 − ε)³ dε, with the measured curve and with the law.
     for share in (0.05, 0.1, 0.3):
         strain = share * (np.arange(2000) + 0.5) / 2000
         weight = (1.0 - strain) ** -3
@@ -170,19 +170,19 @@ def test_the_force_error_is_what_the_misfit_makes_of_the_force():
         ([0, 0.1, 0.2, 0.3, 0.31, 0.9], [0, 1, 2, 3, 90, 91], "no smooth monotone law"),
     ],
 )
-def test_refusals_say_what_is_wrong(strain, stress, words):
+def test_refusals_name_the_problem(strain, stress, words):
     with pytest.raises(MaterialError, match=words):
         Material.from_points(strain, stress)
 
 
-def test_all_that_is_wrong_comes_in_one_report():
+def test_all_problems_are_in_one_report():
     with pytest.raises(MaterialError) as error:
         Material.from_points([0, 0.4, 0.2], [5, 2, 1])
     for words in ("too few", "strain must rise", "not monotone", "starts off zero"):
         assert words in str(error.value)
 
 
-def test_nonnegative_least_squares_meets_its_optimality_conditions():
+def test_nonnegative_least_squares_satisfies_the_optimality_conditions():
     from scipy.optimize import nnls
 
     rng = np.random.default_rng(3)

@@ -1,4 +1,4 @@
-"""Recordings as other programs of the format write them: merged, filtered, without an index."""
+"""MCAP recordings written by other programs: merged, filtered, without an index."""
 
 import json
 from collections.abc import Iterator
@@ -35,7 +35,7 @@ def golden() -> Iterator[Any]:
 def rewritten(
     path: Path, profile: str = "", others: bool = False, ids: int = 1, prefix: str = "", **options
 ) -> Path:
-    """Write the golden recording anew, with ``ids`` channels a topic and ``others`` between."""
+    """Rewrite the golden recording with ``ids`` channels per topic and ``others`` in between."""
     with path.open("wb") as file:
         writer = Writer(file, **options)
         writer.start(profile, "merged")
@@ -50,7 +50,7 @@ def rewritten(
         for k, (kind, channel, message) in enumerate(golden()):
             times = message.log_time + 10**13, message.publish_time
             if others and k % 10 == 0:
-                # A camera that began an hour before.
+                # A camera that started an hour earlier.
                 early = times[0] if k else times[0] - 3600 * 10**9
                 writer.add_message(camera, early, b"\0\1" * 500, early)
                 writer.add_message(pose, times[0], json.dumps({"pose": [1, [2]]}).encode(), 0)
@@ -86,7 +86,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("options", VARIANTS.values(), ids=VARIANTS)
-def test_every_variant_of_the_format_is_the_same_recording(tmp_path, options):
+def test_all_variants_of_the_format_give_the_same_recording(tmp_path, options):
     path = rewritten(tmp_path / "a.mcap", **options)
     told: list[str] = []
     recording = Recording(path, told.append)
@@ -96,7 +96,7 @@ def test_every_variant_of_the_format_is_the_same_recording(tmp_path, options):
     assert recording.total == SHORT
     assert recording.count(schema.STATE) == sum(topic == schema.STATE for topic, _ in wanted)
     times = [message.log_time * 1e-9 for _, _, message in golden()]
-    assert recording.start == pytest.approx(min(times) + 1e4)  # and not another channel's
+    assert recording.start == pytest.approx(min(times) + 1e4)  # not the time of another channel
     assert recording.duration == pytest.approx(max(times) - min(times))
     late = list(recording.messages([schema.STATE], start=0.1))
     assert 0 < len(late) < recording.count(schema.STATE)
@@ -109,7 +109,7 @@ def test_every_variant_of_the_format_is_the_same_recording(tmp_path, options):
     assert [each.name for each in export(recording, tmp_path, CsvTable, [schema.STATE])]
 
 
-def test_a_cut_file_with_other_channels_is_read_to_there_and_not_rewritten(tmp_path):
+def test_a_truncated_file_with_other_channels_is_read_up_to_the_cut_and_not_rewritten(tmp_path):
     path = rewritten(tmp_path / "a.mcap", others=True, use_chunking=False)
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
@@ -123,7 +123,7 @@ def test_a_cut_file_with_other_channels_is_read_to_there_and_not_rewritten(tmp_p
     assert path.read_bytes() == whole[: len(whole) // 2]
 
 
-def test_a_message_of_another_channel_may_be_larger_than_any_of_ours(tmp_path):
+def test_a_message_of_another_channel_may_exceed_our_maximum_size(tmp_path):
     path = tmp_path / "a.mcap"
     state = next(message.data for _, channel, message in golden() if channel.topic == "hand/state")
     with path.open("wb") as file:
@@ -150,7 +150,7 @@ def foreign(path: Path, *channels: tuple[str, str, bytes]) -> Path:
     return path
 
 
-def test_a_file_without_our_channels_is_refused_with_those_that_it_has(tmp_path):
+def test_a_file_without_our_channels_is_refused_with_a_list_of_its_channels(tmp_path):
     path = foreign(tmp_path / "a.mcap", ("/imu", "cdr", b"x"), ("hand/state", "protobuf", b"y"))
     with pytest.raises(RecordingError, match=r"its channels: /imu, hand/state$"):
         Recording(path)
@@ -158,7 +158,7 @@ def test_a_file_without_our_channels_is_refused_with_those_that_it_has(tmp_path)
 
 @pytest.mark.parametrize("data", [b"[1]", b"3", b"\xff", b""])
 @pytest.mark.parametrize("topic", ["hand/state", "hand/settings", "hand/tactile/left"])
-def test_what_is_no_message_on_our_channels_is_left_out(tmp_path, topic, data):
+def test_malformed_messages_on_our_channels_are_omitted(tmp_path, topic, data):
     path = foreign(tmp_path / "a.mcap", (topic, "json", data))
     told: list[str] = []
     recording = Recording(path, told.append)
@@ -167,7 +167,7 @@ def test_what_is_no_message_on_our_channels_is_left_out(tmp_path, topic, data):
     assert "what is sound in it is read" in told[0]
 
 
-def test_view_and_replay_survive_messages_that_are_none(tmp_path, inline):
+def test_view_and_replay_tolerate_malformed_messages(tmp_path, inline):
     state = next(message.data for _, channel, message in golden() if channel.topic == "hand/state")
     path = foreign(
         tmp_path / "a.mcap",

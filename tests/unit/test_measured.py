@@ -1,4 +1,4 @@
-"""A tip that fits no model: curves through presses, the table and the estimator that they make."""
+"""A tip that fits no model: curves through measured contacts, with table and estimator."""
 
 import json
 import math
@@ -32,7 +32,7 @@ from softfinger.kinematics.estimation.measured import MeasuredEstimator
 A = 0.020
 HIL = Path(__file__).parents[2] / "config" / "hil.toml"
 GRID = SensorGrid(32, 32, 0.058 / 32)
-TRUE = replace(GRID, centre=(0.7e-3, -0.4e-3), rotation=0.2)  # where the tip stands
+TRUE = replace(GRID, centre=(0.7e-3, -0.4e-3), rotation=0.2)  # true position of the tip
 NOISE = 600.0
 D = 1e-3 * np.array([0.7, 1.5, 3, 5, 6, 2, 4, 5, 3, 6, 4])
 THETA = np.radians([0, 0, 0, 0, 0, 10, -10, 10, 20, -25, 25])
@@ -40,7 +40,7 @@ WEIRD = 1e6  # N/m², of a force that no model has: F = WEIRD d^1.8 A^0.2 cos θ
 
 
 def weird(d: float, theta: float) -> np.ndarray:
-    """A blunt bump as high as the force wants, which moves by half of what springs' does."""
+    """Return a blunt peak with the required force that moves half as far as for springs."""
     x, y = np.meshgrid(*(pitch * (np.arange(32) - 15.5) for pitch in TRUE.pitches))
     x, y = x - TRUE.centre[0], y - TRUE.centre[1]
     c, s = math.cos(TRUE.rotation), math.sin(TRUE.rotation)
@@ -68,7 +68,7 @@ def law() -> TipCurves:
 
 
 @pytest.mark.parametrize("push", [0.5, 2.0, 5.0])
-def test_a_contact_that_is_not_felt_is_within_what_could_hide(law, push):
+def test_an_undetected_contact_is_within_the_reported_uncertainty(law, push):
     placed = replace(GRID, centre=law.centre, rotation=law.rotation)
     known = Uncertainty(baseline=1e3)
     estimator = MeasuredEstimator(Fingertip(A, "measured", law=law), placed, known=known)
@@ -80,7 +80,7 @@ def test_a_contact_that_is_not_felt_is_within_what_could_hide(law, push):
 
 @pytest.mark.parametrize("name", ["gain", "slope"])
 @pytest.mark.parametrize("d", [1.5e-3, 4e-3])
-def test_what_is_known_of_the_cells_is_in_the_errors(law, name, d):
+def test_declared_cell_uncertainties_are_part_of_the_errors(law, name, d):
     placed = replace(GRID, centre=law.centre, rotation=law.rotation)
     known = {"gain": Uncertainty(gain=0.12), "slope": Uncertainty(slope=500.0)}[name]
     estimator = MeasuredEstimator(Fingertip(A, "measured", law=law), placed, known=known)
@@ -93,16 +93,16 @@ def test_what_is_known_of_the_cells_is_in_the_errors(law, name, d):
         assert found.valid
         off = np.array([found.d - d, found.tilt_x - theta, found.tilt_y])
         off_by.append(np.abs(off) / np.sqrt(found.covariance.diagonal()[:3]))
-    # Curves through other noise make it 1.1 to 1.65 where the presses are the shallowest.
+    # Curves through other noise give 1.1 to 1.65 at the smallest depths.
     assert 0.5 < np.max(off_by) < 2.0
 
 
-def test_the_estimator_of_a_model_names_that_of_a_measured_tip(law):
+def test_the_estimator_of_a_model_refers_to_that_of_a_measured_tip(law):
     with pytest.raises(ValueError, match="MeasuredEstimator"):
         ContactEstimator(Fingertip(A, "measured", law=law), Material.constant(1.0), GRID, NOISE)
 
 
-def test_the_curves_are_those_of_the_tip(law):
+def test_the_curves_equal_those_of_the_tip(law):
     assert (law.deepest, law.tilt, law.presses) == (0.006, pytest.approx(math.radians(25.0)), 11)
     assert law.centre == pytest.approx(TRUE.centre, abs=1e-4)
     assert law.rotation == pytest.approx(TRUE.rotation, abs=0.01)
@@ -126,7 +126,7 @@ def test_the_curves_are_those_of_the_tip(law):
 
 
 @pytest.mark.parametrize(("d", "degrees"), [(1e-3, 0.0), (2.5e-3, 14.0), (5.5e-3, -5.0)])
-def test_a_frame_is_read_by_them_and_its_errors_are_known(law, d, degrees):
+def test_frames_are_estimated_with_consistent_errors(law, d, degrees):
     placed = replace(GRID, centre=law.centre, rotation=law.rotation)
     estimator = MeasuredEstimator(Fingertip(A, "measured", law=law), placed)
     rng, squares = np.random.default_rng(2), []
@@ -148,7 +148,7 @@ def test_a_frame_is_read_by_them_and_its_errors_are_known(law, d, degrees):
     assert estimator(frame).invalid == Invalid.NOT_FINITE
 
 
-def test_presses_that_make_no_law_are_refused():
+def test_unsuitable_contacts_are_refused():
     with pytest.raises(CurvesError, match=r"found 5 presses of 5 depths, 0 of them tilted"):
         fit_measured(presses(count=5), A, GRID)
     falls = presses()
@@ -160,7 +160,7 @@ def test_presses_that_make_no_law_are_refused():
         fit_measured(single, A, GRID)
 
 
-def test_a_finger_takes_its_curves_from_its_file(law, tmp_path):
+def test_a_finger_uses_the_curves_of_its_file(law, tmp_path):
     file, other = tmp_path / "left.json", tmp_path / "other.json"
     settings = load(HIL, tmp_path, [])
     empty = Calibration(sensor=sensor_of(settings, 0), date="")

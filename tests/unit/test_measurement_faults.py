@@ -1,4 +1,4 @@
-"""Faults in words; what sensors of the simulated hand read wrong, while the hand is as it was."""
+"""Measurement faults: their text form, and their effect on sensors of an unchanged hand."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ SHAPE = (5, 7)
 
 
 class Press:
-    """A left tip that is pressed evenly deeper, and its sensor."""
+    """A left tip whose indentation increases steadily, and its sensor."""
 
     def __init__(self, **simulation) -> None:
         self.settings = Settings.model_validate(
@@ -37,7 +37,7 @@ class Press:
         self.faults = self.hand.measurement_faults[0]
 
     def frames(self, count: int) -> list[np.ndarray]:
-        """The next frames' counts, each of which must be a new one by its number and times."""
+        """Return the counts of the next frames, which must have new numbers and times."""
         found = []
         for _ in range(count):
             before = self.sensor.latest()
@@ -50,7 +50,7 @@ class Press:
         return found
 
     def pressed(self, count: int) -> list[np.ndarray]:
-        """As many frames, after the first 1.4 s of the press."""
+        """Return this number of frames after 1.4 s of compression."""
         self.clock.sleep_until(1.4)
         self.sensor.latest()
         return self.frames(count)
@@ -68,7 +68,7 @@ def applied(*faults: tuple[str, float], t: float = 0.0) -> np.ndarray:
     return image
 
 
-def test_each_kind_does_to_the_image_what_its_name_says():
+def test_each_kind_changes_the_image_as_its_name_says():
     image = signal()
     np.testing.assert_array_equal(applied(), image)
     np.testing.assert_array_equal(applied(("gain", 0.5)), 0.5 * image)
@@ -86,13 +86,13 @@ def test_each_kind_does_to_the_image_what_its_name_says():
     np.testing.assert_array_equal(applied(("gain", 2.0), ("gain", 1.0)), image)
 
 
-def test_they_come_evenly_in_their_time_and_end():
+def test_faults_develop_linearly_over_their_duration_and_end():
     faults = MeasurementFaults()
     faults.begin("gain", 0.5, 3.0, 2.0)
     assert [faults("gain", t) for t in (0.0, 3.0, 4.0, 4.5, 5.0, 9.0)] == [
         *(1.0, 1.0, 0.75, 0.625, 0.5, 0.5)
     ]
-    faults.begin("gain", 2.625, 4.5, 4.0)  # from where it is by then
+    faults.begin("gain", 2.625, 4.5, 4.0)  # starts from the current value
     assert [faults("gain", t) for t in (4.5, 6.5, 8.5)] == [0.625, 1.625, 2.625]
     faults.begin("drift", 0.1, 7.0)
     assert [faults("drift", t) for t in (6.999, 7.0)] == [0.0, 0.1]
@@ -104,7 +104,7 @@ def test_they_come_evenly_in_their_time_and_end():
         faults.begin("smell", 1.0, 0.0)
 
 
-def test_a_sensor_lies_and_its_tip_feels_the_truth():
+def test_a_faulty_sensor_does_not_affect_the_tip():
     honest, lying = Press(), Press()
     lying.faults.begin("gain", 0.5, 1.45, 0.1)
     true, read = honest.pressed(30), lying.pressed(30)
@@ -112,7 +112,7 @@ def test_a_sensor_lies_and_its_tip_feels_the_truth():
     instants = 1.39 + 0.01 * np.arange(30)
     np.testing.assert_allclose(sums, np.interp(instants, [1.45, 1.55], [1.0, 0.5]), atol=2e-3)
     np.testing.assert_array_equal(honest.hand.force, lying.hand.force)
-    # Of the other finger nothing is wrong.
+    # The other finger has no faults.
     assert lying.hand.measurement_faults[1]("gain", 9.0) == 1.0
 
 
@@ -122,7 +122,7 @@ def test_frames_are_repeated_with_new_numbers():
     assert len({each.tobytes() for each in kept}) == 20
     press.faults.begin("replay", 0.06, press.clock.now())
     again = press.frames(18)
-    # The sensor's delay is one frame: the first was sampled before it began.
+    # The sensor's delay is one frame, so the first frame was sampled before the fault.
     last = [*kept, again[0]][-6:]
     assert [each.tobytes() for each in again[1:]] == [
         last[k % 6].tobytes() for k in range(len(again) - 1)
@@ -131,7 +131,7 @@ def test_frames_are_repeated_with_new_numbers():
     assert press.frames(3)[-1].sum() > kept[-1].sum()
 
 
-def test_each_sensor_has_its_gain():
+def test_each_sensor_has_its_own_gain():
     total = []
     for gain in ([1.0, 1.0], [0.7, 1.0], [1.0, 0.7]):
         total.append(float(Press(tactile_gain=tuple(gain)).pressed(1)[0].sum()))
@@ -139,7 +139,7 @@ def test_each_sensor_has_its_gain():
     assert total[2] == total[0]
 
 
-def test_a_servo_reports_another_current_than_flows():
+def test_a_servo_reports_a_current_other_than_the_actual_one():
     settings = Settings()
     hand = SimulatedHand(settings)
     client = BusClient(ServoBus.from_settings(settings, hand))
@@ -160,10 +160,11 @@ def test_a_servo_reports_another_current_than_flows():
         for servo, sign in zip((1, 2), signs, strict=True)
     ]
     assert counts == [round(hand.current[0] / unit), round(0.5 * hand.current[1] / unit)]
-    np.testing.assert_allclose(hand.current, flows, rtol=0.02)  # the goal is carried out as it was
+    # The goal is reached as without the fault.
+    np.testing.assert_allclose(hand.current, flows, rtol=0.02)
 
 
-def test_faults_in_words():
+def test_faults_are_parsed():
     words = [" silent=2@3 ", "silent", "left:torn=0.2", "right:frozen@1e1", "drop=0.1", "unplug@2"]
     assert parse_faults(words, (1, 2)) == [
         (0.0, "left", "silent", 1.0, 0.0),
@@ -226,6 +227,6 @@ def test_faults_in_words():
         ("reboot=1.5", "no servo has that ID"),
     ],
 )
-def test_faults_that_can_not_be_understood(text, told):
+def test_invalid_faults_are_refused(text, told):
     with pytest.raises(FaultError, match=told):
         parse_faults([text], (1, 2))

@@ -1,4 +1,4 @@
-"""The page as text, without a terminal: sizes, hostile streams, states, keys, pressure maps."""
+"""The monitor page as text, without a terminal: sizes, malformed streams, states, keys, maps."""
 
 import json
 import math
@@ -52,19 +52,19 @@ def check(lines: Sequence[Text], width: int, height: int) -> str:
 
 
 @pytest.mark.parametrize("size", [(80, 24), (81, 25), (100, 30), (120, 40), (200, 24), (80, 90)])
-def test_fills_the_terminal_exactly(size):
+def test_the_page_fills_the_terminal_exactly(size):
     text = shown(fed(), width=size[0], height=size[1])
     for part in ("HOLDING", "LEFT contact", "RIGHT", "joint", "overruns", "events", "q quit"):
         assert part in text
 
 
 @pytest.mark.parametrize("size", [(79, 24), (80, 23), (30, 8), (1, 1), (12, 3)])
-def test_too_small_says_so(size):
+def test_a_terminal_that_is_too_small_is_reported(size):
     text = shown(fed(), width=size[0], height=size[1])
     assert size[0] < 30 or f"this is {size[0]} × {size[1]}" in text
 
 
-def test_nothing_known_shows_dashes():
+def test_unknown_values_are_shown_as_dashes():
     text = shown(StreamState())
     assert "waiting for a daemon" in text
     assert text.count("—") >= 22
@@ -82,7 +82,7 @@ def test_a_missing_finger_is_marked():
     assert "left —" not in text
 
 
-def test_numbers_of_any_size_keep_the_columns():
+def test_columns_are_kept_for_numbers_of_any_size():
     feed = fed()
     for value in (1e12, -1e12, 123456.0, -99.99, 1e-30, math.inf, math.nan):
         state = fake_daemon.state(1.0, 200)
@@ -97,7 +97,7 @@ def test_numbers_of_any_size_keep_the_columns():
         assert any(line[23:].startswith("energy  ") and line[54:57] == "mJ " for line in lines)
 
 
-def test_long_and_wide_texts_are_cut():
+def test_long_and_wide_texts_are_truncated():
     feed = fed()
     give(feed, b"hand/event", fake_daemon.event(1, "kind" * 9, "手指 force ÷ " * 40, "error"))
     give(feed, b"hand/state", fake_daemon.state(1.0, 99) | {"fault": "過 " * 90, "mode": "m" * 99})
@@ -107,17 +107,17 @@ def test_long_and_wide_texts_are_cut():
     assert "c clears it" in text
 
 
-def test_status_follows_the_age():
+def test_stream_status_follows_the_age_of_data():
     feed = fed()
     assert [feed.status(now) for now in (0.4, 0.6, 1.9, 2.1)] == ["live", "stale", "stale", "lost"]
     assert "◐ stale" in shown(feed, 0.6)
     slow = StreamState()
-    for k in range(100):  # one state a second: a pause of 2 s is no loss
+    for k in range(100):  # at one state per second, a pause of 2 s is not a loss
         give(slow, b"hand/state", fake_daemon.state(k, k) | {"mono_ns": k * 10**9}, float(k))
     assert [slow.status(99 + age) for age in (2.0, 4.0, 11.0)] == ["live", "stale", "lost"]
 
 
-def test_the_rates_are_those_of_states_and_ticks():
+def test_rates_are_those_of_states_and_ticks():
     feed = StreamState()
     assert math.isnan(feed.rate)
     give(feed, b"hand/stats", {"rates": {"tick": 400.0}}, 0.0)
@@ -128,7 +128,7 @@ def test_the_rates_are_those_of_states_and_ticks():
     assert feed.rate == pytest.approx(100.0)
 
 
-def test_a_busy_machine_is_told_while_a_simulated_hand_waits_for_it():
+def test_a_busy_machine_is_reported_while_a_simulated_hand_waits():
     feed = StreamState()
     states = [fake_daemon.state(1.0, seq) | {"mono_ns": 10**9 * (seq - 98)} for seq in (99, 100)]
     give(feed, b"hand/state", states[0] | {"behind_s": 1.55}, 10.0)
@@ -139,7 +139,7 @@ def test_a_busy_machine_is_told_while_a_simulated_hand_waits_for_it():
     assert "busy" not in shown(feed, 13.1)
 
 
-def test_a_new_daemon_begins_a_new_story():
+def test_a_new_daemon_resets_the_rate():
     feed = StreamState()
     for k in range(10):
         state = fake_daemon.state(0.0, 1000 + k) | {"mono_ns": (k + 1) * 10**7}
@@ -149,7 +149,7 @@ def test_a_new_daemon_begins_a_new_story():
     assert math.isnan(feed.rate)
 
 
-def test_temperature_of_a_servo():
+def test_servo_temperature_is_shown():
     feed = fed()
     state = fake_daemon.state(1.0, 99)
     state["left"]["temperature"], state["right"]["temperature"] = 0.0, 71.5
@@ -176,9 +176,10 @@ def told(seq: int, when: float, text: str, again: bool = False) -> dict[str, Any
 TEXTS = ["first", "second", "third"]
 
 
-def test_events_told_again_are_shown_once_and_in_their_order():
+def test_repeated_events_are_shown_once_and_in_order():
     feed = StreamState()
-    give(feed, b"hand/event", told(3, 103.0, "third"))  # between subscription and telling again
+    # This event arrives between the subscription and the repetition.
+    give(feed, b"hand/event", told(3, 103.0, "third"))
     for seq in (1, 2, 3):
         give(
             feed, b"hand/event", told(seq, 100.0 + seq, ("first", "second", "third")[seq - 1], True)
@@ -186,30 +187,31 @@ def test_events_told_again_are_shown_once_and_in_their_order():
     assert [event.text for event in feed.events] == TEXTS
     assert [event.text for event in feed.news()] == ["third", "first", "second"]
     assert feed.news() == []
-    for seq in (1, 2):  # a daemon that was started anew counts from 1 again
+    for seq in (1, 2):  # a restarted daemon counts from 1 again
         give(feed, b"hand/event", told(seq, 200.0 + seq, f"anew {seq}", True))
         give(feed, b"hand/event", told(seq, 200.0 + seq, f"anew {seq}", True))
     assert [event.text for event in feed.events][3:] == ["anew 1", "anew 2"]
 
 
-def test_who_commands_is_told_while_the_lease_lasts():
+def test_the_commander_is_shown_during_its_lease():
     feed = fed()
     give(feed, b"hand/settings", {"settings": json.dumps({"commands": {"lease": 5.0}})})
     carried_out = {"command": "grasp", "client": "note\x1bbook", "ok": True, "error": ""}
     give(feed, b"hand/command", carried_out, 0.0)
     assert "note book commands the hand" in shown(feed, 4.9)
     assert "commands the hand" not in shown(feed, 5.1)
-    give(feed, b"hand/command", carried_out | {"command": "stop"}, 6.0)  # needs none, takes none
+    # Stop requires and takes no lease.
+    give(feed, b"hand/command", carried_out | {"command": "stop"}, 6.0)
     assert "commands the hand" not in shown(feed, 6.1)
     give(feed, b"hand/command", carried_out | {"client": ""}, 7.0)
-    assert "commands the hand" not in shown(feed, 7.1)  # that may be this page itself
+    assert "commands the hand" not in shown(feed, 7.1)  # an unnamed client may be this page
     refused = carried_out | {"ok": False, "error": "grasp: arm first", "timestamp": 5.0}
     give(feed, b"hand/command", refused, 8.0)
     assert "refused   grasp: arm first (to note book)" in shown(feed, 8.0)
 
 
 @pytest.mark.parametrize("keys", [True, False])
-def test_long_reasons_are_shown_in_full_at_the_least_size(keys):
+def test_long_reasons_are_shown_in_full_at_the_minimum_size(keys):
     feed = fed()
     fault = "left: no sound tactile frame for 0.31 s while gripping, more than 0.3 s: torque is off"
     give(feed, b"hand/state", fake_daemon.state(1.0, 99) | {"mode": "fault", "fault": fault})
@@ -254,7 +256,7 @@ FIELDS += ["settings", "command", "client", "ok", "error", "again", "wake", "com
     ),
     st.lists(st.lists(st.binary(max_size=20), max_size=4), max_size=3),
 )
-def test_no_stream_breaks_the_page(records, garbage):
+def test_no_stream_content_breaks_the_page(records, garbage):
     feed = StreamState()
     for topic, record in records:
         give(feed, topic, record)
@@ -265,7 +267,7 @@ def test_no_stream_breaks_the_page(records, garbage):
     assert "HOLDING" in shown(feed)
 
 
-def test_a_frame_that_lies_about_its_size_is_skipped():
+def test_a_frame_with_a_wrong_size_is_skipped():
     feed = StreamState()
     good = fake_daemon.frame(0.0, 0, size=8)
     for change in ({"rows": 9}, {"cols": -8, "rows": -8}, {"rows": True}, {"finger": "thumb"}):
@@ -275,7 +277,7 @@ def test_a_frame_that_lies_about_its_size_is_skipped():
     assert feed.frames["left"].grid.shape == (8, 8)
 
 
-def test_keys():
+def test_key_sequences():
     keys = KeyDecoder()
     assert keys.decode(b"ag \x1b[C\x1bOD\x1b[A\x1b[1;5Cq\xc3\xa9\x07") == [
         *("a", "g", " "),
@@ -283,27 +285,27 @@ def test_keys():
     ]
     assert keys.decode(b"\x1b") == []
     assert keys.decode(b"[") == []
-    assert keys.decode(b"D") == ["left"]  # a sequence in three reads
+    assert keys.decode(b"D") == ["left"]  # one sequence in three reads
     keys.decode(b"\x1b")
     keys.settle()
-    assert keys.decode(b"g") == ["g"]  # a lone Escape has nothing to do with the next key
+    assert keys.decode(b"g") == ["g"]  # a lone Escape does not affect the next key
     assert keys.decode(b"a\x1b[200~go") == ["a"]
     assert keys.decode(b"go\x1b[20") == []
     assert keys.decode(b"1~q") == ["q"]
 
 
-def test_resample_is_the_area_average():
+def test_resampling_equals_the_area_average():
     grid = np.random.default_rng(1).random((44, 44))
     blocks = grid.reshape(22, 2, 11, 4).mean(axis=(1, 3))
     assert resample(grid, 22, 11) == pytest.approx(blocks, abs=1e-12)
     assert resample(grid, 88, 132) == pytest.approx(np.kron(grid, np.ones((2, 3))), abs=1e-12)
-    # On sizes that don't divide: the twin counts on a common refinement.
+    # For sizes that do not divide, the reference uses a common refinement.
     fine = np.kron(grid, np.ones((17, 9)))
     twin = fine.reshape(17, 44, 9, 44).mean(axis=(1, 3))
     assert resample(grid, 17, 9) == pytest.approx(twin, abs=1e-12)
 
 
-def test_row_0_is_lowest_and_column_0_is_left():
+def test_row_0_is_at_the_bottom_and_column_0_on_the_left():
     grid = np.zeros((4, 4))
     grid[0, 0] = 1.0
     lines = picture(grid, 1.0, 2, 4, True)

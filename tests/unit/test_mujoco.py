@@ -1,4 +1,4 @@
-"""The soft tips in MuJoCo against the contact table, and the daemon's grip beside our own plant."""
+"""Soft tips in MuJoCo against the contact table, and a grip compared with our own plant."""
 
 import math
 import re
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.extended
 PAGE = Path(__file__).parents[2] / "docs" / "mujoco.md"
 SETTINGS = checked({"loop": {"clock": "virtual"}})
 RADIUS, FRICTION = SETTINGS.tip.radius, SETTINGS.simulation.tip_friction
-# A tip along x before a wall, its face tilted about z.
+# A tip along x in front of a wall whose face is tilted about z.
 SCENE = """<mujoco><option timestep="0.002" gravity="0 0 0" integrator="{integrator}"/>
 <default><geom contype="0" conaffinity="0"/><joint type="slide" damping="5"/></default><worldbody>
 <body><joint axis="1 0 0"/>{joints}
@@ -34,7 +34,7 @@ FREE = '<joint axis="0 1 0"/><joint axis="0 0 1"/>'
 def scene(
     tilt: float = 0.0, joints: str = "", integrator: str = "implicitfast", radius: float = RADIUS
 ) -> tuple[Any, Any]:
-    """A model and its data; the tip just touches the face, which is tilted by so much [rad]."""
+    """Return a model and data with the tip just touching a face tilted by this angle [rad]."""
     away = RADIUS + 0.05
     place = {"x": away * math.cos(tilt), "y": away * math.sin(tilt), "degrees": math.degrees(tilt)}
     text = SCENE.format(joints=joints, integrator=integrator, radius=radius, **place)
@@ -44,7 +44,7 @@ def scene(
 
 @pytest.mark.parametrize("force", [1.0, 12.0])
 @pytest.mark.parametrize("tilt", [0.0, 0.25])
-def test_a_press_at_rest_is_the_tables(force, tilt):
+def test_a_static_contact_equals_the_table(force, tilt):
     model, data = scene(tilt)
     with SoftTips(model, data, SETTINGS, ("tip",), ("wall",)) as tips:
         data.qfrc_applied[0] = force
@@ -58,7 +58,7 @@ def test_a_press_at_rest_is_the_tables(force, tilt):
 
 
 @pytest.mark.parametrize("used", [0.8, 1.1])
-def test_friction_is_a_cone_across_the_tilt_too(used):
+def test_friction_is_a_cone_including_the_lateral_direction(used):
     model, data = scene(joints=FREE)
     press, push = 6.0, used * FRICTION * 6.0
     with SoftTips(model, data, SETTINGS, ("tip",), ("wall",)) as tips:
@@ -69,16 +69,16 @@ def test_friction_is_a_cone_across_the_tilt_too(used):
         d, slid = data.qpos[0], math.hypot(*data.qpos[1:])
         normal = tips.touches[0].contact.normal
     assert normal == pytest.approx(press, rel=1e-3)
-    if used < 1.0:  # T = 2F d_t/d, as the springs of the face have it
+    if used < 1.0:  # T = 2F d_t/d, as for the springs of the face
         bears = 2.0 * float(tips.table(d, 0.0).force) / d
         assert slid == pytest.approx(push / bears, rel=1e-3)
         assert data.qpos[2] / data.qpos[1] == pytest.approx(4.0 / 3.0, rel=1e-3)
-    else:  # what friction doesn't bear drives it through its damping of 5 N·s/m
+    else:  # the push in excess of friction moves it against a damping of 5 N·s/m
         speed = (push - FRICTION * press) / 5.0
         assert math.hypot(*data.qvel[1:]) == pytest.approx(speed, rel=0.01)
 
 
-def test_what_it_can_not_do_is_refused():
+def test_unsupported_options_are_refused():
     with pytest.raises(SettingsError, match="found RK4"):
         SoftTips(*scene(integrator="RK4"), SETTINGS, ("tip",), ("wall",))
     with pytest.raises(SettingsError, match=r"tip: expected a sphere of 0\.02 m"):
@@ -90,7 +90,7 @@ def test_what_it_can_not_do_is_refused():
 
 
 @pytest.mark.parametrize("timestep", [0.001, 0.002])
-def test_the_page_grasps_and_turns_as_our_plant_does(monkeypatch, timestep):
+def test_the_documented_program_grasps_and_turns_like_our_plant(monkeypatch, timestep):
     entry = EntryPoint("mujoco", "softfinger.mujoco:MujocoServos", "softfinger.servos")
     monkeypatch.setattr(backends, "plugins", lambda kind: [entry] if kind == "servos" else [])
     backends._plugin.cache_clear()
@@ -105,4 +105,4 @@ def test_the_page_grasps_and_turns_as_our_plant_does(monkeypatch, timestep):
         assert mujocos.force[late, mean].mean() == pytest.approx(
             ours.force[late, mean].mean(), rel=0.05
         )
-    assert np.ptp(mujocos.force[late]) - np.ptp(ours.force[late]) < 0.2  # it rests
+    assert np.ptp(mujocos.force[late]) - np.ptp(ours.force[late]) < 0.2  # at rest

@@ -1,4 +1,4 @@
-"""The daemon on what is no block of parallel faces: wedges, discs, a sheet, nothing at all."""
+"""The daemon with objects other than blocks: wedges, discs, a sheet, no object."""
 
 import math
 from typing import Any
@@ -15,7 +15,7 @@ SLOW: dict[str, Any] = {"rate": 25.0}
 
 
 class Rig(SimulatedDaemon):
-    """A watched hand, brought to holding."""
+    """A hand that is observed while holding."""
 
     def grasp(self, force: float, seconds: float = 2.5) -> None:
         super().grasp(force)
@@ -30,7 +30,7 @@ class Rig(SimulatedDaemon):
 
 
 def width_at_the_contacts(plant: Any) -> float:
-    """Distance of both contacts along the object's n, by the plant's outline."""
+    """Return the plant's distance between both contacts along the object's n."""
     found = []
     n = np.array([math.cos(plant.object_pose[2]), math.sin(plant.object_pose[2])])
     for finger, side in ((0, 1.0), (1, -1.0)):
@@ -46,7 +46,7 @@ def width_at_the_contacts(plant: Any) -> float:
 @pytest.mark.parametrize(
     ("taper", "told", "frames"), [(0.2, 0.2, {}), (0.2, 0.13, {}), (-0.3, -0.3, SLOW)]
 )
-def test_a_wedge_is_felt_and_turned_as_it_is(taper, told, frames):
+def test_a_wedge_is_measured_and_turned_correctly(taper, told, frames):
     sections = {
         "simulation": {"object_shape": "wedge", "object_taper": taper},
         "object": {"taper": told},
@@ -77,7 +77,7 @@ def test_a_wedge_is_felt_and_turned_as_it_is(taper, told, frames):
         assert rig.warnings() == []
 
 
-def test_a_taper_that_was_not_told_is_felt_as_it_is_but_told_of():
+def test_an_undeclared_taper_is_measured_and_reported():
     with Rig({"simulation": {"object_shape": "wedge", "object_taper": 0.17}}) as rig:
         rig.grasp(5.0)
         rig.plant.advance(rig.state.reading.t)
@@ -88,7 +88,7 @@ def test_a_taper_that_was_not_told_is_felt_as_it_is_but_told_of():
 
 
 @pytest.mark.parametrize(("force", "frames"), [(1.0, SLOW), (25.0, {})])
-def test_with_nothing_between_the_tips_the_hand_opens(force, frames):
+def test_without_an_object_between_the_tips_the_hand_opens(force, frames):
     with Rig({"simulation": {"object_shape": "none"}, "tactile": frames}) as rig:
         rig.grasp(force, 1.0)
         worst = 0.0
@@ -105,7 +105,7 @@ def test_with_nothing_between_the_tips_the_hand_opens(force, frames):
         )
 
 
-def test_a_sheet_that_is_told_to_be_one_is_not_nothing():
+def test_a_declared_sheet_is_not_mistaken_for_a_missing_object():
     sheet = {"simulation": {"object_width": 0.001}, "object": {"width_min": 0.0005}}
     with Rig(sheet) as rig:
         rig.grasp(1.0, 1.6)
@@ -113,8 +113,8 @@ def test_a_sheet_that_is_told_to_be_one_is_not_nothing():
         assert isinstance(rig.control.state, Gripping) or rig.state.mode == "fault"
 
 
-def test_a_small_disc_is_no_other_tip():
-    """Its misfit hides more than half of d, and yet no uncertainty is known that would."""
+def test_a_small_disc_is_not_mistaken_for_another_tip():
+    """Its misfit hides more than half of d, although no declared uncertainty would."""
     with Rig({"simulation": {"object_shape": "disc", "object_radius": 0.010}}) as rig:
         rig.grasp(8.0)
         assert rig.state.mode == "holding"
@@ -131,7 +131,7 @@ def test_a_disc_is_held_and_turned_by_the_line_between_its_contacts():
         assert rig.state.fault == ""
         tips = HAND.tips(rig.plant.q)
         line = math.atan2(*(tips[1] - tips[0])[::-1])
-        # A curved contact looks slightly less tilted than it is.
+        # A curved contact appears slightly less tilted than it is.
         assert rig.state.object.angle == pytest.approx(0.95 * line, abs=0.01)
-        # The disc itself has rolled on between the tips.
+        # The disc itself has rolled further between the tips.
         assert rig.plant.object_pose[2] > 2.0 * line

@@ -1,4 +1,4 @@
-"""What others have put where this user's files are to be is neither followed nor written over."""
+"""Files of other users in place of this user's files are neither followed nor overwritten."""
 
 import os
 from collections.abc import Callable
@@ -24,7 +24,7 @@ STRANGER = 54321
 
 @pytest.fixture
 def strangers(monkeypatch: pytest.MonkeyPatch) -> Callable[[Path], None]:
-    """Gives a file away; who can't does as if this process were somebody else's."""
+    """Change a file's owner; without permission, pretend that this process is another user."""
 
     def give(path: Path) -> None:
         if os.geteuid() == 0:
@@ -37,7 +37,7 @@ def strangers(monkeypatch: pytest.MonkeyPatch) -> Callable[[Path], None]:
 
 @pytest.fixture
 def shared(tmp_path: Path) -> Path:
-    """A folder as /tmp is one."""
+    """Create a shared folder like /tmp."""
     folder = tmp_path / "shared"
     folder.mkdir()
     folder.chmod(0o1777)
@@ -46,9 +46,7 @@ def shared(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("write", [write_text, write_bytes, lambda path: EventLog(file=path)])
 @pytest.mark.parametrize("linked", [True, False])
-def test_anothers_link_is_not_followed_and_anothers_file_left_alone_where_all_may_write(
-    shared, strangers, write, linked
-):
+def test_foreign_links_and_files_in_a_shared_folder_are_not_used(shared, strangers, write, linked):
     named = shared / "run.csv"
     victim = shared.parent / "victim" if linked else named
     victim.write_text("precious")
@@ -62,7 +60,7 @@ def test_anothers_link_is_not_followed_and_anothers_file_left_alone_where_all_ma
     assert victim.read_text() == "precious"
 
 
-def test_own_files_and_links_are_written_as_ever(shared):
+def test_own_files_and_links_are_written_normally(shared):
     file, link = shared / "run.csv", shared / "newest"
     link.symlink_to(file)
     with write_text(link) as made:
@@ -76,7 +74,7 @@ def test_own_files_and_links_are_written_as_ever(shared):
         nothing.write(b"x")
 
 
-def test_a_file_appears_whole_or_not_at_all(tmp_path, monkeypatch):
+def test_a_file_is_written_completely_or_not_at_all(tmp_path, monkeypatch):
     file = tmp_path / "kept"
     own_folder.write_whole(file, b"before")
 
@@ -98,9 +96,7 @@ def test_a_file_appears_whole_or_not_at_all(tmp_path, monkeypatch):
         (None, "found a link"),
     ],
 )
-def test_what_is_not_the_users_own_folder_is_not_the_stand_in_hands(
-    tmp_path, strangers, mode, told
-):
+def test_the_emulated_hand_refuses_a_folder_of_another_user(tmp_path, strangers, mode, told):
     folder = tmp_path / "hand"
     if mode is None:
         folder.symlink_to(tmp_path)
@@ -113,7 +109,7 @@ def test_what_is_not_the_users_own_folder_is_not_the_stand_in_hands(
         LinkFolder(folder)
 
 
-def test_a_link_in_the_locks_place_is_not_followed(tmp_path):
+def test_a_link_in_place_of_the_lock_is_not_followed(tmp_path):
     victim, folder = tmp_path / "victim", tmp_path / "hand"
     victim.write_text("precious")
     folder.mkdir(mode=0o700)
@@ -123,7 +119,7 @@ def test_a_link_in_the_locks_place_is_not_followed(tmp_path):
     assert victim.read_text() == "precious"
 
 
-def test_the_runtime_folder_is_the_users_own(tmp_path, monkeypatch):
+def test_the_runtime_folder_is_private(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     assert runtime_folder() == tmp_path / "softfinger"
     monkeypatch.setenv("XDG_RUNTIME_DIR", "relative")
@@ -139,7 +135,7 @@ def test_the_runtime_folder_is_the_users_own(tmp_path, monkeypatch):
     assert runtime_folder() == tmp_path / "cache" / "softfinger" / "run"
 
 
-def test_a_runtime_folder_that_others_may_fill_is_refused_with_the_cure(
+def test_a_runtime_folder_writable_by_others_is_refused_with_a_remedy(
     tmp_path, monkeypatch, capsys
 ):
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
@@ -156,8 +152,8 @@ def test_a_runtime_folder_that_others_may_fill_is_refused_with_the_cure(
         assert f"{folder}: may be written by others (0777): {cure}" in capsys.readouterr().err
 
 
-def test_the_local_stop_goes_on_at_home_and_says_so(shared, monkeypatch, request):
-    home = TemporaryDirectory(prefix="softfinger-")  # short enough for a socket's address
+def test_the_local_stop_falls_back_to_the_home_folder_and_reports_it(shared, monkeypatch, request):
+    home = TemporaryDirectory(prefix="softfinger-")  # short enough for a socket address
     request.addfinalizer(home.cleanup)
     for name in ("XDG_RUNTIME_DIR", "RUNTIME_DIRECTORY"):
         monkeypatch.delenv(name, raising=False)

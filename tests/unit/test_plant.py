@@ -1,4 +1,4 @@
-"""The plant's kernel: one energy that no step adds to, what it survives, how shear relaxes."""
+"""The plant's kernel: energy that no step increases, robustness, and relaxation of shear."""
 
 import math
 
@@ -14,7 +14,7 @@ from softfinger.kinematics.compiled.kernel import kernel
 from tests.fuzz.plant import abuse, random_hand
 from tests.harness.plant import MODULUS, PAPER, TABLE_I, make, place
 
-# One tip alone.
+# Single tip.
 
 
 @kernel
@@ -26,7 +26,7 @@ def evaluate_one(plants, tables, finger, turn):
 
 
 def tip_at(hand: SimulatedHand, finger: int, q, pose, shear: float) -> TipContact:
-    """Evaluate one tip at rest; a copy of its contact."""
+    """Evaluate one tip at rest; return a copy of its contact."""
     state = hand.plant.state
     state.velocity[:] = 0.0
     state.position[:] = q, q, *pose
@@ -55,7 +55,7 @@ def test_tip_forces_are_the_gradient_of_one_energy(table, depth, scene):
     gradient_of_one_energy(table, depth, scene)
 
 
-def test_forces_of_a_solid_tip_that_sticks_are_the_gradient_of_one_energy():
+def test_forces_of_a_sticking_solid_tip_are_the_gradient_of_one_energy():
     tip = Fingertip(0.020, "solid", 0.48, "lying", "sticking")
     gradient_of_one_energy(ContactTable.build(tip, Material.constant(MODULUS)), (1e-3, 0.01), {})
 
@@ -93,7 +93,7 @@ def gradient_of_one_energy(table, depth, scene):
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.2])
-def test_bristles_bear_a_shear_whatever_the_tilt_and_press_as_the_springs_do(tilt):
+def test_bristles_carry_shear_at_any_tilt_with_the_normal_force_of_the_springs(tilt):
     d, shear = 0.004, 3e-4
     pose = -0.010 - d / math.cos(tilt), 0.08, tilt
     springs, bristles = (
@@ -115,9 +115,9 @@ def test_bristles_bear_a_shear_whatever_the_tilt_and_press_as_the_springs_do(til
 
 
 @pytest.mark.parametrize("trial", range(24))
-def test_energy_never_rises_without_input(trial):
-    # Any scene, masses, moduli and friction, fingers thrown at the object, past the rim too; one
-    # time in three with a step ten times too long.
+def test_energy_never_increases_without_input(trial):
+    # Random scenes, masses, moduli and friction, with fingers thrown at the object, also beyond the
+    # rim; one trial in three uses a step ten times too long.
     generator = np.random.default_rng(trial)
     hand = random_hand(generator, trial % 3 == 0)
     held = hand.plant.parameters.object_held
@@ -136,16 +136,16 @@ def test_energy_never_rises_without_input(trial):
         later = hand.energy()
         assert later <= energy + 1e-12 * scale
         energy = later
-    # Where joints stick the tips stay pressed, by part of what moved, too.
+    # Sticking joints keep the tips indented, so part of the energy remains stored.
     assert energy < start - min(1e-3 * scale, 0.25 * (start - at_rest))
 
 
-# Abuse.
+# Extreme input.
 
 
 @pytest.mark.extended
-def test_random_commands_and_extreme_parameters_stay_sound():
-    # With the steps that the plant chooses and, one time in three, steps ten times too long.
+def test_the_state_stays_finite_for_random_commands_and_extreme_parameters():
+    # Uses the plant's own steps and, one time in three, steps ten times too long.
     assert [wrong for wrong in map(abuse, range(12)) if wrong] == []
 
 
@@ -155,7 +155,7 @@ MU = 0.3
 
 
 def pressed(**simulation: float) -> SimulatedHand:
-    """The left tip upright on an object; neither moves by itself."""
+    """Return the left tip upright on an object; neither moves by itself."""
     hand = make(PAPER, STEP, tip_friction=MU, **simulation)
     hand.plant.parameters.joints_held = hand.plant.parameters.object_held = True
     place(hand, (0.0, -0.3), (-0.010 - DEPTH, 0.08, 0.0))
@@ -163,7 +163,7 @@ def pressed(**simulation: float) -> SimulatedHand:
 
 
 def sheared(hand: SimulatedHand, way: list[float]) -> list[float]:
-    """The tip's T over μN at the end of each leg, its face moved to and fro from 0 [m]."""
+    """Return T/(μN) at the end of each leg when the face moves back and forth from 0 [m]."""
     found, at = [], 0.0
     for target in way:
         for value in np.linspace(at, target, 400)[1:]:
@@ -185,9 +185,9 @@ def test_creep_relaxes_a_stuck_shear_exponentially():
     assert hand.tangential[0] == pytest.approx(first * math.exp(-1.5), rel=1e-3)
 
 
-def test_slip_begins_at_the_edge_and_is_remembered_layer_by_layer() -> None:
-    # Integrals of the springs' own friction: from rest 1 − (1 − u/μd)², after each turn twice that
-    # of half the way, and after a loop where it was.
+def test_slip_starts_at_the_edge_and_is_stored_layer_by_layer() -> None:
+    # Integrals of the springs' own friction: initially 1 − (1 − u/μd)², after each reversal twice
+    # that of half the distance, and after a closed loop the earlier value.
     def virgin(u: float) -> float:
         return 1.0 - (1.0 - min(u / (MU * DEPTH), 1.0)) ** 2
 
@@ -196,7 +196,7 @@ def test_slip_begins_at_the_edge_and_is_remembered_layer_by_layer() -> None:
     assert out == pytest.approx(virgin(part), abs=0.01)
     assert turned == pytest.approx(out - 2.0 * virgin(0.5 * (part - back)), abs=0.01)
     assert again == pytest.approx(out, abs=1e-3)
-    # To and fro with less and less takes all of it out, as a magnet is demagnetised.
+    # Decreasing oscillations remove all shear, as in demagnetisation.
     fading = [part * (-1.0) ** k * (1.0 - k / 30.0) for k in range(31)]
     (*_, left) = sheared(pressed(tip_micro_slip=True), fading)
     assert abs(left) < 0.05 * out

@@ -1,9 +1,9 @@
-"""The plant against an adaptive solver of SciPy, and its order, in every kind of contact.
+"""The plant against SciPy's adaptive solver, and its order, for every kind of contact.
 
-The smooth equations of motion are written a second time here, in plain NumPy: for a constant
-modulus, tips that stick, and no friction but the tips' and the palm's own losses. Contacts are
-geometric functions of the coordinates (q1, q2, x, y, φ), differentiated by complex steps; forces
-come from the closed form of the tips' energy.
+The smooth equations of motion are implemented again in plain NumPy: for a constant modulus,
+sticking tips, and no damping except that of the tips and the palm. Contacts are geometric functions
+of the coordinates (q1, q2, x, y, φ), differentiated by complex steps; forces come from the closed
+form of the tips' energy.
 """
 
 import math
@@ -22,7 +22,7 @@ PALM_STIFFNESS, PALM_LOSS = 1e5, 1e-3
 
 
 def tips(x):
-    """Both centres, analytic in complex coordinates."""
+    """Return both centres, analytic in complex coordinates."""
     length, half = HAND.finger_length, HAND.half_separation
     return (
         np.array([-half + length * np.sin(x[0]), length * np.cos(x[0])]),
@@ -41,18 +41,18 @@ def length_of(vector):
 
 @dataclass
 class Contact:
-    """One tip's contact: way to the nearest point, κ, and the bodies that meet there."""
+    """One tip's contact: vector to the nearest point, κ, and the two bodies in contact."""
 
     finger: int
     way: Callable  # x → vector from the tip's centre to the point
-    normal: Callable  # x → unit vector into what is touched
+    normal: Callable  # x → unit vector into the touched body
     share: float = 1.0
     mutual: bool = False
 
     def variables(self, x):
         m = self.normal(x)
         d = HAND.tip_radius - (self.way(x) @ m)
-        # The tips' axes stand at −q1 and at π + q2.
+        # The tips' axes point at −q1 and π + q2.
         return np.array([d, np.arctan(m[1] / m[0]) + (x[0] if self.finger == 0 else -x[1])])
 
     def jacobian(self, x):
@@ -64,7 +64,7 @@ class Contact:
         return np.array(columns).T
 
     def slide(self, x):
-        """Row of what is touched less the tip, at the contact, along t."""
+        """Return the row of the touched body's velocity relative to the tip, along t."""
         m = self.normal(x)
         t = np.array([-m[1], m[0]])
         point = tips(x)[self.finger] + self.way(x)
@@ -79,7 +79,7 @@ class Contact:
 
 
 def material(x, finger, point):
-    """Velocity (2, 5) of a finger's material at ``point``: it turns about its pivot."""
+    """Return the velocity (2, 5) of a finger's material at ``point``, about its pivot."""
     pivot = np.array([-HAND.half_separation, 0.0]) * (1 - 2 * finger)
     lever = point - pivot
     out = np.zeros((2, 5))
@@ -88,7 +88,7 @@ def material(x, finger, point):
 
 
 def on_face(finger, point, angle):
-    """A plane face through ``point`` of the object's frame, inward normal at ``angle`` there."""
+    """Return a plane face through ``point`` of the object, with inward normal at ``angle``."""
 
     def normal(x):
         return np.array([np.cos(x[4] + angle), np.sin(x[4] + angle)])
@@ -102,9 +102,9 @@ def on_face(finger, point, angle):
 
 
 def wedge(width, taper=0.0, height=0.060):
-    """Its width stands at half the height, from where a trapezoid's centre of mass is off."""
+    """Return a wedge's contacts; its width is at half the height, off the centre of mass."""
     lean = 0.5 * taper
-    slope = height * math.tan(lean)  # of the two parallel faces, half the difference
+    slope = height * math.tan(lean)  # half the length difference of the two parallel faces
     middle = height * slope / (6.0 * width)
     return [
         on_face(0, np.array([-0.5 * width, middle]), -lean),
@@ -141,16 +141,16 @@ def each_other():
 
 @dataclass
 class Equations:
-    """State: five coordinates, their rates, a shear for each contact, then for each palm point."""
+    """Equations of five coordinates, their velocities, and a shear per contact and palm point."""
 
     contacts: list
     inertias: np.ndarray
     currents: np.ndarray
     loss: float
     weight: np.ndarray
-    corners: np.ndarray | None = None  # of the object's frame; on a palm at y = ``palm``
+    corners: np.ndarray | None = None  # in the object's frame; they rest on a palm at y = ``palm``
     palm: float = 0.0
-    coupling: float = 1.0  # of a shear with d and θ: 0 for bristles
+    coupling: float = 1.0  # of a shear with d and θ; 0 for bristles
 
     def __call__(self, _t, y):
         x, v = y[:5], y[5:10]
@@ -195,7 +195,7 @@ CORNERS = np.array([[-0.020, -0.030], [0.020, -0.030]])
 
 @dataclass
 class Scene:
-    """A smooth motion: contacts neither made nor lost, tips and palm stick."""
+    """A smooth motion: contacts neither form nor break; tips and palm stick."""
 
     contacts: list
     simulation: dict = field(default_factory=dict)
@@ -238,7 +238,7 @@ def start(scene: Scene, loss: float, count: int):
 
 
 def compared(hand, scene: Scene) -> np.ndarray:
-    """The state in the reference's order."""
+    """Return the state in the reference's order."""
     state = hand.plant.state
     shears = state.extra_shear[-2:] if scene.contacts[0].mutual else state.shear
     palm = state.extra_shear[: 0 if scene.corners is None else 2]
@@ -247,7 +247,7 @@ def compared(hand, scene: Scene) -> np.ndarray:
 
 @pytest.mark.parametrize("name", SCENES)
 @pytest.mark.parametrize("loss", [0.002, 0.0])
-def test_agreement_with_an_adaptive_solver_and_order_two(name, loss):
+def test_second_order_agreement_with_an_adaptive_solver(name, loss):
     scene = SCENES[name]
     hand = start(scene, loss, 10)
     p = hand.plant.parameters
@@ -277,7 +277,7 @@ def test_agreement_with_an_adaptive_solver_and_order_two(name, loss):
         hand = start(scene, loss, count)
         hand.advance(hand.t + SECONDS)
         errors.append(np.abs((compared(hand, scene) - exact) / scale).max())
-        assert hand.plant.limited_step_count == 0  # smooth, so that the method alone is seen
+        assert hand.plant.limited_step_count == 0  # smooth, so that only the method matters
         assert hand.d.min() > 0.001
     assert errors[0] / errors[1] == pytest.approx(4, rel=0.1)
     assert errors[2] < 1e-6

@@ -1,4 +1,4 @@
-"""The simulated object's shapes, tips on each other, and the palm."""
+"""Shapes of the simulated object, contact between tips, and the palm."""
 
 import math
 
@@ -33,10 +33,10 @@ def shape(**simulation):
 # Shapes.
 
 
-def test_gyration_and_lever_of_the_shapes():
+def test_radius_of_gyration_and_mean_radius_of_the_shapes():
     square = shape(object_width=0.04, object_height=0.04)
     assert square.gyration == pytest.approx(0.04 / math.sqrt(6))
-    # (√2 + asinh 1)/6 of the side.
+    # (√2 + asinh 1)/6 times the side.
     assert square.mean_radius == pytest.approx(0.04 * (math.sqrt(2) + math.asinh(1)) / 6, rel=1e-4)
     disc = shape(object_shape="disc", object_radius=0.03)
     assert (disc.gyration, disc.mean_radius) == pytest.approx((0.03 / math.sqrt(2), 0.02))
@@ -45,15 +45,15 @@ def test_gyration_and_lever_of_the_shapes():
     assert flat.gyration == pytest.approx(shape().gyration)
 
 
-def test_a_wedge_stands_about_its_centre_of_mass():
+def test_a_wedge_has_its_origin_at_the_centre_of_mass():
     wedge = shape(object_shape="wedge", object_taper=0.6)
-    # Faces narrow away from the palm, 0.6 rad apart, and are 40 mm apart at half the height.
+    # The faces converge away from the palm by 0.6 rad and are 40 mm apart at half the height.
     normals = wedge.edges()[:, 2:4]
     assert math.acos(-normals[1] @ normals[3]) == pytest.approx(0.6)
     np.testing.assert_allclose(normals[1], [math.cos(0.3), math.sin(0.3)])
     sides = wedge.corners[[0, 3]].mean(axis=0), wedge.corners[[1, 2]].mean(axis=0)
     assert sides[1][0] - sides[0][0] == pytest.approx(0.04)
-    # Points drawn in its bounding box, those inside kept.
+    # Random points in the bounding box; those inside are used.
     generator = np.random.default_rng(1)
     low, high = wedge.corners.min(axis=0), wedge.corners.max(axis=0)
     points = generator.uniform(low, high, (400_000, 2))
@@ -67,7 +67,7 @@ def test_a_wedge_stands_about_its_centre_of_mass():
 
 
 def nearest_by_brute_force(corners, point):
-    """Nearest of many points of the outline."""
+    """Return the nearest of many points on the outline."""
     share = np.linspace(0, 1, 20_001)[:, None]
     ends = np.roll(corners, -1, axis=0)
     outline = np.concatenate(
@@ -95,7 +95,7 @@ def test_tips_touch_the_nearest_point_of_a_wedge():
     assert kinds == {True, False}
 
 
-def test_a_disc_is_touched_towards_its_centre():
+def test_a_disc_is_touched_in_the_direction_of_its_centre():
     hand = make(object_shape="disc", object_radius=0.025)
     for height in np.linspace(0.06, 0.10, 9):
         place(hand, (0.1, 0.12), (0.002, height, 1.0))
@@ -105,7 +105,7 @@ def test_a_disc_is_touched_towards_its_centre():
 
 
 def springs_on_a_cylinder(d, theta, curved):
-    """Force and energy of the tip's springs under a cylinder's face, over those under a plane."""
+    """Return force and energy of the springs under a cylinder, relative to those under a plane."""
     away = RADIUS - d + curved
     centre = away * np.array([math.sin(theta), math.cos(theta)])
     x = np.linspace(-RADIUS, min(RADIUS, centre[0] + curved), 50_001)
@@ -129,19 +129,19 @@ def springs_on_a_cylinder(d, theta, curved):
 @pytest.mark.parametrize(
     ("curved", "upright", "tilted"), [(1.0, 1.5e-3, 1e-3), (0.04, 0.02, 0.023), (0.02, 0.01, 0.045)]
 )
-def test_curvature_softens_the_contact_as_the_springs_themselves_say(curved, upright, tilted):
+def test_curvature_softens_the_contact_like_the_springs(curved, upright, tilted):
     share = make(object_shape="disc", object_radius=curved).plant.parameters.factor
     for d in (0.001, 0.004, 0.008):
         assert springs_on_a_cylinder(d, 0.0, curved) == pytest.approx((share,) * 2, rel=upright)
         assert springs_on_a_cylinder(d, math.radians(30), curved) == pytest.approx(
             (share,) * 2, rel=tilted
         )
-    # To leading order it is exact.
+    # Exact to leading order.
     assert springs_on_a_cylinder(1e-4, 0.3, curved) == pytest.approx((share,) * 2, rel=1e-3)
 
 
 @pytest.mark.parametrize("shape", ["disc", "none"])
-def test_what_a_disc_or_the_other_tip_presses_on_a_sensor_is_its_force(shape):
+def test_pressure_of_a_disc_or_another_tip_integrates_to_its_force(shape):
     settings = Settings.model_validate(
         {
             "simulation": {"object_shape": shape, "tactile_noise": 0.0},
@@ -163,10 +163,10 @@ def test_what_a_disc_or_the_other_tip_presses_on_a_sensor_is_its_force(shape):
         assert hand.force[finger] > 3
 
 
-# Tips on each other.
+# Contact between tips.
 
 
-def test_an_object_keeps_the_tips_apart_until_it_is_gone():
+def test_an_object_separates_the_tips_until_it_is_removed():
     hand = make()
     settled(hand, (0.9, 0.9), 0.4, 1.0)
     assert hand.on_other_tip.tolist() == [0.0, 0.0]
@@ -177,7 +177,7 @@ def test_an_object_keeps_the_tips_apart_until_it_is_gone():
     assert (hand.q > held + 0.1).all()
 
 
-# The palm.
+# Palm.
 
 
 @pytest.mark.parametrize("scene", ["rectangle", "disc"])
@@ -197,13 +197,13 @@ def test_an_object_slides_on_the_palm_with_coulomb_friction(scene):
     assert hand.object_velocity[0] == pytest.approx(0.3 - friction * GRAVITY * 0.03, rel=0.02)
     assert hand.object_velocity[2] == pytest.approx(spin, rel=0.05, abs=0.3)
     run(hand, 0.17)
-    # The rectangle has come to rest after v²/2μg, the disc rolls at two thirds of the speed.
+    # The rectangle stops after v²/2μg; the disc rolls at two thirds of the velocity.
     rolling = 0.0 if scene == "rectangle" else 0.3 * 2 / 3
     assert hand.object_velocity[0] == pytest.approx(rolling, abs=2e-3)
     assert hand.object_velocity[2] * 0.03 == pytest.approx(-rolling, abs=2e-3)
     if scene == "rectangle":
         way = 0.3**2 / (2 * friction * GRAVITY)
-        assert hand.object_pose[0] + 0.02 == pytest.approx(way, rel=0.06)  # it rocks a little
+        assert hand.object_pose[0] + 0.02 == pytest.approx(way, rel=0.06)  # it rocks slightly
 
 
 def test_an_object_sticks_to_the_palm_below_friction_and_slides_above():
@@ -220,7 +220,7 @@ def test_an_object_sticks_to_the_palm_below_friction_and_slides_above():
             assert hand.object_pose[0] == pytest.approx(at, abs=1e-9)
 
 
-# What goes wrong is told.
+# Errors.
 
 
 def test_a_long_wedge_whose_faces_meet_is_refused():

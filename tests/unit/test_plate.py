@@ -1,4 +1,4 @@
-"""The plate that presses an emulated tip: its words, its way, and what is refused."""
+"""The plate that presses an emulated tip: its text form, its motion, and refusals."""
 
 import math
 
@@ -13,7 +13,7 @@ TABLE = ContactTable.build(TIP, Material.constant(0.3e6))
 FORCE = math.pi * 0.3e6 * 0.004**2  # N at 4 mm
 
 
-def test_presses_in_words():
+def test_presses_are_parsed():
     words = (
         "tip=left depth=4mm tilt=10deg speed=2mm/s hold=500ms, force=5N, tip=right pressure=2kPa"
     )
@@ -31,25 +31,25 @@ def test_presses_in_words():
     assert str(stiffer) == "4.000 mm at 0.00°, 19.604 N"
 
 
-def test_a_plate_goes_down_holds_and_lifts_off():
+def test_a_plate_descends_holds_and_lifts_off():
     plate = Plate()
     assert plate(5.0) == (-0.001, 0.0, 0.0)
     plate.go(parse_presses("depth=4mm tilt=-10deg speed=5mm/s hold=1s", TABLE, 1.0)["left"], 10.0)
-    assert plate.arrives == pytest.approx(11.0)  # from 1 mm over the tip
+    assert plate.arrives == pytest.approx(11.0)  # from 1 mm above the tip
     tilt = -math.radians(10.0)
     assert plate(10.5) == pytest.approx((0.0015, tilt, 0.0))
     assert plate.reached(10.99) is None
     assert plate(11.5) == pytest.approx((0.004, tilt, 0.0))
     reached = plate.reached(11.5)
     assert reached.d == 0.004
-    assert plate.reached(11.9) is None  # the same
+    assert plate.reached(11.9) is None  # already returned
     assert plate(12.125) == pytest.approx((0.0015, tilt, 0.0))
     assert plate(12.5).d == -0.001
     assert plate(1e4) == (-0.001, 0.0, 0.0)
     assert plate.reached(1e4) is None
 
 
-def test_a_plate_lifts_off_before_it_tilts_and_the_last_press_stays():
+def test_a_plate_lifts_off_before_tilting_and_the_last_press_remains():
     plate = Plate()
     plate.go(parse_presses("depth=4mm", TABLE, 1.0)["left"], 0.0)
     assert plate(1e4) == (0.004, 0.0, 0.0)
@@ -77,6 +77,6 @@ def test_a_plate_lifts_off_before_it_tilts_and_the_last_press_stays():
         ("depth=1mm speed=0mm/s", "expected above 0"),
     ],
 )
-def test_what_no_plate_can_do(words, told):
+def test_impossible_presses_are_refused(words, told):
     with pytest.raises(PlateError, match=told):
         parse_presses(words, TABLE, 1.0)

@@ -1,4 +1,4 @@
-"""Presses at known depths and tilts: which tip made them, its modulus, its ν and its place."""
+"""Fitting contacts at known depths and tilts: tip model, modulus, ν and position."""
 
 import math
 from pathlib import Path
@@ -19,7 +19,7 @@ STICKING = Fingertip(0.020, "solid", 0.48, face="sticking")
 D = np.array([1e-3, 2e-3, 3e-3, 3e-3, 4e-3])
 THETA = np.radians([0.0, 0.0, -10.0, 20.0, 15.0])
 NOISE = 600.0
-LATE = 2e-4  # m that the presses' own zero of d is off
+LATE = 2e-4  # m, zero offset of the recorded d
 
 
 def frames(tip: Fingertip, grid: SensorGrid = GRID) -> np.ndarray:
@@ -35,7 +35,7 @@ def frames(tip: Fingertip, grid: SensorGrid = GRID) -> np.ndarray:
     [STICKING, pytest.param(Fingertip(0.020), marks=pytest.mark.extended)],
     ids=lambda tip: tip.physics,
 )
-def test_the_tip_that_made_them_explains_them_best(tip):
+def test_the_true_tip_model_fits_best(tip):
     seen = frames(tip)
     presses = Presses(seen, D + LATE, THETA, NOISE, np.ones(seen.shape, np.bool_))
     best, *others = compare_tips(presses, 0.020, GRID, np.ones(GRID.shape, np.bool_))
@@ -47,22 +47,22 @@ def test_the_tip_that_made_them_explains_them_best(tip):
     assert best.valid == 1.0
     assert best.d_error < 1e-4
     assert best.theta_error < math.radians(1.5)
-    assert best.force_error < 0.12  # most of it the noise of the sum
+    assert best.force_error < 0.12  # mostly noise of the sum
     if tip.physics == "solid":
         assert (best.tip.base, best.tip.face) == ("bonded", "sticking")
         assert best.tip.poisson == pytest.approx(0.48, abs=0.01)
 
 
 @pytest.mark.extended
-def test_a_solid_tips_place_and_rotation_are_found_by_its_whole_frames():
+def test_position_and_rotation_of_a_solid_tip_are_found_from_complete_frames():
     true = SensorGrid(32, 32, 0.058 / 32, centre=(1.3e-3, -0.8e-3), rotation=-2.0)
     found = fit_centre(frames(TIP, true), THETA, TIP, RUBBER, GRID, NOISE)
-    assert found.centre == pytest.approx(true.centre, abs=6e-5)  # noise: some 2e-5
+    assert found.centre == pytest.approx(true.centre, abs=6e-5)  # noise: about 2e-5
     assert 2e-5 < found.std < 1e-4
     assert found.rotation == pytest.approx(-2.0, abs=0.03)
 
 
-def test_a_solid_tips_modulus_is_found_by_its_own_force_law():
+def test_the_modulus_of_a_solid_tip_is_found_with_its_own_force_law():
     force = frames(TIP).sum(axis=(1, 2)) * GRID.pitches[0] ** 2
     found = fit_modulus(D + LATE, THETA, force, tip=TIP)
     assert found.modulus == pytest.approx(0.25e6, rel=0.05)
@@ -71,7 +71,7 @@ def test_a_solid_tips_modulus_is_found_by_its_own_force_law():
 
 
 @pytest.mark.parametrize("base", ["bonded", "lying"])
-def test_deep_presses_of_other_elements_have_one_modulus(base):
+def test_deep_contacts_of_other_elements_give_one_modulus(base):
     with np.load(Path(__file__).parents[1] / "golden" / "solid_frames.npz") as file:
         known = (file["base"] == base) & (file["theta"] == 0.0) & (file["d"] < 0.31)
         d, force = file["d"][known] * 0.020, file["force"][known] * 0.25e6 * 0.020**2
@@ -89,7 +89,7 @@ def test_deep_presses_of_other_elements_have_one_modulus(base):
         (Fingertip(0.020, "solid", 0.48, "lying"), TIP, -1),
     ],
 )
-def test_a_modulus_that_hides_another_law_drifts_over_depth(made, fitted, sign):
+def test_a_modulus_fitted_with_the_wrong_law_varies_with_depth(made, fitted, sign):
     rng = np.random.default_rng(2)
     d = np.linspace(1e-3, 7e-3, 7)
     force = ContactTable.build(made, RUBBER)(d, 0.0).force * (1.0 + 0.01 * rng.standard_normal(7))
@@ -102,7 +102,7 @@ def test_a_modulus_that_hides_another_law_drifts_over_depth(made, fitted, sign):
     assert found.trend.modulus == pytest.approx(found.modulus / (1.0 + found.errors), rel=1e-12)
 
 
-def test_calibrate_law_says_which_tip_it_is(tmp_path, capsys):
+def test_calibrate_law_names_the_tip_model(tmp_path, capsys):
     each = frames(TIP) / 20.0
     counts = np.clip(np.round(np.concatenate([1.1 * each[1:2], each])), 0, 4095).astype(np.uint16)
     d, theta = np.append(D[1], D) + LATE, np.append(THETA[1], THETA)

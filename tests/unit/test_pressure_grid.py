@@ -1,4 +1,4 @@
-"""The forward model: cell averages against plain integration, sums against the closed forms."""
+"""The forward model: cell averages against plain integration, sums against closed forms."""
 
 import math
 
@@ -10,7 +10,7 @@ from tests.harness.paper_tip import LINEAR, MEASURED, PITCH, TIP, A, E, tilts
 
 
 def cell_mean(grid, material, d, tilt_x, tilt_y, row, col, lines=400):
-    """Plain twin: mean σ(ε) over a cell, midpoint rule in y, Gauss in the angle x = R sin t."""
+    """Return a cell's mean σ(ε): midpoint rule in y, Gauss in the angle x = R sin t."""
     n_x, n_y = math.sin(tilt_x), math.sin(tilt_y)
     n_z = math.sqrt(1.0 - n_x**2 - n_y**2)
     cells = grid.on(TIP)
@@ -20,7 +20,7 @@ def cell_mean(grid, material, d, tilt_x, tilt_y, row, col, lines=400):
     y = (y_first + (row + (np.arange(lines) + 0.5) / lines) * pitch_y)[:, None]
     radius2 = A**2 - y**2
     q = (A - d) - y * n_y
-    # (h − x n_x − y n_y)² = n_z² (R² − x²) bounds the footprint on each line.
+    # (h − x n_x − y n_y)² = n_z² (R² − x²) limits the footprint on each line.
     a2 = n_x**2 + n_z**2
     root = (q * n_x) ** 2 - a2 * (q**2 - n_z**2 * radius2)
     inside = (root > 0.0) & (radius2 > 0.0)
@@ -47,24 +47,24 @@ def cell_mean(grid, material, d, tilt_x, tilt_y, row, col, lines=400):
         (1e-3, 10.0, 0.3),
         (4e-3, 30.0, 0.7),
         (8e-3, 30.0, 2.2),
-        (8e-3, 36.0, 0.4),  # nearly at the rim
+        (8e-3, 36.0, 0.4),  # almost at the rim
     ],
 )
-def test_every_kind_of_cell_is_averaged(material, d, degrees, azimuth):
+def test_cell_averages_for_all_kinds_of_cells(material, d, degrees, azimuth):
     grid = SensorGrid(44, 44, PITCH, centre=(0.3e-3, -0.2e-3))
     tilt_x, tilt_y = tilts(math.radians(degrees), azimuth)
     p = grid.pressure(TIP, material, d, tilt_x, tilt_y)
     touched = np.argwhere(p > 0.0)
     order = np.argsort(p[p > 0.0])
     allowed = 1e-5 if degrees < 30.0 else 1e-4 if degrees < 36.0 else 1e-3
-    # The weakest cells are those that the outline cuts; and some of all the others.
+    # The weakest cells, which the outline cuts, and some of the others.
     chosen = np.unique(np.concatenate([order[:25], order[:: max(1, len(order) // 15)]]))
     for row, col in touched[chosen]:
         expected = cell_mean(grid, material, d, tilt_x, tilt_y, row, col)
         assert abs(p[row, col] - expected) <= allowed * material.reference_modulus
 
 
-def test_cells_off_the_footprint_read_exactly_zero():
+def test_cells_outside_the_footprint_are_exactly_zero():
     grid = SensorGrid(44, 44, PITCH)
     p = grid.pressure(TIP, LINEAR, 0.002, 0.2, -0.1)
     n_x, n_y = math.sin(0.2), math.sin(-0.1)
@@ -80,14 +80,14 @@ def test_cells_off_the_footprint_read_exactly_zero():
     [(8, 45, 81.266754123), (10, 35, 114.126873792), (12, 30, 153.849535079)],
 )
 @pytest.mark.parametrize("azimuth", [0.0, 0.5, math.pi / 2])
-def test_beyond_the_limit_the_strain_ends_at_the_rim(d, degrees, force, azimuth):
+def test_beyond_the_limit_the_strain_is_cut_off_at_the_rim(d, degrees, force, azimuth):
     grid = SensorGrid(44, 44, PITCH, centre=(1e-4, 3e-4))
     p = grid.pressure(TIP, LINEAR, d * 1e-3, *tilts(math.radians(degrees), azimuth))
     assert p.sum() * PITCH**2 == pytest.approx(force, rel=2e-4)
     assert p.max() <= E * (1 + 1e-12)
 
 
-def test_a_turned_sensor_sees_the_tilt_turned_back():
+def test_a_rotated_sensor_sees_the_tilt_rotated_back():
     plain = SensorGrid(44, 44, PITCH)
     turned = SensorGrid(44, 44, PITCH, rotation=math.pi / 2)
     # The sensor's x axis lies along the finger's y axis.
@@ -108,7 +108,7 @@ def test_the_tip_centre_shifts_the_map_and_gain_scales_it():
     np.testing.assert_allclose(doubled, 2.0 * plain, rtol=1e-14)
 
 
-def test_a_footprint_off_the_sensor_is_cut_not_wrapped():
+def test_a_footprint_beyond_the_sensor_is_clipped_not_wrapped():
     grid = SensorGrid(44, 44, PITCH, centre=(0.029, 0.0))
     p = grid.pressure(TIP, LINEAR, 0.004)
     whole = SensorGrid(88, 88, PITCH).pressure(TIP, LINEAR, 0.004)
@@ -138,6 +138,6 @@ def test_no_contact_is_all_zero_and_out_is_reused():
         (lambda: SensorGrid(4, 4, PITCH).pressure(TIP, LINEAR, 0.001, out=np.ones(4)), "shape"),
     ],
 )
-def test_nonsense_is_refused(call, message):
+def test_invalid_arguments_are_refused(call, message):
     with pytest.raises(ValueError, match=message):
         call()

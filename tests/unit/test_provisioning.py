@@ -1,4 +1,4 @@
-"""Finding servos, telling which is which, and setting them up, over a line without a port."""
+"""Finding, identifying and configuring servos, on a line without a port."""
 
 import contextlib
 from collections.abc import Callable, Iterator
@@ -30,7 +30,8 @@ RATES = MODEL.baud_rates
 HOME = 2_000_000
 
 
-# --- which servo is meant ----------------------------------------------------------------------
+# --- identification
+# ---------------------------------------------------------------------------------
 
 
 def servo(servo_id: int, baud: int = HOME, number: int = MODEL.number) -> FoundServo:
@@ -46,25 +47,25 @@ OTHER_IDS = {**ONLY_LEFT, "servos": {"ids": (11, 12)}}
 @pytest.mark.parametrize(
     ("settings", "found", "told"),
     [
-        # At home.
+        # All as configured.
         (BOTH, [servo(1), servo(2)], []),
         (BOTH, [servo(1), servo(2), servo(9)], ["stranger 9@2000000"]),
-        # The right ID at another rate is that servo.
+        # The correct ID at another rate is the expected servo.
         (
             BOTH,
             [servo(1, 57600), servo(2, 57600)],
             ["0: 57600 → 2000000 baud", "1: 57600 → 2000000 baud"],
         ),
-        # A single servo is the single missing one.
+        # A single unexpected servo is the single missing one.
         (BOTH, [servo(1), servo(1, 57600)], ["1: ID 1 → 2, 57600 → 2000000 baud"]),
         (BOTH, [servo(1), servo(7)], ["1: ID 7 → 2"]),
         (OTHER_IDS, [servo(1, 57600)], ["0: ID 1 → 11, 57600 → 2000000 baud"]),
-        # The servo of a finger that the scene leaves out is not the missing one; from the
-        # factory, at another rate, it is nobody's.
+        # The servo of a finger outside the scene is not the missing one; with factory settings at
+        # another rate it cannot be assigned.
         (ONLY_LEFT, [servo(2)], ["missing 0", "stranger 2@2000000"]),
         (ONLY_RIGHT, [servo(1)], ["missing 1", "stranger 1@2000000"]),
         (ONLY_RIGHT, [servo(1, 57600)], ["1: ID 1 → 2, 57600 → 2000000 baud"]),
-        # What would be a guess.
+        # Ambiguous cases.
         (BOTH, [servo(7)], ["missing 0", "missing 1", "stranger 7@2000000"]),
         (
             BOTH,
@@ -77,9 +78,9 @@ OTHER_IDS = {**ONLY_LEFT, "servos": {"ids": (11, 12)}}
             [servo(1, 57600), servo(1, 1_000_000), servo(2)],
             ["missing 0", "stranger 1@57600", "stranger 1@1000000"],
         ),
-        # An emulator without pace answers at every rate.
+        # An unpaced emulator replies at every rate.
         (BOTH, [servo(servo_id, rate) for servo_id in (1, 2) for rate in RATES], []),
-        # What is garbled stays, and no servo may get an ID that is garbled.
+        # Garbled replies are left alone, and no servo gets an ID with garbled replies.
         (BOTH, [servo(1, 57600), Garbled(1, 57600)], ["missing 0", "missing 1"]),
         (
             BOTH,
@@ -88,7 +89,7 @@ OTHER_IDS = {**ONLY_LEFT, "servos": {"ids": (11, 12)}}
         ),
     ],
 )
-def test_which_servo_is_which(settings, found, told):
+def test_servos_are_identified(settings, found, told):
     servos = tuple(each for each in found if isinstance(each, FoundServo))
     garbled = tuple(each for each in found if isinstance(each, Garbled))
     what = plan(Found(servos, garbled), Settings.model_validate(settings), MODEL, RATES)
@@ -97,11 +98,12 @@ def test_which_servo_is_which(settings, found, told):
     assert changes + missing + [f"stranger {s.id}@{s.baud}" for s in what.strangers] == told
 
 
-# --- searching and setting up ------------------------------------------------------------------
+# --- search and configuration
+# -----------------------------------------------------------------------
 
 
 class Bus:
-    """The settings' servos on free joints; ``silent`` ones are unplugged."""
+    """The settings' servos on free joints; ``silent`` servos are unplugged."""
 
     def __init__(self, baud: int = HOME, **options: Any) -> None:
         self.settings = Settings.model_validate({"servos": {"backend": "dynamixel"}})
@@ -129,7 +131,7 @@ class Bus:
 
 @pytest.fixture
 def wired(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Bus]:
-    """Makes buses that the lines of this test lead to."""
+    """Return a function that creates buses for this test's lines."""
 
     def make(**options: Any) -> Bus:
         bus = Bus(**options)
@@ -149,7 +151,8 @@ def named(name: str, *changes: str) -> list[str]:
 
 def test_a_search_finds_servos_at_their_rate(wired):
     wired(baud=1_000_000)
-    found = search("line", (-1, 57600, 1_000_000, 2_000_000))  # the port has no rate of -1
+    # The port does not support a rate of -1.
+    found = search("line", (-1, 57600, 1_000_000, 2_000_000))
     assert found.servos == tuple(FoundServo(i, 1_000_000, 1020, 48) for i in (1, 2))
     assert str(found.servos[0]) == "ID 1 at 1000000 baud: XM430-W350, firmware 48"
     with pytest.raises(ServoError, match="no such rate"):
@@ -166,7 +169,7 @@ def test_a_search_recognises_servos_of_protocol_1(wired):
     assert problems[0].startswith("a servo at 57600 baud: answers Protocol 1.0, expected 2.0: ")
 
 
-def test_a_port_that_goes_away_ends_a_search(wired, monkeypatch):
+def test_a_port_that_disappears_ends_a_search(wired, monkeypatch):
     def gone(*_: object) -> None:
         raise PortLost("the port is gone")
 
@@ -176,7 +179,7 @@ def test_a_port_that_goes_away_ends_a_search(wired, monkeypatch):
         search("line")
 
 
-def test_two_factory_servos_are_set_up_one_after_the_other(wired):
+def test_two_factory_servos_are_configured_one_after_the_other(wired):
     bus = wired(baud=57600, ids=(1, 1), factory=True)
     bus.servos[1].silent = True
     assert bus.provision() == (
@@ -192,7 +195,7 @@ def test_two_factory_servos_are_set_up_one_after_the_other(wired):
     assert not any(each.torque_on for each in bus.servos)
 
 
-def test_factory_servos_together_are_reported_and_not_changed(wired):
+def test_factory_servos_with_the_same_id_are_reported_and_not_changed(wired):
     bus = wired(baud=57600, ids=(1, 1), factory=True)
     before = [bytes(each.table.memory[: reg.RAM]) for each in bus.servos]
     assert search("line", (57600, HOME)).garbled == (Garbled(1, 57600),)
@@ -211,7 +214,7 @@ def test_factory_servos_together_are_reported_and_not_changed(wired):
         ("", reg.STATUS_RETURN_LEVEL, 0, ""),
     ],
 )
-def test_what_is_set_up(wired, fault, register, value, done):
+def test_configured_registers(wired, fault, register, value, done):
     bus = wired()
     if fault:
         put_fault(bus.bus, fault, 0.0)
@@ -223,7 +226,7 @@ def test_what_is_set_up(wired, fault, register, value, done):
     assert bus.servos[0].table.get(reg.STATUS_RETURN_LEVEL) == 2
 
 
-def test_what_can_not_be_set_up_is_reported_beside_what_was(wired):
+def test_failed_and_successful_configurations_are_both_reported(wired):
     bus = wired(factory=True)
     put_fault(bus.bus, "silent=2", 0.0)
     missing = f"{RIGHT}: no answer at any rate: check its power and cable"

@@ -1,4 +1,4 @@
-"""What goes out when; histograms of the loop's times: against plain NumPy, at no allocation."""
+"""Publication rates, and histograms of the loop's times, against NumPy and without allocation."""
 
 import math
 import tracemalloc
@@ -17,13 +17,13 @@ from softfinger.daemon.wire.schema import STATE, STATS, TACTILE, Rates
 
 
 class Listener:
-    """Wants everything and keeps the tick numbers of what it got."""
+    """Subscriber to all topics that stores the received tick numbers."""
 
     wanted = bit(STATE) | bit(TACTILE) | bit(STATS)
 
     def __init__(self) -> None:
         self.ticks: dict[str, list[int]] = {"state": [], "stats": []}
-        self.frames: tuple[list[int], list[int]] = ([], [])  # of each finger, by number
+        self.frames: tuple[list[int], list[int]] = ([], [])  # frame numbers per finger
         self.rates: list[Rates] = []
         self.seq = 0
 
@@ -55,18 +55,18 @@ def listened(seconds: float, **sections: Any) -> tuple[Listener, Daemon]:
     return listener, daemon
 
 
-def test_each_topic_goes_out_on_exactly_every_nth_tick_or_frame():
+def test_each_topic_is_published_on_every_nth_tick_or_frame():
     listener, _ = listened(4.0, stream={"tactile_rate": 25.0})
     ticks = listener.ticks
     assert ticks["state"] == list(range(5, 2001, 5))
     assert ticks["stats"] == [3, 503, 1003, 1503]
     assert not set(ticks["state"]) & set(ticks["stats"])
-    for frames in listener.frames:  # 100 Hz, of which 25 are published: one of each four
+    for frames in listener.frames:  # every fourth of 100 Hz, i.e. 25 Hz
         assert [seq // 4 for seq in frames] == list(range(len(frames)))
         assert len(frames) == pytest.approx(100, abs=1)
 
 
-def test_rates_are_what_really_happened_in_the_last_second():
+def test_rates_are_measured_over_the_last_second():
     stream = {"state_rate": 50.0, "tactile_rate": 20.0}
     listener, _ = listened(4.0, tactile={"rate": 80.0}, stream=stream)
     rates = listener.rates[-1]
@@ -74,14 +74,14 @@ def test_rates_are_what_really_happened_in_the_last_second():
     assert rates.left == pytest.approx(80.0, abs=1.01)
     assert rates.right == pytest.approx(80.0, abs=1.01)
     assert rates.state == pytest.approx(50.0, abs=0.1)
-    assert rates.tactile == pytest.approx(40.0, abs=2.01)  # 20 of each finger
+    assert rates.tactile == pytest.approx(40.0, abs=2.01)  # 20 Hz per finger
 
 
 @pytest.mark.parametrize(
     ("rate", "wanted", "ticks"), [(500.0, 100.0, 5), (1000.0, 100.0, 10), (500.0, 300.0, 2),
                                   (100.0, 400.0, 1), (10.0, 0.1, 100)]
 )  # fmt: skip
-def test_a_rate_is_the_nearest_whole_number_of_ticks(rate, wanted, ticks):
+def test_a_rate_is_rounded_to_whole_numbers_of_ticks(rate, wanted, ticks):
     assert every(rate, wanted) == ticks
 
 
@@ -93,21 +93,21 @@ def fed(rows: np.ndarray) -> Statistics:
 
 
 @pytest.mark.parametrize("count", [1, 7, 1000, 20_000])
-def test_quantiles_are_those_of_the_samples_within_a_bin(count):
+def test_quantiles_match_the_samples_within_one_bin(count):
     generator = np.random.default_rng(count)
     rows = 10.0 ** generator.uniform(-8.5, 1.5, (count, 4)) * [1.0, 1e-1, 1e-2, 1e-3]
     spreads = fed(rows).spreads()
     for j, name in enumerate(TIMES):
         for share, told in zip(QUANTILES, spreads[name], strict=False):
             true = np.quantile(rows[:, j], share, method="inverted_cdf")
-            if true < 2.0**-30:  # one bin for all that is shorter than a nanosecond
+            if true < 2.0**-30:  # one bin for all times below a nanosecond
                 assert told <= 2.0**-29, (name, share)
             else:
                 assert true * (1 - 1e-12) <= told <= true * (1 + 1 / 31), (name, share)
         assert spreads[name].max == rows[:, j].max()
 
 
-def test_times_off_the_scale_are_counted():
+def test_times_beyond_the_scale_are_counted():
     statistics = fed(np.array([[0.0, -1.0, 1e-12, 1e9], [math.nan, 1e9, 0.0, 1e9]]))
     assert statistics.ticks == 2
     assert statistics.counts.sum() == 8
@@ -116,13 +116,13 @@ def test_times_off_the_scale_are_counted():
     assert spreads["compute"].p50 == pytest.approx(0.0, abs=2e-9)
 
 
-def test_nothing_counted_is_all_zero():
+def test_an_empty_histogram_is_all_zero():
     statistics = Statistics()
     assert statistics.ticks == 0
     assert all(spread == (0.0, 0.0, 0.0, 0.0) for spread in statistics.spreads().values())
 
 
-def test_keeping_them_allocates_nothing():
+def test_histograms_allocate_nothing():
     statistics = Statistics()
     counts, largest = statistics.counts, statistics.largest
     values = (1e-6, 2e-5, 1e-5, 3e-6)

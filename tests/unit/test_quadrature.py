@@ -1,4 +1,4 @@
-"""One tip's closed forms and reference integrals, against plain NumPy in other coordinates."""
+"""One tip's closed forms and reference integrals, against NumPy in other coordinates."""
 
 import math
 from fractions import Fraction
@@ -26,7 +26,7 @@ MATERIALS = [LINEAR, TABLE_I, STIFFENING, SOFTENING]
 def twin(
     tip: Fingertip, material: Material, d: complex, theta: complex, nodes: int = 110
 ) -> tuple[complex, complex]:
-    """F and U by Gauss quadrature on the base plane, x = h s + ρ c sin t, y = b sin τ.
+    """Return F and U by Gauss quadrature on the base plane, x = h s + ρ c sin t, y = b sin τ.
 
     Complex arguments give exact derivatives by the complex step.
     """
@@ -52,7 +52,7 @@ def twin(
 @pytest.mark.parametrize(
     ("d", "share"), [(0.5e-3, 0.0), (2e-3, 0.7), (4e-3, -0.5), (8e-3, 0.8), (12e-3, 0.6)]
 )
-def test_values_and_partials_equal_the_twin(material, d, share):
+def test_values_and_partial_derivatives_match_independent_quadrature(material, d, share):
     theta = float(TIP.theta_limit(d)) * share
     c = integrate(TIP, material, d, theta)
     force, energy = twin(TIP, material, d, theta)
@@ -81,7 +81,7 @@ def test_a_constant_modulus_gives_the_closed_form():
     ),
     share=st.one_of(st.floats(0.0, 1.0), st.floats(-12.0, -0.1).map(lambda e: 1 - 10**e)),
 )
-def test_more_nodes_change_nothing_anywhere(depth, share):
+def test_more_nodes_do_not_change_the_result(depth, share):
     h = 1.0 - depth
     limit = math.atan2(h, math.sqrt(depth * (1 + h)))
     s, c = math.sin(limit * share), math.cos(limit * share)
@@ -91,7 +91,7 @@ def test_more_nodes_change_nothing_anywhere(depth, share):
         usual, finer = np.empty((2, 5, 1))
         ratios_at(gauss_rule(), circle_rule(material.degree), parts, *place, usual)
         ratios_at(gauss_rule(40), circle_rule(40), parts, *place, finer)
-        # ∂F/∂θ may pass through zero: to F tan θ, whose ratio is that of F.
+        # Scaled by F tan θ because ∂F/∂θ may pass through zero.
         scale = np.abs(finer)
         scale[3] = max(scale[3], scale[0])
         assert np.all(np.abs(np.subtract(usual, finer)) <= tolerance * scale)
@@ -103,8 +103,8 @@ def test_more_nodes_change_nothing_anywhere(depth, share):
     share=st.floats(-1.0, 1.0).map(lambda share: share * (1 - 1e-9)),
 )
 @settings(max_examples=60)
-def test_every_admissible_material_has_its_least_energy_upright(slopes, depth, share):
-    """Tangent moduli that are any positive Bernstein polynomial: laws of all curvatures."""
+def test_every_admissible_material_has_its_minimum_energy_upright(slopes, depth, share):
+    """Tangent moduli are arbitrary positive Bernstein polynomials, for laws of all curvatures."""
     n = len(slopes) - 1
     modulus = np.polynomial.Polynomial([0.0])
     for k, slope in enumerate(slopes):
@@ -124,7 +124,7 @@ def test_every_admissible_material_has_its_least_energy_upright(slopes, depth, s
     assert deeper.force > c.force[0]
 
 
-def test_outside_the_domain():
+def test_values_outside_the_domain():
     assert integrate(TIP, TABLE_I, -1e-3, 0.1) == (0.0,) * 6
     for pair in [(0.021, 0.0), (8e-3, 0.7), (8e-3, 3.2), (math.nan, 0), (1e-3, math.nan)]:
         assert all(math.isnan(value) for value in integrate(TIP, TABLE_I, *pair))
@@ -133,25 +133,25 @@ def test_outside_the_domain():
 
 radii = st.floats(1e-4, 1.0)
 moduli = st.floats(1.0, 1e9)
-fractions = st.floats(5e-8, 0.9999)  # of the radius
-# Of θ's limit; a tilt that is nearly a denormal number has no relative precision.
+fractions = st.floats(5e-8, 0.9999)  # fraction of the radius
+# Fraction of θ's limit; tilts close to denormal numbers have no relative precision.
 shares = st.floats(-1.0, 1.0).map(lambda share: share if abs(share) > 1e-150 else 0.0)
 
 
 @pytest.mark.parametrize(("d", "theta", "force", "energy"), CHECKPOINTS)
-def test_force_and_energy_meet_the_checkpoints(d, theta, force, energy):
+def test_force_and_energy_match_the_checkpoints(d, theta, force, energy):
     c = closed_forms(E, d * 1e-3, math.radians(theta))
     np.testing.assert_allclose(c.force, force, rtol=2e-13)
     np.testing.assert_allclose(c.energy * 1e3, energy, rtol=2e-13)
 
 
-def test_limit_of_the_tilt():
+def test_tilt_limit():
     limits = np.degrees(TIP.theta_limit(np.array([2, 4, 6, 8, 10, 12]) * 1e-3))
     np.testing.assert_allclose(limits, [64.158, 53.130, 44.427, 36.870, 30.000, 23.578], atol=5e-4)
     assert TIP.theta_limit(-1.0) == TIP.theta_limit(0.0) == math.pi / 2
     assert TIP.theta_limit(0.02) == TIP.theta_limit(1.0) == 0.0
     assert math.isnan(TIP.theta_limit(math.nan))
-    # Its cosine is √(2ad − d²)/a, to all digits even where asin((a − d)/a) has lost them.
+    # Its cosine is √(2ad − d²)/a, accurate in all digits even if asin((a − d)/a) is not.
     d = 10.0 ** np.arange(-17.0, -2.0)
     np.testing.assert_allclose(
         np.pi / 2 - Fingertip(1.0).theta_limit(d),
@@ -162,13 +162,13 @@ def test_limit_of_the_tilt():
 
 
 def _complex(modulus: float, d: complex, theta: complex) -> tuple[complex, complex]:
-    """Force and energy in complex arithmetic, for derivatives without differences."""
+    """Return force and energy in complex arithmetic, for derivatives by the complex step."""
     force = math.pi * modulus * d * d / np.cos(theta)
     return force, force * d / (3 * np.cos(theta))
 
 
 @given(radius=radii, modulus=moduli, part=fractions, share=shares)
-def test_partials_are_the_derivatives(radius, modulus, part, share):
+def test_partial_derivatives_match_complex_steps(radius, modulus, part, share):
     d = radius * part
     theta = float(Fingertip(radius).theta_limit(d)) * share
     c = closed_forms(modulus, d, theta)
@@ -179,7 +179,7 @@ def test_partials_are_the_derivatives(radius, modulus, part, share):
     np.testing.assert_allclose([c.force_theta, c.energy_theta], [f_t, u_t], rtol=1e-12)
 
 
-def test_shapes_types_and_odd_values():
+def test_shapes_types_and_special_values():
     grid = closed_forms(E, np.full((3, 1), 0.004), np.zeros(4))
     assert grid.force.shape == (3, 4)
     for d in (-1e-3, 0.0, -math.inf):
@@ -195,6 +195,6 @@ def test_a_tip_needs_a_radius(radius):
         Fingertip(radius)
 
 
-def test_a_radius_in_millimetres_is_refused_with_the_metres_it_means():
+def test_a_radius_in_millimetres_is_refused_with_the_value_in_metres():
     with pytest.raises(ValueError, match=r"in metres, at most 1, not 20; 20 mm is 0\.02"):
         Fingertip(20.0)

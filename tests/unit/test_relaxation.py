@@ -1,4 +1,4 @@
-"""Tips that relax: the plant against its Prony terms' integrals, and against its own energy."""
+"""Relaxing tips: the plant against the integrals of its Prony terms, and its energy."""
 
 import re
 from pathlib import Path
@@ -24,7 +24,7 @@ SPEED = 0.02  # m/s
 
 
 def pressed(**more: Any) -> SimulatedHand:
-    """One finger; the object is moved to and fro against it."""
+    """Yield one finger against which the object is moved back and forth."""
     simulation = {
         "tip_relaxation": STRENGTHS,
         "tip_relaxation_times": TIMES,
@@ -44,7 +44,7 @@ def pressed(**more: Any) -> SimulatedHand:
     )
 
 
-def test_a_press_and_its_release_follow_the_prony_terms():
+def test_pressing_and_releasing_follow_the_prony_terms():
     hand = pressed()
     rows = []
     for k in range(1, 4000):
@@ -53,7 +53,7 @@ def test_a_press_and_its_release_follow_the_prony_terms():
         lasting = float(hand.table(max(d, 0.0), float(hand.theta[0])).force) if d > 0.0 else 0.0
         rows.append((hand.t, lasting, float(hand.force[0])))
     t, lasting, force = np.array(rows).T
-    assert np.count_nonzero(np.diff((lasting > 0.0).astype(int))) >= 3  # pressed, and let go
+    assert np.count_nonzero(np.diff((lasting > 0.0).astype(int))) >= 3  # pressed and released
 
     def followed(now: float, h: np.ndarray) -> np.ndarray:
         return (np.interp(now, t, lasting) - h) / np.array(TIMES)
@@ -71,8 +71,8 @@ def test_a_press_and_its_release_follow_the_prony_terms():
     assert (force[falling] < lasting[falling]).any()
 
 
-def test_relaxing_tips_make_no_energy():
-    """A free object between relaxing tips that bounce without other losses comes to rest."""
+def test_relaxing_tips_do_not_generate_energy():
+    """A free object bouncing between relaxing tips without other damping comes to rest."""
     settings = Settings.model_validate(
         {
             "material": {"law": "constant"},
@@ -98,8 +98,8 @@ def test_relaxing_tips_make_no_energy():
 
 
 @pytest.mark.parametrize("strengths", [(0.0, 0.15, 0.25), (0.0, 0.3, 0.0), (0.0, 0.0, 0.0)])
-def test_a_press_and_hold_tells_the_strengths(strengths):
-    """Of frames at 100 Hz with noise, by an ODE of its own; 4 ms are too short for these."""
+def test_press_and_hold_gives_the_strengths(strengths):
+    """Noisy frames at 100 Hz from a separate ODE; 4 ms are too short for these frames."""
     t = np.arange(-1.0, 6.0, 0.01)
     lasting = 12.0 * np.clip(t / 0.1, 0.0, 1.0) ** 1.6
 
@@ -124,7 +124,7 @@ def test_too_short_a_hold_is_refused():
 
 
 def grip(aware: bool, tip: dict[str, Any]) -> tuple[float, float, list[str]]:
-    """True force over 8 N after 1 s of a hold and at its end, and what was warned of."""
+    """Return true force over 8 N after 1 s of a hold and at its end, and the warnings."""
     sections: dict[str, dict[str, Any]] = {name: dict(values) for name, values in tip.items()}
     sections.setdefault("simulation", {})["tip_relaxation"] = STRENGTHS
     if aware:
@@ -139,20 +139,20 @@ def grip(aware: bool, tip: dict[str, Any]) -> tuple[float, float, list[str]]:
 
 
 @pytest.mark.parametrize("tip", [{}, pytest.param(SOLID, marks=pytest.mark.extended)])
-def test_a_hold_keeps_its_force_while_known_tips_relax(tip):
+def test_a_hold_keeps_its_force_with_known_relaxation(tip):
     first, last, warned = grip(True, tip)
     assert last == pytest.approx(first, abs=0.015)
     assert last == pytest.approx(1.0, abs=0.05)
     assert warned == []
 
 
-def test_relaxation_that_nobody_told_of_raises_no_grip():
+def test_undeclared_relaxation_does_not_raise_the_grip():
     _, last, warned = grip(False, {})
     assert 0.7 < last < 1.2
     assert "slip" not in warned
 
 
-def test_calibrate_finds_it_in_a_run_of_frames(tmp_path, capsys):
+def test_calibrate_finds_relaxation_in_a_frame_recording(tmp_path, capsys):
     profile = load(Path("sim"))
     grid = make_sensor_model(profile, 0).grid
     t = np.arange(0.0, 5.0, 0.01)

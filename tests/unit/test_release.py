@@ -41,7 +41,7 @@ def test_every_file_states_the_version_of_the_package(release):
         assert found[1] == softfinger.__version__, name
 
 
-def test_the_changelog_has_short_sections_and_begins_with_unreleased(release):
+def test_changelog_sections_are_short_and_start_with_unreleased(release):
     found = release.sections((ROOT / "CHANGELOG.md").read_text(encoding="utf-8"))
     versions = list(found)
     assert versions[0] == "Unreleased"
@@ -74,12 +74,12 @@ def test_unreleased_entries_move_below_the_version_and_its_date(release):
         (LOG.replace("## [Unreleased]\n", ""), "1.3.0", r"no heading '## \[Unreleased\]'"),
     ],
 )
-def test_a_release_that_does_not_fit_the_changelog_is_refused(release, log, version, message):
+def test_a_release_that_contradicts_the_changelog_is_refused(release, log, version, message):
     with pytest.raises(release.ReleaseError, match=message):
         release.dated(log, version, TODAY)
 
 
-def test_workflows_use_actions_by_their_commit_and_hooks_the_ruff_of_make_lint():
+def test_workflows_pin_actions_by_commit_and_hooks_use_the_ruff_of_make_lint():
     workflows = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
     used = [
         line

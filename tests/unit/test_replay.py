@@ -1,4 +1,4 @@
-"""Recordings in their files, and their replay on virtual time."""
+"""Recording files, and their replay on virtual time."""
 
 import numpy as np
 import pytest
@@ -36,7 +36,7 @@ def numbers(sensor, clock, times):
     return found
 
 
-def test_frames_come_at_their_times_and_from_the_start_again(tmp_path):
+def test_frames_are_replayed_at_their_times_and_repeated_from_the_start(tmp_path):
     path = tmp_path / "run.npz"
     np.savez(path, frames=FRAMES, t=np.array([7.0, 7.01, 7.05, 7.06, 7.08]))
     clock = VirtualClock(start=3.0)
@@ -53,7 +53,7 @@ def test_frames_come_at_their_times_and_from_the_start_again(tmp_path):
     assert sensor.latest().seq == 5 * int(997.0 / 0.1) + 1
 
 
-def test_without_again_it_ends_with_an_invalid_frame(tmp_path):
+def test_without_repetition_the_replay_ends_with_an_invalid_frame(tmp_path):
     path = tmp_path / "run.npz"
     np.savez(path, frames=FRAMES)
     clock = VirtualClock()
@@ -65,7 +65,7 @@ def test_without_again_it_ends_with_an_invalid_frame(tmp_path):
     assert not sensor.latest().valid
 
 
-def test_a_folder_of_frames_is_read_in_the_order_of_their_numbers(tmp_path):
+def test_a_folder_of_frames_is_read_in_numerical_order(tmp_path):
     for k in range(5):
         np.save(tmp_path / f"frame{k * 3}.npy", FRAMES[k])  # frame12 after frame9
     recording = load_recording(tmp_path, 1.0, 50.0)
@@ -106,14 +106,14 @@ def test_cells_and_true_contacts_of_an_archive_are_read(tmp_path):
         ({"frames": np.array([{}], dtype=object)}, "run.npz"),
     ],
 )
-def test_what_is_no_recording_is_told(tmp_path, held, told):
+def test_invalid_recordings_are_reported(tmp_path, held, told):
     path = tmp_path / "run.npz"
     np.savez(path, **held)
     with pytest.raises(RecordingError, match=told):
         load_recording(path, 0.001, 100.0)
 
 
-def test_files_that_cannot_be_read_are_told(tmp_path):
+def test_unreadable_files_are_reported(tmp_path):
     with pytest.raises(RecordingError, match="No such file"):
         load_recording(tmp_path / "none.npz", 1.0, 1.0)
     (tmp_path / "bad.npz").write_bytes(b"PK\x03\x04 no zip")

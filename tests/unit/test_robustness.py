@@ -1,4 +1,4 @@
-"""Hands that are not as their settings say; judged by the plant's truth."""
+"""Hands that differ from their settings, measured by the plant's true values."""
 
 import math
 
@@ -30,7 +30,7 @@ LONG = pytest.mark.extended
         ("both gains and currents halve in 5 s", 1),
     ],
 )
-def test_what_the_settings_do_not_know_moves_no_force(name, seed):
+def test_unknown_hand_parameters_do_not_change_the_force(name, seed):
     found = grip(ROW[name], seed)
     assert found.held
     assert found.settled == pytest.approx(1.0, abs=0.2)
@@ -46,8 +46,8 @@ def test_what_the_settings_do_not_know_moves_no_force(name, seed):
         *(pytest.param(name, 2, marks=LONG) for name in ROW if "zero -" in name),
     ],
 )
-def test_a_zero_that_sinks_is_named_and_its_grip_stays(name, seed):
-    """Where readings end at 0, nothing but the joints' closing shows how far it has sunk."""
+def test_a_falling_zero_offset_is_named_and_the_grip_continues(name, seed):
+    """If readings are clipped at 0, only closing joints show how far the offset has fallen."""
     found = grip(ROW[name], seed)
     assert found.end == "holding"
     assert found.settled == pytest.approx(1.0, abs=0.2)
@@ -58,7 +58,7 @@ def test_a_zero_that_sinks_is_named_and_its_grip_stays(name, seed):
 
 @pytest.mark.parametrize("delay", [0.005, 0.01, 0.02])
 @pytest.mark.parametrize("force", [6.0, pytest.param(20.0, marks=LONG)])
-def test_frames_as_late_as_the_default_says_or_sooner_leave_the_force(delay, force):
+def test_frames_up_to_the_default_latency_do_not_change_the_force(delay, force):
     late = HandCase("late", force, {"simulation": {"tactile_delay": delay}})
     found = grip(late)
     assert found.settled == pytest.approx(1.0, abs=0.1)
@@ -66,20 +66,20 @@ def test_frames_as_late_as_the_default_says_or_sooner_leave_the_force(delay, for
 
 
 @pytest.mark.parametrize(("friction", "stiction"), [(0.05, 0.0), (0.12, 0.0), (0.05, 0.1)])
-def test_the_approach_shows_the_joints_friction(friction, stiction):
+def test_joint_friction_is_estimated_during_the_approach(friction, stiction):
     hand = {"simulation": {"joint_friction": friction, "joint_stribeck": stiction}}
     with VirtualGrip({}, hand) as grip:
         grip.command("arm")
         grip.loop.advance(0.1)
         grip.command("grasp", force=6.0)
         assert grip.until("holding", 4.0)
-        # Of the stiction as much as is left while the joint begins to move, and its damping.
+        # Static friction that remains while the joint starts to move, plus its damping.
         shown = grip.estimator.grasp.free_torque
         assert (shown > friction + 0.5 * stiction).all()
         assert (shown < friction + stiction + 0.025).all()
 
 
-def test_the_same_hand_is_drawn_from_the_same_seed():
+def test_equal_seeds_give_equal_hands():
     assert drawn(7) == drawn(7)
     hands = [drawn(seed) for seed in range(1, 201)]
     delays = [hand.hand["simulation"]["tactile_delay"] for hand in hands]
@@ -88,7 +88,7 @@ def test_the_same_hand_is_drawn_from_the_same_seed():
 
 
 def frames(zero: float, cells: int = 32, pressed: int = 200) -> np.ndarray:
-    """Counts of a tip of 20 mm that is pressed 3 mm deep, over a zero."""
+    """Return counts of a 20 mm tip indented by 3 mm, with a zero offset."""
     at = (np.arange(cells) - 0.5 * (cells - 1)) * 0.058 / cells
     inside = np.hypot(*np.meshgrid(at, at)) < 10.5e-3
     return np.where(inside, pressed + zero, zero).astype(np.uint16)
@@ -99,7 +99,7 @@ def unpressed(side: float = 0.058) -> UnloadedCells:
     return UnloadedCells(grid, 0.02, np.ones(grid.shape, np.bool_))
 
 
-def test_a_zero_that_rises_is_taken_off_and_full_cells_stay_full():
+def test_a_rising_zero_offset_is_subtracted_and_saturated_cells_stay_saturated():
     cells = unpressed()
     for zero in (3, 4, 9):
         cells.update(frames(zero))
@@ -114,7 +114,7 @@ def test_a_zero_that_rises_is_taken_off_and_full_cells_stay_full():
     assert cells.corrected(counts, 255) is counts
 
 
-def test_a_second_contact_beside_the_tip_is_no_zero():
+def test_a_second_contact_near_the_tip_is_not_a_zero_offset():
     cells = unpressed()
     cells.update(frames(3))
     touched = frames(3)
@@ -123,7 +123,7 @@ def test_a_second_contact_beside_the_tip_is_no_zero():
     assert cells.zero_shift == 0
 
 
-def test_a_sensor_that_the_tip_fills_tells_nothing():
+def test_a_sensor_covered_by_the_tip_gives_no_offset_and_no_noise():
     cells = unpressed(side=0.018)
     for zero in (3, 9):
         cells.update(frames(zero))
@@ -133,7 +133,7 @@ def test_a_sensor_that_the_tip_fills_tells_nothing():
 
 @pytest.mark.parametrize("zero", [0, 40])
 @pytest.mark.parametrize("sigma", [1.0, 3.0, 12.0])
-def test_the_noise_is_that_of_cells_which_nothing_presses(zero, sigma):
+def test_noise_is_measured_on_cells_without_contact(zero, sigma):
     cells, rng = unpressed(), np.random.default_rng(1)
     for _ in range(40):
         noisy = frames(zero) + rng.normal(0.0, sigma, (32, 32))

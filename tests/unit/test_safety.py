@@ -1,4 +1,4 @@
-"""Bounds on goals, whoever asks for them, and that nothing else writes one."""
+"""Limits on goals from any source, and the rule that only Safety writes goals."""
 
 import ast
 import math
@@ -18,7 +18,7 @@ from tests.harness.safety import bounded as write_bounded
 ROOT = Path(__file__).parents[2]
 
 
-def test_a_sound_state_has_no_cause_and_no_warning():
+def test_a_normal_state_has_no_fault_and_no_warning():
     judge = safety(grasp=levers(0.08))
     state = sound()
     state.reading.current = [0.08 * 5.0 / SETTINGS.control.torque_constant] * 2
@@ -39,7 +39,7 @@ def bounded(judge: Safety, state: State, wanted: Goal) -> Goal:
 
 def test_goals_are_bounded_by_joint_and_current_limits():
     judge, state = safety(), sound()
-    for _ in range(1000):  # as long as the step and the slew take
+    for _ in range(1000):  # the time for the step and the slew
         found = bounded(judge, state, goal((9.0, -9.0), (5.0, -0.2)))
     assert found.valid
     assert found.q == [SETTINGS.hand.q_max[0], SETTINGS.hand.q_min[1]]
@@ -48,7 +48,7 @@ def test_goals_are_bounded_by_joint_and_current_limits():
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
-def test_a_non_finite_goal_is_not_sent_and_is_a_fault(bad):
+def test_a_non_finite_goal_is_a_fault_and_is_not_sent(bad):
     for each in (goal((bad, 0.0), (0.1, 0.1)), goal((0.0, 0.0), (0.1, bad))):
         judge, state = safety(), sound()
         assert not bounded(judge, state, each).valid
@@ -56,7 +56,7 @@ def test_a_non_finite_goal_is_not_sent_and_is_a_fault(bad):
         assert found.name == "goal.number"
 
 
-def test_a_far_goal_goes_there_at_its_speed_and_a_near_one_at_once():
+def test_a_distant_goal_is_approached_at_its_velocity_and_a_near_one_immediately():
     judge, state = safety(), sound()
     limits, dt = SETTINGS.safety, 1.0 / SETTINGS.loop.rate
     assert bounded(judge, state, goal((0.4, -0.4), (0.0, 0.0))).q == [0.4, -0.4]
@@ -65,26 +65,26 @@ def test_a_far_goal_goes_there_at_its_speed_and_a_near_one_at_once():
     assert reached == pytest.approx([limits.goal_reach + (i + 1) * step for i in range(5)])
 
 
-def test_in_position_mode_no_goal_jumps():
+def test_goals_in_position_mode_do_not_jump():
     settings = Settings.model_validate({"servos": {"mode": "position"}})
     judge, state = Safety(settings, True, True), sound()
     step = settings.safety.goal_speed / settings.loop.rate
     assert bounded(judge, state, goal((0.4, 0.0), (0.0, 0.0))).q[0] == pytest.approx(step)
 
 
-def test_a_goal_current_rises_slowly_from_nothing_and_falls_at_once():
+def test_a_goal_current_increases_slowly_and_decreases_immediately():
     judge, state = safety(), sound()
     rise = SETTINGS.safety.current_rate / SETTINGS.loop.rate
     for k in (1, 2, 3):
         assert bounded(judge, state, goal((0, 0), (0.5, 0.0))).current[0] == pytest.approx(k * rise)
     assert bounded(judge, state, goal((0, 0), (0.05, 0.0))).current[0] == 0.05
-    state.seq += 5  # torque was off meanwhile
+    state.seq += 5  # torque was off in between
     assert bounded(judge, state, goal((0, 0), (0.5, 0.0))).current[0] == pytest.approx(rise)
 
 
 @given(st.lists(st.tuples(*[st.floats(width=32) for _ in range(6)]), min_size=1, max_size=20))
 @hypothesis_settings(max_examples=200)
-def test_no_goal_leaves_its_limits_whatever_is_asked(asked):
+def test_goals_stay_within_limits_for_any_input(asked):
     judge, state, hand, limits = safety(), sound(), SETTINGS.hand, SETTINGS.safety
     last = [0.0, 0.0]
     for a, b, c, d, q1, q2 in asked:
@@ -100,7 +100,7 @@ def test_no_goal_leaves_its_limits_whatever_is_asked(asked):
         last = list(found.current)
 
 
-def test_nothing_but_safety_writes_a_goal():
+def test_only_safety_writes_goals():
     callers = []
     for path in (ROOT / "daemon").rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):

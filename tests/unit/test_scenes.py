@@ -1,4 +1,4 @@
-"""Each kind of scene runs the whole pipeline, with what it has."""
+"""The complete pipeline for each kind of scene, with its servos and sensors."""
 
 from typing import Any
 
@@ -18,12 +18,12 @@ state_message = message_maker(STATE)
 
 
 def holding_demo(daemon: Daemon) -> list[Event]:
-    """The demo, brought to holding; its events from then on."""
+    """Run the demo until it holds; return it with its further events."""
     advance_to(daemon, "holding", 5.0)
     return heard(daemon)
 
 
-def test_a_simulated_hands_demo_goes_on_after_a_fault_and_says_so(make):
+def test_the_demo_of_a_simulated_hand_continues_after_a_fault_and_reports_it(make):
     daemon = make(task={"name": "demo"})
     events = holding_demo(daemon)
     daemon.loop._fail("made up")
@@ -61,16 +61,16 @@ def test_a_demo_that_cannot_clear_its_fault_tries_again(make):
     advance_to(daemon, "holding", 6.0)
 
 
-def test_a_demo_whose_step_never_ends_begins_again(make):
+def test_a_demo_with_an_endless_step_restarts(make):
     daemon = make(task={"name": "demo"})
     events = holding_demo(daemon)
-    daemon.loop._task._end_mode = "moving"  # which it never comes to
+    daemon.loop._task._end_mode = "moving"  # a mode that is never reached
     advance_to(daemon, "disarmed", 13.0)
     assert events[0][2].startswith("still holding after 10 s; the task stops it and begins again")
     advance_to(daemon, "holding", 6.0)
 
 
-def test_metals_demo_ends_with_the_first_fault(make):
+def test_the_demo_of_a_real_hand_ends_with_the_first_fault(make):
     metal = Settings.model_validate({"task": {"name": "demo"}, "servos": {"backend": "dynamixel"}})
     task = Task.named(metal)
     assert not task.restarts
@@ -94,7 +94,7 @@ SCENES: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("sections", SCENES.values(), ids=SCENES.keys())
-def test_every_scene_runs_and_its_messages_have_one_shape(make, sections):
+def test_every_scene_runs_with_messages_of_the_same_form(make, sections):
     daemon = make(**sections)
     daemon.loop.advance(2.0)
     message = state_message(daemon.loop.state, parts(daemon.settings))
@@ -139,7 +139,7 @@ def test_servos_without_sensors_move_but_do_not_grasp(make):
         command(daemon, "grasp")
 
 
-def test_the_demo_task_grasps_turns_and_releases_by_itself(make):
+def test_the_demo_task_grasps_turns_and_releases(make):
     daemon = make(task={"name": "demo"})
     seen: list[str] = []
     turned: list[float] = []
@@ -157,7 +157,7 @@ def test_the_demo_task_grasps_turns_and_releases_by_itself(make):
     assert min(turned) < -0.12
 
 
-def test_a_demo_that_a_command_ended_is_begun_again(make):
+def test_a_demo_ended_by_a_command_restarts(make):
     daemon = make(task={"name": "demo"})
     advance_to(daemon, "holding", 6.0)
     assert "demo: not while holding" in refusal(daemon, "demo")

@@ -1,4 +1,4 @@
-"""The stream's schema: what is sent is what it says, to the byte; its page is what it writes."""
+"""The stream's schema: sent messages match it, byte for byte, and its page is up to date."""
 
 import dataclasses
 import json
@@ -19,7 +19,7 @@ KINDS = {"int": int, "float": float, "bool": bool, "str": str, "bin": bytes}
 
 
 @pytest.mark.parametrize("topic", schema.TOPICS)
-def test_what_is_sent_is_what_the_schema_says(topic):
+def test_sent_messages_match_the_schema(topic):
     sent = flat(sample(topic))
     assert list(sent) == [field.name for field in schema.TOPICS[topic].fields]
     for field in schema.TOPICS[topic].fields:
@@ -28,15 +28,15 @@ def test_what_is_sent_is_what_the_schema_says(topic):
 
 
 @pytest.mark.parametrize("topic", schema.TOPICS)
-def test_golden_bytes(topic):
-    """What an analysis tool was written against must go on arriving, to the byte."""
+def test_messages_equal_golden_bytes(topic):
+    """Existing analysis tools rely on unchanged messages, byte for byte."""
     golden = golden_file(topic).read_bytes()
     assert packer(topic)(*arguments(topic)) == golden
     assert msgpack.unpackb(golden) == sample(topic)
 
 
 @pytest.mark.parametrize("topic", schema.TOPICS)
-def test_a_client_reads_what_was_sent(topic):
+def test_a_client_reads_sent_messages(topic):
     sent = sample(topic)
     assert dataclasses.asdict(read(schema.TOPICS[topic].record, sent)) == sent
 
@@ -53,19 +53,19 @@ def test_the_json_schema_names_every_field(topic):
         assert place["description"]
 
 
-def test_what_is_no_number_yet_goes_out_as_it_is():
-    state = State()  # no reading yet: its time is −∞, and a grip's goal is no number
+def test_non_finite_numbers_are_sent_unchanged():
+    state = State()  # before the first reading, the time is −∞ and the grip's goals are NaN
     assert message_maker(schema.INPUT)(state, (None, None))["reading"]["t"] == -math.inf
     sent = message_maker(schema.STATE)(state, SceneParts((True, True), True, True))
     assert math.isnan(sent["goal_force"])
 
 
 @pytest.mark.parametrize("topic", schema.TOPICS)
-def test_integers_take_the_smallest_form(topic):
+def test_integers_use_the_shortest_form(topic):
     assert packer(topic)(*arguments(topic)) == msgpack.packb(sample(topic), use_bin_type=True)
 
 
-def test_the_page_is_the_one_in_the_repository():
+def test_the_schema_page_is_up_to_date():
     assert PAGE.read_text(encoding="utf-8") == schema_docs.page(), (
         "run python -m softfinger.daemon.wire.schema_docs"
     )

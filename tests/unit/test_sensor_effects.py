@@ -1,4 +1,4 @@
-"""What the simulated sensor does to the pressure: each operator against a plain twin."""
+"""Effects of the simulated sensor on the pressure: each operator against plain NumPy."""
 
 import math
 from dataclasses import replace
@@ -25,31 +25,31 @@ def counts(model, contact, t=0.0):
     return out.astype(float)
 
 
-def test_without_flaws_it_rounds_the_forward_model():
+def test_without_defects_the_forward_model_is_rounded():
     model = sensor()
     for contact in CONTACTS:
-        # Either way where a cell stands between two counts. Its model has fewer points, which makes
-        # 1e-4 of the modulus at the outline.
+        # Cells between two counts may be rounded either way. The model has fewer points, which
+        # gives 1e-4 of the modulus at the outline.
         signal = 0.2 * model.grid.pressure(TIP, LINEAR, *contact)
         np.testing.assert_allclose(counts(model, contact), signal, rtol=0, atol=0.5 + 6.0)
     assert not counts(model, (0.0, 0.2, -0.1)).any()
 
 
-def test_noise_has_the_size_asked_for_and_ends_at_zero():
+def test_noise_has_the_configured_deviation_and_is_clipped_at_zero():
     model = sensor(noise=600.0)
     clean = 0.2 * model.grid.pressure(TIP, LINEAR, *CONTACTS[2])
     strong = clean > 4000.0
     rest = np.concatenate([(counts(model, CONTACTS[2]) - clean)[strong] for _ in range(20)])
-    # Deviations of n numbers scatter by 1/√2n, their means by 1/√n of the deviation.
+    # Standard deviations of n numbers scatter by 1/√2n, means by 1/√n of the deviation.
     assert rest.std() == pytest.approx(600.0, rel=4.5 / np.sqrt(2 * rest.size))
     assert abs(rest.mean()) < 4.0 * 600.0 / np.sqrt(rest.size)
     free = counts(model, (0.0, 0.0, 0.0))
     assert (free == 0.0).mean() == pytest.approx(0.5, abs=0.05)
-    # Half a normal distribution has the mean σ/√2π over all cells; of 1936 it is 1 ± 0.033.
+    # A clipped normal distribution has the mean σ/√2π; with 1936 cells, 1 ± 0.033.
     assert free.mean() == pytest.approx(600.0 / np.sqrt(2 * np.pi), rel=0.15)
 
 
-def test_gains_are_each_cells_own_and_dead_cells_read_zero():
+def test_each_cell_has_its_own_gain_and_dead_cells_read_zero():
     flaws = flawed(gain_spread=0.05)
     grid = SensorGrid(44, 44, PITCH)
     model = SensorModel(grid, TIP, LINEAR, board(4.0), flaws, seed=5, dead=[(22, 24), (0, 0)])
@@ -64,7 +64,7 @@ def test_gains_are_each_cells_own_and_dead_cells_read_zero():
 
 @pytest.mark.parametrize("width", [1e-4, 2e-4, 5e-4, 1e-3, 2e-3])
 def test_blur_is_the_continuous_convolution(width):
-    # A grid that the footprint leaves: what presses beyond its edge is spread onto it too.
+    # A grid smaller than the footprint: pressure beyond its edge also spreads onto it.
     blurred = SensorGrid(16, 20, PITCH, (3e-4, 5.3e-3), blur=width)
     model = sensor(replace(blurred, blur=0.0), blur=width)
     for contact in CONTACTS:
@@ -77,7 +77,7 @@ def test_blur_is_the_continuous_convolution(width):
         )
 
 
-def test_loading_is_unchanged_unloading_reads_more_and_loops_close():
+def test_hysteresis_affects_only_unloading_and_loops_close():
     model = sensor(hysteresis=0.1)
     clean = sensor()
 
@@ -88,19 +88,19 @@ def test_loading_is_unchanged_unloading_reads_more_and_loops_close():
     assert force(0.004) == pytest.approx(1.0, abs=1e-9)
     assert force(0.0038) > 1.03
     assert force(0.002) == pytest.approx(1.1, abs=0.005)
-    assert 1.0 < force(0.0021) < 1.07  # on the way back up, within the loop
+    assert 1.0 < force(0.0021) < 1.07  # reloading within the loop
     assert force(0.004) == pytest.approx(1.0, abs=1e-3)  # the loop is closed
     assert force(0.006) == pytest.approx(1.0, abs=1e-9)
     assert not counts(model, (0.0, 0.0, 0.0)).any()
 
 
-def test_a_lag_is_the_exact_response_to_straight_pieces():
+def test_a_lag_is_the_exact_response_to_linear_segments():
     time = 3.0
     memory = np.zeros((2, 2, 2))
     shape = np.array([[1.0, 2.0], [0.5, 0.0]])
     times = [0.0, 0.7, 0.7, 5.0, 5.001, 30.0]
     values = [0.0, 100.0, 40.0, 40.0, 0.0, 10.0]
-    # The twin integrates dz/dt = (p − z)/time in small steps.
+    # The reference integrates dz/dt = (p − z)/time in small steps.
     z = 0.0
     for k in range(1, len(times)):
         elapsed = times[k] - times[k - 1]
@@ -112,7 +112,7 @@ def test_a_lag_is_the_exact_response_to_straight_pieces():
         np.testing.assert_allclose(lagged, z * shape, rtol=1e-6, atol=1e-6)
 
 
-def test_a_lasting_contact_creeps_up_and_its_mark_fades():
+def test_a_long_contact_creeps_and_its_residual_fades():
     model = sensor(creep=0.05, creep_time=10.0)
     contact = (0.004, 0.1, 0.0)
     counts(model, (0.0, 0.0, 0.0), 0.0)
@@ -128,7 +128,7 @@ def test_a_lasting_contact_creeps_up_and_its_mark_fades():
     )
 
 
-def test_a_slow_cell_follows_a_step_to_63_per_cent_in_its_response_time():
+def test_a_slow_cell_reaches_63_percent_of_a_step_in_its_response_time():
     model = sensor(response=0.06)
     assert model.has_memory
     final = counts(sensor(), CONTACTS[1]).sum()
@@ -151,9 +151,7 @@ def test_a_slow_cell_follows_a_step_to_63_per_cent_in_its_response_time():
         (0.5, 4000.0, {1600.0: 4000.0, 10000.0: 4000.0}),
     ],
 )
-def test_a_curve_is_a_power_right_at_full_scale_and_a_hard_pressed_cell_reads_less(
-    exponent, fold, read
-):
+def test_a_curve_preserves_full_scale_and_foldback_lowers_high_readings(exponent, fold, read):
     flaws = flawed(exponent=exponent, fold=fold)
     model = SensorModel(SensorGrid(4, 5, PITCH), TIP, LINEAR, board(full_count=10000), flaws)
     out = np.zeros(model.grid.shape, np.uint16)
@@ -163,7 +161,7 @@ def test_a_curve_is_a_power_right_at_full_scale_and_a_hard_pressed_cell_reads_le
         np.testing.assert_allclose(out, expected, atol=0.5)
 
 
-def test_a_rows_noise_is_its_cells_alike_and_new_with_each_frame():
+def test_row_noise_is_equal_within_a_row_and_new_in_each_frame():
     grid = SensorGrid(200, 6, PITCH)
     flaws = flawed(row_noise=30.0)
     model = SensorModel(grid, TIP, LINEAR, board(), flaws)
@@ -178,7 +176,7 @@ def test_a_rows_noise_is_its_cells_alike_and_new_with_each_frame():
     assert abs(np.mean(rows[:, 1:] * rows[:, :-1])) < 0.05 * 30.0**2
 
 
-def test_a_gain_drifts_for_all_cells_alike_to_its_deviation():
+def test_gain_drift_is_common_to_all_cells_with_the_configured_deviation():
     grid = SensorGrid(4, 5, PITCH)
     ends = []
     for seed in range(400):
@@ -199,31 +197,31 @@ def test_a_gain_drifts_for_all_cells_alike_to_its_deviation():
     assert late == pytest.approx(0.02, rel=0.15)
 
 
-def test_zeros_drift_to_their_deviation_and_forget_in_their_time():
+def test_offset_drift_has_the_configured_deviation_and_time_constant():
     offset = np.zeros((60, 60))
     rng = np.random.default_rng(2)
     sensor_model.drift(offset, 50.0, 60.0, 0.01, rng.standard_normal(offset.shape))
-    # A random walk at first: deviation · √(2 t / time).
+    # Initially a random walk: deviation · √(2 t / time).
     assert offset.std() == pytest.approx(50.0 * math.sqrt(2 * 0.01 / 60.0), rel=0.05)
     for _ in range(40):
         sensor_model.drift(offset, 50.0, 60.0, 20.0, rng.standard_normal(offset.shape))
     assert offset.std() == pytest.approx(50.0, rel=0.05)
     earlier = offset.copy()
     sensor_model.drift(offset, 50.0, 60.0, 60.0, rng.standard_normal(offset.shape))
-    # Of 3600 cells it scatters by 0.018.
+    # With 3600 cells the scatter is 0.018.
     assert np.mean(offset * earlier) / 50.0**2 == pytest.approx(math.exp(-1), abs=0.08)
 
 
-def test_crosstalk_is_a_share_of_both_lines_means():
+def test_crosstalk_is_a_fraction_of_both_line_means():
     model = sensor(crosstalk=0.3)
     signal = counts(sensor(), CONTACTS[1])
     expected = signal + 0.3 * (signal.mean(axis=0) + signal.mean(axis=1)[:, None])
     np.testing.assert_allclose(counts(model, CONTACTS[1]), expected, atol=1.01)
-    assert expected[0].max() > 100.0  # a ghost far from the contact
+    assert expected[0].max() > 100.0  # a ghost away from the contact
 
 
 @pytest.mark.parametrize("least", [0, 3])
-def test_counting_rounds_clips_and_leaves_out_what_is_small_or_dead(least):
+def test_conversion_to_counts_rounds_clips_and_zeroes_weak_and_dead_cells(least):
     rng = np.random.default_rng(3)
     value = rng.normal(4.0, 5.0, (5, 7))
     live = rng.random((5, 7)) > 0.2
@@ -234,7 +232,7 @@ def test_counting_rounds_clips_and_leaves_out_what_is_small_or_dead(least):
     np.testing.assert_array_equal(out, expected)
 
 
-def test_dead_cells_nobody_is_told_of_are_a_share_and_the_seeds():
+def test_undeclared_dead_cells_follow_the_fraction_and_the_seed():
     grid = SensorGrid(100, 100, PITCH)
     flaws = flawed(dead=0.05)
     first, again, other = (
@@ -245,7 +243,7 @@ def test_dead_cells_nobody_is_told_of_are_a_share_and_the_seeds():
     assert (~first).mean() == pytest.approx(0.05, abs=0.01)
 
 
-def test_all_at_once_is_the_same_for_a_seed():
+def test_all_effects_together_are_reproducible_for_a_seed():
     flaws = {
         "noise": 600.0,
         "gain_spread": 0.05,
@@ -281,7 +279,7 @@ def frame(grid: SensorGrid, d: float, tilt: float, curvature: float) -> np.ndarr
 
 
 def literal(d: float, tilt: float, radius: float, rotation: float, parts: int = 24) -> np.ndarray:
-    """Mean pressure on 44 × 44 cells, each of ``parts``² points, sensor turned by ``rotation``."""
+    """Return mean pressure on 44 × 44 cells of ``parts``² points, with a rotated sensor."""
     at = (np.arange(44 * parts) + 0.5) * PITCH / parts - 0.029
     sensor_x, sensor_y = np.meshgrid(at, at)
     x = math.cos(rotation) * sensor_x - math.sin(rotation) * sensor_y
@@ -296,7 +294,7 @@ def literal(d: float, tilt: float, radius: float, rotation: float, parts: int = 
 @pytest.mark.parametrize("rotation", [0.0, 0.4])
 @pytest.mark.parametrize(("d", "tilt"), [(0.001, -0.1), (0.004, 0.3), (0.006, -0.4)])
 @pytest.mark.parametrize("radius", [0.012, 0.04])
-def test_cells_read_the_springs_under_the_cylinder(radius, d, tilt, rotation):
+def test_cells_under_a_cylinder_match_the_springs(radius, d, tilt, rotation):
     grid = SensorGrid(44, 44, PITCH, rotation=rotation)
     found = frame(grid, d, tilt, 1.0 / radius)
     expected = literal(d, tilt, radius, rotation)
@@ -304,7 +302,7 @@ def test_cells_read_the_springs_under_the_cylinder(radius, d, tilt, rotation):
     assert found.sum() == pytest.approx(expected.sum(), rel=1e-3)
 
 
-def test_a_face_that_is_all_but_plane_reads_like_a_plane_one():
+def test_an_almost_plane_face_gives_the_frame_of_a_plane():
     grid = SensorGrid(44, 44, PITCH, rotation=0.2)
     plane, curved = frame(grid, 0.004, 0.25, 0.0), frame(grid, 0.004, 0.25, 1e-5)
     assert np.abs(plane - curved).max() < 6e-4 * MEASURED.reference_modulus

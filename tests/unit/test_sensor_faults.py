@@ -1,4 +1,4 @@
-"""A witness that begins to lie in a grip: named, refused, never obeyed; by the plant's truth."""
+"""Measurement faults during a grip are named and rejected, and have no effect on the true force."""
 
 import math
 from collections.abc import Callable
@@ -15,9 +15,10 @@ from tests.unit.test_control import grasped
 FORCE = 6.0
 BOTH = {"witness.left_sensor", "witness.right_sensor"}
 
-# What lies: (kind, value, over [s], fingers, who is to be named, what the hand is in then). A zero
-# that sinks takes all of a light touch with it: then joints hold where they are, or, where one tip
-# alone seems to let go, its frames are refused. One that rises is seen beside the footprint.
+# Faults: (kind, value, duration [s], fingers, expected events, expected mode afterwards). A falling
+# zero offset hides a light touch completely; the joints then hold their position, or, if only one
+# tip seems to let go, its frames are rejected. A rising zero offset is visible next to the
+# footprint.
 LIES: dict[str, tuple[str, float, float, tuple[int, ...], set[str], str]] = {
     "one zero sinks": ("drift", -0.1, 1.0, (0,), {"witness.left_sensor"}, "armed"),
     "both zeros sink": ("drift", -0.1, 1.0, (0, 1), BOTH, "armed"),
@@ -34,7 +35,7 @@ LIES: dict[str, tuple[str, float, float, tuple[int, ...], set[str], str]] = {
     "lie",
     [pytest.param(lie, marks=[pytest.mark.extended] * lie.startswith("both")) for lie in LIES],
 )
-def test_a_lie_is_named_and_never_obeyed(lie: str) -> None:
+def test_a_measurement_fault_is_named_and_has_no_effect(lie: str) -> None:
     kind, value, over, fingers, named, mode = LIES[lie]
     with Hand({}) as hand:
         grasped(hand, FORCE)
@@ -48,7 +49,7 @@ def test_a_lie_is_named_and_never_obeyed(lie: str) -> None:
         assert hand.mode == mode
         if mode == "holding":
             assert seen.force[-1].mean() == pytest.approx(FORCE, rel=0.1)
-        if mode == "fault":  # without a sensor that can be believed, as without frames
+        if mode == "fault":  # like missing frames, because no sensor is valid
             assert any(kind == "tactile.silent" for _, kind, _ in hand.events)
 
 
@@ -56,7 +57,7 @@ def test_a_lie_is_named_and_never_obeyed(lie: str) -> None:
     ("kind", "value", "force"),
     [("drift", -0.06, 5.0), ("replay", 0.41, 5.0), ("replay", 0.41, 8.0)],
 )
-def test_a_tip_that_seems_to_let_go_is_no_sudden_load(kind, value, force):
+def test_a_tip_that_seems_to_let_go_is_not_a_sudden_load(kind, value, force):
     with Hand({}) as hand:
         hand.grasp(force)
         while hand.mode != "holding":
@@ -75,7 +76,7 @@ def test_a_tip_that_seems_to_let_go_is_no_sudden_load(kind, value, force):
         pytest.param(0.6, 2.0, marks=pytest.mark.extended),
     ],
 )
-def test_a_gain_that_changes_leaves_a_solid_tips_force(gain: float, over: float) -> None:
+def test_a_gain_change_does_not_affect_the_force_of_a_solid_tip(gain: float, over: float) -> None:
     with Hand(SOLID) as hand:
         grasped(hand, FORCE)
         for finger in hand.plant.measurement_faults:
@@ -87,7 +88,7 @@ def test_a_gain_that_changes_leaves_a_solid_tips_force(gain: float, over: float)
         assert not [text for _, kind, text in hand.events if kind == "slip"]
 
 
-def test_a_sensor_that_was_blind_for_a_moment_raises_no_grip() -> None:
+def test_a_brief_loss_of_a_sensor_does_not_raise_the_grip() -> None:
     with Hand({}) as hand:
         grasped(hand, FORCE)
         blind = hand.plant.measurement_faults[0]
@@ -101,7 +102,7 @@ def test_a_sensor_that_was_blind_for_a_moment_raises_no_grip() -> None:
         assert not [text for _, kind, text in hand.events if kind == "slip"]
 
 
-def test_an_estimate_that_is_no_number_or_no_hands_begins_anew():
+def test_an_invalid_estimate_is_reset():
     with Hand({}) as hand:
         grasped(hand, FORCE)
         state = hand.estimator._state
@@ -113,7 +114,7 @@ def test_an_estimate_that_is_no_number_or_no_hands_begins_anew():
         assert abs(state.rotation) < 1.0
 
 
-def test_a_sensor_that_is_honest_again_is_believed_again() -> None:
+def test_a_recovered_sensor_is_used_again() -> None:
     with Hand({}) as hand:
         grasped(hand, FORCE)
         for finger in hand.plant.measurement_faults:
@@ -132,7 +133,7 @@ def test_a_sensor_that_is_honest_again_is_believed_again() -> None:
         assert not [kind for _, kind, _ in hand.events if kind.startswith("witness")]
 
 
-def test_a_d_that_jumps_while_joints_and_the_other_tip_stand_still_is_refused() -> None:
+def test_a_d_jump_without_motion_of_joints_and_the_other_tip_is_rejected() -> None:
     with Hand({}) as hand:
         hand.grasp(FORCE)
         while hand.mode != "holding":
@@ -146,7 +147,7 @@ def test_a_d_that_jumps_while_joints_and_the_other_tip_stand_still_is_refused() 
         assert "mm less deep at once" in told
 
 
-def test_rolling_that_both_tips_show_alike_in_a_turn_is_no_drift() -> None:
+def test_equal_rolling_of_both_tips_in_a_turn_is_not_a_drift() -> None:
     with Hand({}) as hand:
         grasped(hand, 10.0)
         hand.plant.load(twist=-0.122)
@@ -157,7 +158,7 @@ def test_rolling_that_both_tips_show_alike_in_a_turn_is_no_drift() -> None:
         assert not [event for event in hand.events if event[1].startswith("witness")]
 
 
-def test_frames_that_come_again_are_refused_and_a_new_force_is_not_built_up_on_them() -> None:
+def test_repeated_frames_are_rejected_and_the_force_is_not_changed_with_them() -> None:
     with Hand({}) as hand:
         grasped(hand, FORCE)
         for finger in hand.plant.measurement_faults:
@@ -174,7 +175,7 @@ def test_frames_that_come_again_are_refused_and_a_new_force_is_not_built_up_on_t
     "load",
     [(0.0, 5.0, 0.0), pytest.param((3.0, 0.0, 0.0), marks=pytest.mark.extended), (0.0, 0.0, 0.2)],
 )
-def test_a_real_load_and_a_real_turn_are_no_lie(load: tuple[float, float, float]) -> None:
+def test_real_loads_and_turns_are_not_measurement_faults(load: tuple[float, float, float]) -> None:
     with Hand({}) as hand:
         grasped(hand, 10.0)
         for sign in (1.0, -1.0, 0.0):
@@ -187,7 +188,7 @@ def test_a_real_load_and_a_real_turn_are_no_lie(load: tuple[float, float, float]
 
 
 def given(repeats: RepeatDetector, frames: list[float]) -> bool:
-    for number in frames:  # a tenth more is more in one cell alone
+    for number in frames:  # an increase by a tenth affects only one cell
         repeats.update(np.array([number, number, number, 10.0 * number]).astype(np.uint16))
     return repeats.is_fault
 
@@ -207,7 +208,7 @@ SEQUENCES: dict[str, tuple[Callable[[], list[float]], bool]] = {
 
 
 @pytest.mark.parametrize("name", SEQUENCES)
-def test_only_an_order_that_comes_again_is_a_repetition(name: str) -> None:
+def test_only_a_recurring_order_is_a_repetition(name: str) -> None:
     frames, expected = SEQUENCES[name]
     assert given(RepeatDetector(100.0), frames()) is expected
     assert not given(RepeatDetector(100.0, enabled=False), frames())

@@ -1,4 +1,4 @@
-"""The emulated servo bus: published exchanges byte for byte, who answers, faults on the line."""
+"""The emulated servo bus: published exchanges byte for byte, reply rules, faults on the line."""
 
 import struct
 from typing import Any
@@ -23,7 +23,8 @@ def hexes(*texts: str) -> bytes:
     return b"".join(bytes.fromhex(text) for text in texts)
 
 
-# --- published exchanges -----------------------------------------------------------------------
+# --- published exchanges
+# ----------------------------------------------------------------------------
 
 DONE = "FFFFFD00010400 55 00 A10C"
 XC330 = {"model": "XC330-T288"}
@@ -73,11 +74,11 @@ THREE = {**XC330, "ids": (3, 7, 4), "counts": (166, 2079, 1023)}
         "clear",
     ],
 )
-def test_published_exchanges(options: dict[str, Any], asked: str, answers: list[str]) -> None:
+def test_published_read_exchanges(options: dict[str, Any], asked: str, answers: list[str]) -> None:
     assert make_bus(**options).feed(hexes("FFFFFD00", asked), 0.0) == hexes(*answers)
 
 
-def test_published_writes() -> None:
+def test_published_write_exchanges() -> None:
     bus = make_bus()
     left = bus.servos[0].table
     assert bus.feed(hexes("FFFFFD00010900 03 740000020000 CA89"), 0.0) == hexes(DONE)
@@ -113,7 +114,8 @@ def test_published_fast_bulk_read() -> None:
     )
 
 
-# --- who answers, and when ---
+# --- reply rules and timing
+# -------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -138,14 +140,14 @@ def test_a_new_id_takes_effect_after_the_reply_under_the_old_one() -> None:
     assert c.ask(framing.PING, packet_id=40)[0] == 0
 
 
-def test_broadcast_reads_and_writes_are_not_answered() -> None:
+def test_broadcast_reads_and_writes_get_no_reply() -> None:
     c = client()
     assert c.send(BROADCAST, framing.READ, struct.pack("<HH", 132, 4)) == b""
     assert c.send(BROADCAST, framing.WRITE, struct.pack("<HB", reg.LED, 1)) == b""
     assert all(servo.table.get(reg.LED) for servo in c.bus.servos)
 
 
-def test_a_missing_servo_silences_those_named_after_it() -> None:
+def test_a_missing_servo_silences_those_listed_after_it() -> None:
     c = client(ids=(1, 2, 3))
     packets = PacketParser().feed(
         c.send(BROADCAST, framing.SYNC_READ, struct.pack("<HH", 132, 4) + bytes((1, 9, 3))), 0.0
@@ -153,7 +155,7 @@ def test_a_missing_servo_silences_those_named_after_it() -> None:
     assert [packet.id for packet in packets] == [1]
 
 
-def test_an_old_firmware_does_not_know_fast_reads() -> None:
+def test_an_old_firmware_lacks_fast_reads() -> None:
     request = struct.pack("<HHBB", 132, 4, 1, 2)
     old = client(model="XL330-M288", firmware=45)
     assert old.send(BROADCAST, framing.FAST_SYNC_READ, request) == b""
@@ -162,13 +164,13 @@ def test_an_old_firmware_does_not_know_fast_reads() -> None:
     assert len(new.send(BROADCAST, framing.FAST_SYNC_READ, request)) == 8 + 2 * 8
 
 
-def test_a_damaged_packet_is_met_with_silence() -> None:
+def test_a_corrupted_packet_gets_no_reply() -> None:
     damaged = bytearray(frame(1, framing.READ, struct.pack("<HH", 132, 4)))
     damaged[-1] ^= 1
     assert make_bus().feed(bytes(damaged), 0.0) == b""
 
 
-def test_servos_at_another_rate_hear_nothing() -> None:
+def test_servos_at_another_rate_receive_nothing() -> None:
     c = client()
     ping = frame(BROADCAST, framing.PING)
     assert c.bus.feed(ping, c.t, baud=1_000_000) == b""
@@ -178,10 +180,11 @@ def test_servos_at_another_rate_hear_nothing() -> None:
     assert len(c.bus.feed(ping, c.t, baud=1_000_000)) == 14
 
 
-# --- servos that answer at once ------------------------------------------------------------------
+# --- servos that reply simultaneously
+# ---------------------------------------------------------------
 
 
-def test_servos_that_share_an_id_answer_at_once() -> None:
+def test_servos_with_the_same_id_reply_simultaneously() -> None:
     bus = make_bus(ids=(1, 1, 2), counts=(100, 200, 300))
     read = frame(1, framing.READ, b"\x84\x00\x04\x00")
     low, high = (framing.status(1, 0, (100 * k).to_bytes(4, "little")) for k in (1, 2))
@@ -193,10 +196,11 @@ def test_servos_that_share_an_id_answer_at_once() -> None:
     assert bus.feed(group, 0.0)[:5] == b"\xff\xff\xfd\x00\x02"
 
 
-# --- faults on demand ------------------------------------------------------------------------
+# --- injected faults
+# --------------------------------------------------------------------------------
 
 
-def test_reply_faults_do_what_they_say_and_are_seeded() -> None:
+def test_reply_faults_are_injected_reproducibly() -> None:
     def replies(fault: str) -> list[bytes]:
         bus = make_bus()
         put_fault(bus, fault, 0.0)
@@ -218,7 +222,7 @@ def test_reply_faults_do_what_they_say_and_are_seeded() -> None:
     assert late.exchange(frame(1, framing.PING), 0.0)[0].late > 0.0
 
 
-def test_a_silent_servo_comes_back() -> None:
+def test_a_silent_servo_can_be_restored() -> None:
     c = client()
     put_fault(c.bus, "silent=2", c.t)
     assert c.send(2, framing.PING) == b""
@@ -227,10 +231,11 @@ def test_a_silent_servo_comes_back() -> None:
     assert c.send(2, framing.PING) != b""
 
 
-# --- the hand's mapping ----------------------------------------------------------------------
+# --- mapping of the hand
+# ----------------------------------------------------------------------------
 
 
-def test_directions_and_zeros_of_the_settings() -> None:
+def test_directions_and_zero_offsets_of_the_settings() -> None:
     plant = FreeJoints(2)
     plant.q[:] = 0.3
     bus = ServoBus.from_settings(Settings(), plant)
@@ -243,7 +248,7 @@ def test_directions_and_zeros_of_the_settings() -> None:
         hand_bus(servos={"model": "XL330-M288"}, baud=4_500_000)
 
 
-def test_a_reading_may_lag_behind_the_plant_but_neither_writes_nor_watchdogs_do() -> None:
+def test_a_reading_may_lag_behind_the_plant_but_writes_and_watchdogs_may_not() -> None:
     c = client(prepared=True)
     bus = c.bus
     bus.lag = 0.0005
@@ -265,10 +270,11 @@ def test_a_reading_may_lag_behind_the_plant_but_neither_writes_nor_watchdogs_do(
     assert bus.servos[0].report(bus.now)["stopped_by_watchdog"]
 
 
-# --- anything at all -------------------------------------------------------------------------
+# --- random input
+# -----------------------------------------------------------------------------------
 
 
-def test_thousands_of_mutated_packets_neither_crash_nor_hang() -> None:
+def test_thousands_of_mutated_packets_cause_neither_crash_nor_hang() -> None:
     report = fuzz(6000, seed=5)
     assert report.through > 1000
     assert report.wrong == []

@@ -1,6 +1,6 @@
-"""What every servo backend owes, in each operating mode: the simulated one and Dynamixel.
+"""Requirements for every servo backend in each operating mode, simulated and Dynamixel.
 
-The same tests run over both; a backend that joins them is added to ``RIGS``.
+The same tests run for both; to test another backend, add it to ``RIGS``.
 """
 
 import math
@@ -32,16 +32,16 @@ BOUNDED = ("current-based position", "current")
 
 
 class Rig(Protocol):
-    """A backend over something that moves."""
+    """A backend and the joints that it moves."""
 
     servos: Servos
     clock: Clock
 
     def torque(self) -> list[bool]:
-        """Whether each motor is driven, by the other side's own account."""
+        """Return whether each motor is driven, according to the servos themselves."""
 
     def close(self) -> None:
-        """End it."""
+        """Close the backend."""
 
 
 class SimulatedRig:
@@ -63,9 +63,9 @@ class SimulatedRig:
 
 
 class DynamixelRig:
-    """The Dynamixel backend, through the SDK, on an emulated bus that lives in the same time.
+    """The Dynamixel backend with the SDK and an emulated bus on the same clock.
 
-    Bytes go across at once and not through a terminal, so that a busy machine changes nothing.
+    Bytes are transferred immediately, without a pty, so the load of the machine has no effect.
     """
 
     def __init__(
@@ -94,7 +94,7 @@ RIGS: dict[str, Callable[..., Rig]] = {"simulated": SimulatedRig, "dynamixel": D
 def make(
     request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[Callable[..., Rig]]:
-    """Makes rigs of one backend, which end with the test."""
+    """Return a function that creates rigs of one backend, which are closed after the test."""
 
     def start(mode: str = MODES[0], **sections: Any) -> Rig:
         servos = {"mode": mode, "watchdog": 0.5, **sections.pop("servos", {})}
@@ -106,7 +106,7 @@ def make(
 
 
 def ticks(rig: Rig, goal: Goal, seconds: float) -> list[Reading]:
-    """Read and write as the loop does; every reading."""
+    """Read and write as the loop does; return every reading."""
     readings = []
     deadline, end = rig.clock.now(), rig.clock.now() + seconds
     while deadline < end:
@@ -129,12 +129,12 @@ def armed(rig: Rig) -> Reading:
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_connect_leaves_the_hand_limp_and_reads(make, mode):
+def test_connect_leaves_torque_off_and_reads(make, mode):
     rig = make(mode)
     rig.servos.connect()
     assert rig.torque() == [False, False]
     first, second = ticks(rig, Goal(q=[0.3, 0.3], current=[1.0, 1.0]), 0.004)[:2]
-    assert first.q == second.q == [0.0, 0.0]  # a goal while torque is off moves nothing
+    assert first.q == second.q == [0.0, 0.0]  # a goal has no effect while torque is off
     assert first.current == [0.0, 0.0]
     assert second.t >= first.t
     assert first.alert == 0
@@ -142,7 +142,7 @@ def test_connect_leaves_the_hand_limp_and_reads(make, mode):
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_torque_on_holds_where_the_joints_are(make, mode):
+def test_torque_on_holds_the_current_positions(make, mode):
     rig = make(mode)
     before = armed(rig)
     assert rig.torque() == [True, True]
@@ -151,7 +151,7 @@ def test_torque_on_holds_where_the_joints_are(make, mode):
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_joints_go_to_their_goals_with_the_right_signs(make, mode):
+def test_joints_reach_their_goals_in_the_right_direction(make, mode):
     rig = make(mode)
     armed(rig)
     goal = Goal(q=[0.08, -0.12], current=[0.5, 0.5])
@@ -166,7 +166,7 @@ def test_joints_go_to_their_goals_with_the_right_signs(make, mode):
 
 
 @pytest.mark.parametrize("mode", BOUNDED)
-def test_the_bound_on_the_current_holds_on_every_way(make, mode):
+def test_the_current_limit_holds_along_the_entire_motion(make, mode):
     rig = make(mode)
     armed(rig)
     bound = 0.1
@@ -175,7 +175,7 @@ def test_the_bound_on_the_current_holds_on_every_way(make, mode):
     assert 0.5 * bound < max(currents) <= bound + CURRENT_UNIT
 
 
-def test_position_mode_takes_the_current_it_needs(make):
+def test_position_mode_uses_the_current_it_needs(make):
     rig = make("position")
     armed(rig)
     readings = ticks(rig, Goal(q=[0.08, -0.3], current=[0.0, 0.0]), 0.4)
@@ -183,7 +183,7 @@ def test_position_mode_takes_the_current_it_needs(make):
 
 
 @pytest.mark.parametrize("mode", BOUNDED)
-def test_no_current_no_motion(make, mode):
+def test_zero_current_causes_no_motion(make, mode):
     rig = make(mode)
     armed(rig)
     readings = ticks(rig, Goal(q=[0.1, -0.3], current=[0.0, 0.0]), 0.1)
@@ -192,7 +192,7 @@ def test_no_current_no_motion(make, mode):
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_torque_off_and_close_let_go(make, mode):
+def test_torque_off_and_close_release_the_joints(make, mode):
     rig = make(mode)
     armed(rig)
     goal = Goal(q=[0.05, -0.05], current=[0.5, 0.5])
@@ -210,10 +210,10 @@ def test_torque_off_and_close_let_go(make, mode):
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_a_finger_that_is_not_in_the_scene_stays_zero(make, mode):
+def test_a_finger_outside_the_scene_stays_zero(make, mode):
     rig = make(mode, scene={"fingers": ("right",)})
     if isinstance(rig, DynamixelRig):
-        put_fault(rig.bus, "silent=1", 0.0)  # that one is not asked
+        put_fault(rig.bus, "silent=1", 0.0)  # this servo is not addressed
     armed(rig)
     reading = ticks(rig, Goal(q=[0.1, -0.1], current=[0.4, 0.4]), 0.4)[-1]
     assert reading.q[0] == reading.dq[0] == reading.current[0] == 0.0
@@ -222,7 +222,7 @@ def test_a_finger_that_is_not_in_the_scene_stays_zero(make, mode):
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_a_model_that_senses_no_current_can_do_position_mode_alone(make, mode):
+def test_a_model_without_current_sensing_only_supports_position_mode(make, mode):
     rig = make(mode, servos={"model": "XL430-W250"})
     if mode != "position":
         with pytest.raises(ServoError, match=f"XL430-W250 has no {mode} mode"):
@@ -232,10 +232,10 @@ def test_a_model_that_senses_no_current_can_do_position_mode_alone(make, mode):
     assert ticks(rig, Goal(q=[0.08, -0.1]), 0.5)[-1].q == pytest.approx([0.08, -0.1], abs=0.01)
 
 
-# Current mode's own loop, and what position mode checks.
+# The control loop of current mode, and the checks of position mode.
 
 
-def test_the_loop_of_current_mode():
+def test_the_control_loop_of_current_mode():
     servos = ServoSettings(stiffness=10.0, damping=0.5)
     assert current_toward(servos, 0.1, 2.0, 0.0, 0.0) == pytest.approx(1.0)
     assert current_toward(servos, 0.1, 2.0, 0.0, 1.0) == pytest.approx(0.5)
@@ -243,7 +243,7 @@ def test_the_loop_of_current_mode():
     assert current_toward(servos, -9.0, -0.3, 0.0, 0.0) == -0.3
 
 
-def test_position_limits_that_the_joint_does_not_fit_in_are_told(monkeypatch):
+def test_position_limits_that_exclude_the_joint_range_are_reported(monkeypatch):
     rig = DynamixelRig(monkeypatch, servos={"mode": "position"})
     table = rig.bus.servos[1].table
     table.set(reg.MAX_POSITION_LIMIT, 2100)
@@ -257,7 +257,7 @@ def test_position_limits_that_the_joint_does_not_fit_in_are_told(monkeypatch):
 
 
 @pytest.mark.parametrize("mode", BOUNDED)
-def test_each_joints_own_current_limit_binds(make, mode):
+def test_each_joint_has_its_own_current_limit(make, mode):
     rig = make(mode, servos={"current_limit": (0.15, 0.08)})
     armed(rig)
     readings = ticks(rig, Goal(q=[0.1, -0.3], current=[1.0, 1.0]), 0.2)

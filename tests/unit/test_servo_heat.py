@@ -1,5 +1,4 @@
-"""The servos' heat: its forecast against an ODE solver, and what the hand does with it on hidden
-constants."""
+"""Servo temperature: prediction against an ODE solver, and reactions with unknown constants."""
 
 from typing import Any
 
@@ -27,7 +26,8 @@ from tests.harness.golden_recording import RECORDING
 from tests.soak.heat import Bench, foreseen, least_at_half_load
 
 LIMIT = 70.0
-FAST = (1.2, 0.8, 0.3)  # heating, cooling, capacity of the plant's servos
+# Heating, cooling and heat capacity of the plant's servos, relative to the model.
+FAST = (1.2, 0.8, 0.3)
 
 
 def law(state: HeatState) -> HeatState:
@@ -36,7 +36,7 @@ def law(state: HeatState) -> HeatState:
 
 
 def derivative(state: HeatState, x: Any, square: float) -> Any:
-    """The equations of the module's head, of W, C, A, k."""
+    """Return the derivatives of W, C, A and k by the equations in the module docstring."""
     c = state.law
     winding, case, ambient, heating = x
     copper = 1.0 + 0.0039 * (winding - 25.0)
@@ -53,7 +53,7 @@ def derivative(state: HeatState, x: Any, square: float) -> Any:
 
 
 @pytest.mark.parametrize("square", [0.4, 1.0, 2.5])
-def test_the_time_to_the_limit_is_that_of_the_equations(square):
+def test_the_time_to_the_limit_matches_the_equations(square):
     state = law(HeatState())
     follow(state.array, 0.0, 0.5, 30.0)
     state.x[:] = 45.0, 38.0, 28.0, 1.1
@@ -86,13 +86,13 @@ def test_the_lasting_current_settles_at_the_limit():
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_the_limit_of_hidden_constants_is_foreseen(seed):
+def test_the_limit_is_predicted_with_unknown_constants(seed):
     run = foreseen(seed)
     assert run.warned >= 30.0
     assert run.told == pytest.approx(60.0, rel=0.15)
 
 
-def test_the_winding_is_as_far_off_as_its_standard_deviation_says():
+def test_the_winding_error_matches_its_standard_deviation():
     ratios = []
     for seed in range(8):
         bench = Bench(seed)
@@ -105,7 +105,7 @@ def test_the_winding_is_as_far_off_as_its_standard_deviation_says():
     assert np.abs(ratios).max() < 3.0
 
 
-def test_half_of_what_lasts_warns_nobody():
+def test_half_of_the_lasting_current_causes_no_warning():
     assert least_at_half_load(1, 1800.0) > 600.0
 
 
@@ -113,7 +113,7 @@ HOLD = 600.0  # s
 
 
 def recorded(plant: ServoHeat) -> dict[str, Any]:
-    """A hold of 1 A, as a recording has it."""
+    """Return a hold at 1 A in the form of a recording."""
     t, shown = np.arange(0.0, HOLD, 0.5), []
     for _ in t:
         plant.step(1.0, 0.5)
@@ -121,7 +121,7 @@ def recorded(plant: ServoHeat) -> dict[str, Any]:
     return {"t": t, "left.current": np.ones_like(t), "left.temperature": np.array(shown)}
 
 
-def test_a_hold_tells_a_servos_own_constants(tmp_path, monkeypatch, capsys):
+def test_servo_constants_are_identified_from_a_hold(tmp_path, monkeypatch, capsys):
     plant = ServoHeat(by_name("XM430-W350"), 1.25, 0.8, 0.8)
     monkeypatch.setattr(calibrating, "read_recording", lambda _: recorded(plant))
     profile = tmp_path / "my.toml"
@@ -141,10 +141,11 @@ def test_a_hold_tells_a_servos_own_constants(tmp_path, monkeypatch, capsys):
     assert told == pytest.approx(t, rel=0.05)
     follow(law(state).array, 1.0, 0.5, 25.0)
     state.x[:3] = 25.0
-    assert abs(time_to_limit(state.array, 1.0, 60.0) / t - 1.0) > 0.2  # by the model's own
+    # This prediction uses the constants of the model.
+    assert abs(time_to_limit(state.array, 1.0, 60.0) / t - 1.0) > 0.2
 
 
-def test_a_hold_that_hardly_warms_tells_nothing(tmp_path, capsys):
+def test_a_hold_with_little_heating_is_refused(tmp_path, capsys):
     profile = tmp_path / "my.toml"
     profile.write_text("")
     assert main(["calibrate", "heat", str(profile), "--recording", str(RECORDING)]) == 1
@@ -152,7 +153,7 @@ def test_a_hold_that_hardly_warms_tells_nothing(tmp_path, capsys):
 
 
 def hot(force: float, seconds: float, **sections: dict[str, Any]) -> SimulatedDaemon:
-    """A grip on servos that soon get too hot: half the frames a hand has."""
+    """Grip with servos that soon overheat, at half the usual frame rate."""
     sections |= {"simulation": {"servo_heat": FAST, "ambient": 35.0}, "tactile": {"rate": 50.0}}
     hand = SimulatedDaemon(sections)
     hand.grasp(force)
@@ -168,7 +169,7 @@ def heat_events(hand: SimulatedDaemon) -> list[tuple[str, str]]:
     return [(level, text) for level, kind, text in hand.events if kind == "servos.heat"]
 
 
-def test_a_grip_that_gets_too_hot_is_eased_and_holds():
+def test_an_overheating_grip_is_eased_and_keeps_holding():
     with hot(24.0, 45.0) as hand:
         assert hand.mode == Mode.HOLDING
         assert max(heat.sensed for heat in hand.plant.servo_heat) < LIMIT
@@ -178,7 +179,7 @@ def test_a_grip_that_gets_too_hot_is_eased_and_holds():
         assert {level for level, _ in told} == {"warning"}
         eased = hand.state.goal.force
         assert eased < 22.0
-        hand.command("grasp", force=24.0)  # asked for again, while it is hot
+        hand.command("grasp", force=24.0)  # requested again while hot
         hand.run(1.0)
         assert hand.state.goal.force == pytest.approx(eased)
 
@@ -191,8 +192,8 @@ def test_a_grip_that_gets_too_hot_is_eased_and_holds():
         pytest.param("stop", Mode.DISARMED, marks=pytest.mark.extended),
     ],
 )
-def test_where_the_load_needs_the_grip_it_is_said_and_the_action_done(action, mode):
-    # What friction bears of the load is all that 24 N have: easing would let it fall.
+def test_if_the_load_needs_the_force_the_configured_action_is_reported_and_taken(action, mode):
+    # Friction at 24 N just carries this load, so a smaller force would drop it.
     control = {"object_load": 23.5}
     with hot(24.0, 0.0, control=control, safety={"heat_action": action}) as hand:
         for _ in range(90):

@@ -1,4 +1,4 @@
-"""Any instruction, through our packet handler and the emulated bus, equals direct table access."""
+"""Any instruction through our packet handler and the emulated bus equals direct table access."""
 
 import dynamixel_sdk as sdk
 import numpy as np
@@ -13,9 +13,9 @@ from tests.harness.servos import RADIAN, DirectPort, make_bus
 ADDRESSES = st.one_of(
     st.sampled_from([7, 11, 64, 65, 98, 100, 102, 104, 108, 116, 126, 132, 168, 224, 578, 634]),
     st.integers(0, 663),
-    st.integers(640, 663),  # where reads reach past the end
+    st.integers(640, 663),  # reads extend beyond the end here
 )
-# FF and FD often, so that stuffing is due; small numbers, so that writes are often allowed.
+# FF and FD are frequent, to require stuffing; small numbers are frequent, to be valid.
 DATA = st.one_of(
     st.lists(st.sampled_from([0xFF, 0xFD, 0, 1, 5, 100]), min_size=1, max_size=20).map(bytes),
     st.binary(min_size=1, max_size=20),
@@ -33,15 +33,15 @@ STEPS = st.one_of(
 
 
 def placed(angles: tuple[float, float]) -> ServoBus:
-    # Status and ID registers are protected by the test below, so that the servos stay in reach.
+    # The status and ID registers are protected by the check below, so the servos stay reachable.
     return make_bus("XM430-W210", prepared=True, counts=[angle / RADIAN for angle in angles])
 
 
 def out_of_reach(address: int, data: bytes) -> bool:
-    """Whether a write would change who answers to what, which direct access does not know of."""
+    """Return True if a write would change which servo replies to which ID, unlike direct access."""
     span = range(address, address + len(data))
     kept = (reg.ID, reg.BAUD_RATE, reg.STATUS_RETURN_LEVEL)
-    # Indirect addresses could point at those.
+    # indirect addresses could refer to them
     return any(a in span for a in kept) or address >= 168
 
 
@@ -62,7 +62,7 @@ def test_any_instruction_equals_direct_access(steps, angles):
                 continue
             if kind == "write":
                 result, error = handler.writeTxRx(port, servo_id, address, len(what), list(what))
-                error &= 0x7F  # bit 7 tells of a hardware error, which limits may bring about
+                error &= 0x7F  # bit 7 reports a hardware error, which limits may cause
                 assert (result, error) == (
                     sdk.COMM_SUCCESS,
                     servos[servo_id].write(address, what, t),
@@ -91,7 +91,8 @@ def test_any_instruction_equals_direct_access(steps, angles):
                 bulk = sdk.GroupBulkRead(port, handler)
                 for each in servos:
                     bulk.addParam(each, address, what)
-                name = "fastBulkRead" if "fast" in kind else "txRxPacket"  # 3.7 has no fast one
+                # SDK version 3.7 has no fast bulk read.
+                name = "fastBulkRead" if "fast" in kind else "txRxPacket"
                 result = getattr(bulk, name, bulk.txRxPacket)()
                 got = {each: bytes(bulk.data_dict[each][0]) for each in servos}
             else:

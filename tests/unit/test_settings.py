@@ -1,4 +1,4 @@
-"""Settings: profiles load, and whatever is wrong with one is told in one report."""
+"""Settings: profiles are loaded, and all their errors are in one report."""
 
 import json
 import tomllib
@@ -25,12 +25,12 @@ def report(tmp_path: Path, text: str, directory: Path | None = None) -> list[str
     return [line.removeprefix(f"{path}: ") for line in lines]
 
 
-def test_no_file_is_the_built_in_simulated_hand():
+def test_without_a_file_the_built_in_simulated_hand_is_used():
     assert load() == Settings()
     assert load().servos.backend == "simulated"
 
 
-def test_sim_profile_is_the_built_in_hand_with_every_key_as_it_is_declared():
+def test_sim_profile_contains_every_key_with_its_default():
     path = CONFIG / "sim.toml"
     assert path.read_text(encoding="utf-8") == reference.profile()
     assert load(path) == Settings()
@@ -39,7 +39,7 @@ def test_sim_profile_is_the_built_in_hand_with_every_key_as_it_is_declared():
         assert list(written[name]) == list(type(section).model_fields), name
 
 
-def test_the_schema_for_editors_has_meaning_unit_and_default_of_every_key():
+def test_the_editor_schema_has_description_unit_and_default_of_every_key():
     schema = json.loads(reference.schema_text())
     keys = reference.every_key()
     assert len(keys) > 180
@@ -62,33 +62,33 @@ def test_the_schema_for_editors_has_meaning_unit_and_default_of_every_key():
         ("stream.address", ""),
     ],
 )
-def test_the_reference_shows_the_allowed_values(key, allowed):
+def test_the_reference_lists_the_allowed_values(key, allowed):
     shown = {f"{each.section}.{each.name}": each.allowed for each in reference.every_key()}
     assert shown[key] == allowed
 
 
 @pytest.mark.parametrize("path", sorted(CONFIG.glob("*.toml")), ids=lambda path: path.name)
-def test_every_profile_loads_and_names_the_schema(path, tmp_path):
+def test_every_profile_is_valid_and_refers_to_the_schema(path, tmp_path):
     assert path.read_text(encoding="utf-8").startswith("#:schema ./schema.json\n# ")
     settings = load(path, tmp_path)
     assert "{dir}" not in settings.servos.port + "".join(settings.tactile.port)
 
 
 @pytest.mark.parametrize("name", names())
-def test_a_bare_name_is_a_profile_of_the_package_wherever_that_is(name, tmp_path, monkeypatch):
+def test_a_bare_name_is_a_packaged_profile_in_any_folder(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert load(Path(name), tmp_path) == load(CONFIG / f"{name}.toml", tmp_path)
-    (tmp_path / name).write_text("loop.rate = 123.0\n")  # a file here goes before it
+    (tmp_path / name).write_text("loop.rate = 123.0\n")  # a local file takes precedence
     assert load(Path(name)).loop.rate == 123.0
 
 
 @pytest.mark.parametrize("table", BUILT_IN.values(), ids=BUILT_IN)
-def test_every_backend_is_there(table):
+def test_every_backend_is_registered(table):
     for name, backend in table.items():
         assert callable(backend.load()) or name == "none"
 
 
-def test_an_unknown_name_is_told_with_the_known_ones():
+def test_an_unknown_name_is_reported_with_the_known_ones():
     with pytest.raises(SettingsError) as caught:
         load(Path("hill"))
     assert str(caught.value) == (
@@ -96,7 +96,7 @@ def test_an_unknown_name_is_told_with_the_known_ones():
     )
 
 
-def test_all_errors_stand_in_one_report_with_key_found_and_expected(tmp_path):
+def test_all_errors_are_in_one_report_with_key_found_and_expected(tmp_path):
     lines = report(
         tmp_path,
         """
@@ -138,7 +138,7 @@ def test_all_errors_stand_in_one_report_with_key_found_and_expected(tmp_path):
     )
 
 
-def test_contradictions_between_keys_are_all_told(tmp_path):
+def test_all_contradictions_between_keys_are_reported(tmp_path):
     lines = report(
         tmp_path,
         """
@@ -173,7 +173,7 @@ def test_contradictions_between_keys_are_all_told(tmp_path):
     ]
 
 
-def test_a_file_that_is_not_text_or_not_there_is_told(tmp_path):
+def test_a_missing_or_binary_file_is_reported(tmp_path):
     path = tmp_path / "profile.toml"
     path.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(SettingsError, match="not UTF-8 text"):
@@ -184,7 +184,7 @@ def test_a_file_that_is_not_text_or_not_there_is_told(tmp_path):
         load(tmp_path / "config" / "hil.toml")
 
 
-def test_dir_fills_the_ports(tmp_path):
+def test_dir_sets_the_ports(tmp_path):
     path = tmp_path / "profile.toml"
     path.write_text(
         '[servos]\nport = "{dir}/servos"\n[tactile]\nport = ["{dir}/a", "/dev/b"]\n',
@@ -195,7 +195,7 @@ def test_dir_fills_the_ports(tmp_path):
     assert settings.tactile.port == ("/tmp/hand/a", "/dev/b")
 
 
-def test_an_unknown_model_is_told_beside_what_else_is_wrong(tmp_path):
+def test_an_unknown_model_is_reported_with_all_other_errors(tmp_path):
     lines = report(tmp_path, '[servos]\nmodel = "XM999"\nbaud = 1\n[loop]\nrate = 1.0')
     assert [line.split(":")[0] for line in lines] == ["servos.baud", "servos.model", "loop.rate"]
     assert 'found "XM999", expected one of XM430-W350, ' in lines[1]
@@ -261,13 +261,13 @@ def test_an_unknown_model_is_told_beside_what_else_is_wrong(tmp_path):
         ),
     ],
 )
-def test_absurd_settings_are_told_in_one_line(tmp_path, text, line):
+def test_absurd_settings_are_reported_in_one_line(tmp_path, text, line):
     lines = report(tmp_path, text)
     assert lines[0].startswith(line), lines
     assert all(len(each) < 300 for each in lines)
 
 
-def test_changes_go_over_the_file_and_are_checked_with_it(tmp_path):
+def test_command_line_changes_override_the_file_and_are_checked_with_it(tmp_path):
     file = tmp_path / "my.toml"
     file.write_text("loop.rate = 250.0\n[tip]\nradius = 0.015\n")
     changes = ["loop.rate=1000", "tactile.backend=none", 'scene.fingers=["left"]']
@@ -284,12 +284,12 @@ def test_changes_go_over_the_file_and_are_checked_with_it(tmp_path):
 
 
 @pytest.mark.parametrize("change", ["loop.rate", "rate=3", "=", ".=1", "loop.=1"])
-def test_a_change_that_names_no_key_is_told(change):
+def test_a_change_without_a_key_is_reported(change):
     with pytest.raises(SettingsError, match=r"^--set: found .* expected section\.key=value"):
         load(changes=[change])
 
 
-def test_addresses_off_this_machine_need_keys(tmp_path):
+def test_addresses_outside_this_machine_require_keys(tmp_path):
     path = tmp_path / "far.toml"
     path.write_text('commands.address = "tcp://10.0.0.2:9873"\n', encoding="utf-8")
     with pytest.raises(SettingsError, match=r"need access\.keys"):

@@ -1,4 +1,4 @@
-"""The simulated hand's servos and sensors on a virtual clock; when frames arrive."""
+"""Servos and sensors of the simulated hand on a virtual clock, and arrival times of frames."""
 
 import math
 from itertools import pairwise
@@ -20,7 +20,7 @@ CURRENT_UNIT = 2.69e-3
 
 
 class Bench:
-    """A hand, its servos and its sensors on one virtual clock."""
+    """A hand with its servos and sensors on one virtual clock."""
 
     def __init__(self, **sections) -> None:
         sections.setdefault("material", {"law": "constant"})
@@ -35,7 +35,7 @@ class Bench:
         self.goal = Goal()
 
     def run(self, seconds: float, period: float = 0.002) -> None:
-        """Tick as the loop does: read, then write the goal."""
+        """Tick as the loop does: read the joints, then write the goal."""
         end = self.clock.now() + seconds
         while self.clock.now() < end - 1e-9:
             self.clock.sleep_until(self.clock.now() + period)
@@ -53,7 +53,7 @@ class Bench:
 # Servos.
 
 
-def test_goals_are_whole_counts_too():
+def test_goals_are_whole_counts():
     bench = Bench()
     bench.servos.connect()
     bench.servos.torque_on()
@@ -63,19 +63,19 @@ def test_goals_are_whole_counts_too():
 
     goal_q, bound = bench.hand.plant.goals.q, bench.hand.plant.goals.current
     np.testing.assert_allclose(goal_q / COUNT, np.round(0.1003 / COUNT), rtol=1e-12)
-    # A bound is rounded down, so that it stays one.
+    # A limit is rounded down so that it is never exceeded.
     np.testing.assert_allclose(bound / CURRENT_UNIT, math.floor(0.3 / CURRENT_UNIT), rtol=1e-12)
 
 
-def test_watchdog_takes_torque_off_in_silence_only():
+def test_the_watchdog_turns_torque_off_only_without_exchanges():
     bench = Bench(servos={"watchdog": 0.1})
     bench.grasp(0.5, 1.0)
     assert bench.hand.force.min() > 5
-    # Exchanges every 90 ms keep it on.
+    # An exchange every 90 ms keeps torque on.
     bench.run(1.8, period=0.09)
     assert bench.hand.force.min() > 5
     assert bench.servos.counters()["watchdog"] == 0
-    # Silence: the hand opens by itself, whoever moves its time.
+    # Without exchanges, the plant itself turns torque off, whoever advances its time.
     bench.hand.advance(bench.clock.now() + 0.099)
     assert np.abs(bench.hand.current).min() > 0.4
     bench.hand.advance(bench.clock.now() + 0.120)
@@ -99,7 +99,7 @@ def test_watchdog_takes_torque_off_in_silence_only():
 # Tactile.
 
 
-def test_a_softer_tip_than_the_settings_reads_less_pressure():
+def test_a_tip_softer_than_the_settings_gives_less_pressure():
     sums = []
     for scale in (1.0, 0.7):
         bench = Bench(
@@ -112,7 +112,7 @@ def test_a_softer_tip_than_the_settings_reads_less_pressure():
         )
         sensor = bench.sensors[0]
         sensor.open()
-        # Onto the left tip: 18 mm of way at 20 mm/s.
+        # The object moves 18 mm onto the left tip at 20 mm/s.
         bench.clock.sleep_until(0.8)
         frame = sensor.latest()
         sums.append(float(frame.data.sum()) * 4.0 * bench.settings.tactile.pitch**2)
@@ -121,7 +121,7 @@ def test_a_softer_tip_than_the_settings_reads_less_pressure():
     assert sums[1] == pytest.approx(0.7 * sums[0], rel=1e-2)
 
 
-def test_a_long_delay_still_finds_its_sample():
+def test_the_sample_is_available_after_a_long_delay():
     bench = Bench(tactile={"latency": 0.5}, simulation={"tactile_delay": 0.5})
     sensor = bench.sensors[0]
     sensor.open()
@@ -132,7 +132,7 @@ def test_a_long_delay_still_finds_its_sample():
 
 
 def collect(arrivals, until, step=0.0005):
-    """(number, arrival) of each newest frame, asked for every ``step`` [s]."""
+    """Poll every ``step`` [s] and return (number, arrival) of each new frame."""
     found = []
     for k in range(round(until / step)):
         if arrivals.take(k * step):
@@ -140,7 +140,7 @@ def collect(arrivals, until, step=0.0005):
     return found
 
 
-def test_without_chance_each_frame_comes_after_its_delay():
+def test_without_randomness_each_frame_arrives_after_its_delay():
     arrivals = Arrivals(1.0, 0.01, 0.004)
     assert not arrivals.take(1.0039)
     assert arrivals.take(1.004)
@@ -150,7 +150,7 @@ def test_without_chance_each_frame_comes_after_its_delay():
     assert (arrivals.arrived, arrivals.missed) == (20, 0)
 
 
-def test_dropped_frames_are_missed_once_a_later_one_came():
+def test_dropped_frames_count_as_missed_once_a_later_one_arrives():
     arrivals = Arrivals(0.0, 0.01, 0.0, dropped=0.2, seed=(3,))
     found = collect(arrivals, 50.0, 0.01)
     numbers = np.array([number for number, _ in found])
@@ -161,7 +161,7 @@ def test_dropped_frames_are_missed_once_a_later_one_came():
 
 
 @pytest.mark.parametrize("jitter", [0.004, 0.03])
-def test_late_frames_come_in_order_within_the_jitter(jitter):
+def test_late_frames_arrive_in_order_within_the_jitter(jitter):
     arrivals = Arrivals(0.0, 0.01, 0.005, jitter=jitter, seed=(5,))
     found = collect(arrivals, 20.0)
     lateness = np.array([arrival - number * 0.01 - 0.005 for number, arrival in found])
@@ -175,7 +175,7 @@ def test_late_frames_come_in_order_within_the_jitter(jitter):
         assert lateness.mean() == pytest.approx(jitter / 2, rel=0.1)
 
 
-def test_who_asks_how_often_makes_no_difference():
+def test_the_polling_rate_does_not_affect_arrivals():
     often, seldom = (Arrivals(0.0, 0.01, 0.0, 0.3, 0.02, (7,)) for _ in range(2))
     times = dict(collect(often, 5.0, 0.001))
     for number, arrival in collect(seldom, 5.0, 0.083):
@@ -195,7 +195,7 @@ def simulated(**simulation):
     return bench.sensors[0], bench.clock, bench.hand
 
 
-def test_the_sensor_skips_sequence_numbers_and_counts_them():
+def test_skipped_sequence_numbers_of_a_sensor_are_counted():
     sensor, clock, _ = simulated(tactile_dropped=0.3, tactile_jitter=0.006)
     sensor.open()
     frames = [sensor.latest()]
@@ -215,7 +215,7 @@ def test_the_sensor_skips_sequence_numbers_and_counts_them():
     assert 30 < counters["missed"] < 90
 
 
-def test_a_frame_whose_instant_the_plant_forgot_is_missed_not_made_up():
+def test_a_frame_whose_sample_is_no_longer_stored_counts_as_missed():
     sensor, clock, hand = simulated(tactile_dropped=0.9, seed=2)
     sensor.open()
     for _ in range(40):
@@ -229,7 +229,7 @@ def test_a_frame_whose_instant_the_plant_forgot_is_missed_not_made_up():
     assert counters["frames"] < arrivals.arrived
 
 
-def test_cells_with_a_memory_feel_frames_that_nobody_asked_for():
+def test_cells_with_hysteresis_include_frames_that_were_not_read():
     def forces(step):
         sensor, clock, _ = simulated(tactile_creep=0.3, tactile_creep_time=0.2)
         sensor.open()

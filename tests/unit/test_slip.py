@@ -1,4 +1,4 @@
-"""The grip: loads from outside answered, without new frames, and of one finger alone."""
+"""The grip: reactions to external loads, missing frames, and a single finger."""
 
 import math
 
@@ -14,15 +14,15 @@ from tests.harness.plant import push_along
 from tests.unit.test_control import KNOWN, PAPER, grasped
 
 FORCE = 10.0
-BORNE = 2.0 * 0.6 * FORCE  # N, what both tips' friction bears at that grip
-FRICTION = 0.05 / 0.03  # N of a load, what a joint's friction may hide of it by 30 mm
+BORNE = 2.0 * 0.6 * FORCE  # N, load that the friction of both tips can carry at this grip force
+FRICTION = 0.05 / 0.03  # N, load that joint friction can hide at a moment arm of 30 mm
 
 
 @pytest.mark.parametrize(
     "sections", [{}, pytest.param(PAPER, marks=pytest.mark.extended)], ids=["100 Hz", "25 Hz"]
 )
-def test_a_push_beyond_the_margin_is_held_by_a_firmer_grip(sections):
-    """Away from the palm; towards it the object is wedged, and torques hardly show it."""
+def test_a_push_beyond_the_margin_is_held_with_more_force(sections):
+    """The push is away from the palm; towards it the object wedges and torques hardly change."""
     seen, moved = {}, {}
     for raised in (0.0, 10.0):
         with Hand(sections | {"control": {"grip_raise_max": raised}}) as hand:
@@ -42,7 +42,7 @@ def test_a_push_beyond_the_margin_is_held_by_a_firmer_grip(sections):
     assert moved[0.0] > 10e-3
 
 
-def test_the_grip_comes_back_when_the_load_has_gone():
+def test_the_grip_force_decreases_after_the_load_is_removed():
     with Hand(PAPER) as hand:
         grasped(hand)
         push_along(hand, BORNE, rate=4.0)
@@ -51,7 +51,7 @@ def test_the_grip_comes_back_when_the_load_has_gone():
         hand.plant.apply_load(0.0, 0.0)
         hand.watch(4.0)
         assert hand.mode == "holding"
-        # A load that goes while the joints close is partly taken for a stiffer tip.
+        # If the load is removed while the joints close, part of it is attributed to a stiffer tip.
         assert hand.plant.force.mean() == pytest.approx(FORCE, rel=0.1)
 
 
@@ -64,7 +64,7 @@ def test_the_grip_comes_back_when_the_load_has_gone():
         pytest.param(2.0, {}, marks=pytest.mark.extended),
     ],
 )
-def test_turning_alone_raises_nothing(force, sections):
+def test_turning_alone_does_not_increase_the_force(force, sections):
     with Hand(sections) as hand:
         grasped(hand, force)
         for angle in (0.17, -0.17, 0.0):
@@ -73,12 +73,12 @@ def test_turning_alone_raises_nothing(force, sections):
             assert seen.force.mean(axis=1).max() < (1.1 + 2.0 * KNOWN) * force
 
 
-def test_an_object_that_turns_in_the_grip_is_gripped_more_firmly():
+def test_an_object_that_twists_in_the_grip_is_gripped_with_more_force():
     for raised, held in ((0.0, False), (10.0, True)):
         with Hand({"control": {"grip_raise_max": raised}}) as hand:
             grasped(hand)
             start = hand.plant.object_pose[2]
-            # Both tips' friction bears about 0.25 N·m over the object's width.
+            # The friction of both tips resists about 0.25 N·m over the object's width.
             for k in range(1, 76):
                 hand.plant.apply_load(0.0, 0.0, 0.4 * k / 75)
                 hand.watch(0.02)
@@ -89,7 +89,7 @@ def test_an_object_that_turns_in_the_grip_is_gripped_more_firmly():
 
 
 class GripUnderLoad:
-    """A grip of a made-up object, whose loads are set."""
+    """A grip of an imaginary object with prescribed loads."""
 
     def __init__(self, asked: float = FORCE, **control: float) -> None:
         self.held = held = GraspState()
@@ -112,9 +112,9 @@ class GripUnderLoad:
         speed: float = 0.0,
         sense: float = 1.0,
     ) -> float:
-        """So many ticks under a load, joints closing with ``speed``; the force [N] gone to.
+        """Run ``ticks`` under a load with joints closing at ``speed``; return the goal force [N].
 
-        ``sense``: what the right joint shows and does of the left one's; -1 is a twist.
+        ``sense`` is the ratio of the right joint's values to the left one's; -1 is a twist.
         """
         torque = self.held.load_arm * load
         self.held.torque_residual = [torque, sense * torque]
@@ -124,13 +124,13 @@ class GripUnderLoad:
         return self.grip.target
 
 
-def test_what_friction_may_be_is_not_a_load_and_what_it_can_not_is():
-    watched = GripUnderLoad(friction_speed=1e6)  # nothing is given for what closing takes
+def test_a_load_is_detected_only_beyond_joint_friction():
+    watched = GripUnderLoad(friction_speed=1e6)  # no correction for the friction of closing joints
     watched.run(1.5, 500, holding=False)
     watched.grip.begin_holding()
     assert watched.run(1.5, 500) == FORCE
     assert watched.grip.slip.load == 0.0
-    # As much more as friction may hide of it.
+    # The detected load is increased by the amount that friction may hide.
     for load in np.linspace(1.5, 6.0, 500):
         watched.run(load, 1)
     found = watched.run(6.0, 500)
@@ -139,7 +139,7 @@ def test_what_friction_may_be_is_not_a_load_and_what_it_can_not_is():
 
 
 def at_rest(asked: float = FORCE) -> GripUnderLoad:
-    """A grip that has been held for a while."""
+    """Return a grip that has been held for a while."""
     watched = GripUnderLoad(asked, friction_speed=1e6)
     watched.run(0.0, 500, holding=False, normal=asked)
     watched.grip.begin_holding()
@@ -147,12 +147,12 @@ def at_rest(asked: float = FORCE) -> GripUnderLoad:
     return watched
 
 
-GIVES_WAY = -0.024  # rad/s, a count
+GIVES_WAY = -0.024  # rad/s, one count
 
 
-def test_a_load_that_comes_at_once_raises_the_grip_at_once_by_all_it_may():
+def test_a_sudden_load_immediately_raises_the_grip_by_the_maximum():
     watched = at_rest()
-    # What moves no joint is a frame's error, and so little that friction holds it is no danger.
+    # Without joint motion it is a frame error, and a load within friction is harmless.
     assert watched.run(3.0 * FRICTION, 1) == FORCE
     watched = at_rest()
     assert watched.run(0.8 * FRICTION, 1, speed=GIVES_WAY) == FORCE
@@ -160,16 +160,16 @@ def test_a_load_that_comes_at_once_raises_the_grip_at_once_by_all_it_may():
     assert watched.run(2.0 * FRICTION, 1, speed=GIVES_WAY) == FORCE + 10.0
     state = watched.grip._state
     assert state.grip_force > 1.15 * (FORCE + 10.0), "at the same tick"
-    # As much as the torque constants' error, friction and the load may take, and no more.
+    # At most the sum of torque constant error, friction and load.
     most = (FORCE + 10.0) * 1.2 + (0.05 + 0.03 * state.slip.load) / 0.079
     assert state.grip_force <= most + 1e-9
-    # The force felt comes up: the controller holds what the reflex gave.
+    # The measured force rises, so the controller now holds the force set by the reflex.
     watched.held.force = [FORCE + 10.0] * 2
     watched.run(2.0 * FRICTION, 1)
     assert state.grip_force == pytest.approx(FORCE + 10.0, rel=0.03)
 
 
-def test_a_twist_that_comes_at_once_raises_the_grip_at_once():
+def test_a_sudden_twist_immediately_raises_the_grip():
     for speed, raised in ((0.0, 0.0), (-GIVES_WAY, 0.0), (GIVES_WAY, 10.0)):
         watched = at_rest()
         assert watched.run(2.0 * FRICTION, 1, speed=speed, sense=-1.0) == FORCE + raised
@@ -177,8 +177,8 @@ def test_a_twist_that_comes_at_once_raises_the_grip_at_once():
     assert watched.run(0.8 * FRICTION, 1, speed=GIVES_WAY, sense=-1.0) == FORCE
 
 
-def test_a_load_that_stands_leaves_less_to_come():
-    """With 3 N on each tip, a third of what alone would be no danger is one."""
+def test_a_constant_load_leaves_less_margin_for_a_sudden_one():
+    """With 3 N on each tip, a third of an otherwise harmless load triggers the reflex."""
     watched = at_rest()
     for load in np.linspace(0.0, 3.0, 500):
         watched.run(load, 1)
@@ -187,16 +187,16 @@ def test_a_load_that_stands_leaves_less_to_come():
 
 
 @pytest.mark.parametrize("kind", ["pull_shear", "twist_shear"])
-def test_solid_tips_show_a_load_by_themselves(kind):
+def test_shear_of_solid_tips_reveals_a_load(kind):
     watched = at_rest()
     setattr(watched.held, kind, -1.0)
     assert watched.run(0.0, 500) == FORCE
-    setattr(watched.held, kind, -3.5)  # one that comes at once is more than half of what is borne
+    setattr(watched.held, kind, -3.5)  # a sudden load exceeds half of the capacity
     assert watched.run(0.0, 1) == FORCE + 10.0
 
 
-def test_what_one_joint_alone_shows_is_no_sudden_load():
-    """A current that is read wrongly, or a joint that is dead."""
+def test_a_load_on_one_joint_alone_is_not_a_sudden_load():
+    """It is caused by a current measurement fault or a failed joint."""
     watched = at_rest()
     for torque in (0.3, -0.3, 0.3):
         watched.held.torque_residual = [0.0, torque]
@@ -208,23 +208,24 @@ def test_what_one_joint_alone_shows_is_no_sudden_load():
 @pytest.mark.parametrize(
     ("shown", "raised"), [((0.3, 0.3), True), ((0.6, 0.0), False), ((0.6, -0.2), False)]
 )
-def test_a_turn_that_one_tip_alone_shows_is_not_believed(shown, raised):
-    """Its image is mirrored or has shifted."""
+def test_a_turn_seen_by_one_tip_alone_is_ignored(shown, raised):
+    """The image of this tip is mirrored or shifted."""
     watched = at_rest()
     watched.held.unexplained_rotation = list(shown)
     assert (watched.run(0.0, 1) > FORCE) == raised
 
 
 @pytest.mark.parametrize("force", [5.0, 10.0])
-def test_noise_of_the_currents_is_no_load_and_a_load_in_it_is(force):
-    """30 mA on each, for a minute; a load towards the palm is the hardest to see."""
+def test_current_noise_is_not_a_load_but_does_not_hide_one(force):
+    """30 mA on each joint for a minute; a load towards the palm is the hardest to detect."""
     rng = np.random.default_rng(1)
     watched = at_rest(force)
     watched.held.load_arm, watched.held.load_curvature = 0.025, 0.02 / force
     noise = 0.030 * 1.78 * rng.standard_normal((30_000, 2))
     for tick, pair in enumerate(noise.tolist()):
         watched.held.torque_residual = pair
-        watched.grip.torques(Reading(), ObjectPose(), tick > 500)  # it was there before the grip
+        # The load was present before the grip.
+        watched.grip.torques(Reading(), ObjectPose(), tick > 500)
         assert watched.grip.target == force
     watched.held.torque_residual = [0.35, 0.35]
     watched.grip.torques(Reading(dq=[GIVES_WAY, GIVES_WAY]), ObjectPose(), True)
@@ -232,7 +233,7 @@ def test_noise_of_the_currents_is_no_load_and_a_load_in_it_is(force):
 
 
 def standing(load: float, asked: float = 4.0) -> GripUnderLoad:
-    """A grip under a load that has come slowly, while no joint moved."""
+    """Return a grip under a load that increased slowly without joint motion."""
     watched = at_rest(asked)
     for part in np.linspace(0.0, load, 500):
         watched.run(part, 1, normal=asked)
@@ -240,7 +241,7 @@ def standing(load: float, asked: float = 4.0) -> GripUnderLoad:
     return watched
 
 
-def test_torque_alone_raises_a_grip_by_three_tenths_unless_it_is_more_than_friction_can_hold():
+def test_torque_alone_raises_a_grip_by_30_percent_unless_the_load_exceeds_friction():
     assert standing(1.7 * FRICTION).grip.target == pytest.approx(1.3 * 4.0)
     assert standing(3.0 * FRICTION).grip.target > 1.5 * 4.0
     declared = GripUnderLoad(4.0, object_load=6.0)
@@ -248,7 +249,7 @@ def test_torque_alone_raises_a_grip_by_three_tenths_unless_it_is_more_than_frict
     assert declared.run(0.0, 500) == pytest.approx(0.5 * 6.0 / (0.6 * 0.8))
 
 
-def test_friction_that_the_approach_has_shown_hides_as_much():
+def test_friction_identified_during_the_approach_limits_load_detection():
     for shown, raised in ((0.05, True), (0.2, False), (5.0, False)):
         watched = GripUnderLoad(friction_speed=1e6)
         watched.held.free_torque = [shown, shown]
@@ -260,7 +261,7 @@ def test_friction_that_the_approach_has_shown_hides_as_much():
         assert watched.grip.slip.friction == pytest.approx(min(shown, 0.3))
 
 
-def test_a_channel_that_is_named_ends_what_it_raised():
+def test_a_faulty_channel_cancels_the_force_increase_it_caused():
     watched = at_rest()
     assert watched.run(2.0 * FRICTION, 1, speed=GIVES_WAY) == FORCE + 10.0
     watched.held.sensor_fault = True
@@ -268,7 +269,7 @@ def test_a_channel_that_is_named_ends_what_it_raised():
     assert not watched.grip.slip.reflex_triggered
 
 
-def test_the_raise_is_bounded_by_its_setting_and_by_the_force_that_is_a_fault():
+def test_the_force_increase_is_limited_by_its_setting_and_the_force_limit():
     for more, share, expected in (
         *((2.0, 10.0, 12.0), (100.0, 10.0, 27.0), (0.0, 10.0, 10.0)),
         (10.0, 0.5, 15.0),
@@ -278,7 +279,7 @@ def test_the_raise_is_bounded_by_its_setting_and_by_the_force_that_is_a_fault():
         assert watched.run(50.0, 500) == pytest.approx(expected)
 
 
-def test_a_grip_weaker_than_what_friction_hides_is_not_raised_on_torques():
+def test_a_grip_force_below_the_friction_limit_is_not_raised_by_torques():
     watched = GripUnderLoad(2.0)
     watched.held.normal = [2.0, 2.0]
     watched.grip.begin_holding()
@@ -287,7 +288,7 @@ def test_a_grip_weaker_than_what_friction_hides_is_not_raised_on_torques():
     assert watched.run(4.0, 1, holding=False, normal=2.0) == 12.0
 
 
-def test_no_load_shows_before_holding_begins_and_friction_that_turns_round_is_none():
+def test_no_load_is_detected_before_holding_or_when_friction_reverses():
     watched = GripUnderLoad()
     assert {watched.run(20.0, 1, holding=False) for _ in range(500)} == {FORCE}
     watched.run(2.0, 500, holding=False)
@@ -309,7 +310,7 @@ def some_held(generator: np.random.Generator, force: float) -> GraspState:
     return held
 
 
-def test_late_frames_leave_the_push_and_let_a_turn_come_to_rest():
+def test_late_frames_keep_the_force_and_let_a_turn_stop():
     generator = np.random.default_rng(6)
     held = some_held(generator, 8.0)
     grip = Grip(Settings(), [0, 1], held)
@@ -328,7 +329,7 @@ def test_late_frames_leave_the_push_and_let_a_turn_come_to_rest():
 
 
 @pytest.mark.parametrize("finger", [0, 1])
-def test_one_finger_presses_and_the_other_gets_nothing(finger):
+def test_one_finger_alone_presses_with_the_requested_force(finger):
     settings = Settings.model_validate({"scene": {"fingers": (("left", "right")[finger],)}})
     held, closing = some_held(np.random.default_rng(7), 5.0), Reading()
     grip = Grip(settings, [finger], held)

@@ -1,4 +1,4 @@
-"""Some sequences of the soak: what must hold does, and the soak would see it if it did not."""
+"""Some soak sequences: requirements hold, and the soak detects violations."""
 
 import math
 from collections.abc import Iterator
@@ -30,7 +30,7 @@ def holding(soak: Soak) -> Soak:
     ("sequences", "unjudged"),
     [(2, 10), pytest.param(12, 5, marks=pytest.mark.extended)],
 )
-def test_sequences_hold_and_break_nothing(sequences, unjudged):
+def test_sequences_hold_without_violations(sequences, unjudged):
     account = Account()
     for seed in range(sequences):
         sequence(seed, 4000, account)
@@ -40,7 +40,7 @@ def test_sequences_hold_and_break_nothing(sequences, unjudged):
     assert f"{4000 * sequences} ticks" in "\n".join(account.lines())
 
 
-def test_a_sequence_is_the_same_again():
+def test_a_sequence_is_reproducible():
     first, again = Account(), Account()
     sequence(5, 1500, first)
     sequence(5, 1500, again)
@@ -56,7 +56,7 @@ def test_a_sequence_is_the_same_again():
         ((0.0, math.nan), (0.0, 0.0)),
     ],
 )
-def test_a_goal_beyond_its_limits_is_seen(soak, q, current):
+def test_a_goal_beyond_its_limits_is_detected(soak, q, current):
     servos = soak.servos
     servos.torque_on()
     servos.armed = True
@@ -66,12 +66,12 @@ def test_a_goal_beyond_its_limits_is_seen(soak, q, current):
     assert servos.torque_off(Reading())
 
 
-def test_torque_after_a_stop_is_seen(soak):
+def test_torque_after_a_stop_is_detected(soak):
     holding(soak)
     control = soak.daemon.loop._control
     before = control.state
     soak.daemon.loop.command({"command": "stop"})
-    control.state = before  # as if it had not been heard
+    control.state = before  # as if the stop had been missed
     soak._carried_out({"command": "stop"}, "holding")
     with pytest.raises(AssertionError, match="after a stop while holding: a motor is driven"):
         soak.run(3)
@@ -79,7 +79,7 @@ def test_torque_after_a_stop_is_seen(soak):
         soak.servos.write(Goal(valid=True))
 
 
-def test_old_readings_and_frames_are_seen(soak):
+def test_old_readings_and_frames_are_detected(soak):
     holding(soak)
     soak.sensors[0].last_sent -= 0.2
     with pytest.raises(AssertionError, match="old frame"):
@@ -89,7 +89,7 @@ def test_old_readings_and_frames_are_seen(soak):
         soak._judge_ages("holding")
 
 
-def test_a_force_that_nothing_calls_for_is_seen(soak):
+def test_an_unjustified_force_is_detected(soak):
     holding(soak)
     t, asked = soak._asked[-1]
     soak._asked[-1] = t, 0.5 * asked
@@ -97,14 +97,14 @@ def test_a_force_that_nothing_calls_for_is_seen(soak):
         soak.run(300)
 
 
-def test_a_name_is_judged_by_what_was_made_wrong(soak):
+def test_reported_channels_are_compared_with_the_actual_faults(soak):
     holding(soak)
     soak.run(600)
     soak._false.add("left_sensor")
     soak._hear("warning", "witness.left_sensor", "")
     with pytest.raises(AssertionError, match="right_sensor named"):
         soak._hear("warning", "witness.right_sensor", "")
-    soak.hand.object_pose[1] += 0.02  # the object's edge lies under the tips
+    soak.hand.object_pose[1] += 0.02  # the object's edge is at the tips
     soak.hand.refresh()
     soak._judge_sensor_faults("holding")
     soak._hear("warning", "witness.right_sensor", "")

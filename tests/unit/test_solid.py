@@ -1,4 +1,4 @@
-"""A tip of solid rubber: its table, its frames, the estimator on them, a hand with such tips."""
+"""Solid rubber tips: table, frames, estimation, and a hand with such tips."""
 
 import json
 import math
@@ -32,13 +32,13 @@ every = pytest.mark.parametrize("tip", TIPS, ids=lambda tip: f"{tip.base}-{tip.f
 
 
 @every
-def test_the_partials_are_those_of_one_energy(tip):
+def test_partial_derivatives_belong_to_one_energy(tip):
     table = ContactTable.build(tip, RUBBER)
     d, theta = np.meshgrid([0.4e-3, 3e-3, 7.5e-3], [-0.6, -0.1, 0.0, 0.3])
     c, h = table(d, theta), 1e-6
     assert c.inside.all()
     if tip.face == "sticking":
-        # A shear up the slope adds to the force on the base, the more the steeper.
+        # Shear up the slope increases the force on the base, more so at larger tilts.
         held = c.force / (np.cos(theta) * c.energy_d) - 1.0
         assert held[2] == pytest.approx(0.0, abs=1e-12)
         assert (held[0] < 0.2).all()
@@ -55,15 +55,16 @@ def test_the_partials_are_those_of_one_energy(tip):
             size = np.abs(slope).max()
             assert getattr(c, f"{name}_{field}") == pytest.approx(slope, rel=1e-5, abs=1e-6 * size)
     one = table(float(d[1, 1]), float(theta[1, 1]))
-    # In a loop a compiler may fuse other products with their sums.
+    # In a loop, the compiler may fuse different products with their sums.
     assert one[:6] == pytest.approx([float(each[1, 1]) for each in c[:6]], rel=1e-12)
 
 
 @every
-def test_small_contacts_are_hertzs_and_large_ones_end_where_the_data_do(tip):
+def test_small_contacts_are_hertzian_and_large_ones_end_with_the_data(tip):
     table = ContactTable.build(tip, RUBBER)
     stiffness = 4.0 / 3.0 * 0.304e6 / (1.0 - tip.poisson**2) * math.sqrt(tip.radius)
-    # What confines the rubber raises the force with the contact's radius over a, √(d/a).
+    # Confinement of the rubber increases the force in proportion to the contact radius over a,
+    # √(d/a).
     ratios = [float(table(d, 0.0).force) / (stiffness * d**1.5) for d in (1e-8, 1e-7)]
     assert ratios == pytest.approx([1.0, 1.0], abs=0.01)
     end = table(0.008, 0.0)
@@ -78,7 +79,7 @@ def test_small_contacts_are_hertzs_and_large_ones_end_where_the_data_do(tip):
     assert math.isnan(table(math.nan, 0.1).force)
 
 
-def test_the_cells_sum_to_the_force_whatever_the_grid_and_the_azimuth():
+def test_cells_sum_to_the_force_for_any_grid_and_azimuth():
     tip, d, theta = TIPS[0], 0.005, 0.35
     force = float(ContactTable.build(tip, RUBBER)(d, theta).force)
     shifted = SensorGrid(50, 40, (0.0014, 0.0011), centre=(7e-4, -3e-4))
@@ -100,7 +101,7 @@ def test_the_cells_sum_to_the_force_whatever_the_grid_and_the_azimuth():
 @pytest.mark.usefixtures("exact_solid_data")
 @every
 @pytest.mark.parametrize("counts", [False, True])
-def test_the_estimate_is_at_its_bound_whatever_the_shear(tip, counts):
+def test_the_estimate_reaches_its_bound_for_any_shear(tip, counts):
     rng = np.random.default_rng(3)
     estimator = ContactEstimator(tip, RUBBER, GRID, NOISE)
     press, table = SolidPressure(tip, RUBBER, GRID.images(tip)), ContactTable.build(tip, RUBBER)
@@ -123,11 +124,11 @@ def test_the_estimate_is_at_its_bound_whatever_the_shear(tip, counts):
                 assert [found.shear_x, found.shear_y] == pytest.approx(shear, rel=0.01, abs=0.1)
                 error = [found.d - d, found.tilt_x - tilt_x, found.tilt_y - tilt_y]
                 squares.append(error @ np.linalg.solve(found.covariance[:3, :3], error) / 3.0)
-    # 96 frames of three numbers: 1 ± 0.08, and more where cells that are pulled tell nothing.
+    # 96 frames of three values: 1 ± 0.08, more where cells in tension carry no information.
     assert 0.7 < np.mean(squares) < 1.4
 
 
-def test_frames_of_other_elements_are_estimated_as_what_they_are():
+def test_frames_of_other_elements_are_estimated_correctly():
     rng = np.random.default_rng(6)
     with np.load(Path(__file__).parents[1] / "golden" / "solid_frames.npz") as file:
         known = {name: file[name] for name in file.files}
@@ -148,7 +149,7 @@ def test_frames_of_other_elements_are_estimated_as_what_they_are():
             error = [found.d - d, found.tilt_x - theta, found.tilt_y]
             squares.append(error @ np.linalg.solve(found.covariance[:3, :3], error) / 3.0)
             upright += [squares[-1]] if theta == 0.0 else []
-            # Within the aims, or within the noise where that hides them: at 0.5 and 1 mm.
+            # Within the aims, or within the noise if it dominates, at 0.5 and 1 mm.
             turned = math.radians(1.5) + 3.0 * found.tilt_x_std
             assert found.d == pytest.approx(d, rel=0.05, abs=3.0 * found.d_std)
             assert math.hypot(*error[1:]) < turned
@@ -158,7 +159,7 @@ def test_frames_of_other_elements_are_estimated_as_what_they_are():
     assert 0.6 < np.mean(upright) < 1.3
 
 
-def test_noise_at_the_data_s_end_takes_no_estimate_out_of_it():
+def test_noise_at_the_end_of_the_data_keeps_estimates_in_range():
     rng = np.random.default_rng(9)
     for tip in TIPS:
         estimator = ContactEstimator(tip, RUBBER, GRID, NOISE)
@@ -171,7 +172,7 @@ def test_noise_at_the_data_s_end_takes_no_estimate_out_of_it():
                 assert found.d <= 0.008
 
 
-def test_noise_and_shifted_zeros_are_no_contact():
+def test_noise_and_shifted_zero_offsets_are_not_a_contact():
     rng = np.random.default_rng(4)
     estimator = ContactEstimator(TIPS[0], RUBBER, GRID, NOISE)
     for _ in range(300):
@@ -182,7 +183,7 @@ def test_noise_and_shifted_zeros_are_no_contact():
     assert estimator(GRID.pressure(TIPS[0], RUBBER, 0.4e-3) + noise).contact
 
 
-def test_dead_full_and_lone_cells_are_left_out():
+def test_dead_saturated_and_isolated_cells_are_excluded():
     rng = np.random.default_rng(5)
     active = rng.random(GRID.shape) > 0.1
     active[8, 20] = True
@@ -199,7 +200,7 @@ def test_dead_full_and_lone_cells_are_left_out():
     assert (np.abs(error) < 4.0 * np.sqrt(np.diag(found.covariance)[:3])).all()
 
 
-def test_another_tips_frame_is_a_misfit():
+def test_a_frame_of_another_tip_is_a_misfit():
     estimator = ContactEstimator(TIPS[0], RUBBER, GRID, NOISE)
     springs = GRID.pressure(Fingertip(0.020), RUBBER, 0.004, 0.2)
     found = estimator(springs)
@@ -207,7 +208,7 @@ def test_another_tips_frame_is_a_misfit():
     assert found.misfit or not found.valid
 
 
-def test_a_smooth_misfit_widens_what_it_says():
+def test_a_smooth_misfit_increases_the_uncertainty():
     rng, squares = np.random.default_rng(8), []
     estimator = ContactEstimator(TIPS[0], RUBBER, GRID, NOISE)
     frame = GRID.pressure(replace(TIPS[0], base="lying"), RUBBER, 0.006, 0.2)
@@ -236,7 +237,7 @@ def test_a_hand_with_solid_tips_grasps_turns_and_releases(make):
             assert contact.d == pytest.approx(hand.d[finger], abs=5.0 * contact.d_std)
             assert contact.theta == pytest.approx(hand.theta[finger], abs=math.radians(0.3))
             assert contact.force == pytest.approx(hand.force[finger], rel=0.06)
-            # As it acts on the face, of which the base feels what it does at the height a.
+            # Shear on the face; the base measures its moment over the height a.
             shear = hand.tangential[finger] * (1.0 - hand.d[finger] / 0.020)
             assert abs(shear) > 0.2
             assert contact.shear_x == pytest.approx(shear, abs=0.15)
@@ -249,8 +250,8 @@ def test_a_hand_with_solid_tips_grasps_turns_and_releases(make):
 
 
 @pytest.mark.extended
-def test_turning_to_and_fro_leaves_a_solid_tips_force_as_it_was(make):
-    """Rolling moves d by what the joints don't tell well: it must not be taken for a gain."""
+def test_turning_back_and_forth_does_not_change_the_force_of_a_solid_tip(make):
+    """Rolling changes d in a way that joints hardly show; it must not be attributed to the gain."""
     daemon = make(**load(Path("solid")).model_dump(exclude={"loop"}))
     grasped(daemon, 10.0)
     daemon.loop.advance(1.0)
@@ -261,7 +262,7 @@ def test_turning_to_and_fro_leaves_a_solid_tips_force_as_it_was(make):
         assert float(np.mean(hand.force)) == pytest.approx(10.0, rel=0.05)
 
 
-def test_a_profile_that_no_solid_tip_has_is_refused():
+def test_unsuitable_profiles_of_a_solid_tip_are_refused():
     from softfinger.daemon.profile.validation import problems
 
     def wrong(**sections: dict[str, object]) -> list[str]:
@@ -279,7 +280,7 @@ def test_a_profile_that_no_solid_tip_has_is_refused():
 
 
 def _odd_frames() -> dict[str, np.ndarray]:
-    """Strong signals that no contact of a solid tip makes."""
+    """Return strong signals that are impossible for a solid tip's contact."""
     (pitch, _), shape = GRID.pitches, GRID.shape
     y, x = (np.indices(shape) - 0.5 * (np.array(shape)[:, None, None] - 1.0)) * pitch
     radius = np.hypot(x, y)
@@ -297,7 +298,7 @@ ODD = _odd_frames()
 
 
 @pytest.mark.parametrize("frame", ODD.values(), ids=ODD)
-def test_a_strong_signal_is_never_no_contact(frame):
+def test_a_strong_signal_is_never_reported_as_no_contact(frame):
     rng = np.random.default_rng(6)
     estimator = ContactEstimator(TIPS[0], RUBBER, GRID, NOISE)
     for _ in range(20):
@@ -307,14 +308,14 @@ def test_a_strong_signal_is_never_no_contact(frame):
 
 
 @pytest.mark.parametrize(("kind", "scale"), [(np.uint8, 300.0), (np.uint16, 4.0)])
-def test_a_sensor_that_is_full_everywhere_is_saturated(kind, scale):
+def test_a_completely_saturated_sensor_is_reported_as_saturated(kind, scale):
     estimator = ContactEstimator(TIPS[0], RUBBER, GRID, NOISE)
     found = estimator(np.full(GRID.shape, np.iinfo(kind).max, kind), scale)
     assert (found.contact, found.invalid) == (True, Invalid.SATURATED)
 
 
 @pytest.mark.parametrize("times", [4.0, 6.0, 10.0])
-def test_heavy_noise_is_not_taken_for_a_free_tip(times):
+def test_strong_noise_is_not_mistaken_for_no_contact(times):
     rng = np.random.default_rng(7)
     estimator = ContactEstimator(TIPS[0], RUBBER, GRID, NOISE)
     found = [estimator(times * NOISE * rng.standard_normal(GRID.shape)).invalid for _ in range(50)]

@@ -1,4 +1,4 @@
-"""The solid tip's data file and its finite elements, against another finite element method."""
+"""The solid tip's data file and finite elements, against another finite element method."""
 
 from pathlib import Path
 
@@ -13,11 +13,11 @@ from research.solid_tip.green import Meridian
 FILE = Path(contact.__file__).parent / "solid_tip.npz"
 REFERENCE = Path(__file__).parents[1] / "golden" / "solid_frames.npz"
 BASES = ("bonded", "lying", "bonded-sticking", "lying-sticking")
-PITCH, CELLS, MM = 58.0 / 44 / 20.0, 44, 1 / 20.0  # in radii
+PITCH, CELLS, MM = 58.0 / 44 / 20.0, 44, 1 / 20.0  # in tip radii
 
 
 def centroid_and_extent(frame: NDArray[np.float64], pitch: float) -> tuple[float, float, float]:
-    """Centroid along x, and extents σ_x and σ_y, of a frame as the sensor sees it."""
+    """Return a frame's centroid along x and its extents σ_x and σ_y, as measured."""
     place = (np.arange(len(frame)) - (len(frame) - 1) / 2) * pitch
     total = frame.sum()
     x, y2 = (frame.sum(axis=0) @ place) / total, (frame.sum(axis=1) @ place**2) / total
@@ -34,9 +34,9 @@ def tips(arrays: dict[str, np.ndarray]) -> list[SolidTip]:
     return [SolidTip(arrays, base, poisson) for base in BASES for poisson in (*NU, 0.49)]
 
 
-# Of elements of another kind: triangles and tetrahedra, quadratic displacements with linear
-# pressures (Taylor and Hood), and a plane that pushes by a penalty within the faces' points.
-# Neo-Hookean, bonded, ν = 0.49, a = 20 mm, E = 0.304 MPa.
+# From a different method: triangles and tetrahedra with quadratic displacements and linear
+# pressures (Taylor-Hood), and a plane with a penalty at points within the faces. Neo-Hookean,
+# bonded, ν = 0.49, a = 20 mm, E = 0.304 MPa.
 TAYLOR_HOOD = [  # d [mm], θ [°], N [N], tolerance
     (0.9985, 0, 2.8482, 3e-3),
     (1.9979, 0, 8.9695, 3e-3),
@@ -51,14 +51,14 @@ TAYLOR_HOOD = [  # d [mm], θ [°], N [N], tolerance
 
 
 @pytest.mark.parametrize(("d", "tilt", "force", "tolerance"), TAYLOR_HOOD)
-def test_forces_of_other_elements(arrays, d, tilt, force, tolerance):
+def test_forces_match_taylor_hood_elements(arrays, d, tilt, force, tolerance):
     tip = SolidTip(arrays, "bonded", 0.49)
     push = tip.press(d * MM, np.radians(tilt))[0]
     assert push * 0.304 * 20**2 == pytest.approx(force, rel=tolerance)
 
 
 @pytest.mark.parametrize("d", [1, 4, 6])
-def test_the_extent_hardly_tells_the_depth(arrays, d):
+def test_the_extent_hardly_depends_on_the_depth(arrays, d):
     tip = SolidTip(arrays, "bonded", 0.49)
     pressure = tip.press(d * MM, 0.0)[2]
     _, _, sigma = centroid_and_extent(tip.frame(pressure, PITCH, CELLS), PITCH)
@@ -66,14 +66,14 @@ def test_the_extent_hardly_tells_the_depth(arrays, d):
 
 
 @pytest.mark.extended
-def test_frames_of_three_dimensional_elements(arrays):
-    """tests/harness/solid_reference.py: other meshes, and no fit."""
+def test_frames_match_three_dimensional_elements(arrays):
+    """The frames are from tests/harness/solid_reference.py, with other meshes and without a fit."""
     with np.load(REFERENCE) as data:
         names = ("base", "nu", "d", "theta", "push", "energy", "force", "frame")
         rows = list(zip(*(data[name] for name in names), strict=True))
     areas = np.pi * np.diff(arrays["ring_edges"] ** 2)
     place = (np.arange(CELLS) - (CELLS - 1) / 2) * PITCH
-    inner = np.hypot(*np.meshgrid(place, place)) < 0.94  # the rim's stress is singular
+    inner = np.hypot(*np.meshgrid(place, place)) < 0.94  # the stress at the rim is singular
     assert {str(row[0]) for row in rows} == set(BASES)
     assert max(row[3] for row in rows) > 0.2
     for base, poisson, d, theta, push, energy, force, frame in rows:
@@ -83,7 +83,7 @@ def test_frames_of_three_dimensional_elements(arrays):
         assert its_energy == pytest.approx(energy, rel=0.01)
         assert pressure[0] @ areas == pytest.approx(force, rel=0.01)
         mine = tip.frame(pressure, PITCH, CELLS)
-        # The three-dimensional meshes are coarse, at the rim above all.
+        # The three-dimensional meshes are coarse, especially at the rim.
         assert rms_difference(mine[inner], frame[inner]) < (0.07 if theta else 0.015)
         moments = centroid_and_extent(mine, PITCH), centroid_and_extent(frame, PITCH)
         np.testing.assert_allclose(*moments, rtol=0, atol=0.1 * MM)
@@ -93,7 +93,7 @@ THETA, D = np.radians(20.0), 0.25
 
 
 @pytest.mark.extended
-def test_a_linear_press_is_in_balance_and_a_sticking_one_stiffer():
+def test_a_linear_contact_is_at_equilibrium_and_a_sticking_one_is_stiffer():
     from research.solid_tip.contact import TiltedPlane
     from research.solid_tip.fit import RING_EDGES, Samples
     from research.solid_tip.green import green
@@ -111,7 +111,7 @@ def test_a_linear_press_is_in_balance_and_a_sticking_one_stiffer():
     assert -0.1 < stuck.shear / stuck.push < -0.05
 
 
-def test_neo_hookean_elements_press_as_the_data_file_says():
+def test_neo_hookean_elements_match_the_data_file():
     pytest.importorskip("pypardiso")
     from research.solid_tip.rubber import MIDDLES, Body
 

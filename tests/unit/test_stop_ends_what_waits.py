@@ -1,8 +1,8 @@
-"""Whatever arrived before a stop dies with it, wherever it waits: any interleaving of any clients.
+"""A stop cancels all requests that arrived before it, in any order of events and clients.
 
-Clients, gateway and loop act one at a time in an order that hypothesis chooses. What libzmq has
-taken in stands in a list, of which the gateway reads little at a time. So a request may wait in its
-connection, in the gateway, on the link, or in the loop's hands when a stop is carried out.
+Clients, gateway and loop act one at a time in an order that hypothesis chooses. Requests received
+by libzmq are in a list from which the gateway reads few at a time. When a stop is executed, a
+request may therefore wait in its connection, in the gateway, on the link, or in the loop.
 """
 
 from collections import deque
@@ -30,23 +30,23 @@ action = st.one_of(
 
 
 class Scene:
-    """Counts what happens; an ``arm`` is told apart by the count when it was first sent."""
+    """Counts events; an ``arm`` is identified by the count at which it was first sent."""
 
     def __init__(self, folder: str) -> None:
         self.clock = VirtualClock()
         self.arrived: deque[list[zmq.Frame]] = deque()
         self.replies: list[dict[str, Any]] = []
         self.served = Served(commands=f"ipc://{folder}/c", per_second=1e6, clock=self.clock)
-        self.reading = 0.4 * bounds.TURN_TIME  # s that a message takes: few at a look
+        self.reading = 0.4 * bounds.TURN_TIME  # s to read a message, so only few are read per step
         self.now = 0
         self.stopped_at = 0
         self.asked = 0
-        self.last: dict[int, float] = {}  # each client's last arm, which it may send again
+        self.last: dict[int, float] = {}  # last arm of each client, which may be sent again
         self.carried_out: set[float] = set()
         self.busy = False
 
     def read(self) -> list[zmq.Frame]:
-        """In the place of libzmq's socket."""
+        """Replace libzmq's socket."""
         self.pass_time(self.reading)
         return self.arrived.popleft() if self.arrived else []
 
@@ -97,7 +97,7 @@ class Scene:
 
 @contextmanager
 def played() -> Iterator[Scene]:
-    """A scene whose gateway reads and answers in the scene's own way."""
+    """Yield a scene whose gateway reads and replies through the scene."""
     with TemporaryDirectory() as folder:
         scene = Scene(folder)
         with (
@@ -109,16 +109,16 @@ def played() -> Iterator[Scene]:
 
 
 @given(st.lists(action, max_size=60))
-def test_nothing_that_arrived_before_a_stop_is_carried_out(actions):
+def test_no_request_from_before_a_stop_is_executed(actions):
     with played() as scene:
         for what, client in actions:
             scene.act(what, client)
-        for _ in range(100):  # all that was sent has been read, stops included
+        for _ in range(100):  # everything sent has been read, including stops
             scene.act("gateway")
             scene.act("loop")
         asked = scene.asked
         assert len(scene.replies) == asked, "every request is answered, and once"
-        # And what arrives after it is carried out.
+        # Later requests are executed.
         scene.ask(0, command="arm", force=1e9)
         for _ in range(3):
             scene.act("gateway")
@@ -126,8 +126,8 @@ def test_nothing_that_arrived_before_a_stop_is_carried_out(actions):
         assert scene.replies[asked:] == [{"ok": True}]
 
 
-def test_a_backlog_that_libzmq_hands_on_bit_by_bit_dies_with_a_stop():
-    """Nothing waits at times, and still most of what arrived before is to come."""
+def test_a_backlog_that_libzmq_delivers_slowly_is_cancelled_by_a_stop():
+    """At times no request is waiting, although most of the earlier ones are yet to be delivered."""
     with played() as scene:
         scene.reading = 1e-5
         scene.stopped_at = 2
@@ -150,8 +150,8 @@ def test_a_backlog_that_libzmq_hands_on_bit_by_bit_dies_with_a_stop():
         assert scene.replies[-1]["ok"]
 
 
-def test_a_flood_does_not_date_commands_by_a_gap_for_ever():
-    """No more can have waited than the connections hold, though the socket is never empty."""
+def test_a_flood_does_not_count_as_old_forever():
+    """Connections limit how many requests can have waited, even if the socket is never empty."""
     with (
         patch.object(bounds, "CLIENT_COUNT_MAX", 1),
         patch.object(bounds, "SOCKET_QUEUE_LENGTH", 20),

@@ -1,4 +1,4 @@
-"""The publisher on a real socket: what is on the wire, and subscribers of every kind."""
+"""The publisher on a real socket: wire format, and all kinds of subscribers."""
 
 import json
 from collections.abc import Iterator
@@ -69,7 +69,7 @@ def test_tactile_data_is_little_endian_uint16_row_major(context, addresses, serv
     assert (message["finger"], message["rows"], message["cols"]) == ("right", 3, 4)
 
 
-def test_topics_nobody_subscribes_to_are_not_wanted(context, addresses, served):
+def test_topics_without_subscribers_are_not_wanted(context, addresses, served):
     publisher = served.publisher
     served.settle()
     assert not publisher.wanted & bit(STATE)
@@ -80,7 +80,7 @@ def test_topics_nobody_subscribes_to_are_not_wanted(context, addresses, served):
     until(lambda: not wanted(served))
 
 
-def test_what_is_no_subscription_takes_none_from_others(context, addresses, served):
+def test_invalid_subscriptions_do_not_affect_others(context, addresses, served):
     listener = subscribe(context, addresses[0])
     until(lambda: wanted(served))
     other = context.socket(zmq.XSUB)
@@ -96,7 +96,7 @@ def test_what_is_no_subscription_takes_none_from_others(context, addresses, serv
     until(lambda: not wanted(served, EVENT))
 
 
-def test_a_stuck_subscriber_holds_up_nobody_and_its_queue_is_bounded(context, addresses):
+def test_a_stuck_subscriber_blocks_no_others_and_its_queue_is_bounded(context, addresses):
     with Served(addresses[0], queue=50) as served:
         publisher = served.publisher
         stuck = context.socket(zmq.SUB)
@@ -110,7 +110,7 @@ def test_a_stuck_subscriber_holds_up_nobody_and_its_queue_is_bounded(context, ad
         for seq in range(10_000):
             state.seq = seq
             publisher.send(STATE, state, BOTH)
-            served.service.step(0.0)  # would never return if it waited for the stuck one
+            served.service.step(0.0)  # would never return if it waited for the stuck subscriber
             while reading.poll(0):
                 reading.recv_multipart()
         kept = 0
@@ -120,7 +120,7 @@ def test_a_stuck_subscriber_holds_up_nobody_and_its_queue_is_bounded(context, ad
         assert kept < 10_000, "the stuck subscriber's queue has no bound"
 
 
-def test_a_subscriber_that_keeps_the_newest_state_alone_gets_it_in_one_frame(
+def test_a_subscriber_of_only_the_latest_state_gets_it_in_one_frame(
     context, addresses, tmp_path_factory
 ):
     latest = f"ipc://{tmp_path_factory.mktemp('s')}/latest"
@@ -149,12 +149,12 @@ def test_a_subscriber_that_keeps_the_newest_state_alone_gets_it_in_one_frame(
         assert topics == {STATE, EVENT}
 
 
-def test_who_comes_late_is_told_settings_and_events_again(context, addresses, served):
+def test_late_subscribers_receive_settings_and_events_again(context, addresses, served):
     publisher = served.publisher
     publisher.settings(98.0, 0.5, HandInfo("0.1.0", "{}", "", "", "{}", "{}"))
     for k in range(60):
         publisher.event(99.0 + k, 1.0 + k, "info", "mode", f"event {k + 1}")
-    served.settle()  # before anybody subscribes: that may be quicker
+    served.settle()  # before the first subscription, which may be faster
     early = subscribe(context, addresses[0])
     told: list[tuple[bytes, dict[str, Any]]] = []
 
@@ -169,35 +169,36 @@ def test_who_comes_late_is_told_settings_and_events_again(context, addresses, se
     assert told[0][1]["version"] == "0.1.0"
     assert [message["seq"] for _, message in told[1:]] == list(range(11, 61))
     assert all(message["again"] for _, message in told)
-    last = told[-1][1]  # with its own times, not those of the repetition
+    last = told[-1][1]  # original times
     assert (last["timestamp"], last["mono_ns"]) == (158.0, 60_000_000_000)
     assert (last["level"], last["kind"], last["text"]) == ("info", "mode", "event 60")
     told.clear()
     publisher.event(200.0, 100.0, "info", "mode", "new")
     until(lambda: tick(early) == 1)
     assert not told[0][1]["again"]
-    # A second subscriber, of one topic alone, is told that topic's.
+    # A second subscriber to a single topic receives only that topic again.
     told.clear()
     late = subscribe(context, addresses[0], b"hand/event")
     until(lambda: tick(late) == 50)
     assert {topic for topic, _ in told} == {b"hand/event"}
 
 
-def test_a_long_message_comes_in_pieces_and_whole(context, addresses, served):
+def test_a_long_message_is_sent_in_pieces_and_received_whole(context, addresses, served):
     facts = HandInfo("0.1.0", "x" * 150_000, "", "", "{}", "{}")
     grid = np.arange(256 * 256, dtype=np.uint16).reshape(256, 256)
     sensor = SensorInfo(0.002, 0.003, 0.0, 0.0, 0.0, "count", 4.0, False, "")
     served.publisher.settings(98.0, 0.5, facts)
-    served.settle()  # before anybody subscribes: else it comes twice
+    served.settle()  # before the first subscription; otherwise it is received twice
     socket = subscribe(context, addresses[0])
     assert receive(socket, served)[1]["settings"] == facts.settings
     served.publisher.send(TACTILE, Frame(7, 1.0, 1.25, True, grid), grid, 1, sensor, 99.0)
     assert receive(socket, served)[1]["data"] == grid.tobytes()
 
 
-def test_commands_are_told_to_those_who_ask(context, addresses, served):
+def test_commands_are_published_only_to_subscribers(context, addresses, served):
     publisher = served.publisher
-    publisher.command(99.0, 1.0, 500, {"command": "arm"}, "")  # nobody listens: no count either
+    # Without subscribers, the command is not even counted.
+    publisher.command(99.0, 1.0, 500, {"command": "arm"}, "")
     socket = subscribe(context, addresses[0], b"hand/command")
     until(lambda: wanted(served, COMMAND))
     publisher.command(99.0, 1.0, 501, {"command": "grasp", "force": 5.0, "client": "me"}, "no")

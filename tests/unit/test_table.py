@@ -1,4 +1,4 @@
-"""Contact tables: accuracy over the whole domain, the bound of it, forms, files, odd input."""
+"""Contact tables: accuracy over the entire domain, error bound, forms, files, special input."""
 
 import functools
 import math
@@ -29,7 +29,7 @@ HARD = {
     "s-shaped": Material.from_points(Y, 1e5 * (Y + 0.12 * np.sin(6.0 * Y))),
     "root": Material.from_points(Y, 1e5 * Y**0.7),
 }
-# In a loop a compiler may fuse other products with their sums than in a function that is called.
+# In a loop, the compiler may fuse different products with their sums than in a function call.
 FUSED = 1e-12
 OUTPUTS = ("force", "energy", "force_d", "force_theta", "energy_d", "energy_theta")
 
@@ -42,7 +42,7 @@ def table() -> ContactTable:
     return ContactTable.build(TIP, TABLE_I, 1e-9)
 
 
-# A law and a tolerance that lead to each number of pieces.
+# A law and a tolerance for each number of pieces.
 SPLITS = {
     1: (TABLE_I, 1e-6),
     2: (TABLE_I, 1e-9),
@@ -56,7 +56,7 @@ def split(pieces: int) -> ContactTable:
 
 
 def worst(table: ContactTable, material: Material, d: np.ndarray, theta: np.ndarray) -> float:
-    """Largest relative error of any output, as Certificate counts it; 0/0 is none."""
+    """Return the maximum relative error of any output, as in Certificate; 0/0 counts as 0."""
     found = table(d, theta)
     exact = integrate(table.tip, material, d, theta, nodes=40)
     errors = []
@@ -73,7 +73,7 @@ def worst(table: ContactTable, material: Material, d: np.ndarray, theta: np.ndar
 def hard_points(
     radius: float, points: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Random d [m] and θ [rad] over the domain, crowded at its edges and corners; its end first."""
+    """Return random d [m] and θ [rad], dense at edges and corners; the domain's end comes first."""
     which = rng.integers(0, 9, points)
     small = 10.0 ** rng.uniform(-9.0, -0.3, points)
     least = 10.0 ** rng.uniform(-16.0, -0.3, points)
@@ -105,7 +105,7 @@ def test_tolerance_holds_for_laws_from_points(name):
 
 
 @pytest.mark.parametrize("pieces", SPLITS)
-def test_no_table_errs_more_than_its_certificate_says_nor_much_less(pieces):
+def test_table_errors_are_below_their_certificate_but_close_to_it(pieces):
     table, (material, _) = split(pieces), SPLITS[pieces]
     assert table.form == f"springs, {pieces} a slab"
     certificate = table.certificate
@@ -118,7 +118,7 @@ def test_no_table_errs_more_than_its_certificate_says_nor_much_less(pieces):
     assert at >= (0.25 if error > 1e-12 else 0.0) * error
 
 
-def test_constant_modulus_is_the_closed_form():
+def test_a_constant_modulus_gives_the_closed_form():
     table = ContactTable.build(TIP, CONSTANT, 4e-15)
     assert table.form == "closed"
     d, theta = hard_points(TIP.radius, 4000, np.random.default_rng(1))
@@ -131,7 +131,7 @@ def test_constant_modulus_is_the_closed_form():
 
 
 @given(depth=st.floats(5e-8, 0.875), share=st.floats(-1.0, 1.0))
-def test_properties(table, depth, share):
+def test_symmetry_sign_and_monotonicity(table, depth, share):
     d = depth * TIP.radius
     theta = float(TIP.theta_limit(d)) * share
     c = table(d, theta)
@@ -148,8 +148,8 @@ def test_properties(table, depth, share):
 
 @pytest.mark.parametrize("modulus", [1.0, 1e9])
 @pytest.mark.parametrize("radius", [1e-4, 1.0])
-def test_other_radii_and_moduli_scale(table, radius, modulus):
-    """From 0.1 mm to 1 m and from 1 Pa to 1 GPa at zero strain."""
+def test_scaling_with_radius_and_modulus(table, radius, modulus):
+    """From 0.1 mm to 1 m, and from 1 Pa to 1 GPa at zero strain."""
     scale, share = radius / TIP.radius, Fraction(modulus) / TABLE_I.coefficients[0]
     other = Material(tuple(value * share for value in TABLE_I.coefficients))
     large = ContactTable.build(Fingertip(radius), other, 1e-9)
@@ -162,7 +162,7 @@ def test_other_radii_and_moduli_scale(table, radius, modulus):
         np.testing.assert_allclose(value, ratio * scale**power * expected, rtol=3e-12)
 
 
-def test_the_edges_of_pieces_are_seamless(table):
+def test_pieces_are_continuous_at_their_edges(table):
     edges = [*(0.125 * 2.0 ** (np.arange(13) / 4)), 0.15625, 0.1875, 0.25, 0.5, 0.75]
     for h in edges:
         d = TIP.radius * (1 - h * (1 + np.array([-1e-12, 0.0, 1e-12])))
@@ -171,19 +171,19 @@ def test_the_edges_of_pieces_are_seamless(table):
         assert worst(table, TABLE_I, d[keep], theta[keep]) < 1e-9
 
 
-def test_who_asks_outside_the_domain_is_warned(table):
+def test_lookups_outside_the_domain_cause_a_warning(table):
     d = np.array([-1e-3, 0.0, math.nan, 0.004, 0.018, 0.0175, 0.004])
     theta = np.array([0.0, 9.0, 0.0, 1.5, 0.0, 0.0, math.nan])
     with pytest.warns(RuntimeWarning, match=r"2 of 7 points .* at d = 4 mm, θ = 85.9°") as caught:
         table(d, theta)
     assert [each.filename for each in caught] == [__file__]
     assert table(d, theta, edge=True).inside.sum() == 3
-    table(d[:3], theta[:3])  # a warning would be an error here
+    table(d[:3], theta[:3])  # a warning would be an error
     table(0.008, -float(TIP.theta_limit(0.008)) * (1.0 + 1e-15))
 
 
 @pytest.mark.filterwarnings("ignore:.* outside the contact table")
-def test_outside_the_domain_is_clamped_and_flagged(table):
+def test_values_outside_the_domain_are_clamped_and_flagged(table):
     limit = float(TIP.theta_limit(0.008))
     edge = table(0.008, limit)
     assert edge.inside
@@ -191,7 +191,7 @@ def test_outside_the_domain_is_clamped_and_flagged(table):
         for sign in (1, -1):
             c = table(0.008, sign * theta)
             assert not c.inside
-            # The limit is computed twice, here and in the lookup.
+            # The limit is computed separately here and in the lookup.
             assert c.force == pytest.approx(edge.force, rel=FUSED)
             assert c.energy_theta == pytest.approx(sign * edge.energy_theta, rel=FUSED)
     for theta in (0.0, 0.1, -0.12):
@@ -213,11 +213,11 @@ def test_outside_the_domain_is_clamped_and_flagged(table):
 
 @pytest.fixture(scope="module")
 def forms() -> list[ContactTable]:
-    """The closed form, and each number of pieces."""
+    """Return the closed form, and a table for each number of pieces."""
     return [ContactTable.build(TIP, CONSTANT), *map(split, SPLITS)]
 
 
-def test_shapes_and_types(table):
+def test_output_shapes_and_types(table):
     halves = np.linspace(-1e-3, 8e-3, 9, dtype=np.float32)
     np.testing.assert_array_equal(
         table(halves, np.float32(0.25)).force, table(halves.astype(float), 0.25).force
@@ -226,14 +226,14 @@ def test_shapes_and_types(table):
 
 
 @pytest.mark.parametrize("wrong", [None, "0.004", True, 0.004 + 0j, [None, 0.1], [True], ["a"]])
-def test_what_is_no_real_number_is_refused(table, wrong):
+def test_input_that_is_not_real_is_refused(table, wrong):
     for pair in ((wrong, 0.1), (0.004, wrong)):
         with pytest.raises(TypeError, match="d and θ must be real numbers"):
             table(*pair)
 
 
 @pytest.mark.filterwarnings("ignore:.* outside the contact table")
-def test_numbers_are_answered_as_arrays_are(forms):
+def test_scalar_lookups_equal_array_lookups(forms):
     d, theta = hard_points(TIP.radius, 100, np.random.default_rng(11))
     odd = [-1.0, 0.0, 0.02, 0.03, math.inf, math.nan, 0.004, 0.004, 0.004, 1e-9, 0.0174]
     tilts = [0.3, 0.3, 0.0, 0.1, 0.2, 0.1, math.nan, -math.inf, 1.4, -1.57, 0.001]
@@ -248,12 +248,12 @@ def test_numbers_are_answered_as_arrays_are(forms):
             np.testing.assert_allclose(one, same, rtol=FUSED)
 
 
-def test_a_law_off_its_points_is_warned_of():
+def test_a_law_far_from_its_points_causes_a_warning():
     with pytest.warns(RuntimeWarning, match=r"makes 11\.0% of F; expected 5% at most"):
         ContactTable.build(Fingertip(0.02), HARD["root"], 1e-6)
 
 
-def test_refusals():
+def test_invalid_tables_are_refused():
     with pytest.raises(TableError, match="reaches 1e-17; the best reached"):
         ContactTable.build(TIP, CONSTANT, 1e-17)
     with pytest.raises(TableError, match="the best reached") as error:
@@ -265,7 +265,7 @@ def test_refusals():
             ContactTable.build(TIP, TABLE_I, tolerance)
 
 
-def test_hands_of_one_process_share_their_table():
+def test_hands_in_one_process_share_their_table():
     assert make_table(Settings(), TABLE_I) is make_table(Settings(), TABLE_I)
     coarser = make_table(Settings.model_validate({"table": {"tolerance": 1e-5}}), TABLE_I)
     assert make_table(Settings(), TABLE_I).max_error <= 1e-9 < coarser.max_error <= 1e-5

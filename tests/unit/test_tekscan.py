@@ -1,4 +1,4 @@
-"""Tekscan-style exports: what they may look like, and what is told of those that are none."""
+"""Tekscan-style exports: supported variants, and messages for other files."""
 
 import numpy as np
 import pytest
@@ -56,7 +56,7 @@ SAME = {
 
 
 @pytest.mark.parametrize("text", SAME.values(), ids=SAME)
-def test_other_programs_write_the_same_in_other_ways(text):
+def test_variants_of_other_programs_are_read(text):
     export = parse(text)
     assert export.raw
     assert export.pitch == pytest.approx((2e-3, 1.27e-3))
@@ -70,7 +70,7 @@ def test_other_programs_write_the_same_in_other_ways(text):
         *(("N/mm^2", 1e6), ("PSI", 6894.757), ("mmHg", 133.32239)),
     ],
 )
-def test_pressures_are_told_in_pa(unit, pascal):
+def test_pressures_are_converted_to_pa(unit, pascal):
     export = parse(EXPORT.replace("UNITS RAW", f"UNITS {unit}").replace("255", "2.55"))
     assert not export.raw
     assert export.values[0, 1, 1] == pytest.approx(2.55 * pascal)
@@ -104,12 +104,12 @@ def test_a_single_frame_needs_no_frame_line():
         ("3,4,5\n", "3,4,5\n6,7,8\n", "line 22"),
     ],
 )
-def test_what_is_no_export_is_told(old, new, told):
+def test_files_that_are_not_exports_are_reported(old, new, told):
     with pytest.raises(TekscanError, match=told):
         parse(EXPORT.replace(old, new))
 
 
-def test_an_export_is_a_recording(tmp_path):
+def test_an_export_is_read_as_a_recording(tmp_path):
     path = tmp_path / "run.asf"
     path.write_text(EXPORT)
     recording = load_recording(path, 4.0, 100.0)

@@ -1,4 +1,4 @@
-"""Torque on and off, whatever the servos answer, and who may ask for it."""
+"""Torque on and off for any servo replies, and the commands allowed to change it."""
 
 import math
 
@@ -15,7 +15,7 @@ from tests.harness.loop import advance_to, command, grasped, heard, refusal, tor
 from tests.harness.safety import bounded
 
 
-def test_a_non_finite_goal_is_a_fault_though_a_command_was_refused_for_it(make):
+def test_a_non_finite_goal_is_a_fault_even_after_a_refused_command(make):
     daemon = make()
     command(daemon, "arm")
     daemon.loop.advance(0.1)
@@ -27,8 +27,8 @@ def test_a_non_finite_goal_is_a_fault_though_a_command_was_refused_for_it(make):
     command(daemon, "clear")
 
 
-def test_joints_are_held_where_they_are_once_torque_is_on(make):
-    """Switching it on takes the servos a while, in which a limp joint goes on."""
+def test_joints_are_held_at_their_positions_once_torque_is_on(make):
+    """Switching torque on takes a while, during which the joints may still move."""
     daemon = make()
     daemon.loop.advance(daemon.loop.period)
     command(daemon, "arm")
@@ -39,8 +39,8 @@ def test_joints_are_held_where_they_are_once_torque_is_on(make):
         assert daemon.loop.state.goal.q == pytest.approx(list(daemon.hand.q), abs=2e-3)
 
 
-def test_torque_off_that_is_not_confirmed_is_tried_again_and_then_the_bus_falls_silent(make):
-    """Writes get lost and readings come, which keep the servos' watchdogs from acting."""
+def test_unconfirmed_torque_off_is_repeated_until_the_bus_is_silenced(make):
+    """Writes are lost but readings arrive, which keep resetting the servos' watchdogs."""
     daemon = make()
     events = heard(daemon)
     command(daemon, "arm")
@@ -65,7 +65,7 @@ def test_torque_off_that_is_not_confirmed_is_tried_again_and_then_the_bus_falls_
     assert command(daemon, "stop")["torque_off"] == "confirmed"
 
 
-def test_without_a_watchdog_nothing_is_gained_by_silence(make):
+def test_without_a_watchdog_the_bus_is_not_silenced(make):
     daemon = make(servos={"watchdog": 0.0})
     command(daemon, "arm")
     daemon.loop.advance(0.1)
@@ -79,7 +79,7 @@ def test_without_a_watchdog_nothing_is_gained_by_silence(make):
     assert not torque_of(daemon).any()
 
 
-def test_the_end_tries_to_turn_torque_off_more_than_once(make):
+def test_torque_off_is_tried_repeatedly_at_exit(make):
     daemon = make()
     command(daemon, "arm")
     daemon.loop.advance(0.1)
@@ -91,7 +91,7 @@ def test_the_end_tries_to_turn_torque_off_more_than_once(make):
 
 
 class Deaf:
-    """Servos that answer, and hear nothing of what is written: so many tries, or until mended."""
+    """Servos that reply but ignore writes, for a number of attempts or until mended."""
 
     def __init__(self, daemon: Daemon, tries: float = math.inf) -> None:
         self._servos = daemon.loop.torque.servos
@@ -112,7 +112,7 @@ class Deaf:
         self._most = 0
 
 
-def test_arming_that_fails_is_a_fault_with_torque_off(make):
+def test_failed_arming_is_a_fault_with_torque_off(make):
     daemon = make()
     servos = daemon.loop.torque.servos
     really = servos.torque_on
@@ -129,9 +129,9 @@ def test_arming_that_fails_is_a_fault_with_torque_off(make):
     assert not torque_of(daemon).any()
 
 
-def test_a_stall_that_trips_the_servos_watchdog_is_a_fault_and_not_an_idle_hand(make):
+def test_a_stall_that_trips_the_servo_watchdog_is_a_fault(make):
     daemon = grasped(make(), 6.0)
-    daemon.clock.sleep_until(daemon.clock.now() + 0.5)  # the process stood still
+    daemon.clock.sleep_until(daemon.clock.now() + 0.5)  # the process was suspended
     advance_to(daemon, "fault", 0.1)
     assert "watchdog" in daemon.loop.state.fault
     daemon.loop.advance(0.2)
@@ -142,17 +142,17 @@ def test_a_stall_that_trips_the_servos_watchdog_is_a_fault_and_not_an_idle_hand(
     assert daemon.hand.q.tolist() == pytest.approx([-0.1, -0.1], abs=0.04)
 
 
-def test_stop_and_disarm_turn_torque_off_whatever_the_state_and_a_stop_say(make):
+def test_stop_and_disarm_always_turn_torque_off(make):
     daemon = make()
     for name, more in (("stop", {}), ("disarm", {}), ("stop", {"client": 5, "why": "smoke"})):
-        daemon.loop.torque.servos.torque_on()  # as another program may have done
+        daemon.loop.torque.servos.torque_on()  # as another program might have done
         assert command(daemon, name, **more)["torque_off"] == "confirmed"
         daemon.loop.advance(daemon.loop.period)
         assert not torque_of(daemon).any()
         assert not daemon.loop.state.torque
 
 
-def test_a_stop_by_signal_goes_before_what_waits_and_lets_none_of_it_arm_the_hand(
+def test_a_stop_by_signal_precedes_waiting_commands_and_prevents_them_from_arming(
     make, context, addresses
 ):
     daemon = make()

@@ -1,4 +1,4 @@
-"""Files that somebody else has made end in one line, soon, and without much memory."""
+"""Untrusted files are rejected in one line, quickly and with limited memory."""
 
 import base64
 import json
@@ -26,12 +26,12 @@ from softfinger.tools.recordings.export import CsvTable, export
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.record import recover
 
-ROOM = 200e6  # bytes beyond what the tests have mapped
+ROOM = 200e6  # bytes in addition to those already mapped
 
 
 @pytest.fixture(autouse=True)
 def little_memory() -> Iterator[None]:
-    """More than so much can't be had."""
+    """Limit the available memory."""
     mapped = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     before = resource.getrlimit(resource.RLIMIT_AS)
     resource.setrlimit(resource.RLIMIT_AS, (int(mapped + ROOM), before[1]))
@@ -67,7 +67,7 @@ def comments(path: Path) -> None:
 @pytest.mark.timeout(120)  # s, on a busy machine
 @pytest.mark.parametrize("make", [fifo, zeros, comments])
 @pytest.mark.parametrize("read", READERS.values(), ids=READERS)
-def test_a_name_that_leads_elsewhere_is_told(tmp_path, make, read):
+def test_special_files_are_reported(tmp_path, make, read):
     path = tmp_path / "named"
     make(path)
     with pytest.raises(SoftfingerError) as caught:
@@ -88,7 +88,7 @@ PROFILES = {
 
 @pytest.mark.timeout(120)  # s, on a busy machine
 @pytest.mark.parametrize("text", PROFILES.values(), ids=PROFILES)
-def test_a_profile_without_sense_is_told_soon_and_briefly(tmp_path, text):
+def test_a_malformed_profile_is_reported_quickly_and_briefly(tmp_path, text):
     path = tmp_path / "my.toml"
     path.write_text(text)
     with pytest.raises(SettingsError) as caught:
@@ -97,13 +97,13 @@ def test_a_profile_without_sense_is_told_soon_and_briefly(tmp_path, text):
 
 
 def begin(file: IO[bytes], frames: int) -> None:
-    """Write the header of an array of so many frames."""
+    """Write the header of an array with this number of frames."""
     shape = {"descr": "<u2", "fortran_order": False, "shape": (frames, 44, 44)}
     np.lib.format.write_array_header_1_0(file, shape)
 
 
 def claiming(path: Path) -> None:
-    """An array of 3.5 TiB by its header."""
+    """Write an array whose header claims 3.5 TiB."""
     with path.open("wb") as file:
         begin(file, 10**9)
         file.write(bytes(100))
@@ -116,7 +116,7 @@ def holes(path: Path) -> None:
 
 
 def packed(path: Path, method: int = zipfile.ZIP_DEFLATED, *, honest: bool = True) -> None:
-    """20 MB of zeros in an archive, or an array that claims more than is there."""
+    """Write 20 MB of zeros as an archive, or an array that claims more data than it has."""
     with zipfile.ZipFile(path, "w", method) as archive, archive.open("frames.npy", "w") as file:
         begin(file, 5_000 if honest else 10**9)
         for _ in range(20 if honest else 1):
@@ -140,7 +140,7 @@ FRAMES: dict[str, tuple[str, Callable[[Path], object]]] = {
 
 @pytest.mark.timeout(120)  # s, on a busy machine
 @pytest.mark.parametrize(("name", "make"), FRAMES.values(), ids=FRAMES)
-def test_frames_beyond_their_file_are_told(tmp_path, name, make):
+def test_frames_beyond_the_end_of_the_file_are_reported(tmp_path, name, make):
     make(tmp_path / name)
     with pytest.raises(RecordingError, match=r"more than|another compression|no line|expected 4"):
         load_recording(tmp_path / name, 1.0, 100.0)
@@ -181,7 +181,7 @@ def head() -> bytes:
 
 
 def frame_of_zeros() -> bytes:
-    """A finger's frame of 4096² cells, 45 MB of base64."""
+    """Write a finger's frame of 4096² cells, 45 MB in base64."""
     data = base64.b64encode(bytes(2 * 4096 * 4096)).decode()
     fields = {"finger": "left", "unix": 1e9, "rows": 4096, "cols": 4096, "data": data}
     return channel("hand/tactile/left") + message(json.dumps(fields).encode())
@@ -193,11 +193,11 @@ def recording_of_holes(path: Path) -> None:
 
 
 def chunks_of_holes(path: Path) -> None:
-    """4 GB of records in chunks that are holes but for their beginnings."""
+    """Write 4 GB of records in chunks that are sparse except for their beginnings."""
     with path.open("wb") as file:
         file.write(head())
         for _ in range(256):
-            empty = record(7, bytes(9 << 20))  # passed over
+            empty = record(7, bytes(9 << 20))  # skipped by readers
             packed = chunk("", empty, len(empty))
             file.write(packed[:100])
             file.seek(len(packed) - 100, os.SEEK_CUR)
@@ -205,7 +205,7 @@ def chunks_of_holes(path: Path) -> None:
 
 
 SMALL, LARGE = message(b"{}") * 100_000, bytes(70 << 20)
-# What stands behind a head, or what writes the whole file.
+# Content after the header, or a function that writes the whole file.
 BOMBS: dict[str, Callable[[], bytes] | Callable[[Path], None]] = {
     "zstd": lambda: squeezed(LARGE),
     "zstd that claims little": lambda: squeezed(LARGE, 1000),
@@ -240,7 +240,7 @@ def bomb(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
 
 
 @pytest.mark.timeout(300)
-def test_a_bomb_is_told_in_a_line(bomb):
+def test_a_decompression_bomb_is_reported_in_one_line(bomb):
     told: list[str] = []
     recording = Recording(bomb, told.append)
     export(recording, bomb.parent, CsvTable, recording.topics)

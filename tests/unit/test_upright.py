@@ -1,4 +1,4 @@
-"""A held object comes upright without a look at it: the closed form, and the law, on the plant."""
+"""Bringing a held object upright without measuring its angle: closed form and control law."""
 
 import math
 from pathlib import Path
@@ -12,14 +12,15 @@ from softfinger.kinematics.hand.upright import upright_spring
 from softfinger.tools.simulated_daemon import SimulatedDaemon
 from tests.harness.plant import CONSTANT, CURRENT, PAPER, WIDTH, make, push_along
 
-LENGTHS = (0.05, 0.08, 0.0, 0.02)  # half the pivots' separation, finger, its offset, radius
+# Half the distance between the pivots, finger length, finger offset and tip radius.
+LENGTHS = (0.05, 0.08, 0.0, 0.02)
 START = math.radians(5.0)
-DEPTH, FORCE = 0.0032, 10.0  # where the paper's tip has this force
+DEPTH, FORCE = 0.0032, 10.0  # the paper's tip has this force at this depth
 spring_of = upright_spring.py_func
 
 
 def resting_ratio(spring: float) -> float:
-    """Return φ/φ0 by the closed form at the head of `kinematics.hand.upright`, c = 2/3."""
+    """Return φ/φ0 by the closed form in `kinematics.hand.upright`, with c = 2/3."""
     half_separation, _, _, radius = LENGTHS
     inward = half_separation - radius + DEPTH - 0.5 * WIDTH
     b = spring / (FORCE * half_separation)
@@ -29,7 +30,7 @@ def resting_ratio(spring: float) -> float:
 
 
 def at_rest(spring: float) -> SimulatedHand:
-    """A hand without friction but the tips', closed slowly to 10 N on an object put askew."""
+    """Close slowly to 10 N on a tilted object, with friction only at the tips."""
     hand = make(
         PAPER, object_angle=START, joint_friction=0.0, table_friction=0.0, joint_damping=0.1
     )
@@ -46,12 +47,12 @@ def at_rest(spring: float) -> SimulatedHand:
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5, 1.0, 4.0])
-def test_stuck_tips_leave_the_object_where_the_closed_form_says(share):
+def test_sticking_tips_leave_the_object_at_the_angle_of_the_closed_form(share):
     q = math.asin((LENGTHS[0] - LENGTHS[3] + DEPTH - 0.5 * WIDTH) / LENGTHS[1])
     spring = share * spring_of(q, DEPTH, FORCE, 2.0 / 3.0, LENGTHS)
     hand = at_rest(spring)
     expected = resting_ratio(spring)
-    # Left out of the closed form is q², which is 0.03.
+    # The closed form neglects q², which is 0.03.
     assert hand.object_pose[2] / START == pytest.approx(expected, abs=0.03)
     if share == 1.0:
         assert expected == pytest.approx(0.0, abs=1e-12)
@@ -74,7 +75,7 @@ def test_stuck_tips_leave_the_object_where_the_closed_form_says(share):
     ],
     ids=["as assumed", "slippery, heavy, soft", "rough, light, hard", "relaxing"],
 )
-def test_the_upright_law_needs_no_angle(sense, angle_known, simulation):
+def test_the_upright_law_does_not_use_the_angle(sense, angle_known, simulation):
     sections = {
         "control": {"law": "upright"},
         "scene": {"object_model": angle_known},
@@ -93,8 +94,9 @@ def test_the_upright_law_needs_no_angle(sense, angle_known, simulation):
             assert turned == pytest.approx(0.1, abs=math.radians(0.2))
 
 
-def test_solid_tips_come_upright_too() -> None:
-    # Bonded rubber has no local minimum: the law's spring is another one, by the tips' own table.
+def test_solid_tips_bring_the_object_upright() -> None:
+    # Bonded rubber has no local minimum; the control law uses a different spring, from the tips'
+    # own table.
     sections = load(Path("solid")).model_dump(include={"tip", "material", "estimator", "safety"})
     simulation = {"object_angle": START}
     with SimulatedDaemon(
@@ -107,8 +109,8 @@ def test_solid_tips_come_upright_too() -> None:
         assert abs(math.degrees(hand.plant.object_pose[2])) < 0.4
 
 
-def test_ticks_that_come_late_do_not_make_the_dither_slow() -> None:
-    # At a quarter of its frequency it would swing the object out of the grip.
+def test_late_ticks_do_not_slow_the_dither() -> None:
+    # At a quarter of its frequency, the dither would swing the object out of the grip.
     with SimulatedDaemon(
         {"control": {"law": "upright"}, "simulation": {"object_angle": START}}
     ) as hand:
@@ -122,7 +124,7 @@ def test_ticks_that_come_late_do_not_make_the_dither_slow() -> None:
         assert abs(math.degrees(hand.plant.object_pose[2])) < 0.3
 
 
-def test_a_raised_grip_that_comes_back_does_not_hold_the_dither_at_one_side():
+def test_a_decreasing_grip_force_does_not_hold_the_dither_on_one_side():
     with SimulatedDaemon({"control": {"law": "upright"}}) as hand:
         hand.grasp(FORCE)
         hand.run(4.5)
@@ -131,7 +133,7 @@ def test_a_raised_grip_that_comes_back_does_not_hold_the_dither_at_one_side():
         assert goal.force > 1.1 * FORCE
         hand.plant.apply_load(0.0, 0.0)
         hand.run(0.1)
-        hand.command("grasp", force=FORCE)  # a second later, while it shakes, the grip comes back
+        hand.command("grasp", force=FORCE)  # the force decreases a second later, during the dither
         turned = np.abs(hand.watch(3.5).angle).max()
         assert hand.mode == "holding"
         assert goal.force == pytest.approx(FORCE, rel=0.01)

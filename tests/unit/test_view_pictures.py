@@ -1,4 +1,4 @@
-"""What the viewer draws: footprints on frames, the planar hand, the landscape, by the model."""
+"""The viewer's drawings: footprints on frames, the planar hand, the landscape, by the model."""
 
 import json
 import math
@@ -40,7 +40,7 @@ def area(outline: NDArray[np.float64]) -> float:
 
 @pytest.mark.parametrize("grid", GRIDS)
 @pytest.mark.parametrize("contact", [(0.004, 0.3, 0.0), (0.002, -0.2, 0.35), (0.006, 0.0, 0.0)])
-def test_the_footprint_is_where_the_forward_model_presses(grid, contact):
+def test_the_footprint_matches_the_forward_model(grid, contact):
     pressure = grid.pressure(TIP, Material.constant(0.304e6), *contact)
     shown = footprint(grid, TIP.radius, *contact)
     assert shown is not None
@@ -48,7 +48,7 @@ def test_the_footprint_is_where_the_forward_model_presses(grid, contact):
     centroid = (pressure * cols).sum(), (pressure * rows).sum()
     outline, middle = shown
     assert middle == pytest.approx(np.array(centroid) / pressure.sum(), abs=0.05)
-    # Every pressed cell has a corner in the outline, and the outline's ends are pressed.
+    # Every loaded cell has a corner inside the outline, and the outline's ends are loaded.
     pressed = np.column_stack((cols[pressure > 0.0], rows[pressure > 0.0]))
     low, high = outline.min(axis=0), outline.max(axis=0)
     assert (pressed >= low - 0.5).all()
@@ -80,7 +80,7 @@ def test_the_grid_is_read_from_the_frame() -> None:
     )
 
 
-# The hand in its plane
+# The planar hand
 
 HAND = ReferenceHand(0.1, 0.08, 0.005, 0.02)
 POSE = np.array([0.003, 0.081, 0.12])
@@ -95,11 +95,11 @@ def held() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 @pytest.mark.parametrize("finger", [0, 1])
-def test_a_pressed_tip_ends_at_the_objects_face(finger: int) -> None:
+def test_an_indented_tip_ends_at_the_face_of_the_object(finger: int) -> None:
     d, theta = held()
     lines = finger_lines(HAND, finger, Q[finger], d[finger], theta[finger])
     n = np.array([math.cos(POSE[2]), math.sin(POSE[2])])
-    outwards = -n if finger == 0 else n  # of the object, through this face
+    outwards = -n if finger == 0 else n  # outward normal of the object at this face
 
     def beyond(points: NDArray[np.float64]) -> NDArray[np.float64]:
         distance: NDArray[np.float64] = (points - POSE[:2]) @ outwards - 0.5 * WIDTH_M
@@ -114,14 +114,14 @@ def test_a_pressed_tip_ends_at_the_objects_face(finger: int) -> None:
     centre = HAND.tips(Q)[finger]
     assert -outwards @ out == pytest.approx(math.cos(theta[finger]))
     assert (middle - centre) @ outwards == pytest.approx(-(0.02 - d[finger]))
-    # The force stands where the axis through the centroid of pressure meets the face.
+    # The force is drawn where the axis through the centroid of pressure meets the face.
     along = (lines.base[1] - lines.base[0]) / 0.04
     assert -outwards @ along == pytest.approx(math.sin(theta[finger]))
     foot = (lines.push[0] - centre) @ along
     assert foot == pytest.approx((0.02 - d[finger] / 3.0) * math.sin(theta[finger]))
 
 
-def test_the_held_object_stands_between_its_faces() -> None:
+def test_the_held_object_is_drawn_with_its_width_and_height() -> None:
     d, theta = held()
     outline = held_outline(HAND, Q, d, theta, WIDTH_M, 0.06)
     n = np.array([math.cos(POSE[2]), math.sin(POSE[2])])
@@ -130,10 +130,10 @@ def test_the_held_object_stands_between_its_faces() -> None:
     assert np.ptp(outline @ np.array([-n[1], n[0]])) == pytest.approx(0.06)
 
 
-# The landscape
+# The energy landscape
 
 
-def test_colours_are_steps_of_the_energys_cube_root() -> None:
+def test_colours_are_steps_of_the_cube_root_of_energy() -> None:
     shown = landscape(Settings())
     assert shown is not None
     assert shown.d_end == pytest.approx(min(Settings().safety.d_max, 0.95 * TIP.radius))
@@ -147,13 +147,13 @@ def test_colours_are_steps_of_the_energys_cube_root() -> None:
         np.minimum(root, 1.0), abs=0.6 / (LEVELS - 1.0)
     )
     assert (np.abs(theta) <= TIP.theta_limit(d) + 1e-3).all()
-    assert (shown.levels == LEVELS).any()  # no such contact
+    assert (shown.levels == LEVELS).any()  # levels without a contact
 
 
-# What is known of the hand
+# Settings of the hand
 
 
-def test_settings_of_another_version_keep_what_is_known() -> None:
+def test_known_settings_of_another_version_are_kept() -> None:
     sections = json.loads(Settings().model_dump_json())
     sections["tip"]["radius"] = 0.015
     sections["tip"]["wear"] = 0.1

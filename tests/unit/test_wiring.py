@@ -1,4 +1,4 @@
-"""Servos wired to the wrong finger, or with the wrong direction: found before they do harm."""
+"""Servos on the wrong finger or with the wrong direction are detected before they do harm."""
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
@@ -14,7 +14,7 @@ from tests.harness.loop import command, heard
 
 
 class Miswired:
-    """A simulated hand whose servos move each other's finger, or turn the wrong way round."""
+    """A simulated hand whose servos move the other finger or in the wrong direction."""
 
     def __init__(self, hand: Any, swapped: bool) -> None:
         self._hand, self._swapped = hand, swapped
@@ -42,7 +42,7 @@ Make = Callable[..., Daemon]
 
 @pytest.fixture
 def make(monkeypatch: pytest.MonkeyPatch) -> Iterator[Make]:
-    """Makes armed daemons on the virtual clock, by how their servos are wired."""
+    """Return a function that creates armed daemons on the virtual clock with a given wiring."""
     with ExitStack() as stack:
 
         def make(wiring: str, **simulation: Any) -> Daemon:
@@ -64,7 +64,7 @@ def make(monkeypatch: pytest.MonkeyPatch) -> Iterator[Make]:
 
 
 def greatest_force(daemon: Daemon, seconds: float) -> float:
-    """The greatest true force of a tip in this time, or until a fault."""
+    """Return the maximum true tip force during this time, or until a fault."""
     greatest = 0.0
     for _ in range(round(seconds / 0.02)):
         daemon.loop.advance(0.02)
@@ -74,13 +74,13 @@ def greatest_force(daemon: Daemon, seconds: float) -> float:
     return greatest
 
 
-OFF = [0.004, -0.006]  # m that the object lies off the middle
+OFF = [0.004, -0.006]  # m, offset of the object from the middle
 HEAVY = {"object_mass": 0.5, "table_friction": 0.5}
 
 
 @pytest.mark.parametrize("off", OFF)
 @pytest.mark.parametrize("object_", [{}, HEAVY], ids=["light", "heavy"])
-def test_swapped_servos_are_found_in_the_approach(make, off, object_):
+def test_swapped_servos_are_detected_during_the_approach(make, off, object_):
     daemon = make("swapped", object_position=(off, 0.08), **object_)
     command(daemon, "grasp", force=6.0)
     assert greatest_force(daemon, 3.0) < 4.0
@@ -89,8 +89,8 @@ def test_swapped_servos_are_found_in_the_approach(make, off, object_):
     assert not daemon.hand.torque_on.any()
 
 
-def test_swapped_servos_are_found_at_the_beginning_of_a_turn(make):
-    daemon = make("swapped")  # in the middle an approach is the same with both
+def test_swapped_servos_are_detected_at_the_start_of_a_turn(make):
+    daemon = make("swapped")  # with a centred object, the approach is the same for both wirings
     command(daemon, "grasp", force=6.0)
     greatest_force(daemon, 2.0)
     assert daemon.loop.state.mode == "holding"
@@ -102,7 +102,7 @@ def test_swapped_servos_are_found_at_the_beginning_of_a_turn(make):
 
 @pytest.mark.parametrize("off", [0.0, *OFF])
 @pytest.mark.parametrize("object_", [{}, HEAVY], ids=["light", "heavy"])
-def test_servos_that_are_wired_right_grasp_and_turn(make, off, object_):
+def test_correctly_wired_servos_grasp_and_turn(make, off, object_):
     daemon = make("right", object_position=(off, 0.08), **object_)
     events = heard(daemon)
     command(daemon, "grasp", force=6.0)
@@ -115,11 +115,11 @@ def test_servos_that_are_wired_right_grasp_and_turn(make, off, object_):
     assert not [kind for _, kind, _ in events if kind in ("joint.swapped", "joint.blocked")]
 
 
-def test_fingers_that_open_instead_of_closing_are_told(make):
+def test_fingers_that_open_instead_of_closing_are_reported(make):
     daemon = make("reversed")
     events = heard(daemon)
     command(daemon, "grasp", force=6.0)
-    while daemon.hand.q[0] > -0.54:  # until it stands at its stop
+    while daemon.hand.q[0] > -0.54:  # until it reaches its stop
         daemon.loop.advance(0.02)
     daemon.loop.advance(1.0)
     (told,) = [text for level, kind, text in events if kind == "joint.blocked"]
