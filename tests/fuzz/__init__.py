@@ -1,4 +1,4 @@
-"""Fuzz with random and mutated input: the tests briefly, `python -m tests.fuzz` for hours."""
+"""Fuzz with random and mutated input: briefly in tests, for hours by `python -m tests.fuzz`."""
 
 import random
 from typing import NamedTuple

@@ -1,6 +1,6 @@
 """Fuzz the simulated hand with random commands, pushes and parameters, in every kind of scene.
 
-The commands for a hand are drawn at once and executed in one compiled loop.
+All commands for a hand are drawn in advance and executed in one compiled loop.
 """
 
 import math

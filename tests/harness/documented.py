@@ -24,7 +24,7 @@ from softfinger.tools.cli import main, make_parser
 from softfinger.tools.terminal.status import told
 from tests.harness.daemon_process import SOFTFINGER, Running
 
-_BUSY = "DOCUMENTED_BUSY"  # set for processes started by a command, which run separately
+_BUSY = "DOCUMENTED_BUSY"  # marks processes started by a command, which run separately
 _ENDLESS = {"run", "monitor", "view", "replay", "envelope", "bench"}
 # Options that let such commands end by themselves, so they are run.
 _ENDS = {"--record", "--recompute"}

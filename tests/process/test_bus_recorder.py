@@ -39,7 +39,7 @@ def test_extreme_goals_are_recorded_including_refused_ones():
     assert left["goal_q"] == pytest.approx([-50 * RADIAN, 100 * RADIAN])
     assert left["goals_refused"] == 0
     assert hand.report(2)["goal_q"] is None
-    # Exceeds the model's range, then the configured limit, then sent while torque is off.
+    # The goals exceed the model's range and the configured limit while torque is off.
     assert hand.write(reg.GOAL_CURRENT, 5000, 2) == framing.DATA_RANGE
     assert hand.report(1)["goal_current"][1] == pytest.approx(5000 * UNIT)
     hand.write(reg.CURRENT_LIMIT, 200, 2)

@@ -85,7 +85,7 @@ def test_ctrl_c_before_a_compiler_thread_starts_is_passed_on(monkeypatch):
         kernels.build_kernels(Settings(), lambda *_: None, bar=False)
 
 
-def test_compilation_without_parallel_processes_is_explained_in_one_line(monkeypatch):
+def test_compilation_by_plain_numba_is_explained_in_one_line(monkeypatch):
     monkeypatch.setattr(kernels, "is_built", lambda *_: False)
     monkeypatch.setattr(kernels, "why_plain", "Numba 99.0 is new")
     monkeypatch.setattr(kernels._Build, "run", lambda _: None)

@@ -200,7 +200,9 @@ def test_two_fingers_on_one_port_are_detected_by_the_real_path(tmp_path):
         ("uucp", 0o600, "sudo chmod a+rw {}, until it is plugged in again; for good, a udev rule"),
     ],
 )
-def test_the_group_of_the_port_is_recommended(tmp_path, monkeypatch, group, mode, advice):
+def test_membership_in_the_group_of_the_port_is_recommended(
+    tmp_path, monkeypatch, group, mode, advice
+):
     port = tmp_path / "port"
     port.touch()
     port.chmod(mode)

@@ -194,7 +194,7 @@ def test_a_late_command_is_repeated_with_its_key(fake):
 
 
 @pytest.mark.extended
-def test_with_another_commander_of_a_real_daemon(start, profile, addresses):
+def test_the_page_shows_another_commander_of_a_real_daemon(start, profile, addresses):
     stream, commands = addresses
     daemon = start("--config", str(profile("commands.lease = 60.0\n")))
     where = ["--address", f"{stream},{commands}"]

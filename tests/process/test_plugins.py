@@ -44,7 +44,7 @@ def test_the_example_meets_the_backend_interface(caplog):
     found = {each.subject: each for each in doctor.results(settings, False)}
     assert found["servos"].text.startswith("following: a plugin's")
     assert "44 × 44 cells" in found["tactile left"].text
-    assert "/dev/ttyUSB0" not in found  # ports of unknown backends are not checked
+    assert "/dev/ttyUSB0" not in found  # ports of plugin backends are not checked
 
 
 @pytest.mark.usefixtures("here")

@@ -22,7 +22,7 @@ PONG = 14
 
 
 class Wire:
-    """A paced bus with its own clock, and the client's end of the pseudo-terminal."""
+    """A paced bus with its own clock, and the client's end of its pseudo-terminal."""
 
     def __init__(self, bus: ServoBus, baud: int, **options: float) -> None:
         self.t = 1.0

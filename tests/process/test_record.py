@@ -301,7 +301,7 @@ def test_split_files_are_contiguous(fake, tmp_path):
     assert seqs == list(range(seqs[0], seqs[-1] + 5, 5))
 
 
-def test_the_recorder_waits_for_a_daemon_unless_told_otherwise(addresses, tmp_path):
+def test_the_recorder_waits_for_a_daemon_except_with_no_wait(addresses, tmp_path):
     process = record(tmp_path / "a.mcap", "--address", addresses[0], "--no-wait")
     status, _, error = ended(process)
     assert status == 1

@@ -99,7 +99,7 @@ def test_arm_overwrites_changed_ram_registers(bus, connect, reboots):
 
 
 def test_factory_settings_of_every_model_pass_the_checks():
-    """Mode and return delay are exceptions, because their factory settings never fit."""
+    """Mode and return delay are excluded, because their factory settings never suit the hand."""
     for name, model in MODELS.items():
         mode = "current-based position" if model.senses_current else "position"
         small = {"current_max": min(1.2, model.stall_current)}

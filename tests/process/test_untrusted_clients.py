@@ -29,7 +29,7 @@ def old_command(name: str) -> bytes:
 
 
 def posted(frames: bytes, address: str) -> bytes:
-    """Return an HTTP request whose head is one message part and whose body is ``frames``."""
+    """Return an HTTP request whose header is one message part and whose body is ``frames``."""
     for padding in range(256):
         head = (
             f"POST /{'x' * padding} HTTP/1.1\r\nHost: {address.removeprefix('tcp://')}\r\n"

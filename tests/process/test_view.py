@@ -388,7 +388,7 @@ def test_other_machines_need_a_one_time_code() -> None:
         assert ask(viewed.host, query, {"command": "stop"}) == "✓ stop: ok"
         with pytest.raises(InvalidStatus, match="403"):
             ask(viewed.host, query, {"command": "stop"}, origin="http://evil.example")
-        assert got(viewed.host, code)[0] == 403  # used by one browser already
+        assert got(viewed.host, code)[0] == 403  # already used by one browser
         line = viewed.process.stdout.readline()  # the code for the next browser
         assert location(viewed.host, line.split()[1].removeprefix(f"http://{viewed.host}")) == place
         listening = psutil.Process(viewed.process.pid).net_connections()

@@ -161,7 +161,7 @@ def soak(seconds: float, seed: int = 1) -> Account:
                     request = _next(chance, mode)
                     if request is not None and rig.ask(request, 5.0)["ok"]:
                         account.done[str(request["command"])] += 1
-                    elif request is not None and mode == "armed":  # arm reopens a lost board
+                    elif request is not None and mode == "armed":  # arming reopens a lost board
                         rig.ask({"command": "disarm"}, 5.0)
                 if end_fault is not None and now > ends_at:
                     end_fault()

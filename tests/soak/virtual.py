@@ -171,7 +171,7 @@ class FaultyServos:
         self.last_good = -math.inf
         self.torque = False
         self.armed = False  # armed, and this state has not been ended by an event
-        self._last = 0.0  # angle of a joint that is numb [rad]
+        self._last = 0.0  # angle reported by a numb joint [rad]
         self._unheard = 0
 
     def connect(self) -> None:

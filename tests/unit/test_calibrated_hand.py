@@ -1,4 +1,4 @@
-"""Calibration files in the hand: each finger uses its own tip and learns its zero offsets."""
+"""Calibration files in the hand: each finger uses its own tip and its own zero offsets."""
 
 import math
 from pathlib import Path

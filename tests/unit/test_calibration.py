@@ -60,7 +60,7 @@ def test_a_tare_measures_noise_correlation_and_common_drift():
     plain = tare(50.0 + white)
     assert plain.correlation.size == 0
     assert plain.drift == 0.0
-    # Half of each cell's noise is its right neighbour's own.
+    # The noise of each cell combines two sources, each shared with one neighbour.
     shared = 50.0 + (white[:, :, 1:] + white[:, :, :-1]) / math.sqrt(2.0)
     shared[:, 3, 3] += 100.0 * rng.standard_normal(100)  # a faulty cell
     found = tare(shared + 0.7 * rng.standard_normal((100, 1, 1)))

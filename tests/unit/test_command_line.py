@@ -42,7 +42,8 @@ def test_the_closest_subcommand_is_suggested(inline):
         assert f"found {word!r}, expected a known word; nearest: {near}" in wrong.stderr
     assert max(map(len, inline("limits").stdout.splitlines())) <= 120
     assert "unrecognized arguments: --zzz" in inline("run", "--zzz").stderr
-    assert inline("send").stderr.endswith("required: COMMAND\n")  # instead of missing options
+    # Names the missing command only, not missing options.
+    assert inline("send").stderr.endswith("required: COMMAND\n")
 
 
 @pytest.mark.parametrize(

@@ -377,7 +377,7 @@ def test_only_the_newest_waiting_setpoint_is_executed(context, addresses):
                     found.append(msgpack.unpackb(stream.recv()))
             return all(len(found) == 20 for found in replies)
 
-        # All have been received before the loop continues.
+        # All setpoints have been received before the loop continues.
         commands = served.service.commands
         until(lambda: [served.settle(1), commands.count + len(served.link.asked) == 40][1])
         until(lambda: [served.serve(note), collected()][1])

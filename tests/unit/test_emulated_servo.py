@@ -167,7 +167,7 @@ def test_without_position_gain_or_pwm_the_joint_does_not_move() -> None:
 def test_the_velocity_limit_applies_to_profile_and_velocity_mode() -> None:
     profile = (reg.PROFILE_VELOCITY, 200, 4)
     limited = travelled((reg.VELOCITY_LIMIT, 20, 4), profile)
-    # 20 · 0.229 rpm for 0.1 s in counts, minus the joint's lag.
+    # 20 · 0.229 rpm for 0.1 s in counts, minus the distance by which the joint lags.
     assert limited < 20 * 0.229 / 60.0 * 4096 * 0.1 < travelled(profile)
     c = client()
     for address, value, size in (

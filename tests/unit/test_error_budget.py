@@ -1,4 +1,4 @@
-"""The covariance includes errors that frames do not show: actual errors match it in each case."""
+"""The covariance includes errors that are not visible in frames, and matches the actual errors."""
 
 import itertools
 import math

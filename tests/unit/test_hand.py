@@ -68,7 +68,7 @@ def test_quasi_static_steering_gain(degrees, gain):
 def test_load_dependent_friction_equals_the_gear_efficiency():
     # With friction as a fraction μ of motor and contact torque, (1 − μ)/(1 + μ) arrives; when
     # backdriven, the inverse.
-    share, rest = 0.25, 0.02  # share of the torque, and N·m of which half acts only at standstill
+    share, rest = 0.25, 0.02  # fraction of the torque; N·m, of which half acts only at standstill
     simulation = {"joint_friction": 0.5 * rest, "joint_stribeck": 0.5 * rest, "joint_damping": 0.0}
     simulation |= {"joint_load_friction": (0.5 * share, 0.5 * share), "joint_stribeck_speed": 50.0}
     settings = {"scene": {"fingers": ("left",)}, "simulation": simulation}

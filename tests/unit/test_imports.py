@@ -67,7 +67,7 @@ def circle(graph: Mapping[str, set[str]]) -> list[str]:
 
 
 def rooms(top: str) -> dict[str, set[str]]:
-    """Return each subpackage's imports from its siblings; a module next to them counts as one."""
+    """Return each room's imports from the other rooms; a module next to them counts as a room."""
     graph: dict[str, set[str]] = {}
     for name, others in imports().items():
         if name.startswith(f"{top}."):
@@ -77,7 +77,7 @@ def rooms(top: str) -> dict[str, set[str]]:
 
 
 def table_of_rooms() -> list[str]:
-    """Return the rows of the subpackage table in the architecture page, from top to bottom."""
+    """Return the rows of the room table in the architecture page, from top to bottom."""
     _, _, after = PAGE.read_text(encoding="utf-8").partition("| room |")
     return [line for line in after.partition("\n\n")[0].splitlines() if line.startswith("| `")]
 
@@ -100,12 +100,12 @@ def test_modules_have_no_import_cycles():
     assert circle(imports()) == []
 
 
-def test_subpackages_have_no_import_cycles():
+def test_rooms_have_no_import_cycles():
     for top in ORDER:
         assert circle(rooms(top)) == [], top
 
 
-def test_daemon_subpackages_import_downwards_in_the_architecture_table():
+def test_daemon_rooms_import_downwards_in_the_architecture_table():
     rows = (re.findall(r"`daemon/(\w+)", line.split("|")[1]) for line in table_of_rooms())
     place = {room: row for row, names in enumerate(rows) for room in names}
     graph = rooms("daemon")

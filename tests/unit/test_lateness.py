@@ -109,7 +109,7 @@ def test_a_duration_uses_the_time_of_the_machine(on_late_machine):
     assert machine.now() - begin == pytest.approx(5.0, abs=0.02)
 
 
-def test_a_fault_caused_by_a_busy_machine_says_so(on_late_machine):
+def test_a_fault_caused_by_a_busy_machine_names_this_cause(on_late_machine):
     daemon, machine, events = on_late_machine("real")
     daemon.loop.advance(0.3)
     grasped(daemon, 6.0)

@@ -191,7 +191,7 @@ def test_shear_of_solid_tips_reveals_a_load(kind):
     watched = at_rest()
     setattr(watched.held, kind, -1.0)
     assert watched.run(0.0, 500) == FORCE
-    setattr(watched.held, kind, -3.5)  # a sudden load exceeds half of the capacity
+    setattr(watched.held, kind, -3.5)  # a sudden load of this size exceeds half of the capacity
     assert watched.run(0.0, 1) == FORCE + 10.0
 
 

@@ -63,7 +63,7 @@ def test_partial_derivatives_belong_to_one_energy(tip):
 def test_small_contacts_are_hertzian_and_large_ones_end_with_the_data(tip):
     table = ContactTable.build(tip, RUBBER)
     stiffness = 4.0 / 3.0 * 0.304e6 / (1.0 - tip.poisson**2) * math.sqrt(tip.radius)
-    # Confinement of the rubber increases the force in proportion to the contact radius over a,
+    # The confinement of the rubber increases the force with the ratio of contact radius to a,
     # √(d/a).
     ratios = [float(table(d, 0.0).force) / (stiffness * d**1.5) for d in (1e-8, 1e-7)]
     assert ratios == pytest.approx([1.0, 1.0], abs=0.01)
