@@ -39,7 +39,7 @@ def connect(running: Run) -> Iterator[Connect]:
 
 @pytest.fixture
 def fake() -> Iterator[FakeDaemon]:
-    """Return sockets like a daemon's, with a hand computed from formulas."""
+    """Return a fake daemon: real sockets, with a hand computed from formulas."""
     with FakeDaemon() as fake:
         yield fake
 

@@ -76,7 +76,7 @@ def blocks(page: Path) -> list[Block]:
 
 
 class Shell:
-    """A shell for all blocks of a page that keeps variables and reports failed commands."""
+    """Shell shared by all blocks of a page; it keeps variables and reports failed commands."""
 
     def __init__(self, folder: Path, softfinger: Softfinger) -> None:
         self._folder, self._softfinger = folder, softfinger

@@ -378,7 +378,7 @@ def test_a_damaged_chunk_is_reported_and_skipped_and_the_file_can_be_recovered(
     assert "damaged (" in told[0]
     assert 500 < len(read) < len(sent)
     assert read[0] == sent[0]
-    assert read[-1] == sent[-1]  # chunks after it are readable
+    assert read[-1] == sent[-1]  # chunks after the damaged one are readable
     fast = ("--no-wait", "--speed", "1e6", "--address", addresses[0])
     for words in (("export", "--topics", "state"), ("replay", *fast)):
         assert "damaged (" in inline(words[0], path, *words[1:]).stderr, words

@@ -211,7 +211,8 @@ def test_a_picture_has_the_values_of_the_stream() -> None:
     assert picture["events"][-1][2:] == ["warning", "slip", "the object slips"]
     assert picture["notes"][0] == "the object slips"
     assert "left temperature at 94% of safety.temperature_max" in picture["notes"]
-    assert not [note for note in picture["notes"] if "right" in note]  # far from its limits
+    # The right finger is far from its limits.
+    assert not [note for note in picture["notes"] if "right" in note]
     facts = dict(zip(picture["facts"][::2], picture["facts"][1::2], strict=True))
     assert facts["Servos"] == "66 / 41 °C, 12.1 / 12.1 V"
     for name in ("left", "right"):
@@ -219,7 +220,7 @@ def test_a_picture_has_the_values_of_the_stream() -> None:
         levels = np.frombuffer(base64.b64decode(image["data"]), np.uint8).reshape(44, 44)
         assert levels.max() > 20  # of 31 levels: 45 kPa of 50
         assert levels[20:24, 20:24].min() > 10
-        assert levels[:8].max() < 6  # noise
+        assert levels[:8].max() < 6  # only noise
         assert len(picture["panels"][name]["lines"]) == 2  # rim and footprint
         assert picture["panels"][name]["scale"] == ["≤ 3", "50 kPa"]
     assert len(picture["panels"]["landscape"]["dots"]) == 2

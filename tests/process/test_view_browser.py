@@ -440,7 +440,7 @@ def test_the_record_button_writes_a_recording(page, fake, tmp_path):
         until(lambda: page.text("[name=record]") == "Record")
         assert Recording(path).count(b"hand/state") > 0
         assert not Recording(path).truncated
-        page.click("[name=record]")  # stops when the page's server ends
+        page.click("[name=record]")  # recording stops when the page's server ends
         until(lambda: len(list(tmp_path.glob("softfinger-*.mcap"))) == 2)
         viewed.end()
         assert not any(Recording(each).truncated for each in tmp_path.glob("*.mcap"))

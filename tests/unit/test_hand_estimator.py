@@ -111,7 +111,7 @@ def test_systematic_errors_do_not_average_out():
             first = replace(contacts[0])
     contact = contacts[0]
     assert first.d_std == pytest.approx(math.hypot(5e-5, 2e-5), rel=1e-3)
-    # No less remains, because the zero offset may drift.
+    # The error may not decrease, because the zero offset can drift.
     assert 2e-5 < contact.d_std < 1.2 * first.d_std
     assert 4e-3 < contact.theta_std < first.theta_std
     # The force error follows from d by ∂F/∂d = 2F/d and from θ by F tan θ; the modulus is known to

@@ -103,7 +103,8 @@ def test_friction_reverses_over_twice_the_presliding_distance():
     closing, opening = torque[turn - 200 : turn].mean(), torque[-200:].mean()
     assert closing == pytest.approx(FRICTION, rel=0.01)
     assert closing - opening == pytest.approx(2.0 * FRICTION, rel=0.01)
-    # The transition is a straight line, whose slope shows wrong factors of the presliding distance.
+    # The transition is a straight line; its slope would reveal half or twice the presliding
+    # distance.
     within = slice(turn + 20, turn + 80)
     slope, _ = np.polyfit(angle[within], torque[within], 1)
     assert slope == pytest.approx(FRICTION / PRESLIDING, rel=0.02)

@@ -228,7 +228,7 @@ def test_a_tare_of_saturated_sensors_keeps_the_zero_offset_and_is_reported(make)
     assert events.count(("warning", "tare", text)) == 1
 
 
-# --- limits at work -------------------------------------------------------------------------------
+# --- limits in operation --------------------------------------------------------------------------
 
 
 def test_a_long_normal_grip_causes_no_messages(make):
