@@ -79,7 +79,6 @@ def test_activity_matches_plain_numpy():
     assert seen == {True, False}
 
 
-# Make the inner kernel callable.
 free_noise = called(free_noise)
 
 erfc = np.vectorize(math.erfc)

@@ -21,7 +21,6 @@ from tests.harness.paper_tip import E
 from tests.harness.plant import PAPER
 from tests.harness.reference_hand import ReferenceHand
 
-# Make the inner kernels callable.
 holding_moment_arms = called(holding_moment_arms)
 sheared_gradient = called(sheared_gradient)
 held_motion = called(held_motion)

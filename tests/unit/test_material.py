@@ -16,7 +16,6 @@ from softfinger.kinematics.contact.material import (
 from softfinger.kinematics.contact.material_fit import MaterialError, nonnegative
 from tests.harness.called import called
 
-# Make the inner kernel callable.
 stress_at = called(stress_at)
 
 STRAIN = np.linspace(0.0, 1.0, 201)
