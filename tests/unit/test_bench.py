@@ -151,7 +151,7 @@ def test_residual_angle_error_of_a_control_law(way, low, high):
     assert low <= control.left(way, ASKEW) <= high
 
 
-def test_an_object_that_is_not_held_is_counted_without_changing_other_draws():
+def test_an_object_that_is_not_held_is_counted_separately():
     far = {"object_position": (0.0, 0.4)}
     row = control.row("energy", control.WAYS["energy"], [ASKEW, ASKEW | far])
     assert (row["n"], row["not held"]) == (1, 1)

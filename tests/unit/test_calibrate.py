@@ -253,7 +253,7 @@ def test_impossible_steps_are_reported_and_change_nothing(bench, capsys, words, 
         (lambda c: c["sensor"].pop("rows"), "sensor.rows"),
     ],
 )
-def test_a_corrupted_file_is_refused_with_the_position(bench, tmp_path, change, told):
+def test_an_invalid_calibration_file_is_refused_with_the_reason(bench, tmp_path, change, told):
     content = json.loads((bench[0] / "sensor.json").read_text())
     change(content)
     path = tmp_path / "bad.json"

@@ -138,7 +138,7 @@ def test_saturated_sensors_latch_a_fault_and_cause_no_motion(make):
         command(daemon, "clear")
 
 
-def test_sensors_without_readings_end_the_grip_without_more_force(make):
+def test_sensors_that_read_zero_end_the_grip_without_more_force(make):
     daemon = grasped(make(), 5.0)
     blinded(daemon, 0)
     advance_to(daemon, "armed", 0.5)

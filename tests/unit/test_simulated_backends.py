@@ -229,7 +229,7 @@ def test_a_frame_whose_sample_is_no_longer_stored_counts_as_missed():
     assert counters["frames"] < arrivals.arrived
 
 
-def test_cells_with_hysteresis_include_frames_that_were_not_read():
+def test_cells_with_creep_include_frames_that_were_not_read():
     def forces(step):
         sensor, clock, _ = simulated(tactile_creep=0.3, tactile_creep_time=0.2)
         sensor.open()

@@ -178,7 +178,7 @@ def test_a_sudden_twist_immediately_raises_the_grip():
 
 
 def test_a_constant_load_leaves_less_margin_for_a_sudden_one():
-    """With 3 N on each tip, a third of an otherwise harmless load triggers the reflex."""
+    """With 3 N on each tip, a sudden load that would be harmless alone triggers the reflex."""
     watched = at_rest()
     for load in np.linspace(0.0, 3.0, 500):
         watched.run(load, 1)
