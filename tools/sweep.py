@@ -128,7 +128,7 @@ class Sweep(Generic[Case, Result]):
             for done in self._done(processes, scheduler):
                 left = len(self._cases) - done
                 each = (time.monotonic() - began) / max(done - before, 1)
-                progress(done, f"{done}/{len(self._cases)}, {_told(left * each)} left")
+                progress(done, f"{done}/{len(self._cases)}, {_format_duration(left * each)} left")
                 while yielded in self._results:
                     yield self._results[yielded]
                     yielded += 1
@@ -228,6 +228,6 @@ def _cluster(address: str) -> Iterator[Executor]:
         yield client.get_executor()
 
 
-def _told(seconds: float) -> str:
+def _format_duration(seconds: float) -> str:
     minutes, rest = divmod(round(seconds), 60)
     return f"{minutes} min {rest} s" if minutes else f"{rest} s"

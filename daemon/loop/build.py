@@ -104,17 +104,17 @@ class Daemon:
         """Connect, retrying for up to ``servos.open_timeout`` while servos do not answer."""
         patience = self.settings.servos.open_timeout
         began = time.monotonic()
-        told = False
+        was_reported = False
         while True:
             try:
                 return servos.connect()
             except ServosSilent as silent:
                 if time.monotonic() - began >= patience:
                     raise
-                if on_event is not None and not told:
+                if on_event is not None and not was_reported:
                     text = f"{silent}; waiting up to servos.open_timeout = {patience:g} s"
                     on_event("warning", "servos", text)
-                    told = True
+                    was_reported = True
             time.sleep(_RETRY_INTERVAL)
 
     def _bind(self) -> tuple[Publisher, CommandServer]:

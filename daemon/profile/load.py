@@ -65,9 +65,9 @@ def checked(
     try:
         settings = Settings.model_validate(data)
     except ValidationError as error:
-        told = error.errors(include_url=False)
-        found = [_line(details) for details in told[:_ERROR_COUNT_MAX]]
-        more = len(told) - _ERROR_COUNT_MAX
+        errors = error.errors(include_url=False)
+        found = [_line(details) for details in errors[:_ERROR_COUNT_MAX]]
+        more = len(errors) - _ERROR_COUNT_MAX
     else:
         if directory is not None:
             settings = _with_directory(settings, directory)

@@ -106,12 +106,13 @@ class HeatWatch:
             for _ in range(max(round(passed / _UPDATE_INTERVAL), 1)):
                 step = min(passed, _UPDATE_INTERVAL)
                 follow(self._states[i].array, square, step, self._state.reading.temperature[i])
-            heat, told = self._states[i], self._state.heat[i]
-            told.winding, told.case, told.ambient = heat.x[[WINDING, CASE, AMBIENT]].tolist()
-            told.winding_std = winding_std(heat.array)
-            told.case_std = math.sqrt(heat.p.item(CASE, CASE))
+            heat, estimate = self._states[i], self._state.heat[i]
+            temperatures = heat.x[[WINDING, CASE, AMBIENT]].tolist()
+            estimate.winding, estimate.case, estimate.ambient = temperatures
+            estimate.winding_std = winding_std(heat.array)
+            estimate.case_std = math.sqrt(heat.p.item(CASE, CASE))
             limit = self._limits.temperature_max - _HALF_STEP
-            told.time_to_limit = time_to_limit(heat.array, self._square[i], limit)
+            estimate.time_to_limit = time_to_limit(heat.array, self._square[i], limit)
 
     def act(self, control: Control, events: list[Event]) -> str:
         """Reduce the force of a grip that gets too hot; return a ``heat_action`` due now, or ''."""

@@ -142,11 +142,11 @@ class DynamixelServos:
             self._judge(found, port, allowed)
             claims = all(model.fast_read(each.table[reg.FIRMWARE_VERSION]) for each in found)
             ids = [joint.id for joint in self._joints]
-            reads, told = choose_reads(port, self._handler, ids, claims)
-            told += note_slow_replies(port, reads, self._profile)
+            reads, note = choose_reads(port, self._handler, ids, claims)
+            note += note_slow_replies(port, reads, self._profile)
         finally:
             port.reply_timeout = allowed
-        self.notices += tuple(told)
+        self.notices += tuple(note)
         for notice in self.notices:
             _log.warning(notice)
         return reads

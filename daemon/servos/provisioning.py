@@ -57,9 +57,9 @@ class FoundServo:
     firmware: int
 
     def __str__(self) -> str:
-        return self.told(str(self.baud))
+        return self.describe(str(self.baud))
 
-    def told(self, rates: str) -> str:
+    def describe(self, rates: str) -> str:
         """Return the report line of a servo that answers at these rates [baud]."""
         name = reg.name_of(self.number)
         return f"ID {self.id} at {rates} baud: {name}, firmware {self.firmware}"

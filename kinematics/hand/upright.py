@@ -36,16 +36,16 @@ def upright_spring(
     q: float,
     d: float,
     force: float,
-    turning: float,
+    tilt_moment_ratio: float,
     lengths: tuple[float, float, float, float],
 ) -> float:
     """Return the spring k [N·m/rad] between joints at ``q`` [rad] that keeps the object upright.
 
-    ``d`` [m] and ``force`` [N] are the means of both tips, ``turning`` is their c, and ``lengths``
-    [m] are those of :func:`hand.grasp_state.held_motion`.
+    ``d`` [m] and ``force`` [N] are the means of both tips, ``tilt_moment_ratio`` is their c, and
+    ``lengths`` [m] are those of :func:`hand.grasp_state.held_motion`.
     """
     half_separation, length, offset, radius = lengths
     inward = length * math.sin(q) + offset * math.cos(q)
     width = 2.0 * (half_separation - inward - radius + d)
     gap = max(width - d, _WIDTH_MIN * radius)
-    return force * half_separation * (2.0 * inward + (1.0 - 2.0 * turning) * d) / gap
+    return force * half_separation * (2.0 * inward + (1.0 - 2.0 * tilt_moment_ratio) * d) / gap

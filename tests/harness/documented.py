@@ -21,7 +21,7 @@ from softfinger import Hand, HandState, SoftfingerError
 from softfinger.daemon.errors import SettingsError
 from softfinger.tools.arguments import profile
 from softfinger.tools.cli import main, make_parser
-from softfinger.tools.terminal.status import told
+from softfinger.tools.terminal.status import describe
 from tests.harness.daemon_process import SOFTFINGER, Running
 
 _BUSY = "DOCUMENTED_BUSY"  # marks processes started by a command, which run separately
@@ -156,7 +156,8 @@ def _await(shown: str) -> int:
         try:
             hand.wait_for(as_shown, 120.0)
         except SoftfingerError as error:
-            print(f"status: the page shows {shown[2:]!r}: {error}; the hand: {told(hand.state())}")
+            now = describe(hand.state())
+            print(f"status: the page shows {shown[2:]!r}: {error}; the hand: {now}")
             return 1
     return 0
 

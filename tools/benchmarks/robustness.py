@@ -183,8 +183,8 @@ class Outcome:
     def well(self) -> bool:
         """Return True if the force is within `_ERROR_MAX`, or the error was reported in time."""
         near = self.held and abs(self.settled - 1.0) <= _ERROR_MAX and self.above == 0.0
-        told = self.named - self.first_off <= _REPORT_TIME_MAX and not self.raised
-        return near or (self.first_off < math.inf and told)
+        is_reported = self.named - self.first_off <= _REPORT_TIME_MAX and not self.raised
+        return near or (self.first_off < math.inf and is_reported)
 
 
 def grip(case: HandCase, seed: int = 1) -> Outcome:

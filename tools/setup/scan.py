@@ -51,7 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
             rates.setdefault(replace(servo, baud=0), []).append(str(servo.baud))
         for servo, at in rates.items():
             # An emulated servo may answer at several rates; they are joined in one line.
-            print(f"{path}: {servo.told(', '.join(at))}", flush=True)
+            print(f"{path}: {servo.describe(', '.join(at))}", flush=True)
         for garbled in found.garbled:
             print(f"{path}: {garbled}\n  → {ONE_SERVO_ONLY}", flush=True)
         for old in found.old_protocol():

@@ -29,7 +29,7 @@ from softfinger.tools.arguments import (
 )
 from softfinger.tools.stop_condition import StopCondition, available_signals
 from softfinger.tools.terminal.monitor_page import MonitorPage
-from softfinger.tools.terminal.status import told
+from softfinger.tools.terminal.status import describe
 from softfinger.tools.terminal.stream_state import Commander, StreamReader, StreamState, printable
 from softfinger.tools.terminal.terminal import KeyDecoder, Terminal, TerminalGone
 
@@ -311,7 +311,7 @@ def _run_plain(address: str, subscriber: StreamReader, ending: _MonitorStop) -> 
                 _say(f"{event.clock()} {event.level} {event.kind}: {event.text}")
             if status in ("live", "stale") and now >= due:
                 due = now + PLAIN_LINE_INTERVAL
-                _say(f"{_clock()} {printable(told(feed.state))}")
+                _say(f"{_clock()} {printable(describe(feed.state))}")
         return
     # The reader has closed the pipe. Python flushes its output again at exit; send that to
     # /dev/null.

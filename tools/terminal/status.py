@@ -29,11 +29,11 @@ def run(arguments: argparse.Namespace) -> int:
     except NoStream:
         print(f"status: {no_stream(arguments.address, arguments.keys)}", file=sys.stderr)
         return 2
-    print(json.dumps(asdict(state), ensure_ascii=False) if arguments.json else told(state))
+    print(json.dumps(asdict(state), ensure_ascii=False) if arguments.json else describe(state))
     return 1 if state.fault else 0
 
 
-def told(state: HandState) -> str:
+def describe(state: HandState) -> str:
     """Return a line with mode, mean force and the object's angle and width, or the fault."""
     if state.fault:
         return f"{state.mode}: {state.fault}"
