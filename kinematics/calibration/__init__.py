@@ -1,4 +1,4 @@
-"""Calibration of sensors and tips: curves, centre, modulus and laws from frames and test presses.
+"""Calibration of sensors and tips from frames and test presses: curves, centre, modulus and models.
 
-This package contains only the mathematics; files and the procedure are in `tools.calibration`.
+This package contains only the mathematics. Files and the procedure are in `tools.calibration`.
 """

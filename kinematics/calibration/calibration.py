@@ -1,15 +1,15 @@
 """Calibration of a pressure sensor under a soft tip.
 
-The steps, in order, are
+The steps are, in order:
 
-1. tare: zero and noise of each cell without a load,
-2. equilibration: gains that make all cells respond alike,
+1. tare: zero offset and noise of each cell without a load,
+2. equilibration: gains that equalise the response of all cells,
 3. curve: conversion from equilibrated readings to pressure,
 4. centre: position of the tip on the sensor and rotation of the sensor,
-5. modulus: the tip's own law,
-6. relaxation: decrease of the tip's force during a hold.
+5. modulus: modulus of the tip,
+6. relaxation: decrease of the tip force during a hold.
 
-Each step returns its result with the residuals.
+Each step returns its result together with the residuals.
 """
 
 from __future__ import annotations
@@ -40,19 +40,19 @@ from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 FloatArray = NDArray[np.float64]
 Kind = Literal["power", "cubic"]
 
-DEAD_RESPONSE = 0.2  # of the median response; cells below it are dead
+DEAD_RESPONSE = 0.2  # fraction of the median response, below which a cell is dead
 _EXPONENTS = (0.3, 3.0)
-_UNREST_SIGMA = 8.0  # times the median noise, above which a cell is not at rest
-_UNREST_CELL_COUNT = 4  # number of cells not at rest at which the tare fails; fewer may be faulty
-_TILT_MIN = math.radians(3.0)  # smallest range of tilts that determines the rotation
+_UNREST_SIGMA = 8.0  # multiple of the median noise, above which a cell is unsteady
+_UNREST_CELL_COUNT = 4  # unsteady cells at which the tare fails; fewer cells may be faulty
+_TILT_MIN = math.radians(3.0)  # minimum tilt range that determines the rotation
 _UPRIGHT_ERROR = math.radians(0.5)
-_PRESSED_SIGMA = 6.0  # times the noise; the largest cell under a contact reads more
-_LAG_MAX = 8  # cells, largest lag of the noise correlation
-_SIGNIFICANT_SIGMA = 4.0  # standard errors for a significant result
-# Standard deviations of the noise; a zero below it is affected by clipping at 0.
+_PRESSED_SIGMA = 6.0  # multiple of the noise that the largest reading of a contact must exceed
+_LAG_MAX = 8  # cells, maximum lag of the noise correlation
+_SIGNIFICANT_SIGMA = 4.0  # standard errors of a significant result
+# Noise standard deviations; a zero offset below this is affected by clipping at 0.
 _CLIPPED_SIGMA = 4.0
-_HOLD_RATIO_MIN = 2.0  # shortest hold, over the longest time constant
-_ITERATIONS = 25  # alternating iterations for strengths and press
+_HOLD_RATIO_MIN = 2.0  # minimum hold time, relative to the longest time constant
+_ITERATIONS = 25  # alternating iterations for the strengths and the press
 
 
 class CalibrationError(SoftfingerError, ValueError):
@@ -61,12 +61,12 @@ class CalibrationError(SoftfingerError, ValueError):
 
 @dataclass(frozen=True)
 class Tare:
-    """Result of `tare`.
+    """Result of `tare`: zero offset and noise of the cells.
 
     ``zero`` and ``noise`` are the mean and the standard deviation of the unloaded counts, both
-    float64 [rows, cols]. ``correlation`` [k, m] is the correlation of the noise of two cells by
-    their distance in rows and columns, or empty if it is not significant. ``drift`` [counts] is the
-    standard deviation of the common motion of all cells. ``excess`` [counts] is the mean of
+    float64 [rows, cols]. ``correlation`` [k, m] is the noise correlation of two cells by their
+    distance in rows and columns; it is empty if it is not significant. ``drift`` [counts] is the
+    standard deviation of the motion common to all cells. ``excess`` [counts] is the mean of
     max(reading − zero, 0).
     """
 
@@ -78,9 +78,10 @@ class Tare:
 
 
 def tare(frames: ArrayLike) -> Tare:
-    """Determine the zero and noise of each cell from unloaded frames [n, rows, cols].
+    """Determine the zero offset and noise of each cell from unloaded frames [n, rows, cols].
 
-    Raises CalibrationError if some cells vary much more than most, which indicates a contact.
+    Raises CalibrationError if several cells vary much more than the others, which indicates a
+    contact.
     """
     stack = _stack(frames, "tare")
     if len(stack) < 2:
@@ -97,12 +98,12 @@ def tare(frames: ArrayLike) -> Tare:
 def noise_correlation(stack: FloatArray) -> tuple[FloatArray, float]:
     """Return ``correlation`` and ``drift`` of a :class:`Tare` from unloaded frames [n, rows, cols].
 
-    Correlations within four standard errors of zero count as zero.
+    Correlations within four standard errors of zero are set to zero.
     """
     n, rows, cols = stack.shape
     noise = stack - stack.mean(axis=0)
     std = noise.std(axis=0)
-    rests = (std > 0.0) & (std <= _UNREST_SIGMA * np.median(std))  # not dead or faulty
+    rests = (std > 0.0) & (std <= _UNREST_SIGMA * np.median(std))  # excludes dead and faulty cells
     noise *= rests
     common = noise.sum(axis=(1, 2)) / max(np.count_nonzero(rests), 1)
     noise -= common[:, None, None] * rests
@@ -111,7 +112,7 @@ def noise_correlation(stack: FloatArray) -> tuple[FloatArray, float]:
     shape = rows + _LAG_MAX, cols + _LAG_MAX
     power = (np.abs(np.fft.fft2(noise, shape)) ** 2).sum(axis=0)
     products = np.fft.ifft2(power).real
-    # Average over both signs of one lag, that is, over both diagonal directions.
+    # Average over both signs of one lag, and therefore over both diagonal directions.
     both = 0.5 * (products + np.roll(products[:, ::-1], 1, axis=1))[:_LAG_MAX, :_LAG_MAX]
     pairs = (n - 1.0) * np.outer(rows - np.arange(_LAG_MAX), cols - np.arange(_LAG_MAX))
     if rows < _LAG_MAX or cols < _LAG_MAX or not both[0, 0] > 0.0:
@@ -131,10 +132,11 @@ def noise_correlation(stack: FloatArray) -> tuple[FloatArray, float]:
 
 @dataclass(frozen=True)
 class Equilibration:
-    """Result of `equilibrate`.
+    """Result of `equilibrate`: cell gains.
 
-    ``gain`` float64 [rows, cols] makes all cells respond alike and is 0 for dead cells. ``spread``
-    and ``residual`` are the relative rms deviations of the cells from their mean before and after.
+    ``gain`` float64 [rows, cols] equalises the response of all cells; it is 0 for dead cells.
+    ``spread`` and ``residual`` are the cells' relative rms deviations from their mean, before and
+    after equilibration.
     """
 
     gain: FloatArray
@@ -143,11 +145,11 @@ class Equilibration:
 
 
 def equilibrate(loads: Sequence[ArrayLike], zero: FloatArray) -> Equilibration:
-    """Determine the gains from frames [n, rows, cols] under each of several uniform pressures.
+    """Determine the gains from frames [n, rows, cols] at each of several uniform pressures.
 
     The gain of a cell is the least-squares fit of its readings to the mean of all working cells.
-    Cells with less than a fifth of the median response are dead. Raises CalibrationError if the
-    frames show no pressure.
+    Cells with less than a fifth of the median response are considered dead. Raises CalibrationError
+    if the frames show no pressure.
     """
     if not loads:
         raise CalibrationError("equilibrate: no uniform pressure was given")
@@ -173,8 +175,8 @@ def equilibrate(loads: Sequence[ArrayLike], zero: FloatArray) -> Equilibration:
 class SensorCurve:
     """Result of `fit_curve`: p = c_1 x^b + c_2 x² + c_3 x³ [Pa].
 
-    ``coefficients`` are (b, c_1, c_2, c_3). ``errors`` [n] are the relative errors of the known
-    forces, ``residual`` is their rms.
+    ``coefficients`` are (b, c_1, c_2, c_3). ``errors`` [n] are the relative errors at the known
+    forces, and ``residual`` is their rms.
     """
 
     kind: Kind
@@ -188,27 +190,27 @@ def fit_curve(
 ) -> SensorCurve:
     """Fit the pressure curve of the cells to known forces.
 
-    The sum of pressure times cell area over all cells is fitted to the forces by least squares of
-    the relative errors.
+    The sum of pressure times cell area over all cells is fitted to the forces. The fit minimises
+    the squared relative errors.
 
     Parameters
     ----------
     kind
         "power" or "cubic".
     readings
-        x = (counts − zero)·gain, float64 [n, rows, cols]; non-negative and without noise far from
-        the contact, see :func:`above_zero`.
+        x = (counts − zero)·gain, float64 [n, rows, cols]. The readings must be non-negative and
+        free of noise far from the contact, see :func:`above_zero`.
     force
         Known forces [n] [N].
     area
-        Area of a cell [m²].
+        Cell area [m²].
     full
-        Largest possible x; a cubic curve must increase up to it.
+        Maximum possible x. A cubic curve must increase up to this value.
 
     Raises
     ------
     CalibrationError
-        If there are too few forces, or the curve decreases.
+        If there are too few forces, or if the curve decreases.
     """
     x = _stack(readings, "curve")
     x = x.reshape(len(x), -1)
@@ -257,7 +259,7 @@ def _power(
         errors = fit(exponent)[1]
         return float(errors @ errors)
 
-    # Search a coarse grid, then refine the best point by golden section.
+    # Search a coarse grid, then refine the best point with a golden-section search.
     grid = np.linspace(*_EXPONENTS, 28)
     best = int(np.argmin([cost(float(b)) for b in grid]))
     low, high = float(grid[max(best - 1, 0)]), float(grid[min(best + 1, len(grid) - 1)])
@@ -269,9 +271,9 @@ def _power(
 
 
 def above_zero(readings: FloatArray, noise: FloatArray, frames: int) -> FloatArray:
-    """Set mean readings [rows, cols] over ``frames`` frames to 0 if they are within 4 σ of it.
+    """Set mean readings [rows, cols] over ``frames`` frames to 0 if they are within 4 σ of 0.
 
-    Clipped noise has a positive mean, whose sum over all cells may be as large as a contact.
+    Clipped noise has a positive mean. Summed over all cells, it may be as large as a contact.
     """
     level = 4.0 * noise / math.sqrt(frames)
     return np.where(readings > level, readings, 0.0)
@@ -280,9 +282,9 @@ def above_zero(readings: FloatArray, noise: FloatArray, frames: int) -> FloatArr
 def without_clipping(means: FloatArray, zero: FloatArray, noise: float) -> FloatArray:
     """Correct the mean counts of many frames for noise that is clipped at 0.
 
-    ``zero`` and ``noise`` are the mean and the standard deviation of the counts of a tare. For
-    max(x + n, 0) with Gaussian n, both increase with x, and so does their ratio. The ratio
-    determines the standard deviation of n.
+    ``zero`` and ``noise`` are the mean and the standard deviation of the tare counts. For
+    max(x + n, 0) with Gaussian n, the mean, the standard deviation and their ratio all increase
+    with x. The ratio therefore determines the standard deviation of n.
     """
     z = np.linspace(-3.0, 6.0, 1801)
     above = 0.5 * (1.0 + np.array([math.erf(each) for each in z / math.sqrt(2.0)]))
@@ -303,10 +305,10 @@ def without_clipping(means: FloatArray, zero: FloatArray, noise: float) -> Float
 
 @dataclass(frozen=True)
 class Centre:
-    """Result of `fit_centre`: the tip's centre in the sensor's axes [m] and the rotation [rad].
+    """Result of `fit_centre`: the tip centre in sensor axes [m] and the rotation [rad].
 
     ``rotation`` is None if no press was tilted. ``residual`` is the change in the last iteration
-    [m], ``std`` the standard deviation of the centre in x and in y [m].
+    [m], and ``std`` is the standard deviation of the centre in x and in y [m].
     """
 
     centre: tuple[float, float]
@@ -327,8 +329,8 @@ def fit_centre(
     """Determine centre and rotation from presses at known tilts ``theta`` [n] [rad].
 
     The tilts are in the finger's plane. All cells of the ``frames`` [n, rows, cols] [Pa] are
-    fitted; the modulus of a spring tip need not be known. Raises CalibrationError if a frame shows
-    no contact, or if all tilts are equal but not upright.
+    fitted. The modulus of a spring tip need not be known. Raises CalibrationError if a frame shows
+    no contact, or if all tilts are equal but not zero.
     """
     stack = _stack(frames, "centre")
     s = np.sin(np.asarray(theta, np.float64))
@@ -347,7 +349,7 @@ def fit_centre(
     force = (stack * used).sum(axis=(1, 2)) * math.prod(grid.pitches)
     presses = Presses(stack, depth_of_force(tip, material, force), np.arcsin(s), noise, used)
     found, residual, std = fit_place(presses, tip, material, grid, tilted)
-    # Add the uncertainty of the upright orientation, which moves the centroid by lever times angle.
+    # Add the uncertainty of the upright orientation, which shifts the centroid by lever × angle.
     lever = (0.5 if tip.physics == "solid" else 1.0) * tip.radius
     std = math.hypot(std, lever * _UPRIGHT_ERROR / math.sqrt(3.0 * len(s)))
     return Centre(found.centre, found.rotation if tilted else None, residual, std)
@@ -355,10 +357,10 @@ def fit_centre(
 
 @dataclass(frozen=True)
 class Modulus:
-    """Result of `fit_modulus` for the tip's F(d − d₀, θ).
+    """Result of `fit_modulus` for the model F(d − d₀, θ).
 
-    ``modulus`` is E [Pa], ``offset`` is d₀ [m], ``errors`` [n] are the relative errors of the
-    force, and ``trend`` holds E of each load alone.
+    ``modulus`` is E [Pa], ``offset`` is d₀ [m], ``errors`` [n] are the relative force errors, and
+    ``trend`` contains the value of E from each load alone.
     """
 
     modulus: float
@@ -369,11 +371,11 @@ class Modulus:
 
 
 def fit_modulus(d: ArrayLike, theta: ArrayLike, force: ArrayLike, tip: Fingertip) -> Modulus:
-    """Fit a constant modulus of ``tip`` and the zero of d to a compression run.
+    """Fit a constant modulus of ``tip`` and the zero offset of d to a compression run.
 
-    The fit minimises the squared relative errors. ``d`` [m], ``theta`` [rad] and the force measured
-    by the sensor, ``force`` [N], all have shape [n]. Raises CalibrationError for too few points, or
-    if the force does not increase with d.
+    The fit minimises the squared relative errors. ``d`` [m], ``theta`` [rad] and ``force`` [N], the
+    force measured by the sensor, have shape [n]. Raises CalibrationError if there are too few
+    points, or if the force does not increase with d.
     """
     depth, tilt, load = (np.asarray(each, np.float64) for each in (d, theta, force))
     if not depth.shape == tilt.shape == load.shape:
@@ -403,18 +405,18 @@ def fit_modulus(d: ArrayLike, theta: ArrayLike, force: ArrayLike, tip: Fingertip
 class Relaxation:
     """Result of `fit_relaxation`: F = c F∞ (1 + Σ r_i (1 − h_i/F∞)), ḣ_i = (F∞ − h_i)/τ_i.
 
-    The strengths are r_i. ``residual`` is the rms relative error of F during the hold, ``elastic``
-    the same without relaxation.
+    The strengths are r_i. ``residual`` is the rms relative error of F during the hold, and
+    ``elastic`` is the same error without relaxation.
     """
 
     strengths: tuple[float, ...]
     residual: float
     elastic: float
-    model: FloatArray  # fitted F [N]; measured F during the press
+    model: FloatArray  # fitted F [N] during the hold, measured F during the press
 
 
 def follow(t: FloatArray, lasting: FloatArray, time: float) -> FloatArray:
-    """Integrate ḣ = (F∞ − h)/τ from 0 for ``lasting`` F∞, linear between the times ``t``."""
+    """Integrate ḣ = (F∞ − h)/τ from h = 0; ``lasting`` is F∞, linear between the times ``t``."""
     out = np.zeros_like(lasting)
     for k in range(1, t.size):
         step = (t[k] - t[k - 1]) / time
@@ -427,17 +429,17 @@ def follow(t: FloatArray, lasting: FloatArray, time: float) -> FloatArray:
 def fit_relaxation(t: ArrayLike, force: ArrayLike, times: tuple[float, ...]) -> Relaxation:
     """Fit non-negative relaxation strengths to the force of a press and the following hold.
 
-    F∞ is constant during the hold. During the press it follows from F and the strengths, so both
-    are determined alternately.
+    F∞ is constant during the hold. During the press, it follows from F and the strengths.
+    Therefore F∞ and the strengths are determined alternately.
 
     Parameters
     ----------
     t, force
-        Time [s] and force [N]. The press may have any speed and depth, but it must begin without
+        Time [s] and force [N]. The press may have any speed and depth. It must begin without
         contact, because earlier relaxation would not be included.
     times
-        Time constants τ_i [s]. The strength of a term shorter than two frames cannot be determined
-        and is 0.
+        Time constants τ_i [s]. If a time constant is shorter than two frames, its strength cannot
+        be determined and is set to 0.
 
     Raises
     ------
@@ -461,7 +463,7 @@ def fit_relaxation(t: ArrayLike, force: ArrayLike, times: tuple[float, ...]) -> 
         memory = np.array([follow(at, lasting, times[k]) for k in told]).reshape(-1, at.size)
         columns = np.stack([lasting, *(lasting - memory)], axis=1)[held:]
         fits = []
-        # With so few terms, try every subset and keep the best with positive strengths.
+        # There are few terms, so try every subset and keep the best one with positive strengths.
         for chosen in itertools.product((False, True), repeat=len(told)):
             used = np.flatnonzero((True, *chosen))
             found = np.linalg.lstsq(columns[:, used], load[held:], rcond=None)[0]

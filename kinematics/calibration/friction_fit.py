@@ -1,4 +1,4 @@
-"""Coulomb, viscous and break-away friction of a joint from reciprocating motion in free air."""
+"""Coulomb, viscous and break-away friction of a joint, from reciprocating motion in free air."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from softfinger.kinematics.calibration.calibration import CalibrationError
 
 FloatArray = NDArray[np.float64]
 
-DURATION_MAX = 3600.0  # s, longest recording; limits memory
+DURATION_MAX = 3600.0  # s, maximum recording time; limits memory
 _STEP = 0.01  # s, time grid for motion and torque
-_WINDOW = 6  # steps on either side for the fit of velocity and acceleration
-_GAP_MAX = 0.035  # s, longest gap in the data to interpolate across
-_SLIDING_SPEED = 0.2  # rad/s, above which static friction is mostly gone (XL330: 0.12 rad/s)
-_REST_SPEED = 0.02  # rad/s, below which a joint is at rest; one count of 1.5 mrad in 0.08 s
-# rad from rest at break-away: three counts, ten times the compliance of the gears.
+_WINDOW = 6  # steps on either side in the fit of velocity and acceleration
+_GAP_MAX = 0.035  # s, maximum gap in the data to interpolate across
+_SLIDING_SPEED = 0.2  # rad/s, above which static friction has mostly vanished (XL330: 0.12 rad/s)
+_REST_SPEED = 0.02  # rad/s, below which a joint is at standstill; one count of 1.5 mrad in 0.08 s
+# rad, travel from standstill at break-away: three counts, ten times the gear compliance.
 _BREAK_AWAY_DISTANCE = 5e-3
-# rad/s, number of steps: fastest goal for a break-away with little inertia.
+# rad/s over a number of steps: maximum goal velocity at break-away; limits the inertial torque.
 _BREAK_AWAY_RATE = 0.1, 20
-_MOTION_TIME_MIN = 0.5  # s, shortest motion in each direction
-_CORRELATION_TIME = 0.2  # s, correlation time of the remaining errors
-_BREAK_AWAY_COUNT_MIN = 3  # break-aways needed for a mean
-# N·m·s/rad, mean and standard deviation of the prior. Values identified for such servos are 0.015
-# to 0.051 (model M4 of Rhoban's BAM, arXiv 2410.08650).
+_MOTION_TIME_MIN = 0.5  # s, minimum motion time in each direction
+_CORRELATION_TIME = 0.2  # s, correlation time of the residuals
+_BREAK_AWAY_COUNT_MIN = 3  # number of break-aways needed for a mean
+# N·m·s/rad, mean and standard deviation of the prior. Values identified for similar servos range
+# from 0.015 to 0.051 (model M4 of Rhoban's BAM, arXiv 2410.08650).
 _VISCOUS_PRIOR = 0.02, 0.02
 _INERTIA_ERROR = 0.5  # relative error of the configured inertia
 
@@ -38,7 +38,7 @@ class FrictionFit(NamedTuple):
     coulomb_std: float
     viscous: float  # [N·m·s/rad]
     viscous_std: float
-    stiction: float  # at break-away; NaN with fewer than three slow starts from rest
+    stiction: float  # at break-away; NaN for fewer than three slow starts from standstill
     stiction_std: float
 
 
@@ -52,27 +52,27 @@ def fit_friction(
 ) -> FrictionFit:
     """Fit the friction of a joint to reciprocating motion in free air by least squares.
 
-    While the joint moves, its motor gives
+    While the joint moves, the motor torque is
 
         torque = F sign(q̇) + b q̇ + J q̈ + c0 + c1 q + c2 q²
 
-    with the Coulomb friction F and the viscous friction b ≥ 0. The polynomial covers torques that
-    do not depend on the direction of motion: weight, cables and the offset of the current. The
-    break-away friction is the largest torque during a start from rest with a slow goal.
+    where F is the Coulomb friction and b ≥ 0 the viscous friction. The polynomial covers torques
+    that do not depend on the direction of motion: weight, cables and the current offset. The
+    break-away friction is the maximum torque during a start from standstill with a slow goal.
 
     Parameters
     ----------
     t, q, goal, torque
-        Time [s], joint angle and its goal [rad], torque of the motor [N·m].
+        Time [s], joint angle and goal angle [rad], motor torque [N·m].
     inertia
-        J [kg·m²], known to 50 %.
+        J [kg·m²], known to within 50 %.
     step
-        Resolution of the torque [N·m].
+        Torque resolution [N·m].
 
     Raises
     ------
     CalibrationError
-        If the joint moves for less than 0.5 s in either direction, or the data last for more than
+        If the joint moves for less than 0.5 s in either direction, or if the data are longer than
         an hour.
     """
     at, angle, led, given = (np.asarray(each, np.float64) for each in (t, q, goal, torque))
@@ -85,7 +85,7 @@ def fit_friction(
     place, rate, acceleration = _motion(shown)
     after = np.clip(np.searchsorted(at, grid, "right"), 1, at.size - 1)
     whole = at[after] - at[after - 1] < _GAP_MAX
-    # Use only instants with one direction of motion throughout the smoothing window.
+    # Use only instants whose whole smoothing window has the same direction of motion.
     closes, opens = (_throughout(whole & (sign * rate > _SLIDING_SPEED)) for sign in (1.0, -1.0))
     seconds = [float(np.count_nonzero(each)) * _STEP for each in (closes, opens)]
     if min(seconds) < _MOTION_TIME_MIN:
@@ -109,7 +109,7 @@ def fit_friction(
 
 
 def duration_error(seconds: float) -> str:
-    """Return the error message for a recording of ``seconds`` that is too long."""
+    """Return the error message for an overlong recording of ``seconds``."""
     return f"found {seconds:.0f} s of data, expected {DURATION_MAX:g} s at most"
 
 
@@ -130,7 +130,7 @@ def _motion(q: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def _throughout(holds: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return True where the condition holds at all neighbours of an instant."""
+    """Return True where the condition holds throughout the window around an instant."""
     size = 2 * _WINDOW + 1
     return np.convolve(np.pad(holds, _WINDOW), np.ones(size), "valid") > size - 0.5
 
@@ -138,14 +138,14 @@ def _throughout(holds: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def _least_squares(
     columns: FloatArray, values: FloatArray, inertia: float, step: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the least-squares solution and its standard deviations."""
+    """Return the least-squares solution with priors, and its standard deviations."""
     prior = np.array([0.0, _VISCOUS_PRIOR[0], inertia, 0.0, 0.0, 0.0])
     weight = np.diag(
         [0.0, _VISCOUS_PRIOR[1] ** -2, (_INERTIA_ERROR * inertia) ** -2, 0.0, 0.0, 0.0]
     )
     rounding = step * step / 12.0
     variance = rounding
-    for _ in range(2):  # the second pass uses the noise found by the first
+    for _ in range(2):  # the second pass uses the noise estimate of the first
         per_sample = _STEP / _CORRELATION_TIME / variance
         covariance = np.linalg.inv(per_sample * columns.T @ columns + weight)
         found = covariance @ (per_sample * columns.T @ values + weight @ prior)
@@ -153,16 +153,16 @@ def _least_squares(
     std = np.sqrt(np.diag(covariance))
     if found[1] < 0.0:  # b cannot be negative: use the solution for b = 0
         found = found - covariance[:, 1] * (found[1] / covariance[1, 1])
-    # A constant current between two counts has the same quantisation error throughout.
+    # A constant current between two counts always has the same quantisation error.
     std[0] = math.hypot(float(std[0]), math.sqrt(rounding))
     return found, std
 
 
 def _break_aways(q: FloatArray, rate: FloatArray, push: FloatArray, goal: FloatArray) -> FloatArray:
-    """Return torque and standard deviation of each start from rest with a slow goal, [n, 2].
+    """Return torque and standard deviation of each start from standstill with a slow goal, [n, 2].
 
-    The goal and the torque rise by whole counts, so the break-away torque is between the largest
-    torque and the one before.
+    Goal and torque increase in whole counts, so the break-away torque is between the maximum torque
+    and the value before it.
     """
     found = []
     speed, steps = _BREAK_AWAY_RATE

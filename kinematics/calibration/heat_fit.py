@@ -1,4 +1,4 @@
-"""Thermal model of a servo, its temperature rise and time constant, fitted to a hold of minutes."""
+"""Fit a servo's thermal model (temperature rise and time constant) to a hold of several minutes."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from numpy.typing import ArrayLike, NDArray
 from softfinger.kinematics.calibration.calibration import CalibrationError
 from softfinger.kinematics.hand.servo_heat import COPPER, HeatLaw
 
-_PRIOR_STD = (0.4, 0.4, 3.0)  # prior standard deviations of rise and time (relative), ambient [°C]
-_READING_ERROR = 0.4  # °C, error of a reading in whole degrees, including other errors of that kind
+_PRIOR_STD = (0.4, 0.4, 3.0)  # prior standard deviations of rise, time (relative), ambient [°C]
+_READING_ERROR = 0.4  # °C, rounding to whole degrees and similar reading errors
 _STEP = 1.0  # s
-_RISE_MIN = 8.0  # °C, smallest temperature rise of the case
+_RISE_MIN = 8.0  # °C, minimum temperature rise of the case
 _ITERATIONS = 12
 
 
@@ -36,10 +36,10 @@ def forecast(
     start: float,
     ambient: float,
 ) -> NDArray[np.float64]:
-    """Predict the case temperature [°C] for each of ``squares`` [A²], _STEP apart.
+    """Predict the case temperature [°C] for each of ``squares`` [A²], spaced by _STEP.
 
-    The model is that of `hand.servo_heat`. Winding and case start at ``start`` [°C]; ``rise`` and
-    ``time`` are factors on the constants of the law.
+    The model is defined in `hand.servo_heat`. Winding and case start at ``start`` [°C]. ``rise``
+    and ``time`` are factors on the model constants.
     """
     winding = case = start
     heating, inner, outer = law.heating * rise / time, law.winding_time * time, law.case_time * time
@@ -55,9 +55,9 @@ def forecast(
 def fit_heat(law: HeatLaw, t: ArrayLike, current: ArrayLike, reading: ArrayLike) -> HeatFit:
     """Fit the thermal model to a hold that starts at room temperature.
 
-    ``current`` [A] and ``reading`` [°C] are given over ``t`` [s]. ``law`` contains the constants of
-    the servo model, known to 40 %. The fit uses Gauss-Newton on the logarithms of the factors.
-    Raises CalibrationError if the case warms by less than 8 °C.
+    ``current`` [A] and ``reading`` [°C] are sampled at the times ``t`` [s]. ``law`` contains the
+    constants of the servo model, known to within 40 %. Gauss-Newton fits the logarithms of the
+    factors. Raises CalibrationError if the case temperature rises by less than 8 °C.
     """
     at, square, shown = (np.asarray(each, np.float64) for each in (t, np.square(current), reading))
     warmed = float(shown.max() - shown[0]) if shown.size else 0.0
@@ -72,7 +72,8 @@ def fit_heat(law: HeatLaw, t: ArrayLike, current: ArrayLike, reading: ArrayLike)
 
     def rows(x: NDArray[np.float64]) -> NDArray[np.float64]:
         case = forecast(law, squares, np.exp(x[0]), np.exp(x[1]), shown[0], x[2])
-        # Equal readings share one rounding error, so each degree counts once, not every second.
+        # Equal readings share one rounding error, so each degree counts once, however long it
+        # lasts.
         weight = np.sqrt(warmed / grid.size) / _READING_ERROR
         return np.concatenate([(case - readings) * weight, (x - prior) / _PRIOR_STD])
 

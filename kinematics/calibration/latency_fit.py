@@ -1,4 +1,4 @@
-"""Latency of tactile frames: the delay of the tips' d relative to the closing of the joints."""
+"""Latency of tactile frames: the delay of d at the tips relative to the joint closing."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from softfinger.kinematics.calibration.friction_fit import DURATION_MAX, duratio
 
 FloatArray = NDArray[np.float64]
 
-_STEP = 1e-3  # s, time grid, and spacing of the delays tried first
-_DELAY_MIN, _DELAY_MAX = -0.02, 0.2  # s, range of latencies tried
-# m/s, s: a ramp closes faster than this, averaged over this time.
+_STEP = 1e-3  # s, time grid and spacing of the initial delays
+_DELAY_MIN, _DELAY_MAX = -0.02, 0.2  # s, range of latencies to search
+# m/s and s: a ramp closes faster than this speed, averaged over this time.
 _CLOSING_SPEED_MIN, _RATE_TIME = 2e-3, 0.05
-_RAMP_MARGIN = 0.2  # s, time before and after a ramp that belongs to it
-_CLOSING_MIN = 8e-4  # m, smallest closing of a ramp, seven encoder counts
-_FRAME_COUNT_MIN = 8  # smallest number of frames
-_TIME_ERROR = 1e-3  # s, standard deviation of the times of ticks, readings and frames
+_RAMP_MARGIN = 0.2  # s, time before and after a ramp that is included in the ramp
+_CLOSING_MIN = 8e-4  # m, minimum closing of a ramp, seven encoder counts
+_FRAME_COUNT_MIN = 8  # minimum number of frames
+_TIME_ERROR = 1e-3  # s, standard deviation of the tick, reading and frame times
 # Widening of a growing footprint, see `perception.frame_channels`.
 _WIDENING, _SPREAD_MAX = 1.4, 0.1
-_ITERATIONS = 3  # alternating iterations for the touch and the fit
+_ITERATIONS = 3  # alternating iterations for the first touch and the fit
 
 
 class LatencyFit(NamedTuple):
-    """Delay of the frames in addition to the configured latency, with standard deviation [s]."""
+    """Frame delay in addition to the configured latency, with standard deviation [s]."""
 
     delay: float
     std: float
-    scale: float  # d from frames over d from joints
+    scale: float  # ratio of d from the frames to d from the joints
     residual: float  # rms residual of d [m]
     ramps: int
 
@@ -43,7 +43,7 @@ def fit_latency(
     latency: float,
     response: float = 0.0,
 ) -> LatencyFit:
-    """Fit the delay of the frames of a grip with rising or falling force, over its ramps k.
+    """Fit the frame delay to the ramps k of a grip, in which the force rises or falls.
 
         d(t) = scale · closing(t − delay) + offset_k
 
@@ -53,21 +53,21 @@ def fit_latency(
     Parameters
     ----------
     frames
-        Times [s], d [m] and the standard deviation of its noise [m].
+        Times [s], d [m] and its noise standard deviation [m].
     joints
-        Times [s] and the depth to which they close [m], from any origin.
+        Times [s] and closing of the joints [m], from any origin.
     errors
-        Standard deviations: of the joints' depth by their encoders [m], and of d by the frames,
-        relative.
+        Standard deviation of the closing due to the encoders [m], and relative standard deviation
+        of d from the frames.
     latency
-        Latency that the frames' times contain [s].
+        Latency already included in the frame times [s].
     response
         Time constant of the cells [s].
 
     Raises
     ------
     CalibrationError
-        If the joints close by less than 0.8 mm in every ramp, or the data last for more than an
+        If the joints close by less than 0.8 mm in every ramp, or if the data are longer than an
         hour.
     """
     t, d, std = (np.asarray(each, np.float64) for each in frames)
@@ -90,14 +90,14 @@ def fit_latency(
         shown, spread = _filtered_closing(np.maximum(closing, touch), response)
         fit, offset = _fit(data, grid, shown, spread, scale_error, latency)
         touch = -offset / fit.scale
-    # The error of an encoder at rest is constant, and half of it shifts the ramp.
+    # The error of an encoder at standstill is constant, and half of it shifts the ramp.
     speed = float(np.abs(np.interp(data.t, grid, rate)).max())
     held = 0.5 * encoder / speed / math.sqrt(ramps.shape[1])
     return fit._replace(std=math.hypot(fit.std, held))
 
 
 class _Ramps(NamedTuple):
-    """Frames of the ramps: times, d, standard deviations, and the ramp of each frame."""
+    """Frames in the ramps: times, d, standard deviations, and the ramp of each frame."""
 
     t: FloatArray
     d: FloatArray
@@ -113,7 +113,7 @@ def _fit(
     scale_error: float,
     latency: float,
 ) -> tuple[LatencyFit, float]:
-    """Fit d to the closing as shown by the cells; also return the offset of d [m]."""
+    """Fit d to the filtered closing; also return the offset of d [m]."""
 
     def solve(delay: float) -> tuple[FloatArray, FloatArray]:
         at = data.t - delay
@@ -152,7 +152,7 @@ def _too_little(widest: float) -> str:
 
 
 def _filtered_closing(closing: FloatArray, response: float) -> tuple[FloatArray, FloatArray]:
-    """Return ``closing`` as shown by cells with a first-order lag, and its spread [m²]."""
+    """Return ``closing`` as measured by cells with a first-order lag, and its spread [m²]."""
     if response == 0.0:
         return closing, np.zeros_like(closing)
     share = -math.expm1(-_STEP / response)
@@ -167,7 +167,7 @@ def _filtered_closing(closing: FloatArray, response: float) -> tuple[FloatArray,
 
 
 def _rate(closing: FloatArray) -> FloatArray:
-    """Return the smoothed speed of closing [m/s]."""
+    """Return the smoothed closing speed [m/s]."""
     around = np.full(round(_RATE_TIME / _STEP) | 1, 1.0)
     smooth = np.convolve(np.pad(closing, around.size // 2, mode="edge"), around, "valid")
     return np.asarray(np.gradient(smooth / around.size, _STEP))
@@ -176,10 +176,10 @@ def _rate(closing: FloatArray) -> FloatArray:
 def _ramps(
     t: FloatArray, grid: FloatArray, closing: FloatArray, rate: FloatArray
 ) -> tuple[NDArray[np.bool_], float]:
-    """Return a mask of the frames of each ramp, [n, ramps], and the largest closing [m]."""
+    """Return a mask of the frames in each ramp, [n, ramps], and the maximum closing [m]."""
     window = np.ones(2 * round(_RAMP_MARGIN / _STEP) + 1)
     near = np.convolve(np.abs(rate) > _CLOSING_SPEED_MIN, window, "same") > 0.5
-    number = np.cumsum(near & ~np.append(False, near[:-1])) * near  # number of the ramp, 0 for none
+    number = np.cumsum(near & ~np.append(False, near[:-1])) * near  # ramp number; 0 outside ramps
     index = np.clip(np.searchsorted(grid, t), 0, grid.size - 1)
     widths = {
         k: float(np.ptp(closing[index[number[index] == k]]))

@@ -1,4 +1,4 @@
-"""Fit the curves of a measured tip law, `TipCurves`, to calibration presses."""
+"""Fit the curves of a measured tip model, `TipCurves`, to calibration presses."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ from softfinger.kinematics.contact.tip_curves import (
 from softfinger.kinematics.estimation.measured import sum_weights
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
-_PRESS_COUNT_MIN = 6  # smallest number of presses
+_PRESS_COUNT_MIN = 6  # minimum number of presses
 _UPRIGHT_TILT = math.radians(1.0)
 _TILTED_MIN = math.radians(5.0)
-_CURVE_ERROR_MAX = 0.05  # largest error of the curves over the force, and over the radius
-_STAGE_ERROR = 2e-3  # smallest relative error of a stage and sensor
+_CURVE_ERROR_MAX = 0.05  # maximum curve error, relative to the force and to the radius
+_STAGE_ERROR = 2e-3  # minimum relative error of a stage and a sensor
 
 
 class CurvesError(SoftfingerError, ValueError):
-    """Error raised if the presses do not determine a valid law."""
+    """Error raised if the presses do not determine valid curves."""
 
 
 @dataclass(frozen=True)
 class PressSums:
     """Presses at d [n] [m] and θ [n] [rad] in the finger's plane.
 
-    ``frames`` holds the frames of each press [k, rows, cols] [Pa], as the daemon will receive them.
-    ``pressures`` [n, rows, cols] are their means, corrected for the bias of noise clipped at 0;
-    ``rest`` [rows, cols] is this bias without a contact. ``gain`` is the true force over the
-    sensor's force.
+    ``frames`` contains the frames of each press [k, rows, cols] [Pa], as the daemon will receive
+    them. ``pressures`` [n, rows, cols] are the mean frames, corrected for the bias of noise clipped
+    at 0. ``rest`` [rows, cols] is this bias without contact. ``gain`` is the ratio of the true
+    force to the sensor's force.
     """
 
     d: FloatArray
@@ -53,7 +53,7 @@ class PressSums:
 
 
 def fit_measured(presses: PressSums, radius: float, grid: SensorGrid) -> TipCurves:
-    """Fit the law of a tip of ``radius`` together with its position on the ``grid``.
+    """Fit the curves of a tip of ``radius``, and its position on the ``grid``.
 
     Raises CurvesError.
     """
@@ -145,19 +145,19 @@ def fit_measured(presses: PressSums, radius: float, grid: SensorGrid) -> TipCurv
 
 
 def _excess_error(misses: FloatArray, noise: FloatArray, smallest: float) -> float:
-    """Return the standard deviation of residuals in excess of their noise, weighted by noise."""
+    """Return the weighted standard deviation of the residuals in excess of their noise."""
     weight = 1.0 / (noise**2 + smallest**2)
     return math.sqrt(max(float(weight @ (misses**2 - noise**2)) / float(weight.sum()), 0.0))
 
 
 def _sums(frames: Sequence[FloatArray], weights: FloatArray, rest: FloatArray) -> FloatArray:
-    """Return the sums of each press minus those at rest, [4, presses]."""
+    """Return the sums of each press minus the unloaded sums, [4, presses]."""
     means = np.stack([each.mean(axis=0) for each in frames]) - rest
     return np.asarray(weights @ means.reshape(len(frames), -1).T)
 
 
 def _noise(frames: Sequence[FloatArray], weights: FloatArray) -> FloatArray:
-    """Return the covariance of the sums of one frame [4, 4] from the frames of each press."""
+    """Return the covariance [4, 4] of one frame's sums, from the frames of each press."""
     if min(map(len, frames)) < 5:
         raise CurvesError("expected at least five frames of each press: their noise counts")
     each = [weights @ every.reshape(len(every), -1).T for every in frames]
@@ -165,13 +165,13 @@ def _noise(frames: Sequence[FloatArray], weights: FloatArray) -> FloatArray:
 
 
 def _place(sums: FloatArray, theta: FloatArray) -> tuple[tuple[float, float], float]:
-    """Return the tip's centre [m] from upright presses and the rotation [rad] from tilted ones."""
+    """Return the tip centre [m] from upright presses and the rotation [rad] from tilted presses."""
     x, y = sums[1:3] / sums[0]
     weight = np.where(np.abs(theta) < _UPRIGHT_TILT, sums[0], 0.0)
     weight /= weight.sum()
     centre = float(weight @ x), float(weight @ y)
     along = np.sin(theta) * sums[0]
-    # The finger's x axis in the sensor's axes is (cos, −sin) of the rotation.
+    # In sensor axes, the finger's x axis is (cos, −sin) of the rotation.
     return centre, math.atan2(-float(along @ (y - centre[1])), float(along @ (x - centre[0])))
 
 
@@ -183,7 +183,7 @@ def _best_fit(
     squares: int,
     valid: Callable[[FloatArray], bool],
 ) -> FloatArray | None:
-    """Return the valid curve with the smallest χ² + n log presses, for y = times · curve(t, q)."""
+    """Return the valid curve with the lowest BIC for y = times · curve(t, q)."""
     t, q, times = points
     best, smallest = None, math.inf
     for count in range(1, len(powers) + 1):

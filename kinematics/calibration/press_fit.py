@@ -1,6 +1,6 @@
 """Fit a tip's physics, modulus and position to presses at known depths and tilts.
 
-All cells of all frames are fitted by least squares with the forward model of the tip.
+A least-squares fit of the tip's forward model uses all cells of all frames.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ from softfinger.kinematics.sensing.footprint import FloatArray
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
 _UNIT_MATERIAL = Material.constant(1.0)
-_STEP = 1e-5  # m, step of numerical derivatives
-_PLACE_STEP = 2e-4  # m, step in position; larger because rim cells change by whole sample points
+_STEP = 1e-5  # m, step for numerical derivatives
+_PLACE_STEP = 2e-4  # m, position step; larger because rim cells change by whole sample points
 _ROTATION_STEP = 1e-4  # rad
-_ROTATION_STARTS = 8  # initial rotations to try
+_ROTATION_STARTS = 8  # number of initial rotations to try
 _GOLDEN_RATIO = 0.5 * (math.sqrt(5.0) - 1.0)
 _POISSON_TOLERANCE = 4e-3  # tolerance of ν
 _REPEATED_D, _REPEATED_THETA = 5e-5, 0.009  # m, rad; presses that differ by less are repetitions
-_DRIFT_MIN = 0.02  # smallest significant drift of E, relative; the accuracy of presses and tables
+_DRIFT_MIN = 0.02  # minimum significant relative drift of E; accuracy of presses and tables
 
 
 @dataclass(frozen=True)
 class Presses:
     """Frames of presses at known d and θ.
 
-    ``frames`` are float64 [n, rows, cols] [Pa]; d [n] is in m, and θ [n] in rad in the finger's
-    plane. ``noise`` [Pa] is the standard deviation of a cell in these frames. ``used``
+    ``frames`` are float64 [n, rows, cols] [Pa], ``d`` [n] is in m, and ``theta`` [n] is in rad in
+    the finger's plane. ``noise`` [Pa] is the standard deviation of a cell in these frames. ``used``
     [n, rows, cols] excludes dead and saturated cells.
     """
 
@@ -59,10 +59,10 @@ class Presses:
 
 @dataclass(frozen=True)
 class Trend:
-    """Modulus E [n] [Pa] of each press alone over d [n] [m], to check that one E fits all presses.
+    """Modulus E [n] [Pa] of each press versus d [n] [m], to check that one E fits all presses.
 
-    ``drift`` is the relative change of a line through the values from the smallest to the largest
-    d, and ``std`` its standard deviation from the scatter about the line.
+    ``drift`` is the relative change of a fitted line from the minimum to the maximum d, and ``std``
+    is its standard deviation, derived from the scatter about the line.
     """
 
     d: FloatArray
@@ -72,19 +72,19 @@ class Trend:
 
     @property
     def drifts(self) -> bool:
-        """True if E drifts by more than its scatter explains, so the law does not fit the tip."""
+        """True if E drifts by more than its scatter, so the model does not fit the tip."""
         return abs(self.drift) > max(2.0 * self.std, _DRIFT_MIN)
 
     @property
     def cause(self) -> str:
-        """Return the probable cause of the drift."""
+        """Probable cause of the drift."""
         if self.drift > 0.0:
             return "the tip stiffens more than this law: another base or face, or springs"
         return "the tip stiffens less than this law: another base or face, or solid, or it softens"
 
 
 def trend(d: FloatArray, modulus: FloatArray, force: FloatArray) -> Trend:
-    """Fit a line to ``modulus`` [n] [Pa] over ``d`` [n] [m], weighted by ``force`` [n]."""
+    """Fit a line to ``modulus`` [n] [Pa] versus ``d`` [n] [m], weighted by ``force`` [n]."""
     weight = force / force.max()
     span = np.ptp(d)
     rows = weight[:, None] * np.stack([np.ones(len(d)), (d - d.min()) / span], axis=1)
@@ -96,11 +96,11 @@ def trend(d: FloatArray, modulus: FloatArray, force: FloatArray) -> Trend:
 
 
 def first_cycle(d: FloatArray, theta: FloatArray, force: FloatArray) -> float | None:
-    """Return the mean relative excess force of first presses over their repetitions.
+    """Return the mean relative excess force of first presses compared with their repetitions.
 
     Filled rubber softens over its first cycles (Mullins, 1948), so a fit to both would describe
-    neither. The mean is over all pairs of ``d`` [n] [m] and ``theta`` [n] [rad] that are pressed
-    more than once; the result is None if there are none.
+    neither. The mean is taken over all pairs of ``d`` [n] [m] and ``theta`` [n] [rad] that are
+    pressed more than once. The result is None if there are no such pairs.
     """
     poses = np.round(np.stack([d / _REPEATED_D, theta / _REPEATED_THETA], axis=1))
     _, which = np.unique(poses, axis=0, return_inverse=True)
@@ -114,11 +114,12 @@ class TipFit:
     """Fit of one tip model to the presses.
 
     ``law`` is the material law for a modulus of 1 Pa at zero strain. The fitted values are
-    ``modulus`` [Pa], the zero of d ``offset`` [m] and, for a solid tip, ν. ``chi2`` is the mean
-    squared residual per cell over the noise variance. The errors are those of the estimator with
-    this tip: the rms errors of d [m] and θ [rad], and the rms error of the force relative to the
-    sum of the frame, over the rms force. They include only the fraction ``valid`` of frames with a
-    valid estimate. ``trend`` holds E of each press alone.
+    ``modulus`` [Pa], ``offset`` [m] (the zero offset of d) and, for a solid tip, ν. ``chi2`` is the
+    mean squared residual per cell divided by the noise variance. The errors are those of the
+    estimator with this tip. ``d_error`` [m] and ``theta_error`` [rad] are rms errors.
+    ``force_error`` is the rms difference between the estimated force and the frame sum, divided by
+    the rms frame sum. The errors include only frames with a valid estimate; ``valid`` is the
+    fraction of such frames. ``trend`` contains E of each press alone.
     """
 
     tip: Fingertip
@@ -145,7 +146,7 @@ def _scaled(law: Material, factor: float) -> Material:
 def fit_tip(
     presses: Presses, tip: Fingertip, grid: SensorGrid, law: Material = _UNIT_MATERIAL
 ) -> TipFit:
-    """Fit the modulus and the zero of d of one ``tip`` model by Gauss-Newton."""
+    """Fit the modulus and the zero offset of d for one ``tip`` model using Gauss-Newton."""
     readings = presses.frames[presses.used]
     offset = 0.0
     for _ in range(6):
@@ -170,11 +171,11 @@ def compare_tips(
     active: NDArray[np.bool_],
     material: Material = _UNIT_MATERIAL,
 ) -> list[TipFit]:
-    """Fit spring and solid models of the tip and return the fits, the best one first.
+    """Fit spring and solid models of the tip and return the fits, best first.
 
-    Springs are fitted with a constant modulus and, if it differs, with the law of ``material``.
-    Solid rubber is fitted with its best ν on either base with a frictionless face, and on the
-    better base with a sticking face.
+    Springs are fitted with a constant modulus. If ``material`` is not linear, they are also fitted
+    with its law. Solid rubber is fitted with its best ν: with a frictionless face on either base,
+    and with a sticking face on the better base.
     """
     fits = [fit_tip(presses, Fingertip(radius), grid)]
     if not material.is_linear:
@@ -216,7 +217,7 @@ def golden_section(cost: Callable[[float], float], low: float, high: float, with
 def _with_errors(
     presses: Presses, fit: TipFit, grid: SensorGrid, active: NDArray[np.bool_]
 ) -> TipFit:
-    """Return the fit with the errors of the estimator added."""
+    """Return the fit with the estimator's errors added."""
     table = ContactTable.build(fit.tip, fit.material)
     estimator = ContactEstimator(fit.tip, fit.material, grid, presses.noise, active=active)
     area = math.prod(grid.pitches)
@@ -254,10 +255,10 @@ def _with_errors(
 def fit_place(
     presses: Presses, tip: Fingertip, material: Material, grid: SensorGrid, rotate: bool
 ) -> tuple[SensorGrid, float, float]:
-    """Fit the tip's centre and, with ``rotate``, the sensor's rotation.
+    """Fit the tip centre and, if ``rotate`` is True, the sensor rotation.
 
     The tilts are known. Gauss-Newton fits the position, the rotation, the depth of each press
-    (starting at ``presses.d``) and, for springs, the modulus. Returns the grid, the last step [m]
+    (starting from ``presses.d``) and, for springs, the modulus. Returns the grid, the last step [m]
     and the standard deviation of the centre [m].
     """
     gain, free_gain = 1.0, tip.physics == "springs"
@@ -309,6 +310,6 @@ def fit_place(
 
 
 def depth_of_force(tip: Fingertip, material: Material, force: FloatArray) -> FloatArray:
-    """Return d [m] of an upright tip under ``force`` [N] from its contact table."""
+    """Return d [m] of an upright tip at ``force`` [N] from its contact table."""
     d = np.linspace(0.0, 0.4 * tip.radius, 401)
     return np.interp(force, ContactTable.build(tip, material)(d, 0.0).force, d)
