@@ -1,4 +1,4 @@
-"""Compilation and storage of kernels, and their record types.
+"""Compilation and caching of kernels, and their record types.
 
 The package is independent of the computations in the kernels.
 """

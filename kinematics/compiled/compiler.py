@@ -1,21 +1,24 @@
-"""Compile and cache kernels with Numba; the only module that uses Numba's private interfaces.
+"""Compile and cache kernels with Numba, using its private interfaces.
 
-The module is imported only with tested versions of Numba. With other versions, `plain` replaces it.
+No other module uses Numba's private interfaces. This module is imported only with tested Numba
+versions; otherwise `plain` replaces it.
 
-`KernelCompiler` runs only the passes that kernels need. It omits the passes for closures, `with`,
-parallel loops, branches on constants (LLVM removes those) and the type listing, which filled the
-cache. It also caches the result types of operations and the sizes of LLVM types. Otherwise Numba
-would search dozens of candidates for each operation and let LLVM parse a module for each size.
+`KernelCompiler` runs only the passes that kernels need. It omits the passes for closures, `with`
+statements and parallel loops. It also omits the pruning of constant branches, which LLVM does
+anyway, and the type listing, which would fill the cache. The compiler caches the result types of
+operations and the sizes of LLVM types. Without these caches, Numba would search dozens of
+candidates for each operation and let LLVM parse a module for each size.
 
-`BitcodeKernel`s are called only by other kernels. They are compiled to LLVM bitcode and never to
-machine code. By default Numba compiles each function called by a kernel as if Python might call
-it: the function is optimised with its callees, compiled to machine code, wrapped twice and cached,
-and its callers then link the bitcode and repeat the work. Bitcode alone reduces the compile time by
-a third and the cache to a quarter.
+A `BitcodeKernel` can be called only by other kernels. It is compiled to LLVM bitcode and never to
+machine code. By default, Numba compiles each function called by a kernel as if Python might call
+it. It optimises the function with its callees, compiles it to machine code, adds two wrappers and
+caches it; the callers then link the bitcode and repeat the work. Stopping at bitcode reduces the
+compile time by a third and the cache size to a quarter.
 
-`KernelCache` stores the machine code of a kernel without bitcode. Other kernels that call this
-kernel would need the bitcode; they compile it again. To load a kernel, Numba normally imports
-everything that it can compile, which takes a third of a second and 50 MB; this cache avoids that.
+`KernelCache` stores the machine code of a kernel but not its bitcode. Another kernel that calls
+this kernel needs the bitcode and therefore compiles it again. To load a kernel, Numba normally
+imports its entire library of supported functions, which takes a third of a second and 50 MB. This
+cache avoids the import.
 """
 
 from __future__ import annotations
@@ -62,14 +65,14 @@ from softfinger.kinematics.compiled.own_folder import OwnFolder
 
 _operation: Any = types.Function
 _resolve = _operation.get_call_type
-_SIGNATURES: dict[Any, Any] = {}  # of operations, by argument types and arithmetic flags
+_SIGNATURES: dict[Any, Any] = {}  # operation signatures, by argument types and arithmetic flags
 _context: Any = BaseContext
 _size = _context.get_abi_sizeof
-_SIZES: dict[Any, int] = {}  # of LLVM types [bytes]
+_SIZES: dict[Any, int] = {}  # LLVM type sizes [bytes]
 
 
 class KernelCompiler(CompilerBase):
-    """Compiler of one kernel, from source to machine code."""
+    """Compiler for one kernel, from source to machine code."""
 
     lowering: ClassVar[Any] = NativeLowering
 
@@ -78,13 +81,13 @@ class KernelCompiler(CompilerBase):
         self.state.args = _Arguments(self.state.args)
 
     def compile_extra(self, func: Any) -> Any:
-        """Compile ``func``."""
+        """Compile ``func`` with cached signatures and type sizes."""
         with _with_cached_lookups(self.state.flags):
             return super().compile_extra(func)
 
     def define_pipelines(self) -> list[Any]:
-        """Return the compiler passes in order."""
-        # Prune branches such as `if blur is None` that cannot be typed for a given argument.
+        """Return the compiler passes in execution order."""
+        # Prune branches such as `if blur is None` that cannot be typed for some arguments.
         nones = types.none in self.state.args
         passes: list[Any] = [TranslateByteCode, FixupArgs, IRProcessing]
         passes += [RewriteSemanticConstants, DeadBranchPrune] if nones else []
@@ -100,7 +103,7 @@ class KernelCompiler(CompilerBase):
 
 
 class _Arguments(tuple[Any, ...]):
-    """Argument types without their text form, which Numba builds in each pass; records are long."""
+    """Argument types without their long string form, which Numba would build in every pass."""
 
     __slots__ = ()
 
@@ -110,7 +113,7 @@ class _Arguments(tuple[Any, ...]):
 
 @contextmanager
 def _with_cached_lookups(flags: Any) -> Iterator[None]:
-    """Let Numba cache the signatures of its own functions and type sizes within this context."""
+    """Cache the signatures of Numba's functions and its type sizes within this context."""
     arithmetic = frozenset(flags.fastmath.flags), flags.error_model
 
     def signature(function: Any, context: Any, arguments: Any, named: Any) -> Any:
@@ -123,7 +126,7 @@ def _with_cached_lookups(flags: Any) -> Iterator[None]:
                 return None
             _SIGNATURES[key] = found, function._impl_keys[found.args]
         found, body = _SIGNATURES[key]
-        function._impl_keys[found.args] = body  # where Numba looks up the implementation
+        function._impl_keys[found.args] = body  # Numba looks up the implementation here
         return found
 
     def size(context: Any, kind: Any) -> int:
@@ -155,7 +158,7 @@ class BitcodeKernel(plain.InnerKernel):
             no_cfunc_wrapper=True,
             **options,
         )(self.py_func)
-        # Without this, Numba recompiles for each literal argument. LLVM folds literals anyway.
+        # Without this, Numba recompiles for each literal argument, which LLVM would fold anyway.
         resolve = self.dispatcher.get_call_template
         self.dispatcher.get_call_template = lambda args, kws: resolve(
             tuple(types.unliteral(each) for each in args), kws
@@ -171,7 +174,7 @@ class _Bitcode(JITCodeLibrary):
     """Code library that is linked into its callers and never compiled to machine code."""
 
     def _optimize_functions(self, ll_module: Any) -> None:
-        # As Numba does for its own libraries, including functions that are only declared here.
+        # Do what Numba does for its own libraries, also for functions that are only declared here.
         ll_module.data_layout = self._codegen._data_layout
         for function in ll_module.functions:
             if not function.is_declaration:
@@ -188,7 +191,7 @@ class _Bitcode(JITCodeLibrary):
 
 @register_pass(mutates_CFG=True, analysis_only=False)
 class _InnerLowering(NativeLowering):
-    """Lowering into a bitcode library, with a null entry point as placeholder for the kernel."""
+    """Lowering into a bitcode library, with a null entry point as a placeholder for the kernel."""
 
     _name = "inner_lowering"
 
@@ -227,7 +230,7 @@ class KernelFolder:
 
     @classmethod
     def from_function(cls, function: Callable[..., Any], file: str) -> KernelFolder | None:
-        """Return the locator, or None if there is no folder and kernels are not stored."""
+        """Return the locator, or None if no folder is available and kernels are not stored."""
         return None if kernel_folder() is None else cls(function, file)
 
     def get_cache_path(self) -> str:
@@ -237,14 +240,14 @@ class KernelFolder:
         return str(folder.path)
 
     def ensure_cache_path(self) -> None:
-        """Do nothing; `kernel_folder` has created and checked the folder."""
+        """Do nothing, because `kernel_folder` has already created and checked the folder."""
 
     def get_source_stamp(self) -> str:
         """Return the digest of the kernel's own file; the folder name covers all other files."""
         return hashlib.sha256(text(Path(self._py_file))).hexdigest()
 
     def get_disambiguator(self) -> str:
-        """Return a text that distinguishes kernels with equal kernel and module names."""
+        """Return a string that distinguishes kernels with equal kernel and module names."""
         file = Path(self._py_file)
         inside = file.is_relative_to(ROOT)
         place = file.relative_to(ROOT).parent if inside else file.parent
@@ -252,12 +255,12 @@ class KernelFolder:
 
 
 class _MachineCode(CompileResultCacheImpl):
-    """Serialisation of a compiled kernel."""
+    """Serialiser for compiled kernels."""
 
     _locator_classes: Any = (KernelFolder,)
 
     def reduce(self, cres: Any) -> Any:
-        """Replace the bitcode by the names of its symbols, with which Numba finds the code."""
+        """Replace the bitcode with its symbol names, which Numba needs to find the machine code."""
         (name, kind, (code, bitcode)), *rest = super().reduce(cres)
         module = _llvm.parse_bitcode(bitcode)
         defined = (*module.functions, *module.global_variables)
@@ -267,7 +270,7 @@ class _MachineCode(CompileResultCacheImpl):
 
 
 class _Files:
-    """Storage of one file per overload, which replaces Numba's index and data files."""
+    """Storage with one file per overload, replacing Numba's index and data files."""
 
     def __init__(self, folder: OwnFolder, name: str, stamp: str) -> None:
         self._folder, self._name, self._stamp = folder, name, stamp
@@ -284,7 +287,7 @@ class _Files:
 
 
 class KernelCache(FunctionCache):
-    """Numba cache that stores only machine code. Raises RuntimeError without a folder."""
+    """Numba cache that stores only machine code. Raises RuntimeError if there is no folder."""
 
     _impl_class = _MachineCode
 
@@ -296,14 +299,14 @@ class KernelCache(FunctionCache):
         self._cache_file: Any = _Files(folder, self._impl.filename_base, stamp)
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Load an overload without importing everything that Numba can compile."""
+        """Load an overload without importing Numba's library of supported functions."""
         _add_symbols()
         return self._load_overload(sig, target_context)
 
 
 @cache
 def _add_symbols() -> None:
-    """Register Numba's memory functions, which the machine code calls, with LLVM."""
+    """Register with LLVM the Numba memory functions that the machine code calls."""
     for name, address in nrt._nrt.c_helpers.items():  # type: ignore[attr-defined]
         _llvm.add_symbol(name if name.startswith("_") else f"NRT_{name}", address)
 
@@ -312,13 +315,13 @@ inner = BitcodeKernel
 
 
 def compiled(function: Callable[..., Any], options: dict[str, Any]) -> Any:
-    """Return ``function`` compiled by Numba, cached on disk if there is a folder."""
+    """Return ``function`` compiled by Numba, cached on disk if a folder is available."""
     dispatcher = _njit(no_cfunc_wrapper=True, pipeline_class=KernelCompiler, **options)(function)
     try:
         dispatcher._cache = KernelCache(function)
     except RuntimeError:
-        pass  # no folder; `kernel_folder` has issued a warning
-    called = inner(function, options).dispatcher  # the cache has no bitcode
+        pass  # no folder; `kernel_folder` has already issued a warning
+    called = inner(function, options).dispatcher  # the cache does not store bitcode
     dispatcher.get_call_template = called.get_call_template
     dispatcher.get_overload = called.get_overload
     return dispatcher

@@ -1,10 +1,9 @@
 """Decorators for compiled kernels.
 
 A kernel is a pure function of arrays, records and scalars. A ``kernel`` can be called from Python.
-Numba compiles it at its first call, together with all functions that it calls, and stores it in the
-folder of `compiled.kernel_folder`. An ``inner_kernel`` (also ``fast_inner_kernel`` and
-``inlined_kernel``) can only be called from other kernels, and takes a fraction of the time to
-compile.
+Numba compiles it on the first call, together with all functions that it calls, and stores it in the
+folder given by `compiled.kernel_folder`. An ``inner_kernel`` (also ``fast_inner_kernel`` and
+``inlined_kernel``) can only be called from other kernels and compiles in a fraction of the time.
 """
 
 from __future__ import annotations
@@ -21,11 +20,11 @@ from softfinger.kinematics.compiled import plain
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-# Minor versions of Numba with which `compiler`, which uses private interfaces, was tested.
+# Minor versions of Numba tested with `compiler`, which uses private interfaces.
 TESTED_NUMBA = ("0.63", "0.64", "0.65", "0.66", "0.67", "0.68")
 
 # index(k) converts k to an unsigned index. Numba checks signed indices for negative values, which
-# count from the end, and this check prevents vectorisation. Do not mix both kinds in a sum.
+# count from the end; this check prevents vectorisation. Do not mix both kinds in a sum.
 index: Callable[[int], int] = cast(Any, np.uint64)
 
 _OPTIONS: dict[str, Any] = {"error_model": "numpy"}
@@ -33,11 +32,11 @@ _SUMS = {"reassoc", "contract", "nsz", "arcp"}
 
 
 class JitDisabled(SoftfingerError):
-    """Error raised if Numba's compilation is disabled."""
+    """Error raised if Numba's JIT compilation is disabled."""
 
 
 def _chosen_compiler() -> tuple[ModuleType, str]:
-    """Return the compiling module, and the reason if it is `plain`, else an empty text."""
+    """Return the compiler module and the reason for using `plain`, or an empty string."""
     if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
         raise JitDisabled(
             "NUMBA_DISABLE_JIT is set: the kernels run compiled only; unset it to go on"
@@ -55,10 +54,10 @@ _compiler, why_plain = _chosen_compiler()
 
 
 def kernel(function: Function) -> Function:
-    """Compile ``function`` with Numba, with a cache on disk and IEEE arithmetic.
+    """Compile ``function`` with Numba, with an on-disk cache and IEEE arithmetic.
 
-    The kernel keeps the GIL, because reacquiring it in the control loop can take a whole switch
-    interval.
+    The kernel keeps the GIL, because the control loop might wait a whole switch interval to
+    reacquire it.
     """
     return cast(Function, _compiler.compiled(function, _OPTIONS))
 
@@ -79,8 +78,8 @@ def fast_inner_kernel(function: Function) -> Function:
 def inlined_kernel(function: Function) -> Function:
     """Compile an :func:`inner_kernel` inline into its callers; products and sums may be fused.
 
-    Use it for the innermost functions of a hot path, where a call costs as much as the work. The
-    code is repeated in each caller, so it should be short.
+    Use it for the innermost functions of a hot path, where a call costs as much as the function
+    body. The code is repeated in each caller, so it should be short.
     """
     return _inner(function, fastmath={"contract"}, forceinline=True)
 

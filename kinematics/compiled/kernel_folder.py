@@ -1,9 +1,9 @@
-"""Cache folder of compiled kernels, one for each state of the sources and the compiler.
+"""Cache folder for compiled kernels, one for each state of the sources and the compiler.
 
-The folder's name is a digest of all sources that a kernel may depend on, the versions of Python,
-Numba, llvmlite and NumPy, and the processor. Kernels compiled from anything else are therefore
-never loaded. The files are unpickled and executed, so the folder is only used if it belongs to the
-user alone. Each file begins with a digest of its content; damaged files are compiled again.
+The folder name is a digest of all sources that a kernel may depend on, the versions of Python,
+Numba, llvmlite and NumPy, and the processor. Outdated kernels are therefore never loaded. The files
+are unpickled and executed, so the folder is used only if no other user can modify it. Each file
+begins with a digest of its content; corrupted files are compiled again.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from softfinger.kinematics.compiled.own_folder import OwnFolder, user_cache
 ROOT = Path(__file__).resolve().parents[2]  # directory of the package `softfinger`
 _PACKAGES = ("kinematics", "daemon")
 _FOLDER = re.compile(r"kernels-[0-9a-f]{16}")
-_FOLDERS_MAX = 4  # other cache folders to keep, of other checkouts or the last release
-_RECENT = 600.0  # s; folders used since then are also kept, because their program may still run
+_FOLDERS_MAX = 4  # other cache folders to keep, from other checkouts or the previous release
+_RECENT = 600.0  # s; folders used this recently are kept, because they may still be in use
 _DECORATED = re.compile(rb"^@\w*kernel\b", re.MULTILINE)
 _IMPORT = re.compile(
     rb"^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+import[ \t]+(\([^)]*\)|[^\n]+)|import[ \t]+([\w., \t]+))",
@@ -46,7 +46,7 @@ _KERNEL, _MARK = ".kernel", ".built"
 
 @cache
 def kernel_folder() -> OwnFolder | None:
-    """Return the current cache folder, created if absent; warn and return None if that fails."""
+    """Return the current cache folder, created if needed; on failure, warn and return None."""
     try:
         return find_kernel_folder()
     except (OSError, RuntimeError) as error:
@@ -60,9 +60,9 @@ def kernel_folder() -> OwnFolder | None:
 
 
 def find_kernel_folder() -> OwnFolder:
-    """Return the current folder in NUMBA_CACHE_DIR if set, else in the user's cache directory.
+    """Return the current folder in NUMBA_CACHE_DIR if set, otherwise in the user's cache directory.
 
-    Raises the exceptions of :class:`OwnFolder`, and RuntimeError without a home directory.
+    Raises the exceptions of :class:`OwnFolder`, or RuntimeError if there is no home directory.
     """
     given = os.environ.get("NUMBA_CACHE_DIR")
     base = Path(given) if given else user_cache()
@@ -71,14 +71,14 @@ def find_kernel_folder() -> OwnFolder:
     path = base / f"kernels-{digest()}"
     fresh = not path.exists()
     folder = OwnFolder(path)
-    os.utime(folder.path)  # marks the folder as in use for pruning
+    os.utime(folder.path)  # marks the folder as used, so that it is not pruned
     if fresh:
         _prune(base, path)
     return folder
 
 
 def keep(folder: OwnFolder, name: str, content: bytes) -> None:
-    """Store a kernel; on failure issue a warning, and the next start compiles it again."""
+    """Store a kernel. On failure, issue a warning; the next start then compiles it again."""
     try:
         folder.write(name + _KERNEL, hashlib.sha256(content).digest() + content)
     except OSError as error:
@@ -86,7 +86,7 @@ def keep(folder: OwnFolder, name: str, content: bytes) -> None:
 
 
 def kept(folder: OwnFolder, name: str) -> bytes | None:
-    """Return a stored kernel, or None if it is missing or (with a warning) damaged."""
+    """Return a stored kernel, or None if it is missing or, with a warning, corrupted."""
     try:
         return _without_checksum(folder.read(name + _KERNEL))
     except FileNotFoundError:
@@ -104,7 +104,7 @@ def _without_checksum(data: bytes) -> bytes:
 
 
 def damaged(folder: OwnFolder) -> list[str]:
-    """Return the names of damaged or unreadable kernel files; takes a few ms for all files."""
+    """Return the names of corrupted or unreadable kernel files; takes a few ms in total."""
     found = []
     for name in folder.names():
         if name.endswith(_KERNEL):
@@ -116,7 +116,7 @@ def damaged(folder: OwnFolder) -> list[str]:
 
 
 def remove_damaged(folder: OwnFolder) -> int:
-    """Remove damaged files and the marks of compiled parts; return the number of damaged files.
+    """Remove corrupted files and the marks of compiled parts; return the corrupted file count.
 
     Raises OSError.
     """
@@ -132,13 +132,13 @@ def is_marked(folder: OwnFolder, part: str) -> bool:
 
 
 def mark(folder: OwnFolder, part: str) -> None:
-    """Mark the kernels of ``part`` as compiled; on failure the next start checks them again."""
-    with contextlib.suppress(OSError):  # another process may have pruned the folder meanwhile
+    """Mark the kernels of ``part`` as compiled; on failure, the next start checks them again."""
+    with contextlib.suppress(OSError):  # another process may have pruned the folder
         folder.write(part + _MARK, b"")
 
 
 def _prune(base: Path, current: Path) -> None:
-    """Remove other cache folders except recent ones and the most recently used."""
+    """Remove other cache folders except the newest few and those used recently."""
     oldest = time.time() - _RECENT
     others = [
         each
@@ -153,7 +153,7 @@ def _prune(base: Path, current: Path) -> None:
 
 @cache
 def digest() -> str:
-    """Return the digest of the sources, Python, Numba, llvmlite, NumPy and the processor."""
+    """Return a digest of the sources, Python, Numba, llvmlite, NumPy and the processor."""
     state = hashlib.sha256()
     packages = (numba.__version__, llvmlite.__version__, np.__version__)
     versions = (sys.version, *packages, platform.machine())
@@ -170,7 +170,7 @@ def digest() -> str:
 
 @cache
 def kernel_sources() -> tuple[Path, ...]:
-    """Return all modules of this package that contain kernels, and their imports."""
+    """Return all modules of this package that contain kernels, and the modules they import."""
     files = (each for name in _PACKAGES for each in (ROOT / name).rglob("*.py"))
     waiting = [file for file in files if _DECORATED.search(text(file))]
     seen: set[Path] = set()
@@ -183,7 +183,7 @@ def kernel_sources() -> tuple[Path, ...]:
 
 
 def _imported(source: Path) -> Iterator[Path]:
-    """Yield this package's modules imported by ``source``, also in the form `from a import b`."""
+    """Yield the modules of this package that ``source`` imports, including `from a import b`."""
     for module, names, modules in _IMPORT.findall(text(source)):
         found = [each.split()[0] for each in modules.split(b",")] if modules else [module]
         parts = [name.split()[0] for name in names.strip(b"()").split(b",") if name.split()]
@@ -204,5 +204,5 @@ def _files(name: str) -> tuple[Path, ...]:
 
 @cache
 def text(path: Path) -> bytes:
-    """Return the content of a source file, read only once."""
+    """Return the content of a source file; each file is read only once."""
     return path.read_bytes()

@@ -1,6 +1,6 @@
 """Records with named fields that are shared between Python and kernels.
 
-A record is declared once as a class; Python code and kernels then access the same fields.
+A record is declared once as a class. Python code and kernels then access the same fields.
 
     class Tip(Record):
         d: float              # [m]
@@ -8,8 +8,8 @@ A record is declared once as a class; Python code and kernels then access the sa
         cells: int
         live: bool
 
-    tip = Tip()               # zeros
-    tip.d = 1e-3              # Python: reads and writes by name
+    tip = Tip()               # all fields are zero
+    tip.d = 1e-3              # Python reads and writes fields by name
     press(tip.array, 0.1)     # a kernel called from Python takes the array of one record
 
     @kernel
@@ -17,9 +17,9 @@ A record is declared once as a class; Python code and kernels then access the sa
         tip = tips[0]         # a reference to the record, not a copy
         deeper(tip, more)     # an inner kernel takes the record itself
 
-Fields are `float`, `int` (64 bit), `bool`, another record, or an array of fixed shape by
-:data:`Annotated`. Arrays whose size depends on a grid are not fields, because kernels would be
-compiled again for each size.
+A field is a `float`, an `int` (64 bit), a `bool`, another record, or an array of fixed shape
+declared with :data:`Annotated`. Arrays whose size depends on a grid cannot be fields, because
+kernels would have to be compiled again for each size.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _SCALARS: dict[Any, Any] = {float: np.float64, int: np.int64, bool: np.bool_}
 
 
 class Records(Protocol, Generic[Each]):
-    """Type of a structured array of one record class, as indexed by kernels."""
+    """Structured array of one record class, as indexed in kernels."""
 
     def __getitem__(self, index: int, /) -> Each: ...
     def __setitem__(self, index: int, record: Any, /) -> None: ...  # copies
@@ -44,30 +44,30 @@ class Records(Protocol, Generic[Each]):
 
 
 class _Slotted(type):
-    """Metaclass that restricts attributes to fields, so that a misspelt name is an error."""
+    """Metaclass that allows only fields as attributes, so a misspelt name raises an error."""
 
     def __new__(meta, name: str, bases: tuple[type, ...], names: dict[str, Any]) -> _Slotted:
         return super().__new__(meta, name, bases, {"__slots__": (), **names})
 
 
 class Record(metaclass=_Slotted):
-    """Base class of records; the annotations of a subclass are its fields. See the module."""
+    """Base class of records. A subclass declares its fields as annotations; see the module docs."""
 
     __slots__ = ("_fields", "array")
 
     dtype: np.dtype[np.void]
-    array: Records[Self]  # array of one record, the argument of kernels
+    array: Records[Self]  # array of one record, passed to kernels
 
     def __init_subclass__(cls) -> None:
         hints = get_type_hints(cls, include_extras=True)
         kinds = {name: _kind(hints[name]) for name in cls.__annotations__}
-        # C alignment; otherwise Numba uses slow unaligned access for each field.
+        # Align fields as in C; otherwise Numba uses slow unaligned access for each field.
         cls.dtype = np.dtype([(name, *kind) for name, (_, *kind) in kinds.items()], align=True)
         for name, (inner, _, shape) in kinds.items():
             setattr(cls, name, _field(name, inner, shape))
 
     def __init__(self, array: NDArray[np.void] | None = None) -> None:
-        """Create a record of zeros, or a view of the first record of ``array``."""
+        """Create a record of zeros or a view of the first record in ``array``."""
         one: Any = np.zeros(1, self.dtype) if array is None else array
         if one.dtype != self.dtype:
             raise TypeError(f"{type(self).__name__}: expected {self.dtype}, found {one.dtype}")
@@ -98,7 +98,7 @@ class _Views(dict[str, Any]):
 
 
 class _Many(list[Any]):
-    """Views of an array of records inside a record, and the array itself for kernels."""
+    """Views of a record array inside a record, and the array itself for kernels."""
 
     def __init__(self, kind: type[Record], array: Any) -> None:
         super().__init__(kind(array[k : k + 1]) for k in range(len(array)))
@@ -137,7 +137,7 @@ def _field(name: str, inner: Any, shape: tuple[int, ...]) -> Any:
 
 
 def _kind(hint: Any) -> tuple[Any, Any, tuple[int, ...]]:
-    """Return (record class or None, type of one element, shape) of an annotation."""
+    """Return (record class or None, element type, shape) of an annotation."""
     shape = getattr(hint, "__metadata__", ())
     base = hint.__origin__ if shape else hint
     if base in _SCALARS:
@@ -147,5 +147,5 @@ def _kind(hint: Any) -> tuple[Any, Any, tuple[int, ...]]:
     inner = base.__args__[-1]
     if isinstance(inner, type) and issubclass(inner, Record):
         return inner, inner.dtype, shape
-    # The argument of NDArray[np.float64] is dtype[float64], or float64 itself since NumPy 2.5.
+    # The type argument of NDArray[np.float64] is dtype[float64]; since NumPy 2.5 it is float64.
     return None, getattr(inner, "__args__", (inner,))[0], shape

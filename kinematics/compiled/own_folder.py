@@ -1,7 +1,7 @@
 """Folders that only the current user can modify, and atomic file writes.
 
-Anyone who can write to a parent folder may replace the folder, even between a check and its use.
-Therefore all parent folders are checked, a folder is opened once, files are read through its
+A user who can write to a parent folder can replace the folder, even between the check and its use.
+Therefore all parent folders are checked, the folder is opened once, files are read through its
 descriptor, and the owner of each file is checked.
 """
 
@@ -13,24 +13,24 @@ import stat
 from functools import cache
 from pathlib import Path
 
-# Windows has no owners or modes that show who may write, and folders cannot be held open. Nothing
-# is checked there; the access control lists of the user's profile protect the folder.
+# Windows has no owner or mode bits to check, and a folder cannot be held open there. The access
+# control lists of the user profile protect the folder instead.
 HAS_OWNERS = hasattr(os, "geteuid")
 NO_FOLLOW: int = getattr(os, "O_NOFOLLOW", 0)
 _PLAIN: int = NO_FOLLOW | getattr(os, "O_BINARY", 0)
 
 
 def user_cache() -> Path:
-    """Return the user's cache directory of this program. Raises RuntimeError without a home."""
+    """Return this program's cache directory. Raises RuntimeError without a home directory."""
     base = os.environ.get("XDG_CACHE_HOME")
     return Path(base) / "softfinger" if base else Path.home() / ".cache" / "softfinger"
 
 
 def fault(path: Path, found: os.stat_result) -> str:
-    """Return the reason for which other users can modify ``path``, or an empty text if they cannot.
+    """Return the reason why other users can modify ``path``, or an empty string if they cannot.
 
-    ``found`` is the status of the path. The owner must be this user or root. Folders with the
-    sticky bit, such as /tmp, are allowed: their entries can only be replaced by the entry's owner.
+    ``found`` is the stat result for the path. The owner must be this user or root. Folders with the
+    sticky bit, such as /tmp, are allowed: only the owner of an entry can replace it.
     """
     if not HAS_OWNERS:
         return ""
@@ -65,7 +65,7 @@ def _alone_in(group: int) -> bool:
 def check_above(path: Path) -> None:
     """Check all parent folders of ``path``.
 
-    Raises PermissionError if other users can modify one, and the OSError of `Path.stat`.
+    Raises PermissionError if other users can modify one of them, or an OSError from `Path.stat`.
     """
     for folder in path.resolve().parents:
         if wrong := fault(folder, folder.stat()):
@@ -91,9 +91,9 @@ def _check_owner(folder: Path, found: os.stat_result) -> None:
 def write_whole(
     path: str | Path, data: bytes, mode: int = 0o666, folder: int | None = None
 ) -> None:
-    """Write a file atomically, through a temporary file in the same directory.
+    """Write a file atomically, using a temporary file in the same directory.
 
-    ``path`` is relative to the open directory ``folder`` if given. Raises OSError.
+    If an open directory ``folder`` is given, ``path`` is relative to it. Raises OSError.
     """
     part = f"{path}.{os.getpid()}.part"
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | _PLAIN
@@ -115,10 +115,10 @@ def _remove(path: str, folder: int | None) -> None:
 
 
 class OwnFolder:
-    """Context manager of an open folder that only this user can modify.
+    """Context manager for an open folder that only this user can modify.
 
-    The folder is created with mode 0700 if absent. Raises the exceptions of :func:`require_own`, or
-    OSError if it cannot be created.
+    The folder is created with mode 0700 if it does not exist. Raises the exceptions of
+    :func:`require_own`, or OSError if the folder cannot be created.
     """
 
     def __init__(self, path: Path) -> None:
@@ -140,13 +140,13 @@ class OwnFolder:
             raise
 
     def names(self) -> list[str]:
-        """Return the names of the entries."""
+        """Return the names of all entries."""
         return os.listdir(self.path if self.descriptor is None else self.descriptor)  # noqa: PTH208
 
     def read(self, name: str) -> bytes:
         """Return the content of a file.
 
-        Raises the OSError of `open`, or PermissionError if the file belongs to another user.
+        Raises an OSError from `open`, or PermissionError if other users can modify the file.
         """
         flags = os.O_RDONLY | _PLAIN
         descriptor = os.open(self._at(name), flags, dir_fd=self.descriptor)
@@ -156,7 +156,7 @@ class OwnFolder:
             return file.read()
 
     def write(self, name: str, data: bytes) -> None:
-        """Write a file with :func:`write_whole`, readable only by this user. Raises OSError."""
+        """Write a file atomically, readable only by this user. Raises OSError."""
         write_whole(self._at(name), data, 0o600, self.descriptor)
 
     def remove(self, name: str) -> None:

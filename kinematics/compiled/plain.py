@@ -1,8 +1,8 @@
-"""Replacement of `compiler` that uses only Numba's public interface and works with any version.
+"""Replacement for `compiler` that uses only Numba's public interface and works with any version.
 
-The results are the same. The first start takes twice as long, and later starts import everything
-that Numba can compile. Numba stores the kernels, without a digest, in the same folder, whose name
-depends on the sources and the version of Numba.
+The results are the same. The first start takes twice as long, and later starts import Numba's
+entire library of supported functions. Numba stores the kernels in the same folder, but without a
+digest; the folder name depends on the sources and the Numba version.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _config: Any = config
 
 
 class InnerKernel:
-    """Inner kernel as seen from Python: Numba can compile it, and a call from Python fails."""
+    """Inner kernel as a Python object: Numba can compile it, but calling it from Python fails."""
 
     def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
         self.py_func = function
@@ -47,9 +47,9 @@ inner = InnerKernel
 
 
 def compiled(function: Callable[..., Any], options: dict[str, Any]) -> Any:
-    """Return ``function`` compiled by Numba, cached on disk if there is a folder."""
+    """Return ``function`` compiled by Numba, cached on disk if a folder is available."""
     folder = kernel_folder()
-    # Use the descriptor of the checked folder, because the path may have been replaced since.
+    # Use the descriptor of the checked folder, because the path may have been replaced meanwhile.
     place = f"/proc/self/fd/{folder.descriptor}" if folder else ""
     before, _config.CACHE_DIR = _config.CACHE_DIR, place
     try:
