@@ -1,4 +1,4 @@
-"""One soft tip against a plane: material laws, closed forms, reference integrals, lookup tables.
+"""Contact of one soft tip with a plane: material laws, closed forms, integrals, lookup tables.
 
 The package covers the tip and its material. The sensor under the tip is in `kinematics.sensing`.
 """

@@ -1,14 +1,14 @@
-"""Exact contact formulas of a soft hemispherical fingertip of constant modulus against a plane.
+"""Exact contact formulas for a soft hemispherical fingertip of constant modulus on a plane.
 
-The module holds the fingertip's geometry and its force, energy and partial derivatives, both for
-arrays and as kernels. The tip is a hemisphere of radius a on a rigid base, with an independent
-spring normal to the base at each of its points. The object's face is displaced by d along its
-normal, which is tilted by θ from the base's normal. With h = a − d:
+The module defines the fingertip's geometry and computes force, energy and partial derivatives, both
+for arrays and as kernels. The tip is a hemisphere of radius a on a rigid base. Each point of the
+base carries an independent spring that is normal to the base. The object's face is displaced by d
+along its normal, which is tilted by θ from the base normal. With h = a − d:
 
     F = πE d²/cos θ,    U = πE d³/(3 cos² θ),    ∂U/∂d = F/cos θ,    |θ| ≤ asin(h/a).
 
 The formulas are exact because strain × area is an axisymmetric measure about the face's normal on
-the spherical cap, so all its moments are elementary. Beyond the limit of θ, the face touches the
+the spherical cap, so all its moments are elementary. Beyond the limit on θ, the face touches the
 base plate.
 """
 
@@ -27,8 +27,8 @@ from softfinger.kinematics.contact.tip_curves import TipCurves
 FloatArray = NDArray[np.float64]
 
 HALF_PI = math.pi / 2
-RADIUS_MAX = 1.0  # m, largest radius; a larger value was probably given in millimetres
-POISSON = (0.45, 0.4995)  # range of Poisson's ratio covered by the solid tip's data
+RADIUS_MAX = 1.0  # m; a larger value was probably given in millimetres
+POISSON = (0.45, 0.4995)  # range of Poisson's ratio in the solid tip data
 
 
 Physics = Literal["springs", "solid", "measured"]
@@ -50,11 +50,11 @@ class Fingertip:
     poisson
         Poisson's ratio of a solid tip, 0.45 to 0.4995.
     base
-        A solid tip is "bonded" to the sensor or "lying" on it.
+        Whether a solid tip is "bonded" to the sensor or "lying" on it.
     face
-        The surface of a solid tip is "frictionless" or "sticking" on the object.
+        Whether the surface of a solid tip is "frictionless" or "sticking" on the object.
     law
-        Measured curves; required if ``physics`` is "measured", and None otherwise.
+        Measured curves. They are required if ``physics`` is "measured", and must be None otherwise.
 
     Raises
     ------
@@ -91,15 +91,15 @@ class Fingertip:
         object.__setattr__(self, "radius", radius)
 
     def theta_limit(self, d: ArrayLike) -> FloatArray:
-        """Return the largest |θ| [rad] at d [m], asin((a − d)/a); π/2 for d ≤ 0, 0 for d ≥ a."""
+        """Return the maximum |θ| [rad] at d [m]: asin((a − d)/a), π/2 for d ≤ 0, 0 for d ≥ a."""
         h = np.clip(self.radius - np.asarray(d, np.float64), 0.0, self.radius)
-        # cos θ is the footprint radius over a, which is accurate near d → 0, unlike asin(h/a).
+        # cos θ is the footprint radius divided by a. Unlike asin(h/a), this is accurate as d → 0.
         depth = np.clip(d, 0.0, self.radius)
         return np.asarray(np.arctan2(h, np.sqrt(depth * (self.radius + h))))
 
 
 class ClosedForms(NamedTuple):
-    """Results of the closed forms: arrays of the broadcast shape of d and θ, or NumPy scalars."""
+    """Results of the closed forms, as arrays broadcast from d and θ or as NumPy scalars."""
 
     force: FloatArray  # F [N]
     energy: FloatArray  # U [J]
@@ -111,13 +111,13 @@ class ClosedForms(NamedTuple):
 
 @inner_kernel
 def theta_limit(radius: float, d: float) -> float:
-    """Return asin((a − d)/a) [rad], clamped to [0, π/2]; NaN for NaN."""
+    """Return asin((a − d)/a) [rad], clamped to [0, π/2]; NaN input gives NaN."""
     if d <= 0.0:
         return HALF_PI
     if d >= radius:
         return 0.0
     h = radius - d
-    # cos θ is the footprint radius over a, which is accurate near d → 0, unlike asin(h/a).
+    # cos θ is the footprint radius divided by a. Unlike asin(h/a), this is accurate as d → 0.
     return math.atan2(h, math.sqrt(d * (radius + h)))
 
 
@@ -146,8 +146,8 @@ _quiet = np.errstate(invalid="ignore", divide="ignore", over="ignore")
 def closed_forms(modulus: float, d: ArrayLike, theta: ArrayLike) -> ClosedForms:
     """Return force, energy and partials for a constant ``modulus`` [Pa].
 
-    ``d`` [m] and ``theta`` [rad] broadcast. The results are zero for d ≤ 0 and NaN for NaN. The
-    formulas hold up to the limit of θ and are evaluated unchanged beyond it.
+    ``d`` [m] and ``theta`` [rad] broadcast. The results are zero for d ≤ 0 and NaN for NaN input.
+    The formulas are valid up to the limit on θ and are evaluated unchanged beyond it.
     """
     depth, tilt = np.broadcast_arrays(_real(d), _real(theta))
     inverse, slope = 1.0 / np.cos(tilt), np.tan(tilt)

@@ -1,14 +1,14 @@
-"""Lookup kernels of contact tables, and the tabulated form of spring tips.
+"""Lookup kernels for contact tables, and the table format of spring tips.
 
-A spring tip's table holds the ratio of each quantity to its closed form for the modulus at zero
-strain. The ratios are smooth, close to 1 and finite as d → 0. For a constant modulus they are
+A spring tip's table stores the ratio of each quantity to its closed form for the modulus at zero
+strain. The ratios are smooth, close to 1 and finite as d → 0. For a constant modulus, they are
 exactly 1 and the table has no coefficients.
 
-The coordinates make the ratios analytic up to the edges of the domain: the height h = (a − d)/a,
-and y = u/h with u = √(1 − ρ²/(a² cos² θ)). The coordinate y is even in θ, 1 at θ = 0 and 0 at the
-limit of θ; the peak strain is 1 − u. The domain is divided into slabs of h, 16 per octave, and each
-slab into as many pieces of y as the tolerance requires. The domain ends at h = 1/8, because the
-ratios grow as log h towards h = 0.
+Two coordinates make the ratios analytic up to the edges of the domain: the height h = (a − d)/a,
+and y = u/h with u = √(1 − ρ²/(a² cos² θ)). The coordinate y is even in θ. It is 1 at θ = 0 and 0 at
+the limit on θ; the peak strain is 1 − u. The domain is divided into slabs of h, 16 per octave, and
+each slab into as many pieces of y as the tolerance requires. The domain ends at h = 1/8, because
+the ratios grow as log h towards h = 0.
 
 The kernels accept the record of any tip. Solid and measured tips are evaluated by `solid_lookup`.
 """
@@ -43,7 +43,7 @@ FloatArray = NDArray[np.float64]
 HALF_PI = math.pi / 2
 H_END = 0.5**OCTAVES  # h at the end of the domain
 _H_MIN = H_END * (1.0 + 2.0**-52)  # smallest number above H_END
-_END = H_END * (1.0 - 1e-12)  # h below this is outside by more than rounding
+_END = H_END * (1.0 - 1e-12)  # h limit of the domain, with a rounding margin
 
 _MANTISSA = 52
 _FRACTION = (1 << _MANTISSA) - 1
@@ -53,10 +53,10 @@ _FIRST = ((1023 - OCTAVES) << _MANTISSA) + 1  # bits of the smallest number abov
 
 @inlined_kernel
 def _slab(h: float) -> tuple[int, float]:
-    """Return the slab index of h in (H_END, 1] and h's position in the slab from −1 to 1.
+    """Return the slab index of h in (H_END, 1] and the position of h within the slab, −1 to 1.
 
-    Both come from the bits of the float: the exponent gives the octave, and the mantissa gives the
-    slab and the position. A slab includes its upper end but not its lower end.
+    Both are taken from the bits of the float: the exponent gives the octave, and the mantissa gives
+    the slab and the position. A slab includes its upper end but not its lower end.
     """
     number = int(np.float64(h).view(np.int64)) - _FIRST
     fraction = ((number << SLAB_BITS) & _FRACTION) | _ONE
@@ -66,7 +66,7 @@ def _slab(h: float) -> tuple[int, float]:
 
 @inlined_kernel
 def _ratios(table: Table, h: float, y: float) -> Lanes:
-    """Return the five ratios to the closed forms."""
+    """Return the five ratios of the quantities to their closed forms."""
     slab, position = _slab(h)
     splits = table.splits
     place = y * splits
@@ -93,7 +93,7 @@ def _springs_lookup(table: Table, d: float, theta: float) -> SixFloats:
     gap = c * c - d * table.inverse_radius * (1.0 + h)
     if not (gap >= 0.0 and abs(theta) <= HALF_PI):
         limit = theta_limit(radius, d)
-        # Rounding may bring a point exactly at the limit here.
+        # Because of rounding, a point exactly at the limit may reach this branch.
         inside = inside and abs(theta) <= limit * (1.0 + 1e-12)
         angle = min(max(theta, -limit), limit)
         s = math.sin(angle)
@@ -134,7 +134,7 @@ def normal_at(
 ) -> ThreeFloats:
     """Return N = ∂U/∂d, ∂N/∂d and ∂N/∂θ within the domain.
 
-    ``forces`` are F, ∂F/∂d and ∂F/∂θ at the same d and θ.
+    ``forces`` contains F, ∂F/∂d and ∂F/∂θ at the same d and θ.
     """
     if table.sticks:
         return solid_normal(table, d, theta)
@@ -147,7 +147,7 @@ def normal_at(
 def stiffness_ahead(table: Table, scale: float, depth: float) -> float:
     """Return ∂F/∂d [N/m] of an upright tip at d = ``depth`` [m].
 
-    ``scale`` is 2πE [Pa] with the modulus E at zero strain.
+    ``scale`` is 2πE [Pa], where E is the modulus at zero strain.
     """
     return solid_stiffness_ahead(table, scale, depth) if table.is_solid else scale * depth
 
@@ -156,8 +156,8 @@ def stiffness_ahead(table: Table, scale: float, depth: float) -> float:
 def lookup(tables: Records[Table], d: float, theta: float) -> SixFloats:
     """Return (F, U, ∂F/∂d, ∂F/∂θ, ∂U/∂d, ∂U/∂θ, inside) at displacement d [m] and tilt θ [rad].
 
-    The values are zero for d ≤ 0 and NaN for NaN. Outside the domain, d and θ are clamped to the
-    domain and ``inside`` is False.
+    The values are zero for d ≤ 0 and NaN for NaN input. If d or θ is outside the domain, it is
+    clamped to the domain and ``inside`` is False.
     """
     return lookup_at(tables[0], d, theta)
 
@@ -170,7 +170,7 @@ def lookups(
     out: FloatArray,
     inside: NDArray[np.bool_],
 ) -> None:
-    """Evaluate :func:`lookup` at each d, θ [n] into ``out`` [6, n] and ``inside`` [n]."""
+    """Evaluate :func:`lookup` at each d, θ [n] and write to ``out`` [6, n] and ``inside`` [n]."""
     table = tables[0]
     for k in range(d.shape[0]):
         out[0, k], out[1, k], out[2, k], out[3, k], out[4, k], out[5, k], inside[k] = lookup_at(

@@ -1,7 +1,7 @@
-"""Stress-strain laws of the tip's material.
+"""Stress-strain laws of tip materials.
 
-A law σ(ε) is one polynomial on strain ε ∈ [0, 1] with σ(0) = 0 and a positive slope everywhere. It
-is smooth and monotone, so quadrature of its integrals converges fast.
+A law σ(ε) is a single polynomial on the strain range ε ∈ [0, 1], with σ(0) = 0 and a positive slope
+everywhere. It is smooth and monotone, so numerical integration converges fast.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from softfinger.kinematics.contact.material_fit import MaterialError, fit_law
 
 FloatArray = NDArray[np.float64]
 
-# Measured tangent modulus [Pa] of the polyurethane tip over strain, from Table I of the paper. The
-# paper also gives the largest modulus, 0.304 MPa at a strain above 100 %.
+# Measured tangent modulus [Pa] of the polyurethane tip versus strain, from Table I of the paper.
+# The paper also gives the maximum modulus, 0.304 MPa, at a strain above 100 %.
 TABLE_I_STRAIN = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 TABLE_I_MODULUS = (0.135e6, 0.149e6, 0.182e6, 0.201e6, 0.207e6, 0.255e6)
 TABLE_I_MAXIMUM = 0.304e6
-# Exact coefficients c_1, c_2, … [Pa] of σ. The modulus is the polynomial of lowest degree through
-# these values that starts with zero slope; σ is its integral.
+# Exact coefficients c_1, c_2, … [Pa] of σ. The modulus is the lowest-degree polynomial that passes
+# through these values with zero slope at zero strain; σ is its integral.
 _TABLE_I = "135000 0 610000/9 4671875/12 -3015625/3 14453125/18 -4296875/21"
 
 
 @inner_kernel
 def stress_at(law: FloatArray, strain: float) -> float:
-    """Return σ(ε) [Pa] of ``law`` [order]; 0 for ε ≤ 0, extrapolated linearly beyond ε = 1."""
+    """Return σ(ε) [Pa] of ``law`` [order]; 0 for ε ≤ 0, extrapolated linearly above ε = 1."""
     if strain <= 0.0:
         return 0.0
     order = law.shape[0]
@@ -54,8 +54,8 @@ def stress_at(law: FloatArray, strain: float) -> float:
 class Material:
     """Stress-strain law σ(ε) = Σ c_j ε^j with c_0 = 0.
 
-    Create a material with `constant`, `table_i` or `from_points`. ``coefficients`` are the exact
-    values c_1, c_2, … [Pa]. Materials with equal coefficients compare equal.
+    Create a material with `constant`, `table_i` or `from_points`. ``coefficients`` contains the
+    exact values c_1, c_2, … [Pa]. Materials with equal coefficients compare equal.
     """
 
     coefficients: tuple[Fraction, ...]
@@ -86,7 +86,7 @@ class Material:
 
     @classmethod
     def constant(cls, modulus: float) -> Material:
-        """Return Hooke's law of modulus E [Pa]. Raises MaterialError unless finite and > 0."""
+        """Return Hooke's law with modulus E [Pa]. Raises MaterialError unless 0 < E < ∞."""
         value = float(modulus)
         if not (value > 0.0 and math.isfinite(value)):
             raise MaterialError(f"the modulus must be positive and finite, not {modulus!r}")
@@ -100,9 +100,9 @@ class Material:
         The paper gives slopes of the stress-strain curve ('Young's modulus, which corresponds to
         the slope'). They are used as the tangent modulus dσ/dε: 0.135 MPa at zero strain, then
         0.149, 0.182, 0.201, 0.207 and 0.255 MPa at 20 to 100 %. The modulus is interpolated by the
-        polynomial of lowest degree that has zero slope at zero strain, because the paper calls the
-        first value the smallest. This polynomial increases on [0, 1]. The largest modulus in the
-        paper, 0.304 MPa, occurs beyond 100 % and is not used.
+        lowest-degree polynomial with zero slope at zero strain, because the paper calls the first
+        value the smallest. This polynomial increases on [0, 1]. The largest modulus in the paper,
+        0.304 MPa, occurs above 100 % and is not used.
         """
         return cls(tuple(map(Fraction, _TABLE_I.split())), name="table_i")
 
@@ -114,19 +114,19 @@ class Material:
         ----------
         strain, stress
             Strain (a ratio) and stress [Pa]. The origin is implied. Points beyond strain 1 are
-            ignored. If the points end before strain 1, the law continues with their last slope.
+            ignored. If the points end before strain 1, the law continues with their final slope.
 
         Returns
         -------
         Material
-            Its ``misfits`` [2, n] hold the strains of the points and the distances of the law from
-            them [Pa].
+            Fitted material. Its ``misfits`` [2, n] contain the strain of each point and the
+            distance between law and point [Pa].
 
         Raises
         ------
         MaterialError
-            If the points are too few, not finite, not increasing, not zero at the origin, or too
-            far from any such law. The message lists all problems.
+            If there are too few points, or if they are not finite, not increasing, not zero at the
+            origin, or too far from any valid law. The message lists all problems.
         """
         coefficients, misfits = fit_law(strain, stress)
         return cls(tuple(coefficients), name="points", misfits=misfits)
@@ -138,15 +138,15 @@ class Material:
 
     @property
     def fit_error(self) -> float:
-        """Largest distance of the law from the fitted points [Pa]; 0 without points."""
+        """Maximum distance between the law and the fitted points [Pa]; 0 without points."""
         return 0.0 if self.misfits is None else float(self.misfits[1].max())
 
     def force_error(self, ratio: ArrayLike) -> FloatArray:
-        """Return the relative error of an upright tip's force due to the misfit of the law.
+        """Return the relative force error of an upright tip due to the misfit of the law.
 
-        The force is F = 2π h² ∫ σ(ε)/(1 − ε)³ dε up to ε = d/a, with h = a − d. The error is the
-        same integral of the misfits, interpolated linearly from 0 at zero strain, relative to F.
-        ``ratio`` is d/a in (0, 1].
+        The force is F = 2π h² ∫ σ(ε)/(1 − ε)³ dε up to ε = d/a, with h = a − d. Its error is the
+        same integral over the misfits, relative to F; the misfits are interpolated linearly,
+        starting from 0 at zero strain. ``ratio`` is d/a in (0, 1].
         """
         ratios = np.asarray(ratio, np.float64)
         if self.misfits is None:
@@ -160,7 +160,7 @@ class Material:
 
     @property
     def worst_force_error(self) -> float:
-        """Largest relative force error due to the misfit of the law, for d/a from 0.05 to 1."""
+        """Maximum relative force error due to the misfit of the law, for d/a from 0.05 to 1."""
         return float(self.force_error(np.linspace(0.05, 1.0, 20)).max())
 
     @property
@@ -174,15 +174,15 @@ class Material:
         return len(self.coefficients)
 
     def stress(self, strain: ArrayLike) -> FloatArray:
-        """Return σ(ε) [Pa]; 0 for ε ≤ 0, linear beyond 1, NaN for NaN."""
+        """Return σ(ε) [Pa]; 0 for ε ≤ 0, linear above 1, NaN for NaN input."""
         return _evaluate(self.law, strain, 1)
 
     def energy_density(self, strain: ArrayLike) -> FloatArray:
-        """Return the energy density w(ε) = ∫₀^ε σ [J/m³]; 0 for ε ≤ 0, NaN for NaN."""
+        """Return the energy density w(ε) = ∫₀^ε σ [J/m³]; 0 for ε ≤ 0, NaN for NaN input."""
         return _evaluate(self.energy_law, strain, 2)
 
     def expansions(self) -> FloatArray:
-        """Return the expansions of the law over E₀ for the quadrature, float64 [7, order].
+        """Return the law's expansions divided by E₀, for the quadrature, float64 [7, order].
 
         Let S = σ/ε, W = 2w/ε² and T = dσ/dε, each divided by E₀ and therefore 1 at ε = 0. With
         X_1 = (X − X(0))/ε and X_2 = (X_1 − X_1(0))/ε, the rows are S_1, W_1, T_1, S_2, S_2′, T_2
@@ -202,7 +202,7 @@ class Material:
 
 
 def _evaluate(law: FloatArray, strain: ArrayLike, order: int) -> FloatArray:
-    """Return ``law`` at ``strain``: 0 below 0, and a Taylor series to ``order`` beyond 1."""
+    """Return ``law`` at ``strain``: 0 below 0, and a Taylor series up to ``order`` above 1."""
     x = np.asarray(strain, dtype=np.float64)
     u = np.clip(x, 0.0, 1.0)
     value = law[-1]

@@ -1,7 +1,7 @@
-"""Fit smooth monotone stress-strain laws, or a modulus, to measured points.
+"""Fit a smooth monotone stress-strain law, or a modulus, to measured points.
 
-The tangent modulus is a Bernstein polynomial on [0, 1]. Its coefficients are found by bounded least
-squares; positive coefficients make it positive everywhere.
+The tangent modulus is a Bernstein polynomial on [0, 1], fitted by bounded least squares. Its
+coefficients are positive, so the modulus is positive everywhere.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ from softfinger import SoftfingerError
 FloatArray = NDArray[np.float64]
 
 MIN_POINTS = 4
-_DEGREES = range(11)  # degrees of the modulus to try
-_NEGLIGIBLE_MISFIT = 1e-9  # negligible misfit, relative to the largest stress
+_DEGREES = range(11)  # polynomial degrees of the modulus, tried in turn
+_NEGLIGIBLE_MISFIT = 1e-9  # negligible misfit, relative to the maximum stress
 _MISFIT_RATIO_MAX = 1.5  # a lower degree is accepted up to this multiple of the smallest misfit
-_MISFIT_MAX = 0.05  # misfit at which the fit fails, relative to the largest stress
-_MODULUS_MIN = 1e-3  # smallest modulus, relative to the mean
+_MISFIT_MAX = 0.05  # misfit above which the fit fails, relative to the maximum stress
+_MODULUS_MIN = 1e-3  # minimum modulus, relative to the mean
 _EXTENSION_WEIGHT = 0.1  # weight of the points that extend the curve
 _SMOOTHING = 1e-7  # weight of the modulus's second differences; prevents oscillation between points
 
 
 class MaterialError(SoftfingerError, ValueError):
-    """Error raised if the data do not give a usable stress-strain law."""
+    """Error raised if the data do not yield a usable stress-strain law."""
 
 
 def _checked(strain: ArrayLike, stress: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Return the points up to strain 1 without the origin; raise MaterialError for bad points."""
+    """Return the points up to strain 1 without the origin; raise MaterialError if invalid."""
     x = np.asarray(strain, dtype=np.float64)
     y = np.asarray(stress, dtype=np.float64)
     if x.ndim != 1 or x.shape != y.shape:
@@ -71,10 +71,10 @@ def _checked(strain: ArrayLike, stress: ArrayLike) -> tuple[FloatArray, FloatArr
 
 
 def fit_law(strain: ArrayLike, stress: ArrayLike) -> tuple[list[Fraction], FloatArray]:
-    """Fit σ(ε); return c_1, c_2, … [Pa], and the strains and misfits [Pa] of the points [2, n].
+    """Fit σ(ε); return c_1, c_2, … [Pa], and the points' strains and misfits [Pa] as [2, n].
 
-    The fit uses the lowest degree whose misfit is close to the smallest of all degrees. Beyond the
-    last point the law is approximately linear.
+    The fit uses the lowest degree whose misfit is close to the smallest misfit of all degrees.
+    Beyond the last point, the law is approximately linear.
     """
     x, y = _checked(strain, stress)
     top = float(y[-1])
@@ -99,10 +99,11 @@ def fit_law(strain: ArrayLike, stress: ArrayLike) -> tuple[list[Fraction], Float
 
 
 def _continued(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Extend the points to strain 1 with their final slope."""
+    """Extend the points to strain 1 using their slope at the end."""
     if x[-1] > 0.95:
         return x, y
-    # Use the end slope of a parabola fitted to the last third, limited to near the last quarter's.
+    # Fit a parabola to the last third of the points. Its end slope is limited to 0.5 to 2 times
+    # the mean slope of the last quarter.
     last = max(3, x.size // 3)
     back = x[-last:] - x[-1]
     slope = float(np.polyfit(back, y[-last:], 2)[1])
@@ -114,7 +115,7 @@ def _continued(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _positive_modulus(x: FloatArray, y: FloatArray, weights: FloatArray, degree: int) -> FloatArray:
-    """Fit the modulus's Bernstein coefficients, at least _MODULUS_MIN, to the points."""
+    """Fit the Bernstein coefficients of the modulus to the points, each at least _MODULUS_MIN."""
     matrix = _integrals(x, degree) * weights[:, None]
     smooth = np.zeros((max(degree - 1, 0), degree + 1))
     for i in range(degree - 1):
@@ -126,7 +127,7 @@ def _positive_modulus(x: FloatArray, y: FloatArray, weights: FloatArray, degree:
 
 
 def _integrals(x: FloatArray, degree: int) -> FloatArray:
-    """Return the integral from 0 to x of each Bernstein polynomial, [len(x), degree + 1]."""
+    """Return the integral of each Bernstein polynomial from 0 to x, [len(x), degree + 1]."""
     n = degree + 1
     above = np.stack([math.comb(n, j) * x**j * (1.0 - x) ** (n - j) for j in range(n + 1)], axis=1)
     sums = np.cumsum(above[:, ::-1], axis=1)[:, ::-1]
@@ -134,7 +135,7 @@ def _integrals(x: FloatArray, degree: int) -> FloatArray:
 
 
 def _monomials(bernstein: list[Fraction]) -> list[Fraction]:
-    """Convert Bernstein coefficients exactly to coefficients of increasing powers."""
+    """Convert Bernstein coefficients exactly to coefficients of ascending powers."""
     n = len(bernstein) - 1
     out = []
     for j in range(n + 1):
@@ -146,7 +147,7 @@ def _monomials(bernstein: list[Fraction]) -> list[Fraction]:
 
 
 def nonnegative(matrix: FloatArray, right: FloatArray) -> FloatArray:
-    """Solve least squares subject to x ≥ 0 by the active-set method of Lawson and Hanson."""
+    """Solve least squares subject to x ≥ 0 with the active-set method of Lawson and Hanson."""
     count = matrix.shape[1]
     x = np.zeros(count)
     free = np.zeros(count, dtype=np.bool_)

@@ -1,19 +1,20 @@
 """Reference integrals of force and energy for any material law.
 
 Contact tables are fitted to these integrals and checked against them. The springs stand on the base
-plane, and the face of the object cuts the spherical cap, so
+plane, and the object's face cuts the spherical cap, so
 
     F = ∬ σ(ε) dx dy,   U = ∬ z w(ε) dx dy,   ε = (n·P − h)/(z cos θ),   P = (x, y, z) on the cap.
 
-In the coordinates t = n·P and the angle φ about the normal n, dx dy = z dt dφ (lengths over a). The
-integrals give the ratio of each quantity to its closed form for a constant modulus E₀. The ratio is
-1 plus a term due to the material's nonlinearity, so there is no cancellation as d → 0.
+In the coordinates t = n·P and φ, the angle about the normal n, dx dy = z dt dφ (lengths divided by
+a). The integrals give the ratio of each quantity to its closed form for a constant modulus E₀. The
+ratio is 1 plus a term that describes the material's nonlinearity, so there is no cancellation as
+d → 0.
 
 The integral over φ is exact: with ε dφ = (t − h)/(p cos θ) dχ and p = √(t² − sin² θ), ε is linear
 in cos χ, and a polynomial law needs few nodes. The integral over t is evaluated in
-y = √(t − sin θ), in which the integrand is analytic except for poles at and near y = 0. The range
-is divided into pieces of at most an octave, whose number grows logarithmically as the face
-approaches the rim.
+y = √(t − sin θ); in this variable, the integrand is analytic except for poles at and near y = 0.
+The range is divided into pieces of at most one octave. The number of pieces grows logarithmically
+as the face approaches the rim.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ FloatArray = NDArray[np.float64]
 
 _NODES = 18  # Gauss points per piece; 14 give an error of 1e-10 in ∂F/∂θ, 18 only rounding
 _NODES_HIGH_DEGREE = 26  # for laws of degree above 8, where 18 points may give an error of 1e-11
-_PIECE_MIN = 2.0**-14  # smallest graded piece, relative to the scale of the singular point
+_PIECE_MIN = 2.0**-14  # minimum size of a graded piece, relative to the scale of the singular point
 
 
 def gauss_rule(nodes: int = _NODES) -> FloatArray:
@@ -47,14 +48,14 @@ def gauss_rule(nodes: int = _NODES) -> FloatArray:
 
 
 def circle_rule(degree: int) -> FloatArray:
-    """Return the nodes cos χ and sin² χ [2, m] of the equal-weight rule exact up to ``degree``."""
+    """Return the nodes cos χ and sin² χ [2, m] of the equal-weight rule, exact up to ``degree``."""
     count = max(1, degree // 2 + 1)
     angles = np.pi * (np.arange(count) + 0.5) / count
     return np.stack([np.cos(angles), np.sin(angles) ** 2])
 
 
 def nodes_for(degree: int) -> int:
-    """Return the number of Gauss points per piece for a law of ``degree``."""
+    """Return the number of Gauss points per piece for a material law of ``degree``."""
     return _NODES if degree <= 8 else _NODES_HIGH_DEGREE
 
 
@@ -79,28 +80,34 @@ def ratios(
 ) -> tuple[float, float, float, float, float]:
     """Return the ratios of F, U, ∂F/∂d, ∂F/∂θ and ∂U/∂θ to their closed forms for modulus E₀.
 
-    With v = (t − h)/δ, q = t − h, r² = 1 − t², p² = t² − s², ``middle`` = r² c/(t c + p), ⟨·⟩ the
-    mean over χ at the strain ε = ``mean`` + ``amplitude`` cos χ = q (t + s r cos χ/c)/p², and the
-    law's expansions S_1, W_1, T_1, S_2, T_2 of `Material.expansions`:
+    The integrals use
+
+        v = (t − h)/δ    q = t − h    r² = 1 − t²    p² = t² − s²    ``middle`` = r² c/(t c + p)
+        ε = ``mean`` + ``amplitude`` cos χ = q (t + s r cos χ/c)/p²
+        k = ``curvature`` = sin² χ t q/p²
+
+    where ⟨·⟩ is the mean over χ at the strain ε, and S_1, W_1, T_1, S_2 and T_2 are the expansions
+    of the law from `Material.expansions`:
 
         F      1 + 2δ ∫ v² ⟨S_1⟩ dv/(c p)          ∂F/∂d   1 + δ ∫ v ⟨T_1⟩ dv/(c p)
         U      1 + 3δ ∫ v³ ⟨W_1⟩ dv/(c p)
         ∂F/∂θ  1 + 2 ∫ v (q ⟨T_1⟩ + T_1(0) middle + q r²/p² ⟨T_2 + k T_2′⟩) dv/(c p)
         ∂U/∂θ  1 + 3 ∫ v² (q ⟨S_1⟩ + S_1(0) middle + q r²/p² ⟨S_2 + k S_2′⟩) dv/(c p)
 
-    over v from 0 to 1, with k = ``curvature`` = sin² χ t q/p². In y, t = sin θ + y².
+    The integrals run over v from 0 to 1. In terms of y, t = sin θ + y².
 
-    ``gauss`` [2, n] are points and weights on [0, 1], ``circle`` [2, m] the values cos χ and sin² χ
-    at equidistant angles, and ``polynomials`` the law's expansions. delta = d/a is in (0, 1];
-    h = 1 − delta is passed separately to keep full precision. s = |sin θ| ≤ h, and c = cos θ.
+    ``gauss`` [2, n] contains points and weights on [0, 1], ``circle`` [2, m] the values cos χ and
+    sin² χ at equidistant angles, and ``polynomials`` the expansions of the law. delta = d/a is in
+    (0, 1]; h = 1 − delta is passed separately to keep full precision. s = |sin θ| ≤ h, and
+    c = cos θ.
     """
-    # Near 1, h − s is computed without cancellation from h² − s² = c² − ρ².
+    # Near 1, compute h − s from h² − s² = c² − ρ² to avoid cancellation.
     gap = h - s if h < 0.5 else (c * c - delta * (1.0 + h)) / (h + s)
     y0 = 0.0
     if gap > 0.0:
         y0 = math.sqrt(gap)
     else:
-        # θ is at its limit, up to rounding.
+        # θ is at its limit, to within rounding.
         s = h
         c = math.sqrt(delta * (1.0 + h))
     y1 = math.sqrt(c * c / (1.0 + s))
@@ -109,7 +116,7 @@ def ratios(
     first_t = polynomials[2, 0]
     count = circle.shape[1]
     nodes = gauss.shape[1]
-    # There are poles at y = 0 (unless y0 = 0) and at y² = −2 sin θ, and none if h = 0.
+    # There are poles at y = 0 (unless y0 = 0) and at y² = −2 sin θ. For h = 0 there are none.
     start = max(2.0 * y0, _PIECE_MIN * min(y1, math.sqrt(h))) if h > 0.0 else y1
     sum_f = 0.0
     sum_u = 0.0
@@ -194,9 +201,9 @@ def integrate(
 ) -> ClosedForms:
     """Integrate force, energy and first partials for any material, to a relative error of 1e-14.
 
-    ``d`` [m] and ``theta`` [rad] broadcast. The results are zero for d ≤ 0, and NaN outside the
-    domain d ≤ a, |θ| ≤ θ's limit. ``nodes`` is the number of Gauss points per piece; by default it
-    depends on the degree of the law.
+    ``d`` [m] and ``theta`` [rad] broadcast. The results are zero for d ≤ 0. They are NaN outside
+    the domain, which ends at d = a and at the limit on θ. ``nodes`` is the number of Gauss points
+    per piece; by default it depends on the degree of the law.
     """
     shape, (depth, tilt) = flatten(d, theta)
     radius = tip.radius

@@ -2,23 +2,23 @@
 
 The rubber is neo-Hookean with strain energy W = μ/2 (J^(−2/3) tr FᵀF − 3) + κ/2 (J − 1)², where
 μ = E/(2 + 2ν) and κ = E/(3 − 6ν) are the small-strain moduli. Contact is computed in the deformed
-state.
+configuration.
 
-The data file holds polynomials in t = √(d/a), sin² θ and Poisson's ratio ν, scaled by Young's
+The data file contains polynomials in t = √(d/a), sin² θ and Poisson's ratio ν, scaled by Young's
 modulus E and the radius a. Its ``notes`` describe the computation and the remaining errors. This
-module evaluates the polynomials at one ν. The energy is U = E a³ t⁵ g(t, sin² θ). Its partials are
-the force along the face's normal, N = ∂U/∂d, and the moment ∂U/∂θ. With the force F on the base,
-the base pressure is
+module evaluates the polynomials for one value of ν. The energy is U = E a³ t⁵ g(t, sin² θ). Its
+partials are the force along the face's normal, N = ∂U/∂d, and the moment ∂U/∂θ. With the base force
+F, the base pressure is
 
     p(r, φ) = F/a² B_0(r) + N/a² Σ_k q_k(t, sin² θ) Re((n_x + i n_y)^m e^{−i m φ}) B_k(r).
 
 Without friction, F = N cos θ. A sticking face holds each point of the tip where it first touched,
-while the plane moves straight along its normal. N = ∂U/∂d still holds, and ∂U/∂θ is the difference
-between such presses at neighbouring tilts. A shear T = −N sin θ cos θ q_0 pulls the tip up the
-slope, and F = N cos θ (1 − sin² θ q_0).
+while the plane moves straight along its normal. N = ∂U/∂d still holds, and ∂U/∂θ describes how the
+energy of such presses changes with the tilt. A shear force T = −N sin θ cos θ q_0 pulls the tip up
+the slope, and F = N cos θ (1 − sin² θ q_0).
 
-A shear force T on the face in direction φ_T adds T/a² B_T(r) cos(φ − φ_T). T is taken to act at
-height a, so its moment about the centre of the base is T a.
+A shear force T on the face in direction φ_T adds T/a² B_T(r) cos(φ − φ_T). T is assumed to act at
+height a, so its moment about the base centre is T a.
 """
 
 from __future__ import annotations
@@ -43,25 +43,25 @@ _FILE = Path(__file__).with_name("solid_tip.npz")
 class SolidData:
     """Data of a solid tip at one ν, for E = a = 1.
 
-    Polynomials are stored by powers of x = 2 t/``root`` − 1, then of y = 2 sin² θ/``square`` − 1.
+    Polynomials are stored in powers of x = 2 t/``root`` − 1, then of y = 2 sin² θ/``square`` − 1.
     """
 
-    root: float  # largest t
-    square: float  # largest sin² θ
+    root: float  # maximum t
+    square: float  # maximum sin² θ
     energy: FloatArray  # g, ∂g/∂t, ∂²g/∂t², ∂g/∂sin² θ, ∂²g/∂t ∂sin² θ [5, i, j]
     harmonics: NDArray[np.int64]  # m of each mode [k]; the first is 0
     ratios: FloatArray  # q [k, i, j]
     stick: FloatArray  # q_0, ∂q_0/∂t, ∂q_0/∂sin² θ [3, i, j]
-    edges: FloatArray  # of the rings, r/a [rings + 1]
+    edges: FloatArray  # ring edges, r/a [rings + 1]
     modes: FloatArray  # B averaged over each ring [k, rings]
     shear: FloatArray  # B_T [rings]
-    error: float  # relative error of N, against other meshes
-    pressure_error: float  # rms error over rms of the base pressure, against other meshes
+    error: float  # relative error of N compared with other meshes
+    pressure_error: float  # relative rms error of the base pressure compared with other meshes
 
 
 @lru_cache(maxsize=8)
 def solid_data(tip: Fingertip) -> SolidData:
-    """Return the data for the ν, base and face of a solid ``tip``."""
+    """Return the data that match the Poisson's ratio, base and face of a solid ``tip``."""
     block = tip.base if tip.face == "frictionless" else f"{tip.base}-{tip.face}"
     with np.load(_FILE) as file:
         stored: dict[str, Any] = {
@@ -103,7 +103,7 @@ def solid_data(tip: Fingertip) -> SolidData:
 
 
 def with_partials(energy: FloatArray, root: float, square: float) -> FloatArray:
-    """Return g [i, j] and its partials in the layout of `SolidData.energy`."""
+    """Return g [i, j] and its partials, arranged as in `SolidData.energy`."""
     by_t = 2.0 / root * _slope(energy)
     by_square = 2.0 / square * _slope(energy.T).T
     by_both = 2.0 / square * _slope(by_t.T).T
@@ -111,19 +111,19 @@ def with_partials(energy: FloatArray, root: float, square: float) -> FloatArray:
 
 
 def powers(terms: FloatArray) -> FloatArray:
-    """Convert Chebyshev coefficients [i, j] to coefficients of powers."""
+    """Convert Chebyshev coefficients [i, j] to power-series coefficients."""
     in_t, in_square = (to_powers(count) for count in terms.shape)
     return np.asarray(in_t @ terms @ in_square.T)
 
 
 @cache
 def to_powers(count: int) -> FloatArray:
-    """Return the matrix that converts ``count`` Chebyshev coefficients to increasing powers."""
+    """Return the matrix that converts ``count`` Chebyshev coefficients to ascending powers."""
     columns = [chebyshev.cheb2poly(row) for row in np.eye(count)]
     return np.stack([np.pad(column, (0, count - len(column))) for column in columns], axis=1)
 
 
 def _slope(rising: FloatArray) -> FloatArray:
-    """Return the derivatives of polynomials stored in columns, with the same number of powers."""
+    """Return the derivatives of polynomials stored in columns, keeping the number of powers."""
     factors = np.arange(1.0, len(rising))[:, None]
     return np.concatenate([rising[1:] * factors, np.zeros((1, rising.shape[1]))])

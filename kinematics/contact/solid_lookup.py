@@ -1,8 +1,8 @@
 """Contact tables of solid and measured tips, and their lookup kernels.
 
-All six outputs follow from one energy U = E a³ t⁵ g (see `solid_data`) with the polynomial
-g(t, sin² θ), t = √(d/a), and its partials. They are therefore consistent to rounding. For a
-sticking face, a second polynomial q_0 gives the reduction of the force on the base.
+All six outputs follow from the energy U = E a³ t⁵ g (see `solid_data`), where g(t, sin² θ) is a
+polynomial and t = √(d/a). They are therefore consistent to within rounding. For a sticking face, a
+second polynomial q_0 gives the reduction of the force on the base.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ ENERGY, STICK = range(2)  # pieces of the table: g with its partials, q_0 with i
 
 
 def solid_table(tip: Fingertip, material: Material) -> Table:
-    """Return the table of a solid or measured ``tip``; a measured tip ignores the material.
+    """Return the table of a solid or measured ``tip``; the material is ignored for a measured tip.
 
     Raises MaterialError if the tip is solid and the material is not linear.
     """
@@ -74,7 +74,7 @@ def energy_lanes(table: Table, t: float, square: float) -> Lanes:
 
 @inlined_kernel
 def _clamped(table: Table, t: float, square: float) -> ThreeFloats:
-    """Return F/(N cos θ) = 1 − sin² θ q_0 and its partials by t and sin² θ."""
+    """Return F/(N cos θ) = 1 − sin² θ q_0 and its partials in t and sin² θ."""
     if not table.sticks:
         return 1.0, 0.0, 0.0
     x = t * table.by_root - 1.0
@@ -87,8 +87,8 @@ def _clamped(table: Table, t: float, square: float) -> ThreeFloats:
 def solid_lookup(table: Table, d: float, theta: float) -> SixFloats:
     """Evaluate `lookup.lookup`.
 
-    For |θ| beyond the data, the energy is constant in θ at fixed d, the partials are those of that
-    energy, and the force continues to vary with cos θ.
+    For |θ| beyond the data, the energy is taken as constant in θ at fixed d, and the partials are
+    those of this energy. The force continues to vary with cos θ.
     """
     if math.isnan(d) or math.isnan(theta):
         nan = math.nan
@@ -103,7 +103,7 @@ def solid_lookup(table: Table, d: float, theta: float) -> SixFloats:
     t = math.sqrt(min(d, table.deepest) * table.inverse_radius)
     square = s * s if within else 2.0 / table.by_square
     g, g_t, g_tt, g_s, g_ts = energy_lanes(table, t, square)
-    # The chain rule from sin² θ to θ gives 2 sin θ cos θ.
+    # The chain rule gives d(sin² θ)/dθ = 2 sin θ cos θ.
     chain = 2.0 * s * c if within else 0.0
     a = table.radius
     size = table.modulus * a * a * t * t * t
@@ -125,7 +125,7 @@ def solid_lookup(table: Table, d: float, theta: float) -> SixFloats:
 
 @inner_kernel
 def solid_stiffness_ahead(table: Table, scale: float, depth: float) -> float:
-    """Evaluate `lookup.stiffness_ahead` with Hertz's ∂N/∂d at d = ``depth``."""
+    """Evaluate `lookup.stiffness_ahead` using Hertz's ∂N/∂d at d = ``depth``."""
     stiffness = 0.5 * scale / math.pi * 3.75 * table.at_first
     return stiffness * math.sqrt(depth * table.radius)
 

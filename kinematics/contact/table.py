@@ -1,6 +1,6 @@
 """Contact tables: fast lookup of force, energy and their partials within a certified tolerance.
 
-A table is one record, `table_record.Table`, for every tip model. Module `table_build` builds the
+For every tip model, a table is one `table_record.Table` record. The `table_build` module builds the
 tables of spring tips and bounds their error; `lookup` evaluates tables.
 """
 
@@ -24,7 +24,7 @@ FloatArray = NDArray[np.float64]
 
 
 class ContactForces(NamedTuple):
-    """Result of a lookup: arrays of the broadcast shape of d and θ, or floats."""
+    """Result of a lookup: arrays broadcast from d and θ, or floats."""
 
     force: FloatArray  # F [N]
     energy: FloatArray  # U [J]
@@ -37,11 +37,11 @@ class ContactForces(NamedTuple):
 
 
 class Certificate(NamedTuple):
-    """Bound on the relative error of all outputs, and the approximate place of the largest error.
+    """Bound on the relative error of all outputs, and the approximate location of the maximum.
 
-    The bound covers the whole domain, its edges and rounding; `table_build` lists its assumptions.
-    For softening laws ∂F/∂θ may pass through zero, so its error is taken relative to F tan θ if
-    that is larger.
+    The bound covers the whole domain including its edges, and rounding. Its assumptions are listed
+    in `table_build`. For softening laws, ∂F/∂θ may pass through zero, so its error is relative to
+    F tan θ where F tan θ is larger.
     """
 
     max_error: float
@@ -49,30 +49,30 @@ class Certificate(NamedTuple):
     theta: float  # [rad]
 
 
-# Builds a ContactForces of plain floats in a quarter of the time of ContactForces(…).
+# tuple.__new__ builds a ContactForces of plain floats in a quarter of the constructor's time.
 _numbers: Any = tuple.__new__
 
-_EDGE_FACTOR = 1.0 - 1e-12  # scales d and θ so that rounding does not put edge points outside
+_EDGE_FACTOR = 1.0 - 1e-12  # factor on d and θ that keeps edge points inside despite rounding
 
-_LAW_ERROR = 0.05  # relative force error due to the law's misfit, above which build warns
+_LAW_ERROR = 0.05  # relative force error due to the law's misfit, above which `build` warns
 
 
 class ContactTable:
-    """Lookup table of force, energy and their first partials for one tip and material.
+    """Lookup table of force, energy and their first partials for one tip and one material.
 
     Attributes
     ----------
     data
-        Array with the single table record that :func:`lookup` takes.
+        Array with the single table record that :func:`lookup` takes as its argument.
     header
-        The same record with named fields.
+        The same record, accessible by field names.
     max_error
-        Bound on the relative error of all outputs. For a solid tip it is the error of its data.
+        Bound on the relative error of all outputs. For a solid tip, it is the data error.
 
     Notes
     -----
-    The domain of a spring tip is 0 < d ≤ 7/8 a and |θ| ≤ asin((a − d)/a). A solid tip's domain is
-    the range covered by the data in `solid_data`; the table reproduces the data exactly.
+    The domain of a spring tip is 0 < d ≤ 7/8 a and |θ| ≤ asin((a − d)/a). The domain of a solid tip
+    is the range covered by `solid_data`; the table reproduces these data exactly.
     """
 
     def __init__(self, table: Table) -> None:
@@ -84,19 +84,19 @@ class ContactTable:
 
     @classmethod
     def build(cls, tip: Fingertip, material: Material, tolerance: float = 1e-9) -> ContactTable:
-        """Build the smallest table within a relative ``tolerance`` on all outputs.
+        """Build the smallest table that meets a relative ``tolerance`` on all outputs.
 
         Parameters
         ----------
         tip
-            The fingertip.
+            Fingertip.
         material
-            Its stress-strain law. A solid tip requires a constant modulus; a measured tip has its
-            own curves and ignores the material.
+            Material law. A solid tip requires a constant modulus. A measured tip has its own curves
+            and ignores the material.
         tolerance
-            Largest relative numerical error, for spring tips only. The error of ∂F/∂θ is relative
-            to F tan θ if that is larger. Errors of the material law are not included: a modulus
-            that is off by 1 % changes F by 1 %.
+            Maximum relative numerical error, for spring tips only. The error of ∂F/∂θ is relative
+            to F tan θ if F tan θ is larger. Errors of the material law are not included: a modulus
+            error of 1 % changes F by 1 %.
 
         Raises
         ------
@@ -108,7 +108,7 @@ class ContactTable:
         Warns
         -----
         RuntimeWarning
-            If the misfit of a spring tip's law changes F by more than 5 %.
+            If the misfit of a spring tip's material law changes F by more than 5 %.
         """
         if tip.physics != "springs":
             return cls(solid_table(tip, material))
@@ -123,25 +123,25 @@ class ContactTable:
 
     @property
     def tolerance(self) -> float:
-        """Tolerance given to `build`."""
+        """Tolerance passed to `build`."""
         tolerance: float = self.header.tolerance
         return tolerance
 
     @property
     def certificate(self) -> Certificate:
-        """Bound on the relative error, and the d and θ of the largest error."""
+        """Bound on the relative error, and the d and θ where the error is largest."""
         return Certificate(self.max_error, self.header.worst_d, self.header.worst_theta)
 
     @property
     def form(self) -> str:
-        """Representation: "closed", "springs" with the number of pieces per slab, or "solid"."""
+        """Table type: "closed", "springs" with the number of pieces per slab, or "solid"."""
         if self.is_solid:
             return "solid"
         return "closed" if self.header.is_closed else f"springs, {self.header.splits} a slab"
 
     @property
     def tip(self) -> Fingertip:
-        """Tip of springs with the table's radius."""
+        """Spring tip with the table's radius."""
         return Fingertip(self.header.radius)
 
     def __call__(self, d: ArrayLike, theta: ArrayLike, edge: bool = False) -> ContactForces:
@@ -150,10 +150,10 @@ class ContactTable:
         Parameters
         ----------
         d, theta
-            Numbers or arrays, which broadcast. Results are zero for d ≤ 0 and NaN for NaN.
+            Numbers or arrays, which broadcast. Results are zero for d ≤ 0 and NaN for NaN input.
         edge
-            If True, clamp points outside the domain without a RuntimeWarning. Clamped points have
-            ``inside`` False in either case.
+            If True, clamp points outside the domain without a RuntimeWarning. ``inside`` is False
+            for clamped points in either case.
 
         Raises
         ------
@@ -178,7 +178,7 @@ class ContactTable:
         )
 
     def _warn(self, d: FloatArray, theta: FloatArray) -> None:
-        """Issue a RuntimeWarning, in the user's code, for points outside the domain except NaN."""
+        """Issue a RuntimeWarning in the caller's code for points outside the domain, except NaN."""
         within = np.empty(d.size, dtype=np.bool_)
         lookups(self.data, d * _EDGE_FACTOR, theta * _EDGE_FACTOR, np.empty((6, d.size)), within)
         outside = np.flatnonzero(~(within | np.isnan(d) | np.isnan(theta)))

@@ -1,10 +1,11 @@
 """Fit contact tables to the reference integrals with a certified error.
 
 The error is bounded for each piece of the table, over the whole domain and its edges. The bound is
-the sum of the Chebyshev coefficients that the piece omits, an estimate of the higher coefficients,
-and rounding. It assumes that the error of the reference integrals is rounding alone and that the
-coefficients beyond the computed ones keep decreasing. Both hold for every law here, since each law
-is one polynomial. Pieces are halved until the bound is within the tolerance.
+the sum of three terms: the Chebyshev coefficients that the piece omits, an estimate of the higher
+coefficients, and rounding. It assumes that the reference integrals have only rounding errors, and
+that the coefficients beyond the computed ones keep decreasing. Both assumptions hold for every law
+here, since each law is a single polynomial. Pieces are halved until the bound is within the
+tolerance.
 """
 
 from __future__ import annotations
@@ -44,10 +45,10 @@ from softfinger.kinematics.contact.table_record import (
 
 FloatArray = NDArray[np.float64]
 
-ROUNDING = 16.0 * np.finfo(float).eps  # rounding of the closed forms and the kernel's last products
-_EXTRA_V, _EXTRA_U = 4, 6  # computed Chebyshev coefficients in h and y beyond those stored
+ROUNDING = 16.0 * np.finfo(float).eps  # rounding in the closed forms and the kernel's last products
+_EXTRA_V, _EXTRA_U = 4, 6  # Chebyshev coefficients in h and y computed beyond those stored
 _SLAB_ENDS = np.arange(1, 1 + (1 << SLAB_BITS)) / (1 << SLAB_BITS)
-# Edges of the slabs in h, from H_END to 1.
+# Slab edges in h, from H_END to 1.
 _EDGES = [
     H_END,
     *(H_END * 2.0**k * (1.0 + piece) for k in range(OCTAVES) for piece in _SLAB_ENDS),
@@ -55,7 +56,7 @@ _EDGES = [
 
 
 class _WorstError(NamedTuple):
-    """Bound on the relative error of a piece, and the place of its largest error."""
+    """Bound on the relative error of a piece, and the location of its maximum error."""
 
     bound: float
     h: float
@@ -64,7 +65,7 @@ class _WorstError(NamedTuple):
 
 @dataclass(frozen=True)
 class LawTerms:
-    """Material law in the form that the quadrature kernels take."""
+    """Material law in the form that the quadrature kernels use."""
 
     material: Material
     gauss: FloatArray
@@ -85,7 +86,7 @@ class LawTerms:
 
 
 def build(tip: Fingertip, material: Material, tolerance: float) -> Table:
-    """Build the smallest table within ``tolerance``; see ContactTable.build."""
+    """Build the smallest table that meets ``tolerance``; see ContactTable.build."""
     if not (0.0 < tolerance < 1.0):
         raise TableError(f"the tolerance must lie between 0 and 1, not {tolerance!r}")
     law, splits = LawTerms.of(material), 1
@@ -106,7 +107,7 @@ def build(tip: Fingertip, material: Material, tolerance: float) -> Table:
 def _build_pieces(
     tip: Fingertip, law: LawTerms, tolerance: float, splits: int, limit: float
 ) -> Table:
-    """Build a table with ``splits`` pieces per slab; stop when its error exceeds ``limit``."""
+    """Build a table with ``splits`` pieces per slab; stop if its error exceeds ``limit``."""
     table = Table()
     table.is_closed, table.splits, table.tolerance = law.material.is_linear, splits, tolerance
     table.radius, table.modulus = tip.radius, law.modulus
@@ -124,7 +125,7 @@ def _build_pieces(
 
 def _fill(table: Table, law: LawTerms) -> Iterator[_WorstError]:
     """Set the coefficients piece by piece; yield the error bound of each piece."""
-    # Extra coefficients in each direction give the truncation error.
+    # Additional coefficients in each direction give the truncation error.
     rows, width = POWERS_V + _EXTRA_V, POWERS_U + _EXTRA_U
     mask = np.zeros((rows, width), dtype=np.bool_)
     mask[:POWERS_V, :POWERS_U] = True
@@ -151,13 +152,13 @@ def _fill(table: Table, law: LawTerms) -> Iterator[_WorstError]:
 def _bound(
     values: FloatArray, lost: FloatArray, rounding: FloatArray, h: FloatArray, y: FloatArray
 ) -> _WorstError:
-    """Return the bound on a piece's relative error and the approximate place of the largest.
+    """Return the bound on a piece's relative error and the approximate location of the maximum.
 
-    ``values`` [5, h, y] are the ratios at the nodes of the piece; ``lost`` are the Chebyshev
-    coefficients of the ratios minus the table. The sum of their magnitudes bounds this difference.
-    The coefficients beyond the computed ones add less than twice the last two in each direction:
-    each is less than half of the one before, because the ratios are analytic well beyond the piece.
-    ``rounding`` [5] is absolute.
+    ``values`` [5, h, y] are the ratios at the nodes of the piece. ``lost`` are the Chebyshev
+    coefficients of the difference between ratios and table; the sum of their magnitudes bounds this
+    difference. The coefficients beyond the computed ones add less than twice the last two in each
+    direction. Each of them is less than half of its predecessor, because the ratios are analytic
+    well beyond the piece. ``rounding`` [5] is absolute.
     """
     everywhere = _dense_nodes(len(h)) @ _terms(values) @ _dense_nodes(len(y)).T
     size = np.abs(everywhere)
@@ -170,17 +171,18 @@ def _bound(
     k = int(np.argmax(bounds))
     here = np.abs(_dense_nodes(len(h)) @ lost[k] @ _dense_nodes(len(y)).T)
     i, j = np.unravel_index(int(np.argmax(here)), here.shape)
-    # Dense points are in increasing order, four per node; the nodes are in decreasing order.
+    # Dense points are in ascending order, four per node; the nodes are in descending order.
     return _WorstError(float(bounds[k]) + ROUNDING, float(h[-1 - i // 4]), float(y[-1 - j // 4]))
 
 
 def _rounding(terms: FloatArray, steep: float, low: float, splits: int) -> FloatArray:
     """Return bounds on the rounding errors of a piece's five ratios from their Chebyshev ``terms``.
 
-    There are three sources. Each sum of powers has at most about 32 roundings. h is off by two
-    ulps, and ``steep`` is h over half the width of the piece. y² is off by 4 ulps over h², because
-    cos² θ − ρ² cancels near the limit of θ. There the slope of the ratios in y is 0, so the second
-    derivative bounds the error due to y². In addition y is off by ``splits`` ulps.
+    There are three sources. First, each sum of powers has at most about 32 roundings. Second, h has
+    an error of two ulps, and ``steep`` is the ratio of h to half the width of the piece. Third, y²
+    has an error of 4 ulps divided by h², because cos² θ − ρ² cancels near the limit on θ. There the
+    slope of the ratios in y is 0, so the second derivative bounds the error due to y². In addition,
+    y has an error of ``splits`` ulps.
     """
     i, j = np.arange(terms.shape[1])[:, None], np.arange(terms.shape[2])
     size = np.abs(terms)
@@ -194,14 +196,14 @@ def _rounding(terms: FloatArray, steep: float, low: float, splits: int) -> Float
 
 
 def _terms(values: FloatArray) -> FloatArray:
-    """Return the Chebyshev coefficients [5, i, j] of ``values`` [5, i, j] at the nodes."""
+    """Return the Chebyshev coefficients [5, i, j] of ``values`` [5, i, j] given at the nodes."""
     in_x, in_y = _nodes(values.shape[1])[1], _nodes(values.shape[2])[1]
     return np.asarray(np.einsum("ai,bj,kij->kab", in_x, in_y, values, optimize=True))
 
 
 @cache
 def _nodes(count: int) -> tuple[FloatArray, FloatArray]:
-    """Return Chebyshev nodes on [−1, 1] and the matrix from values there to coefficients."""
+    """Return Chebyshev nodes on [−1, 1] and the matrix that turns node values into coefficients."""
     nodes: FloatArray = np.cos(np.pi * (np.arange(count) + 0.5) / count)
     inverse = np.linalg.inv(chebyshev.chebvander(nodes, count - 1))
     return nodes, np.asarray(inverse, dtype=np.float64)
@@ -209,12 +211,12 @@ def _nodes(count: int) -> tuple[FloatArray, FloatArray]:
 
 @cache
 def _dense_nodes(count: int) -> FloatArray:
-    """Return ``count`` Chebyshev polynomials at points dense enough to resolve all of them."""
+    """Evaluate ``count`` Chebyshev polynomials at points dense enough to resolve all of them."""
     return np.asarray(chebyshev.chebvander(np.cos(np.linspace(np.pi, 0.0, 4 * count)), count - 1))
 
 
 def _tilt(at: _WorstError) -> float:
-    """Return θ [rad] at the h and y of ``at``."""
+    """Return the tilt θ [rad] at the coordinates h and y of ``at``."""
     complement = 1.0 - (at.h * at.y) ** 2
     return math.asin(min(at.h * math.sqrt((1.0 - at.y) * (1.0 + at.y) / complement), 1.0))
 
@@ -223,7 +225,7 @@ def _ratios_at(law: LawTerms, h: FloatArray, y: FloatArray) -> FloatArray:
     """Return the ratios [5, …] at broadcast coordinates h in (0, 1) and y in [0, 1]."""
     h, y = np.broadcast_arrays(h, y)
     delta = 1.0 - h
-    # 1 − u² with u = h y, written without cancellation for h and y near 1.
+    # 1 − u² with u = h y, in a form without cancellation for h and y near 1.
     complement = (1.0 - y + delta * y) * (1.0 + h * y)
     c = np.sqrt(delta * (1.0 + h) / complement)
     s = h * np.sqrt((1.0 - y) * (1.0 + y) / complement)

@@ -1,7 +1,7 @@
 """Record type of contact tables, and the evaluation of their polynomials.
 
 A table consists of pieces. Each piece has five polynomials in two variables (the lanes), which are
-evaluated together. Their meaning and variables depend on the tip's law; see `lookup` and
+evaluated together. Their meaning and variables depend on the tip model; see `lookup` and
 `solid_lookup`.
 """
 
@@ -24,41 +24,41 @@ ThreeFloats: TypeAlias = tuple[float, float, float]
 LANES = 5
 POWERS_U, POWERS_V = 12, 6  # terms in each variable
 PIECE = POWERS_V * POWERS_U * LANES  # coefficients per piece
-OCTAVES = 3  # octaves of the height h covered by the pieces of a spring tip
+OCTAVES = 3  # octaves of the height h, covered by the pieces of a spring tip
 SLAB_BITS = 4  # 2^4 slabs per octave
-SPLITS_MAX = 4  # largest number of pieces per slab
+SPLITS_MAX = 4  # maximum number of pieces per slab
 PIECES = OCTAVES * 2**SLAB_BITS * SPLITS_MAX
 
 
 class TableError(SoftfingerError):
-    """Error raised if a table cannot be built to the tolerance."""
+    """Error raised if a table cannot be built within the tolerance."""
 
 
 class Table(Record):
     """Contact table of one tip and material."""
 
     is_solid: bool  # solid or measured tip, evaluated by `solid_lookup`; otherwise springs
-    is_closed: bool  # springs of constant modulus; the table has no pieces
+    is_closed: bool  # springs with a constant modulus; the table has no pieces
     sticks: bool
     splits: int  # pieces per slab
     radius: float  # [m]
     inverse_radius: float
     modulus: float  # at zero strain [Pa]
-    deepest: float  # largest d [m]
-    tilt: float  # largest |θ| of a solid tip [rad]
-    by_root: float  # 2/largest t
-    by_square: float  # 2/largest sin² θ
-    at_first: float  # g at t = 0, Hertz's value
+    deepest: float  # maximum d [m]
+    tilt: float  # maximum |θ| of a solid tip [rad]
+    by_root: float  # 2/(maximum t)
+    by_square: float  # 2/(maximum sin² θ)
+    at_first: float  # g at t = 0, from Hertz theory
     tolerance: float
-    max_error: float  # bound on the relative error; for a solid tip, error of the data
-    worst_d: float  # place of the largest error [m]
-    worst_theta: float  # [rad]
+    max_error: float  # bound on the relative error; data error for a solid tip
+    worst_d: float  # d of the largest error [m]
+    worst_theta: float  # θ of the largest error [rad]
     coefficients: Annotated[FloatArray, PIECES * PIECE]
 
 
 @inlined_kernel
 def lanes(table: Table, piece: int, u: float, v: float) -> Lanes:
-    """Evaluate the five polynomials of a ``piece`` at u and v, both from −1 to 1."""
+    """Evaluate the five polynomials of a ``piece`` at u and v, both in [−1, 1]."""
     c = table.coefficients
     at = index((piece + 1) * PIECE)
     step = index(LANES)
@@ -81,7 +81,7 @@ def lanes(table: Table, piece: int, u: float, v: float) -> Lanes:
 
 
 def set_piece(table: Table, piece: int, powers: FloatArray) -> None:
-    """Store the polynomials of a piece, given by increasing powers [lanes, u, v]."""
+    """Store the polynomials of a piece, given as ascending powers [lanes, u, v]."""
     count, in_u, in_v = powers.shape
     place = table.coefficients[piece * PIECE : (piece + 1) * PIECE]
     place.reshape(POWERS_V, POWERS_U, LANES)[:in_v, :in_u, :count] = powers.T

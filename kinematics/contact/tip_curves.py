@@ -1,14 +1,14 @@
-"""Measured tip law: polynomial curves fitted to calibration presses, and their contact table.
+"""Measured tip model: polynomial curves fitted to calibration presses, and their contact table.
 
-With t = √(d/a) and q = sin² θ each curve is a polynomial Σ c_ij t^i q^j:
+With t = √(d/a) and q = sin² θ, each curve is a polynomial Σ c_ij t^i q^j:
 
     push     N, the force along the face's normal [N]; the force on the base is N cos θ
     shown    force summed over the sensor's frame [N]
-    lever    centroid of the frame in the direction of the tilt, over sin θ [m]
+    lever    frame centroid along the tilt direction, divided by sin θ [m]
     extent   mean squared radius of the frame [m²]
 
-The lowest power of t in the push is 3, so its energy U = ∫ N dd has the polynomial form of a solid
-tip.
+The lowest power of t in ``push`` is 3, so the energy U = ∫ N dd has the same polynomial form as for
+a solid tip.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 FloatArray = NDArray[np.float64]
 POWERS = 6  # number of powers of t
 SQUARES = 3  # number of powers of q
-FIRST = 3  # lowest power of t in the push
+FIRST = 3  # lowest power of t in ``push``
 _value: Any = polyval2d
 
 Curve: TypeAlias = tuple[tuple[float, ...], ...]  # c [POWERS][SQUARES]
@@ -32,15 +32,15 @@ Curve: TypeAlias = tuple[tuple[float, ...], ...]  # c [POWERS][SQUARES]
 
 @dataclass(frozen=True)
 class TipCurves:
-    """Measured curves of one tip on its sensor; the module defines the four curves.
+    """Measured curves of one tip on its sensor; see the module docstring for the four curves.
 
     The curves are valid up to ``deepest`` [m] and ``tilt`` [rad]. ``centre`` [m] and ``rotation``
-    [rad] locate the tip on the sensor, as in `SensorGrid`; ``presses`` is the number of presses
-    used. The four sums of a frame are over its cell forces, pressure times area: the force [N], the
-    first moments in x and y [N·m] and the second moment [N·m²]. ``rest`` are the sums of an
-    untouched tip, ``noise`` [4][4] is the covariance of the sums of one frame. ``force_error``
-    (relative, of push and shown) and ``lever_error`` [m] are the residuals of the curves. Raises
-    ValueError for curves that are not a valid law.
+    [rad] locate the tip on the sensor, as in `SensorGrid`. ``presses`` is the number of presses
+    used. Four sums describe a frame: the force [N], the first moments in x and y [N·m] and the
+    second moment [N·m²]. They are taken over the cell forces, which are pressure times area.
+    ``rest`` contains the sums of an unloaded tip, and ``noise`` [4][4] is the covariance of one
+    frame's sums. ``force_error`` (relative, for push and shown) and ``lever_error`` [m] are the
+    residuals of the curves. Raises ValueError if the curves are invalid.
     """
 
     radius: float
@@ -73,12 +73,12 @@ class TipCurves:
 
     @property
     def root(self) -> float:
-        """Largest t of the curves."""
+        """Maximum t of the curves."""
         return math.sqrt(self.deepest / self.radius)
 
     @property
     def square(self) -> float:
-        """Largest q of the curves."""
+        """Maximum q of the curves."""
         return math.sin(self.tilt) ** 2
 
     def at(self, curve: Curve, d: ArrayLike, theta: ArrayLike) -> FloatArray:
@@ -87,7 +87,7 @@ class TipCurves:
         return np.asarray(_value(*np.broadcast_arrays(t, q), np.array(curve)))
 
     def energy(self) -> FloatArray:
-        """Return g [Pa] of U = a³ t⁵ g(t, q) by powers of 2 t/root − 1, 2 q/square − 1, [i, j]."""
+        """Return g [Pa] [i, j] of U = a³ t⁵ g, in powers of 2 t/root − 1 and 2 q/square − 1."""
         powers = np.arange(POWERS - FIRST)
         g = np.array(self.push)[FIRST:] * (2.0 / (5.0 + powers))[:, None] / self.radius**2
         return np.asarray(
@@ -98,14 +98,14 @@ class TipCurves:
 
 
 def _shifted_polynomial(count: int, end: float) -> FloatArray:
-    """Return the powers of u = end/2 (1 + x) by powers of x, [power of u, power of x]."""
+    """Return the powers of u = end/2 (1 + x) as polynomials in x, [power of u, power of x]."""
     return np.array(
         [[(0.5 * end) ** i * math.comb(i, k) for k in range(count)] for i in range(count)]
     )
 
 
 def rises(curve: ArrayLike, root: float, square: float) -> bool:
-    """Return True if the curve is positive and rises with t on (0, root] × [0, square]."""
+    """Return True if the curve is positive and increases with t on (0, root] × [0, square]."""
     t, q = np.meshgrid(np.linspace(0.0, root, 41), np.linspace(0.0, square, 9), indexing="ij")
     values = _value(t, q, np.asarray(curve))
     return bool((np.diff(values, axis=0) > 0.0).all() and (values[0] >= 0.0).all())
