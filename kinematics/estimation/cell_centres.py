@@ -1,7 +1,6 @@
 """Geometry of cell centres, and kernels for sums over cells.
 
-Loops that should be vectorised use unsigned indices, because Numba checks signed ones for negative
-values.
+Vectorised loops use unsigned indices, because Numba checks signed indices for negative values.
 """
 
 from __future__ import annotations
@@ -21,9 +20,9 @@ def cell_centres(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return height, x and y of the cells as flat arrays; ``active`` [rows, cols] masks cells.
 
-    The height is √(a² − x² − y²) at the cell's centre, or at its nearest corner if the centre lies
-    beyond the rim. It is −∞ for inactive cells and for cells outside the disc of ``radius`` [m]
-    around the tip's centre.
+    The height is √(a² − x² − y²) at the cell centre, or at the corner nearest to the tip centre if
+    the cell centre is outside the rim. It is −∞ for inactive cells and for cells outside the disc
+    of ``radius`` [m] around the tip centre.
     """
     a, pitch_x, pitch_y = grid.radius, grid.pitch_x, grid.pitch_y
     rows, cols = active.shape
@@ -41,7 +40,7 @@ def cell_centres(
 
 @fast_inner_kernel
 def totals(frame: FloatArray, height: FloatArray) -> tuple[float, float, float]:
-    """Return Σ p, Σ p² and the largest p ≥ 0; Σ p is not finite if any cell is not."""
+    """Return Σ p, Σ p² and the maximum p ≥ 0; if a cell is not finite, Σ p is not finite either."""
     total = 0.0
     energy = 0.0
     peak = np.int64(0)
@@ -49,7 +48,7 @@ def totals(frame: FloatArray, height: FloatArray) -> tuple[float, float, float]:
         value = frame[k] if height[k] >= 0.0 else 0.0
         total += value
         energy += value * value
-        # Non-negative floats have the same order as their bits; comparing bits avoids NaN rules.
+        # Non-negative floats sort like their bits. Comparing bits avoids special cases for NaN.
         bits = np.float64(value).view(np.int64)
         peak = bits if bits > peak else peak
     return total, energy, np.int64(peak).view(np.float64)
@@ -57,7 +56,7 @@ def totals(frame: FloatArray, height: FloatArray) -> tuple[float, float, float]:
 
 @fast_inner_kernel
 def sums_above(m: Moments, frame: FloatArray, cells: Cells, level: float) -> None:
-    """Sum p, p x, p y and the count of cells with p above ``level`` into ``m``."""
+    """Store the sums of p, p x and p y and the number of cells with p above ``level`` in ``m``."""
     total = sum_x = sum_y = number = 0.0
     for k in range(index(0), index(frame.shape[0])):
         counts = (cells.height[k] >= 0.0) & (frame[k] > level)
@@ -74,7 +73,7 @@ def sums_above(m: Moments, frame: FloatArray, cells: Cells, level: float) -> Non
 
 @fast_inner_kernel
 def sums_inside(m: Moments, frame: FloatArray, cells: Cells, u: float, v: float, w: float) -> None:
-    """Sum p, p x, p y and p (x² + y²) of the cells whose centre is pressed by the face u, v, w."""
+    """Sum p, p x, p y and p (x² + y²) over the cells whose centre is pressed by the face."""
     total = sum_x = sum_y = square = 0.0
     for k in range(index(0), index(frame.shape[0])):
         x = cells.x[k]

@@ -1,7 +1,7 @@
-"""Fast contact detection and outlier rejection for a frame.
+"""Fast contact detection and outlier rejection in a frame.
 
-The kernels use only the readings and their noise, without a fit. Single cells that read too high to
-be part of any contact are masked as outliers.
+The kernels use only the readings and their noise; no fit is needed. Single cells whose reading is
+too high for any contact are masked as outliers.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from softfinger.kinematics.sensing.footprint import (
     steps,
 )
 
-_HYSTERESIS = 0.5  # detection level during a contact over that for a new one; avoids flicker
-STRONG_PEAK = 6.0  # in noise standard deviations; above it the largest cell is tested first
+_HYSTERESIS = 0.5  # ratio of the detection levels during and before a contact; avoids flicker
+STRONG_PEAK = 6.0  # noise standard deviations; above it, the largest cell is tested first
 
 
 @inner_kernel
 def neighbourhood(frame: FloatArray, height: FloatArray, grid: Grid, at: int) -> float:
-    """Return the weighted sum of the 24 neighbours of cell ``at`` over its standard deviation.
+    """Return the weighted sum of the 24 neighbours of cell ``at``, in standard deviations.
 
-    The weights of the 5 × 5 window are (1, 2, 2, 2, 1) in both directions without the cell itself,
-    for noise of standard deviation 1. Cells with negative ``height`` (see
-    :mod:`estimation.cell_centres`) are excluded.
+    The weights of the 5 × 5 window are (1, 2, 2, 2, 1) in both directions; the cell itself is
+    excluded. The standard deviation assumes a cell noise of 1. Cells with negative ``height``
+    (see :mod:`estimation.cell_centres`) are excluded as well.
     """
     cols = grid.cols
     i = at // cols
@@ -52,11 +52,11 @@ def activity(state: EstimatorState, frame: FloatArray, height: FloatArray) -> No
     """Test the frame for a contact and store the result in ``state.signal``.
 
     A contact is detected if a cell reads at least ``peak_level`` · noise and the weighted sum of
-    its neighbours exceeds ``patch_level`` standard deviations, so a single outlier is not a
-    contact. At levels 3 and 4.9, the false alarm rate for white noise on 788 cells is
-    788 · 1.35e-3 · 4.8e-7 = 5.1e-7 per frame, since a cell and its neighbours are independent. A
-    contact of d = 0.2 mm at a noise of 0.2 % of the modulus is detected in 99.98 % of frames
-    (150 000 simulated frames, all azimuths, tilts up to 30°, positions between the cells).
+    its neighbours exceeds ``patch_level`` standard deviations. A single outlier is therefore not
+    detected as a contact. A cell and its neighbours are independent, so at levels of 3 and 4.9 the
+    false alarm rate for white noise on 788 cells is 788 · 1.35e-3 · 4.8e-7 = 5.1e-7 per frame. At a
+    noise of 0.2 % of the modulus, a contact of d = 0.2 mm is detected in 99.98 % of frames (150 000
+    simulated frames, all azimuths, tilts up to 30°, positions between cells).
     """
     signal = state.signal
     grid = state.grid
@@ -86,11 +86,13 @@ def activity(state: EstimatorState, frame: FloatArray, height: FloatArray) -> No
 
 @inner_kernel
 def shows_pattern(state: EstimatorState, frame: FloatArray, cells: Cells) -> bool:
-    """Return True if a solid tip's frame matches the contact pattern by ``patch_level``.
+    """Return True if a solid tip's frame matches the contact pattern significantly.
 
-    Much of a solid tip's pressure is spread over its base, so a weak contact is visible in the sum
-    over all cells long before it is in any neighbourhood. The pattern has zero mean and unit norm.
-    A common zero offset or noise clipped at 0 is therefore not detected as a contact.
+    A solid tip spreads much of its pressure over the base. A weak contact is therefore visible in
+    the sum over all cells long before it is visible in any neighbourhood. The pattern has zero mean
+    and unit norm, so a common zero offset and noise clipped at 0 are not detected as a contact. The
+    threshold is ``patch_level`` noise standard deviations, or half of it after a contact in the
+    last frame.
     """
     projection = 0.0
     for k in range(frame.shape[0]):
@@ -106,8 +108,8 @@ def presses_outside(
     """Return True if a group of cells outside the footprint reads at least ``level``.
 
     The footprint is extended by two cells and three standard deviations of the blur. ``level`` is
-    in the unit of the frame. The weighted mean of the cell's neighbours must exceed a third of it,
-    so a single cell is not enough.
+    in frame units. The weighted mean of a cell's neighbours must exceed a third of ``level``, so a
+    single cell is not enough.
     """
     grid = state.grid
     a = grid.radius
@@ -125,7 +127,7 @@ def presses_outside(
         start = i * cols
         at = next_above(frame, height, start, start + cols, level)
         while at < start + cols:
-            # Σ w = 60 and √Σ w² = 13.4 over a full neighbourhood.
+            # In a full neighbourhood, Σ w = 60 and √Σ w² = 13.4.
             if not first <= at - start < last and (
                 neighbourhood(frame, height, grid, at) > 1.5 * level
             ):
@@ -134,15 +136,15 @@ def presses_outside(
     return False
 
 
-_MASK_DEPTH = 1e3  # m, lowers the height of masked cells out of reach of any face
+_MASK_DEPTH = 1e3  # m, lowers the height of masked cells beyond the reach of any face
 
 
 @inner_kernel
 def _is_outlier(state: EstimatorState, frame: FloatArray, height: FloatArray) -> bool:
     """Return True if the largest cell is too high above its neighbours to be part of a contact.
 
-    A contact about as wide as a cell produces at most ``signal.narrow_contact_max``. In a wider
-    contact, no cell reads twice the mean of its neighbours.
+    The reading of a contact about as wide as a cell is at most ``signal.narrow_contact_max``. In a
+    wider contact, each cell reads less than twice the mean of its neighbours.
     """
     rows = state.grid.rows
     cols = state.grid.cols
@@ -165,9 +167,9 @@ def _is_outlier(state: EstimatorState, frame: FloatArray, height: FloatArray) ->
 
 @inner_kernel
 def without_outliers(state: EstimatorState, frame: FloatArray, height: FloatArray) -> int:
-    """Run :func:`activity` without the outliers and return their number.
+    """Run :func:`activity` with outliers masked and return the number of outliers.
 
-    The outliers are masked until :func:`restore_outliers` is called.
+    Call :func:`restore_outliers` to unmask them.
     """
     signal = state.signal
     cols = state.grid.cols
@@ -190,7 +192,7 @@ def without_outliers(state: EstimatorState, frame: FloatArray, height: FloatArra
 
 @inner_kernel
 def restore_outliers(state: EstimatorState, rejected: int, height: FloatArray) -> None:
-    """Unmask the outliers."""
+    """Unmask the first ``rejected`` outliers."""
     for k in range(rejected):
         height[state.outliers[k]] += _MASK_DEPTH
         state.signal.number += 1

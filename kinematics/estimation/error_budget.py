@@ -1,28 +1,28 @@
-"""Error budget: errors other than white cell noise, propagated into the covariance of an estimate.
+"""Error budget: propagate errors other than white cell noise into the covariance of an estimate.
 
 White noise of variance σ² gives the covariance σ² (JᵀJ)⁻¹, where J is the Jacobian of the fit. The
 other errors are propagated linearly:
 
     shared error q     m mᵀ,   m = size (JᵀJ)⁻¹ Jᵀq                        (`set_shared_errors`)
-      it leaves        Σ size² qᵀq − m·(size Jᵀq)
-    smooth error       W (JᵀJ)⁻¹ W smooth² Σ p², p the model's pressures         (likewise)
+      residuals        Σ size² qᵀq − m·(size Jᵀq)
+    smooth error       W (JᵀJ)⁻¹ W smooth² Σ p², p the modelled pressures        (likewise)
     rotation           (n × z) rotation                                          (likewise)
-    solid tip's data   n lean d/a                                                (likewise)
+    solid tip data     n tilt_error d/a                                          (likewise)
     correlated noise   standard deviations times √(C_ii/(JᵀJ)⁻¹_ii),
-                       C = (JᵀJ)⁻¹ JᵀRJ (JᵀJ)⁻¹, at no tilt           (`widen_covariance`)
+                       C = (JᵀJ)⁻¹ JᵀRJ (JᵀJ)⁻¹, at zero tilt         (`widen_covariance`)
     smooth misfit      Σ r_k r_(k−1) − n ρ₁ σ² − decrement                 (`undetected_misfit`)
 
-The patterns q are errors that are the same in every frame: a shift of all cells, its slopes in x
-and y, the tip's centre in x and y, the pitch, and the modulus or gain. ``size`` is the standard
-deviation of each. Patterns that move the tip relative to the cells are the differences of the
-modelled pressure between neighbouring cells.
+The patterns q describe errors that are the same in every frame: a shift of all cells, its slopes in
+x and y, the tip centre in x and y, the pitch, and the modulus or gain. ``size`` is the standard
+deviation of each error. Patterns that move the tip relative to the cells are computed from pressure
+differences between neighbouring cells.
 
-R is the correlation of the noise by lag, as measured by `calibrate`. Its widening effect depends on
-the size of the footprint and is tabulated over it. W² are the fractions of a smooth error's square
-that look like a change of d and gain, and like a tilt. They are small because the errors of real
-cells are nearly as symmetric as the pressure. r_k are the residuals. Products of neighbouring
-residuals average to zero for independent noise, but a misfit that is smooth over the footprint
-contributes fully to them.
+R is the noise correlation as a function of the lag, as measured by `calibrate`. The widening due to
+R depends on the footprint size and is tabulated. W² are the fractions of a smooth error's energy
+that appear as a change of d and gain, and as a tilt. They are small because the errors of real
+cells are nearly as symmetric as the pressure. r_k are the residuals. For independent noise, the
+products of neighbouring residuals average to zero, whereas a misfit that is smooth over the
+footprint contributes fully to the sum.
 """
 
 from __future__ import annotations
@@ -58,39 +58,40 @@ from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
 NEIGHBOURS = np.outer((1.0, 2.0, 2.0, 2.0, 1.0), (1.0, 2.0, 2.0, 2.0, 1.0))  # see `detection`
 NEIGHBOURS[2, 2] = 0.0
-_NOISE_PEAK = 4.5  # largest cell under noise alone, in standard deviations
+_NOISE_PEAK = 4.5  # maximum reading due to noise alone, in standard deviations
 _CELL_COUNT_MIN = 48.0  # cells, below which smooth and rough misfits cannot be distinguished
-# Fractions of a smooth error's square that appear in d (and the gain), in each tilt, and in the
-# residuals. Errors of curves, hysteresis and crosstalk are nearly as symmetric as the pressure.
+# Fractions of a smooth error's energy that appear in d (and the gain), in each tilt, and in the
+# residuals. Curve errors, hysteresis and crosstalk are nearly as symmetric as the pressure.
 _SMOOTH_IN_DEPTH, _SMOOTH_IN_TILT, _SMOOTH_IN_RESIDUALS = 0.15, 0.06, 0.2
-# Relative tilt error of the solid model over d/a, from frames of independent finite elements up to
-# 20° and 7 mm. There the error is 4 % for a bonded tip and negligible for a lying one.
+# Relative tilt error of the solid model per d/a, compared with frames from independent finite
+# elements up to 20° and 7 mm. In that range, the error is 4 % for a bonded tip and negligible for a
+# lying tip.
 _SOLID_TILT_ERROR = 0.1
-_PRODUCT_SIGMA = 6.0  # threshold of the neighbours' products in standard deviations of the noise
+_PRODUCT_SIGMA = 6.0  # threshold for products of neighbours, in noise standard deviations
 
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """Standard deviations of a sensor's common errors, and the correlation of its noise.
+    """Standard deviations of the sensor's common errors, and its noise correlation.
 
     Parameters
     ----------
     baseline
         Common shift of all cells [Pa].
     centre
-        Position of the tip on the sensor, in x and in y [m].
+        Position error of the tip on the sensor, in x and in y [m].
     pitch, modulus, gain
         Relative errors of the cell pitch, the tip's modulus and the common gain of all cells.
     correlation
-        Correlation of the noise of two cells by their distance in rows and columns, [rows, cols],
-        with 1 at [0, 0]; it is 0 at larger distances. None for white noise.
+        Noise correlation of two cells by their distance in rows and columns, [rows, cols], with 1
+        at [0, 0]. It is 0 at larger distances. None means white noise.
     slope
-        Shift of the zero from the tip's centre to its rim, in x and in y [Pa].
+        Change of the zero offset from the tip centre to its rim, in x and in y [Pa].
     smooth
-        Relative pressure error of a cell that is shared by its neighbours, due to curve errors,
-        hysteresis or crosstalk.
+        Relative pressure error that neighbouring cells share, due to curve errors, hysteresis or
+        crosstalk.
     rotation
-        Rotation of the sensor [rad].
+        Rotation error of the sensor [rad].
 
     Raises
     ------
@@ -127,11 +128,11 @@ def set_budget(
     material: Material,
     pattern: FloatArray | None,
 ) -> None:
-    """Set the error budget, and raise the level of the activity test above the common errors.
+    """Set the error budget, and raise the threshold of the activity test above the common errors.
 
-    The material's ``fit_error`` [Pa], the distance of the law from the fitted points, acts like a
-    shift on the pressed cells. ``pattern`` [rows, cols] is the pattern by which a solid tip's
-    contact is detected.
+    The material's ``fit_error`` [Pa], the distance between the law and the fitted points, acts like
+    a shift of the pressed cells. ``pattern`` [rows, cols] is the pattern used to detect the contact
+    of a solid tip.
     """
     budget, options = state.budget, state.options
     modulus = 0.0 if options.free_gain else math.hypot(known.modulus, known.gain)
@@ -158,13 +159,13 @@ def set_budget(
         with_centre = float((weights * _cropped(rho, 5)).sum()) if pattern is None else 0.0
         variance = float(quadratic(weights, rho)) - with_centre**2
         level = (level * math.sqrt(max(variance, 0.0)) + _NOISE_PEAK * max(with_centre, 0.0)) / norm
-    # A shift of up to twice the baseline's standard deviation must not be detected as a contact.
+    # A shift of twice the baseline's standard deviation must not be detected as a contact.
     shift = 2.0 * known.baseline / options.noise * weights.sum() / norm
     options.patch_level = level + max(shift, 0.0)
 
 
 def mirrored(correlation: FloatArray | None) -> FloatArray:
-    """Extend a correlation to lags of both signs, [2 rows − 1, 2 cols − 1]."""
+    """Extend a correlation to positive and negative lags, [2 rows − 1, 2 cols − 1]."""
     assert correlation is not None
     rows, cols = correlation.shape
     return np.asarray(
@@ -173,7 +174,7 @@ def mirrored(correlation: FloatArray | None) -> FloatArray:
 
 
 def _cropped(rho: FloatArray, size: int) -> FloatArray:
-    """Return the centre [size, size] of ``rho``, padded with zeros."""
+    """Return the central part [size, size] of ``rho``, padded with zeros."""
     out = np.zeros((size, size))
     for i in range(size):
         for j in range(size):
@@ -184,13 +185,13 @@ def _cropped(rho: FloatArray, size: int) -> FloatArray:
 
 
 def quadratic(fields: FloatArray, rho: FloatArray) -> FloatArray:
-    """Return Σ over pairs of cells of field · ρ · field, for fields [rows, cols] or […, n]."""
+    """Return Σ field · ρ · field over pairs of cells, for fields [rows, cols] or […, n]."""
     several = fields.reshape(*fields.shape[:2], -1)
     shape = [n + m for n, m in zip(fields.shape[:2], rho.shape, strict=True)]
     kernel = np.zeros(shape)
     kernel[: rho.shape[0], : rho.shape[1]] = rho
     kernel = np.roll(kernel, (-(rho.shape[0] // 2), -(rho.shape[1] // 2)), (0, 1))
-    # A measured correlation may imply negative power at some frequencies; clip it to zero.
+    # A measured correlation may imply negative power at some frequencies; clip the power at zero.
     power = np.maximum(np.fft.fft2(kernel).real, 0.0)
     waves = np.fft.fft2(several, shape, axes=(0, 1))
     out = np.einsum("xyi,xy,xyj->ij", waves.conj(), power, waves).real / power.size
@@ -200,7 +201,7 @@ def quadratic(fields: FloatArray, rho: FloatArray) -> FloatArray:
 def _set_widening(
     state: EstimatorState, rho: FloatArray, grid: SensorGrid, tip: Fingertip, material: Material
 ) -> None:
-    """Tabulate the widening by correlated noise at zero tilt, and the cells used up by the fit."""
+    """Tabulate the widening by correlated noise at zero tilt, and the degrees of freedom used."""
     options = state.options
     first = 0 if options.free_gain else 1
     for k in range(DEPTHS):
@@ -228,7 +229,7 @@ def _set_widening(
 
 @inner_kernel
 def widen_covariance(state: EstimatorState) -> float:
-    """Widen ``fit.inverse`` by correlated noise; return the number of cells used up by the fit."""
+    """Widen ``fit.inverse`` for correlated noise; return the degrees of freedom used by the fit."""
     inverse = state.fit.inverse
     table = state.budget.widening
     t = DEPTHS * math.sqrt(state.fit.d / state.options.deepest) - 1.0
@@ -246,9 +247,9 @@ def widen_covariance(state: EstimatorState) -> float:
 
 @fast_inner_kernel
 def _neighbours_products(cells: Cells, lowest: float, first: int, last: int) -> tuple[float, float]:
-    """Return the sum of products of neighbouring residuals in rows [Pa²], and their number.
+    """Return the sum of the products of row-wise neighbouring residuals [Pa²], and their number.
 
-    Only cells with a modelled pressure above ``lowest`` [Pa] count.
+    Only cells with a modelled pressure above ``lowest`` [Pa] are included.
     """
     total = 0.0
     number = 0.0
@@ -264,20 +265,21 @@ def _neighbours_products(cells: Cells, lowest: float, first: int, last: int) -> 
 
 @inner_kernel
 def undetected_misfit(state: EstimatorState, cells: Cells, beyond: float) -> float:
-    """Return the square sum [Pa²] of the misfit that is smooth over the footprint.
+    """Return the part of the squared misfit [Pa²] that is smooth over the footprint.
 
-    It is 0 if the noise explains it. ``beyond`` [Pa²] is the total misfit in excess of the expected
-    one. In a footprint of few cells the smooth part cannot be separated, so all of it is returned.
+    The result is 0 if noise explains the misfit. ``beyond`` [Pa²] is the total misfit in excess of
+    the expected value. If the footprint has only a few cells, the smooth part cannot be separated
+    and the whole excess is returned.
     """
     fit = state.fit
     variance = state.signal.variance
     cols = state.grid.cols
-    # Near the floor, clipping biases the readings above the pressure.
+    # Near the floor, clipping raises the mean reading above the pressure.
     lowest = max(state.signal.floor, 0.0) + 2.0 * fit.clip_noise
     total, number = _neighbours_products(
         cells, lowest, index(fit.first_row * cols), index(fit.last_row * cols)
     )
-    # The residuals do not include the decrement of the last step yet.
+    # The residuals do not yet include the decrement of the last step.
     total -= number * variance * state.budget.row_correlation + fit.decrement
     total = beyond if number < _CELL_COUNT_MIN else min(total, beyond)
     if total <= _PRODUCT_SIGMA * variance * math.sqrt(number * state.budget.cells_per_sample):
@@ -289,7 +291,7 @@ def undetected_misfit(state: EstimatorState, cells: Cells, beyond: float) -> flo
 def _project(
     state: EstimatorState, cells: Cells, column: int, values: FloatArray, first: int, last: int
 ) -> None:
-    """Set Jᵀq of one column of the Jacobian, and qᵀq, for all patterns except the pressure."""
+    """Set Jᵀq of one Jacobian column, and qᵀq, for all patterns except the pressure."""
     one = index(1)
     two = index(2)
     cols = index(state.grid.cols)
@@ -334,10 +336,10 @@ def _project(
 
 @inner_kernel
 def set_shared_errors(state: EstimatorState, cells: Cells) -> float:
-    """Set ``budget.shared``, the covariance of the fit's parameters due to common errors.
+    """Set ``budget.shared``, the covariance of the fit parameters due to common errors.
 
-    ``fit.inverse`` must be the covariance for white noise of variance 1 Pa². Returns the square sum
-    of the residuals [Pa²] if each common error is twice its standard deviation.
+    ``fit.inverse`` must be the covariance for white noise of variance 1 Pa². Returns the squared
+    residuals [Pa²] that result if each common error is twice its standard deviation.
     """
     fit = state.fit
     budget = state.budget
@@ -370,7 +372,7 @@ def set_shared_errors(state: EstimatorState, cells: Cells) -> float:
         size = budget.sizes[source]
         if size == 0.0:
             continue
-        # Patterns that move or scale the pressure are proportional to the gain; zero errors aren't.
+        # Patterns that move or scale the pressure are proportional to the gain; offsets are not.
         size *= gain if source >= PLACE_X else 1.0
         remaining += size * size * budget.squares[source]
         for i in range(PARAMETERS):
@@ -384,7 +386,7 @@ def set_shared_errors(state: EstimatorState, cells: Cells) -> float:
     along = budget.tilt_error * fit.d / state.grid.radius
     for i in range(2):
         for j in range(2):
-            # Components along the tilt and across it.
+            # Components along and across the tilt direction.
             n_i = fit.n_y if i else fit.n_x
             n_j = fit.n_y if j else fit.n_x
             m_i = fit.n_x if i else -fit.n_y

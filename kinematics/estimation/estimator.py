@@ -1,7 +1,7 @@
 """Estimate displacement, tilt, gain and their covariance from a frame of a pressure grid.
 
-This module holds `ContactEstimator` and its result `ContactEstimate`. The processing of a frame,
-one compiled call, is in `frame_pipeline`.
+This module contains `ContactEstimator` and its result `ContactEstimate`. A frame is processed in
+one compiled call; see `frame_pipeline`.
 """
 
 from __future__ import annotations
@@ -30,47 +30,50 @@ from softfinger.kinematics.sensing.springs_pressure import count_for, points_of
 
 @dataclass(slots=True)
 class ContactEstimate:
-    """Estimate of the contact in one frame, in SI units with angles in rad.
+    """Estimated contact in one frame; SI units, angles in rad.
 
     Attributes
     ----------
     contact
         True if a contact is detected.
     invalid
-        The reason for which the estimate cannot be used, or `Invalid.NONE`.
+        Reason why the estimate cannot be used, or `Invalid.NONE`.
     d
         Displacement [m].
     tilt_x, tilt_y
-        Tilts of the object's normal [rad].
+        Tilts of the object's face normal [rad].
     gain
         Ratio of measured to modelled pressure.
     covariance
-        Covariance of (d, tilt_x, tilt_y, gain). The row of a fixed gain is zero.
+        Covariance of (d, tilt_x, tilt_y, gain). If the gain is fixed, its row is zero.
     systematic
-        The part of the covariance that is common to all frames and not reduced by averaging.
+        Part of the covariance that is common to all frames and is not reduced by averaging.
     chi2
-        Mean squared residual per cell over the noise variance; 0 without a fit.
+        Mean squared residual per cell divided by the noise variance; 0 without a fit.
     r_squared
-        Fraction of the frame's squared pressure explained by the model; 0 without a fit.
+        Fraction of the frame's squared pressure that the model explains; 0 without a fit.
     misfit
-        True if χ² is larger than noise causes once in 3.5 million frames. Then the model does not
-        describe the contact well, or the noise is larger than given.
+        True if χ² exceeds the value that noise alone reaches once in 3.5 million frames. In this
+        case, the model does not describe the contact well, or the noise is larger than specified.
 
     Notes
     -----
-    A ``valid`` estimate with a contact fulfils these conditions:
+    A ``valid`` estimate with a contact meets these conditions:
 
-    - The fit converged with d below 3/4 of the radius and a gain from 1/20 to 20.
+    - The fit has converged, d is below 3/4 of the radius, and the gain is between 1/20 and 20.
     - The model explains at least 80 % of the frame's squared pressure.
     - There is no second contact.
-    - The smooth part of the residual could change d by at most 60 % (one standard deviation), or by
-      3 % if the gain is outside 1/2 to 2, since both together indicate a different tip.
-    - The smooth residual (for example of a curved face) and the known uncertainties, both included
-      in the covariance, leave a standard deviation of d of at most half of d.
+    - The smooth part of the residual could change d by at most 60 % (one standard deviation). If
+      the gain is outside the range 1/2 to 2, the limit is 3 %, because a gain error and a smooth
+      residual together indicate a different tip.
+    - The standard deviation of d due to the known uncertainties is at most half of d.
 
-    Without a contact, d and the tilts are 0, the estimate is valid, and ``d_std`` is the d of the
-    smallest detectable contact. Some errors cannot be detected from a frame: a wrong modulus with a
-    fixed gain, and a tip that is displaced on the sensor.
+    The covariance includes the smooth residual (for example on a curved face) and the known
+    uncertainties.
+
+    Without a contact, d and the tilts are 0, the estimate is valid, and ``d_std`` is the smallest
+    detectable d. Two errors cannot be detected from a single frame: a wrong modulus with a fixed
+    gain, and a tip that is displaced on the sensor.
     """
 
     contact: bool = False
@@ -81,11 +84,11 @@ class ContactEstimate:
     gain: float = 1.0
     chi2: float = 0.0
     r_squared: float = 0.0
-    peak: float = 0.0  # largest cell [Pa]
-    cells: int = 0  # cells in the fit
+    peak: float = 0.0  # largest reading [Pa]
+    cells: int = 0  # number of cells in the fit
     iterations: int = 0
-    rejected_count: int = 0  # outliers excluded
-    has_second_contact: bool = False  # a second contact presses outside the footprint
+    rejected_count: int = 0  # number of outliers excluded
+    has_second_contact: bool = False  # True if a second contact presses outside the footprint
     misfit: bool = False
     shear_x: float = 0.0  # force along the face [N], for solid tips
     shear_y: float = 0.0
@@ -114,7 +117,7 @@ class ContactEstimate:
         return math.sqrt(self.covariance.item(10))
 
 
-# Accepted frame types and their saturation readings.
+# Accepted frame types and the readings at which they saturate.
 _SATURATION_COUNTS = {
     np.dtype(np.uint8): 255.0,
     np.dtype(np.uint16): 65535.0,
@@ -125,18 +128,18 @@ _SATURATION_COUNTS = {
 
 @dataclass(frozen=True, slots=True)
 class Readings:
-    """Range and resolution of a board's readings.
+    """Range and resolution of the board's readings.
 
     Parameters
     ----------
     saturation
-        Reading at which a cell saturates [counts, or Pa for float frames]. None stands for the
-        largest value of an integer type.
+        Reading at which a cell saturates [counts, or Pa for float frames]. None means the integer
+        type's maximum.
     threshold
-        Smallest nonzero count that the board sends; smaller readings are sent as 0. Used for
-        integer frames.
+        Smallest nonzero count that the board sends; smaller readings are sent as 0. It applies to
+        integer frames only.
     quantum
-        Width of a count [Pa] if float frames were converted from counts that end at 0; otherwise 0.
+        Size of one count [Pa] if float frames were converted from counts clipped at 0, otherwise 0.
 
     Raises
     ------
@@ -159,31 +162,31 @@ _RESULTS = (
     "rejected_count", "contact", "has_second_contact", "shear_x", "shear_y", "invalid",
 )  # fmt: skip
 
-# Parameters of the fit and the activity test. They can be changed in `ContactEstimator.state`.
-_TOLERANCE = 16.0  # squared step over the noise floor's square at which the iteration ends
+# Parameters of the fit and the activity test. They can be modified in `ContactEstimator.state`.
+_TOLERANCE = 16.0  # squared ratio of the step to the noise floor, below which the iteration ends
 _ITERATIONS = 20
-PEAK_LEVEL = 3.0  # in noise standard deviations, see `detection.activity`
+PEAK_LEVEL = 3.0  # noise standard deviations, see `detection.activity`
 PATCH_LEVEL = 4.9
-_R_SQUARED_MIN = 0.8  # smallest explained fraction of the squared pressure for a valid estimate
-# Smallest number of model points per tip radius, for linear and for nonlinear laws. Up to 25° the
-# bias is at most a quarter of the noise floor at a noise of 0.2 % of the modulus. Within 4° of the
-# domain's limit it is up to four times that floor.
+_R_SQUARED_MIN = 0.8  # minimum explained fraction of the squared pressure in a valid estimate
+# Minimum number of model points per tip radius, for linear and for nonlinear material laws. At a
+# noise of 0.2 % of the modulus and tilts up to 25°, the bias is at most a quarter of the noise
+# floor. Within 4° of the domain limit, it is up to four times the noise floor.
 _FINENESS_LINEAR, _FINENESS_NONLINEAR = 22.0, 31.0
 _DEEPEST, _SINE_MAX = 0.95, 3.0 / math.sqrt(10.0)  # limits of d/a and sin θ in a spring fit
-_STEP_MARGIN = 1.01  # a fit near the limits of a solid tip's data may exceed them by this factor
-_SHEAR_PRIOR = 0.1  # standard deviation of a solid tip's shear over its normal force
-# Width of the excluded rim of a solid tip over the radius.
+_STEP_MARGIN = 1.01  # factor by which a fit may exceed the data range of a solid tip
+_SHEAR_PRIOR = 0.1  # standard deviation of a solid tip's shear force, relative to its normal force
+# Width of the excluded rim of a solid tip, relative to the radius.
 _RIM_WIDTH = {"bonded": 0.03, "lying": 0.05}
-CELLS_MIN = 9  # smallest number of cells to estimate a solid tip's contact and shear
+CELLS_MIN = 9  # minimum number of cells to estimate a solid tip's contact and shear
 
 
 def cells_within_rim(grid: SensorGrid, tip: Fingertip, known: Uncertainty) -> NDArray[np.bool_]:
-    """Return a mask [rows, cols] of the cells away from a solid tip's rim.
+    """Return a mask [rows, cols] of the cells inside a solid tip's rim.
 
     The model may be wrong at the rim. The stress of a bonded base is singular there and depends on
-    the mesh: compared with frames of independent finite elements, the model is off by 3 % rms with
-    these cells and by 0.6 % without them. A tilted lying base pulls at the rim in the model, where
-    real rubber lifts off. The mask also allows for an uncertain position of the tip.
+    the mesh. Compared with frames from independent finite elements, the model's rms error is 3 %
+    with these cells and 0.6 % without them. If a lying base is tilted, the model predicts tension
+    at the rim, where real rubber lifts off. The mask also allows for an uncertain tip position.
     """
     margin = max(_RIM_WIDTH[tip.base] * tip.radius, 2.0 * (known.centre + known.pitch * tip.radius))
     cells = grid.on(tip)
@@ -198,25 +201,25 @@ def cells_within_rim(grid: SensorGrid, tip: Fingertip, known: Uncertainty) -> ND
 
 
 class ContactEstimator:
-    """Estimator of the contact under one tip from frames of a pressure grid.
+    """Estimator for the contact under one tip, using frames from a pressure grid.
 
     Parameters
     ----------
     tip, material, grid
-        The fingertip (springs or solid), its stress-strain law, and the sensor.
+        Fingertip ("springs" or "solid"), its stress-strain law, and the sensor.
     noise
         Standard deviation of a cell's noise [Pa].
     free_gain
         If True, also estimate the gain, the ratio of measured to modelled pressure. Otherwise the
         gain is 1. The default is True for springs and False for solid tips: the shape of a solid
-        tip's frame hardly depends on d, so d can only be found from the force.
+        tip's frame hardly depends on d, so d can only be determined from the force.
     active
-        Mask of working cells, bool [rows, cols]; all cells if None.
+        Mask of working cells, bool [rows, cols]; None uses all cells.
     readings
         Range and resolution of the readings.
     known
         Other uncertainties of the sensor. They widen the covariance and reduce the sensitivity of
-        the contact detection. The ``fit_error`` of the material is added to them.
+        the contact detection. The material's ``fit_error`` is added to them.
 
     Raises
     ------
@@ -225,7 +228,7 @@ class ContactEstimator:
 
     Notes
     -----
-    Tilts of a spring tip are estimated up to 71.57° (tan θ = 3); those of a solid tip up to the
+    Tilts of a spring tip are estimated up to 71.57° (tan θ = 3), and tilts of a solid tip up to the
     limits of its data.
     """
 
@@ -250,7 +253,7 @@ class ContactEstimator:
             raise ValueError(f"active must have shape {grid.shape}, got {np.shape(active)}")
         readings = readings or Readings()
         self.grid = grid
-        self._full = math.nan  # saturation of the last frame's type
+        self._full = math.nan  # saturation for the type of the last frame
         self.saturation = readings.saturation
         self._quantum = readings.quantum
         known = known or Uncertainty()
@@ -266,7 +269,7 @@ class ContactEstimator:
         options = self._options = state.options
         self.noise = noise
         options.saturation = math.inf
-        # Counts are rounded, so the smallest count includes readings down to half a count less.
+        # Counts are rounded, so the smallest count covers readings down to half a count below it.
         options.floor = max(readings.threshold - 0.5, 0.0)
         options.free_gain = not is_solid if free_gain is None else free_gain
         options.tolerance, options.iterations = _TOLERANCE, _ITERATIONS
@@ -294,7 +297,7 @@ class ContactEstimator:
         )
 
     def _lay_out(self, tip: Fingertip, material: Material, alive: NDArray[np.bool_]) -> None:
-        """Set the window of cells that a contact can press, their arrays, and the forward model."""
+        """Set the window of cells that a contact can press, the cell arrays and the model."""
         grid, state, options = self.grid, self.state, self.state.options
         reach = cell_centres(grid.on(tip), alive, tip.radius + 3.0 * grid.blur)[0] >= 0.0
         rows, cols = (np.flatnonzero(reach.reshape(grid.shape).any(axis=k)) for k in (1, 0))
@@ -329,11 +332,11 @@ class ContactEstimator:
 
         fineness = _FINENESS_LINEAR if material.is_linear else _FINENESS_NONLINEAR
         points = points_of(model_cells, material, grid.blur, count_for(cells, fineness))
-        # Arguments of the kernel other than the state and the frame.
+        # All kernel arguments except the state and the frame.
         self._arrays = self._rows, pixels, weights.array, *points
 
     def _pattern(self, tip: Fingertip, alive: NDArray[np.bool_]) -> FloatArray:
-        """Set and return the contact pattern [rows, cols] of a solid tip, its dominant image."""
+        """Set and return a solid tip's contact pattern [rows, cols], from its dominant image."""
         pattern = self.grid.images(tip)[0].reshape(self.grid.shape) * alive
         pattern = np.where(alive, pattern - pattern.sum() / alive.sum(), 0.0)
         pattern /= math.sqrt((pattern**2).sum())
@@ -343,10 +346,10 @@ class ContactEstimator:
     def _smallest_detectable_d(
         self, tip: Fingertip, material: Material, pattern: FloatArray | None
     ) -> float:
-        """Return the d [m] of the smallest upright contact that the activity test detects.
+        """Return the smallest d [m] of an upright contact that the activity test detects.
 
-        The test compares a frame with the ``pattern`` or, if it is None, examines the cells around
-        the largest reading.
+        The test compares a frame with the ``pattern``. If ``pattern`` is None, it examines the
+        cells around the largest reading.
         """
         options = self._options
         uses_pattern = pattern is not None
@@ -370,10 +373,10 @@ class ContactEstimator:
 
     @property
     def saturation(self) -> float | None:
-        """Reading at which a cell saturates; None stands for the largest value of an integer type.
+        """Reading at which a cell saturates; None means the integer type's maximum.
 
-        Update it when a different zero is subtracted from the readings. Setting a value that is not
-        positive raises ValueError.
+        Update it when the zero offset subtracted from the readings changes. Setting a value that is
+        not positive raises ValueError.
         """
         return self._saturation
 
@@ -385,7 +388,7 @@ class ContactEstimator:
 
     @property
     def noise(self) -> float:
-        """Standard deviation of a cell's noise [Pa]; it must be positive."""
+        """Standard deviation of a cell's noise [Pa]. It must be positive."""
         return float(self._options.noise)
 
     @noise.setter
@@ -397,7 +400,7 @@ class ContactEstimator:
     def __call__(self, frame: NDArray[Any], pascal_per_count: float = 1.0) -> ContactEstimate:
         """Estimate the contact from this frame alone and return a new result.
 
-        Earlier frames have no influence. The arguments and exceptions are those of :meth:`update`.
+        Earlier frames have no influence. See :meth:`update` for the arguments and exceptions.
         """
         estimate = self.state.estimate
         before, seq, last = self._estimate.copy(), self._seq, self._last
@@ -414,27 +417,27 @@ class ContactEstimator:
     def update(
         self, frame: NDArray[Any], pascal_per_count: float = 1.0, seq: int | None = None
     ) -> ContactEstimate:
-        """Estimate the contact from this frame, starting the fit at the last estimate.
+        """Estimate the contact from this frame, starting the fit from the last estimate.
 
         Parameters
         ----------
         frame
             Readings [rows, cols] of type uint8, uint16, float32 or float64. For integer types, the
-            quantisation noise is added to the noise of the cells.
+            quantisation noise is added to the cell noise.
         pascal_per_count
-            Factor from readings to Pa.
+            Conversion factor from readings to Pa.
         seq
-            Sequence number. If it equals that of the last frame, the last result is returned.
+            Sequence number. If it equals the last frame's number, the last result is returned.
 
         Returns
         -------
         ContactEstimate
-            The estimate. The same object is returned and overwritten by each call.
+            Result; every call overwrites and returns the same object.
 
         Raises
         ------
         ValueError
-            If the frame has a wrong shape or type, or ``pascal_per_count`` is not positive.
+            If the frame has the wrong shape or type, or if ``pascal_per_count`` is not positive.
         """
         if seq is not None and seq == self._seq:
             return self._last
@@ -449,7 +452,7 @@ class ContactEstimator:
         if full != self._full:
             self._full = full
             self._options.saturation = full if self._saturation is None else self._saturation
-        # The copy lets the compiled entry handle frames of any type, layout and writability.
+        # Copy the frame, so that the compiled code can handle any type, layout and writability.
         self._frame[...] = frame[self._window]
         step = self._quantum if full == math.inf else pascal_per_count
         estimate_frame(
@@ -460,7 +463,7 @@ class ContactEstimator:
         for name, value in zip(_RESULTS, self._results.item(), strict=True):
             setattr(result, name, value)
         result.invalid = REASONS[result.invalid]
-        # Threshold of χ² at 5 σ, by the Wilson-Hilferty approximation.
+        # Threshold of χ² at 5 σ, from the Wilson-Hilferty approximation.
         variance = 2.0 / (9.0 * max(result.cells / result.cells_per_sample - 4, 1))
         result.misfit = result.chi2 > (1.0 - variance + 5.0 * math.sqrt(variance)) ** 3
         self._seq = seq
@@ -473,10 +476,10 @@ class ContactEstimator:
 
 
 def _with_data_errors(known: Uncertainty, tip: Fingertip, free_gain: bool) -> Uncertainty:
-    """Add the errors of a solid tip's data, relative to independent finite elements.
+    """Add the errors of a solid tip's data, from a comparison with independent finite elements.
 
-    The pressure error counts only with a free gain: it is as symmetric as the pressure itself, so
-    with a known gain it hardly changes d.
+    The pressure error is included only with a free gain. It is as symmetric as the pressure itself,
+    so it hardly changes d if the gain is known.
     """
     data = solid_data(tip)
     smooth = data.pressure_error if free_gain else 0.0

@@ -1,7 +1,7 @@
 """Processing of one pressure frame, with the estimator's only compiled entry point.
 
-The steps are the activity test, outlier rejection, and a maximum likelihood fit that starts from
-the last estimate or from the frame alone.
+The steps are the activity test, the outlier rejection, and a maximum likelihood fit. The fit starts
+from the last estimate, or from an initial estimate based on the frame alone.
 """
 
 from __future__ import annotations
@@ -33,24 +33,24 @@ from softfinger.kinematics.sensing.footprint import FloatArray
 from softfinger.kinematics.sensing.solid_pressure import Weights
 from softfinger.kinematics.sensing.springs_pressure import points_in
 
-# Noise clipped at 0 raises the sums of neighbourhoods. This increase of the level restores the
-# false alarm rate.
+# Clipping of the noise at 0 raises the sums of neighbourhoods. This increase of the detection level
+# restores the false alarm rate.
 CLIPPED_LEVEL_INCREASE = 0.5
-GAIN_MIN, GAIN_MAX = 0.05, 20.0  # outside, the contact is not of this tip on this sensor
-D_MAX = 0.75  # largest valid d over the radius
-# Largest relative error of d that a smooth misfit may cause. The curved face of a disc causes this
-# much, which the covariance includes. With a gain far from 1 the limit is small, because both
-# together indicate a different tip, which the covariance does not include.
+GAIN_MIN, GAIN_MAX = 0.05, 20.0  # outside this range, the contact is not of this tip on this sensor
+D_MAX = 0.75  # maximum valid d, relative to the radius
+# Maximum relative error of d that a smooth misfit may cause. The curved face of a disc causes an
+# error of this size, which is included in the covariance. If the gain is far from 1, a smaller
+# limit applies: both together indicate a different tip, which the covariance does not cover.
 UNDETECTED_MAX = 0.6
 UNDETECTED_MAX_FAR_GAIN = 0.03
 GAIN_FAR = 2.0
-# If at least ABOVE_FRACTION of the cells under the tip exceeds both levels (in noise and over the
-# peak), the sensor needs a tare. A solid tip presses all cells, but 5 % of them are below 0.32 of
-# the peak.
+# If at least ABOVE_FRACTION of the cells under the tip exceed both levels (relative to the noise
+# and to the peak), the sensor needs a tare. A solid tip loads all cells, but 5 % of them read less
+# than 0.32 of the peak.
 ABOVE_FRACTION, ABOVE_NOISE, ABOVE_PEAK = 0.95, 3.0, 0.4
-FULL_FRACTION_MAX = 0.5  # largest fraction of saturated cells among those above half of the peak
-ZERO_MAX = 0.22  # largest zero error over the peak for which linear propagation holds
-SHARED_MAX = 0.5  # largest standard deviation of d due to known uncertainties, over d
+FULL_FRACTION_MAX = 0.5  # maximum fraction of saturated cells among those above half the peak
+ZERO_MAX = 0.22  # maximum ratio of zero-offset error to peak for which linear propagation is valid
+SHARED_MAX = 0.5  # maximum standard deviation of d due to known uncertainties, relative to d
 
 
 @inner_kernel
@@ -76,7 +76,7 @@ def _fit_frame(state: EstimatorState, model: Model, frame: FloatArray, cells: Ce
                 reason = Invalid.MODEL_MISMATCH
                 continue
             # Search for a second contact only if the residual exceeds the noise and a small
-            # fraction of the energy. A solid tip presses its whole base, so it is not searched.
+            # fraction of the energy. Skip solid tips, which load their whole base.
             if not options.is_solid and misfit > 8.0 * scatter + 0.003 * energy:
                 level = max(5.0 * signal.noise, 0.15 * estimate.peak / signal.scale)
                 level += 2.0 * state.budget.baseline / signal.scale
@@ -89,7 +89,7 @@ def _fit_frame(state: EstimatorState, model: Model, frame: FloatArray, cells: Ce
 
 @inner_kernel
 def _check_fit_of_tip(state: EstimatorState) -> Invalid:
-    """Check that the misfit is compatible with the tip's model and that d is certain enough."""
+    """Check that the misfit is consistent with the tip model and that d is accurate enough."""
     estimate = state.estimate
     zero = math.hypot(state.budget.baseline, state.budget.slope)
     if estimate.shared > SHARED_MAX or zero > ZERO_MAX * estimate.peak:
@@ -102,7 +102,7 @@ def _check_fit_of_tip(state: EstimatorState) -> Invalid:
 
 @inner_kernel
 def _set_r_squared(state: EstimatorState) -> tuple[float, float]:
-    """Set r², the fraction of the frame's squared pressure, less noise, explained by the model.
+    """Set r², the fraction of the frame's squared pressure (minus noise) that the model explains.
 
     Returns the unexplained part [Pa²] and the scatter of the noise.
     """
@@ -123,9 +123,9 @@ def _set_r_squared(state: EstimatorState) -> tuple[float, float]:
 
 @inner_kernel
 def _to_tilts(state: EstimatorState, covariance: Matrix, rotated: Matrix) -> None:
-    """Convert the estimate from normals in the sensor's axes to tilts in the finger's axes.
+    """Convert the estimate from normals in sensor axes to tilts in finger axes.
 
-    The ``covariance``, which is overwritten, is converted into ``rotated``.
+    The ``covariance`` is converted into ``rotated`` and overwritten.
     """
     estimate = state.estimate
     c = math.cos(state.options.rotation)
@@ -134,7 +134,7 @@ def _to_tilts(state: EstimatorState, covariance: Matrix, rotated: Matrix) -> Non
     n_y = s * estimate.n_x + c * estimate.n_y
     estimate.tilt_x = math.asin(n_x)
     estimate.tilt_y = math.asin(n_y)
-    # ∂tilt/∂n = 1/cos tilt. Only the two middle rows and columns are rotated.
+    # ∂tilt/∂n = 1/cos tilt. Only the two middle rows and columns need the rotation.
     per_x = 1.0 / math.sqrt(1.0 - n_x * n_x)
     per_y = 1.0 / math.sqrt(1.0 - n_y * n_y)
     for j in range(4):
@@ -155,7 +155,7 @@ def _to_tilts(state: EstimatorState, covariance: Matrix, rotated: Matrix) -> Non
 def _fault_in_readings(
     state: EstimatorState, frame: FloatArray, height: FloatArray, reason: Invalid
 ) -> Invalid:
-    """Return the fault in the readings that explains a failed estimate, or else ``reason``."""
+    """Return the fault in the readings that explains a failed estimate, otherwise ``reason``."""
     signal = state.signal
     level = max(ABOVE_NOISE * signal.noise, ABOVE_PEAK * signal.peak)
     above = pressed = full = 0
@@ -171,12 +171,12 @@ def _fault_in_readings(
 
 @inner_kernel
 def _estimate(state: EstimatorState, model: Model, frame: FloatArray, cells: Cells) -> Invalid:
-    """Estimate a frame with a contact and return the reason for which it is invalid, if any."""
+    """Estimate the contact in a frame; return the reason if the estimate is invalid."""
     estimate = state.estimate
     reason = _fit_frame(state, model, frame, cells)
     fit = state.fit
     if state.options.is_solid and reason == Invalid.NOT_CONVERGED:
-        # A contact of this tip converges within the data or is explained at their limit.
+        # A contact of this tip either converges within the data range or is explained at its limit.
         unexplained = fit.misfit > (1.0 - state.options.r_squared_min) * fit.readings
         reason = Invalid.MODEL_MISMATCH if unexplained or not fit.is_limited else reason
     if reason == Invalid.NONE and not GAIN_MIN < estimate.gain < GAIN_MAX:
@@ -196,7 +196,7 @@ def _estimate(state: EstimatorState, model: Model, frame: FloatArray, cells: Cel
 
 @inner_kernel
 def _reset_results(state: EstimatorState, scale: float, step: float) -> None:
-    """Set the unit of the frame and clear the last results except the contact."""
+    """Set the frame unit and clear the last results except for the contact."""
     options = state.options
     signal = state.signal
     grid = state.grid
@@ -207,7 +207,7 @@ def _reset_results(state: EstimatorState, scale: float, step: float) -> None:
     signal.saturation = options.saturation * scale
     signal.floor = options.floor * scale if step > 0.0 or options.floor > 0.0 else -math.inf
     signal.patch_level = options.patch_level + (CLIPPED_LEVEL_INCREASE if step > 0.0 else 0.0)
-    # A contact no wider than a cell strains it by at most about pitch²/2a²; allow gains up to 3.
+    # A contact no wider than a cell strains it by at most about pitch²/2a². Allow gains up to 3.
     pitch = max(grid.pitch_x, grid.pitch_y)
     signal.narrow_contact_max = 6.0 * options.modulus * (pitch / grid.radius) ** 2 / scale
     estimate = state.estimate
@@ -244,12 +244,11 @@ def estimate_frame(
     law: FloatArray,
     sums: FloatArray,
 ) -> None:
-    """Estimate one frame and store the result in the state; the estimator's compiled entry point.
+    """Estimate the contact in one frame and store the result in the state (compiled entry point).
 
-    ``frame`` is float64 [cells] in counts, ``scale`` is Pa per count, and ``step`` is the width of
-    the quantum [Pa] or 0. ``rows`` is the storage of `state.Cells`; ``pixels`` and ``weights`` are
-    the `state.Images` of a solid tip; the remaining arguments are the `PointArrays` of a spring
-    tip.
+    ``frame`` is float64 [cells] in counts, ``scale`` is in Pa per count, and ``step`` is the
+    quantum size [Pa] or 0. ``rows`` stores the `state.Cells`. ``pixels`` and ``weights`` are the
+    `state.Images` of a solid tip. The remaining arguments are the `PointArrays` of a spring tip.
     """
     state = states[0]
     cells = cells_in(rows, state.grid)
@@ -261,8 +260,8 @@ def estimate_frame(
     rejected = without_outliers(state, frame, cells.height)
     unexplained = False
     if state.options.is_solid and signal.is_finite:
-        # Every contact matches the pattern. A strong signal without it is not a contact of this
-        # tip, and a small shift of all zeros is not a signal.
+        # Every contact matches the pattern. A strong signal without the pattern is not a contact of
+        # this tip; a small common zero offset is not a signal.
         level = max(signal.mean, signal.peak - signal.mean)
         strong = signal.contact and level > STRONG_PEAK * signal.noise
         signal.contact = shows_pattern(state, frame, cells)

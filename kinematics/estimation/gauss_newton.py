@@ -1,7 +1,7 @@
 """Gauss-Newton fit of a contact to one pressure frame, as kernels.
 
-The parameters are the gain, d, n_x, n_y and, for solid tips, the shear on the face along x and y.
-Each step uses the pressures and partials of the forward model of the tip's law.
+The parameters are the gain, d, n_x, n_y and, for solid tips, the shear force on the face along x
+and y. Each step uses the pressures and partials from the tip's forward model.
 """
 
 from __future__ import annotations
@@ -35,20 +35,21 @@ from softfinger.kinematics.sensing.footprint import FloatArray, set_face
 from softfinger.kinematics.sensing.solid_pressure import own_shear, press_solid
 from softfinger.kinematics.sensing.springs_pressure import press_springs
 
-# For a free gain the covariance grows by this times (σ_d/d)². Measured on simulated frames over the
-# operating range, as the ratio of the squared errors to the linear prediction.
+# With a free gain, the covariance is multiplied by 1 + _GAIN_CURVATURE (σ_d/d)². The factor was
+# determined by comparing the squared errors in simulated frames over the operating range with the
+# linear prediction.
 _GAIN_CURVATURE = 6.0
 _HALVINGS_MAX = 5
-_LIMITED_MAX = 4  # largest number of consecutive steps clamped to the limits of the model
-# Smallest pivot of a scaled normal matrix. For 2 × 2 it is the determinant over the product of the
-# diagonal, with a rounding error of 1e-12.
+_LIMITED_MAX = 4  # maximum number of consecutive steps clamped to the limits of the model
+# Minimum pivot of a scaled normal matrix. For a 2 × 2 matrix, the pivot is the determinant divided
+# by the product of the diagonal, with a rounding error of 1e-12.
 _PIVOT_MIN = 1e-11
 
-# A cell that cannot read below its floor (0, or the smallest count sent) reads more than the
-# pressure on average. At a pressure z standard deviations above the floor, the excess in standard
-# deviations is E[max(z + e, 0)] − z = E[max(e − z, 0)] with e ~ N(0, 1). It is approximated by
-# (1 − z/CLIP_END)² times this polynomial, within 3e-4. Cells more than CLIP_BELOW below the floor
-# carry almost no information.
+# A cell that cannot read below its floor (0, or the smallest count sent) has a mean reading above
+# the true pressure. At a pressure z standard deviations above the floor, this excess, in standard
+# deviations, is E[max(z + e, 0)] − z = E[max(e − z, 0)] with e ~ N(0, 1). It is approximated by
+# (1 − z/CLIP_END)² times this polynomial, to within 3e-4. Cells more than CLIP_BELOW below the
+# floor carry almost no information.
 CLIP_END = 3.5
 CLIP_BELOW = 2.0
 CLIP = (0.399207, -0.275277, 0.0188358, 0.0260713, -0.00538491)
@@ -74,7 +75,7 @@ def _add_shear(images: Images, x: float, y: float, cells: Cells, image: int, cou
 
 @inner_kernel
 def press(state: EstimatorState, model: Model, cells: Cells) -> tuple[int, int]:
-    """Evaluate the model at the fit's contact; return the range of cells touched."""
+    """Evaluate the model at the current contact; return the range of affected cells."""
     fit = state.fit
     if state.options.is_solid:
         images = model.images
@@ -95,7 +96,7 @@ def press(state: EstimatorState, model: Model, cells: Cells) -> tuple[int, int]:
 
 @fast_inner_kernel
 def _energy_inside(frame: FloatArray, cells: Cells, first: int, last: int) -> tuple[float, float]:
-    """Return Σ p² and the number of cells over the cells pressed by the model."""
+    """Return Σ p² over the cells that the model presses, and their number."""
     energy = 0.0
     number = 0.0
     for k in range(first, last):
@@ -107,11 +108,11 @@ def _energy_inside(frame: FloatArray, cells: Cells, first: int, last: int) -> tu
 
 @inner_kernel
 def free_noise(square: float, floor: float) -> float:
-    """Return a cell's noise σ [Pa] from the mean ``square`` [Pa²] of unpressed cells.
+    """Return a cell's noise σ [Pa] from the mean ``square`` [Pa²] of unloaded cells.
 
-    These cells read 0 below ``floor`` [Pa], so E[y²] = σ²(τ φ(τ) + Q(τ)) with τ = floor/σ. This is
-    half of the variance for a floor of 0. If no cell is above the floor, σ is less than a third of
-    it.
+    These cells read 0 below ``floor`` [Pa], so E[y²] = σ²(τ φ(τ) + Q(τ)) with τ = floor/σ. For a
+    floor of 0, this is half the variance. If all cells read below the floor, σ is less than a third
+    of the floor.
     """
     if not floor > 0.0:
         return math.sqrt(2.0 * square)
@@ -131,7 +132,7 @@ def free_noise(square: float, floor: float) -> float:
 
 @inner_kernel
 def squared_sum(state: EstimatorState) -> float:
-    """Return Σ p² [Pa²] of all cells."""
+    """Return Σ p² [Pa²] over all cells."""
     energy: float = state.signal.energy * state.signal.scale * state.signal.scale
     return energy
 
@@ -140,9 +141,9 @@ def squared_sum(state: EstimatorState) -> float:
 def _clip_noise(
     state: EstimatorState, frame: FloatArray, cells: Cells, first: int, last: int
 ) -> float:
-    """Estimate the noise [Pa] of cells clipped at the floor from the unpressed cells.
+    """Use the unloaded cells to estimate the noise [Pa] of cells clipped at the floor.
 
-    A board that sends no noise needs no correction.
+    If the unloaded cells show no noise, no correction is needed.
     """
     signal = state.signal
     inside, inside_number = _energy_inside(frame, cells, index(first), index(last))
@@ -158,9 +159,9 @@ def _clip_noise(
 def compare(state: EstimatorState, frame: FloatArray, cells: Cells, first: int, last: int) -> None:
     """Compute ``residual`` and ``factor`` of each cell, and their sums, from readings and model.
 
-    A cell cannot read below 0, even where solid rubber pulls, or below the floor. A saturated cell
-    counts only if the model is below saturation. With ``fit.clip_noise`` > 0, the floor clips the
-    noise. Otherwise cells with a model below the floor do not count.
+    A cell cannot read below 0, even where the rubber is in tension, nor below the floor. A
+    saturated cell is used only if the model is below saturation. If ``fit.clip_noise`` > 0, the
+    noise is clipped at the floor; otherwise, cells with a model below the floor are excluded.
     """
     fit = state.fit
     saturation = state.signal.saturation
@@ -169,7 +170,7 @@ def compare(state: EstimatorState, frame: FloatArray, cells: Cells, first: int, 
     clip = fit.clip_noise
     clipped = clip > 0.0
     per_clip = 1.0 / clip if clipped else 0.0
-    # Without a floor, ``floor`` is far below every reading.
+    # Without a floor, ``floor`` is −∞.
     lower = floor - CLIP_BELOW * clip
     misfit = readings = weight = 0.0
     for k in range(first, last):
@@ -180,7 +181,7 @@ def compare(state: EstimatorState, frame: FloatArray, cells: Cells, first: int, 
         reading = max(raw, floor)
         residual = reading - pressure
         if clipped:
-            # The excess over max(pressure, floor) is symmetric about the floor.
+            # The excess above max(pressure, floor) is symmetric about the floor.
             depth = (pressure - floor) * per_clip
             z = min(abs(depth), CLIP_END)
             above = 1.0 - z * (1.0 / CLIP_END)
@@ -204,7 +205,7 @@ def compare(state: EstimatorState, frame: FloatArray, cells: Cells, first: int, 
 
 @fast_inner_kernel
 def _accumulate(fit: Fit, cells: Cells, first: int, last: int) -> None:
-    """Sum JᵀJ and Jᵀr over the cells for the gain, d and the tilts."""
+    """Compute JᵀJ and Jᵀr over the cells for the gain, d and the tilts."""
     gain = fit.gain
     s00 = s01 = s02 = s03 = s11 = s12 = s13 = s22 = s23 = s33 = 0.0
     r0 = r1 = r2 = r3 = 0.0
@@ -242,7 +243,7 @@ def _accumulate(fit: Fit, cells: Cells, first: int, last: int) -> None:
 def _accumulate_shear(
     fit: Fit, images: Images, cells: Cells, row: int, first: int, second: int
 ) -> None:
-    """Sum the products of one shear image, which starts at ``first``."""
+    """Compute the normal-equation entries of one shear image, which starts at ``first``."""
     t0 = t1 = t2 = t3 = own = other = right = 0.0
     for k in range(index(0), index(cells.factor.shape[0])):
         factor = cells.factor[k]
@@ -265,9 +266,9 @@ def _accumulate_shear(
 
 @inner_kernel
 def linearise(state: EstimatorState, model: Model, frame: FloatArray, cells: Cells) -> float:
-    """Set up the normal equations at the fit's contact; return the cost [Pa²] less Σ reading².
+    """Set up the normal equations at the current contact; return the cost [Pa²] minus Σ reading².
 
-    The shear has a prior with a standard deviation proportional to the normal force.
+    The shear force has a prior whose standard deviation is proportional to the normal force.
     """
     fit = state.fit
     images = model.images
@@ -297,10 +298,10 @@ def linearise(state: EstimatorState, model: Model, frame: FloatArray, cells: Cel
 
 @inner_kernel
 def solve(fit: Fit, first: int, last: int) -> bool:
-    """Solve the normal equations of the parameters first to last for step, inverse and decrement.
+    """Solve the normal equations for parameters first to last; set step, inverse and decrement.
 
-    Returns False if a pivot of the scaled matrix is too small, that is, if the frame does not
-    determine every parameter.
+    Returns False if a pivot of the scaled matrix is too small. In this case, the frame does not
+    determine all parameters.
     """
     normal = fit.normal
     lower = fit.lower
@@ -309,7 +310,7 @@ def solve(fit: Fit, first: int, last: int) -> bool:
         if not normal[i, i] > 0.0:
             return False
         scale[i] = 1.0 / math.sqrt(normal[i, i])
-    # Cholesky factorisation, with the inverse of the factor stored in place.
+    # Cholesky factorisation; the inverse of the factor is stored in place.
     for j in range(first, last):
         pivot = 1.0
         for k in range(first, j):
@@ -345,7 +346,7 @@ def solve(fit: Fit, first: int, last: int) -> bool:
 
 @inner_kernel
 def _apply_step(state: EstimatorState) -> bool:
-    """Apply the step, clamped to the limits of the model; return False if it was clamped."""
+    """Apply the step, clamped to the limits of the model; return False if d was clamped."""
     fit = state.fit
     options = state.options
     shallow = fit.d
@@ -367,7 +368,7 @@ def _apply_step(state: EstimatorState) -> bool:
 
 @inner_kernel
 def set_covariance(inverse: Normal, variance: float, out: Matrix) -> None:
-    """Set the covariance of (d, n_x, n_y, gain) from that of the fit's parameters."""
+    """Set the covariance of (d, n_x, n_y, gain) from that of the fit parameters."""
     for i in range(4):
         for j in range(4):
             out[(i + 3) % 4, (j + 3) % 4] = variance * inverse[i, j]
@@ -375,11 +376,11 @@ def set_covariance(inverse: Normal, variance: float, out: Matrix) -> None:
 
 @inner_kernel
 def _check_fit(state: EstimatorState, model: Model, cells: Cells) -> float:
-    """Compute χ² of the solved fit, and the covariance due to common errors and a smooth misfit.
+    """Compute χ² of the solved fit, and the covariance due to common errors and smooth misfit.
 
-    Returns the variance of the noise [Pa²], widened if the misfit exceeds its scatter, or a
-    negative number if there are too few cells. The returned variance times ``fit.inverse`` is the
-    covariance due to noise.
+    Returns the noise variance [Pa²], or a negative number if there are too few cells. The variance
+    is increased if the misfit exceeds its expected scatter. The returned variance times
+    ``fit.inverse`` is the covariance due to noise.
     """
     fit = state.fit
     estimate = state.estimate
@@ -412,7 +413,7 @@ def _check_fit(state: EstimatorState, model: Model, cells: Cells) -> float:
 
 @inner_kernel
 def _finish(state: EstimatorState, model: Model, cells: Cells, iterations: int) -> bool:
-    """Set the estimate and its covariance after the fit; return False with too few cells."""
+    """Set the estimate and its covariance after the fit; return False for too few cells."""
     fit = state.fit
     estimate = state.estimate
     options = state.options
@@ -426,7 +427,7 @@ def _finish(state: EstimatorState, model: Model, cells: Cells, iterations: int) 
         y = fit.shear[1] + own * fit.n_y
         estimate.shear_x = along * x - across * y
         estimate.shear_y = across * x + along * y
-    # Noise may carry the fit beyond the limits of the model; clamp the result.
+    # Noise may push the fit beyond the limits of the model; clamp the result.
     within = min(1.0, options.sine_max / max(math.sqrt(square), 1e-9))
     estimate.d = min(fit.d, options.deepest)
     estimate.n_x = within * fit.n_x
@@ -437,7 +438,7 @@ def _finish(state: EstimatorState, model: Model, cells: Cells, iterations: int) 
     variance = _check_fit(state, model, cells)
     wider = 1.0
     if options.free_gain:
-        # The more uncertain d is, the less linear is its dependence on the gain.
+        # The larger the uncertainty of d, the less linearly d depends on the gain.
         uncertain = variance * fit.inverse[DEPTH, DEPTH] + state.budget.shared[DEPTH, DEPTH]
         wider += _GAIN_CURVATURE * min(uncertain / (fit.d * fit.d), 1.0)
     set_covariance(fit.inverse, wider * variance, fit.covariance)
@@ -453,8 +454,8 @@ def fit(
 
     The iteration stops if the predicted decrement is below ``tolerance`` · variance, where
     ``tolerance`` is the squared ratio of the step to the noise floor. Returns False if the frame
-    does not determine the contact, the iteration does not converge, or the contact is beyond the
-    limits of the model.
+    does not determine the contact, if the iteration does not converge, or if the contact is beyond
+    the limits of the model.
     """
     fit = state.fit
     estimate = state.estimate
@@ -465,7 +466,7 @@ def fit(
     fit.n_y = estimate.n_y
     fit.gain = estimate.gain
     fit.shear[:] = estimate.shear
-    d = n_x = n_y = gain = shear_x = shear_y = 0.0  # before the last step
+    d = n_x = n_y = gain = shear_x = shear_y = 0.0  # values before the last step
     before = math.inf
     halvings = 0
     limited = 0
@@ -473,7 +474,7 @@ def fit(
     for iteration in range(state.options.iterations):
         cost = linearise(state, model, frame, cells)
         if solved and not cost <= before + variance and halvings < _HALVINGS_MAX:
-            # The cost increased: halve the step.
+            # The cost increased, so halve the step.
             fit.d = 0.5 * (fit.d + d)
             fit.n_x = 0.5 * (fit.n_x + n_x)
             fit.n_y = 0.5 * (fit.n_y + n_y)

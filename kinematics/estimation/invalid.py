@@ -1,4 +1,4 @@
-"""Reasons for invalid contact estimates."""
+"""Reasons why contact estimates are invalid."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from enum import IntEnum
 
 
 class Invalid(IntEnum):
-    """Reason for which an estimate is invalid, or ``NONE`` if it is valid.
+    """Reason why an estimate is invalid, or ``NONE`` if it is valid.
 
-    ``text`` is the message for users. If several reasons apply, the first one is used: a fault in
-    the readings comes before its effect on the fit.
+    ``text`` is the message for users. If several reasons apply, a fault in the readings takes
+    precedence over its effect on the fit.
     """
 
     text: str
@@ -31,7 +31,7 @@ class Invalid(IntEnum):
     MODEL_MISMATCH = 8, "not this tip"
     OUT_OF_RANGE = 9, "deeper or steeper than the model holds"
     UNCERTAIN = 10, "too uncertain: press more, or calibrate"
-    # Set by the daemon, which tracks estimates over time.
+    # The following reasons are set by the daemon, which tracks estimates over time.
     NO_FRAME = 11, "no frame yet"
     BAD_FRAME = 12, "the board is gone, or its frames repeat"
     STALE = 13, "no valid frame for too long"

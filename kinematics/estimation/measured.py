@@ -1,7 +1,7 @@
-"""Estimate a contact from a measured tip law.
+"""Estimate a contact using the measured curves of a tip.
 
-The force follows from the sum of the frame, the tilt from its centroid, and d from the force. The
-method needs no model of the pressure distribution and takes about 0.1 ms.
+The force follows from the frame sum, the tilt from the centroid, and d from the force. The method
+does not need a model of the pressure distribution and takes about 0.1 ms.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from softfinger.kinematics.sensing.footprint import FloatArray
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
 _CONTACT_SIGMA = 5.0  # contact threshold of the sum, in standard deviations
-_EXTRAPOLATION_MAX = 1.02  # extrapolation limit of the curves over the measured depth and tilt
-_EXTENT_ERROR_MAX = 0.08  # largest relative difference between measured and expected extent
-_ITERATIONS_MAX = 20  # largest number of iterations between d and θ
-_TOLERANCE = 1e-7  # convergence tolerance over the range
+_EXTRAPOLATION_MAX = 1.02  # extrapolation limit, relative to the measured depth and tilt
+_EXTENT_ERROR_MAX = 0.08  # maximum relative difference between measured and expected extent
+_ITERATIONS_MAX = 20  # maximum number of alternating iterations for d and θ
+_TOLERANCE = 1e-7  # convergence tolerance, relative to the range
 
 
 def sum_weights(
@@ -33,10 +33,9 @@ def sum_weights(
     radius: float,
     active: NDArray[np.bool_],
 ) -> FloatArray:
-    """Return the weights of a frame's sums [4, cells]: area, and area times x, y and r².
+    """Return the weights of the frame sums [4, cells]: area, and area times x, y and r².
 
-    The weights are zero except for ``active`` cells under the tip. x and y are in the finger's
-    axes.
+    The weights are zero except for ``active`` cells under the tip. x and y are in finger axes.
     """
     x, y = (
         pitch * (np.arange(count) - 0.5 * (count - 1)) - at
@@ -50,7 +49,7 @@ def sum_weights(
 
 
 def _curve(curve: Curve, t: float, q: float) -> tuple[float, float, float]:
-    """Return the value of a curve and its partials by t and q."""
+    """Return the value of a curve and its partials with respect to t and q."""
     value = by_t = by_q = 0.0
     for a, b, c in reversed(curve):
         by_t = by_t * t + value
@@ -60,19 +59,19 @@ def _curve(curve: Curve, t: float, q: float) -> tuple[float, float, float]:
 
 
 class MeasuredEstimator:
-    """Contact estimator for a tip whose ``physics`` is "measured"; frames are independent.
+    """Contact estimator for a tip whose ``physics`` is "measured"; each frame is independent.
 
     Parameters
     ----------
     tip
-        The measured tip.
+        Measured tip.
     grid
-        The sensor, with the position of the tip from its law.
+        Sensor, with the tip position from the measured curves.
     active
-        Mask of working cells, bool [rows, cols]; all cells if None.
+        Mask of working cells, bool [rows, cols]; None uses all cells.
     known
-        Uncertainties of the sensor: baseline and slope, and the changes of gain, centre and
-        rotation since the curves were measured.
+        Sensor uncertainties: baseline and slope, and the changes of gain, centre and rotation since
+        the curves were measured.
 
     Raises
     ------
@@ -81,13 +80,13 @@ class MeasuredEstimator:
 
     Notes
     -----
-    An estimate is ``valid`` within the measured range of the curves if the extent of the frame is
-    within 8 % of the value expected from its force.
+    An estimate is ``valid`` if it is within the measured range of the curves and the frame's extent
+    differs by less than 8 % from the value expected for the force.
     """
 
-    saturation: float | None = None  # saturated cells count as they read
+    saturation: float | None = None  # saturated cells are used like any other cell
 
-    noise = 0.0  # unused here: the curves contain the measured noise
+    noise = 0.0  # not used: the curves include the measured noise
 
     def __init__(
         self,
@@ -107,19 +106,19 @@ class MeasuredEstimator:
         self._weights = sum_weights(grid, tip.radius, alive)
         self._used = self._weights[0] > 0.0
         self._zero_sums, self._noise = np.array(law.rest), np.array(law.noise)
-        # Sums due to a common shift of all cells, and the moment due to a slope of the zeros [N·m].
+        # Sums due to a common shift of all cells; moment due to a slope of the zero offset [N·m].
         self._shift = known.baseline * self._weights.sum(axis=1)
         self._zero_moment = known.slope / tip.radius * 0.5 * self._weights[3].sum()
         sum_std = math.hypot(math.sqrt(self._noise[0, 0]), self._shift[0])
         self._contact_threshold = _CONTACT_SIGMA * sum_std
-        # Largest undetected d: its force is at the contact threshold.
+        # Maximum undetected d, whose force equals the contact threshold.
         root = self._root_of(self._contact_threshold, 0.0, self._root_max)
         self._undetected_d = tip.radius * root**2
         self._seq: int | None = None
         self._last = ContactEstimate()
 
     def __call__(self, frame: NDArray[Any], pascal_per_count: float = 1.0) -> ContactEstimate:
-        """Estimate the contact and return a new result; the arguments are those of `update`."""
+        """Estimate the contact and return a new result; see `update` for the arguments."""
         before, self._last = self._last, ContactEstimate()
         try:
             return self.update(frame, pascal_per_count)
@@ -131,8 +130,8 @@ class MeasuredEstimator:
     ) -> ContactEstimate:
         """Estimate the contact from a frame [rows, cols] of any numeric type.
 
-        ``pascal_per_count`` converts readings to Pa. The same result object is returned by each
-        call. Raises ValueError for a wrong shape.
+        ``pascal_per_count`` converts readings to Pa. Each call returns the same result object.
+        Raises ValueError if the shape is wrong.
         """
         result = self._last
         if seq is not None and seq == self._seq:
@@ -149,7 +148,7 @@ class MeasuredEstimator:
         result.invalid = Invalid.NONE if finite else Invalid.NOT_FINITE
         if result.contact:
             result.invalid = self._contact(sums, result)
-            # If nearly all cells read high, the sensor has not been tared.
+            # If nearly all cells read high, the sensor needs a tare.
             above = np.count_nonzero(readings > ABOVE_PEAK * result.peak)
             if result.invalid and above > ABOVE_FRACTION * readings.size:
                 result.invalid = Invalid.ABOVE_ZERO
@@ -159,11 +158,11 @@ class MeasuredEstimator:
         return result
 
     def reset(self) -> None:
-        """Forget the sequence number of the last frame."""
+        """Discard the sequence number of the last frame."""
         self._seq = None
 
     def _root_of(self, force: float, q: float, t: float) -> float:
-        """Solve ``shown`` = ``force`` for t by Newton's method from ``t``; ``shown`` increases."""
+        """Solve ``shown`` = ``force`` for t with Newton's method, starting at ``t``."""
         for _ in range(24):
             value, by_t, _ = _curve(self._law.shown, t, q)
             before = t
@@ -173,7 +172,7 @@ class MeasuredEstimator:
         return t
 
     def _contact(self, sums: FloatArray, result: ContactEstimate) -> Invalid:
-        """Set the contact from the sums; check its extent and that it is within the curves."""
+        """Set the contact from the sums; check the extent and the range of the curves."""
         force, along, across, square = sums.tolist()
         moment = math.hypot(along, across)
         s_max = _EXTRAPOLATION_MAX * self._tilt_sine_max
@@ -200,7 +199,7 @@ class MeasuredEstimator:
         for found, out in zip(covariances, (result.covariance, result.systematic), strict=True):
             out[:3, :3] = found * np.outer(per_tilt, per_tilt)
         extent = force * _curve(self._law.extent, t, s * s)[0]
-        # A second contact changes the mean squared radius by more than 8 % and its noise.
+        # A second contact changes the mean squared radius by more than this tolerance.
         tolerance = _EXTENT_ERROR_MAX * extent + _CONTACT_SIGMA * math.sqrt(self._noise[3, 3])
         agrees = abs(square - extent) < tolerance
         t_max = _EXTRAPOLATION_MAX * self._root_max * (1.0 - 1e-9)
@@ -211,20 +210,20 @@ class MeasuredEstimator:
     def _covariances(
         self, t: float, s: float, c_x: float, c_y: float
     ) -> tuple[float, tuple[FloatArray, FloatArray]]:
-        """Return sin θ's standard deviation due to the sums, and two covariances of (d, n_x, n_y).
+        """Return the standard deviation of sin θ due to errors in the sums, and two covariances.
 
-        The covariances are those of all errors and of the errors common to all frames. The errors
-        of the sum and of both moments are propagated through the partials, in axes along and across
-        the tilt. If the centroid hardly determines the tilt, the tilts of the calibration presses
-        (``slope``) serve as a prior. Like a Kalman update, the prior draws the tilt towards 0; this
-        error is common to all frames.
+        Both covariances are those of (d, n_x, n_y): one for all errors, and one for the errors
+        common to all frames. The errors of the sum and of both moments are propagated through the
+        partials, in axes along and across the tilt. The tilt range of the calibration presses
+        serves as a prior where the centroid hardly determines the tilt. As in a Kalman update, the
+        prior pulls the tilt towards 0; this error is common to all frames.
         """
         law, known, q = self._law, self._known, s * s
         shown, shown_t, shown_q = _curve(law.shown, t, q)
         lever, lever_t, lever_q = _curve(law.lever, t, q)
         per_d = 1.0 / (2.0 * law.radius * t)  # dt/dd
-        # Partials of (sum, moment along the tilt) by (d, s), and of the moment across by the tilt
-        # across.
+        # Partials of (sum, moment along the tilt) with respect to (d, s), and of the moment across
+        # the tilt with respect to the tilt across.
         by_d = shown_t * per_d, s * (shown_t * per_d * lever + shown * lever_t * per_d)
         b = 2.0 * s * shown_q
         by_s = b, shown * lever + s * (b * lever + shown * 2.0 * s * lever_q)

@@ -1,7 +1,7 @@
 """Initial estimate of a contact from the sum, centroid and extent of a frame, as kernels.
 
-The moments of the pressure over the footprint are compared with those of the model, which are
-tabulated over d. The force or the extent gives d, and the centroid gives the tilt.
+The pressure moments over the footprint are compared with those of the model, which are tabulated
+versus d. The force or the extent determines d, and the centroid determines the tilt.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from softfinger.kinematics.sensing.footprint import FloatArray, Grid, set_around
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
 # Margin around the footprint for cell centres, in cell diagonals. It includes all cells that touch
-# the footprint, even if the contact has moved slightly.
+# the footprint, even after a small motion of the contact.
 _MARGIN = 0.75
 _BLUR_MARGIN = 2.0  # additional margin, in standard deviations of the blur
-_TILT = 0.2  # rad, tilt at which the arm of the centroid is computed; it hardly depends on the tilt
+_TILT = 0.2  # rad, tilt at which the centroid arm is computed; the arm hardly depends on the tilt
 _WEAK_PEAK = 15.0  # peak in noise standard deviations, below which neighbourhoods are used
 _SINE_MAX = 0.95
-_NO_LEVEL = -1e300  # a level below every reading
+_NO_LEVEL = -1e300  # threshold below every reading
 
 
 def tabulate_moments(
     m: Moments, grid: SensorGrid, tip: Fingertip, material: Material, deepest: float
 ) -> None:
-    """Tabulate the moments of the model over d up to ``deepest`` [m]."""
+    """Tabulate the moments of the model for d up to ``deepest`` [m]."""
     cells = grid.on(tip)
     x = (cells.x + cells.pitch_x * (np.arange(cells.cols) + 0.5))[None, :]
     y = (cells.y + cells.pitch_y * (np.arange(cells.rows) + 0.5))[:, None]
@@ -52,14 +52,14 @@ def tabulate_moments(
 
 @inner_kernel
 def _interpolate(values: FloatArray, t: float) -> float:
-    """Interpolate a table at the position t."""
+    """Interpolate a table at position t."""
     k = min(int(t), START_POINTS - 2)
     return float(values[k] + (t - k) * (values[k + 1] - values[k]))
 
 
 @inner_kernel
 def _inverse(values: FloatArray, value: float) -> float:
-    """Return the position at which an increasing table has ``value``, clamped to its ends."""
+    """Return the position of ``value`` in an increasing table, clamped to the ends of the table."""
     for k in range(START_POINTS - 1):
         if value < values[k + 1]:
             rise = values[k + 1] - values[k]
@@ -69,12 +69,12 @@ def _inverse(values: FloatArray, value: float) -> float:
 
 @inner_kernel
 def start(state: EstimatorState, frame: FloatArray, cells: Cells) -> None:
-    """Estimate from the frame alone: from its strongest cells, then twice from moments."""
+    """Estimate the contact from the frame alone: from strong cells, then twice from moments."""
     m = state.moments
     signal = state.signal
     estimate = state.estimate
     if state.options.is_solid:
-        # A solid tip presses its whole base, and its extent hardly depends on d.
+        # A solid tip loads its whole base, and its extent hardly depends on d.
         sums_above(m, frame, cells, _NO_LEVEL)
         m.gain = 1.0
         if m.total > 0.0:
@@ -90,7 +90,7 @@ def start(state: EstimatorState, frame: FloatArray, cells: Cells) -> None:
         if not m.total > 0.0:
             at = signal.row * state.grid.cols + signal.col
             m.total, m.x, m.y, m.number = 1.0, cells.x[at], cells.y[at], 1.0
-        # About three quarters of a weak contact's cells exceed the level.
+        # About three quarters of the cells of a weak contact exceed the threshold.
         _set_from_area(m, state.grid, 1.3 * m.number if weak else m.number)
         _refine(state, frame, cells)
         _refine(state, frame, cells)
@@ -103,10 +103,10 @@ def start(state: EstimatorState, frame: FloatArray, cells: Cells) -> None:
 
 @inner_kernel
 def _sums_of_weak(state: EstimatorState, frame: FloatArray, cells: Cells) -> None:
-    """Compute the sums of :func:`sums_above` for pressures of a few times the noise.
+    """Compute the same sums as :func:`sums_above` for pressures of a few times the noise.
 
-    Single noisy cells would distort these sums. Only cells of at least twice the noise whose
-    neighbourhood is significant count.
+    Single noisy cells would distort the sums. Therefore only cells that read at least twice the
+    noise and have a significant neighbourhood are included.
     """
     m = state.moments
     level = 2.0 * state.signal.noise
@@ -129,9 +129,9 @@ def _sums_of_weak(state: EstimatorState, frame: FloatArray, cells: Cells) -> Non
 
 @inner_kernel
 def _set_from_area(m: Moments, grid: Grid, number: float) -> None:
-    """Set (d, n_x, n_y) of a contact of ``number`` cells around the centroid of the sums."""
+    """Set (d, n_x, n_y) for a contact of ``number`` cells around the centroid of the sums."""
     a = grid.radius
-    # The area of the footprint is π ρ² cos θ with ρ² = 2 a d − d².
+    # The footprint area is π ρ² cos θ with ρ² = 2 a d − d².
     rho2 = min(number * grid.pitch_x * grid.pitch_y / math.pi, 0.75 * a * a)
     m.d = max(a - math.sqrt(a * a - rho2), 1e-3 * a)
     distance = m.total * (a - m.d / 3.0)
@@ -148,7 +148,7 @@ def _set_normal(m: Moments, n_x: float, n_y: float) -> None:
 
 @inner_kernel
 def _refine(state: EstimatorState, frame: FloatArray, cells: Cells) -> None:
-    """Refine the contact in ``state.moments`` from the moments over its widened footprint."""
+    """Refine the contact in ``state.moments`` using the moments over its widened footprint."""
     m = state.moments
     grid = state.grid
     face = state.around
@@ -169,7 +169,8 @@ def _refine(state: EstimatorState, frame: FloatArray, cells: Cells) -> None:
 def _set_contact(state: EstimatorState, by_extent: bool) -> None:
     """Set the contact from the moments.
 
-    With ``by_extent`` the extent gives d and the force gives the gain; otherwise the force gives d.
+    If ``by_extent`` is True, the extent determines d and the force determines the gain. Otherwise
+    the force determines d.
     """
     m = state.moments
     force = m.total * state.signal.scale

@@ -1,4 +1,4 @@
-"""Record types of the estimator's state: options, frame, estimate, fit and cells."""
+"""Record types for the estimator state: options, frame, estimate, fit and cells."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from softfinger.kinematics.sensing.footprint import Face, FloatArray, Grid, IntA
 from softfinger.kinematics.sensing.solid_pressure import Weights
 from softfinger.kinematics.sensing.springs_pressure import SpringPoints
 
-OUTLIERS_MAX = 6  # largest number of outliers excluded from a frame
-# Parameters of the fit; only solid tips have the last two.
+OUTLIERS_MAX = 6  # maximum number of outliers excluded from a frame
+# Fit parameters; only solid tips have the last two.
 GAIN, DEPTH, TILT_X, TILT_Y, SHEAR_X, SHEAR_Y = range(6)
 PARAMETERS = 6
 START_POINTS = 17  # depths in the table for the initial estimate
-DEPTHS = 12  # depths in the table of the effect of correlated noise
-# Patterns of common errors: a shift of all cells, its slopes in x and y, the tip's position in x
-# and y, the pitch, and the pressure itself.
+DEPTHS = 12  # depths in the table of correlated-noise effects
+# Patterns of common errors: a shift of all cells, its slopes in x and y, the tip position in x and
+# y, the pitch, and the pressure itself.
 SHIFT, SLOPE_X, SLOPE_Y, PLACE_X, PLACE_Y, SCALING, PRESSURE = range(7)
 SOURCES = 7
 
@@ -33,47 +33,47 @@ class Options(Record):
     noise: float  # standard deviation of a cell [Pa]
     undetected: float  # d of the smallest detectable contact [m]
     saturation: float  # [counts]
-    floor: float  # smallest count sent, less a half
+    floor: float  # smallest count that the board sends, minus one half
     tolerance: float
-    peak_level: float  # [noise]
+    peak_level: float  # [noise standard deviations]
     patch_level: float
     r_squared_min: float
     modulus: float  # at zero strain [Pa]
     blur: float  # standard deviation [m]
-    rotation: float  # of the sensor [rad]
+    rotation: float  # rotation of the sensor [rad]
     iterations: int
     free_gain: bool
     is_solid: bool
-    deepest: float  # largest d of the model [m]
-    sine_max: float  # largest sin of the tilt of the model
-    step_deepest: float  # limits of d [m] and sin of the tilt for a step
+    deepest: float  # maximum d of the model [m]
+    sine_max: float  # sin of the model's maximum tilt
+    step_deepest: float  # limits on d [m] and the sin of the tilt during the iteration
     step_sine: float
-    shear_prior: float  # standard deviation of the shear over the normal force
+    shear_prior: float  # standard deviation of the shear, relative to the normal force
 
 
 class Signal(Record):
-    """One frame: its unit, noise and limits, and the result of the activity test."""
+    """Unit, noise and limits of one frame, and the result of the activity test."""
 
     scale: float  # Pa per count
     variance: float  # noise of a cell [Pa²]
     noise: float  # standard deviation of a cell [counts]
-    narrow_contact_max: float  # largest reading of a contact as wide as a cell [counts]
+    narrow_contact_max: float  # maximum reading of a contact as wide as a cell [counts]
     patch_level: float
     saturation: float  # [Pa]
-    floor: float  # [Pa]; −inf for none
+    floor: float  # [Pa]; −inf without a floor
     number: int  # number of cells that a contact can press
-    peak: float  # largest cell [counts]; its indices are −1 if it is below the level
+    peak: float  # largest reading [counts]; row and col are −1 if it is below the level
     row: int
     col: int
     mean: float  # [counts]
     energy: float  # Σ p² [counts²]
-    is_clipped: bool  # no cell reads below the floor
+    is_clipped: bool  # readings are clipped at the floor
     contact: bool
     is_finite: bool
 
 
 class Estimate(Record):
-    """Estimate of one frame and start of the next, in the sensor's and then the finger's axes."""
+    """Estimate for one frame, in sensor and then finger axes, and initial guess for the next."""
 
     d: float
     gain: float
@@ -93,34 +93,34 @@ class Estimate(Record):
     shear_y: float
     n_x: float
     n_y: float
-    shear: Pair  # in the model, over the radius squared [Pa]
+    shear: Pair  # model shear force divided by the squared radius [Pa]
     residual: float  # Σ over the footprint of (reading − model)² − reading² [Pa²]
     undetected: float  # relative error of d that a smooth misfit may cause
-    shared: float  # relative standard deviation of d due to the known uncertainties
+    shared: float  # relative standard deviation of d due to known uncertainties
     covariance: Matrix  # of (d, tilt_x, tilt_y, gain)
-    systematic: Matrix  # the part common to all frames
+    systematic: Matrix  # part of the covariance that is common to all frames
 
 
 class Moments(Record):
-    """Sums over the footprint, and the contact estimated from them."""
+    """Sums over the footprint and the contact estimated from them."""
 
     total: float  # Σ p
     x: float  # centroid
     y: float
-    trace: float  # of the covariance
-    number: float  # cells
+    trace: float  # trace of the pressure's covariance
+    number: float  # number of cells
     d: float
     n_x: float
     n_y: float
     gain: float
     # Moments of the model at the depths deepest · (k/(START_POINTS − 1))²:
-    force: Depths  # Σ p, upright [Pa]
-    extent: Depths  # trace of the pressure's covariance, upright [m²]
-    centroid_arm: Depths  # centroid over sin of the tilt [m]
+    force: Depths  # Σ p for an upright tip [Pa]
+    extent: Depths  # trace of the pressure's covariance for an upright tip [m²]
+    centroid_arm: Depths  # centroid divided by the sin of the tilt [m]
 
 
 class Fit(Record):
-    """Gauss-Newton step at one contact and gain."""
+    """Gauss-Newton step for one contact and gain."""
 
     face: Face
     gain: float
@@ -128,14 +128,14 @@ class Fit(Record):
     n_x: float
     n_y: float
     shear: Pair
-    first_row: int  # range of cells pressed by the model
+    first_row: int  # range of cells under pressure in the model
     last_row: int
     clip_noise: float  # noise of cells clipped at the floor [Pa]; 0 without clipping
     decrement: float  # predicted decrease of the sum of squares
     misfit: float  # Σ (reading − model)²
     readings: float  # Σ reading²
-    counted_cells: float  # number of cells that count
-    is_limited: bool  # the last step was clamped to the limits of the model
+    counted_cells: float  # number of cells in the fit
+    is_limited: bool  # True if the last step was clamped to the limits of the model
     normal: Normal  # JᵀJ
     gradient: Column  # Jᵀr
     step: Column
@@ -146,45 +146,45 @@ class Fit(Record):
 
 
 class Budget(Record):
-    """Errors other than white cell noise, and scratch arrays for them; see `error_budget`."""
+    """Errors other than white cell noise, with scratch arrays; see `error_budget`."""
 
-    sizes: Annotated[FloatArray, SOURCES]  # standard deviations of the patterns' factors
+    sizes: Annotated[FloatArray, SOURCES]  # standard deviations of the pattern factors
     baseline: float  # standard deviation of a shift of all cells [Pa]
-    slope: float  # standard deviation of a slope of the zeros, at the rim [Pa]
+    slope: float  # standard deviation of the zero-offset slope, at the rim [Pa]
     smooth: float  # relative pressure error
-    rotation: float  # of the sensor [rad]
-    tilt_error: float  # relative tilt error of a solid tip over d/a
-    row_correlation: float  # correlation of neighbours in a row
+    rotation: float  # rotation of the sensor [rad]
+    tilt_error: float  # relative tilt error of a solid tip per d/a
+    row_correlation: float  # correlation of neighbouring cells in a row
     cells_per_sample: float  # Σρ², cells per independent noise sample
-    has_common_errors: bool  # True if any error other than the correlation is set
+    has_common_errors: bool  # True for any error other than correlated noise
     is_correlated: bool
-    widening: Annotated[FloatArray, DEPTHS, 5]  # factors of the standard deviations, used-up cells
+    widening: Annotated[FloatArray, DEPTHS, 5]  # factors on standard deviations, DOF used
     responses: Annotated[FloatArray, PARAMETERS, SOURCES]  # Jᵀq
     squares: Annotated[FloatArray, SOURCES]  # qᵀq
     displacement: Column
     shared: Normal  # covariance due to common errors
-    covariance: Matrix  # the same of (d, n_x, n_y, gain)
+    covariance: Matrix  # covariance of (d, n_x, n_y, gain) due to common errors
 
 
 class EstimatorState(Record):
-    """Complete state of an estimator except its cell arrays."""
+    """Complete state of an estimator except for its cell arrays."""
 
     options: Options
-    grid: Grid  # the part of the sensor that a contact can press
+    grid: Grid  # cells that a contact can press
     signal: Signal
     estimate: Estimate
     moments: Moments
     fit: Fit
     budget: Budget
     around: Face  # widened footprint
-    outliers: Annotated[IntArray, OUTLIERS_MAX]  # cells
+    outliers: Annotated[IntArray, OUTLIERS_MAX]  # cell indices
 
 
 class Cells(NamedTuple):
     """Arrays over the cells of `EstimatorState.grid`, float64 [cells].
 
-    ``planes`` [4, rows, cols] holds ``stress`` to ``by_y`` in one array: the modelled pressure at a
-    gain of 1 and its partials.
+    ``planes`` [4, rows, cols] contains ``stress`` to ``by_y`` in one array: the modelled pressure
+    at a gain of 1, and its partials.
     """
 
     planes: FloatArray
@@ -193,12 +193,12 @@ class Cells(NamedTuple):
     by_x: FloatArray
     by_y: FloatArray
     height: FloatArray  # √(a² − x² − y²) [m], see `cell_centres`; negative for unused cells
-    x: FloatArray  # centre of the cell [m]
+    x: FloatArray  # cell centre [m]
     y: FloatArray
-    pattern: FloatArray  # for the detection of a solid tip's contact
-    model: FloatArray  # pressure [Pa] with gain and shear
-    residual: FloatArray  # reading − model [Pa], 0 for cells that do not count
-    factor: FloatArray  # sensitivity of the reading to pressure, likewise
+    pattern: FloatArray  # pattern that detects the contact of a solid tip
+    model: FloatArray  # modelled pressure [Pa] including gain and shear
+    residual: FloatArray  # reading − model [Pa], 0 for cells excluded from the fit
+    factor: FloatArray  # sensitivity of the reading to pressure, 0 for excluded cells
 
 
 STRESS, BY_D, BY_X, BY_Y, HEIGHT, X, Y, PATTERN, MODEL, RESIDUAL, FACTOR = range(11)  # row indices
@@ -216,14 +216,14 @@ def cells_in(rows: FloatArray, grid: Grid) -> Cells:
 
 
 class Images(NamedTuple):
-    """Images of a solid tip on `EstimatorState.grid`, and their weights."""
+    """Images of a solid tip on `EstimatorState.grid`, with their weights."""
 
-    pixels: FloatArray  # [images · cells]; the last two images are those of shear
+    pixels: FloatArray  # [images · cells]; the last two are the shear images
     weights: Weights
 
 
 class Model(NamedTuple):
-    """Forward model: points for springs or images for solid rubber; the other one is empty."""
+    """Forward model: points for springs or images for solid rubber; the unused part is empty."""
 
     points: SpringPoints
     images: Images
