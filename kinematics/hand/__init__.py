@@ -1,4 +1,4 @@
 """Two rotational fingers and the object between them: geometry, grasp state, external loads.
 
-The mechanics is planar. Servo temperatures are also estimated here.
+The mechanics are planar. The servo temperature estimator is also in this package.
 """

@@ -1,20 +1,20 @@
 """Planar geometry of two rotational fingers and the object between them.
 
-The origin of the hand's plane is midway between the pivots. x points from the left pivot to the
-right one, y away from the palm. The pivots are at (∓B, 0), and positive joint angles q close the
-fingers. The tip centres are
+The origin of the hand plane is midway between the pivots. x points from the left pivot to the right
+pivot, and y points away from the palm. The pivots are at (∓B, 0), and positive joint angles q close
+the fingers. The tip centres are
 
     O1 = (−B + L sin q1 + e cos q1,  L cos q1 − e sin q1)       O2 mirrors it
 
-with finger length L and offset e (towards the object at q = 0). The object has centre G, width W
-and angle φ; n = (cos φ, sin φ) points from its left face to its right face, and
-t = (−sin φ, cos φ). The contact variables of a tip of radius a are
+where L is the finger length and e the finger offset (towards the object at q = 0). The object has
+centre G, width W and angle φ; n = (cos φ, sin φ) points from its left face to its right face, and
+t = (−sin φ, cos φ). For tips of radius a, the contact variables are
 
     d1 = a + W/2 + (O1 − G)·n     θ1 = φ + q1     s1 = (O1 − G)·t
     d2 = a + W/2 − (O2 − G)·n     θ2 = φ − q2     s2 = (O2 − G)·t
 
 where d is the normal displacement (positive during contact), θ the tilt of the object relative to
-the tip, and s the position of the tip along the face.
+the tip, and s the tip position along the face.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ FloatArray = NDArray[np.float64]
 def tip_position(
     q: float, side: float, half_separation: float, length: float, offset: float
 ) -> tuple[float, float]:
-    """Return the centre (x, y) [m] of one tip at joint angle ``q`` [rad].
+    """Return the centre (x, y) [m] of a tip at joint angle ``q`` [rad].
 
     ``side`` is +1 for the left finger and −1 for the right one.
     """
@@ -46,7 +46,7 @@ def tip_position(
 
 @kernel
 def tip_velocity(q: float, side: float, length: float, offset: float) -> tuple[float, float]:
-    """Return (∂x/∂q, ∂y/∂q) [m/rad] of a tip's centre; ``side`` is as in `tip_position`."""
+    """Return (∂x/∂q, ∂y/∂q) [m/rad] of a tip centre; see `tip_position` for ``side``."""
     sine = math.sin(q)
     cosine = math.cos(q)
     return side * (length * cosine - offset * sine), -(length * sine + offset * cosine)
@@ -63,7 +63,7 @@ class ContactVariables:
 
 @dataclass(frozen=True)
 class HandGeometry:
-    """Lengths of the hand [m]: pivot separation 2B, finger length L, offset e, tip radius a."""
+    """Hand dimensions [m]: pivot separation 2B, finger length L, offset e, tip radius a."""
 
     pivot_separation: float = 0.100
     finger_length: float = 0.080
@@ -80,12 +80,12 @@ class HandGeometry:
 
     @property
     def half_separation(self) -> float:
-        """Half the separation of the pivots, B [m]."""
+        """Half the pivot separation, B [m]."""
         return 0.5 * self.pivot_separation
 
     @property
     def reach(self) -> float:
-        """Distance from a pivot to the centre of its tip, √(L² + e²) [m]."""
+        """Distance between a pivot and its tip centre, √(L² + e²) [m]."""
         return math.hypot(self.finger_length, self.finger_offset)
 
     def tips(self, q: ArrayLike) -> FloatArray:

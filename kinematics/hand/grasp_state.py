@@ -1,13 +1,13 @@
-"""Kernels for an object held by two rotational fingers: its motion, holding torques and load.
+"""Kernels for an object held by two rotational fingers: motion, holding torques and load.
 
-Coordinates and signs are those of :mod:`hand.geometry`. The tips stick and roll, and the joints are
-at rest. A load along the faces is estimated from the joint torques, because a pressure grid does
-not measure shear. The part of the torques that the normal forces and the turning moments of the
-tips do not explain is shear times its moment arm about the pivot.
+Coordinates and signs follow :mod:`hand.geometry`. The tips stick and roll, and the joints are at
+standstill. Because a pressure grid cannot measure shear, the load along the faces is estimated from
+the joint torques. After subtracting the contributions of the normal forces and of the tips' turning
+moments, the residual is the shear force times its moment arm about the pivot.
 
 The object's faces may be inclined by a taper α, which is positive if the object is wider at the
-palm. θ is then φ + q1 − α/2 at the left tip and φ − q2 + α/2 at the right tip, where φ is the angle
-of the bisector of the faces.
+palm. Then θ = φ + q1 − α/2 at the left tip and θ = φ − q2 + α/2 at the right tip, where the
+bisector of the faces is at angle φ.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _SHEAR_STEPS = 3  # fixed-point iterations for the shears; each adds two digits
 
 @kernel
 def total_tilt(tilt_x: float, tilt_y: float) -> float:
-    """Return the angle θ of the normal to the tip's axis, sin² θ = sin² tilt_x + sin² tilt_y."""
+    """Return the angle θ between normal and tip axis: sin² θ = sin² tilt_x + sin² tilt_y."""
     return math.asin(min(math.hypot(math.sin(tilt_x), math.sin(tilt_y)), 1.0))
 
 
@@ -43,23 +43,24 @@ def held_motion(
 ) -> Motion:
     """Return (arm1, arm2, turn1, turn2, slide, width, across) of a held object.
 
-    ``lengths`` [m] are half the pivot separation, the finger's length and offset, and the tip's
-    radius. v_i is the derivative of the position of tip i by q_i. If the tips roll without slip and
-    both displacements change equally,
+    ``lengths`` [m] are half the pivot separation, the finger length, the finger offset and the tip
+    radius. v_i is the derivative of tip position i with respect to q_i. If the tips roll without
+    slip and both displacements change by the same amount,
 
         φ̇ = turn1 q̇1 − turn2 q̇2      turn_i W = a − d_i − v_i·t/cos(α/2)
         ḋ1 + ḋ2 = arm1 q̇1 + arm2 q̇2 + slide φ̇
         arm_i = ±v_i·n/cos(α/2) − tan(α/2) (a − d_i)
         slide = (O1 − O2)·t/cos(α/2) + tan(α/2) (d1 − d2)
 
-    with n and t at the bisector's ``angle`` φ, and α the ``taper`` [rad]. The object moves along t
-    as the tips roll and approach each other. For parallel faces, arm [m] is the moment arm of the
-    normal force about the pivot, and in the symmetric grasp turn1 + turn2 is
+    where n and t belong to the bisector's ``angle`` φ, and α is the ``taper`` [rad]. The object
+    moves along t as the tips roll and approach each other. For parallel faces, arm [m] is the
+    moment arm of the normal force about the pivot. In the symmetric grasp, turn1 + turn2 equals
     2 (a − d + L sin q + e cos q)/W. ``across`` is W = d1 + d2 − 2a + (O2 − O1)·n/cos(α/2) [m], and
-    ``width`` is the distance of the contacts along n, W cos(α/2).
+    ``width`` is W cos(α/2), the distance between the contacts along n.
 
-    In turn_i, W is at least half the tip's radius. The inertia of a thinner object and the shear of
-    the tips make it turn more slowly than ideal rolling, so an unlimited prediction would diverge.
+    In turn_i, W is limited to at least half the tip radius. A thinner object rotates more slowly
+    than ideal rolling because of its inertia and the tips' shear compliance, so the prediction
+    would diverge without this limit.
     """
     q1, q2 = q
     d1, d2 = d
@@ -99,7 +100,7 @@ def sheared_gradient(
     force, _, force_d, force_theta, energy_d, energy_theta, _ = contact
     sine = math.sin(theta)
     cosine = math.cos(theta)
-    # Solve T = F (sin θ + 2 cos θ d_t/d) for d_t/d.
+    # Solve T = F (sin θ + 2 cos θ d_t/d) for the shear ratio d_t/d.
     shear_ratio = 0.5 * (tangential / force - sine) / cosine
     shear = shear_ratio * d
     depth_change = shear * (sine + cosine * shear_ratio)
@@ -120,18 +121,18 @@ def holding_moment_arms(
 ) -> tuple[float, float, float, float, float]:
     """Return (τ1/F, τ2/F, T, N1, N2) of an object held in equilibrium.
 
-    The torques are the gradient of the energy along the rolling motion, where ``motion`` is the
-    result of :func:`held_motion`:
+    The torques are the energy gradient along the rolling motion, where ``motion`` is the result of
+    :func:`held_motion`:
 
         τ1 = N arm1 + ∂U1/∂θ1 + T W turn1      τ2 = N arm2 − ∂U2/∂θ2 − T W turn2
 
-    Equilibrium of the object gives T W = N slide + ∂U1/∂θ1 + ∂U2/∂θ2 for the mean shear force T.
-    The shear forces of the tips are T − N tan(α/2) at the left and T + N tan(α/2) at the right,
-    since tapered faces push the object out; α is the ``taper`` [rad]. F is the mean force of both
-    tips, so the moment arms τ/F [m] do not depend on a common modulus. N is the mean of the normal
-    forces N1 and N2 [N], which differ if friction with the surroundings acts on the object.
-    ``data1`` and ``data2`` are the data of the contact tables. All results are zero unless both
-    tips are in contact.
+    Moment equilibrium of the object gives T W = N slide + ∂U1/∂θ1 + ∂U2/∂θ2, where T is the mean
+    shear force. Tapered faces push the object out, so the shear force is T − N tan(α/2) at the left
+    tip and T + N tan(α/2) at the right tip; α is the ``taper`` [rad]. F is the mean contact force
+    of both tips, so a common modulus cancels in the moment arms τ/F [m]. N is the mean of the
+    normal forces N1 and N2 [N], which differ if the surroundings exert friction on the object.
+    ``data1`` and ``data2`` are the contact table arrays. All results are zero unless both tips are
+    in contact.
     """
     d1, d2 = d
     theta1, theta2 = theta
@@ -163,7 +164,7 @@ def holding_moment_arms(
     )
 
 
-_SLOPE_MIN = 0.1  # smallest slope, relative to the slope without a load
+_SLOPE_MIN = 0.1  # minimum slope, relative to the slope without a load
 
 
 @inner_kernel
@@ -177,9 +178,9 @@ def _unexplained(
     arm: float,
     moment_arm: float,
 ) -> tuple[float, float, float]:
-    """Return the residual torque of one finger [N·m] and its decrease with T and T².
+    """Return one finger's residual torque [N·m] and its decrease with T and T².
 
-    The residual is the joint torque, signed by ``side``, minus the torques of N, ∂U/∂θ and T.
+    The residual is the joint torque, signed by ``side``, minus the contributions of N, ∂U/∂θ and T.
     """
     contact = lookup(data, d, theta)
     force, _, force_d, force_theta, _, _, _ = contact
@@ -220,27 +221,28 @@ def load_torques(
 ) -> tuple[float, float, float, float]:
     """Return the residual torques and the load model of a held object.
 
-    δ1 and δ2 [N·m] are the parts of the joint torques that only a load along the object's t can
-    explain. If each tip carries L [N] of a load 2 L, the torques are
+    δ1 and δ2 [N·m] are the parts of the joint torques that only a load along the object's t axis
+    can explain. If each tip carries a force L [N], half of the load 2 L, the torques are
 
         τ1 = N1 v1·n1 + ∂U1/∂θ1 + T1 lever1      T1 = rolled1 + L      lever_i = a − d_i − v_i·t_i
         τ2 = −N2 v2·n2 − ∂U2/∂θ2 − T2 lever2     T2 = rolled2 − L
 
-    with n_i and t_i of the face at each tip. ``rolled`` [N] are the shears that rolling, the
-    turning moments and the ``taper`` [rad] cause without a load (:func:`holding_moment_arms`). N
-    and ∂U/∂θ include the effect of the shears. ``motion`` is the result of :func:`held_motion`; for
-    parallel faces ±v_i·n is arm_i and lever_i is W turn_i.
+    where n_i and t_i belong to the face at each tip. ``rolled`` [N] are the shear forces that
+    rolling, the turning moments and the ``taper`` [rad] cause without a load
+    (:func:`holding_moment_arms`). N and ∂U/∂θ include the effect of the shear forces. ``motion`` is
+    the result of :func:`held_motion`. For parallel faces, ±v_i·n equals arm_i and lever_i equals
+    W turn_i.
 
     δ_i is the residual of τ_i at L = 0. A load gives exactly
-    (δ1 + δ2)/2 = moment_arm L + curvature L². The results are (δ1, δ2, moment_arm, curvature), all
-    zero unless both tips are in contact, and if a load would not change the torques.
+    (δ1 + δ2)/2 = moment_arm L + curvature L². The function returns (δ1, δ2, moment_arm, curvature).
+    All four are zero if a tip is not in contact or if a load would not change the torques.
     """
     d1, d2 = d
     theta1, theta2 = theta
     if not (d1 > 0.0 and d2 > 0.0):
         return 0.0, 0.0, 0.0, 0.0
     arm1, arm2, turn1, turn2, _, _, across = motion
-    # The motion along the bisector is not part of the moment arms of the forces; remove it.
+    # Remove the motion along the bisector, which does not contribute to the moment arms.
     face_slope = math.tan(0.5 * taper)
     scale = 1.0 / (1.0 + face_slope * face_slope)
     moment_arm1 = scale * (across * turn1 - face_slope * arm1)
@@ -263,7 +265,7 @@ def load_torques(
 def load_of(torque: float, moment_arm: float, curvature: float) -> tuple[float, float]:
     """Solve torque = moment_arm L + curvature L² [N·m]; return L [N] and the slope ∂torque/∂L [m].
 
-    Torques beyond the vertex of the parabola, which no load can cause, use the smallest slope.
+    No load can cause a torque beyond the parabola's vertex; there the minimum slope is used.
     """
     slope_min = _SLOPE_MIN * moment_arm
     slope = math.sqrt(

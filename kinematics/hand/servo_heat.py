@@ -1,14 +1,15 @@
-"""Temperatures of a servo's winding and case, estimated by a Kalman filter.
+"""Kalman filter for the winding and case temperatures of a servo.
 
     Ẇ = k r I² (1 + α (W − 25 °C)) − (W − C)/τ_w      winding
     Ċ = s (W − C)/τ_w − g (C − A)/τ_c                 case, measured by the servo in steps of 1 °C
     A, k random walks                                 ambient; heating relative to the model
 
-Here r = R/C_w, s = C_w/C_c, τ_w = C_w R_wc and τ_c = C_c R_ca, from the electrical resistance, the
-heat capacities and the thermal resistances. α is the temperature coefficient of copper, and
-g = ((C − A)/30 K)^(1/4) describes natural convection. For known I² the model is linear except for α
-and g, which are evaluated at the estimate. A constant reading carries little information; a step of
-the reading gives the temperature of the case accurately.
+Here r = R/C_w, s = C_w/C_c, τ_w = C_w R_wc and τ_c = C_c R_ca, where R is the electrical
+resistance, C_w and C_c are heat capacities, and R_wc and R_ca are thermal resistances. α is the
+temperature coefficient of copper, and g = ((C − A)/30 K)^(1/4) describes natural convection. For
+known I², the model is linear except for α and g, which are evaluated at the current estimate. A
+constant reading carries little information; a step in the reading gives an accurate case
+temperature.
 """
 
 from __future__ import annotations
@@ -26,14 +27,14 @@ FloatArray = NDArray[np.float64]
 
 WINDING, CASE, AMBIENT, HEATING = range(4)
 COPPER = 0.0039  # 1/K, temperature coefficient of the winding's resistance
-TIME_MAX = 3600.0  # s, largest time to a limit that is reported
+TIME_MAX = 3600.0  # s, upper limit of the reported time to a limit
 _ROOM_TEMPERATURE = 25.0  # °C
 _CONVECTION_DIFFERENCE = 30.0  # K above ambient at which τ_c is defined
 _INITIAL_STD = (6.0, 0.5, 8.0, 0.35)  # initial standard deviations of W, C, A [°C] and k
 _RANDOM_WALK = (0.03, 0.01, 0.2, 0.01)  # random walks of W, C, A [°C/√s] and k [1/√s]
-_STEP_STD = 0.12  # °C, standard deviation of the case temperature at a step of the reading
+_STEP_STD = 0.12  # °C, standard deviation of the case temperature when the reading steps
 _STAY_STD = 6.0  # °C, standard deviation of a constant reading over 1 s
-_COUPLING = 0.25  # unobservable error of τ_w, as a fraction of W − C
+_COUPLING = 0.25  # unobservable τ_w error, as a fraction of W − C
 
 
 class HeatLaw(Record):
@@ -82,7 +83,7 @@ def follow(states: Records[HeatState], square: float, dt: float, reading: float)
 
 @inner_kernel
 def _convection_factor(over: float) -> float:
-    """Return g of a case ``over`` K above ambient, at least that of 1 K."""
+    """Return the convection factor g for a case that is ``over`` K above ambient, at least 1 K."""
     return math.sqrt(math.sqrt(max(over, 1.0) / _CONVECTION_DIFFERENCE))
 
 
@@ -144,7 +145,8 @@ def winding_std(states: Records[HeatState]) -> float:
 def time_to_limit(states: Records[HeatState], square: float, limit: float) -> float:
     """Return the time [s] until the case reaches ``limit`` [°C] at a mean squared current [A²].
 
-    The result is at most TIME_MAX. The winding is integrated implicitly, so the steps may grow.
+    The result is at most TIME_MAX. Implicit integration of the winding temperature allows growing
+    time steps.
     """
     s = states[0]
     law = s.law

@@ -2,24 +2,24 @@
 
 Two mirrored fingers hold an object of width W between parallel faces with a displacement d at each
 tip. The small antisymmetric motions are the object's angle φ and the antisymmetric joint angle
-δ = (q1 − q2)/2. They change the tilt of each tip by ψ = φ + δ and its shear by σ. A virtual spring
-k between the fingers reduces the torque of joint 1 by kδ and increases that of joint 2 by kδ. For
-the force N of each tip, the linearised tip law is T/N = ψ + 2σ/d and (∂U/∂θ)/N = cdψ + σ, where c
-is 2/3 for the springs of the paper. With b = k/(N B) for pivots 2B apart,
+δ = (q1 − q2)/2. They change each tip's tilt by ψ = φ + δ and its shear by σ. A virtual spring k
+between the fingers reduces the torque of joint 1 by kδ and increases that of joint 2 by kδ. For a
+normal force N at each tip, the linearised tip model is T/N = ψ + 2σ/d and (∂U/∂θ)/N = cdψ + σ,
+where c is 2/3 for the spring model of the paper. With b = k/(N B) and pivots 2B apart,
 
     T = N (φ − bδ)                                       the forces of both fingers are collinear
     W T = N ((W + 2(a − d))φ − 2ℓδ) + 2 ∂U/∂θ            moment balance of the object
     σ = (a − d + ℓ)δ − W(φ − φ0)/2                       rolling since the tips stuck
 
-with ℓ = L sin q + e cos q. The last equation is an integral of the stick condition over changing d
-and q, so the result does not depend on the path. For an object at angle φ0 at first contact,
+where ℓ = L sin q + e cos q. The last equation integrates the stick condition while d and q change,
+so the result does not depend on the path. For an object whose angle is φ0 at first contact,
 
     φ/φ0 = W D/(W D − 4 (a − d + cd) M)
     D = 2ℓ + (1 − 2c)d − b(W − d)        M = a − d + ℓ + (1 + b)d/2
 
 which vanishes for D = 0. The spring b = (2ℓ + (1 − 2c)d)/(W − d) therefore keeps the object upright
-for any φ0. The model neglects the tilt q of the tips relative to the faces, which is of second
-order, and all friction except at the tips.
+for any φ0. The model neglects the tip tilt q relative to the faces, a second-order effect, and all
+friction except at the tips.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ import math
 
 from softfinger.kinematics.compiled.kernel import inner_kernel
 
-_WIDTH_MIN = 0.1  # lower limit of W − d over the tip's radius
+_WIDTH_MIN = 0.1  # minimum of W − d, relative to the tip radius
 
 
 @inner_kernel
@@ -39,10 +39,10 @@ def upright_spring(
     tilt_moment_ratio: float,
     lengths: tuple[float, float, float, float],
 ) -> float:
-    """Return the spring k [N·m/rad] between joints at ``q`` [rad] that keeps the object upright.
+    """Return the joint spring k [N·m/rad] that keeps the object upright at joint angle ``q`` [rad].
 
-    ``d`` [m] and ``force`` [N] are the means of both tips, ``tilt_moment_ratio`` is their c, and
-    ``lengths`` [m] are those of :func:`hand.grasp_state.held_motion`.
+    ``d`` [m] and ``force`` [N] are averages of both tips, ``tilt_moment_ratio`` is their c, and
+    ``lengths`` [m] are defined in :func:`hand.grasp_state.held_motion`.
     """
     half_separation, length, offset, radius = lengths
     inward = length * math.sin(q) + offset * math.cos(q)
