@@ -1,4 +1,4 @@
 """Forward model of the pressure sensor under a tip.
 
-The modules compute with arrays only and use no files or ports.
+The modules operate on arrays only and do not access files or ports.
 """

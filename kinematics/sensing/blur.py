@@ -1,8 +1,9 @@
-"""Sample points of cells along one axis, and the weights of their mean over a cell.
+"""Sample points of cells along one axis, and their weights in the cell mean.
 
-The elastomer over a sensor spreads pressure like a Gaussian blur. The blur is a weighted sum over
-neighbouring points along one axis and then along the other, so it is included in the weights with
-which a cell averages its points. Without a blur, a cell averages its own points with equal weights.
+The elastomer over a sensor spreads pressure like a Gaussian blur. A Gaussian blur is separable: it
+is a weighted sum over neighbouring points along one axis, then along the other. The blur is
+therefore included in the weights with which a cell averages its points. Without blur, a cell
+averages its own points with equal weights.
 """
 
 from __future__ import annotations
@@ -14,18 +15,18 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 
-# Points; narrower blurs use moment-matching weights, wider ones Gaussian samples.
+# Points; moment-matching weights are used below this width, Gaussian samples above it.
 _MOMENT_MATCHED_MAX = 0.75
-_CUTOFF = 4.5  # standard deviations at which the Gaussian is truncated
+_CUTOFF = 4.5  # standard deviations, truncation of the Gaussian
 
 
 def axis_points(
     start: float, pitch: float, number: int, count: int, blur: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the positions of points [count, cells] and the weights of a cell's mean over them.
+    """Return the positions of points [count, cells] and their weights in the mean of one cell.
 
-    There are ``number`` cells of ``pitch``, beginning at ``start``, and additional cells on both
-    sides within the range of the blur. The value of cell j is the sum over m and q of weights[m, q]
+    There are ``number`` cells of width ``pitch``, beginning at ``start``. Cells within the range of
+    the blur are added on both sides. The value of cell j is the sum over m and q of weights[m, q]
     times point m of cell j + q.
     """
     mean = np.convolve(stencil(blur * count / pitch), np.full(count, 1.0 / count))
@@ -39,7 +40,7 @@ def axis_points(
 
 
 def mean_matrix(weights: FloatArray, number: int) -> FloatArray:
-    """Return the weights of :func:`axis_points` as a matrix [cells, points]."""
+    """Return the weights from :func:`axis_points` as a matrix [cells, points]."""
     count, reach = weights.shape
     matrix = np.zeros((number, (number + reach - 1) * count))
     for j in range(number):
@@ -48,11 +49,11 @@ def mean_matrix(weights: FloatArray, number: int) -> FloatArray:
 
 
 def stencil(width: float) -> FloatArray:
-    """Return the weights of a blur of ``width`` w, in points, over neighbouring points [2 n + 1].
+    """Return the blur weights [2 n + 1] over neighbouring points, for a ``width`` w in points.
 
-    The weights are samples of the Gaussian (trapezoid rule), whose error decreases like
-    exp(−2π² w²). Below 0.75 points there are five weights that match the Gaussian's moments up to
-    the fifth, and so are exact for polynomials of degree five. Without a blur the only weight is 1.
+    The weights are samples of the Gaussian (trapezoid rule); their error decreases as exp(−2π² w²).
+    For widths below 0.75 points, five weights match the Gaussian's moments up to the fifth, so they
+    are exact for polynomials up to degree five. Without blur, the only weight is 1.
     """
     if width == 0.0:
         return np.ones(1)

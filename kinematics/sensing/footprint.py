@@ -1,14 +1,14 @@
 """Outline of the footprint on a grid of cells, as kernels.
 
-The forward model and the estimator share this geometry. Lengths are in m, in the sensor's axes,
-from the tip's centre. The object's face is the plane ``n·(x, y, z) = h`` with ``h = a − d``; above
-the base point (x, y) its height is ``z = u − v x − w y``, where
+The forward model and the estimator share this geometry. Lengths are in m, in sensor axes, relative
+to the tip centre. The object's face is the plane ``n·(x, y, z) = h`` with ``h = a − d``. Above the
+base point (x, y), the height of the face is ``z = u − v x − w y``, where
 
     u = h/n_z,  v = n_x/n_z,  w = n_y/n_z,
 
-and the strain of the spring there is ``ε = 1 − (u − v x − w y)/√(a² − x² − y²)`` (eq. 2 of the
+and the spring strain at this point is ``ε = 1 − (u − v x − w y)/√(a² − x² − y²)`` (eq. 2 of the
 parallel-distributed model). The footprint {ε > 0} is the projection of a flat disc. It is an
-ellipse or, beyond the domain's limit, an ellipse cut by the rim; both are convex.
+ellipse or, beyond the model's domain, an ellipse truncated by the rim; both are convex.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Span = tuple[float, float]
 
 
 class Grid(Record):
-    """Grid of cells under a tip; lengths [m] in the sensor's axes, from the tip's centre."""
+    """Grid of cells under a tip; lengths [m] in sensor axes, relative to the tip centre."""
 
     radius: float
     x: float  # corner of the first cell
@@ -48,7 +48,7 @@ class Face(Record):
 
 @inner_kernel
 def set_face(face: Face, a: float, d: float, n_x: float, n_y: float) -> None:
-    """Set the face at displacement ``d`` with the normal (n_x, n_y, n_z), n_z > 0."""
+    """Set the face for displacement ``d`` and the normal (n_x, n_y, n_z), where n_z > 0."""
     n_z = math.sqrt(1.0 - n_x * n_x - n_y * n_y)
     face.u = (a - d) / n_z
     face.v = n_x / n_z
@@ -57,9 +57,9 @@ def set_face(face: Face, a: float, d: float, n_x: float, n_y: float) -> None:
 
 @inner_kernel
 def set_around(out: Face, face: Face, a: float, margin: float) -> None:
-    """Set ``out`` parallel to ``face`` with a footprint disc that is larger by ``margin`` [m].
+    """Set ``out`` parallel to ``face``, with a footprint radius larger by ``margin`` [m].
 
-    The larger footprint ends at the tip's rim.
+    The enlarged footprint is limited to the tip's rim.
     """
     c = math.sqrt(1.0 + face.v * face.v + face.w * face.w)
     h = face.u / c
@@ -71,10 +71,10 @@ def set_around(out: Face, face: Face, a: float, margin: float) -> None:
 
 @inner_kernel
 def extremes(face: Face, a: float) -> Span:
-    """Return the smallest and largest y of the footprint, or (inf, −inf) if it is empty.
+    """Return the minimum and maximum y of the footprint, or (inf, −inf) if it is empty.
 
-    Beyond the domain's limit, where the face cuts the base plane within the rim, both values are
-    those of the rim.
+    Beyond the model's domain, where the face cuts the base plane inside the rim, return the limits
+    of the rim.
     """
     u = face.u
     w = face.w
@@ -90,7 +90,7 @@ def extremes(face: Face, a: float) -> Span:
 
 @inner_kernel
 def line_span(face: Face, a: float, y: float) -> Span:
-    """Return the footprint's ends (left, right) in x on the line ``y``, or (inf, −inf) if empty."""
+    """Return the footprint's x range (left, right) on the line ``y``, or (inf, −inf) if empty."""
     v = face.v
     rim = a * a - y * y
     if rim <= 0.0:
@@ -104,15 +104,15 @@ def line_span(face: Face, a: float, y: float) -> Span:
     root = math.sqrt(root)
     left = (v * q - root) / e
     right = (v * q + root) / e
-    # A root below the base plane is not an edge; there the footprint ends at the rim.
+    # A root below the base plane is not an edge; in that case the footprint ends at the rim.
     return -edge if q < v * left else left, edge if q < v * right else right
 
 
 @inner_kernel
 def steps(low: float, high: float, start: float, pitch: float, count: int) -> tuple[int, int]:
-    """Return the index range of the ``count`` intervals that overlap the span low to high.
+    """Return the index range of the intervals that overlap the span from low to high.
 
-    The intervals have width ``pitch`` and begin at ``start``.
+    The ``count`` intervals have width ``pitch`` and begin at ``start``.
     """
     if not low < high:
         return 0, 0

@@ -1,8 +1,8 @@
 """Forward model of a pressure grid under a soft tip.
 
-`SensorGrid` describes the geometry of the sensor and renders the pressure of a contact on it. Each
-cell reads the pressure averaged over its area. Sensor imperfections (noise, quantisation, dead
-cells) are not included.
+`SensorGrid` describes the sensor geometry and renders the contact pressure on it. Each cell reads
+the pressure averaged over its area. Sensor imperfections (noise, quantisation, dead cells) are not
+modelled.
 """
 
 from __future__ import annotations
@@ -20,26 +20,26 @@ from softfinger.kinematics.sensing.solid_pressure import SolidPressure, images
 from softfinger.kinematics.sensing.springs_pressure import SpringsPressure, count_for
 
 _PITCH_MAX = 0.1  # m; a larger value was probably given in millimetres
-_POINTS_PER_RADIUS = 150.0  # smallest number of sample points per tip radius
+_POINTS_PER_RADIUS = 150.0  # minimum number of sample points per tip radius
 
 
 @dataclass(frozen=True)
 class SensorGrid:
-    """Grid of rows × cols pressure cells under a tip; row indices grow along y, columns along x.
+    """Grid of rows × cols pressure cells under a tip; rows are along y and columns along x.
 
     Parameters
     ----------
     rows, cols
         Number of cells along y and x.
     pitch
-        Cell size [m], one number or (x, y).
+        Cell size [m], as one number or as (x, y).
     centre
-        Position of the tip's centre in the sensor's axes [m], from the middle of the grid.
+        Tip centre in sensor axes [m], relative to the middle of the grid.
     rotation
-        Rotation of the sensor's axes relative to the finger's [rad], counter-clockwise seen along
+        Rotation of the sensor axes relative to the finger axes [rad], counter-clockwise seen along
         +z.
     blur
-        Standard deviation with which the elastomer over the cells spreads pressure [m].
+        Standard deviation of the pressure blur in the elastomer over the cells [m].
 
     Raises
     ------
@@ -77,20 +77,20 @@ class SensorGrid:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Shape of a frame, (rows, cols)."""
+        """Frame shape, (rows, cols)."""
         return self.rows, self.cols
 
     def on(self, tip: Fingertip) -> Grid:
-        """Return the grid as a record for kernels, with lengths from the tip's centre."""
+        """Return the grid as a record for kernels, with lengths relative to the tip centre."""
         pitch_x, pitch_y = self.pitches
         x = -0.5 * self.cols * pitch_x - self.centre[0]
         y = -0.5 * self.rows * pitch_y - self.centre[1]
-        # In the order of the record's fields; setting them one by one takes ten times as long.
+        # The values are in field order. Setting the fields one by one takes ten times as long.
         fields = (tip.radius, x, y, pitch_x, pitch_y, self.rows, self.cols)
         return Grid(np.array([fields], Grid.dtype))
 
     def to_sensor(self, n_x: float, n_y: float) -> tuple[float, float]:
-        """Rotate vector components from the finger's axes to the sensor's axes."""
+        """Rotate vector components from finger axes to sensor axes."""
         if self.rotation == 0.0:
             return n_x, n_y
         c, s = math.cos(self.rotation), math.sin(self.rotation)
@@ -108,22 +108,22 @@ class SensorGrid:
     ) -> FloatArray:
         """Return the pressure [Pa] of a contact, averaged over each cell.
 
-        The error for a spring tip is at most 1e-5 of the modulus, including cells at the outline,
-        1e-4 above 30° and 1e-3 where the outline almost reaches the rim. A solid tip is as accurate
-        as `solid_data`, and contacts beyond its data are clamped.
+        For a spring tip, the error is at most 1e-5 of the modulus, including cells at the outline.
+        It is 1e-4 above 30° and 1e-3 where the outline almost reaches the rim. The accuracy of a
+        solid tip is that of `solid_data`; contacts outside the range of its data are clamped.
 
         Parameters
         ----------
         tip, material
-            The tip and its stress-strain law.
+            Tip and its material law.
         d
             Displacement [m].
         tilt_x, tilt_y
             Tilts [rad] of the object's normal (sin tilt_x, sin tilt_y, …).
         gain
-            Factor on all pressures.
+            Factor applied to all pressures.
         out
-            Array to write to and return; a new one if None.
+            Array to write to and return; None allocates a new one.
 
         Returns
         -------
@@ -148,11 +148,11 @@ class SensorGrid:
         return out
 
     def images(self, tip: Fingertip) -> FloatArray:
-        """Return the images of a solid tip's modes and shear [·, cells]; see `solid_pressure`."""
+        """Return a solid tip's mode and shear images [·, cells]; see `solid_pressure`."""
         return _images(replace(self, rotation=0.0), tip)
 
 
-@lru_cache(maxsize=16)  # the grids of two fingers and their shifted copies for the error budget
+@lru_cache(maxsize=16)  # grids of two fingers and their shifted copies for the error budget
 def _images(grid: SensorGrid, tip: Fingertip) -> FloatArray:
     return images(tip, grid.on(tip), grid.blur)
 

@@ -1,9 +1,9 @@
 """Forward model of a solid tip: a frame is a weighted sum of fixed images.
 
-The images are the modes of `solid_data`. A mode gives one image of the grid, or two if it is
-directional: B(r) cos mφ and B(r) sin mφ, averaged over each cell. The weights of the images are
-smooth functions of (d, n_x, n_y). The sensor cannot measure tension, so a cell reads 0 where the
-sum is negative.
+Each image shows a mode from `solid_data`. A mode gives one image of the grid, or two if it is
+directional: B(r) cos mφ and B(r) sin mφ, averaged over each cell. The image weights are smooth
+functions of (d, n_x, n_y). Because the sensor cannot measure tension, a cell reads 0 where the sum
+is negative.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from softfinger.kinematics.sensing.footprint import FloatArray, Grid, IntArray
 
 MODES = 32
 IMAGES = 2 * MODES
-_IMAGES_PER_PASS = 4  # images added per pass; IMAGES is a multiple of it
-ROOT_TERMS, SQUARE_TERMS = 12, 6  # largest number of terms of a mode's polynomial
+_IMAGES_PER_PASS = 4  # images added per pass; must divide IMAGES
+ROOT_TERMS, SQUARE_TERMS = 12, 6  # maximum number of terms in a mode's polynomial
 
-# Sample points per side of a cell: inside, cut by the rim, and with blur.
+# Sample points along each side of a cell: inside the rim, cut by the rim, and with blur.
 _INSIDE, _CUT, _BLURRED = 6, 24, 12
 
 
 class Weights(Record):
-    """Weights of the images for one contact, set by `set_weights`."""
+    """Image weights for one contact, set by `set_weights`."""
 
     table: Table
     modes: int
@@ -53,7 +53,7 @@ class Weights(Record):
 
 
 def weights_of(tip: Fingertip, material: Material) -> Weights:
-    """Return the modes of a solid tip, before any contact is set.
+    """Return the modes of a solid tip; no contact is set yet.
 
     Raises MaterialError unless the material is linear.
     """
@@ -67,12 +67,12 @@ def weights_of(tip: Fingertip, material: Material) -> Weights:
 
 
 def image_count(harmonics: IntArray) -> int:
-    """Return the number of images of the modes."""
+    """Return the number of images that the modes need."""
     return int(len(harmonics) + np.count_nonzero(harmonics))
 
 
 def images(tip: Fingertip, cells: Grid, blur: float) -> FloatArray:
-    """Return the images of the modes, then of shear along x and y, float64 [·, rows · cols]."""
+    """Return the mode images, then those of shear along x and y, float64 [·, rows · cols]."""
     if blur > 0.0:
         return _blurred_images(tip, cells, blur)
     data = solid_data(tip)
@@ -115,7 +115,7 @@ def _nearest(low: NDArray[Any], width: float) -> NDArray[Any]:
 
 
 def _means(tip: Fingertip, z: NDArray[np.complex128]) -> FloatArray:
-    """Return the mean of each image over the points x + i y [cells, points]; 0 beyond the rings."""
+    """Return each image's mean over the points x + i y [cells, points]; 0 outside the rings."""
     data = solid_data(tip)
     middle = 0.5 * (data.edges[1:] + data.edges[:-1])
     r = np.abs(z)
@@ -136,14 +136,14 @@ def _means(tip: Fingertip, z: NDArray[np.complex128]) -> FloatArray:
 
 @inner_kernel
 def set_weights(weights: Weights, d: float, n_x: float, n_y: float) -> None:
-    """Set the weights of a contact, for pressures in Pa, and their partials by d, n_x and n_y."""
+    """Set the image weights of a contact (for Pa) and their partials in d, n_x and n_y."""
     table = weights.table
     square = n_x * n_x + n_y * n_y
     t = math.sqrt(d * table.inverse_radius)
     x = t * table.by_root - 1.0
     y = square * table.by_square - 1.0
     g, g_t, g_tt, g_s, g_ts = energy_lanes(table, t, square)
-    # Normal force over a², and its partials by t and sin² θ.
+    # Normal force divided by a², and its partials with respect to t and sin² θ.
     normal = table.modulus * t * t * t * (2.5 * g + 0.5 * t * g_t)
     normal_t = 0.5 * table.modulus * t * t * (15.0 * g + t * (9.0 * g_t + t * g_tt))
     normal_s = table.modulus * t * t * t * (2.5 * g_s + 0.5 * t * g_ts)
@@ -163,7 +163,7 @@ def set_weights(weights: Weights, d: float, n_x: float, n_y: float) -> None:
     both = 2.0 * (normal_s * held + normal * held_s) * cosine - normal * held / cosine
     by_x[0] = n_x * both
     by_y[0] = n_y * both
-    # (n_x + i n_y)^m, and its derivative divided by m; the modes are in the order of m.
+    # (n_x + i n_y)^m, and its derivative divided by m; the modes are sorted by m.
     m = 0
     power = 1.0 + 0.0j
     below = 0.0j
@@ -194,10 +194,10 @@ def set_weights(weights: Weights, d: float, n_x: float, n_y: float) -> None:
 
 @inner_kernel
 def own_shear(weights: Weights, d: float, square: float) -> float:
-    """Return the shear of a straight press on a sticking face, over sin θ and a² [Pa].
+    """Return the shear force of straight indentation on a sticking face, divided by a² sin θ [Pa].
 
-    The shear acts at height a and is already contained in the modes. ``weights`` are those of the
-    contact.
+    The shear acts at height a and is already included in the modes. ``weights`` must be set for
+    this contact.
     """
     q = weights.q[0]
     normal = weights.value[0] / (1.0 - square * q)
@@ -207,7 +207,7 @@ def own_shear(weights: Weights, d: float, square: float) -> float:
 
 @fast_inner_kernel
 def _evaluate_ratios(weights: Weights, x: float, y: float) -> None:
-    """Evaluate q of each mode and its partials by x and y, with one SIMD lane per mode."""
+    """Evaluate q of each mode and its partials in x and y, using one SIMD lane per mode."""
     ratios = weights.ratios
     q = weights.q
     q_x = weights.q_x
@@ -239,7 +239,7 @@ def _add_images(
     count: int,
     out: FloatArray,
 ) -> None:
-    """Add four weighted images, beginning with the ``first``; its pixels start at ``image``."""
+    """Add four weighted images, starting with index ``first``; their pixels begin at ``image``."""
     a, b, c, d = weights[first], weights[first + 1], weights[first + 2], weights[first + 3]
     second = image + count
     third = second + count
@@ -255,9 +255,9 @@ def _add_images(
 
 @inner_kernel
 def add_images(weights: Weights, of: FloatArray, pixels: FloatArray, out: FloatArray) -> None:
-    """Add all images, stored consecutively in ``pixels``, times the weights ``of``.
+    """Add all images, stored consecutively in ``pixels``, multiplied by the weights ``of``.
 
-    The last group may include the images of shear, whose weights are 0 here.
+    The last group may include the shear images, whose weights are 0 here.
     """
     count = out.shape[0]
     for j in range(0, weights.images, _IMAGES_PER_PASS):
@@ -268,9 +268,9 @@ def add_images(weights: Weights, of: FloatArray, pixels: FloatArray, out: FloatA
 def press_solid(
     weights: Weights, pixels: FloatArray, d: float, n_x: float, n_y: float, planes: FloatArray
 ) -> None:
-    """Set the pressure of a contact and its partials by d, n_x and n_y, [4, rows, cols].
+    """Compute the contact pressure and its partials in d, n_x and n_y, [4, rows, cols].
 
-    The pressure is not clipped and is negative where the rubber pulls.
+    The pressure is not clipped; it is negative where the rubber is in tension.
     """
     set_weights(weights, d, n_x, n_y)
     count = planes.shape[1] * planes.shape[2]
@@ -292,12 +292,12 @@ def render_solid(
     gain: float,
     out: FloatArray,
 ) -> None:
-    """Write the pressure [Pa] of a ``contact`` (d, n_x, n_y), times ``gain``, into ``out``.
+    """Write the pressure [Pa] of a ``contact`` (d, n_x, n_y), multiplied by ``gain``, into ``out``.
 
-    ``shear`` [N] is the force on the face along x and y, acting at height a. It is the total shear
-    if ``whole`` is True, and otherwise the excess over that of a straight press. ``basis`` holds
-    the images of the grid. The result is zero for d ≤ 0; contacts beyond the data are clamped to
-    the largest depth and tilt at the same azimuth.
+    ``shear`` [N] is the force on the face along x and y, acting at height a. If ``whole`` is True,
+    it is the total shear; otherwise it is added to the shear of straight indentation. ``basis``
+    holds the grid's images. The result is zero for d ≤ 0. Contacts outside the range of the data
+    are clamped to the maximum depth and tilt at the same azimuth.
     """
     each = weights[0]
     table = each.table
@@ -325,7 +325,7 @@ def render_solid(
 
 
 def padded(images: FloatArray) -> FloatArray:
-    """Return images [·, cells] as one flat array, padded so that `add_images` can read past it."""
+    """Flatten images [·, cells] and pad them so that `add_images` can read past the end."""
     return np.concatenate([images.ravel(), np.zeros((_IMAGES_PER_PASS - 1) * images.shape[1])])
 
 
@@ -343,7 +343,7 @@ class SolidPressure:
         out: FloatArray,
         shear: tuple[float, float] | None = None,
     ) -> None:
-        """Render with :func:`render_solid`; without ``shear``, that of a straight press is used."""
+        """Call :func:`render_solid`; by default, ``shear`` is that of straight indentation."""
         whole = shear is not None
         render_solid(
             self._weights, self._basis, contact, shear or (0.0, 0.0), whole, gain, out.reshape(-1)

@@ -1,13 +1,13 @@
 """Forward model of a spring tip on a grid of cells: pressure and its partials.
 
-A cell reads the mean over sample points that are spread evenly over it. Above a point (x, y) of the
-base, the spring has length ℓ = √(a² − x² − y²) and strain ε = 1 − z/ℓ with z = u − v x − w y; see
-`footprint`. Each point represents a small rectangle and uses the mean strain over it. Inside the
-footprint, the mean strain follows from the tabulated means of 1/ℓ, x/ℓ and y/ℓ. Where the outline
-cuts the rectangle, only the part with f = ℓ² − z² > 0 counts; f is treated as a plane whose values
-are evenly distributed over the rectangle.
+A cell reads the mean over sample points that are distributed evenly over its area. Above a point
+(x, y) of the base, the spring has length ℓ = √(a² − x² − y²) and strain ε = 1 − z/ℓ with
+z = u − v x − w y; see `footprint`. Each point represents a small rectangle and uses the mean strain
+over it. Inside the footprint, the mean strain follows from tabulated means of 1/ℓ, x/ℓ and y/ℓ.
+Where the outline cuts the rectangle, only the part with f = ℓ² − z² > 0 contributes. There f is
+treated as a plane whose values are evenly distributed over the rectangle.
 
-The weights of the points include the sensor's blur; see `blur`.
+The point weights include the sensor's blur; see `blur`.
 """
 
 from __future__ import annotations
@@ -35,23 +35,23 @@ from softfinger.kinematics.sensing.footprint import (
 
 FloatArray = NDArray[np.float64]
 
-STRESS, BY_D, BY_X, BY_Y = range(4)  # planes: pressure [Pa] and its partials by d, n_x and n_y
+STRESS, BY_D, BY_X, BY_Y = range(4)  # planes: pressure [Pa] and its partials in d, n_x and n_y
 PLANES = 4
 Cells = tuple[int, int]  # half-open range
 _SPREAD_MIN = 1e-12
-# Gauss-Legendre rule on the rectangle of a point, scaled to width 1.
+# Gauss-Legendre rule on a point's rectangle, scaled to width 1.
 _NODES, _WEIGHTS = (0.5 * each for each in np.polynomial.legendre.leggauss(3))
 
 
 class SpringPoints(NamedTuple):
-    """Sample points of a grid under a tip, in the layout used by kernels.
+    """Sample points of a grid under a tip, in the layout that the kernels use.
 
-    A row of points is one array: first the points at the first position of each cell, then those at
-    the second position, and so on. The array includes cells outside the grid within the range of
-    the blur. Arrays are one-dimensional so that loops over them can be vectorised.
+    A row of points is one array. It starts with the points at the first position in each cell, then
+    those at the second position, and so on. The array includes cells outside the grid within the
+    range of the blur. One-dimensional arrays allow vectorised loops.
     """
 
-    x: FloatArray  # from the tip's centre [m], one row
+    x: FloatArray  # from the tip centre [m], one row
     strain: FloatArray  # scratch, one row
     slope: FloatArray
     factor: FloatArray
@@ -62,12 +62,12 @@ class SpringPoints(NamedTuple):
     y: FloatArray  # one value per row
     across: FloatArray  # weights along x [position, cell offset], see `blur.axis_points`
     along: FloatArray  # weights along y
-    law: FloatArray  # σ(ε) of the material by increasing powers
+    law: FloatArray  # σ(ε) coefficients of the material, by increasing powers
     sums: FloatArray  # scratch, three rows of cells
 
 
 class PointArrays(NamedTuple):
-    """Storage of `SpringPoints` in few arrays, since each array argument of a kernel costs time."""
+    """`SpringPoints` stored in few arrays, because each array argument of a kernel costs time."""
 
     line: FloatArray  # [5, row]
     inverse: FloatArray  # [3, all rows]
@@ -91,7 +91,7 @@ def points_in(
 
 
 def points_of(cells: Grid, material: Material, blur: float, count: tuple[int, int]) -> PointArrays:
-    """Return the sample points of the cells, ``count`` (x, y) per side of a cell."""
+    """Return the sample points of the cells, with ``count`` (x, y) points per cell side."""
     a = cells.radius
     x, across = axis_points(cells.x, cells.pitch_x, cells.cols, count[0], blur)
     y, along = axis_points(cells.y, cells.pitch_y, cells.rows, count[1], blur)
@@ -124,10 +124,10 @@ def _set_strains(
     a2: float,
     half: Span,
 ) -> None:
-    """Set ε and −∂ε/∂u of the points ``first`` to ``last`` of the row that begins at ``row``.
+    """Set ε and −∂ε/∂u of the points from ``first`` to ``last`` in the row that begins at ``row``.
 
-    ``half`` are half the side lengths of a point's rectangle. Indices are unsigned because Numba
-    checks signed ones for negative values, which prevents vectorisation.
+    ``half`` holds half the side lengths of a point's rectangle. Indices are unsigned because Numba
+    checks signed indices for negative values, which prevents vectorisation.
     """
     u = face.u
     v = face.v
@@ -137,17 +137,18 @@ def _set_strains(
     least = _SPREAD_MIN * a2 * math.sqrt(a2)
     for k in range(first, last):
         x = points.x[k]
-        # ε > 0 where f = ℓ² − z² > 0; f is close to linear up to the rim and beyond.
+        # ε > 0 where f = ℓ² − z² > 0; f is almost linear up to the rim and beyond.
         z = max(u - v * x - w * y, 0.0)
         f = rim - x * x - z * z
-        # Spread of f over the rectangle; makes the mean of max(f, 0) exact for a centred outline.
+        # This spread of f over the rectangle makes the mean of max(f, 0) exact if the outline
+        # passes through the centre.
         by_x = abs(size_x * (x - z * v))
         by_y = abs(size_y * (y - z * w))
         big = max(by_x, by_y)
         small = min(by_x, by_y)
         spread = 4.0 * max(big, max(0.963 * big + 0.222 * small, 0.77 * big + 0.556 * small))
         part = min(max(f + 0.5 * spread, 0.0), spread)
-        # z at the middle of the part with f > 0; f decreases along (p, q).
+        # z in the middle of the part with f > 0; f decreases along (p, q).
         p = x - z * v
         q = y - z * w
         away = 0.5 * max(0.5 * part - f, 0.0) / (p * p + q * q + least)
@@ -173,7 +174,7 @@ def _start_stresses(points: SpringPoints, first: int, last: int, highest: float)
 
 @inlined_kernel
 def _raise_power(points: SpringPoints, first: int, last: int, coefficient: float) -> None:
-    """Do one step of Horner's scheme for σ(ε) and its slope."""
+    """Perform one step of Horner's scheme for σ(ε) and its slope."""
     for k in range(first, last):
         strain = points.strain[k]
         points.factor[k] = points.factor[k] * strain + points.stress[k]
@@ -186,7 +187,7 @@ def _sum_points(
 ) -> None:
     """Add the points at the index offset ``ahead`` to the sums of cells ``first`` to ``last``.
 
-    The sums are the stress, its partial by −u, and that partial times x.
+    The three sums are the stress, its partial in −u, and this partial times x.
     """
     for k in range(first, last):
         slope = weight * points.slope[ahead + k] * points.factor[ahead + k]
@@ -199,9 +200,9 @@ def _sum_points(
 def _press_line(
     points: SpringPoints, i: int, first: int, last: int, face: Face, a2: float, half: Span
 ) -> Cells:
-    """Evaluate one line of points over cells ``first`` to ``last`` and sum it over the cells.
+    """Evaluate one line of points over cells ``first`` to ``last`` and sum it for each cell.
 
-    Returns the range of cells affected.
+    Returns the range of affected cells.
     """
     places, reach = points.across.shape
     wide = points.x.shape[0] // places
@@ -245,14 +246,14 @@ def _add_row(
     row: int,
     out: FloatArray,
 ) -> None:
-    """Add the sums of a line to a row of cells, converting the partials to d, n_x and n_y."""
+    """Add a line's sums to a row of cells, converting the partials to d, n_x and n_y."""
     u = face.u
     v = face.v
     w = face.w
     c = weight * math.sqrt(1.0 + v * v + w * w)
     cols = points.sums.shape[0] // 3
     for j in range(low, high):
-        # Partials of the pressure by −u, v and w.
+        # Partials of the pressure with respect to −u, v and w.
         by_u = points.sums[cols + j]
         by_v = points.sums[2 * cols + j]
         by_w = y * by_u
@@ -267,16 +268,16 @@ def _add_row(
 def press_springs(
     points: SpringPoints, grid: Grid, face: Face, around: Face, out: FloatArray
 ) -> Cells:
-    """Set the pressure and its partials [PLANES, rows, cols]; return the range of rows touched.
+    """Compute the pressure and its partials [PLANES, rows, cols]; return the range of changed rows.
 
-    Other rows are left unchanged. ``around`` is scratch.
+    Other rows are left unchanged. ``around`` is scratch memory.
     """
     a = grid.radius
     count_x = points.across.shape[0]
     count_y, reach = points.along.shape
     size_x = 0.5 * grid.pitch_x / count_x
     size_y = 0.5 * grid.pitch_y / count_y
-    # The centre of a rectangle cut by the outline may lie outside the outline.
+    # A rectangle that the outline cuts may have its centre outside the outline.
     set_around(around, face, a, math.hypot(size_x, size_y))
     low, high = extremes(around, a)
     lines = points.y.shape[0]
@@ -312,13 +313,13 @@ def render(
     inverse: FloatArray, y: FloatArray, across: FloatArray, along: FloatArray, law: FloatArray,
     sums: FloatArray,
 ) -> Cells:  # fmt: skip
-    """Evaluate :func:`press_springs` for the first of ``faces``; the second is scratch."""
+    """Run :func:`press_springs` with the first of ``faces``; the second is scratch memory."""
     points = points_in(line, inverse, y, across, along, law, sums)
     return press_springs(points, grids[0], faces[0], faces[1], planes)
 
 
 def count_for(cells: Grid, fineness: float) -> tuple[int, int]:
-    """Return the points per side (x, y) of a cell for ``fineness`` points per tip radius."""
+    """Return the points per cell side (x, y) for ``fineness`` points per tip radius."""
     per_length = fineness / cells.radius
     x, y = (
         max(math.ceil(pitch * per_length - 1e-9), 1) for pitch in (cells.pitch_x, cells.pitch_y)
@@ -339,9 +340,9 @@ class SpringsPressure:
         self._planes = np.zeros((PLANES, cells.rows, cells.cols))
 
     def __call__(self, contact: tuple[float, float, float], gain: float, out: FloatArray) -> None:
-        """Write the pressure [Pa] of a ``contact`` (d, n_x, n_y), times ``gain``, into ``out``.
+        """Write the pressure [Pa] of a ``contact`` (d, n_x, n_y), times ``gain``, to ``out``.
 
-        The result is zero for d ≤ 0. Beyond the domain's limit, the footprint ends at the rim.
+        The result is zero for d ≤ 0. Beyond the model's domain, the footprint ends at the rim.
         """
         d, n_x, n_y = contact
         out[:] = 0.0
