@@ -1,1 +1,1 @@
-"""Programs that computed the package's data files. They run from the source tree only."""
+"""Programs that computed the package's data files. They can be run only from the source tree."""

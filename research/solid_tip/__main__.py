@@ -1,6 +1,6 @@
-"""Compute the linear law of a solid tip: ``python -m research.solid_tip``.
+"""Compute the linear model of a solid tip: ``python -m research.solid_tip``.
 
-The result is the input file of `strain`, in the format described in the notes of `strain`'s file.
+The result is the input file of `strain`; the notes in the output of `strain` describe the format.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def presses(which: tuple[str, int, float], folder: Path) -> fit.Samples:
 
 
 def differences(tip: SolidTip, samples: fit.Samples) -> str:
-    """Return the errors of the file's N, U and p against presses, over three ranges of depth."""
+    """Return the errors in N, U and p compared with presses, over three depth ranges."""
     areas = np.sqrt(np.diff(tip.edges**2))
     rows = []
     for d, theta, push, energy, _, base in zip(*samples, strict=True):
@@ -61,7 +61,7 @@ def differences(tip: SolidTip, samples: fit.Samples) -> str:
 
 
 def mesh_errors(arrays: Arrays, other: Arrays, block: str) -> tuple[float, float]:
-    """Return the largest relative differences of two files in N and in a sensor's frame."""
+    """Return the maximum relative differences of two files in N and in a sensor frame."""
     force, pressure = [], []
     for poisson in (*fit.NU, 0.49):
         tip, second = SolidTip(arrays, block, poisson), SolidTip(other, block, poisson)
@@ -75,7 +75,7 @@ def mesh_errors(arrays: Arrays, other: Arrays, block: str) -> tuple[float, float
 
 
 def main() -> None:
-    """Compute the presses, fit and write the file, and print its errors."""
+    """Compute the presses, fit the model, write the file and print its errors."""
     parser = argparse.ArgumentParser(prog="python -m research.solid_tip", description=__doc__)
     parser.add_argument("out", type=Path, help="file to write, .npz")
     parser.add_argument("--rings", type=int, default=64, help="elements along the arc")

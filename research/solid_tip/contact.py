@@ -1,13 +1,14 @@
 """Contact of a rigid plane with the hemisphere as a linear complementarity problem.
 
 Without friction, the unknown of each surface cell is its normal force q ≥ 0 along the plane's
-normal n = (sin θ, 0, cos θ), for the two mirror images y and −y together. The cells move by C q,
-where C is the compliance, and the plane overlaps them by δ = X·n − (a − d). Contact therefore
-requires q ≥ 0, C q − δ ≥ 0 and q·(C q − δ) = 0.
+normal n = (sin θ, 0, cos θ), applied to both mirror images y and −y. The cells move by C q, where
+C is the compliance, and the plane overlaps them by δ = X·n − (a − d). Contact therefore requires
+q ≥ 0, C q − δ ≥ 0 and q·(C q − δ) = 0.
 
-Sticking adds two forces along the plane to each cell, which hold the cell where it first touched.
-The result then depends on the path. Here the plane moves straight along n, so the held points do
-not move along the plane, the tangential forces do no work, and N = ∂U/∂d holds as without friction.
+A sticking face adds two forces along the plane to each cell, which hold the cell where it first
+touched. The result then depends on the path. Here the plane moves straight along n, so the held
+points do not move along the plane and the tangential forces do no work. N = ∂U/∂d therefore holds
+as it does without friction.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from research.solid_tip.green import FloatArray, Green
 
-BEYOND = 0.06  # cells may touch this far outside the undeformed overlap [a]
+BEYOND = 0.06  # a; cells may touch this far outside the undeformed overlap
 
 
 class Press(NamedTuple):
@@ -27,10 +28,10 @@ class Press(NamedTuple):
 
     d: float
     theta: float
-    push: float  # N along the plane's normal
+    push: float  # normal force N
     energy: float  # U
-    base: FloatArray  # (H, B) cosine harmonics of the base pressure at the nodes of the base
-    shear: float  # force along (cos θ, 0, −sin θ), against the tip; 0 without friction
+    base: FloatArray  # (H, B) cosine harmonics of the base pressure at the base nodes
+    shear: float  # force against the tip along (cos θ, 0, −sin θ); 0 without friction
 
 
 class TiltedPlane:
@@ -50,7 +51,7 @@ class TiltedPlane:
             height = r * np.cos(phi) * sine + z * cosine
             near = height > 1 - d_max - BEYOND
             phi, half = phi[near, None], cells // 2
-            # The axes in cylindrical components, and the harmonics resolved by the ring's cells.
+            # Axes in cylindrical components, for the harmonics that the ring's cells resolve.
             x, y, upright = axes.T
             load = np.stack(
                 np.broadcast_arrays(
@@ -86,11 +87,11 @@ class TiltedPlane:
         self.depth = 0.0
 
     def press(self, d: float) -> Press:
-        """Solve at depth ``d``, starting from the cells in contact at the last press.
+        """Solve at depth ``d``, starting from the cells in contact in the last press.
 
-        Sticking depends on the path, so press deeper in small steps. A cell that comes into contact
-        within a step sticks at an interpolated position. Raises RuntimeError if the active sets do
-        not converge.
+        Sticking depends on the path, so increase the depth in small steps. A cell that comes into
+        contact within a step sticks at an interpolated position. Raises RuntimeError if the active
+        sets do not converge.
         """
         overlap, step = self.reach - (1 - d), len(self.axes)
         before = self.moved

@@ -1,10 +1,10 @@
-"""Fit of the data file to presses: a polynomial for the energy, a few modes for the base pressure.
+"""Fit the data file to presses: a polynomial for the energy, a few modes for the base pressure.
 
-The ratio of the energy to Hertz is fitted to energies and pushes together, so N = ∂U/∂d holds
-exactly. The base pressure over N is decomposed by singular values, one harmonic at a time, and the
-amplitudes of the modes are polynomials as well. All polynomials are Chebyshev series in s = √(d/a),
-sin²θ and ν; the notes in the file describe their layout. `SolidTip` reads the file with plain
-NumPy.
+The ratio of the energy to Hertz theory is fitted to energies and normal forces together, so
+N = ∂U/∂d holds exactly. The base pressure divided by N is decomposed by singular values, one
+harmonic at a time. The mode amplitudes are polynomials as well. All polynomials are Chebyshev
+series in s = √(d/a), sin²θ and ν; the notes in the file describe their layout. `SolidTip` reads the
+file using only NumPy.
 """
 
 from __future__ import annotations
@@ -25,23 +25,23 @@ NU = (0.45, 0.4995)
 S_MAX = np.sqrt(D_MAX)
 ORDERS = (11, 6)  # coefficients in s and sin²θ
 HARMONICS = 9
-RIM = 0.95  # cells beyond are ignored: a bonded base is singular there, and a lying one ends
+RIM = 0.95  # cells beyond it are down-weighted: bonded stress is singular, a lying base ends
 
 
 def chebyshev_nodes(low: float, high: float, count: int) -> FloatArray:
-    """Return Chebyshev points of the first kind on [low, high] in increasing order."""
+    """Return Chebyshev points of the first kind on [low, high] in ascending order."""
     return (low + high) / 2 - (high - low) / 2 * np.cos(np.pi * (np.arange(count) + 0.5) / count)
 
 
 class Samples(NamedTuple):
-    """Arrays over the presses of one base at one ν."""
+    """Arrays over all presses of one base at one ν."""
 
     d: FloatArray
     theta: FloatArray
     push: FloatArray
     energy: FloatArray
     shear: FloatArray
-    base: FloatArray  # (n, H, R) harmonics of the base pressure, means over rings
+    base: FloatArray  # (n, H, R) harmonics of the base pressure, averaged over rings
 
     @classmethod
     def of(cls, presses: list[Press], base_radius: FloatArray) -> Samples:
@@ -56,7 +56,7 @@ class Samples(NamedTuple):
 
 
 def ring_means(base_radius: FloatArray) -> FloatArray:
-    """Return the matrix (R, B) of area means over rings from quadratic elements at the nodes."""
+    """Return the matrix (R, B) of ring area means from quadratic elements with the given nodes."""
     points, gauss = GAUSS
     ends = base_radius[::2]
     cuts = np.unique(np.concatenate([RING_EDGES, ends]))
@@ -75,7 +75,7 @@ def ring_means(base_radius: FloatArray) -> FloatArray:
 def terms(
     s: FloatArray, theta: FloatArray, orders: tuple[int, int]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the products T_i T_j at each point, (n, I·J), and their derivatives by s."""
+    """Return the products T_i T_j at each point, (n, I·J), and their derivatives in s."""
     x, w = 2 * s / S_MAX - 1, 2 * (np.sin(theta) / np.sin(THETA_MAX)) ** 2 - 1
     first, second = chebyshev.chebvander(x, orders[0] - 1), chebyshev.chebvander(w, orders[1] - 1)
     slope = chebyshev.chebval(x, chebyshev.chebder(np.eye(orders[0]))).T * (2 / S_MAX)
@@ -84,7 +84,7 @@ def terms(
 
 
 def energy_terms(s: FloatArray, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the contributions of the energy's coefficients to U/U_Hertz and N/N_Hertz."""
+    """Return the contributions of the energy coefficients to U/U_Hertz and N/N_Hertz."""
     value, slope = terms(s, theta, ORDERS)
     return s[:, None] * value, s[:, None] * (1.2 * value + 0.2 * s[:, None] * slope)
 
@@ -94,7 +94,7 @@ def fit_energy(samples: Samples, poisson: float, step: float) -> FloatArray:
     s = np.sqrt(samples.d)
     hertz = 4 / (3 * (1 - poisson**2)) * s**3
     of_energy, of_push = energy_terms(s, samples.theta)
-    # Scatter of U and N between meshes, for a contact of radius s and this cell width.
+    # Scatter of U and N between meshes, for contact radius s and this cell width.
     scatter = 1e-4 + np.concatenate([0.05 * (step / s) ** 2, 0.2 * (step / s) ** 2 + 5e-4])
     right = np.concatenate([samples.energy / (0.4 * hertz * s**2) - 1, samples.push / hertz - 1])
     left = np.concatenate([of_energy, of_push])
@@ -105,13 +105,13 @@ def fit_energy(samples: Samples, poisson: float, step: float) -> FloatArray:
 def push_of(energy: FloatArray) -> FloatArray:
     """Convert coefficients of V to those of Q = 6/5 V + s/5 ∂V/∂s in N = N_Hertz (1 + s Q)."""
     slope = chebyshev.chebder(energy, axis=0) * (2 / S_MAX)
-    s = np.array([S_MAX / 2, S_MAX / 2])  # s itself, as a Chebyshev series
+    s = np.array([S_MAX / 2, S_MAX / 2])  # s as a Chebyshev series
     product = np.apply_along_axis(lambda row: chebyshev.chebmul(s, row), 0, slope)
     return np.asarray(1.2 * energy + 0.2 * product[: len(energy)])
 
 
 def over_nu(values: FloatArray) -> FloatArray:
-    """Convert values at the nodes of ν (first axis) to Chebyshev coefficients (last axis)."""
+    """Convert values at the ν nodes (first axis) to Chebyshev coefficients (last axis)."""
     count = len(values)
     x = chebyshev_nodes(-1, 1, count)
     inverse = np.linalg.inv(chebyshev.chebvander(x, count - 1))
@@ -121,7 +121,7 @@ def over_nu(values: FloatArray) -> FloatArray:
 def fit(
     all_samples: list[Samples], nodes: FloatArray, step: float, tolerance: float
 ) -> dict[str, FloatArray]:
-    """Fit the arrays of one base; ``nodes`` are the samples' values of ν, Chebyshev points."""
+    """Fit the arrays of one base; ``nodes`` are the ν values of the samples, Chebyshev points."""
     energy = np.array(
         [fit_energy(one, nu, step) for one, nu in zip(all_samples, nodes, strict=True)]
     )
@@ -130,7 +130,7 @@ def fit(
     patterns = np.array([one.base / one.push[:, None, None] for one in all_samples])
     s, theta = np.sqrt(all_samples[0].d), all_samples[0].theta
     design = terms(s, theta, ORDERS)[0]
-    # The shear along the plane is T = N sin θ cos θ Q, so that F = N cos θ (1 − sin² θ Q).
+    # The shear force along the plane is T = N sin θ cos θ Q, so F = N cos θ (1 − sin² θ Q).
     slope = np.sin(theta) * np.cos(theta)
     ratio = np.array([one.shear / one.push for one in all_samples])
     stick = np.linalg.lstsq(design * slope[:, None], ratio.T, rcond=None)[0].T
@@ -144,7 +144,7 @@ def fit(
     for m in range(HARMONICS):
         weight = np.sqrt(areas * (1.0 if m == 0 else 0.5)) * np.where(RING_EDGES[1:] > RIM, 0.05, 1)
         flat = patterns[:, :, m] * weight
-        # Include the moment on the base, so that the modes carry it despite the rim's low weight.
+        # Include the base moment, so that the modes reproduce it despite the rim's low weight.
         moment = (m == 1) * 2.0 * patterns[:, :, m] @ levers
         flat = np.concatenate([flat, moment[..., None]], axis=-1)
         _, size, rows = np.linalg.svd(flat.reshape(-1, areas.size + 1), full_matrices=False)
@@ -184,7 +184,7 @@ class SolidTip:
         self.edges = arrays["ring_edges"].astype(float)
 
     def press(self, d: float, theta: float) -> tuple[float, float, FloatArray]:
-        """Return push N, energy U and the harmonics (H, R) of the base pressure over the rings."""
+        """Return the normal force N, the energy U and the base pressure harmonics (H, R)."""
         s = np.sqrt(d)
         x = 2 * s / self.s_max - 1
         w = 2 * (np.sin(theta) / np.sin(self.theta_max)) ** 2 - 1
@@ -207,7 +207,7 @@ class SolidTip:
         return stick * float(np.sin(theta) * np.cos(theta))
 
     def frame(self, pressure: FloatArray, pitch: float, cells: int) -> FloatArray:
-        """Average the pressure over a square grid of cells centred under the tip, rows along y."""
+        """Average the pressure over a square grid of cells centred under the tip; rows along y."""
         parts, turns = 10, 2000  # radial and angular pieces of each ring
         edges = np.interp(
             np.arange(parts * (self.edges.size - 1) + 1) / parts,
@@ -229,5 +229,5 @@ class SolidTip:
 
 
 def rms_difference(one: ArrayLike, other: ArrayLike) -> float:
-    """Return the rms of the difference over the rms of ``other``."""
+    """Return the rms of the difference divided by the rms of ``other``."""
     return float(np.linalg.norm(np.subtract(one, other)) / np.linalg.norm(other))

@@ -1,14 +1,14 @@
 """Surface Green's functions of the hemisphere: response of its rings and base to ring loads.
 
 A ring is one element of the arc. The load is a traction that is constant along the ring's arc and
-of harmonic m around the axis. The response is the mean displacement of every ring and the pressure
-on the base.
+has harmonic m around the axis. The response consists of the mean displacement of every ring and the
+pressure on the base.
 
-The functions are computed by finite elements of the linear elastic hemisphere, one Fourier harmonic
-at a time. A displacement of harmonic m is (U cos mφ, V sin mφ, W cos mφ) with U, V, W on the
-meridian plane (r, z), a quarter disc. The elements are quadrilaterals with nine nodes. The volume
-strain is projected onto linear functions in each element (the Q2/P1 pair with the discontinuous
-pressure eliminated), which avoids locking as ν approaches ½.
+The functions are computed with finite elements of the linear elastic hemisphere, one Fourier
+harmonic at a time. A displacement of harmonic m is (U cos mφ, V sin mφ, W cos mφ), where U, V and W
+are defined on the meridian plane (r, z), a quarter disc. The elements are quadrilaterals with nine
+nodes. The volumetric strain is projected onto linear functions in each element (the Q2/P1 pair with
+the discontinuous pressure eliminated), which avoids locking as ν approaches ½.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from scipy.sparse.linalg import splu
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-# Rings of the base: fine at the rim, where a bonded base is singular, and mirrored beyond the rim,
-# where a lying base spreads.
+# Rings of the base. They are fine at the rim, where the stress of a bonded base is singular, and
+# are mirrored beyond the rim, where a lying base spreads.
 RING_EDGES = np.sin(np.linspace(0, np.pi / 2, 97))
 RING_EDGES = np.concatenate([RING_EDGES, 2 - RING_EDGES[RING_EDGES > 0.8][-2::-1]])
 MIDDLES = (RING_EDGES[1:] + RING_EDGES[:-1]) / 2
@@ -34,13 +34,13 @@ GAUSS = np.polynomial.legendre.leggauss(3)
 
 
 def quadratic(x: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the quadratic shape functions on [−1, 1] at ``x`` and their derivatives, (n, 3)."""
+    """Return the quadratic shape functions on [−1, 1] at ``x``, and their derivatives, (n, 3)."""
     values = np.stack([x * (x - 1) / 2, 1 - x * x, x * (x + 1) / 2], axis=-1)
     return values, np.stack([x - 0.5, -2 * x, x + 0.5], axis=-1)
 
 
 def graded(last: float, widest: float, growth: float, length: float) -> FloatArray:
-    """Return graded element ends on [0, length]; widths fall from ``widest`` to ``last``."""
+    """Return graded element ends on [0, length]; widths decrease from ``widest`` to ``last``."""
     widths = [last]
     while sum(widths) < length:
         widths.append(min(widths[-1] * growth, widest))
@@ -49,18 +49,18 @@ def graded(last: float, widest: float, growth: float, length: float) -> FloatArr
 
 
 class Meridian:
-    """Mesh of the quarter disc with ``rings`` elements along the arc where contact may occur."""
+    """Mesh of the quarter disc with ``rings`` elements along the arc, where contact may occur."""
 
     def __init__(self, rings: int, finer: float = 8.0, widest: float = 0.08) -> None:
         step = np.pi / 2 / rings
-        # Refine both directions towards the rim, where the stress of a bonded base is singular.
+        # Refine in both directions towards the rim, where the stress of a bonded base is singular.
         radii = graded(step / finer, min(2.5 * step, widest), 1.6, 1.0)
         angles = graded(step / finer, step, 2.0, np.pi / 2)
         self.layers, self.arcs = len(radii) - 1, len(angles) - 1
         radius, angle = (
             np.sort(np.concatenate([ends, (ends[1:] + ends[:-1]) / 2])) for ends in (radii, angles)
         )
-        # Node (i, j) is at radius i and polar angle j; all nodes with i = 0 are the origin, node 0.
+        # Node (i, j) is at radius i and polar angle j. All nodes with i = 0 are the origin, node 0.
         number = np.arange(radius.size * angle.size).reshape(radius.size, angle.size)
         number = np.maximum(number - angle.size + 1, 0)
         self.number = number
@@ -96,17 +96,17 @@ class Meridian:
         return shape, gradient, r, area * r
 
     def stiffness(self, m: int, poisson: float) -> sparse.csc_matrix:
-        """Return the stiffness of harmonic ``m`` for E = 1.
+        """Return the stiffness matrix of harmonic ``m`` for E = 1.
 
-        The degrees of freedom are 3 node + (0 U, 1 V, 2 W). The energy is integrated over r and z
-        only; the factor π (2π for m = 0) is omitted, as in the loads.
+        The degrees of freedom are 3 node + (0 U, 1 V, 2 W). The energy is integrated only over r
+        and z; the factor π (2π for m = 0) is omitted here and in the loads.
         """
         shear, lame = 0.5 / (1 + poisson), poisson / ((1 + poisson) * (1 - 2 * poisson))
         shape, gradient, r, weight = self._geometry
         count = len(self.elements)
         over_r = shape / r[:, :, None]
         d_r, d_z = gradient[..., 0], gradient[..., 1]
-        strain = np.zeros((count, 9, 6, 9, 3))  # rr, φφ, zz, and √½ of the engineering shears
+        strain = np.zeros((count, 9, 6, 9, 3))  # rr, φφ, zz, and engineering shear strains times √½
         strain[:, :, 0, :, 0] = d_r
         strain[:, :, 1, :, 0], strain[:, :, 1, :, 1] = over_r, m * over_r
         strain[:, :, 2, :, 2] = d_z
@@ -132,20 +132,20 @@ class Meridian:
         return sparse.csc_matrix((matrices.ravel(), (row.ravel(), column.ravel())), (size, size))
 
 
-STIFF = 1e4  # stiffness [E] of the springs that constrain the free motions of harmonic 1
+STIFF = 1e4  # E, stiffness of the springs that suppress rigid motions of harmonic 1
 CONTACT_END = np.radians(85.0)  # polar angle beyond which rings carry no contact
-CAP = 0.2  # polar angle of the cap on which a shear force acts [rad]
+CAP = 0.2  # rad, polar angle of the cap on which a shear force acts
 
 
 class Green(NamedTuple):
-    """Response of rings and base; components are (r, φ, z), rings are ordered from the pole."""
+    """Response of rings and base. Components are (r, φ, z); rings are ordered from the pole."""
 
     place: FloatArray  # (R, 2) mean r and z of each ring [a]
     weight: FloatArray  # (R,) ∫ r ds of each ring [a²]
-    cells: IntArray  # (R,) cells around each ring, an even number
+    cells: IntArray  # (R,) number of cells around each ring, even
     rings: FloatArray  # (M + 1, 3, R, 3, R) weight × mean displacement for unit traction
-    base_radius: FloatArray  # (B,) nodes of the base [a]
-    base: FloatArray  # (H, B, 3, R) base pressure at them for unit traction
+    base_radius: FloatArray  # (B,) radii of the base nodes [a]
+    base: FloatArray  # (H, B, 3, R) base pressure at these nodes for unit traction
 
 
 def arc_loads(mesh: Meridian) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -163,7 +163,7 @@ def arc_loads(mesh: Meridian) -> tuple[FloatArray, FloatArray, FloatArray, Float
 
 
 def base_mass(radius: FloatArray) -> sparse.csc_matrix:
-    """Return ∫ N N r dr of the base's quadratic elements, whose nodes are at ``radius``."""
+    """Return ∫ N N r dr of the quadratic base elements, whose nodes are at ``radius``."""
     points, gauss = GAUSS
     value, slope = quadratic(points)
     rows, columns, entries = [], [], []
@@ -179,7 +179,7 @@ def base_mass(radius: FloatArray) -> sparse.csc_matrix:
 
 
 def fixed(mesh: Meridian, m: int, bonded: bool) -> IntArray:
-    """Return the fixed degrees of freedom: base, axis, and the twist of symmetric loads."""
+    """Return the fixed degrees of freedom: base, axis and, for symmetric loads, the twist."""
     base = 3 * mesh.base[:, None] + (np.arange(3) if bonded else np.array([2]))
     axis = 3 * mesh.axis[:, None] + {0: [0, 1], 1: [2]}.get(m, [0, 1, 2])
     twist = 3 * np.arange(len(mesh.nodes) if m == 0 else 0) + 1
@@ -187,7 +187,7 @@ def fixed(mesh: Meridian, m: int, bonded: bool) -> IntArray:
 
 
 def supports(mesh: Meridian, m: int, bonded: bool) -> sparse.csc_matrix | float:
-    """Return the springs of harmonic 1: U + V = 0 on the axis, and the mean of a lying base."""
+    """Return the springs of harmonic 1: U + V = 0 on the axis; no mean motion of a lying base."""
     if m != 1:
         return 0.0
     size = 3 * len(mesh.nodes)
@@ -207,7 +207,7 @@ def supports(mesh: Meridian, m: int, bonded: bool) -> sparse.csc_matrix | float:
 
 
 def green(rings: int, poisson: float, bonded: bool, base_harmonics: int = 12) -> Green:
-    """Compute the Green's functions for ``rings`` elements along the arc, with square cells."""
+    """Compute the Green's functions for ``rings`` elements along the arc, using square cells."""
     mesh = Meridian(rings)
     place, weight, nodal, angle = arc_loads(mesh)
     count = int(np.sum(angle < CONTACT_END))
@@ -229,7 +229,7 @@ def green(rings: int, poisson: float, bonded: bool, base_harmonics: int = 12) ->
         factors = splu(
             held, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
         )
-        loads = np.zeros((size, 3 * active.size))  # columns: component, then ring
+        loads = np.zeros((size, 3 * active.size))  # columns are sorted by component, then by ring
         for k, ring in enumerate(active):
             for c in range(3):
                 loads[3 * arc[2 * ring : 2 * ring + 3] + c, c * active.size + k] = nodal[ring]
@@ -244,7 +244,7 @@ def green(rings: int, poisson: float, bonded: bool, base_harmonics: int = 12) ->
 
 
 def shear_response(rings: int, poisson: float, bonded: bool) -> tuple[FloatArray, FloatArray]:
-    """Return the base's nodes and harmonic 1 of its pressure for a unit shear force on the cap."""
+    """Return base node radii and harmonic 1 of their pressure for a unit shear force on the cap."""
     mesh = Meridian(rings)
     _, _, nodal, angle = arc_loads(mesh)
     load = np.zeros(3 * len(mesh.nodes))

@@ -1,15 +1,15 @@
-"""Neo-Hookean finite elements of the hemisphere under a rigid plane, in the deformed state.
+"""Neo-Hookean finite elements of the hemisphere under a rigid plane, in the deformed configuration.
 
 The strain energy is W = μ/2 (J^(−2/3) tr FᵀF − 3) + κ/2 (J − 1)² with μ = E/(2 + 2ν) and
-κ = E/(3 − 6ν), from E and ν at small strains. Elements have 27 nodes. In the volumetric part, J − 1
-is projected onto linear functions in each element (mean dilatation to first order), which avoids
-locking as ν approaches ½. The mesh is a revolved meridian mesh. For a tilted plane it covers half a
-turn, with the symmetry plane y = 0. For an upright plane it is one thin wedge whose nodes have
-equal motions along r and z.
+κ = E/(3 − 6ν), where E and ν are the small-strain values. Elements have 27 nodes. In the volumetric
+part, J − 1 is projected onto linear functions in each element (mean dilatation to first order),
+which avoids locking as ν approaches ½. The mesh is obtained by revolving a meridian mesh. For a
+tilted plane, it covers half a turn, with the symmetry plane y = 0. For an upright plane, it is one
+thin wedge, and all nodes at the same r and z have the same motion.
 
-Contact is between the plane and nodes. An active node lies in the plane, transmits a normal force,
-and moves freely along the plane unless the face sticks. Each Newton step also updates the active
-set. The linear solver is pypardiso.
+Contact occurs between the plane and nodes. An active node lies in the plane, transmits a normal
+force, and moves freely along the plane unless the face sticks. Each Newton step also updates the
+active set. The linear solver is pypardiso.
 """
 
 from __future__ import annotations
@@ -35,24 +35,24 @@ from research.solid_tip.green import (
     quadratic,
 )
 
-WEDGE = 0.1  # angle of the wedge [rad]
-STIFF = 1e3  # stiffness [E] of the spring that holds the mean position of a lying base
+WEDGE = 0.1  # rad, angle of the wedge
+STIFF = 1e3  # E, stiffness of the spring that holds the mean position of a lying base
 HARMONICS = 9
-AZIMUTHS = 48  # number of azimuths at which base pressures are evaluated
+AZIMUTHS = 48  # number of azimuths at which the base pressure is evaluated
 SLICES = 8
 ROOTS = np.linspace(0.2, np.sqrt(0.4), 8)  # √(d/a) of the presses
-REACHED = 0.5  # lowest height of nodes that the plane may touch, undeformed [a]
-CHUNK = 64  # elements processed at once
+REACHED = 0.5  # a, minimum undeformed height of nodes that the plane may touch
+CHUNK = 64  # number of elements processed at once
 
 
 class Strained(NamedTuple):
     """Result of one press for E = a = 1, with nonlinear or linear elements."""
 
     d: float
-    push: float  # N along the plane's normal
-    shear: float  # force along (cos θ, 0, −sin θ), against the tip
+    push: float  # normal force N
+    shear: float  # force against the tip along (cos θ, 0, −sin θ)
     energy: float
-    base: FloatArray  # (H, R) harmonics of the base pressure at radii on the sensor
+    base: FloatArray  # (H, R) harmonics of the base pressure versus radius on the sensor
 
 
 class State(NamedTuple):
@@ -60,8 +60,8 @@ class State(NamedTuple):
 
     depth: float
     motion: FloatArray  # displacement of each dof
-    touching: NDArray[np.bool_]  # nodes of the face
-    held: FloatArray  # their positions along the plane while sticking
+    touching: NDArray[np.bool_]  # contact state of the face nodes
+    held: FloatArray  # positions of sticking nodes along the plane
 
 
 class Body:
@@ -87,7 +87,7 @@ class Body:
         self._revolve(mesh, phis)
         gradient = self._geometry()
         turns = self._free_nodes(bonded) if whole else self._axisymmetric(mesh, bonded)
-        # Matrix from an element's dofs to the displacement gradient at its quadrature points.
+        # Matrix from element dofs to the displacement gradient at the quadrature points.
         size = self.places.shape[1]
         self.strain = np.zeros((len(self.elements), 243, size))
         for k in range(3):
@@ -140,7 +140,7 @@ class Body:
         self.below = np.unique(self.base)
         face = np.setdiff1d(np.unique(number[mesh.number[-1]]), self.below)
         self.face = face[self.nodes[face] @ self.axes[0] > REACHED]
-        self.lines = number[mesh.base].T  # nodes of the base from the centre to the rim
+        self.lines = number[mesh.base].T  # base nodes from the centre to the rim
 
     def _geometry(self) -> FloatArray:
         """Set weights and linear functions; return shape function gradients (e, q, 27, 3)."""
@@ -172,7 +172,7 @@ class Body:
         return np.asarray(gradient)
 
     def _free_nodes(self, bonded: bool) -> FloatArray:
-        """Define three dofs per node: along the plane's axes on the face, else along x, y, z."""
+        """Define three dofs per node: along the plane's axes on the face, otherwise x, y, z."""
         frames = np.tile(np.eye(3), (len(self.nodes), 1, 1))
         frames[self.face] = self.axes.T
         turns = np.zeros((len(self.elements), 27, 3, 27, 3))
@@ -197,7 +197,7 @@ class Body:
         return turns
 
     def _axisymmetric(self, mesh: Meridian, bonded: bool) -> FloatArray:
-        """Define two dofs per node of the meridian, along z and r."""
+        """Define two dofs per meridian node, along z and r."""
         self.frames = np.zeros((len(self.nodes), 3, 2))
         phi = np.arctan2(self.nodes[:, 1], self.nodes[:, 0])
         self.frames[:, 2, 0] = 1.0
@@ -241,7 +241,7 @@ class Body:
         return np.asarray(moved.reshape(-1, 27, 3, 3))
 
     def pressures(self, motion: FloatArray, change: FloatArray) -> FloatArray:
-        """Return the linear functions of p after a ``change`` of motion, to first order."""
+        """Return p as linear functions, to first order after a ``change`` of motion."""
         moved = self._strain(slice(None), motion)
         more = self._strain(slice(None), change)
         f = moved + np.eye(3)
@@ -250,17 +250,17 @@ class Body:
         return np.asarray(self.bulk * (self.project @ volume[..., None])[..., 0])
 
     def least_volume(self, motion: FloatArray) -> float:
-        """Return the smallest J of all points."""
+        """Return the minimum J over all points."""
         return float(np.linalg.det(self._strain(slice(None), motion) + np.eye(3)).min())
 
     def forces(
         self, motion: FloatArray, pressures: FloatArray | None = None
     ) -> tuple[float, FloatArray, FloatArray | None]:
-        """Return the energy, the forces on the dofs and, with ``pressures``, the upper tangent.
+        """Return the energy, the dof forces and, if ``pressures`` are given, the upper tangent.
 
-        ``pressures`` are the coefficients (e, 4) of the linear functions of each element, updated
-        as in the Newton steps of a mixed method. Otherwise the second-order change of volume in a
-        step, multiplied by κ, would distort the next tangent.
+        ``pressures`` are the coefficients (e, 4) of each element's linear functions, updated as in
+        the Newton steps of a mixed method. Without them, the second-order volume change in a step,
+        multiplied by κ, would distort the next tangent.
         """
         if self.at_rest is not None:
             out = self.times_tangent(self.at_rest, motion)
@@ -314,7 +314,7 @@ class Body:
         four -= both + both.transpose(0, 1, 3, 2)
         one = g[..., :, None] * g[..., None, :]
         four += (2 / 9 * scale * first + bent)[..., None, None] * one
-        # F^−T dFᵀ F^−T: swap the two second indices.
+        # F^−T dFᵀ F^−T: swap the second indices.
         turned = one.reshape(count, 27, 3, 3, 3, 3).transpose(0, 1, 2, 5, 4, 3)
         four += (scale * first / 3 - bent)[..., None, None] * turned.reshape(count, 27, 9, 9)
         return stress, density, four, swell
@@ -337,9 +337,9 @@ class Body:
         return np.asarray(found).squeeze()
 
     def _solve_at_rest(self, right: FloatArray, known: FloatArray) -> FloatArray:
-        """Solve the linear elements as in `solve`, from the response to forces on the face."""
+        """Solve for linear elements as in `solve`, using the response to forces on the face."""
         assert self.moves is not None
-        # All forces except those on the face are in equilibrium from the start.
+        # All forces except those on the face are at equilibrium from the start.
         given = ~np.isnan(known[self.pushed])
         load = right[self.pushed]
         if given.any():
@@ -350,13 +350,13 @@ class Body:
         return np.asarray(self.moves @ load)
 
     def times_tangent(self, numbers: FloatArray, vector: FloatArray) -> FloatArray:
-        """Multiply the tangent, given by its upper triangle, with a vector."""
+        """Multiply the tangent, given by its upper triangle, by a vector."""
         matrix = sparse.csr_matrix((numbers, self.columns, self.starts), (self.count, self.count))
         diagonal = numbers[self.rows == self.columns]
         return np.asarray(matrix @ vector + matrix.T @ vector - diagonal * vector)
 
     def press(self, depths: Iterable[float]) -> Iterator[Strained]:
-        """Press to increasing ``depths``, each from the last; stop where there is no solution."""
+        """Press to increasing ``depths`` in sequence; stop if there is no solution."""
         state = State(
             0.0,
             np.zeros(self.count),
@@ -414,7 +414,7 @@ class Body:
             reaction = (forces + self.times_tangent(numbers, change))[self.normal]
             gap = motion[self.normal] - target
             now = np.where(touching, reaction < 0, gap > 1e-10)
-            if attempt > 15:  # nodes that alternate stay active
+            if attempt > 15:  # keep nodes active that alternate
                 now |= touching
             still = np.abs(change).max() < 1e-6 and size == 1.0
             if still and (now == touching).all():
@@ -428,7 +428,7 @@ class Body:
         raise RuntimeError(f"no contact found at d = {d} a, θ = {self.theta} rad")
 
     def base_pressure(self, motion: FloatArray, forces: FloatArray) -> FloatArray:
-        """Return cosine harmonics of the base pressure at `MIDDLES`, at the deformed positions."""
+        """Return cosine harmonics of the base pressure at `MIDDLES` in the deformed position."""
         place = self.nodes.copy()
         if self.at_rest is not None:  # linear elements
             motion = 0 * motion
@@ -467,7 +467,7 @@ class Body:
         return np.asarray(np.where(m == 0, 1.0, 2.0) / AZIMUTHS * (np.cos(m * phi) @ at))
 
     def _between(self) -> FloatArray:
-        """Return the interpolation from the lines of nodes to four times as many azimuths."""
+        """Return the interpolation from the node lines to four times as many azimuths."""
         count = len(self.lines)
         local = np.linspace(0, count - 1, 4 * (count - 1) + 1)
         first = 2 * np.minimum(local // 2, count // 2 - 1).astype(int)
@@ -478,7 +478,7 @@ class Body:
         return out
 
     def _base_shares(self, nodes: FloatArray) -> FloatArray:
-        """Return ∫ N dA of each node of the base's facets."""
+        """Return ∫ N dA for each node of the base facets."""
         return np.asarray(self._base_mass(nodes).sum(axis=2))
 
     def _base_mass(self, nodes: FloatArray) -> FloatArray:

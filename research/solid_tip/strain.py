@@ -1,10 +1,12 @@
 """Finite strain: ``python -m research.solid_tip.strain LINEAR OUT --folder FOLDER``.
 
-The program reads the file of the linear law (``python -m research.solid_tip``) and writes the
-neo-Hookean one in the same format. The effect of finite strain is computed with the linear and the
-neo-Hookean elements of `rubber` on the same mesh, so the mesh error cancels. Energies are scaled by
-the ratio of both kinds, and base pressures over the push are changed by their difference. Upright
-presses use a fine mesh. Tilted presses use a coarse mesh, relative to upright presses on that mesh.
+The program reads the linear model from the file written by ``python -m research.solid_tip`` and
+writes the neo-Hookean model in the same format. To obtain the effect of finite strain, the linear
+and neo-Hookean elements of `rubber` are compared on the same mesh, so the mesh error cancels. The
+ratio of their energies scales the energy of the linear model. The difference of their base
+pressures, relative to the normal force, is added to the base pressure of the linear model. Upright
+presses use a fine mesh. Tilted presses use a coarse mesh and are compared with upright presses on
+that mesh.
 """
 
 from __future__ import annotations
@@ -27,15 +29,16 @@ from research.solid_tip.rubber import HARMONICS, strained
 NU = fit.chebyshev_nodes(*fit.NU, 3)
 SINES = np.sin(fit.THETA_MAX) ** 2 * (1 - np.cos(np.pi * np.arange(5) / 4)) / 2  # sin²θ
 AREAS = np.pi * np.diff(RING_EDGES**2)
-# Indices of sin²θ in `SINES` to press for each block, with their values of ν. At the far corner of
-# the domain, lying rubber is crushed and the elements do not converge; the fit extrapolates there.
+# For each block, the indices of sin²θ in `SINES` to press, with the values of ν. At the far corner
+# of the domain, the elements of lying rubber are crushed and do not converge; there the fit
+# extrapolates.
 TILTS = {
     "bonded": {1: NU[1:2], 2: NU[1:2], 4: NU[1:2]},
     "lying": {1: NU[1:2], 2: NU[1:2]},
     "bonded-sticking": {2: NU[1:2], 4: NU[1:2]},
     "lying-sticking": {2: NU[1:2]},
 }
-IN_ROOT = 5  # terms in √(d/a) of the effect of strain, which begin with d/a
+IN_ROOT = 5  # terms in √(d/a) for the effect of strain; the lowest order is d/a
 
 
 NOTES = """Hemisphere of neo-Hookean rubber, W = μ/2 (J^(−2/3) tr FᵀF − 3) + κ/2 (J − 1)², pressed
@@ -54,25 +57,25 @@ that carries the tip's own; it presses where it has slid to, beyond 1, too. forc
 pressure_error: of N, and of the base pressure where it is smooth (within 0.95 a), against elements
 of other meshes, d to 0.35 a, θ to 20°. Largest and rms differences of what was fitted:
 {errors}"""
-# From the presses of tests/harness/solid_reference.py. A coarse mesh hardly resolves a tilted
-# bonded rim.
+# From the presses in tests/harness/solid_reference.py. A coarse mesh hardly resolves the rim of a
+# tilted bonded base.
 FORCE_ERROR = 0.005
 PRESSURE_ERROR = {"bonded": 0.01, "lying": 0.004}
 
 
 class Change(NamedTuple):
-    """Effect of strain on presses at one θ and ν, over the sampled d."""
+    """Effect of strain on presses at one θ and ν, versus d."""
 
     s: FloatArray
     energy: FloatArray  # ratio to the linear energy, minus 1 (n,)
     push: FloatArray
     lever: FloatArray  # linear U/(N d)
-    shear: FloatArray  # over the push
-    base: FloatArray  # over the push (n, H, R)
+    shear: FloatArray  # divided by the normal force
+    base: FloatArray  # divided by the normal force (n, H, R)
 
 
 def change(arrays: Mapping[str, FloatArray], theta: float) -> Change:
-    """Compare the linear and nonlinear presses of `rubber.strained`."""
+    """Compare the linear and nonlinear presses from `rubber.strained`."""
     d, push, shear, energy = (arrays[name] for name in ("d", "push", "shear", "energy"))
     force = push * np.cos(theta) - shear * np.sin(theta)
     found = arrays["base"][:, :, 0] @ AREAS
@@ -89,7 +92,7 @@ def change(arrays: Mapping[str, FloatArray], theta: float) -> Change:
 
 
 def in_root(s: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the terms d/a T_i(s) at each s (n, i), and their derivatives by d/a."""
+    """Return the terms d/a T_i(s) at each s (n, i), and their derivatives with respect to d/a."""
     x = 2 * s / fit.S_MAX - 1
     value = chebyshev.chebvander(x, IN_ROOT - 1)
     slope = chebyshev.chebval(x, chebyshev.chebder(np.eye(IN_ROOT))).T * (2 / fit.S_MAX)
@@ -97,9 +100,9 @@ def in_root(s: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def coefficients(each: Change, step: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Fit coefficients of U's ratio (i,), T (i,) and base pressure (i, H, R).
+    """Fit coefficients of the energy ratio (i,), T (i,) and base pressure (i, H, R).
 
-    ``step`` is the width of the cells.
+    ``step`` is the cell width.
     """
     value, slope = in_root(each.s)
     scatter = 0.001 + 0.05 * (step / each.s) ** 2
@@ -116,7 +119,7 @@ def coefficients(each: Change, step: float) -> tuple[FloatArray, FloatArray, Flo
 
 
 def through(points: FloatArray, values: FloatArray) -> Callable[[float], FloatArray]:
-    """Return the polynomial through ``values`` (first axis) at ``points``."""
+    """Return the polynomial that interpolates ``values`` (first axis) at ``points``."""
 
     def at(point: float) -> FloatArray:
         weights = [
@@ -129,10 +132,10 @@ def through(points: FloatArray, values: FloatArray) -> Callable[[float], FloatAr
 
 
 class Strain:
-    """Effect of strain in one block for any d, θ and ν."""
+    """Effect of strain in one block, for any d, θ and ν."""
 
     def __init__(self, block: str, tilts: Mapping[int, FloatArray], folder: Path) -> None:
-        """Set up a block; ``tilts`` maps indices of `SINES` to the coarse presses' values of ν."""
+        """Set up a block; ``tilts`` maps indices of `SINES` to the ν values of coarse presses."""
         fine, coarse = Meridian(16), Meridian(8, finer=2, widest=0.2)
 
         def of(name: str, poisson: float, mesh: Meridian, theta: float | None) -> Any:
@@ -161,9 +164,9 @@ class Strain:
         self.energy, self.shear, self.base, self.first = energy, shear, base, first
 
     def at(self, poisson: float) -> Callable[[float], tuple[FloatArray, FloatArray, FloatArray]]:
-        """Return a function of sin²θ for the coefficients at one ν.
+        """Return a function of sin²θ that gives the coefficients at one ν.
 
-        The coefficients are those of U's ratio, T over N sin θ cos θ, and the base pressure.
+        The coefficients are those of the energy ratio, T/(N sin θ cos θ) and the base pressure.
         """
         energy, _, base = (each(poisson) for each in self.upright)
         rises, shears, bases, firsts = (
@@ -173,7 +176,7 @@ class Strain:
         rise = through(np.append(0.0, self.sines), np.concatenate([[0 * rises[0]], rises]))
         first = through(np.append(0.0, self.sines), np.concatenate([[0 * firsts[0]], firsts]))
         shear, harmonics = through(self.sines, shears), through(self.sines, bases)
-        # At small tilts the higher harmonics are tiny; over sin^m θ only the mesh error would show.
+        # At small tilts the higher harmonics are tiny; divided by sin^m θ, they are all mesh error.
         least = len(self.sines) > 1
         higher = through(self.sines[least:], bases[least:])
 
@@ -187,7 +190,7 @@ class Strain:
         return of
 
     def strain(self, tip: SolidTip) -> fit.Samples:
-        """Return the presses of the linear ``tip`` over the whole domain with finite strain."""
+        """Return presses of the linear ``tip`` over the whole domain, with finite strain added."""
         rows = []
         at = self.at(tip.poisson)
         for square in fit.chebyshev_nodes(0, np.sin(fit.THETA_MAX) ** 2, 9):
@@ -209,7 +212,7 @@ class Strain:
 
 
 def main() -> None:
-    """Compute the presses that are not in the folder yet, and write the file."""
+    """Compute the presses that are missing from the folder, and write the file."""
     parser = argparse.ArgumentParser(
         prog="python -m research.solid_tip.strain", description=__doc__
     )
