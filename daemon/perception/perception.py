@@ -122,7 +122,7 @@ class FingerPerception:
     def __init__(
         self, sensor: TactileSensor, model: FingerModel, settings: Settings, events: list[Event]
     ) -> None:
-        """Create the perception of one finger; a failed tare appends to ``events``."""
+        """Create the perception of one finger; each tare appends to ``events``."""
         full = getattr(sensor, "full_count", None)  # some recordings have their own
         if full is not None and full < settings.tactile.full_count:
             own = settings.tactile.model_copy(update={"full_count": full})
@@ -156,8 +156,8 @@ class FingerPerception:
         self.info = self._info(settings, model)
         self._events = events
         self._zero: NDArray[np.uint16] | None = None  # used without a converter
-        live = np.ones(model.grid.shape, np.bool_) if active is None else active
-        self._unloaded = UnloadedCells(model.grid, settings.tip.radius, live)
+        self._live = np.ones(model.grid.shape, np.bool_) if active is None else active
+        self._unloaded = UnloadedCells(model.grid, settings.tip.radius, self._live)
         self._noise = tactile.noise  # of a cell, from the settings [Pa]
         self._tare_sum: NDArray[np.uint32] | int = 0
         self._tare_remaining_count = 0
@@ -249,15 +249,23 @@ class FingerPerception:
         self._tare_remaining_count -= 1
         if self._tare_remaining_count:
             return
-        mean = self._tare_sum / _TARE_FRAME_COUNT
+        mean, side = self._tare_sum / _TARE_FRAME_COUNT, FINGERS[self.finger]
         ends = self._full_count - np.round(mean)
         if not np.median(ends) > 0.0:  # above such a zero no contact could be measured
-            side = FINGERS[self.finger]
             text = f"{side} sensor's zero stays: most cells are full where nothing presses"
             self._events.append(("warning", "tare", text))
-        elif self._converter is not None:
+            return
+        if self._converter is not None:
+            moved = (mean - self._converter.zero)[self._live & self._converter.live]
             self._converter.zero[:] = mean
             self._estimator.saturation = self._converter.saturation
         else:
+            moved = (mean - (0 if self._zero is None else self._zero))[self._live]
             self._zero = np.round(mean).astype(np.uint16)
             self._estimator.saturation = least_end(ends)
+        middle, most = float(np.median(moved)), float(moved[np.argmax(np.abs(moved))])
+        text = (
+            f"{side} sensor's zero moved by {middle:+.1f} counts "
+            f"({middle * self._quantum:+.0f} Pa), one cell by {most:+.1f} counts"
+        )
+        self._events.append(("info", "tare", text))

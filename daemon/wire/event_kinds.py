@@ -248,9 +248,11 @@ KINDS: dict[str, EventKind] = {
         "Find the model with `softfinger calibrate law`; check `tactile.dead` and the noise.",
     ),
     "tare": EventKind(
-        "warning",
-        "The sensor's zero was not changed, since most cells are saturated without contact.",
-        "Check the board's gain and `tactile.full_count`.",
+        "info, warning",
+        "A tare ended: the median change of the cells' zeros, and the largest. The warning says "
+        "that the zero was not changed, since most cells are saturated without contact.",
+        "After the warning, check the board's gain and `tactile.full_count`. A large change at "
+        "every start is worth a new `softfinger calibrate tare`.",
     ),
     # The hand's parts compared with each other
     "hand.angle": EventKind(

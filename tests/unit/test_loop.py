@@ -10,6 +10,7 @@ import pytest
 from softfinger.daemon.errors import Refused
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.loop.publishing import parts
+from softfinger.daemon.types import Frame
 from softfinger.daemon.wire.schema import STATE
 from tests.harness.golden_wire import message_maker
 from tests.harness.loop import (
@@ -212,6 +213,35 @@ def test_tare_removes_a_constant_offset(make):
     grasped(daemon, 6.0)
     daemon.loop.advance(1.0)
     assert daemon.loop.state.contacts[0].force == pytest.approx(daemon.hand.force[0], rel=0.05)
+
+
+def test_a_tare_reports_the_change_of_the_zero(make):
+    daemon = make()
+    events = heard(daemon)
+
+    def tared(offset: int, spike: int) -> str:
+        def raised(frame: Frame) -> Frame:
+            data = np.full_like(frame.data, 100 + offset)
+            data[3, 4] = 100 + offset + spike
+            return replace(frame, data=data)
+
+        del events[:]
+        change_frames(daemon, 0, raised)
+        command(daemon, "tare")
+        daemon.loop.advance(0.5)
+        [text] = [text for level, kind, text in events
+                  if (level, kind) == ("info", "tare") and text.startswith("left")]  # fmt: skip
+        return text
+
+    pascal = daemon.settings.tactile.pascal_per_count
+    found = tared(0, 0)
+    assert found.startswith(f"left sensor's zero moved by +100.0 counts ({100 * pascal:+.0f} Pa)")
+    assert tared(30, 50) == (
+        f"left sensor's zero moved by +30.0 counts ({30 * pascal:+.0f} Pa), "
+        "one cell by +80.0 counts"
+    )
+    # The change is that from the last zero, not from the first.
+    assert tared(-10, -60).endswith("one cell by -150.0 counts")
 
 
 def test_a_tare_of_saturated_sensors_keeps_the_zero_offset_and_is_reported(make):
