@@ -56,7 +56,8 @@ steps of a tip, in this order; each is written into FILE, which keeps the others
   centre       presses upright or at known tilt (--theta): position and rotation of the tip
   modulus      a run of known displacement (--d): E; the zero of d is fitted
   law          presses at known depths and tilts (--d, --theta): compares springs and solid rubber
-               by E, ν, fit to the frames and remaining error
+               by E, ν, fit to the frames and remaining error; or --compression with CSV files of a
+               testing machine: E, or E over d, by force alone
   relaxation   a press held for some seconds at a known d (--d, --frames 500): initial stiffness of
                the rubber relative to its final stiffness, for the profile
   scales       factors of the tip's modulus, the sensor's gain and the joint's torque, as estimated
@@ -86,6 +87,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=[],
         metavar="R",
         help="recordings to use instead of the live sensor",
+    )
+    parser.add_argument(
+        "--compression",
+        type=Path,
+        nargs="+",
+        default=[],
+        metavar="CSV",
+        help="law: files with d and F, or strain and stress, with units in the header; --theta "
+        "gives the tilt of each file that has no column for it",
     )
     parser.add_argument(
         "--frames", type=_frames, default=64, help="live frames for each load (default 64)"
@@ -128,6 +138,10 @@ def run(arguments: argparse.Namespace) -> int:
         The file is then unchanged.
     """
     step = arguments.step
+    if arguments.compression and step != "law":
+        from softfinger.kinematics.calibration.calibration import CalibrationError
+
+        raise CalibrationError(f"--compression: found the step {step}, expected law")
     if step in _OF_PROFILE and arguments.config is None:
         arguments.config = arguments.file
     settings = profile(arguments)
@@ -163,8 +177,15 @@ def _calibrate_tip(arguments: argparse.Namespace, settings: Settings) -> str:
 
     file = arguments.file
     calibration = begin(arguments, settings)
-    loads = gather(arguments, settings, calibration)
-    calibration, line, panels = done(Step(arguments, settings, calibration, loads))
+    if arguments.compression:
+        from softfinger.tools.calibration.compression import fit_files
+
+        calibration, line, panels = fit_files(
+            calibration, settings, arguments.compression, arguments.theta
+        )
+    else:
+        loads = gather(arguments, settings, calibration)
+        calibration, line, panels = done(Step(arguments, settings, calibration, loads))
     save_calibration(file, calibration)
     if panels and not arguments.no_plot:
         try:

@@ -1,0 +1,392 @@
+"""Fit the law of a tip to the displacement and force of a testing machine.
+
+A platen presses the tip along the platen's normal and sticks to it, so the machine measures
+∂U/∂d. The zeros of d and F of each run, and the first contact of an uneven surface (the toe of the
+curve), are not known beforehand.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from typing import Any, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from softfinger.kinematics.calibration.calibration import CalibrationError
+from softfinger.kinematics.contact.closed_form import Base, Face, Fingertip
+from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.contact.table import ContactTable
+
+FloatArray = NDArray[np.float64]
+
+_UNIT = Material.constant(1.0)
+_SLACK = 0.02  # of the range of d; smaller reversals are noise of the encoder
+_TURNS = 5  # rows per reversal of d, below which the rows are not in the order of the test
+_DEEP = 0.9  # of the deepest d; a shallower cycle is preconditioning
+TOE = 0.1  # of the depth, on either side of the first contact
+_STEEP = 0.2  # of the largest force, above which the curve shows where it begins
+_POWER = 0.55  # makes F(d) of springs and solid rubber nearly straight
+_FEWEST = 6  # rows of a run that are fitted
+_LOADED = 20.0  # times the noise, least force of a run
+_SMOOTHEST = 1e-4  # of the largest force, least noise: rounding and interpolation
+_ROUNDS = 60
+_CLIP = 0.02  # of the depth, largest step of the zero of d
+_STEP = 1e-8  # m, step of numerical derivatives
+_TOLERANCE = 1e-7  # of the tables
+_EDGE = 1.0 - 1e-4  # of the range of a table, with room for the step
+_TOO_DEEP = "the run is deeper or more tilted than its data"
+_NO_BEGINNING = "no zero of d fits: the run must show where the contact begins"
+# Further coefficients of the laws whose forces span those of σ = c_1 ε + c_2 ε² + c_3 ε³.
+_POWERS: tuple[tuple[Fraction, ...], ...] = ((), (Fraction(1),), (Fraction(0), Fraction(1)))
+
+
+@dataclass(frozen=True)
+class Run:
+    """Loading branch of one compression at a fixed tilt.
+
+    ``theta`` is in rad, ``d`` [n] in m and ``force`` [n] in N, both with zeros of their own.
+    ``begin`` [m] is where the curve begins, ``dropped`` the number of rows of other branches.
+    """
+
+    theta: float
+    d: FloatArray
+    force: FloatArray
+    begin: float
+    cycles: int
+    dropped: int
+
+    @property
+    def depth(self) -> float:
+        """Largest d beyond the beginning of the curve [m]."""
+        return float(self.d.max()) - self.begin
+
+    @property
+    def toe(self) -> float:
+        """Half width of the toe [m]."""
+        return TOE * self.depth
+
+    @property
+    def before(self) -> NDArray[np.bool_]:
+        """Rows before the contact."""
+        return self.d < self.begin - self.toe
+
+    @property
+    def pressed(self) -> NDArray[np.bool_]:
+        """Rows beyond the toe."""
+        return self.d > self.begin + self.toe
+
+
+def loading(d: ArrayLike, force: ArrayLike, theta: float = 0.0) -> Run:
+    """Find the loading branch of a test, and where its curve begins.
+
+    Of several cycles, the last one that reaches the full depth is used, because rubber softens in
+    its first cycles (Mullins, 1948). The branch ends within 0.5 % of the largest d, so that a hold
+    is not part of it.
+
+    Parameters
+    ----------
+    d, force
+        Displacement [m] and force [N] in the order of the test, both [n].
+    theta
+        Tilt of the platen [rad].
+
+    Raises
+    ------
+    CalibrationError
+        If the rows are not in the order of a test, are an unloading, or carry no load.
+    """
+    depth, load = np.asarray(d, np.float64), np.asarray(force, np.float64)
+    used, cycles = rising(depth)
+    begin = _begin(depth[used], load[used])
+    dropped = depth.size - (used.stop - used.start)
+    run = Run(theta, depth[used], load[used], begin, cycles, dropped)
+    if (count := np.count_nonzero(run.pressed)) < _FEWEST:
+        raise CalibrationError(
+            f"found {count} rows of loading beyond the toe, expected at least {_FEWEST}"
+        )
+    if np.ptp(run.force[run.pressed]) < _LOADED * _noise([run]):
+        raise CalibrationError(
+            f"found a force of {np.ptp(run.force):.3g} N with a scatter of {_noise([run]):.2g} N, "
+            f"expected {_LOADED:g} times the scatter: the tip was not loaded"
+        )
+    return run
+
+
+def rising(d: FloatArray) -> tuple[slice, int]:
+    """Return the rows of the last rising branch of ``d`` to its full depth, and their number.
+
+    Raises CalibrationError as `loading`.
+    """
+    span = float(np.ptp(d)) if d.size else 0.0
+    if not span > 0.0:
+        raise CalibrationError("found one displacement in all rows, expected a run that presses")
+    turns = _turning_points(d, _SLACK * span)
+    if len(turns) - 2 > max(2, d.size // _TURNS):
+        raise CalibrationError(
+            f"found {len(turns) - 2} reversals of d in {d.size} rows, expected the order of the "
+            "test: sort the rows by time"
+        )
+    top = d.max() - (1.0 - _DEEP) * span
+    found = [(i, j) for i, j in itertools.pairwise(turns) if d[j] > d[i] and d[j] >= top]
+    if not found:
+        raise CalibrationError(
+            "found only falling d, the unloading; expected d to rise with the compression"
+        )
+    start, peak = found[-1]
+    reached = np.argmax(d[start : peak + 1] >= d[peak] - 0.25 * _SLACK * span)
+    return slice(start, start + int(reached) + 1), len(found)
+
+
+def _turning_points(d: FloatArray, slack: float) -> list[int]:
+    """Return the first and last index and the reversals of ``d`` that exceed ``slack``."""
+    turns, extreme, way = [0], 0, 0
+    for k in range(1, d.size):
+        moved = d[k] - d[extreme]
+        if way == 0 and abs(moved) > slack:
+            way = 1 if moved > 0.0 else -1
+            extreme = k
+        elif way * moved > 0.0:
+            extreme = k
+        elif way and abs(moved) > slack:
+            turns.append(extreme)
+            way, extreme = -way, k
+    turns.append(extreme if way else d.size - 1)
+    return turns
+
+
+def _begin(d: FloatArray, force: FloatArray) -> float:
+    """Return the d at which the steep part of the curve, made straight, meets the zero of F."""
+    zero = float(np.median(force[: max(1, force.size // 50)]))
+    rise = force - zero
+    most = float(rise.max())
+    if most <= 0.0 or rise[np.argmax(d)] < 0.5 * most:
+        raise CalibrationError(
+            "found no force that rises with d; compression counts as positive in d and F"
+        )
+    begin = float(d[0])
+    for _ in range(4):  # the zero of F follows from the rows before the contact, if there are any
+        steep = rise > _STEEP * most
+        if (count := np.count_nonzero(steep)) < 3:
+            raise CalibrationError(
+                f"found {count} rows above {_STEEP:.0%} of the largest force, expected at least "
+                f"{_FEWEST}"
+            )
+        slope, start = np.polyfit(d[steep], rise[steep] ** _POWER, 1)
+        if not slope > 0.0:
+            raise CalibrationError("found a force that falls with d, expected it to rise")
+        begin = float(-start / slope)
+        before = d < begin - TOE * (d.max() - begin)
+        if np.count_nonzero(before) < 3:
+            break
+        rise = force - float(np.mean(force[before]))
+        most = float(rise.max())
+    return begin
+
+
+@dataclass(frozen=True)
+class CompressionFit:
+    """Fit of one law to runs of a testing machine.
+
+    ``factors`` [k] [Pa] multiply the powers 1 to k of the strain or, if k = 1, the shape ``law``.
+    ``std`` is the largest relative standard deviation of the law's force from a quarter of the
+    deepest d on; if k = 1, it is that of the modulus. ``zeros`` [runs][4] are the zero of d [m] and
+    of F [N], and their standard deviations. ``residual`` [N] is the rms residual, ``chi2`` its
+    square over that of the scatter about a smooth curve. ``score`` is the Bayesian information
+    criterion: the best law has the lowest.
+    """
+
+    tip: Fingertip
+    law: Material
+    factors: FloatArray
+    std: float
+    zeros: FloatArray
+    residual: float
+    chi2: float
+    score: float
+
+    @property
+    def modulus(self) -> float:
+        """Modulus at zero strain [Pa]."""
+        return float(self.factors[0])
+
+    def stress(self, strain: ArrayLike) -> FloatArray:
+        """Return the stress [Pa] at ``strain``."""
+        if len(self.factors) > 1:
+            return _power_law(self.factors, strain)
+        return np.asarray(self.modulus * self.law.stress(strain))
+
+    def force(self, run: Run, zeros: FloatArray) -> FloatArray:
+        """Return the force of a run [N] with its row of ``zeros``."""
+        tables = _tables(self.tip, self.law if len(self.factors) == 1 else None)
+        theta = np.full(len(run.d), run.theta)
+        return np.asarray(_shapes(tables, run.d - zeros[0], theta)[0] @ self.factors + zeros[1])
+
+
+def _power_law(factors: FloatArray, strain: ArrayLike, derivative: int = 0) -> FloatArray:
+    law: Any = np.polynomial.Polynomial([0.0, *factors]).deriv(derivative)
+    return np.asarray(law(np.asarray(strain, np.float64)))
+
+
+def fit_compression(runs: Sequence[Run], tip: Fingertip, law: Material | None) -> CompressionFit:
+    """Fit a law to runs by least squares, with the zeros of d and F of each run.
+
+    Correlated residuals increase the standard deviations.
+
+    Parameters
+    ----------
+    runs
+        The loading branches.
+    tip
+        Its radius and physics.
+    law
+        Shape of the stress-strain law for a modulus of 1 Pa. None stands for springs with
+        σ = c_1 ε + c_2 ε² + c_3 ε³, whose modulus changes with the depth.
+
+    Raises
+    ------
+    CalibrationError
+        If the runs are too deep for the law, or contradict it.
+    """
+    tables, deepest = _tables(tip, law), max(run.depth for run in runs)
+    end = _end(tables[0], tip, max(abs(run.theta) for run in runs))
+    if deepest > end:
+        raise CalibrationError(_TOO_DEEP)
+    used = [run.before | run.pressed for run in runs]
+    pairs = [*zip(runs, used, strict=True)]
+    d = np.concatenate([run.d[rows] for run, rows in pairs])
+    force = np.concatenate([run.force[rows] for run, rows in pairs])
+    tilt = np.concatenate([np.full(np.count_nonzero(rows), run.theta) for run, rows in pairs])
+    owner = np.repeat(np.arange(len(runs)), [np.count_nonzero(rows) for rows in used])
+    own = (owner[:, None] == np.arange(len(runs))).astype(np.float64)
+    begins, count = np.array([run.begin for run in runs]), len(tables)
+    longest = _CLIP * np.array([run.depth for run in runs])
+    factors: FloatArray | None = None
+    for _ in range(_ROUNDS):
+        shape, slope = _shapes(tables, np.minimum(d - begins[owner], end), tilt)
+        if factors is None:
+            columns = np.concatenate([shape, own], axis=1)
+            factors = np.linalg.lstsq(columns, force, rcond=None)[0][:count]
+        jacobian = np.concatenate([shape, -(slope @ factors)[:, None] * own, own], axis=1)
+        solved = np.linalg.lstsq(jacobian, force, rcond=None)[0]
+        factors, shift, zeros = np.split(solved, [count, count + len(runs)])
+        shift = np.clip(shift, -longest, longest)
+        begins = begins + shift
+        if (np.abs(shift) < 1e-6 * longest).all():
+            break
+    else:
+        raise CalibrationError(_NO_BEGINNING)
+    if any(zero < run.d.min() - run.toe for zero, run in zip(begins, runs, strict=True)):
+        raise CalibrationError(_NO_BEGINNING)
+    if (d - begins[owner]).max() > end:
+        raise CalibrationError(_TOO_DEEP)
+    strains = np.linspace(0.0, deepest / tip.radius, 50)
+    if not (_power_law(factors, strains, 1) > 0.0).all():
+        raise CalibrationError("its modulus would not be positive")
+    left = force - jacobian @ np.concatenate([factors, np.zeros(len(runs)), zeros])
+    freedom = max(len(force) - jacobian.shape[1], 1)
+    variance = float(left @ left) / freedom
+    covariance = variance * _variance_inflation(left) * np.linalg.inv(jacobian.T @ jacobian)
+    std = np.sqrt(np.diag(covariance)[count:]).reshape(2, -1)
+    return CompressionFit(
+        tip=tip,
+        law=law or _UNIT,
+        factors=factors,
+        std=_force_std(tables, factors, covariance[:count, :count], deepest),
+        zeros=np.stack([begins, zeros, *std], axis=1),
+        residual=math.sqrt(variance),
+        chi2=variance / _noise(runs) ** 2,
+        score=len(force) * math.log(variance) + jacobian.shape[1] * math.log(len(force)),
+    )
+
+
+def compare_laws(
+    runs: Sequence[Run], radius: float, poisson: float, material: Material
+) -> tuple[list[CompressionFit], list[str]]:
+    """Fit springs and solid rubber to runs; return the fits, the best first, and notes.
+
+    Springs are fitted with a constant modulus, with the shape of ``material`` if that is not
+    linear, and with a modulus that changes with the depth. Solid rubber has the given Poisson's
+    ratio, which F(d) does not show.
+    """
+    springs, solid = Fingertip(radius), Fingertip(radius, "solid", poisson)
+    tried: list[tuple[str, Fingertip, Material | None]] = [("springs", springs, _UNIT)]
+    if not material.is_linear:
+        unit = tuple(each / material.coefficients[0] for each in material.coefficients)
+        tried.append(("springs", springs, Material(unit, material.name)))
+    tried.append(("springs, E(d)", springs, None))
+    for base in get_args(Base):
+        for face in get_args(Face):
+            tip = replace(solid, base=base, face=face)
+            tried.append((f"solid, {base}, {face}", tip, _UNIT))
+    fits, notes = [], []
+    for name, tip, law in tried:
+        try:
+            fits.append(fit_compression(runs, tip, law))
+        except CalibrationError as error:
+            notes.append(f"{name}: not compared: {error}")
+    if not fits:
+        raise CalibrationError("; ".join(notes))
+    return sorted(fits, key=lambda fit: fit.score), notes
+
+
+def _end(table: ContactTable, tip: Fingertip, theta: float) -> float:
+    """Return the largest d [m] of a table at a tilt; 0 if the tilt is outside it."""
+    if tip.physics == "solid":
+        return _EDGE * table.header.deepest if theta <= table.header.tilt else 0.0
+    return _EDGE * tip.radius * min(7.0 / 8.0, 1.0 - math.sin(theta))
+
+
+def _tables(tip: Fingertip, law: Material | None) -> list[ContactTable]:
+    """Return the tables whose forces the fit adds."""
+    if law is not None:
+        return [ContactTable.build(tip, law, _TOLERANCE)]
+    return [ContactTable.build(tip, Material((Fraction(1), *each)), _TOLERANCE) for each in _POWERS]
+
+
+def _shapes(
+    tables: Sequence[ContactTable], d: FloatArray, theta: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the normal forces of the powers of the strain and their slopes by d, both [n, k]."""
+    touching, depth = d > 0.0, np.maximum(d, _STEP)
+
+    def forces(at: FloatArray) -> FloatArray:
+        first, *others = [table(at, theta).energy_d * touching for table in tables]
+        return np.stack([first, *(each - first for each in others)], axis=1)
+
+    here = forces(depth)
+    return here, (forces(depth + _STEP) - here) / _STEP
+
+
+def _variance_inflation(left: FloatArray) -> float:
+    """Return the factor of the variance for residuals with the lag-1 correlation of ``left``."""
+    lag = float(left[1:] @ left[:-1]) / float(left @ left)
+    lag = min(max(lag, 0.0), 0.99)
+    return (1.0 + lag) / (1.0 - lag)
+
+
+def _force_std(
+    tables: Sequence[ContactTable], factors: FloatArray, covariance: FloatArray, deepest: float
+) -> float:
+    d = np.linspace(0.25 * deepest, deepest, 16)
+    shape, _ = _shapes(tables, d, np.zeros(len(d)))
+    variance = np.einsum("ni,ij,nj->n", shape, covariance, shape)
+    return float((np.sqrt(variance) / (shape @ factors)).max())
+
+
+def _noise(runs: Sequence[Run]) -> float:
+    """Return the scatter of the force about a smooth curve through each run [N]."""
+    squares, freedom, most = 0.0, 0, 0.0
+    for run in runs:
+        d, force = run.d[run.pressed], run.force[run.pressed]
+        degree = min(7, len(d) // 3)
+        curve: Any = np.polynomial.Chebyshev.fit(d, force, degree)
+        left = force - curve(d)
+        squares += float(left @ left)
+        freedom += len(d) - degree - 1
+        most = max(most, float(np.ptp(force)))
+    return max(math.sqrt(squares / max(freedom, 1)), _SMOOTHEST * most)

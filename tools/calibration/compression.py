@@ -1,0 +1,381 @@
+"""Calibrate the law of a tip with CSV files of a testing machine: `calibrate law --compression`.
+
+A file has displacement and force, with the tilt in a column or by ``--theta``, or strain and
+stress.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softfinger.daemon.own_files import read_file
+from softfinger.daemon.perception.calibration_file import Calibration, ModulusStep, now
+from softfinger.daemon.perception.prior import CALIBRATED_ERROR
+from softfinger.daemon.profile.factory import make_material
+from softfinger.daemon.profile.settings import Settings
+from softfinger.kinematics.calibration.calibration import CalibrationError
+from softfinger.kinematics.calibration.compression_fit import (
+    CompressionFit,
+    Run,
+    compare_laws,
+    loading,
+    rising,
+)
+from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.contact.material_fit import MaterialError
+from softfinger.tools.calibration.calibration_plot import Panel, Points
+
+FloatArray = NDArray[np.float64]
+
+
+class _Quantity(NamedTuple):
+    """A quantity of a file: the words that name its column, and its units in SI."""
+
+    words: set[str]
+    units: dict[str, float]
+
+
+_QUANTITIES = {
+    "strain": _Quantity({"strain", "ε", "epsilon"}, {"%": 0.01, "1": 1.0, "-": 1.0}),
+    "stress": _Quantity(
+        {"stress", "σ", "sigma"}, {"MPa": 1e6, "kPa": 1e3, "Pa": 1.0, "N/mm²": 1e6, "N/mm2": 1e6}
+    ),
+    "force": _Quantity(
+        {"force", "f", "load"},
+        {"N": 1.0, "mN": 1e-3, "kN": 1e3, "gf": 9.80665e-3, "kgf": 9.80665, "lbf": 4.4482216},
+    ),
+    "tilt": _Quantity(
+        {"tilt", "theta", "θ", "angle"},
+        {"deg": math.pi / 180.0, "°": math.pi / 180.0, "rad": 1.0},
+    ),
+    "displacement": _Quantity(
+        {"displacement", "d", "depth", "compression", "indentation", "extension", "travel"},
+        {"mm": 1e-3, "µm": 1e-6, "um": 1e-6, "m": 1.0, "cm": 1e-2, "in": 25.4e-3},
+    ),
+}
+_EXAMPLE = "`d [mm],F [N],tilt [deg]` or `strain [%],stress [kPa]`"
+_NAMED = re.compile(r"^(.*?)\s*(?:[\[(]\s*(.*?)\s*[\])]|[/_]\s*([^\s/_]+))?$")
+_SAME_TILT = 2e-4  # rad, tilts of one run
+_POINTS = 10  # of a fitted law
+_BINS = 20  # points of a measured stress-strain law
+_TOE = 2.0  # ratio of slopes that shows a toe or an offset
+# Difference of the information criterion that is strong evidence (Kass & Raftery, 1995).
+_BETTER = 6.0
+
+
+def read_csv(path: Path) -> dict[str, FloatArray]:
+    """Read the columns of a file by quantity, in SI units.
+
+    The separator is a tab, a semicolon or a comma; decimal commas need one of the first two. The
+    unit stands behind the name in the header, or in a row of its own below. Other columns, empty
+    lines and lines beginning with # are ignored.
+
+    Raises
+    ------
+    CalibrationError
+        The message gives the line or the column.
+    OSError
+    """
+    try:
+        text = read_file(path).decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise CalibrationError(f"{path}: found no UTF-8 text, expected a CSV file") from None
+    lines = [(k, line) for k, line in enumerate(text.splitlines(), 1)
+             if line.strip(" \t;,") and not line.startswith("#")]  # fmt: skip
+    if not lines:
+        raise CalibrationError(f"{path}: found no line, expected {_EXAMPLE}")
+    separator = next((each for each in "\t;" if each in lines[0][1]), ",")
+    rows = csv.reader((line for _, line in lines), delimiter=separator, skipinitialspace=True)
+    header, *cells = ([cell.strip() for cell in row] for row in rows)
+    below = cells[0] if cells and not any(map(_is_number, cells[0])) else []
+    columns = _columns(path, header, below)
+    found: dict[str, list[float]] = {name: [] for name in columns}
+    for (number, _), row in zip(lines[1 + bool(below) :], cells[bool(below) :], strict=True):
+        for name, (column, unit) in columns.items():
+            cell = row[column] if column < len(row) else ""
+            if not _is_number(cell):
+                raise CalibrationError(
+                    f"{path}: line {number}: {name}: found {cell!r}, expected a number"
+                )
+            found[name].append(float(cell.replace(",", ".")) * unit)
+    return {name: np.array(values) for name, values in found.items()}
+
+
+def _columns(path: Path, header: list[str], below: list[str]) -> dict[str, tuple[int, float]]:
+    """Return index and unit of each quantity's column."""
+    found: dict[str, tuple[int, float]] = {}
+    for k, title in enumerate(header):
+        match = _NAMED.match(title)
+        assert match is not None
+        words = set(re.findall(r"[^\W\d_]+", match[1].lower()))
+        name = next((each for each, known in _QUANTITIES.items() if words & known.words), "")
+        if not name:
+            continue
+        if name in found:
+            raise CalibrationError(
+                f"{path}: found {header[found[name][0]]!r} and {title!r}, expected one {name}"
+            )
+        unit = match[2] or match[3] or (below[k].strip("[]()") if k < len(below) else "")
+        units = {each.replace("μ", "µ"): value for each, value in _QUANTITIES[name].units.items()}
+        if unit.replace("μ", "µ") not in units:
+            raise CalibrationError(
+                f"{path}: {title!r}: found {f'the unit {unit!r}' if unit else 'no unit'}, expected "
+                f"one of {', '.join(units)}, as in {_EXAMPLE}"
+            )
+        found[name] = k, units[unit.replace("μ", "µ")]
+    if not ({"displacement", "force"} <= set(found) or {"strain", "stress"} <= set(found)):
+        raise CalibrationError(
+            f"{path}: found the columns {', '.join(map(repr, header))}, expected {_EXAMPLE}"
+        )
+    return found
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        return math.isfinite(float(cell.replace(",", ".")))
+    except ValueError:
+        return False
+
+
+@dataclass(frozen=True)
+class _Test:
+    """A run, and its name in messages."""
+
+    name: str
+    run: Run
+
+
+def fit_files(
+    calibration: Calibration, settings: Settings, paths: list[Path], theta: list[float]
+) -> tuple[Calibration, str, tuple[Panel, ...]]:
+    """Fit the law of the profile's `tip.physics` to the files.
+
+    Parameters
+    ----------
+    calibration, settings
+        Calibration of the tip, and the profile.
+    paths
+        Files of the machine.
+    theta
+        Tilt of each file [deg], or none.
+
+    Returns
+    -------
+    The new calibration, the line to print, and the panels of a picture.
+
+    Raises
+    ------
+    CalibrationError, OSError
+    """
+    if settings.tip.physics == "measured":
+        raise CalibrationError(
+            'law: found tip.physics = "measured", whose curves need frames; expected "springs" or '
+            '"solid"'
+        )
+    if theta and len(theta) != len(paths):
+        raise CalibrationError(f"--theta: found {len(theta)} values for {len(paths)} files")
+    files = [read_csv(path) for path in paths]
+    if any("strain" in file for file in files):
+        if len(files) > 1 or settings.tip.physics != "springs":
+            raise CalibrationError(
+                'law: stress and strain: expected one file, and tip.physics = "springs"'
+            )
+        return _stress_strain(calibration, paths[0], files[0])
+    tilts = np.radians(theta or np.zeros(len(files))).tolist()
+    tests = [test for each in zip(paths, files, tilts, strict=True) for test in _tests(*each)]
+    return _force_law(calibration, settings, tests)
+
+
+def _tests(path: Path, file: dict[str, FloatArray], theta: float) -> list[_Test]:
+    """Return the runs of a file, one for each tilt."""
+    tilt = file.get("tilt", np.full(len(file["force"]), theta))
+    edges = np.flatnonzero(np.abs(np.diff(tilt)) > _SAME_TILT) + 1
+    tests = []
+    for rows in np.split(np.arange(len(tilt)), edges):
+        if not len(rows):
+            raise CalibrationError(f"{path}: found no row of numbers below the header")
+        name = f"{path.name} at {math.degrees(tilt[rows[0]]):.3g}°"
+        try:
+            run = loading(file["displacement"][rows], file["force"][rows], float(tilt[rows[0]]))
+        except CalibrationError as error:
+            raise CalibrationError(f"law: {name}: {error}") from None
+        tests.append(_Test(name, run))
+    return tests
+
+
+def _force_law(
+    calibration: Calibration, settings: Settings, tests: list[_Test]
+) -> tuple[Calibration, str, tuple[Panel, ...]]:
+    tip, runs = settings.tip, [test.run for test in tests]
+    fits, notes = compare_laws(runs, tip.radius, tip.poisson, make_material(settings.material))
+    ours = [fit for fit in fits if fit.tip.physics == tip.physics]
+    if not ours:
+        raise CalibrationError(f"law: {'; '.join(notes)}")
+    best, deepest = ours[0], max(run.depth for run in runs)
+    force = max(float(np.ptp(run.force)) for run in runs)
+    # The part of the residuals that is not noise is an error of the law.
+    misfit = best.residual * math.sqrt(max(1.0 - 1.0 / best.chi2, 0.0)) / force
+    count = 0 if _is_constant(best) else _POINTS
+    strain = np.linspace(0.0, deepest / tip.radius, count + 1)[1:]
+    step = ModulusStep(
+        date=now(),
+        modulus=best.modulus,
+        strain=np.round(strain, 5).tolist(),
+        stress=np.round(best.stress(strain), 2).tolist(),
+        offset=float(best.zeros[0, 0]),
+        residual=math.hypot(best.std, misfit),
+    )
+    wants: dict[str, Any] = {"physics": tip.physics}
+    if tip.physics == "solid":
+        wants |= {"base": best.tip.base, "face": best.tip.face, "poisson": tip.poisson}
+    lines = [
+        _fit_line(best, deepest),
+        *(_fit_line(fit, deepest) for fit in fits if fit is not best),
+    ]
+    lines += notes
+    if fits[0].score < best.score - _BETTER:
+        lines.append(
+            f"{_name(fits[0])} fits better; F alone does not identify a model: compare frames of "
+            "the sensor with `calibrate law --d`, then set tip.physics"
+        )
+    lines += [_run_line(test, zeros) for test, zeros in zip(tests, best.zeros, strict=True)]
+    lines.append(f"for the profile: {_profile_line(wants, step)}")
+    changed = {"modulus": step, "wants": wants, "scales": None, "date": now()}
+    return calibration.model_copy(update=changed), "\n  ".join(lines), _panels(best, tests)
+
+
+def _is_constant(fit: CompressionFit) -> bool:
+    return len(fit.factors) == 1 and fit.law.is_linear
+
+
+def _name(fit: CompressionFit) -> str:
+    if fit.tip.physics == "solid":
+        return f"solid, {fit.tip.base}, {fit.tip.face}, ν {fit.tip.poisson:.3f}"
+    if len(fit.factors) > 1:
+        return "springs, E(d)"
+    return "springs, constant E" if fit.law.is_linear else f"springs, law {fit.law.name}"
+
+
+def _fit_line(fit: CompressionFit, deepest: float) -> str:
+    if len(fit.factors) > 1:
+        mean = float(fit.stress(deepest / fit.tip.radius)) * fit.tip.radius / deepest
+        told = (
+            f"E = {fit.modulus / 1e6:.4f} MPa at d = 0, {mean / 1e6:.4f} MPa on average to "
+            f"{deepest * 1e3:.1f} mm"
+        )
+    else:
+        told = f"E = {fit.modulus / 1e6:.4f} ± {fit.std * fit.modulus / 1e6:.4f} MPa"
+        told += "" if _is_constant(fit) else " at d = 0"
+    return (
+        f"{_name(fit)}: {told}; standard deviation of F {fit.std:.2%}, residuals "
+        f"{fit.residual:.2g} N, χ² {fit.chi2:.2f}"
+    )
+
+
+def _run_line(test: _Test, zeros: FloatArray) -> str:
+    run = test.run
+    before, pressed = np.count_nonzero(run.before), np.count_nonzero(run.pressed)
+    told = (
+        f"{test.name}: zero of d {zeros[0] * 1e3:.3f} ± {zeros[2] * 1e3:.3f} mm, of F "
+        f"{zeros[1]:.3f} ± {zeros[3]:.3f} N; fitted {pressed} rows to d = "
+        f"{(run.d.max() - zeros[0]) * 1e3:.2f} mm and {before} before the contact; left out "
+        f"{len(run.d) - before - pressed} of the toe"
+    )
+    if run.dropped:
+        told += f", {run.dropped} of the unloading"
+        told += f" and of {run.cycles - 1} earlier cycles" * (run.cycles > 1)
+    return told + "; no zero of F was measured: begin above the tip" * (not before)
+
+
+def _profile_line(wants: dict[str, Any], step: ModulusStep) -> str:
+    values = {f"tip.{name}": value for name, value in wants.items()}
+    law: dict[str, Any] = {"law": "constant", "modulus": round(step.modulus, -1)}
+    if step.strain:
+        law = {"law": "points", "strain": step.strain, "stress": step.stress}
+    law["modulus_error"] = round(max(step.residual, CALIBRATED_ERROR), 3)
+    values |= {f"material.{name}": value for name, value in law.items()}
+    return ", ".join(f"{name} = {json.dumps(value)}" for name, value in values.items())
+
+
+def _panels(fit: CompressionFit, tests: list[_Test]) -> tuple[Panel, ...]:
+    d, force, model = [], [], []
+    for test, zeros in zip(tests, fit.zeros, strict=True):
+        used = test.run.before | test.run.pressed
+        d.append((test.run.d - zeros[0])[used] * 1e3)
+        force.append((test.run.force - zeros[1])[used])
+        model.append((fit.force(test.run, zeros) - zeros[1])[used])
+    x, y, fitted = map(np.concatenate, (d, force, model))
+    shown = Points(_name(fit), "d [mm]", "F [N]", x, y, fitted)
+    return shown, Points("residuals", "d [mm]", "measured − fit [N]", x, y - fitted)
+
+
+def _stress_strain(
+    calibration: Calibration, path: Path, file: dict[str, FloatArray]
+) -> tuple[Calibration, str, tuple[Panel, ...]]:
+    """Store points of a stress-strain curve as the law."""
+    strain, stress = file["strain"], file["stress"]
+    try:
+        rows, _ = rising(strain)
+        x, y = _thinned(strain[rows], stress[rows])
+        _check_beginning(x, y)
+        material = Material.from_points(x, y)
+    except (CalibrationError, MaterialError) as error:
+        raise CalibrationError(f"law: {path.name}: {error}") from None
+    step = ModulusStep(
+        date=now(),
+        modulus=material.reference_modulus,
+        strain=np.round(x, 5).tolist(),
+        stress=np.round(y, 2).tolist(),
+        offset=0.0,
+        residual=material.worst_force_error,
+    )
+    wants: dict[str, Any] = {"physics": "springs"}
+    line = (
+        f"springs, law of {len(x)} points to a strain of {x[-1]:.2f}: E = "
+        f"{material.reference_modulus / 1e6:.4f} MPa at zero strain; F within "
+        f"{material.worst_force_error:.2%}; {len(strain) - (rows.stop - rows.start)} rows of the "
+        f"unloading left out\n  for the profile: {_profile_line(wants, step)}"
+    )
+    changed = {"modulus": step, "wants": wants, "scales": None, "date": now()}
+    shown = Points("law", "strain", "stress [kPa]", x, y * 1e-3, material.stress(x) * 1e-3)
+    return calibration.model_copy(update=changed), line, (shown,)
+
+
+def _thinned(strain: FloatArray, stress: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the means of `_BINS` ranges of strain, if there are many more points."""
+    if len(strain) < 2 * _BINS:
+        return strain, stress
+    edges = np.linspace(strain.min(), strain.max(), _BINS + 1)
+    which = np.clip(np.searchsorted(edges, strain, "right") - 1, 0, _BINS - 1)
+    counts = np.bincount(which, minlength=_BINS)
+    used = counts > 0
+
+    def mean(values: FloatArray) -> FloatArray:
+        return np.asarray(np.bincount(which, values, _BINS)[used] / counts[used])
+
+    return mean(strain), mean(stress)
+
+
+def _check_beginning(strain: FloatArray, stress: FloatArray) -> None:
+    """Raise CalibrationError if the curve does not begin straight from zero."""
+    part = (strain > 0.15 * strain[-1]) & (strain < 0.5 * strain[-1])
+    first = np.flatnonzero(strain > 0.02 * strain[-1])
+    if np.count_nonzero(part) < 2 or not first.size:
+        return
+    slope, start = np.polyfit(strain[part], stress[part], 1)
+    secant = stress[first[0]] / strain[first[0]]
+    if secant < slope / _TOE or secant > slope * _TOE:
+        raise CalibrationError(
+            f"found {secant / 1e3:.3g} kPa from 0 to the strain {strain[first[0]]:.3g}, then "
+            f"{slope / 1e3:.3g} kPa: a toe, or a zero that is off; expected a curve through 0: "
+            f"subtract {-start / slope:.3g} from the strain, and leave out what is below 0"
+        )
