@@ -1,6 +1,7 @@
-"""LeRobot plugin for the softfinger hand: ``--robot.type=softfinger``."""
+"""LeRobot plugin: the softfinger hand as ``--robot.type`` and ``--env.type`` ``softfinger``."""
 
+from lerobot_robot_softfinger.config_environment import SoftfingerEnvConfig
 from lerobot_robot_softfinger.config_softfinger import SoftfingerConfig
 from lerobot_robot_softfinger.softfinger import Softfinger
 
-__all__ = ["Softfinger", "SoftfingerConfig"]
+__all__ = ["Softfinger", "SoftfingerConfig", "SoftfingerEnvConfig"]

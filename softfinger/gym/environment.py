@@ -12,16 +12,22 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
+import msgpack
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from softfinger.daemon.client.stream import read
 from softfinger.daemon.control.modes import Mode
 from softfinger.daemon.errors import Refused
 from softfinger.daemon.loop.build import Daemon
+from softfinger.daemon.loop.publishing import parts
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.wire.publisher import packer
+from softfinger.daemon.wire.schema import STATE, TRUTH, HandState
 from softfinger.gym import STEP, TASKS
+from softfinger.gym.picture import Image, Painter, Window
 from softfinger.tools.processes.compile import build_kernels, print_event
 
 Observation = dict[str, NDArray[Any]]
@@ -62,6 +68,9 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         Add potential-based shaping to the reward of ``grasp``: up to 10 for closing the fingers
         and up to 10 for both forces. It rewards progress before the first touch and leaves the
         optimal policy unchanged [1]_.
+    render_mode
+        ``rgb_array`` makes `render` return an image [300, 550, 3]; ``human`` shows each step in a
+        window, at most in real time.
 
     Notes
     -----
@@ -73,15 +82,16 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     - ``goal`` [1]: target in N, or in rad for ``rotate``.
 
     An episode terminates when the object is lost or the hand is in a fault state. ``info`` holds
-    ``truth`` (the object's x, y [m] and angle [rad]), ``fault``, and ``refused``: the reason for
-    which the daemon refused a command, or an empty string.
+    ``truth`` (the object's x, y [m] and angle [rad]), ``fault``, ``refused``: the reason for which
+    the daemon refused a command, or an empty string, and ``is_success``: whether the error is
+    within the scale of the reward (1 N, 0.05 rad or 2 mm).
 
     References
     ----------
     .. [1] Ng, Harada & Russell, "Policy invariance under reward transformations", ICML 1999.
     """
 
-    metadata = {"render_modes": []}  # noqa: RUF012
+    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": round(1.0 / STEP)}  # noqa: RUF012
 
     def __init__(
         self,
@@ -90,11 +100,19 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         profile: Path | str | None = None,
         changes: Sequence[str] = (),
         shaped: bool = False,
+        render_mode: str | None = None,
     ) -> None:
         if task not in TASKS:
             raise ValueError(f"task: found {task!r}, expected one of {', '.join(TASKS)}")
         if control not in ("joints", "law"):
             raise ValueError(f"control: found {control!r}, expected 'joints' or 'law'")
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ValueError(
+                f"render_mode: found {render_mode!r}, expected None, 'human' or 'rgb_array'"
+            )
+        self.render_mode = render_mode
+        self._window: Window | None = None
+        self._pack_state, self._pack_truth = packer(STATE), packer(TRUTH)
         # Joint goals may press as hard as the grip law.
         ours = ("loop.clock=virtual", "safety.current_move=1.2")
         file = None if profile is None else Path(profile)
@@ -122,10 +140,12 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     ) -> tuple[Observation, dict[str, Any]]:
         """Start an episode with a new object; ``options`` may contain a ``goal``."""
         super().reset(seed=seed)
-        self.close()
-        daemon = Daemon(self._drawn(), wire=False)
+        self._end_episode()
+        drawn = self._drawn()
+        daemon = Daemon(drawn, wire=False)
         assert daemon.hand is not None
         self._daemon, self._hand, self._loop = daemon, daemon.hand, daemon.loop
+        self._painter = Painter(drawn, WHITE / self.pascal_per_count)
         self._refused = ""
         goal = FORCE
         if self._task == "rotate":
@@ -137,13 +157,14 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._loop.advance(0.1)
         if self._task != "grasp":
             self._take_hold()
-        self._joints = list(self._loop.state.reading.q)
+        self.goals = list(self._loop.state.reading.q)  # of the joints [rad]
         self._first = self._hand.object_pose.copy()
         self._potential = self._closed()
         if self._task == "push":
             self._push = float(self.np_random.choice((-1.0, 1.0)) * self.np_random.uniform(1, 3))
             self._push_at = self._loop.state.t + float(self.np_random.uniform(0.2, 1.0))
             self._push_until = self._push_at + float(self.np_random.uniform(0.3, 1.5))
+        self._show()
         return self._observation(), self._info()
 
     def _drawn(self) -> Settings:
@@ -199,6 +220,7 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         if self._shaped:
             self._potential = self._closed()
             reward += self._potential - before
+        self._show()
         return self._observation(), reward, ended, False, self._info()
 
     def _act(self, action: NDArray[np.float64]) -> None:
@@ -210,8 +232,8 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         if not self._by_law:
             low, high = self._settings.hand.q_min, self._settings.hand.q_max
             for i, share in enumerate((first, second)):
-                self._joints[i] = min(max(self._joints[i] + REACH * share, low[i]), high[i])
-            self._command("move", left=self._joints[0], right=self._joints[1])
+                self.goals[i] = min(max(self.goals[i] + REACH * share, low[i]), high[i])
+            self._command("move", left=self.goals[0], right=self.goals[1])
             return
         least, most = FORCES
         force, angle = least + 0.5 * (first + 1.0) * (most - least), ANGLE * second
@@ -237,15 +259,23 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         force = sum(min(float(each) / FORCE, 1.0) for each in self._hand.force)
         return 5.0 * (q[0] / most[0] + q[1] / most[1] + force)
 
+    def state(self) -> HandState:
+        """Return the hand's state as clients receive it."""
+        packed = self._pack_state(self._loop.state, parts(self._settings))
+        return read(HandState, msgpack.unpackb(packed))
+
+    def _pressure(self) -> NDArray[np.uint16]:
+        frames = [finger.sensor.latest() for finger in self._loop.perception.fingers]
+        return np.stack([self._empty if each is None else each.data for each in frames])
+
     def _observation(self) -> Observation:
         state = self._loop.state
         reading = state.reading
-        frames = [finger.sensor.latest() for finger in self._loop.perception.fingers]
         felt = [(c.d, c.theta, c.force) if c.contact else (0.0,) * 3 for c in state.contacts]
         return {
             "joints": np.array([*reading.q, *reading.dq, *reading.current], np.float32),
             "contacts": np.array([*felt[0], *felt[1]], np.float32),
-            "pressure": np.stack([self._empty if each is None else each.data for each in frames]),
+            "pressure": self._pressure(),
             "goal": np.array([self._goal], np.float32),
         }
 
@@ -254,10 +284,34 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             "truth": self._hand.object_pose.copy(),
             "fault": self._loop.state.fault,
             "refused": self._refused,
+            "is_success": self._reward() > math.exp(-1.0),
         }
 
+    def render(self) -> Image | None:
+        """Return the image of the last step with ``rgb_array``; otherwise return None."""
+        if self.render_mode != "rgb_array" or self._daemon is None:
+            return None
+        return self._picture()
+
+    def _picture(self) -> Image:
+        truth = msgpack.unpackb(self._pack_truth(self._loop.state, self._hand))
+        return self._painter(self.state(), truth, self._pressure())
+
+    def _show(self) -> None:
+        if self.render_mode != "human":
+            return
+        if self._window is None:
+            self._window = Window(f"softfinger: {self._task}")
+        self._window.show(self._picture(), STEP)
+
     def close(self) -> None:
-        """Switch the torque off and discard the simulated hand."""
+        """Switch the torque off, discard the simulated hand and close the window."""
+        self._end_episode()
+        if self._window is not None:
+            self._window.close()
+            self._window = None
+
+    def _end_episode(self) -> None:
         if self._daemon is not None:
             self._daemon.close()
             self._daemon = None

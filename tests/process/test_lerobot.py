@@ -1,4 +1,4 @@
-"""The hand as a LeRobot robot: found, driven and recorded by the real package."""
+"""The hand as a LeRobot robot and environment: found and used by the real package."""
 
 import math
 import runpy
@@ -22,16 +22,21 @@ PACKAGE = Path(__file__).parents[2] / "lerobot_robot_softfinger"
 
 
 @pytest.fixture
-def make(tmp_path: Path, addresses: Addresses, monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Return a function that creates the installed robot as LeRobot's programs do."""
+def plugin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Register the installed package as LeRobot's programs do."""
     monkeypatch.setenv("HF_HOME", str(tmp_path / "hf"))
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     pytest.importorskip("lerobot")
-    from lerobot.robots import RobotConfig, make_robot_from_config
     from lerobot.utils.import_utils import register_third_party_plugins
 
     monkeypatch.syspath_prepend(pip_installed(PACKAGE, tmp_path / "robot"))
     register_third_party_plugins()
+
+
+@pytest.fixture
+def make(tmp_path: Path, addresses: Addresses, plugin: None) -> Any:
+    """Return a function that creates the robot as LeRobot's programs do."""
+    from lerobot.robots import RobotConfig, make_robot_from_config
 
     def make(**options: Any) -> Any:
         kind = RobotConfig.get_choice_class("softfinger")
@@ -112,6 +117,48 @@ def test_lerobot_drives_and_records_the_simulated_hand(make, start, profile, tmp
     again.connect()
     assert not again._hand.status()["torque"]
     again.disconnect()
+
+
+@pytest.mark.extended
+def test_the_environment_has_the_features_and_actions_of_the_robot(plugin):
+    from lerobot.envs.configs import EnvConfig
+    from lerobot.envs.factory import make_env
+    from lerobot.envs.utils import env_to_policy_features, preprocess_observation
+
+    kind = EnvConfig.get_choice_class("softfinger")
+
+    def made(**options: Any) -> Any:
+        return make_env(kind(**options), n_envs=1)["softfinger"][0]
+
+    env = made(task="Rotate-v0")
+    seen, _ = env.reset(seed=[1])
+    goal = float(seen["environment_state"][0, 0])
+    for _ in range(100):  # the robot's actions: N and rad
+        seen, reward, *_, info = env.step(np.array([[6.0, goal]], np.float32))
+    observed = preprocess_observation(seen)
+    for name, feature in env_to_policy_features(kind()).items():
+        if name != "action":
+            assert tuple(observed[name].shape[1:]) == feature.shape, name
+    state = dict(zip(STATE, observed["observation.state"][0].tolist(), strict=True))
+    assert state["object.angle"] == pytest.approx(goal, abs=0.02)
+    assert state["left.force"] == pytest.approx(6.0, abs=0.5)
+    assert 0.0 <= state["left.touch_age"] < 0.06
+    assert reward[0] > 0.7
+    assert info["is_success"][0]
+    assert env.call("_max_episode_steps") == (200,)
+    assert env.call("task_description") == ("turn the held object to the goal",)
+    assert env.call("render")[0].shape == (300, 550, 3)
+    env.close()
+
+    env = made(task="Grasp-v0", control="joints")
+    seen, _ = env.reset(seed=[1])
+    at = seen["agent_pos"][0, [STATE.index(f"{each}.pos") for each in ("left", "right")]]
+    for _ in range(20):
+        seen, *_, info = env.step((at + 0.1)[None])
+    after = seen["agent_pos"][0, [STATE.index(f"{each}.pos") for each in ("left", "right")]]
+    np.testing.assert_allclose(after, at + 0.1, atol=0.01)
+    assert not info["is_success"][0]
+    env.close()
 
 
 def record(kind, robot, first, action, moved, root):

@@ -1,5 +1,10 @@
 """The Gymnasium environments: API checker, reproducible seeds, observations and rewards."""
 
+import os
+import shutil
+import subprocess
+from collections.abc import Iterator
+
 import gymnasium
 import numpy as np
 import pytest
@@ -9,6 +14,7 @@ from softfinger.gym import TASKS
 from softfinger.gym.__main__ import at_random, by_law, episode
 from softfinger.gym.baseline import policy
 from softfinger.gym.environment import Images, SoftFingerEnv
+from softfinger.tools.viewing.hand_drawing import COLOURS
 
 pytestmark = pytest.mark.filterwarnings("error")
 
@@ -17,9 +23,88 @@ pytestmark = pytest.mark.filterwarnings("error")
     "task",
     [pytest.param(task, marks=[pytest.mark.extended] * (task != "grasp")) for task in TASKS],
 )
-def test_the_environment_passes_the_gymnasium_checker(task):
-    env = gymnasium.make(f"SoftFinger-{task.capitalize()}-v0")
-    check_env(env.unwrapped, skip_render_check=True)
+def test_the_environment_passes_the_gymnasium_checker(task, monkeypatch):
+    # Rendering to a window needs a display and is tested separately.
+    monkeypatch.setitem(SoftFingerEnv.metadata, "render_modes", ["rgb_array"])
+    env = gymnasium.make(f"softfinger.gym:SoftFinger-{task.capitalize()}-v0")
+    check_env(env.unwrapped)
+    env.close()
+
+
+def test_the_picture_shows_the_hand_and_its_pressure_maps():
+    env = SoftFingerEnv("rotate", "law", render_mode="rgb_array")
+    env.reset(seed=1)
+
+    def found(image: np.ndarray, part: str) -> np.ndarray:
+        """Mean row and column of a part's colour in the scene."""
+        close = np.abs(image[:, :400].astype(int) - COLOURS[part]).max(axis=2) < 8
+        assert close.any(), part
+        return np.argwhere(close).mean(axis=0)
+
+    before = env.render()
+    assert (before.shape, before.dtype) == ((300, 550, 3), np.uint8)
+    assert found(before, "left")[1] < found(before, "object")[1] < found(before, "right")[1]
+    for _ in range(25):
+        *_, info = env.step(np.array([0.0, 0.9], np.float32))
+    after = env.render()
+    # To turn the object counter-clockwise both fingers lean clockwise, to the right.
+    assert info["truth"][2] > 0.1
+    assert found(after, "left")[1] > found(before, "left")[1] + 2
+    assert found(after, "right")[1] > found(before, "right")[1] + 2
+    maps = after[:, 400:].astype(int).sum(axis=2)
+    bright = [np.argwhere(half > half.max() - 60).mean(axis=0) for half in (maps[:150], maps[150:])]
+    assert np.abs(np.array(bright) - 75).max() < 40  # a footprint near the middle of either map
+    assert env.render_mode == "rgb_array"
+    env.close()
+    assert env.render() is None
+
+
+@pytest.fixture
+def display(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    if shutil.which("Xvfb") is None:
+        pytest.skip("needs Xvfb")
+    read, write = os.pipe()
+    words = ["Xvfb", "-displayfd", str(write), "-screen", "0", "800x600x24"]
+    with subprocess.Popen(words, pass_fds=[write], stderr=subprocess.DEVNULL) as server:
+        os.close(write)
+        with os.fdopen(read) as told:
+            monkeypatch.setenv("DISPLAY", f":{told.readline().strip()}")
+        yield
+        server.terminate()
+
+
+def test_a_window_shows_each_step(display):
+    env = SoftFingerEnv("grasp", render_mode="human")
+    env.reset(seed=1)
+    for _ in range(3):
+        env.step(np.ones(2, np.float32))
+    window = env._window
+    shown = np.array([window._photo.get(x, 40) for x in range(0, 550, 5)])
+    np.testing.assert_array_equal(shown, env._picture()[40, ::5])
+    assert env.render() is None
+    window.close()  # as its user does
+    env.step(np.ones(2, np.float32))
+    env.close()
+
+
+def test_human_rendering_without_a_display_is_rejected(monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    env = SoftFingerEnv("grasp", render_mode="human")
+    with pytest.raises(RuntimeError, match="found 'human', but no window can be opened"):
+        env.reset(seed=1)
+    env.close()
+    with pytest.raises(ValueError, match="found 'ansi', expected None, 'human' or 'rgb_array'"):
+        SoftFingerEnv("grasp", render_mode="ansi")
+
+
+def test_success_is_reported_within_the_scale_of_the_reward():
+    env = SoftFingerEnv("rotate", "law")
+    observation, info = env.reset(seed=1, options={"goal": 0.2})
+    assert not info["is_success"]
+    for _ in range(60):
+        observation, *_, info = env.step(by_law(observation))
+    assert abs(info["truth"][2] - 0.2) < 0.05
+    assert info["is_success"]
     env.close()
 
 

@@ -1,0 +1,124 @@
+"""Draw the simulated hand and its pressure maps as an RGB image, with NumPy, and show it.
+
+The scene has the lines of the page of `softfinger view`: the fingers and their tips, the estimated
+object in green, the true one in grey. Beside it are the pressure maps, left above right.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import time
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.wire.schema import HandState
+from softfinger.tools.terminal.heatmap import colour_map
+from softfinger.tools.viewing.hand_drawing import COLOURS, hand_parts
+
+Image = NDArray[np.uint8]
+
+_SIDE, _MAP = 400, 150  # pixels: width of the scene, side of a pressure map
+HEIGHT, WIDTH = 2 * _MAP, _SIDE + _MAP
+_SCALE = 2100.0  # pixels a metre
+_LOWEST = -0.012  # m, y of the lower edge of the scene
+_THINNEST = 1.6  # pixels
+_BACKGROUND = 24
+
+
+class Painter:
+    """Draws images of one hand."""
+
+    def __init__(self, settings: Settings, full_scale: float) -> None:
+        """Create a painter; ``full_scale`` [counts] has the brightest colour of a map."""
+        self._settings = settings
+        colours = np.array(colour_map(), np.uint8)
+        self._colours, self._full = colours, full_scale / len(colours)
+
+    def __call__(
+        self, state: HandState, truth: dict[str, Any], pressure: NDArray[np.uint16]
+    ) -> Image:
+        """Return the image [HEIGHT, WIDTH, 3] of a state, a ``hand/truth`` message and frames."""
+        scene = np.full((HEIGHT, _SIDE, 3), float(_BACKGROUND))
+        for part in hand_parts(self._settings, state, truth).values():
+            for colour, width, points in part.lines:
+                _stroke(scene, points, width, COLOURS[colour])
+        image = np.full((HEIGHT, WIDTH, 3), _BACKGROUND, np.uint8)
+        image[:, :_SIDE] = np.rint(scene)
+        for k, frame in enumerate(pressure):
+            level = np.minimum(frame / self._full, len(self._colours) - 1).astype(np.intp)
+            rows, cols = (np.arange(_MAP) * n // _MAP for n in frame.shape)
+            shown = self._colours[level[::-1][rows[:, None], cols]]  # row 0 is at the bottom
+            image[k * _MAP : (k + 1) * _MAP, _SIDE:] = shown
+        return image
+
+
+def _stroke(
+    scene: NDArray[np.float64], points: NDArray[Any], width: float, colour: tuple[int, int, int]
+) -> None:
+    """Draw a line through points [n, 2] m, smoothed over one pixel."""
+    at = np.array([0.5 * _SIDE, HEIGHT]) + _SCALE * (points - (0.0, _LOWEST)) * (1.0, -1.0)
+    reach = 0.5 * max(_SCALE * width, _THINNEST) + 0.5
+    cover = np.zeros(scene.shape[:2])
+    for start, end in itertools.pairwise(at):
+        rows, cols = _box(np.array([start, end]), reach)
+        x = np.arange(_SIDE)[cols] + 0.5 - start[0]
+        y = np.arange(HEIGHT)[rows, None] + 0.5 - start[1]
+        along, across = (end - start).tolist()
+        share = np.clip((x * along + y * across) / max(along**2 + across**2, 1e-9), 0.0, 1.0)
+        distance = np.hypot(x - share * along, y - share * across)
+        part = cover[rows, cols]
+        np.maximum(part, np.clip(reach - distance, 0.0, 1.0), out=part)
+    part = scene[_box(at, reach)]
+    part += cover[_box(at, reach)][..., None] * (np.array(colour) - part)
+
+
+def _box(at: NDArray[np.float64], reach: float) -> tuple[slice, slice]:
+    """Return rows and columns of the pixels within ``reach`` of points [n, 2]."""
+    low, high = np.floor(at.min(axis=0) - reach), np.ceil(at.max(axis=0) + reach)
+    (x0, y0), (x1, y1) = np.clip((low, high), 0, (_SIDE, HEIGHT)).astype(int).tolist()
+    return slice(y0, y1), slice(x0, x1)
+
+
+class Window:
+    """A window of tkinter that shows images, at most as fast as the simulated time."""
+
+    def __init__(self, title: str) -> None:
+        """Open the window.
+
+        Raises RuntimeError without tkinter or a display.
+        """
+        self._shown = 0.0
+        try:
+            import tkinter
+
+            self._root = tkinter.Tk()
+        except Exception as error:  # ImportError or TclError, which is defined in tkinter
+            raise RuntimeError(
+                f"render_mode: found 'human', but no window can be opened: {error}; use a display "
+                "and a Python with tkinter, or 'rgb_array'"
+            ) from None
+        self._root.title(title)
+        self._photo = tkinter.PhotoImage(width=WIDTH, height=HEIGHT)
+        tkinter.Label(self._root, image=self._photo).pack()
+
+    def show(self, image: Image, period: float) -> None:
+        """Show an image ``period`` [s] after the last one. A closed window stays closed."""
+        time.sleep(max(self._shown + period - time.monotonic(), 0.0))
+        self._shown = time.monotonic()
+        import tkinter
+
+        with contextlib.suppress(tkinter.TclError):
+            head = f"P6 {WIDTH} {HEIGHT} 255\n".encode()
+            self._photo.configure(data=head + image.tobytes())
+            self._root.update()
+
+    def close(self) -> None:
+        """Close the window."""
+        import tkinter
+
+        with contextlib.suppress(tkinter.TclError):
+            self._root.destroy()
