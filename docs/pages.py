@@ -435,6 +435,23 @@ def symmetric_grips() -> str:
     return _table(("d [mm]", "q [°]", "N [N]", "τ [mN·m]"), rows)
 
 
+def torsion() -> str:
+    """Tabulate the largest friction moment about the normal of an upright tip of springs.
+
+    It is the integral of μ p r over the footprint, for a = 20 mm and E = 0.304 MPa.
+    """
+    rows, a = [], 20.0
+    for d in (2, 4, 6, 8):
+        h, rho = a - d, math.sqrt(2 * a * d - d * d)
+        area = 0.5 * (a * a * math.asin(rho / a) - rho * h)
+        moment = 2 * math.pi * 0.304 * (rho**3 / 3 - h * area)
+        normal = math.pi * 0.304 * d * d
+        share = moment / (normal * rho)
+        rows.append([str(d), f"{normal:.2f}", f"{rho:.2f}", f"{moment:.1f}", f"{share:.3f}"])
+    heads = ("d [mm]", "N [N]", "ρ [mm]", "M / μ [N·mm]", "M / (μ N ρ)")
+    return _table(heads, rows)
+
+
 def relaxations() -> str:
     """Tabulate the relative force after a sudden press for three relaxation models."""
     times = (0.001, 0.01, 0.1, 1.0, 10.0)
@@ -593,6 +610,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "minimum_strength": minimum_strength,
     "upright_grips": upright_grips,
     "symmetric_grips": symmetric_grips,
+    "torsion": torsion,
     "relaxations": relaxations,
     "errata": errata,
     "servos": servos,

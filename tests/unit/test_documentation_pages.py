@@ -3,11 +3,13 @@
 import ast
 import html
 import importlib.util
+import math
 import re
 from pathlib import Path
 from types import ModuleType
 
 import pytest
+from scipy.integrate import quad
 
 from softfinger.tools.paper import validate
 
@@ -167,3 +169,22 @@ def test_every_quoted_message_exists_in_the_program():
         if not re.search(words, known):
             unknown.append(message)
     assert unknown == []
+
+
+def test_the_torsion_moments_match_the_integrated_pressure(site):
+    rows = re.findall(r"(?m)^\| (\d) \| (\S+) \| (\S+) \| (\S+) \| (\S+) \|$", site[0].torsion())
+    assert len(rows) == 4
+    a, modulus = 20.0, 0.304
+    for d, normal, radius, moment, share in (map(float, row) for row in rows):
+        reach = math.sqrt(a * a - (a - d) ** 2)
+
+        def load(r: float, power: int, h: float = a - d) -> float:
+            strain = 1.0 - h / math.sqrt(a * a - r * r)
+            return 2.0 * math.pi * modulus * strain * r**power
+
+        found = [quad(load, 0.0, reach, power)[0] for power in (1, 2)]
+        assert radius == pytest.approx(reach, abs=0.005)
+        assert normal == pytest.approx(found[0], rel=1e-3)
+        assert moment == pytest.approx(found[1], abs=0.06)
+        assert share == pytest.approx(found[1] / (found[0] * reach), abs=6e-4)
+        assert share < 3.0 * math.pi / 16.0
