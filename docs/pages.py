@@ -533,12 +533,12 @@ def _control(table: int) -> str:
     return _table(heads, _shown(shown, ("median", "p99", "n", "not held")))
 
 
-def control_late() -> str:
-    """Tabulate the remaining angle for delayed measurements, from the third table of that file."""
+def _control_late(ending: str) -> str:
+    """Tabulate the remaining angle for delayed measurements, from the table with this ending."""
     _, rows = _stored("control.json")
     found: dict[str, dict[str, str]] = {}
     for row in rows:
-        if "late" in row["table"]:
+        if row["table"].endswith(ending):
             law, delay = row["name"].rsplit(", ", 1)
             held = "" if row.get("median") is None else f"{row['median']:.2g}°"
             lost = f"{row['not held']} of {row['not held'] + (row.get('n') or 0)} lost"
@@ -617,7 +617,8 @@ TABLES: dict[str, Callable[[], str]] = {
     "measured": measured,
     "control": partial(_control, 0),
     "control_limits": partial(_control, 1),
-    "control_late": control_late,
+    "control_late": partial(_control_late, "late"),
+    "control_late_tips": partial(_control_late, "two-phased"),
     "held_loads": held_loads,
     "envelope_map": envelope_map,
 }

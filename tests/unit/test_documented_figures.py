@@ -53,7 +53,8 @@ def test_tip_models_identified_from_finite_elements_match_the_page() -> None:
             (control.WAYS, "upright (blind)"),
             (control.LIMITS, "torque constants 5 % apart"),
             (control.LIMITS, "tips without tangential coupling"),
-            (control.LATE_LIMITS, "two-phased, 300 ms"),
+            (control.LATE_LIMITS, "two-phased, 0.5 Hz, 300 ms"),
+            (control.LATE_TIPS, "without tangential coupling, 300 ms"),
         )
     ],
 )

@@ -34,8 +34,9 @@ _DRAW_COUNT = 12
 _READ_TIME = 5.0  # s from the grasp command until the object's angle is read
 _STEERING_TIME = 2.0  # s before that, during which the angle is steered to 0
 DELAYS = (0.0, 0.05, 0.1, 0.2, 0.3)  # s
-# Hz, angle integral that is stable for all these delays: ω times the delay is below π/2
-_SLOW_BANDWIDTH = 0.5
+# Hz, bandwidths of the integral of the angle. The slow one is stable for all these delays, since ω
+# times the delay is below π/2; the fast one is the default of `control.rotate_bandwidth`.
+_SLOW_BANDWIDTH, _FAST_BANDWIDTH = 0.5, 4.0
 
 
 class Altered(Grip):
@@ -64,17 +65,24 @@ class Altered(Grip):
 class TwoPhased(Altered):
     """Published serial two-phased controller.
 
-    Phase one integrates the error of the object's angle into an antisymmetric goal for the joints.
-    Phase two is a PD law of the joints for that goal, in addition to equal bias torques for the
-    grip. It does not use the measured force: the bias follows from the requested force.
+    Phase one integrates the error of the object's angle with ``bandwidth`` [Hz] into an
+    antisymmetric goal for the joints. Phase two is a PD law of the joints for that goal, in
+    addition to equal bias torques for the grip. It does not use the measured force: the bias
+    follows from the requested force.
     """
+
+    def __init__(
+        self, hand: SimulatedDaemon, delay: float = 0.0, bandwidth: float = _SLOW_BANDWIDTH
+    ) -> None:
+        super().__init__(hand, delay)
+        self._bandwidth = bandwidth
 
     def _law(self, reading: Reading, pose: ObjectPose, _: bool) -> tuple[float, float]:
         state, grasp, (q1, q2), (dq1, dq2) = self._state, self._grasp, reading.q, reading.dq
         self.force.step(state.force_rate)
         if pose.valid and not math.isnan(self.target_angle):
             error = self.target_angle - pose.angle
-            rate = 2.0 * math.pi * _SLOW_BANDWIDTH * error / sum(grasp.jacobian_rotation)
+            rate = 2.0 * math.pi * self._bandwidth * error / sum(grasp.jacobian_rotation)
             state.offset += rate * state.law.dt
         bias = 0.5 * self.force.value * sum(grasp.moment_arm)
         damping = state.law.damping * math.sqrt(state.joint_stiffness)
@@ -142,13 +150,29 @@ LIMITS = {
     **{f"joint friction {each:g} N·m": _upright(joint_friction=each) for each in (0.1, 0.15, 0.2)},
     **{f"an object of {1e3 * width:g} mm": _upright(width=width) for width in (0.06, 0.07, 0.09)},
 }
+_STEERED_LAWS: dict[str, tuple[Mapping[str, Any], Callable[..., Grip]]] = {
+    f"two-phased, {_SLOW_BANDWIDTH:g} Hz": ({}, TwoPhased),
+    f"energy, {_SLOW_BANDWIDTH:g} Hz": ({"rotate_bandwidth": _SLOW_BANDWIDTH}, Altered),
+    f"two-phased, {_FAST_BANDWIDTH:g} Hz": ({}, partial(TwoPhased, bandwidth=_FAST_BANDWIDTH)),
+    f"energy, {_FAST_BANDWIDTH:g} Hz": ({}, Altered),
+}
 LATE_LIMITS = {
     f"{name}, {1e3 * delay:g} ms": Way(control, is_steered=True, law=partial(law, delay=delay))
-    for name, control, law in (
-        ("two-phased", {}, TwoPhased),
-        ("energy, 4 Hz", {}, Altered),
-        (f"energy, {_SLOW_BANDWIDTH:g} Hz", {"rotate_bandwidth": _SLOW_BANDWIDTH}, Altered),
+    for name, (control, law) in _STEERED_LAWS.items()
+    for delay in DELAYS
+}
+# Relaxed tips without coupling have four times the curvature of the springs' minimum of energy, and
+# tips below three quarters of the stiffness along the face have a maximum.
+_TIPS: dict[str, Sections] = {
+    "solid": SOLID,
+    "without tangential coupling": {"simulation": {"tip_law": "bristles"}},
+    "half as stiff along the face": {"simulation": {"tip_shear_stiffness": 0.5}},
+}
+LATE_TIPS = {
+    f"{name}, {1e3 * delay:g} ms": Way(
+        {}, tips, is_steered=True, law=partial(TwoPhased, delay=delay)
     )
+    for name, tips in _TIPS.items()
     for delay in DELAYS
 }
 
@@ -163,6 +187,7 @@ def measure(brief: bool = False) -> list[Report]:
             ("", WAYS),
             (", upright, limits", LIMITS),
             (", its angle late", LATE_LIMITS),
+            (", its angle late, other tips, two-phased", LATE_TIPS),
         )
     ]
 
