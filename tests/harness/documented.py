@@ -170,7 +170,7 @@ def _patient_doctor() -> contextlib.ExitStack:
     stack = contextlib.ExitStack()
     for module, name, value in (
         (doctor, "check_addresses", lambda _: []),
-        (machine, "_WAKE_UPS", 5),
+        (machine, "_WAKE_UP_COUNT", 5),
     ):
         stack.enter_context(mock.patch.object(module, name, value))
     return stack
