@@ -112,5 +112,9 @@ class HandClosed(SoftfingerError):
     """Use of a `Hand` or a subscription after it was closed."""
 
 
+class WrongThread(SoftfingerError):
+    """Use of a `Hand`'s stream in a second thread. The message names both threads."""
+
+
 class HandFault(SoftfingerError):
     """Fault that the hand latched during a wait. The message is the fault's text."""

@@ -13,7 +13,14 @@ if TYPE_CHECKING:
     from softfinger.daemon.client.asynchronous import AsyncHand
     from softfinger.daemon.client.command_client import NoAnswer
     from softfinger.daemon.client.hand import Hand
-    from softfinger.daemon.errors import HandClosed, HandFault, NoStream, NotInTime, Refused
+    from softfinger.daemon.errors import (
+        HandClosed,
+        HandFault,
+        NoStream,
+        NotInTime,
+        Refused,
+        WrongThread,
+    )
     from softfinger.daemon.wire.schema import HandState
     from softfinger.kinematics.contact.closed_form import Fingertip
     from softfinger.kinematics.contact.material import Material
@@ -40,6 +47,7 @@ __all__ = [
     "Refused",
     "SensorGrid",
     "SoftfingerError",
+    "WrongThread",
     "__version__",
     "read_recording",
 ]

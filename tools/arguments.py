@@ -106,13 +106,29 @@ def command_address(text: str) -> str:
 
 
 def addresses(text: str) -> tuple[str, str]:
-    """Return the addresses of stream and commands; a single socket address is used for both."""
-    from softfinger.daemon.client.connection import both_addresses, default_addresses, is_host
+    """Return the addresses of stream and commands; a single socket address is used for both.
+
+    Raises
+    ------
+    ArgumentTypeError
+        If an address is malformed, or its host is unknown.
+    """
+    from softfinger.daemon.client.connection import (
+        both_addresses,
+        default_addresses,
+        is_host,
+        require_host,
+    )
 
     try:
+        found = text, text
         if not text:
-            return default_addresses()
-        return both_addresses(text, "address") if "," in text or is_host(text) else (text, text)
+            found = default_addresses()
+        elif "," in text or is_host(text):
+            found = both_addresses(text, "address")
+        for address in found:
+            require_host(address)
+        return found
     except SettingsError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
 

@@ -92,7 +92,7 @@ class AsyncHand(HandClient[Coroutine[Any, Any, None]]):
 
     def _subscription(self, topic: bytes, timeout: float | None) -> AsyncSubscription[Any]:
         self._require_open()
-        return AsyncSubscription(self._context, self.stream_address, topic, timeout)
+        return AsyncSubscription(self._context, self.stream_address, topic, timeout, self._thread)
 
     async def collect(self, seconds: float) -> list[HandState]:
         """Return all states of the next ``seconds`` s of the daemon's clock. Raises NoStream."""

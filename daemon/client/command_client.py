@@ -17,9 +17,11 @@ from softfinger import SoftfingerError
 from softfinger.daemon.client.connection import (
     REPLY_TIMEOUT,
     SILENCE_TIME,
+    OneThread,
     both_addresses,
     default_addresses,
     is_host,
+    require_host,
     still_waiting,
 )
 from softfinger.daemon.errors import HandClosed, Reason, Refused
@@ -195,15 +197,23 @@ class HandClient(Generic[_Done]):
             usual, stream = both_addresses(stream, "address"), None
         self.stream_address = stream or usual[0]
         self.command_address = commands or usual[1]
+        for address in (self.stream_address, self.command_address):
+            require_host(address)
         self.client = client
         self.timeout = timeout
         self._keys = None if keys is None else load_client(keys)
+        self._thread = OneThread()
         self._context = self._CONTEXT()
         if self._keys is not None:
             self._keys.guard(self._context)
 
+    def __repr__(self) -> str:
+        ended = ", closed" if self._context.closed else ""
+        return f"{type(self).__name__}: {self.stream_address}, {self.command_address}{ended}"
+
     def close(self) -> None:
         """Close all sockets, including those of open subscriptions. The hand keeps its state."""
+        self._thread.claim()
         self._context.destroy(linger=0)
 
     def _require_open(self) -> None:

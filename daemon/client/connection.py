@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Iterator
+from socket import getaddrinfo
 from typing import Any
 
 import msgpack
 import zmq
 
-from softfinger.daemon.errors import SettingsError
+from softfinger.daemon.errors import SettingsError, WrongThread
 from softfinger.daemon.types import COMMAND_ADDRESS, STREAM_ADDRESS
 
 REPLY_TIMEOUT = 5.0  # s, default timeout of a reply or a first message
@@ -54,6 +56,48 @@ def is_host(named: str) -> bool:
     """Return True if an address is ``tcp://HOST`` without a port."""
     alone = named.startswith("tcp://") and "," not in named
     return alone and ":" not in named[6:].split("]")[-1]
+
+
+def require_host(address: str) -> None:
+    """Raise SettingsError if this machine cannot resolve the host of a TCP address.
+
+    ZeroMQ does not report an unknown host; it tries again without end.
+    """
+    if not address.startswith("tcp://"):
+        return
+    host = address[6:].rpartition(":")[0].strip("[]")
+    try:
+        getaddrinfo(host, None)
+    except (OSError, UnicodeError) as error:
+        why = getattr(error, "strerror", None) or "not a host name"
+        raise SettingsError(
+            f"{address}: found the unknown host {host!r} ({why}), expected a name that this "
+            "machine can resolve, or an IP address"
+        ) from None
+
+
+class OneThread:
+    """Owner of a hand's sockets: the first thread that uses them, until it ends.
+
+    A ZeroMQ socket that two threads use loses messages or aborts the process.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._owner: threading.Thread | None = None
+
+    def claim(self) -> None:
+        """Make this thread the owner. Raises WrongThread while the owner is another one."""
+        thread = threading.current_thread()
+        with self._lock:
+            if self._owner is None or not self._owner.is_alive():
+                self._owner = thread
+            owner = self._owner
+        if owner is not thread:
+            raise WrongThread(
+                f"thread {thread.name}: found a Hand whose stream thread {owner.name} uses, "
+                "expected one thread for each Hand; make another Hand in this thread"
+            )
 
 
 def subscribe(

@@ -52,9 +52,12 @@ class Subscription(Subscriber[_Record]):
 
 
 class Hand(HandClient[None]):
-    """Client of one hand. Not thread-safe: create one object in each thread.
+    """Client of one hand. Create one object in each thread.
 
-    All methods raise HandClosed after `close`.
+    Commands may be sent from any thread. The stream of one object (`state`, `stream`, `frames`,
+    `events`, `collect`, `wait_for`) and `close` belong to the first thread that uses the stream,
+    until it ends; they raise WrongThread in other threads. All methods raise HandClosed after
+    `close`.
 
     Parameters
     ----------
@@ -71,6 +74,8 @@ class Hand(HandClient[None]):
 
     Raises
     ------
+    SettingsError
+        If an address is malformed, or its host is unknown.
     KeyFileError
         If the keys can't be read.
     """
@@ -105,7 +110,7 @@ class Hand(HandClient[None]):
 
     def _subscription(self, topic: bytes, timeout: float | None) -> Subscription[Any]:
         self._require_open()
-        return Subscription(self._context, self.stream_address, topic, timeout)
+        return Subscription(self._context, self.stream_address, topic, timeout, self._thread)
 
     def collect(self, seconds: float) -> list[HandState]:
         """Return all states of the next ``seconds`` s of the daemon's clock. Raises NoStream."""

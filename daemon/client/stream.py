@@ -21,7 +21,13 @@ import numpy as np
 import zmq
 from numpy.typing import NDArray
 
-from softfinger.daemon.client.connection import SILENCE_TIME, still_waiting, subscribe, unpack
+from softfinger.daemon.client.connection import (
+    SILENCE_TIME,
+    OneThread,
+    still_waiting,
+    subscribe,
+    unpack,
+)
 from softfinger.daemon.errors import HandClosed, HandFault, NoStream, NotInTime
 from softfinger.daemon.wire.schema import SCHEMA, STATE, TOPICS, HandState, fields_of
 
@@ -126,8 +132,14 @@ class Subscriber(Generic[_Record]):
     """
 
     def __init__(
-        self, context: zmq.Context[Any], address: str, topic: bytes, timeout: float | None
+        self,
+        context: zmq.Context[Any],
+        address: str,
+        topic: bytes,
+        timeout: float | None,
+        thread: OneThread,
     ) -> None:
+        self._thread = thread
         self._address = address
         self._topic = topic
         self._timeout = timeout
@@ -137,15 +149,23 @@ class Subscriber(Generic[_Record]):
         self.unreadable = 0
         self._socket: Any = subscribe(context, address, topic)
 
+    def __repr__(self) -> str:
+        ended = ", closed" if self._socket.closed else ""
+        where = f"{self._topic.decode()} from {self._address}"
+        return f"{type(self).__name__}: {where}, {self.lost} lost{ended}"
+
     @property
     def lost(self) -> int:
         """Number of lost messages, from the gaps in their sequence numbers."""
         return self._gaps.lost
 
     def close(self) -> None:
+        """End the subscription."""
+        self._thread.claim()
         self._socket.close()
 
     def _require_open(self) -> None:
+        self._thread.claim()
         if self._socket.closed:
             raise HandClosed("this subscription is closed: make another")
 

@@ -27,6 +27,7 @@ from softfinger.daemon.types import (
     TimeSpread,
     Truth,
 )
+from softfinger.daemon.wire import record_text
 from softfinger.daemon.wire.fields import TOPICS as TOPICS
 from softfinger.daemon.wire.fields import FieldSource, record, topic
 from softfinger.daemon.wire.fields import fields_of as fields_of
@@ -202,6 +203,9 @@ class FingerState:
         "s", "time until safety.temperature_max at the present current; 3600 means one hour or more"
     )
 
+    def __repr__(self) -> str:
+        return f"FingerState: {record_text.finger_text(self)}"
+
 
 @record
 class ObjectState:
@@ -218,6 +222,9 @@ class ObjectState:
         "", "consistency of the torque channel: mean normalised innovation squared, expected 1"
     )
     nis_balance: float = _pose("", "consistency of the balance channel (forces of both tips)")
+
+    def __repr__(self) -> str:
+        return f"ObjectState: {record_text.object_text(self)}"
 
 
 @topic(
@@ -251,6 +258,12 @@ class HandState(_TickMessage):
     left: FingerState = _tick.part("left finger: ", lambda m: _Finger(m.state, m.scene, 0))
     right: FingerState = _tick.part("right finger: ", lambda m: _Finger(m.state, m.scene, 1))
     object: ObjectState = _state.part("", lambda s: s.object)
+
+    def __repr__(self) -> str:
+        return f"HandState: {', '.join(record_text.state_parts(self))}"
+
+    def _repr_html_(self) -> str:
+        return record_text.state_html(self)
 
     def finger(self, name: str) -> FingerState:
         """Return ``left`` or ``right`` by its name. Raises ValueError for other names."""
@@ -321,13 +334,20 @@ class TactileFrame:
                 f"hand/tactile: {len(self.data)} bytes are no {self.rows} × {self.cols} uint16 grid"
             )
 
+    def __repr__(self) -> str:
+        return f"TactileFrame: {record_text.frame_text(self)}"
+
+    def _repr_html_(self) -> str:
+        return record_text.frame_html(self)
+
     @property
     def counts(self) -> NDArray[np.uint16]:
-        """The data [rows, cols], read-only."""
+        """The data, uint16 [rows, cols], read-only."""
         return np.frombuffer(self.data, dtype="<u2").reshape(self.rows, self.cols)
 
+    @property
     def pressure(self) -> NDArray[np.float64]:
-        """Return counts times scale [Pa], shape [rows, cols]."""
+        """Pressure of each cell [Pa], counts times scale, float64 [rows, cols]."""
         return self.counts.astype(np.float64) * self.scale
 
 
@@ -357,6 +377,9 @@ class Event(_Announcement):
     level: str = _event("", "info, warning or error")
     kind: str = _event("", "kind of the event: mode, fault, servos, …")
     text: str = _event("", "one-line message")
+
+    def __repr__(self) -> str:
+        return f"Event: {self.level}, {self.kind}: {self.text}"
 
 
 _times = FieldSource[TimeSpread]()

@@ -91,11 +91,15 @@ class Fingertip:
         object.__setattr__(self, "radius", radius)
 
     def theta_limit(self, d: ArrayLike) -> FloatArray:
-        """Return the maximum |θ| [rad] at d [m]: asin((a − d)/a), π/2 for d ≤ 0, 0 for d ≥ a."""
+        """Return the maximum |θ| [rad] at d [m]: asin((a − d)/a), π/2 for d ≤ 0, 0 for d ≥ a.
+
+        ``d`` is a number or an array, and so is the result.
+        """
         h = np.clip(self.radius - np.asarray(d, np.float64), 0.0, self.radius)
         # cos θ is the footprint radius divided by a. Unlike asin(h/a), this is accurate as d → 0.
         depth = np.clip(d, 0.0, self.radius)
-        return np.asarray(np.arctan2(h, np.sqrt(depth * (self.radius + h))))
+        limit: FloatArray = np.arctan2(h, np.sqrt(depth * (self.radius + h)))
+        return limit
 
 
 class ClosedForms(NamedTuple):

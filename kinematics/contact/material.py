@@ -84,6 +84,10 @@ class Material:
                 f"strain {worst / 512:.3f}"
             )
 
+    def __repr__(self) -> str:
+        modulus = f"E₀ {1e-6 * self.reference_modulus:.4g} MPa"
+        return f"Material: {self.name}, {modulus}, σ of degree {self.degree}"
+
     @classmethod
     def constant(cls, modulus: float) -> Material:
         """Return Hooke's law with modulus E [Pa]. Raises MaterialError unless 0 < E < ∞."""
@@ -146,17 +150,19 @@ class Material:
 
         The force is F = 2π h² ∫ σ(ε)/(1 − ε)³ dε up to ε = d/a, with h = a − d. Its error is the
         same integral over the misfits, relative to F; the misfits are interpolated linearly,
-        starting from 0 at zero strain. ``ratio`` is d/a in (0, 1].
+        starting from 0 at zero strain. ``ratio`` is d/a in (0, 1], a number or an array, and so is
+        the result.
         """
         ratios = np.asarray(ratio, np.float64)
         if self.misfits is None:
-            return np.zeros(ratios.shape)
+            return np.zeros(ratios.shape)[()]
         ends = np.minimum(ratios[..., None], 0.999)
         strain = ends * (np.arange(200) + 0.5) / 200
         weight = (1.0 - strain) ** -3
         x, misses = np.concatenate([np.zeros((2, 1)), self.misfits], axis=1)
         missed = (np.interp(strain, x, misses) * weight).sum(axis=-1)
-        return np.asarray(missed / (self.stress(strain) * weight).sum(axis=-1))
+        error: FloatArray = missed / (self.stress(strain) * weight).sum(axis=-1)
+        return error
 
     @property
     def worst_force_error(self) -> float:
@@ -174,11 +180,11 @@ class Material:
         return len(self.coefficients)
 
     def stress(self, strain: ArrayLike) -> FloatArray:
-        """Return σ(ε) [Pa]; 0 for ε ≤ 0, linear above 1, NaN for NaN input."""
+        """Return σ(ε) [Pa] of a number or an array; 0 for ε ≤ 0, linear above 1, NaN for NaN."""
         return _evaluate(self.law, strain, 1)
 
     def energy_density(self, strain: ArrayLike) -> FloatArray:
-        """Return the energy density w(ε) = ∫₀^ε σ [J/m³]; 0 for ε ≤ 0, NaN for NaN input."""
+        """Return the energy density w(ε) = ∫₀^ε σ [J/m³] likewise; 0 for ε ≤ 0, NaN for NaN."""
         return _evaluate(self.energy_law, strain, 2)
 
     def expansions(self) -> FloatArray:
@@ -202,7 +208,10 @@ class Material:
 
 
 def _evaluate(law: FloatArray, strain: ArrayLike, order: int) -> FloatArray:
-    """Return ``law`` at ``strain``: 0 below 0, and a Taylor series up to ``order`` above 1."""
+    """Return ``law`` at ``strain``: 0 below 0, and a Taylor series up to ``order`` above 1.
+
+    The result has the shape of ``strain``; for a number it is a NumPy scalar.
+    """
     x = np.asarray(strain, dtype=np.float64)
     u = np.clip(x, 0.0, 1.0)
     value = law[-1]
@@ -213,7 +222,8 @@ def _evaluate(law: FloatArray, strain: ArrayLike, order: int) -> FloatArray:
         last = np.polynomial.Polynomial(law)
         for n in range(1, order + 1):
             value = value + last.deriv(n)(1.0) / math.factorial(n) * beyond**n
-    return np.asarray(np.where(x <= 0.0, 0.0, value))
+    result: FloatArray = np.where(x <= 0.0, 0.0, value)[()]
+    return result
 
 
 def _integral(polynomial: Sequence[Fraction]) -> list[Fraction]:

@@ -82,6 +82,10 @@ class ContactTable:
         self.max_error = table.max_error
         self._error = (self.max_error,)
 
+    def __repr__(self) -> str:
+        radius = f"radius {1e3 * self.header.radius:.4g} mm"
+        return f"ContactTable: {self.form}, {radius}, relative error at most {self.max_error:.1e}"
+
     @classmethod
     def build(cls, tip: Fingertip, material: Material, tolerance: float = 1e-9) -> ContactTable:
         """Build the smallest table that meets a relative ``tolerance`` on all outputs.
@@ -150,7 +154,8 @@ class ContactTable:
         Parameters
         ----------
         d, theta
-            Numbers or arrays, which broadcast. Results are zero for d ≤ 0 and NaN for NaN input.
+            Numbers or arrays, which broadcast. Two numbers give numbers, inside the domain and
+            outside. Results are zero for d ≤ 0 and NaN for NaN input.
         edge
             If True, clamp points outside the domain without a RuntimeWarning. ``inside`` is False
             for clamped points in either case.
@@ -160,13 +165,19 @@ class ContactTable:
         TypeError
             If an argument is not a real number.
         """
+        point: tuple[float, float] | None = None
         if type(d) is float and type(theta) is float:
-            found = lookup(self.data, d, theta)
+            point = d, theta
+        else:
+            shape, (depth, tilt) = flatten(d, theta)
+            if not shape:
+                point = depth.item(), tilt.item()
+        if point is not None:
+            found = lookup(self.data, *point)
             if not (found[6] or edge):
-                self._warn(np.array([d]), np.array([theta]))
+                self._warn(*np.reshape(point, (2, 1)))
             numbers: ContactForces = _numbers(ContactForces, found + self._error)
             return numbers
-        shape, (depth, tilt) = flatten(d, theta)
         out = np.empty((6, depth.size))
         within = np.empty(depth.size, dtype=np.bool_)
         lookups(self.data, depth, tilt, out, within)

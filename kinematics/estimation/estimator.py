@@ -96,6 +96,16 @@ class ContactEstimate:
     covariance: FloatArray = field(default_factory=lambda: np.zeros((4, 4)))
     systematic: FloatArray = field(default_factory=lambda: np.zeros((4, 4)))
 
+    def __repr__(self) -> str:
+        if not self.valid:
+            return f"ContactEstimate: not valid: {self.invalid.text}"
+        if not self.contact:
+            return f"ContactEstimate: no contact of more than {1e3 * self.d_std:.2g} mm"
+        tilts = (self.tilt_x, self.tilt_x_std), (self.tilt_y, self.tilt_y_std)
+        told = ", ".join(f"{math.degrees(a):z.2f} ± {math.degrees(std):.2f}°" for a, std in tilts)
+        d = f"d {1e3 * self.d:.3f} ± {1e3 * self.d_std:.3f} mm"
+        return f"ContactEstimate: {d}, tilts {told}, gain {self.gain:.2f}"
+
     @property
     def valid(self) -> bool:
         """True if the estimate can be used; see the class notes."""
@@ -295,6 +305,11 @@ class ContactEstimator:
             covariance=state.estimate.covariance,
             systematic=state.estimate.systematic,
         )
+
+    def __repr__(self) -> str:
+        rows, cols = self.grid.shape
+        gain = "free" if self._options.free_gain else "fixed"
+        return f"ContactEstimator: {rows} × {cols} cells, noise {self.noise:g} Pa, {gain} gain"
 
     def _lay_out(self, tip: Fingertip, material: Material, alive: NDArray[np.bool_]) -> None:
         """Set the window of cells that a contact can press, the cell arrays and the model."""

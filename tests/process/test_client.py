@@ -5,7 +5,10 @@ import inspect
 import json
 import math
 import re
-from collections.abc import Iterator
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from fractions import Fraction
 from typing import Any
 
@@ -13,8 +16,18 @@ import msgpack
 import numpy as np
 import pytest
 
-from softfinger import AsyncHand, Hand, HandFault, HandState, NoAnswer, NoStream, NotInTime, Refused
-from softfinger.daemon.client import command_client
+from softfinger import (
+    AsyncHand,
+    Hand,
+    HandFault,
+    HandState,
+    NoAnswer,
+    NoStream,
+    NotInTime,
+    Refused,
+    WrongThread,
+)
+from softfinger.daemon.client import command_client, connection
 from softfinger.daemon.client.asynchronous import AsyncSubscription
 from softfinger.daemon.client.command_client import UNCONFIRMED_TEXT
 from softfinger.daemon.client.connection import SILENCE_TIME, still_waiting
@@ -50,7 +63,7 @@ def test_grasp_turn_and_release_on_a_running_daemon(daemon):
             assert held.right.contact
             frame = next(frames)
             assert frame.counts.shape == (44, 44)
-            assert frame.pressure().sum() > 0.0
+            assert frame.pressure.sum() > 0.0
             assert any("grasping" in event.text for event in events)
         hand.rotate(angle=math.radians(5.0))
         hand.wait_for(lambda state: abs(state.object.angle - math.radians(5.0)) < 5e-3, 60.0)
@@ -291,7 +304,7 @@ def test_a_frame_has_cell_positions_and_units():
     assert (frame.finger, frame.valid, frame.unit, frame.calibrated) == ("right", True, "Pa", True)
     where = frame.pitch_y, frame.centre_x, frame.centre_y
     assert (where, frame.calibration) == ((0.002, 1e-4, 0.0), "A17 2026")
-    assert np.array_equal(frame.pressure(), 0.5 * frame.counts)
+    assert np.array_equal(frame.pressure, 0.5 * frame.counts)
 
 
 def test_missing_fields_are_nan():
@@ -406,6 +419,106 @@ def test_one_string_names_both_addresses(monkeypatch, named, addresses, given):
         monkeypatch.setenv("SOFTFINGER_ADDRESS", wrong)
         with pytest.raises(SettingsError, match=r"SOFTFINGER_ADDRESS: found .*, expected tcp://H"):
             Hand()
+
+
+UNKNOWN = "found the unknown host 'no..host' (not a host name), expected a name that"
+
+
+@pytest.mark.parametrize("cls", [Hand, AsyncHand])
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"stream": "tcp://no..host"},
+        {"stream": "tcp://no..host:9872"},
+        {"stream": STREAM_ADDRESS, "commands": "tcp://no..host:9873"},
+    ],
+)
+def test_an_unknown_host_fails_at_once_with_its_name(cls, given):
+    with pytest.raises(SettingsError, match=re.escape(UNKNOWN)):
+        cls(**given)
+
+
+def test_a_host_that_the_resolver_does_not_know_is_named_with_its_reason(monkeypatch):
+    def unknown(host: str, _: object) -> None:
+        raise socket.gaierror(socket.EAI_NONAME, f"no address for {host}")
+
+    monkeypatch.setattr(connection, "getaddrinfo", unknown)
+    with pytest.raises(SettingsError, match=r"unknown host 'lab7' \(no address for lab7\)"):
+        Hand("tcp://lab7")
+    with Hand("ipc:///run/a,ipc:///run/b"):
+        pass  # has no host
+
+
+@pytest.mark.parametrize("words", [["monitor"], ["send", "stop"], ["status"], ["record", "a.mcap"]])
+@pytest.mark.parametrize("given", [True, False], ids=["argument", "environment"])
+def test_commands_fail_at_once_for_an_unknown_host(inline, monkeypatch, words, given):
+    monkeypatch.setenv("SOFTFINGER_ADDRESS", "" if given else "tcp://no..host")
+    done = inline(*words, *(["--address", "tcp://no..host"] if given else []))
+    assert done.returncode == 2
+    assert UNKNOWN in done.stderr
+
+
+def in_a_thread(use: Callable[[], object]) -> BaseException | None:
+    """The exception that a call raises in a thread of its own."""
+    with ThreadPoolExecutor(1, "other") as pool:
+        return pool.submit(use).exception(60.0)
+
+
+def test_a_second_thread_that_uses_the_stream_is_refused_at_once(fake, hand):
+    states = hand.stream(60.0)
+    assert in_a_thread(hand.grasp) is None  # commands have a socket of their own
+    next(states)
+    for use in (
+        lambda: next(states),
+        hand.state,
+        lambda: next(hand.events()),
+        lambda: hand.wait_for(lambda _: True),
+        states.skip,
+        states.close,
+        hand.close,
+    ):
+        error = in_a_thread(use)
+        assert isinstance(error, WrongThread), use
+        assert "thread other_0: found a Hand whose stream thread MainThread uses" in str(error)
+    assert next(states).mode == hand.state().mode == "holding"
+
+
+def test_a_hand_may_be_used_after_the_thread_that_used_it(fake, hand):
+    assert in_a_thread(hand.state) is None
+    assert hand.state().mode == "holding"
+
+
+def test_a_thread_that_waits_without_limit_is_not_disturbed(fake, hand):
+    fake.changes = {"mode": "armed"}
+    found: list[str] = []
+    waits = threading.Event()
+
+    def wait() -> None:
+        ended = hand.wait_for(lambda state: waits.set() or state.mode == "holding", 60.0)
+        found.append(ended.mode)
+
+    waiting = threading.Thread(target=wait)
+    waiting.start()
+    assert waits.wait(60.0)
+    for use in (hand.state, hand.close):
+        with pytest.raises(WrongThread):
+            use()
+    fake.changes = {"mode": "holding"}
+    waiting.join(60.0)
+    assert found == ["holding"]
+
+
+def test_two_threads_do_not_share_an_async_hand(fake):
+    async def state(hand: AsyncHand) -> str:
+        return (await hand.state(60.0)).mode
+
+    async def session() -> None:
+        async with AsyncHand(fake.state_address, fake.command_address, timeout=60.0) as hand:
+            await hand.state()
+            error = await asyncio.to_thread(in_a_thread, lambda: asyncio.run(state(hand)))
+            assert isinstance(error, WrongThread)
+
+    asyncio.run(session())
 
 
 def test_status_prints_one_line_or_the_complete_state_as_json(fake, inline):

@@ -1,6 +1,7 @@
 """The contact estimator reaches the Cramér-Rao bound, and its covariance is consistent."""
 
 import math
+import re
 import tracemalloc
 
 import numpy as np
@@ -325,3 +326,19 @@ def test_a_wrong_model_increases_chi2_and_the_covariance():
         GRID.pressure(TIP, Material.constant(2 * E), twice.d, twice.tilt_x, twice.tilt_y)
     )
     assert twice.d_std > 5.0 * ideal.d_std
+
+
+def test_an_estimate_says_what_it_found():
+    estimator = ContactEstimator(TIP, LINEAR, GRID, NOISE)
+    assert repr(estimator) == f"ContactEstimator: 44 × 44 cells, noise {NOISE:g} Pa, free gain"
+    pressed = repr(estimator(GRID.pressure(TIP, LINEAR, 0.004, 0.2, 0.0)))
+    told = (
+        r"ContactEstimate: d 4\.000 ± 0\.\d{3} mm, tilts 11\.46 ± 0\.\d\d°, 0\.00 ± .*, gain 1\.00"
+    )
+    assert re.fullmatch(told, pressed)
+    air = repr(estimator(np.zeros(GRID.shape)))
+    assert re.fullmatch(r"ContactEstimate: no contact of more than 0\.\d+ mm", air)
+    assert repr(estimator(np.full(GRID.shape, math.nan))).endswith(
+        "not valid: readings are not finite"
+    )
+    assert repr(ContactEstimate()) == "ContactEstimate: not valid: no frame yet"

@@ -97,7 +97,22 @@ def test_strains_outside_zero_to_one(index):
     below = (material.stress(1.0) - material.stress(1.0 - 1e-6)) / 1e-6
     np.testing.assert_allclose(slope, below, rtol=1e-4)
     assert material.stress(np.empty((0, 3))).shape == (0, 3)
-    assert material.stress(np.float32(0.5)).shape == ()
+
+
+@pytest.mark.parametrize("strain", [-1, 0, 0.5, 2.0, math.nan, np.float32(0.5), np.array(0.5)])
+def test_numbers_give_numbers(strain):
+    for material in laws():
+        ratio_too = (material.force_error,) * bool(strain > 0)
+        for of in (material.stress, material.energy_density, *ratio_too):
+            assert isinstance(of(strain), float)
+            assert of([strain, strain]).shape == (2,)
+            np.testing.assert_array_equal(of([strain]), of(strain))
+
+
+def test_a_law_says_what_it_is():
+    told = [repr(law) for law in laws()]
+    assert told[0] == "Material: constant, E₀ 0.304 MPa, σ of degree 1"
+    assert told[1] == "Material: table_i, E₀ 0.135 MPa, σ of degree 7"
 
 
 def test_a_law_is_recovered_from_its_points():

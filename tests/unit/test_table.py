@@ -2,6 +2,7 @@
 
 import functools
 import math
+import re
 from fractions import Fraction
 
 import numpy as np
@@ -180,6 +181,26 @@ def test_lookups_outside_the_domain_cause_a_warning(table):
     assert table(d, theta, edge=True).inside.sum() == 3
     table(d[:3], theta[:3])  # a warning would be an error
     table(0.008, -float(TIP.theta_limit(0.008)) * (1.0 + 1e-15))
+
+
+@pytest.mark.filterwarnings("ignore:.* outside the contact table")
+@pytest.mark.parametrize("kind", [float, np.float64, np.float32, np.array, int])
+@pytest.mark.parametrize("point", [(0.004, 0.2), (0.03, 2.0), (-1.0, 0.0), (math.nan, 0.1)])
+def test_numbers_give_numbers_and_arrays_give_arrays(table, kind, point):
+    if kind is int and math.isnan(point[0]):
+        return
+    d, theta = map(kind, point)
+    found = table(d, theta)
+    assert {type(each) for each in found} == {float, bool}
+    np.testing.assert_array_equal(found, table(float(d), float(theta)))
+    whole = table(np.array([d]), theta)
+    assert {each.shape for each in whole[:7]} == {(1,)}
+    np.testing.assert_array_equal([each[0] for each in whole[:7]], found[:7])
+
+
+def test_a_table_says_what_it_is(table):
+    told = r"ContactTable: springs, 2 a slab, radius 20 mm, relative error at most \d\.\de-1\d"
+    assert re.fullmatch(told, repr(table))
 
 
 @pytest.mark.filterwarnings("ignore:.* outside the contact table")

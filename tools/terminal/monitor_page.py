@@ -13,9 +13,9 @@ from dataclasses import dataclass, field
 from rich.text import Text
 
 from softfinger.daemon.types import FINGERS
+from softfinger.daemon.wire.record_text import why_invalid
 from softfinger.daemon.wire.schema import SCHEMA
 from softfinger.tools.terminal import heatmap
-from softfinger.tools.terminal.status import why_invalid
 from softfinger.tools.terminal.stream_state import GLOSSARY, ShownReply, StreamState
 from softfinger.tools.terminal.text_layout import (
     DIM,

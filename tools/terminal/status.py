@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import sys
 from dataclasses import asdict
 
 from softfinger.daemon.client.hand import Hand
 from softfinger.daemon.errors import NoStream
-from softfinger.daemon.types import FINGERS
+from softfinger.daemon.wire.record_text import state_parts
 from softfinger.daemon.wire.schema import HandState
-from softfinger.kinematics.estimation.invalid import Invalid
 from softfinger.tools.arguments import add_daemon, no_stream, stream_address
 
 
@@ -35,26 +33,6 @@ def run(arguments: argparse.Namespace) -> int:
 
 def describe(state: HandState) -> str:
     """Return a line with mode, mean force and the object's angle and width, or the fault."""
-    if state.fault:
-        return f"{state.mode}: {state.fault}"
-    parts = [state.mode]
-    touching = [finger for finger in (state.left, state.right) if finger.contact]
-    if touching:
-        force = sum(finger.force for finger in touching) / len(touching)
-        tips = ", ".join(f"{finger.force:.1f} ± {finger.force_std:.1f}" for finger in touching)
-        parts.append(f"{force:.1f} N ({tips})")
-    if state.object.valid:
-        parts.append(f"{math.degrees(state.object.angle):z.1f}°")
-        parts.append(f"{state.object.width * 1e3:.1f} mm")
-    parts += [why_invalid(state)] if why_invalid(state) else []
-    return " ".join(parts[:1]) + (" " + ", ".join(parts[1:]) if parts[1:] else "")
-
-
-def why_invalid(state: HandState) -> str:
-    """Return the reason why the fingers' estimates are invalid; empty if they are valid."""
-    reasons = {name: state.finger(name).invalid for name in FINGERS}
-    return "; ".join(
-        f"{name} not valid: {reason}"
-        for name, reason in reasons.items()
-        if reason not in ("", Invalid.NOT_IN_SCENE.text)
-    )
+    mode, *details = state_parts(state)
+    separator = ": " if state.fault else " "
+    return separator.join(filter(None, [mode, ", ".join(details)]))

@@ -27,9 +27,9 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.physics.simulated_hand import geometry_of
 from softfinger.daemon.types import FINGERS
 from softfinger.daemon.wire import schema
+from softfinger.daemon.wire.record_text import why_invalid
 from softfinger.daemon.wire.schema import HandState
 from softfinger.tools.terminal import heatmap
-from softfinger.tools.terminal.status import why_invalid
 from softfinger.tools.terminal.stream_state import StreamState, number, printable, text
 from softfinger.tools.terminal.text_layout import format_microseconds, format_value
 from softfinger.tools.viewing import hand_drawing
