@@ -10,6 +10,25 @@ from enum import StrEnum
 
 from softfinger import SoftfingerError as SoftfingerError
 
+__all__ = [
+    "AddressError",
+    "HandClosed",
+    "HandFault",
+    "KeyFileError",
+    "NoDescriptor",
+    "NoStream",
+    "NotInTime",
+    "PluginError",
+    "Reason",
+    "RecordingError",
+    "Refused",
+    "ServoError",
+    "ServosSilent",
+    "SettingsError",
+    "TactileError",
+    "WrongThread",
+]
+
 
 class SettingsError(SoftfingerError):
     """Unusable settings. The message lists every error with file, key, found and expected."""

@@ -247,19 +247,56 @@ def events() -> str:
 # --- the interface for programs -------------------------------------------------------------------
 
 
+_API = """\
+# Python interface
+
+Import these names from `softfinger`. [Programs](programs.md) shows how to use them. Lengths are in
+m, forces in N, pressures in Pa, angles in rad and times in s, unless another unit is given.
+"""
+
+# Sections of the page: title, introduction, and the names in it.
+_SECTIONS = (
+    (
+        "Control a hand",
+        "The commands of `AsyncHand` and its methods that wait are awaited; its other methods are "
+        "those of `Hand`.",
+        "Hand AsyncHand Subscription AsyncSubscription to_columns",
+    ),
+    (
+        "States, frames and events",
+        "The records that a `Hand` returns.",
+        "HandState FingerState ObjectState TactileFrame Event",
+    ),
+    (
+        "Other records of the stream",
+        "The records of the topics that programs rarely need; [the stream](stream.md) lists all "
+        "topics.",
+        "LoopStatistics Spread Rates HandSettings AnsweredCommand TickInput InputReading "
+        "InputFinger TrueState TrueFinger TrueObject",
+    ),
+    (
+        "Errors",
+        "Every exception derives from `SoftfingerError`.",
+        "SoftfingerError Refused Reason NoAnswer NoStream NotInTime HandFault HandClosed "
+        "WrongThread SettingsError KeyFileError RecordingError TableError MaterialError",
+    ),
+    ("Recordings", "", "read_recording"),
+    (
+        "Contact model and estimator",
+        "These need no daemon. Numbers give numbers, and arrays give arrays.",
+        "Fingertip Material ContactTable ContactForces Certificate SensorGrid ContactEstimator "
+        "ContactEstimate Invalid Readings Uncertainty",
+    ),
+    ("Checks for plugin authors", "", "testing"),
+)
+
+
 def api() -> str:
     """List the public names of the package with their docstrings."""
-    import softfinger
-
-    parts = [
-        "# Python interface\n\nImport these names from `softfinger`. "
-        "[Programs](programs.md) shows how to use them.\n"
-    ]
-    for name in softfinger.__all__:
-        if not name.startswith("_"):
-            module = softfinger._MODULES.get(name, "softfinger")
-            parts.append(f"\n::: {module}.{name}\n")
-    parts.append("\n## Checks for plugin authors\n\n::: softfinger.testing\n")
+    parts = [_API]
+    for title, introduction, names in _SECTIONS:
+        parts.append(f"\n## {title}\n\n{introduction}\n")
+        parts += [f"\n::: softfinger.{name}\n" for name in names.split()]
     return "".join(parts)
 
 

@@ -50,6 +50,8 @@ from softfinger.kinematics.compiled.layout import Record, Records
 from softfinger.kinematics.contact.table import ContactTable
 from softfinger.kinematics.contact.table_record import Table
 
+__all__ = ["MujocoHand", "SoftTips"]
+
 Work = tuple[FloatArray, FloatArray, FloatArray]
 
 _ROWS = 4  # rows per tip: d, θ, shear along and across the tilt

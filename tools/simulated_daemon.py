@@ -16,6 +16,8 @@ from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.load import checked
 from softfinger.daemon.types import Event
 
+__all__ = ["SimulatedDaemon"]
+
 
 @dataclass(frozen=True)
 class TrueStates:

@@ -21,11 +21,13 @@ from softfinger.daemon.client.stream import Subscriber, Wait, no_stream
 from softfinger.daemon.errors import NoStream, Refused
 from softfinger.daemon.wire.schema import EVENT, STATE, TACTILE, Event, HandState, TactileFrame
 
+__all__ = ["AsyncHand", "AsyncSubscription"]
+
 _Record = TypeVar("_Record")
 
 
 class AsyncSubscription(Subscriber[_Record]):
-    """`client.hand.Subscription` for asyncio: ``async for record in hand.stream(): …``."""
+    """`Subscription` for asyncio: ``async for record in hand.stream(): …``."""
 
     def __aiter__(self) -> AsyncIterator[_Record]:
         return self
@@ -58,7 +60,7 @@ class AsyncSubscription(Subscriber[_Record]):
 class AsyncHand(HandClient[Coroutine[Any, Any, None]]):
     """Hand for use in one event loop: ``async with AsyncHand() as hand: …``.
 
-    See `client.hand.Hand`.
+    Parameters, methods and exceptions are those of `Hand`.
     """
 
     _CONTEXT = zmq.asyncio.Context
@@ -110,7 +112,7 @@ class AsyncHand(HandClient[Coroutine[Any, Any, None]]):
     ) -> HandState:
         """Return the first new state for which ``condition`` holds.
 
-        Raises the same exceptions as `client.hand.Hand.wait_for`.
+        Raises the same exceptions as `Hand.wait_for`.
         """
         wait = Wait(condition, timeout)
         async with self.stream() as states:

@@ -29,6 +29,8 @@ from softfinger.daemon.types import NO_LEASE_COMMANDS
 from softfinger.daemon.wire.keys import ClientKeys, load_client
 from softfinger.daemon.wire.local_stop import stop_locally
 
+__all__ = ["HandClient", "NoAnswer", "send"]
+
 _Done = TypeVar("_Done")
 
 _log = logging.getLogger(__name__)

@@ -10,6 +10,8 @@ from softfinger.daemon.client.stream import Subscriber, Wait, no_stream
 from softfinger.daemon.errors import NoStream, Refused
 from softfinger.daemon.wire.schema import EVENT, STATE, TACTILE, Event, HandState, TactileFrame
 
+__all__ = ["Hand", "Subscription"]
+
 _Record = TypeVar("_Record")
 
 
@@ -64,7 +66,7 @@ class Hand(HandClient[None]):
     stream, commands
         Addresses of the daemon. ``stream`` may also contain both, as ``tcp://HOST`` or
         ``STREAM,COMMANDS``. The default is the environment variable SOFTFINGER_ADDRESS, or else
-        this machine (`client.connection.default_addresses`).
+        this machine.
     client
         Name that owns the command lease.
     timeout

@@ -10,6 +10,8 @@ from pydantic_core import PydanticCustomError
 from softfinger.daemon.backends import Kind, backend, known, known_servo_models
 from softfinger.daemon.errors import PluginError
 
+__all__ = ["Section", "setting"]
+
 # Every number has two bounds, because implausible values are typing errors and must not reach an
 # integral. Whether a bound itself is allowed depends on the quantity.
 Positive = Annotated[float, Field(ge=1e-9, le=1e9, allow_inf_nan=False)]

@@ -23,6 +23,8 @@ from softfinger.daemon.own_files import read_file
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.profile.validation import problems, shown
 
+__all__ = ["load"]
+
 _PROFILES = Path(softfinger.__file__).parent / "config"
 _FILE_SIZE_MAX = 256 << 10  # bytes; the reference, which contains every key, has 21 kB
 _DEPTH_MAX = 8  # nesting depth of tables and arrays

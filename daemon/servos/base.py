@@ -13,6 +13,8 @@ from softfinger.daemon.clock import Clock
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import Goal, Reading
 
+__all__ = ["Servos"]
+
 FloatArray = NDArray[np.float64]
 Status = Literal["pass", "note", "fixed", "warn", "FAIL"]
 

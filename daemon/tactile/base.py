@@ -9,6 +9,8 @@ from softfinger.daemon.clock import Clock
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import Frame
 
+__all__ = ["TactileSensor"]
+
 
 class TactileSensor(Protocol):
     """The pressure grid under one fingertip. It is read outside the tick."""

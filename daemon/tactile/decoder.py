@@ -11,6 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+__all__ = ["Decoded", "DelimitedDecoder"]
+
 _LOST_AFTER = 10  # frame lengths without a frame, after which the stream counts as lost
 
 

@@ -22,6 +22,8 @@ from softfinger.daemon.profile.settings import TactileSettings
 from softfinger.daemon.tactile.decoder import Decoded, Decoder
 from softfinger.daemon.types import Frame
 
+__all__ = ["SerialReader"]
+
 _READ_SIZE = 65536  # bytes per read, the capacity of a Linux tty
 BITS_PER_BYTE = 10  # start bit, eight data bits, stop bit
 _GAP_TIME = 5e-4  # s without a byte, counts as a gap between frames

@@ -1,6 +1,7 @@
 """Declaration of the stream's topics, records and fields; `wire.schema` uses it."""
 
 import dataclasses
+import inspect
 from collections.abc import Callable, Iterator
 from operator import attrgetter
 from typing import Any, Generic, NamedTuple, TypeVar, cast, dataclass_transform
@@ -87,8 +88,15 @@ def members(cls: type[Any]) -> Iterator[Member]:
 
 @dataclass_transform(frozen_default=True)
 def record(cls: type[_Record]) -> type[_Record]:
-    """Turn a class of declared fields into a record."""
-    return dataclasses.dataclass(frozen=True, slots=True)(cls)
+    """Turn a class of declared fields into a record, whose docstring lists them."""
+    made = dataclasses.dataclass(frozen=True, slots=True)(cls)
+    listed = ["", "Attributes", "----------"]
+    for each in members(made):
+        unit = f" [{each.unit}]" if each.unit else ""
+        meaning = each.meaning.removesuffix(": ") or each.type.__doc__.partition("\n")[0]
+        listed += [f"{each.name} : {each.type.__name__}", f"    {meaning}{unit}"]
+    made.__doc__ = "\n".join([inspect.cleandoc(cls.__doc__ or ""), *listed])
+    return made
 
 
 def topic(

@@ -24,6 +24,8 @@ from numpy.typing import ArrayLike, NDArray
 from softfinger.kinematics.compiled.kernel import inner_kernel
 from softfinger.kinematics.contact.tip_curves import TipCurves
 
+__all__ = ["ClosedForms", "Fingertip", "closed_forms"]
+
 FloatArray = NDArray[np.float64]
 
 HALF_PI = math.pi / 2

@@ -18,6 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 from softfinger.kinematics.compiled.kernel import inner_kernel
 from softfinger.kinematics.contact.material_fit import MaterialError, fit_law
 
+__all__ = ["Material"]
+
 FloatArray = NDArray[np.float64]
 
 # Measured tangent modulus [Pa] of the polyurethane tip versus strain, from Table I of the paper.

@@ -14,6 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from softfinger import SoftfingerError
 
+__all__ = ["MaterialError"]
+
 FloatArray = NDArray[np.float64]
 
 MIN_POINTS = 4

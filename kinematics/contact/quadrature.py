@@ -228,4 +228,4 @@ def integrate(
     six = (
         each * ratio for each, ratio in zip(closed, (r_f, r_u, r_fd, r_ft, r_f, r_ut), strict=True)
     )
-    return ClosedForms(*(row.reshape(shape) for row in six))
+    return ClosedForms(*(row.reshape(shape)[()] for row in six))

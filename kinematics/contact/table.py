@@ -20,20 +20,42 @@ from softfinger.kinematics.contact.solid_lookup import solid_table
 from softfinger.kinematics.contact.table_build import build
 from softfinger.kinematics.contact.table_record import Table
 
+__all__ = ["Certificate", "ContactForces", "ContactTable"]
+
 FloatArray = NDArray[np.float64]
 
 
 class ContactForces(NamedTuple):
-    """Result of a lookup: arrays broadcast from d and θ, or floats."""
+    """Result of a lookup: arrays broadcast from d and θ, or floats.
 
-    force: FloatArray  # F [N]
-    energy: FloatArray  # U [J]
-    force_d: FloatArray  # ∂F/∂d [N/m]
-    force_theta: FloatArray  # ∂F/∂θ [N/rad]
-    energy_d: FloatArray  # ∂U/∂d [N], force along the normal; F/cos θ unless the face sticks
-    energy_theta: FloatArray  # ∂U/∂θ [N·m/rad]
-    inside: NDArray[np.bool_]  # False if d or θ was clamped to the domain
-    max_error: float  # bound on the relative error of the six values, see Certificate
+    Attributes
+    ----------
+    force
+        Elastic force F on the tip's base [N].
+    energy
+        Elastic potential energy U [J].
+    force_d
+        ∂F/∂d [N/m].
+    force_theta
+        ∂F/∂θ [N/rad].
+    energy_d
+        ∂U/∂d [N], the force along the object's normal: F/cos θ unless the face sticks.
+    energy_theta
+        ∂U/∂θ [N·m/rad].
+    inside
+        False if d or θ was clamped to the domain of the table.
+    max_error
+        Bound on the relative error of the six values; see `Certificate`.
+    """
+
+    force: FloatArray
+    energy: FloatArray
+    force_d: FloatArray
+    force_theta: FloatArray
+    energy_d: FloatArray
+    energy_theta: FloatArray
+    inside: NDArray[np.bool_]
+    max_error: float
 
 
 class Certificate(NamedTuple):
@@ -42,11 +64,20 @@ class Certificate(NamedTuple):
     The bound covers the whole domain including its edges, and rounding. Its assumptions are listed
     in `table_build`. For softening laws, ∂F/∂θ may pass through zero, so its error is relative to
     F tan θ where F tan θ is larger.
+
+    Attributes
+    ----------
+    max_error
+        Bound on the relative error.
+    d
+        Displacement at which the error is largest [m].
+    theta
+        Tilt at which the error is largest [rad].
     """
 
     max_error: float
-    d: float  # [m]
-    theta: float  # [rad]
+    d: float
+    theta: float
 
 
 # tuple.__new__ builds a ContactForces of plain floats in a quarter of the constructor's time.

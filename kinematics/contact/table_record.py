@@ -16,6 +16,8 @@ from softfinger import SoftfingerError
 from softfinger.kinematics.compiled.kernel import index, inlined_kernel
 from softfinger.kinematics.compiled.layout import Record
 
+__all__ = ["TableError"]
+
 FloatArray = NDArray[np.float64]
 Lanes: TypeAlias = tuple[float, float, float, float, float]
 SixFloats: TypeAlias = tuple[float, float, float, float, float, float, bool]

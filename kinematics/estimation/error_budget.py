@@ -56,6 +56,8 @@ from softfinger.kinematics.estimation.state import (
 from softfinger.kinematics.sensing.footprint import FloatArray
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
+__all__ = ["Uncertainty"]
+
 NEIGHBOURS = np.outer((1.0, 2.0, 2.0, 2.0, 1.0), (1.0, 2.0, 2.0, 2.0, 1.0))  # see `detection`
 NEIGHBOURS[2, 2] = 0.0
 _NOISE_PEAK = 4.5  # maximum reading due to noise alone, in standard deviations

@@ -27,6 +27,8 @@ from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from softfinger.kinematics.sensing.solid_pressure import Weights, padded, weights_of
 from softfinger.kinematics.sensing.springs_pressure import count_for, points_of
 
+__all__ = ["ContactEstimate", "ContactEstimator", "Readings"]
+
 
 @dataclass(slots=True)
 class ContactEstimate:
@@ -44,17 +46,31 @@ class ContactEstimate:
         Tilts of the object's face normal [rad].
     gain
         Ratio of measured to modelled pressure.
-    covariance
-        Covariance of (d, tilt_x, tilt_y, gain). If the gain is fixed, its row is zero.
-    systematic
-        Part of the covariance that is common to all frames and is not reduced by averaging.
     chi2
         Mean squared residual per cell divided by the noise variance; 0 without a fit.
     r_squared
         Fraction of the frame's squared pressure that the model explains; 0 without a fit.
+    peak
+        Largest reading [Pa].
+    cells
+        Number of cells in the fit.
+    iterations
+        Number of iterations of the fit.
+    rejected_count
+        Number of outliers excluded from the fit.
+    has_second_contact
+        True if a second contact presses outside the footprint.
     misfit
         True if χ² exceeds the value that noise alone reaches once in 3.5 million frames. In this
         case, the model does not describe the contact well, or the noise is larger than specified.
+    shear_x, shear_y
+        Force along the face [N] of a solid tip; 0 for springs.
+    cells_per_sample
+        Number of cells per independent noise sample.
+    covariance
+        Covariance of (d, tilt_x, tilt_y, gain) in m and rad. If the gain is fixed, its row is zero.
+    systematic
+        Part of the covariance that is common to all frames and is not reduced by averaging.
 
     Notes
     -----
@@ -84,15 +100,15 @@ class ContactEstimate:
     gain: float = 1.0
     chi2: float = 0.0
     r_squared: float = 0.0
-    peak: float = 0.0  # largest reading [Pa]
-    cells: int = 0  # number of cells in the fit
+    peak: float = 0.0
+    cells: int = 0
     iterations: int = 0
-    rejected_count: int = 0  # number of outliers excluded
-    has_second_contact: bool = False  # True if a second contact presses outside the footprint
+    rejected_count: int = 0
+    has_second_contact: bool = False
     misfit: bool = False
-    shear_x: float = 0.0  # force along the face [N], for solid tips
+    shear_x: float = 0.0
     shear_y: float = 0.0
-    cells_per_sample: float = 1.0  # cells per independent noise sample
+    cells_per_sample: float = 1.0
     covariance: FloatArray = field(default_factory=lambda: np.zeros((4, 4)))
     systematic: FloatArray = field(default_factory=lambda: np.zeros((4, 4)))
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from enum import IntEnum
 
+__all__ = ["Invalid"]
+
 
 class Invalid(IntEnum):
     """Reason why an estimate is invalid, or ``NONE`` if it is valid.

@@ -27,6 +27,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from softfinger.kinematics.compiled.kernel import kernel
 
+__all__ = ["HandGeometry"]
+
 FloatArray = NDArray[np.float64]
 
 

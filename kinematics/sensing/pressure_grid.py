@@ -19,6 +19,8 @@ from softfinger.kinematics.sensing.footprint import FloatArray, Grid
 from softfinger.kinematics.sensing.solid_pressure import SolidPressure, images
 from softfinger.kinematics.sensing.springs_pressure import SpringsPressure, count_for
 
+__all__ = ["SensorGrid"]
+
 _PITCH_MAX = 0.1  # m; a larger value was probably given in millimetres
 _POINTS_PER_RADIUS = 150.0  # minimum number of sample points per tip radius
 

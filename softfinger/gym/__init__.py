@@ -13,6 +13,8 @@ require("gym")
 
 from gymnasium.envs.registration import register  # noqa: E402 - require() explains a missing install
 
+__all__ = ["SECONDS", "STEP", "TASKS"]
+
 TASKS = ("grasp", "rotate", "push")
 SECONDS = 4.0  # s, longest episode
 STEP = 0.02  # s, simulated time per step

@@ -30,6 +30,8 @@ from softfinger.gym import STEP, TASKS
 from softfinger.gym.picture import Image, Painter, Window
 from softfinger.tools.processes.compile import build_kernels, print_event
 
+__all__ = ["Images", "SoftFingerEnv"]
+
 Observation = dict[str, NDArray[Any]]
 
 FORCE = 6.0  # N, target grip force

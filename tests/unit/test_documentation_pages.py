@@ -11,6 +11,7 @@ from types import ModuleType
 import pytest
 from scipy.integrate import quad
 
+import softfinger
 from softfinger.tools.paper import validate
 
 ROOT = Path(__file__).parents[2]
@@ -76,6 +77,11 @@ def test_every_setting_is_described(site):
     rows = re.findall(r"(?m)^\| `(\w+)` \|.*\| (.*?) ?\|$", site[1]["configuration.md"])
     assert len(rows) > 150
     assert [key for key, meaning in rows if not meaning] == []
+
+
+def test_the_reference_has_every_public_name_once(site):
+    named = re.findall(r"(?m)^::: softfinger\.([\w.]+)$", site[1]["api.md"])
+    assert sorted([*named, "__version__"]) == sorted([*softfinger.__all__, "testing"])
 
 
 def test_every_erratum_is_listed(site):

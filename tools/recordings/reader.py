@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from mcap.records import Statistics
     from numpy.typing import NDArray
 
+__all__ = ["Recording", "read_recording"]
+
 _MESSAGE_SIZE_MAX = 1 << 20  # bytes; a frame of the largest grid has 0.2 MB
 _SETTINGS_SIZE_MAX = 4 << 20  # bytes; includes calibrations of each cell
 _CHUNK_SIZE_MAX = 64 << 20  # bytes unpacked; chunks usually have 1 to 8 MB

@@ -18,6 +18,8 @@ from softfinger.daemon.simulation.physics.plant_state import (
     POLYGON,
 )
 
+__all__ = ["Shape", "polygon"]
+
 FloatArray = NDArray[np.float64]
 
 

@@ -1,0 +1,42 @@
+"""Extension of mkdocstrings: document the fields of records and the results of commands.
+
+mkdocstrings reads the sources without importing them. It would miss the fields that the decorator
+`softfinger.daemon.wire.fields.record` adds to the docstring of a record.
+"""
+
+from __future__ import annotations
+
+import inspect
+from enum import Enum
+from importlib import import_module
+from typing import Any
+
+import griffe
+
+
+class FieldDocs(griffe.Extension):
+    """Add the fields of records and the members of enumerations to their docstrings."""
+
+    def on_class(self, *, cls: griffe.Class, **_: Any) -> None:
+        """Complete the docstring of a record or of an enumeration."""
+        is_record = any(str(each.value) == "record" for each in cls.decorators)
+        is_enumeration = any(str(each) in ("IntEnum", "StrEnum") for each in cls.bases)
+        if cls.docstring and (is_record or is_enumeration):
+            found = getattr(import_module(cls.module.path), cls.name)
+            cls.docstring.value = inspect.getdoc(found) or ""
+            if is_enumeration:
+                cls.docstring.value += _members(found)
+
+    def on_function(self, *, func: griffe.Function, **_: Any) -> None:
+        """Replace the type variable that stands for a command's result in `Hand`: None."""
+        if str(func.returns) == "_Done":
+            func.returns = "None"
+
+
+def _members(enumeration: type[Enum]) -> str:
+    """Return a section with the members of an enumeration that explain themselves."""
+    told = {
+        each.name: getattr(each, "meaning", "") or getattr(each, "text", "") for each in enumeration
+    }
+    rows = "".join(f"\n{name}\n    {text}" for name, text in told.items() if text)
+    return f"\n\nAttributes\n----------{rows}" if rows else ""
