@@ -7,10 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from softfinger import read_recording
 from softfinger.daemon.wire import schema
 from softfinger.tools.recordings.export import CsvTable, ParquetTable, export
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.record import RecordingWriter
+from tests.harness.fake_daemon import frame
 from tests.harness.golden_wire import flat, sample
 from tests.process.test_record import written
 
@@ -30,9 +32,10 @@ def test_csv_has_every_field_in_full_precision(path, tmp_path):
         rows = list(csv.DictReader(file))
     assert len(rows) == STATES
     expected = flat(sample(schema.STATE))
-    assert list(rows[0]) == [*expected, "t"]
+    assert list(rows[0]) == ["t", *expected]
+    assert [float(row["t"]) for row in rows] == pytest.approx(range(STATES))
     for name, value in expected.items():
-        if name not in ("seq", "timestamp"):
+        if name not in ("seq", "timestamp", "mono_ns"):
             told = rows[-1][name]
             assert told == str(value) if isinstance(value, str) else float(told) == value, name
     assert [int(row["seq"]) for row in rows] == list(range(STATES))
@@ -57,9 +60,39 @@ def test_parquet_keeps_types_and_frames(path, tmp_path):
     frames = pyarrow.parquet.read_table(tmp_path / "hand-tactile.parquet")
     raw = np.load(tmp_path / "tactile-left.npz")
     assert raw["frames"].shape == (103, 44, 44)
-    assert raw["t"][0] == 0.0
+    assert raw.files == ["t", "frames"]
+    told = frames["t"].to_pylist(), frames["finger"].to_pylist()
+    assert raw["t"].tolist() == [t for t, finger in zip(*told, strict=True) if finger == "left"]
     left = [k for k, name in enumerate(frames["finger"].to_pylist()) if name == "left"]
     assert frames["data"][left[5]].as_py() == raw["frames"][5].tobytes()
+
+
+@pytest.mark.parametrize("first", [schema.STATE, schema.TACTILE])
+def test_times_of_all_files_count_from_one_zero(tmp_path, first):
+    writer = RecordingWriter(tmp_path / "a.mcap")
+    before = {"mono_ns": 6_000_000_000, "timestamp": 1e9 + 6.0, "again": True}
+    writer.add(schema.EVENT, sample(schema.EVENT) | before)
+    scan = {"mono_ns": 7_000_000_000, "timestamp": 1e9 + 7.02, "delay_s": 0.02}
+    tick = {"mono_ns": 7_020_000_000, "timestamp": 1e9 + 7.02}
+    messages = [(schema.STATE, sample(schema.STATE) | tick)]
+    messages.insert(first != schema.TACTILE, (schema.TACTILE, frame(0.0, 1) | scan))
+    for topic, message in messages:
+        writer.add(topic, message)
+    late = {"mono_ns": 9_020_000_000, "timestamp": 1e9 + 9.52}  # Unix time was set meanwhile
+    writer.add(schema.STATE, sample(schema.STATE) | late)
+    writer.close()
+    recording = Recording(tmp_path / "a.mcap")
+    export(recording, tmp_path, CsvTable, recording.topics)
+    times = {}
+    for topic in ("state", "tactile", "event"):
+        with (tmp_path / f"hand-{topic}.csv").open(encoding="utf-8") as file:
+            times[topic] = [float(row["t"]) for row in csv.DictReader(file)]
+    assert times["state"] == pytest.approx([0.0, 2.0], abs=1e-6)
+    assert times["tactile"] == pytest.approx([-0.02], abs=1e-6)
+    assert times["event"] == pytest.approx([-1.02], abs=1e-6)
+    assert np.load(tmp_path / "tactile-right.npz")["t"].tolist() == times["tactile"]
+    assert read_recording(tmp_path / "a.mcap")["t"].tolist() == times["state"]
+    assert next(iter(read_recording(tmp_path / "a.mcap"))) == "t"
 
 
 def test_nan_values_are_empty_cells(tmp_path):
@@ -73,6 +106,7 @@ def test_nan_values_are_empty_cells(tmp_path):
     with (tmp_path / "hand-state.csv").open(newline="", encoding="utf-8") as file:
         [row] = csv.DictReader(file)
     assert (row["left.force"], row["news"]) == ("", "3.5")
+    assert next(iter(row)) == "t"
 
 
 def test_files_have_plain_names_for_any_topic_prefix(tmp_path):

@@ -57,9 +57,10 @@ def written(path: Path, count: int = 400) -> list[tuple[bytes, dict[str, Any]]]:
     """Write a recording of ``count`` states with frames in between; return its messages."""
     sent: list[tuple[bytes, dict[str, Any]]] = []
     for k in range(count):
-        sent.append((schema.STATE, {**sample(schema.STATE), "seq": k, "timestamp": 1e9 + k}))
+        times = {"timestamp": 1e9 + k, "mono_ns": k * 10**9}
+        sent.append((schema.STATE, {**sample(schema.STATE), "seq": k, **times}))
         if k % 10 == 0:
-            sent.append((schema.TACTILE, {**frame(k / 25, k % 20 // 10), "timestamp": 1e9 + k}))
+            sent.append((schema.TACTILE, frame(k / 25, k % 20 // 10) | times))
     writer = RecordingWriter(path)
     for topic, message in sent:
         writer.add(topic, dict(message))
@@ -89,7 +90,7 @@ def test_states_of_a_recording_are_columns(tmp_path):
     assert columns["seq"].tolist() == list(range(400))
     assert columns["left.force"].tolist() == [each["left"]["force"] for each in states]
     assert columns["mode"][0] == states[0]["mode"]
-    assert columns["t"][0] == 0.0
+    assert columns["t"].tolist() == pytest.approx(range(400))
     assert {len(column) for column in columns.values()} == {400}
     writer = RecordingWriter(tmp_path / "b.mcap")
     writer.add(schema.TACTILE, {**frame(0.0, 0), "timestamp": 1e9})

@@ -155,9 +155,9 @@ OnProgress = Callable[[int], None]
 class Source:
     """Frames of the sensors in one file: ``frames(progress)`` yields (finger, t [s], counts).
 
-    ``t`` counts from the first frame; ``total`` is the final value of ``progress``. ``recording``
-    is set for a file with frames only. Kernels are loaded when ``models`` is called, so that an
-    unreadable file fails quickly.
+    ``t`` counts from the recording's first message, or from the first frame of a file with frames
+    only. ``total`` is the final value of ``progress``. ``recording`` is set for a file with frames
+    only. Kernels are loaded when ``models`` is called, so that an unreadable file fails quickly.
     """
 
     settings: Settings
@@ -207,11 +207,9 @@ def _stream(path: Path, settings: Settings, own: bool) -> Source:
     )
 
     def frames(progress: OnProgress) -> Iterator[tuple[int, float, Counts]]:
-        first = None
         for _, message in recording.messages([schema.TACTILE], progress=progress):
             counts = counts_of(recording, message, settings)
-            first = message["timestamp"] if first is None else first
-            yield FINGERS.index(message["finger"]), message["timestamp"] - first, counts
+            yield FINGERS.index(message["finger"]), recording.time(message), counts
 
     return Source(settings, models, present, recording.size, frames)
 

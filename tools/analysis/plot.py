@@ -110,15 +110,12 @@ class RecordedRun:
     models: tuple[FingerModel, FingerModel] | None
     why_no_model: str
     states: dict[str, NDArray[Any]]
-    offset: float  # timestamp at t = 0
+    zero: int  # daemon's clock at t = 0 [ns]
 
     @cached_property
     def t(self) -> FloatArray:
         """Time of each state [s], from the daemon's monotonic clock."""
-        mono, wall = self.states["mono_ns"], self.states["timestamp"]
-        if not mono.size:
-            return mono
-        t: FloatArray = (mono - mono[0]) * 1e-9 + (wall[0] - self.offset)
+        t: FloatArray = (self.states["mono_ns"] - self.zero) * 1e-9
         return t
 
     @cached_property
@@ -153,7 +150,7 @@ def load_run(
     messages = recording.messages([schema.STATE], start, end, progress)
     record = schema.TOPICS[schema.STATE].record
     states = to_columns([read(record, message) for _, message in messages])
-    return RecordedRun(recording.path.name, *_model(recording), states, recording.start)
+    return RecordedRun(recording.path.name, *_model(recording), states, recording.zero)
 
 
 def _model(recording: Recording) -> tuple[tuple[FingerModel, FingerModel] | None, str]:

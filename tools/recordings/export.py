@@ -22,10 +22,11 @@ from softfinger.tools.extras import require
 from softfinger.tools.recordings.reader import Recording
 
 _EPILOG = """\
-Writes one table for each topic, e.g. hand-state.csv, with a column for each field (left.force). The
-frames of a sensor are also written to tactile-left.npz or tactile-right.npz, as frames
-[n, rows, cols] and t [n], for `softfinger analyse` and numpy.load. Parquet tables also contain the
-bytes of the frames."""
+Writes one table for each topic, e.g. hand-state.csv, with the time t and a column for each field
+(left.force). The frames of a sensor are also written to tactile-left.npz or tactile-right.npz, as
+t [n] and frames [n, rows, cols], for `softfinger analyse` and numpy.load. Parquet tables also
+contain the bytes of the frames. In all files, t is the time since the recording's first message in
+s by the daemon's clock; that of a frame is the time of its scan."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -152,8 +153,9 @@ def export(
 ) -> list[Path]:
     """Write a table for each topic into ``folder``, and one ``.npz`` file of frames per sensor.
 
-    The columns are those of the schema and any additional fields of the first message; ``t`` is the
-    time since the recording's first message [s].
+    The first column ``t`` is the time since the recording's first message [s] by the daemon's
+    clock, in all files alike. The others are those of the schema and any additional fields of the
+    first message of a topic.
 
     Returns
     -------
@@ -168,9 +170,8 @@ def export(
     files: list[Path] = []
     with contextlib.ExitStack() as opened:
         for topic, message in recording.messages(topics, start, end, progress):
-            stamp = message.get("timestamp")
-            since = stamp - recording.start if isinstance(stamp, int | float) else math.nan
-            row = _flat(message) | {"t": since}
+            t = recording.time(message)
+            row = {"t": t} | _flat(message)
             if topic not in tables:
                 name = _file_name(topic)
                 if any(each.stem == name for each in files):
@@ -181,14 +182,13 @@ def export(
             if topic == schema.TACTILE:
                 times, frames = grids.setdefault(message["finger"], ([], []))
                 shape = message["rows"], message["cols"]
-                times.append(message["timestamp"])
+                times.append(t)
                 frames.append(np.frombuffer(message["data"], "<u2").reshape(shape))
             tables[topic].add(row)
     for finger, (times, frames) in sorted(grids.items()):
         files.append(folder / f"tactile-{finger}.npz")
         with write_bytes(files[-1]) as packed:
-            t = np.array(times)
-            np.savez_compressed(packed, frames=np.stack(frames), t=t - t[0])
+            np.savez_compressed(packed, t=np.array(times), frames=np.stack(frames))
     return files
 
 
@@ -210,7 +210,7 @@ def _flat(message: Row, outer: str = "") -> Row:
 
 def _columns(topic: bytes, first: Row) -> dict[str, str]:
     fields = schema.TOPICS[topic].fields if topic in schema.TOPICS else ()
-    known = {field.name: field.kind for field in fields}
+    known = {"t": "float"} | {field.name: field.kind for field in fields}
     more = {name: KINDS.get(type(value), "") for name, value in first.items() if name not in known}
     return known | more
 

@@ -13,6 +13,7 @@ import os
 import struct
 import zlib
 from collections.abc import Callable, Collection, Iterator
+from functools import cached_property
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, BinaryIO, Protocol
 
@@ -49,8 +50,9 @@ _END = struct.Struct("<BQQQI8s")  # footer and magic
 def read_recording(path: str | Path) -> dict[str, NDArray[Any]]:
     """Read a recording's states as one array per field, in the order in which they arrived.
 
-    Names are those of `hand/state`, nested ones with a dot (``left.force``); ``t`` is the time
-    since the first state [s]. ``pandas.DataFrame(read_recording("run.mcap"))`` accepts the result.
+    Names are those of `hand/state`, nested ones with a dot (``left.force``). The first, ``t``, is
+    the time since the recording's first message [s], as in all files of ``softfinger export``.
+    ``pandas.DataFrame(read_recording("run.mcap"))`` accepts the result.
 
     Raises
     ------
@@ -65,7 +67,7 @@ def read_recording(path: str | Path) -> dict[str, NDArray[Any]]:
     if not states:
         raise RecordingError(f"{path}: no {STATE.decode()} in it")
     columns = to_columns(states)
-    return {"t": (columns["mono_ns"] - columns["mono_ns"][0]) * 1e-9, **columns}
+    return {"t": (columns["mono_ns"] - recording.zero) * 1e-9, **columns}
 
 
 class MessageSource(Protocol):
@@ -152,6 +154,26 @@ class Recording:
     def count(self, topic: bytes) -> int:
         """Return the number of messages of one topic."""
         return sum(n for name, n in self.counts.items() if topic_of(name) == topic)
+
+    @cached_property
+    def zero(self) -> int:
+        """Time of the first message by the daemon's clock [ns]; all times ``t`` count from it."""
+        state = self._left, self.chunks  # of a loop over messages that asks for it
+        for _, message in self.messages():
+            mono, stamp = message.get("mono_ns"), message.get("timestamp")
+            if isinstance(mono, int) and isinstance(stamp, float) and not message.get("again"):
+                # The clock's time of a frame is that of its scan, its timestamp that of arrival.
+                after = stamp - self.start - float(message.get("delay_s", 0.0))
+                self._left, self.chunks = state
+                return mono - round(after * 1e6) * 1000  # Unix time is a float, exact to 0.2 µs
+        return 0
+
+    def time(self, message: dict[str, Any]) -> float:
+        """Return the time of a message since the first one [s], of a frame the time of its scan."""
+        mono, stamp = message.get("mono_ns"), message.get("timestamp")
+        if isinstance(mono, int):
+            return (mono - self.zero) * 1e-9
+        return stamp - self.start if isinstance(stamp, int | float) else math.nan
 
     def messages(
         self,
