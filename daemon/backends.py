@@ -129,11 +129,10 @@ def _plugin(kind: Kind, name: str) -> Backend:
     return Backend(entry.load, metal, hand, source(entry), getattr(made, "Settings", None))
 
 
-def known_servo_models(name: str) -> str:
-    """Return an empty text for a known servo model, otherwise the names of all models."""
+def servo_model(name: str) -> Any:
+    """Return the `ServoModel` of this name. Raises KeyError with the names of all models."""
     table = import_module("softfinger.daemon.servos.control_table")
     try:
-        table.by_name(name)
+        return table.by_name(name)
     except KeyError:
-        return ", ".join(table.MODELS)
-    return ""
+        raise KeyError(", ".join(table.MODELS)) from None

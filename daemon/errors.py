@@ -6,6 +6,8 @@ imports neither Numba nor ZeroMQ.
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Iterable
 from enum import StrEnum
 
 from softfinger import SoftfingerError as SoftfingerError
@@ -28,6 +30,15 @@ __all__ = [
     "TactileError",
     "WrongThread",
 ]
+
+
+_SIMILAR = 0.75  # smallest similarity of a suggested word: about one wrong letter in four
+
+
+def nearest(word: str, known: Iterable[str]) -> str:
+    """Return a hint with the most similar known word, or an empty text if none is similar."""
+    found = difflib.get_close_matches(word[:80], list(known), n=1, cutoff=_SIMILAR)
+    return f"; nearest: {found[0]}" if found else ""
 
 
 class SettingsError(SoftfingerError):

@@ -61,10 +61,12 @@ built-in simulated hand. To change a setting for one run, add an option such as
 `--set loop.rate=1000`. Units are SI unless stated otherwise, and pairs are [left, right]. A hand
 can have one or two fingers, and servos or sensors can be omitted.
 
-At startup, all unknown keys, wrong types and numbers out of range are reported together. Some
-errors can only be detected when the models are built: a contact table that cannot reach
-`table.tolerance`, a material law that does not fit its measured points, or a calibration file that
-does not match the profile. These errors are reported afterwards.
+To check a profile without starting the daemon or touching hardware, run
+`softfinger config check FILE`. It prints all errors: unknown keys, wrong types, numbers out of
+range, keys that contradict each other, and calibration files that do not match. It also warns of
+settings that are probably wrong: a sensor smaller than the footprint at the set force, and forces
+beyond the servos. The exit status is 1 if there are errors, and 0 if there are only warnings.
+`softfinger run` reports the same errors and warnings at startup.
 
 To print a section in the terminal, run `softfinger config reference SECTION`.
 

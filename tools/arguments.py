@@ -25,6 +25,11 @@ WAIT_MAX = 5.0  # s, how long `--no-wait` waits for the first message
 def add_profile(parser: argparse.ArgumentParser) -> None:
     """Add ``--config``, ``--set`` and ``--dir``, which select the hand; `profile` loads it."""
     add_settings(parser)
+    add_directory(parser)
+
+
+def add_directory(parser: argparse.ArgumentParser) -> None:
+    """Add ``--dir``."""
     parser.add_argument(
         "--dir",
         type=Path,
@@ -41,6 +46,11 @@ def add_settings(parser: argparse.ArgumentParser) -> None:
         metavar="PROFILE",
         help="the settings: a TOML file, or a profile name from `softfinger config list`",
     )
+    add_changes(parser)
+
+
+def add_changes(parser: argparse.ArgumentParser) -> None:
+    """Add ``--set``."""
     parser.add_argument(
         "--set",
         action="append",

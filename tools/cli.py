@@ -9,7 +9,6 @@ about a file (exit status 1).
 from __future__ import annotations
 
 import argparse
-import difflib
 import importlib
 import io
 import os
@@ -20,7 +19,7 @@ from collections.abc import Collection, Sequence
 from typing import Any, NoReturn
 
 from softfinger import __version__
-from softfinger.daemon.errors import SettingsError, SoftfingerError
+from softfinger.daemon.errors import SettingsError, SoftfingerError, nearest
 
 _OPTIONS = ("-h", "--help", "--version")
 _UNKNOWN = re.compile(r"invalid choice: '([^']*)'|unrecognized arguments: (\S+)")
@@ -101,9 +100,8 @@ class Parser(argparse.ArgumentParser):
             known = [word for action in self._actions for word in action.option_strings]
             known += [word for action in self._actions for word in action.choices or ()]
             word = next(filter(None, unknown.groups()))
-            near = difflib.get_close_matches(word.partition("=")[0], known, n=1)
-            if near:
-                message = f"found {word!r}, expected a known word; nearest: {near[0]}"
+            if near := nearest(word.partition("=")[0], known):
+                message = f"found {word!r}, expected a known word{near}"
         super().error(message)
 
 
@@ -202,9 +200,9 @@ def _main(argv: Sequence[str] | None) -> int:
         print(f"{called}: {error}", file=sys.stderr)
         return 1
     if not called and words[0] not in _OPTIONS:
-        near = difflib.get_close_matches(words[0], [*SUBCOMMANDS, *_OPTIONS], n=1)
-        hint = f"nearest: {near[0]}" if near else "`softfinger help` lists them"
-        parser.error(f"found {words[0]!r}, expected a subcommand; {hint}")
+        near = nearest(words[0], [*SUBCOMMANDS, *_OPTIONS])
+        hint = near or "; `softfinger help` lists them"
+        parser.error(f"found {words[0]!r}, expected a subcommand{hint}")
     arguments, unknown = parser.parse_known_args(words)
     module, subparser = made[called]
     if unknown:

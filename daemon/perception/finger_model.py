@@ -20,7 +20,7 @@ from softfinger.daemon.profile.factory import (
     make_tip,
 )
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.profile.validation import sensor_warnings
+from softfinger.daemon.profile.validation import plausibility_warnings
 from softfinger.daemon.types import FINGERS
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
@@ -59,8 +59,8 @@ def make_models(
     Raises the exceptions of `profile.factory.make_table` and `calibration_file.calibration_for`.
     """
     if on_event is not None:
-        for doubt in sensor_warnings(settings):
-            on_event("warning", "tactile", doubt)
+        for warning in plausibility_warnings(settings):
+            on_event("warning", "settings", warning)
     measured = settings.tip.physics == "measured"
     made: dict[int, FingerModel] = {}
     common: tuple[Material, ContactTable] | None = None

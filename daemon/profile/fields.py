@@ -7,7 +7,7 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from pydantic_core import PydanticCustomError
 
-from softfinger.daemon.backends import Kind, backend, known, known_servo_models
+from softfinger.daemon.backends import Kind, backend, known, servo_model
 from softfinger.daemon.errors import PluginError
 
 __all__ = ["Section", "setting"]
@@ -84,8 +84,12 @@ def names_backend(kind: Kind) -> AfterValidator:
 
 
 def _servo_model(name: str) -> str:
-    if models := known_servo_models(name):
-        raise PydanticCustomError("servo_model", "one of {known}", {"known": models})
+    try:
+        servo_model(name)
+    except KeyError as error:
+        raise PydanticCustomError(
+            "servo_model", "one of {known}", {"known": error.args[0]}
+        ) from None
     return name
 
 

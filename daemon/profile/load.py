@@ -6,22 +6,21 @@ combinations of keys.
 
 from __future__ import annotations
 
-import difflib
 import re
 import tomllib
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 import softfinger
 from softfinger.daemon.backends import BUILT_IN, backend, known
-from softfinger.daemon.errors import SettingsError
+from softfinger.daemon.errors import SettingsError, nearest
 from softfinger.daemon.own_files import read_file
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.profile.validation import problems, shown
+from softfinger.daemon.profile.validation import plausibility_warnings, problems, shown
 
 __all__ = ["load"]
 
@@ -31,7 +30,35 @@ _DEPTH_MAX = 8  # nesting depth of tables and arrays
 _ERROR_COUNT_MAX = 20  # largest number of reported errors
 # A dotted key of 16 parts or more. tomllib needs minutes for a key of thousands of parts.
 _DEEP_KEY = re.compile(r"""(?<![\w-])(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*){16}""")
+_WORD = re.compile(r"\w+")
 _MESSAGE_START = re.compile(r"\w+ should (be |have )?")  # start of pydantic's messages
+
+
+class Examined(NamedTuple):
+    """Profile with its errors.
+
+    Attributes
+    ----------
+    name
+        Name of the profile.
+    settings
+        The settings, with defaults for the keys in ``unused``.
+    errors
+        One line for every unknown key, wrong type and violated bound, and for every contradiction
+        between the other keys.
+    unused
+        Names of the keys and sections whose values cannot be used.
+    """
+
+    name: str
+    settings: Settings
+    errors: list[str]
+    unused: set[str]
+
+    def warnings(self) -> list[str]:
+        """Return a line for every setting that is allowed but probably wrong."""
+        found = _without_words(plausibility_warnings(self.settings), self.unused)
+        return [f"{self.name}: {line}" for line in found]
 
 
 def load(
@@ -48,40 +75,77 @@ def load(
     Raises
     ------
     SettingsError
-        One line for every unknown key, wrong type and violated bound. If there are none, one line
-        for every contradiction between keys.
+        One line for each error of `Examined`, at most 20.
+    """
+    return _without_errors(examine(path, directory, changes))
+
+
+def examine(
+    path: Path | None = None, directory: Path | None = None, changes: Sequence[str] = ()
+) -> Examined:
+    """Read a profile and find all of its errors. Raises SettingsError if it cannot be read.
+
+    The arguments are those of `load`.
     """
     name = str(path) if path else "built-in settings"
     data = _read(find(path), name) if path else {}
     changed = {_change(data, change) for change in changes}
-    return checked(data, name, changed, directory)
+    return _examined(data, name, changed, directory)
 
 
-def checked(
+def checked(data: dict[str, Any]) -> Settings:
+    """Validate the sections ``data``. Raises SettingsError as `load`."""
+    return _without_errors(_examined(data, "settings"))
+
+
+def _without_errors(found: Examined) -> Settings:
+    told, more = found.errors[:_ERROR_COUNT_MAX], len(found.errors) - _ERROR_COUNT_MAX
+    if more > 0:
+        told.append(f"{found.name}: and {more} more errors")
+    if told:
+        raise SettingsError("\n".join(told))
+    return found.settings
+
+
+def _examined(
     data: dict[str, Any],
-    name: str = "settings",
+    name: str,
     changed: Collection[str] = (),
     directory: Path | None = None,
-) -> Settings:
-    """Validate the sections ``data`` of the profile ``name``; the rest is as for `load`."""
+) -> Examined:
+    unused: set[str] = set()
+    found: list[str] = []
     try:
         settings = Settings.model_validate(data)
     except ValidationError as error:
-        errors = error.errors(include_url=False)
-        found = [_line(details) for details in errors[:_ERROR_COUNT_MAX]]
-        more = len(errors) - _ERROR_COUNT_MAX
-    else:
-        if directory is not None:
-            settings = _with_directory(settings, directory)
-        found, more = [*problems(settings), *_plugin_problems(settings)], 0
-        if not found:
-            return settings
-    lines = [
+        told = error.errors(include_url=False)
+        found = [_line(details) for details in told]
+        unused = {str(part) for details in told for part in details["loc"][:2][-1:]}
+        settings = Settings.model_validate(_without(data, told))
+    if directory is not None:
+        settings = _with_directory(settings, directory)
+    found += _without_words((*problems(settings), *_plugin_problems(settings)), unused)
+    errors = [
         f"{'--set' if problem.split(':')[0] in changed else name}: {problem}" for problem in found
     ]
-    if more > 0:
-        lines.append(f"{name}: and {more} more errors")
-    raise SettingsError("\n".join(lines))
+    return Examined(name, settings, errors, unused)
+
+
+def _without_words(lines: Iterable[str], words: set[str]) -> list[str]:
+    return [line for line in lines if not words & set(_WORD.findall(line))]
+
+
+def _without(data: dict[str, Any], told: Sequence[ErrorDetails]) -> dict[str, Any]:
+    """Return the sections without the keys, or the whole sections, that have errors."""
+    kept: dict[Any, Any] = {
+        name: dict(keys) if isinstance(keys, dict) else keys for name, keys in data.items()
+    }
+    for section, *inside in (details["loc"] for details in told):
+        if inside and isinstance(kept.get(section), dict):
+            kept[section].pop(inside[0], None)
+        else:
+            kept.pop(section, None)
+    return kept
 
 
 def names() -> list[str]:
@@ -212,9 +276,7 @@ def _line(
     key = shown(".".join(location))[1:-1]
     if details["type"] == "extra_forbidden":
         known = list(_model(inside[:-1], model).model_fields)
-        near = difflib.get_close_matches(location[-1][:80], known, n=1, cutoff=0.0)
-        nearest = f"; nearest: {near[0]}" if near else ""
-        return f"{key}: found an unknown key, expected a known one{nearest}"
+        return f"{key}: found an unknown key, expected a known one{nearest(location[-1], known)}"
     if details["type"] in ("model_type", "model_attributes_type", "dict_type"):
         return f"{key}: found {shown(details['input'])}, expected a table"
     expected = _MESSAGE_START.sub("", details["msg"], count=1)

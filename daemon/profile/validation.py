@@ -11,12 +11,13 @@ import re
 from collections.abc import Iterator
 from typing import Any
 
-from softfinger.daemon.backends import backend
+from softfinger.daemon.backends import backend, servo_model
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS, GRIP_FRACTION
 
 _VALUE_LENGTH_MAX = 60  # longest value in a message, in characters
 _DITHER_TICKS_MIN = 8  # ticks per period of the dither; fewer give no separate oscillation
+_SENSOR_WIDTH_MAX = 2.0  # tip diameters; a larger sensor probably belongs to another tip
 _TCP = re.compile(r"tcp://(127(?:\.\d{1,3}){3}|localhost|\[::1\]):(\d{1,5})")
 _ANY_TCP = re.compile(r"tcp://([\w.-]+|\*|\[[0-9a-fA-F:.]+(?:%\w+)?\]):(\d{1,5})")
 
@@ -26,33 +27,130 @@ def problems(settings: Settings) -> list[str]:
     return [problem for check in _CHECKS for problem in check(settings)]
 
 
-_SENSOR_WIDTH_MAX = 2.0  # tip diameters, a larger sensor probably belongs to another tip
+def plausibility_warnings(settings: Settings) -> list[str]:
+    """Return warnings about settings that are allowed but probably wrong, one per line.
+
+    ``run``, ``doctor`` and ``config check`` report them.
+    """
+    grip = [warning for check in (_deep_grip, _strong_grip) for warning in check(settings)]
+    return sensor_warnings(settings) + grip
 
 
 def sensor_warnings(settings: Settings) -> list[str]:
-    """Return warnings about the sensors' size under these tips, one per line."""
-    tip, tactile = settings.tip, settings.tactile
-    if tactile.backend == "none":
-        return []
-    sides = tactile.cols * tactile.pitch, tactile.rows * (tactile.pitch_y or tactile.pitch)
-    size = f"{sides[0] * 1e3:.4g} × {sides[1] * 1e3:.4g} mm"
-    doubts = []
-    if min(sides) > _SENSOR_WIDTH_MAX * 2.0 * tip.radius:
-        doubts.append(
-            f"tactile.rows, cols, pitch: found a sensor of {size} for a tip of "
+    """Return warnings about the size of the sensors under these tips, one per line."""
+    return [*_wide_sensor(settings), *_small_sensor(settings)]
+
+
+def _wide_sensor(settings: Settings) -> Iterator[str]:
+    tip = settings.tip
+    if (
+        settings.tactile.backend != "none"
+        and min(_sides(settings)) > _SENSOR_WIDTH_MAX * 2.0 * tip.radius
+    ):
+        yield (
+            f"tactile.rows, cols, pitch: found a sensor of {_size(settings)} for a tip of "
             f"{tip.radius * 2e3:.4g} mm diameter; is it another tip's, or tip.radius wrong?"
         )
-    # A solid tip presses with its whole base, springs only with the footprint.
-    d = min(settings.safety.d_max, tip.radius)
-    reach = tip.radius if tip.physics == "solid" else math.sqrt(d * (2.0 * tip.radius - d))
-    half = min(0.5 * side - abs(at) for side, at in zip(sides, tactile.centre, strict=True))
-    if half < reach:
-        what = "base" if tip.physics == "solid" else f"footprint at {d * 1e3:.3g} mm"
-        doubts.append(
-            f"tactile.rows, cols, pitch: found a sensor of {size}, smaller than the tip's {what}, "
-            f"{reach * 2e3:.3g} mm wide: what is pressed beyond it is not felt"
+
+
+def _small_sensor(settings: Settings) -> Iterator[str]:
+    """Compare the sensor with what a tip presses on it.
+
+    A solid tip presses with its whole base, springs only with the footprint.
+    """
+    tip, tactile = settings.tip, settings.tactile
+    if tactile.backend == "none":
+        return
+    sides = zip(_sides(settings), tactile.centre, strict=True)
+    half = min(0.5 * side - abs(at) for side, at in sides)
+    reaches = []
+    if tip.physics == "solid":
+        reaches.append(("base", tip.radius))
+    else:
+        depths = [(f"{key} = {force:g} N", d) for key, force, d in _set_depths(settings)]
+        depths.append(
+            (f"safety.d_max = {settings.safety.d_max * 1e3:.3g} mm", settings.safety.d_max)
         )
-    return doubts
+        for key, depth in depths:
+            d = min(depth, tip.radius)
+            reaches.append((f"footprint at {key}", math.sqrt(d * (2.0 * tip.radius - d))))
+    for what, reach in reaches:
+        if half < reach:
+            yield (
+                f"tactile.rows, cols, pitch: found a sensor of {_size(settings)}, smaller than the "
+                f"tip's {what}, {reach * 2e3:.3g} mm wide with tip.radius = {tip.radius * 1e3:.3g} "
+                "mm: pressure beyond the sensor is not measured"
+            )
+            return
+
+
+def _deep_grip(settings: Settings) -> Iterator[str]:
+    for key, force, d in _set_depths(settings):
+        if d > settings.safety.d_max:
+            yield (
+                f"{key}: found {force:g} N, which displaces the tip by {d * 1e3:.3g} mm, expected "
+                f"at most safety.d_max, {settings.safety.d_max * 1e3:.3g} mm"
+            )
+
+
+def _strong_grip(settings: Settings) -> Iterator[str]:
+    """Compare forces with the torque of the servos over the length of a finger."""
+    servos, lever = settings.servos, settings.hand.finger_length
+    if servos.backend == "none" or backend("servos", servos.backend).source:
+        return
+    force = GRIP_FRACTION * settings.safety.force_max
+    stall = servos.gear_ratio * servo_model(servos.model).stall[0] / lever
+    if force > stall:
+        yield (
+            f"safety.force_max: found {settings.safety.force_max:g} N, which allows grips of "
+            f"{force:.3g} N, expected at most the {stall:.2g} N at which {servos.model} stalls on "
+            "this finger; lower safety.force_max and safety.current_max"
+        )
+    bound = settings.control.torque_constant * settings.safety.current_max / lever
+    for key, force in _set_forces(settings):
+        if force > bound:
+            yield (
+                f"{key}: found {force:g} N, expected at most {bound:.3g} N, the force of "
+                f"safety.current_max = {settings.safety.current_max:g} A on this finger"
+            )
+
+
+def _set_forces(settings: Settings) -> list[tuple[str, float]]:
+    """Return key and value [N] of the forces that are gripped with unless a command names one."""
+    forces = [("control.force_default", settings.control.force_default)]
+    if settings.task.name != "none":
+        forces.append(("task.force", settings.task.force))
+    return forces
+
+
+def _set_depths(settings: Settings) -> Iterator[tuple[str, float, float]]:
+    """Yield key, force [N] and displacement [m] of an upright spring tip at the set forces.
+
+    The force is that of `Material.force_error`, by sums over steps of the strain.
+    """
+    if settings.tip.physics != "springs":
+        return
+    import numpy as np
+
+    from softfinger.daemon.profile.factory import make_material
+
+    strain = np.linspace(0.0, 0.99, 1000)
+    weighted = make_material(settings.material).stress(strain) / (1.0 - strain) ** 3
+    height = settings.tip.radius * (1.0 - strain)
+    forces = 2.0 * math.pi * height**2 * np.cumsum(weighted) * strain[1]
+    for key, force in _set_forces(settings):
+        yield key, force, settings.tip.radius * float(np.interp(force, forces, strain))
+
+
+def _sides(settings: Settings) -> tuple[float, float]:
+    """Return width and height of the sensor [m]."""
+    tactile = settings.tactile
+    return tactile.cols * tactile.pitch, tactile.rows * (tactile.pitch_y or tactile.pitch)
+
+
+def _size(settings: Settings) -> str:
+    width, height = _sides(settings)
+    return f"{width * 1e3:.4g} × {height * 1e3:.4g} mm"
 
 
 def shown(value: Any) -> str:
@@ -160,6 +258,12 @@ def _too_large(key: str, found: float, unit: str, limit: float, why: str) -> Ite
         yield f"{key}: found {found:g} {unit}, expected at most {limit:g} {unit}, {why}"
 
 
+def _depth(settings: Settings) -> Iterator[str]:
+    """Check that the limit of the displacement can act."""
+    why = "the tip's radius"
+    yield from _too_large("safety.d_max", settings.safety.d_max, "m", settings.tip.radius, why)
+
+
 def _solid_tip(settings: Settings) -> Iterator[str]:
     tip, tactile = settings.tip, settings.tactile
     if tip.physics != "solid":
@@ -252,8 +356,7 @@ def _cells(settings: Settings) -> Iterator[str]:
 
 def _blur(settings: Settings) -> Iterator[str]:
     tactile = settings.tactile
-    height = tactile.rows * (tactile.pitch_y or tactile.pitch)
-    limit = 0.5 * min(height, tactile.cols * tactile.pitch)
+    limit = 0.5 * min(_sides(settings))
     yield from _too_large("tactile.blur", tactile.blur, "m", limit, "half the sensor")
 
 
@@ -285,10 +388,7 @@ def _forces(settings: Settings) -> Iterator[str]:
             f"safety.force_max, {high:g}"
         )
         return
-    forces = [("control.force_default", settings.control.force_default)]
-    if settings.task.name != "none":
-        forces.append(("task.force", settings.task.force))
-    for key, force in forces:
+    for key, force in _set_forces(settings):
         if not low < force <= high:
             yield f"{key}: found {force:g} N, expected above {low:g} to {high:g}"
 
@@ -349,6 +449,7 @@ _CHECKS = (
     _ports,
     _timing,
     _material,
+    _depth,
     _solid_tip,
     _measured_tip,
     _wedge,

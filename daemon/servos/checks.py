@@ -18,7 +18,7 @@ from softfinger.daemon.servos.joint import JointScale, servo_name
 from softfinger.daemon.servos.port import latency_file
 from softfinger.daemon.servos.protocol import ServoLine
 from softfinger.daemon.servos.register_table import required_registers
-from softfinger.daemon.types import FINGERS, GRIP_FRACTION
+from softfinger.daemon.types import FINGERS
 
 CHECKED = reg.BACKUP_READY  # registers 0 … 146 are read
 DRIVE_REVERSE = 0b0001
@@ -225,14 +225,12 @@ def notice_servo(
 
 
 def notice_strength(name: str, model: ServoModel, settings: Settings) -> list[Finding]:
-    """Return warnings about forces, torque constant and friction that do not fit the model."""
-    gear, lever = settings.servos.gear_ratio, settings.hand.finger_length
-    force = GRIP_FRACTION * settings.safety.force_max
-    bound, constant = gear * model.stall[0] / lever, gear * model.torque_constant
+    """Return warnings about torque constant and friction that do not fit the model.
+
+    `profile.validation.plausibility_warnings` compares the forces with the model.
+    """
+    constant = settings.servos.gear_ratio * model.torque_constant
     found = []
-    if force > bound:
-        text = f"{force:.3g} N may be asked for, and it stalls at {bound:.2g} N on this finger"
-        found.append(Finding("warn", name, text, "lower safety.force_max and safety.current_max"))
     given = settings.control.torque_constant
     if constant and not 1.0 / _CONSTANT_RATIO_MAX < given / constant < _CONSTANT_RATIO_MAX:
         text = f"control.torque_constant is {given:g} N·m/A, its data sheet's {constant:.3g}"

@@ -36,6 +36,11 @@ KINDS: dict[str, EventKind] = {
         "ahead of time.",
         "Run `softfinger compile` once. After a warning, remove the cause that the text names.",
     ),
+    "settings": EventKind(
+        "warning",
+        "A setting is allowed but probably wrong, for example a sensor smaller than the footprint.",
+        "Correct the keys that the text names; `softfinger config check` repeats the warning.",
+    ),
     "calibration": EventKind("info", "A calibration file was loaded; the text summarises it."),
     "material": EventKind(
         "info",

@@ -16,7 +16,7 @@ from softfinger.daemon.errors import RecordingError, TactileError
 from softfinger.daemon.perception.finger_model import make_models
 from softfinger.daemon.perception.unloaded_cells import UnloadedCells
 from softfinger.daemon.profile.settings import Settings, TactileSettings
-from softfinger.daemon.profile.validation import sensor_warnings
+from softfinger.daemon.profile.validation import plausibility_warnings
 from softfinger.daemon.tactile.frame_files import load_recording
 from softfinger.daemon.tactile.replay import ReplayTactile
 from softfinger.tools.analysis.analyse import analyse, open_source
@@ -433,7 +433,14 @@ def test_generators_differ():
     [
         ({}, ""),
         ({"tip.radius": 0.010}, "sensor of 58 × 58 mm for a tip of 20 mm diameter"),
-        ({"tactile.rows": 20}, r"smaller than the tip's footprint at 12 mm, .* mm wide"),
+        (
+            {"tactile.rows": 26},
+            r"smaller than the tip's footprint at safety\.d_max = 12 mm, 36\.7 mm wide",
+        ),
+        (
+            {"tactile.rows": 20, "control.force_default": 24.0},
+            r"smaller than the tip's footprint at control\.force_default = 24 N, 30\.9 mm wide",
+        ),
         ({"tactile.centre": (0.02, 0.0)}, "smaller than the tip's footprint"),
         ({"tactile.pitch_y": 0.0006}, "sensor of 58 × 26.4 mm, smaller than"),
     ],
@@ -444,7 +451,7 @@ def test_a_sensor_size_that_does_not_fit_the_tip_is_reported(changes, told):
         section, name = key.split(".")
         tables.setdefault(section, {})[name] = value
     settings = Settings.model_validate(tables)
-    doubts = sensor_warnings(settings)
+    doubts = plausibility_warnings(settings)
     events: list[tuple[str, str, str]] = []
     make_models(settings, lambda *event: events.append(event))
     warned = [text for level, _, text in events if level == "warning"]
@@ -456,7 +463,7 @@ def test_a_sensor_size_that_does_not_fit_the_tip_is_reported(changes, told):
 def test_the_sensor_of_a_solid_tip_covers_its_base():
     solid = {"tip": {"physics": "solid"}, "material": {"law": "constant"}}
     settings = Settings.model_validate({**solid, "tactile": {"rows": 28}})
-    (doubt,) = sensor_warnings(settings)
+    (doubt,) = plausibility_warnings(settings)
     assert "smaller than the tip's base, 40 mm wide" in doubt
 
 

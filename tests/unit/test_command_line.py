@@ -119,3 +119,65 @@ def test_one_address_suits_every_client(text, stream, commands):
         assert parsed(*words) == stream
     for words in (["monitor"], ["view"]):
         assert parsed(*words) == (stream, commands)
+
+
+@pytest.mark.parametrize(
+    ("text", "status", "shown"),
+    [
+        ("", 0, ["FILE: 0 errors, 0 warnings"]),
+        (
+            "tactile.rows = 20\n",
+            0,
+            [
+                "warning: FILE: tactile.rows, cols, pitch: found a sensor",
+                "FILE: 0 errors, 1 warning",
+            ],
+        ),
+        (
+            "tactile.rows = 20\nloop.rat = 3\nsafety.d_max = 0.03\n",
+            1,
+            [
+                "error: FILE: loop.rat: found an unknown key",
+                "error: FILE: safety.d_max: found 0.03 m, expected at most 0.02 m",
+                "warning: FILE: tactile.rows",
+                "FILE: 2 errors, 1 warning",
+            ],
+        ),
+        (
+            "tip.radius = 20\ntactile.rows = 20\n",
+            1,
+            ["error: FILE: tip.radius", "FILE: 1 error, 0"],
+        ),
+        ("loop = [", 1, ["error: FILE: not TOML", "FILE: 1 error, 0 warnings"]),
+        (
+            'tactile.calibration = ["absent.json", ""]\n',
+            1,
+            ["error: absent.json: can't be read", "FILE: 1 error, 0 warnings"],
+        ),
+        (
+            "".join(f"x{k} = 1\n" for k in range(30)),
+            1,
+            [*30 * ["error: FILE: x"], "FILE: 30 errors, 0 warnings"],
+        ),
+    ],
+)
+def test_a_profile_is_checked_for_all_errors_and_warnings(inline, tmp_path, text, status, shown):
+    file = tmp_path / "my.toml"
+    file.write_text(text, encoding="utf-8")
+    done = inline("config", "check", file)
+    lines = done.stdout.splitlines()
+    assert (done.returncode, done.stderr, len(lines)) == (status, "", len(shown)), lines
+    for line, start in zip(lines, shown, strict=True):
+        assert line.startswith(start.replace("FILE", str(file))), line
+
+
+@pytest.mark.parametrize("name", names())
+def test_the_profiles_of_the_package_are_without_errors_and_warnings(inline, tmp_path, name):
+    done = inline("config", "check", name, "--dir", tmp_path)
+    assert (done.returncode, done.stdout) == (0, f"{name}: 0 errors, 0 warnings\n")
+
+
+def test_a_change_of_a_checked_profile_is_checked_with_it(inline):
+    done = inline("config", "check", "sim", "--set", "tip.radius=0.01")
+    assert done.returncode == 1
+    assert done.stdout.startswith("error: sim: safety.d_max: found 0.012 m, expected at most 0.01")

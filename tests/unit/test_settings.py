@@ -9,8 +9,10 @@ import pytest
 from softfinger.daemon.backends import BUILT_IN, known
 from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.profile import reference
+from softfinger.daemon.profile.factory import make_material, make_table
 from softfinger.daemon.profile.load import load, names
 from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.profile.validation import _set_depths, plausibility_warnings
 
 CONFIG = Path(__file__).parents[2] / "config"
 
@@ -138,6 +140,42 @@ def test_all_errors_are_in_one_report_with_key_found_and_expected(tmp_path):
     )
 
 
+def test_wrong_values_do_not_hide_contradictions_between_other_keys(tmp_path):
+    lines = report(
+        tmp_path,
+        """
+        [hand]
+        q_min = [0.5, -0.5]
+        q_max = [0.2, 1.0]
+        open_angle = [0.0, "wide"]
+        [tip]
+        radius = 20
+        [safety]
+        d_max = 0.03
+        [servos]
+        ids = [3, 3]
+        """,
+    )
+    assert [line.split(":")[0] for line in lines] == [
+        "hand.open_angle.1",
+        "tip.radius",
+        "hand.q_max",
+        "servos.ids",  # and not safety.d_max, which was compared with another radius
+    ]
+
+
+def test_only_a_similar_key_is_suggested(tmp_path):
+    for key, hint in (("nosie", "; nearest: noise"), ("resolution", ""), ("x", "")):
+        (line,) = report(tmp_path, f"[tactile]\n{key} = 1")
+        assert line == f"tactile.{key}: found an unknown key, expected a known one{hint}"
+
+
+def test_at_most_20_errors_are_told_and_the_others_counted(tmp_path):
+    lines = report(tmp_path, "".join(f"x{k} = 1\n" for k in range(30)))
+    assert len(lines) == 21
+    assert lines[-1] == "and 10 more errors"
+
+
 def test_all_contradictions_between_keys_are_reported(tmp_path):
     lines = report(
         tmp_path,
@@ -251,6 +289,10 @@ def test_an_unknown_model_is_reported_with_all_other_errors(tmp_path):
         ),
         ("x = " + "9" * 5000, "not TOML: "),
         (
+            "[tip]\nradius = 0.010",
+            "safety.d_max: found 0.012 m, expected at most 0.01 m, the tip's radius",
+        ),
+        (
             '[material]\nlaw = "points"\nstrain = [0.0, 0.2, 0.1]\nstress = [0.0, 1.0, 2.0]',
             "material.strain, material.stress: ",
         ),
@@ -300,3 +342,33 @@ def test_addresses_outside_this_machine_require_keys(tmp_path):
             encoding="utf-8",
         )
         assert load(path).commands.address == address
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ([], ""),
+        (["control.force_default=24", "safety.d_max=0.007"], "control.force_default: found 24 N, "
+         "which displaces the tip by 7.27 mm"),
+        (["task.name=demo", "task.force=26", "safety.current_max=1"], "task.force: found 26 N, "
+         "expected at most 22.2 N, the force of safety.current_max = 1 A on this finger"),
+        (["servos.model=XL330-M288"], "safety.force_max: found 30 N, which allows grips of 27 N, "
+         "expected at most the 6.5 N at which XL330-M288 stalls on this finger"),
+        (["servos.model=XL330-M288", "servos.backend=none"], ""),
+    ],
+)  # fmt: skip
+def test_forces_that_the_hand_does_not_have_are_warned_of(changes, told):
+    settings = load(changes=changes)
+    warnings = plausibility_warnings(settings)
+    assert len(warnings) == bool(told)
+    assert " ".join(warnings).startswith(told)
+
+
+@pytest.mark.parametrize("law", ["constant", "table_i"])
+def test_the_displacement_at_a_force_is_the_contact_tables(law):
+    settings = load(changes=[f"material.law={law}"])
+    table = make_table(settings, make_material(settings.material))
+    for force in (0.6, 5.0, 26.0):
+        changes = [f"material.law={law}", f"control.force_default={force}"]
+        ((_, _, d),) = _set_depths(load(changes=changes))
+        assert table(d, 0.0).force == pytest.approx(force, rel=0.03)

@@ -237,8 +237,8 @@ def _frames_alone(path: Path, settings: Settings, own: bool) -> Source:
             "set tactile.rows, tactile.cols and tactile.pitch"
         )
     settings = settings.model_copy(update={"tactile": tactile.model_copy(update=changes)})
-    for doubt in sensor_warnings(settings):
-        to_stderr("analyse")(f"{path}: {doubt}")
+    for warning in sensor_warnings(settings):
+        to_stderr("analyse")(f"{path}: {warning}")
 
     def frames(progress: OnProgress) -> Iterator[tuple[int, float, Counts]]:
         for k, t in enumerate(recording.t.tolist()):

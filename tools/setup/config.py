@@ -1,4 +1,4 @@
-"""Run ``softfinger config``: show the profiles of the package, and every setting."""
+"""Run ``softfinger config``: check profiles, show those of the package, and every setting."""
 
 from __future__ import annotations
 
@@ -6,19 +6,39 @@ import argparse
 import itertools
 from pathlib import Path
 
-from softfinger.daemon.errors import SettingsError
+from softfinger.daemon.errors import SettingsError, SoftfingerError
 from softfinger.daemon.profile import reference
-from softfinger.daemon.profile.load import find, names, profile_text
+from softfinger.daemon.profile.load import examine, find, names, profile_text
+from softfinger.tools.arguments import add_changes, add_directory, own_runtime_folder
 
 _EPILOG = """\
+  softfinger config check my.toml           print all errors and warnings; status 1 for errors
   softfinger config show hil > my.toml      start your own profile from a packaged one
   softfinger config schema > schema.json    in the same folder, for completion and checks in editors
   softfinger config reference tactile       print one section; or a key's name, e.g. pitch"""
 
 
+_CHECK = """\
+Print all errors and warnings of a profile, without touching hardware. Errors are those with which
+`softfinger run` does not start: keys, values, contradictions, and calibration files or contact
+tables that do not fit. Warnings are settings that are allowed but probably wrong, for example a
+sensor smaller than the footprint, or forces beyond the servos.
+
+exit status: 0 no errors (there may be warnings), 1 errors"""
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
     actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
+    check = actions.add_parser(
+        "check",
+        help="print all errors and warnings of a profile",
+        description=_CHECK,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    check.add_argument("config", type=Path, metavar="FILE", help="a TOML file, or a profile's name")
+    add_changes(check)
+    add_directory(check)
     actions.add_parser("list", help="list the names of the profiles")
     show = actions.add_parser("show", help="print a profile")
     show.add_argument("profile", type=Path, metavar="PROFILE", help=f"one of {', '.join(names())}")
@@ -28,10 +48,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print the requested list, profile or reference.
+    """Check a profile, or print the requested list, profile or reference.
 
     Raises SettingsError for an unknown profile, section or key, or OSError.
     """
+    if arguments.action == "check":
+        return _check(arguments)
     if arguments.action == "list":
         width = max(map(len, names()))
         for name in names():
@@ -43,6 +65,29 @@ def run(arguments: argparse.Namespace) -> int:
     else:
         print(_explained(arguments.what), end="")
     return 0
+
+
+def _check(arguments: argparse.Namespace) -> int:
+    """Print errors and warnings of a profile; return 1 if there are errors."""
+    from softfinger.daemon.perception.finger_model import make_models
+
+    name, errors, warnings = str(arguments.config), list[str](), list[str]()
+    try:
+        found = examine(arguments.config, arguments.dir or own_runtime_folder(), arguments.set)
+        errors, warnings = found.errors, found.warnings()
+        if not errors:
+            make_models(found.settings)
+    except (SoftfingerError, ValueError) as error:
+        errors += str(error).splitlines()
+    for kind, lines in (("error", errors), ("warning", warnings)):
+        for line in lines:
+            print(f"{kind}: {line}")
+    print(f"{name}: {_count(errors, 'error')}, {_count(warnings, 'warning')}")
+    return 1 if errors else 0
+
+
+def _count(lines: list[str], what: str) -> str:
+    return f"{len(lines)} {what}{'' if len(lines) == 1 else 's'}"
 
 
 def _text(profile: Path) -> str:

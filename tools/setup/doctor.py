@@ -29,7 +29,7 @@ from softfinger.daemon.diagnosis.ports import (
 from softfinger.daemon.diagnosis.register_file import restore_registers, save_registers
 from softfinger.daemon.errors import ServoError
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.profile.validation import sensor_warnings
+from softfinger.daemon.profile.validation import plausibility_warnings
 from softfinger.daemon.servos.base import Finding
 from softfinger.daemon.servos.checks import check_latency_timer
 from softfinger.daemon.types import FINGERS
@@ -98,8 +98,8 @@ def results(
     if free.get(settings.servos.port):
         yield from _register_files(settings, save, restore)
     yield from _servos(settings, free, fix)
-    for doubt in sensor_warnings(settings):
-        yield Finding("warn", "sensor", doubt, "set tactile.rows, cols and pitch, or tip.radius")
+    for warning in plausibility_warnings(settings):
+        yield Finding("warn", "settings", warning)
     tactile = settings.tactile
     if not backend("tactile", tactile.backend).metal:
         yield Finding("note", "tactile", f"{tactile.backend}: no board to ask")
