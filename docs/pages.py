@@ -125,26 +125,68 @@ def stream() -> str:
 # --- commands and subcommands ---------------------------------------------------------------------
 
 
+_COMMANDS = """\
+# Commands to the hand
+
+Send a command with `softfinger send`, with a method of [`Hand`](api.md), or as a msgpack map on a
+REQ socket ([the stream](stream.md#commands)). All three use the same names:
+
+```sh
+softfinger send grasp force=10N   # {{"ok": true, "mode": "grasping"}}
+```
+
+```text
+{}
+```
+
+Each command is accepted only in certain modes. Most commands need the lease: after a command, its
+client has the lease for `commands.lease` seconds, and other clients cannot command the hand.
+
+Every reply contains `ok`, and `mode` if the command was carried out. A refusal contains `error`, a
+message for people, and `reason`. Any command except `stop` can be refused with the reasons `mode`,
+`lease`, `late`, `stopped`, `superseded`, `busy` and `request`
+([explanations](stream.md#commands)). The sections below list the further causes. Ranges in numbers
+are those of the built-in hand.
+
+"""
+
+
 def commands() -> str:
-    """List the hand's commands from the table of modes."""
-    from softfinger.daemon.control.modes import COMMANDS, Mode
+    """Describe each command of the hand, from the table of commands."""
+    from softfinger.daemon.control.modes import COMMANDS, REPLY, Mode
+    from softfinger.daemon.loop.requests import bounds
+    from softfinger.daemon.profile.settings import Settings
     from softfinger.daemon.types import NO_LEASE_COMMANDS
     from softfinger.tools.terminal.send import _EPILOG
 
     parts = [
-        "# Commands to the hand\n\nYou can send a command with `softfinger send`, with a method of "
-        "[`Hand`](api.md), or as a msgpack map on a REQ socket ([the stream](stream.md#commands)). "
-        "All three use the same names:\n\n"
-        f"```text\n{_EPILOG}\n```\n\nEach command is only accepted in certain modes. Most commands "
-        "need the lease. While one client has the lease, other clients cannot command the "
-        "hand.\n\n",
+        _COMMANDS.format(_EPILOG),
         _head("command", "parameters", "accepted in the modes", "needs the lease"),
     ]
-    for name, (modes, numbers) in COMMANDS.items():
-        given = ", ".join(f"`{key}`" + " (optional)" * (not numbers[key]) for key in numbers)
-        where = "any" if modes == set(Mode) else ", ".join(m for m in Mode if m in modes)
+    for name, each in COMMANDS.items():
+        given = ", ".join(
+            f"`{key}`" + " (optional)" * (not parameter.required)
+            for key, parameter in each.parameters.items()
+        )
+        where = "any" if each.modes == set(Mode) else ", ".join(m for m in Mode if m in each.modes)
         leased = "no" if name in NO_LEASE_COMMANDS | {"stop"} else "yes"
-        parts.append(_row(f"`{name}`", given, where, leased))
+        parts.append(_row(f"[`{name}`](#{name})", given, where, leased))
+    for name, each in COMMANDS.items():
+        parts.append(f"\n## {name}\n\n{each.action}\n")
+        if each.parameters:
+            parts.append("\n" + _head("parameter", "unit", "range", "meaning"))
+        for key, parameter in each.parameters.items():
+            low, high = bounds(Settings(), key)
+            numbers = f"{_signed(low, 'g')} to {_signed(high, 'g')}" if low > -math.inf else ""
+            allowed = f"{parameter.range} ({numbers})" if parameter.range and numbers else ""
+            cells = parameter.unit, allowed or parameter.range or numbers, parameter.meaning
+            parts.append(_row(f"`{key}`", *cells))
+        if each.reply:
+            parts += ["\n" + _head("field of the reply", "meaning")]
+            parts += [_row(f"`{field}`", REPLY[field]) for field in each.reply]
+        if each.refusals:
+            parts += ["\n" + _head("refused as", "if")]
+            parts += [_row(f"`{reason}`", cause) for reason, cause in each.refusals.items()]
     return "".join(parts)
 
 

@@ -50,15 +50,15 @@ def parse(request: dict[str, Any], mode: Mode) -> Command:
     client = request.get("client", "")
     if not isinstance(client, str) or len(client) > 64:
         raise _malformed("client: expected a text of at most 64 characters")
-    heard, parameters = COMMANDS[name]
+    heard, parameters = COMMANDS[name].modes, COMMANDS[name].parameters
     unknown = sorted(set(request) - _ENVELOPE_KEYS - set(parameters))
     if unknown:
         known = ", ".join(parameters) or "no parameters"
         raise _malformed(f"{name}: unknown parameter {unknown[0][:40]!r}; expected {known}")
     numbers = {}
-    for key, required in parameters.items():
+    for key, parameter in parameters.items():
         if key not in request:
-            if required:
+            if parameter.required:
                 raise _malformed(f"{name}: {key} is missing")
             continue
         value = request[key]
@@ -77,6 +77,19 @@ def parse(request: dict[str, Any], mode: Mode) -> Command:
 
 def _malformed(text: str) -> Refused:
     return Refused(text, Reason.REQUEST)
+
+
+def bounds(settings: Settings, parameter: str) -> tuple[float, float]:
+    """Return the range of a command's parameter; infinite if it depends on the grip.
+
+    A force must be above the lower bound.
+    """
+    if parameter in FINGERS:
+        hand, index = settings.hand, FINGERS.index(parameter)
+        return hand.q_min[index], hand.q_max[index]
+    if parameter == "force":
+        return settings.control.contact_force, GRIP_FRACTION * settings.safety.force_max
+    return _COMPLIANCE_RANGE if parameter == "compliance" else (-math.inf, math.inf)
 
 
 class Lease:
@@ -283,8 +296,7 @@ class Requests:
             refuse_if(settings.servos.mode == "position", Reason.SCENE, text)
             numbers.setdefault("force", settings.control.force_default)
         if "force" in numbers:
-            force = numbers["force"]
-            low, high = settings.control.contact_force, GRIP_FRACTION * settings.safety.force_max
+            force, (low, high) = numbers["force"], bounds(settings, "force")
             text = f"force: found {force:g} N, expected above {low:g} to {high:g}"
             refuse_if(not low < force <= high, Reason.BOUNDS, text)
         if "angle" in numbers:
@@ -295,7 +307,7 @@ class Requests:
                 text = self._control.fingers.turn_refusal(numbers["angle"])
                 refuse_if(text, Reason.BOUNDS if state.object.valid else Reason.STATE, text)
         if name == "set":
-            compliance, (low, high) = numbers["compliance"], _COMPLIANCE_RANGE
+            compliance, (low, high) = numbers["compliance"], bounds(settings, "compliance")
             text = f"compliance: found {compliance:g} rad/(N·m), expected {low:g} to {high:g}"
             refuse_if(not low <= compliance <= high, Reason.BOUNDS, text)
 
@@ -303,10 +315,9 @@ class Requests:
         if not numbers:
             raise _malformed("move: left or right is missing")
         for name, q in numbers.items():
-            hand, index = self._settings.hand, FINGERS.index(name)
             if name not in self._settings.scene.fingers:
                 raise Refused(f"move: this scene has no {name} finger", Reason.SCENE)
-            low, high = hand.q_min[index], hand.q_max[index]
+            low, high = bounds(self._settings, name)
             if not low <= q <= high:
                 raise Refused(f"move: {name}: {range_text(q, low, high)}", Reason.BOUNDS)
 

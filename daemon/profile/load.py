@@ -34,7 +34,7 @@ _WORD = re.compile(r"\w+")
 _MESSAGE_START = re.compile(r"\w+ should (be |have )?")  # start of pydantic's messages
 
 
-class Examined(NamedTuple):
+class ExaminedProfile(NamedTuple):
     """Profile with its errors.
 
     Attributes
@@ -75,14 +75,14 @@ def load(
     Raises
     ------
     SettingsError
-        One line for each error of `Examined`, at most 20.
+        One line for each error of `ExaminedProfile`, at most 20.
     """
     return _without_errors(examine(path, directory, changes))
 
 
 def examine(
     path: Path | None = None, directory: Path | None = None, changes: Sequence[str] = ()
-) -> Examined:
+) -> ExaminedProfile:
     """Read a profile and find all of its errors. Raises SettingsError if it cannot be read.
 
     The arguments are those of `load`.
@@ -98,7 +98,7 @@ def checked(data: dict[str, Any]) -> Settings:
     return _without_errors(_examined(data, "settings"))
 
 
-def _without_errors(found: Examined) -> Settings:
+def _without_errors(found: ExaminedProfile) -> Settings:
     told, more = found.errors[:_ERROR_COUNT_MAX], len(found.errors) - _ERROR_COUNT_MAX
     if more > 0:
         told.append(f"{found.name}: and {more} more errors")
@@ -112,7 +112,7 @@ def _examined(
     name: str,
     changed: Collection[str] = (),
     directory: Path | None = None,
-) -> Examined:
+) -> ExaminedProfile:
     unused: set[str] = set()
     found: list[str] = []
     try:
@@ -128,7 +128,7 @@ def _examined(
     errors = [
         f"{'--set' if problem.split(':')[0] in changed else name}: {problem}" for problem in found
     ]
-    return Examined(name, settings, errors, unused)
+    return ExaminedProfile(name, settings, errors, unused)
 
 
 def _without_words(lines: Iterable[str], words: set[str]) -> list[str]:

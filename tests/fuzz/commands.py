@@ -44,7 +44,7 @@ def some_request(rng: random.Random) -> Any:
     """Return a command in the correct form, or nearly."""
     name = rng.choice([*COMMANDS, "arm", "grasp", "nothing"])
     request: dict[Any, Any] = {"command": name}
-    for key in COMMANDS.get(name, (None, {}))[1]:
+    for key in COMMANDS[name].parameters if name in COMMANDS else ():
         if rng.random() < 0.8:
             request[key] = rng.choice((rng.uniform(-2, 12), rng.choice(_ODD)))
     if rng.random() < 0.3:

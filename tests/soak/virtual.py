@@ -468,8 +468,8 @@ class Soak:
         }.get(mode, ("status",))
         name = chance.choice(usual if chance.random() > _WILD else sorted(COMMANDS))
         request: dict[str, Any] = {"command": name}
-        for key, required in COMMANDS[name][1].items():
-            if required or chance.random() < 0.8:
+        for key, parameter in COMMANDS[name].parameters.items():
+            if parameter.required or chance.random() < 0.8:
                 request[key] = self._number(key)
         self._put_object_back()
         try:

@@ -558,7 +558,7 @@ def test_a_signal_while_sockets_are_created_ends_the_start_up(monkeypatch, addre
 
 
 def heard(mode: Mode) -> set[str]:
-    return {name for name, (modes, _) in COMMANDS.items() if mode in modes}
+    return {name for name, each in COMMANDS.items() if mode in each.modes}
 
 
 def test_stop_and_status_are_accepted_in_every_mode():

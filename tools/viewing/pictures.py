@@ -248,7 +248,7 @@ class Pictures:
             "columns": _COLUMNS,
             "palette": heatmap.colour_map(),
             "modes": [mode.value for mode in Mode],
-            "commands": {name: list(modes) for name, (modes, _) in COMMANDS.items()},
+            "commands": {name: list(each.modes) for name, each in COMMANDS.items()},
             "force_default": settings.control.force_default,
             "marks": self._marks,
         }
