@@ -132,12 +132,10 @@ Send a command with `softfinger send`, with a method of [`Hand`](api.md), or as 
 REQ socket ([the stream](stream.md#commands)). All three use the same names:
 
 ```sh
-softfinger send grasp force=10N   # {{"ok": true, "mode": "grasping"}}
+softfinger send grasp force=10N   # {"ok": true, "mode": "grasping"}
 ```
 
-```text
-{}
-```
+Numbers are in SI units. With `send` they can carry a unit, as in `force=10N` and `angle=8deg`.
 
 Each command is accepted only in certain modes. Most commands need the lease: after a command, its
 client has the lease for `commands.lease` seconds, and other clients cannot command the hand.
@@ -157,10 +155,9 @@ def commands() -> str:
     from softfinger.daemon.loop.requests import bounds
     from softfinger.daemon.profile.settings import Settings
     from softfinger.daemon.types import NO_LEASE_COMMANDS
-    from softfinger.tools.terminal.send import _EPILOG
 
     parts = [
-        _COMMANDS.format(_EPILOG),
+        _COMMANDS,
         _head("command", "parameters", "accepted in the modes", "needs the lease"),
     ]
     for name, each in COMMANDS.items():

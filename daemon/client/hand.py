@@ -70,7 +70,7 @@ class Hand(HandClient[None]):
     client
         Name that owns the command lease.
     timeout
-        Time limit for a reply or a first state [s].
+        Time limit for a reply or a first state [s]; 5 s by default.
     keys
         Folder with the keys of this client, if the daemon requires keys.
 
