@@ -35,8 +35,8 @@ class FieldDocs(griffe.Extension):
 
 def _members(enumeration: type[Enum]) -> str:
     """Return a section with the members of an enumeration that explain themselves."""
-    told = {
+    meanings = {
         each.name: getattr(each, "meaning", "") or getattr(each, "text", "") for each in enumeration
     }
-    rows = "".join(f"\n{name}\n    {text}" for name, text in told.items() if text)
+    rows = "".join(f"\n{name}\n    {text}" for name, text in meanings.items() if text)
     return f"\n\nAttributes\n----------{rows}" if rows else ""

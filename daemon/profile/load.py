@@ -99,11 +99,11 @@ def checked(data: dict[str, Any]) -> Settings:
 
 
 def _without_errors(found: ExaminedProfile) -> Settings:
-    told, more = found.errors[:_ERROR_COUNT_MAX], len(found.errors) - _ERROR_COUNT_MAX
+    lines, more = found.errors[:_ERROR_COUNT_MAX], len(found.errors) - _ERROR_COUNT_MAX
     if more > 0:
-        told.append(f"{found.name}: and {more} more errors")
-    if told:
-        raise SettingsError("\n".join(told))
+        lines.append(f"{found.name}: and {more} more errors")
+    if lines:
+        raise SettingsError("\n".join(lines))
     return found.settings
 
 
@@ -118,10 +118,10 @@ def _examined(
     try:
         settings = Settings.model_validate(data)
     except ValidationError as error:
-        told = error.errors(include_url=False)
-        found = [_line(details) for details in told]
-        unused = {str(part) for details in told for part in details["loc"][:2][-1:]}
-        settings = Settings.model_validate(_without(data, told))
+        wrong = error.errors(include_url=False)
+        found = [_line(details) for details in wrong]
+        unused = {str(part) for details in wrong for part in details["loc"][:2][-1:]}
+        settings = Settings.model_validate(_without(data, wrong))
     if directory is not None:
         settings = _with_directory(settings, directory)
     found += _without_words((*problems(settings), *_plugin_problems(settings)), unused)
@@ -135,12 +135,12 @@ def _without_words(lines: Iterable[str], words: set[str]) -> list[str]:
     return [line for line in lines if not words & set(_WORD.findall(line))]
 
 
-def _without(data: dict[str, Any], told: Sequence[ErrorDetails]) -> dict[str, Any]:
+def _without(data: dict[str, Any], wrong: Sequence[ErrorDetails]) -> dict[str, Any]:
     """Return the sections without the keys, or the whole sections, that have errors."""
     kept: dict[Any, Any] = {
         name: dict(keys) if isinstance(keys, dict) else keys for name, keys in data.items()
     }
-    for section, *inside in (details["loc"] for details in told):
+    for section, *inside in (details["loc"] for details in wrong):
         if inside and isinstance(kept.get(section), dict):
             kept[section].pop(inside[0], None)
         else:

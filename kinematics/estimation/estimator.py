@@ -117,10 +117,10 @@ class ContactEstimate:
             return f"ContactEstimate: not valid: {self.invalid.text}"
         if not self.contact:
             return f"ContactEstimate: no contact of more than {1e3 * self.d_std:.2g} mm"
-        tilts = (self.tilt_x, self.tilt_x_std), (self.tilt_y, self.tilt_y_std)
-        told = ", ".join(f"{math.degrees(a):z.2f} ± {math.degrees(std):.2f}°" for a, std in tilts)
+        pairs = (self.tilt_x, self.tilt_x_std), (self.tilt_y, self.tilt_y_std)
+        tilts = ", ".join(f"{math.degrees(a):z.2f} ± {math.degrees(std):.2f}°" for a, std in pairs)
         d = f"d {1e3 * self.d:.3f} ± {1e3 * self.d_std:.3f} mm"
-        return f"ContactEstimate: {d}, tilts {told}, gain {self.gain:.2f}"
+        return f"ContactEstimate: {d}, tilts {tilts}, gain {self.gain:.2f}"
 
     @property
     def valid(self) -> bool:
