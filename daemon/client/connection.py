@@ -65,7 +65,7 @@ def require_host(address: str) -> None:
     """
     if not address.startswith("tcp://"):
         return
-    host = address[6:].rpartition(":")[0].strip("[]")
+    host = address[6:].rpartition(";")[2].rpartition(":")[0].strip("[]")  # after a source address
     try:
         getaddrinfo(host, None)
     except (OSError, UnicodeError) as error:

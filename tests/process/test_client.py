@@ -447,6 +447,9 @@ def test_a_host_that_the_resolver_does_not_know_is_named_with_its_reason(monkeyp
         Hand("tcp://lab7")
     with Hand("ipc:///run/a,ipc:///run/b"):
         pass  # has no host
+    monkeypatch.undo()
+    with Hand("tcp://127.0.0.1:0;127.0.0.1:9872", "tcp://[::1]:9873"):
+        pass  # a source address, and a numeric one
 
 
 @pytest.mark.parametrize("words", [["monitor"], ["send", "stop"], ["status"], ["record", "a.mcap"]])
