@@ -1,4 +1,4 @@
-"""The hand's modes and commands, and which command is accepted in which mode."""
+"""Modes and commands of the hand, and the modes in which each command is accepted."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ class Mode(StrEnum):
     """Mode of the hand."""
 
     DISARMED = "disarmed"  # torque off
-    ARMED = "armed"  # torque on, joints hold where they are
-    MOVING = "moving"  # joints on their way to commanded angles
-    GRASPING = "grasping"  # closing, or building up the force
-    HOLDING = "holding"  # force and object's angle held
-    ROTATING = "rotating"  # turning the object in the grip
-    RELEASING = "releasing"  # opening
+    ARMED = "armed"  # torque on, joints hold their positions
+    MOVING = "moving"  # joints moving to commanded angles
+    GRASPING = "grasping"  # closing, or increasing the force
+    HOLDING = "holding"  # holding force and object angle
+    ROTATING = "rotating"  # rotating the object
+    RELEASING = "releasing"  # opening the fingers
     FAULT = "fault"  # torque off until the fault is cleared
 
 
@@ -24,7 +24,7 @@ HOLDING_MODES = frozenset({Mode.HOLDING, Mode.ROTATING})
 _TORQUE_MODES = frozenset(Mode) - {Mode.DISARMED, Mode.FAULT}
 _ALL_MODES = frozenset(Mode)
 
-# command → (modes in which it is accepted, its numeric arguments: name → required)
+# Map from command to (modes in which it is accepted, map from numeric argument to "required").
 COMMANDS: dict[str, tuple[frozenset[Mode], dict[str, bool]]] = {
     "arm": (frozenset({Mode.DISARMED}), {}),
     "disarm": (_ALL_MODES - {Mode.FAULT}, {}),
@@ -34,18 +34,18 @@ COMMANDS: dict[str, tuple[frozenset[Mode], dict[str, bool]]] = {
         frozenset({Mode.ARMED, Mode.MOVING}) | GRIPPING_MODES,
         {"force": False},
     ),
-    "rotate": (GRIPPING_MODES, {"angle": True}),  # waits for the grip to hold
-    "hold": (  # streamed setpoints; does not change the mode of a grip
+    "rotate": (GRIPPING_MODES, {"angle": True}),  # starts once the grip holds
+    "hold": (  # streamed setpoints; the mode of a grip stays the same
         frozenset({Mode.ARMED, Mode.MOVING}) | GRIPPING_MODES,
         {"force": False, "angle": False},
     ),
     "release": (_TORQUE_MODES, {}),
     "set": (_TORQUE_MODES, {"compliance": True}),
-    "demo": (frozenset({Mode.DISARMED}), {}),  # restarts the task of the profile
+    "demo": (frozenset({Mode.DISARMED}), {}),  # restarts the profile's task
     "stop": (_ALL_MODES, {}),
     "clear": (frozenset({Mode.FAULT}), {}),
     "status": (_ALL_MODES, {}),
 }
 
-# These commands never stiffen or move the hand, so they are accepted even if they arrived late.
+# These commands never stiffen or move the hand, so they are accepted even if they arrive late.
 SAFE_COMMANDS = frozenset({"disarm", "tare", "clear"})
