@@ -35,7 +35,7 @@ class Reading:
     """Latest joint measurements. ``Servos.read`` updates them in place."""
 
     seq: int = 0
-    t: float = -math.inf  # time of the last good reading
+    t: float = -math.inf  # time of the last valid reading [s]
     valid: bool = False
     q: list[float] = field(default_factory=_pair)  # joint angle [rad]
     dq: list[float] = field(default_factory=_pair)  # joint velocity [rad/s]
@@ -72,8 +72,8 @@ class Contact:
     d: float = 0.0  # maximum displacement [m]
     theta: float = 0.0  # object angle relative to the tip, in the hand plane [rad]
     tilt_y: float = 0.0  # object angle perpendicular to the hand plane [rad]
-    d_std: float = 0.0  # standard deviation [m]; see `ContactEstimate`
-    theta_std: float = 0.0
+    d_std: float = 0.0  # standard deviation of d [m]; see `ContactEstimate`
+    theta_std: float = 0.0  # standard deviation of theta [rad]
     gain: float = 1.0  # ratio of measured to modelled pressure
     modulus_scale: float = 1.0  # ratio of tip modulus to the setting
     modulus_scale_std: float = 0.0

@@ -35,7 +35,7 @@ def identity(settings: Settings) -> dict[str, Any]:
 
 
 def increased_force_limit(settings: Settings, force: float) -> float:
-    """Return the maximum force [N] to which the slip monitor may increase a ``force`` [N]."""
+    """Return the maximum [N] to which the slip monitor may increase a commanded ``force`` [N]."""
     force_max = GRIP_FRACTION * settings.safety.force_max
     return max(min(force + settings.control.grip_raise_max, force_max), force)
 

@@ -83,7 +83,7 @@ class Grip:
 
     @property
     def is_dithering(self) -> bool:
-        """True while the dither that uprights the object is running or pending."""
+        """True while the dither that brings the object upright is running or pending."""
         state = self._state
         awaited = state.law.is_blind and self._single_finger is None and not state.is_steering
         return awaited and state.dither_elapsed < state.law.dither_time
@@ -110,7 +110,7 @@ class Grip:
     def retarget(self, force: float) -> None:
         """Change the commanded force [N].
 
-        A lower force reduces the increase due to slip in proportion.
+        A lower force also reduces the slip-related increase in proportion.
         """
         force = min(force, self.commanded_max)
         if force < self.commanded:

@@ -47,7 +47,7 @@ class GripLaw(Record):
     torque_max: float  # [N·m]
     torque_error: float  # relative error of the torque constants
     turn_decay: float  # decay factor per tick of the turning rate without frames
-    is_blind: bool  # dither uprights the object; its measured angle is not used
+    is_blind: bool  # dither brings the object upright; its angle is not used
     half_separation: float  # half the pivot separation [m]
     length: float  # finger length [m]
     offset: float  # fingertip offset [m]

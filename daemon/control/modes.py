@@ -24,7 +24,7 @@ HOLDING_MODES = frozenset({Mode.HOLDING, Mode.ROTATING})
 _TORQUE_MODES = frozenset(Mode) - {Mode.DISARMED, Mode.FAULT}
 _ALL_MODES = frozenset(Mode)
 
-# Map from command to (modes in which it is accepted, map from numeric argument to "required").
+# Command → (modes in which it is accepted, numeric argument → True if required).
 COMMANDS: dict[str, tuple[frozenset[Mode], dict[str, bool]]] = {
     "arm": (frozenset({Mode.DISARMED}), {}),
     "disarm": (_ALL_MODES - {Mode.FAULT}, {}),

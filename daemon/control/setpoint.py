@@ -37,7 +37,7 @@ class SetpointState(Record):
 
 @inner_kernel
 def reset(s: SetpointState, windows: FloatArray, value: float) -> None:
-    """Set the setpoint to ``value``, at rest."""
+    """Set the setpoint to ``value`` with zero speed."""
     s.target = s.ramp = s.value = value
     s.speed = 0.0
     s.idle_count = s.first.length + s.second.length
@@ -122,7 +122,7 @@ class Setpoint:
         self.step(0.0)  # Compile the kernel before the first tick.
 
     def reset(self, value: float) -> None:
-        """Set the setpoint to ``value``, at rest."""
+        """Set the setpoint to ``value`` with zero speed."""
         _reset(self.state.array, self.windows, value)
 
     def step(self, rate: float) -> bool:

@@ -68,7 +68,7 @@ _FRICTION_MAX = 0.3  # N·m; a larger torque during free approach is not frictio
 _UNCONFIRMED_SHARE = 0.3  # fraction of the commanded force
 _RELAXATION_SHARE = 0.2  # fraction of the tip force that rubber may lose during a hold
 _ARM_MIN = 0.2  # fraction of the object width, minimum lever arm of the load
-_SPARE_MIN = 0.3  # fraction of the friction, minimum that remains after rolling
+_SPARE_MIN = 0.3  # minimum fraction of the friction that remains after rolling
 
 
 class SlipLaw(Record):
@@ -201,10 +201,10 @@ def update(
         s.has_turned = _has_turned(s, grasp)
     s.rotation_seen[:] = grasp.unexplained_rotation
     s.torque = mean(torques)
-    # The torques are not usable if joint friction hides more load than the grip can bear.
+    # Ignore the torques if joint friction hides more load than the grip can bear.
     if law.friction * commanded * grasp.load_arm <= s.friction:
         s.load = 0.0
-    if law.has_shear:  # A load beyond the shear is a force error.
+    if law.has_shear:  # A load above the measured shear is a force error.
         s.load = min(s.load, pull + _SHEAR_JUMP)
     if grasp.sensor_fault:
         s.load = pull = s.needed_force = 0.0

@@ -47,7 +47,7 @@ from softfinger.daemon.perception.grasp import GraspState
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS, Event, Goal, State
 
-# rad, distance from its goal below which a joint has arrived. It is five times the position error
+# rad, maximum distance between a joint and its goal on arrival. It is five times the position error
 # due to the default joint friction at the default servos.stiffness.
 _ARRIVAL_DISTANCE = 0.03
 # s allowed for a joint to arrive after its setpoint; friction then holds the joint.

@@ -62,7 +62,7 @@ class Commands(Protocol):
 
 
 class Loop:
-    """The pipeline, run on a clock entirely in the thread that calls `run`."""
+    """The pipeline, driven by a clock and run entirely in the thread that calls `run`."""
 
     def __init__(
         self,

@@ -38,7 +38,7 @@ _UPPER_EDGES = np.append(_BIN_EDGES.ravel()[:-1], np.inf)
 LATENESS_MIN = 0.05  # s, minimum delay that is reported
 # s, minimum time between reports. In addition, the reported delay must at least double each time.
 REPORT_INTERVAL = 60.0
-ATTRIBUTION_TIME = 0.25  # s after a late tick in which faults may be attributed to it
+ATTRIBUTION_TIME = 0.25  # s after a late tick during which faults may be attributed to it
 # Limits that a late tick alone can violate.
 _TIME_LIMITS = frozenset({"servos.bus", "servos.silent", "tactile.silent", "loop.overruns"})
 

@@ -128,7 +128,7 @@ def _motion_at(history: Records[HistoryRow], newest: int, t: float, finger: int)
 def _rates(
     h: HandFilter, history: Records[HistoryRow], finger: int, scan: float, sense: float
 ) -> tuple[float, float]:
-    """Return the rates of d [m/s] and θ [rad/s] at the ``scan``: their derivatives by latency.
+    """Return the rates of d [m/s] and θ [rad/s] at the ``scan``, for the latency slopes.
 
     The rates are secants over ±1 standard deviation of the latency, since the joints may have
     stopped in between. Rates below the velocity resolution are set to 0.
@@ -179,7 +179,7 @@ def update(
     systematic: FloatArray,
     table: FloatArray,
 ) -> bool:
-    """Update with one finger's frame of time ``t``; return False if the frame is rejected.
+    """Update with one finger's frame from time ``t``; return False if the frame is rejected.
 
     ``covariance`` is the [4, 4] covariance of d, θ, tilt_y and gain; ``systematic`` is the part of
     it that all frames share. A gain variance above 0 means that the gain was fitted.

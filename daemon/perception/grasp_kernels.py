@@ -47,7 +47,7 @@ from softfinger.kinematics.hand.grasp_state import holding_moment_arms, load_tor
 FloatArray = NDArray[np.float64]
 
 _TORQUE_NOISE = 0.05  # N·m, noise of moving joints
-_CLOSING_MIN = 0.03  # rad/s, above the velocity resolution, so that friction opposes closing
+_CLOSING_MIN = 0.03  # rad/s, minimum closing speed at which friction opposes the motion
 _BALANCE_ERROR = 0.05  # relative error of the normal forces
 _SUPPORT_FRICTION = 0.4  # N, friction between object and table
 _BALANCE_TIME = 0.1  # s, correlation time of both errors

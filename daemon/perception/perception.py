@@ -29,7 +29,7 @@ _PRESSURE_STEPS = 65535  # quantisation steps of a published pressure
 _STORED_TIME = 2.0  # s of stored frames
 _REPEATED_TIME = 0.1  # s of repeated frames that indicate a fault
 _REPEATED_COUNT_MIN = 5  # minimum number of repeated frames for a fault
-_CHANGED_CELLS_MIN = 4  # between frames; one or two noisy cells may repeat by chance
+_CHANGED_CELLS_MIN = 4  # minimum per frame; one or two noisy cells may repeat by chance
 
 
 class Perception:
@@ -55,7 +55,7 @@ class Perception:
         )
 
     def tare(self) -> None:
-        """Set the zero of each cell to its mean over the next frames."""
+        """Start a tare: set each cell's zero offset to its mean over the next frames."""
         for each in self.fingers:
             each.tare()
 
@@ -84,7 +84,7 @@ class RepeatDetector:
     def __init__(self, rate: float, enabled: bool = True) -> None:
         """Create a detector for a frame ``rate`` [Hz]; ``enabled`` makes repetition a fault."""
         self._enabled = enabled
-        self.period = 0  # repetition period in frames, 0 if frames do not repeat
+        self.period = 0  # repetition period in frames, 0 without repetition
         self._repeated_count = 0  # consecutive frames with this period
         self._fault_count = max(round(_REPEATED_TIME * rate), _REPEATED_COUNT_MIN)
         self._digests: deque[int] = deque(maxlen=round(_STORED_TIME * rate))  # newest first
@@ -178,7 +178,7 @@ class FingerPerception:
         return self._tare_remaining_count > 0
 
     def tare(self) -> None:
-        """Set the zero of each cell to its mean over the next frames."""
+        """Start a tare: set each cell's zero offset to its mean over the next frames."""
         self._tare_sum = 0
         self._tare_remaining_count = _TARE_FRAME_COUNT
         self._unloaded.reset_zero()

@@ -40,7 +40,7 @@ _FORCE_RISE_MIN = 0.2
 _RESPONSE_TIME = 0.3  # s, time allowed for the measured force to follow
 _STEP_TOLERANCE = 0.02  # rad, step tolerance beyond the distance at maximum velocity
 _DRIFT_MAX = 0.1  # rad, allowed difference between angle and integrated velocity
-_DRIFT_TIME = 0.1  # s, window for this difference, because the velocity lags
+_DRIFT_TIME = 0.1  # s, window for this difference, to allow for velocity lag
 _LATE_TIME = 0.02  # s or 3 ticks, interval between readings that restarts the window
 _FAILURE_TIME = 0.72  # s, time constant for the fraction of failed readings
 _FAILED_FRACTION_MAX = 0.75  # warning threshold, reached after 1 s without a valid reading
@@ -109,14 +109,14 @@ class View:
         self.failed = 0.0  # fraction of failed readings during about the last second
         self._t = math.nan  # time of the previous state [s]
         self.motion = JointMotion(self.fingers, self.limits.velocity_max, 1.0 / settings.loop.rate)
-        servos = settings.servos  # the stiffness limits it in current mode
+        servos = settings.servos  # limited by the stiffness in current mode
         self.pull = _CURRENT_PER_ERROR
         if servos.mode == "current":
             self.pull = min(self.pull, 0.5 * servos.stiffness)
         self.bad_goal = False  # a goal since the previous check was not finite
         self.grip_width = math.nan  # object width at the start of the grip [m]
         self._target = math.nan  # commanded grip force on the previous tick [N]
-        self.rise_t = math.inf  # time of a force command increase not yet measured [s]
+        self.rise_t = math.inf  # time of a commanded increase without a measured response [s]
         self.rise_felt = 0.0  # measured force at that time [N]
         low, high = settings.safety.voltage_min, settings.safety.voltage_max
         if settings.servos.backend != "none":

@@ -24,7 +24,7 @@ _CLOSING_TRY_COUNT = 15  # attempts at shutdown
 
 
 class TorqueState:
-    """Torque controller; it writes ``torque``, ``torque_off`` and ``write_error`` of the state."""
+    """Torque controller that writes ``torque``, ``torque_off`` and ``write_error`` of the state."""
 
     def __init__(
         self,

@@ -82,7 +82,7 @@ class Servos(Protocol):
         """Send each joint's goal angle and current limit."""
 
     def counters(self) -> dict[str, int]:
-        """Return the failed exchanges since connect, counted by type: ``timeouts``, ``crc``, …"""
+        """Return the numbers of failed exchanges since connect by type: ``timeouts``, ``crc``, …"""
 
     def close(self) -> None:
         """Try to switch torque off and close the port. Never raises."""

@@ -337,7 +337,7 @@ class DynamixelServos:
     # --- closing ---------------------------------------------------------------------------------
 
     def counters(self) -> dict[str, int]:
-        """Return the failed exchanges since connect, counted by type."""
+        """Return the numbers of failed exchanges since connect by type."""
         handler = self._handler
         return {
             "timeouts": handler.timeouts,

@@ -32,7 +32,7 @@ LENGTH_COUNT = 11  # per span: the shortest version, and up to ten preceding reg
 
 EXCHANGE_COUNT = 50  # number of exchanges timed by `doctor`
 _TIMED_REPLY_TIMEOUT = 0.1  # s, minimum reply timeout for timed exchanges
-_CONNECT_READ_COUNT = 9  # reads at connect, whose fastest gives the minimum reply time
+_CONNECT_READ_COUNT = 9  # reads at connect; the fastest one gives the minimum reply time
 _REPLY_FRACTION_MAX = 0.8  # maximum fraction of a tick for a reply
 _FAILED_FRACTION_WARN, _FAILED_FRACTION_FAIL = 0.02, 0.2  # fraction of failed exchanges
 

@@ -95,8 +95,8 @@ class PacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
     ) -> tuple[list[int], int, int]:
         """Read a span; return (data, result code, error byte). After an error, data are zeros.
 
-        A reply with another length is skipped. It is a late reply to an action, for which the SDK
-        does not wait.
+        Replies with another length are skipped. They are late replies to an action instruction, for
+        which the SDK does not wait.
         """
         if dxl_id >= BROADCAST_ID:
             return [], int(COMM_NOT_AVAILABLE), 0
@@ -185,7 +185,7 @@ class GroupRead:
         self._reply = (_STATUS_SIZE + length) * len(ids)
 
     def exchange(self, until: float = math.inf) -> int:
-        """Request and wait at most ``until`` [s, time.monotonic()]; return an SDK result code."""
+        """Exchange by the time ``until`` [s, time.monotonic()]; return an SDK result code."""
         if not self.port.send(self._request, self._reply, until):
             return int(COMM_TX_FAIL)
         handler = self._handler
@@ -212,7 +212,7 @@ class FastGroupRead(GroupRead):
     instruction = _FAST_SYNC_READ
 
     def exchange(self, until: float = math.inf) -> int:
-        """Request and wait at most ``until`` [s, time.monotonic()]; return an SDK result code."""
+        """Exchange by the time ``until`` [s, time.monotonic()]; return an SDK result code."""
         if not self.port.send(self._request, self._reply, until):
             return int(COMM_TX_FAIL)
         handler, length = self._handler, self._length

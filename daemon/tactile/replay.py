@@ -67,7 +67,7 @@ class GivenFrames:
 
 
 class ReplayTactile:
-    """Player of a recording's frames at their own times, starting at ``open``.
+    """Backend that replays a recording at its recorded times, starting at ``open``.
 
     The recording restarts one mean interval after its last frame. If ``tactile.replay_again`` is
     false, the last frame is instead repeated once with ``valid`` False. ``live`` [rows, cols] is

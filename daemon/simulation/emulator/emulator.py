@@ -50,11 +50,11 @@ _REQUESTS = ("report", "forget", "place")  # control socket words other than fau
 _TURN_GOALS = {"closed": 6.0, "open": -6.0, "zero": 0.0}
 _TURN_CURRENT = 0.3  # A, motor current equivalent to turning by hand
 _TURN_TIME = 1.0  # s
-_STALL_TIME = 0.05  # s; the hand's clock does not count the rest of a longer pause
+_STALL_TIME = 0.05  # s, maximum pause counted by the hand's clock
 # s by which the hand's clock may be ahead of the daemon, which waits for replies.
 _AHEAD_TIME = 0.002
 _POLL_INTERVAL = 0.0005  # s between checks for a new deadline
-# Board for profiles without a board, as in config/hil.toml.
+# Default board, as in config/hil.toml.
 DEFAULT_BOARD = {
     "backend": "flexitac",
     "rows": 32,
@@ -121,7 +121,7 @@ class EmulatorClock:
 
 @dataclass(frozen=True, slots=True)
 class EmulatedServos:
-    """Options for the emulated servos that are not in the settings."""
+    """Emulated servo options that are not part of the settings."""
 
     baud: int = 0  # 0: reply immediately at any rate
     factory: bool = False  # factory defaults except for IDs and baud rate

@@ -1,8 +1,8 @@
 """Compute the plant energy, and prevent integration steps from creating energy.
 
 With smooth forces, the integration error is small and decreases with the step size. With non-smooth
-forces (for example, when a light object hits the stiff rim of the backing plate) or a far too long
-step, the energy could increase by more than the work of the motors and loads. The guard then
+forces (for example, when a light object hits the stiff rim of the backing plate) or an excessively
+long step, the energy could increase by more than the work of the motors and loads. The guard then
 removes the excess from the kinetic energy. If the kinetic energy is too small for this, the motion
 stops at an earlier point of the step. Without damping, the energy should be constant; in this case,
 the method's small drift is allowed in smooth steps.

@@ -52,7 +52,7 @@ def current_reference(plant: Plant, joint: int, q: float, rate: float) -> float:
 
 @inner_kernel
 def set_motor_slopes(plant: Plant, g: float) -> None:
-    """Set the derivatives of the motor torques by angle and velocity, divided by (τ + g).
+    """Set the motor torque derivatives (angle and velocity), divided by (τ + g).
 
     The derivatives are 0 unless the motors are stiff for a step ``g``. They are upper bounds, since
     the current may enter or leave its limits within the step.

@@ -174,8 +174,8 @@ def advance_state(plant: Plant, h: float) -> None:
             continue
         displacement = h * (1.5 * first.position[j] + 0.5 * second.position[j])
         change = h * (1.5 * first.velocity[j] + 0.5 * second.velocity[j])
-        # A step that would move a tip by more than a quarter of its radius is far too long.
-        # Limiting the displacement can only remove energy.
+        # A step that would move a tip by more than a quarter of its radius is too long. Limiting
+        # the displacement can only remove energy.
         limit = 0.25 * p.radius
         if j < 2:
             limit /= p.length + abs(p.offset)
@@ -215,7 +215,7 @@ def store_bristles(plant: Plant) -> None:
 
 @inner_kernel
 def senses_other_tip(plant: Plant, finger: int) -> bool:
-    """Return True if the contact with the other tip is the stronger one, which is sensed."""
+    """Return True if a tip senses the other tip because that contact is stronger."""
     if not plant.tips_may_touch:
         return False
     stage = plant.stages[0]

@@ -199,9 +199,9 @@ class TipContact(Record):
     tangential: float  # T [N]
     rim: float  # rim penetration depth, 0 without contact [m]
     rim_energy: float  # rim energy, set if ``rim`` is above 0 [J]
-    rim_d: float  # derivatives of rim energy by d [N] and by θ [N·m]
+    rim_d: float  # derivatives of rim energy: d [N], θ [N·m]
     rim_theta: float
-    rows: Annotated[FloatArray, 3, 4]  # derivatives of d, θ and d_t by the coordinates
+    rows: Annotated[FloatArray, 3, 4]  # derivatives of d, θ and d_t with respect to the coordinates
     stiffness: FloatTriple  # stiffness along each row
     damping: FloatTriple
     along: FloatTriple  # forces along the rows, including damping

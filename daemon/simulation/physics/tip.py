@@ -16,8 +16,8 @@ This is the contact law ``simulation.tip_law = "springs"``. With ``"bristles"``,
 is omitted. The tangential force T = 2 s F cos θ d_t/d (2πE s d d_t for a constant E) then comes
 from a bristle at the centre of the contact. Tilt and compression do not bend this bristle, and d_t
 only follows the sliding motion at that point. The upright force, the force at d_t = 0 and the
-sensor are the same for both laws. The bristles are therefore used to test a controller that
-compensates the tangential terms of the springs on a tip without these terms.
+sensor are the same for both laws. The bristles therefore allow a controller that compensates the
+springs' tangential terms to be tested on a tip without these terms.
 
 The tip touches the nearest point of the object. On a face, the contact direction is the face
 normal. At a corner, it is the line to the corner, as for a plane normal to that line. On a disc, it

@@ -296,7 +296,7 @@ def curve(pressure: FloatArray, exponent: float, full_scale: float, fold: float)
 def drift(
     value: FloatArray, deviation: float, time: float, elapsed: float, normals: FloatArray
 ) -> None:
-    """Advance the drift of zero offsets or gain, an Ornstein-Uhlenbeck process.
+    """Advance the zero or gain drift, modelled as an Ornstein-Uhlenbeck process.
 
     ``value`` starts at 0 after a tare, and its standard deviation approaches ``deviation`` with the
     correlation time ``time`` [s]. ``normals`` are standard normal numbers.

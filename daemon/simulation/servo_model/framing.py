@@ -93,7 +93,7 @@ def _packet(raw: bytes) -> Packet:
 
 
 class PacketParser:
-    """Parser that finds packets in a byte stream like a real servo.
+    """Packet parser that behaves like a real servo.
 
     A packet is discarded if a header occurs inside it (FF FF FD not followed by FD, which stuffing
     prevents), or if it is interrupted by more than ``gap`` seconds of silence. A packet sent

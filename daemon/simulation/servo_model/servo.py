@@ -5,8 +5,8 @@ shutdown and reboot. Packets are handled in :mod:`simulation.servo_model.servo_b
 is not used by any known client, is rejected as out of range. The integral gain and startup from a
 RAM backup have no effect.
 
-The manuals do not specify two details. Here, a write that violates any rule does not change any
-register, and switching torque on after a shutdown is rejected with RESULT_FAIL.
+Two details are not specified in the manuals. Here, a write that violates any rule does not change
+any register, and switching torque on after a shutdown is rejected with RESULT_FAIL.
 """
 
 from __future__ import annotations
