@@ -133,7 +133,7 @@ class HandFilter(Record):
     is_single: bool  # one-finger hand
     gain_is_known: bool  # `estimator.free_gain` is false
     t: float  # time of the last reading [s]
-    newest_row: int  # newest row of the history
+    newest_row: int  # index in the history
     rotation: float  # integrated predicted rotation [rad]
     closing_speed: float  # mean speed of both joints, low-pass filtered [rad/s]
     last_closing_speed: float  # on the previous tick [rad/s]
@@ -306,7 +306,7 @@ def _move(h: HandFilter, dq: FloatPair, dt: float) -> None:
     left = h.tip[0]
     right = h.tip[1]
     arm1, arm2, turn1, turn2, slide, _, _ = motion_of(h)
-    # Before contact, a tip approaches the object at the same rate as it would be compressed.
+    # Before contact, a tip approaches at the rate at which it would later be compressed.
     if h.is_single:
         by1, by2 = arm1, arm2
     else:

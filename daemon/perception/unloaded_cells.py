@@ -37,7 +37,7 @@ class UnloadedCells:
         self._cells = cells if cells.size >= _CELL_COUNT_MIN else cells[:0]
         self._live = np.flatnonzero(live)
         self._last_readings: NDArray[np.float64] | None = None  # last readings of the live cells
-        self._squared_changes: NDArray[np.float64] | None = None  # average squared changes
+        self._squared_changes: NDArray[np.float64] | None = None  # running average
         self._zero_fraction = 0.0  # fraction of the live cells that read 0
         self._reference: float | None = None  # median of the unloaded cells at the tare
         self._variance: float | None = None

@@ -23,7 +23,7 @@ FloatArray = NDArray[np.float64]
 
 SERVOS = "servos"
 OBJECT = "object"
-LATE_REPLY_DELAY = 0.010  # s, delay of a late reply
+LATE_REPLY_DELAY = 0.010  # s
 
 
 @dataclass(slots=True)

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from softfinger.daemon.errors import SoftfingerError
 
 _SIZE_MAX = 1024  # maximum number of rows or cols
-_HEADER_LINES_MAX = 1000  # maximum number of header lines
+_HEADER_LINES_MAX = 1000
 _READING_MAX = 1e12  # maximum reading in its unit
 _RAW_SATURATION = 255  # the manufacturer's electronics have 8 bits
 _SATURATION_FRACTION = 0.995  # fraction of the saturation pressure, to allow for rounding

@@ -104,7 +104,7 @@ class Parameters(Record):
     roundness: float  # radius of a disc [m]
     factor: float  # tip stiffness on the object relative to a plane
     extent: float  # maximum distance of an outline point from the object centre [m]
-    corners: int  # number of corners
+    corners: int  # used entries of the outline
     outline: Annotated[Records[Edge], CORNERS]  # counter-clockwise
     mass: float  # object mass [kg]
     inertia: float  # object moment of inertia [kg·m²]
@@ -181,7 +181,7 @@ class TipContact(Record):
 
     d: float  # normal displacement, negative for a gap [m]
     theta: float  # tilt of the object relative to the tip [rad]
-    sine: float  # sine of θ
+    sine: float  # sin θ
     cosine: float
     tangent: float  # tan θ, 0 for bristles and beyond the soft hemisphere
     gain: float  # force relative to a plane, due to w(θ) and face curvature

@@ -210,7 +210,7 @@ class ServoJoint:
 
 
 ROOM_TEMPERATURE = 25.0  # °C
-_THERMOMETER_LAG = 4.0  # s, thermometer lag
+_THERMOMETER_LAG = 4.0  # s
 _CONVECTION = 0.006  # 1/K, relative increase in cooling with temperature difference
 _STEP_MAX = 1.0  # s, maximum step
 # counts; without this tolerance, square root rounding would prevent arrival.
